@@ -1,0 +1,1 @@
+"""Markerless motion capture from a few calibrated cameras."""

@@ -1,0 +1,42 @@
+"""The one place where Taichi is imported and started.
+
+Other modules write ``from tk.kernels.runtime import ti`` and call :func:`ensure_runtime` in each public host
+function. The runtime starts lazily on the first call; a runtime that the caller made before is left as it is.
+Never ``fork`` after it has started: use the ``spawn`` start method for worker processes.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+
+# Taichi greets on import unless told otherwise; a library has no business on the user's stdout.
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+os.environ.setdefault("TI_LOG_LEVEL", "error")
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # taichi's own deprecation notices are not ours to mend
+    import taichi as ti
+
+__all__ = ["ensure_runtime", "ti"]
+
+
+def ensure_runtime() -> None:
+    """Start Taichi on CPU threads unless a runtime exists already.
+
+    ``fast_math`` is off, so that NaN and infinity keep their meaning. ``TK_DEBUG=1`` in the environment turns on
+    bounds checking (slow), ``TK_THREADS`` limits the number of CPU threads.
+    """
+    if ti.lang.impl.get_runtime()._prog is not None:
+        return
+    options: dict[str, object] = {
+        "arch": ti.cpu,
+        "fast_math": False,
+        "default_fp": ti.f32,
+        "offline_cache": True,
+        "debug": os.environ.get("TK_DEBUG") == "1",
+    }
+    threads = os.environ.get("TK_THREADS")
+    if threads:
+        options["cpu_max_num_threads"] = int(threads)
+    ti.init(**options)

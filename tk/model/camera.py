@@ -1,0 +1,146 @@
+"""Calibrated cameras. Pixel centres lie at integer coordinates (OpenCV's convention)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera with lens distortion.
+
+    ``p_camera = rotation @ p_world + translation`` with x right, y down, z forward.
+
+    Attributes:
+        name: the camera's name, as in `calibration.toml`.
+        width, height: image size, pixels.
+        matrix: (3, 3) intrinsic matrix, pixels.
+        distortions: (4,) or (5,) in OpenCV's order k1 k2 p1 p2 [k3]; (4,) k1…k4 when ``fisheye``.
+        rotation: (3, 3) rotation from world to camera.
+        translation: (3,) metres, of the world's origin in the camera frame.
+        fisheye: True for OpenCV's fisheye (equidistant) model.
+    """
+
+    name: str
+    width: int
+    height: int
+    matrix: Float
+    distortions: Float
+    rotation: Float
+    translation: Float
+    fisheye: bool = False
+
+    @property
+    def center(self) -> Float:
+        """(3,) the centre of projection in the world frame, metres."""
+        return -self.rotation.T @ self.translation
+
+    @property
+    def projection(self) -> Float:
+        """(3, 4) K [R | t], without lens distortion."""
+        return self.matrix @ np.column_stack([self.rotation, self.translation])
+
+    def to_camera(self, p_world: ArrayLike) -> Float:
+        """World points (N, 3) in the camera frame, metres."""
+        return np.asarray(p_world, dtype=np.float64).reshape(-1, 3) @ self.rotation.T + self.translation
+
+    def project(self, p_world: ArrayLike) -> tuple[Float, Float]:
+        """Project world points, lens distortion included.
+
+        Args:
+            p_world: (N, 3) metres.
+
+        Returns:
+            pixels (N, 2) as (x, y) and depth (N,) in metres. Points at or behind the camera plane have NaN pixels.
+        """
+        p_camera = self.to_camera(p_world)
+        depth = p_camera[:, 2]
+        pixels = np.full((len(p_camera), 2), np.nan)
+        front = depth > 1e-6
+        if front.any():
+            points = np.ascontiguousarray(p_camera[front])
+            zero = np.zeros(3)
+            if self.fisheye:
+                projected, _ = cv2.fisheye.projectPoints(
+                    points[:, None, :], zero, zero, self.matrix, self.distortions[:4]
+                )
+            else:
+                projected, _ = cv2.projectPoints(points, zero, zero, self.matrix, self.distortions)
+            pixels[front] = np.asarray(projected).reshape(-1, 2)
+            # A distortion polynomial folds back far outside the picture: such a point is not seen at all.
+            pixels[front] = np.where(self._unfolded(points)[:, None], pixels[front], np.nan)
+        return pixels, depth
+
+    def _unfolded(self, p_camera: Float) -> NDArray[np.bool_]:
+        """True where the radial distortion still grows with the radius (it is one-to-one there)."""
+        if self.fisheye:
+            return np.ones(len(p_camera), dtype=bool)
+        k1, k2 = self.distortions[:2]
+        k3 = self.distortions[4] if len(self.distortions) > 4 else 0.0
+        r2 = np.sum((p_camera[:, :2] / p_camera[:, 2:]) ** 2, axis=1)
+        # the derivative must be positive from the axis to the point; test it at a few radii on the way
+        steps = np.linspace(0.1, 1.0, 8)[:, None] ** 2 * r2[None, :]
+        return np.all(1 + 3 * k1 * steps + 5 * k2 * steps**2 + 7 * k3 * steps**3 > 0, axis=0)
+
+    def undistort(self, pixels: ArrayLike) -> Float:
+        """Pixels (N, 2) to normalised image coordinates (N, 2): x/z and y/z in the camera frame."""
+        points = np.ascontiguousarray(np.asarray(pixels, dtype=np.float64).reshape(-1, 1, 2))
+        if self.fisheye:
+            result = cv2.fisheye.undistortPoints(points, self.matrix, self.distortions[:4])
+        else:
+            result = cv2.undistortPoints(points, self.matrix, self.distortions)
+        return np.asarray(result).reshape(-1, 2)
+
+    def rays(self, pixels: ArrayLike) -> Float:
+        """Unit viewing directions (N, 3) in the world frame through pixels (N, 2)."""
+        xy = self.undistort(pixels)
+        directions = np.column_stack([xy, np.ones(len(xy))]) @ self.rotation
+        return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+    def sees(self, p_world: ArrayLike) -> NDArray[np.bool_]:
+        """(N,) True for points whose projection rounds to a pixel of the picture."""
+        pixels, _ = self.project(p_world)
+        with np.errstate(invalid="ignore"):
+            return (
+                (pixels[:, 0] >= -0.5)
+                & (pixels[:, 0] < self.width - 0.5)
+                & (pixels[:, 1] >= -0.5)
+                & (pixels[:, 1] < self.height - 0.5)
+            )
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The cameras of a capture, in a fixed order."""
+
+    cameras: tuple[Camera, ...]
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def __iter__(self) -> Iterator[Camera]:
+        return iter(self.cameras)
+
+    def __getitem__(self, index: int) -> Camera:
+        return self.cameras[index]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(camera.name for camera in self.cameras)
+
+    @property
+    def frame_shape(self) -> tuple[int, int]:
+        """(height, width) that holds every camera's picture: the shape of packed image stacks."""
+        return max(c.height for c in self.cameras), max(c.width for c in self.cameras)
+
+    @property
+    def centers(self) -> Float:
+        """(C, 3) centres of projection, metres."""
+        return np.array([c.center for c in self.cameras])
