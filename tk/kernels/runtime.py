@@ -27,13 +27,14 @@ def ensure_runtime() -> None:
     ``fast_math`` is off, so that NaN and infinity keep their meaning. ``TK_DEBUG=1`` in the environment turns on
     bounds checking (slow), ``TK_THREADS`` limits the number of CPU threads.
     """
-    if ti.lang.impl.get_runtime()._prog is not None:
+    if ti.lang.impl.get_runtime().prog is not None:
         return
     options: dict[str, object] = {
         "arch": ti.cpu,
         "fast_math": False,
         "default_fp": ti.f32,
         "offline_cache": True,
+        "log_level": ti.ERROR,
         "debug": os.environ.get("TK_DEBUG") == "1",
     }
     threads = os.environ.get("TK_THREADS")

@@ -1,0 +1,292 @@
+"""The skeleton: a tree of exponential twists with 24 degrees of freedom (Kehl 2006, section 5.1, figure 5a).
+
+A pose is a configuration vector p. The transform after degree of freedom k is
+
+    T_k = T_parent(k) · exp(ξ_k p_k)
+
+with the twist ξ_k given by an axis and a point on it in the *zero configuration* (silhouette paper, eqs. 2-5).
+∂x/∂p_k of a point x below k is then ω_k × (x − q_k), axis and point carried along by T_parent(k) (eqs. 6-8).
+
+Zero configuration, in the body frame (x forward, y to the left, z up; origin midway between the hip centres): legs hang
+straight, both arms point horizontally forward and outward at 45°. Ball joints are three successive rotations whose middle
+angle must stay within ±90°. The paper does not give its axes. Here they are chosen so that the singular directions are
+hardly ever taken: a leg straight to the side, the trunk lying on its side, and, for an arm, the diagonal
+back-out-up / forward-in-down, which is at least 54° away from hanging, raised, forward, backward and sideways.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ConfigError
+from tk.model.anthropometry import BodyDimensions
+
+Float = NDArray[np.float64]
+
+JOINTS = (
+    "pelvis",
+    "neck",
+    "head_top",
+    "shoulder_l",
+    "elbow_l",
+    "wrist_l",
+    "shoulder_r",
+    "elbow_r",
+    "wrist_r",
+    "hip_l",
+    "knee_l",
+    "ankle_l",
+    "hip_r",
+    "knee_r",
+    "ankle_r",
+)
+
+SEGMENTS = (
+    "torso",
+    "head",
+    "upper_arm_l",
+    "forearm_l",
+    "upper_arm_r",
+    "forearm_r",
+    "thigh_l",
+    "calf_l",
+    "thigh_r",
+    "calf_r",
+)
+
+# The five chains that are refined one by one with the torso held (section 6.4): the segments of each.
+CHAINS: dict[str, tuple[str, ...]] = {
+    "head": ("head",),
+    "arm_l": ("upper_arm_l", "forearm_l"),
+    "arm_r": ("upper_arm_r", "forearm_r"),
+    "leg_l": ("thigh_l", "calf_l"),
+    "leg_r": ("thigh_r", "calf_r"),
+}
+
+# Zero configuration of the left arm (see the module's docstring).
+_ARM = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
+_ARM_POLE = np.array([-1.0, 1.0, 1.0]) / np.sqrt(3)
+_ARM_RISE = np.cross(_ARM, _ARM_POLE)
+# An elbow at zero twist bends inward and up: forward when the arm hangs, inward when it is raised.
+_ELBOW = np.cross(_ARM, [0.5, -0.5, np.sqrt(0.5)])
+
+# Ranges in degrees. Active ranges of healthy men with three standard deviations, Boone & Azen, J. Bone Joint Surg. Am.
+# 61 (1979) 756-759, widened by 10° because a single hinge or ball stands for a whole joint complex (the shoulder girdle,
+# the lumbar spine): hip flexion 122±6, extension 10±7, abduction 46±9, adduction 27±4, rotation 47±6; knee 143±5; elbow
+# 143±6. The shoulder's ranges (flexion 167±5, extension 62±10, abduction 184±7, rotation 69/104) are given about other
+# axes than ours: the box below is the smallest that holds them (tests/model/test_skeleton.py samples them). Neck: Youdas
+# et al., Phys. Ther. 72 (1992) 770-780: flexion and extension 60-70 together with the upper spine, lateral bending 40-45.
+_LIMITS_DEG: dict[str, tuple[float, float]] = {
+    "torso_yaw": (-np.inf, np.inf),
+    "torso_roll": (-80.0, 80.0),
+    "torso_pitch": (-np.inf, np.inf),
+    "neck_pitch": (-70.0, 65.0),
+    "neck_yaw": (-50.0, 50.0),
+    "shoulder_yaw": (-180.0, 180.0),
+    "shoulder_pitch": (-80.0, 80.0),
+    "shoulder_roll": (-110.0, 110.0),
+    "elbow_flexion": (-5.0, 155.0),
+    "hip_pitch": (-150.0, 40.0),
+    "hip_yaw": (-45.0, 80.0),
+    "hip_roll": (-70.0, 70.0),
+    "knee_flexion": (-10.0, 160.0),
+}
+
+DEGREES_OF_FREEDOM = 24
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """The kinematic tree as plain arrays (D = 24 degrees of freedom, S = 10 segments, J = 15 joints).
+
+    Attributes:
+        names: (D,) names of the degrees of freedom; translations first.
+        units: (D,) "m" or "rad".
+        axis: (D, 3) unit axes in the zero configuration, world frame.
+        point: (D, 3) a point on each axis, metres; unused for translations.
+        prismatic: (D,) True for translations.
+        parent: (D,) index of the degree of freedom before, -1 at the root.
+        lower, upper: (D,) limits, radians; infinite where there is none.
+        segment_dof: (S,) the last degree of freedom above each segment.
+        joint_segment: (J,) the segment that carries each joint.
+        joint_position: (J, 3) joint centres in the zero configuration, metres.
+        T_world_body: (3, 3) rotation of the body frame in the zero configuration (identity when z is up).
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    axis: Float
+    point: Float
+    prismatic: NDArray[np.bool_]
+    parent: NDArray[np.int32]
+    lower: Float
+    upper: Float
+    segment_dof: NDArray[np.int32]
+    joint_segment: NDArray[np.int32]
+    joint_position: Float
+    T_world_body: Float
+
+    def index(self, name: str) -> int:
+        """The position of a degree of freedom in p."""
+        return self.names.index(name)
+
+    def clip(self, poses: Float) -> Float:
+        """Poses (..., D) mapped into the limits (eq. 22)."""
+        return np.clip(poses, self.lower, self.upper)
+
+    def transforms(self, pose: Float) -> Float:
+        """(D, 4, 4) transforms T_k after each degree of freedom, float64. Kernels have their own."""
+        result = np.empty((len(self.names), 4, 4))
+        for k, angle in enumerate(np.asarray(pose, dtype=np.float64)):
+            step = np.eye(4)
+            if self.prismatic[k]:
+                step[:3, 3] = self.axis[k] * angle
+            else:
+                step = twist_exp(self.axis[k], self.point[k], angle)
+            result[k] = step if self.parent[k] < 0 else result[self.parent[k]] @ step
+        return result
+
+    def segment_transforms(self, pose: Float) -> Float:
+        """(S, 4, 4) transforms of the segments."""
+        return self.transforms(pose)[self.segment_dof]
+
+    def joints(self, pose: Float) -> Float:
+        """(J, 3) joint centres in the world frame, metres, in the order of :data:`JOINTS`."""
+        T = self.segment_transforms(pose)[self.joint_segment]
+        return np.einsum("jab,jb->ja", T[:, :3, :3], self.joint_position) + T[:, :3, 3]
+
+    def ancestors(self) -> NDArray[np.bool_]:
+        """(S, D): True where a degree of freedom moves a segment."""
+        result = np.zeros((len(SEGMENTS), len(self.names)), dtype=bool)
+        for s, k in enumerate(self.segment_dof):
+            while k >= 0:
+                result[s, k] = True
+                k = self.parent[k]
+        return result
+
+    def chain_dofs(self, chain: str) -> NDArray[np.bool_]:
+        """(D,) True for the degrees of freedom of one of :data:`CHAINS`; the torso's are none of them."""
+        prefixes = {
+            "head": ("neck",),
+            "arm_l": ("shoulder_l", "elbow_l"),
+            "arm_r": ("shoulder_r", "elbow_r"),
+            "leg_l": ("hip_l", "knee_l"),
+            "leg_r": ("hip_r", "knee_r"),
+        }[chain]
+        return np.array([name.startswith(prefixes) for name in self.names])
+
+
+def twist_exp(axis: Float, point: Float, angle: float) -> Float:
+    """(4, 4) exp of a revolute twist: the rotation by ``angle`` about ``axis`` (unit) through ``point``."""
+    x, y, z = axis
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    R = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = point - R @ point
+    return T
+
+
+def up_rotation(up: str) -> Float:
+    """(3, 3) rotation of the body frame such that its z axis is the world axis ``up`` ("z", "-y", …)."""
+    name = up.strip().lower()
+    sign = -1.0 if name.startswith("-") else 1.0
+    axis = name.lstrip("+-")
+    if axis not in ("x", "y", "z"):
+        raise ConfigError(f'up = "{up}" must be one of x, y, z, -x, -y, -z')
+    z = np.zeros(3)
+    z["xyz".index(axis)] = sign
+    x = np.zeros(3)
+    x[("xyz".index(axis) + 1) % 3] = 1.0
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def build_skeleton(dimensions: BodyDimensions, up: str = "z") -> Skeleton:
+    """The 24-DOF skeleton with these dimensions, standing upright along ``up``."""
+    d = dimensions
+    B = up_rotation(up) if up != "z" else np.eye(3)
+    x, y, z = np.eye(3)
+    pelvis = np.zeros(3)
+    neck = np.array([0.0, 0.0, d.trunk])
+    mirror = np.diag([1.0, -1.0, 1.0])
+    shoulder = np.array([0.0, d.shoulder_half_width, d.trunk - d.shoulder_drop])
+    hip = np.array([0.0, d.hip_half_width, 0.0])
+
+    rows: list[tuple[str, Float, Float, int]] = []  # name, axis, point, parent
+
+    def add(name: str, axis: Float, point: Float, parent: int) -> int:
+        rows.append((name, np.asarray(axis, dtype=float), point, parent))
+        return len(rows) - 1
+
+    last = -1
+    for name, axis in (("torso_x", x), ("torso_y", y), ("torso_z", z)):
+        last = add(name, axis, pelvis, last)
+    for name, axis in (("torso_yaw", z), ("torso_roll", x), ("torso_pitch", y)):
+        last = add(name, axis, pelvis, last)
+    torso = last
+    last = add("neck_pitch", y, neck, torso)
+    head = add("neck_yaw", x, neck, last)
+    segment_dof = {"torso": torso, "head": head}
+
+    joints: dict[str, tuple[str, Float]] = {
+        "pelvis": ("torso", pelvis),
+        "neck": ("torso", neck),
+        "head_top": ("head", neck + d.head * z),
+    }
+    for side in ("l", "r"):
+        M = np.eye(3) if side == "l" else mirror
+        spin = 1.0 if side == "l" else -1.0  # a mirrored rotation turns about the negative mirrored axis
+        arm = M @ _ARM
+        s, e = M @ shoulder, M @ shoulder + d.upper_arm * arm
+        last = add(f"shoulder_{side}_yaw", spin * M @ _ARM_POLE, s, torso)
+        last = add(f"shoulder_{side}_pitch", spin * M @ _ARM_RISE, s, last)
+        segment_dof[f"upper_arm_{side}"] = add(f"shoulder_{side}_roll", spin * M @ _ARM, s, last)
+        segment_dof[f"forearm_{side}"] = add(
+            f"elbow_{side}_flexion", spin * M @ _ELBOW, e, segment_dof[f"upper_arm_{side}"]
+        )
+        joints[f"shoulder_{side}"] = ("torso", s)
+        joints[f"elbow_{side}"] = (f"upper_arm_{side}", e)
+        joints[f"wrist_{side}"] = (f"forearm_{side}", e + d.forearm * arm)
+    for side in ("l", "r"):
+        M = np.eye(3) if side == "l" else mirror
+        spin = 1.0 if side == "l" else -1.0
+        h = M @ hip
+        knee = h - d.thigh * z
+        last = add(f"hip_{side}_pitch", y, h, torso)
+        last = add(f"hip_{side}_yaw", spin * x, h, last)
+        segment_dof[f"thigh_{side}"] = add(f"hip_{side}_roll", -spin * z, h, last)
+        segment_dof[f"calf_{side}"] = add(f"knee_{side}_flexion", y, knee, segment_dof[f"thigh_{side}"])
+        joints[f"hip_{side}"] = ("torso", h)
+        joints[f"knee_{side}"] = (f"thigh_{side}", knee)
+        joints[f"ankle_{side}"] = (f"calf_{side}", knee - d.calf * z)
+
+    names = tuple(row[0] for row in rows)
+    prismatic = np.array([name in ("torso_x", "torso_y", "torso_z") for name in names])
+    limits = np.array([_limits(name) for name in names])
+    axis = np.array([row[1] for row in rows])
+    axis[~prismatic] = axis[~prismatic] @ B.T
+    return Skeleton(
+        names=names,
+        units=tuple("m" if p else "rad" for p in prismatic),
+        axis=axis,
+        point=np.array([row[2] for row in rows]) @ B.T,
+        prismatic=prismatic,
+        parent=np.array([row[3] for row in rows], dtype=np.int32),
+        lower=limits[:, 0],
+        upper=limits[:, 1],
+        segment_dof=np.array([segment_dof[s] for s in SEGMENTS], dtype=np.int32),
+        joint_segment=np.array([SEGMENTS.index(joints[j][0]) for j in JOINTS], dtype=np.int32),
+        joint_position=np.array([joints[j][1] for j in JOINTS]) @ B.T,
+        T_world_body=B,
+    )
+
+
+def _limits(name: str) -> tuple[float, float]:
+    if name in ("torso_x", "torso_y", "torso_z"):
+        return -np.inf, np.inf
+    key = name.replace("_l_", "_").replace("_r_", "_")
+    lower, upper = _LIMITS_DEG[key]
+    return float(np.radians(lower)), float(np.radians(upper))
