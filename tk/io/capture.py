@@ -1,0 +1,271 @@
+"""A capture: the folder that goes in. Opening one checks everything that can be checked without decoding it all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import CaptureError, VideoError, VolumeError
+from tk.io.calibration import Calibration, match_camera, read_calibration
+from tk.io.frames import FrameReader, FrameSet
+from tk.io.settings import CaptureSettings, read_settings
+from tk.io.video import Clip, Image, list_clips, probe
+from tk.model.camera import Camera, Rig
+from tk.model.common_view import infer_volume, sample_box, views_of
+from tk.model.volume import Volume
+
+__all__ = ["Capture", "FrameReader", "FrameSet", "open_capture"]
+
+#: frames a second when neither `capture.toml` nor the videos say
+DEFAULT_FPS = 30.0
+
+#: pictures of the empty scene that are kept a camera, and the bytes that all of them may take
+_BACKGROUND_FRAMES = 50
+_BACKGROUND_BYTES = 384 * 2**20
+
+#: cameras farther apart than this, in metres, are taken for millimetres in disguise
+_FAR_APART_M = 100.0
+
+
+@dataclass(frozen=True)
+class Capture:
+    """An open capture folder: a few numbers, and where the pictures are. Pictures are read by :meth:`frames`.
+
+    Attributes:
+        path: the folder.
+        name: from `capture.toml`, else the folder's name.
+        fps: frames a second, from `capture.toml`, else from the videos, else 30.
+        up: the world axis that points up: x, y, z, -x, -y or -z.
+        rig: the cameras, in the calibration file's order.
+        volume: the working volume, world frame, metres; inferred from the rig where `capture.toml` has none.
+        frame_count: frames that all cameras (and masks) have.
+        subject_height_m: metres, None if unknown.
+        init_frame: the frame in which the subject stands in the initialisation pose.
+        init_pose: "da-vinci", or "any" when no pose is promised.
+        warnings: what was put up with, a line each, for the user to read.
+        clips: a clip a camera.
+        mask_clips: a mask clip a camera, None without ready masks.
+    """
+
+    path: Path
+    name: str
+    fps: float
+    up: str
+    rig: Rig
+    volume: Volume
+    frame_count: int
+    subject_height_m: float | None
+    init_frame: int
+    init_pose: str
+    warnings: tuple[str, ...]
+    clips: tuple[Clip, ...]
+    mask_clips: tuple[Clip, ...] | None
+    _calibration: Calibration
+
+    @property
+    def has_masks(self) -> bool:
+        return self.mask_clips is not None
+
+    @property
+    def up_axis(self) -> NDArray[np.float64]:
+        """(3,) unit vector that points up, world frame."""
+        axis = np.zeros(3)
+        axis["xyz".index(self.up[-1])] = -1.0 if self.up.startswith("-") else 1.0
+        return axis
+
+    def frames(self, start: int = 0, stop: int | None = None) -> FrameReader:
+        """The frames ``start`` … ``stop - 1``, decoded ahead; up to the capture's end by default.
+
+        Raises:
+            CaptureError: there are no such frames.
+        """
+        stop = self.frame_count if stop is None else min(stop, self.frame_count)
+        if not 0 <= start < stop:
+            raise CaptureError(
+                f"{self.path}: no frames from {start} to {stop}; it has frames 0 to {self.frame_count - 1}"
+            )
+        return FrameReader(self.clips, self.mask_clips, self.rig.frame_shape, start, stop)
+
+    def background(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """The empty scene: an array (T, h, w, 3) uint8 BGR a camera, None without a `background/` folder.
+
+        T is 1 for a picture. Of a clip at most 50 frames are kept, spread evenly over it, and fewer of large
+        pictures (384 MiB over all cameras): enough for a mean and a variance.
+
+        Raises:
+            VideoError: a camera has no background, or it cannot be read, or has another size.
+        """
+        folder = self.path / "background"
+        if not folder.is_dir():
+            return None
+        clips = _clips_of(self._calibration, folder, "background", "png", pictures=True)
+        pixels = sum(camera.width * camera.height for camera in self.rig)
+        most = min(_BACKGROUND_FRAMES, max(2, _BACKGROUND_BYTES // (3 * pixels)))
+        return tuple(_read_some(clip, most) for clip in clips)
+
+
+def open_capture(path: str | Path, cameras: Sequence[str] | None = None, masks: str = "auto") -> Capture:
+    """Open a capture folder.
+
+    Args:
+        path: the folder.
+        cameras: names of the cameras to use; all of them by default.
+        masks: "auto" takes the capture's `masks/` where there is one, "none" takes no masks, anything else is a folder
+            in the layout of `masks/`.
+
+    Raises:
+        CaptureError: or one of its subclasses, with one line that names the file and what is wrong with it.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise CaptureError(f"{path}: is not a folder; a capture is a folder with calibration.toml and videos/")
+    calibration = read_calibration(path / "calibration.toml").select(cameras)
+    rig = calibration.rig
+    settings = read_settings(path / "capture.toml")
+
+    clips = _open_clips(calibration, path)
+    mask_clips = _open_masks(calibration, path, masks)
+    warnings: list[str] = []
+    if settings.unknown:
+        warnings.append(f"{path / 'capture.toml'}: unknown keys are ignored: {', '.join(settings.unknown)}")
+    _warn_of_units(calibration, warnings.append)
+    frame_count = _common_length([*clips, *(mask_clips or ())], warnings.append)
+    if settings.init_frame >= frame_count:
+        raise CaptureError(
+            f"{path / 'capture.toml'}: [init]: frame = {settings.init_frame} is past the last frame, {frame_count - 1}"
+        )
+    return Capture(
+        path=path,
+        name=settings.name or path.resolve().name,
+        fps=_frame_rate(settings, clips, path, warnings.append),
+        up=settings.up,
+        rig=rig,
+        volume=_working_volume(settings, rig, path, warnings.append),
+        frame_count=frame_count,
+        subject_height_m=settings.subject_height_m,
+        init_frame=settings.init_frame,
+        init_pose=settings.init_pose,
+        warnings=tuple(warnings),
+        clips=clips,
+        mask_clips=mask_clips,
+        _calibration=calibration,
+    )
+
+
+def _open_clips(calibration: Calibration, path: Path) -> tuple[Clip, ...]:
+    for folder in (path / "videos", path / "images"):
+        if folder.is_dir():
+            return _clips_of(calibration, folder, "video" if folder.name == "videos" else "folder of pictures", "mp4")
+    raise VideoError(f"{path}: has neither videos/ nor images/")
+
+
+def _open_masks(calibration: Calibration, path: Path, masks: str) -> tuple[Clip, ...] | None:
+    if masks == "none":
+        return None
+    folder = path / "masks" if masks == "auto" else Path(masks)
+    if not folder.is_dir():
+        if masks == "auto":
+            return None
+        raise CaptureError(f"--masks {masks}: is not a folder; give auto, none or a folder of masks")
+    return _clips_of(calibration, folder, "masks", "mp4", is_mask=True)
+
+
+def _clips_of(
+    calibration: Calibration, folder: Path, what: str, suffix: str, *, pictures: bool = False, is_mask: bool = False
+) -> tuple[Clip, ...]:
+    """The clip in ``folder`` of each camera, probed and of the camera's size."""
+    found = list_clips(folder, pictures)
+    taken: dict[str, Camera] = {}
+    clips: list[Clip] = []
+    for camera, key in zip(calibration.rig, calibration.keys, strict=True):
+        try:
+            stem = match_camera(camera.name, key, found)
+        except CaptureError as ambiguous:
+            raise VideoError(f"{folder}: {ambiguous}") from None
+        if stem is None:
+            expected = folder / (camera.name if folder.name == "images" else f"{camera.name}.{suffix}")
+            there = ", ".join(file.name for file in found.values()) or "nothing"
+            raise VideoError(f"{expected}: camera {camera.name!r} has no {what}; {folder.name}/ holds {there}")
+        if stem in taken:
+            raise VideoError(
+                f"{found[stem]}: fits both cameras {taken[stem].name!r} and {camera.name!r}; rename it to its camera"
+            )
+        taken[stem] = camera
+        clip = probe(found[stem], is_mask)
+        if (clip.width, clip.height) != (camera.width, camera.height):
+            raise VideoError(
+                f"{clip.path}: is {clip.width}×{clip.height}, but {calibration.path.name} gives camera {camera.name!r} "
+                f"{camera.width}×{camera.height}; calibrate for this size or scale the pictures"
+            )
+        clips.append(clip)
+    return tuple(clips)
+
+
+def _common_length(clips: Sequence[Clip], warn: Callable[[str], None]) -> int:
+    counts = [clip.frame_count for clip in clips]
+    common = min(counts)
+    if common < max(counts):
+        short = ", ".join(str(clip.path) for clip in clips if clip.frame_count == common)
+        warn(f"{short}: has {common} frames, others up to {max(counts)}; only the first {common} are used")
+    return common
+
+
+def _frame_rate(settings: CaptureSettings, clips: Sequence[Clip], path: Path, warn: Callable[[str], None]) -> float:
+    if settings.fps is not None:
+        return settings.fps
+    rates = [clip.fps for clip in clips if clip.fps is not None]
+    if not rates:
+        warn(f"{path / 'capture.toml'}: gives no fps, and neither do the pictures; {DEFAULT_FPS:g} is assumed")
+        return DEFAULT_FPS
+    if max(rates) > 1.01 * min(rates):
+        listed = ", ".join(f"{clip.path.name} {clip.fps:g}" for clip in clips if clip.fps is not None)
+        warn(
+            f"{path / 'videos'}: frame rates differ ({listed}); {rates[0]:g} is used, fps in capture.toml overrides it"
+        )
+    return rates[0]
+
+
+def _working_volume(settings: CaptureSettings, rig: Rig, path: Path, warn: Callable[[str], None]) -> Volume:
+    """The volume from `capture.toml`, or the inferred one; checked to be in sight of two cameras somewhere."""
+    file = path / "capture.toml"
+    if settings.volume is None:
+        try:
+            volume = infer_volume(rig)
+        except VolumeError as reason:
+            raise VolumeError(f"{file}: gives no [volume], and none can be inferred: {reason}; add one") from None
+        center, size = ([round(x, 2) for x in values] for values in (volume.center, volume.size))
+        warn(f"{file}: gives no [volume]; inferred from the cameras: center = {center}, size = {size} (metres)")
+        return volume
+    if not (views_of(rig, sample_box(settings.volume)) >= 2).any():
+        raise VolumeError(
+            f"{file}: [volume]: no two cameras see center = {list(settings.volume.center)}, "
+            f"size = {list(settings.volume.size)}; move it (metres), or check the units in calibration.toml"
+        )
+    return settings.volume
+
+
+def _warn_of_units(calibration: Calibration, warn: Callable[[str], None]) -> None:
+    centers = calibration.rig.centers
+    if np.linalg.norm(np.ptp(centers, axis=0)) > _FAR_APART_M:
+        warn(f'{calibration.path}: the cameras are over {_FAR_APART_M:g} m apart; is [metadata] units = "mm" missing?')
+
+
+def _read_some(clip: Clip, most: int) -> Image:
+    """(T, h, w, 3): at most ``most`` frames, spread evenly over the clip."""
+    count = min(clip.frame_count, most)
+    chosen = (np.arange(count) * clip.frame_count) // count
+    result = np.empty((count, clip.height, clip.width, 3), np.uint8)
+    position = 0
+    with closing(clip.open()) as reader:
+        for out, index in zip(result, chosen, strict=True):
+            while position < index:
+                reader.skip()
+                position += 1
+            reader.read(out)
+            position += 1
+    return result

@@ -1,0 +1,116 @@
+"""`capture.toml`: what a person says about a capture. Everything in it is optional."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tk.errors import VolumeError
+from tk.io.toml import Table, load_toml
+from tk.model.volume import Volume
+
+#: world axes that may point up
+UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
+
+#: known initialisation poses; "any" promises none
+INIT_POSES = ("da-vinci", "any")
+
+_KEYS: dict[str, tuple[str, ...]] = {
+    "volume": ("center", "size"),
+    "subject": ("height",),
+    "init": ("frame", "pose"),
+}
+_TOP_KEYS = ("name", "fps", "up", *_KEYS)
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """What `capture.toml` says; None where it is silent and the default comes from elsewhere.
+
+    Attributes:
+        name: of the capture.
+        fps: frames a second.
+        up: the world axis that points up, one of :data:`UP_AXES`.
+        volume: the working volume, metres.
+        subject_height_m: the subject's height without shoes, metres.
+        init_frame: the frame in which the subject stands in the initialisation pose.
+        init_pose: one of :data:`INIT_POSES`.
+        unknown: keys that mean nothing to us, e.g. a misspelt one.
+    """
+
+    name: str | None = None
+    fps: float | None = None
+    up: str = "z"
+    volume: Volume | None = None
+    subject_height_m: float | None = None
+    init_frame: int = 0
+    init_pose: str = "da-vinci"
+    unknown: tuple[str, ...] = ()
+
+
+def read_settings(path: Path) -> CaptureSettings:
+    """Read `capture.toml`; a missing file is an empty one.
+
+    Raises:
+        CaptureError: invalid TOML or a value out of range, with the file and the key.
+        VolumeError: the working volume is empty.
+    """
+    if not path.exists():
+        return CaptureSettings()
+    document = Table(load_toml(path), str(path))
+
+    fps = document.number("fps") if "fps" in document else None
+    if fps is not None and fps <= 0:
+        document.fail(f"fps = {fps:g} must be positive")
+
+    up = document.text("up", "z").strip().lower().removeprefix("+")
+    if up not in UP_AXES:
+        document.fail(f"up = {up!r} must be one of {', '.join(UP_AXES)}")
+
+    subject = document.table("subject")
+    height_m = subject.number("height") if "height" in subject else None
+    if height_m is not None and not 0.3 <= height_m <= 3.0:
+        subject.fail(f"height = {height_m:g} must be between 0.3 and 3 metres")
+
+    init = document.table("init")
+    init_frame = init.integer("frame", 0)
+    if init_frame < 0:
+        init.fail(f"frame = {init_frame} must not be negative")
+    init_pose = init.text("pose", "da-vinci")
+    if init_pose not in INIT_POSES:
+        init.fail(f"pose = {init_pose!r} must be one of {', '.join(INIT_POSES)}")
+
+    return CaptureSettings(
+        name=document.text("name", "") if "name" in document else None,
+        fps=fps,
+        up=up,
+        volume=_volume(document.table("volume")) if "volume" in document else None,
+        subject_height_m=height_m,
+        init_frame=init_frame,
+        init_pose=init_pose,
+        unknown=_unknown_keys(document.values),
+    )
+
+
+def _volume(table: Table) -> Volume:
+    table.error = VolumeError
+    center = table.array("center", (3,))
+    size = table.array("size", (3,))
+    if (size <= 0).any():
+        table.fail(f"size = {size.tolist()} is empty; give three positive lengths in metres")
+    return Volume(_triple(center), _triple(size))
+
+
+def _unknown_keys(document: Any) -> tuple[str, ...]:
+    unknown = [key for key in document if key not in _TOP_KEYS]
+    for table, keys in _KEYS.items():
+        unknown += [f"{table}.{key}" for key in document.get(table, {}) if key not in keys]
+    return tuple(unknown)
+
+
+def _triple(values: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z

@@ -1,0 +1,70 @@
+"""Where the cameras of a rig look together: a working volume when nobody has given one."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import VolumeError
+from tk.model.camera import Rig
+from tk.model.volume import Volume
+
+Float = NDArray[np.float64]
+
+#: samples along each side of a box whose visibility is asked for
+_SAMPLES = 24
+
+
+def views_of(rig: Rig, p_world: Float) -> NDArray[np.int64]:
+    """(N,) the number of cameras that have each of the points (N, 3) in their picture."""
+    return np.sum([camera.sees(p_world) for camera in rig], axis=0)
+
+
+def sample_box(volume: Volume, samples: int = _SAMPLES) -> Float:
+    """(samples³, 3) points on a regular grid over the box, its faces included, metres."""
+    axes = [np.linspace(low, high, samples) for low, high in zip(volume.lower, volume.upper, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def closest_to_axes(rig: Rig) -> Float:
+    """(3,) the point with the least sum of squared distances to the cameras' optical axes, metres.
+
+    Raises:
+        VolumeError: the axes are parallel, so that there is no such point.
+    """
+    directions = np.array([camera.rotation[2] for camera in rig])
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]  # projects onto the plane across each axis
+    normal = across.sum(axis=0)
+    if np.linalg.cond(normal) > 1e6:  # axes within about a milliradian of one another
+        raise VolumeError("the cameras' axes are parallel")
+    return np.linalg.solve(normal, np.einsum("cij,cj->i", across, rig.centers))
+
+
+def infer_volume(rig: Rig) -> Volume:
+    """A working volume for a rig: the box around what all cameras see in common.
+
+    The rule: start at the point closest to all optical axes. Around it, out to 0.6 of the distance to the nearest
+    camera, take the points that are in every camera's picture. The volume is their axis-aligned bounding box: rather
+    too large than a head cut off. The paper (section 4.1) takes the volume as given.
+
+    Raises:
+        VolumeError: the axes do not meet, or no region is seen by all cameras.
+    """
+    middle = closest_to_axes(rig)
+    reach_m = 0.6 * float(np.linalg.norm(rig.centers - middle, axis=1).min())
+    if not reach_m > 0:
+        raise VolumeError("a camera stands where the others look")
+    ball = sample_box(Volume(_triple(middle), (2 * reach_m,) * 3), 2 * _SAMPLES)
+    ball = ball[np.linalg.norm(ball - middle, axis=1) <= reach_m]
+    common = ball[views_of(rig, ball) == len(rig)]
+    if len(common) == 0:
+        raise VolumeError("no region is seen by all cameras")
+    lower, upper = common.min(axis=0), common.max(axis=0)
+    if not (upper > lower).all():
+        raise VolumeError("no region is seen by all cameras")
+    return Volume(_triple((lower + upper) / 2), _triple(upper - lower))
+
+
+def _triple(values: Float) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
