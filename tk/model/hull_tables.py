@@ -1,0 +1,197 @@
+"""Look-up tables of the visual hull: which voxels each pixel holds. Built once a rig and grid, cached on disk."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import tempfile
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ConfigError, VolumeError
+from tk.kernels import hull as kernels
+from tk.model.camera import Camera, Rig
+from tk.model.volume import VoxelGrid
+
+__all__ = ["MAX_CAMERAS", "HullTables", "default_cache_dir", "load_or_build", "table_key"]
+
+MAX_CAMERAS = 31  # a bit each in an int32, and one for "seen by two"
+_FORMAT = 1  # part of the key: raise it when the tables' meaning changes
+_CACHE_BYTES = 1 << 30  # the oldest tables go when the folder holds more
+_BLOCK = 1 << 15  # voxels projected at a time: the intermediate arrays stay in the processor's cache
+
+
+@dataclass(frozen=True)
+class HullTables:
+    """The paper's look-up tables (section 4.1, fig. 2) in compressed rows.
+
+    With P = H * W pixels a picture of the packed stack, V voxels and C cameras:
+
+    Attributes:
+        row_offsets: (C * P + 1,) int32; pixel p of camera c owns ``voxels[row_offsets[c*P+p] : row_offsets[c*P+p+1]]``.
+        voxels: (L,) int32 flat voxel indices whose centres project to the pixel, ascending in each row.
+        camera_count: C.
+        voxel_count: V.
+    """
+
+    row_offsets: NDArray[np.int32]
+    voxels: NDArray[np.int32]
+    camera_count: int
+    voxel_count: int
+
+    @cached_property
+    def pixels(self) -> NDArray[np.int32]:
+        """(C, V) int32, the lists turned back: the pixel of each voxel, -1 outside the picture."""
+        pixels = np.full((self.camera_count, self.voxel_count), -1, dtype=np.int32)
+        pixel_count = (len(self.row_offsets) - 1) // self.camera_count
+        lengths = np.diff(self.row_offsets).reshape(self.camera_count, pixel_count)
+        index = np.arange(pixel_count, dtype=np.int32)
+        for camera in range(self.camera_count):
+            start, stop = self.row_offsets[camera * pixel_count], self.row_offsets[(camera + 1) * pixel_count]
+            pixels[camera, self.voxels[start:stop]] = np.repeat(index, lengths[camera])
+        return pixels
+
+    @cached_property
+    def empty_bits(self) -> NDArray[np.int32]:
+        """(V,) int32, the voxels' bits before any foreground: cameras that do not hold them, and the bit for two."""
+        bits = np.zeros(self.voxel_count, dtype=np.uint32)
+        holders = np.zeros(self.voxel_count, dtype=np.uint8)
+        for camera, row in enumerate(self.pixels):
+            outside = row < 0
+            bits[outside] |= np.uint32(1 << camera)
+            holders += ~outside
+        bits[holders >= 2] |= np.uint32(1 << self.camera_count)
+        return bits.view(np.int32)
+
+
+def load_or_build(rig: Rig, grid: VoxelGrid, cache_dir: Path | None = None, use_cache: bool = True) -> HullTables:
+    """The tables of this rig and grid, from the cache where it has them, else built and cached.
+
+    Raises:
+        VolumeError: no voxel is seen by two cameras.
+        ConfigError: more than 31 cameras, or more look-ups than 32-bit offsets reach.
+    """
+    if len(rig) > MAX_CAMERAS:
+        raise ConfigError(f"{len(rig)} cameras: the visual hull takes up to {MAX_CAMERAS}; choose some with --cameras")
+    height, width = rig.frame_shape
+    if max(grid.count * len(rig), height * width * len(rig)) >= 2**31 - 1:
+        raise ConfigError(f"{grid.count} voxels by {len(rig)} cameras are too many look-ups; give fewer --voxels")
+    path: Path | None = None
+    if use_cache:
+        path = (default_cache_dir() if cache_dir is None else cache_dir) / f"hull-{table_key(rig, grid)}.npz"
+        tables = _load(path, rig, grid)
+        if tables is not None:
+            return tables
+    tables = _build(rig, grid)
+    if path is not None:
+        _save(path, tables)
+    return tables
+
+
+def default_cache_dir() -> Path:
+    """The platform's folder for this program's cached files; it need not exist."""
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA", "")
+    elif sys.platform == "darwin":
+        base = os.path.join("~", "Library", "Caches")
+    else:
+        base = os.environ.get("XDG_CACHE_HOME", "")
+    return Path(os.path.expanduser(base or os.path.join("~", ".cache"))) / "tk"
+
+
+def table_key(rig: Rig, grid: VoxelGrid) -> str:
+    """A hash of all that the tables depend on: format, the cameras' numbers (not their names), and the grid."""
+    digest = hashlib.sha256(f"tk-hull {_FORMAT} {np.dtype(np.int32).newbyteorder('=').str}".encode())
+    for camera in rig:
+        digest.update(f"{camera.width} {camera.height} {camera.fisheye} {len(camera.distortions)}".encode())
+        for numbers in (camera.matrix, camera.distortions, camera.rotation, camera.translation):
+            digest.update(np.ascontiguousarray(numbers, dtype="<f8").tobytes())
+    digest.update(np.array([*grid.origin, grid.voxel_m, *grid.shape], dtype="<f8").tobytes())
+    return digest.hexdigest()[:32]
+
+
+def _build(rig: Rig, grid: VoxelGrid) -> HullTables:
+    width = rig.frame_shape[1]
+    pixels = np.empty((len(rig), grid.count), dtype=np.int32)
+    starts = range(0, grid.count, _BLOCK)
+
+    def project(start: int) -> None:
+        stop = min(start + _BLOCK, grid.count)
+        centers = grid.centers(np.arange(start, stop))
+        for row, camera in zip(pixels, rig, strict=True):
+            row[start:stop] = _pixel_index(camera, centers, width)
+
+    with ThreadPoolExecutor() as pool:  # numpy and OpenCV let go of the interpreter lock
+        list(pool.map(project, starts))
+    if not ((pixels >= 0).sum(axis=0, dtype=np.int32) >= 2).any():
+        raise VolumeError(
+            "capture.toml: no two cameras see any of the working volume; "
+            "correct center and size in [volume], or the cameras' poses in calibration.toml"
+        )
+    row_offsets, voxels = kernels.sort_by_pixel(pixels, int(np.prod(rig.frame_shape)))
+    return HullTables(row_offsets, voxels, len(rig), grid.count)
+
+
+def _pixel_index(camera: Camera, p_world: NDArray[np.float64], stride: int) -> NDArray[np.int32]:
+    """(N,) index ``y * stride + x`` of the pixel each point falls on, -1 outside the camera's picture."""
+    xy, _ = camera.project(p_world)
+    inside = (xy >= -0.5).all(axis=1) & (xy < (camera.width - 0.5, camera.height - 0.5)).all(axis=1)
+    cell = np.floor(np.where(inside[:, None], xy, 0.0) + 0.5).astype(np.int32)
+    return np.where(inside, cell[:, 1] * stride + cell[:, 0], -1).astype(np.int32)
+
+
+def _load(path: Path, rig: Rig, grid: VoxelGrid) -> HullTables | None:
+    """The tables in this file; None unless they are whole and fit (zip checksums are verified on reading)."""
+    try:
+        # a stream of our own: numpy leaves the one that it opens to the collector when the archive is broken
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+            row_offsets, voxels = stored["row_offsets"], stored["voxels"]
+        os.utime(path)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+    height, width = rig.frame_shape
+    fits = (
+        row_offsets.dtype == voxels.dtype == np.int32
+        and row_offsets.shape == (len(rig) * height * width + 1,)
+        and voxels.ndim == 1
+        and row_offsets[0] == 0
+        and row_offsets[-1] == len(voxels) > 0
+        and (np.diff(row_offsets) >= 0).all()
+        and voxels.min() >= 0
+        and voxels.max() < grid.count
+    )
+    return HullTables(row_offsets, voxels, len(rig), grid.count) if fits else None
+
+
+def _save(path: Path, tables: HullTables) -> None:
+    """Write under a temporary name and rename, so that no reader ever finds half a file; failure is no matter."""
+    temporary: str | None = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
+        with os.fdopen(handle, "wb") as stream:
+            np.savez(stream, row_offsets=tables.row_offsets, voxels=tables.voxels)
+        os.replace(temporary, path)
+        temporary = None
+        _prune(path.parent)
+    except OSError:
+        pass
+    finally:
+        if temporary is not None and os.path.exists(temporary):
+            os.unlink(temporary)
+
+
+def _prune(folder: Path) -> None:
+    """Delete the tables used longest ago until the rest keep within the cache's size."""
+    total = 0
+    for stat, path in sorted(((p.stat(), p) for p in folder.glob("hull-*.npz")), key=lambda e: -e[0].st_mtime):
+        total += stat.st_size
+        if total > _CACHE_BYTES:
+            path.unlink(missing_ok=True)
