@@ -290,12 +290,23 @@ def _numbered_pictures(folder: Path) -> tuple[Path, ...]:
 def _read_picture(path: Path, is_mask: bool) -> NDArray[Any]:
     if not path.is_file():
         raise VideoError(f"{path}: there is no such file")
-    # not cv2.imread: it cannot open every path on every system
-    coded = np.fromfile(path, dtype=np.uint8)
-    picture = cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE if is_mask else cv2.IMREAD_COLOR) if coded.size else None
+    coded = path.read_bytes()
+    picture = None
+    if _has_end(coded):
+        flags = cv2.IMREAD_GRAYSCALE if is_mask else cv2.IMREAD_COLOR
+        picture = cv2.imdecode(np.frombuffer(coded, np.uint8), flags)
     if picture is None:
         raise VideoError(f"{path}: is not a picture that can be decoded, or is cut off")
     return picture
+
+
+def _has_end(coded: bytes) -> bool:
+    """False for a PNG or JPEG that is cut off: OpenCV would fill up a JPEG with grey, and libpng complain aloud."""
+    if not coded:
+        return False
+    if coded.startswith(b"\x89PNG"):
+        return b"IEND" in coded
+    return not coded.startswith(b"\xff\xd8") or b"\xff\xd9" in coded
 
 
 def _check_size(clip: VideoClip | PictureClip, picture: NDArray[Any], path: Path) -> None:

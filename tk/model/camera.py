@@ -111,11 +111,13 @@ class Camera:
     def undistort(self, pixels: ArrayLike) -> Float:
         """Pixels (N, 2) to normalised image coordinates (N, 2): x/z and y/z in the camera frame."""
         points = np.ascontiguousarray(np.asarray(pixels, dtype=np.float64).reshape(-1, 1, 2))
+        if len(points) == 0:  # OpenCV makes a single zero of nothing
+            return np.zeros((0, 2))
         if self.fisheye:
             result = cv2.fisheye.undistortPoints(points, self.matrix, self.distortions[:4])
         else:
             result = _undistort(points, self.matrix, self.distortions, _CONVERGED)
-        return np.asarray(result).reshape(-1, 2)
+        return np.asarray(result, dtype=np.float64).reshape(-1, 2)
 
     def rays(self, pixels: ArrayLike) -> Float:
         """Unit viewing directions (N, 3) in the world frame through pixels (N, 2)."""
