@@ -204,9 +204,8 @@ def table(rows: Sequence[HullTimes]) -> str:
     head = ("capture", "views", "voxels", "surface", "scratch", "increm.", "texture", "Open3D", "NumPy", "x Open3D")
     lines = [" ".join(f"{h:>9}" for h in head)]
     for row in rows:
-        cells = (row.capture, row.cameras, f"{row.voxels}^3", row.surface_voxels) + tuple(
-            number(v) for v in (row.scratch, row.incremental, row.surface, row.open3d, row.numpy, row.speedup)
-        )
+        times = (row.scratch, row.incremental, row.surface, row.open3d, row.numpy, row.speedup)
+        cells = (row.capture, row.cameras, f"{row.voxels}^3", row.surface_voxels, *map(number, times))
         lines.append(" ".join(f"{c!s:>9}" for c in cells))
     return "\n".join([*lines, "times in ms a frame; texture = surface voxels, normals, visibility and colours"])
 

@@ -12,7 +12,7 @@ seeds = st.integers(0, 2**32 - 1)
 few = settings(max_examples=25, deadline=None)
 
 
-def pack(active):
+def pack_oracle(active):
     """(nx, ny, nz) bool to packed words, by the documented layout."""
     nx, ny, nz = active.shape
     words = np.zeros((nx, ny, (nz + 31) // 32), dtype=np.uint32)
@@ -58,7 +58,8 @@ def shade(active, eyes, pixels=None, images=None, masks=None, spacing=1):
         pixels = np.zeros((count, active.size), dtype=np.int32)
     if masks is None:
         masks = np.full((count, 4, 4), 255, dtype=np.uint8)
-    occupied = pack(active)
+    masks = masks.reshape(count, -1)
+    occupied = pack_oracle(active)
     voxels, box = kernels.surface_voxels(occupied, active.shape, np.empty(active.size, dtype=np.int32))
     spacings = np.full(count, spacing, dtype=np.int32)
     shaded = kernels.shade_surface(occupied, active.shape, pixels, eyes, spacings, images, masks, voxels, box)
@@ -78,31 +79,48 @@ def test_look_up_lists_are_the_inverse_of_the_projection(cameras, pixel_count, v
 
 
 @few
-@given(st.integers(2, 31), shapes, seeds)
-def test_carving_follows_any_sequence_of_masks(cameras, shape, seed):
-    """Bits and packed occupancy after each of several frames equal the definition, from one camera's bit to the 31st."""
+@given(shapes, seeds)
+def test_packing_follows_the_documented_layout(shape, seed):
+    active = blob(shape, seed)
+    plane = kernels.pack(active)
+    np.testing.assert_array_equal(plane, pack_oracle(active))
+    np.testing.assert_array_equal(kernels.unpack(plane, shape), active)
+    place = kernels.places(np.arange(active.size, dtype=np.int32), shape[2])
+    np.testing.assert_array_equal((plane[place >> 5] >> (place & 31).astype(np.uint32)) & 1, active.ravel())
+
+
+@few
+@given(st.integers(1, 31), shapes, st.sampled_from([7, 16, 3000]), seeds)
+def test_carving_follows_any_sequence_of_masks(cameras, shape, pixel_count, seed):
+    """Planes and occupancy after each of several frames equal the definition."""
     rng = np.random.default_rng(seed)
-    pixel_count = 12
     count = int(np.prod(shape))
     pixels = rng.integers(-1, pixel_count, (cameras, count)).astype(np.int32)
-    row_offsets, lists = kernels.sort_by_pixel(pixels, pixel_count)
-    full = kernels.full_mask(cameras)
-    outside = [(pixels[c] < 0).astype(np.int64) << c for c in range(cameras)]
-    enough = ((pixels >= 0).sum(0) >= 2).astype(np.int64) << cameras
-    bits = (np.sum(outside, axis=0) + enough).astype(np.uint32).view(np.int32)
-    previous = np.zeros(-(-cameras * pixel_count // 8), dtype=np.int64)
-    occupied = np.zeros(kernels.occupied_words(shape), dtype=np.uint32)
+    row_offsets, voxels = kernels.sort_by_pixel(pixels, pixel_count)
+    enough = (pixels >= 0).sum(0) >= 2
+    outside = [kernels.pack((row < 0).reshape(shape)) for row in pixels]
+    planes = np.stack([p for one in outside for p in (one, np.zeros_like(one))])
+    occupied = np.zeros_like(outside[0])
+    previous = np.zeros((cameras, -(-pixel_count // 8)), dtype=np.int64)
     for share in (0.9, 1.0, 0.95, 0.0, 1.0):
-        masks = np.zeros(len(previous) * 8, dtype=np.uint8)
-        masks[: cameras * pixel_count] = (rng.random(cameras * pixel_count) < share) * rng.integers(1, 256)
-        kernels.carve(row_offsets, lists, pixel_count, full, shape[2], masks.view(np.int64), previous, bits, occupied)
-        foreground = masks[: cameras * pixel_count].reshape(cameras, pixel_count) != 0
-        passed = [(pixels[c] < 0) | foreground[c, np.maximum(pixels[c], 0)] for c in range(cameras)]
-        active = np.all(passed, axis=0) & (enough != 0)
-        np.testing.assert_array_equal(occupied, pack(active.reshape(shape)))
+        masks = np.zeros((cameras, previous.shape[1] * 8), dtype=np.uint8)
+        foreground = rng.random((cameras, pixel_count)) < share
+        masks[:, :pixel_count] = foreground * rng.choice([1, 255], foreground.shape)
+        kernels.carve(
+            row_offsets,
+            kernels.places(voxels, shape[2]),
+            pixel_count,
+            kernels.pack(enough.reshape(shape)),
+            masks.view(np.int64),
+            previous,
+            planes,
+            occupied,
+        )
+        passed = [(pixels[c] < 0) | foreground[c, pixels[c]] for c in range(cameras)]
         for camera in range(cameras):
-            np.testing.assert_array_equal((bits >> camera) & 1, passed[camera])
-        np.testing.assert_array_equal(bits == full, active)
+            both = kernels.unpack(planes[2 * camera] | planes[2 * camera + 1], shape)
+            np.testing.assert_array_equal(both.ravel(), passed[camera])
+        np.testing.assert_array_equal(kernels.unpack(occupied, shape).ravel(), np.all(passed, axis=0) & enough)
         np.testing.assert_array_equal(previous, masks.view(np.int64))
 
 
@@ -113,7 +131,9 @@ def test_surface_voxels_and_normals(shape, seed, share):
     voxels, normals, colors, seen = shade(active, [[100.0, 0.0, 0.0]])
     expected, box = surface_oracle(active)
     np.testing.assert_array_equal(voxels, expected)
-    np.testing.assert_array_equal(kernels.surface_voxels(pack(active), shape, np.empty(active.size, np.int32))[1], box)
+    np.testing.assert_array_equal(
+        kernels.surface_voxels(pack_oracle(active), shape, np.empty(active.size, np.int32))[1], box
+    )
     np.testing.assert_allclose(normals, normals_oracle(active, voxels), atol=1e-6)
     assert not colors.any() and len(seen) == len(voxels)
 

@@ -124,7 +124,7 @@ def test_masks_in_any_memory_layout():
 def test_reset_forgets_the_frame():
     rig, grid = make_rig(3), VoxelGrid.cover(VOLUME, 16)
     hull = VisualHull(rig, grid, use_cache=False)
-    fresh = hull.camera_bits.copy()
+    fresh = hull.camera_bits
     assert not hull.occupancy.any() and len(hull.surface()) == 0
     hull.update(silhouettes(rig, ball()))
     assert hull.occupancy.any()
@@ -206,7 +206,7 @@ def test_thirty_one_cameras_and_no_more():
     masks[30, 15:25, 15:30] = 0
     hull.update(masks)
     np.testing.assert_array_equal(hull.occupancy, hull_oracle(rig, grid, masks))
-    with pytest.raises(ConfigError, match="32 cameras.*31"):
+    with pytest.raises(ConfigError, match=r"32 cameras.*31"):
         VisualHull(make_rig(32), grid, use_cache=False)
 
 
@@ -228,7 +228,7 @@ def build_calls(monkeypatch):
 
 
 def same(a, b):
-    return np.array_equal(a.row_offsets, b.row_offsets) and np.array_equal(a.voxels, b.voxels)
+    return np.array_equal(a.row_offsets, b.row_offsets) and np.array_equal(a.places, b.places)
 
 
 def test_tables_come_back_from_the_cache(tmp_path, build_calls):
@@ -280,17 +280,17 @@ def test_a_spoilt_cache_never_breaks_a_run(tmp_path, build_calls):
         with path.open("wb") as stream:
             np.savez(stream, **arrays)
 
-    beyond = good.voxels.copy()
-    beyond[5] = grid.count
+    beyond = good.places.copy()
+    beyond[-1] = 32 * grid.shape[0] * grid.shape[1]
     spoilers = [
         lambda: path.write_bytes(b""),
         lambda: path.write_bytes(content[: len(content) // 2]),
         lambda: path.write_bytes(bytes(flipped)),
         lambda: path.write_text("not an archive"),
         lambda: write_npz(row_offsets=good.row_offsets),
-        lambda: write_npz(row_offsets=good.row_offsets[:-1], voxels=good.voxels),
-        lambda: write_npz(row_offsets=good.row_offsets, voxels=beyond),
-        lambda: write_npz(row_offsets=good.row_offsets.astype(object), voxels=good.voxels),
+        lambda: write_npz(row_offsets=good.row_offsets[:-1], places=good.places),
+        lambda: write_npz(row_offsets=good.row_offsets, places=beyond),
+        lambda: write_npz(row_offsets=good.row_offsets.astype(object), places=good.places),
     ]
     for number, spoil in enumerate(spoilers, start=2):
         spoil()

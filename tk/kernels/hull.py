@@ -1,17 +1,18 @@
 """Visual hull kernels: carving by per-pixel look-up lists, surface voxels, their normals and colours.
 
-Kehl & Van Gool 2006, section 4.1. The state of a hull is two integer arrays, so that every result is exact and does
-not depend on the order in which threads work:
+Kehl & Van Gool 2006, section 4.1. Where the paper gives each voxel a mask with a bit a camera, the same bits lie here
+in planes, one bit a voxel, packed along z into words of 32: voxel (x, y, z) is bit ``z % 32`` of word
+``(x * ny + y) * nw + z // 32`` with nw = ceil(nz / 32). This "place" of a voxel, 32 times its word plus its bit, is
+what the look-up lists hold. W = nx * ny * nw words make a plane.
 
-``bits`` (V,) int32, one word a voxel
-    Bit c is set where camera c does not carve the voxel: its pixel is foreground, or it lies outside the picture.
-    Bit C (one above the last camera) is fixed: set where at least two cameras see the voxel at all.
-    A voxel is active where all C + 1 bits are set.
-``occupied`` (nx * ny * nw,) uint32, one bit a voxel
-    The active voxels, packed along z: nw = ceil(nz / 32) words a column. It is kept up to date by the carving itself:
-    whichever change makes a voxel's bits complete, or incomplete again, flips its bit here. Surface and visibility
-    read only this array, 32 times smaller than ``bits``.
+``planes`` (2C, W) uint32
+    Rows 2c and 2c + 1 together are camera c's bits: set where the camera does not carve the voxel, because its pixel is
+    foreground or it lies outside the picture. Two threads work on a camera, each on every other stretch of its pixels
+    and each in its own row; so nothing is shared, no atomics are needed, and a plane stays in the processor's cache.
+``occupied`` (W,) uint32
+    The active voxels: all cameras' planes anded. Surface and visibility read only this.
 
+All of it is integers: results are exact and do not depend on the order in which threads work.
 Masks enter as int64 words, eight pixels at a time; memory is little-endian (as on all platforms that Taichi runs on).
 """
 
@@ -20,23 +21,52 @@ from numpy.typing import NDArray
 
 from tk.kernels.runtime import ensure_runtime, ti
 
-__all__ = ["carve", "full_mask", "occupied_words", "shade_surface", "sort_by_pixel", "surface_voxels"]
+__all__ = [
+    "SHARES",
+    "carve",
+    "pack",
+    "places",
+    "shade_surface",
+    "sort_by_pixel",
+    "surface_voxels",
+    "unpack",
+    "words_per_column",
+]
 
-_CHUNK = 128  # mask words a parallel task: 1024 pixels
+SHARES = 2  # threads, and planes, a camera
+_STRETCH = 128  # mask words, 1024 pixels, that fall to one thread before it is the other's turn
 _WINDOW = 2  # normals come from the voxels within a ball around a voxel: half width of its box ...
 _BALL = 6  # ... and squared radius, both in voxels
 _FRONTAL = 0.1  # cosine below which a camera sees a surface only at a grazing angle, that is, not truly
 _LIFT = 1.25  # voxels by which a line of sight starts off the surface, so that its own neighbours do not block it
 
 
-def full_mask(cameras: int) -> int:
-    """The value of ``bits`` at an active voxel, as a signed 32-bit integer, for up to 31 cameras."""
-    return int(np.array([(1 << (cameras + 1)) - 1], dtype=np.uint32).view(np.int32)[0])
+# --- layout ------------------------------------------------------------------------------------------------------
 
 
-def occupied_words(shape: tuple[int, int, int]) -> int:
-    """Length of ``occupied`` for a grid of this shape."""
-    return shape[0] * shape[1] * ((shape[2] + 31) // 32)
+def words_per_column(nz: int) -> int:
+    """Words that hold a column of voxels along z."""
+    return (nz + 31) // 32
+
+
+def places(voxels: NDArray[np.int32], nz: int) -> NDArray[np.int32]:
+    """Places in a packed plane of voxels given by flat index (z fastest)."""
+    gap = 32 * words_per_column(nz) - nz
+    return voxels if gap == 0 else voxels + voxels // np.int32(nz) * np.int32(gap)
+
+
+def pack(flags: NDArray[np.bool_]) -> NDArray[np.uint32]:
+    """(nx, ny, nz) bool to a plane (W,) uint32."""
+    nx, ny, nz = flags.shape
+    padded = np.zeros((nx, ny, 32 * words_per_column(nz)), dtype=np.bool_)
+    padded[:, :, :nz] = flags
+    return np.packbits(padded, bitorder="little").view(np.uint32)
+
+
+def unpack(plane: NDArray[np.uint32], shape: tuple[int, int, int]) -> NDArray[np.bool_]:
+    """A plane (W,) uint32 to (nx, ny, nz) bool."""
+    octets = np.ascontiguousarray(plane).view(np.uint8).reshape(shape[0], shape[1], -1)
+    return np.unpackbits(octets, axis=-1, count=shape[2], bitorder="little").view(np.bool_)
 
 
 # --- look-up lists -----------------------------------------------------------------------------------------------
@@ -82,83 +112,90 @@ def sort_by_pixel(pixels: NDArray[np.int32], pixel_count: int) -> tuple[NDArray[
 
 
 @ti.func
-def _turn(now, before, byte):
-    """1 where this byte of a mask word turned to foreground, -1 to background, 0 where it stayed what it was."""
+def _turned(now: ti.i64, before: ti.i64, byte: ti.i32) -> ti.i32:
+    """1 where this byte of a mask word turned from background to foreground or back."""
     is_set = ((now >> (8 * byte)) & 255) != 0
     was_set = ((before >> (8 * byte)) & 255) != 0
-    return ti.cast(is_set, ti.i32) - ti.cast(was_set, ti.i32)
+    return ti.cast(is_set != was_set, ti.i32)
 
 
 @ti.kernel
 def _carve_kernel(
     row_offsets: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (C * P + 1,)
-    voxels: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (L,)
+    places_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (L,)
     pixel_count: ti.i32,  # P
-    full: ti.i32,
-    nz: ti.i32,
-    current: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (W,) masks, eight pixels a word
-    previous: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (W,) in and out
-    bits: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (V,) in and out
-    occupied: ti.types.ndarray(dtype=ti.u32, ndim=1),  # (nx * ny * nw,) in and out
+    enough: ti.types.ndarray(dtype=ti.u32, ndim=1),  # (W,)
+    current: ti.types.ndarray(dtype=ti.i64, ndim=2),  # (C, M) masks, eight pixels a word
+    previous: ti.types.ndarray(dtype=ti.i64, ndim=2),  # (C, M) in and out
+    planes: ti.types.ndarray(dtype=ti.u32, ndim=2),  # (2C, W) in and out
+    occupied: ti.types.ndarray(dtype=ti.u32, ndim=1),  # (W,) out
 ):
-    words = current.shape[0]
-    nw = (nz + 31) >> 5
-    for chunk in range((words + _CHUNK - 1) // _CHUNK):
-        for word in range(chunk * _CHUNK, ti.min((chunk + 1) * _CHUNK, words)):
-            now = current[word]
-            before = previous[word]
-            if now != before:
-                previous[word] = now
-                whole = (now == -1 and before == 0) or (now == 0 and before == -1)
-                end = 0
-                while end < 8:
-                    first = end
-                    turn = _turn(now, before, first)
-                    camera = (word * 8 + first) // pixel_count
-                    last = ti.min(8, (camera + 1) * pixel_count - word * 8)  # a word may reach into the next picture
-                    end = ti.select(whole, last, first + 1)
-                    while end < last and _turn(now, before, end) == turn:
-                        end += 1
-                    if turn != 0:
-                        # A voxel has one pixel a camera, so its bit flips at most once: adding is setting it.
-                        change = turn * (1 << camera)
-                        # the lists of neighbouring pixels follow each other in memory
-                        for k in range(row_offsets[word * 8 + first], row_offsets[word * 8 + end]):
-                            voxel = voxels[k]
-                            old = ti.atomic_add(bits[voxel], change)
-                            if old == full or old + change == full:
-                                column = voxel // nz
-                                z = voxel - column * nz
-                                ti.atomic_xor(occupied[column * nw + (z >> 5)], ti.u32(1) << ti.cast(z & 31, ti.u32))
+    words = current.shape[1]
+    turns = (words + SHARES * _STRETCH - 1) // (SHARES * _STRETCH)
+    ti.loop_config(block_dim=1)  # few long tasks
+    for task in range(planes.shape[0]):
+        camera = task // SHARES
+        for turn in range(turns):
+            start = (turn * SHARES + task % SHARES) * _STRETCH
+            for word in range(start, ti.min(start + _STRETCH, words)):
+                now = current[camera, word]
+                before = previous[camera, word]
+                if now != before:
+                    previous[camera, word] = now
+                    whole = (now == -1 and before == 0) or (now == 0 and before == -1)
+                    row = camera * pixel_count + word * 8
+                    end = 0
+                    while end < 8:
+                        first = end
+                        turned = _turned(now, before, first)
+                        end = ti.select(whole, 8, first + 1)
+                        while end < 8 and _turned(now, before, end) == turned:
+                            end += 1
+                        if turned:
+                            # the lists of neighbouring pixels follow each other in memory
+                            for k in range(row_offsets[row + first], row_offsets[row + end]):
+                                place = places_in[k]
+                                bit = ti.u32(1) << ti.cast(place & 31, ti.u32)
+                                # not ^=, which Taichi makes an atomic operation, four times as slow
+                                planes[task, place >> 5] = planes[task, place >> 5] ^ bit
+    for w in range(occupied.shape[0]):
+        active = enough[w]
+        camera = 0
+        while active != 0 and camera < current.shape[0]:
+            passed = ti.u32(0)
+            for share in ti.static(range(SHARES)):
+                passed |= planes[camera * SHARES + share, w]
+            active &= passed
+            camera += 1
+        occupied[w] = active
 
 
 def carve(
     row_offsets: NDArray[np.int32],
-    voxels: NDArray[np.int32],
+    places: NDArray[np.int32],
     pixel_count: int,
-    full: int,
-    nz: int,
+    enough: NDArray[np.uint32],
     current: NDArray[np.int64],
     previous: NDArray[np.int64],
-    bits: NDArray[np.int32],
+    planes: NDArray[np.uint32],
     occupied: NDArray[np.uint32],
 ) -> None:
-    """Bring ``bits``, ``occupied`` and ``previous`` from the masks ``previous`` to the masks ``current``, in place.
+    """Bring ``planes``, ``occupied`` and ``previous`` from the masks ``previous`` to the masks ``current``, in place.
 
     Only the lists of pixels that changed between background (0) and foreground (anything else) are visited. From
-    scratch is the same with ``previous`` and ``occupied`` zero and ``bits`` as no foreground at all leaves them.
+    scratch is the same with ``previous`` zero and ``planes`` as no foreground at all leaves them: row 2c has the voxels
+    outside camera c's picture, row 2c + 1 nothing.
 
     Args:
-        row_offsets, voxels: the look-up lists of :func:`sort_by_pixel`.
+        row_offsets, places: the look-up lists of :func:`sort_by_pixel`, with :func:`places` for voxels.
         pixel_count: P, pixels of one picture.
-        full: :func:`full_mask`.
-        nz: voxels along z.
-        current, previous: (W,) int64, the mask stack (C, H, W) uint8 in its own order, zero-padded to whole words.
-        bits: (V,) int32.
-        occupied: (nx * ny * nw,) uint32.
+        enough: (W,) uint32, the voxels that may be active at all.
+        current, previous: (C, M) int64, each camera's mask (P,) uint8, zero-padded to whole words.
+        planes: (2C, W) uint32.
+        occupied: (W,) uint32.
     """
     ensure_runtime()
-    _carve_kernel(row_offsets, voxels, pixel_count, full, nz, current, previous, bits, occupied)
+    _carve_kernel(row_offsets, places, pixel_count, enough, current, previous, planes, occupied)
 
 
 # --- surface -----------------------------------------------------------------------------------------------------
@@ -212,7 +249,7 @@ def surface_voxels(
     """Active voxels with at least one inactive neighbour of six; outside the grid counts as inactive.
 
     Args:
-        occupied: (nx * ny * nw,) uint32.
+        occupied: (W,) uint32.
         shape: (nx, ny, nz).
         found: (V,) int32, scratch space that the caller keeps from frame to frame.
 
@@ -234,7 +271,7 @@ def surface_voxels(
 
 
 @ti.func
-def _is_occupied(occupied: ti.template(), x, y, z, nz):
+def _is_occupied(occupied: ti.template(), x: ti.i32, y: ti.i32, z: ti.i32, nz: ti.i32) -> ti.i32:
     """1 where the voxel is active, 0 where it is not or lies outside the grid."""
     result = ti.u32(0)
     if 0 <= x < occupied.shape[0] and 0 <= y < occupied.shape[1] and 0 <= z < nz:
@@ -243,7 +280,7 @@ def _is_occupied(occupied: ti.template(), x, y, z, nz):
 
 
 @ti.func
-def _outward(occupied: ti.template(), x, y, z, nz):
+def _outward(occupied: ti.template(), x: ti.i32, y: ti.i32, z: ti.i32, nz: ti.i32) -> ti.math.vec3:
     """Unit vector from the centroid of the active voxels in a ball to its centre; zero where they coincide."""
     moment = ti.Vector([0, 0, 0])
     for dx in range(-_WINDOW, _WINDOW + 1):
@@ -259,7 +296,9 @@ def _outward(occupied: ti.template(), x, y, z, nz):
 
 
 @ti.func
-def _in_sight(occupied: ti.template(), start, view, box: ti.template(), nz):
+def _in_sight(
+    occupied: ti.template(), start: ti.math.vec3, view: ti.math.vec3, box: ti.template(), nz: ti.i32
+) -> ti.i32:
     """1 where no active voxel lies on the way from ``start`` along the unit vector ``view`` until out of the box.
 
     The line is sampled where it crosses the layers of its dominant axis; all in voxels.
@@ -289,14 +328,14 @@ def _shade_kernel(
     eyes: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (C, 3) voxels
     spacing: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (C,) pixels
     images: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (C, H, W, 3), or (C, 0, 0, 3)
-    masks: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (C, H, W)
+    masks: ti.types.ndarray(dtype=ti.u8, ndim=2),  # (C, at least H * W)
     voxels: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,)
     box: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (2, 3)
     normals: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (N, 3) out
     colors: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (N, 3) out
     seen: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,) out
 ):
-    height, width = masks.shape[1], masks.shape[2]
+    height, width = images.shape[1], images.shape[2]
     for n in range(voxels.shape[0]):
         voxel = voxels[n]
         column = voxel // nz
@@ -320,14 +359,14 @@ def _shade_kernel(
                     start = center + _LIFT * view
                 if cosine > _FRONTAL and _in_sight(occupied, start, view, box, nz):
                     cameras |= 1 << camera
-                    if images.shape[1] > 0:
+                    if height > 0:
                         # nine foreground pixels spread over the voxel's footprint
                         row = pixel // width
                         for i in range(-1, 2):
                             for j in range(-1, 2):
                                 v = row + i * spacing[camera]
                                 u = pixel - row * width + j * spacing[camera]
-                                if 0 <= v < height and 0 <= u < width and masks[camera, v, u] != 0:
+                                if 0 <= v < height and 0 <= u < width and masks[camera, v * width + u] != 0:
                                     weight += cosine * cosine
                                     for channel in ti.static(range(3)):
                                         color[channel] += (
@@ -357,13 +396,13 @@ def shade_surface(
     sight. The paper (section 4.1) leaves texturing to its reference [19]; this is ours.
 
     Args:
-        occupied: (nx * ny * nw,) uint32.
+        occupied: (W,) uint32.
         shape: (nx, ny, nz).
         pixels: (C, V) int32, pixel of each voxel in each camera, -1 outside the picture.
         eyes: (C, 3) float32, centres of projection in voxels: the centre of voxel (0, 0, 0) is the origin.
         spacing: (C,) int32, pixels between the three by three samples that make up a voxel's colour.
         images: (C, H, W, 3) uint8, or None for no colours.
-        masks: (C, H, W) uint8; only foreground pixels lend their colour.
+        masks: (C, at least H * W) uint8; only foreground pixels lend their colour.
         voxels: (N,) int32 flat indices.
         box: (2, 3) int32 from :func:`surface_voxels`.
 

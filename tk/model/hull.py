@@ -60,21 +60,20 @@ class VisualHull:
         self.rig = rig
         self.grid = grid
         self._tables: HullTables = load_or_build(rig, grid, cache_dir, use_cache)
-        height, width = rig.frame_shape
-        self._mask_shape = (len(rig), height, width)
-        self._full = kernels.full_mask(len(rig))
+        self._mask_shape = (len(rig), *rig.frame_shape)
+        self._pixel_count = int(np.prod(rig.frame_shape))
         self._eyes = ((rig.centers - np.asarray(grid.origin)) / grid.voxel_m).astype(np.float32)
         self._spacing = _sample_spacing(rig, grid)
-        self._bits = self._tables.empty_bits.copy()
-        self._occupied = np.zeros(kernels.occupied_words(grid.shape), dtype=np.uint32)
-        self._previous = np.zeros(-(-len(rig) * height * width // 8), dtype=np.int64)
+        self._planes = self._tables.empty_planes.copy()
+        self._occupied = np.zeros(self._planes.shape[1], dtype=np.uint32)
+        self._previous = np.zeros((len(rig), -(-self._pixel_count // 8)), dtype=np.int64)
         self._found = np.empty(grid.count, dtype=np.int32)
         self._clean = True
 
     def reset(self) -> None:
         """Forget the previous frame: nothing is active."""
         if not self._clean:
-            self._bits[:] = self._tables.empty_bits
+            self._planes[:] = self._tables.empty_planes
             self._occupied.fill(0)
             self._previous.fill(0)
             self._clean = True
@@ -92,33 +91,30 @@ class VisualHull:
         """
         words = self._as_words(masks)
         tables = self._tables
-        _, height, width = self._mask_shape
         self._clean = False
         kernels.carve(
             tables.row_offsets,
-            tables.voxels,
-            height * width,
-            self._full,
-            self.grid.shape[2],
+            tables.places,
+            self._pixel_count,
+            tables.enough,
             words,
             self._previous,
-            self._bits,
+            self._planes,
             self._occupied,
         )
 
     @property
     def occupancy(self) -> NDArray[np.bool_]:
         """(nx, ny, nz) bool, the active voxels; a copy."""
-        nx, ny, nz = self.grid.shape
-        octets = self._occupied.view(np.uint8).reshape(nx, ny, -1)
-        return np.unpackbits(octets, axis=-1, count=nz, bitorder="little").view(np.bool_)
+        return kernels.unpack(self._occupied, self.grid.shape)
 
     @property
     def camera_bits(self) -> NDArray[np.int32]:
-        """(nx, ny, nz) int32: bit c is set where camera c does not carve the voxel; bit C where two see it. Read-only."""
-        view = self._bits.reshape(self.grid.shape).view()
-        view.flags.writeable = False
-        return view
+        """(nx, ny, nz) int32, the paper's bit masks: bit c is set where camera c does not carve the voxel; a copy."""
+        bits = np.zeros(self.grid.shape, dtype=np.int32)
+        for row, plane in enumerate(self._planes):
+            bits |= kernels.unpack(plane, self.grid.shape).astype(np.int32) << (row // kernels.SHARES)
+        return bits
 
     def surface(self, images: NDArray[np.uint8] | None = None) -> HullSurface:
         """The surface voxels of the current hull, coloured if ``images`` (C, H, W, 3) uint8 BGR are given."""
@@ -126,7 +122,6 @@ class VisualHull:
         if images is not None and (images.shape != channels or images.dtype != np.uint8):
             raise ValueError(f"images are {images.dtype} {images.shape}, expected uint8 {channels}")
         voxels, box = kernels.surface_voxels(self._occupied, self.grid.shape, self._found)
-        pixels = int(np.prod(self._mask_shape))
         normals, colors, seen = kernels.shade_surface(
             self._occupied,
             self.grid.shape,
@@ -134,7 +129,7 @@ class VisualHull:
             self._eyes,
             self._spacing,
             None if images is None else np.ascontiguousarray(images),
-            self._previous.view(np.uint8)[:pixels].reshape(self._mask_shape),
+            self._previous.view(np.uint8),
             voxels,
             box,
         )
@@ -142,16 +137,16 @@ class VisualHull:
         return HullSurface(voxels, positions, normals, colors, seen)
 
     def _as_words(self, masks: NDArray[np.uint8]) -> NDArray[np.int64]:
-        """The mask stack as int64 words: a view where memory allows it, a zero-padded copy otherwise."""
+        """(C, M) the masks as int64 words: a view where memory allows it, a zero-padded copy otherwise."""
         if masks.shape != self._mask_shape or masks.dtype != np.uint8:
             raise ValueError(f"masks are {masks.dtype} {masks.shape}, expected uint8 {self._mask_shape}")
-        flat = np.ascontiguousarray(masks).reshape(-1)
-        if flat.size % 8 == 0:
+        flat = np.ascontiguousarray(masks).reshape(len(masks), self._pixel_count)
+        if self._pixel_count % 8 == 0:
             words = flat.view(np.int64)
             if words.flags.aligned:
                 return words
-        words = np.zeros(len(self._previous), dtype=np.int64)
-        words.view(np.uint8)[: flat.size] = flat
+        words = np.zeros_like(self._previous)
+        words.view(np.uint8)[:, : self._pixel_count] = flat
         return words
 
 

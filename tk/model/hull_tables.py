@@ -22,7 +22,7 @@ from tk.model.volume import VoxelGrid
 
 __all__ = ["MAX_CAMERAS", "HullTables", "default_cache_dir", "load_or_build", "table_key"]
 
-MAX_CAMERAS = 31  # a bit each in an int32, and one for "seen by two"
+MAX_CAMERAS = 31  # a bit each in an int32 that stays positive
 _FORMAT = 1  # part of the key: raise it when the tables' meaning changes
 _CACHE_BYTES = 1 << 30  # the oldest tables go when the folder holds more
 _BLOCK = 1 << 15  # voxels projected at a time: the intermediate arrays stay in the processor's cache
@@ -35,40 +35,45 @@ class HullTables:
     With P = H * W pixels a picture of the packed stack, V voxels and C cameras:
 
     Attributes:
-        row_offsets: (C * P + 1,) int32; pixel p of camera c owns ``voxels[row_offsets[c*P+p] : row_offsets[c*P+p+1]]``.
-        voxels: (L,) int32 flat voxel indices whose centres project to the pixel, ascending in each row.
+        row_offsets: (C * P + 1,) int32; pixel p of camera c owns ``places[row_offsets[c*P+p] : row_offsets[c*P+p+1]]``.
+        places: (L,) int32, ascending in each row: the voxels whose centres project to the pixel, each as its place in
+            a packed plane (:func:`tk.kernels.hull.places`).
         camera_count: C.
-        voxel_count: V.
+        shape: (nx, ny, nz) of the grid.
     """
 
     row_offsets: NDArray[np.int32]
-    voxels: NDArray[np.int32]
+    places: NDArray[np.int32]
     camera_count: int
-    voxel_count: int
+    shape: tuple[int, int, int]
 
     @cached_property
     def pixels(self) -> NDArray[np.int32]:
         """(C, V) int32, the lists turned back: the pixel of each voxel, -1 outside the picture."""
-        pixels = np.full((self.camera_count, self.voxel_count), -1, dtype=np.int32)
+        nz = self.shape[2]
+        depth = 32 * kernels.words_per_column(nz)
+        pixels = np.full((self.camera_count, self.shape[0] * self.shape[1], nz), -1, dtype=np.int32)
         pixel_count = (len(self.row_offsets) - 1) // self.camera_count
         lengths = np.diff(self.row_offsets).reshape(self.camera_count, pixel_count)
         index = np.arange(pixel_count, dtype=np.int32)
         for camera in range(self.camera_count):
             start, stop = self.row_offsets[camera * pixel_count], self.row_offsets[(camera + 1) * pixel_count]
-            pixels[camera, self.voxels[start:stop]] = np.repeat(index, lengths[camera])
-        return pixels
+            column, z = np.divmod(self.places[start:stop], np.int32(depth))
+            pixels[camera, column, z] = np.repeat(index, lengths[camera])
+        return pixels.reshape(self.camera_count, -1)
 
     @cached_property
-    def empty_bits(self) -> NDArray[np.int32]:
-        """(V,) int32, the voxels' bits before any foreground: cameras that do not hold them, and the bit for two."""
-        bits = np.zeros(self.voxel_count, dtype=np.uint32)
-        holders = np.zeros(self.voxel_count, dtype=np.uint8)
+    def empty_planes(self) -> NDArray[np.uint32]:
+        """(2C, W) uint32, the cameras' planes before any foreground: a camera does not carve what it does not hold."""
+        planes = np.zeros((kernels.SHARES * self.camera_count, len(self.enough)), dtype=np.uint32)
         for camera, row in enumerate(self.pixels):
-            outside = row < 0
-            bits[outside] |= np.uint32(1 << camera)
-            holders += ~outside
-        bits[holders >= 2] |= np.uint32(1 << self.camera_count)
-        return bits.view(np.int32)
+            planes[kernels.SHARES * camera] = kernels.pack((row < 0).reshape(self.shape))
+        return planes
+
+    @cached_property
+    def enough(self) -> NDArray[np.uint32]:
+        """(W,) uint32, the voxels that at least two pictures hold."""
+        return kernels.pack(_holders(self.pixels).reshape(self.shape) >= 2)
 
 
 def load_or_build(rig: Rig, grid: VoxelGrid, cache_dir: Path | None = None, use_cache: bool = True) -> HullTables:
@@ -81,7 +86,8 @@ def load_or_build(rig: Rig, grid: VoxelGrid, cache_dir: Path | None = None, use_
     if len(rig) > MAX_CAMERAS:
         raise ConfigError(f"{len(rig)} cameras: the visual hull takes up to {MAX_CAMERAS}; choose some with --cameras")
     height, width = rig.frame_shape
-    if max(grid.count * len(rig), height * width * len(rig)) >= 2**31 - 1:
+    column = 32 * kernels.words_per_column(grid.shape[2])  # places, in a plane
+    if len(rig) * max(grid.shape[0] * grid.shape[1] * column, height * width) >= 2**31 - 1:
         raise ConfigError(f"{grid.count} voxels by {len(rig)} cameras are too many look-ups; give fewer --voxels")
     path: Path | None = None
     if use_cache:
@@ -108,7 +114,7 @@ def default_cache_dir() -> Path:
 
 def table_key(rig: Rig, grid: VoxelGrid) -> str:
     """A hash of all that the tables depend on: format, the cameras' numbers (not their names), and the grid."""
-    digest = hashlib.sha256(f"tk-hull {_FORMAT} {np.dtype(np.int32).newbyteorder('=').str}".encode())
+    digest = hashlib.sha256(f"tk-hull {_FORMAT} {sys.byteorder}".encode())
     for camera in rig:
         digest.update(f"{camera.width} {camera.height} {camera.fisheye} {len(camera.distortions)}".encode())
         for numbers in (camera.matrix, camera.distortions, camera.rotation, camera.translation):
@@ -130,19 +136,28 @@ def _build(rig: Rig, grid: VoxelGrid) -> HullTables:
 
     with ThreadPoolExecutor() as pool:  # numpy and OpenCV let go of the interpreter lock
         list(pool.map(project, starts))
-    if not ((pixels >= 0).sum(axis=0, dtype=np.int32) >= 2).any():
+    if _holders(pixels).max() < 2:
         raise VolumeError(
             "capture.toml: no two cameras see any of the working volume; "
             "correct center and size in [volume], or the cameras' poses in calibration.toml"
         )
     row_offsets, voxels = kernels.sort_by_pixel(pixels, int(np.prod(rig.frame_shape)))
-    return HullTables(row_offsets, voxels, len(rig), grid.count)
+    return HullTables(row_offsets, kernels.places(voxels, grid.shape[2]), len(rig), grid.shape)
+
+
+def _holders(pixels: NDArray[np.int32]) -> NDArray[np.uint8]:
+    """(V,) how many pictures hold each voxel."""
+    holders = np.zeros(pixels.shape[1], dtype=np.uint8)
+    for row in pixels:
+        holders += row >= 0
+    return holders
 
 
 def _pixel_index(camera: Camera, p_world: NDArray[np.float64], stride: int) -> NDArray[np.int32]:
     """(N,) index ``y * stride + x`` of the pixel each point falls on, -1 outside the camera's picture."""
     xy, _ = camera.project(p_world)
-    inside = (xy >= -0.5).all(axis=1) & (xy < (camera.width - 0.5, camera.height - 0.5)).all(axis=1)
+    limit = np.array([camera.width - 0.5, camera.height - 0.5])
+    inside = np.logical_and((xy >= -0.5).all(axis=1), (xy < limit).all(axis=1))  # NaN is not
     cell = np.floor(np.where(inside[:, None], xy, 0.0) + 0.5).astype(np.int32)
     return np.where(inside, cell[:, 1] * stride + cell[:, 0], -1).astype(np.int32)
 
@@ -152,22 +167,24 @@ def _load(path: Path, rig: Rig, grid: VoxelGrid) -> HullTables | None:
     try:
         # a stream of our own: numpy leaves the one that it opens to the collector when the archive is broken
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            row_offsets, voxels = stored["row_offsets"], stored["voxels"]
+            row_offsets, places = stored["row_offsets"], stored["places"]
         os.utime(path)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
     height, width = rig.frame_shape
+    depth = 32 * kernels.words_per_column(grid.shape[2])
     fits = (
-        row_offsets.dtype == voxels.dtype == np.int32
+        row_offsets.dtype == places.dtype == np.int32
         and row_offsets.shape == (len(rig) * height * width + 1,)
-        and voxels.ndim == 1
+        and places.ndim == 1
         and row_offsets[0] == 0
-        and row_offsets[-1] == len(voxels) > 0
+        and row_offsets[-1] == len(places) > 0
         and (np.diff(row_offsets) >= 0).all()
-        and voxels.min() >= 0
-        and voxels.max() < grid.count
+        and places.min() >= 0
+        and places.max() < grid.shape[0] * grid.shape[1] * depth
+        and (places % depth).max() < grid.shape[2]
     )
-    return HullTables(row_offsets, voxels, len(rig), grid.count) if fits else None
+    return HullTables(row_offsets, places, len(rig), grid.shape) if fits else None
 
 
 def _save(path: Path, tables: HullTables) -> None:
@@ -177,7 +194,7 @@ def _save(path: Path, tables: HullTables) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
         with os.fdopen(handle, "wb") as stream:
-            np.savez(stream, row_offsets=tables.row_offsets, voxels=tables.voxels)
+            np.savez(stream, row_offsets=tables.row_offsets, places=tables.places)
         os.replace(temporary, path)
         temporary = None
         _prune(path.parent)
