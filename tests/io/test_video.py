@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import gc
 import subprocess
 import sys
@@ -15,7 +16,7 @@ import pytest
 from tests.io.conftest import HEIGHT, WIDTH, picture, read_tag, write_picture, write_video
 from tk.errors import VideoError
 from tk.io.frames import FrameReader
-from tk.io.video import Clip, Image, list_clips, probe
+from tk.io.video import Clip, Image, list_clips, probe, probe_video
 
 
 @pytest.fixture(autouse=True)
@@ -167,6 +168,17 @@ def test_a_video_that_is_cut_off(tmp_path: Path) -> None:
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(VideoError, match=r"cut\.mp4: is cut off: \d+ of its 40 frames are there"):
         probe(path)
+
+
+def test_a_video_that_ends_before_its_count(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", [picture(0, k) for k in range(12)])
+    clip = dataclasses.replace(probe_video(tmp_path / "a.mp4"), frame_count=20)
+    reader = FrameReader([clip, clip], None, (HEIGHT, WIDTH), 0, 20)
+    seen = []
+    with pytest.raises(VideoError, match=r"a\.mp4: ends after 12 of its 20 frames; .*--frames 0:12"):
+        for frame_set in reader:
+            seen.append(read_tag(frame_set.images[1])[1])
+    assert seen == list(range(12))
 
 
 def test_files_that_are_no_video(tmp_path: Path) -> None:
