@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import re
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -162,10 +163,9 @@ class ResultWriter:
         """Bring the file up to date. :meth:`append` does it by itself; this is for a model without frames."""
         self._require_open()
         with _as_result_error(self.path):
-            twin = self._twins[0]
             self._intact = False
+            twin = self._twins[0]
             self._update(twin)
-            twin.file.flush()
             self._workshop.publish(twin.path)
             self._twins.reverse()
             self._published = True
@@ -177,21 +177,19 @@ class ResultWriter:
         """Close the file and tidy up. A second call does nothing."""
         if not self._twins:
             return
-        last = self._twins[0]
         twins, self._twins = self._twins, []
         try:
             with _as_result_error(self.path):
                 if self._intact:
                     # HDF5 touches a file while it closes it: close first, publish then
-                    self._update(last)
-                    last.file.close()
-                    with last.path.open("rb") as stream:
+                    self._update(twins[0])
+                    twins[0].file.close()
+                    with twins[0].path.open("rb") as stream:
                         os.fsync(stream.fileno())
-                    self._workshop.publish(last.path)
+                    self._workshop.publish(twins[0].path)
         finally:
             for twin in twins:
-                with contextlib.suppress(OSError, RuntimeError, ValueError):
-                    twin.file.close()
+                twin.file.close()
             self._workshop.close()
 
     def __enter__(self) -> ResultWriter:
@@ -216,12 +214,17 @@ class ResultWriter:
 
     def _update(self, twin: Twin) -> None:
         """Write into this twin what it lacks."""
-        if twin.model_version != self._model_version:
-            twin.put_model(self._model)
-            twin.model_version = self._model_version
-        news = [row for row in self._recent if row.index >= twin.rows]
-        if news:
-            twin.append(news)
+        try:
+            if twin.model_version != self._model_version:
+                twin.put_model(self._model)
+                twin.model_version = self._model_version
+            news = [row for row in self._recent if row.index >= twin.rows]
+            if news:
+                twin.append(news)
+            twin.file.flush()
+        except (OSError, RuntimeError):
+            _move_to_memory(twin.file)
+            raise
 
 
 class _Workshop:
@@ -288,14 +291,31 @@ def _check_is_result(target: Path) -> None:
     raise ResultError(f"{target}: exists and is not a {FORMAT}; it is not overwritten: choose another name")
 
 
+def _move_to_memory(file: h5py.File) -> None:
+    """After a failed write: let HDF5 go on in memory, for the file is lost.
+
+    HDF5 1.10 to 2.0 crash the process when a file is closed, at the latest at exit, that still cannot be written.
+    """
+    if not hasattr(os, "memfd_create"):  # Linux
+        return
+    handle = file.id.get_vfd_handle()
+    memory = os.memfd_create("tk-result")
+    size, done = os.fstat(handle).st_size, 0
+    while done < size:
+        done += os.sendfile(memory, handle, done, size - done)
+    os.dup2(memory, handle)
+    os.close(memory)
+
+
 @contextlib.contextmanager
 def _as_result_error(target: Path) -> Iterator[None]:
     """The system's and HDF5's refusals as one line; HDF5 reports a full disk as either of the two types."""
     try:
         yield
     except (OSError, RuntimeError) as error:
-        number = getattr(error, "errno", None)
-        reason = os.strerror(number) if number else " ".join(str(error).split())
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        system = re.search(r"error message = '([^']+)'", reason)
+        reason = system[1] if system else reason
         raise ResultError(f"{target}: cannot be written: {reason}") from error
 
 

@@ -230,7 +230,11 @@ def _columns(meta: ResultMeta) -> dict[str, tuple[tuple[int, ...], str]]:
 
 def _create_growing(file: h5py.File, name: str, shape: tuple[int, ...], dtype: str, rows: int) -> h5py.Dataset:
     return file.create_dataset(
-        name, shape=(0, *shape), maxshape=(None, *shape), chunks=(rows, *(max(1, n) for n in shape)), dtype=dtype
+        name,
+        shape=(0, *shape),
+        maxshape=(None, *(n or None for n in shape)),  # HDF5 has no chunks of no columns
+        chunks=(rows, *(max(1, n) for n in shape)),
+        dtype=dtype,
     )
 
 

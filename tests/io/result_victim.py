@@ -1,0 +1,62 @@
+"""Writes a result as fast as it can until somebody kills it: ``python -m tests.io.result_victim RESULT FRAMES``.
+
+Prints the number of finished frames after each one. Everything in a frame follows from its index, so that whoever
+finds the file can check it.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+
+from tk.io.result import FrameResult, HullPoints, ResultMeta, ResultWriter, Status
+
+META = ResultMeta(
+    pose_names=tuple(f"p{i}" for i in range(24)),
+    pose_units=("m",) * 3 + ("rad",) * 21,
+    stages=("all", "chains"),
+    timing_stages=("hull", "optimise", "total"),
+    fps=15.0,
+    up="z",
+    capture="walk",
+    method="volumetric",
+    seed=7,
+    config_toml='method = "volumetric"\n[smd]\nmu = 0.1\n',
+)
+
+
+def make_frame(index: int) -> FrameResult:
+    hull = None
+    if index % 5:  # some frames without voxels
+        count = 200 + index % 37
+        hull = HullPoints(np.full((count, 3), index / 8), np.full((count, 3), index % 256, dtype=np.uint8))
+    return FrameResult(
+        frame=index + 3,
+        time=index / 15,
+        pose=np.arange(24) + 100.0 * index,
+        joints=np.arange(45.0).reshape(15, 3) + index,
+        status=Status.INITIALISED if index == 0 else Status.TRACKED,
+        objective=index / 2,
+        iterations=np.array([index, index + 1]),
+        timing={"hull": 0.01, "total": 0.05 + index},
+        hull=hull,
+    )
+
+
+def make_state(index: int) -> dict[str, np.ndarray | str]:
+    return {"mean": np.full((220, 3), float(index)), "generator": "{" + "9" * (20 + index % 9) + f", {index}}}"}
+
+
+def main() -> None:
+    writer, done = ResultWriter.resume(sys.argv[1], META)
+    with writer:
+        if done == 0:
+            writer.write_model({"torso/radii_m": np.array([0.1, 0.2]), "sex": "any"})
+        for index in range(done, int(sys.argv[2])):
+            writer.append(make_frame(index), make_state(index))
+            print(index + 1, flush=True)
+
+
+if __name__ == "__main__":
+    main()
