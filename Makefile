@@ -1,0 +1,48 @@
+# `make demo` and `make test` are enough by themselves: they set up what is missing first.
+VENV ?= .venv
+RUN = "$(VENV)/bin/python" -m
+
+.PHONY: help install demo test test-slow lint format bench clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make demo       track the capture that ships with tk, compare with its truth"
+	@echo "make test       the tests"
+	@echo "make test-slow  the accuracy tests on whole captures (minutes)"
+	@echo "make lint       ruff and mypy"
+	@echo "make bench      the benchmarks of scripts/bench.py"
+	@echo "make install    only set up $(VENV)"
+	@echo "make clean      remove $(VENV) and caches"
+	@echo "PYTHON=python3.12 chooses the interpreter, VENV=folder where to install"
+
+install: $(VENV)/.installed
+
+# the stamp: set up again only when the dependencies or the set-up have changed
+$(VENV)/.installed: pyproject.toml scripts/setup.sh
+	@bash scripts/setup.sh "$(VENV)"
+	@touch "$@"
+
+demo: install
+	@"$(VENV)/bin/tk" demo
+
+test: install
+	@$(RUN) pytest
+
+test-slow: install
+	@$(RUN) pytest -m slow
+
+lint: install
+	@$(RUN) ruff check .
+	@$(RUN) ruff format --check .
+	@$(RUN) mypy
+
+format: install
+	@$(RUN) ruff check --fix .
+	@$(RUN) ruff format .
+
+bench: install
+	@$(RUN) scripts.bench
+
+clean:
+	rm -rf "$(VENV)" .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist *.egg-info
+	find tk tests scripts -name __pycache__ -type d -prune -exec rm -rf {} +
