@@ -18,7 +18,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
 from tk.io.calibration import read_calibration
@@ -92,6 +91,8 @@ def open3d_carver(rig: Rig, grid: VoxelGrid) -> Callable[[NDArray[np.uint8]], in
     Open3D takes pinholes only, so distortion is ignored here, and keeps a voxel if any of its corners falls on
     foreground (ours asks its centre): its hull is thicker by up to a voxel.
     """
+    import open3d as o3d  # takes seconds to import; the tests need the rest of this module only
+
     size = np.asarray(grid.shape) * grid.voxel_m
     lower = np.asarray(grid.origin) - grid.voxel_m / 2
     parameters = []

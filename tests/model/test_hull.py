@@ -228,7 +228,7 @@ def build_calls(monkeypatch):
 
 
 def same(a, b):
-    return np.array_equal(a.row_offsets, b.row_offsets) and np.array_equal(a.places, b.places)
+    return np.array_equal(a.row_offsets, b.row_offsets) and np.array_equal(a.entries, b.entries)
 
 
 def test_tables_come_back_from_the_cache(tmp_path, build_calls):
@@ -280,17 +280,17 @@ def test_a_spoilt_cache_never_breaks_a_run(tmp_path, build_calls):
         with path.open("wb") as stream:
             np.savez(stream, **arrays)
 
-    beyond = good.places.copy()
-    beyond[-1] = 32 * grid.shape[0] * grid.shape[1]
+    beyond = good.entries.copy()
+    beyond[-1] = (32 * grid.shape[0] * grid.shape[1]) << 3
     spoilers = [
         lambda: path.write_bytes(b""),
         lambda: path.write_bytes(content[: len(content) // 2]),
         lambda: path.write_bytes(bytes(flipped)),
         lambda: path.write_text("not an archive"),
         lambda: write_npz(row_offsets=good.row_offsets),
-        lambda: write_npz(row_offsets=good.row_offsets[:-1], places=good.places),
-        lambda: write_npz(row_offsets=good.row_offsets, places=beyond),
-        lambda: write_npz(row_offsets=good.row_offsets.astype(object), places=good.places),
+        lambda: write_npz(row_offsets=good.row_offsets[:-1], entries=good.entries),
+        lambda: write_npz(row_offsets=good.row_offsets, entries=beyond),
+        lambda: write_npz(row_offsets=good.row_offsets.astype(object), entries=good.entries),
     ]
     for number, spoil in enumerate(spoilers, start=2):
         spoil()
@@ -337,8 +337,8 @@ def test_a_person_is_followed_exactly(name):
 
     capture = bench_hull.load_masks(CAPTURES / name, range(20, 40))
     grid = VoxelGrid.cover(capture.volume, 64)
-    followed = VisualHull(capture.rig, grid, use_cache=False)
-    anew = VisualHull(capture.rig, grid, use_cache=False)
+    followed = VisualHull(capture.rig, grid)
+    anew = VisualHull(capture.rig, grid)
     for masks in capture.masks:
         followed.update(masks)
         anew.carve(masks)

@@ -2,8 +2,12 @@
 
 Kehl & Van Gool 2006, section 4.1. Where the paper gives each voxel a mask with a bit a camera, the same bits lie here
 in planes, one bit a voxel, packed along z into words of 32: voxel (x, y, z) is bit ``z % 32`` of word
-``(x * ny + y) * nw + z // 32`` with nw = ceil(nz / 32). This "place" of a voxel, 32 times its word plus its bit, is
-what the look-up lists hold. W = nx * ny * nw words make a plane.
+``(x * ny + y) * nw + z // 32`` with nw = ceil(nz / 32). W = nx * ny * nw words make a plane; a voxel's "place" in it is
+32 times its word plus its bit.
+
+Masks enter as int64 words, eight pixels at a time (little-endian, as all platforms are that Taichi runs on), M words a
+picture. The look-up lists are kept for such words: a word's list holds the voxels that project to its pixels, each as
+``place << 3 | pixel % 8``. So finding what changed, and what to do about it, both go eight pixels at a time.
 
 ``planes`` (2C, W) uint32
     Rows 2c and 2c + 1 together are camera c's bits: set where the camera does not carve the voxel, because its pixel is
@@ -13,7 +17,6 @@ what the look-up lists hold. W = nx * ny * nw words make a plane.
     The active voxels: all cameras' planes anded. Surface and visibility read only this.
 
 All of it is integers: results are exact and do not depend on the order in which threads work.
-Masks enter as int64 words, eight pixels at a time; memory is little-endian (as on all platforms that Taichi runs on).
 """
 
 import numpy as np
@@ -24,10 +27,10 @@ from tk.kernels.runtime import ensure_runtime, ti
 __all__ = [
     "SHARES",
     "carve",
+    "look_up_lists",
     "pack",
     "places",
     "shade_surface",
-    "sort_by_pixel",
     "surface_voxels",
     "unpack",
     "words_per_column",
@@ -74,97 +77,94 @@ def unpack(plane: NDArray[np.uint32], shape: tuple[int, int, int]) -> NDArray[np
 
 @ti.kernel
 def _sort_kernel(
-    pixels_in: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (C, V)
-    cursor: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (C, P) start of each list; its end when done
-    voxels_out: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (L,)
+    pixels: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (C, V)
+    places_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (V,)
+    cursor: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (C, M) start of each list; its end when done
+    entries: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (L,) out
 ):
-    for camera in range(pixels_in.shape[0]):
-        for voxel in range(pixels_in.shape[1]):
-            pixel = pixels_in[camera, voxel]
+    for camera in range(pixels.shape[0]):
+        for voxel in range(pixels.shape[1]):
+            pixel = pixels[camera, voxel]
             if pixel >= 0:
-                slot = cursor[camera, pixel]
-                cursor[camera, pixel] = slot + 1
-                voxels_out[slot] = voxel
+                slot = cursor[camera, pixel >> 3]
+                cursor[camera, pixel >> 3] = slot + 1
+                entries[slot] = places_in[voxel] << 3 | (pixel & 7)
 
 
-def sort_by_pixel(pixels: NDArray[np.int32], pixel_count: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Turn the voxels' pixels into the pixels' voxels (compressed rows).
+def look_up_lists(pixels: NDArray[np.int32], mask_words: int, nz: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Turn the voxels' pixels into the pixels' voxels, in compressed rows of eight pixels.
 
     Args:
         pixels: (C, V) int32, the pixel each voxel's centre falls on in each camera; -1 outside the picture.
-        pixel_count: P, pixels of one picture in the packed stack.
+        mask_words: M, words of eight pixels in a picture.
+        nz: voxels along z.
 
     Returns:
-        row_offsets (C * P + 1,) int32 and voxels (L,) int32: pixel p of camera c has the voxels
-        ``voxels[row_offsets[c * P + p] : row_offsets[c * P + p + 1]]``, ascending.
+        row_offsets (C * M + 1,) int32 and entries (L,) int32: word w of camera c has the voxels
+        ``entries[row_offsets[c * M + w] : row_offsets[c * M + w + 1]]``, ascending, ``place << 3 | pixel % 8`` each.
     """
     ensure_runtime()
-    counts = np.stack([np.bincount(row[row >= 0], minlength=pixel_count) for row in pixels])
+    counts = np.stack([np.bincount(row[row >= 0] >> 3, minlength=mask_words) for row in pixels])
     row_offsets = np.zeros(counts.size + 1, dtype=np.int32)
     np.cumsum(counts.ravel(), out=row_offsets[1:])
-    voxels = np.empty(int(row_offsets[-1]), dtype=np.int32)
-    if len(voxels):
-        _sort_kernel(np.ascontiguousarray(pixels), row_offsets[:-1].reshape(counts.shape).copy(), voxels)
-    return row_offsets, voxels
+    entries = np.empty(int(row_offsets[-1]), dtype=np.int32)
+    if len(entries):
+        all_places = places(np.arange(pixels.shape[1], dtype=np.int32), nz)
+        cursor = row_offsets[:-1].reshape(counts.shape).copy()
+        _sort_kernel(np.ascontiguousarray(pixels), all_places, cursor, entries)
+    return row_offsets, entries
 
 
 # --- carving -----------------------------------------------------------------------------------------------------
 
 
 @ti.func
-def _turned(now: ti.i64, before: ti.i64, byte: ti.i32) -> ti.i32:
-    """1 where this byte of a mask word turned from background to foreground or back."""
-    is_set = ((now >> (8 * byte)) & 255) != 0
-    was_set = ((before >> (8 * byte)) & 255) != 0
-    return ti.cast(is_set != was_set, ti.i32)
+def _foreground(word: ti.i64) -> ti.i64:
+    """The lowest bit of each byte set where the byte is not zero."""
+    low = (ti.i64(0x7F7F7F7F) << 32) | ti.i64(0x7F7F7F7F)
+    return ((((word & low) + low) | word) >> 7) & ((ti.i64(0x01010101) << 32) | ti.i64(0x01010101))
 
 
 @ti.kernel
 def _carve_kernel(
-    row_offsets: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (C * P + 1,)
-    places_in: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (L,)
-    pixel_count: ti.i32,  # P
+    row_offsets: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (C * M + 1,)
+    entries: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (L,)
+    cameras: ti.i32,  # C
     enough: ti.types.ndarray(dtype=ti.u32, ndim=1),  # (W,)
-    current: ti.types.ndarray(dtype=ti.i64, ndim=2),  # (C, M) masks, eight pixels a word
-    previous: ti.types.ndarray(dtype=ti.i64, ndim=2),  # (C, M) in and out
-    planes: ti.types.ndarray(dtype=ti.u32, ndim=2),  # (2C, W) in and out
+    current: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (C * M,) masks, eight pixels a word
+    previous: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (C * M,) in and out
+    planes: ti.types.ndarray(dtype=ti.u32, ndim=1),  # (2C * W,) in and out
     occupied: ti.types.ndarray(dtype=ti.u32, ndim=1),  # (W,) out
 ):
-    words = current.shape[1]
-    turns = (words + SHARES * _STRETCH - 1) // (SHARES * _STRETCH)
+    # arrays are flat here: the shape of another would be read again at every access
+    mask_words = current.shape[0] // cameras
+    plane_words = enough.shape[0]
+    turns = (mask_words + SHARES * _STRETCH - 1) // (SHARES * _STRETCH)
     ti.loop_config(block_dim=1)  # few long tasks
-    for task in range(planes.shape[0]):
-        camera = task // SHARES
+    for task in range(cameras * SHARES):
+        first = task // SHARES * mask_words
+        plane = task * plane_words
         for turn in range(turns):
             start = (turn * SHARES + task % SHARES) * _STRETCH
-            for word in range(start, ti.min(start + _STRETCH, words)):
-                now = current[camera, word]
-                before = previous[camera, word]
+            for word in range(first + start, first + ti.min(start + _STRETCH, mask_words)):
+                now = current[word]
+                before = previous[word]
                 if now != before:
-                    previous[camera, word] = now
-                    whole = (now == -1 and before == 0) or (now == 0 and before == -1)
-                    row = camera * pixel_count + word * 8
-                    end = 0
-                    while end < 8:
-                        first = end
-                        turned = _turned(now, before, first)
-                        end = ti.select(whole, 8, first + 1)
-                        while end < 8 and _turned(now, before, end) == turned:
-                            end += 1
-                        if turned:
-                            # the lists of neighbouring pixels follow each other in memory
-                            for k in range(row_offsets[row + first], row_offsets[row + end]):
-                                place = places_in[k]
-                                bit = ti.u32(1) << ti.cast(place & 31, ti.u32)
-                                # not ^=, which Taichi makes an atomic operation, four times as slow
-                                planes[task, place >> 5] = planes[task, place >> 5] ^ bit
-    for w in range(occupied.shape[0]):
+                    previous[word] = now
+                    changed = _foreground(now) ^ _foreground(before)
+                    for k in range(row_offsets[word], row_offsets[word + 1]):
+                        entry = entries[k]
+                        flip = ti.cast(changed >> ((entry & 7) << 3), ti.u32) & ti.u32(1)
+                        at = plane + (entry >> 8)
+                        # not ^=, which Taichi makes an atomic operation, four times as slow
+                        planes[at] = planes[at] ^ (flip << ti.cast((entry >> 3) & 31, ti.u32))
+    for w in range(plane_words):
         active = enough[w]
         camera = 0
-        while active != 0 and camera < current.shape[0]:
+        while active != 0 and camera < cameras:
             passed = ti.u32(0)
             for share in ti.static(range(SHARES)):
-                passed |= planes[camera * SHARES + share, w]
+                passed |= planes[(camera * SHARES + share) * plane_words + w]
             active &= passed
             camera += 1
         occupied[w] = active
@@ -172,8 +172,7 @@ def _carve_kernel(
 
 def carve(
     row_offsets: NDArray[np.int32],
-    places: NDArray[np.int32],
-    pixel_count: int,
+    entries: NDArray[np.int32],
     enough: NDArray[np.uint32],
     current: NDArray[np.int64],
     previous: NDArray[np.int64],
@@ -182,20 +181,21 @@ def carve(
 ) -> None:
     """Bring ``planes``, ``occupied`` and ``previous`` from the masks ``previous`` to the masks ``current``, in place.
 
-    Only the lists of pixels that changed between background (0) and foreground (anything else) are visited. From
+    Only the lists of words in which a pixel changed are visited. A pixel is background where 0, else foreground. From
     scratch is the same with ``previous`` zero and ``planes`` as no foreground at all leaves them: row 2c has the voxels
     outside camera c's picture, row 2c + 1 nothing.
 
     Args:
-        row_offsets, places: the look-up lists of :func:`sort_by_pixel`, with :func:`places` for voxels.
-        pixel_count: P, pixels of one picture.
+        row_offsets, entries: the look-up lists of :func:`look_up_lists`.
         enough: (W,) uint32, the voxels that may be active at all.
-        current, previous: (C, M) int64, each camera's mask (P,) uint8, zero-padded to whole words.
+        current, previous: (C, M) int64, each camera's mask (H * W,) uint8, zero-padded to whole words.
         planes: (2C, W) uint32.
         occupied: (W,) uint32.
     """
     ensure_runtime()
-    _carve_kernel(row_offsets, places, pixel_count, enough, current, previous, planes, occupied)
+    cameras = len(current)
+    flat = (current.reshape(-1), previous.reshape(-1), planes.reshape(-1))
+    _carve_kernel(row_offsets, entries, cameras, enough, *flat, occupied)
 
 
 # --- surface -----------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tk.kernels import hull as kernels
 from tk.model.camera import Rig
-from tk.model.hull_tables import HullTables, load_or_build
+from tk.model.hull_tables import HullTables, load_or_build, mask_words
 from tk.model.volume import VoxelGrid
 
 __all__ = ["HullSurface", "VisualHull"]
@@ -66,7 +66,7 @@ class VisualHull:
         self._spacing = _sample_spacing(rig, grid)
         self._planes = self._tables.empty_planes.copy()
         self._occupied = np.zeros(self._planes.shape[1], dtype=np.uint32)
-        self._previous = np.zeros((len(rig), -(-self._pixel_count // 8)), dtype=np.int64)
+        self._previous = np.zeros((len(rig), mask_words(rig)), dtype=np.int64)
         self._found = np.empty(grid.count, dtype=np.int32)
         self._clean = True
 
@@ -94,8 +94,7 @@ class VisualHull:
         self._clean = False
         kernels.carve(
             tables.row_offsets,
-            tables.places,
-            self._pixel_count,
+            tables.entries,
             tables.enough,
             words,
             self._previous,

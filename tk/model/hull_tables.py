@@ -20,7 +20,7 @@ from tk.kernels import hull as kernels
 from tk.model.camera import Camera, Rig
 from tk.model.volume import VoxelGrid
 
-__all__ = ["MAX_CAMERAS", "HullTables", "default_cache_dir", "load_or_build", "table_key"]
+__all__ = ["MAX_CAMERAS", "HullTables", "default_cache_dir", "load_or_build", "mask_words", "table_key"]
 
 MAX_CAMERAS = 31  # a bit each in an int32 that stays positive
 _FORMAT = 1  # part of the key: raise it when the tables' meaning changes
@@ -32,18 +32,19 @@ _BLOCK = 1 << 15  # voxels projected at a time: the intermediate arrays stay in 
 class HullTables:
     """The paper's look-up tables (section 4.1, fig. 2) in compressed rows.
 
-    With P = H * W pixels a picture of the packed stack, V voxels and C cameras:
+    For C cameras, M words of eight mask pixels a picture, V voxels:
 
     Attributes:
-        row_offsets: (C * P + 1,) int32; pixel p of camera c owns ``places[row_offsets[c*P+p] : row_offsets[c*P+p+1]]``.
-        places: (L,) int32, ascending in each row: the voxels whose centres project to the pixel, each as its place in
-            a packed plane (:func:`tk.kernels.hull.places`).
+        row_offsets: (C * M + 1,) int32; word w of camera c owns
+            ``entries[row_offsets[c * M + w] : row_offsets[c * M + w + 1]]``.
+        entries: (L,) int32, the voxels whose centres project to one of the word's pixels, and which pixel it is, in
+            the layout of :func:`tk.kernels.hull.look_up_lists`.
         camera_count: C.
         shape: (nx, ny, nz) of the grid.
     """
 
     row_offsets: NDArray[np.int32]
-    places: NDArray[np.int32]
+    entries: NDArray[np.int32]
     camera_count: int
     shape: tuple[int, int, int]
 
@@ -51,15 +52,15 @@ class HullTables:
     def pixels(self) -> NDArray[np.int32]:
         """(C, V) int32, the lists turned back: the pixel of each voxel, -1 outside the picture."""
         nz = self.shape[2]
-        depth = 32 * kernels.words_per_column(nz)
+        depth = np.int32(32 * kernels.words_per_column(nz))
         pixels = np.full((self.camera_count, self.shape[0] * self.shape[1], nz), -1, dtype=np.int32)
-        pixel_count = (len(self.row_offsets) - 1) // self.camera_count
-        lengths = np.diff(self.row_offsets).reshape(self.camera_count, pixel_count)
-        index = np.arange(pixel_count, dtype=np.int32)
+        words = (len(self.row_offsets) - 1) // self.camera_count
+        lengths = np.diff(self.row_offsets).reshape(self.camera_count, words)
+        first_pixels = np.arange(words, dtype=np.int32) * np.int32(8)
         for camera in range(self.camera_count):
-            start, stop = self.row_offsets[camera * pixel_count], self.row_offsets[(camera + 1) * pixel_count]
-            column, z = np.divmod(self.places[start:stop], np.int32(depth))
-            pixels[camera, column, z] = np.repeat(index, lengths[camera])
+            entries = self.entries[self.row_offsets[camera * words] : self.row_offsets[(camera + 1) * words]]
+            column, z = np.divmod(entries >> 3, depth)
+            pixels[camera, column, z] = np.repeat(first_pixels, lengths[camera]) + (entries & 7)
         return pixels.reshape(self.camera_count, -1)
 
     @cached_property
@@ -85,9 +86,8 @@ def load_or_build(rig: Rig, grid: VoxelGrid, cache_dir: Path | None = None, use_
     """
     if len(rig) > MAX_CAMERAS:
         raise ConfigError(f"{len(rig)} cameras: the visual hull takes up to {MAX_CAMERAS}; choose some with --cameras")
-    height, width = rig.frame_shape
-    column = 32 * kernels.words_per_column(grid.shape[2])  # places, in a plane
-    if len(rig) * max(grid.shape[0] * grid.shape[1] * column, height * width) >= 2**31 - 1:
+    plane = 32 * kernels.words_per_column(grid.shape[2]) * grid.shape[0] * grid.shape[1]
+    if plane >= 2**28 or len(rig) * plane >= 2**31:  # 29 bits of an entry, 32 of an offset, less the signs
         raise ConfigError(f"{grid.count} voxels by {len(rig)} cameras are too many look-ups; give fewer --voxels")
     path: Path | None = None
     if use_cache:
@@ -99,6 +99,12 @@ def load_or_build(rig: Rig, grid: VoxelGrid, cache_dir: Path | None = None, use_
     if path is not None:
         _save(path, tables)
     return tables
+
+
+def mask_words(rig: Rig) -> int:
+    """Words of eight pixels that hold one picture of the packed stack."""
+    height, width = rig.frame_shape
+    return (height * width + 7) // 8
 
 
 def default_cache_dir() -> Path:
@@ -141,8 +147,8 @@ def _build(rig: Rig, grid: VoxelGrid) -> HullTables:
             "capture.toml: no two cameras see any of the working volume; "
             "correct center and size in [volume], or the cameras' poses in calibration.toml"
         )
-    row_offsets, voxels = kernels.sort_by_pixel(pixels, int(np.prod(rig.frame_shape)))
-    return HullTables(row_offsets, kernels.places(voxels, grid.shape[2]), len(rig), grid.shape)
+    row_offsets, entries = kernels.look_up_lists(pixels, mask_words(rig), grid.shape[2])
+    return HullTables(row_offsets, entries, len(rig), grid.shape)
 
 
 def _holders(pixels: NDArray[np.int32]) -> NDArray[np.uint8]:
@@ -167,24 +173,23 @@ def _load(path: Path, rig: Rig, grid: VoxelGrid) -> HullTables | None:
     try:
         # a stream of our own: numpy leaves the one that it opens to the collector when the archive is broken
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            row_offsets, places = stored["row_offsets"], stored["places"]
+            row_offsets, entries = stored["row_offsets"], stored["entries"]
         os.utime(path)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
-    height, width = rig.frame_shape
     depth = 32 * kernels.words_per_column(grid.shape[2])
     fits = (
-        row_offsets.dtype == places.dtype == np.int32
-        and row_offsets.shape == (len(rig) * height * width + 1,)
-        and places.ndim == 1
+        row_offsets.dtype == entries.dtype == np.int32
+        and row_offsets.shape == (len(rig) * mask_words(rig) + 1,)
+        and entries.ndim == 1
         and row_offsets[0] == 0
-        and row_offsets[-1] == len(places) > 0
+        and row_offsets[-1] == len(entries) > 0
         and (np.diff(row_offsets) >= 0).all()
-        and places.min() >= 0
-        and places.max() < grid.shape[0] * grid.shape[1] * depth
-        and (places % depth).max() < grid.shape[2]
+        and entries.min() >= 0
+        and entries.max() >> 3 < grid.shape[0] * grid.shape[1] * depth
+        and ((entries >> 3) % depth).max() < grid.shape[2]
     )
-    return HullTables(row_offsets, places, len(rig), grid.shape) if fits else None
+    return HullTables(row_offsets, entries, len(rig), grid.shape) if fits else None
 
 
 def _save(path: Path, tables: HullTables) -> None:
@@ -194,7 +199,7 @@ def _save(path: Path, tables: HullTables) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
         with os.fdopen(handle, "wb") as stream:
-            np.savez(stream, row_offsets=tables.row_offsets, places=tables.places)
+            np.savez(stream, row_offsets=tables.row_offsets, entries=tables.entries)
         os.replace(temporary, path)
         temporary = None
         _prune(path.parent)
