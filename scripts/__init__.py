@@ -1,0 +1,1 @@
+"""Experiments, benchmarks and generators; run them from the repository root as ``python -m scripts.NAME``."""
