@@ -15,9 +15,9 @@ def windows(values):
     """(H, W, 3) to (H, W, 27): the 3×3 windows, zero outside the picture."""
     height, width = values.shape[:2]
     padded = np.pad(values.astype(np.float64), ((1, 1), (1, 1), (0, 0)))
-    return np.stack(
-        [padded[dy : dy + height, dx : dx + width] for dy in range(3) for dx in range(3)], axis=-1
-    ).reshape(height, width, 27)
+    return np.stack([padded[dy : dy + height, dx : dx + width] for dy in range(3) for dx in range(3)], axis=-1).reshape(
+        height, width, 27
+    )
 
 
 def oracle(image, plate, weight, precision, darkness_offset, shadow_min, difference_min):
@@ -144,9 +144,9 @@ def test_the_frame_of_the_planes_stays_empty():
     images, plates = scene(5)
     planes = measure(255 - images, plates)
     planes.relax(6.0, 0.5, 4)
-    framed = planes.labels.base
-    assert framed.sum() == planes.labels.sum() > 0
-    assert framed.shape[1] == planes.labels.shape[1] + 2 * PAD
+    for picture, whole in ((planes.labels, planes._labels), (planes.collinearity, planes._collinearity)):
+        assert whole.sum() == picture.sum() > 0
+        assert whole.size >= 2 * (picture.shape[1] + 2 * PAD) * (picture.shape[2] + 2 * PAD)
 
 
 def test_levels_are_monotonic_and_eight_an_octave():

@@ -1,15 +1,16 @@
 """How unlike the empty scene each pixel is: the clamped collinearity statistic, for all cameras in one launch.
 
-The colour values of a 3×3 window of the picture and of the (gain-corrected) plate are stacked into two vectors **a**, **b**
-of 27 components; a constant component, the darkness offset, is added to both (Mester et al. 2001; Griesser et al. 2005).
-The smaller eigenvalue of their Gram matrix is ``min over s of |a - s b|² / (1 + s²)``: the distance from being collinear,
-whatever the factor ``s``. A cast shadow can only darken, and only so far, thus here ``s`` is confined to
-``[shadow_min, 1]`` (neither paper does so; a black shoe is collinear with any floor). With ``s = 1`` the same expression is
-``|a - b|² / 2``, an upper bound, so that the costlier statistic is needed only where this plain difference is significant.
+The colour values of a 3×3 window of the picture and of the (gain-corrected) plate are stacked into two vectors **a**,
+**b** of 27 components; a constant component, the darkness offset, is added to both (Mester et al. 2001; Griesser et al.
+2005). The smaller eigenvalue of their Gram matrix is ``min over s of |a - s b|² / (1 + s²)``: the distance from being
+collinear, whatever the factor ``s``. A cast shadow can only darken, and only so far, thus here ``s`` is confined to
+``[shadow_min, 1]`` (neither paper does so; a black shoe is collinear with any floor). With ``s = 1`` the same
+expression is ``|a - b|² / 2``, an upper bound, so that the costlier statistic is needed only where this plain
+difference is significant.
 
-Sums are integers and the results are levels on a logarithmic scale in one byte, so they repeat bit for bit.
-Planes have a frame of :data:`PAD` zero pixels around each camera's picture: nothing has to test for borders, and what lies
-outside the picture adds nothing to a sum.
+Sums are integers and the results are levels on a logarithmic scale in one byte, so they repeat bit for bit. Planes have
+a frame of :data:`PAD` zero pixels around each camera's picture: nothing has to test for borders, and what lies outside
+the picture adds nothing to a sum.
 """
 
 import numpy as np
@@ -52,7 +53,9 @@ def _square(images: ti.template(), plates: ti.template(), i: ti.i32) -> ti.i32:
 
 
 @ti.func
-def _column(images: ti.template(), plates: ti.template(), pixel: ti.i32, width: ti.i32, up: ti.i32, down: ti.i32):
+def _column(
+    images: ti.template(), plates: ti.template(), pixel: ti.i32, width: ti.i32, up: ti.i32, down: ti.i32
+) -> ti.math.ivec2:
     """(d·b, b·b) over a column of the window: rows ``up`` (-1 or 0) to ``down`` (0 or 1) around ``pixel``."""
     db = 0
     bb = 0
@@ -79,7 +82,7 @@ def _statistic_kernel(
     scratch: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [C * strips * (STRIP + 2) * (W + 2)] outer columns are zero
     difference: ti.types.ndarray(dtype=ti.u8, ndim=1),  # [C * (H + 2 PAD) * (W + 2 PAD)] out, zero before
     collinearity: ti.types.ndarray(dtype=ti.u8, ndim=1),  # [C * (H + 2 PAD) * (W + 2 PAD)] out, zero before
-):
+) -> None:
     strips = (height + STRIP - 1) // STRIP
     line = width + 2
     for strip in range(precision.shape[0] * strips):
@@ -148,23 +151,23 @@ def _statistic_kernel(
 
 @ti.kernel
 def _relax_kernel(
-    collinearity: ti.types.ndarray(dtype=ti.u8, ndim=1),  # [C * (H + 2 PAD) * (W + 2 PAD)]
+    collinearity: ti.types.ndarray(dtype=ti.u8, ndim=1),  # [C * (H + 2 PAD) * (W + 2 PAD)], zeros to 8 n
+    eights: ti.types.ndarray(dtype=ti.i64, ndim=1),  # the same memory, eight pixels a word
     threshold: ti.i32,  # level
     per_neighbour: ti.i32,  # levels
-    lines: ti.i32,  # C * (H + 2 PAD)
     stride: ti.i32,  # W + 2 PAD
-    labels: ti.types.ndarray(dtype=ti.u8, ndim=1),  # [C * (H + 2 PAD) * (W + 2 PAD)] 0 or 1
-    out: ti.types.ndarray(dtype=ti.u8, ndim=1),  # [C * (H + 2 PAD) * (W + 2 PAD)] 0 or 1
-):
-    for row in range(PAD, lines - PAD):
-        for x in range(PAD, stride - PAD):
-            i = row * stride + x
-            level = ti.cast(collinearity[i], ti.i32)
-            if level > 0:
-                above = labels[i - stride - 1] + labels[i - stride] + labels[i - stride + 1]
-                below = labels[i + stride - 1] + labels[i + stride] + labels[i + stride + 1]
-                count = ti.cast(above + below + labels[i - 1] + labels[i + 1], ti.i32)
-                out[i] = ti.cast(level + per_neighbour * (count - 4) >= threshold, ti.u8)
+    labels: ti.types.ndarray(dtype=ti.u8, ndim=1),  # as collinearity, 0 or 1
+    out: ti.types.ndarray(dtype=ti.u8, ndim=1),  # as collinearity, 0 or 1; zero where collinearity is
+) -> None:
+    for word in range(eights.shape[0]):
+        if eights[word] != 0:
+            for i in range(8 * word, 8 * word + 8):
+                level = ti.cast(collinearity[i], ti.i32)
+                if level > 0:
+                    above = labels[i - stride - 1] + labels[i - stride] + labels[i - stride + 1]
+                    below = labels[i + stride - 1] + labels[i + stride] + labels[i + stride + 1]
+                    count = ti.cast(above + below + labels[i - 1] + labels[i + 1], ti.i32)
+                    out[i] = ti.cast(level + per_neighbour * (count - 4) >= threshold, ti.u8)
 
 
 class Planes:
@@ -178,24 +181,28 @@ class Planes:
 
     def __init__(self, cameras: int, height: int, width: int) -> None:
         self.shape = (cameras, height, width)
-        framed = (cameras, height + 2 * PAD, width + 2 * PAD)
+        self._framed = (cameras, height + 2 * PAD, width + 2 * PAD)
+        size = -(-int(np.prod(self._framed)) // 8) * 8
         self._difference, self._collinearity, self._labels, self._spare = (
-            np.zeros(framed, dtype=np.uint8) for _ in range(4)
+            np.zeros(size, dtype=np.uint8) for _ in range(4)
         )
         strips = -(-height // STRIP)
         self._scratch = np.zeros(cameras * strips * (STRIP + 2) * (width + 2), dtype=np.int32)
 
+    def _picture(self, plane: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return plane[: int(np.prod(self._framed))].reshape(self._framed)[:, PAD:-PAD, PAD:-PAD]
+
     @property
     def difference(self) -> NDArray[np.uint8]:
-        return self._difference[:, PAD:-PAD, PAD:-PAD]
+        return self._picture(self._difference)
 
     @property
     def collinearity(self) -> NDArray[np.uint8]:
-        return self._collinearity[:, PAD:-PAD, PAD:-PAD]
+        return self._picture(self._collinearity)
 
     @property
     def labels(self) -> NDArray[np.uint8]:
-        return self._labels[:, PAD:-PAD, PAD:-PAD]
+        return self._picture(self._labels)
 
     def measure(
         self,
@@ -219,7 +226,7 @@ class Planes:
             difference_min: below this many noise variances of plain difference a pixel is background for certain.
         """
         ensure_runtime()
-        cameras, height, width = self.shape
+        _, height, width = self.shape
         self._difference.fill(0)
         self._collinearity.fill(0)
         _statistic_kernel(
@@ -233,8 +240,8 @@ class Planes:
             shadow_min,
             54.0 * difference_min,
             self._scratch,
-            self._difference.reshape(-1),
-            self._collinearity.reshape(-1),
+            self._difference,
+            self._collinearity,
         )
 
     def relax(self, threshold: float, octaves_per_neighbour: float, iterations: int) -> None:
@@ -244,18 +251,17 @@ class Planes:
         labels start from the bare threshold and are updated all at once, a fixed number of times.
         """
         ensure_runtime()
-        cameras, height, width = self.shape
         level = level_of(threshold)
         np.greater_equal(self._collinearity, level, out=self._labels.view(np.bool_))
         self._spare.fill(0)
         for _ in range(iterations):
             _relax_kernel(
-                self._collinearity.reshape(-1),
+                self._collinearity,
+                self._collinearity.view(np.int64),
                 level,
                 round(octaves_per_neighbour * STEPS_PER_OCTAVE),
-                cameras * (height + 2 * PAD),
-                width + 2 * PAD,
-                self._labels.reshape(-1),
-                self._spare.reshape(-1),
+                self._framed[2],
+                self._labels,
+                self._spare,
             )
             self._labels, self._spare = self._spare, self._labels

@@ -4,24 +4,23 @@ The main method is the collinearity test (Mester et al. 2001, extended by Griess
 section 4, use it). :mod:`tk.kernels.background` computes the statistic; here is what surrounds it: learning the empty
 scene and its noise, following gain and noise from frame to frame, and cleaning up the labels.
 
-No state passes from one frame to the next, so a run that is resumed gives the same masks. The papers are silent on three
-things, which are settled here as follows.
+No state passes from one frame to the next, so a run that is resumed gives the same masks. The papers are silent on
+three things, which are settled here as follows.
 
-* **Grey clothes.** A cloth of the floor's colour is collinear with the floor, as a shadow is. Shadows are confined to the
-  factors that they can have, and a region that could be either is decided by its border: a region mostly bounded by
+* **Grey clothes.** A cloth of the floor's colour is collinear with the floor, as a shadow is. Shadows are confined to
+  the factors that they can have, and a region that could be either is decided by its border: a region mostly bounded by
   certain foreground is part of the person, one mostly bounded by background is a shadow.
 * **Penumbrae.** Over the blurred edge of a shadow the window is not collinear. Such labels are thin, and their
   statistic is small against the plain difference next to them; they count as "could be either".
-* **The rim.** A 3×3 window fires one pixel outside the outline. A pixel of the rim stays if its own difference reaches a
-  given share of the largest one next to it, which is where the outline covers that share of the pixel.
+* **The rim.** A 3×3 window fires one pixel outside the outline. A pixel of the rim stays if its own difference reaches
+  a given share of the largest one next to it, which is where the outline covers that share of the pixel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -135,14 +134,16 @@ def _check_clips(clips: Sequence[Images], frame_shape: tuple[int, int], sizes: N
     for c, (clip, (width, height)) in enumerate(zip(clips, sizes, strict=True)):
         if clip.ndim != 4 or len(clip) == 0 or clip.shape[1:] != (height, width, 3):
             raise CaptureError(
-                f"background: the clip of camera {c + 1} has shape {clip.shape}, its calibration wants (T, {height}, {width}, 3)"
+                f"background: the clip of camera {c + 1} has shape {clip.shape}, "
+                f"its calibration wants (T, {height}, {width}, 3)"
             )
         if height > frame_shape[0] or width > frame_shape[1]:
             raise CaptureError(f"background: camera {c + 1} is larger than the frame {frame_shape}")
 
 
-def _samples(images: Images, step: int = 10) -> Images:
-    """(C, 3, N) pixels on a coarse grid."""
+def _samples(images: NDArray[Any]) -> NDArray[Any]:
+    """(C, 3, N) pixels on a coarse grid: about thirty rows."""
+    step = max(min(images.shape[1:3]) // 30, 1)
     grid = images[:, step // 2 :: step, step // 2 :: step]
     return np.ascontiguousarray(np.moveaxis(grid, -1, 1)).reshape(len(images), 3, -1)
 
@@ -176,7 +177,7 @@ def _gain_and_noise(
 
 
 def _learn_scene(clip: Images) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Mean (h, w, 3) and temporal variance (h, w, 3) of a clip of the empty scene, flicker taken off; None for T = 1."""
+    """Mean and temporal variance (h, w, 3) of a clip of the empty scene, flicker taken off; no variance for T = 1."""
     reference = clip[0].astype(np.float32)
     if len(clip) == 1:
         return reference, None
@@ -195,18 +196,22 @@ def _learn_scene(clip: Images) -> tuple[NDArray[np.float32], NDArray[np.float32]
     return reference + mean, np.maximum(variance, 0)
 
 
+def _box_mean(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    mean = cv2.boxFilter(values, cv2.CV_32F, (3, 3), borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(mean, dtype=np.float32)
+
+
 def _relative_noise(
     plate: NDArray[np.float32], variance: NDArray[np.float32] | None, config: ForegroundConfig
 ) -> NDArray[np.float32]:
     """(h, w) noise variance of each window as a multiple of the picture's level."""
-    box = {"ddepth": cv2.CV_32F, "ksize": (3, 3), "borderType": cv2.BORDER_REPLICATE}
     level = config.noise_floor
     relative = np.ones(plate.shape[:2], np.float32)
     if variance is not None:
-        window = cv2.boxFilter(variance, **box).mean(axis=2)
+        window = _box_mean(variance).mean(axis=2)
         level = max(float(np.median(window)), config.noise_floor)
         relative = np.maximum(window / level, np.float32(config.relative_noise_floor))
-    contrast = np.maximum(cv2.boxFilter(plate * plate, **box) - cv2.boxFilter(plate, **box) ** 2, 0).mean(axis=2)
+    contrast = np.maximum(_box_mean(plate * plate) - _box_mean(plate) ** 2, 0).mean(axis=2)
     return (relative + config.jitter_px**2 * contrast / level).astype(np.float32)
 
 
@@ -228,7 +233,6 @@ class CollinearityForeground:
         self._plate_samples = _samples(plates).astype(np.float32)
         self._noise_samples = _samples(relative_noise[..., None].repeat(3, axis=3))[:, 0]
         self._planes = Planes(*plates.shape[:3])
-        self._workers = ThreadPoolExecutor(max_workers=2, thread_name_prefix="foreground")
 
     @classmethod
     def learn(
@@ -283,7 +287,8 @@ class CollinearityForeground:
         )
         self._planes.relax(config.threshold, config.neighbour_octaves, config.iterations)
         masks = np.zeros(images.shape[:3], np.uint8)
-        list(self._workers.map(lambda c: self._clean(c, images[c], scenes[c], masks[c]), range(len(images))))
+        for c in range(len(images)):
+            self._clean(c, images[c], scenes[c], masks[c])
         return masks
 
     def _clean(self, c: int, image: Images, scene: Images, mask: Images) -> None:
@@ -302,11 +307,9 @@ class CollinearityForeground:
         certain, unsure = _without_penumbrae(labels, difference, collinearity, self.config.penumbra)
         foreground = certain | _enclosed(unsure, certain, self.config.enclosure)
         foreground |= unsure & _closed(foreground, reach)
-        foreground = _drop_small(foreground, self.config.speck_area * area)
-        contrast = cv2.transform(cv2.absdiff(image[crop], scene[crop]), np.full((1, 3), 1 / 3))
+        contrast = np.asarray(cv2.transform(cv2.absdiff(image[crop], scene[crop]), np.full((1, 3), 1 / 3)), np.uint8)
         foreground = _trim_rim(foreground, contrast, self.config.rim, self.config.rim_layers)
-        foreground = ~_drop_small(~foreground, self.config.hole_area * area, connectivity=4)
-        np.multiply(foreground.view(np.uint8), 255, out=mask[crop])
+        mask[crop] = _clean_by_area(foreground, self.config.speck_area * area, self.config.hole_area * area)
 
 
 Mask = NDArray[np.bool_]
@@ -341,12 +344,28 @@ def _closed(mask: Mask, size: int) -> Mask:
     return np.ascontiguousarray(closed[size:-size, size:-size]).view(np.bool_)
 
 
-def _drop_small(mask: Mask, area: float, connectivity: int = 8) -> Mask:
-    """The mask without its components of less than ``area`` pixels."""
-    _, regions, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=connectivity)
-    large = stats[:, cv2.CC_STAT_AREA] >= area
-    large[0] = False
-    return large[regions]
+def _clean_by_area(mask: Mask, speck: float, hole: float) -> Images:
+    """Drop foreground (8-connected) of less than ``speck`` pixels, fill holes (4-connected) of less than ``hole``.
+
+    Works on outlines, which are short, not on regions: Pick's theorem turns the polygon through the outline's pixel
+    centres into a count of pixels. The outline of a hole runs on the foreground around it. What lies inside an outline
+    goes with it.
+
+    Returns:
+        (h, w) uint8, 0 or 255.
+    """
+    clean = mask.view(np.uint8) * np.uint8(255)
+    contours, hierarchy = cv2.findContours(clean, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    specks = []
+    for contour, (_, _, _, parent) in zip(contours, hierarchy[0] if len(contours) else (), strict=True):
+        area, half_length = cv2.contourArea(contour), len(contour) / 2
+        if parent < 0 and area + half_length + 1 < speck:
+            specks.append(contour)
+        elif parent >= 0 and area - half_length + 1 < hole:
+            cv2.drawContours(clean, [contour], -1, 255, cv2.FILLED)
+    if specks:
+        cv2.drawContours(clean, specks, -1, 0, cv2.FILLED)
+    return clean
 
 
 def _trim_rim(mask: Mask, contrast: Images, share: float, layers: int) -> Mask:
@@ -361,7 +380,9 @@ def _trim_rim(mask: Mask, contrast: Images, share: float, layers: int) -> Mask:
 class Mog2Foreground:
     """OpenCV's mixture of Gaussians (MOG2) a pixel, learned from the clips and then frozen; its shadows are dropped."""
 
-    def __init__(self, models: Sequence[cv2.BackgroundSubtractorMOG2], sizes: NDArray[np.int_], config: ForegroundConfig):
+    def __init__(
+        self, models: Sequence[cv2.BackgroundSubtractorMOG2], sizes: NDArray[np.int_], config: ForegroundConfig
+    ):
         self.config = config
         self.sizes = sizes
         self._models = tuple(models)
@@ -394,7 +415,8 @@ class Mog2Foreground:
         masks = np.zeros(images.shape[:3], np.uint8)
         for c, (model, (width, height)) in enumerate(zip(self._models, self.sizes, strict=True)):
             labels = model.apply(np.ascontiguousarray(images[c, :height, :width]), learningRate=0)
-            mask = _drop_small(labels == 255, self.config.speck_area * width * height)
-            mask = ~_drop_small(~mask, self.config.hole_area * width * height, connectivity=4)
-            masks[c, :height, :width] = mask.view(np.uint8) * 255
+            area = width * height
+            masks[c, :height, :width] = _clean_by_area(
+                labels == 255, self.config.speck_area * area, self.config.hole_area * area
+            )
         return masks
