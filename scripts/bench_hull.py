@@ -89,7 +89,8 @@ def open3d_carver(rig: Rig, grid: VoxelGrid) -> Callable[[NDArray[np.uint8]], in
     """Open3D's carving of the same grid; returns a function from masks to the number of voxels left.
 
     Open3D takes pinholes only, so distortion is ignored here, and keeps a voxel if any of its corners falls on
-    foreground (ours asks its centre): its hull is thicker by up to a voxel.
+    foreground (ours asks its centre): its hull is thicker by up to a voxel. It carves destructively, so each frame needs a new
+    dense grid; that is left out of its time.
     """
     import open3d as o3d  # takes seconds to import; the tests need the rest of this module only
 

@@ -187,6 +187,32 @@ def test_surface_of_a_two_coloured_ball():
     assert not plain.colors.any()
 
 
+def test_the_boundary_is_finer_than_the_grid():
+    """Inside all silhouettes a little before it, outside one a little after; no point lies inside the ball."""
+    eyes = [(3, 0.4, 1.2), (-3, 0.5, 1.0), (0.5, 3, 1.1), (-0.4, -3, 0.9), (0.3, 0.2, 4.0)]
+    rig = Rig(tuple(look_at(f"c{i}", e, size=(320, 240), focal=400.0) for i, e in enumerate(eyes)))
+    grid = VoxelGrid.cover(Volume((0, 0, 1), (0.8, 0.8, 0.8)), 16)
+    masks = silhouettes(rig, ball(radius=0.3, count=40000))
+    hull = VisualHull(rig, grid, use_cache=False)
+    hull.carve(masks)
+    surface = hull.surface(boundary=True)
+    assert hull.surface().boundary is None and surface.boundary is not None
+    distance = np.linalg.norm(surface.boundary - (0, 0, 1), axis=1)
+    voxel_distance = np.linalg.norm(surface.positions - (0, 0, 1), axis=1)
+    assert (voxel_distance < 0.3 - 0.1 * grid.voxel_m).mean() > 0.3  # which the voxels' centres do
+    assert (distance < 0.3 - 0.1 * grid.voxel_m).mean() < 0.02
+    moved = (surface.boundary != surface.positions).any(axis=1)
+    assert moved.mean() > 0.95
+
+    def inside(p_world):
+        xy = [np.floor(camera.project(p_world)[0] + 0.5).astype(int) for camera in rig]
+        return np.all([mask[at[:, 1], at[:, 0]] != 0 for mask, at in zip(masks, xy, strict=True)], axis=0)
+
+    step = 0.08 * grid.voxel_m * surface.normals  # half a sample is 0.055 voxels, the rest is rounding
+    assert inside(surface.boundary - step)[moved].mean() > 0.98
+    assert inside(surface.boundary + step)[moved].mean() < 0.02
+
+
 def test_wrong_shapes_are_refused():
     rig, grid = make_rig(3), VoxelGrid.cover(VOLUME, 8)
     hull = VisualHull(rig, grid, use_cache=False)

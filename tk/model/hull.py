@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tk.kernels import hull as kernels
 from tk.model.camera import Rig
+from tk.model.hull_boundary import hull_boundary
 from tk.model.hull_tables import HullTables, load_or_build, mask_words
 from tk.model.volume import VoxelGrid
 
@@ -26,6 +27,7 @@ class HullSurface:
         normals: (N, 3) float32 outward unit normals; zero where undefined (a voxel amid symmetric neighbours).
         colors: (N, 3) float32, 0..255 in the images' channel order (BGR); zero where ``seen`` is 0.
         seen: (N,) int32, bit c set where camera c truly sees the voxel: frontal, and nothing of the hull in between.
+        boundary: (N, 3) float32 metres where asked for: each voxel moved along its normal to the hull's own boundary.
     """
 
     voxels: NDArray[np.int32]
@@ -33,6 +35,7 @@ class HullSurface:
     normals: NDArray[np.float32]
     colors: NDArray[np.float32]
     seen: NDArray[np.int32]
+    boundary: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.voxels)
@@ -115,12 +118,18 @@ class VisualHull:
             bits |= kernels.unpack(plane, self.grid.shape).astype(np.int32) << (row // kernels.SHARES)
         return bits
 
-    def surface(self, images: NDArray[np.uint8] | None = None) -> HullSurface:
-        """The surface voxels of the current hull, coloured if ``images`` (C, H, W, 3) uint8 BGR are given."""
+    def surface(self, images: NDArray[np.uint8] | None = None, boundary: bool = False) -> HullSurface:
+        """The surface voxels of the current hull.
+
+        Args:
+            images: (C, H, W, 3) uint8 BGR of the same frame as the masks; None for no colours.
+            boundary: also find where the hull ends between voxels; costs a few milliseconds.
+        """
         channels = (*self._mask_shape, 3)
         if images is not None and (images.shape != channels or images.dtype != np.uint8):
             raise ValueError(f"images are {images.dtype} {images.shape}, expected uint8 {channels}")
         voxels, box = kernels.surface_voxels(self._occupied, self.grid.shape, self._found)
+        masks = self._previous.view(np.uint8)
         normals, colors, seen = kernels.shade_surface(
             self._occupied,
             self.grid.shape,
@@ -128,12 +137,16 @@ class VisualHull:
             self._eyes,
             self._spacing,
             None if images is None else np.ascontiguousarray(images),
-            self._previous.view(np.uint8),
+            masks,
             voxels,
             box,
         )
         positions = self.grid.centers(voxels).astype(np.float32)
-        return HullSurface(voxels, positions, normals, colors, seen)
+        ends = None
+        if boundary:
+            pictures = masks[:, : self._pixel_count].reshape(self._mask_shape)
+            ends = hull_boundary(self.rig, pictures, positions, normals, self.grid.voxel_m)
+        return HullSurface(voxels, positions, normals, colors, seen, ends)
 
     def _as_words(self, masks: NDArray[np.uint8]) -> NDArray[np.int64]:
         """(C, M) the masks as int64 words: a view where memory allows it, a zero-padded copy otherwise."""
