@@ -53,9 +53,7 @@ def _square(images: ti.template(), plates: ti.template(), i: ti.i32) -> ti.i32:
 
 
 @ti.func
-def _column(
-    images: ti.template(), plates: ti.template(), pixel: ti.i32, width: ti.i32, up: ti.i32, down: ti.i32
-) -> ti.math.ivec2:
+def _column(images: ti.template(), plates: ti.template(), pixel: ti.i32, width: ti.i32, up: ti.i32, down: ti.i32):
     """(d·b, b·b) over a column of the window: rows ``up`` (-1 or 0) to ``down`` (0 or 1) around ``pixel``."""
     db = 0
     bb = 0
@@ -82,7 +80,7 @@ def _statistic_kernel(
     scratch: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [C * strips * (STRIP + 2) * (W + 2)] outer columns are zero
     difference: ti.types.ndarray(dtype=ti.u8, ndim=1),  # [C * (H + 2 PAD) * (W + 2 PAD)] out, zero before
     collinearity: ti.types.ndarray(dtype=ti.u8, ndim=1),  # [C * (H + 2 PAD) * (W + 2 PAD)] out, zero before
-) -> None:
+):
     strips = (height + STRIP - 1) // STRIP
     line = width + 2
     for strip in range(precision.shape[0] * strips):
@@ -158,7 +156,7 @@ def _relax_kernel(
     stride: ti.i32,  # W + 2 PAD
     labels: ti.types.ndarray(dtype=ti.u8, ndim=1),  # as collinearity, 0 or 1
     out: ti.types.ndarray(dtype=ti.u8, ndim=1),  # as collinearity, 0 or 1; zero where collinearity is
-) -> None:
+):
     for word in range(eights.shape[0]):
         if eights[word] != 0:
             for i in range(8 * word, 8 * word + 8):
