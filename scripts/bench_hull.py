@@ -89,8 +89,8 @@ def open3d_carver(rig: Rig, grid: VoxelGrid) -> Callable[[NDArray[np.uint8]], in
     """Open3D's carving of the same grid; returns a function from masks to the number of voxels left.
 
     Open3D takes pinholes only, so distortion is ignored here, and keeps a voxel if any of its corners falls on
-    foreground (ours asks its centre): its hull is thicker by up to a voxel. It carves destructively, so each frame needs a new
-    dense grid; that is left out of its time.
+    foreground (ours asks its centre): its hull is thicker by up to a voxel. It carves destructively, so each
+    frame needs a new dense grid; that is left out of its time.
     """
     import open3d as o3d  # takes seconds to import; the tests need the rest of this module only
 
@@ -153,7 +153,9 @@ def measure(capture: MaskedCapture, voxels: int, repeats: int = 5, baselines: bo
     hull.surface(images)  # compiled
     scratch, incremental, surface, sizes = [], [], [], []
     for _ in range(repeats):
-        scratch += [_timed(lambda masks=masks: hull.carve(masks)) for masks in capture.masks]
+        for masks in capture.masks:
+            scratch.append(_timed(lambda masks=masks: hull.carve(masks)))
+            surface.append(_timed(lambda: sizes.append(len(hull.surface(images)))))
         hull.update(capture.masks[0])
         for masks in capture.masks[1:]:
             incremental.append(_timed(lambda masks=masks: hull.update(masks)))

@@ -55,7 +55,7 @@ def shade(active, eyes, pixels=None, images=None, masks=None, spacing=1):
     eyes = np.atleast_2d(np.asarray(eyes, dtype=np.float32))
     count = len(eyes)
     if pixels is None:
-        pixels = np.zeros((count, active.size), dtype=np.int32)
+        pixels = np.zeros((active.size, count), dtype=np.int32)
     if masks is None:
         masks = np.full((count, 4, 4), 255, dtype=np.uint8)
     masks = masks.reshape(count, -1)
@@ -216,7 +216,7 @@ def test_colours_of_two_cameras_are_weighted_by_squared_cosines():
     eyes = [[3.0, 3.0, 80.0], [3.0 + 60.0, 3.0, 2.0 + 60.0]]
     images = np.zeros((2, 4, 4, 3), dtype=np.uint8)
     images[0], images[1] = (200, 100, 0), (50, 100, 250)
-    pixels = np.full((2, active.size), 5, dtype=np.int32)
+    pixels = np.full((active.size, 2), 5, dtype=np.int32)
     voxels, normals, colors, seen = shade(active, eyes, pixels, images)
     middle = np.flatnonzero(voxels == np.ravel_multi_index((3, 3, 2), active.shape))[0]
     np.testing.assert_allclose(normals[middle], [0, 0, 1])
@@ -229,6 +229,6 @@ def test_colours_of_two_cameras_are_weighted_by_squared_cosines():
 def test_a_voxel_outside_the_picture_has_no_colour_from_it():
     active = np.ones((1, 1, 1), dtype=bool)
     images = np.full((2, 4, 4, 3), 90, dtype=np.uint8)
-    pixels = np.array([[-1], [-1]], dtype=np.int32)
+    pixels = np.array([[-1, -1]], dtype=np.int32)
     _, _, colors, seen = shade(active, [[50.0, 0, 0], [0, 50.0, 0]], pixels, images)
     assert seen.tolist() == [0] and colors.tolist() == [[0.0, 0.0, 0.0]]

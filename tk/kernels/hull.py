@@ -324,7 +324,7 @@ def _in_sight(
 def _shade_kernel(
     occupied: ti.types.ndarray(dtype=ti.u32, ndim=3),  # (nx, ny, nw)
     nz: ti.i32,
-    pixels: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (C, V)
+    pixels: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (V, C)
     eyes: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (C, 3) voxels
     spacing: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (C,) pixels
     images: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (C, H, W, 3), or (C, 0, 0, 3)
@@ -348,8 +348,8 @@ def _shade_kernel(
         color = ti.Vector([ti.f32(0.0), ti.f32(0.0), ti.f32(0.0)])
         weight = ti.f32(0.0)
         cameras = 0
-        for camera in range(pixels.shape[0]):
-            pixel = pixels[camera, voxel]
+        for camera in range(pixels.shape[1]):
+            pixel = pixels[voxel, camera]
             if pixel >= 0:
                 view = (ti.Vector([eyes[camera, 0], eyes[camera, 1], eyes[camera, 2]]) - center).normalized()
                 cosine = normal.dot(view)
@@ -398,7 +398,7 @@ def shade_surface(
     Args:
         occupied: (W,) uint32.
         shape: (nx, ny, nz).
-        pixels: (C, V) int32, pixel of each voxel in each camera, -1 outside the picture.
+        pixels: (V, C) int32, pixel of each voxel in each camera, -1 outside the picture.
         eyes: (C, 3) float32, centres of projection in voxels: the centre of voxel (0, 0, 0) is the origin.
         spacing: (C,) int32, pixels between the three by three samples that make up a voxel's colour.
         images: (C, H, W, 3) uint8, or None for no colours.

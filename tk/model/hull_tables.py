@@ -50,31 +50,31 @@ class HullTables:
 
     @cached_property
     def pixels(self) -> NDArray[np.int32]:
-        """(C, V) int32, the lists turned back: the pixel of each voxel, -1 outside the picture."""
+        """(V, C) int32, the lists turned back: each voxel's pixel in each camera, -1 outside the picture."""
         nz = self.shape[2]
         depth = np.int32(32 * kernels.words_per_column(nz))
-        pixels = np.full((self.camera_count, self.shape[0] * self.shape[1], nz), -1, dtype=np.int32)
+        pixels = np.full((self.shape[0] * self.shape[1], nz, self.camera_count), -1, dtype=np.int32)
         words = (len(self.row_offsets) - 1) // self.camera_count
         lengths = np.diff(self.row_offsets).reshape(self.camera_count, words)
         first_pixels = np.arange(words, dtype=np.int32) * np.int32(8)
         for camera in range(self.camera_count):
             entries = self.entries[self.row_offsets[camera * words] : self.row_offsets[(camera + 1) * words]]
             column, z = np.divmod(entries >> 3, depth)
-            pixels[camera, column, z] = np.repeat(first_pixels, lengths[camera]) + (entries & 7)
-        return pixels.reshape(self.camera_count, -1)
+            pixels[column, z, camera] = np.repeat(first_pixels, lengths[camera]) + (entries & 7)
+        return pixels.reshape(-1, self.camera_count)
 
     @cached_property
     def empty_planes(self) -> NDArray[np.uint32]:
         """(2C, W) uint32, the cameras' planes before any foreground: a camera does not carve what it does not hold."""
         planes = np.zeros((kernels.SHARES * self.camera_count, len(self.enough)), dtype=np.uint32)
-        for camera, row in enumerate(self.pixels):
+        for camera, row in enumerate(self.pixels.T):
             planes[kernels.SHARES * camera] = kernels.pack((row < 0).reshape(self.shape))
         return planes
 
     @cached_property
     def enough(self) -> NDArray[np.uint32]:
         """(W,) uint32, the voxels that at least two pictures hold."""
-        return kernels.pack(_holders(self.pixels).reshape(self.shape) >= 2)
+        return kernels.pack(_holders(self.pixels.T).reshape(self.shape) >= 2)
 
 
 def load_or_build(rig: Rig, grid: VoxelGrid, cache_dir: Path | None = None, use_cache: bool = True) -> HullTables:
