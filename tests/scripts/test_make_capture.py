@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 from scripts.make_capture import main
-from scripts.synthetic.actor import HAIR, SHIRT, SKIN, TROUSERS, Look, make_actor
+from scripts.synthetic.actor import Look, make_actor
 from scripts.synthetic.capture import BACKGROUND_FRAMES, CameraRenderer, Options, Plan, plan_capture
 from scripts.synthetic.motion import HOLD, MOTIONS
 from scripts.synthetic.render import CLOSE_M, Body, distances
@@ -201,7 +201,6 @@ def test_materials_are_where_they_belong(tiny: Plan) -> None:
     assert image[y, x, 0] > 1.5 * image[y, x, 2]
     x, y = np.rint(camera.project(joint(tiny, "knee_l")[:1])[0][0]).astype(int)
     assert image[y, x, 2] > 1.2 * image[y, x, 0]
-    assert len({SKIN, HAIR, SHIRT, TROUSERS}) == 4
 
 
 @pytest.mark.parametrize("count", RIGS)
