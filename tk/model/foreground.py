@@ -54,20 +54,22 @@ class ForegroundConfig:
         shadow_min: the darkest shadow, as a share of the lit plate. Measured: 0.76 under two lamps; a shadow that is
             darker is taken for the person, which the other cameras put right, while a hole in one mask cuts through the
             visual hull.
-        noise_floor: variance added to the measured noise, grey levels²: what video coding does to the picture. It rounds
-            small noise away in places and then lets it jump; its errors are alike over a window. Measured: more would
-            make cleaner rims, but holes in grey clothes before a grey wall.
+        noise_floor: variance added to the measured noise, grey levels²: what video coding does to the picture. It
+            rounds small noise away in places and then lets it jump; its errors are alike over a window. Measured: more
+            would make cleaner rims, but holes in grey clothes before a grey wall.
         relative_noise_floor: least noise variance of a pixel, as a share of its picture's. As above.
         jitter_px: unsteadiness of camera and coding, pixels: adds noise where the plate has contrast. Measured.
         penumbra: a thin label is the edge of a shadow where the statistic is below this share of the plain difference
             nearby. 0.29 at a sharp edge, 0.05 over four pixels of blur (both follow from the statistic).
-        enclosure: share of its border by which a region must touch certain foreground to become foreground.
+        enclosure: share of its border by which a region must touch certain foreground to become foreground. The
+            majority, for want of a better reason.
         bridge: a region that could be either is also foreground between parts of the person that are no farther apart
-            than this share of the picture's height.
-        rim: share of coverage from which a rim pixel stays; 0.5 is unbiased, less is cautious.
+            than this share of the picture's height (a gap of 10 of 480 pixels). Measured.
+        rim: share of coverage from which a rim pixel stays; 0.5 is unbiased, less is cautious: a
+            pixel too many swells the hull a little, one too few cuts through it.
         rim_layers: how deep the rim is searched, pixels: one for the window, one for blur.
-        speck_area: smaller foreground components go, share of the picture's area.
-        hole_area: smaller holes are filled, share of the picture's area.
+        speck_area: smaller foreground components go, share of the picture's area (61 pixels of 640×480). Measured.
+        hole_area: smaller holes are filled, share of the picture's area (123 pixels of 640×480). Measured.
     """
 
     threshold: float = 3.0
