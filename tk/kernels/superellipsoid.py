@@ -1,0 +1,64 @@
+"""Truncated superellipsoids as Taichi functions (Kehl 2006, sections 5.2 and 5.3).
+
+G = F^(ε₁/2), with F Barr's inside-outside function, is homogeneous of degree one: it grows linearly along every ray from
+the centre and is 1 on the surface, so one Newton step along its gradient lands close to the nearest surface point.
+"""
+
+from tk.kernels.runtime import ti
+
+
+@ti.func
+def power(base, exponent):
+    """|base|^exponent, safe at zero."""
+    return ti.exp(exponent * ti.log(ti.max(ti.abs(base), 1e-6)))
+
+
+@ti.func
+def inside_outside(q, radii, e1, e2):
+    """F(q): below 1 inside, above 1 outside."""
+    xy = power(q[0] / radii[0], 2.0 / e2) + power(q[1] / radii[1], 2.0 / e2)
+    return power(xy, e2 / e1) + power(q[2] / radii[2], 2.0 / e1)
+
+
+@ti.func
+def implicit(q, radii, e1, e2):
+    """G(q) and its gradient, as one vector (G, ∂x, ∂y, ∂z)."""
+    ax = power(q[0] / radii[0], 2.0 / e2)
+    ay = power(q[1] / radii[1], 2.0 / e2)
+    xy = ti.max(ax + ay, 1e-12)
+    ring = power(xy, e2 / e1)
+    az = power(q[2] / radii[2], 2.0 / e1)
+    F = ti.max(ring + az, 1e-12)
+    G = power(F, 0.5 * e1)
+    # ∂G/∂x = (e1/2) F^(e1/2 - 1) · (e2/e1) xy^(e2/e1 - 1) · (2/e2) |x|^(2/e2 - 1) / a^(2/e2)
+    scale = G / F
+    flat = ring / xy
+    gx = scale * flat * ax / _away_from_zero(q[0])
+    gy = scale * flat * ay / _away_from_zero(q[1])
+    gz = scale * az / _away_from_zero(q[2])
+    return ti.Vector([G, gx, gy, gz])
+
+
+@ti.func
+def _away_from_zero(x):
+    return ti.select(x < 0, ti.min(x, -1e-6), ti.max(x, 1e-6))
+
+
+@ti.func
+def project(q, radii, e1, e2, z_lower, z_upper):
+    """The surface point nearest to q, to first order, and its outward normal: (x, y, z, nx, ny, nz).
+
+    Points beyond a cutting plane are first moved onto it, so that a truncated piece attracts to its rim.
+    """
+    c = ti.Vector([q[0], q[1], ti.min(ti.max(q[2], z_lower), z_upper)])
+    g = implicit(c, radii, e1, e2)
+    gradient = ti.Vector([g[1], g[2], g[3]])
+    square = ti.max(gradient.norm_sqr(), 1e-9)
+    # the step is bounded by the piece's own size: deep inside, near the centre, the gradient is no guide
+    step = (g[0] - 1.0) / square
+    s = c - step * gradient
+    limit = 2.0 * ti.max(radii[0], ti.max(radii[1], radii[2]))
+    if (s - c).norm_sqr() > limit * limit:
+        s = c
+    normal = gradient / ti.sqrt(square)
+    return ti.Vector([s[0], s[1], s[2], normal[0], normal[1], normal[2]])

@@ -1,0 +1,294 @@
+"""A body's objective in one frame: which samples and voxels are drawn, and what the kernel makes of them.
+
+The optimisers see callables of poses (:meth:`FrameObjective.full`, :meth:`FrameObjective.chains`); what they are made of,
+voxels, colours, samples, stays here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ConfigError
+from tk.kernels.nearest import SurfaceIndex
+from tk.kernels.objective import Held, Linearisation, ObjectiveKernel, ObjectiveSettings
+from tk.model.body import Body
+from tk.model.skeleton import CHAINS, SEGMENTS
+
+Float = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+CHAIN_NAMES = tuple(CHAINS)
+# the chain of each segment, -1 for the torso
+CHAIN_OF_SEGMENT = np.array(
+    [next((c for c, chain in enumerate(CHAINS.values()) if name in chain), -1) for name in SEGMENTS]
+)
+
+
+@dataclass(frozen=True)
+class SamplingConfig:
+    """How many points an evaluation uses (section 6.4: 60 on the torso, 20 on each limb and the head).
+
+    Attributes:
+        torso, chain: surface samples on the torso, and on the head and each limb.
+        voxels: voxels of the coverage term in the optimisation of all degrees of freedom.
+        chain_voxels: the same for one chain.
+        sigma_m: σ of eq. 10 for every sample, metres; 0 takes the limb's diameter, as the paper does. Distances are
+            as uncertain on the trunk as on an arm: both come from the same voxels. In units of the diameter the trunk,
+            five times as thick, weighs a twenty-fifth and follows the arms.
+    """
+
+    torso: int = 60
+    chain: int = 20
+    voxels: int = 150
+    chain_voxels: int = 30
+    sigma_m: float = 0.1
+
+    def __post_init__(self) -> None:
+        if min(self.torso, self.chain, self.voxels, self.chain_voxels) < 1 or self.sigma_m < 0:
+            raise ConfigError("sampling: numbers of points must be at least 1, sigma_m at least 0")
+
+
+class BodyObjective:
+    """The objective of one body, ready for any frame.
+
+    Args:
+        body: the person.
+        settings: constants of the objective.
+        sampling: numbers of points.
+        dtype: precision of the kernel.
+    """
+
+    def __init__(
+        self, body: Body, settings: ObjectiveSettings, sampling: SamplingConfig, dtype: type = np.float32
+    ) -> None:
+        self.body = body
+        self.settings = settings
+        self.sampling = sampling
+        skeleton, pieces = body.skeleton, body.pieces
+        T_world_body = np.eye(4)
+        T_world_body[:3, :3] = skeleton.T_world_body
+        fixed = sampling.sigma_m
+        self.piece_segment = np.array([SEGMENTS.index(p.segment) for p in pieces])
+        self.kernel = ObjectiveKernel(
+            axis=skeleton.axis,
+            point=skeleton.point,
+            prismatic=skeleton.prismatic,
+            parent=skeleton.parent,
+            local=body.points,
+            normal=body.normals,
+            last_dof=skeleton.segment_dof[body.segment],
+            sigma=np.full(len(body.points), fixed) if fixed else body.diameter,
+            patch=body.patch,
+            piece_dof=skeleton.segment_dof[self.piece_segment],
+            piece_frame=np.array([(T_world_body @ p.T_body_piece)[:3] for p in pieces]),
+            piece_shape=np.array([[*p.radii, p.e1, p.e2, p.z_lower, p.z_upper] for p in pieces]),
+            piece_sigma=np.array([fixed or p.diameter_m for p in pieces]),
+            dtype=dtype,
+        )
+        chain = CHAIN_OF_SEGMENT[body.segment]
+        self.torso_samples = np.flatnonzero(chain < 0).astype(np.int32)
+        self.chain_samples = [np.flatnonzero(chain == c).astype(np.int32) for c in range(len(CHAINS))]
+        self.chain_free = np.array([skeleton.chain_dofs(c) for c in CHAIN_NAMES])
+
+    def draw(self, rng: np.random.Generator, scale: int = 1) -> Ints:
+        """(M,) fresh surface samples, in the proportions of section 6.4, ``scale`` times as many."""
+        parts = [pick(rng, self.torso_samples, scale * self.sampling.torso)]
+        parts += [pick(rng, samples, scale * self.sampling.chain) for samples in self.chain_samples]
+        return np.concatenate(parts)
+
+    def spread(self, scale: int = 3) -> Ints:
+        """(M,) surface samples evenly over the body, the same at every call."""
+        parts = [even(self.torso_samples, scale * self.sampling.torso)]
+        parts += [even(samples, scale * self.sampling.chain) for samples in self.chain_samples]
+        return np.concatenate(parts)
+
+    def damping(self, lever_m: float) -> Float:
+        """(D,) curvature of f along each degree of freedom, were all points ``lever_m`` from its axis."""
+        s = self.settings
+        sigma = self.sampling.sigma_m or float(np.median(self.body.diameter))
+        unit = (1 / s.nu + s.coverage_weight / s.coverage_nu) / sigma**2
+        return unit * np.where(self.body.skeleton.prismatic, 1.0, lever_m**2)
+
+
+def pick(rng: np.random.Generator, samples: Ints, count: int) -> Ints:
+    """``count`` of the samples at random, all of them where there are no more."""
+    if count >= len(samples):
+        return samples
+    # a random start in a random order would do as well; partial shuffles cost more than they give at these sizes
+    return samples[rng.permutation(len(samples))[:count]]
+
+
+def even(samples: Ints, count: int) -> Ints:
+    """``count`` of the samples at equal steps, all of them where there are no more."""
+    if count >= len(samples):
+        return samples
+    return samples[(np.arange(count) * len(samples)) // count]
+
+
+class Evaluation(NamedTuple):
+    """An objective at B poses: value (B,), gradient (B, D), Hessian-vector product (B, D)."""
+
+    value: Float
+    gradient: Float
+    hessian_vector: Float
+
+
+# A voxel farther from the body than this is not explained by it, metres.
+ASTRAY_M = 0.1
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well a pose explains a frame.
+
+    Attributes:
+        value: the objective over evenly spread samples and voxels.
+        linear: the linearisation at the pose (M + Q pairs); held: its assignments.
+        samples: (M,) the samples used; voxels: (Q,) the voxels used.
+    """
+
+    value: float
+    linear: Linearisation
+    held: Held
+    samples: Ints
+    voxels: Ints
+
+    @property
+    def stranded(self) -> NDArray[np.bool_]:
+        """(M,) True for samples with no voxel within σ."""
+        M = len(self.samples)
+        distance2 = np.sum(self.linear.residual[:M] ** 2, axis=1)
+        return (self.linear.partner[:M] < 0) | (distance2 * self.linear.inv_sigma2[:M] > 1)
+
+    @property
+    def astray(self) -> NDArray[np.bool_]:
+        """(Q,) True for voxels that the body does not explain."""
+        M = len(self.samples)
+        if len(self.linear.residual) == M:
+            return np.zeros(len(self.voxels), bool)
+        return (self.linear.partner[M:] < 0) | (np.linalg.norm(self.linear.residual[M:], axis=1) > ASTRAY_M)
+
+
+class FrameObjective:
+    """The objective of one body in one frame; what :class:`tk.optim.schedule.Problem` asks for.
+
+    Args:
+        objective: the body's.
+        index: the frame's surface voxels.
+        rng: where samples are drawn from.
+        outliers: least weight of a pair in the Hessian.
+    """
+
+    def __init__(
+        self, objective: BodyObjective, index: SurfaceIndex, rng: np.random.Generator, outliers: float = 0.1
+    ) -> None:
+        self.objective = objective
+        self.index = index
+        self.rng = rng
+        self.outliers = outliers
+        self.voxel_count = len(index.positions)
+        self.free = objective.chain_free
+        self.angular = ~objective.body.skeleton.prismatic
+        self._fits: dict[bytes, Fit] = {}
+        self._pools: list[Ints] = []
+
+    def constrain(self, poses: Float) -> Float:
+        """Poses (B, D) mapped into the joints' limits (eq. 22)."""
+        return self.objective.body.skeleton.clip(poses)
+
+    def damping(self, lever_m: float) -> Float:
+        """See :meth:`BodyObjective.damping`."""
+        return self.objective.damping(lever_m)
+
+    def full(self) -> Callable[[Float, Float, int], Evaluation]:
+        """All degrees of freedom: new samples for every iteration number, the same in all rows."""
+        draws = _Draws(self._draw_full)
+
+        def evaluate(poses: Float, directions: Float, iteration: int) -> Evaluation:
+            samples, voxels = draws(iteration)
+            B = len(poses)
+            return self._evaluate(np.repeat(samples[None], B, 0), np.repeat(voxels[None], B, 0), poses, directions)
+
+        return evaluate
+
+    def chains(self, owner: NDArray[np.intp], pose: Float) -> Callable[[Float, Float, int], Evaluation]:
+        """Row b is chain ``owner[b]`` with its own samples, and voxels that are its own or nobody's at ``pose``."""
+        s = self.objective.sampling
+        self._pools = self._chain_pools(self.fit(pose))
+
+        def draw() -> tuple[Ints, Ints]:
+            samples = [pick(self.rng, samples, s.chain) for samples in self.objective.chain_samples]
+            voxels = [pool[self.rng.integers(len(pool), size=s.chain_voxels)] for pool in self._pools]
+            return np.stack(samples)[owner], np.stack(voxels)[owner]
+
+        draws = _Draws(draw)
+
+        def evaluate(poses: Float, directions: Float, iteration: int) -> Evaluation:
+            return self._evaluate(*draws(iteration), poses, directions)
+
+        return evaluate
+
+    def chain_values(self, owner: NDArray[np.intp], poses: Float) -> Float:
+        """(B,) the chains' objectives on even samples and on the voxels of the last :meth:`chains`."""
+        samples = np.stack([even(s, 60) if len(s) >= 60 else np.resize(s, 60) for s in self.objective.chain_samples])
+        voxels = np.stack([even(p, 120) if len(p) >= 120 else np.resize(p, 120) for p in self._pools])
+        return self._evaluate(samples[owner], voxels[owner], poses, None).value
+
+    def value(self, pose: Float) -> float:
+        """The objective at ``pose`` (D,) on even samples and all voxels."""
+        return self.fit(pose).value
+
+    def curvature(self, pose: Float) -> Float:
+        """(D, D) Gauss-Newton Hessian at ``pose`` (D,)."""
+        return self.fit(pose).linear.gauss_newton(self.outliers)
+
+    def fit(self, pose: Float) -> Fit:
+        """How well ``pose`` (D,) explains the frame, on samples that do not change from call to call."""
+        key = np.asarray(pose, np.float64).tobytes()
+        if key in self._fits:
+            return self._fits[key]
+        samples = self.objective.spread()
+        voxels = np.arange(0, self.voxel_count, max(self.voxel_count // 1000, 1), dtype=np.int32)
+        kernel, settings = self.objective.kernel, self.objective.settings
+        value, _, _, held = kernel.evaluate(self.index, samples[None], voxels[None], pose[None], None, settings)
+        linear = kernel.linearise(self.index, samples, voxels, pose, held, settings)
+        self._fits[key] = Fit(float(value[0]), linear, held, samples, voxels)
+        return self._fits[key]
+
+    def _chain_pools(self, fit: Fit) -> list[Ints]:
+        """For each chain the voxels it may have to cover: those nearest to it, and those that nothing covers."""
+        if self.objective.settings.coverage_weight <= 0:
+            return [np.zeros(1, np.int32)] * len(CHAINS)
+        piece = fit.held.covering[0, : len(fit.voxels), 0].astype(np.int64)
+        nearest = np.where(piece >= 0, CHAIN_OF_SEGMENT[self.objective.piece_segment[piece]], -1)
+        pools = [fit.voxels[(nearest == c) | fit.astray] for c in range(len(CHAINS))]
+        return [pool if len(pool) else fit.voxels for pool in pools]
+
+    def _draw_full(self) -> tuple[Ints, Ints]:
+        s = self.objective.sampling
+        return self.objective.draw(self.rng), self.rng.integers(self.voxel_count, size=s.voxels).astype(np.int32)
+
+    def _evaluate(self, samples: Ints, voxels: Ints, poses: Float, directions: Float | None) -> Evaluation:
+        value, gradient, product, _ = self.objective.kernel.evaluate(
+            self.index, samples, voxels, poses, directions, self.objective.settings
+        )
+        return Evaluation(value, gradient, product)
+
+
+class _Draws:
+    """The samples of each iteration number; the same number gives the same samples."""
+
+    def __init__(self, draw: Callable[[], tuple[Ints, Ints]]) -> None:
+        self._draw = draw
+        self._iteration: int | None = None
+        self._last: tuple[Ints, Ints] | None = None
+
+    def __call__(self, iteration: int) -> tuple[Ints, Ints]:
+        if self._last is None or iteration != self._iteration:
+            self._last, self._iteration = self._draw(), iteration
+        return self._last

@@ -1,0 +1,166 @@
+"""Stochastic Meta Descent (Kehl 2006, section 6.2, after Schraudolph 1999), for a batch of problems at once.
+
+Gradient descent with a step size for every parameter, adapted while it runs:
+
+    a ← a ⊗ max(½, 1 + μ v ⊗ g)                  (18)
+    p ← constrain(p − a ⊗ g)                     (17, 22)
+    gᶜ = (p_old − p) / a                         (23)
+    v ← λ v + a ⊗ (gᶜ − λ H v)                   (19)
+
+The optimiser knows an objective as a callable of a batch of poses and nothing of bodies. The objective draws its samples
+anew for each iteration number it is called with; ``shuffle = False`` calls it with the same number throughout, which is
+the deterministic variant of section 7.1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ConfigError
+
+Float = NDArray[np.float64]
+
+
+class Evaluation(Protocol):
+    """An objective at B poses: value (B,), gradient (B, D) and Hessian-vector product (B, D)."""
+
+    @property
+    def value(self) -> Float: ...
+    @property
+    def gradient(self) -> Float: ...
+    @property
+    def hessian_vector(self) -> Float: ...
+
+
+Objective = Callable[[Float, Float, int], Evaluation]
+"""(poses (B, D), directions (B, D), iteration) -> Evaluation."""
+
+
+@dataclass(frozen=True)
+class SmdConfig:
+    """Settings of SMD. The paper's values where it gives any that do not depend on its units.
+
+    Attributes:
+        meta_step: μ of eq. 18, per unit of the objective, which runs from 0 to 1 here. The paper takes a tenth of its
+            initial step sizes, a number that belongs to its objective's scale.
+        memory: λ of eq. 19 (paper: 0.3).
+        max_iterations: i_max of eq. 21 (paper: 40).
+        window: n of eq. 20 (paper: 3).
+        shuffle: new samples each iteration.
+        average: return the mean of the last ``window`` states, whose change eq. 20 bounds, and not the last one, which
+            carries the last sample's noise. The paper does not say which of the two it returns.
+    """
+
+    meta_step: float = 1.0
+    memory: float = 0.3
+    max_iterations: int = 40
+    window: int = 3
+    shuffle: bool = True
+    average: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.memory <= 1:
+            raise ConfigError(f"smd.memory = {self.memory} must lie between 0 and 1")
+        if self.meta_step < 0 or self.max_iterations < 1 or self.window < 1:
+            raise ConfigError(
+                f"smd: meta_step {self.meta_step} must not be negative, max_iterations {self.max_iterations} "
+                f"and window {self.window} must be at least 1"
+            )
+
+
+@dataclass(frozen=True)
+class SmdResult:
+    """Where B descents ended.
+
+    Attributes:
+        pose: (B, D).
+        value: (B,) the objective at the last evaluation before the end, on that iteration's samples.
+        iterations: (B,) iterations made.
+        converged: (B,) True where eq. 20 stopped it, False where eq. 21 did.
+        path: (I + 1, B, D) all states when asked for, else None; a finished row repeats its last state.
+    """
+
+    pose: Float
+    value: Float
+    iterations: NDArray[np.int32]
+    converged: NDArray[np.bool_]
+    path: Float | None = None
+
+
+def minimise(
+    objective: Objective,
+    start: Float,
+    step: Float | float,
+    tolerance: Float,
+    constrain: Callable[[Float], Float],
+    basis: Float | None = None,
+    config: SmdConfig | None = None,
+    keep_path: bool = False,
+) -> SmdResult:
+    """Minimise B objectives, each row by itself.
+
+    Args:
+        objective: see :data:`Objective`.
+        start: (B, D) first states.
+        step: initial step sizes a₀ > 0, (B, U), (U,) or one number.
+        tolerance: (D,) ε of eq. 20, a number for every parameter in its own unit: a row stops when the change of its
+            moving average is at most ε in each. The paper gives one for angles and one for the displacement.
+        constrain: maps states (B, D) into the feasible region (eq. 22).
+        basis: (B, D, U) directions in which SMD works, p = p_start + basis·u, with a step size for each of the U
+            directions; the unit vectors of p by default, as in the paper. With a basis that whitens the Hessian the
+            diagonal step sizes lose nothing to the coupling of the joints along a limb. Columns of zeros hold a row's
+            parameters still.
+        config: see :class:`SmdConfig`.
+        keep_path: record every state.
+
+    Raises:
+        ConfigError: when a step size is not positive.
+    """
+    config = config or SmdConfig()
+    p = constrain(np.array(start, dtype=np.float64, ndmin=2))
+    B, D = p.shape
+    W = np.broadcast_to(np.eye(D), (B, D, D)) if basis is None else np.asarray(basis, np.float64)
+    W_inverse = np.linalg.pinv(W)
+    a = np.broadcast_to(np.asarray(step, np.float64), (B, W.shape[2])).copy()
+    if not (a > 0).all():
+        raise ConfigError("smd: every initial step size must be positive")
+    v = np.zeros_like(a)
+    history = [p]
+    value = np.full(B, np.nan)
+    iterations = np.zeros(B, np.int32)
+    converged = np.zeros(B, bool)
+    active = np.ones(B, bool)
+    for i in range(config.max_iterations):
+        now = objective(p, _times(W, v), i if config.shuffle else 0)
+        g = _times(W.transpose(0, 2, 1), now.gradient)
+        Hv = _times(W.transpose(0, 2, 1), now.hessian_vector)
+        value = np.where(active, now.value, value)
+        a = np.where(active[:, None], a * np.maximum(0.5, 1.0 + config.meta_step * v * g), a)
+        p_next = np.where(active[:, None], constrain(p - _times(W, a * g)), p)
+        g_constrained = _times(W_inverse, p - p_next) / a
+        v = config.memory * v + a * (g_constrained - config.memory * Hv)
+        p = p_next
+        history.append(p)
+        iterations += active
+        if len(history) > config.window:
+            moved = np.abs(history[-1] - history[-1 - config.window]) / config.window
+            done = active & np.all(moved <= tolerance, axis=1)
+            converged |= done
+            active &= ~done
+            if not active.any():
+                break
+    pose = p
+    if config.average:
+        first = np.maximum(iterations - config.window + 1, 0)
+        pose = np.stack([np.mean([h[b] for h in history[first[b] : n + 1]], axis=0) for b, n in enumerate(iterations)])
+    return SmdResult(pose, value, iterations, converged, np.stack(history) if keep_path else None)
+
+
+def _times(matrices: Float, vectors: Float) -> Float:
+    """(B, D, U) times (B, U)."""
+    return np.einsum("bdu,bu->bd", matrices, vectors)
