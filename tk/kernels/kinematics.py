@@ -37,7 +37,9 @@ def rodrigues(w, angle):
     """exp of the skew matrix of ``angle·w``, with w a unit axis."""
     s, c = ti.sin(angle), ti.cos(angle)
     K = ti.Matrix([[0.0 * s, -w[2], w[1]], [w[2], 0.0 * s, -w[0]], [-w[1], w[0], 0.0 * s]])
-    eye = ti.Matrix([[1.0 + 0.0 * s, 0.0 * s, 0.0 * s], [0.0 * s, 1.0 + 0.0 * s, 0.0 * s], [0.0 * s, 0.0 * s, 1.0 + 0.0 * s]])
+    eye = ti.Matrix(
+        [[1.0 + 0.0 * s, 0.0 * s, 0.0 * s], [0.0 * s, 1.0 + 0.0 * s, 0.0 * s], [0.0 * s, 0.0 * s, 1.0 + 0.0 * s]]
+    )
     return eye + s * K + (1.0 - c) * (K @ K)
 
 

@@ -105,7 +105,11 @@ def nearest_voxel(
                                 d2 = d.norm_sqr()
                                 if d2 < best_d2:
                                     m = ti.Vector([normals[v, a] for a in ti.static(range(3))])
-                                    cosine = ti.cast(n[0], ti.f32) * m[0] + ti.cast(n[1], ti.f32) * m[1] + ti.cast(n[2], ti.f32) * m[2]
+                                    cosine = (
+                                        ti.cast(n[0], ti.f32) * m[0]
+                                        + ti.cast(n[1], ti.f32) * m[1]
+                                        + ti.cast(n[2], ti.f32) * m[2]
+                                    )
                                     if cosine >= min_cosine or m.norm_sqr() == 0.0:
                                         best_d2 = d2
                                         best = v

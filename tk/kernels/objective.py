@@ -5,11 +5,11 @@ Two terms share one form, ρ(e) = 1 − exp(−e / ν) with e = ½ (‖x − x̄
 surface
     model to data: a surface sample x and its nearest surface voxel x̄, which fits x's colour patch (6.1.1, 6.1.3).
 coverage
-    data to model: a surface voxel x̄ and the nearest point x of the nearest superellipsoid. Not in the paper: it keeps a
-    limb from hiding inside the trunk, where every sample of it still finds a voxel.
+    data to model: a surface voxel x̄ and the nearest point x of the nearest superellipsoid. Not in the paper: it keeps
+    a limb from hiding inside the trunk, where every sample of it still finds a voxel.
 
-Where the paper is silent: a sample without any candidate within reach counts as an outlier (ρ = 1, no gradient), and the
-Hessian of eq. 19 is approximated, as Schraudolph does, by the positive semi-definite part Σ ρ'(e)/σ² JᵀJ.
+Where the paper is silent: a sample without any candidate within reach counts as an outlier (ρ = 1, no gradient), and
+the Hessian of eq. 19 is approximated, as Schraudolph does, by the positive semi-definite part Σ ρ'(e)/σ² JᵀJ.
 """
 
 import functools
@@ -51,7 +51,13 @@ def _nearest_piece(
         radii = ti.Vector([piece_shape[i, a] for a in ti.static(range(3))])
         z_lower, z_upper = piece_shape[i, 5], piece_shape[i, 6]
         # a box about the piece: what lies further outside it than the best so far cannot win
-        over = ti.Vector([ti.max(ti.abs(q[0]) - radii[0], 0.0), ti.max(ti.abs(q[1]) - radii[1], 0.0), ti.max(ti.max(z_lower - q[2], q[2] - z_upper), 0.0)])
+        over = ti.Vector(
+            [
+                ti.max(ti.abs(q[0]) - radii[0], 0.0),
+                ti.max(ti.abs(q[1]) - radii[1], 0.0),
+                ti.max(ti.max(z_lower - q[2], q[2] - z_upper), 0.0),
+            ]
+        )
         if over.norm_sqr() < best_d * best_d:
             s = project(q, radii, piece_shape[i, 3], piece_shape[i, 4], z_lower, z_upper)
             on = ti.Vector([s[0], s[1], s[2]])
@@ -467,9 +473,11 @@ class ObjectiveKernel:
         M, Q = len(chosen), len(voxels) if settings.coverage_weight > 0 else 0
         tasks = -(-(M + Q) // POINTS_PER_TASK)
         D = self.degrees
-        axis, point, prismatic, parent, local, _, last_dof, inv_sigma2, _, piece_dof, _, _, piece_inv_sigma2 = self._body
-        residual = np.zeros((M + Q, 3), self.dtype)
-        jacobian = np.zeros((M + Q, D, 3), self.dtype)
+        axis, point, prismatic, parent, local, _, last_dof, inv_sigma2, _, piece_dof, _, _, piece_inv_sigma2 = (
+            self._body
+        )
+        residual: np.ndarray = np.zeros((M + Q, 3), self.dtype)
+        jacobian: np.ndarray = np.zeros((M + Q, D, 3), self.dtype)
         partner = np.empty(M + Q, np.int32)
         _linearise_kernel(ti.f64 if self.dtype == np.float64 else ti.f32)(
             axis,

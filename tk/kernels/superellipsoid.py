@@ -1,7 +1,7 @@
 """Truncated superellipsoids as Taichi functions (Kehl 2006, sections 5.2 and 5.3).
 
-G = F^(ε₁/2), with F Barr's inside-outside function, is homogeneous of degree one: it grows linearly along every ray from
-the centre and is 1 on the surface, so one Newton step along its gradient lands close to the nearest surface point.
+G = F^(ε₁/2), with F Barr's inside-outside function, is homogeneous of degree one: it grows linearly along every ray
+from the centre and is 1 on the surface, so one Newton step along its gradient lands close to the nearest surface point.
 """
 
 from tk.kernels.runtime import ti

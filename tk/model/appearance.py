@@ -1,10 +1,10 @@
 """The colours of the body's patches (Kehl 2006, section 6.1.3).
 
-Each patch is one Gaussian a YUV channel. The paper learns the model on the initialised body, segments the surface voxels
-by it once a frame and updates the means by eq. 16. In its section 7.2 wrong assignments destroy the models; the guards
-here are ours, since the paper has none: only samples that sit on a voxel that a camera sees teach a colour, a patch with
-too few of them learns nothing, a mean never leaves the neighbourhood of the initial one, and a patch that hardly any voxel
-fits constrains nothing in that frame.
+Each patch is one Gaussian a YUV channel. The paper learns the model on the initialised body, segments the surface
+voxels by it once a frame and updates the means by eq. 16. In its section 7.2 wrong assignments destroy the models; the
+guards here are ours, since the paper has none: only samples that sit on a voxel that a camera sees teach a colour, a
+patch with too few of them learns nothing, a mean never leaves the neighbourhood of the initial one, and a patch that
+hardly any voxel fits constrains nothing in that frame.
 """
 
 from __future__ import annotations

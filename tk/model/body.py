@@ -1,8 +1,9 @@
 """The body of superellipsoids on the skeleton, and its sampled surface (Kehl 2006, section 5).
 
 The paper shows its model in figure 5 and prints no sizes; :func:`build_pieces` lays the pieces out from
-:class:`~tk.model.anthropometry.BodyDimensions`. Hands and feet have no joints of their own (section 5.1), but they are in
-the pictures, so a stump of a hand and a foot ride on the forearm and the calf; ``extremities=False`` leaves them out.
+:class:`~tk.model.anthropometry.BodyDimensions`. Hands and feet have no joints of their own (section 5.1), but they are
+in the pictures, so a stump of a hand and a foot ride on the forearm and the calf; ``extremities=False`` leaves them
+out.
 """
 
 from __future__ import annotations
@@ -54,9 +55,7 @@ class Body:
         return points, np.einsum("nab,nb->na", T[:, :3, :3], self.normals)
 
 
-def build_body(
-    dimensions: BodyDimensions, up: str = "z", spacing_m: float = 0.03, extremities: bool = True
-) -> Body:
+def build_body(dimensions: BodyDimensions, up: str = "z", spacing_m: float = 0.03, extremities: bool = True) -> Body:
     """The body with these dimensions.
 
     Args:
@@ -82,7 +81,7 @@ def build_body(
     segment_of = np.array([SEGMENTS.index(p.segment) for p in pieces], dtype=np.int32)[piece_of]
     keep = ~_buried(skeleton, pieces, p_zero @ B.T, segment_of, piece_of)
     patch, patch_names = _patches(p_zero, np.concatenate(normals), segment_of)
-    used, patch = np.unique(patch[keep], return_inverse=True)
+    used, patch_of = np.unique(patch[keep], return_inverse=True)
     return Body(
         dimensions=dimensions,
         skeleton=skeleton,
@@ -92,14 +91,14 @@ def build_body(
         segment=segment_of[keep],
         piece=piece_of[keep],
         diameter=np.array([p.diameter_m for p in pieces])[piece_of][keep],
-        patch=patch.astype(np.int32),
+        patch=patch_of.astype(np.int32),
         patch_names=tuple(patch_names[i] for i in used),
     )
 
 
 def build_pieces(d: BodyDimensions, extremities: bool = True) -> tuple[Superellipsoid, ...]:
     """The superellipsoids of a body, placed in the zero configuration (body frame)."""
-    x, y, z = np.eye(3)
+    x, _, z = np.eye(3)
     pieces: list[Superellipsoid] = []
 
     def add(
@@ -114,7 +113,8 @@ def build_pieces(d: BodyDimensions, extremities: bool = True) -> tuple[Superelli
     ) -> None:
         pieces.append(Superellipsoid(segment, _frame(origin, axis, front), radii, *e, *cut, diameter))
 
-    # The trunk: two halves that meet at the waist; the lower reaches down to the crotch, the upper to the shoulders' top.
+    # The trunk: two halves that meet at the waist; the lower reaches down to the crotch, the upper to the shoulders'
+    # top.
     waist = 0.42 * d.trunk
     top = d.trunk - 0.25 * d.shoulder_drop
     bottom = -0.95 * d.hips_half_depth
@@ -126,9 +126,25 @@ def build_pieces(d: BodyDimensions, extremities: bool = True) -> tuple[Superelli
         add("torso", waist * z, axis, (depth, width, length), (0.45, 0.8), (0.0, length), trunk_width)
 
     skull = 0.46 * d.head
-    add("head", (d.trunk + d.head - skull) * z, z, (1.12 * d.head_radius, d.head_radius, skull), (1.0, 1.0), (-skull, skull), 2 * d.head_radius)
+    add(
+        "head",
+        (d.trunk + d.head - skull) * z,
+        z,
+        (1.12 * d.head_radius, d.head_radius, skull),
+        (1.0, 1.0),
+        (-skull, skull),
+        2 * d.head_radius,
+    )
     neck = d.head - 1.5 * skull
-    add("head", (d.trunk - 0.02) * z, z, (d.neck_radius, d.neck_radius, 2 * neck), (0.3, 1.0), (0.02, neck + 0.02), 2 * d.neck_radius)
+    add(
+        "head",
+        (d.trunk - 0.02) * z,
+        z,
+        (d.neck_radius, d.neck_radius, 2 * neck),
+        (0.3, 1.0),
+        (0.02, neck + 0.02),
+        2 * d.neck_radius,
+    )
 
     arm = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
     for side, sign in (("l", 1.0), ("r", -1.0)):
@@ -141,7 +157,16 @@ def build_pieces(d: BodyDimensions, extremities: bool = True) -> tuple[Superelli
         _limb(add, f"forearm_{side}", elbow, u, d.forearm, d.elbow_radius, d.wrist_radius, z)
         if extremities:
             grip = 0.35 * d.hand
-            add(f"forearm_{side}", wrist + grip * u, u, (0.45 * grip, 0.8 * grip, 1.15 * grip), (1.0, 1.0), (-grip, 1.15 * grip), 2 * d.wrist_radius, z)
+            add(
+                f"forearm_{side}",
+                wrist + grip * u,
+                u,
+                (0.45 * grip, 0.8 * grip, 1.15 * grip),
+                (1.0, 1.0),
+                (-grip, 1.15 * grip),
+                2 * d.wrist_radius,
+                z,
+            )
         hip = M @ np.array([0.0, d.hip_half_width, 0.0])
         knee = hip - d.thigh * z
         ankle = knee - d.calf * z
@@ -217,12 +242,14 @@ def _patches(points: Float, normals: Float, segment: NDArray[np.int32]) -> tuple
     patch = np.zeros(len(points), dtype=np.int32)
     for s, name in enumerate(SEGMENTS):
         here = segment == s
-        along = points[here] @ (np.array([1.0, np.sign(points[here][0, 1]), 0]) if "arm" in name else np.array([0, 0, 1.0]))
+        axis = np.array([1.0, np.sign(points[here][0, 1]), 0.0]) if "arm" in name else np.array([0.0, 0.0, 1.0])
+        along = points[here] @ axis
         low, high = along.min(), along.max()
         rows = {"torso": 4, "head": 2}.get(name, 3)
         level = np.clip(((along - low) / (high - low + 1e-9) * rows).astype(int), 0, rows - 1)
         sides = 2 if name in ("torso", "head") else 1
         face = (normals[here][:, 0] < 0).astype(int) if sides == 2 else np.zeros(here.sum(), dtype=int)
         patch[here] = len(names) + level * sides + face
-        names += [f"{name}_{r}" + (("_front", "_back")[f] if sides == 2 else "") for r in range(rows) for f in range(sides)]
+        suffixes = ("_front", "_back") if sides == 2 else ("",)
+        names += [f"{name}_{row}{suffix}" for row in range(rows) for suffix in suffixes]
     return patch, names

@@ -1,8 +1,9 @@
 """Fits the body to a standing person: pose and dimensions together (Kehl 2006, section 6.3).
 
-The paper completes the skeleton from ratios and stops there. Here lengths and girths then follow the hull of a few first
-frames, left and right alike, held to the ratios by a prior where the hull says little: where along a straight arm the
-elbow lies cannot be seen. A surface point moves with the dimensions as eq. 1 says, in proportion to its piece's radii.
+The paper completes the skeleton from ratios and stops there. Here lengths and girths then follow the hull of a few
+first frames, left and right alike, held to the ratios by a prior where the hull says little: where along a straight arm
+the elbow lies cannot be seen. A surface point moves with the dimensions as eq. 1 says, in proportion to its piece's
+radii.
 """
 
 from __future__ import annotations
@@ -18,11 +19,13 @@ from tk.model.anthropometry import BodyDimensions
 from tk.model.body import Body, build_body, build_pieces
 from tk.model.objective import BodyObjective, FrameObjective, SamplingConfig
 from tk.model.skeleton import SEGMENTS, build_skeleton
+from tk.model.superellipsoid import Superellipsoid
 
 Float = NDArray[np.float64]
 
-# Parameters of the fit: dimensions that share a factor, and the prior's standard deviation of its logarithm. Lengths of a
-# stature scatter by some 4 % (NASA-STD-3000, vol. 1, sec. 3.3); an arm's or leg's two lengths keep their ratio better.
+# Parameters of the fit: dimensions that share a factor, and the prior's standard deviation of its logarithm. Lengths of
+# a stature scatter by some 4 % (NASA-STD-3000, vol. 1, sec. 3.3); an arm's or leg's two lengths keep their ratio
+# better.
 GROUPS: tuple[tuple[tuple[str, ...], float], ...] = (
     (("trunk",), 0.03),
     (("head",), 0.06),
@@ -166,7 +169,7 @@ def _equations(
 def _surface(
     dimensions: BodyDimensions,
     piece: NDArray[np.integer],
-    old_pieces: tuple | None,
+    old_pieces: tuple[Superellipsoid, ...] | None,
     x0: Float,
     pose: Float,
     up: str,
@@ -182,8 +185,8 @@ def _surface(
     if old_pieces is not None:
         old_T = np.array([p.T_body_piece for p in old_pieces])[piece]
         new_T = np.array([p.T_body_piece for p in pieces])[piece]
-        scale = np.array([np.array(n.radii) / np.array(o.radii) for n, o in zip(pieces, old_pieces, strict=True)])[piece]
-        q = np.einsum("kba,kb->ka", old_T[:, :3, :3], x0 @ B - old_T[:, :3, 3]) * scale
+        growth = [np.array(n.radii) / np.array(o.radii) for n, o in zip(pieces, old_pieces, strict=True)]
+        q = np.einsum("kba,kb->ka", old_T[:, :3, :3], x0 @ B - old_T[:, :3, 3]) * np.array(growth)[piece]
         x0 = (np.einsum("kab,kb->ka", new_T[:, :3, :3], q) + new_T[:, :3, 3]) @ B.T
     segment = np.array([SEGMENTS.index(p.segment) for p in pieces])[piece]
     T = skeleton.segment_transforms(pose)[segment]

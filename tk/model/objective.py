@@ -1,7 +1,7 @@
 """A body's objective in one frame: which samples and voxels are drawn, and what the kernel makes of them.
 
-The optimisers see callables of poses (:meth:`FrameObjective.full`, :meth:`FrameObjective.chains`); what they are made of,
-voxels, colours, samples, stays here.
+The optimisers see callables of poses (:meth:`FrameObjective.full`, :meth:`FrameObjective.chains`); what they are made
+of, voxels, colours, samples, stays here.
 """
 
 from __future__ import annotations

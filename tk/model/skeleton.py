@@ -8,9 +8,9 @@ with the twist ξ_k given by an axis and a point on it in the *zero configuratio
 ∂x/∂p_k of a point x below k is then ω_k × (x − q_k), axis and point carried along by T_parent(k) (eqs. 6-8).
 
 Zero configuration, in the body frame (x forward, y to the left, z up; origin midway between the hip centres): legs hang
-straight, both arms point horizontally forward and outward at 45°. Ball joints are three successive rotations whose middle
-angle must stay within ±90°. The paper does not give its axes. Here they are chosen so that the singular directions are
-hardly ever taken: a leg straight to the side, the trunk lying on its side, and, for an arm, the diagonal
+straight, both arms point horizontally forward and outward at 45°. Ball joints are three successive rotations whose
+middle angle must stay within ±90°. The paper does not give its axes. Here they are chosen so that the singular
+directions are hardly ever taken: a leg straight to the side, the trunk lying on its side, and, for an arm, the diagonal
 back-out-up / forward-in-down, which is at least 54° away from hanging, raised, forward, backward and sideways.
 """
 
@@ -74,11 +74,12 @@ _ARM_RISE = np.cross(_ARM, _ARM_POLE)
 _ELBOW = np.cross(_ARM, [0.5, -0.5, np.sqrt(0.5)])
 
 # Ranges in degrees. Active ranges of healthy men with three standard deviations, Boone & Azen, J. Bone Joint Surg. Am.
-# 61 (1979) 756-759, widened by 10° because a single hinge or ball stands for a whole joint complex (the shoulder girdle,
-# the lumbar spine): hip flexion 122±6, extension 10±7, abduction 46±9, adduction 27±4, rotation 47±6; knee 143±5; elbow
-# 143±6. The shoulder's ranges (flexion 167±5, extension 62±10, abduction 184±7, rotation 69/104) are given about other
-# axes than ours: the box below is the smallest that holds them (tests/model/test_skeleton.py samples them). Neck: Youdas
-# et al., Phys. Ther. 72 (1992) 770-780: flexion and extension 60-70 together with the upper spine, lateral bending 40-45.
+# 61 (1979) 756-759, widened by 10° because a single hinge or ball stands for a whole joint complex (the shoulder
+# girdle, the lumbar spine): hip flexion 122±6, extension 10±7, abduction 46±9, adduction 27±4, rotation 47±6; knee
+# 143±5; elbow 143±6. The shoulder's ranges (flexion 167±5, extension 62±10, abduction 184±7, rotation 69/104) are given
+# about other axes than ours: the box below is the smallest that holds them (tests/model/test_skeleton.py samples them).
+# Neck: Youdas et al., Phys. Ther. 72 (1992) 770-780: flexion and extension 60-70 together with the upper spine, lateral
+# bending 40-45.
 _LIMITS_DEG: dict[str, tuple[float, float]] = {
     "torso_yaw": (-np.inf, np.inf),
     "torso_roll": (-80.0, 80.0),

@@ -83,7 +83,7 @@ class Superellipsoid:
 
         The paper does not print F; this is Barr's. It ignores the truncation: see :meth:`contains`.
         """
-        x, y, z = np.abs(np.moveaxis(np.asarray(p_piece, dtype=np.float64), -1, 0) / np.array(self.radii).reshape(3, *[1] * (np.ndim(p_piece) - 1)))
+        x, y, z = np.moveaxis(np.abs(np.asarray(p_piece, dtype=np.float64) / np.array(self.radii)), -1, 0)
         return (x ** (2 / self.e2) + y ** (2 / self.e2)) ** (self.e2 / self.e1) + z ** (2 / self.e1)
 
     def contains(self, p_piece: Float) -> NDArray[np.bool_]:
@@ -104,7 +104,7 @@ class Superellipsoid:
             np.gradient(self.radii[2] * signed_power(np.sin(eta), self.e1)),
         )
         arc = np.concatenate([[0.0], np.cumsum((meridian[1:] + meridian[:-1]) / 2)])
-        rings = max(int(round(arc[-1] / spacing_m)), 1)
+        rings = max(round(float(arc[-1]) / spacing_m), 1)
         etas = np.interp((np.arange(rings) + 0.5) / rings * arc[-1], arc, eta)
 
         omega = np.linspace(-np.pi, np.pi, 721)
@@ -112,7 +112,7 @@ class Superellipsoid:
         steps = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(circle, axis=0), axis=1))])
         all_eta, all_omega = [], []
         for i, e in enumerate(etas):
-            count = max(int(round(float(np.cos(e)) ** self.e1 * steps[-1] / spacing_m)), 1)
+            count = max(round(float(np.cos(e) ** self.e1 * steps[-1]) / spacing_m), 1)
             at = (np.arange(count) + 0.5 * (i % 2) + 0.25) / count * steps[-1]
             all_omega.append(np.interp(at, steps, omega))
             all_eta.append(np.full(count, e))
