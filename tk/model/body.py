@@ -80,6 +80,8 @@ def build_body(dimensions: BodyDimensions, up: str = "z", spacing_m: float = 0.0
     piece_of = np.concatenate(owner)
     segment_of = np.array([SEGMENTS.index(p.segment) for p in pieces], dtype=np.int32)[piece_of]
     keep = ~_buried(skeleton, pieces, p_zero @ B.T, segment_of, piece_of)
+    # the crotch: silhouettes cannot carve between the thighs, so the hull is always too low there
+    keep &= ~((segment_of == SEGMENTS.index("torso")) & (np.concatenate(normals)[:, 2] < -0.3))
     patch, patch_names = _patches(p_zero, np.concatenate(normals), segment_of)
     used, patch_of = np.unique(patch[keep], return_inverse=True)
     return Body(

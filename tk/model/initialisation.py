@@ -1,8 +1,9 @@
 """Finds the subject in the Da Vinci pose (Kehl 2006, section 6.3).
 
-The hull's centroid gives the place; planes swept through the hull find the feet (from below), the hands (from both sides)
-and the crown (from above); ratios of the stature give the rest. The paper leaves open how the heading is found. The arms
-span the widest horizontal direction, and of its two senses the one is taken towards which the feet stick out of the legs.
+The hull's centroid gives the place; planes swept through the hull find the feet (from below), the hands (from both
+sides) and the crown (from above); ratios of the stature give the rest. The paper leaves open how the heading is found.
+The arms span the widest horizontal direction, and of its two senses the one is taken towards which the feet stick out
+of the legs.
 """
 
 from __future__ import annotations
@@ -13,20 +14,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.optimize import least_squares
 
 from tk.errors import CaptureError
 from tk.model.anthropometry import (
     ANKLE_HEIGHT,
     CALF_LENGTH,
+    FOREARM_LENGTH,
+    HEAD_LENGTH,
     HIP_HALF_WIDTH,
     SHOULDER_DROP,
     SHOULDER_HALF_WIDTH,
     THIGH_LENGTH,
     TRUNK_LENGTH,
+    UPPER_ARM_LENGTH,
     BodyDimensions,
 )
 from tk.model.body import neutral_pose
-from tk.model.skeleton import Skeleton, build_skeleton, up_rotation
+from tk.model.skeleton import JOINTS, Skeleton, build_skeleton, up_rotation
 from tk.model.volume import VoxelGrid
 
 Float = NDArray[np.float64]
@@ -219,3 +224,74 @@ def certainty(skeleton: Skeleton) -> Float:
         elif "roll" in name and "torso" not in name:
             result[k] = 0.15
     return result
+
+
+def rough_pose(
+    joints: dict[str, Float], angles: dict[str, float], height_m: float | None, up: str
+) -> tuple[BodyDimensions, Float]:
+    """Average body and pose from what a person wrote down.
+
+    Args:
+        joints: name → (3,) metres of some joints; or empty.
+        angles: name → value of some entries of the configuration vector (radians, metres); or empty.
+        height_m: the subject's height; without it, the joints' distances tell, else 1.72 m.
+        up: the world axis that points up.
+
+    Returns:
+        Dimensions and pose (D,).
+    """
+    stature = height_m or _stature_of(joints) or 1.72
+    dimensions = BodyDimensions.from_stature(stature)
+    skeleton = build_skeleton(dimensions, up)
+    pose = np.zeros(len(skeleton.names))
+    if angles:
+        pose = neutral_pose(skeleton)
+        for name, value in angles.items():
+            pose[skeleton.index(name)] = value
+        return dimensions, skeleton.clip(pose)
+    rows = [JOINTS.index(name) for name in joints]
+    targets = np.array([joints[name] for name in joints])
+
+    def residual(p: Float) -> Float:
+        # a little weight on plain angles settles what the joints leave open
+        return np.concatenate([((skeleton.joints(p)[rows] - targets) / 0.02).ravel(), 0.2 * (p[3:] - rest[3:])])
+
+    lower, upper = skeleton.lower - 1e-9, skeleton.upper + 1e-9
+    best = None
+    for yaw in np.arange(8) * np.pi / 4:
+        rest = neutral_pose(skeleton)
+        for side in ("l", "r"):  # arms down, legs together
+            rest[skeleton.index(f"shoulder_{side}_yaw")], rest[skeleton.index(f"shoulder_{side}_pitch")] = shoulder_angles(
+                np.array([0.0, 0.2, -0.98])
+            )
+            rest[skeleton.index(f"hip_{side}_yaw")] = 0.0
+        rest[:3] = targets.mean(axis=0) - skeleton.joints(rest)[rows].mean(axis=0)
+        rest[skeleton.index("torso_yaw")] = yaw
+        fit = least_squares(residual, rest, bounds=(lower, upper), max_nfev=60)
+        if best is None or fit.cost < best.cost:
+            best = fit
+    assert best is not None
+    return dimensions, skeleton.clip(best.x)
+
+
+def _stature_of(joints: dict[str, Float]) -> float | None:
+    """Median stature that the distances of neighbouring joints stand for; None where there are too few."""
+    table = {
+        ("pelvis", "neck"): TRUNK_LENGTH,
+        ("neck", "head_top"): HEAD_LENGTH,
+        ("shoulder_l", "shoulder_r"): 2 * SHOULDER_HALF_WIDTH,
+    }
+    for side in ("l", "r"):
+        table |= {
+            (f"shoulder_{side}", f"elbow_{side}"): UPPER_ARM_LENGTH,
+            (f"elbow_{side}", f"wrist_{side}"): FOREARM_LENGTH,
+            (f"hip_{side}", f"knee_{side}"): THIGH_LENGTH,
+            (f"knee_{side}", f"ankle_{side}"): CALF_LENGTH,
+        }
+    found = [np.linalg.norm(joints[a] - joints[b]) / ratio for (a, b), ratio in table.items() if a in joints and b in joints]
+    return float(np.clip(np.median(found), LEAST_STATURE, GREATEST_STATURE)) if len(found) >= 3 else None
+
+
+def rough_certainty(skeleton: Skeleton) -> Float:
+    """(D,) how far a pose written down by hand may be off, one standard deviation, radians and metres."""
+    return np.where(skeleton.prismatic, 0.1, 0.3)

@@ -1,0 +1,229 @@
+"""The commands: parse, call, print. Nothing is computed here."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from tk import __version__
+from tk.errors import ConfigError, TkError
+
+_CONSOLE = Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+class _Commands(click.Group):
+    """Turns a :class:`TkError` into one line and exit code 2."""
+
+    def invoke(self, ctx: click.Context) -> object:
+        try:
+            return super().invoke(ctx)
+        except TkError as error:
+            click.echo(f"tk: {' '.join(str(error).split())}", err=True)
+            ctx.exit(2)
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="tk")
+def main() -> None:
+    """A person's motion out of a few ordinary, calibrated cameras: no markers, no trained weights, no GPU."""
+
+
+_capture = click.argument("capture", type=click.Path(path_type=Path))
+_cameras = click.option("--cameras", metavar="A,B,…", help="Use these cameras only.")
+_frames = click.option("--frames", metavar="A:B", help="Frames A to B-1; either may be left out.")
+_masks = click.option(
+    "--masks", default="auto", show_default=True, metavar="auto|none|DIR",
+    help="The capture's masks where it has some, none (segment the videos), or a folder of masks.",
+)  # fmt: skip
+_voxels = click.option("--voxels", type=int, help="Voxels along the working volume's longest side.  [default: 64]")
+_config = click.option("--config", "config_file", type=click.Path(path_type=Path), help="Settings, TOML.")
+
+
+@main.command()
+@_capture
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="RESULT.h5")
+@click.option("--method", default="volumetric", show_default=True, help="The tracker: volumetric.")
+@_voxels
+@_cameras
+@_frames
+@click.option("--seed", type=int, help="Of the random generator.  [default: 0]")
+@_masks
+@click.option("--init-pose", type=click.Path(path_type=Path), metavar="FILE", help="Start from this rough pose (TOML).")
+@click.option("--resume", is_flag=True, help="Go on where an earlier run of the same command stopped.")
+@click.option("--store-hull", is_flag=True, help="Keep the hull's coloured surface in the result.")
+@_config
+def track(
+    capture: Path,
+    output: Path,
+    method: str,
+    voxels: int | None,
+    cameras: str | None,
+    frames: str | None,
+    seed: int | None,
+    masks: str,
+    init_pose: Path | None,
+    resume: bool,
+    store_hull: bool,
+    config_file: Path | None,
+) -> None:
+    """Track the person in CAPTURE and write the pose of every frame to RESULT.h5."""
+    from tk import sequence  # the heavy imports wait until a command needs them
+    from tk.io.capture import open_capture
+
+    span = _span(frames)
+    config = _configuration(config_file, voxels=voxels, seed=seed)
+    opened = open_capture(capture, _names(cameras), masks)
+    with _Report() as report:
+        summary = sequence.track(
+            opened, output, config, report, method, span, init_pose, resume, store_hull
+        )
+    rate = summary.tracked_now / summary.seconds if summary.seconds > 0 else 0.0
+    state = f"{summary.frames} frames in {output}"
+    click.echo(f"{state}, {summary.lost} lost, {rate:.1f} frames/s", err=True)
+    if summary.interrupted:
+        click.echo("tk: interrupted; go on with the same command and --resume", err=True)
+        sys.exit(1)
+
+
+@main.command()
+@_capture
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="HULL.h5")
+@click.option("--ply", type=click.Path(path_type=Path), metavar="DIR", help="Also write a PLY file a frame.")
+@_voxels
+@_cameras
+@_frames
+@_masks
+@_config
+def reconstruct(
+    capture: Path,
+    output: Path,
+    ply: Path | None,
+    voxels: int | None,
+    cameras: str | None,
+    frames: str | None,
+    masks: str,
+    config_file: Path | None,
+) -> None:
+    """Reconstruct the coloured surface of the visual hull in every frame of CAPTURE."""
+    from tk import reconstruction
+    from tk.io.capture import open_capture
+
+    span = _span(frames)
+    config = _configuration(config_file, voxels=voxels)
+    opened = open_capture(capture, _names(cameras), masks)
+    with _Report() as report:
+        count = reconstruction.reconstruct(opened, output, config, report, span, ply)
+    click.echo(f"{count} frames in {output}", err=True)
+
+
+@main.command()
+@click.argument("result", type=click.Path(path_type=Path))
+@click.argument("truth", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def evaluate(result: Path, truth: Path, as_json: bool) -> None:
+    """Compare RESULT.h5 with TRUTH.h5: joint distances, PCK, lost frames, frames/s."""
+    from tk.evaluation import evaluate_files
+
+    found = evaluate_files(result, truth)
+    click.echo(found.to_json() if as_json else found.format_table())
+
+
+@main.command()
+@click.option("-o", "--output", default="demo.h5", show_default=True, type=click.Path(path_type=Path))
+@_voxels
+def demo(output: Path, voxels: int | None) -> None:
+    """Track the capture that ships with tk and compare the result with its truth."""
+    from importlib.resources import as_file, files
+
+    from tk import sequence
+    from tk.evaluation import evaluate_files
+    from tk.io.capture import open_capture
+
+    with as_file(files("tk") / "data" / "demo") as folder:
+        click.echo(f"tracking the capture that ships with tk: {folder}", err=True)
+        with _Report() as report:
+            summary = sequence.track(open_capture(folder), output, _configuration(None, voxels=voxels), report)
+        if summary.interrupted:
+            sys.exit(1)
+        click.echo(evaluate_files(output, folder / "truth.h5").format_table())
+    click.echo(f"The result is in {output}. Try it on your own recording: tk track CAPTURE -o RESULT.h5")
+
+
+def _names(cameras: str | None) -> tuple[str, ...] | None:
+    return tuple(name.strip() for name in cameras.split(",") if name.strip()) if cameras else None
+
+
+def _span(frames: str | None) -> tuple[int, int | None]:
+    """``A:B`` as (A, B)."""
+    if frames is None:
+        return 0, None
+    first, colon, last = frames.partition(":")
+    try:
+        start, stop = int(first) if first else 0, int(last) if last else None
+        if not colon or start < 0 or (stop is not None and stop <= start):
+            raise ValueError
+    except ValueError:
+        raise ConfigError(f"--frames {frames}: give A:B with 0 ≤ A < B, for example 0:100") from None
+    return start, stop
+
+
+def _configuration(file: Path | None, **overrides: int | None):  # type: ignore[no-untyped-def]
+    from dataclasses import replace
+
+    from tk.config import Config
+
+    config = Config.read(file) if file else Config()
+    return replace(config, **{name: value for name, value in overrides.items() if value is not None})
+
+
+class _Report:
+    """Progress on stderr: a bar on a terminal, a plain line every few seconds elsewhere."""
+
+    every_s = 2.0
+
+    def __init__(self) -> None:
+        self._bar: Progress | None = None
+        self._lost = 0
+        self._count = self._done = self._total = 0
+        self._started = self._last = time.perf_counter()
+
+    def __enter__(self) -> _Report:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def note(self, text: str) -> None:
+        _CONSOLE.print(f"note: {text}", style="yellow", markup=False)
+
+    def begin(self, total: int, done: int) -> None:
+        self._total, self._done = total, done
+        if done:
+            self.note(f"{done} of {total} frames are there already")
+        if _CONSOLE.is_terminal:
+            columns = (
+                TextColumn("tracking"), BarColumn(), MofNCompleteColumn(),
+                TextColumn("{task.fields[rate]}"), TimeRemainingColumn(), TextColumn("{task.fields[lost]}"),
+            )  # fmt: skip
+            self._bar = Progress(*columns, console=_CONSOLE)
+            self._task = self._bar.add_task("", total=total, completed=done, rate="", lost="")
+            self._bar.start()
+        self._started = self._last = time.perf_counter()
+
+    def advance(self, frame: int, estimate: object) -> None:
+        self._count += 1
+        self._lost += getattr(estimate, "status", "") == "lost"
+        now = time.perf_counter()
+        rate = f"{self._count / max(now - self._started, 1e-9):.1f} frames/s"
+        lost = f"{self._lost} lost" if self._lost else ""
+        if self._bar is not None:
+            self._bar.update(self._task, advance=1, rate=rate, lost=lost)
+        elif now - self._last > self.every_s or self._done + self._count == self._total:
+            self._last = now
+            click.echo(f"frame {frame}: {self._done + self._count}/{self._total}, {rate} {lost}".rstrip(), err=True)

@@ -1,0 +1,140 @@
+"""Every setting of the program, as one tree of frozen dataclasses; TOML in, TOML out.
+
+Each default stands with its unit and source in the dataclass of the part that it belongs to.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import tomli_w
+
+from tk.errors import ConfigError
+from tk.kernels.objective import ObjectiveSettings
+from tk.model.appearance import AppearanceConfig
+from tk.model.fitting import FitConfig
+from tk.model.foreground import ForegroundConfig
+from tk.model.objective import SamplingConfig
+from tk.optim.schedule import ScheduleConfig
+from tk.optim.smd import SmdConfig
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+T = TypeVar("T")
+
+SEGMENTATIONS = ("collinearity", "mog2")
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """Following a person from frame to frame.
+
+    Attributes:
+        prediction: share of the last frame's motion that the next is expected to repeat. The paper does not say how it
+            predicts; at 15 Hz an arm turns by up to 31° between frames (its section 7.4).
+        init_frames: frames from which the body is fitted.
+        lost_value: the objective above which a frame is lost (it runs from 0 to 1 plus the coverage term's weight).
+        lost_share: a frame is lost, too, when more than this share of the hull's surface is farther than 10 cm from
+            the body: the body is somewhere, but the person is elsewhere.
+        least_voxels: fewer surface voxels than this are no person.
+    """
+
+    prediction: float = 0.8
+    init_frames: int = 4
+    lost_value: float = 0.45
+    lost_share: float = 0.35
+    least_voxels: int = 60
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.prediction <= 1.5 or self.init_frames < 1:
+            raise ConfigError(
+                f"tracking: prediction = {self.prediction} must lie in [0, 1.5], init_frames = {self.init_frames} ≥ 1"
+            )
+
+
+@dataclass(frozen=True)
+class Config:
+    """All settings of a run.
+
+    Attributes:
+        voxels: voxels along the working volume's longest side (the paper: 64 and 128).
+        seed: of the one random generator.
+        segmentation: "collinearity" (the paper's) or "mog2".
+    """
+
+    voxels: int = 64
+    seed: int = 0
+    segmentation: str = "collinearity"
+    foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
+    appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
+    objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    smd: SmdConfig = field(default_factory=SmdConfig)
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+
+    def __post_init__(self) -> None:
+        if not 8 <= self.voxels <= 512:
+            raise ConfigError(f"--voxels {self.voxels}: choose from 8 to 512")
+        if self.seed < 0:
+            raise ConfigError(f"--seed {self.seed}: must not be negative")
+        if self.segmentation not in SEGMENTATIONS:
+            raise ConfigError(f'segmentation = "{self.segmentation}": choose one of {", ".join(SEGMENTATIONS)}')
+
+    def to_toml(self) -> str:
+        """The whole configuration as TOML text."""
+        return tomli_w.dumps(dataclasses.asdict(self))
+
+    @staticmethod
+    def from_toml(text: str, where: str = "configuration") -> Config:
+        """A configuration from TOML text; what it leaves out keeps its default.
+
+        Raises:
+            ConfigError: unknown names, wrong types, values out of range; ``where`` names the source.
+        """
+        try:
+            values = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise ConfigError(f"{where}: not valid TOML: {error}") from None
+        return _build(Config(), values, where)
+
+    @staticmethod
+    def read(path: Path) -> Config:
+        """A configuration file."""
+        try:
+            return Config.from_toml(path.read_text(encoding="utf-8"), str(path))
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{path}: cannot be read: {error}") from None
+
+
+def _build(default: T, values: dict[str, Any], where: str, path: str = "") -> T:
+    """``default`` with the values of a table put in, recursively."""
+    known = {f.name: getattr(default, f.name) for f in dataclasses.fields(default)}  # type: ignore[arg-type]
+    changes: dict[str, Any] = {}
+    for key, value in values.items():
+        name = f"{path}{key}"
+        if key not in known:
+            raise ConfigError(f"{where}: unknown setting {name}; known here: {', '.join(known)}")
+        old = known[key]
+        if dataclasses.is_dataclass(old):
+            if not isinstance(value, dict):
+                raise ConfigError(f"{where}: {name} must be a table")
+            changes[key] = _build(old, value, where, f"{name}.")
+        elif isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
+            changes[key] = float(value)
+        elif type(value) is not type(old):
+            raise ConfigError(f"{where}: {name} = {value!r} must be of type {type(old).__name__}, as {old!r} is")
+        else:
+            changes[key] = value
+    try:
+        return dataclasses.replace(default, **changes)  # type: ignore[type-var]
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None

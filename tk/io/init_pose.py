@@ -1,0 +1,84 @@
+"""Reads a rough initial pose that a person wrote down: a small TOML file.
+
+Either joint centres, as many as are known (at least six, three of them not in a line):
+
+    frame = 0                      # optional
+    [joints]                       # metres, world frame
+    pelvis = [0.1, 0.0, 0.95]
+    neck = [0.1, 0.0, 1.5]
+    ...
+
+or angles by the names of `/pose`, in degrees, with the place of the pelvis; what is left out is 0:
+
+    [angles]
+    torso_x = 0.1                  # metres
+    torso_yaw = 90.0
+    ...
+
+`[subject] height` (metres) may stand in either.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import CaptureError
+from tk.io.toml import Table, load_toml
+from tk.model.skeleton import JOINTS
+
+LEAST_JOINTS = 6
+
+
+@dataclass(frozen=True)
+class InitPose:
+    """A rough pose: ``joints`` name → (3,) metres, or ``angles`` name → metres or radians; the other is empty.
+
+    ``frame`` and ``height_m`` are None where the file does not give them.
+    """
+
+    joints: dict[str, NDArray[np.float64]]
+    angles: dict[str, float]
+    frame: int | None = None
+    height_m: float | None = None
+
+
+def read_init_pose(path: str | Path, pose_names: tuple[str, ...]) -> InitPose:
+    """Read an initial pose.
+
+    Args:
+        path: the TOML file.
+        pose_names: (D,) names of the configuration vector; those that are no translation are in degrees.
+
+    Raises:
+        CaptureError: the file cannot be read, names an unknown joint or angle, or gives too little.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CaptureError(f"{path}: no such file; --init-pose wants a TOML file with a [joints] or an [angles] table")
+    table = Table(load_toml(path, CaptureError), str(path), CaptureError)
+    height = table.table("subject").number("height") if "subject" in table and "height" in table.table("subject") else None
+    frame = table.integer("frame", 0) if "frame" in table else None
+    if ("joints" in table) == ("angles" in table):
+        raise CaptureError(f"{path}: give either a [joints] or an [angles] table")
+    if "joints" in table:
+        joints = table.table("joints")
+        unknown = sorted(set(joints.values) - set(JOINTS))
+        if unknown:
+            raise CaptureError(f"{path}: unknown joint {unknown[0]}; known are {', '.join(JOINTS)}")
+        found = {name: joints.array(name, (3,)) for name in JOINTS if name in joints}
+        if len(found) < LEAST_JOINTS:
+            raise CaptureError(f"{path}: {len(found)} joints are too few to place a body; give at least {LEAST_JOINTS}")
+        return InitPose(found, {}, frame, height)
+    angles = table.table("angles")
+    unknown = sorted(set(angles.values) - set(pose_names))
+    if unknown:
+        raise CaptureError(f"{path}: unknown angle {unknown[0]}; known are {', '.join(pose_names)}")
+    translations = ("torso_x", "torso_y", "torso_z")
+    values = {name: angles.number(name) for name in pose_names if name in angles}
+    if not all(name in values for name in translations):
+        raise CaptureError(f"{path}: [angles] must give torso_x, torso_y and torso_z, the place of the pelvis in metres")
+    return InitPose({}, {n: v if n in translations else float(np.radians(v)) for n, v in values.items()}, frame, height)

@@ -1,0 +1,59 @@
+"""Visual hulls of a whole capture: `tk reconstruct`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from tk.config import Config
+from tk.errors import ConfigError
+from tk.io.capture import Capture
+from tk.io.point_cloud import write_hulls, write_ply
+from tk.io.result import HullPoints
+from tk.model.hull import VisualHull
+from tk.model.volume import VoxelGrid
+from tk.sequence import Reporter, make_segmenter, points_of
+
+
+def reconstruct(
+    capture: Capture,
+    output: Path,
+    config: Config,
+    reporter: Reporter,
+    frames: tuple[int, int | None] = (0, None),
+    ply: Path | None = None,
+) -> int:
+    """Write the coloured surface voxels of every frame.
+
+    Args:
+        capture: what to reconstruct.
+        output: HDF5 file with `/frames`, `/time` and `/hull` as in a result.
+        config: settings of the segmentation and the resolution.
+        reporter: who hears of the progress.
+        frames: first frame and the one to stop before (None: the last).
+        ply: folder for a PLY file a frame; needs Open3D.
+
+    Returns:
+        Frames written.
+    """
+    for warning in capture.warnings:
+        reporter.note(warning)
+    stop = min(frames[1], capture.frame_count) if frames[1] is not None else capture.frame_count
+    if frames[0] >= stop:
+        raise ConfigError(f"--frames {frames[0]}:{frames[1]}: the capture has {capture.frame_count} frames")
+    segment = make_segmenter(capture, config, reporter.note)
+    hull = VisualHull(capture.rig, VoxelGrid.cover(capture.volume, config.voxels))
+    reporter.begin(stop - frames[0], 0)
+
+    def hulls():  # type: ignore[no-untyped-def]
+        with capture.frames(frames[0], stop) as reader:
+            for frame in reader:
+                hull.update(segment(frame))
+                points: HullPoints = points_of(hull.surface(frame.images))
+                if ply is not None:
+                    write_ply(ply / f"{frame.index:06d}.ply", np.asarray(points.positions), points.colors)
+                yield frame.index, points
+                reporter.advance(frame.index, None)
+
+    return write_hulls(output, capture, hull.grid, hulls())

@@ -1,0 +1,92 @@
+"""What a tracker is: the protocol that :mod:`tk.volumetric` and :mod:`tk.silhouette` share."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.io.init_pose import InitPose
+from tk.model.hull import HullSurface
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the cameras saw at one instant: images (C, H, W, 3) uint8 BGR and masks (C, H, W) uint8, 0 or 255."""
+
+    index: int
+    images: NDArray[np.uint8]
+    masks: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A tracker's answer for one frame.
+
+    Attributes:
+        pose: (D,) configuration vector.
+        joints: (15, 3) joint centres, metres.
+        status: "tracked", "initialised", "recovered" or "lost".
+        objective: the objective's final value.
+        iterations: (S,) optimiser iterations a stage.
+        timing: seconds a stage.
+        surface: the hull's surface, if the tracker made one.
+    """
+
+    pose: Float
+    joints: Float
+    status: str
+    objective: float
+    iterations: NDArray[np.int32]
+    timing: Mapping[str, float]
+    surface: HullSurface | None = None
+
+
+class Tracker(Protocol):
+    """Follows one person from frame to frame."""
+
+    method: str
+    stages: tuple[str, ...]
+    timing_stages: tuple[str, ...]
+    pose_names: tuple[str, ...]
+    pose_units: tuple[str, ...]
+
+    def start(self, frames: Sequence[Observation], height_m: float | None, init: InitPose | None) -> None:
+        """Find the subject in the first of the frames; nothing is returned, :meth:`step` begins with that frame."""
+        ...
+
+    def step(self, frame: Observation) -> Estimate:
+        """The pose in the next frame."""
+        ...
+
+    def model(self) -> Mapping[str, Any]:
+        """The fitted body, for `/model` of the result."""
+        ...
+
+    def state(self) -> Mapping[str, Any]:
+        """All that changes from frame to frame."""
+        ...
+
+    def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
+        """Take up where a run stopped."""
+        ...
+
+
+class Stopwatch:
+    """Seconds a stage."""
+
+    def __init__(self) -> None:
+        self.laps: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """What passed since the last lap belongs to ``stage``."""
+        now = time.perf_counter()
+        self.laps[stage] = self.laps.get(stage, 0.0) + now - self._last
+        self._last = now

@@ -1,0 +1,283 @@
+"""The volumetric tracker: visual hull, colour, superellipsoid body, Stochastic Meta Descent (Kehl & Van Gool 2006).
+
+A frame's way, top to bottom (figure 8 of the paper, with what goes before it):
+
+    masks → hull → coloured surface → colour segmentation → all 24 degrees of freedom → five chains → colours updated
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.config import Config
+from tk.errors import CaptureError
+from tk.io.init_pose import InitPose
+from tk.kernels.nearest import SurfaceIndex
+from tk.model import initialisation
+from tk.model.anthropometry import BodyDimensions
+from tk.model.appearance import Appearance
+from tk.model.body import Body, build_body
+from tk.model.camera import Rig
+from tk.model.fitting import fit_body
+from tk.model.hull import HullSurface, VisualHull
+from tk.model.objective import BodyObjective, Fit, FrameObjective
+from tk.model.skeleton import CHAINS, JOINTS, build_skeleton
+from tk.model.volume import Volume, VoxelGrid
+from tk.optim import schedule
+from tk.tracker import Estimate, Observation, Stopwatch
+
+Float = NDArray[np.float64]
+
+# Cells of the nearest-neighbour search, in voxels: about ten surface voxels a cell.
+CELL_VOXELS = 2.5
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """What the tracker makes of one observation before it looks for the pose."""
+
+    surface: HullSurface
+    index: SurfaceIndex
+
+
+class VolumetricTracker:
+    """Tracks one person. :meth:`start` once, then :meth:`step` for every frame, the first included.
+
+    Args:
+        rig: the cameras.
+        volume: the working volume.
+        up: the world axis that points up.
+        config: all settings.
+        cache_dir: where look-up tables are kept between runs; None for the platform's cache folder.
+
+    Raises:
+        VolumeError: no two cameras see the volume.
+    """
+
+    method = "volumetric"
+    stages = ("all", *CHAINS)
+    timing_stages = ("hull", "surface", "colour", "optimise", "update")
+
+    def __init__(self, rig: Rig, volume: Volume, up: str, config: Config, cache_dir: Path | None = None) -> None:
+        self.config = config
+        self.up = up
+        self.hull = VisualHull(rig, VoxelGrid.cover(volume, config.voxels), cache_dir)
+        skeleton = build_skeleton(BodyDimensions.from_stature(1.7), up)
+        self.pose_names = skeleton.names
+        self.pose_units = skeleton.units
+        self._body: Body | None = None
+        self._objective: BodyObjective
+        self._appearance: Appearance
+        self._pose = np.zeros(len(skeleton.names))
+        self._previous = self._pose
+        self._lost_for = 0
+        self._fresh = True
+
+    # --- initialisation (section 6.3) ---------------------------------------------------------------------------
+
+    def start(self, frames: Sequence[Observation], height_m: float | None, init: InitPose | None) -> None:
+        """Find the subject in the first frame and fit the body to the first few.
+
+        Args:
+            frames: consecutive observations from the initial one on, at least one.
+            height_m: the subject's height, if known.
+            init: a rough pose given by a person; None looks for the Da Vinci pose.
+
+        Raises:
+            CaptureError: there is nobody, or nobody in the Da Vinci pose.
+        """
+        surfaces = []
+        for frame in frames:
+            self.hull.update(frame.masks)
+            surfaces.append(self.hull.surface(frame.images))
+            if len(surfaces) == 1:
+                occupancy = self.hull.occupancy
+        if len(surfaces[0]) < self.config.tracking.least_voxels:
+            raise CaptureError(
+                f"initialisation: only {len(surfaces[0])} surface voxels in frame {frames[0].index}: check the masks, "
+                "the calibration and the working volume ([volume] of capture.toml)"
+            )
+        if init is None:
+            marks = initialisation.find_landmarks(occupancy, self.hull.grid, self.up)
+            dimensions, pose = initialisation.da_vinci_pose(marks, height_m, self.up)
+            anchor = initialisation.certainty(build_skeleton(dimensions, self.up))
+        else:
+            dimensions, pose = initialisation.rough_pose(init.joints, init.angles, init.height_m or height_m, self.up)
+            anchor = initialisation.rough_certainty(build_skeleton(dimensions, self.up))
+        surfaces = [s for s in surfaces if len(s) >= self.config.tracking.least_voxels]
+        indices = [self._index(surface, np.full(len(surface), -1, np.int64)) for surface in surfaces]
+        dimensions, poses = fit_body(
+            dimensions,
+            np.repeat(pose[None], len(indices), axis=0),
+            indices,
+            self.up,
+            self.config.objective,
+            self.config.sampling,
+            anchor,
+            self.config.fit,
+        )
+        self._take_body(dimensions)
+        self._pose = self._previous = poses[0]
+        self._learn_colours(surfaces[0], indices[0], poses[0])
+        self.hull.reset()
+
+    def _take_body(self, dimensions: BodyDimensions) -> None:
+        self._body = build_body(dimensions, self.up)
+        self._objective = BodyObjective(self._body, self.config.objective, self.config.sampling)
+
+    def _learn_colours(self, surface: HullSurface, index: SurfaceIndex, pose: Float) -> None:
+        """Each patch takes the colours of the voxels under its samples."""
+        assert self._body is not None
+        fit = FrameObjective(self._objective, index, np.random.default_rng(0)).fit(pose)
+        patch, colors = self._taught(surface, index, fit)
+        self._appearance = Appearance.learn(len(self._body.patch_names), patch, colors, self.config.appearance)
+
+    # --- tracking (section 6.4) ---------------------------------------------------------------------------------
+
+    def step(self, frame: Observation) -> Estimate:
+        """The pose in the next frame."""
+        watch = Stopwatch()
+        config = self.config
+        self.hull.update(frame.masks)
+        watch.lap("hull")
+        surface = self.hull.surface(frame.images)
+        watch.lap("surface")
+        if len(surface) < config.tracking.least_voxels:
+            return self._nothing_seen(frame, surface, watch)
+        index = self._index(surface, self._appearance.segment(surface.colors, surface.seen, config.appearance))
+        watch.lap("colour")
+        # a generator of its own for every frame: a resumed run draws what an unbroken one would have drawn
+        rng = np.random.default_rng([config.seed, frame.index])
+        problem = FrameObjective(self._objective, index, rng, config.schedule.outliers)
+        result = schedule.optimise(
+            problem, self._starts(surface), self._pose, rng, config.schedule, config.smd
+        )
+        fit = problem.fit(result.pose)
+        watch.lap("optimise")
+        lost = self._is_lost(fit)
+        status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
+        if not lost:
+            patch, colors = self._taught(surface, index, fit)
+            self._appearance = self._appearance.updated(patch, colors, config.appearance)
+        self._previous = result.pose if lost or self._lost_for else self._pose
+        self._pose = result.pose
+        self._lost_for = self._lost_for + 1 if lost else 0
+        self._fresh = False
+        watch.lap("update")
+        return Estimate(
+            pose=result.pose,
+            joints=self.body.skeleton.joints(result.pose),
+            status=status,
+            objective=fit.value,
+            iterations=result.iterations,
+            timing=watch.laps,
+            surface=surface,
+        )
+
+    @property
+    def body(self) -> Body:
+        """The fitted body; only after :meth:`start` or :meth:`restore`."""
+        if self._body is None:
+            raise RuntimeError("the tracker has no body yet: call start() or restore() first")
+        return self._body
+
+    def _starts(self, surface: HullSurface) -> Float:
+        """(S, D) where the search may begin."""
+        skeleton = self.body.skeleton
+        predicted = self._pose + self.config.tracking.prediction * (self._pose - self._previous)
+        starts = [predicted, self._pose]
+        if self._lost_for:
+            # the last pose, carried to where the person now is
+            moved = self._pose.copy()
+            moved[:3] += surface.positions.mean(axis=0) - skeleton.joints(self._pose)[list(JOINTS).index("pelvis")]
+            turned = [moved.copy() for _ in range(4)]
+            for i, pose in enumerate(turned):
+                pose[skeleton.index("torso_yaw")] += i * np.pi / 2
+            starts += turned
+        elif np.array_equal(predicted, self._pose):
+            starts = starts[:1]
+        return np.array(starts)
+
+    def _is_lost(self, fit: Fit) -> bool:
+        limits = self.config.tracking
+        astray = fit.astray
+        return fit.value > limits.lost_value or (len(astray) > 0 and float(astray.mean()) > limits.lost_share)
+
+    def _nothing_seen(self, frame: Observation, surface: HullSurface, watch: Stopwatch) -> Estimate:
+        """Nobody is in the volume: the last pose stands, as lost."""
+        self._previous = self._pose
+        self._lost_for += 1
+        for stage in ("colour", "optimise", "update"):
+            watch.lap(stage)
+        return Estimate(
+            pose=self._pose,
+            joints=self.body.skeleton.joints(self._pose),
+            status="lost",
+            objective=1.0 + self.config.objective.coverage_weight,
+            iterations=np.zeros(len(self.stages), np.int32),
+            timing=watch.laps,
+            surface=surface,
+        )
+
+    def _index(self, surface: HullSurface, fits: NDArray[np.int64]) -> SurfaceIndex:
+        return SurfaceIndex.build(surface.positions, surface.normals, fits, CELL_VOXELS * self.hull.grid.voxel_m)
+
+    def _taught(
+        self, surface: HullSurface, index: SurfaceIndex, fit: Fit
+    ) -> tuple[NDArray[np.integer], NDArray[np.floating]]:
+        """Patches (N,) and colours (N, 3) of the samples that sit on a voxel which a camera sees."""
+        M = len(fit.samples)
+        near = np.linalg.norm(fit.linear.residual[:M], axis=1) < self.config.appearance.teaching_m
+        partner = index.order[fit.linear.partner[:M]]
+        sure = (fit.linear.partner[:M] >= 0) & near & (surface.seen[partner] > 0)
+        return self.body.patch[fit.samples[sure]], surface.colors[partner[sure]]
+
+    # --- what a result file keeps -------------------------------------------------------------------------------
+
+    def model(self) -> Mapping[str, Any]:
+        """The fitted body for `/model`."""
+        body = self.body
+        return {
+            **{f"dimensions/{name}": value for name, value in asdict(body.dimensions).items()},
+            "pieces/segment": json.dumps([p.segment for p in body.pieces]),
+            "pieces/radii": np.array([p.radii for p in body.pieces]),
+            "pieces/exponents": np.array([(p.e1, p.e2) for p in body.pieces]),
+            "pieces/cut": np.array([(p.z_lower, p.z_upper) for p in body.pieces]),
+            "pieces/T_body_piece": np.array([p.T_body_piece for p in body.pieces]),
+            "patches/names": json.dumps(body.patch_names),
+            "patches/mean_yuv": self._appearance.initial,
+            "patches/deviation_yuv": self._appearance.deviation,
+            "patches/known": self._appearance.known.astype(np.uint8),
+        }
+
+    def state(self) -> Mapping[str, Any]:
+        """What :meth:`restore` needs beside the model to go on from the last frame."""
+        return {
+            "pose": self._pose,
+            "previous": self._previous,
+            "lost_for": self._lost_for,
+            "mean_yuv": self._appearance.mean,
+        }
+
+    def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
+        """Take up where a run with this model and state stopped."""
+        prefix = "dimensions/"
+        self._take_body(
+            BodyDimensions(**{k[len(prefix) :]: float(v) for k, v in model.items() if k.startswith(prefix)})
+        )
+        initial = np.asarray(model["patches/mean_yuv"])
+        learned = Appearance(
+            initial, initial, np.asarray(model["patches/deviation_yuv"]), np.asarray(model["patches/known"]).astype(bool)
+        )
+        self._appearance = replace(learned, mean=np.asarray(state["mean_yuv"]))
+        self._pose = np.asarray(state["pose"])
+        self._previous = np.asarray(state["previous"])
+        self._lost_for = int(state["lost_for"])
+        self._fresh = False
