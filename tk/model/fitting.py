@@ -146,12 +146,13 @@ def _equations(
     body = objective.body
     fit = FrameObjective(objective, index, np.random.default_rng(0)).fit(pose)
     M = len(fit.samples)
-    piece = np.concatenate([body.piece[fit.samples], fit.held.covering[0, : len(fit.voxels), 0].astype(np.int64)])
-    x0 = np.concatenate([body.points[fit.samples], fit.held.covering[0, : len(fit.voxels), 1:]])
+    Q = len(fit.linear.residual) - M  # none where the coverage term is off
+    piece = np.concatenate([body.piece[fit.samples], fit.held.covering[0, :Q, 0].astype(np.int64)])
+    x0 = np.concatenate([body.points[fit.samples], fit.held.covering[0, :Q, 1:]])
     keep = (fit.linear.partner >= 0) & (fit.linear.decay > 0.2)
     piece, x0 = piece[keep], x0[keep]
     # both terms see the same surfaces; together they should count as much as the voxels alone
-    share = np.concatenate([np.full(M, len(fit.voxels) / max(M, 1)), np.ones(len(fit.voxels))])[keep] / 2
+    share = np.concatenate([np.full(M, len(fit.voxels) / max(M, 1)), np.ones(Q)])[keep] / (2 if Q else 1)
     weight = fit.linear.decay[keep] * share / config.noise_m**2 / config.redundancy
 
     here = _surface(apply_factors(dimensions, log_factors), piece, None, x0, pose, up)
