@@ -74,9 +74,11 @@ def find_landmarks(occupancy: NDArray[np.bool_], grid: VoxelGrid, up: str = "z")
         CaptureError: there is no upright figure with two feet and two hands apart.
     """
     p_world = grid.centers(np.flatnonzero(largest_part(occupancy)))
-    hint = 'use --init-pose FILE, or [init] frame of capture.toml for a frame with arms and legs spread'
+    hint = "use --init-pose FILE, or [init] frame of capture.toml for a frame with arms and legs spread"
     if len(p_world) < 50:
-        raise CaptureError(f"initialisation: the visual hull is empty ({len(p_world)} voxels): check the masks; or {hint}")
+        raise CaptureError(
+            f"initialisation: the visual hull is empty ({len(p_world)} voxels): check the masks; or {hint}"
+        )
     B = up_rotation(up)
     p = p_world @ B  # x, y horizontal, z up
     voxel = grid.voxel_m
@@ -84,8 +86,8 @@ def find_landmarks(occupancy: NDArray[np.bool_], grid: VoxelGrid, up: str = "z")
     stature = float(top - floor)
     if not LEAST_STATURE < stature < GREATEST_STATURE:
         raise CaptureError(
-            f"initialisation: the hull is {stature:.2f} m tall, a standing person {LEAST_STATURE} to {GREATEST_STATURE} m: "
-            f"check the masks and the calibration's unit; or {hint}"
+            f"initialisation: the hull is {stature:.2f} m tall, a standing person {LEAST_STATURE} to "
+            f"{GREATEST_STATURE} m: check the masks and the calibration's unit; or {hint}"
         )
     centroid = p.mean(axis=0)
     # The arms: the widest horizontal direction of the body above the hips.
@@ -96,7 +98,8 @@ def find_landmarks(occupancy: NDArray[np.bool_], grid: VoxelGrid, up: str = "z")
     reach = along.max() - along.min()
     if reach < 0.65 * stature:
         raise CaptureError(
-            f"initialisation: the hull is only {reach:.2f} m wide at {stature:.2f} m height: no Da Vinci pose in this frame; {hint}"
+            f"initialisation: the hull is only {reach:.2f} m wide at {stature:.2f} m height: "
+            f"no Da Vinci pose in this frame; {hint}"
         )
     # from left to right and back: the hands are what the first planes meet
     hands = []
@@ -193,8 +196,8 @@ def da_vinci_pose(marks: Landmarks, stature_m: float | None, up: str) -> tuple[B
     for side, sign, hand in (("l", 1.0, hands[0]), ("r", -1.0, hands[1])):
         pose[skeleton.index(f"hip_{side}_yaw")] = tilt
         # the arm points from the shoulder to the hand
-        shoulder = pelvis + (TRUNK_LENGTH - SHOULDER_DROP) * stature * marks.up + sign * SHOULDER_HALF_WIDTH * stature * left
-        d = hand - shoulder
+        rise, aside = (TRUNK_LENGTH - SHOULDER_DROP) * stature, sign * SHOULDER_HALF_WIDTH * stature
+        d = hand - (pelvis + rise * marks.up + aside * left)
         d = d / np.linalg.norm(d)
         arm = np.array([d @ forward, sign * (d @ left), d @ marks.up])
         yaw, pitch = shoulder_angles(arm)
@@ -261,9 +264,8 @@ def rough_pose(
     for yaw in np.arange(8) * np.pi / 4:
         rest = neutral_pose(skeleton)
         for side in ("l", "r"):  # arms down, legs together
-            rest[skeleton.index(f"shoulder_{side}_yaw")], rest[skeleton.index(f"shoulder_{side}_pitch")] = shoulder_angles(
-                np.array([0.0, 0.2, -0.98])
-            )
+            hanging = shoulder_angles(np.array([0.0, 0.2, -0.98]))
+            rest[skeleton.index(f"shoulder_{side}_yaw")], rest[skeleton.index(f"shoulder_{side}_pitch")] = hanging
             rest[skeleton.index(f"hip_{side}_yaw")] = 0.0
         rest[:3] = targets.mean(axis=0) - skeleton.joints(rest)[rows].mean(axis=0)
         rest[skeleton.index("torso_yaw")] = yaw
@@ -288,7 +290,8 @@ def _stature_of(joints: dict[str, Float]) -> float | None:
             (f"hip_{side}", f"knee_{side}"): THIGH_LENGTH,
             (f"knee_{side}", f"ankle_{side}"): CALF_LENGTH,
         }
-    found = [np.linalg.norm(joints[a] - joints[b]) / ratio for (a, b), ratio in table.items() if a in joints and b in joints]
+    known = [(a, b, ratio) for (a, b), ratio in table.items() if a in joints and b in joints]
+    found = [np.linalg.norm(joints[a] - joints[b]) / ratio for a, b, ratio in known]
     return float(np.clip(np.median(found), LEAST_STATURE, GREATEST_STATURE)) if len(found) >= 3 else None
 
 
