@@ -7,6 +7,8 @@ Never ``fork`` after it has started: use the ``spawn`` start method for worker p
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import warnings
 
@@ -40,4 +42,5 @@ def ensure_runtime() -> None:
     threads = os.environ.get("TK_THREADS")
     if threads:
         options["cpu_max_num_threads"] = int(threads)
-    ti.init(**options)
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints that it starts, whatever the log level
+        ti.init(**options)
