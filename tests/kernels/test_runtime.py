@@ -1,0 +1,78 @@
+"""The lazy start of Taichi."""
+
+import os
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+
+from tk.kernels.runtime import ensure_runtime, ti
+
+
+def run(code, **environment):
+    """What a fresh interpreter prints; its environment is this one's with these variables."""
+    inherited = {
+        k: v for k, v in os.environ.items() if k not in ("TK_DEBUG", "TK_THREADS", "ENABLE_TAICHI_HEADER_PRINT")
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        env=inherited | environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+STATE = """
+    from tk.kernels.runtime import ensure_runtime, ti
+    ensure_runtime()
+    ensure_runtime()
+    config = ti.lang.impl.current_cfg()
+    print(config.arch == ti.cpu, config.debug, config.cpu_max_num_threads, config.fast_math)
+"""
+
+
+def test_starts_once_on_the_cpu_by_the_environment_and_says_nothing():
+    """The four words are all that the process prints: a greeting would spoil a user's pipe."""
+    assert run(STATE, TK_THREADS="1", TK_DEBUG="1") == ["True", "True", "1", "False"]
+
+
+def test_leaves_the_callers_runtime_alone():
+    printed = run(
+        """
+        from tk.kernels.runtime import ensure_runtime, ti
+        ti.init(arch=ti.cpu, cpu_max_num_threads=1, random_seed=7, log_level=ti.ERROR)
+        program = ti.lang.impl.get_runtime().prog
+        ensure_runtime()
+        print(ti.lang.impl.get_runtime().prog is program, ti.lang.impl.current_cfg().random_seed)
+        """,
+        TK_THREADS="2",
+    )
+    assert printed[-2:] == ["True", "7"]
+
+
+@ti.kernel
+def _count_odd(values: ti.types.ndarray(dtype=ti.f32, ndim=1), found: ti.types.ndarray(dtype=ti.i32, ndim=1)):
+    for _ in range(1):
+        for i in range(values.shape[0]):
+            if not values[i] < 0.0 and not values[i] >= 0.0:
+                found[0] += 1
+            if values[i] > 3e38:
+                found[1] += 1
+
+
+def test_nan_and_infinity_keep_their_meaning():
+    ensure_runtime()
+    found = np.zeros(2, np.int32)
+    _count_odd(np.array([1, np.nan, np.inf, np.nan, -np.inf], np.float32), found)
+    np.testing.assert_array_equal(found, [2, 1])
+
+
+@pytest.mark.parametrize("module", ["tk.kernels.objective", "tk.model.objective", "tk.model.initialisation"])
+def test_importing_starts_nothing(module):
+    code = f"import {module}; from tk.kernels.runtime import ti; print(ti.lang.impl.get_runtime().prog is None)"
+    assert run(code) == ["True"]
