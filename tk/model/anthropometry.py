@@ -27,6 +27,7 @@ THIGH_LENGTH = 0.245
 CALF_LENGTH = 0.246
 ANKLE_HEIGHT = 0.044  # ankle centre above the sole
 FOOT_LENGTH = 0.150
+CROTCH_DROP = 0.070  # lowest point of the trunk below the hip centres, in trousers
 
 # Half widths and girths as radii, fractions of the stature, over light clothes.
 CHEST_HALF_WIDTH = 0.098

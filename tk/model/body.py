@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.anthropometry import BodyDimensions
+from tk.model.anthropometry import CROTCH_DROP, HIP_HALF_WIDTH, BodyDimensions
 from tk.model.skeleton import SEGMENTS, Skeleton, build_skeleton
 from tk.model.superellipsoid import Superellipsoid
 
@@ -119,7 +119,7 @@ def build_pieces(d: BodyDimensions, extremities: bool = True) -> tuple[Superelli
     # top.
     waist = 0.42 * d.trunk
     top = d.trunk - 0.25 * d.shoulder_drop
-    bottom = -0.95 * d.hips_half_depth
+    bottom = -CROTCH_DROP / HIP_HALF_WIDTH * d.hip_half_width
     trunk_width = d.chest_half_width + d.hips_half_width
     for axis, length, depth, width in (
         (-z, waist - bottom, d.hips_half_depth, d.hips_half_width),
