@@ -7,9 +7,13 @@ Gradient descent with a step size for every parameter, adapted while it runs:
     gᶜ = (p_old − p) / a                         (23)
     v ← λ v + a ⊗ (gᶜ − λ H v)                   (19)
 
-The optimiser knows an objective as a callable of a batch of poses and nothing of bodies. The objective draws its samples
-anew for each iteration number it is called with; ``shuffle = False`` calls it with the same number throughout, which is
-the deterministic variant of section 7.1.
+The optimiser knows an objective as a callable of a batch of poses and nothing of bodies. The objective draws its
+samples anew for each iteration number it is called with; ``shuffle = False`` calls it with the same number throughout,
+which is the deterministic variant of section 7.1.
+
+Beyond the paper, which bounds no step: ``max_step`` bounds the update of an iteration. One factor for the row scales
+all of it, so that its direction stays; eqs. 19 and 23 take the step sizes so scaled, as p moved by those; and no step
+size grows in such an iteration, where growth could only turn the direction and a steep objective would let it run away.
 """
 
 from __future__ import annotations
@@ -101,6 +105,8 @@ def minimise(
     basis: Float | None = None,
     config: SmdConfig | None = None,
     keep_path: bool = False,
+    max_step: Float | float | None = None,
+    basis_inverse: Float | None = None,
 ) -> SmdResult:
     """Minimise B objectives, each row by itself.
 
@@ -117,18 +123,26 @@ def minimise(
             parameters still.
         config: see :class:`SmdConfig`.
         keep_path: record every state.
+        max_step: (D,) most that an iteration may change each parameter, in its own unit, positive; None for no bound.
+        basis_inverse: (B, U, D) the pseudo-inverse of ``basis``, where the caller has it at hand.
 
     Raises:
-        ConfigError: when a step size is not positive.
+        ConfigError: when a step size or a bound on the update is not positive.
+        FloatingPointError: when the objective returns a gradient or a Hessian-vector product that is not finite, or the
+            descent diverges until its state is not. To take such a gradient for zero would end the descent wherever it
+            is and call it converged.
     """
     config = config or SmdConfig()
     p = constrain(np.array(start, dtype=np.float64, ndmin=2))
     B, D = p.shape
     W = np.broadcast_to(np.eye(D), (B, D, D)) if basis is None else np.asarray(basis, np.float64)
-    W_inverse = np.linalg.pinv(W)
+    W_inverse = np.asarray(np.linalg.pinv(W) if basis_inverse is None else basis_inverse, np.float64)
     a = np.broadcast_to(np.asarray(step, np.float64), (B, W.shape[2])).copy()
+    bound = None if max_step is None else np.broadcast_to(np.asarray(max_step, np.float64), (D,))
     if not (a > 0).all():
         raise ConfigError("smd: every initial step size must be positive")
+    if bound is not None and not (bound > 0).all():
+        raise ConfigError("smd: every component of max_step must be positive")
     v = np.zeros_like(a)
     history = [p]
     value = np.full(B, np.nan)
@@ -137,14 +151,22 @@ def minimise(
     active = np.ones(B, bool)
     for i in range(config.max_iterations):
         now = objective(p, _times(W, v), i if config.shuffle else 0)
-        g = _times(W.transpose(0, 2, 1), now.gradient)
-        Hv = _times(W.transpose(0, 2, 1), now.hessian_vector)
+        _require_finite("the objective's gradient", now.gradient, active, i)
+        _require_finite("the objective's Hessian-vector product", now.hessian_vector, active, i)
         value = np.where(active, now.value, value)
-        a = np.where(active[:, None], a * np.maximum(0.5, 1.0 + config.meta_step * v * g), a)
-        p_next = np.where(active[:, None], constrain(p - _times(W, a * g)), p)
-        g_constrained = _times(W_inverse, p - p_next) / a
-        v = config.memory * v + a * (g_constrained - config.memory * Hv)
+        running = active[:, None]
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # of rows at rest; the others are checked
+            g = _times(W.transpose(0, 2, 1), now.gradient)
+            Hv = _times(W.transpose(0, 2, 1), now.hessian_vector)
+            adapted = np.where(running, a * np.maximum(0.5, 1.0 + config.meta_step * v * g), a)
+            a, scale = (adapted, 1.0) if bound is None else _bounded(W, a, adapted, g, bound)
+            a_used = scale * a
+            p_next = np.where(running, constrain(p - _times(W, a_used * g)), p)
+            g_constrained = _times(W_inverse, p - p_next) / a_used
+            v = np.where(running, config.memory * v + a_used * (g_constrained - config.memory * Hv), v)
         p = p_next
+        _require_finite("the state", p, active, i)
+        _require_finite("the trace v of the state's past", v, active, i)
         history.append(p)
         iterations += active
         if len(history) > config.window:
@@ -158,7 +180,29 @@ def minimise(
     if config.average:
         first = np.maximum(iterations - config.window + 1, 0)
         pose = np.stack([np.mean([h[b] for h in history[first[b] : n + 1]], axis=0) for b, n in enumerate(iterations)])
+        pose = constrain(pose)  # a mean of states on a limit can round to beyond it
     return SmdResult(pose, value, iterations, converged, np.stack(history) if keep_path else None)
+
+
+def _bounded(W: Float, a: Float, adapted: Float, g: Float, bound: Float) -> tuple[Float, Float]:
+    """Step sizes (B, U) and the factor (B, 1), at most 1, that keeps the update within ``bound`` (D,)."""
+
+    def factor(a: Float) -> Float:
+        excess = np.max(np.abs(_times(W, a * g)) / bound, axis=1, keepdims=True)
+        return 1.0 / np.maximum(excess, 1.0)
+
+    a = np.where(factor(adapted) < 1.0, np.minimum(adapted, a), adapted)
+    return a, factor(a)
+
+
+def _require_finite(what: str, values: Float, active: NDArray[np.bool_], iteration: int) -> None:
+    """Refuse NaN and infinity in the active rows of ``values`` (B, ·)."""
+    bad = np.argwhere(active[:, None] & ~np.isfinite(values))
+    if len(bad):
+        raise FloatingPointError(
+            f"SMD: {what} is not finite at iteration {iteration}, row {bad[0][0]}, component {bad[0][1]}; "
+            "where the descent diverges, take a smaller first step or bound the update with max_step"
+        )
 
 
 def _times(matrices: Float, vectors: Float) -> Float:
