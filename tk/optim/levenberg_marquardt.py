@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.errors import ConfigError
+
 Float = NDArray[np.float64]
 
 
@@ -26,17 +28,36 @@ class Quadratic(NamedTuple):
 
 @dataclass(frozen=True)
 class LmConfig:
-    """damping: λ at the start, as a share of the Hessian's diagonal; raised ×4 on refusal, lowered ×0.3 on success.
-    max_iterations: evaluations of the quadratic model. tolerance: least relative fall of the value."""
+    """Settings.
+
+    Attributes:
+        damping: λ at the start, as a share of the Hessian's diagonal; raised ×4 on refusal, lowered ×0.3 on success.
+        max_iterations: most steps that are taken.
+        tolerance: least fall of the value, relative to it, that is worth a step.
+    """
 
     damping: float = 1e-2
     max_iterations: int = 30
     tolerance: float = 1e-4
 
+    def __post_init__(self) -> None:
+        if not self.damping > 0 or not self.tolerance >= 0 or self.max_iterations < 1:
+            raise ConfigError(
+                f"levenberg_marquardt: damping {self.damping} must be positive, "
+                f"tolerance {self.tolerance} not negative, max_iterations {self.max_iterations} at least 1"
+            )
+
 
 @dataclass(frozen=True)
 class LmResult:
-    """pose (D,), its value, the iterations made, and whether the tolerance was met."""
+    """Where the descent ended.
+
+    Attributes:
+        pose: (D,).
+        value: the objective there.
+        iterations: steps tried, refusals not counted.
+        converged: True where the last step gained, or the next could gain, less than the tolerance.
+    """
 
     pose: Float
     value: float
@@ -54,34 +75,52 @@ def minimise(
 ) -> LmResult:
     """Minimise from ``start``.
 
+    A parameter on a limit that the gradient pushes against is left out of the step: projected afterwards, the step of
+    the others would make up for a motion that did not happen. A refused step is tried again, shorter, until its own
+    model promises less than the tolerance.
+
     Args:
         model: the quadratic model at a state (D,).
         value: the objective alone at a state.
         start: (D,).
-        constrain: maps a state into the feasible region.
+        constrain: maps a state into the feasible region, each parameter by itself.
         floor: (D,) least diagonal of the damping term: keeps parameters that the data does not see in place.
         config: see :class:`LmConfig`.
+
+    Raises:
+        FloatingPointError: when the model is not finite. A value that is not finite refuses its step.
     """
     config = config or LmConfig()
     p = constrain(np.asarray(start, np.float64))
     damping = config.damping
-    now = model(p)
+    now = _finite(model(p))
     for i in range(config.max_iterations):
-        accepted = False
-        for _ in range(6):
-            D = np.diag(np.maximum(np.diag(now.hessian), floor) + 1e-12)
-            candidate = constrain(p - np.linalg.solve(now.hessian + damping * D, now.gradient))
+        worth = config.tolerance * max(abs(now.value), 1e-12)
+        D = np.maximum(np.diag(now.hessian), floor) + 1e-12
+        downhill = p - now.gradient / D
+        free = (constrain(downhill) != p) | (downhill == p)
+        while True:
+            H = now.hessian + np.diag(damping * D)
+            delta = np.zeros_like(p)
+            delta[free] = np.linalg.solve(H[np.ix_(free, free)], -now.gradient[free])
+            candidate = constrain(p + delta)
             f = value(candidate)
             if f < now.value:
-                accepted = True
                 break
+            promised = -now.gradient @ delta - 0.5 * delta @ now.hessian @ delta
+            if promised <= worth or np.array_equal(candidate, p):
+                return LmResult(p, now.value, i + 1, True)
             damping *= 4
-        if not accepted:
-            return LmResult(p, now.value, i + 1, True)
-        fall = (now.value - f) / max(abs(now.value), 1e-12)
+        fall = now.value - f
         p = candidate
         damping = max(damping * 0.3, 1e-6)
-        now = model(p)
-        if fall < config.tolerance:
+        now = _finite(model(p))
+        if fall < worth:
             return LmResult(p, now.value, i + 1, True)
     return LmResult(p, now.value, config.max_iterations, False)
+
+
+def _finite(quadratic: Quadratic) -> Quadratic:
+    if not all(np.isfinite(part).all() for part in quadratic):
+        raise FloatingPointError("Levenberg-Marquardt: the quadratic model is not finite")
+    return quadratic
