@@ -1,11 +1,12 @@
-"""The two passes of a frame (Kehl 2006, section 6.4): all degrees of freedom at ε₁, then the chains at ε₂ with the torso
-held, as one batch. What they optimise is known only as a :class:`Problem`.
+"""The two passes of a frame (Kehl 2006, section 6.4): all degrees of freedom at ε₁, then the chains at ε₂ with the
+torso held, as one batch. What they optimise is known only as a :class:`Problem`.
 
 Beyond the paper:
 
-* SMD works in directions that whiten the Gauss-Newton Hessian at the start of each pass. The paper's step sizes (2500 for
-  most angles, 5000 for rolls, 10000 for knees and elbows) are a diagonal guess at the inverse Hessian in its own units;
-  here the same is read off the data, so that a step of 1 is a Newton step. ``whiten = False`` takes the diagonal alone.
+* SMD works in directions that whiten the Gauss-Newton Hessian at the start of each pass. The paper's step sizes (2500
+  for most angles, 5000 for rolls, 10000 for knees and elbows) are a diagonal guess at the inverse Hessian in its own
+  units; here the same is read off the data, so that a step of 1 is a Newton step. ``whiten = False`` takes the diagonal
+  alone.
 * The chains start from several hypotheses at once: where the first pass left them, where the last frame had them, and a
   few at random about that. A limb that has lost its data is found again in this way; a row of a batch costs little.
 """
@@ -82,6 +83,8 @@ class ScheduleConfig:
         hypotheses: starts of each chain, at least 1.
         spread_deg: standard deviation of the random ones.
         margin: by how much a hypothesis must be better than the first.
+        max_step_deg, max_step_m: greatest change in one iteration; samples that happen to see little of a parameter ask
+            for more.
     """
 
     tolerance_deg: float = 0.2
@@ -95,6 +98,8 @@ class ScheduleConfig:
     hypotheses: int = 4
     spread_deg: float = 17.0
     margin: float = 0.01
+    max_step_deg: float = 20.0
+    max_step_m: float = 0.15
 
     def __post_init__(self) -> None:
         if self.hypotheses < 1 or not 0 < self.rate <= 2 or min(self.tolerance_deg, self.tolerance_m, self.lever_m) <= 0:
@@ -130,17 +135,19 @@ def optimise(
         config, smd_config: settings.
     """
     tolerance = np.where(problem.angular, np.radians(config.tolerance_deg), config.tolerance_m)
+    max_step = np.where(problem.angular, np.radians(config.max_step_deg), config.max_step_m)
     starts = problem.constrain(starts)
     start = starts[0] if len(starts) == 1 else min(starts, key=problem.value)
     everything = np.ones(len(start), bool)
-    basis = descent_basis(problem.curvature(start), everything, problem.damping(config.lever_m), config)
+    basis, inverse = descent_basis(problem.curvature(start), everything, problem.damping(config.lever_m), config)
     first = smd.minimise(
-        problem.full(), start[None], config.rate, tolerance, problem.constrain, basis[None], smd_config
-    )
+        problem.full(), start[None], config.rate, tolerance, problem.constrain, basis[None], smd_config,
+        max_step=max_step, basis_inverse=inverse[None],
+    )  # fmt: skip
     pose = first.pose[0]
 
     free = problem.free
-    K, D = free.shape
+    K = len(free)
     owner = np.tile(np.arange(K), config.hypotheses)
     hypotheses = np.repeat(pose[None], K * config.hypotheses, axis=0)
     noise = rng.normal(scale=np.radians(config.spread_deg), size=hypotheses.shape)
@@ -149,15 +156,17 @@ def optimise(
         hypotheses[row, mine] = previous[mine] if row < 2 * K else pose[mine] + noise[row, mine]
     H = problem.curvature(pose)
     damping = problem.damping(config.chain_lever_m)
-    bases = np.stack([descent_basis(H, free[k], damping, config) for k in range(K)])[owner]
+    pairs = [descent_basis(H, free[k], damping, config) for k in range(K)]
     second = smd.minimise(
         problem.chains(owner, pose),
         problem.constrain(hypotheses),
         config.rate,
         tolerance * config.refine,
         problem.constrain,
-        bases,
+        np.stack([basis for basis, _ in pairs])[owner],
         smd_config,
+        max_step=max_step,
+        basis_inverse=np.stack([inverse for _, inverse in pairs])[owner],
     )
     best = np.arange(K)
     if config.hypotheses > 1:
@@ -172,13 +181,16 @@ def optimise(
 
 def descent_basis(
     hessian: Float, free: NDArray[np.bool_], damping: Float, config: ScheduleConfig
-) -> Float:
-    """(D, D) directions with unit curvature in the free parameters, zero in the others."""
+) -> tuple[Float, Float]:
+    """Directions (D, D) with unit curvature in the free parameters, zero in the others; and their pseudo-inverse."""
     index = np.flatnonzero(free)
-    basis = np.zeros_like(hessian)
+    basis, inverse = np.zeros_like(hessian), np.zeros_like(hessian)
     H = hessian[np.ix_(index, index)] + np.diag(damping[index])
     if config.whiten:
-        basis[np.ix_(index, index)] = np.linalg.inv(np.linalg.cholesky(H)).T
+        L = np.linalg.cholesky(H)
+        basis[np.ix_(index, index)] = np.linalg.inv(L).T
+        inverse[np.ix_(index, index)] = L.T
     else:
         basis[index, index] = 1 / np.sqrt(np.diag(H))
-    return basis
+        inverse[index, index] = np.sqrt(np.diag(H))
+    return basis, inverse
