@@ -24,5 +24,4 @@ def project(q, radii, e1, e2, z_lower, z_upper):
     gradient = implicit_gradient(c, radii, e1, e2)
     square = np.sum(gradient**2, axis=1)
     step = ((implicit(c, radii, e1, e2) - 1) / square)[:, None] * gradient
-    too_far = np.linalg.norm(step, axis=1) > 2 * np.max(radii)
-    return np.where(too_far[:, None], c, c - step), gradient / np.sqrt(square)[:, None]
+    return c - step, gradient / np.sqrt(square)[:, None]

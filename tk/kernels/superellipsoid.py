@@ -54,11 +54,12 @@ def project(q, radii, e1, e2, z_lower, z_upper):
     g = implicit(c, radii, e1, e2)
     gradient = ti.Vector([g[1], g[2], g[3]])
     square = ti.max(gradient.norm_sqr(), 1e-9)
-    # the step is bounded by the piece's own size: deep inside, near the centre, the gradient is no guide
+    # Deep inside, near the centre, the gradient is no guide: there the step is bounded by the piece's own size. A point
+    # far outside is taken all the way; left where it is, it would count as lying on the surface.
     step = (g[0] - 1.0) / square
     s = c - step * gradient
     limit = 2.0 * ti.max(radii[0], ti.max(radii[1], radii[2]))
-    if (s - c).norm_sqr() > limit * limit:
+    if g[0] < 1.0 and (s - c).norm_sqr() > limit * limit:
         s = c
     normal = gradient / ti.sqrt(square)
     return ti.Vector([s[0], s[1], s[2], normal[0], normal[1], normal[2]])

@@ -1,0 +1,340 @@
+"""The objective's kernel against NumPy: pairs, value, gradient, Gauss-Newton products, linearisation."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.kernels import oracles
+from tk.kernels import kinematics
+from tk.kernels.nearest import SurfaceIndex, nearest
+from tk.kernels.objective import Held, ObjectiveKernel, ObjectiveSettings
+from tk.model.anthropometry import BodyDimensions
+from tk.model.body import build_body, neutral_pose
+from tk.model.skeleton import SEGMENTS
+
+BODY = build_body(BodyDimensions.from_stature(1.75))
+SKELETON = BODY.skeleton
+D = len(SKELETON.names)
+SAMPLE_DOF = SKELETON.segment_dof[BODY.segment]
+PIECE_DOF = SKELETON.segment_dof[[SEGMENTS.index(p.segment) for p in BODY.pieces]]
+PIECE_SIGMA = np.linspace(0.08, 0.15, len(BODY.pieces))
+
+BOTH = ObjectiveSettings()
+SURFACE = ObjectiveSettings(coverage_weight=0.0)
+# the surface term all but silent: every sample is an outlier and pulls nowhere
+COVERAGE = ObjectiveSettings(reach_m=1e-6)
+# sums of some hundred terms near 1 / 100 in double precision
+EXACT = 1e-11
+
+
+def kernel_of(dtype=np.float64):
+    return ObjectiveKernel(
+        axis=SKELETON.axis,
+        point=SKELETON.point,
+        prismatic=SKELETON.prismatic,
+        parent=SKELETON.parent,
+        local=BODY.points,
+        normal=BODY.normals,
+        last_dof=SAMPLE_DOF,
+        sigma=BODY.diameter,
+        patch=BODY.patch,
+        piece_dof=PIECE_DOF,
+        piece_frame=np.array([p.T_body_piece[:3] for p in BODY.pieces]),
+        piece_shape=np.array([[*p.radii, p.e1, p.e2, p.z_lower, p.z_upper] for p in BODY.pieces]),
+        piece_sigma=PIECE_SIGMA,
+        dtype=dtype,
+    )
+
+
+@pytest.fixture(scope="module")
+def kernel():
+    return kernel_of()
+
+
+class Scene:
+    """Voxels: the body at one pose with noise, some without a normal, some far from everything. Poses to judge."""
+
+    def __init__(self, seed, poses=1, samples=75, voxels=45, bits=True):
+        rng = np.random.default_rng(seed)
+        truth = neutral_pose(SKELETON) + rng.normal(0, 0.2, D)
+        points, normals = BODY.place(truth)
+        points = points + rng.normal(0, 0.01, points.shape)
+        points[::20] += rng.normal(0, 1.0, (len(points[::20]), 3))
+        normals[rng.random(len(points)) < 0.1] = 0
+        every = np.int64(2**63 - 1)
+        fits = rng.integers(0, every, len(points)) if bits else np.full(len(points), every)
+        self.index = SurfaceIndex.build(points, normals, fits, 0.06)
+        self.pose = truth + rng.normal(0, 0.08, (poses, D))
+        self.direction = rng.normal(0, 1, (poses, D))
+        self.chosen = rng.integers(0, len(BODY.points), (poses, samples)).astype(np.int32)
+        self.voxels = rng.integers(0, len(points), (poses, voxels)).astype(np.int32)
+
+    def evaluate(self, kernel, settings, held=None, pose=None, direction=None):
+        pose = self.pose if pose is None else pose
+        return kernel.evaluate(self.index, self.chosen, self.voxels, pose, direction, settings, held)
+
+
+def placed(local, last_dof, pose):
+    s = SKELETON
+    return kinematics.place(s.axis, s.point, s.prismatic, s.parent, local, last_dof, pose[None])[0]
+
+
+def pairs_oracle(scene, b, held, settings):
+    """The pairs of pose b, samples before voxels: x (NaN if none), x̄, M (weights of directions), 1/σ², ν, share."""
+    n, v = scene.chosen[b], held.assigned[b]
+    x = placed(BODY.points[n], SAMPLE_DOF[n], scene.pose[b])
+    y, y_normal = scene.index.positions[v], scene.index.normals[v]
+    share = np.where(y_normal.any(axis=1), settings.tangential, 1.0)[:, None, None]
+    metric = share * np.eye(3) + (1 - share) * y_normal[:, :, None] * y_normal[:, None, :]
+    inv_sigma2, nu = 1 / BODY.diameter[n] ** 2, np.full(len(n), settings.nu)
+    scale = np.full(len(n), 1 / len(n))
+    x[v < 0] = np.nan
+    if settings.coverage_weight > 0:
+        q, i = scene.voxels[b], held.covering[b, :, 0].astype(int)
+        on = placed(held.covering[b, :, 1:], PIECE_DOF[i], scene.pose[b])
+        on[i < 0] = np.nan
+        x, y = np.concatenate([x, on]), np.concatenate([y, scene.index.positions[q]])
+        metric = np.concatenate([metric, np.tile(np.eye(3), (len(q), 1, 1))])
+        inv_sigma2 = np.concatenate([inv_sigma2, 1 / PIECE_SIGMA[i] ** 2])
+        nu = np.concatenate([nu, np.full(len(q), settings.coverage_nu)])
+        scale = np.concatenate([scale, np.full(len(q), settings.coverage_weight / len(q))])
+    return x, y, metric, inv_sigma2, nu, scale
+
+
+def value_oracle(scene, b, held, settings):
+    x, y, metric, inv_sigma2, nu, scale = pairs_oracle(scene, b, held, settings)
+    e = 0.5 * np.einsum("ka,kab,kb->k", x - y, metric, x - y) * inv_sigma2
+    return np.sum(scale * np.where(np.isnan(e), 1.0, 1 - np.exp(-e / nu)))
+
+
+cases = pytest.mark.parametrize(
+    "case",
+    [
+        BOTH,
+        SURFACE,
+        COVERAGE,
+        replace(BOTH, tangential=0.0),
+        ObjectiveSettings(2.0, 0.3, -1.0, coverage_weight=2.5, coverage_nu=0.3, coverage_cosine=-1.0),
+    ],
+    ids=["both", "surface", "coverage", "point-to-plane", "others"],
+)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_samples_are_paired_with_their_nearest_voxels(kernel, seed):
+    scene = Scene(seed, poses=2)
+    held = scene.evaluate(kernel, BOTH)[3]
+    for b, n in enumerate(scene.chosen):
+        x = placed(BODY.points[n], SAMPLE_DOF[n], scene.pose[b])
+        normals = placed(BODY.normals[n], SAMPLE_DOF[n], scene.pose[b]) - placed(0 * x, SAMPLE_DOF[n], scene.pose[b])
+        expected = nearest(scene.index, x, normals, BODY.patch[n], BOTH.min_cosine, BOTH.reach_m)
+        # the search of its own is tested in test_nearest.py; rotating in another precision may turn a near tie
+        assert np.mean(held.assigned[b] == expected) > 0.98
+    assert 0.5 < np.mean(held.assigned >= 0) <= 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("cosine", [-1.0, 0.0, 0.7])
+def test_voxels_are_paired_with_the_nearest_piece(kernel, seed, cosine):
+    case = replace(BOTH, coverage_cosine=cosine, coverage_reach_m=0.4)
+    scene = Scene(seed, voxels=200)
+    held = scene.evaluate(kernel, case)[3]
+    y = scene.index.positions[scene.voxels[0]].astype(np.float64)
+    y_normal = scene.index.normals[scene.voxels[0]].astype(np.float64)
+    T = SKELETON.transforms(scene.pose[0])
+    distance = np.full((len(BODY.pieces), len(y)), np.inf)
+    on_zero = np.empty((len(BODY.pieces), len(y), 3))
+    for i, p in enumerate(BODY.pieces):
+        T_world_piece = T[PIECE_DOF[i]] @ p.T_body_piece
+        R, t = T_world_piece[:3, :3], T_world_piece[:3, 3]
+        q = (y - t) @ R
+        on, normal = oracles.project(q, np.array(p.radii), p.e1, p.e2, p.z_lower, p.z_upper)
+        agrees = (np.sum(normal @ R.T * y_normal, axis=1) >= cosine) | ~y_normal.any(axis=1)
+        d = np.linalg.norm(q - on, axis=1)
+        distance[i] = np.where(agrees & (d < case.coverage_reach_m), d, np.inf)
+        on_zero[i] = on @ p.T_body_piece[:3, :3].T + p.T_body_piece[:3, 3]
+    best = distance.argmin(axis=0)
+    expected = np.where(np.isfinite(distance.min(axis=0)), best, -1)
+    got = held.covering[0, :, 0].astype(int)
+    # the kernel leaves out pieces whose box is farther than the best so far; a first-order projection outside its own
+    # box may be nearer still: at the rims of truncated pieces, and rarely
+    same = got == expected
+    assert same.mean() > 0.97
+    for m in np.flatnonzero(~same):
+        assert got[m] >= 0 and distance[got[m], m] < distance[expected[m], m] + 0.02
+    hit = same & (got >= 0)
+    assert 0.3 < hit.mean() < 1
+    np.testing.assert_allclose(held.covering[0, hit, 1:], on_zero[got[hit], hit], atol=2e-4)
+
+
+@cases
+def test_value(kernel, case):
+    scene = Scene(11, poses=3)
+    value, _, _, held = scene.evaluate(kernel, case)
+    expected = [value_oracle(scene, b, held, case) for b in range(3)]
+    np.testing.assert_allclose(value, expected, rtol=0, atol=EXACT)
+    assert (value > 0).all() and (value < 1 + case.coverage_weight).all()
+
+
+@cases
+@pytest.mark.parametrize("seed", range(2))
+def test_gradient(kernel, case, seed):
+    """All 24 degrees of freedom by central differences, with the pairs held (eq. 15 holds them, too)."""
+    scene = Scene(seed)
+    _, gradient, _, held = scene.evaluate(kernel, case)
+    h = 1e-6
+    steps = np.concatenate([h * np.eye(D), -h * np.eye(D)])
+    many = Scene(seed)
+    many.chosen, many.voxels = np.repeat(scene.chosen, 2 * D, 0), np.repeat(scene.voxels, 2 * D, 0)
+    all_held = Held(np.repeat(held.assigned, 2 * D, 0), np.repeat(held.covering, 2 * D, 0))
+    values = many.evaluate(kernel, case, all_held, pose=scene.pose + steps)[0]
+    numeric = (values[:D] - values[D:]) / (2 * h)
+    np.testing.assert_allclose(gradient[0], numeric, rtol=1e-7, atol=1e-8)
+    assert (np.abs(numeric) > 1e-6).all(), "a degree of freedom that nothing pulls tests nothing"
+
+
+@cases
+def test_hessian_vector_product_is_gauss_newtons(kernel, case):
+    """H = Σ share·ρ'(e)/σ² Jᵀ M J (eq. 19, its positive part), with J from the linearisation."""
+    scene = Scene(5)
+    _, gradient, product, held = scene.evaluate(kernel, case, direction=scene.direction)
+    linear = kernel.linearise(scene.index, scene.chosen[0], scene.voxels[0], scene.pose[0], held, case)
+    x, y, metric, inv_sigma2, nu, scale = pairs_oracle(scene, 0, held, case)
+    present = ~np.isnan(x).any(axis=1)
+    x = np.where(present[:, None], x, y)
+    e = 0.5 * np.einsum("ka,kab,kb->k", x - y, metric, x - y) * inv_sigma2
+    weight = present * scale * np.exp(-e / nu) / nu * inv_sigma2
+    J = linear.jacobian
+    hessian = np.einsum("k,kai,kab,kbj->ij", weight, J, metric, J)
+    np.testing.assert_allclose(product[0], hessian @ scene.direction[0], rtol=0, atol=EXACT * np.abs(hessian).max())
+    np.testing.assert_allclose(gradient[0], np.einsum("k,kai,kab,kb->i", weight, J, metric, x - y), atol=EXACT)
+    if case.tangential == 1.0:
+        np.testing.assert_allclose(linear.gauss_newton(), hessian, rtol=0, atol=EXACT * np.abs(hessian).max())
+
+
+@pytest.mark.parametrize("case", [BOTH, SURFACE], ids=["both", "surface"])
+def test_linearisation(kernel, case):
+    scene = Scene(6)
+    case = replace(case, reach_m=0.06, coverage_reach_m=0.1)  # some pairs are missing
+    held = scene.evaluate(kernel, case)[3]
+    linear = kernel.linearise(scene.index, scene.chosen[0], scene.voxels[0], scene.pose[0], held, case)
+    x, y, _, inv_sigma2, nu, scale = pairs_oracle(scene, 0, held, case)
+    present = ~np.isnan(x).any(axis=1)
+    assert 0 < present.sum() < len(present)
+    np.testing.assert_array_equal(linear.partner >= 0, present)
+    np.testing.assert_allclose(linear.residual, np.where(present[:, None], x - y, 0), rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(linear.jacobian[~present], 0)
+    np.testing.assert_allclose(linear.inv_sigma2[present], inv_sigma2[present])
+    np.testing.assert_array_equal(linear.nu, nu)
+    np.testing.assert_allclose(linear.scale, scale)
+    # ∂x/∂p of the pairs' points by central differences
+    n, h = scene.chosen[0], 1e-6
+    local, dof = BODY.points[n], SAMPLE_DOF[n]
+    if case.coverage_weight:
+        local = np.concatenate([local, held.covering[0, :, 1:]])
+        dof = np.concatenate([dof, PIECE_DOF[held.covering[0, :, 0].astype(int)]])
+    for k in range(D):
+        step = h * np.eye(D)[k]
+        numeric = (placed(local, dof, scene.pose[0] + step) - placed(local, dof, scene.pose[0] - step)) / (2 * h)
+        np.testing.assert_allclose(linear.jacobian[present, :, k], numeric[present], rtol=0, atol=1e-8)
+
+
+def test_outliers_weigh_nothing_or_the_floor(kernel):
+    scene = Scene(7)
+    held = scene.evaluate(kernel, BOTH)[3]
+    linear = kernel.linearise(scene.index, scene.chosen[0], scene.voxels[0], scene.pose[0], held, BOTH)
+    assert (linear.decay[linear.partner < 0] == 0).all() and linear.decay.max() <= 1
+    plain, floored = linear.gauss_newton(), linear.gauss_newton(0.1)
+    assert np.linalg.eigvalsh(plain).min() > -1e-9 * np.abs(plain).max()
+    assert np.linalg.eigvalsh(floored - plain).min() > -1e-9 * np.abs(plain).max()
+    # with all decays at the floor, and the missing pairs still without weight
+    weight = linear.scale / linear.nu * linear.inv_sigma2 * (linear.partner >= 0)
+    np.testing.assert_allclose(linear.gauss_newton(1.0), np.einsum("k,kai,kaj->ij", weight, *[linear.jacobian] * 2))
+
+
+def test_nothing_within_reach_is_all_outliers(kernel):
+    """ρ = 1 each, no gradient, no curvature."""
+    scene = Scene(8)
+    case = replace(BOTH, reach_m=1e-6, coverage_reach_m=1e-6)
+    value, gradient, product, held = scene.evaluate(kernel, case, direction=scene.direction)
+    assert (held.assigned == -1).all() and (held.covering[:, :, 0] == -1).all()
+    np.testing.assert_allclose(value, 2.0, rtol=1e-12)
+    np.testing.assert_array_equal(gradient, 0)
+    np.testing.assert_array_equal(product, 0)
+
+
+@given(st.integers(1, 70), st.integers(1, 40), st.integers(1, 5), st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_any_number_of_points_and_poses(samples, voxels, poses, seed):
+    """Tasks of 16 points: full, part-filled, and less than one."""
+    scene = Scene(seed, poses, samples, voxels)
+    value, _, _, held = scene.evaluate(ANY, BOTH)
+    np.testing.assert_allclose(value, [value_oracle(scene, b, held, BOTH) for b in range(poses)], rtol=0, atol=EXACT)
+
+
+ANY = kernel_of()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_same_input_same_bits(dtype):
+    """Whatever thread does what, and whatever the scratch held before."""
+    scene, other = Scene(9, poses=4), Scene(10, poses=4)
+    first, second = kernel_of(dtype), kernel_of(dtype)
+    reference = scene.evaluate(first, BOTH, direction=scene.direction)
+    other.evaluate(second, BOTH, direction=other.direction)
+    for _ in range(5):
+        again = scene.evaluate(second, BOTH, direction=scene.direction)
+        for a, b in zip(reference[:3], again[:3], strict=True):
+            np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(reference[3].assigned, again[3].assigned)
+        np.testing.assert_array_equal(reference[3].covering, again[3].covering)
+
+
+def test_a_batch_is_its_rows(kernel):
+    scene = Scene(12, poses=3)
+    together = scene.evaluate(kernel, BOTH, direction=scene.direction)
+    for b in range(3):
+        row = slice(b, b + 1)
+        alone = kernel.evaluate(
+            scene.index, scene.chosen[row], scene.voxels[row], scene.pose[row], scene.direction[row], BOTH
+        )
+        for a, t in zip(alone[:3], together[:3], strict=True):
+            np.testing.assert_array_equal(a[0], t[b])
+
+
+def test_held_pairs_are_kept(kernel):
+    """At another pose with the first pose's pairs: they come back as they went in, and the value is theirs."""
+    scene = Scene(13)
+    held = scene.evaluate(kernel, BOTH)[3]
+    scene.pose = scene.pose + 0.05
+    value, _, _, returned = scene.evaluate(kernel, BOTH, held)
+    np.testing.assert_array_equal(returned.assigned, held.assigned)
+    np.testing.assert_array_equal(returned.covering, held.covering)
+    np.testing.assert_allclose(value[0], value_oracle(scene, 0, held, BOTH), rtol=0, atol=EXACT)
+    assert not np.array_equal(scene.evaluate(kernel, BOTH)[3].assigned, held.assigned)
+
+
+def test_single_precision_agrees_with_double(kernel):
+    """With the same pairs: 120 terms, levers of a metre, 1/σ² near 100."""
+    scene = Scene(14, poses=2)
+    double = scene.evaluate(kernel, BOTH, direction=scene.direction)
+    single = scene.evaluate(kernel_of(np.float32), BOTH, double[3], direction=scene.direction)
+    for s, d in zip(single[:3], double[:3], strict=True):
+        np.testing.assert_allclose(s, d, rtol=0, atol=2e-5 * max(np.abs(d).max(), 1))
+
+
+def test_colours_and_normals_confine_the_pairs(kernel):
+    """Every pair's voxel fits the sample's patch and, where it has a normal, agrees with the sample's."""
+    scene = Scene(15)
+    case = replace(BOTH, min_cosine=0.5)
+    v = scene.evaluate(kernel, case)[3].assigned[0]
+    n = scene.chosen[0][v >= 0]
+    v = v[v >= 0]
+    assert len(v) > 20
+    assert ((scene.index.fits[v] >> BODY.patch[n]) & 1 == 1).all()
+    T = SKELETON.transforms(scene.pose[0])[SAMPLE_DOF[n], :3, :3]
+    cosine = np.sum(np.einsum("nab,nb->na", T, BODY.normals[n]) * scene.index.normals[v], axis=1)
+    assert (cosine[scene.index.normals[v].any(axis=1)] >= 0.5 - 1e-5).all()
