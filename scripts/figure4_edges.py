@@ -3,8 +3,8 @@
 True edges are the outlines of a capture's exact masks. Recall is the share of them with a detected edge within 2 px.
 Clutter, in pixels a picture, is counted at the thresholds that give both detectors the same recall:
 
-- shadow: edges outside the person where the picture differs from the empty scene (cast shadows), without those that
-  the empty scene has as well;
+- shadow: edges outside the person where the picture differs from the empty scene (cast shadows), without those that the
+  empty scene may have as well (at the low threshold);
 - clothes: edges inside the person where the material is the same all around (shading and wrinkles). Materials are
   clusters of colour in which lightness counts a quarter, found in each picture. Edges between materials (sleeves,
   stripes, an arm before the trunk) are what a tracker wants and count for neither; a leg's edge before the other leg
@@ -36,10 +36,10 @@ from matplotlib import pyplot as plt
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
-#: edges at a threshold
-Detect = Callable[[float], Mask]
+#: edges at a low and a high threshold
+Detect = Callable[[float, float], Mask]
 
-RECALLS = (0.7, 0.8, 0.9)
+RECALLS = (0.8, 0.9, 0.95)
 RECALL_PX = 2
 BAND_PX = 3
 LOW_SHARE = 0.4  # of the high threshold; Canny 1986 advises a third to a half
@@ -53,13 +53,13 @@ def grey_canny(image: Image) -> Detect:
     """OpenCV's Canny on the grey-level picture; thresholds in levels of the Sobel magnitude."""
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     dx, dy = cv2.Sobel(grey, cv2.CV_16S, 1, 0), cv2.Sobel(grey, cv2.CV_16S, 0, 1)
-    return lambda high: cv2.Canny(dx, dy, LOW_SHARE * high, high, L2gradient=True) > 0
+    return lambda low, high: cv2.Canny(dx, dy, low, high, L2gradient=True) > 0
 
 
 def rgb_edges(image: Image, config: EdgeConfig | None = None) -> Detect:
     """The colour edges of :mod:`tk.kernels.edges`; thresholds of its magnitude."""
     thin = thin_edges(*rgb_gradient(image[None], config))
-    return lambda high: follow_edges(thin, LOW_SHARE * high, high)[0]
+    return lambda low, high: follow_edges(thin, low, high)[0]
 
 
 @dataclass(frozen=True)
@@ -126,13 +126,15 @@ def describe(image: Image, plate: Image, mask: Image) -> Picture:
     band = _near(outline, BAND_PX)
     materials = _materials(image, inside)
     uniform = cv2.dilate(materials, _disc(BAND_PX)) == cv2.erode(materials, _disc(BAND_PX))
-    blurred, empty = (cv2.GaussianBlur(p.astype(np.float32), (0, 0), 2.0) for p in (image, plate))
     away = ~_near(inside, 4 * BAND_PX)
     # lamps flicker and cameras adapt
-    if away.any():
-        empty = empty * np.median(blurred[away] / np.maximum(empty[away], 1), axis=0)
-    changed = (np.abs(blurred - empty).max(axis=2) > CHANGED) & ~inside
-    return Picture(image, plate, outline, inside & uniform & ~band, _near(changed, BAND_PX) & ~inside & ~band)
+    gain = np.median(image[away] / np.maximum(plate[away], 1.0), axis=0) if away.any() else np.ones(3)
+    empty = plate * gain
+    # the person out of the picture, or the blur would carry them into the floor
+    without = np.where(_near(inside, BAND_PX)[..., None], empty, image)
+    difference = np.abs(cv2.GaussianBlur(without - empty, (0, 0), 2.0)).max(axis=2)
+    shadow = _near(difference > CHANGED, BAND_PX) & ~inside & ~band
+    return Picture(image, plate, outline, inside & uniform & ~band, shadow)
 
 
 def load(folder: Path, frames: Sequence[int], cameras: Sequence[str] | None = None) -> Iterator[Picture]:
@@ -173,9 +175,12 @@ def measure(pictures: Sequence[Picture], detector: Detector) -> Curve:
     counts = np.zeros((len(detector.thresholds), 4))
     for picture in pictures:
         detect, detect_empty = detector(picture.image), detector(picture.plate)
-        for row, threshold in zip(counts, detector.thresholds, strict=True):
-            edges = detect(threshold)
-            moving = edges & ~_near(detect_empty(threshold), RECALL_PX)
+        for row, high in zip(counts, detector.thresholds, strict=True):
+            low = LOW_SHARE * high
+            edges = detect(low, high)
+            # all that hysteresis might follow, were it led there by the person's own edges
+            static = detect_empty(low, low)
+            moving = edges & ~_near(static, RECALL_PX)
             row += (
                 (_near(edges, RECALL_PX) & picture.outline).sum(),
                 picture.outline.sum(),
@@ -211,7 +216,7 @@ def draw(picture: Picture, rows: list[tuple[Detector, Curve]], recall: float, pa
     for axis, (detector, curve) in zip((axes[0, 1], axes[0, 2], axes[1, 1], axes[1, 2]), rows, strict=True):
         # recall rises as the threshold falls
         threshold = np.exp(np.interp(recall, curve.recall, np.log(detector.thresholds)))
-        axis.imshow(~detector(picture.image)(threshold), cmap="gray")
+        axis.imshow(~detector(picture.image)(LOW_SHARE * threshold, threshold), cmap="gray")
         axis.set_title(f"{detector.name}, σ = {detector.sigma:g} px, recall {recall:.0%} over all pictures")
     for axis in axes.flat:
         axis.set_axis_off()
