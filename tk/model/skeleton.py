@@ -77,9 +77,9 @@ _ELBOW = np.cross(_ARM, [0.5, -0.5, np.sqrt(0.5)])
 # 61 (1979) 756-759, widened by 10° because a single hinge or ball stands for a whole joint complex (the shoulder
 # girdle, the lumbar spine): hip flexion 122±6, extension 10±7, abduction 46±9, adduction 27±4, rotation 47±6; knee
 # 143±5; elbow 143±6. The shoulder's ranges (flexion 167±5, extension 62±10, abduction 184±7, rotation 69/104) are given
-# about other axes than ours: the box below is the smallest that holds them (tests/model/test_skeleton.py samples them).
-# Neck: Youdas et al., Phys. Ther. 72 (1992) 770-780: flexion and extension 60-70 together with the upper spine, lateral
-# bending 40-45.
+# about other axes than ours: the box below holds them, and every direction of the arm but a cone of 10° about the
+# singular diagonal (tests/model/test_skeleton.py samples them). Neck: Youdas et al., Phys. Ther. 72 (1992) 770-780:
+# flexion and extension 60-70 together with the upper spine, lateral bending 40-45.
 _LIMITS_DEG: dict[str, tuple[float, float]] = {
     "torso_yaw": (-np.inf, np.inf),
     "torso_roll": (-80.0, 80.0),
