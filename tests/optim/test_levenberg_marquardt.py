@@ -1,0 +1,214 @@
+"""Levenberg-Marquardt on problems whose answer is known, and against SciPy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import scipy.optimize
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tk.errors import ConfigError
+from tk.optim.levenberg_marquardt import Float, LmConfig, LmResult, Quadratic, minimise
+
+Residuals = Callable[[Float], Float]
+Jacobian = Callable[[Float], Float]
+
+
+def rosenbrock(p: Float) -> Float:
+    return np.array([10 * (p[1] - p[0] ** 2), 1 - p[0]])
+
+
+def rosenbrock_jacobian(p: Float) -> Float:
+    return np.array([[-20 * p[0], 10.0], [-1.0, 0.0]])
+
+
+TIMES = np.linspace(0, 4, 30)
+DECAY = 2.0 * np.exp(-0.7 * TIMES) + 0.05 * np.sin(37 * TIMES)
+
+
+def decay(p: Float) -> Float:
+    return np.asarray(p[0] * np.exp(-p[1] * TIMES) + p[2] - DECAY)
+
+
+def decay_jacobian(p: Float) -> Float:
+    e = np.exp(-p[1] * TIMES)
+    return np.stack([e, -p[0] * TIMES * e, np.ones_like(e)], axis=1)
+
+
+def least_squares(
+    residuals: Residuals,
+    jacobian: Jacobian,
+    start: Float,
+    limits: tuple[Float | float, Float | float] = (-np.inf, np.inf),
+    floor: Float | float = 0.0,
+    config: LmConfig | None = None,
+) -> tuple[LmResult, list[float]]:
+    """The result, and the values at the states that were accepted."""
+    accepted: list[float] = []
+
+    def value(p: Float) -> float:
+        return 0.5 * float(residuals(p) @ residuals(p))
+
+    def model(p: Float) -> Quadratic:
+        J = jacobian(p)
+        accepted.append(value(p))
+        return Quadratic(accepted[-1], J.T @ residuals(p), J.T @ J)
+
+    result = minimise(model, value, start, lambda p: np.clip(p, *limits), floor, config)
+    return result, accepted
+
+
+def linear(seed: int, rows: int, columns: int) -> tuple[Float, Float]:
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(rows, columns)), rng.normal(size=rows)
+
+
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 6))
+@settings(max_examples=30, deadline=None)
+def test_a_quadratic_takes_one_step(seed: int, n: int) -> None:
+    A, y = linear(seed, n + 5, n)
+    config = LmConfig(damping=1e-12, max_iterations=1)
+    result, _ = least_squares(lambda p: A @ p - y, lambda p: A, np.zeros(n), config=config)
+    np.testing.assert_allclose(result.pose, np.linalg.lstsq(A, y, rcond=None)[0], atol=1e-7)
+    assert result.iterations == 1
+
+
+@pytest.mark.parametrize(
+    ("residuals", "jacobian", "start"),
+    [
+        (rosenbrock, rosenbrock_jacobian, [-1.2, 1.0]),
+        (rosenbrock, rosenbrock_jacobian, [5.0, -8.0]),
+        (decay, decay_jacobian, [1.0, 0.1, 0.5]),
+    ],
+)
+def test_agrees_with_scipy(residuals: Residuals, jacobian: Jacobian, start: list[float]) -> None:
+    config = LmConfig(tolerance=1e-12, max_iterations=200)
+    result, _ = least_squares(residuals, jacobian, np.array(start), config=config)
+    expected = scipy.optimize.least_squares(residuals, start, jacobian, xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    assert result.converged
+    np.testing.assert_allclose(result.pose, expected.x, atol=1e-4)
+    np.testing.assert_allclose(result.value, expected.cost, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("residuals", "jacobian", "start", "limits"),
+    [
+        (rosenbrock, rosenbrock_jacobian, [-1.2, 1.0], ([-2.0, -1.0], [0.6, 2.0])),
+        (rosenbrock, rosenbrock_jacobian, [2.0, 2.0], ([1.2, -1.0], [3.0, 3.0])),
+        (decay, decay_jacobian, [1.0, 0.1, 0.5], ([0.0, 0.0, 0.1], [1.5, 0.6, 1.0])),
+    ],
+)
+def test_agrees_with_scipy_on_a_box(
+    residuals: Residuals, jacobian: Jacobian, start: list[float], limits: tuple[list[float], list[float]]
+) -> None:
+    lower, upper = np.array(limits)
+    config = LmConfig(tolerance=1e-12, max_iterations=200)
+    result, _ = least_squares(residuals, jacobian, np.array(start), (lower, upper), config=config)
+    expected = scipy.optimize.least_squares(
+        residuals, start, jacobian, bounds=(lower, upper), xtol=1e-14, ftol=1e-14, gtol=1e-14
+    )
+    assert result.converged
+    assert np.any((result.pose == lower) | (result.pose == upper))  # the optimum without limits is outside
+    assert np.all((result.pose >= lower) & (result.pose <= upper))
+    np.testing.assert_allclose(result.pose, expected.x, atol=1e-4)
+    assert result.value <= expected.cost + 1e-9
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None)
+def test_the_optimum_of_a_coupled_bowl_on_a_box(seed: int) -> None:
+    """The gradient vanishes in the parameters between their limits and pushes outwards in those on one."""
+    A, y = linear(seed, 9, 5)
+    config = LmConfig(damping=1e-6, tolerance=1e-14, max_iterations=300)
+    result, _ = least_squares(lambda p: A @ p - 3 * y, lambda p: A, np.zeros(5), (-0.4, 0.4), config=config)
+    gradient = A.T @ (A @ result.pose - 3 * y)
+    scale = np.abs(A.T @ y).max()
+    inside = np.abs(result.pose) < 0.4
+    np.testing.assert_allclose(gradient[inside] / scale, 0, atol=1e-4)
+    assert np.all(gradient[~inside] * result.pose[~inside] <= 0)
+
+
+def test_floor_holds_what_the_data_does_not_see() -> None:
+    """The second parameter has a trace of noise for a gradient, and next to no curvature."""
+
+    def model(p: Float) -> Quadratic:
+        return Quadratic(value(p), np.array([p[0] - 1, 1e-4]), np.diag([1.0, 1e-8]))
+
+    def value(p: Float) -> float:
+        return 1 + 0.5 * (p[0] - 1) ** 2 + 1e-4 * p[1]
+
+    def step(floor: Float | float) -> Float:
+        return minimise(model, value, np.zeros(2), lambda p: p, floor, LmConfig(max_iterations=1)).pose
+
+    assert abs(step(0.0)[1]) > 1e3
+    assert abs(step(np.array([0.0, 1.0]))[1]) <= 1e-2
+    assert step(np.array([0.0, 1.0]))[0] == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.parametrize("start", [[-1.2, 1.0], [3.0, -4.0], [0.0, 7.0]])
+def test_no_step_goes_uphill(start: list[float]) -> None:
+    _, accepted = least_squares(rosenbrock, rosenbrock_jacobian, np.array(start), config=LmConfig(damping=1e-6))
+    assert len(accepted) > 3
+    assert np.all(np.diff(accepted) < 0)
+
+
+def test_a_step_that_overshoots_is_shortened_until_it_falls() -> None:
+    """√(1 + p²) from p = 20: Newton's step is p³ long, and the damping must rise by many powers of four."""
+
+    def value(p: Float) -> float:
+        return float(np.sqrt(1 + p[0] ** 2))
+
+    def model(p: Float) -> Quadratic:
+        root = value(p)
+        return Quadratic(root, p / root, np.array([[root**-3]]))
+
+    result = minimise(model, value, np.array([20.0]), lambda p: p, config=LmConfig(damping=1e-6, tolerance=1e-9))
+    assert result.converged
+    assert result.pose[0] == pytest.approx(0, abs=1e-3)
+
+
+def test_says_whether_it_converged() -> None:
+    few, _ = least_squares(rosenbrock, rosenbrock_jacobian, np.array([-1.2, 1.0]), config=LmConfig(max_iterations=3))
+    assert (few.iterations, few.converged) == (3, False)
+    many, _ = least_squares(rosenbrock, rosenbrock_jacobian, np.array([-1.2, 1.0]), config=LmConfig(max_iterations=99))
+    assert many.converged and many.iterations < 99
+
+
+def test_stays_at_an_optimum() -> None:
+    result, _ = least_squares(rosenbrock, rosenbrock_jacobian, np.ones(2))
+    assert (result.iterations, result.converged) == (1, True)
+    np.testing.assert_array_equal(result.pose, np.ones(2))
+
+
+def test_a_start_outside_the_limits_is_moved_in() -> None:
+    result, _ = least_squares(rosenbrock, rosenbrock_jacobian, np.array([9.0, -9.0]), (2.0, 2.5))
+    np.testing.assert_array_equal(result.pose, [2.0, 2.5])  # the corner nearest to the valley
+    assert result.converged
+
+
+def test_a_value_that_is_not_finite_refuses_the_step() -> None:
+    """The logarithm's domain ends within the first, undamped step."""
+
+    def value(p: Float) -> float:
+        return float(p[0] - np.log(p[0])) if p[0] > 0 else float("nan")
+
+    def model(p: Float) -> Quadratic:
+        return Quadratic(value(p), 1 - 1 / p, np.diag(p**-2))
+
+    result = minimise(model, value, np.array([5.0]), lambda p: p, config=LmConfig(damping=1e-6, tolerance=1e-9))
+    assert result.converged
+    assert result.pose[0] == pytest.approx(1, abs=1e-3)
+
+
+def test_a_model_that_is_not_finite_is_an_error() -> None:
+    with pytest.raises(FloatingPointError, match="not finite"):
+        minimise(lambda p: Quadratic(1.0, np.array([np.nan]), np.eye(1)), lambda p: 1.0, np.zeros(1), lambda p: p)
+
+
+@pytest.mark.parametrize("wrong", [{"damping": 0.0}, {"max_iterations": 0}, {"tolerance": -1.0}])
+def test_impossible_settings_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        LmConfig(**wrong)  # type: ignore[arg-type]
