@@ -79,7 +79,7 @@ def test_something_is_found_and_something_is_not():
 def test_queries_on_the_walls_between_cells():
     grid = np.stack(np.meshgrid(*[np.arange(6) * 0.1] * 3, indexing="ij"), -1).reshape(-1, 3)
     index = SurfaceIndex.build(grid, np.zeros_like(grid), np.full(len(grid), -1), 0.1)
-    walls = grid + index.origin.astype(np.float64) - grid.min(0)
+    walls = grid + index.grid[:3].astype(np.float64) - grid.min(0)
     check(index, walls, np.zeros_like(walls), np.zeros(len(walls), np.int64), -1.0, 0.5)
 
 
@@ -120,8 +120,8 @@ def test_index_holds_every_voxel_once_and_in_its_cell(seed, count, cell_m):
     np.testing.assert_array_equal(index.positions, positions.astype(np.float32)[index.order])
     np.testing.assert_array_equal(index.normals, normals.astype(np.float32)[index.order])
     np.testing.assert_array_equal(index.fits, index.order)
-    assert index.starts[0] == 0 and index.starts[-1] == count and len(index.starts) == np.prod(index.cells) + 1
+    assert index.starts[0] == 0 and index.starts[-1] == count and len(index.starts) == np.prod(index.grid[4:]) + 1
     cell = np.repeat(np.arange(len(index.starts) - 1), np.diff(index.starts))
-    ijk = np.stack(np.unravel_index(cell, index.cells), -1)
-    inside = (index.positions - index.origin) / index.cell_m - ijk
+    ijk = np.stack(np.unravel_index(cell, index.grid[4:].astype(int)), -1)
+    inside = (index.positions - index.grid[:3]) / index.grid[3] - ijk
     assert inside.min() > -1e-4 and inside.max() < 1 + 1e-4

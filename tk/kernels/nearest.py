@@ -17,24 +17,29 @@ class SurfaceIndex:
     """Surface voxels in cell order. V voxels, G cells along each axis (3,).
 
     Attributes:
-        positions: (V, 3) float32, metres.
-        normals: (V, 3) float32; zero where unknown (such a voxel agrees with every query).
+        voxels: (V, 6) float32, position (metres) and normal; a zero normal is unknown and agrees with every query. One
+            array, as Taichi takes several microseconds for every array that a kernel is handed.
         fits: (V,) int64, bit p set where the voxel's colour fits patch p.
         starts: (G0·G1·G2 + 1,) int32, first voxel of each cell.
-        cells: (3,) int32, cells along each axis.
-        origin: (3,) float32, lower corner of cell 0, metres.
-        cell_m: edge of a cell, metres.
+        grid: (7,) float32, lower corner of cell 0 and edge of a cell (metres), cells along each axis.
         order: (V,) the voxels' places in the arrays given to :meth:`build`.
     """
 
-    positions: np.ndarray
-    normals: np.ndarray
+    voxels: np.ndarray
     fits: np.ndarray
     starts: np.ndarray
-    cells: np.ndarray
-    origin: np.ndarray
-    cell_m: float
+    grid: np.ndarray
     order: np.ndarray
+
+    @property
+    def positions(self) -> np.ndarray:
+        """(V, 3) metres."""
+        return self.voxels[:, :3]
+
+    @property
+    def normals(self) -> np.ndarray:
+        """(V, 3) unit vectors, or zero."""
+        return self.voxels[:, 3:]
 
     @staticmethod
     def build(positions: np.ndarray, normals: np.ndarray, fits: np.ndarray, cell_m: float) -> "SurfaceIndex":
@@ -49,26 +54,20 @@ class SurfaceIndex:
         starts = np.zeros(len(counts) + 1, np.int32)
         np.cumsum(counts, out=starts[1:])
         return SurfaceIndex(
-            positions=p[order],
-            normals=np.ascontiguousarray(normals, np.float32)[order],
+            voxels=np.hstack([p, np.asarray(normals, np.float32)])[order],
             fits=np.ascontiguousarray(fits, np.int64)[order],
             starts=starts,
-            cells=cells.astype(np.int32),
-            origin=origin.astype(np.float32),
-            cell_m=float(cell_m),
+            grid=np.array([*origin, cell_m, *cells], np.float32),
             order=order,
         )
 
 
 @ti.func
 def nearest_voxel(
-    positions: ti.template(),  # (V, 3)
-    normals: ti.template(),  # (V, 3)
+    voxels: ti.template(),  # (V, 6)
     fits: ti.template(),  # (V,)
     starts: ti.template(),
-    cells: ti.template(),  # (3,)
-    origin: ti.template(),  # (3,)
-    cell_m: ti.f32,
+    grid: ti.template(),  # (7,)
     x,  # query point
     n,  # query normal
     patch: int,
@@ -78,7 +77,9 @@ def nearest_voxel(
     """Index of the nearest candidate within ``reach`` metres, or -1."""
     best = -1
     best_d2 = reach * reach
-    local = ti.Vector([ti.cast(x[i], ti.f32) - origin[i] for i in ti.static(range(3))]) / cell_m
+    cell_m = grid[3]
+    cells = ti.Vector([ti.cast(grid[4 + a], ti.i32) for a in ti.static(range(3))])
+    local = ti.Vector([ti.cast(x[i], ti.f32) - grid[i] for i in ti.static(range(3))]) / cell_m
     home = ti.cast(ti.floor(local), ti.i32)
     # distance from the query to the nearest wall of its own cell: ring r lies at least (r - 1)·cell + margin away
     inner = local - ti.cast(home, ti.f32)
@@ -101,10 +102,10 @@ def nearest_voxel(
                         cell = (i * cells[1] + j) * cells[2] + k
                         for v in range(starts[cell], starts[cell + 1]):
                             if (fits[v] >> patch) & 1 == 1:
-                                d = ti.Vector([positions[v, a] - ti.cast(x[a], ti.f32) for a in ti.static(range(3))])
+                                d = ti.Vector([voxels[v, a] - ti.cast(x[a], ti.f32) for a in ti.static(range(3))])
                                 d2 = d.norm_sqr()
                                 if d2 < best_d2:
-                                    m = ti.Vector([normals[v, a] for a in ti.static(range(3))])
+                                    m = ti.Vector([voxels[v, 3 + a] for a in ti.static(range(3))])
                                     cosine = (
                                         ti.cast(n[0], ti.f32) * m[0]
                                         + ti.cast(n[1], ti.f32) * m[1]
@@ -120,13 +121,10 @@ def nearest_voxel(
 
 @ti.kernel
 def _nearest_kernel(
-    positions: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 3)
-    normals: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 3)
+    voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 6)
     fits: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (V,)
     starts: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (G + 1,)
-    cells: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (3,)
-    origin: ti.types.ndarray(dtype=ti.f32, ndim=1),  # (3,)
-    cell_m: ti.f32,
+    grid: ti.types.ndarray(dtype=ti.f32, ndim=1),  # (7,)
     points: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (N, 3)
     point_normals: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (N, 3)
     patch: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,)
@@ -138,7 +136,7 @@ def _nearest_kernel(
         x = ti.Vector([points[q, a] for a in ti.static(range(3))])
         n = ti.Vector([point_normals[q, a] for a in ti.static(range(3))])
         found[q] = nearest_voxel(
-            positions, normals, fits, starts, cells, origin, cell_m, x, n, patch[q], min_cosine, reach
+            voxels, fits, starts, grid, x, n, patch[q], min_cosine, reach
         )
 
 
@@ -165,13 +163,10 @@ def nearest(
     ensure_runtime()
     found = np.empty(len(points), np.int32)
     _nearest_kernel(
-        index.positions,
-        index.normals,
+        index.voxels,
         index.fits,
         index.starts,
-        index.cells,
-        index.origin,
-        index.cell_m,
+        index.grid,
         np.ascontiguousarray(points, np.float32),
         np.ascontiguousarray(normals, np.float32),
         np.ascontiguousarray(patch, np.int32),

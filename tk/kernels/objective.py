@@ -27,13 +27,16 @@ from tk.kernels.superellipsoid import project
 POINTS_PER_TASK = 16
 
 
+# Columns of the packed arrays. Every array that a launch is handed costs about 7 µs, so the body comes in few.
+SAMPLE_NORMAL, SAMPLE_DOF, SAMPLE_PATCH, SAMPLE_WEIGHT = 3, 6, 7, 8  # after the position; weight is 1/σ²
+PIECE_SHAPE, PIECE_DOF, PIECE_WEIGHT = 12, 19, 20  # after the 3×4 frame: a1 a2 a3 ε1 ε2 z_lower z_upper
+
+
 @ti.func
 def _nearest_piece(
     frames: ti.template(),
     c: int,
-    piece_dof: ti.template(),  # (P,)
-    piece_frame: ti.template(),  # (P, 12) piece to zero configuration
-    piece_shape: ti.template(),  # (P, 7) a1 a2 a3 e1 e2 z_lower z_upper
+    pieces: ti.template(),  # (P, 21)
     y,  # voxel, world
     y_normal,
     min_cosine,
@@ -43,13 +46,14 @@ def _nearest_piece(
     best = -1
     best_d = reach
     best_x = y * 0.0
-    for i in range(piece_dof.shape[0]):
-        R = load_rotation(frames, c, piece_dof[i])
-        Rp = ti.Matrix([[piece_frame[i, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
-        tp = ti.Vector([piece_frame[i, 4 * a + 3] for a in ti.static(range(3))])
-        q = Rp.transpose() @ (R.transpose() @ (y - load_translation(frames, c, piece_dof[i])) - tp)
-        radii = ti.Vector([piece_shape[i, a] for a in ti.static(range(3))])
-        z_lower, z_upper = piece_shape[i, 5], piece_shape[i, 6]
+    for i in range(pieces.shape[0]):
+        k = ti.cast(pieces[i, PIECE_DOF], ti.i32)
+        R = load_rotation(frames, c, k)
+        Rp = ti.Matrix([[pieces[i, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
+        tp = ti.Vector([pieces[i, 4 * a + 3] for a in ti.static(range(3))])
+        q = Rp.transpose() @ (R.transpose() @ (y - load_translation(frames, c, k)) - tp)
+        radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
+        z_lower, z_upper = pieces[i, PIECE_SHAPE + 5], pieces[i, PIECE_SHAPE + 6]
         # a box about the piece: what lies further outside it than the best so far cannot win
         over = ti.Vector(
             [
@@ -59,7 +63,7 @@ def _nearest_piece(
             ]
         )
         if over.norm_sqr() < best_d * best_d:
-            s = project(q, radii, piece_shape[i, 3], piece_shape[i, 4], z_lower, z_upper)
+            s = project(q, radii, pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4], z_lower, z_upper)
             on = ti.Vector([s[0], s[1], s[2]])
             d = (q - on).norm()
             if d < best_d:
@@ -110,124 +114,123 @@ def _add_residual(
         k = parent[k]
 
 
+@ti.func
+def _pair_sample(
+    samples: ti.template(),
+    voxels: ti.template(),
+    fits: ti.template(),
+    starts: ti.template(),
+    grid: ti.template(),
+    settings: ti.template(),
+    frames: ti.template(),
+    c: int,
+    n: int,
+):
+    """The voxel of surface sample n, or -1."""
+    k = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
+    R = load_rotation(frames, c, k)
+    normal = ti.Vector([samples[n, SAMPLE_NORMAL + a] for a in ti.static(range(3))])
+    return nearest_voxel(
+        voxels,
+        fits,
+        starts,
+        grid,
+        R @ load_vector3(samples, n) + load_translation(frames, c, k),
+        R @ normal,
+        ti.cast(samples[n, SAMPLE_PATCH], ti.i32),
+        ti.cast(settings[2], ti.f32),
+        ti.cast(settings[3], ti.f32),
+    )
+
+
 @functools.cache
 def _objective_kernel(real):
     @ti.kernel
     def objective(
-        # the body
         axis: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
         point: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
         prismatic: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
         parent: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
-        local: ti.types.ndarray(dtype=real, ndim=2),  # (N, 3)
-        normal: ti.types.ndarray(dtype=real, ndim=2),  # (N, 3)
-        last_dof: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,)
-        inv_sigma2: ti.types.ndarray(dtype=real, ndim=1),  # (N,)
-        patch: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,)
-        piece_dof: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
-        piece_frame: ti.types.ndarray(dtype=real, ndim=2),  # (P, 12)
-        piece_shape: ti.types.ndarray(dtype=real, ndim=2),  # (P, 7)
-        piece_inv_sigma2: ti.types.ndarray(dtype=real, ndim=1),  # (P,)
-        # the frame
-        v_position: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 3)
-        v_normal: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 3)
+        samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 9)
+        pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 21)
+        voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 6)
         fits: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (V,)
         starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        cells: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (3,)
-        origin: ti.types.ndarray(dtype=ti.f32, ndim=1),  # (3,)
-        cell_m: ti.f32,
-        # settings
-        nu: real,
-        tangential: real,
-        min_cosine: real,
-        reach: real,
-        coverage_nu: real,
-        coverage_cosine: real,
-        coverage_reach: real,
-        surface_scale: real,  # w_s / M
-        coverage_scale: real,  # w_c / Q
+        grid: ti.types.ndarray(dtype=ti.f32, ndim=1),  # (7,)
+        settings: ti.types.ndarray(dtype=real, ndim=1),  # (9,)
         hold: ti.i32,
-        # the poses
-        chosen: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, M) samples
-        voxels: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, Q) voxels of the coverage term
+        M: ti.i32,
+        Q: ti.i32,
+        chosen: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, M + Q) samples, then voxels of the coverage term
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
         direction: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
-        surface_tasks: ti.i32,
-        coverage_tasks: ti.i32,
         frames: ti.types.ndarray(dtype=real, ndim=3),  # (C, D, 12) scratch
         twists: ti.types.ndarray(dtype=real, ndim=3),  # (C, D, 6) scratch
         assigned: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, M) out, in when hold = 1
         covering: ti.types.ndarray(dtype=real, ndim=3),  # (B, Q, 4) piece and projection, out, in when hold = 1
         sums: ti.types.ndarray(dtype=real, ndim=2),  # (C, 1 + 2 D) out
     ):
-        for c in range(pose.shape[0] * (surface_tasks + coverage_tasks)):
-            b = c // (surface_tasks + coverage_tasks)
-            task = c % (surface_tasks + coverage_tasks)
+        for c in range(sums.shape[0]):
+            tasks = sums.shape[0] // pose.shape[0]
+            b = c // tasks
             for s in range(sums.shape[1]):
                 sums[c, s] = 0.0
             forward(axis, point, prismatic, parent, pose, b, c, frames, twists)
-            if task < surface_tasks:
-                first = task * POINTS_PER_TASK
-                for m in range(first, ti.min(first + POINTS_PER_TASK, chosen.shape[1])):
+            first = (c % tasks) * POINTS_PER_TASK
+            for m in range(first, ti.min(first + POINTS_PER_TASK, M + Q)):
+                v = -1
+                k = 0
+                x0 = ti.Vector([settings[0] * 0.0, settings[0] * 0.0, settings[0] * 0.0])
+                inv_sigma2, nu, share, scale = x0[0], settings[0], settings[1], settings[7]
+                if m < M:
                     n = chosen[b, m]
-                    k = last_dof[n]
-                    R = load_rotation(frames, c, k)
-                    x = R @ load_vector3(local, n) + load_translation(frames, c, k)
                     v = assigned[b, m]
                     if hold == 0:
-                        v = nearest_voxel(
-                            v_position,
-                            v_normal,
-                            fits,
-                            starts,
-                            cells,
-                            origin,
-                            cell_m,
-                            x,
-                            R @ load_vector3(normal, n),
-                            patch[n],
-                            ti.cast(min_cosine, ti.f32),
-                            ti.cast(reach, ti.f32),
-                        )
+                        v = _pair_sample(samples, voxels, fits, starts, grid, settings, frames, c, n)
                         assigned[b, m] = v
-                    if v < 0:
-                        sums[c, 0] += surface_scale
-                    else:
-                        y = ti.Vector([ti.cast(v_position[v, a], real) for a in ti.static(range(3))])
-                        y_normal = ti.Vector([ti.cast(v_normal[v, a], real) for a in ti.static(range(3))])
-                        share = tangential
-                        if y_normal.norm_sqr() == 0.0:
-                            share = tangential * 0.0 + 1.0
-                        _add_residual(
-                            prismatic, parent, twists, direction, sums, b, c, k, x, x - y, y_normal, share,
-                            inv_sigma2[n], nu, surface_scale,
-                        )  # fmt: skip
-            else:
-                first = (task - surface_tasks) * POINTS_PER_TASK
-                for m in range(first, ti.min(first + POINTS_PER_TASK, voxels.shape[1])):
-                    v = voxels[b, m]
-                    y = ti.Vector([ti.cast(v_position[v, a], real) for a in ti.static(range(3))])
-                    y_normal = ti.Vector([ti.cast(v_normal[v, a], real) for a in ti.static(range(3))])
-                    i = ti.cast(covering[b, m, 0], ti.i32)
-                    x0 = ti.Vector([covering[b, m, 1 + a] for a in ti.static(range(3))])
+                    k = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
+                    x0 = load_vector3(samples, n)
+                    inv_sigma2 = samples[n, SAMPLE_WEIGHT]
+                else:
+                    scale, nu, share = settings[8], settings[4], x0[0] + 1.0
+                    q = m - M
+                    v = chosen[b, m]
+                    i = ti.cast(covering[b, q, 0], ti.i32)
+                    x0 = ti.Vector([covering[b, q, 1 + a] for a in ti.static(range(3))])
                     if hold == 0:
-                        i, x0 = _nearest_piece(
-                            frames, c, piece_dof, piece_frame, piece_shape, y, y_normal, coverage_cosine, coverage_reach
-                        )
-                        covering[b, m, 0] = ti.cast(i, real)
+                        y = ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
+                        y_normal = ti.Vector([ti.cast(voxels[v, 3 + a], real) for a in ti.static(range(3))])
+                        i, x0 = _nearest_piece(frames, c, pieces, y, y_normal, settings[5], settings[6])
+                        covering[b, q, 0] = ti.cast(i, real)
                         for a in ti.static(range(3)):
-                            covering[b, m, 1 + a] = x0[a]
+                            covering[b, q, 1 + a] = x0[a]
                     if i < 0:
-                        sums[c, 0] += coverage_scale
+                        v = -1
                     else:
-                        k = piece_dof[i]
-                        x = load_rotation(frames, c, k) @ x0 + load_translation(frames, c, k)
-                        _add_residual(
-                            prismatic, parent, twists, direction, sums, b, c, k, x, x - y, y_normal,
-                            tangential * 0.0 + 1.0, piece_inv_sigma2[i], coverage_nu, coverage_scale,
-                        )  # fmt: skip
+                        k = ti.cast(pieces[i, PIECE_DOF], ti.i32)
+                        inv_sigma2 = pieces[i, PIECE_WEIGHT]
+                if v < 0:
+                    sums[c, 0] += scale
+                else:
+                    y = ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
+                    y_normal = ti.Vector([ti.cast(voxels[v, 3 + a], real) for a in ti.static(range(3))])
+                    x = load_rotation(frames, c, k) @ x0 + load_translation(frames, c, k)
+                    if y_normal.norm_sqr() == 0.0:
+                        share = share * 0.0 + 1.0
+                    _add_residual(
+                        prismatic, parent, twists, direction, sums, b, c, k, x, x - y, y_normal, share,
+                        inv_sigma2, nu, scale,
+                    )  # fmt: skip
 
     return objective
+
+
+# The Hessian's task holds D² sums: fewer and longer tasks.
+PAIRS_PER_TASK = 128
+
+
+# The Hessian's task holds D² sums: fewer and longer tasks.
+PAIRS_PER_TASK = 128
 
 
 @functools.cache
@@ -238,53 +241,66 @@ def _linearise_kernel(real):
         point: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
         prismatic: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
         parent: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
-        local: ti.types.ndarray(dtype=real, ndim=2),  # (N, 3)
-        last_dof: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,)
-        piece_dof: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
-        v_position: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 3)
+        samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 9)
+        pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 21)
+        voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 6)
+        settings: ti.types.ndarray(dtype=real, ndim=1),  # (9,)
+        floor: real,
+        want_jacobian: ti.i32,
+        M: ti.i32,
+        Q: ti.i32,
+        chosen: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M + Q,)
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (1, D)
-        chosen: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M,)
-        voxels: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (Q,)
+        frames: ti.types.ndarray(dtype=real, ndim=3),  # (C, D, 12) scratch
+        twists: ti.types.ndarray(dtype=real, ndim=3),  # (C, D, 6) scratch
         assigned: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M,)
         covering: ti.types.ndarray(dtype=real, ndim=2),  # (Q, 4)
-        pairs: ti.i32,  # M, or M + Q
-        frames: ti.types.ndarray(dtype=real, ndim=3),  # (tasks, D, 12) scratch
-        twists: ti.types.ndarray(dtype=real, ndim=3),  # (tasks, D, 6) scratch
         residual: ti.types.ndarray(dtype=real, ndim=2),  # (M + Q, 3) out, metres
-        jacobian: ti.types.ndarray(dtype=real, ndim=3),  # (M + Q, D, 3) out
         partner: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M + Q,) out, the voxel or -1
+        jacobian: ti.types.ndarray(dtype=real, ndim=3),  # (M + Q, D, 3) out if wanted, zeroed by the caller
+        hessian: ti.types.ndarray(dtype=real, ndim=3),  # (C, D, D) out, zeroed by the caller; the lower triangle
     ):
-        for c in range((pairs + POINTS_PER_TASK - 1) // POINTS_PER_TASK):
+        for c in range(hessian.shape[0]):
             forward(axis, point, prismatic, parent, pose, 0, c, frames, twists)
-            for m in range(c * POINTS_PER_TASK, ti.min((c + 1) * POINTS_PER_TASK, pairs)):
-                k = 0
+            for m in range(c * PAIRS_PER_TASK, ti.min((c + 1) * PAIRS_PER_TASK, M + Q)):
+                k_last = 0
                 v = -1
                 x0 = ti.Vector([pose[0, 0] * 0.0, pose[0, 0] * 0.0, pose[0, 0] * 0.0])
-                if m < chosen.shape[0]:
-                    k = last_dof[chosen[m]]
-                    x0 = load_vector3(local, chosen[m])
+                inv_sigma2, nu, scale = x0[0], settings[0], settings[7]
+                if m < M:
+                    n = chosen[m]
+                    k_last = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
+                    x0 = load_vector3(samples, n)
                     v = assigned[m]
+                    inv_sigma2 = samples[n, SAMPLE_WEIGHT]
                 else:
-                    q = m - chosen.shape[0]
-                    i = ti.cast(covering[q, 0], ti.i32)
+                    i = ti.cast(covering[m - M, 0], ti.i32)
                     if i >= 0:
-                        k = piece_dof[i]
-                        v = voxels[q]
-                        x0 = ti.Vector([covering[q, 1 + a] for a in ti.static(range(3))])
+                        k_last = ti.cast(pieces[i, PIECE_DOF], ti.i32)
+                        v = chosen[m]
+                        x0 = ti.Vector([covering[m - M, 1 + a] for a in ti.static(range(3))])
+                        nu, scale = settings[4], settings[8]
+                        inv_sigma2 = pieces[i, PIECE_WEIGHT]
                 partner[m] = v
-                x = load_rotation(frames, c, k) @ x0 + load_translation(frames, c, k)
+                x = load_rotation(frames, c, k_last) @ x0 + load_translation(frames, c, k_last)
                 for a in ti.static(range(3)):
                     residual[m, a] = 0.0
                 if v >= 0:
+                    r = x - ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
                     for a in ti.static(range(3)):
-                        residual[m, a] = x[a] - ti.cast(v_position[v, a], real)
-                    for d in range(jacobian.shape[1]):
-                        for a in ti.static(range(3)):
-                            jacobian[m, d, a] = 0.0
+                        residual[m, a] = r[a]
+                    decay = ti.exp(-0.5 * r.norm_sqr() * inv_sigma2 / nu)
+                    weight = scale * inv_sigma2 / nu * ti.max(decay, floor)
+                    k = k_last
                     while k >= 0:
                         J = point_velocity(prismatic, twists, c, k, x)
-                        for a in ti.static(range(3)):
-                            jacobian[m, k, a] = J[a]
+                        if want_jacobian == 1:
+                            for a in ti.static(range(3)):
+                                jacobian[m, k, a] = J[a]
+                        j = k
+                        while j >= 0:
+                            hessian[c, k, j] += weight * J.dot(point_velocity(prismatic, twists, c, j, x))
+                            j = parent[j]
                         k = parent[k]
 
     return linearise
@@ -365,22 +381,24 @@ class ObjectiveKernel:
         def whole(array: np.ndarray) -> np.ndarray:
             return np.ascontiguousarray(array, np.int32)
 
-        self._body = (
-            real(axis),
-            real(point),
-            whole(prismatic),
-            whole(parent),
-            real(local),
-            real(normal),
-            whole(last_dof),
-            real(1.0 / np.asarray(sigma, np.float64) ** 2),
-            whole(patch),
-            whole(piece_dof),
-            real(np.reshape(piece_frame, (-1, 12))),
-            real(piece_shape),
-            real(1.0 / np.asarray(piece_sigma, np.float64) ** 2),
-        )
+        weight = 1.0 / np.asarray(sigma, np.float64) ** 2
+        piece_weight = 1.0 / np.asarray(piece_sigma, np.float64) ** 2
+        self._weights = weight, piece_weight
+        self._tree = real(axis), real(point), whole(prismatic), whole(parent)
+        self._samples = real(np.column_stack([local, normal, last_dof, patch, weight]))
+        self._pieces = real(np.column_stack([np.reshape(piece_frame, (-1, 12)), piece_shape, piece_dof, piece_weight]))
         self._scratch: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+    def _scratch_of(self, rows: int) -> tuple[np.ndarray, np.ndarray]:
+        if rows not in self._scratch:
+            D = self.degrees
+            self._scratch[rows] = np.empty((rows, D, 12), self.dtype), np.empty((rows, D, 6), self.dtype)
+        return self._scratch[rows]
+
+    def _packed(self, s: ObjectiveSettings, M: int, Q: int) -> np.ndarray:
+        """The settings in the order in which the kernels read them."""
+        values = [s.nu, s.tangential, s.min_cosine, s.reach_m, s.coverage_nu, s.coverage_cosine, s.coverage_reach_m]
+        return np.array([*values, 1.0 / max(M, 1), s.coverage_weight / max(Q, 1)], self.dtype)
 
     def evaluate(
         self,
@@ -409,49 +427,35 @@ class ObjectiveKernel:
         """
         B, D = pose.shape
         M, Q = chosen.shape[1], voxels.shape[1] if settings.coverage_weight > 0 else 0
-        surface_tasks, coverage_tasks = -(-M // POINTS_PER_TASK), -(-Q // POINTS_PER_TASK)
-        rows = B * (surface_tasks + coverage_tasks)
-        if rows not in self._scratch:
-            self._scratch[rows] = np.empty((rows, D, 12), self.dtype), np.empty((rows, D, 6), self.dtype)
-        sums = np.empty((rows, 1 + 2 * D), self.dtype)
+        tasks = -(-(M + Q) // POINTS_PER_TASK)
+        sums = np.empty((B * tasks, 1 + 2 * D), self.dtype)
         if held is None:
             found = Held(np.empty((B, M), np.int32), np.empty((B, max(Q, 1), 4), self.dtype))
         else:
             found = Held(np.array(held.assigned, np.int32), np.array(held.covering, self.dtype))
-        s = settings
         self._kernel(
-            *self._body,
-            index.positions,
-            index.normals,
+            *self._tree,
+            self._samples,
+            self._pieces,
+            index.voxels,
             index.fits,
             index.starts,
-            index.cells,
-            index.origin,
-            index.cell_m,
-            s.nu,
-            s.tangential,
-            s.min_cosine,
-            s.reach_m,
-            s.coverage_nu,
-            s.coverage_cosine,
-            s.coverage_reach_m,
-            1.0 / max(M, 1),
-            s.coverage_weight / max(Q, 1),
+            index.grid,
+            self._packed(settings, M, Q),
             int(held is not None),
-            np.ascontiguousarray(chosen, np.int32),
-            np.ascontiguousarray(voxels, np.int32),
+            M,
+            Q,
+            np.ascontiguousarray(np.concatenate([chosen, voxels[:, :Q]], axis=1), np.int32),
             np.ascontiguousarray(pose, self.dtype),
             np.zeros((B, D), self.dtype) if direction is None else np.ascontiguousarray(direction, self.dtype),
-            surface_tasks,
-            coverage_tasks,
-            *self._scratch[rows],
+            *self._scratch_of(B * tasks),
             found.assigned,
             found.covering,
             sums,
         )
         self.launches += 1
         # the tasks' sums are added in a fixed order: the same input gives the same bits
-        total = sums.reshape(B, surface_tasks + coverage_tasks, -1).sum(axis=1, dtype=np.float64)
+        total = sums.reshape(B, tasks, -1).sum(axis=1, dtype=np.float64)
         return total[:, 0], total[:, 1 : 1 + D], total[:, 1 + D :], found
 
     def linearise(
@@ -462,51 +466,54 @@ class ObjectiveKernel:
         pose: np.ndarray,
         held: Held,
         settings: ObjectiveSettings,
+        floor: float = 0.0,
+        with_jacobian: bool = True,
     ) -> "Linearisation":
-        """Residuals and their Jacobian at one pose, for methods that want more than a gradient.
+        """Residuals, their Jacobian and the Gauss-Newton Hessian at one pose.
 
         Args:
             chosen: (M,) samples; voxels: (Q,) voxels of the coverage term.
             pose: (D,).
             held: assignments of :meth:`evaluate` at this pose, with B = 1.
+            floor: least weight of an outlier in the Hessian.
+            with_jacobian: False leaves the Jacobian out; the Hessian is summed in the kernel either way.
         """
         M, Q = len(chosen), len(voxels) if settings.coverage_weight > 0 else 0
-        tasks = -(-(M + Q) // POINTS_PER_TASK)
+        tasks = max(-(-(M + Q) // PAIRS_PER_TASK), 1)
         D = self.degrees
-        axis, point, prismatic, parent, local, _, last_dof, inv_sigma2, _, piece_dof, _, _, piece_inv_sigma2 = (
-            self._body
-        )
-        residual: np.ndarray = np.zeros((M + Q, 3), self.dtype)
-        jacobian: np.ndarray = np.zeros((M + Q, D, 3), self.dtype)
+        residual = np.zeros((M + Q, 3), self.dtype)
+        jacobian = np.zeros((M + Q if with_jacobian else 1, D, 3), self.dtype)
+        hessian = np.zeros((tasks, D, D), self.dtype)
         partner = np.empty(M + Q, np.int32)
         _linearise_kernel(ti.f64 if self.dtype == np.float64 else ti.f32)(
-            axis,
-            point,
-            prismatic,
-            parent,
-            local,
-            last_dof,
-            piece_dof,
-            index.positions,
+            *self._tree,
+            self._samples,
+            self._pieces,
+            index.voxels,
+            self._packed(settings, M, Q),
+            floor,
+            int(with_jacobian),
+            M,
+            Q,
+            np.ascontiguousarray(np.concatenate([chosen, voxels[:Q]]), np.int32),
             np.ascontiguousarray(pose[None], self.dtype),
-            np.ascontiguousarray(chosen, np.int32),
-            np.ascontiguousarray(voxels, np.int32),
+            *self._scratch_of(tasks),
             np.ascontiguousarray(held.assigned[0], np.int32),
             np.ascontiguousarray(held.covering[0], self.dtype),
-            M + Q,
-            np.empty((tasks, D, 12), self.dtype),
-            np.empty((tasks, D, 6), self.dtype),
             residual,
-            jacobian,
             partner,
+            jacobian,
+            hessian,
         )
         self.launches += 1
-        covering_piece = held.covering[0, :Q, 0].astype(np.int64)
+        lower = hessian.sum(axis=0, dtype=np.float64)
+        weight, piece_weight = self._weights
         return Linearisation(
             residual=residual.astype(np.float64),
             jacobian=jacobian.transpose(0, 2, 1).astype(np.float64),
+            hessian=lower + np.tril(lower, -1).T,
             partner=partner,
-            inv_sigma2=np.concatenate([inv_sigma2[chosen], piece_inv_sigma2[covering_piece]]).astype(np.float64),
+            inv_sigma2=np.concatenate([weight[chosen], piece_weight[held.covering[0, :Q, 0].astype(np.int64)]]),
             nu=np.repeat([settings.nu, settings.coverage_nu], [M, Q]),
             scale=np.repeat([1.0 / max(M, 1), settings.coverage_weight / max(Q, 1)], [M, Q]),
         )
@@ -518,7 +525,8 @@ class Linearisation:
 
     Attributes:
         residual: (K, 3) x − x̄, metres; zero where a pair is missing.
-        jacobian: (K, 3, D) ∂x/∂p.
+        jacobian: (K, 3, D) ∂x/∂p; (1, 3, D) zeros where it was not asked for.
+        hessian: (D, D) Gauss-Newton Hessian of f with tangential = 1, outliers weighing at least the floor asked for.
         partner: (K,) the voxel, -1 where missing.
         inv_sigma2: (K,) 1/σ², 1/m².
         nu: (K,) Leclerc's ν; scale: (K,) the pair's share of f.
@@ -526,6 +534,7 @@ class Linearisation:
 
     residual: np.ndarray
     jacobian: np.ndarray
+    hessian: np.ndarray
     partner: np.ndarray
     inv_sigma2: np.ndarray
     nu: np.ndarray

@@ -147,7 +147,7 @@ def _equations(
 ) -> tuple[Float, Float, Float]:
     """Linear equations of one frame: A (K, 3, G + D), residuals (K, 3), weights (K,)."""
     body = objective.body
-    fit = FrameObjective(objective, index, np.random.default_rng(0)).fit(pose)
+    fit = FrameObjective(objective, index, np.random.default_rng(0), with_jacobian=True).fit(pose)
     M = len(fit.samples)
     Q = len(fit.linear.residual) - M  # none where the coverage term is off
     piece = np.concatenate([body.piece[fit.samples], fit.held.covering[0, :Q, 0].astype(np.int64)])

@@ -182,15 +182,22 @@ class FrameObjective:
         index: the frame's surface voxels.
         rng: where samples are drawn from.
         outliers: least weight of a pair in the Hessian.
+        with_jacobian: whether :meth:`fit` keeps the pairs' Jacobian.
     """
 
     def __init__(
-        self, objective: BodyObjective, index: SurfaceIndex, rng: np.random.Generator, outliers: float = 0.1
+        self,
+        objective: BodyObjective,
+        index: SurfaceIndex,
+        rng: np.random.Generator,
+        outliers: float = 0.1,
+        with_jacobian: bool = False,
     ) -> None:
         self.objective = objective
         self.index = index
         self.rng = rng
         self.outliers = outliers
+        self.with_jacobian = with_jacobian
         self.voxel_count = len(index.positions)
         self.free = objective.chain_free
         self.angular = ~objective.body.skeleton.prismatic
@@ -245,7 +252,7 @@ class FrameObjective:
 
     def curvature(self, pose: Float) -> Float:
         """(D, D) Gauss-Newton Hessian at ``pose`` (D,)."""
-        return self.fit(pose).linear.gauss_newton(self.outliers)
+        return self.fit(pose).linear.hessian
 
     def fit(self, pose: Float) -> Fit:
         """How well ``pose`` (D,) explains the frame, on samples that do not change from call to call."""
@@ -256,7 +263,9 @@ class FrameObjective:
         voxels = np.arange(0, self.voxel_count, max(self.voxel_count // 1000, 1), dtype=np.int32)
         kernel, settings = self.objective.kernel, self.objective.settings
         value, _, _, held = kernel.evaluate(self.index, samples[None], voxels[None], pose[None], None, settings)
-        linear = kernel.linearise(self.index, samples, voxels, pose, held, settings)
+        linear = kernel.linearise(
+            self.index, samples, voxels, pose, held, settings, self.outliers, with_jacobian=self.with_jacobian
+        )
         self._fits[key] = Fit(float(value[0]), linear, held, samples, voxels)
         return self._fits[key]
 
