@@ -102,10 +102,16 @@ class ScheduleConfig:
     max_step_m: float = 0.15
 
     def __post_init__(self) -> None:
-        if self.hypotheses < 1 or not 0 < self.rate <= 2 or min(self.tolerance_deg, self.tolerance_m, self.lever_m) <= 0:
+        positive = ("tolerance_deg", "tolerance_m", "refine", "lever_m", "chain_lever_m", "max_step_deg", "max_step_m")
+        for name in positive:
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"schedule.{name} = {getattr(self, name)} must be positive")
+        for name in ("outliers", "spread_deg", "margin"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"schedule.{name} = {getattr(self, name)} must not be negative")
+        if self.hypotheses < 1 or not 0 < self.rate <= 2:
             raise ConfigError(
-                f"schedule: hypotheses {self.hypotheses} must be at least 1, rate {self.rate} in (0, 2], "
-                "tolerances and lever_m positive"
+                f"schedule: hypotheses {self.hypotheses} must be at least 1 and rate {self.rate} in (0, 2]"
             )
 
 
@@ -150,7 +156,7 @@ def optimise(
     K = len(free)
     owner = np.tile(np.arange(K), config.hypotheses)
     hypotheses = np.repeat(pose[None], K * config.hypotheses, axis=0)
-    noise = rng.normal(scale=np.radians(config.spread_deg), size=hypotheses.shape)
+    noise = rng.normal(scale=np.radians(config.spread_deg), size=hypotheses.shape) * problem.angular
     for row in range(K, len(owner)):
         mine = free[owner[row]]
         hypotheses[row, mine] = previous[mine] if row < 2 * K else pose[mine] + noise[row, mine]
