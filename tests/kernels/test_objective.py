@@ -255,6 +255,24 @@ def test_outliers_weigh_nothing_or_the_floor(kernel):
     np.testing.assert_allclose(linear.gauss_newton(1.0), np.einsum("k,kai,kaj->ij", weight, *[linear.jacobian] * 2))
 
 
+@pytest.mark.parametrize("floor", [0.0, 0.1, 1.0])
+@pytest.mark.parametrize("samples", [20, 300])
+def test_hessian_summed_in_the_kernel(kernel, floor, samples):
+    """One task and several; with the Jacobian and without."""
+    scene = Scene(16, samples=samples)
+    case = replace(BOTH, reach_m=0.06)
+    held = scene.evaluate(kernel, case)[3]
+    pairs = scene.index, scene.chosen[0], scene.voxels[0], scene.pose[0], held, case
+    linear = kernel.linearise(*pairs, floor=floor)
+    assert (linear.partner < 0).any()
+    expected = linear.gauss_newton(floor)
+    np.testing.assert_allclose(linear.hessian, expected, rtol=0, atol=EXACT * np.abs(expected).max())
+    lean = kernel.linearise(*pairs, floor=floor, with_jacobian=False)
+    np.testing.assert_array_equal(lean.hessian, linear.hessian)
+    np.testing.assert_array_equal(lean.residual, linear.residual)
+    assert len(lean.jacobian) == 1
+
+
 def test_nothing_within_reach_is_all_outliers(kernel):
     """ρ = 1 each, no gradient, no curvature."""
     scene = Scene(8)

@@ -229,10 +229,6 @@ def _objective_kernel(real):
 PAIRS_PER_TASK = 128
 
 
-# The Hessian's task holds D² sums: fewer and longer tasks.
-PAIRS_PER_TASK = 128
-
-
 @functools.cache
 def _linearise_kernel(real):
     @ti.kernel
