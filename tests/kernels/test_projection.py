@@ -1,0 +1,53 @@
+"""Projection in Taichi against OpenCV, its derivative against finite differences."""
+
+import numpy as np
+import pytest
+
+from tk.kernels.projection import pack_camera, project_points
+from tk.model.camera import Camera
+
+# double precision, hundreds of pixels
+EXACT_PX = 1e-9
+# central differences with a step of a micrometre, pixels per metre
+DERIVATIVE = 1e-5
+
+
+def camera_of(fisheye: bool, distortions) -> Camera:
+    angle = 0.4
+    rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    matrix = np.array([[510.0, 0, 300], [0, 495.0, 210], [0, 0, 1]])
+    return Camera("c", 640, 480, matrix, np.array(distortions), rotation, np.array([0.1, -0.2, 3.0]), fisheye)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        camera_of(False, [0.0, 0, 0, 0]),
+        camera_of(False, [-0.2, 0.05, 1e-3, -2e-3, 0.01]),
+        camera_of(True, [0.02, -0.01, 3e-3, -1e-3]),
+    ],
+    ids=["pinhole", "brown", "fisheye"],
+)
+def test_projection_is_opencvs(camera):
+    p = np.random.default_rng(3).uniform(-0.9, 0.9, (80, 3))
+    row = pack_camera(camera.matrix, camera.distortions, camera.rotation, camera.translation, camera.fisheye)[None]
+    view = np.zeros(len(p), int)
+    pixels, jacobian, depth = project_points(row, view, p)
+    expected, expected_depth = camera.project(p)
+    assert np.isfinite(expected).all()
+    np.testing.assert_allclose(pixels, expected, rtol=0, atol=EXACT_PX)
+    np.testing.assert_allclose(depth, expected_depth, rtol=0, atol=1e-12)
+    h = 1e-6
+    numeric = [
+        (project_points(row, view, p + h * e)[0] - project_points(row, view, p - h * e)[0]) / (2 * h) for e in np.eye(3)
+    ]
+    np.testing.assert_allclose(jacobian, np.stack(numeric, -1), rtol=0, atol=DERIVATIVE)
+
+
+def test_single_precision_stays_within_a_thousandth_of_a_pixel():
+    camera = camera_of(False, [-0.2, 0.05, 1e-3, -2e-3, 0.01])
+    p = np.random.default_rng(4).uniform(-0.9, 0.9, (80, 3)).astype(np.float32)
+    row = pack_camera(camera.matrix, camera.distortions, camera.rotation, camera.translation, False)[None]
+    pixels, _, _ = project_points(row, np.zeros(len(p), int), p)
+    assert pixels.dtype == np.float32
+    np.testing.assert_allclose(pixels, camera.project(p)[0], rtol=0, atol=1e-3)

@@ -1,0 +1,183 @@
+"""Frusta of elliptical cones and ellipsoids under perspective: occluding contours and viewing rays in closed form.
+
+A part has a frame of its own. ``shape`` is (a, b, h, m): a cone's cross-section at height z = u h, 0 ≤ u ≤ 1, has the
+semi-axes a r and b r with r = 1 + (m - 1) u. An ellipsoid has the semi-axes a, b, h about its origin.
+
+Seen from c, the occluding contour of a cone is two straight generators, those at the angles φ with
+(cₓ/a) cos φ + (c_y/b) sin φ = 1 + (m - 1) c_z / h, and an arc of each rim, between the generators, on the side where
+only one of cap and mantle faces c. With the axes of an ellipsoid scaled to 1 its contour is a circle about c. (The
+silhouette paper, section 4.1, does not say how it finds the contours.)
+
+A curve is one of these pieces; u in [0, 1] runs along it.
+"""
+
+from tk.kernels.runtime import ti
+
+CONE, ELLIPSOID = 0, 1
+# kinds of curves: the two generators, the rims at z = 0 and z = h, the outline of an ellipsoid
+SIDE_A, SIDE_B, END_NEAR, END_FAR, OUTLINE = 0, 1, 2, 3, 4
+
+
+@ti.func
+def curve_of(kind: int, shape, c):
+    """(visible, (q0, q1)) of a curve seen from c, in the part's frame: what :func:`point_on` needs.
+
+    Generators: q0 is the angle. Rims: start angle and span; sides none. Outlines: nothing.
+    """
+    q = ti.Vector([0.0 * shape[0], 0.0 * shape[0]])
+    visible = 1
+    if kind == OUTLINE:
+        s = ti.Vector([c[0] / shape[0], c[1] / shape[1], c[2] / shape[2]])
+        if s.norm_sqr() <= 1.0:
+            visible = 0
+    else:
+        x, y = c[0] / shape[0], c[1] / shape[1]
+        w = 1.0 + (shape[3] - 1.0) * c[2] / shape[2]
+        rho = ti.sqrt(x * x + y * y)
+        middle = ti.atan2(y, x)
+        # the mantle faces c where |φ - middle| < half
+        half = 0.0 * rho
+        if w <= -rho:
+            half = 3.14159265358979 + 0.0 * rho
+        elif w < rho:
+            half = ti.acos(w / rho)
+        whole = ti.abs(w) >= rho
+        if kind == SIDE_A or kind == SIDE_B:
+            q[0] = middle + half
+            if kind == SIDE_B:
+                q[0] = middle - half
+            if whole:
+                visible = 0
+        else:
+            faces = c[2] < 0.0
+            if kind == END_FAR:
+                faces = c[2] > shape[2]
+            # the cap faces c: the arc where the mantle does not; else the arc where it does
+            q[0], q[1] = middle - half, 2.0 * half
+            if faces:
+                q[0], q[1] = middle + half, 2.0 * (3.14159265358979 - half)
+            if q[1] < 1e-6:
+                visible = 0
+    return visible, q
+
+
+@ti.func
+def point_on(kind: int, shape, c, q, u):
+    """Point and tangent (d/du) of a curve at u, in the part's frame."""
+    x = c * 0.0
+    tangent = c * 0.0
+    if kind == OUTLINE:
+        radii = ti.Vector([shape[0], shape[1], shape[2]])
+        s = c / radii
+        k = s.norm()
+        e3 = s / k
+        # a direction across e3: from the coordinate axis that is farthest from it
+        axis = c * 0.0
+        if ti.abs(e3[2]) < 0.7:
+            axis[2] += 1.0
+        else:
+            axis[0] += 1.0
+        e1 = axis.cross(e3).normalized()
+        e2 = e3.cross(e1)
+        r = ti.sqrt(ti.max(1.0 - 1.0 / (k * k), 0.0))
+        angle = 6.28318530717959 * u
+        x = radii * (e3 / k + r * (ti.cos(angle) * e1 + ti.sin(angle) * e2))
+        tangent = 6.28318530717959 * r * radii * (ti.cos(angle) * e2 - ti.sin(angle) * e1)
+    elif kind == SIDE_A or kind == SIDE_B:
+        r = 1.0 + (shape[3] - 1.0) * u
+        X, Y = shape[0] * ti.cos(q[0]), shape[1] * ti.sin(q[0])
+        x = ti.Vector([X * r, Y * r, shape[2] * u])
+        tangent = ti.Vector([X * (shape[3] - 1.0), Y * (shape[3] - 1.0), shape[2]])
+    else:
+        r = 1.0 + 0.0 * u
+        z = 0.0 * u
+        if kind == END_FAR:
+            r = shape[3] + 0.0 * u
+            z = shape[2] + 0.0 * u
+        angle = q[0] + u * q[1]
+        X, Y = shape[0] * r, shape[1] * r
+        x = ti.Vector([X * ti.cos(angle), Y * ti.sin(angle), z])
+        tangent = q[1] * ti.Vector([-X * ti.sin(angle), Y * ti.cos(angle), 0.0 * u])
+    return x, tangent
+
+
+@ti.func
+def unscaled(kind: int, shape, x):
+    """A surface point in coordinates that do not depend on the shape: (x / a r, y / b r, z / h)."""
+    r = 1.0 + 0.0 * shape[0]
+    if kind != OUTLINE:
+        r = 1.0 + (shape[3] - 1.0) * x[2] / shape[2]
+    return ti.Vector([x[0] / (shape[0] * r), x[1] / (shape[1] * r), x[2] / shape[2]])
+
+
+@ti.func
+def interior_point(part_kind: int, shape):
+    """A point well inside a part."""
+    z = 0.0 * shape[2]
+    if part_kind == CONE:
+        z = 0.5 * shape[2]
+    return ti.Vector([0.0 * z, 0.0 * z, z])
+
+
+@ti.func
+def enclosing_radius(part_kind: int, shape):
+    """Radius of a sphere about :func:`interior_point` that holds the part."""
+    wide = ti.max(shape[0], shape[1])
+    result = ti.max(wide, shape[2])
+    if part_kind == CONE:
+        wide *= ti.max(shape[3], 1.0)
+        result = ti.sqrt(wide * wide + 0.25 * shape[2] * shape[2])
+    return result
+
+
+@ti.func
+def enter(part_kind: int, shape, c, d, shrink):
+    """Where the ray c + t d, t > 0, enters a part; -1 where it misses. ``shrink`` scales the cross-section."""
+    result = -1.0 + 0.0 * d[0]
+    middle = interior_point(part_kind, shape) - c
+    reach = enclosing_radius(part_kind, shape)
+    along = middle.dot(d)
+    dd = d.norm_sqr()
+    if along > 0.0 and middle.norm_sqr() * dd - along * along < reach * reach * dd:
+        a, b = shape[0] * shrink, shape[1] * shrink
+        # A t² + 2 B t + C < 0 inside, for lower < t < upper
+        A = (d[0] / a) ** 2 + (d[1] / b) ** 2
+        B = c[0] * d[0] / (a * a) + c[1] * d[1] / (b * b)
+        C = (c[0] / a) ** 2 + (c[1] / b) ** 2
+        lower, upper = 0.0 * dd, 1e9 + 0.0 * dd
+        if part_kind == ELLIPSOID:
+            h = shape[2] * shrink
+            A += (d[2] / h) ** 2
+            B += c[2] * d[2] / (h * h)
+            C += (c[2] / h) ** 2 - 1.0
+        else:
+            g = (shape[3] - 1.0) / shape[2]
+            r0 = 1.0 + g * c[2]
+            A -= (g * d[2]) ** 2
+            B -= g * d[2] * r0
+            C -= r0 * r0
+            if ti.abs(d[2]) > 1e-12:
+                t0, t1 = -c[2] / d[2], (shape[2] - c[2]) / d[2]
+                lower = ti.max(lower, ti.min(t0, t1))
+                upper = ti.min(upper, ti.max(t0, t1))
+            elif c[2] < 0.0 or c[2] > shape[2]:
+                upper = -1.0 + 0.0 * dd
+        if lower < upper:
+            square = B * B - A * C
+            if A > 0.0:
+                if square > 0.0:
+                    root = ti.sqrt(square)
+                    first = ti.max(lower, (-B - root) / A)
+                    if first < ti.min(upper, (-B + root) / A):
+                        result = first
+            elif square <= 0.0:
+                result = lower
+            else:
+                # the ray crosses both nappes: inside before the smaller and after the greater root
+                root = ti.sqrt(square)
+                small, great = (-B + root) / ti.min(A, -1e-30), (-B - root) / ti.min(A, -1e-30)
+                if lower < small:
+                    result = lower
+                elif ti.max(lower, great) < upper:
+                    result = ti.max(lower, great)
+    return result

@@ -1,0 +1,140 @@
+"""Perspective projection with lens distortion and its derivative, as a Taichi function: OpenCV's two models.
+
+A camera is a row of 22 numbers: rotation (9, row by row, world to camera), translation (3, metres), fx, fy, cx, cy
+(pixels), five distortion coefficients, and 1 for the fisheye model or 0. Like OpenCV, skew is ignored.
+"""
+
+import functools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.kernels.runtime import ensure_runtime, ti
+
+CAMERA_NUMBERS = 22
+
+
+def pack_camera(
+    matrix: NDArray[np.float64],
+    distortions: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+    translation: NDArray[np.float64],
+    fisheye: bool,
+) -> NDArray[np.float64]:
+    """(22,) the row of one camera.
+
+    Args:
+        matrix: (3, 3) intrinsic matrix, pixels.
+        distortions: (4,) or (5,) k1 k2 p1 p2 [k3]; (4,) k1…k4 when ``fisheye``.
+        rotation, translation: (3, 3), (3,) from world to camera, metres.
+        fisheye: OpenCV's equidistant model.
+    """
+    row = np.zeros(CAMERA_NUMBERS)
+    row[:9] = rotation.ravel()
+    row[9:12] = translation
+    row[12:16] = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+    row[16 : 16 + len(distortions)] = distortions
+    row[21] = float(fisheye)
+    return row
+
+
+@ti.func
+def camera_center(camera: ti.template(), v: int):
+    """(3,) centre of projection of camera v, world frame."""
+    R = ti.Matrix([[camera[v, 3 * i + j] for j in ti.static(range(3))] for i in ti.static(range(3))])
+    t = ti.Vector([camera[v, 9 + i] for i in ti.static(range(3))])
+    return -(R.transpose() @ t)
+
+
+@ti.func
+def project(camera: ti.template(), v: int, x):
+    """Pixel (2,), its derivative (2, 3) by the world point, and the depth. Behind the camera only the depth is valid."""
+    R = ti.Matrix([[camera[v, 3 * i + j] for j in ti.static(range(3))] for i in ti.static(range(3))])
+    t = ti.Vector([camera[v, 9 + i] for i in ti.static(range(3))])
+    p = R @ x + t
+    z = p[2]
+    inverse = 1.0 / z
+    a, b = p[0] * inverse, p[1] * inverse
+    r2 = a * a + b * b
+    k = ti.Vector([camera[v, 16 + i] for i in ti.static(range(5))])
+    # the distorted point and the symmetric derivative ((D00, D01), (D01, D11)) of the distortion
+    xd, yd = a, b
+    D00, D01, D11 = 1.0 + 0.0 * a, 0.0 * a, 1.0 + 0.0 * a
+    if camera[v, 21] == 0.0:
+        radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+        slope = 2.0 * (k[0] + r2 * (2.0 * k[1] + 3.0 * r2 * k[4]))
+        xd = a * radial + 2.0 * k[2] * a * b + k[3] * (r2 + 2.0 * a * a)
+        yd = b * radial + k[2] * (r2 + 2.0 * b * b) + 2.0 * k[3] * a * b
+        D00 = radial + a * a * slope + 2.0 * k[2] * b + 6.0 * k[3] * a
+        D01 = a * b * slope + 2.0 * k[2] * a + 2.0 * k[3] * b
+        D11 = radial + b * b * slope + 6.0 * k[2] * b + 2.0 * k[3] * a
+    elif r2 > 1e-12:
+        r = ti.sqrt(r2)
+        angle = ti.atan2(r, 1.0 + 0.0 * r)
+        q = angle * angle
+        bent = angle * (1.0 + q * (k[0] + q * (k[1] + q * (k[2] + q * k[3]))))
+        rate = 1.0 + q * (3.0 * k[0] + q * (5.0 * k[1] + q * (7.0 * k[2] + 9.0 * q * k[3])))
+        scale = bent / r
+        slope = (rate / (1.0 + r2) - scale) / r2
+        xd, yd = a * scale, b * scale
+        D00, D01, D11 = scale + a * a * slope, a * b * slope, scale + b * b * slope
+    fx, fy = camera[v, 12], camera[v, 13]
+    pixel = ti.Vector([fx * xd + camera[v, 14], fy * yd + camera[v, 15]])
+    J = ti.Matrix(
+        [
+            [fx * D00 * inverse, fx * D01 * inverse, -fx * (D00 * a + D01 * b) * inverse],
+            [fy * D01 * inverse, fy * D11 * inverse, -fy * (D01 * a + D11 * b) * inverse],
+        ]
+    )
+    return pixel, J @ R, z
+
+
+@functools.cache
+def _project_kernel(real):
+    @ti.kernel
+    def kernel(
+        camera: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
+        view: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,)
+        world: ti.types.ndarray(dtype=real, ndim=2),  # (N, 3)
+        pixels: ti.types.ndarray(dtype=real, ndim=2),  # (N, 2) out
+        jacobian: ti.types.ndarray(dtype=real, ndim=3),  # (N, 2, 3) out
+        depth: ti.types.ndarray(dtype=real, ndim=1),  # (N,) out
+    ):
+        for n in range(world.shape[0]):
+            x = ti.Vector([world[n, i] for i in ti.static(range(3))])
+            pixel, J, z = project(camera, view[n], x)
+            depth[n] = z
+            for i in ti.static(range(2)):
+                pixels[n, i] = pixel[i]
+                for j in ti.static(range(3)):
+                    jacobian[n, i, j] = J[i, j]
+
+    return kernel
+
+
+def project_points(
+    cameras: np.ndarray, view: np.ndarray, p_world: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Project points, each by a camera of its own.
+
+    Args:
+        cameras: (V, 22) rows of :func:`pack_camera`.
+        view: (N,) which camera.
+        p_world: (N, 3) metres, float32 or float64: the precision of the computation.
+
+    Returns:
+        pixels (N, 2), their derivatives (N, 2, 3) by the world points, depth (N,) in metres.
+    """
+    ensure_runtime()
+    dtype = p_world.dtype
+    N = len(p_world)
+    pixels, jacobian, depth = np.empty((N, 2), dtype), np.empty((N, 2, 3), dtype), np.empty(N, dtype)
+    _project_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
+        np.ascontiguousarray(cameras, dtype),
+        np.ascontiguousarray(view, np.int32),
+        np.ascontiguousarray(p_world),
+        pixels,
+        jacobian,
+        depth,
+    )
+    return pixels, jacobian, depth

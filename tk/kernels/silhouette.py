@@ -1,0 +1,630 @@
+"""Occluding contours of a cone body against silhouettes: search along normals, normal equations, overlap.
+
+The silhouette paper, sections 4.1, 4.3 and 4.4. A sample of a contour looks for the silhouette along its normal, in one
+direction: outwards where it lies in the mask, inwards where it does not, so that only foreground-to-background
+transitions are found. Each found edgel adds a row n·Jπ·∂x/∂θ = d to the equations. The paper adds two rows, dx and dy,
+which also hold a contour back along itself, where an edgel says nothing; :attr:`SearchSettings.tangential` weighs that
+second row, 0 leaves it out.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ConfigError
+from tk.kernels.cones import (
+    ELLIPSOID,
+    OUTLINE,
+    SIDE_A,
+    SIDE_B,
+    curve_of,
+    enter,
+    interior_point,
+    point_on,
+    unscaled,
+)
+from tk.kernels.kinematics import forward, load_rotation, load_translation, load_vector3, point_velocity
+from tk.kernels.projection import camera_center, project
+from tk.kernels.runtime import ensure_runtime, ti
+
+# Degrees of freedom above a part: the trunk's six and at most four of a limb.
+LONGEST_CHAIN = 10
+# Chords that stand for a curve when its length is measured and when edgels are compared with it.
+CHORDS = 12
+# A sample must lie this far inside another part's cross-section to be hidden by it: neighbours that share a joint touch.
+HIDING_SHRINK = 0.95
+# Nearer than this to a camera nothing is projected, metres.
+NEAREST_M = 0.1
+# Columns of a task's sums: cost, weight of the edgels found, weight of all samples, gradient, upper triangle of JᵀWJ.
+_SUMS = 3 + LONGEST_CHAIN + LONGEST_CHAIN * (LONGEST_CHAIN + 1) // 2
+# Columns of an exported sample: see Edgels.
+_EXPORT = 12
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How the silhouette is searched.
+
+    Attributes:
+        window_px: how far along the normal, in pixels of the scale (the paper: typically 8).
+        spacing_px: distance between samples, in pixels of the scale (the paper: typically every pixel).
+        most_samples: of a curve; longer ones are sampled more coarsely, with more weight each.
+        ambiguous_px: an edgel nearer than this, in pixels of the scale, to a model edge of another limb is shared with
+            it (4.4); 0 gives every edgel its full weight. The paper does not say how near; its window is meant here.
+        tangential: weight of the row along the contour (1: the paper's dx and dy; 0: the distance along the normal).
+        robust_px: scale of the Geman-McClure weights (1 + (d/s)²)⁻², in pixels of the full picture; 0: least squares.
+        lost_px: what a sample costs, as a distance, that finds no edge. Only poses are compared by it.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+
+    window_px: float = 8.0
+    spacing_px: float = 2.0
+    most_samples: int = 64
+    ambiguous_px: float = 8.0
+    tangential: float = 0.0
+    robust_px: float = 0.0
+    lost_px: float = 16.0
+
+    def __post_init__(self) -> None:
+        for name, value, valid, expected in (
+            ("window_px", self.window_px, 1 <= self.window_px <= 64, "in [1, 64]"),
+            ("spacing_px", self.spacing_px, 0.25 <= self.spacing_px <= 32, "in [0.25, 32]"),
+            ("most_samples", self.most_samples, 2 <= self.most_samples <= 1024, "in [2, 1024]"),
+            ("ambiguous_px", self.ambiguous_px, 0 <= self.ambiguous_px <= 64, "in [0, 64]"),
+            ("tangential", self.tangential, 0 <= self.tangential <= 1, "in [0, 1]"),
+            ("robust_px", self.robust_px, 0 <= self.robust_px <= 1000, "in [0, 1000]"),
+            ("lost_px", self.lost_px, 0 <= self.lost_px <= 1000, "in [0, 1000]"),
+        ):
+            if not valid:
+                raise ConfigError(f"silhouette search: {name} = {value} must lie {expected}")
+
+
+class ConeArrays(NamedTuple):
+    """A cone body as plain arrays (D degrees of freedom, P parts, Q curves), all of one real type.
+
+    Attributes:
+        axis, point: (D, 3) twists in the zero configuration.
+        prismatic, parent: (D,) int32.
+        part_kind: (P,) int32, CONE or ELLIPSOID.
+        part_shape: (P, 4) a, b, h, m.
+        part_frame: (P, 12) 3×4 transform from the part to the zero configuration.
+        part_dof: (P,) int32 the last degree of freedom above each part.
+        part_limb: (P,) int32 parts of one limb never make each other's edges ambiguous.
+        chain: (P, LONGEST_CHAIN) int32 the degrees of freedom above each part, -1 behind the last.
+        curve_part, curve_kind: (Q,) int32.
+    """
+
+    axis: NDArray
+    point: NDArray
+    prismatic: NDArray[np.int32]
+    parent: NDArray[np.int32]
+    part_kind: NDArray[np.int32]
+    part_shape: NDArray
+    part_frame: NDArray
+    part_dof: NDArray[np.int32]
+    part_limb: NDArray[np.int32]
+    chain: NDArray[np.int32]
+    curve_part: NDArray[np.int32]
+    curve_kind: NDArray[np.int32]
+
+
+class NormalEquations(NamedTuple):
+    """What the edgels of B poses add up to, distances in pixels of the full picture.
+
+    Attributes:
+        hessian: (B, D, D) JᵀWJ.
+        gradient: (B, D) JᵀWd: the step solves ``hessian @ step = gradient``.
+        cost: (B,) weighted mean square distance, samples without an edge counted as ``lost_px``; inf without samples.
+        found: (B,) weight of the samples that found an edge, as a share of all.
+    """
+
+    hessian: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    cost: NDArray[np.float64]
+    found: NDArray[np.float64]
+
+
+class Edgels(NamedTuple):
+    """The samples of one pose that found an edge (N of them).
+
+    Attributes:
+        view, part: (N,) camera and part.
+        unscaled: (N, 3) the contour point as (x / a r, y / b r, z / h) in the part's frame.
+        distance: (N,) signed distance to the edgel, pixels, positive outwards.
+        weight: (N,) of the edgel.
+        row: (N, 3) derivative of the contour's position along its normal by the point's world coordinates, pixels per
+            metre.
+        pixel: (N, 2) of the sample.
+    """
+
+    view: NDArray[np.int32]
+    part: NDArray[np.int32]
+    unscaled: NDArray[np.float64]
+    distance: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    row: NDArray[np.float64]
+    pixel: NDArray[np.float64]
+
+
+@ti.func
+def _bilinear(mask: ti.template(), v: int, width: int, height: int, x):
+    """Mask value, 0 to 255, at a place inside the picture."""
+    i = ti.min(ti.max(ti.cast(ti.floor(x[0]), ti.i32), 0), width - 2)
+    j = ti.min(ti.max(ti.cast(ti.floor(x[1]), ti.i32), 0), height - 2)
+    s, t = x[0] - i, x[1] - j
+    top = (1.0 - s) * mask[v, j, i] + s * mask[v, j, i + 1]
+    low = (1.0 - s) * mask[v, j + 1, i] + s * mask[v, j + 1, i + 1]
+    return (1.0 - t) * top + t * low
+
+
+@ti.func
+def _in_picture(width: int, height: int, x):
+    return x[0] >= 0.0 and x[1] >= 0.0 and x[0] <= width - 1.0 and x[1] <= height - 1.0
+
+
+@ti.func
+def _search(mask: ti.template(), v: int, width: int, height: int, x, n, window):
+    """(found, signed distance) of the transition along ±n: outwards from the foreground, inwards from the background."""
+    inside = _bilinear(mask, v, width, height, x) >= 127.5
+    way = 1.0 + 0.0 * window
+    if not inside:
+        way = -way
+    found = 0
+    distance = 0.0 * window
+    before = _bilinear(mask, v, width, height, x)
+    step = 1
+    while step <= window and found == 0:
+        place = x + way * step * n
+        if not _in_picture(width, height, place):
+            step = 1 << 20
+        else:
+            value = _bilinear(mask, v, width, height, place)
+            if (value >= 127.5) != inside:
+                found = 1
+                distance = way * (step - 1.0 + (before - 127.5) / (before - value))
+            before = value
+            step += 1
+    return found, distance
+
+
+@ti.func
+def _to_segment(e, a, b):
+    """Squared distance of e from the segment a b."""
+    ab = b - a
+    t = ti.min(ti.max((e - a).dot(ab) / ti.max(ab.norm_sqr(), 1e-12), 0.0), 1.0)
+    return (e - a - t * ab).norm_sqr()
+
+
+@ti.func
+def _shape(part_shape: ti.template(), p: int):
+    return ti.Vector([part_shape[p, i] for i in ti.static(range(4))])
+
+
+@ti.func
+def _place_part(frames: ti.template(), part_dof: ti.template(), part_frame: ti.template(), b: int, p: int):
+    """Rotation and translation from part p to the world at pose b."""
+    R0 = ti.Matrix([[part_frame[p, 4 * i + j] for j in ti.static(range(3))] for i in ti.static(range(3))])
+    t0 = ti.Vector([part_frame[p, 4 * i + 3] for i in ti.static(range(3))])
+    R = load_rotation(frames, b, part_dof[p])
+    return R @ R0, R @ t0 + load_translation(frames, b, part_dof[p])
+
+
+@ti.func
+def _keep(placed: ti.template(), b: int, p: int, R, t):
+    for i in ti.static(range(3)):
+        for j in ti.static(range(3)):
+            placed[b, p, 4 * i + j] = R[i, j]
+        placed[b, p, 4 * i + 3] = t[i]
+
+
+@functools.cache
+def _equations_kernel(real):
+    @ti.kernel
+    def kernel(
+        # the body
+        axis: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
+        point: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
+        prismatic: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
+        parent: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
+        part_kind: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
+        part_shape: ti.types.ndarray(dtype=real, ndim=2),  # (P, 4)
+        part_frame: ti.types.ndarray(dtype=real, ndim=2),  # (P, 12)
+        part_dof: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
+        part_limb: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
+        chain: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (P, L)
+        curve_part: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (Q,)
+        curve_kind: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (Q,)
+        # the frame
+        camera: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
+        size: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (V, 2) width, height at this scale
+        mask: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (V, H, W) at this scale
+        scale: real,  # pixels of the full picture in one of this scale
+        # settings
+        window: real,
+        spacing: real,
+        most_samples: ti.i32,
+        ambiguous: real,
+        tangential: real,
+        robust: real,
+        lost: real,
+        export: ti.i32,
+        # the poses
+        pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
+        frames: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 12) scratch
+        twists: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 6) scratch
+        placed: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 12) scratch, parts to world
+        lines: ti.types.ndarray(dtype=real, ndim=3),  # (B V Q, CHORDS + 1, 2) scratch, pixels of the full picture
+        facts: ti.types.ndarray(dtype=real, ndim=2),  # (B V Q, 5) scratch: visible, q0, q1, length, outward sign
+        row: ti.types.ndarray(dtype=real, ndim=3),  # (B V Q, 2, L) scratch
+        sums: ti.types.ndarray(dtype=real, ndim=2),  # (B V Q, _SUMS) scratch
+        samples: ti.types.ndarray(dtype=real, ndim=3),  # (V Q, most_samples, _EXPORT) out, if export
+        total: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (B, 3 + D + D D) out
+    ):
+        B, V, Q = pose.shape[0], camera.shape[0], curve_part.shape[0]
+        P, D = part_dof.shape[0], axis.shape[0]
+
+        for b in range(B):
+            forward(axis, point, prismatic, parent, pose, b, b, frames, twists)
+            for p in range(P):
+                R, t = _place_part(frames, part_dof, part_frame, b, p)
+                _keep(placed, b, p, R, t)
+
+        for c in range(B * V * Q):
+            b, v, q = c // (V * Q), (c // Q) % V, c % Q
+            p, kind = curve_part[q], curve_kind[q]
+            shape = _shape(part_shape, p)
+            R, t = load_rotation(placed, b, p), load_translation(placed, b, p)
+            center = R.transpose() @ (camera_center(camera, v) - t)
+            visible, params = curve_of(kind, shape, center)
+            chords = CHORDS
+            if kind == SIDE_A or kind == SIDE_B:
+                chords = 1
+            length = 0.0 * shape[0]
+            sign = 0.0 * shape[0]
+            last = ti.Vector([0.0 * length, 0.0 * length])
+            for i in range(chords + 1):
+                if visible == 1:
+                    x, tangent = point_on(kind, shape, center, params, ti.cast(i, real) / chords)
+                    pixel, J, z = project(camera, v, R @ x + t)
+                    if z < NEAREST_M:
+                        visible = 0
+                    if i > 0:
+                        length += (pixel - last).norm()
+                    if i == 0:
+                        # the plane of viewing ray and tangent, turned away from the part's inside
+                        n = tangent.cross(x - center)
+                        if n.dot(interior_point(part_kind[p], shape) - x) > 0.0:
+                            n = -n
+                        along, out = J @ (R @ tangent), J @ (R @ n)
+                        sign = 1.0 + 0.0 * length
+                        if along[1] * out[0] - along[0] * out[1] < 0.0:
+                            sign = -sign
+                    last = pixel
+                    lines[c, i, 0], lines[c, i, 1] = pixel[0], pixel[1]
+            facts[c, 0] = visible
+            facts[c, 1], facts[c, 2], facts[c, 3], facts[c, 4] = params[0], params[1], length, sign
+
+        for c in range(B * V * Q):
+            b, v, q = c // (V * Q), (c // Q) % V, c % Q
+            p, kind = curve_part[q], curve_kind[q]
+            for i in range(sums.shape[1]):
+                sums[c, i] = 0.0
+            if export == 1:
+                for i in range(most_samples):
+                    samples[c, i, 0] = 0.0
+            if facts[c, 0] > 0.0:
+                shape = _shape(part_shape, p)
+                R, t = load_rotation(placed, b, p), load_translation(placed, b, p)
+                eye = camera_center(camera, v)
+                center = R.transpose() @ (eye - t)
+                params = ti.Vector([facts[c, 1], facts[c, 2]])
+                length, sign = facts[c, 3], facts[c, 4]
+                width, height = size[v, 0], size[v, 1]
+                wanted = ti.cast(ti.ceil(length / (spacing * scale)), ti.i32)
+                count = ti.min(ti.max(wanted, 1), most_samples)
+                share = length / count
+                for i in range(count):
+                    x_part, tangent = point_on(kind, shape, center, params, (i + 0.5 + 0.0 * scale) / count)
+                    x = R @ x_part + t
+                    pixel, J, _ = project(camera, v, x)
+                    along = J @ (R @ tangent)
+                    norm = along.norm()
+                    n = ti.Vector([along[1], -along[0]]) * (sign / ti.max(norm, 1e-9))
+                    at = (pixel + 0.5) / scale - 0.5
+                    use = norm > 1e-6 and _in_picture(width, height, at)
+                    if use:
+                        ray = x - eye
+                        for o in range(P):
+                            if use and o != p:
+                                Ro = load_rotation(placed, b, o)
+                                co = Ro.transpose() @ (eye - load_translation(placed, b, o))
+                                # within another part's outline: before it or behind it, no silhouette edge is expected
+                                if (
+                                    enter(part_kind[o], _shape(part_shape, o), co, Ro.transpose() @ ray, HIDING_SHRINK)
+                                    > 0.0
+                                ):
+                                    use = False
+                    if use:
+                        found, d = _search(mask, v, width, height, at, n, window)
+                        d *= scale
+                        weight = share
+                        if found == 0:
+                            sums[c, 0] += share * lost * lost
+                            sums[c, 2] += share
+                        else:
+                            if ambiguous > 0.0:
+                                edgel = pixel + d * n
+                                nearest = (ambiguous * scale) ** 2
+                                near = False
+                                for q2 in range(Q):
+                                    c2 = c - q + q2
+                                    if part_limb[curve_part[q2]] != part_limb[p] and facts[c2, 0] > 0.0:
+                                        chords = CHORDS
+                                        if curve_kind[q2] == SIDE_A or curve_kind[q2] == SIDE_B:
+                                            chords = 1
+                                        for s in range(chords):
+                                            e0 = ti.Vector([lines[c2, s, 0], lines[c2, s, 1]])
+                                            e1 = ti.Vector([lines[c2, s + 1, 0], lines[c2, s + 1, 1]])
+                                            # an edge that faces the other way has its foreground on the other side
+                                            facing = ti.Vector([e1[1] - e0[1], e0[0] - e1[0]]).dot(n) * facts[c2, 4]
+                                            if facing > 0.0:
+                                                square = _to_segment(edgel, e0, e1)
+                                                if square < nearest:
+                                                    nearest = square
+                                                    near = True
+                                if near:
+                                    other = ti.sqrt(nearest)
+                                    weight *= 0.5 * other / ti.max(other + ti.abs(d), 1e-6)
+                            if robust > 0.0:
+                                weight *= 1.0 / (1.0 + (d / robust) ** 2) ** 2
+                            sums[c, 0] += share * ti.min(d * d, lost * lost)
+                            sums[c, 1] += share
+                            sums[c, 2] += share
+                            g = J.transpose() @ n
+                            h = J.transpose() @ ti.Vector([-n[1], n[0]])
+                            L = 0
+                            while L < LONGEST_CHAIN and chain[p, L] >= 0:
+                                velocity = point_velocity(prismatic, twists, b, chain[p, L], x)
+                                row[c, 0, L] = g.dot(velocity)
+                                row[c, 1, L] = h.dot(velocity)
+                                L += 1
+                            at_sum = 3 + LONGEST_CHAIN
+                            for k in range(L):
+                                sums[c, 3 + k] += weight * d * row[c, 0, k]
+                                for m in range(k, L):
+                                    sums[c, at_sum] += weight * row[c, 0, k] * row[c, 0, m]
+                                    if tangential > 0.0:
+                                        sums[c, at_sum] += weight * tangential * row[c, 1, k] * row[c, 1, m]
+                                    at_sum += 1
+                            if export == 1:
+                                s = unscaled(kind, shape, x_part)
+                                samples[c, i, 0] = 1.0
+                                samples[c, i, 1] = d
+                                samples[c, i, 2] = weight
+                                for a in ti.static(range(3)):
+                                    samples[c, i, 3 + a] = s[a]
+                                    samples[c, i, 6 + a] = g[a]
+                                samples[c, i, 9], samples[c, i, 10] = pixel[0], pixel[1]
+
+        # in a fixed order: the same sums every time
+        for b in range(B):
+            for i in range(total.shape[1]):
+                total[b, i] = 0.0
+            for j in range(V * Q):
+                c = b * V * Q + j
+                if sums[c, 2] > 0.0:
+                    p = curve_part[j % Q]
+                    for i in ti.static(range(3)):
+                        total[b, i] += sums[c, i]
+                    L = 0
+                    while L < LONGEST_CHAIN and chain[p, L] >= 0:
+                        L += 1
+                    at_sum = 3 + LONGEST_CHAIN
+                    for k in range(L):
+                        total[b, 3 + chain[p, k]] += sums[c, 3 + k]
+                        for m in range(k, L):
+                            r, s = chain[p, k], chain[p, m]
+                            total[b, 3 + D + r * D + s] += sums[c, at_sum]
+                            if r != s:
+                                total[b, 3 + D + s * D + r] += sums[c, at_sum]
+                            at_sum += 1
+
+    return kernel
+
+
+def _launch(body, cameras, sizes, masks, scale, poses, settings, export):  # type: ignore[no-untyped-def]
+    ensure_runtime()
+    dtype = body.axis.dtype
+    poses = np.ascontiguousarray(poses, dtype)
+    B, D = poses.shape
+    V, Q, P = len(cameras), len(body.curve_part), len(body.part_kind)
+    tasks = B * V * Q
+    total = np.empty((B, 3 + D + D * D))
+    samples = np.zeros((tasks, settings.most_samples, _EXPORT) if export else (1, 1, _EXPORT), dtype)
+    _equations_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
+        *body,
+        np.ascontiguousarray(cameras, dtype),
+        np.ascontiguousarray(sizes, np.int32),
+        np.ascontiguousarray(masks),
+        float(scale),
+        settings.window_px,
+        settings.spacing_px,
+        settings.most_samples,
+        settings.ambiguous_px,
+        settings.tangential,
+        settings.robust_px,
+        settings.lost_px,
+        int(export),
+        poses,
+        np.empty((B, D, 12), dtype),
+        np.empty((B, D, 6), dtype),
+        np.empty((B, P, 12), dtype),
+        np.empty((tasks, CHORDS + 1, 2), dtype),
+        np.empty((tasks, 5), dtype),
+        np.empty((tasks, 2, LONGEST_CHAIN), dtype),
+        np.empty((tasks, _SUMS), dtype),
+        samples,
+        total,
+    )
+    return total, samples
+
+
+def normal_equations(
+    body: ConeArrays,
+    cameras: np.ndarray,
+    sizes: np.ndarray,
+    masks: np.ndarray,
+    scale: float,
+    poses: np.ndarray,
+    settings: SearchSettings,
+) -> NormalEquations:
+    """Search the silhouettes from B poses and add up the equations (eqs. 9-11 of the silhouette paper).
+
+    Args:
+        body: the cone body; its real type is the precision of the computation.
+        cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_camera`, of the full picture.
+        sizes: (V, 2) width and height of each camera's mask at this scale.
+        masks: (V, H, W) uint8 at this scale; values between 0 and 255 where a pixel is partly covered.
+        scale: pixels of the full picture in one of this scale (1, 2, …).
+        poses: (B, D).
+        settings: see :class:`SearchSettings`.
+    """
+    total, _ = _launch(body, cameras, sizes, masks, scale, poses, settings, False)
+    B, D = poses.shape
+    weight = total[:, 2]
+    seen = weight > 0
+    safe = np.where(seen, weight, 1.0)
+    return NormalEquations(
+        hessian=total[:, 3 + D :].reshape(B, D, D),
+        gradient=total[:, 3 : 3 + D],
+        cost=np.where(seen, total[:, 0] / safe, np.inf),
+        found=np.where(seen, total[:, 1] / safe, 0.0),
+    )
+
+
+def find_edgels(
+    body: ConeArrays,
+    cameras: np.ndarray,
+    sizes: np.ndarray,
+    masks: np.ndarray,
+    scale: float,
+    pose: np.ndarray,
+    settings: SearchSettings,
+) -> Edgels:
+    """The edgels that one pose (D,) finds; arguments as for :func:`normal_equations`."""
+    _, samples = _launch(body, cameras, sizes, masks, scale, pose[None], settings, True)
+    Q = len(body.curve_part)
+    task, index = np.nonzero(samples[:, :, 0])
+    chosen = samples[task, index].astype(np.float64)
+    return Edgels(
+        view=(task // Q).astype(np.int32),
+        part=body.curve_part[task % Q],
+        unscaled=chosen[:, 3:6],
+        distance=chosen[:, 1],
+        weight=chosen[:, 2],
+        row=chosen[:, 6:9],
+        pixel=chosen[:, 9:11],
+    )
+
+
+@functools.cache
+def _overlap_kernel(real):
+    @ti.kernel
+    def kernel(
+        axis: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
+        point: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
+        prismatic: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
+        parent: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
+        part_kind: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
+        part_shape: ti.types.ndarray(dtype=real, ndim=2),  # (P, 4)
+        part_frame: ti.types.ndarray(dtype=real, ndim=2),  # (P, 12)
+        part_dof: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
+        centers: ti.types.ndarray(dtype=real, ndim=2),  # (V, 3)
+        rays: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (V, H, W, 3) world; zero outside the picture
+        mask: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (V, H, W)
+        draw: ti.i32,
+        pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
+        frames: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 12) scratch
+        twists: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 6) scratch
+        placed: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 12) scratch
+        counts: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B V H, 2) out: model without mask, mask without model
+        picture: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (B, V, H, W) out, if draw
+    ):
+        B, V, H, W = pose.shape[0], rays.shape[0], rays.shape[1], rays.shape[2]
+        for b in range(B):
+            forward(axis, point, prismatic, parent, pose, b, b, frames, twists)
+            for p in range(part_dof.shape[0]):
+                R, t = _place_part(frames, part_dof, part_frame, b, p)
+                _keep(placed, b, p, R, t)
+        for c in range(B * V * H):
+            b, v, j = c // (V * H), (c // H) % V, c % H
+            eye = load_vector3(centers, v)
+            more, less = 0, 0
+            for i in range(W):
+                ray = ti.Vector([ti.cast(rays[v, j, i, a], real) for a in ti.static(range(3))])
+                hit = False
+                if ray.norm_sqr() > 0.0:
+                    for p in range(part_dof.shape[0]):
+                        if not hit:
+                            R = load_rotation(placed, b, p)
+                            local = R.transpose() @ (eye - load_translation(placed, b, p))
+                            hit = enter(part_kind[p], _shape(part_shape, p), local, R.transpose() @ ray, 1.0) > 0.0
+                if hit and mask[v, j, i] < 128:
+                    more += 1
+                if not hit and mask[v, j, i] >= 128:
+                    less += 1
+                if draw == 1:
+                    picture[b, v, j, i] = ti.cast(ti.select(hit, 255, 0), ti.u8)
+            counts[c, 0], counts[c, 1] = more, less
+
+    return kernel
+
+
+def overlap(
+    body: ConeArrays,
+    centers: np.ndarray,
+    rays: np.ndarray,
+    masks: np.ndarray,
+    poses: np.ndarray,
+    draw: bool = False,
+) -> tuple[NDArray[np.int64], NDArray[np.uint8] | None]:
+    """Cast a ray through every pixel: the silhouettes of B poses against masks.
+
+    Args:
+        body: the cone body.
+        centers: (V, 3) the cameras' centres, metres.
+        rays: (V, H, W, 3) float32 viewing directions, world frame; zero where a camera has no pixel.
+        masks: (V, H, W) uint8.
+        poses: (B, D).
+        draw: whether the silhouettes are wanted.
+
+    Returns:
+        counts (B, V, 2) of pixels in the model but not the mask, and in the mask but not the model; silhouettes
+        (B, V, H, W) uint8, 0 or 255, or None.
+    """
+    ensure_runtime()
+    dtype = body.axis.dtype
+    poses = np.ascontiguousarray(poses, dtype)
+    B, D = poses.shape
+    V, H, W = rays.shape[:3]
+    counts = np.empty((B * V * H, 2), np.int32)
+    picture = np.empty((B, V, H, W) if draw else (1, 1, 1, 1), np.uint8)
+    _overlap_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
+        *body[:8],
+        np.ascontiguousarray(centers, dtype),
+        np.ascontiguousarray(rays, np.float32),
+        np.ascontiguousarray(masks),
+        int(draw),
+        poses,
+        np.empty((B, D, 12), dtype),
+        np.empty((B, D, 6), dtype),
+        np.empty((B, len(body.part_kind), 12), dtype),
+        counts,
+        picture,
+    )
+    return counts.reshape(B, V, H, 2).sum(axis=2, dtype=np.int64), picture if draw else None

@@ -1,0 +1,247 @@
+"""The body of elliptical cone frusta and an ellipsoid head, on the skeleton (silhouette paper, section 3).
+
+The paper prints no sizes; :func:`build_cone_body` lays the parts out from
+:class:`~tk.model.anthropometry.BodyDimensions`, as the superellipsoid body is laid out. Hands and feet ride on forearm
+and calf: the skeleton has no joints for them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ConfigError
+from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A, SIDE_B
+from tk.kernels.silhouette import LONGEST_CHAIN, ConeArrays
+from tk.model.anthropometry import CROTCH_DROP, HIP_HALF_WIDTH, BodyDimensions
+from tk.model.skeleton import SEGMENTS, Skeleton, build_skeleton
+
+Float = NDArray[np.float64]
+
+# How much of a body is modelled: all fourteen parts; without hands and feet; the paper's six-part walker.
+PRESETS = ("full", "limbs", "walker")
+
+# Edges of different limbs can be mistaken for one another (section 4.4).
+_LIMBS = {
+    "torso": 0,
+    "head": 1,
+    "upper_arm_l": 2,
+    "forearm_l": 2,
+    "upper_arm_r": 3,
+    "forearm_r": 3,
+    "thigh_l": 4,
+    "calf_l": 4,
+    "thigh_r": 5,
+    "calf_r": 5,
+}
+
+# The seven degrees of freedom of the paper's experiments (section 6): translation, hips and knees.
+_WALKER_DOFS = (
+    "torso_x",
+    "torso_y",
+    "torso_z",
+    "hip_l_pitch",
+    "knee_l_flexion",
+    "hip_r_pitch",
+    "knee_r_flexion",
+)
+
+
+@dataclass(frozen=True)
+class ConePart:
+    """A frustum of an elliptical cone, or an ellipsoid.
+
+    Attributes:
+        name: what it is.
+        segment: the skeleton's segment that carries it.
+        kind: :data:`~tk.kernels.cones.CONE` or :data:`~tk.kernels.cones.ELLIPSOID`.
+        shape: cone: semi-axes a, b of the section at z = 0, height h, magnification m of the section at z = h;
+            ellipsoid: semi-axes along x, y, z, and 1. Metres.
+        T_body_part: (4, 4) the part's frame in the zero configuration: a cone's axis runs from the origin along z, an
+            ellipsoid is centred on the origin.
+        ends: whether the rims at z = 0 and z = h are tracked, too.
+    """
+
+    name: str
+    segment: str
+    kind: int
+    shape: tuple[float, float, float, float]
+    T_body_part: Float
+    ends: tuple[bool, bool] = (False, False)
+
+    def __post_init__(self) -> None:
+        if not all(0 < value < 3 for value in self.shape):
+            raise ConfigError(f"part {self.name}: sizes {self.shape} must lie between 0 and 3")
+
+    def surface(self, unscaled: Float) -> Float:
+        """Points (N, 3) of the surface in the part's frame from coordinates (x / a r, y / b r, z / h)."""
+        a, b, h, m = self.shape
+        z = unscaled[:, 2]
+        r = 1 + (m - 1) * z if self.kind == CONE else np.ones_like(z)
+        return np.column_stack([a * r * unscaled[:, 0], b * r * unscaled[:, 1], h * z])
+
+
+@dataclass(frozen=True)
+class ConeBody:
+    """One person's body, fixed during tracking.
+
+    Attributes:
+        dimensions: lengths and radii, metres.
+        skeleton: the kinematic tree.
+        parts: the cones and the ellipsoid.
+        preset: one of :data:`PRESETS`.
+    """
+
+    dimensions: BodyDimensions
+    skeleton: Skeleton
+    parts: tuple[ConePart, ...]
+    preset: str = "full"
+
+    @cached_property
+    def free(self) -> NDArray[np.bool_]:
+        """(D,) the degrees of freedom that are tracked: those that move a part, or the walker's seven."""
+        names = self.skeleton.names
+        if self.preset == "walker":
+            return np.array([name in _WALKER_DOFS for name in names])
+        carried = [SEGMENTS.index(part.segment) for part in self.parts]
+        return np.asarray(self.skeleton.ancestors()[carried].any(axis=0))
+
+    @cached_property
+    def arrays(self) -> ConeArrays:
+        """The body for the kernels, float32."""
+        return self.pack(np.float32)
+
+    def pack(self, dtype: type[np.floating]) -> ConeArrays:
+        """The body for the kernels in this precision."""
+        s = self.skeleton
+        B = np.eye(4)
+        B[:3, :3] = s.T_world_body
+        segments = [SEGMENTS.index(part.segment) for part in self.parts]
+        moves = s.ancestors()
+        chain = np.full((len(self.parts), LONGEST_CHAIN), -1, np.int32)
+        for p, segment in enumerate(segments):
+            dofs = np.flatnonzero(moves[segment])
+            chain[p, : len(dofs)] = dofs
+        curves: list[tuple[int, int]] = []
+        for p, part in enumerate(self.parts):
+            if part.kind == ELLIPSOID:
+                curves.append((p, OUTLINE))
+                continue
+            curves += [(p, SIDE_A), (p, SIDE_B)]
+            curves += [(p, kind) for kind, tracked in zip((END_NEAR, END_FAR), part.ends, strict=True) if tracked]
+        return ConeArrays(
+            axis=np.ascontiguousarray(s.axis, dtype),
+            point=np.ascontiguousarray(s.point, dtype),
+            prismatic=s.prismatic.astype(np.int32),
+            parent=s.parent.astype(np.int32),
+            part_kind=np.array([part.kind for part in self.parts], np.int32),
+            part_shape=np.array([part.shape for part in self.parts], dtype),
+            part_frame=np.array([(B @ part.T_body_part)[:3].ravel() for part in self.parts], dtype),
+            part_dof=s.segment_dof[segments].astype(np.int32),
+            part_limb=np.array([_LIMBS[part.segment] for part in self.parts], np.int32),
+            chain=chain,
+            curve_part=np.array([p for p, _ in curves], np.int32),
+            curve_kind=np.array([kind for _, kind in curves], np.int32),
+        )
+
+    def place(self, pose: Float, part: NDArray[np.integer], unscaled: Float) -> Float:
+        """World points (N, 3) on the surface of parts (N,), from coordinates as :meth:`ConePart.surface` takes them."""
+        T_world_segment = self.skeleton.segment_transforms(pose)
+        B = np.eye(4)
+        B[:3, :3] = self.skeleton.T_world_body
+        result = np.empty((len(part), 3))
+        for p, here in enumerate(self.parts):
+            chosen = part == p
+            T = T_world_segment[SEGMENTS.index(here.segment)] @ B @ here.T_body_part
+            result[chosen] = here.surface(unscaled[chosen]) @ T[:3, :3].T + T[:3, 3]
+        return result
+
+
+def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "full") -> ConeBody:
+    """The cone body with these dimensions.
+
+    Args:
+        dimensions: lengths and radii, metres.
+        up: the world axis that points up.
+        preset: "full" (14 parts: torso, head, upper and lower arms, hands, thighs, calves, feet), "limbs" (10, without
+            hands and feet), or "walker" (6: torso, head, thighs, calves; seven degrees of freedom are free).
+
+    Raises:
+        ConfigError: an unknown preset.
+    """
+    if preset not in PRESETS:
+        raise ConfigError(f'cone body "{preset}": choose one of {", ".join(PRESETS)}')
+    d = dimensions
+    x, _, z = np.eye(3)
+    parts = [_torso(d), _head(d)]
+    for side, sign in (("l", 1.0), ("r", -1.0)):
+        M = np.diag([1.0, sign, 1.0])
+        if preset != "walker":
+            u = M @ np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
+            shoulder = M @ np.array([0.0, d.shoulder_half_width, d.trunk - d.shoulder_drop])
+            elbow = shoulder + d.upper_arm * u
+            wrist = elbow + d.forearm * u
+            parts.append(_limb(f"upper_arm_{side}", shoulder, u, d.upper_arm, d.upper_arm_radius, d.elbow_radius, z))
+            parts.append(_limb(f"forearm_{side}", elbow, u, d.forearm, d.elbow_radius, d.wrist_radius, z))
+        if preset == "full":
+            # half closed: shorter than the stretched hand, wider than the wrist across the palm
+            shape = (0.9 * d.wrist_radius, 1.3 * d.wrist_radius, 0.85 * d.hand, 0.7)
+            parts.append(
+                ConePart(f"hand_{side}", f"forearm_{side}", CONE, shape, _frame(wrist, u, z), ends=(False, True))
+            )
+        hip = M @ np.array([0.0, d.hip_half_width, 0.0])
+        knee = hip - d.thigh * z
+        ankle = knee - d.calf * z
+        # without a foot the calf reaches the ground
+        shin = d.calf if preset == "full" else d.calf + d.ankle_height
+        parts.append(_limb(f"thigh_{side}", hip, -z, d.thigh, d.thigh_radius, d.knee_radius, x))
+        parts.append(_limb(f"calf_{side}", knee, -z, shin, d.knee_radius, d.ankle_radius, x, (False, preset != "full")))
+        if preset == "full":
+            half = 0.55 * d.ankle_height
+            heel = ankle - (d.ankle_height - half) * z - 0.25 * d.foot * x
+            shape = (half, 0.18 * d.foot, d.foot, 0.75)
+            parts.append(ConePart(f"foot_{side}", f"calf_{side}", CONE, shape, _frame(heel, x, z), ends=(True, True)))
+    return ConeBody(d, build_skeleton(d, up), tuple(parts), preset)
+
+
+def _torso(d: BodyDimensions) -> ConePart:
+    """From the crotch to the shoulders; one magnification for width and depth, as the paper has it."""
+    x, y, z = np.eye(3)
+    bottom = -CROTCH_DROP / HIP_HALF_WIDTH * d.hip_half_width * 0.5
+    top = d.trunk - 0.6 * d.shoulder_drop
+    m = d.chest_half_width / d.hips_half_width
+    depth = 0.5 * (d.hips_half_depth + d.chest_half_depth / m)
+    shape = (depth, d.hips_half_width, top - bottom, m)
+    return ConePart("torso", "torso", CONE, shape, _frame(bottom * z, z, x), ends=(False, True))
+
+
+def _head(d: BodyDimensions) -> ConePart:
+    """An ellipsoid from C7 to the crown: it stands for the neck, too."""
+    x, _, z = np.eye(3)
+    half = 0.5 * d.head
+    shape = (1.12 * d.head_radius, d.head_radius, half, 1.0)
+    return ConePart("head", "head", ELLIPSOID, shape, _frame((d.trunk + half) * z, z, x))
+
+
+def _limb(
+    segment: str,
+    origin: Float,
+    axis: Float,
+    length: float,
+    r0: float,
+    r1: float,
+    front: Float,
+    ends: tuple[bool, bool] = (False, False),
+) -> ConePart:
+    return ConePart(segment, segment, CONE, (r0, r0, length, r1 / r0), _frame(origin, axis, front), ends)
+
+
+def _frame(origin: Float, axis: Float, front: Float) -> Float:
+    """(4, 4) frame at ``origin`` with z along ``axis`` and x along ``front`` (perpendicular to it)."""
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([front, np.cross(axis, front), axis])
+    T[:3, 3] = origin
+    return T

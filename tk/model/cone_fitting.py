@@ -1,0 +1,189 @@
+"""Adapts a cone body's dimensions to observed silhouettes (the silhouette paper's future work).
+
+Gauss-Newton on the poses of several frames and the logarithms of shared dimensions at once. An edgel's row by a
+dimension is n·Jπ·∂x/∂δ at the material point x of the contour, as it is by a degree of freedom: along an occluding
+contour the surface slides in the image's tangent only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ConfigError
+from tk.kernels.silhouette import Edgels, SearchSettings
+from tk.model.anthropometry import BodyDimensions
+from tk.model.cone_body import ConeBody, build_cone_body
+from tk.model.silhouettes import Pyramid, Views
+
+Float = NDArray[np.float64]
+
+# One standard deviation of a dimension's logarithm about the proportions of the stature. Lengths between joints vary by
+# 4 to 5 % at a given stature (Drillis & Contini 1966), radii by girth and by clothes.
+_LENGTHS = {
+    "trunk": 0.05,
+    "head": 0.05,
+    "upper_arm": 0.05,
+    "forearm": 0.05,
+    "thigh": 0.05,
+    "calf": 0.05,
+    "foot": 0.06,
+    "hand": 0.1,
+    "shoulder_drop": 0.1,
+    "shoulder_half_width": 0.06,
+    "hip_half_width": 0.06,
+    "ankle_height": 0.1,
+}
+_RADII = 0.2
+
+
+@dataclass(frozen=True)
+class ConeFitConfig:
+    """Settings.
+
+    Attributes:
+        frames: most frames that are used, evenly spaced.
+        rounds: Gauss-Newton iterations.
+        edge_noise_px: standard deviation of an edgel, clothes and ragged masks included.
+        correlation_px: along a contour this many pixels err together; edgels within them count as one.
+        stature_deviation: of the logarithm of the stature about the given one; the hair and the soles are in it.
+    """
+
+    frames: int = 8
+    rounds: int = 8
+    edge_noise_px: float = 2.0
+    correlation_px: float = 10.0
+    stature_deviation: float = 0.01
+
+    def __post_init__(self) -> None:
+        if self.frames < 1 or self.rounds < 0:
+            raise ConfigError(f"cone fit: frames = {self.frames} must be at least 1, rounds = {self.rounds} at least 0")
+        if min(self.edge_noise_px, self.correlation_px, self.stature_deviation) <= 0:
+            raise ConfigError(
+                f"cone fit: edge_noise_px {self.edge_noise_px}, correlation_px {self.correlation_px} and "
+                f"stature_deviation {self.stature_deviation} must be positive"
+            )
+
+
+def fit_dimensions(
+    body: ConeBody,
+    views: Views,
+    pyramids: Sequence[Pyramid],
+    poses: Float,
+    up: str,
+    settings: SearchSettings,
+    stature_m: float | None,
+    config: ConeFitConfig | None = None,
+) -> tuple[ConeBody, Float]:
+    """Dimensions that suit several frames, with their poses.
+
+    Args:
+        body: the body to start from; its dimensions are the prior's mean.
+        views: the cameras.
+        pyramids: F frames' silhouettes.
+        poses: (F, D) their poses, close enough for the search to find the right edges.
+        up: the world axis that points up.
+        settings: of the search.
+        stature_m: the subject's height, if known.
+        config: see :class:`ConeFitConfig`.
+
+    Returns:
+        The body, and poses (F, D).
+    """
+    config = config or ConeFitConfig()
+    names = [field.name for field in fields(BodyDimensions)]
+    prior = np.array([_LENGTHS.get(name, _RADII) for name in names])
+    mean = _log(body.dimensions)
+    log = mean.copy()
+    poses = np.array(poses)
+    F, D, K = len(poses), poses.shape[1], len(names)
+    free = np.flatnonzero(body.free)
+    # information of one pixel of contour
+    information = 1.0 / (config.edge_noise_px**2 * config.correlation_px)
+    for _ in range(config.rounds):
+        here = build_cone_body(_dimensions(log), up, body.preset)
+        H = np.zeros((F * D + K, F * D + K))
+        g = np.zeros(F * D + K)
+        shape = slice(F * D, F * D + K)
+        for f in range(F):
+            edgels = views.edgels(here, pyramids[f], poses[f], 0, settings)
+            rows = np.hstack([pose_rows(here, poses[f], edgels), dimension_rows(here, poses[f], edgels, up)])
+            weight = edgels.weight * information
+            A = rows.T @ (weight[:, None] * rows)
+            y = rows.T @ (weight * edgels.distance)
+            at = slice(f * D, (f + 1) * D)
+            H[at, at] += A[:D, :D]
+            H[at, shape] += A[:D, D:]
+            H[shape, at] += A[D:, :D]
+            H[shape, shape] += A[D:, D:]
+            g[at] += y[:D]
+            g[shape] += y[D:]
+            # joints that the silhouettes leave open stay; those beyond a limit are pulled back
+            excess = here.skeleton.clip(poses[f]) - poses[f]
+            stay = np.where(excess != 0, 1e3, 10.0)
+            H[at, at] += np.diag(stay)
+            g[at] += np.where(excess != 0, stay * excess, 0.0)
+        H[shape, shape] += np.diag(prior**-2)
+        g[shape] += (mean - log) / prior**2
+        if stature_m is not None:
+            d = here.dimensions
+            row = np.array([_stature_rate(d, name) for name in names])
+            H[shape, shape] += np.outer(row, row) / config.stature_deviation**2
+            g[shape] += row * np.log(stature_m / d.stature) / config.stature_deviation**2
+        chosen = np.concatenate([*(f * D + free for f in range(F)), F * D + np.arange(K)])
+        delta = np.zeros(len(g))
+        delta[chosen] = np.linalg.solve(H[np.ix_(chosen, chosen)], g[chosen])
+        poses += np.clip(delta[: F * D].reshape(F, D), -0.3, 0.3)
+        log += np.clip(delta[shape], -0.1, 0.1)
+    return build_cone_body(_dimensions(log), up, body.preset), poses
+
+
+def pose_rows(body: ConeBody, pose: Float, edgels: Edgels) -> Float:
+    """(N, D) derivative of the contour's position along its normal by the pose, pixels."""
+    s = body.skeleton
+    T = s.transforms(pose)
+    x = body.place(pose, edgels.part, edgels.unscaled)
+    moved = body.pack(np.float64).chain[edgels.part]
+    rows = np.zeros((len(x), len(s.names)))
+    for k in range(len(s.names)):
+        below = (moved == k).any(axis=1)
+        above = T[s.parent[k]] if s.parent[k] >= 0 else np.eye(4)
+        axis = above[:3, :3] @ s.axis[k]
+        if s.prismatic[k]:
+            rows[below, k] = edgels.row[below] @ axis
+        else:
+            q = above[:3, :3] @ s.point[k] + above[:3, 3]
+            rows[below, k] = np.einsum("na,na->n", edgels.row[below], np.cross(axis, x[below] - q))
+    return rows
+
+
+def dimension_rows(body: ConeBody, pose: Float, edgels: Edgels, up: str) -> Float:
+    """(N, K) the same by the logarithms of the dimensions, by central differences of the surface points."""
+    h = 1e-4
+    columns = []
+    for field in fields(BodyDimensions):
+        ends = [
+            build_cone_body(body.dimensions.scaled(**{field.name: np.exp(step)}), up, body.preset).place(
+                pose, edgels.part, edgels.unscaled
+            )
+            for step in (h, -h)
+        ]
+        columns.append(np.einsum("na,na->n", edgels.row, ends[0] - ends[1]) / (2 * h))
+    return np.column_stack(columns)
+
+
+def _log(dimensions: BodyDimensions) -> Float:
+    return np.log([getattr(dimensions, field.name) for field in fields(BodyDimensions)])
+
+
+def _dimensions(log: Float) -> BodyDimensions:
+    values = np.exp(log)
+    return BodyDimensions(**{f.name: float(v) for f, v in zip(fields(BodyDimensions), values, strict=True)})
+
+
+def _stature_rate(d: BodyDimensions, name: str) -> float:
+    """d log stature / d log dimension."""
+    return getattr(d, name) / d.stature if name in ("head", "trunk", "thigh", "calf", "ankle_height") else 0.0

@@ -1,0 +1,181 @@
+"""Silhouettes of one instant in several views: cleaning, scales, and how well a cone body covers them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ConfigError
+from tk.kernels import silhouette as kernels
+from tk.kernels.projection import pack_camera
+from tk.kernels.silhouette import Edgels, NormalEquations, SearchSettings
+from tk.model.camera import Rig
+from tk.model.cone_body import ConeBody
+
+Float = NDArray[np.float64]
+Masks = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class CleaningConfig:
+    """What is mended in a mask before contours are pulled to it. The paper takes its masks as they are.
+
+    Attributes:
+        speck_share: connected parts smaller than this share of the largest one are no part of the person.
+        hole_share: holes smaller than this share of it are filled; gaps between limbs are larger.
+    """
+
+    speck_share: float = 0.05
+    hole_share: float = 0.004
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.speck_share <= 1 or not 0 <= self.hole_share <= 1:
+            raise ConfigError(
+                f"silhouette cleaning: speck_share = {self.speck_share} and hole_share = {self.hole_share} "
+                "must lie in [0, 1]"
+            )
+
+
+def clean(mask: Masks, config: CleaningConfig) -> Masks:
+    """A mask (H, W) without specks and small holes."""
+    ys = np.flatnonzero(mask.any(axis=1))
+    if len(ys) == 0:
+        return mask
+    xs = np.flatnonzero(mask.any(axis=0))
+    # a margin of background makes everything around the person one region
+    rows, columns = slice(ys[0], ys[-1] + 1), slice(xs[0], xs[-1] + 1)
+    part = cv2.copyMakeBorder(mask[rows, columns], 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=8, ltype=cv2.CV_16U)
+    area = stats[:, cv2.CC_STAT_AREA].copy()
+    area[0] = 0
+    keep = area >= config.speck_share * area.max()
+    keep[0] = False
+    body = (keep.astype(np.uint8) * 255)[labels]
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(255 - body, connectivity=4, ltype=cv2.CV_16U)
+    hole = stats[:, cv2.CC_STAT_AREA] < config.hole_share * area.max()
+    hole[0] = False
+    body |= (hole.astype(np.uint8) * 255)[labels]
+    result = np.zeros_like(mask)
+    result[rows, columns] = body[1:-1, 1:-1]
+    return result
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """Masks at several scales, a factor of two apart.
+
+    Attributes:
+        masks: for each scale (V, H, W) uint8; scale 0 is the full picture.
+        sizes: for each scale (V, 2) width and height of each camera's part.
+    """
+
+    masks: tuple[Masks, ...]
+    sizes: tuple[NDArray[np.int32], ...]
+
+
+class Views:
+    """The cameras of a rig as the kernels want them.
+
+    Args:
+        rig: the cameras.
+        ray_step: pixels between the rays by which poses are compared.
+    """
+
+    def __init__(self, rig: Rig, ray_step: int = 4) -> None:
+        self.rig = rig
+        self.cameras = np.array(
+            [pack_camera(c.matrix, c.distortions, c.rotation, c.translation, c.fisheye) for c in rig]
+        )
+        self._cameras32 = self.cameras.astype(np.float32)
+        self.sizes = np.array([(c.width, c.height) for c in rig], np.int32)
+        self.ray_step = ray_step
+        self.rays = pixel_rays(rig, ray_step)
+
+    def pyramid(self, masks: Masks, scales: int, cleaning: CleaningConfig | None) -> Pyramid:
+        """The scales of masks (V, H, W), cleaned unless ``cleaning`` is None."""
+        if cleaning is not None:
+            masks = np.stack([clean(mask, cleaning) for mask in masks])
+        levels, sizes = [masks], [self.sizes]
+        for _ in range(scales - 1):
+            last = levels[-1]
+            height, width = (last.shape[1] + 1) // 2, (last.shape[2] + 1) // 2
+            even = [cv2.copyMakeBorder(m, 0, m.shape[0] % 2, 0, m.shape[1] % 2, cv2.BORDER_CONSTANT) for m in last]
+            levels.append(
+                np.stack([cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in even]).astype(np.uint8)
+            )
+            sizes.append((sizes[-1] + 1) // 2)
+        return Pyramid(tuple(levels), tuple(sizes))
+
+    def equations(
+        self, body: ConeBody, pyramid: Pyramid, poses: Float, scale: int, settings: SearchSettings
+    ) -> NormalEquations:
+        """Normal equations of poses (B, D) at a scale's index."""
+        return kernels.normal_equations(
+            body.arrays, self._cameras32, pyramid.sizes[scale], pyramid.masks[scale], 2.0**scale, poses, settings
+        )
+
+    def edgels(self, body: ConeBody, pyramid: Pyramid, pose: Float, scale: int, settings: SearchSettings) -> Edgels:
+        """The edgels that a pose (D,) finds at a scale's index."""
+        return kernels.find_edgels(
+            body.arrays, self._cameras32, pyramid.sizes[scale], pyramid.masks[scale], 2.0**scale, pose, settings
+        )
+
+    def fit_error(self, body: ConeBody, masks: Masks, poses: Float) -> Float:
+        """(B, V) E_S of poses (B, D) against masks (V, H, W), on every ``ray_step``-th pixel (eq. 12)."""
+        return silhouette_error(body, self.rig, masks, poses, self.ray_step, self.rays)
+
+
+def pixel_rays(rig: Rig, step: int = 1) -> NDArray[np.float32]:
+    """(V, H, W, 3) viewing directions of every ``step``-th pixel, world frame; zero outside smaller pictures."""
+    height, width = rig.frame_shape
+    offset = step // 2
+    ys, xs = np.arange(offset, height, step), np.arange(offset, width, step)
+    grid = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2).astype(np.float64)
+    rays = np.zeros((len(rig), len(ys) * len(xs), 3), np.float32)
+    for out, camera in zip(rays, rig, strict=True):
+        inside = (grid[:, 0] < camera.width) & (grid[:, 1] < camera.height)
+        out[inside] = camera.rays(grid[inside])
+    return rays.reshape(len(rig), len(ys), len(xs), 3)
+
+
+def silhouette_error(
+    body: ConeBody,
+    rig: Rig,
+    masks: Masks,
+    poses: Float,
+    step: int = 1,
+    rays: NDArray[np.float32] | None = None,
+) -> Float:
+    """(B, V) share of wrongly classified pixels E_S = |S_M △ S_T| / |S_T| (silhouette paper, eq. 12).
+
+    Args:
+        body: the body that is projected.
+        rig: the cameras.
+        masks: (V, H, W) uint8, S_T.
+        poses: (B, D).
+        step: every how many pixels.
+        rays: :func:`pixel_rays` of the rig and step, if at hand.
+
+    Returns:
+        One number a pose and view; inf where the mask is empty.
+    """
+    if rays is None:
+        rays = pixel_rays(rig, step)
+    offset = step // 2
+    seen = np.ascontiguousarray(masks[:, offset::step, offset::step])
+    counts, _ = kernels.overlap(body.arrays, rig.centers, rays, seen, poses)
+    total = np.count_nonzero(seen >= 128, axis=(1, 2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(total > 0, counts.sum(axis=2) / total, np.inf)
+
+
+def draw_silhouettes(body: ConeBody, rig: Rig, poses: Float) -> NDArray[np.uint8]:
+    """(B, V, H, W) silhouettes of the body at poses (B, D), 0 or 255."""
+    rays = pixel_rays(rig)
+    empty = np.zeros(rays.shape[:3], np.uint8)
+    _, pictures = kernels.overlap(body.arrays, rig.centers, rays, empty, poses, draw=True)
+    assert pictures is not None
+    return pictures
