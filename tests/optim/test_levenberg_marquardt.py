@@ -76,6 +76,21 @@ def test_a_quadratic_takes_one_step(seed: int, n: int) -> None:
     assert result.iterations == 1
 
 
+def test_a_parameter_without_a_gradient_moves_with_the_others() -> None:
+    """It is not taken for one that a limit stops."""
+    hessian = np.array([[1.0, 0.5], [0.5, 1.0]])
+    optimum = np.linalg.solve(hessian, [1.0, 0.0])
+
+    def value(p: Float) -> float:
+        return float(0.5 * (p - optimum) @ hessian @ (p - optimum))
+
+    def model(p: Float) -> Quadratic:
+        return Quadratic(value(p), np.array([-1.0, 0.0]), hessian)
+
+    result = minimise(model, value, np.zeros(2), lambda p: p, config=LmConfig(damping=1e-9, max_iterations=1))
+    np.testing.assert_allclose(result.pose, optimum, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("residuals", "jacobian", "start"),
     [
@@ -175,6 +190,9 @@ def test_says_whether_it_converged() -> None:
     assert (few.iterations, few.converged) == (3, False)
     many, _ = least_squares(rosenbrock, rosenbrock_jacobian, np.array([-1.2, 1.0]), config=LmConfig(max_iterations=99))
     assert many.converged and many.iterations < 99
+    # any fall is less than the whole value, and so the first step is the last
+    once, _ = least_squares(rosenbrock, rosenbrock_jacobian, np.array([-1.2, 1.0]), config=LmConfig(tolerance=1.0))
+    assert (once.iterations, once.converged) == (1, True)
 
 
 def test_stays_at_an_optimum() -> None:

@@ -228,6 +228,22 @@ def test_a_finished_row_is_not_asked_for_more() -> None:
     assert result.pose[0, 0] == 7.0
 
 
+def test_a_finished_rows_direction_does_not_run_away() -> None:
+    """Eq. 19 alone would go on: with λ|1 − aH| above 1, v grows without bound where p stands still."""
+    directions: list[float] = []
+
+    def evaluate(poses: Float, along: Float, iteration: int) -> Evaluation:
+        directions.append(along[0, 0])
+        gradient = np.array([[0.0 if iteration else 1e-3], [1.0]])
+        return Evaluation(np.zeros(2), gradient, 100 * along)
+
+    config = SmdConfig(max_iterations=30, meta_step=0)
+    result = minimise(evaluate, np.zeros((2, 1)), 0.1, np.array([1e-3]), anywhere, config=config)
+    assert result.iterations.tolist() == [3, 30]
+    assert directions[3] != 0
+    np.testing.assert_array_equal(directions[3:], directions[3])
+
+
 def test_the_inverse_of_a_basis_may_come_with_it() -> None:
     rng = np.random.default_rng(7)
     bases = rng.normal(size=(2, 3, 2))
