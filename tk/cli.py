@@ -79,9 +79,7 @@ def track(
     config = _configuration(config_file, voxels=voxels, seed=seed)
     opened = open_capture(capture, _names(cameras), masks)
     with _Report() as report:
-        summary = sequence.track(
-            opened, output, config, report, method, span, init_pose, resume, store_hull
-        )
+        summary = sequence.track(opened, output, config, report, method, span, init_pose, resume, store_hull)
     rate = summary.tracked_now / summary.seconds if summary.seconds > 0 else 0.0
     state = f"{summary.frames} frames in {output}"
     click.echo(f"{state}, {summary.lost} lost, {rate:.1f} frames/s", err=True)

@@ -40,6 +40,7 @@ class TrackingConfig:
         prediction: share of the last frame's motion that the next is expected to repeat. The paper does not say how it
             predicts; at 15 Hz an arm turns by up to 31° between frames (its section 7.4).
         init_frames: frames from which the body is fitted.
+        retry_ratio: a frame whose objective exceeds that of the usual frame by this factor is searched anew.
         lost_value: the objective above which a frame is lost (it runs from 0 to 1 plus the coverage term's weight).
         lost_share: a frame is lost, too, when more than this share of the hull's surface is farther than 10 cm from
             the body: the body is somewhere, but the person is elsewhere.
@@ -48,6 +49,7 @@ class TrackingConfig:
 
     prediction: float = 0.8
     init_frames: int = 4
+    retry_ratio: float = 1.4
     lost_value: float = 0.45
     lost_share: float = 0.35
     least_voxels: int = 60

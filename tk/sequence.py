@@ -72,7 +72,9 @@ def make_segmenter(capture: Capture, config: Config, note: Callable[[str], None]
     sizes = [(camera.width, camera.height) for camera in capture.rig]
     clips = capture.background()
     if clips is None:
-        note(f"{capture.path}: no masks and no background/; taking the median of {PLATE_FRAMES} frames as the empty scene")
+        note(
+            f"{capture.path}: no masks and no background/; taking the median of {PLATE_FRAMES} frames as the empty scene"
+        )
         step = max(capture.frame_count // PLATE_FRAMES, 1)
         with capture.frames() as frames:
             samples = [frame.images.copy() for frame in frames if frame.index % step == 0]
@@ -130,7 +132,9 @@ def track(
     stop = min(frames[1], capture.frame_count) if frames[1] is not None else capture.frame_count
     begin = max(frames[0], first)
     if frames[0] < first:
-        reporter.note(f"frames before {first} are left out: the subject is found in frame {first} and followed forwards")
+        reporter.note(
+            f"frames before {first} are left out: the subject is found in frame {first} and followed forwards"
+        )
     if begin >= stop:
         raise ConfigError(f"--frames {frames[0]}:{frames[1]}: nothing to track between frames {begin} and {stop}")
     meta = ResultMeta(
@@ -145,7 +149,7 @@ def track(
         seed=config.seed,
         config_toml=config.to_toml(),
     )
-    writer, done = (ResultWriter.resume(output, meta) if resume else (ResultWriter.create(output, meta), 0))
+    writer, done = ResultWriter.resume(output, meta) if resume else (ResultWriter.create(output, meta), 0)
     with writer:
         return _run(capture, tracker, writer, done, config, reporter, (first, begin, stop), init, store_hull)
 
@@ -189,9 +193,7 @@ def _run(
                     continue
                 timing = {**watch.laps, **estimate.timing}
                 timing["total"] = sum(timing.values())
-                writer.append(
-                    _row(observation.index, capture.fps, estimate, timing, store_hull), tracker.state()
-                )
+                writer.append(_row(observation.index, capture.fps, estimate, timing, store_hull), tracker.state())
                 tracked += 1
                 lost += estimate.status == "lost"
                 reporter.advance(observation.index, estimate)

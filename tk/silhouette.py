@@ -38,8 +38,8 @@ class SilhouetteConfig:
     """All settings of the silhouette tracker.
 
     Attributes:
-        body: "full" (14 parts, 24 degrees of freedom), "limbs" (10 parts) or "walker" (the paper's 6 parts and 7 degrees
-            of freedom).
+        body: "full" (14 parts, 24 degrees of freedom), "limbs" (10 parts) or "walker" (the paper's 6 parts and 7
+            degrees of freedom).
         prediction: share of the last frame's motion that the next is expected to repeat. The paper found none useful.
         headings, phases: how many headings and walking phases the initialisation tries.
         finalists: how many of them are followed through the first frames before one is chosen.
@@ -176,8 +176,8 @@ class SilhouetteTracker:
             count += 1
         if count < 2:
             raise CaptureError(
-                f"initialisation: {count} of {len(self.views.rig)} masks of frame {index} show anybody, two are needed: "
-                "check the masks, or choose another first frame"
+                f"initialisation: {count} of {len(self.views.rig)} masks of frame {index} show anybody, two are "
+                "needed: check the masks, or choose another first frame"
             )
         return np.linalg.solve(A, y)
 

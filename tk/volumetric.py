@@ -77,6 +77,7 @@ class VolumetricTracker:
         self._appearance: Appearance
         self._pose = np.zeros(len(skeleton.names))
         self._previous = self._pose
+        self._usual = np.inf
         self._lost_for = 0
         self._fresh = True
 
@@ -125,6 +126,8 @@ class VolumetricTracker:
         )
         self._take_body(dimensions)
         self._pose = self._previous = poses[0]
+        fit = FrameObjective(self._objective, indices[0], np.random.default_rng(0)).fit(poses[0])
+        self._usual = fit.value
         self._learn_colours(surfaces[0], indices[0], poses[0])
         self.hull.reset()
 
@@ -157,13 +160,22 @@ class VolumetricTracker:
         rng = np.random.default_rng([config.seed, frame.index])
         problem = FrameObjective(self._objective, index, rng, config.schedule.outliers)
         result = schedule.optimise(
-            problem, self._starts(surface), self._pose, rng, config.schedule, config.smd
+            problem,
+            self._starts(surface),
+            self._pose,
+            rng,
+            config.schedule,
+            config.smd,
+            good_enough=config.tracking.retry_ratio * self._usual,
+            alternatives=self._alternatives,
         )
         fit = problem.fit(result.pose)
         watch.lap("optimise")
         lost = self._is_lost(fit)
         status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
         if not lost:
+            # slowly towards what a good frame of this person costs; a bad one may not pass for usual
+            self._usual += 0.1 * (min(fit.value, 1.5 * self._usual) - self._usual)
             patch, colors = self._taught(surface, index, fit)
             self._appearance = self._appearance.updated(patch, colors, config.appearance)
         self._previous = result.pose if lost or self._lost_for else self._pose
@@ -204,6 +216,23 @@ class VolumetricTracker:
         elif np.array_equal(predicted, self._pose):
             starts = starts[:1]
         return np.array(starts)
+
+    def _alternatives(self, pose: Float, rng: np.random.Generator) -> Float:
+        """(A, D) other places to look from when ``pose`` explains the frame badly."""
+        skeleton = self.body.skeleton
+        side = {
+            k: name.replace("_l_", "_r_") if "_l_" in name else name.replace("_r_", "_l_")
+            for k, name in enumerate(skeleton.names)
+        }
+        other = np.array([skeleton.index(side[k]) for k in range(len(side))])
+        legs = np.array([name.startswith(("hip", "knee")) for name in skeleton.names])
+        arms = np.array([name.startswith(("shoulder", "elbow")) for name in skeleton.names])
+        swapped = [np.where(chains, pose[other], pose) for chains in (legs, arms)]
+        limbs = np.where(legs | arms, self._pose, pose)  # the limbs as they were
+        straight = self._pose + (self._pose - self._previous)  # all of the last motion again
+        spread = np.radians(25.0) * (legs | arms)
+        shaken = [pose + spread * rng.normal(size=len(pose)) for _ in range(2)]
+        return np.array([*swapped, limbs, straight, *shaken])
 
     def _is_lost(self, fit: Fit) -> bool:
         limits = self.config.tracking
@@ -262,6 +291,7 @@ class VolumetricTracker:
         return {
             "pose": self._pose,
             "previous": self._previous,
+            "usual": self._usual,
             "lost_for": self._lost_for,
             "mean_yuv": self._appearance.mean,
         }
@@ -274,10 +304,14 @@ class VolumetricTracker:
         )
         initial = np.asarray(model["patches/mean_yuv"])
         learned = Appearance(
-            initial, initial, np.asarray(model["patches/deviation_yuv"]), np.asarray(model["patches/known"]).astype(bool)
+            initial,
+            initial,
+            np.asarray(model["patches/deviation_yuv"]),
+            np.asarray(model["patches/known"]).astype(bool),
         )
         self._appearance = replace(learned, mean=np.asarray(state["mean_yuv"]))
         self._pose = np.asarray(state["pose"])
         self._previous = np.asarray(state["previous"])
+        self._usual = float(state["usual"])
         self._lost_for = int(state["lost_for"])
         self._fresh = False

@@ -60,7 +60,9 @@ def read_init_pose(path: str | Path, pose_names: tuple[str, ...]) -> InitPose:
     if not path.is_file():
         raise CaptureError(f"{path}: no such file; --init-pose wants a TOML file with a [joints] or an [angles] table")
     table = Table(load_toml(path, CaptureError), str(path), CaptureError)
-    height = table.table("subject").number("height") if "subject" in table and "height" in table.table("subject") else None
+    height = (
+        table.table("subject").number("height") if "subject" in table and "height" in table.table("subject") else None
+    )
     frame = table.integer("frame", 0) if "frame" in table else None
     if ("joints" in table) == ("angles" in table):
         raise CaptureError(f"{path}: give either a [joints] or an [angles] table")
@@ -80,5 +82,7 @@ def read_init_pose(path: str | Path, pose_names: tuple[str, ...]) -> InitPose:
     translations = ("torso_x", "torso_y", "torso_z")
     values = {name: angles.number(name) for name in pose_names if name in angles}
     if not all(name in values for name in translations):
-        raise CaptureError(f"{path}: [angles] must give torso_x, torso_y and torso_z, the place of the pelvis in metres")
+        raise CaptureError(
+            f"{path}: [angles] must give torso_x, torso_y and torso_z, the place of the pelvis in metres"
+        )
     return InitPose({}, {n: v if n in translations else float(np.radians(v)) for n, v in values.items()}, frame, height)

@@ -42,9 +42,7 @@ def write_ply(path: Path, positions: NDArray[np.floating], colors_rgb: NDArray[n
         raise ResultError(f"{path}: cannot be written: check the folder's permissions and the space on the disk")
 
 
-def write_hulls(
-    path: Path, capture: Capture, grid: VoxelGrid, frames: Iterable[tuple[int, HullPoints]]
-) -> int:
+def write_hulls(path: Path, capture: Capture, grid: VoxelGrid, frames: Iterable[tuple[int, HullPoints]]) -> int:
     """Write surface voxels of many frames, ragged, in a result's layout: `/frames`, `/time`, `/hull/…`.
 
     Args:

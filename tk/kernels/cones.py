@@ -42,7 +42,7 @@ def curve_of(kind: int, shape, c):
         elif w < rho:
             half = ti.acos(w / rho)
         whole = ti.abs(w) >= rho
-        if kind == SIDE_A or kind == SIDE_B:
+        if kind <= SIDE_B:
             q[0] = middle + half
             if kind == SIDE_B:
                 q[0] = middle - half
@@ -83,7 +83,7 @@ def point_on(kind: int, shape, c, q, u):
         angle = 6.28318530717959 * u
         x = radii * (e3 / k + r * (ti.cos(angle) * e1 + ti.sin(angle) * e2))
         tangent = 6.28318530717959 * r * radii * (ti.cos(angle) * e2 - ti.sin(angle) * e1)
-    elif kind == SIDE_A or kind == SIDE_B:
+    elif kind <= SIDE_B:
         r = 1.0 + (shape[3] - 1.0) * u
         X, Y = shape[0] * ti.cos(q[0]), shape[1] * ti.sin(q[0])
         x = ti.Vector([X * r, Y * r, shape[2] * u])

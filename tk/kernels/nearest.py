@@ -135,9 +135,7 @@ def _nearest_kernel(
     for q in range(points.shape[0]):
         x = ti.Vector([points[q, a] for a in ti.static(range(3))])
         n = ti.Vector([point_normals[q, a] for a in ti.static(range(3))])
-        found[q] = nearest_voxel(
-            voxels, fits, starts, grid, x, n, patch[q], min_cosine, reach
-        )
+        found[q] = nearest_voxel(voxels, fits, starts, grid, x, n, patch[q], min_cosine, reach)
 
 
 def nearest(

@@ -48,7 +48,7 @@ def camera_center(camera: ti.template(), v: int):
 
 @ti.func
 def project(camera: ti.template(), v: int, x):
-    """Pixel (2,), its derivative (2, 3) by the world point, and the depth. Behind the camera only the depth is valid."""
+    """Pixel (2,), its derivative (2, 3) by the world point, depth. Behind the camera only the depth is valid."""
     R = ti.Matrix([[camera[v, 3 * i + j] for j in ti.static(range(3))] for i in ti.static(range(3))])
     t = ti.Vector([camera[v, 9 + i] for i in ti.static(range(3))])
     p = R @ x + t

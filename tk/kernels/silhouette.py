@@ -16,9 +16,6 @@ from numpy.typing import NDArray
 
 from tk.errors import ConfigError
 from tk.kernels.cones import (
-    ELLIPSOID,
-    OUTLINE,
-    SIDE_A,
     SIDE_B,
     curve_of,
     enter,
@@ -34,7 +31,7 @@ from tk.kernels.runtime import ensure_runtime, ti
 LONGEST_CHAIN = 10
 # Chords that stand for a curve when its length is measured and when edgels are compared with it.
 CHORDS = 12
-# A sample must lie this far inside another part's cross-section to be hidden by it: neighbours that share a joint touch.
+# A sample is hidden by another part if it lies this far inside its cross-section: neighbours at a joint touch.
 HIDING_SHRINK = 0.95
 # Nearer than this to a camera nothing is projected, metres.
 NEAREST_M = 0.1
@@ -169,7 +166,7 @@ def _in_picture(width: int, height: int, x):
 
 @ti.func
 def _search(mask: ti.template(), v: int, width: int, height: int, x, n, window):
-    """(found, signed distance) of the transition along ±n: outwards from the foreground, inwards from the background."""
+    """(found, signed distance) of the transition along ±n: outwards from foreground, inwards from background."""
     inside = _bilinear(mask, v, width, height, x) >= 127.5
     way = 1.0 + 0.0 * window
     if not inside:
@@ -282,7 +279,7 @@ def _equations_kernel(real):
             center = R.transpose() @ (camera_center(camera, v) - t)
             visible, params = curve_of(kind, shape, center)
             chords = CHORDS
-            if kind == SIDE_A or kind == SIDE_B:
+            if kind <= SIDE_B:
                 chords = 1
             length = 0.0 * shape[0]
             sign = 0.0 * shape[0]
@@ -365,7 +362,7 @@ def _equations_kernel(real):
                                     c2 = c - q + q2
                                     if part_limb[curve_part[q2]] != part_limb[p] and facts[c2, 0] > 0.0:
                                         chords = CHORDS
-                                        if curve_kind[q2] == SIDE_A or curve_kind[q2] == SIDE_B:
+                                        if curve_kind[q2] <= SIDE_B:
                                             chords = 1
                                         for s in range(chords):
                                             e0 = ti.Vector([lines[c2, s, 0], lines[c2, s, 1]])

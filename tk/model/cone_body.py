@@ -187,8 +187,8 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
             parts.append(_limb(f"upper_arm_{side}", shoulder, u, d.upper_arm, d.upper_arm_radius, d.elbow_radius, z))
             parts.append(_limb(f"forearm_{side}", elbow, u, d.forearm, d.elbow_radius, d.wrist_radius, z))
         if preset == "full":
-            # half closed: shorter than the stretched hand, wider than the wrist across the palm
-            shape = (0.9 * d.wrist_radius, 1.3 * d.wrist_radius, 0.85 * d.hand, 0.7)
+            # half open: a little shorter than the stretched hand, wider than the wrist across the palm
+            shape = (0.9 * d.wrist_radius, 1.4 * d.wrist_radius, 0.95 * d.hand, 0.6)
             parts.append(
                 ConePart(f"hand_{side}", f"forearm_{side}", CONE, shape, _frame(wrist, u, z), ends=(False, True))
             )
@@ -208,10 +208,10 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
 
 
 def _torso(d: BodyDimensions) -> ConePart:
-    """From the crotch to the shoulders; one magnification for width and depth, as the paper has it."""
-    x, y, z = np.eye(3)
-    bottom = -CROTCH_DROP / HIP_HALF_WIDTH * d.hip_half_width * 0.5
-    top = d.trunk - 0.6 * d.shoulder_drop
+    """From the crotch to the root of the neck; one magnification for width and depth, as the paper has it."""
+    x, _, z = np.eye(3)
+    bottom = -0.5 * CROTCH_DROP / HIP_HALF_WIDTH * d.hip_half_width
+    top = 0.94 * d.trunk
     m = d.chest_half_width / d.hips_half_width
     depth = 0.5 * (d.hips_half_depth + d.chest_half_depth / m)
     shape = (depth, d.hips_half_width, top - bottom, m)
@@ -219,11 +219,15 @@ def _torso(d: BodyDimensions) -> ConePart:
 
 
 def _head(d: BodyDimensions) -> ConePart:
-    """An ellipsoid from C7 to the crown: it stands for the neck, too."""
+    """An ellipsoid that reaches from the crown into the torso: it stands for the neck, too.
+
+    C7 lies at the back of the neck and the crown behind the middle of the head: its centre is before their line.
+    """
     x, _, z = np.eye(3)
-    half = 0.5 * d.head
+    half = 0.58 * d.head
     shape = (1.12 * d.head_radius, d.head_radius, half, 1.0)
-    return ConePart("head", "head", ELLIPSOID, shape, _frame((d.trunk + half) * z, z, x))
+    center = (d.trunk + d.head - half) * z + 0.1 * d.head * x
+    return ConePart("head", "head", ELLIPSOID, shape, _frame(center, z, x))
 
 
 def _limb(

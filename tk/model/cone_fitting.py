@@ -32,12 +32,15 @@ _LENGTHS = {
     "calf": 0.05,
     "foot": 0.06,
     "hand": 0.1,
-    "shoulder_drop": 0.1,
+    "shoulder_drop": 0.25,
     "shoulder_half_width": 0.06,
     "hip_half_width": 0.06,
     "ankle_height": 0.1,
 }
 _RADII = 0.2
+
+# Step of the differences by the logarithm of a dimension.
+_STEP = 1e-4
 
 
 @dataclass(frozen=True)
@@ -105,12 +108,13 @@ def fit_dimensions(
     information = 1.0 / (config.edge_noise_px**2 * config.correlation_px)
     for _ in range(config.rounds):
         here = build_cone_body(_dimensions(log), up, body.preset)
+        pairs = neighbours(here, up)
         H = np.zeros((F * D + K, F * D + K))
         g = np.zeros(F * D + K)
         shape = slice(F * D, F * D + K)
         for f in range(F):
             edgels = views.edgels(here, pyramids[f], poses[f], 0, settings)
-            rows = np.hstack([pose_rows(here, poses[f], edgels), dimension_rows(here, poses[f], edgels, up)])
+            rows = np.hstack([pose_rows(here, poses[f], edgels), dimension_rows(pairs, poses[f], edgels)])
             weight = edgels.weight * information
             A = rows.T @ (weight[:, None] * rows)
             y = rows.T @ (weight * edgels.distance)
@@ -160,18 +164,23 @@ def pose_rows(body: ConeBody, pose: Float, edgels: Edgels) -> Float:
     return rows
 
 
-def dimension_rows(body: ConeBody, pose: Float, edgels: Edgels, up: str) -> Float:
+def neighbours(body: ConeBody, up: str) -> list[tuple[ConeBody, ConeBody]]:
+    """(K) bodies with each dimension a little larger and a little smaller: what :func:`dimension_rows` differs."""
+    return [
+        (
+            build_cone_body(body.dimensions.scaled(**{field.name: np.exp(_STEP)}), up, body.preset),
+            build_cone_body(body.dimensions.scaled(**{field.name: np.exp(-_STEP)}), up, body.preset),
+        )
+        for field in fields(BodyDimensions)
+    ]
+
+
+def dimension_rows(pairs: Sequence[tuple[ConeBody, ConeBody]], pose: Float, edgels: Edgels) -> Float:
     """(N, K) the same by the logarithms of the dimensions, by central differences of the surface points."""
-    h = 1e-4
     columns = []
-    for field in fields(BodyDimensions):
-        ends = [
-            build_cone_body(body.dimensions.scaled(**{field.name: np.exp(step)}), up, body.preset).place(
-                pose, edgels.part, edgels.unscaled
-            )
-            for step in (h, -h)
-        ]
-        columns.append(np.einsum("na,na->n", edgels.row, ends[0] - ends[1]) / (2 * h))
+    for larger, smaller in pairs:
+        moved = larger.place(pose, edgels.part, edgels.unscaled) - smaller.place(pose, edgels.part, edgels.unscaled)
+        columns.append(np.einsum("na,na->n", edgels.row, moved) / (2 * _STEP))
     return np.column_stack(columns)
 
 

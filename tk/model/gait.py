@@ -51,7 +51,7 @@ def walking_pose(skeleton: Skeleton, phase: float | None) -> Float:
 
 
 def hypotheses(skeleton: Skeleton, headings: int, phases: int, p_pelvis: Float) -> Float:
-    """(B, D) poses with the pelvis at ``p_pelvis`` (3,): walking phases, standing and Da Vinci pose, each at every heading."""
+    """(B, D) walking phases, standing and Da Vinci pose at every heading, with the pelvis at ``p_pelvis`` (3,)."""
     figures = [walking_pose(skeleton, i / phases) for i in range(phases)]
     figures += [standing_pose(skeleton), neutral_pose(skeleton)]
     poses = []

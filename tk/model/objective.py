@@ -7,7 +7,7 @@ of, voxels, colours, samples, stays here.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -208,35 +208,41 @@ class FrameObjective:
         """Poses (B, D) mapped into the joints' limits (eq. 22)."""
         return self.objective.body.skeleton.clip(poses)
 
-    def damping(self, lever_m: float) -> Float:
+    def damping(self, lever_m: float, softness: float = 1.0) -> Float:
         """See :meth:`BodyObjective.damping`."""
-        return self.objective.damping(lever_m)
+        return self.objective.damping(lever_m) / softness
 
-    def full(self) -> Callable[[Float, Float, int], Evaluation]:
+    def full(self, softness: float = 1.0) -> Callable[[Float, Float, int], Evaluation]:
         """All degrees of freedom: new samples for every iteration number, the same in all rows."""
         draws = _Draws(self._draw_full)
+        settings = self._softened(softness)
 
         def evaluate(poses: Float, directions: Float, iteration: int) -> Evaluation:
             samples, voxels = draws(iteration)
             B = len(poses)
-            return self._evaluate(np.repeat(samples[None], B, 0), np.repeat(voxels[None], B, 0), poses, directions)
+            rows = np.repeat(samples[None], B, 0), np.repeat(voxels[None], B, 0)
+            return self._evaluate(*rows, poses, directions, settings)
 
         return evaluate
 
-    def chains(self, owner: NDArray[np.intp], pose: Float) -> Callable[[Float, Float, int], Evaluation]:
+    def chains(
+        self, owner: NDArray[np.intp], pose: Float, softness: float = 1.0
+    ) -> Callable[[Float, Float, int], Evaluation]:
         """Row b is chain ``owner[b]`` with its own samples, and voxels that are its own or nobody's at ``pose``."""
         s = self.objective.sampling
         self._pools = self._chain_pools(self.fit(pose))
+        settings = self._softened(softness)
 
         def draw() -> tuple[Ints, Ints]:
-            samples = [pick(self.rng, samples, s.chain) for samples in self.objective.chain_samples]
+            # a chain with fewer samples than asked for gives some of them twice: rows are of one length
+            samples = [np.resize(pick(self.rng, own, s.chain), s.chain) for own in self.objective.chain_samples]
             voxels = [pool[self.rng.integers(len(pool), size=s.chain_voxels)] for pool in self._pools]
             return np.stack(samples)[owner], np.stack(voxels)[owner]
 
         draws = _Draws(draw)
 
         def evaluate(poses: Float, directions: Float, iteration: int) -> Evaluation:
-            return self._evaluate(*draws(iteration), poses, directions)
+            return self._evaluate(*draws(iteration), poses, directions, settings)
 
         return evaluate
 
@@ -244,15 +250,20 @@ class FrameObjective:
         """(B,) the chains' objectives on even samples and on the voxels of the last :meth:`chains`."""
         samples = np.stack([even(s, 60) if len(s) >= 60 else np.resize(s, 60) for s in self.objective.chain_samples])
         voxels = np.stack([even(p, 120) if len(p) >= 120 else np.resize(p, 120) for p in self._pools])
-        return self._evaluate(samples[owner], voxels[owner], poses, None).value
+        return self._evaluate(samples[owner], voxels[owner], poses, None, self.objective.settings).value
 
     def value(self, pose: Float) -> float:
         """The objective at ``pose`` (D,) on even samples and all voxels."""
         return self.fit(pose).value
 
-    def curvature(self, pose: Float) -> Float:
-        """(D, D) Gauss-Newton Hessian at ``pose`` (D,)."""
-        return self.fit(pose).linear.hessian
+    def curvature(self, pose: Float, softness: float = 1.0) -> Float:
+        """(D, D) Gauss-Newton Hessian at ``pose`` (D,), outliers weighing at least :attr:`outliers`."""
+        fit = self.fit(pose)
+        settings = self._softened(softness)
+        kernel = self.objective.kernel
+        return kernel.linearise(
+            self.index, fit.samples, fit.voxels, pose, fit.held, settings, self.outliers, with_jacobian=False
+        ).hessian
 
     def fit(self, pose: Float) -> Fit:
         """How well ``pose`` (D,) explains the frame, on samples that do not change from call to call."""
@@ -282,9 +293,15 @@ class FrameObjective:
         s = self.objective.sampling
         return self.objective.draw(self.rng), self.rng.integers(self.voxel_count, size=s.voxels).astype(np.int32)
 
-    def _evaluate(self, samples: Ints, voxels: Ints, poses: Float, directions: Float | None) -> Evaluation:
+    def _softened(self, softness: float) -> ObjectiveSettings:
+        s = self.objective.settings
+        return replace(s, nu=softness * s.nu, coverage_nu=softness * s.coverage_nu)
+
+    def _evaluate(
+        self, samples: Ints, voxels: Ints, poses: Float, directions: Float | None, settings: ObjectiveSettings
+    ) -> Evaluation:
         value, gradient, product, _ = self.objective.kernel.evaluate(
-            self.index, samples, voxels, poses, directions, self.objective.settings
+            self.index, samples, voxels, poses, directions, settings
         )
         return Evaluation(value, gradient, product)
 

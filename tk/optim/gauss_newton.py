@@ -44,7 +44,8 @@ class GaussNewtonConfig:
         damping: share of the diagonal that is added to it.
         stiffness: what is added to the diagonal at least, as a share of its mean over the free parameters that the
             data sees; it keeps the others where they are.
-        limit_weight: weight of the squared excess over a limit, as a share of the same mean (4.5; the paper gives none).
+        limit_weight: weight of the squared excess over a limit, as a share of the same mean (4.5, which gives no
+            number).
         longest_step: largest change of a parameter in one iteration; steps are shortened to it as a whole.
     """
 

@@ -1,4 +1,4 @@
-"""The two passes of a frame (Kehl 2006, section 6.4): all degrees of freedom at ε₁, then the chains at ε₂ with the
+"""The passes of a frame (Kehl 2006, section 6.4): all degrees of freedom at ε₁, then the chains at ε₂ with the
 torso held, as one batch. What they optimise is known only as a :class:`Problem`.
 
 Beyond the paper:
@@ -7,13 +7,17 @@ Beyond the paper:
   for most angles, 5000 for rolls, 10000 for knees and elbows) are a diagonal guess at the inverse Hessian in its own
   units; here the same is read off the data, so that a step of 1 is a Newton step. ``whiten = False`` takes the diagonal
   alone.
+* The error potential starts soft and hardens from pass to pass: with the final ν a limb that has moved by two σ since
+  the last frame is all outliers and feels nothing.
 * The chains start from several hypotheses at once: where the first pass left them, where the last frame had them, and a
   few at random about that. A limb that has lost its data is found again in this way; a row of a batch costs little.
+* A last pass over all degrees of freedom lets the torso profit from limbs in place. The paper fixes it after the first.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -42,23 +46,23 @@ class Problem(Protocol):
         """Poses (B, D) mapped into the limits."""
         ...
 
-    def full(self) -> smd.Objective:
-        """The objective of all parameters."""
+    def full(self, softness: float) -> smd.Objective:
+        """The objective of all parameters; ``softness`` multiplies Leclerc's ν: outliers count from farther away."""
         ...
 
     def value(self, pose: Float) -> float:
         """The objective at a pose (D,) on samples that do not change from call to call."""
         ...
 
-    def curvature(self, pose: Float) -> Float:
+    def curvature(self, pose: Float, softness: float) -> Float:
         """(D, D) Gauss-Newton Hessian at a pose."""
         ...
 
-    def damping(self, lever_m: float) -> Float:
+    def damping(self, lever_m: float, softness: float) -> Float:
         """(D,) curvature that a parameter would have, were all points ``lever_m`` from its axis."""
         ...
 
-    def chains(self, owner: NDArray[np.intp], pose: Float) -> smd.Objective:
+    def chains(self, owner: NDArray[np.intp], pose: Float, softness: float) -> smd.Objective:
         """The objective whose row b is chain ``owner[b]``, the rest of the body being at ``pose``."""
         ...
 
@@ -77,9 +81,13 @@ class ScheduleConfig:
         refine: ε₂ / ε₁ (paper: ½).
         rate: first step size, as a share of a Newton step.
         whiten: see the module's docstring.
-        lever_m: a parameter whose points all lie nearer to its axis is damped as if they lay this far: the roll of a
-            straight limb follows noise otherwise.
+        lever_m, chain_lever_m: a parameter whose points all lie nearer to its axis is damped as if they lay this far:
+            the roll of a straight limb follows noise otherwise.
         outliers: least weight of a pair in the Hessian.
+        soft, chain_soft: by how much Leclerc's ν is multiplied in the first pass and for the chains; 1 is the paper's.
+        iterations, chain_iterations, polish_iterations: i_max (eq. 21) of the three passes; no polish with 0, as in the
+            paper.
+        retries: how often a frame whose objective stays high is searched anew from other starts.
         hypotheses: starts of each chain, at least 1.
         spread_deg: standard deviation of the random ones.
         margin: by how much a hypothesis must be better than the first.
@@ -90,11 +98,17 @@ class ScheduleConfig:
     tolerance_deg: float = 0.2
     tolerance_m: float = 0.002
     refine: float = 0.5
-    rate: float = 0.5
+    rate: float = 0.6
     whiten: bool = True
     lever_m: float = 0.03
     chain_lever_m: float = 0.06
     outliers: float = 0.1
+    soft: float = 4.0
+    chain_soft: float = 2.0
+    iterations: int = 10
+    chain_iterations: int = 10
+    polish_iterations: int = 6
+    retries: int = 2
     hypotheses: int = 4
     spread_deg: float = 17.0
     margin: float = 0.01
@@ -102,11 +116,11 @@ class ScheduleConfig:
     max_step_m: float = 0.15
 
     def __post_init__(self) -> None:
-        positive = ("tolerance_deg", "tolerance_m", "refine", "lever_m", "chain_lever_m", "max_step_deg", "max_step_m")
-        for name in positive:
+        lengths = ("tolerance_deg", "tolerance_m", "max_step_deg", "max_step_m", "lever_m", "chain_lever_m")
+        for name in (*lengths, "refine", "soft", "chain_soft", "iterations", "chain_iterations"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"schedule.{name} = {getattr(self, name)} must be positive")
-        for name in ("outliers", "spread_deg", "margin"):
+        for name in ("outliers", "spread_deg", "margin", "polish_iterations"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"schedule.{name} = {getattr(self, name)} must not be negative")
         if self.hypotheses < 1 or not 0 < self.rate <= 2:
@@ -130,8 +144,10 @@ def optimise(
     rng: np.random.Generator,
     config: ScheduleConfig,
     smd_config: smd.SmdConfig,
+    good_enough: float = np.inf,
+    alternatives: Callable[[Float, np.random.Generator], Float] | None = None,
 ) -> ScheduleResult:
-    """Both passes.
+    """All passes; again from elsewhere while the objective stays high.
 
     Args:
         problem: the frame.
@@ -139,50 +155,125 @@ def optimise(
         previous: (D,) the last frame's pose.
         rng: for the random hypotheses.
         config, smd_config: settings.
+        good_enough: the value of the objective that ends the search.
+        alternatives: other starts (A, D), made from the best pose so far, for when it is not good enough.
     """
     tolerance = np.where(problem.angular, np.radians(config.tolerance_deg), config.tolerance_m)
-    max_step = np.where(problem.angular, np.radians(config.max_step_deg), config.max_step_m)
     starts = problem.constrain(starts)
-    start = starts[0] if len(starts) == 1 else min(starts, key=problem.value)
-    everything = np.ones(len(start), bool)
-    basis, inverse = descent_basis(problem.curvature(start), everything, problem.damping(config.lever_m), config)
-    first = smd.minimise(
-        problem.full(), start[None], config.rate, tolerance, problem.constrain, basis[None], smd_config,
-        max_step=max_step, basis_inverse=inverse[None],
-    )  # fmt: skip
-    pose = first.pose[0]
+    best = _passes(problem, _best(problem, starts), previous, tolerance, rng, config, smd_config)
+    value = problem.value(best.pose)
+    for _ in range(config.retries if alternatives is not None else 0):
+        if value <= good_enough:
+            break
+        others = problem.constrain(np.concatenate([best.pose[None], alternatives(best.pose, rng)]))
+        limit = replace(smd_config, max_iterations=config.iterations)
+        moved = _all(problem, others, tolerance, config.soft, config, limit)
+        again = _passes(problem, _best(problem, moved.pose), previous, tolerance, rng, config, smd_config)
+        iterations = best.iterations + again.iterations
+        iterations[0] += moved.iterations.max()
+        found = problem.value(again.pose)
+        better = found < value
+        best = ScheduleResult(again.pose if better else best.pose, iterations)
+        value = min(value, found)
+    return best
 
+
+def _best(problem: Problem, poses: Float) -> Float:
+    return poses[0] if len(poses) == 1 else min(poses, key=problem.value)
+
+
+def _passes(
+    problem: Problem,
+    start: Float,
+    previous: Float,
+    tolerance: Float,
+    rng: np.random.Generator,
+    config: ScheduleConfig,
+    smd_config: smd.SmdConfig,
+) -> ScheduleResult:
+    """All parameters, the chains, all parameters."""
+    limit = replace(smd_config, max_iterations=config.iterations)
+    first = _all(problem, start[None], tolerance, config.soft, config, limit)
+    pose, winners = _chains(problem, first.pose[0], previous, tolerance * config.refine, rng, config, smd_config)
+    made = first.iterations
+    if config.polish_iterations:
+        limit = replace(smd_config, max_iterations=config.polish_iterations)
+        last = _all(problem, pose[None], tolerance * config.refine, 1.0, config, limit)
+        pose = last.pose[0]
+        made = made + last.iterations
+    return ScheduleResult(pose, np.concatenate([made, winners]).astype(np.int32))
+
+
+def _all(
+    problem: Problem,
+    starts: Float,
+    tolerance: Float,
+    softness: float,
+    config: ScheduleConfig,
+    smd_config: smd.SmdConfig,
+) -> smd.SmdResult:
+    """One pass over all parameters, from each of the starts (B, D)."""
+    everything = np.ones(starts.shape[1], bool)
+    damping = problem.damping(config.lever_m, softness)
+    pairs = [descent_basis(problem.curvature(start, softness), everything, damping, config) for start in starts]
+    return smd.minimise(
+        problem.full(softness),
+        starts,
+        config.rate,
+        tolerance,
+        problem.constrain,
+        np.stack([basis for basis, _ in pairs]),
+        smd_config,
+        max_step=_max_step(problem, config),
+        basis_inverse=np.stack([inverse for _, inverse in pairs]),
+    )
+
+
+def _max_step(problem: Problem, config: ScheduleConfig) -> Float:
+    return np.where(problem.angular, np.radians(config.max_step_deg), config.max_step_m)
+
+
+def _chains(
+    problem: Problem,
+    pose: Float,
+    previous: Float,
+    tolerance: Float,
+    rng: np.random.Generator,
+    config: ScheduleConfig,
+    smd_config: smd.SmdConfig,
+) -> tuple[Float, NDArray[np.int32]]:
+    """The chains with the torso at ``pose``: the pose with each chain's best hypothesis, and their iterations (K,)."""
     free = problem.free
     K = len(free)
     owner = np.tile(np.arange(K), config.hypotheses)
-    hypotheses = np.repeat(pose[None], K * config.hypotheses, axis=0)
+    hypotheses = np.repeat(pose[None], len(owner), axis=0)
     noise = rng.normal(scale=np.radians(config.spread_deg), size=hypotheses.shape) * problem.angular
     for row in range(K, len(owner)):
         mine = free[owner[row]]
         hypotheses[row, mine] = previous[mine] if row < 2 * K else pose[mine] + noise[row, mine]
-    H = problem.curvature(pose)
-    damping = problem.damping(config.chain_lever_m)
+    H = problem.curvature(pose, config.chain_soft)
+    damping = problem.damping(config.chain_lever_m, config.chain_soft)
     pairs = [descent_basis(H, free[k], damping, config) for k in range(K)]
-    second = smd.minimise(
-        problem.chains(owner, pose),
+    found = smd.minimise(
+        problem.chains(owner, pose, config.chain_soft),
         problem.constrain(hypotheses),
         config.rate,
-        tolerance * config.refine,
+        tolerance,
         problem.constrain,
         np.stack([basis for basis, _ in pairs])[owner],
-        smd_config,
-        max_step=max_step,
+        replace(smd_config, max_iterations=config.chain_iterations),
+        max_step=_max_step(problem, config),
         basis_inverse=np.stack([inverse for _, inverse in pairs])[owner],
     )
     best = np.arange(K)
     if config.hypotheses > 1:
-        values = problem.chain_values(owner, second.pose).reshape(config.hypotheses, K)
+        values = problem.chain_values(owner, found.pose).reshape(config.hypotheses, K)
         values[1:] += config.margin
         best = values.argmin(axis=0) * K + np.arange(K)
     result = pose.copy()
     for k in range(K):
-        result[free[k]] = second.pose[best[k], free[k]]
-    return ScheduleResult(result, np.concatenate([first.iterations, second.iterations[best]]).astype(np.int32))
+        result[free[k]] = found.pose[best[k], free[k]]
+    return result, found.iterations[best]
 
 
 def descent_basis(
