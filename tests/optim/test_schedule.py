@@ -1,0 +1,428 @@
+"""The passes on a body of ten numbers: a torso of three lengths and an angle, and two chains of three angles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from tests.optim.problems import Evaluation
+from tk.errors import ConfigError
+from tk.optim.schedule import Float, Problem, ScheduleConfig, ScheduleResult, descent_basis, optimise
+from tk.optim.smd import Objective, SmdConfig
+
+D = 10
+TORSO, CHAINS = slice(0, 4), (slice(4, 7), slice(7, 10))
+TARGET = np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.3, 0.2, -0.5, 0.3, 0.6])
+LIMIT = 3.0
+# the paper's two passes, each long enough to converge: one hypothesis, one error potential, no polish
+PAPER = ScheduleConfig(
+    soft=1.0, chain_soft=1.0, iterations=60, chain_iterations=60, polish_iterations=0, hypotheses=1, rate=0.5
+)
+
+
+@dataclass
+class Toy:
+    """A bowl for the torso; for each chain a well of width ``width`` at its target, and where there is one a shallower
+    well at its decoy. The forearm's place depends on the torso's, as a real one does.
+
+    Attributes:
+        decoys: per chain, (3,) or None.
+        depth: of the decoys' wells, the true one being 1 deep.
+        coupling: how far the chains' targets move with the torso's third length.
+        noise: standard deviation of the gradient, drawn anew for each iteration.
+        asked_full, asked_chains: all poses that the objectives were asked for.
+        held: the poses and owners that :meth:`chains` was called with.
+        softnesses: those of the objectives, in the order in which they were asked for.
+    """
+
+    target: Float = field(default_factory=lambda: TARGET.copy())
+    decoys: tuple[Float | None, Float | None] = (None, None)
+    depth: float = 0.6
+    width: float = 0.5
+    coupling: float = 0.0
+    noise: float = 0.0
+    full_moves_chains: bool = True
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+    asked_full: list[Float] = field(default_factory=list)
+    asked_chains: list[Float] = field(default_factory=list)
+    held: list[tuple[NDArray[np.intp], Float]] = field(default_factory=list)
+    softnesses: list[float] = field(default_factory=list)
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        free = np.zeros((2, D), bool)
+        for k, chain in enumerate(CHAINS):
+            free[k, chain] = True
+        return free
+
+    @property
+    def angular(self) -> NDArray[np.bool_]:
+        return np.arange(D) >= 3
+
+    def constrain(self, poses: Float) -> Float:
+        return np.clip(poses, -LIMIT, LIMIT)
+
+    def damping(self, lever_m: float, softness: float) -> Float:
+        return np.full(D, lever_m**2)
+
+    def _chain(self, k: int, pose: Float, softness: float = 1.0) -> tuple[float, Float]:
+        """Value and gradient (D,) of chain k."""
+        gradient = np.zeros(D)
+        value = 1.0
+        width2 = softness * self.width**2
+        for depth, centre in ((1.0, self.target[CHAINS[k]]), (self.depth, self.decoys[k])):
+            if centre is None:
+                continue
+            away = pose[CHAINS[k]] - centre - self.coupling * (pose[2] - self.target[2])
+            well = depth * np.exp(-0.5 * away @ away / width2)
+            value -= well
+            gradient[CHAINS[k]] += well * away / width2
+            gradient[2] -= self.coupling * well * away.sum() / width2
+        return float(value), gradient
+
+    def _whole(self, pose: Float, softness: float = 1.0, chains: bool = True) -> tuple[float, Float]:
+        away = np.zeros(D)
+        away[TORSO] = (pose - self.target)[TORSO]
+        value, gradient = 0.5 * float(away @ away), away
+        for k in range(2 if chains else 0):
+            f, g = self._chain(k, pose, softness)
+            value, gradient = value + f, gradient + g
+        return value, gradient
+
+    def _evaluation(self, rows: list[tuple[float, Float]], directions: Float, softness: float) -> Evaluation:
+        values, gradients = zip(*rows, strict=True)
+        noise = self.noise * self.rng.normal(size=directions.shape) if self.noise else 0.0
+        return Evaluation(
+            np.array(values), np.array(gradients) + noise, directions @ self.curvature(self.target, softness)
+        )
+
+    def full(self, softness: float) -> Objective:
+        self.softnesses.append(softness)
+
+        def evaluate(poses: Float, directions: Float, iteration: int) -> Evaluation:
+            self.asked_full.append(poses.copy())
+            return self._evaluation(
+                [self._whole(p, softness, self.full_moves_chains) for p in poses], directions, softness
+            )
+
+        return evaluate
+
+    def chains(self, owner: NDArray[np.intp], pose: Float, softness: float) -> Objective:
+        self.softnesses.append(softness)
+        self.held.append((owner.copy(), pose.copy()))
+
+        def evaluate(poses: Float, directions: Float, iteration: int) -> Evaluation:
+            self.asked_chains.append(poses.copy())
+            return self._evaluation(
+                [self._chain(k, p, softness) for k, p in zip(owner, poses, strict=True)], directions, softness
+            )
+
+        return evaluate
+
+    def value(self, pose: Float) -> float:
+        return self._whole(pose)[0]
+
+    def curvature(self, pose: Float, softness: float) -> Float:
+        rows = np.eye(D)  # the residuals' Jacobian: at the target the wells are bowls
+        rows[4:, 2] -= self.coupling
+        rows[4:] /= self.width * np.sqrt(softness)
+        return rows.T @ rows
+
+    def chain_values(self, owner: NDArray[np.intp], poses: Float) -> Float:
+        return np.array([self._chain(k, p)[0] for k, p in zip(owner, poses, strict=True)])
+
+
+def solve(
+    toy: Toy,
+    start: Float | None = None,
+    previous: Float | None = None,
+    config: ScheduleConfig = PAPER,
+    seed: int = 0,
+    smd_config: SmdConfig | None = None,
+) -> ScheduleResult:
+    problem: Problem = toy
+    start = toy.target + 0.2 if start is None else start
+    previous = start if previous is None else previous
+    rng = np.random.default_rng(seed)
+    return optimise(problem, np.atleast_2d(start), previous, rng, config, smd_config or SmdConfig())
+
+
+def beside(pose: Float, chain: int, place: Float | float) -> Float:
+    """``pose`` with a chain put elsewhere."""
+    pose = pose.copy()
+    pose[CHAINS[chain]] = place
+    return pose
+
+
+# --- the passes -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("whiten", "coupling"), [(True, 0.5), (True, 0.0), (False, 0.0)])
+@pytest.mark.parametrize("hypotheses", [1, 2, 5])
+def test_finds_the_target(whiten: bool, coupling: float, hypotheses: int) -> None:
+    result = solve(Toy(coupling=coupling), config=replace(PAPER, whiten=whiten, hypotheses=hypotheses))
+    assert np.abs(result.pose - TARGET).max() < 0.005  # a few of the second tolerance
+    assert result.iterations.shape == (3,) and result.iterations.dtype == np.int32
+
+
+def test_the_second_pass_holds_the_torso_and_the_other_chains() -> None:
+    toy = Toy(coupling=0.3)
+    # so short a first pass leaves the torso where the chains would like to pull it
+    result = solve(toy, TARGET + 0.6, config=replace(PAPER, hypotheses=3, iterations=4))
+    ((owner, pose),) = toy.held
+    assert np.abs(pose - TARGET)[TORSO].min() > 0.01
+    np.testing.assert_array_equal(result.pose[TORSO], pose[TORSO])
+    for poses in toy.asked_chains:
+        for k, row in zip(owner, poses, strict=True):
+            np.testing.assert_array_equal(row[~toy.free[k]], pose[~toy.free[k]])
+    assert np.abs(toy.asked_chains[-1] - toy.asked_chains[0]).max() > 0.01
+
+
+def test_the_second_pass_begins_where_the_first_ended() -> None:
+    toy = Toy()
+    solve(toy, smd_config=SmdConfig(average=False))
+    ((owner, pose),) = toy.held
+    np.testing.assert_array_equal(owner, [0, 1])
+    np.testing.assert_array_equal(toy.asked_chains[0], [pose, pose])
+    # and a last state is a step away from the last that was asked for
+    assert 0 < np.abs(pose - toy.asked_full[-1][0]).max() < np.radians(2)
+
+
+def test_refines_to_a_part_of_the_first_tolerance() -> None:
+    """The chains alone: the coarser ε₁ leaves an error that ε₂ does not."""
+    coarse, fine = (
+        solve(Toy(), config=replace(PAPER, tolerance_deg=8.0, tolerance_m=0.1, refine=refine)) for refine in (1.0, 0.01)
+    )
+    assert np.abs(fine.pose - TARGET)[4:].max() < 0.1 * np.abs(coarse.pose - TARGET)[4:].max()
+    np.testing.assert_array_equal(fine.pose[TORSO], coarse.pose[TORSO])
+
+
+def test_a_chain_does_not_depend_on_the_other() -> None:
+    """With a first pass that moves the torso only, so that the second begins at the same pose."""
+    here = Toy(full_moves_chains=False)
+    there = Toy(full_moves_chains=False, target=beside(TARGET, 1, 0.0))
+    start = TARGET + 0.2
+    config = replace(PAPER, hypotheses=3)
+    first, second = (solve(toy, start, config=config) for toy in (here, there))
+    np.testing.assert_array_equal(first.pose[CHAINS[0]], second.pose[CHAINS[0]])
+    assert first.iterations[1] == second.iterations[1]
+    assert np.abs(first.pose - second.pose)[CHAINS[1]].max() > 0.2
+
+
+def test_begins_at_the_best_of_the_predictions() -> None:
+    toy = Toy()
+    starts = np.stack([TARGET + 0.5, TARGET + 0.2, TARGET - 0.3])
+    solve(toy, starts, previous=starts[0])
+    np.testing.assert_array_equal(toy.asked_full[0], starts[[1]])
+
+
+def test_a_prediction_outside_the_limits_is_judged_inside() -> None:
+    """Far outside, the first would be the worst of the two."""
+    toy = Toy(target=np.where(np.arange(D) == 0, LIMIT, TARGET))
+    beyond, near = toy.target.copy(), toy.target + 0.1
+    beyond[0] += 10
+    assert toy.value(beyond) > toy.value(near)
+    solve(toy, np.stack([near, beyond]), previous=near)
+    np.testing.assert_array_equal(toy.asked_full[0], [toy.target])
+
+
+def test_iterations_are_those_of_the_first_pass_and_of_each_chain_in_turn() -> None:
+    """One chain is there already and stops after the first window; the other has far to go. The first pass, which
+    moves neither, is somewhere between."""
+    for slow in (0, 1):
+        toy = Toy(full_moves_chains=False)
+        result = solve(toy, beside(TARGET, slow, TARGET[CHAINS[slow]] + 0.4))
+        assert len(toy.asked_full) == result.iterations[0] == 3
+        assert result.iterations[1 + (1 - slow)] == 3
+        assert len(toy.asked_chains) == result.iterations[1 + slow] > 6
+
+
+def test_the_potential_hardens_from_pass_to_pass() -> None:
+    toy = Toy()
+    solve(toy, config=replace(PAPER, soft=5.0, chain_soft=3.0, polish_iterations=4))
+    assert toy.softnesses == [5.0, 3.0, 1.0]
+
+
+def test_a_soft_potential_reaches_a_limb_that_moved_far() -> None:
+    """Four widths away the true well is flat. It is not while it is soft, and in the end it is as narrow as ever."""
+    far = beside(TARGET, 0, TARGET[CHAINS[0]] + 1.2)
+    hard = solve(Toy(), far)
+    assert np.abs(hard.pose - TARGET)[CHAINS[0]].min() > 0.5
+    soft = solve(Toy(), far, config=replace(PAPER, soft=8.0, chain_soft=2.0))
+    np.testing.assert_allclose(soft.pose, TARGET, atol=0.01)
+
+
+def test_the_polish_lets_the_torso_profit_from_limbs_in_place() -> None:
+    """Too short a first pass leaves the torso astray; the polish brings it home, and counts with the first."""
+    short = replace(PAPER, iterations=4)
+    without = solve(Toy(coupling=0.3), config=short)
+    toy = Toy(coupling=0.3)
+    polished = solve(toy, config=replace(short, polish_iterations=30))
+    assert np.abs(without.pose - TARGET)[TORSO].max() > 0.01
+    np.testing.assert_allclose(polished.pose, TARGET, atol=0.005)
+    assert without.iterations[0] == 4 < polished.iterations[0] == len(toy.asked_full)
+    np.testing.assert_array_equal(polished.iterations[1:], without.iterations[1:])
+
+
+def test_each_pass_has_its_own_limit() -> None:
+    toy = Toy()
+    config = replace(PAPER, tolerance_deg=1e-6, tolerance_m=1e-8, iterations=4, chain_iterations=5, polish_iterations=6)
+    result = solve(toy, config=config)
+    assert result.iterations.tolist() == [4 + 6, 5, 5]
+    assert (len(toy.asked_full), len(toy.asked_chains)) == (10, 5)
+
+
+# --- hypotheses -------------------------------------------------------------------------------------------------------
+
+DECOY = TARGET[CHAINS[0]] + 1.0
+
+
+def test_the_last_frames_pose_rescues_a_chain() -> None:
+    """The prediction threw the arm into another well. From there SMD alone does not return; the last pose does."""
+    toy = Toy(decoys=(DECOY, None))
+    thrown = beside(TARGET, 0, DECOY)
+    alone = solve(toy, thrown, previous=TARGET, config=replace(PAPER, hypotheses=1))
+    np.testing.assert_allclose(alone.pose[CHAINS[0]], DECOY, atol=0.05)
+    rescued = solve(toy, thrown, previous=TARGET, config=replace(PAPER, hypotheses=2))
+    np.testing.assert_allclose(rescued.pose, TARGET, atol=0.01)
+
+
+def test_a_chains_iterations_are_its_winners() -> None:
+    """The last pose is the optimum and stops after one window; where the first pass ends, there is far to go."""
+    for hypotheses, iterations in ((1, range(6, 60)), (2, range(3, 4))):
+        toy = Toy(decoys=(DECOY, None), full_moves_chains=False)
+        config = replace(PAPER, hypotheses=hypotheses)
+        result = solve(toy, beside(TARGET, 0, DECOY + 0.3), previous=TARGET, config=config)
+        assert result.iterations[1] in iterations
+
+
+def test_random_hypotheses_rescue_a_chain_that_was_lost_before() -> None:
+    thrown = beside(TARGET, 0, DECOY)
+    config = replace(PAPER, hypotheses=30, spread_deg=40.0)
+    rescued = 0
+    for seed in range(10):
+        result = solve(Toy(decoys=(DECOY, None)), thrown, previous=thrown, config=config, seed=seed)
+        rescued += bool(np.abs(result.pose - TARGET).max() < 0.02)
+    assert rescued >= 8
+    lost = solve(Toy(decoys=(DECOY, None)), thrown, previous=thrown, config=replace(config, hypotheses=2))
+    np.testing.assert_allclose(lost.pose[CHAINS[0]], DECOY, atol=0.05)
+
+
+def test_a_hypothesis_must_be_better_by_the_margin() -> None:
+    thrown = beside(TARGET, 0, DECOY)
+    for margin, place in ((0.05, DECOY), (0.01, TARGET[CHAINS[0]])):
+        toy = Toy(decoys=(DECOY, None), depth=0.97)
+        result = solve(toy, thrown, previous=TARGET, config=replace(PAPER, hypotheses=2, margin=margin))
+        np.testing.assert_allclose(result.pose[CHAINS[0]], place, atol=0.05)
+
+
+def test_where_each_hypothesis_begins() -> None:
+    toy = Toy()
+    previous = TARGET - 0.4
+    config = replace(PAPER, hypotheses=200, spread_deg=10.0)
+    solve(toy, previous=previous, config=config)
+    ((owner, pose),) = toy.held
+    begin = toy.asked_chains[0].reshape(200, 2, D)
+    for k, chain in enumerate(CHAINS):
+        np.testing.assert_array_equal(owner.reshape(200, 2)[:, k], k)
+        np.testing.assert_array_equal(begin[0, k], pose)
+        np.testing.assert_array_equal(begin[1, k, chain], previous[chain])
+        np.testing.assert_allclose(np.std(begin[2:, k, chain] - pose[chain]), np.radians(10), rtol=0.1)
+
+
+def test_random_hypotheses_change_angles_only() -> None:
+    class Telescope(Toy):
+        """The last parameter of each chain is a length."""
+
+        @property
+        def angular(self) -> NDArray[np.bool_]:
+            return ~np.isin(np.arange(D), [0, 1, 2, 6, 9])
+
+    toy = Telescope()
+    solve(toy, config=replace(PAPER, hypotheses=6))
+    ((_, pose),) = toy.held
+    moved = toy.asked_chains[0][4:] != pose
+    assert not moved[:, [6, 9]].any()
+    assert moved[::2, 4:6].all() and moved[1::2, 7:9].all()
+
+
+def test_hypotheses_keep_to_the_limits() -> None:
+    toy = Toy()
+    previous = np.full(D, 2 * LIMIT)
+    solve(toy, previous=previous, config=replace(PAPER, hypotheses=50, spread_deg=120.0))
+    assert max(np.abs(poses).max() for poses in toy.asked_chains) == LIMIT
+
+
+# --- seeds, bounds, settings ------------------------------------------------------------------------------------------
+
+
+def test_a_seed_decides_everything() -> None:
+    def run(seed: int) -> ScheduleResult:
+        toy = Toy(decoys=(DECOY, None), noise=0.05, rng=np.random.default_rng(seed))
+        return solve(toy, config=replace(PAPER, hypotheses=5), seed=seed)
+
+    first, again, other = run(1), run(1), run(2)
+    np.testing.assert_array_equal(first.pose, again.pose)
+    np.testing.assert_array_equal(first.iterations, again.iterations)
+    assert np.any(first.pose != other.pose)
+
+
+def test_no_iteration_moves_further_than_its_bound() -> None:
+    """Neither in the first pass nor in the second, which the first leaves far to go."""
+    toy = Toy()
+    solve(toy, TARGET + 0.5, config=replace(PAPER, max_step_deg=2.0, max_step_m=0.01, iterations=6))
+    bound = np.where(toy.angular, np.radians(2.0), 0.01)
+    for path in (np.array(toy.asked_full)[:, 0], np.array(toy.asked_chains)[:, 0], np.array(toy.asked_chains)[:, 1]):
+        share = np.max(np.abs(np.diff(path, axis=0)) / bound, axis=1)
+        assert np.all(share <= 1 + 1e-9)
+        np.testing.assert_allclose(share[:4], 1)
+
+
+@given(seed=st.integers(0, 2**32 - 1), free=st.lists(st.booleans(), min_size=6, max_size=6).filter(any))
+@settings(max_examples=40, deadline=None)
+def test_the_descent_basis_makes_the_curvature_of_the_free_parameters_one(seed: int, free: list[bool]) -> None:
+    rng = np.random.default_rng(seed)
+    J = rng.normal(size=(4, 6))  # fewer residuals than parameters: the damping makes up for what they do not see
+    hessian, damping = J.T @ J, rng.uniform(0.1, 1, 6)
+    mask = np.array(free)
+    basis, inverse = descent_basis(hessian, mask, damping, ScheduleConfig())
+    held = np.diag(mask.astype(float))
+    np.testing.assert_allclose(basis.T @ (hessian + np.diag(damping)) @ basis, held, atol=1e-9)
+    np.testing.assert_allclose(inverse, np.linalg.pinv(basis), atol=1e-9)
+    assert not basis[~mask].any() and not basis[:, ~mask].any()
+    diagonal, inverse = descent_basis(hessian, mask, damping, replace(PAPER, whiten=False))
+    np.testing.assert_allclose(diagonal, np.diag(mask / np.sqrt(np.diag(hessian) + damping)))
+    np.testing.assert_allclose(inverse, np.linalg.pinv(diagonal), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("hypotheses", 0),
+        ("rate", 0.0),
+        ("rate", 2.5),
+        ("tolerance_deg", 0.0),
+        ("tolerance_m", -1.0),
+        ("refine", 0.0),
+        ("lever_m", 0.0),
+        ("chain_lever_m", 0.0),
+        ("max_step_deg", 0.0),
+        ("max_step_m", float("nan")),
+        ("outliers", -0.1),
+        ("spread_deg", -1.0),
+        ("margin", -0.1),
+        ("soft", 0.0),
+        ("chain_soft", -1.0),
+        ("iterations", 0),
+        ("chain_iterations", 0),
+        ("polish_iterations", -1),
+    ],
+)
+def test_impossible_settings_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=name):
+        replace(ScheduleConfig(), **{name: value})
