@@ -120,7 +120,7 @@ class ScheduleConfig:
         for name in (*lengths, "refine", "soft", "chain_soft", "iterations", "chain_iterations"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"schedule.{name} = {getattr(self, name)} must be positive")
-        for name in ("outliers", "spread_deg", "margin", "polish_iterations"):
+        for name in ("outliers", "spread_deg", "margin", "polish_iterations", "retries"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"schedule.{name} = {getattr(self, name)} must not be negative")
         if self.hypotheses < 1 or not 0 < self.rate <= 2:
@@ -162,8 +162,8 @@ def optimise(
     starts = problem.constrain(starts)
     best = _passes(problem, _best(problem, starts), previous, tolerance, rng, config, smd_config)
     value = problem.value(best.pose)
-    for _ in range(config.retries if alternatives is not None else 0):
-        if value <= good_enough:
+    for _ in range(config.retries):
+        if alternatives is None or value <= good_enough:
             break
         others = problem.constrain(np.concatenate([best.pose[None], alternatives(best.pose, rng)]))
         limit = replace(smd_config, max_iterations=config.iterations)
