@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -144,12 +145,15 @@ def solve(
     config: ScheduleConfig = PAPER,
     seed: int = 0,
     smd_config: SmdConfig | None = None,
+    good_enough: float = np.inf,
+    alternatives: Callable[[Float, np.random.Generator], Float] | None = None,
 ) -> ScheduleResult:
     problem: Problem = toy
     start = toy.target + 0.2 if start is None else start
     previous = start if previous is None else previous
     rng = np.random.default_rng(seed)
-    return optimise(problem, np.atleast_2d(start), previous, rng, config, smd_config or SmdConfig())
+    smd_config = smd_config or SmdConfig()
+    return optimise(problem, np.atleast_2d(start), previous, rng, config, smd_config, good_enough, alternatives)
 
 
 def beside(pose: Float, chain: int, place: Float | float) -> Float:
@@ -358,6 +362,55 @@ def test_hypotheses_keep_to_the_limits() -> None:
     assert max(np.abs(poses).max() for poses in toy.asked_chains) == LIMIT
 
 
+# --- retries ----------------------------------------------------------------------------------------------------------
+
+
+class Elsewhere:
+    """Offers the torso's pose with the first chain put near its decoy and near its target; counts its calls."""
+
+    def __init__(self, *places: Float) -> None:
+        self.places = places
+        self.asked: list[Float] = []
+
+    def __call__(self, pose: Float, rng: np.random.Generator) -> Float:
+        self.asked.append(pose.copy())
+        return np.stack([beside(pose, 0, place) for place in self.places])
+
+
+def test_a_bad_end_is_searched_anew_from_elsewhere() -> None:
+    """Lost in the decoy, whose well leaves 0.4 of the objective; one of two other starts is near the true one."""
+    elsewhere = Elsewhere(DECOY + 0.1, TARGET[CHAINS[0]] + 0.3)
+    thrown = beside(TARGET, 0, DECOY)
+    toy = Toy(decoys=(DECOY, None))
+    result = solve(toy, thrown, config=replace(PAPER, retries=3), good_enough=0.1, alternatives=elsewhere)
+    np.testing.assert_allclose(result.pose, TARGET, atol=0.01)
+    (first_end,) = elsewhere.asked  # once was enough
+    np.testing.assert_allclose(first_end[CHAINS[0]], DECOY, atol=0.05)
+    # all iterations of all passes count, the starts' pass by that of its slowest row
+    assert result.iterations[0] == len(toy.asked_full)
+
+
+@pytest.mark.parametrize(("good_enough", "retries", "asked"), [(np.inf, 2, 0), (0.5, 2, 0), (0.1, 2, 2), (0.1, 0, 0)])
+def test_retries_end_when_good_enough_or_used_up(good_enough: float, retries: int, asked: int) -> None:
+    elsewhere = Elsewhere(DECOY - 0.1)
+    thrown = beside(TARGET, 0, DECOY)
+    config = replace(PAPER, retries=retries)
+    solve(Toy(decoys=(DECOY, None)), thrown, config=config, good_enough=good_enough, alternatives=elsewhere)
+    assert len(elsewhere.asked) == asked
+
+
+def test_a_retry_that_ends_worse_is_forgotten() -> None:
+    """Noise throws every search a little off; only one that ends lower may replace the pose."""
+    thrown = beside(TARGET, 0, DECOY)
+    ends: list[float] = []
+    for retries in range(5):
+        toy = Toy(decoys=(DECOY, None), noise=0.05)
+        config = replace(PAPER, retries=retries)
+        result = solve(toy, thrown, config=config, good_enough=0.0, alternatives=Elsewhere(DECOY - 0.1))
+        ends.append(toy.value(result.pose))
+    assert np.all(np.diff(ends) <= 0)
+
+
 # --- seeds, bounds, settings ------------------------------------------------------------------------------------------
 
 
@@ -421,6 +474,7 @@ def test_the_descent_basis_makes_the_curvature_of_the_free_parameters_one(seed: 
         ("iterations", 0),
         ("chain_iterations", 0),
         ("polish_iterations", -1),
+        ("retries", -1),
     ],
 )
 def test_impossible_settings_are_refused(name: str, value: float) -> None:
