@@ -192,6 +192,16 @@ def test_elbow_bends_forward_when_the_arm_hangs_and_inward_when_it_is_raised(sid
     assert abs(bend @ along) < 1e-9 and bend @ towards > np.cos(np.pi / 4)
 
 
+@pytest.mark.parametrize("side", ["l", "r"])
+@pytest.mark.parametrize(("ball", "end"), [("shoulder", "elbow"), ("hip", "knee")])
+def test_ball_joints_turn_about_three_perpendicular_axes_the_last_along_the_limb(ball, end, side):
+    rows = [k for k, name in enumerate(SKELETON.names) if name.startswith(f"{ball}_{side}_")]
+    axis, j = SKELETON.axis[rows], joints(np.zeros(D))
+    np.testing.assert_allclose(axis @ axis.T, np.eye(3), atol=1e-12)
+    limb = j[f"{end}_{side}"] - j[f"{ball}_{side}"]
+    assert abs(axis[-1] @ limb) == pytest.approx(np.linalg.norm(limb))
+
+
 # Limits
 
 
