@@ -477,9 +477,9 @@ class ObjectiveKernel:
         M, Q = len(chosen), len(voxels) if settings.coverage_weight > 0 else 0
         tasks = max(-(-(M + Q) // PAIRS_PER_TASK), 1)
         D = self.degrees
-        residual = np.zeros((M + Q, 3), self.dtype)
-        jacobian = np.zeros((M + Q if with_jacobian else 1, D, 3), self.dtype)
-        hessian = np.zeros((tasks, D, D), self.dtype)
+        residual: np.ndarray = np.zeros((M + Q, 3), self.dtype)
+        jacobian: np.ndarray = np.zeros((M + Q if with_jacobian else 1, D, 3), self.dtype)
+        hessian: np.ndarray = np.zeros((tasks, D, D), self.dtype)
         partner = np.empty(M + Q, np.int32)
         _linearise_kernel(ti.f64 if self.dtype == np.float64 else ti.f32)(
             *self._tree,
