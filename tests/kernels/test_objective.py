@@ -146,12 +146,16 @@ def test_voxels_are_paired_with_the_nearest_piece(kernel, seed, cosine):
     y_normal = scene.index.normals[scene.voxels[0]].astype(np.float64)
     T = SKELETON.transforms(scene.pose[0])
     distance = np.full((len(BODY.pieces), len(y)), np.inf)
+    to_box = np.empty_like(distance)
     on_zero = np.empty((len(BODY.pieces), len(y), 3))
     for i, p in enumerate(BODY.pieces):
         T_world_piece = T[PIECE_DOF[i]] @ p.T_body_piece
         R, t = T_world_piece[:3, :3], T_world_piece[:3, 3]
         q = (y - t) @ R
         on, normal = oracles.project(q, np.array(p.radii), p.e1, p.e2, p.z_lower, p.z_upper)
+        beyond = np.abs(q) - p.radii
+        beyond[:, 2] = np.maximum(p.z_lower - q[:, 2], q[:, 2] - p.z_upper)
+        to_box[i] = np.linalg.norm(np.maximum(beyond, 0), axis=1)
         agrees = (np.sum(normal @ R.T * y_normal, axis=1) >= cosine) | ~y_normal.any(axis=1)
         d = np.linalg.norm(q - on, axis=1)
         distance[i] = np.where(agrees & (d < case.coverage_reach_m), d, np.inf)
@@ -159,12 +163,12 @@ def test_voxels_are_paired_with_the_nearest_piece(kernel, seed, cosine):
     best = distance.argmin(axis=0)
     expected = np.where(np.isfinite(distance.min(axis=0)), best, -1)
     got = held.covering[0, :, 0].astype(int)
-    # the kernel leaves out pieces whose box is farther than the best so far; a first-order projection outside its own
-    # box may be nearer still: at the rims of truncated pieces, and rarely
+    # The kernel leaves out a piece whose box is farther than the best so far; its first-order projection may lie
+    # outside that box and be nearer still: at the rims of truncated pieces, and rarely.
     same = got == expected
     assert same.mean() > 0.97
     for m in np.flatnonzero(~same):
-        assert got[m] >= 0 and distance[got[m], m] < distance[expected[m], m] + 0.02
+        assert got[m] >= 0 and to_box[expected[m], m] >= distance[got[m], m] - 1e-6
     hit = same & (got >= 0)
     assert 0.3 < hit.mean() < 1
     np.testing.assert_allclose(held.covering[0, hit, 1:], on_zero[got[hit], hit], atol=2e-4)

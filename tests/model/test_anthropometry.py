@@ -13,8 +13,8 @@ NAMES = [f.name for f in fields(BodyDimensions)]
 
 @pytest.mark.parametrize("stature", [1.1, 1.5, 1.75, 2.1])
 def test_the_average_body_is_as_tall_as_asked(stature):
-    """The segments of a standing person add up, to the rounding of the table."""
-    assert BodyDimensions.from_stature(stature).stature == pytest.approx(stature, rel=0.006)
+    """The segments of a standing person add up, to the rounding of the table and a shoe's sole."""
+    assert -0.005 < BodyDimensions.from_stature(stature).stature / stature - 1 < 0.02
 
 
 def test_every_dimension_grows_with_the_stature():
@@ -38,7 +38,8 @@ def test_table_agrees_with_drillis_and_contini():
     winter |= {"CALF_LENGTH": 0.246, "ANKLE_HEIGHT": 0.039, "FOOT_LENGTH": 0.152}
     del winter["UPPER_ARM_LENGTH"]  # there from the acromion, which is not the joint's centre
     for name, value in winter.items():
-        assert getattr(anthropometry, name) == pytest.approx(value, abs=0.01), name
+        shoe = 0.013 if name == "ANKLE_HEIGHT" else 0.0
+        assert value - 0.01 < getattr(anthropometry, name) < value + 0.01 + shoe, name
 
 
 def test_scaled_changes_what_is_named():
