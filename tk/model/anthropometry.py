@@ -1,10 +1,10 @@
 """Body proportions: what the length of a limb is when only the stature is known.
 
-The paper (section 6.3) takes the ratios from Dreyfuss, *The Measure of Man* (1959-67), and prints none of them. The
-table below gives distances between joint centres as fractions of the stature. They are the rounded means of the
-50th-percentile man and woman of Dreyfuss's plates, checked against two sources that define joint centres and not skin
-landmarks: Drillis & Contini (1966; in Winter, *Biomechanics and Motor Control of Human Movement*, fig. 4.1) and de Leva
-(J. Biomech. 29, 1996, table 4). Where they disagree by more than 0.01 the value lies between them.
+The paper (section 6.3) takes its ratios from Dreyfuss, *The Measure of Man* (1959-67), and prints none of them. The book
+is not at hand either, so the table stands on two sources that give distances between joint centres as fractions of the
+stature: Drillis & Contini (1966; in Winter, *Biomechanics and Motor Control of Human Movement*, fig. 4.1) and de Leva
+(J. Biomech. 29, 1996, table 4: men and women averaged). They measure the shoulder, the hip and the neck at different
+points; where they disagree the value lies between them. The fit to the hull then moves each length within its scatter.
 """
 
 from __future__ import annotations
@@ -25,9 +25,14 @@ FOREARM_LENGTH = 0.149
 HAND_LENGTH = 0.108  # wrist to the tip of the middle finger
 THIGH_LENGTH = 0.245
 CALF_LENGTH = 0.246
-ANKLE_HEIGHT = 0.044  # ankle centre above the sole
+ANKLE_HEIGHT = 0.052  # ankle centre above the sole of a shoe; 0.039 barefoot
 FOOT_LENGTH = 0.150
 CROTCH_DROP = 0.070  # lowest point of the trunk below the hip centres, in trousers
+
+# The trunk's surface lies forward of the line from the hip centres to C7/T1, which runs nearer to the back: how far the
+# middle of the chest and of the pelvis lies ahead of that line. Estimates: neither source gives them.
+CHEST_FORWARD = 0.014
+PELVIS_FORWARD = 0.008
 
 # Half widths and girths as radii, fractions of the stature, over light clothes.
 CHEST_HALF_WIDTH = 0.098

@@ -8,12 +8,13 @@ out.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.anthropometry import CROTCH_DROP, HIP_HALF_WIDTH, BodyDimensions
+from tk.model.anthropometry import CHEST_FORWARD, CROTCH_DROP, HIP_HALF_WIDTH, PELVIS_FORWARD, BodyDimensions
 from tk.model.skeleton import SEGMENTS, Skeleton, build_skeleton
 from tk.model.superellipsoid import Superellipsoid
 
@@ -121,11 +122,13 @@ def build_pieces(d: BodyDimensions, extremities: bool = True) -> tuple[Superelli
     top = d.trunk - 0.25 * d.shoulder_drop
     bottom = -CROTCH_DROP / HIP_HALF_WIDTH * d.hip_half_width
     trunk_width = d.chest_half_width + d.hips_half_width
-    for axis, length, depth, width in (
-        (-z, waist - bottom, d.hips_half_depth, d.hips_half_width),
-        (z, top - waist, d.chest_half_depth, d.chest_half_width),
+    stature = d.stature
+    for axis, length, depth, width, forward in (
+        (-z, waist - bottom, d.hips_half_depth, d.hips_half_width, PELVIS_FORWARD * stature),
+        (z, top - waist, d.chest_half_depth, d.chest_half_width, CHEST_FORWARD * stature),
     ):
-        add("torso", waist * z, axis, (depth, width, length), (0.45, 0.8), (0.0, length), trunk_width)
+        origin = waist * z + forward * x
+        add("torso", origin, axis, (depth, width, length), (0.45, 0.8), (0.0, length), trunk_width)
 
     skull = 0.46 * d.head
     add(
@@ -156,6 +159,7 @@ def build_pieces(d: BodyDimensions, extremities: bool = True) -> tuple[Superelli
         elbow = shoulder + d.upper_arm * u
         wrist = elbow + d.forearm * u
         _limb(add, f"upper_arm_{side}", shoulder, u, d.upper_arm, d.upper_arm_radius, d.elbow_radius, z)
+        _cap(add, f"upper_arm_{side}", shoulder, -u, d.upper_arm_radius, z)
         _limb(add, f"forearm_{side}", elbow, u, d.forearm, d.elbow_radius, d.wrist_radius, z)
         if extremities:
             grip = 0.35 * d.hand
@@ -172,7 +176,9 @@ def build_pieces(d: BodyDimensions, extremities: bool = True) -> tuple[Superelli
         hip = M @ np.array([0.0, d.hip_half_width, 0.0])
         knee = hip - d.thigh * z
         ankle = knee - d.calf * z
-        _limb(add, f"thigh_{side}", hip, -z, d.thigh, d.thigh_radius, d.knee_radius, x)
+        # the thigh begins below the crotch: beside the hip joint the body is no wider than the trunk
+        _limb(add, f"thigh_{side}", hip, -z, d.thigh, d.thigh_radius, d.knee_radius, x, begin=0.2)
+        _cap(add, f"thigh_{side}", hip, z, 0.65 * d.thigh_radius, x)
         _limb(add, f"calf_{side}", knee, -z, d.calf, d.knee_radius, d.ankle_radius, x)
         if extremities:
             half = 0.5 * d.foot
@@ -189,12 +195,28 @@ def build_pieces(d: BodyDimensions, extremities: bool = True) -> tuple[Superelli
     return tuple(pieces)
 
 
-def _limb(add, segment: str, origin: Float, axis: Float, length: float, r0: float, r1: float, front: Float) -> None:  # type: ignore[no-untyped-def]
-    """A tapered limb from r0 to r1 and the round cap at its far end."""
+def _limb(
+    add: Callable[..., None],
+    segment: str,
+    origin: Float,
+    axis: Float,
+    length: float,
+    r0: float,
+    r1: float,
+    front: Float,
+    begin: float = 0.0,
+) -> None:
+    """A tapered limb from r0 to r1 along ``axis``, from ``begin`` of its length on, and the round cap at its far end."""
     slope = min(r1 / r0, 0.98)
     a3 = length / np.sqrt(1 - slope**2)  # the ellipsoid whose radius has fallen to r1 at the limb's end
-    add(segment, origin, axis, (r0, r0, a3), (1.0, 1.0), (0.0, length), 2 * r0, front)
-    add(segment, origin + length * axis, axis, (r1, r1, 0.6 * r1), (1.0, 1.0), (0.0, 0.6 * r1), 2 * r1, front)
+    add(segment, origin, axis, (r0, r0, a3), (1.0, 1.0), (begin * length, length), 2 * r0, front)
+    _cap(add, segment, origin + length * axis, axis, r1, front)
+
+
+def _cap(add: Callable[..., None], segment: str, origin: Float, axis: Float, radius: float, front: Float) -> None:
+    """Half an ellipsoid of revolution on the side of ``axis``, a little flatter than a sphere."""
+    height = 0.6 * radius
+    add(segment, origin, axis, (radius, radius, height), (1.0, 1.0), (0.0, height), 2 * radius, front)
 
 
 def _frame(origin: Float, axis: Float, front: Float) -> Float:
