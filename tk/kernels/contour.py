@@ -1,0 +1,313 @@
+"""The model's occluding contour in the pictures, batched over poses: one launch for all of them (Kehl 2006, 5.2, 5.3).
+
+A strip is a row of surface points of one superellipsoid along a circle of latitude or a meridian. Where n·v changes its
+sign along it, with n the normal and v the viewing ray, the contour passes (eq. 3). The camera is moved into the piece's
+frame (eq. 4), with full perspective. The normals n_d of eq. 2 satisfy n_d · r = 1 at every surface point r (insert
+eq. 1), so with C the moved camera's centre
+
+    t = n_d · v = n_d · (r − C) = 1 − n_d · C,
+
+and a strip needs no more than its angles and normals. Equation 5 as printed divides by t₁ + t₂, which have opposite
+signs: it extrapolates, and fails where they cancel. The linear interpolation that is meant takes their magnitudes,
+
+    u_c = (u₁ |t₂| + u₂ |t₁|) / (|t₁| + |t₂|).
+
+A superellipsoid is convex: on a strip n_d · C crosses 1 at most once in each direction. Slot 0 of a strip is the
+crossing from the hidden to the visible side, slot 1 the one back, so the two points of a circle of latitude never swap.
+They are the pair symmetric about the limb's axis. On a meridian either may be there; each stands for itself.
+
+A pose that puts a point so far beside a picture that the lens model folds back cannot be told from one inside it;
+cameras that see the volume do not come near.
+"""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from tk.kernels.kinematics import forward
+from tk.kernels.objective import PIECE_SHAPE
+from tk.kernels.occlusion import (
+    PLACED_CAMERA,
+    PLACED_NUMBERS,
+    PLACED_TRANSLATION,
+    is_occluded,
+    load_placed_rotation,
+    load_placed_vector,
+    place_pieces,
+)
+from tk.kernels.projection import camera_center, project
+from tk.kernels.runtime import ensure_runtime, ti
+from tk.kernels.superellipsoid import power
+
+# Strips that one parallel task handles, each task with its own forward kinematics (some microseconds).
+STRIPS_PER_TASK = 10
+
+FOUND, VISIBLE = 1, 2  # bits of a point's flags
+
+
+@ti.func
+def signed_power(base, exponent):
+    """sign(b)·|b|^e."""
+    return ti.select(base < 0, -power(base, exponent), power(base, exponent))
+
+
+@ti.func
+def surface_point(eta, omega, radii, e1, e2):
+    """r(η, ω) (eq. 1)."""
+    ring = signed_power(ti.cos(eta), e1)
+    return ti.Vector(
+        [
+            radii[0] * ring * signed_power(ti.cos(omega), e2),
+            radii[1] * ring * signed_power(ti.sin(omega), e2),
+            radii[2] * signed_power(ti.sin(eta), e1),
+        ]
+    )
+
+
+@ti.func
+def surface_normal(eta, omega, radii, e1, e2):
+    """n_d(η, ω), outward, not of unit length (eq. 2)."""
+    ring = signed_power(ti.cos(eta), 2.0 - e1)
+    return ti.Vector(
+        [
+            ring * signed_power(ti.cos(omega), 2.0 - e2) / radii[0],
+            ring * signed_power(ti.sin(omega), 2.0 - e2) / radii[1],
+            signed_power(ti.sin(eta), 2.0 - e1) / radii[2],
+        ]
+    )
+
+
+@ti.func
+def rim_crossings(strips: ti.template(), s: int, camera):  # (S, N, 5), camera centre in the piece's frame
+    """Where strip s crosses the rim: (found₀, η₀, ω₀, found₁, η₁, ω₁), slots as in the module's docstring."""
+    zero = camera[0] * 0.0
+    result = ti.Vector([zero, zero, zero, zero, zero, zero])
+    before = zero
+    for i in range(strips.shape[1]):
+        t = 1.0 - (strips[s, i, 2] * camera[0] + strips[s, i, 3] * camera[1] + strips[s, i, 4] * camera[2])
+        if i > 0 and (t < 0) != (before < 0):
+            share = ti.abs(before) / (ti.abs(before) + ti.abs(t))
+            eta = strips[s, i - 1, 0] + share * (strips[s, i, 0] - strips[s, i - 1, 0])
+            omega = strips[s, i - 1, 1] + share * (strips[s, i, 1] - strips[s, i - 1, 1])
+            if t < 0:
+                result[0], result[1], result[2] = 1.0, eta, omega
+            else:
+                result[3], result[4], result[5] = 1.0, eta, omega
+        before = t
+    return result
+
+
+@ti.func
+def image_normal(J, n):
+    """Unit normal (2,) of the contour's image at a point of the rim; J (2, 3) the projection's derivative.
+
+    Normal to the images J s of all tangents s of the surface, lens distortion included: on the rim n is perpendicular
+    to the viewing ray, which is J's null space, so Jᵀ m ∝ n has the solution m ∝ (J Jᵀ)⁻¹ J n.
+    """
+    A = J @ J.transpose()
+    g = J @ n
+    m = ti.Vector([A[1, 1] * g[0] - A[0, 1] * g[1], A[0, 0] * g[1] - A[0, 1] * g[0]])
+    return m / ti.sqrt(ti.max(m.norm_sqr(), 1e-30))
+
+
+@functools.cache
+def _contour_kernel(real):
+    @ti.kernel
+    def contour(
+        axis: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
+        point: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
+        prismatic: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
+        parent: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
+        pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 20)
+        strips: ti.types.ndarray(dtype=real, ndim=3),  # (S, N, 5) η, ω, n_d
+        strip_piece: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (S,)
+        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (C, 22)
+        chosen: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, K)
+        pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
+        frames: ti.types.ndarray(dtype=real, ndim=3),  # (T, D, 12) scratch
+        twists: ti.types.ndarray(dtype=real, ndim=3),  # (T, D, 6) scratch
+        placed: ti.types.ndarray(dtype=real, ndim=3),  # (T, P, 19) scratch
+        geometry: ti.types.ndarray(dtype=real, ndim=3),  # (B C K, 2, 7) out: zero configuration 3, pixel 2, normal 2
+        flags: ti.types.ndarray(dtype=ti.u8, ndim=2),  # (B C K, 2) out
+    ):
+        for c in range(frames.shape[0]):
+            C, K = cameras.shape[0], chosen.shape[1]
+            blocks = (K + STRIPS_PER_TASK - 1) // STRIPS_PER_TASK
+            b = c // (C * blocks)
+            v = c // blocks % C
+            first = c % blocks * STRIPS_PER_TASK
+            forward(axis, point, prismatic, parent, pose, b, c, frames, twists)
+            center = camera_center(cameras, v)
+            place_pieces(frames, c, pieces, center, placed)
+            for m in range(first, ti.min(first + STRIPS_PER_TASK, K)):
+                s = chosen[b, m]
+                i = strip_piece[s]
+                radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
+                e1, e2 = pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4]
+                R = load_placed_rotation(placed, c, i)
+                t = load_placed_vector(placed, c, i, PLACED_TRANSLATION)
+                crossings = rim_crossings(strips, s, load_placed_vector(placed, c, i, PLACED_CAMERA))
+                row = (b * C + v) * K + m
+                for slot in range(2):
+                    # a dynamic index into a vector would spill it to memory
+                    here = ti.select(slot == 0, crossings[0], crossings[3])
+                    eta = ti.select(slot == 0, crossings[1], crossings[4])
+                    omega = ti.select(slot == 0, crossings[2], crossings[5])
+                    flag = 0
+                    if here > 0:
+                        q = surface_point(eta, omega, radii, e1, e2)
+                        x = R @ q + t
+                        pixel, J, depth = project(cameras, v, x)
+                        if depth > 1e-6:
+                            flag = FOUND
+                            if is_occluded(placed, c, pieces, i, x, center) == 0:
+                                flag = FOUND | VISIBLE
+                            normal = image_normal(J, R @ surface_normal(eta, omega, radii, e1, e2).normalized())
+                            for a in ti.static(range(3)):
+                                zero = pieces[i, 4 * a + 3]
+                                for j in ti.static(range(3)):
+                                    zero += pieces[i, 4 * a + j] * q[j]
+                                geometry[row, slot, a] = zero
+                            for a in ti.static(range(2)):
+                                geometry[row, slot, 3 + a] = pixel[a]
+                                geometry[row, slot, 5 + a] = normal[a]
+                    if flag == 0:
+                        for a in range(7):
+                            geometry[row, slot, a] = 0.0
+                    flags[row, slot] = ti.cast(flag, ti.u8)
+
+    return contour
+
+
+@dataclass(frozen=True)
+class ContourPoints:
+    """Contour points of B poses in C cameras on K strips, two slots each. What was not found is zero.
+
+    Attributes:
+        strip: (B, K) the strips; segment: (B, K) their body segments; paired: (B, K) whether the two slots are a pair
+            symmetric about the limb's axis (circles of latitude) or points of their own (meridians).
+        points_zero: (B, C, K, 2, 3) the points in the zero configuration, metres: they move with p as material points.
+        pixels: (B, C, K, 2, 2) their images (x, y), lens distortion included; they may lie outside the picture.
+        normals: (B, C, K, 2, 2) unit normals of the contour in the image, outward.
+        found: (B, C, K, 2) uint8, 1 where the strip crosses the rim in front of the camera.
+        visible: (B, C, K, 2) uint8, 1 where found and not hidden by another piece.
+    """
+
+    strip: np.ndarray
+    segment: np.ndarray
+    paired: np.ndarray
+    points_zero: np.ndarray
+    pixels: np.ndarray
+    normals: np.ndarray
+    found: np.ndarray
+    visible: np.ndarray
+
+    @property
+    def occluded(self) -> np.ndarray:
+        """(B, C) contour points found and hidden: section 6.1.2 takes the three views with the fewest."""
+        return np.sum(self.found != self.visible, axis=(2, 3))
+
+
+class ContourKernel:
+    """The contours of one body in a rig's cameras: constants and scratch are laid out once.
+
+    Args:
+        axis, point: (D, 3) twists; prismatic, parent: (D,).
+        piece_dof: (P,) last degree of freedom above each superellipsoid.
+        piece_frame: (P, 3, 4) from its frame to the zero configuration.
+        piece_shape: (P, 7) a1 a2 a3 ε1 ε2 z_lower z_upper.
+        strip_angles: (S, N, 2) η and ω along each strip, radians; a circle's last sample is its first.
+        strip_normals: (S, N, 3) n_d of eq. 2 there, in the piece's frame, 1/m.
+        strip_piece: (S,) the piece of each strip; strip_segment: (S,) its segment.
+        strip_paired: (S,) True for circles of latitude.
+        cameras: (C, 22) rows of :func:`tk.kernels.projection.pack_camera`.
+        dtype: np.float32, or np.float64 for checks.
+    """
+
+    def __init__(
+        self,
+        *,
+        axis: np.ndarray,
+        point: np.ndarray,
+        prismatic: np.ndarray,
+        parent: np.ndarray,
+        piece_dof: np.ndarray,
+        piece_frame: np.ndarray,
+        piece_shape: np.ndarray,
+        strip_angles: np.ndarray,
+        strip_normals: np.ndarray,
+        strip_piece: np.ndarray,
+        strip_segment: np.ndarray,
+        strip_paired: np.ndarray,
+        cameras: np.ndarray,
+        dtype: type = np.float32,
+    ) -> None:
+        ensure_runtime()
+        self.dtype = dtype
+        self._kernel = _contour_kernel(ti.f64 if dtype == np.float64 else ti.f32)
+
+        def real(array: np.ndarray) -> np.ndarray:
+            return np.ascontiguousarray(array, dtype)
+
+        def whole(array: np.ndarray) -> np.ndarray:
+            return np.ascontiguousarray(array, np.int32)
+
+        self._tree = real(axis), real(point), whole(prismatic), whole(parent)
+        self._pieces = real(np.column_stack([np.reshape(piece_frame, (-1, 12)), piece_shape, piece_dof]))
+        self._strips = real(np.concatenate([strip_angles, strip_normals], axis=2))
+        self._strip_piece = whole(strip_piece)
+        self._strip_segment = whole(strip_segment)
+        self._strip_paired = np.asarray(strip_paired, bool)
+        self._cameras = real(cameras)
+        self._scratch: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+
+    def _scratch_of(self, rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        if rows not in self._scratch:
+            D, P = len(self._tree[0]), len(self._pieces)
+            self._scratch[rows] = (
+                np.empty((rows, D, 12), self.dtype),
+                np.empty((rows, D, 6), self.dtype),
+                np.empty((rows, P, PLACED_NUMBERS), self.dtype),
+            )
+        return self._scratch[rows]
+
+    def __call__(self, pose: np.ndarray, chosen: np.ndarray) -> ContourPoints:
+        """Contour points of B poses in all C cameras, occlusion included; one launch.
+
+        Args:
+            pose: (B, D).
+            chosen: (B, K) strips of each pose.
+        """
+        chosen = np.ascontiguousarray(chosen, np.int32)
+        B, K = chosen.shape
+        C = len(self._cameras)
+        if K and (chosen.min() < 0 or chosen.max() >= len(self._strips)):
+            raise IndexError(f"strips {chosen.min()} to {chosen.max()}: there are 0 to {len(self._strips) - 1}")
+        geometry = np.empty((B * C * K, 2, 7), self.dtype)
+        flags = np.empty((B * C * K, 2), np.uint8)
+        if B * C * K:
+            self._kernel(
+                *self._tree,
+                self._pieces,
+                self._strips,
+                self._strip_piece,
+                self._cameras,
+                chosen,
+                np.ascontiguousarray(pose, self.dtype),
+                *self._scratch_of(B * C * -(-K // STRIPS_PER_TASK)),
+                geometry,
+                flags,
+            )
+        geometry = geometry.reshape(B, C, K, 2, 7)
+        flags = flags.reshape(B, C, K, 2)
+        return ContourPoints(
+            strip=chosen,
+            segment=self._strip_segment[chosen],
+            paired=self._strip_paired[chosen],
+            points_zero=geometry[..., :3],
+            pixels=geometry[..., 3:5],
+            normals=geometry[..., 5:],
+            found=flags & FOUND,
+            visible=flags >> 1,
+        )

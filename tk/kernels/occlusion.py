@@ -1,0 +1,133 @@
+"""Does a piece of the body hide a point from a camera? Taichi functions (Kehl 2006, section 5.3, eqs. 6 and 7).
+
+The paper's three steps for each other superellipsoid: clip the viewing ray to its bounding box, test whether the point
+itself lies inside, search the clipped ray recursively from the middle. A bounding sphere is asked before all three.
+
+The recursion becomes a bisection here. G = F^(ε₁/2) is a norm for exponents in (0, 2), so along a ray it is convex:
+only the half towards which it falls can hold a point inside, and the tangent in the middle bounds G on it from below.
+Most rays are decided by the first or second middle.
+
+Where the paper is silent: a point inside another piece (at the joints) counts as hidden, and pieces that only touch do
+not hide each other, or every seam of the model would flicker.
+"""
+
+from tk.kernels.kinematics import load_rotation, load_translation
+from tk.kernels.objective import PIECE_DOF, PIECE_SHAPE
+from tk.kernels.runtime import ti
+from tk.kernels.superellipsoid import implicit, inside_outside, power
+
+# Rounds of the bisection. A ray undecided after them runs less than 1/4096 of its clipped length inside the piece.
+DEPTH = 12
+# A ray that passes through the outermost thousandth of a piece touches it.
+TOUCH = 1e-3
+
+# Columns of a placed piece: rotation (9, row by row) and translation (3) to the world, the camera's centre in the
+# piece's frame (3), the bounding sphere's centre in the world (3) and its squared radius.
+PLACED_TRANSLATION, PLACED_CAMERA, PLACED_SPHERE, PLACED_NUMBERS = 9, 12, 15, 19
+
+
+@ti.func
+def place_pieces(
+    frames: ti.template(),  # (T, D, 12) filled by kinematics.forward
+    c: int,
+    pieces: ti.template(),  # (P, 20 or more) as in tk.kernels.objective
+    center,  # camera centre, world
+    placed: ti.template(),  # (T, P, 19) out
+):
+    """Fill row c of the scratch with the pieces at a pose, as one camera sees them."""
+    for i in range(pieces.shape[0]):
+        k = ti.cast(pieces[i, PIECE_DOF], ti.i32)
+        R = load_rotation(frames, c, k)
+        Rp = ti.Matrix([[pieces[i, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
+        tp = ti.Vector([pieces[i, 4 * a + 3] for a in ti.static(range(3))])
+        R_world = R @ Rp
+        t_world = R @ tp + load_translation(frames, c, k)
+        camera = R_world.transpose() @ (center - t_world)
+        lower, upper = pieces[i, PIECE_SHAPE + 5], pieces[i, PIECE_SHAPE + 6]
+        half = 0.5 * (upper - lower)
+        middle = 0.5 * (upper + lower)
+        for a in ti.static(range(3)):
+            for b in ti.static(range(3)):
+                placed[c, i, 3 * a + b] = R_world[a, b]
+            placed[c, i, PLACED_TRANSLATION + a] = t_world[a]
+            placed[c, i, PLACED_CAMERA + a] = camera[a]
+            placed[c, i, PLACED_SPHERE + a] = t_world[a] + middle * R_world[a, 2]
+        placed[c, i, PLACED_SPHERE + 3] = (
+            pieces[i, PIECE_SHAPE] * pieces[i, PIECE_SHAPE] + pieces[i, PIECE_SHAPE + 1] * pieces[i, PIECE_SHAPE + 1]
+        ) + half * half
+
+
+@ti.func
+def load_placed_rotation(placed: ti.template(), c: int, i: int):
+    return ti.Matrix([[placed[c, i, 3 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
+
+
+@ti.func
+def load_placed_vector(placed: ti.template(), c: int, i: int, first: ti.template()):
+    return ti.Vector([placed[c, i, first + a] for a in ti.static(range(3))])
+
+
+@ti.func
+def segment_enters(q, d, radii, e1, e2, z_lower, z_upper):
+    """1 if the segment q + λ d, 0 ≤ λ ≤ 1, enters a truncated superellipsoid, all in its frame."""
+    low = ti.Vector([-radii[0], -radii[1], z_lower])
+    high = ti.Vector([radii[0], radii[1], z_upper])
+    start = q[0] * 0.0
+    end = start + 1.0
+    for a in ti.static(range(3)):
+        rate = ti.select(d[a] < 0, ti.min(d[a], -1e-9), ti.max(d[a], 1e-9))
+        first, second = (low[a] - q[a]) / rate, (high[a] - q[a]) / rate
+        start = ti.max(start, ti.min(first, second))
+        end = ti.min(end, ti.max(first, second))
+    hit = 0
+    if start < end:
+        if start == 0.0 and power(inside_outside(q, radii, e1, e2), 0.5 * e1) < 1.0 - TOUCH:
+            hit = 1
+        level = 0
+        while hit == 0 and level < DEPTH:
+            middle = 0.5 * (start + end)
+            g = implicit(q + middle * d, radii, e1, e2)
+            slope = g[1] * d[0] + g[2] * d[1] + g[3] * d[2]
+            if g[0] < 1.0 - TOUCH:
+                hit = 1
+            elif g[0] - ti.abs(slope) * 0.5 * (end - start) >= 1.0 - TOUCH:
+                level = DEPTH
+            elif slope > 0.0:
+                end = middle
+            else:
+                start = middle
+            level += 1
+    return hit
+
+
+@ti.func
+def is_occluded(
+    placed: ti.template(),  # (T, P, 19)
+    c: int,
+    pieces: ti.template(),  # (P, 20 or more)
+    own: int,  # the piece that the point lies on; its rim cannot hide from itself, it is convex
+    x,  # world
+    center,  # camera centre, world
+):
+    """1 if another piece lies between a point and the camera that row c of the scratch was placed for."""
+    d = center - x
+    inv_square = 1.0 / ti.max(d.norm_sqr(), 1e-12)
+    hit = 0
+    i = 0
+    while hit == 0 and i < pieces.shape[0]:
+        w = load_placed_vector(placed, c, i, PLACED_SPHERE) - x
+        nearest = ti.min(ti.max(w.dot(d) * inv_square, 0.0), 1.0)
+        if i != own and (w - nearest * d).norm_sqr() < placed[c, i, PLACED_SPHERE + 3]:
+            R = load_placed_rotation(placed, c, i)
+            q = R.transpose() @ (x - load_placed_vector(placed, c, i, PLACED_TRANSLATION))
+            hit = segment_enters(
+                q,
+                load_placed_vector(placed, c, i, PLACED_CAMERA) - q,
+                ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))]),
+                pieces[i, PIECE_SHAPE + 3],
+                pieces[i, PIECE_SHAPE + 4],
+                pieces[i, PIECE_SHAPE + 5],
+                pieces[i, PIECE_SHAPE + 6],
+            )
+        i += 1
+    return hit
