@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tk.errors import CaptureError, ConfigError
-from tk.model.foreground import CollinearityForeground, ForegroundConfig, Mog2Foreground, _clean_by_area, median_plate
+from tk.model.foreground import CollinearityForeground, ForegroundConfig, Mog2Foreground, median_plate
+from tk.model.regions import clean_by_area
 
 CAPTURES = Path(__file__).parents[3] / "shared" / "captures"
 SHAPE = (120, 160)
@@ -84,6 +85,18 @@ def test_clothes_of_the_wall_s_colour_leave_no_hole(learned):
     assert iou(masks[0], truth[0]) > 0.85
 
 
+def test_a_sleeve_brighter_than_the_floor_by_less_than_its_noise_is_found():
+    rng = np.random.default_rng(11)
+    scene, clips = background(rng, noise=2.0)
+    image, truth = with_person(scene, (40, 40, 200))
+    sleeve = np.zeros_like(truth)
+    sleeve[0, 40:52, 85:125] = True
+    image[sleeve] = scene[sleeve] + 4.0
+    masks = CollinearityForeground.learn(clips, SHAPE, SIZES).segment(expose(image, rng, noise=2.0))
+    assert np.mean(masks[sleeve] > 0) > 0.8
+    assert iou(masks[0], truth[0] | sleeve[0]) > 0.9
+
+
 def test_an_empty_scene_has_empty_masks(learned):
     scene, _, foreground = learned
     for seed in range(3):
@@ -154,7 +167,7 @@ def test_areas_are_counted_in_pixels(seed, density, smooth):
         around = cv2.dilate(hole.astype(np.uint8), np.ones((3, 3))) > 0
         if not edge and np.sum(filled(hole)) < 6 and (expected & around).any():
             expected[filled(hole)] = True
-    np.testing.assert_array_equal(_clean_by_area(mask, 10, 6) > 0, expected)
+    np.testing.assert_array_equal(clean_by_area(mask, 10, 6) > 0, expected)
 
 
 def filled(region):
@@ -202,7 +215,8 @@ def test_wrong_clips_are_refused(learned):
 
 
 @pytest.mark.parametrize(
-    "change", [{"threshold": -1.0}, {"threshold": float("nan")}, {"shadow_min": 1.5}, {"shadow_min": 0.0}]
+    "change",
+    [{"threshold": -1.0}, {"threshold": float("nan")}, {"shadow_min": 1.5}, {"shadow_min": 0.0}, {"reduction": 1.5}],
 )
 def test_wrong_configuration_is_refused(change):
     with pytest.raises(ConfigError, match=next(iter(change))):

@@ -4,21 +4,31 @@ The main method is the collinearity test (Mester et al. 2001, extended by Griess
 section 4, use it). :mod:`tk.kernels.background` computes the statistic; here is what surrounds it: learning the empty
 scene and its noise, following gain and noise from frame to frame, and cleaning up the labels.
 
+The test runs on pictures reduced by two: four pixels together have a quarter of the noise, and a grey sleeve on a grey
+floor shows. The full picture then draws the outline.
+
 No state passes from one frame to the next, so a run that is resumed gives the same masks. The papers are silent on
-three things, which are settled here as follows.
+five things, which are settled here as follows.
 
 * **Grey clothes.** A cloth of the floor's colour is collinear with the floor, as a shadow is. Shadows are confined to
-  the factors that they can have, and a region that could be either is decided by its border: a region mostly bounded by
-  certain foreground is part of the person, one mostly bounded by background is a shadow.
-* **Penumbrae.** Over the blurred edge of a shadow the window is not collinear. Such labels are thin, and their
+  the factors that they can have: what is brighter than the scene, averaged over a few pixels, is the person. A region
+  that could be either is decided by its border: a region mostly bounded by certain foreground is part of the person,
+  one mostly bounded by background is a shadow. What is too faint for a shadow and too far from a darker place to be its
+  edge belongs to the person.
+* **Penumbrae.** Over the blurred edge of a shadow the window is not collinear. Such labels are thin or weak, and their
   statistic is small against the plain difference next to them; they count as "could be either".
-* **The rim.** A 3×3 window fires one pixel outside the outline. A pixel of the rim stays if its own difference reaches
-  a given share of the largest one next to it, which is where the outline covers that share of the pixel.
+* **Parts.** A hand beyond a sleeve that cannot be seen is joined to the body, for a person is in one piece. Parts that
+  are nowhere strong are edges of shadows.
+* **The rim.** A window fires outside the outline. A pixel of the rim stays if its own difference reaches a given share
+  of the largest one nearby, which is where the outline covers that share of the pixel.
+* **The empty scene's noise.** It is measured in every frame, from pixels of which most show the scene.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
@@ -27,13 +37,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tk.errors import CaptureError, ConfigError
-from tk.kernels.background import STEPS_PER_OCTAVE, Planes
+from tk.kernels.background import Planes
+from tk.model.regions import (
+    beyond_shadows,
+    clean_by_area,
+    closed,
+    enclosed,
+    joined,
+    trim_rim,
+    without_penumbrae,
+)
 
 Images = NDArray[np.uint8]
 
 _SQUARE3 = np.ones((3, 3), np.uint8)
-_SQUARE5 = np.ones((5, 5), np.uint8)
-_CROSS3 = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+_MEAN = np.full((1, 3), 1 / 3)  # of the three channels
+_LEAST_NOISE = 0.4  # of a mean over 3×3 pixels: grey levels, rounded twice, do not tell less
 
 
 @dataclass(frozen=True)
@@ -41,6 +60,8 @@ class ForegroundConfig:
     """How the segmentation decides. "Measured" means: on rendered captures with exact masks and on one real one.
 
     Attributes:
+        reduction: how many pixels of the full picture are one of the picture that is tested, each way. Two: the sleeves
+            of a grey man over a grey floor show, and it takes a quarter of the time.
         threshold: statistic that makes a pixel foreground with four of its eight neighbours foreground, in noise
             variances; pure noise gives 0.5. Measured.
         neighbour_octaves: a further foreground neighbour divides the threshold by 2 to this power (Griesser et al.
@@ -54,38 +75,59 @@ class ForegroundConfig:
         shadow_min: the darkest shadow, as a share of the lit plate. Measured: 0.76 under two lamps; a shadow that is
             darker is taken for the person, which the other cameras put right, while a hole in one mask cuts through the
             visual hull.
+        shadow_max: the faintest shadow, as a share of the lit plate. What is fainter is the edge of a darker one.
+            Measured.
+        bright: a mean over 3×3 reduced pixels that is brighter than the scene by this many of its noise deviations is
+            foreground, for shadows only darken. Four: once in 30 000 pixels by chance, then dropped as a speck.
         noise_floor: variance added to the measured noise, grey levels²: what video coding does to the picture. It
             rounds small noise away in places and then lets it jump; its errors are alike over a window. Measured: more
             would make cleaner rims, but holes in grey clothes before a grey wall.
         relative_noise_floor: least noise variance of a pixel, as a share of its picture's. As above.
         jitter_px: unsteadiness of camera and coding, pixels: adds noise where the plate has contrast. Measured.
-        penumbra: a thin label is the edge of a shadow where the statistic is below this share of the plain difference
-            nearby. 0.29 at a sharp edge, 0.05 over four pixels of blur (both follow from the statistic).
-        enclosure: share of its border by which a region must touch certain foreground to become foreground. The
-            majority, for want of a better reason.
+        penumbra: a label is the edge of a shadow where the statistic is below this share of the plain difference
+            nearby. 0.29 at a sharp edge, 0.05 over four reduced pixels of blur (both follow from the statistic).
+        core: thick labels of more than this statistic, noise variances, are no edge of a shadow. Measured.
+        penumbra_reach: how far from a shadow its edge may reach, share of the picture's height. Measured.
+        faint_enclosure: share of its border by which a region that no shadow explains must touch certain foreground.
+            Measured.
+        enclosure: share of its border by which a region must touch certain foreground to become foreground: a clear
+            majority, for a shadow between two legs touches them on two sides. Measured.
         bridge: a region that could be either is also foreground between parts of the person that are no farther apart
             than this share of the picture's height (a gap of 10 of 480 pixels). Measured.
-        rim: share of coverage from which a rim pixel stays; 0.5 is unbiased, less is cautious: a
-            pixel too many swells the hull a little, one too few cuts through it.
-        rim_layers: how deep the rim is searched, pixels: one for the window, one for blur.
+        seed: parts of the person but the largest hold pixels of this statistic, noise variances. Measured.
+        gap: parts that are no farther apart than this share of the picture's height are joined. Half a forearm, where a
+            person's height is half of the picture's.
+        limb: how thick they are joined, share of the picture's height. As above: a thin arm.
+        rim: share of the largest contrast nearby from which a rim pixel stays; 0.5 would be unbiased at a sharp
+            outline, less is cautious: a pixel too many swells the hull a little, one too few cuts through it.
+        rim_layers: how deep the rim is searched, pixels: two reduced ones for the window.
         speck_area: smaller foreground components go, share of the picture's area (61 pixels of 640×480). Measured.
         hole_area: smaller holes are filled, share of the picture's area (123 pixels of 640×480). Measured.
     """
 
+    reduction: int = 2
     threshold: float = 3.0
     neighbour_octaves: float = 0.5
     iterations: int = 3
     difference_min: float = 2.0
     darkness_offset: float = 40.0
     shadow_min: float = 0.7
-    noise_floor: float = 1.5
+    shadow_max: float = 0.95
+    bright: float = 4.0
+    noise_floor: float = 0.7
     relative_noise_floor: float = 0.5
     jitter_px: float = 0.04
-    penumbra: float = 0.15
-    enclosure: float = 0.5
+    penumbra: float = 0.2
+    core: float = 8.0
+    penumbra_reach: float = 0.017
+    faint_enclosure: float = 0.2
+    enclosure: float = 0.6
+    seed: float = 64.0
     bridge: float = 0.02
-    rim: float = 0.4
-    rim_layers: int = 2
+    rim: float = 0.3
+    rim_layers: int = 4
+    gap: float = 0.08
+    limb: float = 0.025
     speck_area: float = 2e-4
     hole_area: float = 4e-4
 
@@ -94,12 +136,31 @@ class ForegroundConfig:
             value = getattr(self, field.name)
             if not (np.isfinite(value) and value >= 0):
                 raise ConfigError(f"foreground.{field.name} = {value}: must be a finite number, 0 or more")
-        for name in ("threshold", "difference_min", "darkness_offset", "noise_floor", "penumbra"):
+        for name in (
+            "reduction",
+            "threshold",
+            "difference_min",
+            "darkness_offset",
+            "noise_floor",
+            "penumbra",
+            "core",
+            "seed",
+        ):
             if getattr(self, name) == 0:
                 raise ConfigError(f"foreground.{name} = 0: must be positive")
-        for name in ("shadow_min", "relative_noise_floor", "penumbra", "enclosure", "rim"):
+        for name in (
+            "shadow_min",
+            "shadow_max",
+            "relative_noise_floor",
+            "penumbra",
+            "enclosure",
+            "faint_enclosure",
+            "rim",
+        ):
             if getattr(self, name) > 1:
                 raise ConfigError(f"foreground.{name} = {getattr(self, name)}: a share, at most 1")
+        if self.reduction != int(self.reduction):
+            raise ConfigError(f"foreground.reduction = {self.reduction}: must be a whole number of pixels, 1 or more")
         if self.shadow_min == 0:
             raise ConfigError("foreground.shadow_min = 0: must be positive (1 switches the tolerance of shadows off)")
 
@@ -144,6 +205,12 @@ def _check_clips(clips: Sequence[Images], frame_shape: tuple[int, int], sizes: N
             )
         if height > frame_shape[0] or width > frame_shape[1]:
             raise CaptureError(f"background: camera {c + 1} is larger than the frame {frame_shape}")
+
+
+def _reduced(images: Images, factor: int) -> Images:
+    """(N, H // factor, W // factor, 3): means over squares of pixels."""
+    height, width = images.shape[1] // factor, images.shape[2] // factor
+    return np.stack([cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) for image in images])
 
 
 def _samples(images: NDArray[Any]) -> NDArray[Any]:
@@ -231,14 +298,18 @@ class CollinearityForeground:
         sizes: NDArray[np.int_],
         config: ForegroundConfig,
     ) -> None:
-        """Plates (C, H, W, 3) uint8, relative noise variances (C, H, W), sizes (C, 2) of (width, height)."""
+        """Plates (C, H, W, 3) uint8, relative noise (C, h, w) of the reduced ones, sizes (C, 2) of (width, height)."""
         self.config = config
         self.plates = plates
         self.sizes = sizes
+        self._small_plates = _reduced(plates, config.reduction)
+        self._small = np.empty_like(self._small_plates)
+        self._small_scenes = np.empty_like(self._small_plates)
         self._weights = (1.0 / relative_noise).astype(np.float32)
-        self._plate_samples = _samples(plates).astype(np.float32)
+        self._plate_samples = _samples(self._small_plates).astype(np.float32)
         self._noise_samples = _samples(relative_noise[..., None].repeat(3, axis=3))[:, 0]
-        self._planes = Planes(*plates.shape[:3])
+        self._planes = Planes(*self._small.shape[:3])
+        self._pool = ThreadPoolExecutor(max_workers=min(len(plates), os.cpu_count() or 1))
 
     @classmethod
     def learn(
@@ -266,121 +337,100 @@ class CollinearityForeground:
         sizes = np.asarray(sizes, dtype=int).reshape(-1, 2)
         _check_clips(clips, frame_shape, sizes)
         plates = np.zeros((len(clips), *frame_shape, 3), np.uint8)
-        relative = np.ones((len(clips), *frame_shape), np.float32)
+        relative = np.ones((len(clips), *(n // config.reduction for n in frame_shape)), np.float32)
         for c, (clip, (width, height)) in enumerate(zip(clips, sizes, strict=True)):
-            plate, variance = _learn_scene(clip)
+            plate, _ = _learn_scene(clip)
             plates[c, :height, :width] = np.clip(plate.round(), 0, 255)
-            relative[c, :height, :width] = _relative_noise(plate, variance, config)
+            small_plate, variance = _learn_scene(_reduced(clip, config.reduction))
+            noise = _relative_noise(small_plate, variance, config)
+            relative[c, : noise.shape[0], : noise.shape[1]] = noise
         return cls(plates, relative, sizes, config)
 
     def segment(self, images: Images) -> Images:
         """Pictures (C, H, W, 3) uint8 BGR to masks (C, H, W) uint8, 0 or 255."""
         config = self.config
-        scenes = np.empty_like(self.plates)
-        precision = np.empty(len(images), np.float32)
-        for c, sample in enumerate(_samples(images)):
-            gain, variance = _gain_and_noise(sample, self._plate_samples[c], self._noise_samples[c])
-            cv2.transform(self.plates[c], np.diag(gain), dst=scenes[c])
-            precision[c] = 1.0 / (variance + config.noise_floor)
+        cameras = range(len(images))
+        # OpenCV lets go of the interpreter: cameras run side by side, each with its own memory
+        levels = list(self._pool.map(lambda c: self._expose(c, images[c]), cameras))
         self._planes.measure(
-            images,
-            scenes,
+            self._small,
+            self._small_scenes,
             self._weights,
-            precision,
+            np.array([1.0 / (variance + config.noise_floor) for _, variance in levels], np.float32),
             darkness_offset=config.darkness_offset,
             shadow_min=config.shadow_min,
             difference_min=config.difference_min,
         )
         self._planes.relax(config.threshold, config.neighbour_octaves, config.iterations)
         masks = np.zeros(images.shape[:3], np.uint8)
-        for c in range(len(images)):
-            self._clean(c, images[c], scenes[c], masks[c])
+        list(self._pool.map(lambda c: self._outline(images[c], c, levels[c][0], self._decide(c), masks[c]), cameras))
         return masks
 
-    def _clean(self, c: int, image: Images, scene: Images, mask: Images) -> None:
-        """Settle what could be either, trim the rim, drop specks and fill holes of camera ``c``, into ``mask``."""
+    def _expose(self, c: int, image: Images) -> tuple[NDArray[np.float64], float]:
+        """Reduce camera ``c``'s picture and bring its reduced plate to the same gain; the gain (3,) and the noise."""
+        small = self._small[c]
+        cv2.resize(image, small.shape[1::-1], dst=small, interpolation=cv2.INTER_AREA)
+        gain, variance = _gain_and_noise(_samples(small[None])[0], self._plate_samples[c], self._noise_samples[c])
+        cv2.transform(self._small_plates[c], np.diag(gain), dst=self._small_scenes[c])
+        return gain, variance
+
+    def _decide(self, c: int) -> Images:
+        """(h, w) uint8, 0 or 255: which pixels of camera ``c``'s reduced picture show the person."""
+        config, planes = self.config, self._planes
+        mask = np.zeros(self._small.shape[1:3], np.uint8)
+        height = int(self.sizes[c, 1]) // config.reduction
+        area = int(np.prod(self.sizes[c])) / config.reduction**2
+        reach = 2 * round(config.bridge * height / 2) + 1
+        # the window widens whatever shows the person: what vanishes under erosion is noise
+        x, y, w, h = cv2.boundingRect(cv2.erode(planes.labels[c], _SQUARE3))
+        if w == 0:
+            return mask
+        margin = reach + height // 10  # shows enough of a shadow to tell it from a cloth
+        crop = (slice(max(y - margin, 0), y + h + margin), slice(max(x - margin, 0), x + w + margin))
+        difference = np.ascontiguousarray(planes.difference[c][crop])
+        collinearity = np.ascontiguousarray(planes.collinearity[c][crop])
+        labels = planes.labels[c][crop].view(np.bool_)
+        certain, unsure = without_penumbrae(labels, difference, collinearity, config.penumbra, config.core)
+        brightness, noise, scene = self._brightness(c)
+        bright = unsure & (brightness[crop] > config.bright * noise)
+        certain, unsure = certain | bright, unsure & ~bright
+        dark = brightness[crop] < (config.shadow_max - 1.0) * scene[crop]
+        width = 2 * round(config.penumbra_reach * height) + 1
+        faint = beyond_shadows(unsure, certain, dark, width, config.faint_enclosure)
+        certain, unsure = certain | faint, unsure & ~faint
+        foreground = certain | enclosed(unsure, certain, config.enclosure)
+        foreground |= unsure & closed(foreground, reach)
+        bar = max(round(config.limb * height), 1)
+        foreground = joined(
+            foreground, difference > 0, collinearity, config.seed, config.speck_area * area, config.gap * height, bar
+        )
+        mask[crop] = clean_by_area(foreground, config.speck_area * area, config.hole_area * area)
+        return mask
+
+    def _brightness(self, c: int) -> tuple[NDArray[np.float32], float, NDArray[Any]]:
+        """Of camera ``c``'s reduced picture: mean over 3×3 pixels less the scene's, its noise, and the scene (h, w)."""
+        image, scene = (cv2.transform(picture[c], _MEAN) for picture in (self._small, self._small_scenes))
+        signed = cv2.subtract(image, scene, dtype=cv2.CV_16S)
+        brightness = cv2.boxFilter(signed, cv2.CV_32F, (3, 3))
+        sample = brightness[2::4, 2::4]  # most of it shows the scene
+        median = float(np.median(sample))
+        noise = 1.4826 * float(np.median(np.abs(sample - median)))
+        return np.subtract(brightness, np.float32(median), dtype=np.float32), max(noise, _LEAST_NOISE), scene
+
+    def _outline(self, image: Images, c: int, gain: NDArray[np.float64], decision: Images, mask: Images) -> None:
+        """Draw camera ``c``'s outline in the full picture, into ``mask``: the rim goes where it shows the scene."""
         area = int(np.prod(self.sizes[c]))
-        reach = 2 * round(self.config.bridge * self.sizes[c, 1] / 2) + 1
-        # the window widens whatever shows the person by two pixels: what vanishes under erosion is noise
-        x, y, width, height = cv2.boundingRect(cv2.erode(self._planes.labels[c], _SQUARE5))
-        if width == 0:
+        height, width = mask.shape
+        whole = cv2.resize(decision, (width, height), interpolation=cv2.INTER_LINEAR)
+        x, y, w, h = cv2.boundingRect(whole)
+        if w == 0:
             return
-        margin = reach + int(self.sizes[c, 1]) // 10  # shows enough of a shadow to tell it from a cloth
-        crop = (slice(max(y - margin, 0), y + height + margin), slice(max(x - margin, 0), x + width + margin))
-        difference = np.ascontiguousarray(self._planes.difference[c][crop])
-        collinearity = self._planes.collinearity[c][crop]
-        labels = self._planes.labels[c][crop].view(np.bool_)
-        certain, unsure = _without_penumbrae(labels, difference, collinearity, self.config.penumbra)
-        foreground = certain | _enclosed(unsure, certain, self.config.enclosure)
-        foreground |= unsure & _closed(foreground, reach)
-        contrast = np.asarray(cv2.transform(cv2.absdiff(image[crop], scene[crop]), np.full((1, 3), 1 / 3)), np.uint8)
-        foreground = _trim_rim(foreground, contrast, self.config.rim, self.config.rim_layers)
-        mask[crop] = _clean_by_area(foreground, self.config.speck_area * area, self.config.hole_area * area)
-
-
-Mask = NDArray[np.bool_]
-
-
-def _without_penumbrae(labels: Mask, difference: Images, collinearity: Images, penumbra: float) -> tuple[Mask, Mask]:
-    """Split what differs from the scene into certain foreground and what may be a shadow (both (h, w) bool)."""
-    core = cv2.morphologyEx(labels.view(np.uint8), cv2.MORPH_OPEN, _SQUARE5).view(np.bool_)
-    levels = round(-STEPS_PER_OCTAVE * np.log2(penumbra))
-    blurred = cv2.add(collinearity, levels) < cv2.dilate(difference, _SQUARE5)
-    certain = labels & (core | ~blurred)
-    return certain, (difference > 0) & ~certain
-
-
-def _enclosed(unsure: Mask, certain: Mask, share: float) -> Mask:
-    """The 4-connected regions of ``unsure`` whose border touches ``certain`` more than the share allows."""
-    count, regions = cv2.connectedComponents(unsure.view(np.uint8), connectivity=4, ltype=cv2.CV_32S)
-    background = (~(unsure | certain)).view(np.uint8)
-    outside = cv2.dilate(background, _CROSS3, borderType=cv2.BORDER_CONSTANT, borderValue=1).view(np.bool_)
-    inside = cv2.dilate(certain.view(np.uint8), _CROSS3).view(np.bool_)
-    touching_outside = np.bincount(regions[unsure & outside], minlength=count)
-    touching_inside = np.bincount(regions[unsure & inside], minlength=count)
-    chosen = touching_inside > share * (touching_inside + touching_outside)
-    chosen[0] = False
-    return chosen[regions]
-
-
-def _closed(mask: Mask, size: int) -> Mask:
-    """Morphological closing with a square of this size, as if nothing lay outside."""
-    framed = cv2.copyMakeBorder(mask.view(np.uint8), size, size, size, size, cv2.BORDER_CONSTANT, value=0)
-    closed = cv2.morphologyEx(framed, cv2.MORPH_CLOSE, np.ones((size, size), np.uint8))
-    return np.ascontiguousarray(closed[size:-size, size:-size]).view(np.bool_)
-
-
-def _clean_by_area(mask: Mask, speck: float, hole: float) -> Images:
-    """Drop foreground (8-connected) of less than ``speck`` pixels, fill holes (4-connected) of less than ``hole``.
-
-    Works on outlines, which are short, not on regions: Pick's theorem turns the polygon through the outline's pixel
-    centres into a count of pixels. The outline of a hole runs on the foreground around it. What lies inside an outline
-    goes with it.
-
-    Returns:
-        (h, w) uint8, 0 or 255.
-    """
-    clean = mask.view(np.uint8) * np.uint8(255)
-    contours, hierarchy = cv2.findContours(clean, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    specks = []
-    for contour, (_, _, _, parent) in zip(contours, hierarchy[0] if len(contours) else (), strict=True):
-        area, half_length = cv2.contourArea(contour), len(contour) / 2
-        if parent < 0 and area + half_length + 1 < speck:
-            specks.append(contour)
-        elif parent >= 0 and area - half_length + 1 < hole:
-            cv2.drawContours(clean, [contour], -1, 255, cv2.FILLED)
-    if specks:
-        cv2.drawContours(clean, specks, -1, 0, cv2.FILLED)
-    return clean
-
-
-def _trim_rim(mask: Mask, contrast: Images, share: float, layers: int) -> Mask:
-    """Take pixels off the outline whose contrast is less than a share of the largest in their 3×3 neighbourhood."""
-    weak = contrast < share * cv2.dilate(contrast, _SQUARE3)
-    for _ in range(layers):
-        inside = cv2.erode(mask.view(np.uint8), _SQUARE3, borderValue=1).view(np.bool_)
-        mask = mask & (inside | ~weak)
-    return mask
+        margin = self.config.rim_layers
+        crop = (slice(max(y - margin, 0), y + h + margin), slice(max(x - margin, 0), x + w + margin))
+        scene = cv2.transform(self.plates[c][crop], np.diag(gain))
+        contrast = np.asarray(cv2.transform(cv2.absdiff(image[crop], scene), _MEAN), np.uint8)
+        person = trim_rim(whole[crop] > 127, contrast, self.config.rim, self.config.rim_layers)
+        mask[crop] = clean_by_area(person, self.config.speck_area * area, self.config.hole_area * area)
 
 
 class Mog2Foreground:
@@ -422,7 +472,7 @@ class Mog2Foreground:
         for c, (model, (width, height)) in enumerate(zip(self._models, self.sizes, strict=True)):
             labels = model.apply(np.ascontiguousarray(images[c, :height, :width]), learningRate=0)
             area = width * height
-            masks[c, :height, :width] = _clean_by_area(
+            masks[c, :height, :width] = clean_by_area(
                 labels == 255, self.config.speck_area * area, self.config.hole_area * area
             )
         return masks

@@ -1,0 +1,81 @@
+"""Decisions on label pictures, on drawings small enough to see the answer."""
+
+import numpy as np
+import pytest
+
+from tk.kernels.background import level_of
+from tk.model.regions import beyond_shadows, enclosed, joined, trim_rim, without_penumbrae
+
+SHAPE = (40, 60)
+
+
+def boxes(*slices):
+    mask = np.zeros(SHAPE, bool)
+    for rows, columns in slices:
+        mask[rows, columns] = True
+    return mask
+
+
+def levels(mask, value):
+    return np.where(mask, level_of(value), 0).astype(np.uint8)
+
+
+def test_edges_of_shadows_are_unsure_and_sharp_outlines_certain():
+    labels = boxes((slice(5, 7), slice(5, 50)))
+    difference = boxes((slice(5, 20), slice(5, 50)))
+    plain = levels(difference, 200.0)
+    certain, unsure = without_penumbrae(labels, plain, levels(labels, 20.0), 0.2, 8.0)
+    assert not certain.any() and np.array_equal(unsure, difference)
+    certain, unsure = without_penumbrae(labels, plain, levels(labels, 80.0), 0.2, 8.0)
+    assert np.array_equal(certain, labels) and np.array_equal(unsure, difference & ~labels)
+
+
+@pytest.mark.parametrize("statistic, is_certain", [(4.0, False), (20.0, True)])
+def test_a_thick_region_is_certain_where_it_is_strong(statistic, is_certain):
+    labels = boxes((slice(5, 20), slice(5, 50)))
+    certain, _ = without_penumbrae(labels, levels(labels, 500.0), levels(labels, statistic), 0.2, 8.0)
+    assert certain.any() == is_certain
+
+
+def test_a_faint_sleeve_is_no_shadow_and_a_dark_one_may_be():
+    hand = boxes((slice(10, 20), slice(40, 50)))
+    sleeve = boxes((slice(10, 20), slice(30, 40)))
+    assert np.array_equal(beyond_shadows(sleeve, hand, np.zeros(SHAPE, bool), 9, 0.2), sleeve)
+    assert not beyond_shadows(sleeve, hand, sleeve, 9, 0.2).any()
+    assert not beyond_shadows(sleeve, np.zeros(SHAPE, bool), np.zeros(SHAPE, bool), 9, 0.2).any()
+
+
+def test_enclosure_counts_the_border():
+    patch = boxes((slice(10, 20), slice(10, 20)))
+    three_sides = boxes((slice(7, 23), slice(7, 20))) & ~patch
+    assert np.array_equal(enclosed(patch, three_sides, 0.6), patch)
+    assert not enclosed(patch, three_sides, 0.9).any()
+
+
+def test_a_hand_is_joined_through_what_differs_only():
+    body = boxes((slice(10, 30), slice(5, 20)))
+    hand = boxes((slice(18, 24), slice(36, 44)))
+    arm = boxes((slice(18, 24), slice(20, 36)))
+    strong = levels(body | hand, 100.0)
+    bridged = joined(body | hand, arm, strong, 64.0, 20, 20.0, 4)
+    assert bridged[21, 20:36].all() and not (bridged & ~(body | hand | arm)).any()
+    for seen, reach in ((arm & False, 20.0), (arm, 10.0)):
+        np.testing.assert_array_equal(joined(body | hand, seen, strong, 64.0, 20, reach, 4), body | hand)
+
+
+def test_weak_parts_go_but_never_the_largest():
+    body, edge = boxes((slice(10, 30), slice(5, 20))), boxes((slice(33, 36), slice(30, 50)))
+    weak = levels(body | edge, 10.0)
+    np.testing.assert_array_equal(joined(body | edge, body, weak, 64.0, 20, 5.0, 4), body)
+    strong = levels(body | edge, 100.0)
+    np.testing.assert_array_equal(joined(body | edge, body, strong, 64.0, 20, 5.0, 4), body | edge)
+
+
+def test_the_rim_goes_where_it_shows_the_scene():
+    person = boxes((slice(10, 30), slice(10, 40)))
+    swollen = boxes((slice(7, 33), slice(7, 43)))
+    contrast = np.where(person, 80, 2).astype(np.uint8)
+    np.testing.assert_array_equal(trim_rim(swollen, contrast, 0.3, 4), person)
+    # a dark patch inside is no rim
+    contrast[18:22, 20:30] = 0
+    np.testing.assert_array_equal(trim_rim(swollen, contrast, 0.3, 4), person)
