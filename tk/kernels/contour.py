@@ -99,6 +99,24 @@ def rim_crossings(strips: ti.template(), s: int, camera):  # (S, N, 5), camera c
 
 
 @ti.func
+def rim_point(placed: ti.template(), c: int, pieces: ti.template(), i: int, eta, omega):
+    """A point of piece i: in the piece's frame, in the world, and its unit normal in the world."""
+    radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
+    e1, e2 = pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4]
+    R = load_placed_rotation(placed, c, i)
+    q = surface_point(eta, omega, radii, e1, e2)
+    n = R @ surface_normal(eta, omega, radii, e1, e2).normalized()
+    return q, R @ q + load_placed_vector(placed, c, i, PLACED_TRANSLATION), n
+
+
+@ti.func
+def to_zero_configuration(pieces: ti.template(), i: int, q):
+    """A point of piece i from the piece's frame to the zero configuration, where it is a material point."""
+    R = ti.Matrix([[pieces[i, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
+    return R @ q + ti.Vector([pieces[i, 4 * a + 3] for a in ti.static(range(3))])
+
+
+@ti.func
 def image_normal(J, n):
     """Unit normal (2,) of the contour's image at a point of the rim; J (2, 3) the projection's derivative.
 
@@ -143,10 +161,6 @@ def _contour_kernel(real):
             for m in range(first, ti.min(first + STRIPS_PER_TASK, K)):
                 s = chosen[b, m]
                 i = strip_piece[s]
-                radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
-                e1, e2 = pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4]
-                R = load_placed_rotation(placed, c, i)
-                t = load_placed_vector(placed, c, i, PLACED_TRANSLATION)
                 crossings = rim_crossings(strips, s, load_placed_vector(placed, c, i, PLACED_CAMERA))
                 row = (b * C + v) * K + m
                 for slot in range(2):
@@ -156,19 +170,16 @@ def _contour_kernel(real):
                     omega = ti.select(slot == 0, crossings[2], crossings[5])
                     flag = 0
                     if here > 0:
-                        q = surface_point(eta, omega, radii, e1, e2)
-                        x = R @ q + t
+                        q, x, n = rim_point(placed, c, pieces, i, eta, omega)
                         pixel, J, depth = project(cameras, v, x)
                         if depth > 1e-6:
                             flag = FOUND
                             if is_occluded(placed, c, pieces, i, x, center) == 0:
                                 flag = FOUND | VISIBLE
-                            normal = image_normal(J, R @ surface_normal(eta, omega, radii, e1, e2).normalized())
+                            normal = image_normal(J, n)
+                            x_zero = to_zero_configuration(pieces, i, q)
                             for a in ti.static(range(3)):
-                                zero = pieces[i, 4 * a + 3]
-                                for j in ti.static(range(3)):
-                                    zero += pieces[i, 4 * a + j] * q[j]
-                                geometry[row, slot, a] = zero
+                                geometry[row, slot, a] = x_zero[a]
                             for a in ti.static(range(2)):
                                 geometry[row, slot, 3 + a] = pixel[a]
                                 geometry[row, slot, 5 + a] = normal[a]
@@ -205,7 +216,10 @@ class ContourPoints:
 
     @property
     def occluded(self) -> np.ndarray:
-        """(B, C) contour points found and hidden: section 6.1.2 takes the three views with the fewest."""
+        """(B, C) contour points found and hidden: section 6.1.2 takes the three views with the fewest.
+
+        Where the paper is silent: a strip that a camera sees end-on has no contour and counts as neither.
+        """
         return np.sum(self.found != self.visible, axis=(2, 3))
 
 
