@@ -40,7 +40,8 @@ class SilhouetteConfig:
     Attributes:
         body: "full" (14 parts, 24 degrees of freedom), "limbs" (10 parts) or "walker" (the paper's 6 parts and 7
             degrees of freedom).
-        prediction: share of the last frame's motion that the next is expected to repeat. The paper found none useful.
+        prediction: share of the last frame's motion that the next is expected to repeat (the paper: 0, for it found
+            none useful; half of it pays when arms and legs swing).
         headings, phases: how many headings and walking phases the initialisation tries.
         finalists: how many of them are followed through the first frames before one is chosen.
         adapt: whether the limbs' dimensions are adapted to the silhouettes.
@@ -50,7 +51,7 @@ class SilhouetteConfig:
     """
 
     body: str = "full"
-    prediction: float = 0.0
+    prediction: float = 0.5
     headings: int = 8
     phases: int = 8
     finalists: int = 6
@@ -179,7 +180,7 @@ class SilhouetteTracker:
                 f"initialisation: {count} of {len(self.views.rig)} masks of frame {index} show anybody, two are "
                 "needed: check the masks, or choose another first frame"
             )
-        return np.linalg.solve(A, y)
+        return np.asarray(np.linalg.solve(A, y), np.float64)
 
     def _stature(self, pyramid: Pyramid, p_centroid: Float) -> float:
         """Median over the views of the silhouette's height at the depth of its centroid, metres."""

@@ -50,10 +50,13 @@ class SearchSettings:
         spacing_px: distance between samples, in pixels of the scale (the paper: typically every pixel).
         most_samples: of a curve; longer ones are sampled more coarsely, with more weight each.
         ambiguous_px: an edgel nearer than this, in pixels of the scale, to a model edge of another limb is shared with
-            it (4.4); 0 gives every edgel its full weight. The paper does not say how near; its window is meant here.
+            it (4.4); 0 gives every edgel its full weight. The paper does not say how near; 8, its window, suits.
         tangential: weight of the row along the contour (1: the paper's dx and dy; 0: the distance along the normal).
         robust_px: scale of the Geman-McClure weights (1 + (d/s)²)⁻², in pixels of the full picture; 0: least squares.
         lost_px: what a sample costs, as a distance, that finds no edge. Only poses are compared by it.
+        interior: whether contours before another part are searched, too, as in the paper. No silhouette edge is
+            expected there, and most of what they find belongs to others: sharing ambiguous edgels (4.4) mends part of
+            that, leaving the contours out mends more, and there is little left to share.
 
     Raises:
         ConfigError: a value is out of range.
@@ -62,10 +65,11 @@ class SearchSettings:
     window_px: float = 8.0
     spacing_px: float = 2.0
     most_samples: int = 64
-    ambiguous_px: float = 8.0
-    tangential: float = 0.0
+    ambiguous_px: float = 0.0
+    tangential: float = 0.1
     robust_px: float = 0.0
     lost_px: float = 16.0
+    interior: bool = False
 
     def __post_init__(self) -> None:
         for name, value, valid, expected in (
@@ -240,15 +244,10 @@ def _equations_kernel(real):
         camera: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
         size: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (V, 2) width, height at this scale
         mask: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (V, H, W) at this scale
-        scale: real,  # pixels of the full picture in one of this scale
-        # settings
-        window: real,
-        spacing: real,
+        # settings; scale: pixels of the full picture in one of this scale
+        numbers: ti.types.ndarray(dtype=real, ndim=1),  # scale, window, spacing, ambiguous, tangential, robust, lost
         most_samples: ti.i32,
-        ambiguous: real,
-        tangential: real,
-        robust: real,
-        lost: real,
+        interior: ti.i32,
         export: ti.i32,
         # the poses
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
@@ -286,7 +285,7 @@ def _equations_kernel(real):
             last = ti.Vector([0.0 * length, 0.0 * length])
             for i in range(chords + 1):
                 if visible == 1:
-                    x, tangent = point_on(kind, shape, center, params, ti.cast(i, real) / chords)
+                    x, tangent = point_on(kind, shape, center, params, (i + 0.0 * length) / chords)
                     pixel, J, z = project(camera, v, R @ x + t)
                     if z < NEAREST_M:
                         visible = 0
@@ -309,6 +308,8 @@ def _equations_kernel(real):
         for c in range(B * V * Q):
             b, v, q = c // (V * Q), (c // Q) % V, c % Q
             p, kind = curve_part[q], curve_kind[q]
+            scale, window, spacing, ambiguous = numbers[0], numbers[1], numbers[2], numbers[3]
+            tangential, robust, lost = numbers[4], numbers[5], numbers[6]
             for i in range(sums.shape[1]):
                 sums[c, i] = 0.0
             if export == 1:
@@ -340,11 +341,11 @@ def _equations_kernel(real):
                             if use and o != p:
                                 Ro = load_rotation(placed, b, o)
                                 co = Ro.transpose() @ (eye - load_translation(placed, b, o))
-                                # within another part's outline: before it or behind it, no silhouette edge is expected
-                                if (
-                                    enter(part_kind[o], _shape(part_shape, o), co, Ro.transpose() @ ray, HIDING_SHRINK)
-                                    > 0.0
-                                ):
+                                t_o = enter(
+                                    part_kind[o], _shape(part_shape, o), co, Ro.transpose() @ ray, HIDING_SHRINK
+                                )
+                                # behind another part it is not seen; before one it is no edge of the silhouette
+                                if t_o > 0.0 and (interior == 0 or t_o < 1.0):
                                     use = False
                     if use:
                         found, d = _search(mask, v, width, height, at, n, window)
@@ -434,13 +435,24 @@ def _equations_kernel(real):
     return kernel
 
 
-def _launch(body, cameras, sizes, masks, scale, poses, settings, export):  # type: ignore[no-untyped-def]
+def _launch(
+    body: ConeArrays,
+    cameras: NDArray[np.floating],
+    sizes: NDArray[np.integer],
+    masks: NDArray[np.uint8],
+    scale: float,
+    poses: NDArray[np.floating],
+    settings: SearchSettings,
+    export: bool,
+) -> tuple[NDArray[np.float64], NDArray[np.floating]]:
     ensure_runtime()
     dtype = body.axis.dtype
     poses = np.ascontiguousarray(poses, dtype)
     B, D = poses.shape
     V, Q, P = len(cameras), len(body.curve_part), len(body.part_kind)
     tasks = B * V * Q
+    s = settings
+    numbers = (scale, s.window_px, s.spacing_px, s.ambiguous_px, s.tangential, s.robust_px, s.lost_px)
     total = np.empty((B, 3 + D + D * D))
     samples = np.zeros((tasks, settings.most_samples, _EXPORT) if export else (1, 1, _EXPORT), dtype)
     _equations_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
@@ -448,14 +460,9 @@ def _launch(body, cameras, sizes, masks, scale, poses, settings, export):  # typ
         np.ascontiguousarray(cameras, dtype),
         np.ascontiguousarray(sizes, np.int32),
         np.ascontiguousarray(masks),
-        float(scale),
-        settings.window_px,
-        settings.spacing_px,
+        np.array(numbers, dtype),
         settings.most_samples,
-        settings.ambiguous_px,
-        settings.tangential,
-        settings.robust_px,
-        settings.lost_px,
+        int(settings.interior),
         int(export),
         poses,
         np.empty((B, D, 12), dtype),

@@ -176,7 +176,7 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
         raise ConfigError(f'cone body "{preset}": choose one of {", ".join(PRESETS)}')
     d = dimensions
     x, _, z = np.eye(3)
-    parts = [_torso(d), _head(d)]
+    parts = _trunk_and_head(d) if preset == "full" else [_torso(d), _head(d)]
     for side, sign in (("l", 1.0), ("r", -1.0)):
         M = np.diag([1.0, sign, 1.0])
         if preset != "walker":
@@ -201,7 +201,7 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
         parts.append(_limb(f"calf_{side}", knee, -z, shin, d.knee_radius, d.ankle_radius, x, (False, preset != "full")))
         if preset == "full":
             half = 0.55 * d.ankle_height
-            heel = ankle - (d.ankle_height - half) * z - 0.25 * d.foot * x
+            heel = ankle - (d.ankle_height - half) * z - 0.2 * d.foot * x
             shape = (half, 0.18 * d.foot, d.foot, 0.75)
             parts.append(ConePart(f"foot_{side}", f"calf_{side}", CONE, shape, _frame(heel, x, z), ends=(True, True)))
     return ConeBody(d, build_skeleton(d, up), tuple(parts), preset)
@@ -210,12 +210,59 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
 def _torso(d: BodyDimensions) -> ConePart:
     """From the crotch to the root of the neck; one magnification for width and depth, as the paper has it."""
     x, _, z = np.eye(3)
-    bottom = -0.5 * CROTCH_DROP / HIP_HALF_WIDTH * d.hip_half_width
+    bottom = -0.9 * CROTCH_DROP / HIP_HALF_WIDTH * d.hip_half_width
     top = 0.94 * d.trunk
     m = d.chest_half_width / d.hips_half_width
     depth = 0.5 * (d.hips_half_depth + d.chest_half_depth / m)
     shape = (depth, d.hips_half_width, top - bottom, m)
     return ConePart("torso", "torso", CONE, shape, _frame(bottom * z, z, x), ends=(False, True))
+
+
+def _trunk_and_head(d: BodyDimensions) -> list[ConePart]:
+    """Torso and head in more detail: abdomen, chest, shoulders; skull, neck."""
+    x, _, z = np.eye(3)
+    bottom = -0.9 * CROTCH_DROP / HIP_HALF_WIDTH * d.hip_half_width
+    waist, shoulders = 0.42 * d.trunk, d.trunk - 0.7 * d.shoulder_drop
+    taper = 0.93
+    skull = 0.44 * d.head
+    lean = 0.1 * d.head
+    return [
+        ConePart(
+            "abdomen",
+            "torso",
+            CONE,
+            (d.hips_half_depth, d.hips_half_width, waist - bottom, taper),
+            _frame(bottom * z, z, x),
+        ),
+        ConePart(
+            "chest",
+            "torso",
+            CONE,
+            (taper * d.chest_half_depth, taper * d.chest_half_width, shoulders - waist, 1 / taper),
+            _frame(waist * z, z, x),
+        ),
+        ConePart(
+            "shoulders",
+            "torso",
+            CONE,
+            (0.85 * d.chest_half_depth, d.chest_half_width, d.trunk - shoulders, 0.5),
+            _frame(shoulders * z, z, x),
+        ),
+        ConePart(
+            "head",
+            "head",
+            ELLIPSOID,
+            (1.12 * d.head_radius, d.head_radius, skull, 1.0),
+            _frame((d.trunk + d.head - skull) * z + lean * x, z, x),
+        ),
+        ConePart(
+            "neck",
+            "head",
+            CONE,
+            (d.neck_radius, d.neck_radius, 0.5 * d.head, 0.95),
+            _frame((d.trunk - 0.15 * d.head) * z + 0.3 * lean * x, z, x),
+        ),
+    ]
 
 
 def _head(d: BodyDimensions) -> ConePart:

@@ -50,14 +50,15 @@ class ConeFitConfig:
     Attributes:
         frames: most frames that are used, evenly spaced.
         rounds: Gauss-Newton iterations.
-        edge_noise_px: standard deviation of an edgel, clothes and ragged masks included.
+        edge_noise_px: standard deviation of an edgel. Besides ragged masks it stands for shapes that no cone has, which
+            err alike in all frames: too small a value bends lengths to make up for shapes.
         correlation_px: along a contour this many pixels err together; edgels within them count as one.
         stature_deviation: of the logarithm of the stature about the given one; the hair and the soles are in it.
     """
 
     frames: int = 8
     rounds: int = 8
-    edge_noise_px: float = 2.0
+    edge_noise_px: float = 6.0
     correlation_px: float = 10.0
     stature_deviation: float = 0.01
 
