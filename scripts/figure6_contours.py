@@ -143,7 +143,7 @@ def from_capture(capture: Path, result: Path, frame: int, cameras: Sequence[str]
     """
     opened, tracked = open_capture(capture, cameras), read_result(result)
     prefix = "dimensions/"
-    dimensions = {k[len(prefix) :]: float(v) for k, v in tracked.model.items() if k.startswith(prefix)}  # type: ignore[arg-type]
+    dimensions = {k[len(prefix) :]: float(v) for k, v in tracked.model.items() if k.startswith(prefix)}
     if tracked.meta.method != "volumetric" or not dimensions:
         raise TkError(f"{result}: holds no body of superellipsoids; give a result of the volumetric method")
     body = build_body(BodyDimensions(**dimensions), tracked.meta.up)
