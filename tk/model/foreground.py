@@ -51,7 +51,6 @@ from tk.model.regions import (
 Images = NDArray[np.uint8]
 
 _SQUARE3 = np.ones((3, 3), np.uint8)
-_MEAN = np.full((1, 3), 1 / 3)  # of the three channels
 _LEAST_NOISE = 0.4  # of a mean over 3×3 pixels: grey levels, rounded twice, do not tell less
 
 
@@ -409,10 +408,10 @@ class CollinearityForeground:
 
     def _brightness(self, c: int) -> tuple[NDArray[np.float32], float, NDArray[Any]]:
         """Of camera ``c``'s reduced picture: mean over 3×3 pixels less the scene's, its noise, and the scene (h, w)."""
-        image, scene = (cv2.transform(picture[c], _MEAN) for picture in (self._small, self._small_scenes))
+        image, scene = (cv2.cvtColor(p[c], cv2.COLOR_BGR2GRAY) for p in (self._small, self._small_scenes))
         signed = cv2.subtract(image, scene, dtype=cv2.CV_16S)
         brightness = cv2.boxFilter(signed, cv2.CV_32F, (3, 3))
-        sample = brightness[2::4, 2::4]  # most of it shows the scene
+        sample = brightness[2::6, 2::6]  # most of it shows the scene
         median = float(np.median(sample))
         noise = 1.4826 * float(np.median(np.abs(sample - median)))
         return np.subtract(brightness, np.float32(median), dtype=np.float32), max(noise, _LEAST_NOISE), scene
@@ -428,7 +427,7 @@ class CollinearityForeground:
         margin = self.config.rim_layers
         crop = (slice(max(y - margin, 0), y + h + margin), slice(max(x - margin, 0), x + w + margin))
         scene = cv2.transform(self.plates[c][crop], np.diag(gain))
-        contrast = np.asarray(cv2.transform(cv2.absdiff(image[crop], scene), _MEAN), np.uint8)
+        contrast = np.asarray(cv2.cvtColor(cv2.absdiff(image[crop], scene), cv2.COLOR_BGR2GRAY), np.uint8)
         person = trim_rim(whole[crop] > 127, contrast, self.config.rim, self.config.rim_layers)
         mask[crop] = clean_by_area(person, self.config.speck_area * area, self.config.hole_area * area)
 
