@@ -1,0 +1,63 @@
+"""The benchmark at a small size: that its figures are of what they say, not how large they are."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scripts.bench import Run, Stage, counted_launches, main, median_ms
+from tk.kernels.nearest import SurfaceIndex, nearest
+
+
+def test_launches_are_counted_by_kernel_only_inside_the_block() -> None:
+    points = np.zeros((3, 3))
+    index = SurfaceIndex.build(points, points, np.full(3, -1), 0.1)
+    patch = np.zeros(3, np.int32)
+    with counted_launches() as counts:
+        nearest(index, points, points, patch)
+        nearest(index, points, points, patch)
+    nearest(index, points, points, patch)
+    assert dict(counts) == {"nearest_kernel": 2}
+
+
+def test_ratio_is_peer_over_ours() -> None:
+    assert Stage("hull", 2.0, {"peer": 50.0}).ratios == {"peer": 25.0}
+
+
+def test_first_call_does_not_count() -> None:
+    calls: list[int] = []
+    assert median_ms(lambda: calls.append(1), repeats=3) >= 0
+    assert len(calls) == 4
+
+
+def test_the_demo_at_a_small_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("open3d", exc_type=ImportError)
+    file = tmp_path / "bench.json"
+    main(["--voxels", "40", "--repeat", "1", "--frames", "4", "--json", str(file)])
+    printed = capsys.readouterr().out
+    report = json.loads(file.read_text(encoding="utf-8"))
+    assert report["machine"]["cores"] >= 1 and report["growth"] == []
+    (found,) = report["runs"]
+    run = Run(**found["end_to_end"])
+    assert run.frames == 4 and run.frames_per_second > 0 and run.peak_mib > 50
+    assert 0 < run.first_frame_s < run.seconds
+    assert run.launches["carve_kernel"] == 1, "one launch a frame for all cameras"
+    assert run.launches["objective"] > 1
+    stages = found["stages_ms"]
+    assert stages["total"] == pytest.approx(sum(ms for name, ms in stages.items() if name != "total"), rel=0.5)
+    alone = {stage["name"]: stage for stage in found["alone"]}
+    hull = alone["hull, from scratch"]
+    for peer, ratio in hull["ratios"].items():
+        assert ratio == pytest.approx(hull["peers"][peer] / hull["ms"])
+    assert set(hull["peers"]) == {"Open3D carve_silhouette", "NumPy projection"}
+    assert alone["neighbours: build and query"]["peers"].keys() == {"SciPy cKDTree"}
+    for text in ("kernel launches a frame", "peak memory", "Open3D carve_silhouette", "demo at 40³"):
+        assert text in printed
+
+
+def test_a_capture_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="nowhere"):
+        main([str(tmp_path / "nowhere"), "--repeat", "1"])
