@@ -427,7 +427,8 @@ class CollinearityForeground:
         margin = self.config.rim_layers
         crop = (slice(max(y - margin, 0), y + h + margin), slice(max(x - margin, 0), x + w + margin))
         scene = cv2.transform(self.plates[c][crop], np.diag(gain))
-        contrast = np.asarray(cv2.cvtColor(cv2.absdiff(image[crop], scene), cv2.COLOR_BGR2GRAY), np.uint8)
+        # the plain mean: a grey level all but leaves out blue
+        contrast = np.asarray(cv2.transform(cv2.absdiff(image[crop], scene), np.full((1, 3), 1 / 3)), np.uint8)
         person = trim_rim(whole[crop] > 127, contrast, self.config.rim, self.config.rim_layers)
         mask[crop] = clean_by_area(person, self.config.speck_area * area, self.config.hole_area * area)
 
