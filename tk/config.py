@@ -49,7 +49,7 @@ class TrackingConfig:
 
     prediction: float = 0.8
     init_frames: int = 4
-    retry_ratio: float = 1.4
+    retry_ratio: float = 1.25
     lost_value: float = 0.45
     lost_share: float = 0.35
     least_voxels: int = 60

@@ -124,7 +124,7 @@ class VolumetricTracker:
             anchor,
             self.config.fit,
         )
-        self._take_body(dimensions)
+        self._take_body(initialisation.at_rest(dimensions) if init is None else dimensions)
         self._pose = self._previous = poses[0]
         fit = FrameObjective(self._objective, indices[0], np.random.default_rng(0)).fit(poses[0])
         self._usual = fit.value

@@ -75,7 +75,7 @@ class ResultWriter:
         self._workshop = workshop
         self._twins = twins  # [0] is written next; [1] is published, or both are as new
         self._recent: list[Row] = []  # those that a twin lacks
-        self._model: dict[str, Value] = {}
+        self.model: dict[str, Value] = {}
         self._model_version = 0
         self._published = False
         self._intact = True
@@ -105,7 +105,8 @@ class ResultWriter:
     def resume(cls, path: str | os.PathLike[str], meta: ResultMeta) -> tuple[ResultWriter, int]:
         """Take up a result where its run stopped; start a new one where there is none.
 
-        The writer's ``state`` holds what was last given to :meth:`append`; the frames reach exactly as far.
+        The writer's ``state`` holds what was last given to :meth:`append`; the frames reach exactly as far. Its ``model`` is
+        what was given to :meth:`write_model`.
 
         Returns:
             the writer and the number of frames that are done.
@@ -121,7 +122,7 @@ class ResultWriter:
             difference = read_meta(done, target).difference(meta)
             if difference:
                 raise ResultError(f"{target}: was made differently: {difference}; run without --resume to start afresh")
-            state = read_values(done, "resume/state")
+            state, model = read_values(done, "resume/state"), read_values(done, "model")
         with _as_result_error(target), contextlib.ExitStack() as undo:
             workshop = undo.enter_context(_Workshop(target))
             twins = []
@@ -132,7 +133,7 @@ class ResultWriter:
                 twins[-1].drop_rows_without_state()
             undo.pop_all()
         writer = cls(target, meta, workshop, twins)
-        writer.state = state
+        writer.state, writer.model = state, model
         return writer, twins[0].rows
 
     def write_model(self, model: Mapping[str, Value]) -> None:
@@ -140,7 +141,7 @@ class ResultWriter:
 
         A name may hold slashes: ``{"torso/radii_m": ...}``.
         """
-        self._model = dict(model)
+        self.model = dict(model)
         self._model_version += 1
 
     def append(self, result: FrameResult, state: Mapping[str, Value] | None = None) -> None:
@@ -216,7 +217,7 @@ class ResultWriter:
         """Write into this twin what it lacks."""
         try:
             if twin.model_version != self._model_version:
-                twin.put_model(self._model)
+                twin.put_model(self.model)
                 twin.model_version = self._model_version
             news = [row for row in self._recent if row.index >= twin.rows]
             if news:

@@ -316,7 +316,7 @@ class ObjectiveSettings:
     """
 
     nu: float = 0.5
-    tangential: float = 1.0
+    tangential: float = 0.3
     min_cosine: float = 0.0
     reach_m: float = 0.3
     coverage_weight: float = 1.0

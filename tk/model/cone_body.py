@@ -21,7 +21,7 @@ from tk.model.skeleton import SEGMENTS, Skeleton, build_skeleton
 
 Float = NDArray[np.float64]
 
-# How much of a body is modelled: all fourteen parts; without hands and feet; the paper's six-part walker.
+# How much of a body is modelled: all fourteen components; without hands and feet; the paper's six-part walker.
 PRESETS = ("full", "limbs", "walker")
 
 # Edges of different limbs can be mistaken for one another (section 4.4).
@@ -71,6 +71,11 @@ class ConePart:
     shape: tuple[float, float, float, float]
     T_body_part: Float
     ends: tuple[bool, bool] = (False, False)
+
+    @property
+    def component(self) -> str:
+        """The rigid component that it is a part of: "torso", "head", or its own name."""
+        return self.segment if self.segment in ("torso", "head") else self.name
 
     def __post_init__(self) -> None:
         if not all(0 < value < 3 for value in self.shape):
@@ -166,8 +171,10 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
     Args:
         dimensions: lengths and radii, metres.
         up: the world axis that points up.
-        preset: "full" (14 parts: torso, head, upper and lower arms, hands, thighs, calves, feet), "limbs" (10, without
-            hands and feet), or "walker" (6: torso, head, thighs, calves; seven degrees of freedom are free).
+        preset: "full" (14 rigid components: torso, head, upper and lower arms, hands, thighs, calves, feet), "limbs"
+            (10, without hands and feet), or "walker" (6: torso, head, thighs, calves; seven degrees of freedom are
+            free). In the full body the torso consists of three frusta and the head has a neck ("variable resolution",
+            section 3); in the others every component is one solid.
 
     Raises:
         ConfigError: an unknown preset.

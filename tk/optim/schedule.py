@@ -109,7 +109,7 @@ class ScheduleConfig:
     chain_iterations: int = 10
     polish_iterations: int = 6
     retries: int = 2
-    hypotheses: int = 4
+    hypotheses: int = 2
     spread_deg: float = 17.0
     margin: float = 0.01
     max_step_deg: float = 20.0
