@@ -270,6 +270,17 @@ def test_resumed_equals_uninterrupted(tmp_path: Path) -> None:
     assert read_result(path).created == created
 
 
+def test_a_resumed_writer_knows_the_model(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    model = {"height_m": 1.7, "torso/radii_m": np.arange(3.0), "names": '["torso"]'}
+    with ResultWriter.create(path, META) as writer:
+        writer.write_model(model)
+        writer.append(make_frame(0), make_state(0))
+    with ResultWriter.resume(path, META)[0] as writer:
+        assert_equal_values(writer.model, model)
+    assert_equal_values(read_result(path).model, model)
+
+
 def test_resume_without_a_file_starts_one(tmp_path: Path) -> None:
     writer, done = ResultWriter.resume(tmp_path / "result.h5", META)
     with writer:

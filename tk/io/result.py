@@ -105,8 +105,8 @@ class ResultWriter:
     def resume(cls, path: str | os.PathLike[str], meta: ResultMeta) -> tuple[ResultWriter, int]:
         """Take up a result where its run stopped; start a new one where there is none.
 
-        The writer's ``state`` holds what was last given to :meth:`append`; the frames reach exactly as far. Its ``model`` is
-        what was given to :meth:`write_model`.
+        The writer's ``state`` holds what was last given to :meth:`append`; the frames reach exactly as far. Its
+        ``model`` is what was given to :meth:`write_model`.
 
         Returns:
             the writer and the number of frames that are done.
