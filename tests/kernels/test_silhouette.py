@@ -1,0 +1,313 @@
+"""Contours against dense point clouds, rays against sampling, search and normal equations against plain NumPy."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
+
+from tests.model.ring import ring_of_cameras
+from tk.errors import ConfigError
+from tk.kernels import silhouette
+from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A, SIDE_B, curve_of, enter, point_on
+from tk.kernels.runtime import ensure_runtime, ti
+from tk.kernels.silhouette import SearchSettings
+from tk.model import gait
+from tk.model.anthropometry import BodyDimensions
+from tk.model.cone_body import build_cone_body
+from tk.model.cone_fitting import pose_rows
+from tk.model.silhouettes import Views, draw_silhouettes
+
+BODY = build_cone_body(BodyDimensions.from_stature(1.75))
+D = len(BODY.skeleton.names)
+few = settings(max_examples=30, deadline=None)
+sizes = st.floats(0.03, 0.4)
+
+
+@ti.kernel
+def _trace(
+    kind: ti.i32,
+    shape: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    eye: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    points: ti.types.ndarray(dtype=ti.f64, ndim=2),
+    tangents: ti.types.ndarray(dtype=ti.f64, ndim=2),
+) -> ti.i32:
+    s = ti.Vector([shape[i] for i in ti.static(range(4))])
+    c = ti.Vector([eye[i] for i in ti.static(range(3))])
+    visible, q = curve_of(kind, s, c)
+    for n in range(points.shape[0]):
+        x, t = point_on(kind, s, c, q, ti.cast(n, ti.f64) / (points.shape[0] - 1))
+        for i in ti.static(range(3)):
+            points[n, i] = x[i]
+            tangents[n, i] = t[i]
+    return visible
+
+
+@ti.kernel
+def _cast(
+    kind: ti.i32,
+    shape: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    eye: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    rays: ti.types.ndarray(dtype=ti.f64, ndim=2),
+    entered: ti.types.ndarray(dtype=ti.f64, ndim=1),
+):
+    for n in range(rays.shape[0]):
+        s = ti.Vector([shape[i] for i in ti.static(range(4))])
+        c = ti.Vector([eye[i] for i in ti.static(range(3))])
+        d = ti.Vector([rays[n, i] for i in ti.static(range(3))])
+        entered[n] = enter(kind, s, c, d, ti.cast(1.0, ti.f64))
+
+
+def trace(kind, shape, eye, count=181):
+    ensure_runtime()
+    points, tangents = np.empty((count, 3)), np.empty((count, 3))
+    visible = _trace(kind, np.array(shape), np.array(eye), points, tangents)
+    return points if visible else np.empty((0, 3)), tangents
+
+
+def cloud(kind, shape):
+    """Dense points of a part's surface, caps included by their rims."""
+    a, b, h, m = shape
+    u, v = np.meshgrid(np.linspace(0, 1, 121), np.linspace(0, 2 * np.pi, 721))
+    u, v = u.ravel(), v.ravel()
+    if kind == ELLIPSOID:
+        w = np.pi * u
+        return np.column_stack([a * np.sin(w) * np.cos(v), b * np.sin(w) * np.sin(v), h * np.cos(w)])
+    r = 1 + (m - 1) * u
+    return np.column_stack([a * r * np.cos(v), b * r * np.sin(v), h * u])
+
+
+def seen_from(eye, target, points):
+    """Perspective coordinates (N, 2) from eye, looking at target."""
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.linalg.svd(z[None])[2][1]
+    p = (points - eye) @ np.column_stack([x, np.cross(z, x), z])
+    return p[:, :2] / p[:, 2:]
+
+
+def inside(kind, shape, p):
+    a, b, h, m = shape
+    if kind == ELLIPSOID:
+        return (p[..., 0] / a) ** 2 + (p[..., 1] / b) ** 2 + (p[..., 2] / h) ** 2 < 1
+    r = 1 + (m - 1) * p[..., 2] / h
+    within = (p[..., 2] > 0) & (p[..., 2] < h)
+    return within & ((p[..., 0] / a) ** 2 + (p[..., 1] / b) ** 2 < r**2)
+
+
+shapes = st.tuples(sizes, sizes, sizes, st.floats(0.3, 1.8))
+eyes = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.2)
+
+
+@given(shape=shapes, direction=eyes, kind=st.sampled_from([CONE, ELLIPSOID]))
+@few
+def test_contours_bound_the_projected_surface(shape, direction, kind):
+    """The hull of a dense cloud and the hull of the contours are the same region of the image."""
+    middle = np.array([0, 0, 0.5 * shape[2] if kind == CONE else 0.0])
+    eye = middle + 2.5 * np.array(direction) / np.linalg.norm(direction)
+    kinds = (OUTLINE,) if kind == ELLIPSOID else (SIDE_A, SIDE_B, END_NEAR, END_FAR)
+    contour = np.concatenate([trace(k, shape, eye)[0] for k in kinds])
+    around = ConvexHull(seen_from(eye, middle, contour))
+    surface = ConvexHull(seen_from(eye, middle, cloud(kind, shape)))
+    size = np.sqrt(surface.volume)
+    # the cloud's facets cut 1e-4 of the size off its outline, the contour's chords as much of its own
+    distances = surface.points[surface.vertices] @ around.equations[:, :2].T + around.equations[:, 2]
+    assert distances.max() < 1e-3 * size
+    distances = around.points[around.vertices] @ surface.equations[:, :2].T + surface.equations[:, 2]
+    assert distances.max() < 1e-3 * size
+    # every contour point lies on the outline, none inside
+    depth = -(around.points @ surface.equations[:, :2].T + surface.equations[:, 2]).max(axis=1)
+    assert depth.max() < 2e-3 * size
+
+
+@given(shape=shapes, direction=eyes, kind=st.sampled_from([OUTLINE, SIDE_A, SIDE_B, END_NEAR, END_FAR]))
+@few
+def test_tangents_are_derivatives(shape, direction, kind):
+    eye = 2.5 * np.array(direction) / np.linalg.norm(direction)
+    points, tangents = trace(kind, shape, eye, 20001)
+    if len(points):
+        numeric = (points[2:] - points[:-2]) * 20000 / 2
+        np.testing.assert_allclose(tangents[1:-1], numeric, rtol=0, atol=1e-5)
+
+
+@given(shape=shapes, direction=eyes, kind=st.sampled_from([CONE, ELLIPSOID]), seed=st.integers(0, 1000))
+@few
+def test_rays_enter_where_the_solid_begins(shape, direction, kind, seed):
+    eye = 1.5 * np.array(direction) / np.linalg.norm(direction)
+    rays = np.random.default_rng(seed).normal(0, 0.25, (40, 3)) - eye
+    entered = np.empty(len(rays))
+    ensure_runtime()
+    _cast(kind, np.array(shape), eye, rays, entered)
+    t = np.linspace(0, 3, 6001)
+    along = inside(kind, shape, eye + t[None, :, None] * rays[:, None, :])
+    first = np.where(along.any(axis=1), t[along.argmax(axis=1)], -1.0)
+    hit = entered > 0
+    # what grazes the surface for less than two steps of the oracle may go either way
+    sure = (along.sum(axis=1) > 1) | ~along.any(axis=1)
+    missed = sure & along.any(axis=1) & ~hit
+    assert not missed.any()
+    both = hit & along.any(axis=1)
+    np.testing.assert_allclose(entered[both], first[both], rtol=0, atol=6e-4)
+    # and where only the kernel hits, the oracle's steps went past a sliver
+    middle = eye + (entered[hit] + 1e-6)[:, None] * rays[hit]
+    slack = 1 + 1e-4
+    a, b, h, m = shape
+    assert inside(kind, (a * slack, b * slack, h * (slack if kind == ELLIPSOID else 1), m), middle).all()
+
+
+RIG = ring_of_cameras(3, width=160, height=200)
+VIEWS = Views(RIG)
+
+
+def standing(**angles):
+    pose = gait.standing_pose(BODY.skeleton)
+    pose[2] = 0.92
+    for name, value in angles.items():
+        pose[BODY.skeleton.index(name)] = value
+    return pose
+
+
+def edgels_of(body, masks, pose, settings, dtype=np.float64):
+    return silhouette.find_edgels(body.pack(dtype), VIEWS.cameras, VIEWS.sizes, masks, 1.0, pose, settings)
+
+
+def equations_of(body, masks, poses, settings, dtype=np.float64):
+    return silhouette.normal_equations(body.pack(dtype), VIEWS.cameras, VIEWS.sizes, masks, 1.0, poses, settings)
+
+
+POSE = standing(hip_l_pitch=-0.5, knee_l_flexion=0.6, hip_r_pitch=0.2, torso_yaw=0.3)
+MASKS = draw_silhouettes(BODY, RIG, POSE[None])[0]
+PLAIN = SearchSettings(tangential=0.0)
+
+
+def test_equations_are_the_sums_of_the_edgels_rows():
+    moved = POSE + np.random.default_rng(0).normal(0, 0.02, D)
+    edgels = edgels_of(BODY, MASKS, moved, PLAIN)
+    assert len(edgels.view) > 200
+    rows = pose_rows(BODY, moved, edgels)
+    total = equations_of(BODY, MASKS, moved[None], PLAIN)
+    np.testing.assert_allclose(total.hessian[0], rows.T @ (edgels.weight[:, None] * rows), rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(total.gradient[0], rows.T @ (edgels.weight * edgels.distance), rtol=1e-9, atol=1e-6)
+    assert 0 < total.found[0] <= 1
+
+
+@pytest.mark.parametrize("k", range(D))
+def test_rows_are_derivatives_of_the_contour(k):
+    """A generator's image is a line; where it meets the old normal moves as the row says."""
+    settings = SearchSettings(tangential=0.0, most_samples=3, spacing_px=0.25, window_px=12, interior=True)
+    before = edgels_of(BODY, MASKS, POSE, settings)
+    rows = pose_rows(BODY, POSE, before)[:, k]
+    h = 1e-5
+    lines = {}
+    for sign in (-1, 1):
+        step = POSE.copy()
+        step[k] += sign * h
+        lines[sign] = edgels_of(BODY, MASKS, step, settings)
+    tested = 0
+    for i in range(len(before.view)):
+        part = BODY.parts[before.part[i]]
+        if part.kind != CONE or abs(before.unscaled[i, 2] - 0.5) > 1e-6:
+            continue
+        rotation = RIG[before.view[i]].rotation
+        n = (rotation @ before.row[i])[:2]
+        n = n / np.linalg.norm(n)
+        ends = []
+        for sign in (-1, 1):
+            e = lines[sign]
+            near = (e.view == before.view[i]) & (e.part == before.part[i])
+            near &= np.abs(e.unscaled[:, :2] - before.unscaled[i, :2]).max(axis=1) < 1e-3
+            low, high = e.pixel[near & (e.unscaled[:, 2] < 0.4)], e.pixel[near & (e.unscaled[:, 2] > 0.6)]
+            if len(low) != 1 or len(high) != 1:
+                break
+            along = (high - low)[0]
+            across = np.array([along[1], -along[0]])
+            ends.append((low[0] - before.pixel[i]) @ across / (n @ across))
+        if len(ends) == 2:
+            assert (ends[1] - ends[0]) / (2 * h) == pytest.approx(rows[i], abs=2e-2, rel=1e-3)
+            tested += 1
+    assert tested >= 5
+
+
+def test_search_goes_one_way_and_knows_its_window():
+    """A head before half-plane masks: outwards from the foreground, inwards from the background."""
+    edgels = edgels_of(BODY, np.full_like(MASKS, 255), POSE, PLAIN)
+    assert len(edgels.view) == 0  # no background anywhere
+    grown = np.zeros_like(MASKS)
+    body = build_cone_body(BODY.dimensions.scaled(head_radius=1.3))
+    grown[:] = draw_silhouettes(body, RIG, POSE[None])[0]
+    head = next(i for i, part in enumerate(BODY.parts) if part.name == "head")
+    outward = edgels_of(BODY, grown, POSE, PLAIN)
+    wide = outward.distance[outward.part == head]
+    assert len(wide) > 10 and (wide > -0.8).all() and wide.mean() > 0.5
+    inward = edgels_of(body, MASKS, POSE, PLAIN)
+    assert inward.distance[inward.part == head].mean() < -0.5
+    narrow = edgels_of(BODY, grown, POSE, SearchSettings(window_px=1.0))
+    assert np.abs(narrow.distance).max() <= 1.0
+
+
+def test_contours_of_the_pose_itself_lie_on_the_silhouette():
+    edgels = edgels_of(BODY, MASKS, POSE, PLAIN)
+    # a drawn silhouette is right to half a pixel; where outlines of parts meet, its corners are round
+    assert np.median(np.abs(edgels.distance)) < 0.35
+    assert abs(np.average(edgels.distance, weights=edgels.weight)) < 0.1
+
+
+def test_ambiguous_edgels_are_shared():
+    """Legs side by side, seen from the front: weights follow d_b / (2 (d_a + d_b))."""
+    pose = standing(hip_l_yaw=0.02, hip_r_yaw=0.02)
+    masks = draw_silhouettes(BODY, RIG, pose[None])[0]
+    fine = {"spacing_px": 0.25, "tangential": 0.0, "most_samples": 1024, "interior": True}
+    alone = edgels_of(BODY, masks, pose, SearchSettings(**fine))
+    shared = edgels_of(BODY, masks, pose, SearchSettings(**fine, ambiguous_px=3.0))
+    ratio = shared.weight / alone.weight
+    assert (np.abs(ratio - 1) < 1e-9).any() and (ratio < 0.5).any()
+    assert ((ratio <= 0.5 + 1e-9) | (np.abs(ratio - 1) < 1e-9)).all()
+    segments = [BODY.parts[p].segment for p in alone.part]
+    arms = np.array([i for i, s in enumerate(segments) if "arm_l" in s and ratio[i] < 0.5][::15])
+    others = np.array([i for i, s in enumerate(segments) if "arm_l" not in s])
+    normal = np.einsum("nab,nb->na", np.array([c.rotation for c in RIG])[alone.view], alone.row)[:, :2]
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    for i in arms:
+        edgel = alone.pixel[i] + alone.distance[i] * normal[i]
+        rivals = others[(alone.view[others] == alone.view[i]) & (normal[others] @ normal[i] > 0)]
+        nearest = np.linalg.norm(alone.pixel[rivals] - edgel, axis=1).min() if len(rivals) else np.inf
+        # rivals that found no edge are not listed: the true nearest one is at most as far
+        expected = nearest / (2 * (abs(alone.distance[i]) + nearest)) if nearest < 3 else 0.5
+        assert ratio[i] <= expected + 0.05
+
+
+def test_robust_weights_fall_with_the_distance():
+    moved = POSE + 0.02
+    plain = edgels_of(BODY, MASKS, moved, PLAIN)
+    robust = edgels_of(BODY, MASKS, moved, SearchSettings(tangential=0.0, robust_px=2.0))
+    np.testing.assert_allclose(robust.weight, plain.weight / (1 + (plain.distance / 2) ** 2) ** 2, rtol=1e-9)
+
+
+def test_equations_are_the_same_every_time_and_in_any_batch():
+    poses = POSE + np.random.default_rng(1).normal(0, 0.03, (5, D))
+    first = equations_of(BODY, MASKS, poses, SearchSettings(), np.float32)
+    again = equations_of(BODY, MASKS, poses, SearchSettings(), np.float32)
+    alone = equations_of(BODY, MASKS, poses[3:4], SearchSettings(), np.float32)
+    for a, b, c in zip(first, again, alone, strict=True):
+        np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(a[3:4], c)
+
+
+def test_a_body_that_no_camera_sees_has_no_equations():
+    away = POSE.copy()
+    away[2] += 50
+    total = equations_of(BODY, MASKS, away[None], SearchSettings())
+    assert np.isinf(total.cost[0]) and total.found[0] == 0 and not total.hessian.any()
+
+
+def test_overlap_counts_what_it_draws():
+    poses = np.stack([POSE, POSE + 0.1])
+    counts, pictures = silhouette.overlap(BODY.arrays, RIG.centers, VIEWS.rays, MASKS[:, 2::4, 2::4], poses, draw=True)
+    drawn, masks = pictures > 0, MASKS[None, :, 2::4, 2::4] > 0
+    np.testing.assert_array_equal(counts[..., 0], (drawn & ~masks).sum(axis=(2, 3)))
+    np.testing.assert_array_equal(counts[..., 1], (masks & ~drawn).sum(axis=(2, 3)))
+    assert not counts[0].any() and counts[1].all()
+
+
+def test_settings_out_of_range_are_told():
+    with pytest.raises(ConfigError, match="window_px = 0"):
+        SearchSettings(window_px=0)

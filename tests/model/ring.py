@@ -1,0 +1,21 @@
+"""Cameras in a ring about the origin's vertical: what the tests of the silhouette tracker look through."""
+
+import numpy as np
+
+from tk.model.camera import Camera, Rig
+
+
+def ring_of_cameras(count: int, width: int, height: int, radius_m: float = 3.5) -> Rig:
+    """Level cameras at hip height that see a standing person from top to toe; no two opposite each other."""
+    cameras = []
+    for i in range(count):
+        angle = 0.2 + i * 2 * np.pi / (count if count % 2 else count + 1)
+        center = np.array([radius_m * np.cos(angle), radius_m * np.sin(angle), 1.0])
+        z = -center / np.linalg.norm(center[:2])
+        z[2] = 0.0
+        x = np.cross(z, [0, 0, 1.0])
+        rotation = np.stack([x, np.cross(z, x), z])
+        focal = 0.72 * height * radius_m / 2.0
+        matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+        cameras.append(Camera(f"c{i}", width, height, matrix, np.zeros(5), rotation, -rotation @ center))
+    return Rig(tuple(cameras))

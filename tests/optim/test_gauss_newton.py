@@ -1,0 +1,133 @@
+"""Damped Gauss-Newton on small problems with known answers; it is shown no body."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tk.errors import ConfigError
+from tk.optim.gauss_newton import GaussNewtonConfig, minimise, step
+
+UNDAMPED = GaussNewtonConfig(scales=1, iterations=1, damping=0.0, stiffness=0.0, longest_step=100.0)
+NONE = (np.full(4, -np.inf), np.full(4, np.inf))
+ALL = np.ones(4, bool)
+
+
+class Sums(NamedTuple):
+    hessian: np.ndarray
+    gradient: np.ndarray
+    cost: np.ndarray
+
+
+def linear(A, y):
+    """‖A p − y‖² for a batch of states."""
+
+    def equations(states, scale):
+        residual = y - states @ A.T
+        return Sums(np.repeat((A.T @ A)[None], len(states), 0), residual @ A, (residual**2).mean(axis=1))
+
+    return equations
+
+
+def problem(seed, rows=9):
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(rows, 4)), rng.normal(size=rows), rng.normal(size=(3, 4))
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=30, deadline=None)
+def test_a_linear_problem_is_solved_in_one_step(seed):
+    A, y, start = problem(seed)
+    expected = np.linalg.lstsq(A, y, rcond=None)[0]
+    found = minimise(linear(A, y), start, ALL, *NONE, UNDAMPED)
+    np.testing.assert_allclose(found, np.repeat(expected[None], 3, 0), rtol=1e-4, atol=1e-5)
+
+
+def test_damping_shortens_and_iterations_make_up_for_it():
+    A, y, start = problem(1)
+    expected = np.linalg.lstsq(A, y, rcond=None)[0]
+    errors = [
+        np.abs(
+            minimise(
+                linear(A, y),
+                start,
+                ALL,
+                *NONE,
+                GaussNewtonConfig(scales=1, iterations=n, damping=0.5, longest_step=100.0),
+            )
+            - expected
+        ).max()
+        for n in (1, 5, 60)
+    ]
+    assert errors[0] > errors[1] > errors[2] and errors[2] < 1e-4
+
+
+def test_parameters_that_are_not_free_stay():
+    A, y, start = problem(2)
+    free = np.array([True, False, True, False])
+    found = minimise(linear(A, y), start, free, *NONE, UNDAMPED)
+    np.testing.assert_array_equal(found[:, ~free], start[:, ~free])
+    expected = np.linalg.lstsq(A[:, free], y - A[:, ~free] @ start[0, ~free], rcond=None)[0]
+    np.testing.assert_allclose(found[0, free], expected, rtol=1e-4, atol=1e-5)
+
+
+def test_unseen_parameters_stay_where_they_are():
+    A, y, start = problem(3)
+    A[:, 2] = 0.0
+    found = minimise(linear(A, y), start, ALL, *NONE, GaussNewtonConfig(scales=1, iterations=4))
+    np.testing.assert_array_equal(found[:, 2], start[:, 2])
+    nothing = minimise(linear(0 * A, y), start, ALL, *NONE, GaussNewtonConfig())
+    np.testing.assert_array_equal(nothing, start)
+
+
+def test_a_limit_pulls_back_in_proportion_and_only_beyond_it():
+    """The minimum of ‖p − 1‖² + w (p − 0.5)₊²: between limit and data."""
+    A, y = np.eye(4), np.ones(4)
+    upper = np.array([0.5, np.inf, 2.0, np.inf])
+    for weight in (0.0, 1.0, 10.0):
+        config = GaussNewtonConfig(
+            scales=1, iterations=60, damping=0.0, stiffness=0.0, limit_weight=weight, longest_step=100.0
+        )
+        found = minimise(linear(A, y), np.full((1, 4), 0.9), ALL, NONE[0], upper, config)
+        np.testing.assert_allclose(found[0, 0], (1 + 0.5 * weight) / (1 + weight), atol=1e-4)
+        np.testing.assert_allclose(found[0, 1:], 1.0, atol=1e-4)
+
+
+def test_steps_are_shortened_as_a_whole():
+    gradient = np.array([[4.0, 2.0, 0.0, -1.0]])
+    config = GaussNewtonConfig(damping=0.0, stiffness=0.0, longest_step=0.1)
+    delta = step(np.eye(4)[None], gradient, np.zeros((1, 4)), ALL, *NONE, config)
+    np.testing.assert_allclose(delta, 0.1 * gradient / 4.0, rtol=1e-6)
+
+
+def test_scales_run_from_coarse_to_fine():
+    seen = []
+    A, y, start = problem(4)
+
+    def watched(states, scale):
+        seen.append(scale)
+        return linear(A, y)(states, scale)
+
+    minimise(watched, start, ALL, *NONE, GaussNewtonConfig(scales=3, iterations=2))
+    assert seen == [2, 2, 1, 1, 0, 0]
+
+
+def test_a_batch_is_as_good_as_one_at_a_time():
+    A, y, start = problem(5)
+    config = GaussNewtonConfig()
+    together = minimise(linear(A, y), start, ALL, *NONE, config)
+    for i in range(len(start)):
+        np.testing.assert_allclose(
+            minimise(linear(A, y), start[i : i + 1], ALL, *NONE, config)[0], together[i], rtol=1e-12
+        )
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [({"scales": 0}, "scales = 0"), ({"iterations": 0}, "iterations = 0"), ({"damping": -1.0}, "damping -1")],
+)
+def test_settings_out_of_range_are_told(values, message):
+    with pytest.raises(ConfigError, match=message):
+        GaussNewtonConfig(**values)

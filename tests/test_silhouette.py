@@ -1,0 +1,150 @@
+"""The silhouette tracker on silhouettes of its own body, drawn by ray casting."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.model.ring import ring_of_cameras
+from tk.errors import CaptureError, ConfigError
+from tk.io.init_pose import InitPose
+from tk.model.anthropometry import BodyDimensions
+from tk.model.cone_body import build_cone_body
+from tk.model.cone_fitting import ConeFitConfig
+from tk.model.gait import walking_pose
+from tk.model.silhouettes import draw_silhouettes
+from tk.model.skeleton import JOINTS
+from tk.silhouette import SilhouetteConfig, SilhouetteTracker
+from tk.tracker import Observation
+
+STATURE = 1.75
+RIG = ring_of_cameras(3, width=160, height=200)
+BODY = build_cone_body(BodyDimensions.from_stature(STATURE))
+NAMES = BODY.skeleton.names
+# A pixel is 2 cm wide at the subject; a joint rests on dozens of edgels in three views.
+CLOSE_M = 0.025
+
+
+def walk(count: int, first: float = 0.0) -> np.ndarray:
+    """(count, D) a stride at 30 Hz, on the spot."""
+    poses = np.array([walking_pose(BODY.skeleton, first + i / 34) for i in range(count)])
+    poses[:, :3] = [0.05, -0.04, 0.93]
+    poses[:, NAMES.index("torso_yaw")] = 0.7
+    return poses
+
+
+POSES = walk(6)
+MASKS = draw_silhouettes(BODY, RIG, POSES)
+EMPTY = np.zeros((0,), np.uint8)
+
+
+def observe(masks, index=0):
+    return Observation(index, EMPTY, masks)
+
+
+def errors(estimate, pose):
+    return np.linalg.norm(estimate.joints - BODY.skeleton.joints(pose), axis=1)
+
+
+def tracker_at(pose, **settings) -> SilhouetteTracker:
+    """A tracker of the true body that starts near a pose."""
+    tracker = SilhouetteTracker(RIG, "z", SilhouetteConfig(adapt=False, **settings))
+    init = InitPose({}, dict(zip(NAMES, pose, strict=True)), None, STATURE)
+    tracker.start([observe(MASKS[0])], None, init)
+    return tracker
+
+
+def test_a_disturbed_pose_is_recovered():
+    rng = np.random.default_rng(2)
+    disturbed = POSES[0] + np.where(np.arange(len(NAMES)) < 3, 0.03, 0.07) * rng.choice([-1, 1], len(NAMES))
+    tracker = tracker_at(disturbed)
+    before = np.linalg.norm(BODY.skeleton.joints(disturbed) - BODY.skeleton.joints(POSES[0]), axis=1)
+    estimate = tracker.step(observe(MASKS[0]))
+    assert before.mean() > 0.05
+    assert errors(estimate, POSES[0]).mean() < CLOSE_M
+    assert estimate.status == "initialised" and estimate.objective < 0.1
+    assert set(estimate.timing) == set(tracker.timing_stages)
+    assert estimate.iterations.tolist() == [3, 3] and len(tracker.stages) == 2
+
+
+def test_a_walk_is_followed_and_can_be_taken_up_again():
+    tracker = tracker_at(POSES[0])
+    estimates = []
+    for i, masks in enumerate(MASKS):
+        estimates.append(tracker.step(observe(masks, i)))
+        if i == 2:
+            model, state = dict(tracker.model()), {k: np.copy(v) for k, v in tracker.state().items()}
+    assert [e.status for e in estimates] == ["initialised"] + ["tracked"] * 5
+    assert max(errors(e, p).mean() for e, p in zip(estimates, POSES, strict=True)) < CLOSE_M
+    second = SilhouetteTracker(RIG, "z", tracker.config)
+    second.restore(model, state)
+    for i in range(3, 6):
+        np.testing.assert_array_equal(second.step(observe(MASKS[i], i)).pose, estimates[i].pose)
+
+
+def test_the_subject_is_found_without_any_hint():
+    config = SilhouetteConfig(headings=8, phases=4, finalists=3, adapt=False)
+    tracker = SilhouetteTracker(RIG, "z", config)
+    tracker.start([observe(m, i) for i, m in enumerate(MASKS)], STATURE, None)
+    estimate = tracker.step(observe(MASKS[0]))
+    assert errors(estimate, POSES[0]).mean() < 2 * CLOSE_M
+    sides = [JOINTS.index(name) for name in ("ankle_l", "ankle_r")]
+    truth = BODY.skeleton.joints(POSES[0])[sides]
+    found = estimate.joints[sides]
+    assert np.linalg.norm(found - truth) < np.linalg.norm(found[::-1] - truth)
+
+
+def test_the_stature_is_read_off_the_silhouettes():
+    tracker = SilhouetteTracker(RIG, "z", SilhouetteConfig(headings=8, phases=1, finalists=1, adapt=False))
+    tracker.start([observe(MASKS[0])], None, None)
+    assert tracker.body.dimensions.stature == pytest.approx(STATURE, rel=0.06)
+
+
+def test_dimensions_are_adapted_in_start():
+    thick = BODY.dimensions.scaled(thigh_radius=1.25, head_radius=1.15)
+    masks = draw_silhouettes(build_cone_body(thick), RIG, POSES[:3])
+    config = SilhouetteConfig(fit=ConeFitConfig(frames=2, rounds=5, edge_noise_px=1.0))
+    tracker = SilhouetteTracker(RIG, "z", config)
+    init = InitPose({}, dict(zip(NAMES, POSES[0], strict=True)), None, STATURE)
+    tracker.start([observe(m, i) for i, m in enumerate(masks)], None, init)
+    found = tracker.body.dimensions
+    assert found.thigh_radius == pytest.approx(thick.thigh_radius, rel=0.06)
+    assert found.head_radius == pytest.approx(thick.head_radius, rel=0.06)
+    assert found.stature == pytest.approx(STATURE, rel=0.02)
+
+
+def test_an_empty_picture_is_a_lost_frame_and_the_next_one_is_recovered():
+    tracker = tracker_at(POSES[0])
+    first = tracker.step(observe(MASKS[0]))
+    lost = tracker.step(observe(np.zeros_like(MASKS[0]), 1))
+    assert lost.status == "lost" and np.isinf(lost.objective)
+    assert np.isfinite(lost.pose).all() and np.abs(lost.pose - first.pose).max() < 0.1
+    assert tracker.step(observe(MASKS[1], 2)).status == "recovered"
+    assert tracker.step(observe(MASKS[2], 3)).status == "tracked"
+
+
+def test_the_walker_moves_only_its_seven_degrees_of_freedom():
+    tracker = tracker_at(POSES[0], body="walker")
+    start = tracker.state()["pose"]
+    estimate = tracker.step(observe(MASKS[1]))
+    moved = estimate.pose != start
+    assert moved.any() and not (moved & ~tracker.body.free).any()
+    ankles = [JOINTS.index("ankle_l"), JOINTS.index("ankle_r")]
+    assert errors(estimate, POSES[1])[ankles].max() < 0.08
+
+
+def test_nobody_in_the_first_frame_is_told():
+    tracker = SilhouetteTracker(RIG, "z")
+    masks = MASKS[0].copy()
+    masks[1:] = 0
+    with pytest.raises(CaptureError, match="1 of 3 masks of frame 7 show anybody"):
+        tracker.start([observe(masks, 7)], None, None)
+    with pytest.raises(RuntimeError, match="no body yet"):
+        tracker.step(observe(MASKS[0]))
+
+
+def test_settings_out_of_range_are_told():
+    with pytest.raises(ConfigError, match="prediction = 2"):
+        replace(SilhouetteConfig(), prediction=2.0)
+    with pytest.raises(ConfigError, match="finalists"):
+        SilhouetteConfig(finalists=0)
