@@ -262,7 +262,7 @@ def _linearise_kernel(real):
                 k_last = 0
                 v = -1
                 x0 = ti.Vector([pose[0, 0] * 0.0, pose[0, 0] * 0.0, pose[0, 0] * 0.0])
-                inv_sigma2, nu, scale = x0[0], settings[0], settings[7]
+                inv_sigma2, nu, scale, share = x0[0], settings[0], settings[7], settings[1]
                 if m < M:
                     n = chosen[m]
                     k_last = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
@@ -285,7 +285,11 @@ def _linearise_kernel(real):
                     r = x - ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
                     for a in ti.static(range(3)):
                         residual[m, a] = r[a]
-                    decay = ti.exp(-0.5 * r.norm_sqr() * inv_sigma2 / nu)
+                    y_normal = ti.Vector([ti.cast(voxels[v, 3 + a], real) for a in ti.static(range(3))])
+                    if y_normal.norm_sqr() == 0.0 or m >= M:
+                        share = share * 0.0 + 1.0
+                    across = y_normal.dot(r)
+                    decay = ti.exp(-0.5 * (share * r.norm_sqr() + (1.0 - share) * across * across) * inv_sigma2 / nu)
                     weight = scale * inv_sigma2 / nu * ti.max(decay, floor)
                     k = k_last
                     while k >= 0:
@@ -293,9 +297,10 @@ def _linearise_kernel(real):
                         if want_jacobian == 1:
                             for a in ti.static(range(3)):
                                 jacobian[m, k, a] = J[a]
+                        MJ = weight * (share * J + (1.0 - share) * y_normal.dot(J) * y_normal)
                         j = k
                         while j >= 0:
-                            hessian[c, k, j] += weight * J.dot(point_velocity(prismatic, twists, c, j, x))
+                            hessian[c, k, j] += MJ.dot(point_velocity(prismatic, twists, c, j, x))
                             j = parent[j]
                         k = parent[k]
 
@@ -508,6 +513,7 @@ class ObjectiveKernel:
             residual=residual.astype(np.float64),
             jacobian=jacobian.transpose(0, 2, 1).astype(np.float64),
             hessian=lower + np.tril(lower, -1).T,
+            metric=_metric(index.normals[partner], np.repeat([settings.tangential, 1.0], [M, Q])),
             partner=partner,
             inv_sigma2=np.concatenate([weight[chosen], piece_weight[held.covering[0, :Q, 0].astype(np.int64)]]),
             nu=np.repeat([settings.nu, settings.coverage_nu], [M, Q]),
@@ -522,7 +528,8 @@ class Linearisation:
     Attributes:
         residual: (K, 3) x − x̄, metres; zero where a pair is missing.
         jacobian: (K, 3, D) ∂x/∂p; (1, 3, D) zeros where it was not asked for.
-        hessian: (D, D) Gauss-Newton Hessian of f with tangential = 1, outliers weighing at least the floor asked for.
+        hessian: (D, D) Gauss-Newton Hessian of f, outliers weighing at least the floor asked for.
+        metric: (K, 3, 3) how directions count: the identity, or less along the data's surface.
         partner: (K,) the voxel, -1 where missing.
         inv_sigma2: (K,) 1/σ², 1/m².
         nu: (K,) Leclerc's ν; scale: (K,) the pair's share of f.
@@ -531,6 +538,7 @@ class Linearisation:
     residual: np.ndarray
     jacobian: np.ndarray
     hessian: np.ndarray
+    metric: np.ndarray
     partner: np.ndarray
     inv_sigma2: np.ndarray
     nu: np.ndarray
@@ -539,11 +547,19 @@ class Linearisation:
     @property
     def decay(self) -> np.ndarray:
         """(K,) exp(−e/ν): near 1 for inliers, 0 for outliers and missing pairs."""
-        e = 0.5 * np.sum(self.residual**2, axis=1) * self.inv_sigma2
+        e = 0.5 * np.einsum("ka,kab,kb->k", self.residual, self.metric, self.residual) * self.inv_sigma2
         return np.where(self.partner >= 0, np.exp(-e / self.nu), 0.0)
 
     def gauss_newton(self, floor: float = 0.0) -> np.ndarray:
         """(D, D) the Gauss-Newton Hessian of f, outliers weighing at least ``floor``."""
         weight = self.scale / self.nu * self.inv_sigma2 * np.maximum(self.decay, floor) * (self.partner >= 0)
-        rows = (self.jacobian * np.sqrt(weight)[:, None, None]).reshape(-1, self.jacobian.shape[2])
-        return rows.T @ rows
+        weighted = np.einsum("k,kab,kbd->kad", weight, self.metric, self.jacobian)
+        D = self.jacobian.shape[2]
+        return self.jacobian.reshape(-1, D).T @ weighted.reshape(-1, D)
+
+
+def _metric(normals: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """(K, 3, 3) share·I + (1 − share)·n nᵀ; the identity where the normal is zero."""
+    n = normals.astype(np.float64)
+    share = np.where(n.any(axis=1), share, 1.0)[:, None, None]
+    return share * np.eye(3) + (1 - share) * n[:, :, None] * n[:, None, :]
