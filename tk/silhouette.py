@@ -46,6 +46,10 @@ class SilhouetteConfig:
         finalists: how many of them are followed through the first frames before one is chosen.
         adapt: whether the limbs' dimensions are adapted to the silhouettes.
         init_frames: frames that the initialisation looks at; a stride is about one second.
+        second_thoughts: every how many frames other places are tried for the arms; 0: never. A silhouette hides an arm
+            before or behind the trunk, and where it comes out again no contour may be near (beyond the paper, with the
+            means of its section 4.6).
+        gain: the fall of E_S that makes one of them the pose.
         lost_error: a frame whose E_S, averaged over the views, is above this is lost.
         ray_step: every how many pixels E_S is taken during tracking.
     """
@@ -57,8 +61,10 @@ class SilhouetteConfig:
     finalists: int = 6
     adapt: bool = True
     init_frames: int = 40
+    second_thoughts: int = 3
+    gain: float = 0.002
     lost_error: float = 0.6
-    ray_step: int = 4
+    ray_step: int = 6
     search: SearchSettings = field(default_factory=SearchSettings)
     solver: GaussNewtonConfig = field(default_factory=GaussNewtonConfig)
     cleaning: CleaningConfig = field(default_factory=CleaningConfig)
@@ -211,6 +217,9 @@ class SilhouetteTracker:
         pose = self._settle(pyramid, start[None], config.solver.scales)[0]
         watch.lap("optimise")
         error = float(self._fit_error(pyramid, pose[None])[0])
+        every = config.second_thoughts
+        if every and frame.index % every == 0 and config.body != "walker" and np.isfinite(error):
+            pose, error = self._reconsider(pyramid, pose, error)
         lost = not error <= config.lost_error
         status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
         # nobody is in sight: the last pose stands
@@ -227,6 +236,15 @@ class SilhouetteTracker:
             iterations=np.full(len(self.stages), config.solver.iterations, np.int32),
             timing=watch.laps,
         )
+
+    def _reconsider(self, pyramid: Pyramid, pose: Float, error: float) -> tuple[Float, float]:
+        """The pose or, if that explains the silhouettes better, one with an arm elsewhere; and its E_S."""
+        variants = gait.arm_variants(self.body.skeleton, pose)
+        best = variants[np.argsort(self._fit_error(pyramid, variants), kind="stable")[:2]]
+        settled = self._settle(pyramid, best, 1)
+        errors = self._fit_error(pyramid, settled)
+        i = int(np.argmin(errors))
+        return (settled[i], float(errors[i])) if errors[i] < error - self.config.gain else (pose, error)
 
     @property
     def body(self) -> ConeBody:

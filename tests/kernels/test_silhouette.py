@@ -1,5 +1,8 @@
 """Contours against dense point clouds, rays against sampling, search and normal equations against plain NumPy."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,6 +17,7 @@ from tk.kernels.runtime import ensure_runtime, ti
 from tk.kernels.silhouette import SearchSettings
 from tk.model import gait
 from tk.model.anthropometry import BodyDimensions
+from tk.model.camera import Rig
 from tk.model.cone_body import build_cone_body
 from tk.model.cone_fitting import pose_rows
 from tk.model.silhouettes import Views, draw_silhouettes
@@ -301,11 +305,35 @@ def test_a_body_that_no_camera_sees_has_no_equations():
 
 def test_overlap_counts_what_it_draws():
     poses = np.stack([POSE, POSE + 0.1])
-    counts, pictures = silhouette.overlap(BODY.arrays, RIG.centers, VIEWS.rays, MASKS[:, 2::4, 2::4], poses, draw=True)
+    seen = MASKS[:, 2::4, 2::4]
+    counts, pictures = silhouette.overlap(BODY.arrays, VIEWS.cameras, 4, VIEWS.rays, seen, poses, draw=True)
     drawn, masks = pictures > 0, MASKS[None, :, 2::4, 2::4] > 0
     np.testing.assert_array_equal(counts[..., 0], (drawn & ~masks).sum(axis=(2, 3)))
     np.testing.assert_array_equal(counts[..., 1], (masks & ~drawn).sum(axis=(2, 3)))
     assert not counts[0].any() and counts[1].all()
+
+
+def test_drawn_silhouettes_are_the_hulls_of_the_parts():
+    """Each part is convex: its silhouette is the convex hull of its projected cloud, lens distortion included."""
+    rig = ring_of_cameras(2, width=160, height=200)
+    bent = [replace(camera, distortions=np.array([-0.15, 0.03, 1e-3, -1e-3, 0])) for camera in rig]
+    drawn = draw_silhouettes(BODY, Rig(tuple(bent)), POSE[None])[0]
+    for camera, picture in zip(bent, drawn, strict=True):
+        around, core = np.zeros_like(picture), np.zeros_like(picture)
+        for p, part in enumerate(BODY.parts):
+            a, b, h, m = part.shape
+            x, y, z = cloud(part.kind, part.shape)[::7].T
+            r = 1 + (m - 1) * z / h if part.kind == CONE else np.ones(len(z))
+            unscaled = np.column_stack([x / (a * r), y / (b * r), z / h])
+            pixels, _ = camera.project(BODY.place(POSE, np.full(len(unscaled), p), unscaled))
+            alone = np.zeros_like(picture)
+            cv2.fillConvexPoly(alone, cv2.convexHull((pixels * 256).round().astype(np.int32)), 255, shift=8)
+            around |= alone
+            # OpenCV paints the boundary's pixels, too: up to a pixel more all around
+            core |= cv2.erode(alone, np.ones((3, 3), np.uint8))
+        assert not ((picture > 0) & (around == 0)).any()
+        assert not ((core > 0) & (picture == 0)).any()
+        assert (core > 0).sum() > 0.6 * (picture > 0).sum()
 
 
 def test_settings_out_of_range_are_told():

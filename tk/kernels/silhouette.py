@@ -18,6 +18,7 @@ from tk.errors import ConfigError
 from tk.kernels.cones import (
     SIDE_B,
     curve_of,
+    enclosing_radius,
     enter,
     interior_point,
     point_on,
@@ -35,6 +36,8 @@ CHORDS = 12
 HIDING_SHRINK = 0.95
 # Nearer than this to a camera nothing is projected, metres.
 NEAREST_M = 0.1
+# How much larger than its first-order size a part's disc is taken when rays are cast.
+DISC_MARGIN = 1.1
 # Columns of a task's sums: cost, weight of the edgels found, weight of all samples, gradient, upper triangle of JᵀWJ.
 _SUMS = 3 + LONGEST_CHAIN + LONGEST_CHAIN * (LONGEST_CHAIN + 1) // 2
 # Columns of an exported sample: see Edgels.
@@ -548,7 +551,8 @@ def _overlap_kernel(real):
         part_shape: ti.types.ndarray(dtype=real, ndim=2),  # (P, 4)
         part_frame: ti.types.ndarray(dtype=real, ndim=2),  # (P, 12)
         part_dof: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
-        centers: ti.types.ndarray(dtype=real, ndim=2),  # (V, 3)
+        camera: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
+        step: ti.i32,  # pixels between rays; the first is at step // 2
         rays: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (V, H, W, 3) world; zero outside the picture
         mask: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (V, H, W)
         draw: ti.i32,
@@ -556,25 +560,42 @@ def _overlap_kernel(real):
         frames: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 12) scratch
         twists: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 6) scratch
         placed: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 12) scratch
+        disc: ti.types.ndarray(dtype=real, ndim=4),  # (B, V, P, 3) scratch, centre and square radius in pixels
         counts: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B V H, 2) out: model without mask, mask without model
         picture: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (B, V, H, W) out, if draw
     ):
         B, V, H, W = pose.shape[0], rays.shape[0], rays.shape[1], rays.shape[2]
+        P = part_dof.shape[0]
         for b in range(B):
             forward(axis, point, prismatic, parent, pose, b, b, frames, twists)
-            for p in range(part_dof.shape[0]):
+            for p in range(P):
                 R, t = _place_part(frames, part_dof, part_frame, b, p)
                 _keep(placed, b, p, R, t)
+                # a disc in each picture that holds the part: most pixels are far from most parts
+                shape = _shape(part_shape, p)
+                middle = R @ interior_point(part_kind[p], shape) + t
+                reach = enclosing_radius(part_kind[p], shape)
+                for v in range(V):
+                    pixel, J, z = project(camera, v, middle)
+                    radius = 0.0 * z
+                    if z > 1.5 * reach + NEAREST_M:
+                        # the Frobenius norm of the derivative is at least its growth in any direction
+                        radius = DISC_MARGIN * J.norm() * reach * z / (z - reach)
+                    elif z > -reach:
+                        radius = 1e6 + 0.0 * z
+                    disc[b, v, p, 0], disc[b, v, p, 1], disc[b, v, p, 2] = pixel[0], pixel[1], radius * radius
         for c in range(B * V * H):
             b, v, j = c // (V * H), (c // H) % V, c % H
-            eye = load_vector3(centers, v)
+            eye = camera_center(camera, v)
             more, less = 0, 0
             for i in range(W):
                 ray = ti.Vector([ti.cast(rays[v, j, i, a], real) for a in ti.static(range(3))])
                 hit = False
                 if ray.norm_sqr() > 0.0:
-                    for p in range(part_dof.shape[0]):
-                        if not hit:
+                    x, y = i * step + step // 2, j * step + step // 2
+                    for p in range(P):
+                        away = (x - disc[b, v, p, 0]) ** 2 + (y - disc[b, v, p, 1]) ** 2
+                        if not hit and away < disc[b, v, p, 2]:
                             R = load_rotation(placed, b, p)
                             local = R.transpose() @ (eye - load_translation(placed, b, p))
                             hit = enter(part_kind[p], _shape(part_shape, p), local, R.transpose() @ ray, 1.0) > 0.0
@@ -591,7 +612,8 @@ def _overlap_kernel(real):
 
 def overlap(
     body: ConeArrays,
-    centers: np.ndarray,
+    cameras: np.ndarray,
+    step: int,
     rays: np.ndarray,
     masks: np.ndarray,
     poses: np.ndarray,
@@ -601,7 +623,8 @@ def overlap(
 
     Args:
         body: the cone body.
-        centers: (V, 3) the cameras' centres, metres.
+        cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_camera`.
+        step: pixels between rays; the first goes through pixel ``step // 2``.
         rays: (V, H, W, 3) float32 viewing directions, world frame; zero where a camera has no pixel.
         masks: (V, H, W) uint8.
         poses: (B, D).
@@ -620,7 +643,8 @@ def overlap(
     picture = np.empty((B, V, H, W) if draw else (1, 1, 1, 1), np.uint8)
     _overlap_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
         *body[:8],
-        np.ascontiguousarray(centers, dtype),
+        np.ascontiguousarray(cameras, dtype),
+        step,
         np.ascontiguousarray(rays, np.float32),
         np.ascontiguousarray(masks),
         int(draw),
@@ -628,6 +652,7 @@ def overlap(
         np.empty((B, D, 12), dtype),
         np.empty((B, D, 6), dtype),
         np.empty((B, len(body.part_kind), 12), dtype),
+        np.empty((B, V, len(body.part_kind), 3), dtype),
         counts,
         picture,
     )

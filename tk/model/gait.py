@@ -50,6 +50,23 @@ def walking_pose(skeleton: Skeleton, phase: float | None) -> Float:
     return pose
 
 
+def arm_variants(skeleton: Skeleton, pose: Float) -> Float:
+    """(B, D) copies of a pose with one arm elsewhere: swung to four angles, the elbow at three."""
+    variants = []
+    for side in ("l", "r"):
+        for swing in np.radians([-30.0, -10.0, 15.0, 40.0]):
+            for elbow in np.radians([15.0, 45.0, 75.0]):
+                arm = np.array([np.sin(swing), 0.12, -np.cos(swing)])
+                changed = pose.copy()
+                yaw, pitch = shoulder_angles(arm / np.linalg.norm(arm))
+                changed[skeleton.index(f"shoulder_{side}_yaw")] = yaw
+                changed[skeleton.index(f"shoulder_{side}_pitch")] = pitch
+                changed[skeleton.index(f"shoulder_{side}_roll")] = 0.0
+                changed[skeleton.index(f"elbow_{side}_flexion")] = elbow
+                variants.append(changed)
+    return np.array(variants)
+
+
 def hypotheses(skeleton: Skeleton, headings: int, phases: int, p_pelvis: Float) -> Float:
     """(B, D) walking phases, standing and Da Vinci pose at every heading, with the pelvis at ``p_pelvis`` (3,)."""
     figures = [walking_pose(skeleton, i / phases) for i in range(phases)]

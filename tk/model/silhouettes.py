@@ -86,9 +86,7 @@ class Views:
 
     def __init__(self, rig: Rig, ray_step: int = 4) -> None:
         self.rig = rig
-        self.cameras = np.array(
-            [pack_camera(c.matrix, c.distortions, c.rotation, c.translation, c.fisheye) for c in rig]
-        )
+        self.cameras = pack_rig(rig)
         self._cameras32 = self.cameras.astype(np.float32)
         self.sizes = np.array([(c.width, c.height) for c in rig], np.int32)
         self.ray_step = ray_step
@@ -126,6 +124,11 @@ class Views:
     def fit_error(self, body: ConeBody, masks: Masks, poses: Float) -> Float:
         """(B, V) E_S of poses (B, D) against masks (V, H, W), on every ``ray_step``-th pixel (eq. 12)."""
         return silhouette_error(body, self.rig, masks, poses, self.ray_step, self.rays)
+
+
+def pack_rig(rig: Rig) -> Float:
+    """(V, 22) the cameras as the kernels take them."""
+    return np.array([pack_camera(c.matrix, c.distortions, c.rotation, c.translation, c.fisheye) for c in rig])
 
 
 def pixel_rays(rig: Rig, step: int = 1) -> NDArray[np.float32]:
@@ -166,7 +169,7 @@ def silhouette_error(
         rays = pixel_rays(rig, step)
     offset = step // 2
     seen = np.ascontiguousarray(masks[:, offset::step, offset::step])
-    counts, _ = kernels.overlap(body.arrays, rig.centers, rays, seen, poses)
+    counts, _ = kernels.overlap(body.arrays, pack_rig(rig), step, rays, seen, poses)
     total = np.count_nonzero(seen >= 128, axis=(1, 2))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(total > 0, counts.sum(axis=2) / total, np.inf)
@@ -176,6 +179,6 @@ def draw_silhouettes(body: ConeBody, rig: Rig, poses: Float) -> NDArray[np.uint8
     """(B, V, H, W) silhouettes of the body at poses (B, D), 0 or 255."""
     rays = pixel_rays(rig)
     empty = np.zeros(rays.shape[:3], np.uint8)
-    _, pictures = kernels.overlap(body.arrays, rig.centers, rays, empty, poses, draw=True)
+    _, pictures = kernels.overlap(body.arrays, pack_rig(rig), 1, rays, empty, poses, draw=True)
     assert pictures is not None
     return pictures
