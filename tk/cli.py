@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
@@ -13,18 +16,38 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from tk import __version__
 from tk.errors import ConfigError, TkError
 
+if TYPE_CHECKING:
+    from tk.config import Config
+
 _CONSOLE = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
+@contextmanager
+def _one_line() -> Iterator[None]:
+    """A user's mistake, in the input or in the command, becomes one line and exit code 2."""
+    try:
+        yield
+    except TkError as error:
+        click.echo(f"tk: {' '.join(str(error).split())}", err=True)
+        raise click.exceptions.Exit(2) from None
+    except click.UsageError as error:
+        if type(error).__name__ == "NoArgsIsHelpError":  # `tk` alone: the help
+            raise
+        command = error.ctx.command_path if error.ctx else "tk"
+        click.echo(f"tk: {' '.join(error.format_message().split())} See {command} --help", err=True)
+        raise click.exceptions.Exit(2) from None
+
+
 class _Commands(click.Group):
-    """Turns a :class:`TkError` into one line and exit code 2."""
+    """Reports mistakes as :func:`_one_line` does."""
+
+    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
+        with _one_line():
+            return super().make_context(*args, **kwargs)
 
     def invoke(self, ctx: click.Context) -> object:
-        try:
+        with _one_line():
             return super().invoke(ctx)
-        except TkError as error:
-            click.echo(f"tk: {' '.join(str(error).split())}", err=True)
-            ctx.exit(2)
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
@@ -81,10 +104,11 @@ def track(
     with _Report() as report:
         summary = sequence.track(opened, output, config, report, method, span, init_pose, resume, store_hull)
     rate = summary.tracked_now / summary.seconds if summary.seconds > 0 else 0.0
-    state = f"{summary.frames} frames in {output}"
-    click.echo(f"{state}, {summary.lost} lost, {rate:.1f} frames/s", err=True)
+    if summary.frames:
+        click.echo(f"{summary.frames} frames in {output}, {summary.lost} lost, {rate:.1f} frames/s", err=True)
     if summary.interrupted:
-        click.echo("tk: interrupted; go on with the same command and --resume", err=True)
+        further = "go on with the same command and --resume" if summary.frames else "no frame was finished"
+        click.echo(f"tk: interrupted; {further}", err=True)
         sys.exit(1)
 
 
@@ -170,7 +194,7 @@ def _span(frames: str | None) -> tuple[int, int | None]:
     return start, stop
 
 
-def _configuration(file: Path | None, **overrides: int | None):  # type: ignore[no-untyped-def]
+def _configuration(file: Path | None, **overrides: Any) -> Config:
     from dataclasses import replace
 
     from tk.config import Config

@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from tk.config import Config
-from tk.errors import ConfigError
 from tk.io.capture import Capture
-from tk.io.point_cloud import write_hulls, write_ply
+from tk.io.point_cloud import check_hull_path, write_hulls, write_ply
 from tk.io.result import HullPoints
 from tk.model.hull import VisualHull
 from tk.model.volume import VoxelGrid
-from tk.sequence import Reporter, make_segmenter, points_of
+from tk.sequence import Reporter, choose_frames, make_segmenter, points_of
 
 
 def reconstruct(
@@ -36,18 +35,20 @@ def reconstruct(
 
     Returns:
         Frames written.
+
+    Raises:
+        TkError: bad input; every frame finished before it is in the file.
     """
+    check_hull_path(output)
     for warning in capture.warnings:
         reporter.note(warning)
-    stop = min(frames[1], capture.frame_count) if frames[1] is not None else capture.frame_count
-    if frames[0] >= stop:
-        raise ConfigError(f"--frames {frames[0]}:{frames[1]}: the capture has {capture.frame_count} frames")
+    start, stop = choose_frames(capture, frames, reporter.note)
     segment = make_segmenter(capture, config, reporter.note)
     hull = VisualHull(capture.rig, VoxelGrid.cover(capture.volume, config.voxels))
-    reporter.begin(stop - frames[0], 0)
+    reporter.begin(stop - start, 0)
 
     def hulls():  # type: ignore[no-untyped-def]
-        with capture.frames(frames[0], stop) as reader:
+        with capture.frames(start, stop) as reader:
             for frame in reader:
                 hull.update(segment(frame))
                 points: HullPoints = points_of(hull.surface(frame.images))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from typing import Protocol
 
@@ -13,17 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.config import Config
-from tk.errors import CaptureError, ConfigError
+from tk.errors import CaptureError, ConfigError, ResultError, TkError
 from tk.io.capture import Capture
 from tk.io.frames import FrameSet
 from tk.io.init_pose import InitPose, read_init_pose
-from tk.io.result import FrameResult, HullPoints, ResultMeta, ResultWriter, Status
+from tk.io.result import FrameResult, HullPoints, ResultMeta, ResultWriter, Status, Value
 from tk.model.foreground import CollinearityForeground, Mog2Foreground, median_plate
 from tk.model.hull import HullSurface
 from tk.tracker import Estimate, Observation, Stopwatch, Tracker
 from tk.volumetric import VolumetricTracker
 
 Segmenter = Callable[[FrameSet], NDArray[np.uint8]]
+Observations = Iterator[tuple[Observation, Stopwatch]]
 
 METHODS = ("volumetric",)
 
@@ -49,7 +52,15 @@ class Reporter(Protocol):
 
 @dataclass(frozen=True)
 class Summary:
-    """What a run did: frames written in all, those lost, seconds of this run, frames of this run, interrupted or not."""
+    """What a run did.
+
+    Attributes:
+        frames: in the result, those of earlier runs included.
+        lost: frames among them that are lost.
+        seconds: that this run took.
+        tracked_now: frames that this run added.
+        interrupted: somebody stopped it with Ctrl-C.
+    """
 
     frames: int
     lost: int
@@ -73,9 +84,9 @@ def make_segmenter(capture: Capture, config: Config, note: Callable[[str], None]
     clips = capture.background()
     if clips is None:
         note(
-            f"{capture.path}: no masks and no background/; taking the median of {PLATE_FRAMES} frames as the empty scene"
+            f"{capture.path}: no masks and no background/; the median of up to {PLATE_FRAMES} frames is the empty scene"
         )
-        step = max(capture.frame_count // PLATE_FRAMES, 1)
+        step = -(-capture.frame_count // PLATE_FRAMES)
         with capture.frames() as frames:
             samples = [frame.images.copy() for frame in frames if frame.index % step == 0]
         clips = median_plate(samples, sizes)
@@ -103,7 +114,7 @@ def track(
     """Track a capture and write the result, frame by frame.
 
     The subject is found in the capture's initial frame and followed from there; what lies before ``frames`` is tracked
-    but not written. Ctrl-C ends the run after the frame in hand, with the file closed and ready for ``resume``.
+    but not written. Ctrl-C ends the run with all finished frames in the file, closed and ready for ``resume``.
 
     Args:
         capture: what to track.
@@ -129,14 +140,19 @@ def track(
             f'{capture.path / "capture.toml"}: init.pose = "any", so nobody stands in the Da Vinci pose; '
             "give a rough pose with --init-pose FILE"
         )
-    stop = min(frames[1], capture.frame_count) if frames[1] is not None else capture.frame_count
-    begin = max(frames[0], first)
-    if frames[0] < first:
+    start, stop = choose_frames(capture, frames, reporter.note)
+    if not first < capture.frame_count:
+        raise CaptureError(f"{init_pose}: frame = {first} is past the capture's last, {capture.frame_count - 1}")
+    if first >= stop:
+        raise ConfigError(
+            f"--frames {start}:{stop}: the subject is found in frame {first} and followed forwards; "
+            f"end after frame {first}, or start elsewhere with --init-pose FILE"
+        )
+    begin = max(start, first)
+    if start < first:
         reporter.note(
             f"frames before {first} are left out: the subject is found in frame {first} and followed forwards"
         )
-    if begin >= stop:
-        raise ConfigError(f"--frames {frames[0]}:{frames[1]}: nothing to track between frames {begin} and {stop}")
     meta = ResultMeta(
         pose_names=tracker.pose_names,
         pose_units=tracker.pose_units,
@@ -149,60 +165,150 @@ def track(
         seed=config.seed,
         config_toml=config.to_toml(),
     )
+    origin = _origin(capture, first, begin, init, store_hull)
     writer, done = ResultWriter.resume(output, meta) if resume else (ResultWriter.create(output, meta), 0)
-    with writer:
-        return _run(capture, tracker, writer, done, config, reporter, (first, begin, stop), init, store_hull)
-
-
-def _run(
-    capture: Capture,
-    tracker: Tracker,
-    writer: ResultWriter,
-    done: int,
-    config: Config,
-    reporter: Reporter,
-    span: tuple[int, int, int],
-    init: InitPose | None,
-    store_hull: bool,
-) -> Summary:
-    first, begin, stop = span
-    reporter.begin(stop - begin, done)
-    if begin + done >= stop:
-        return Summary(done, 0, 0.0, 0)
+    run = _Run(capture, tracker, writer, config, reporter, (first, begin, stop), done, origin, store_hull)
     started = time.perf_counter()
-    segment = make_segmenter(capture, config, reporter.note)
-    height = capture.subject_height_m
-    if done:
-        tracker.restore(writer.model, writer.state)
-        reader_start = begin + done
-    else:
-        reader_start = first
-    lost = tracked = 0
     interrupted = False
-    with capture.frames(reader_start, stop) as frames:
-        observations = _observe(frames, segment)
-        try:
-            if not done:
-                opening = list(islice(observations, config.tracking.init_frames))
-                tracker.start([observation for observation, _ in opening], height, init)
-                writer.write_model(tracker.model())
-                observations = chain(opening, observations)
-            for observation, watch in observations:
-                estimate = tracker.step(observation)
-                if observation.index < begin:
-                    continue
-                timing = {**watch.laps, **estimate.timing}
-                timing["total"] = sum(timing.values())
-                writer.append(_row(observation.index, capture.fps, estimate, timing, store_hull), tracker.state())
-                tracked += 1
-                lost += estimate.status == "lost"
-                reporter.advance(observation.index, estimate)
-        except KeyboardInterrupt:
-            interrupted = True
-    return Summary(done + tracked, lost, time.perf_counter() - started, tracked, interrupted)
+    try:
+        with writer:
+            run.go(init)
+    except KeyboardInterrupt:  # caught outside the writer, which then leaves an older result alone if nothing is done
+        interrupted = True
+    return Summary(done + run.tracked, run.lost, time.perf_counter() - started, run.tracked, interrupted)
 
 
-def _observe(frames: Iterator[FrameSet], segment: Segmenter) -> Iterator[tuple[Observation, Stopwatch]]:
+def choose_frames(capture: Capture, frames: tuple[int, int | None], note: Callable[[str], None]) -> tuple[int, int]:
+    """The first frame of ``--frames`` and the one to stop before, within the capture.
+
+    Raises:
+        ConfigError: the capture ends before the first.
+    """
+    start, stop = frames
+    if start >= capture.frame_count:
+        asked = f"{start}:" if stop is None else f"{start}:{stop}"
+        raise ConfigError(f"--frames {asked}: {capture.path} has only frames 0 to {capture.frame_count - 1}")
+    if stop is not None and stop > capture.frame_count:
+        note(f"--frames {start}:{stop}: {capture.path} ends with frame {capture.frame_count - 1}")
+    return start, capture.frame_count if stop is None else min(stop, capture.frame_count)
+
+
+def _origin(capture: Capture, first: int, begin: int, init: InitPose | None, store_hull: bool) -> dict[str, str]:
+    """What else but :class:`ResultMeta` must agree when a run is taken up again, by the name that a user knows."""
+    masks = capture.mask_clips
+    return {
+        "first frame": str(begin),
+        "frame of the initial pose": str(first),
+        "cameras": ", ".join(capture.rig.names),
+        "masks": "none" if masks is None else os.path.relpath(masks[0].path.parent, capture.path),
+        "initial pose (its hash)": "none" if init is None else hashlib.sha256(repr(init).encode()).hexdigest()[:12],
+        "hull": "stored" if store_hull else "not stored",
+    }
+
+
+_ORIGIN, _LOST = "run/", "lost frames"
+
+
+class _Run:
+    """One run of a tracker through a capture; how far it got stands in ``tracked`` and ``lost`` whatever ends it."""
+
+    def __init__(
+        self,
+        capture: Capture,
+        tracker: Tracker,
+        writer: ResultWriter,
+        config: Config,
+        reporter: Reporter,
+        span: tuple[int, int, int],
+        done: int,
+        origin: Mapping[str, str],
+        store_hull: bool,
+    ) -> None:
+        self.capture, self.tracker, self.writer = capture, tracker, writer
+        self.config, self.reporter = config, reporter
+        self.first, self.begin, self.stop = span
+        self.done = done
+        self.origin = origin
+        self.store_hull = store_hull
+        self.tracked = 0
+        self.lost = 0
+
+    def go(self, init: InitPose | None) -> None:
+        """Start or restore the tracker, and step it to the end."""
+        if self.done:
+            self._check_origin()
+            self.lost = int(np.asarray(self.writer.state[_ORIGIN + _LOST]))
+        self.reporter.begin(self.stop - self.begin, min(self.done, self.stop - self.begin))
+        if self.begin + self.done >= self.stop:
+            return
+        segment = make_segmenter(self.capture, self.config, self.reporter.note)
+        if self.done:
+            self.tracker.restore(self.writer.model, self.writer.state)
+            with self.capture.frames(self.begin + self.done, self.stop) as frames:
+                self._step_through(_observe(frames, segment))
+            return
+        # The body is fitted to the same frames however few are asked for, so that a run may be prolonged by --resume.
+        opening_stop = self.first + self.config.tracking.init_frames
+        with self.capture.frames(self.first, max(self.stop, opening_stop)) as frames:
+            observations = _observe(frames, segment)
+            opening, broken = _take(observations, self.config.tracking.init_frames)
+            try:
+                self.tracker.start([o for o, _ in opening], self.capture.subject_height_m, init)
+            except CaptureError as error:
+                raise CaptureError(f"{self.capture.path}: {error}") from None
+            self.writer.write_model(self.tracker.model())
+            self._step_through(chain(opening, broken or observations))
+
+    def _check_origin(self) -> None:
+        for name, value in self.origin.items():
+            found = self.writer.state.get(_ORIGIN + name)
+            if found != value:
+                raise ResultError(
+                    f"{self.writer.path}: was made differently: {name}: {found}, not {value}; "
+                    "run without --resume to start afresh"
+                )
+
+    def _step_through(self, observations: Observations) -> None:
+        for observation, watch in observations:
+            if observation.index >= self.stop:
+                return
+            estimate = self.tracker.step(observation)
+            if observation.index < self.begin:
+                continue
+            timing = {**watch.laps, **estimate.timing}
+            timing["total"] = sum(timing.values())
+            row = _row(observation.index, self.capture.fps, estimate, timing, self.store_hull)
+            self.writer.append(row, self._state(self.lost + (estimate.status == "lost")))
+            self.tracked += 1
+            self.lost += estimate.status == "lost"
+            self.reporter.advance(observation.index, estimate)
+
+    def _state(self, lost: int) -> Mapping[str, Value]:
+        origin = {_ORIGIN + name: value for name, value in self.origin.items()}
+        return {**self.tracker.state(), **origin, _ORIGIN + _LOST: lost}
+
+
+def _take(observations: Observations, count: int) -> tuple[list[tuple[Observation, Stopwatch]], Observations | None]:
+    """The first ``count`` observations; if one after the first cannot be read, those before it and what raises then."""
+    taken: list[tuple[Observation, Stopwatch]] = []
+    try:
+        for observation in observations:
+            taken.append(observation)
+            if len(taken) == count:
+                break
+    except TkError as error:
+        if not taken:
+            raise
+        return taken, _raising(error)
+    return taken, None
+
+
+def _raising(error: TkError) -> Observations:
+    raise error
+    yield
+
+
+def _observe(frames: Iterator[FrameSet], segment: Segmenter) -> Observations:
     """Frames with their masks, and what it took to get them."""
     while True:
         watch = Stopwatch()

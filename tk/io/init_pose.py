@@ -32,6 +32,9 @@ from tk.model.skeleton import JOINTS
 
 LEAST_JOINTS = 6
 
+# metres; the same for a height in capture.toml
+HEIGHT_RANGE_M = (0.3, 3.0)
+
 
 @dataclass(frozen=True)
 class InitPose:
@@ -60,10 +63,13 @@ def read_init_pose(path: str | Path, pose_names: tuple[str, ...]) -> InitPose:
     if not path.is_file():
         raise CaptureError(f"{path}: no such file; --init-pose wants a TOML file with a [joints] or an [angles] table")
     table = Table(load_toml(path, CaptureError), str(path), CaptureError)
-    height = (
-        table.table("subject").number("height") if "subject" in table and "height" in table.table("subject") else None
-    )
+    subject = table.table("subject")
+    height = subject.number("height") if "height" in subject else None
+    if height is not None and not HEIGHT_RANGE_M[0] <= height <= HEIGHT_RANGE_M[1]:
+        subject.fail(f"height = {height:g} must be between {HEIGHT_RANGE_M[0]:g} and {HEIGHT_RANGE_M[1]:g} metres")
     frame = table.integer("frame", 0) if "frame" in table else None
+    if frame is not None and frame < 0:
+        table.fail(f"frame = {frame} must not be negative")
     if ("joints" in table) == ("angles" in table):
         raise CaptureError(f"{path}: give either a [joints] or an [angles] table")
     if "joints" in table:

@@ -1,8 +1,9 @@
-"""Point clouds: PLY files through Open3D, and `tk reconstruct`'s HDF5 file. Open3D is imported only when it is needed."""
+"""Point clouds: PLY files through Open3D, which is imported only then, and the HDF5 file of `tk reconstruct`."""
 
 from __future__ import annotations
 
 import datetime
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -15,6 +16,20 @@ from tk.errors import ResultError
 from tk.io.capture import Capture
 from tk.io.result import HullPoints
 from tk.model.volume import VoxelGrid
+
+HULL_FORMAT = "tk-hull"
+
+_EMPTY_PLY = b"""ply
+format binary_little_endian 1.0
+element vertex 0
+property double x
+property double y
+property double z
+property uchar red
+property uchar green
+property uchar blue
+end_header
+"""
 
 
 def write_ply(path: Path, positions: NDArray[np.floating], colors_rgb: NDArray[np.uint8]) -> None:
@@ -35,18 +50,26 @@ def write_ply(path: Path, positions: NDArray[np.floating], colors_rgb: NDArray[n
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ResultError(f"{path.parent}: cannot be made: {error.strerror}") from None
+    try:  # Open3D does not tell why it cannot write, and writes no cloud without points
+        path.write_bytes(_EMPTY_PLY)
+    except OSError as error:
+        raise ResultError(f"{path}: cannot be written: {error.strerror}") from None
+    if len(positions) == 0:
+        return
     cloud = open3d.geometry.PointCloud()
     cloud.points = open3d.utility.Vector3dVector(np.asarray(positions, np.float64))
     cloud.colors = open3d.utility.Vector3dVector(np.asarray(colors_rgb, np.float64) / 255)
-    if not open3d.io.write_point_cloud(str(path), cloud):
-        raise ResultError(f"{path}: cannot be written: check the folder's permissions and the space on the disk")
+    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+        written = open3d.io.write_point_cloud(str(path), cloud)
+    if not written:
+        raise ResultError(f"{path}: cannot be written: check the space on the disk")
 
 
 def write_hulls(path: Path, capture: Capture, grid: VoxelGrid, frames: Iterable[tuple[int, HullPoints]]) -> int:
     """Write surface voxels of many frames, ragged, in a result's layout: `/frames`, `/time`, `/hull/…`.
 
     Args:
-        path: the HDF5 file; it replaces an older one when it is complete.
+        path: the HDF5 file; it replaces an older hull file at the end. When ``frames`` raises, those before are kept.
         capture: where the frames come from.
         grid: the voxels.
         frames: frame index and surface of each frame.
@@ -55,19 +78,16 @@ def write_hulls(path: Path, capture: Capture, grid: VoxelGrid, frames: Iterable[
         Frames written.
 
     Raises:
-        ResultError: the file cannot be written.
+        ResultError: the file cannot be written, or a file of that name is no hull file (it is left alone).
     """
+    check_hull_path(path)
     temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        file = h5py.File(temporary, "w")
-    except OSError as error:
-        raise ResultError(f"{path}: cannot be written: {error}") from None
     count = 0
     try:
-        with file:
+        with h5py.File(temporary, "w") as file:
             file.attrs.update(
                 {
-                    "format": "tk-hull",
+                    "format": HULL_FORMAT,
                     "format_version": 1,
                     "fps": capture.fps,
                     "units": "m",
@@ -84,20 +104,58 @@ def write_hulls(path: Path, capture: Capture, grid: VoxelGrid, frames: Iterable[
             offsets = group.create_dataset("offsets", (1,), np.int64, maxshape=(None,))
             positions = group.create_dataset("positions", (0, 3), np.float32, maxshape=(None, 3), chunks=(16384, 3))
             colors = group.create_dataset("colors", (0, 3), np.uint8, maxshape=(None, 3), chunks=(16384, 3))
-            for frame, points in frames:
-                start, stop = len(positions), len(positions) + len(points.positions)
-                for dataset, values in ((positions, points.positions), (colors, points.colors)):
-                    dataset.resize(stop, axis=0)
-                    dataset[start:stop] = values
-                count += 1
-                for dataset, value in ((index, frame), (seconds, frame / capture.fps)):
-                    dataset.resize(count, axis=0)
-                    dataset[-1] = value
+            voxels = 0
+            try:
+                for frame, points in frames:
+                    stop = voxels + len(points.positions)
+                    for dataset, values in ((positions, points.positions), (colors, points.colors)):
+                        dataset.resize(stop, axis=0)
+                        dataset[voxels:stop] = values
+                    for dataset, value in ((index, frame), (seconds, frame / capture.fps)):
+                        dataset.resize(count + 1, axis=0)
+                        dataset[count] = value
+                    offsets.resize(count + 2, axis=0)
+                    offsets[count + 1] = stop
+                    count, voxels = count + 1, stop
+            finally:  # Ctrl-C may come in the middle of a frame
+                for dataset, rows in ((positions, voxels), (colors, voxels), (index, count), (seconds, count)):
+                    dataset.resize(rows, axis=0)
                 offsets.resize(count + 1, axis=0)
-                offsets[-1] = stop
-        temporary.replace(path)
     except OSError as error:
-        raise ResultError(f"{path}: cannot be written: {error}") from None
-    finally:
         temporary.unlink(missing_ok=True)
+        raise ResultError(f"{path}: cannot be written: {' '.join(str(error).split())}") from None
+    except BaseException:
+        _publish(temporary, path, count)
+        raise
+    _publish(temporary, path, count)
     return count
+
+
+def _publish(temporary: Path, path: Path, count: int) -> None:
+    if count:
+        temporary.replace(path)
+    else:  # nothing was finished: an older file stays
+        temporary.unlink(missing_ok=True)
+
+
+def check_hull_path(path: Path) -> None:
+    """Refuse a path that cannot be written, or that is somebody else's file.
+
+    Raises:
+        ResultError: with what to do about it.
+    """
+    if path.is_dir():
+        raise ResultError(f"{path}: is a folder; name a file in it")
+    if not path.parent.is_dir():
+        raise ResultError(f"{path}: the folder {path.parent} does not exist; make it first")
+    if not os.access(path.parent, os.W_OK):
+        raise ResultError(f"{path}: no permission to write in {path.parent}; choose another folder")
+    if not path.exists():
+        return
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") == HULL_FORMAT:
+                return
+    except OSError:
+        pass
+    raise ResultError(f"{path}: exists and is not a {HULL_FORMAT} file; it is not overwritten: choose another name")
