@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,7 @@ def reconstruct(
     hull = VisualHull(capture.rig, VoxelGrid.cover(capture.volume, config.voxels))
     reporter.begin(stop - start, 0)
 
-    def hulls():  # type: ignore[no-untyped-def]
+    def hulls() -> Iterator[tuple[int, HullPoints]]:
         with capture.frames(start, stop) as reader:
             for frame in reader:
                 hull.update(segment(frame))

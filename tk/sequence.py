@@ -45,8 +45,8 @@ class Reporter(Protocol):
         """``total`` frames are to be tracked, ``done`` of which an earlier run has finished."""
         ...
 
-    def advance(self, frame: int, estimate: Estimate) -> None:
-        """A frame is finished and in the file."""
+    def advance(self, frame: int, estimate: Estimate | None) -> None:
+        """A frame is finished; ``estimate`` is None where no pose is sought."""
         ...
 
 

@@ -62,8 +62,8 @@ class VolumetricTracker:
     """
 
     method = "volumetric"
-    stages = ("all", *CHAINS)
-    timing_stages = ("hull", "surface", "colour", "optimise", "update")
+    stages: tuple[str, ...] = ("all", *CHAINS)
+    timing_stages: tuple[str, ...] = ("hull", "surface", "colour", "optimise", "update")
 
     def __init__(self, rig: Rig, volume: Volume, up: str, config: Config, cache_dir: Path | None = None) -> None:
         self.config = config

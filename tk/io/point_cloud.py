@@ -60,7 +60,7 @@ def write_ply(path: Path, positions: NDArray[np.floating], colors_rgb: NDArray[n
     cloud.points = open3d.utility.Vector3dVector(np.asarray(positions, np.float64))
     cloud.colors = open3d.utility.Vector3dVector(np.asarray(colors_rgb, np.float64) / 255)
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        written = open3d.io.write_point_cloud(str(path), cloud)
+        written = open3d.io.write_point_cloud(path, cloud)
     if not written:
         raise ResultError(f"{path}: cannot be written: check the space on the disk")
 

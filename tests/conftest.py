@@ -1,0 +1,70 @@
+"""A tiny capture with everything in it, and the command line as a function."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from scripts.synthetic.capture import Options, plan_capture, write_capture
+
+FRAMES = 14
+VOXELS = "32"
+
+
+@dataclass(frozen=True)
+class Ran:
+    """What a command said."""
+
+    code: int
+    out: str
+    err: str
+
+    def complaint(self, *parts: str) -> str:
+        """The one line that a command left that could not use its input; it holds these parts."""
+        lines = self.err.splitlines()
+        assert self.code == 2, (self.code, self.out, self.err)
+        assert self.out == ""
+        assert len([line for line in lines if not line.startswith("note: ")]) == 1, self.err
+        assert lines[-1].startswith("tk: "), self.err
+        for part in parts:
+            assert part in lines[-1], self.err
+        return lines[-1]
+
+
+Tk = Callable[..., Ran]
+
+
+@pytest.fixture
+def tk(capfd: pytest.CaptureFixture[str]) -> Tk:
+    """``tk("track", capture, "-o", result)`` in this process; what libraries print below Python is heard, too."""
+    from tk.cli import main
+
+    def run(*arguments: Any) -> Ran:
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main([str(argument) for argument in arguments], prog_name="tk")
+        said = capfd.readouterr()
+        code = ended.value.code
+        return Ran(code if isinstance(code, int) else int(code is not None), said.out, said.err)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A rendered capture: 4 cameras of 160×120, :data:`FRAMES` frames, backgrounds, masks, truth. Not to be changed."""
+    folder = tmp_path_factory.mktemp("captures") / "tiny"
+    plan = plan_capture(Options(frames=FRAMES, cameras=4, size=(160, 120), seed=3))
+    write_capture(plan, folder, masks=True)
+    return folder
+
+
+@pytest.fixture
+def copy(tiny: Path, tmp_path: Path) -> Path:
+    """The tiny capture, to be spoilt."""
+    return Path(shutil.copytree(tiny, tmp_path / "capture"))
