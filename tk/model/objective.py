@@ -140,6 +140,8 @@ class Evaluation(NamedTuple):
 
 # A voxel farther from the body than this is not explained by it, metres.
 ASTRAY_M = 0.1
+# A voxel this far from the nearest piece may belong to another: voxels lie 2 to 3 cm off the piece they belong to.
+UNCLAIMED_M = 0.05
 
 
 @dataclass(frozen=True)
@@ -247,10 +249,13 @@ class FrameObjective:
         return evaluate
 
     def chain_values(self, owner: NDArray[np.intp], poses: Float) -> Float:
-        """(B,) the chains' objectives on even samples and on the voxels of the last :meth:`chains`."""
+        """(B,) the chains' objectives on even samples, and on voxels of the whole hull: a limb that leaves the voxels it
+        lay on uncovered is no better for it."""
         samples = np.stack([even(s, 60) if len(s) >= 60 else np.resize(s, 60) for s in self.objective.chain_samples])
-        voxels = np.stack([even(p, 120) if len(p) >= 120 else np.resize(p, 120) for p in self._pools])
-        return self._evaluate(samples[owner], voxels[owner], poses, None, self.objective.settings).value
+        voxels = even(np.arange(self.voxel_count, dtype=np.int32), 400)
+        return self._evaluate(
+            samples[owner], np.repeat(voxels[None], len(owner), 0), poses, None, self.objective.settings
+        ).value
 
     def value(self, pose: Float) -> float:
         """The objective at ``pose`` (D,) on even samples and all voxels."""
@@ -286,7 +291,9 @@ class FrameObjective:
             return [np.zeros(1, np.int32)] * len(CHAINS)
         piece = fit.held.covering[0, : len(fit.voxels), 0].astype(np.int64)
         nearest = np.where(piece >= 0, CHAIN_OF_SEGMENT[self.objective.piece_segment[piece]], -1)
-        pools = [fit.voxels[(nearest == c) | fit.astray] for c in range(len(CHAINS))]
+        M = len(fit.samples)
+        unclaimed = np.linalg.norm(fit.linear.residual[M:], axis=1) > UNCLAIMED_M
+        pools = [fit.voxels[(nearest == c) | fit.astray | unclaimed] for c in range(len(CHAINS))]
         return [pool if len(pool) else fit.voxels for pool in pools]
 
     def _draw_full(self) -> tuple[Ints, Ints]:

@@ -90,6 +90,7 @@ class ScheduleConfig:
         retries: how often a frame whose objective stays high is searched anew from other starts.
         hypotheses: starts of each chain, at least 1.
         spread_deg: standard deviation of the random ones.
+        wide_hypotheses, wide_spread_deg: the same when a frame is searched anew.
         margin: by how much a hypothesis must be better than the first.
         max_step_deg, max_step_m: greatest change in one iteration; samples that happen to see little of a parameter ask
             for more.
@@ -111,7 +112,9 @@ class ScheduleConfig:
     retries: int = 2
     hypotheses: int = 2
     spread_deg: float = 17.0
-    margin: float = 0.01
+    wide_hypotheses: int = 16
+    wide_spread_deg: float = 50.0
+    margin: float = 0.004
     max_step_deg: float = 20.0
     max_step_m: float = 0.15
 
@@ -168,7 +171,7 @@ def optimise(
         others = problem.constrain(np.concatenate([best.pose[None], alternatives(best.pose, rng)]))
         limit = replace(smd_config, max_iterations=config.iterations)
         moved = _all(problem, others, tolerance, config.soft, config, limit)
-        again = _passes(problem, _best(problem, moved.pose), previous, tolerance, rng, config, smd_config)
+        again = _passes(problem, _best(problem, moved.pose), previous, tolerance, rng, config, smd_config, wide=True)
         iterations = best.iterations + again.iterations
         iterations[0] += moved.iterations.max()
         found = problem.value(again.pose)
@@ -190,11 +193,12 @@ def _passes(
     rng: np.random.Generator,
     config: ScheduleConfig,
     smd_config: smd.SmdConfig,
+    wide: bool = False,
 ) -> ScheduleResult:
     """All parameters, the chains, all parameters."""
     limit = replace(smd_config, max_iterations=config.iterations)
     first = _all(problem, start[None], tolerance, config.soft, config, limit)
-    pose, winners = _chains(problem, first.pose[0], previous, tolerance * config.refine, rng, config, smd_config)
+    pose, winners = _chains(problem, first.pose[0], previous, tolerance * config.refine, rng, config, smd_config, wide)
     made = first.iterations
     if config.polish_iterations:
         limit = replace(smd_config, max_iterations=config.polish_iterations)
@@ -241,13 +245,17 @@ def _chains(
     rng: np.random.Generator,
     config: ScheduleConfig,
     smd_config: smd.SmdConfig,
+    wide: bool = False,
 ) -> tuple[Float, NDArray[np.int32]]:
     """The chains with the torso at ``pose``: the pose with each chain's best hypothesis, and their iterations (K,)."""
     free = problem.free
     K = len(free)
-    owner = np.tile(np.arange(K), config.hypotheses)
+    count, spread = config.hypotheses, config.spread_deg
+    if wide:
+        count, spread = max(config.wide_hypotheses, count), config.wide_spread_deg
+    owner = np.tile(np.arange(K), count)
     hypotheses = np.repeat(pose[None], len(owner), axis=0)
-    noise = rng.normal(scale=np.radians(config.spread_deg), size=hypotheses.shape) * problem.angular
+    noise = rng.normal(scale=np.radians(spread), size=hypotheses.shape) * problem.angular
     for row in range(K, len(owner)):
         mine = free[owner[row]]
         hypotheses[row, mine] = previous[mine] if row < 2 * K else pose[mine] + noise[row, mine]
@@ -266,8 +274,8 @@ def _chains(
         basis_inverse=np.stack([inverse for _, inverse in pairs])[owner],
     )
     best = np.arange(K)
-    if config.hypotheses > 1:
-        values = problem.chain_values(owner, found.pose).reshape(config.hypotheses, K)
+    if count > 1:
+        values = problem.chain_values(owner, found.pose).reshape(count, K)
         values[1:] += config.margin
         best = values.argmin(axis=0) * K + np.arange(K)
     result = pose.copy()
