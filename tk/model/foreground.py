@@ -81,6 +81,8 @@ class ForegroundConfig:
         noise_floor: variance added to the measured noise, grey levels²: what video coding does to the picture. It
             rounds small noise away in places and then lets it jump; its errors are alike over a window. Measured: more
             would make cleaner rims, but holes in grey clothes before a grey wall.
+        still_noise: the same where the plate is a single picture: its coding errors and the light that has changed
+            since are alike over a window, and no mean takes them away. Measured on one real recording.
         relative_noise_floor: least noise variance of a pixel, as a share of its picture's. As above.
         jitter_px: unsteadiness of camera and coding, pixels: adds noise where the plate has contrast. Measured.
         penumbra: a label is the edge of a shadow where the statistic is below this share of the plain difference
@@ -114,6 +116,7 @@ class ForegroundConfig:
     shadow_max: float = 0.95
     bright: float = 4.0
     noise_floor: float = 0.7
+    still_noise: float = 15.0
     relative_noise_floor: float = 0.5
     jitter_px: float = 0.04
     penumbra: float = 0.2
@@ -296,14 +299,19 @@ class CollinearityForeground:
         relative_noise: NDArray[np.float32],
         sizes: NDArray[np.int_],
         config: ForegroundConfig,
+        noise_floor: NDArray[np.floating],
     ) -> None:
-        """Plates (C, H, W, 3) uint8, relative noise (C, h, w) of the reduced ones, sizes (C, 2) of (width, height)."""
+        """Plates (C, H, W, 3) uint8, relative noise (C, h, w) of the reduced ones, sizes (C, 2) of (width, height).
+
+        ``noise_floor`` (C,): variance added to each camera's measured noise, grey levels².
+        """
         self.config = config
         self.plates = plates
         self.sizes = sizes
         self._small_plates = _reduced(plates, config.reduction)
         self._small = np.empty_like(self._small_plates)
         self._small_scenes = np.empty_like(self._small_plates)
+        self._noise_floor = noise_floor
         self._weights = (1.0 / relative_noise).astype(np.float32)
         self._plate_samples = _samples(self._small_plates).astype(np.float32)
         self._noise_samples = _samples(relative_noise[..., None].repeat(3, axis=3))[:, 0]
@@ -321,7 +329,8 @@ class CollinearityForeground:
         """Learn the empty scene.
 
         A clip gives the plate and how the noise varies over the picture; of a single picture (T = 1) the noise is taken
-        to be even. The noise's level is measured in each frame that is segmented, so a plate need not tell it.
+        to be even. The noise's level is measured in each frame that is segmented, so a plate need not tell it;
+        of a single picture, ``still_noise`` is added.
 
         Args:
             clips: one (T, h, w, 3) uint8 a camera.
@@ -337,13 +346,14 @@ class CollinearityForeground:
         _check_clips(clips, frame_shape, sizes)
         plates = np.zeros((len(clips), *frame_shape, 3), np.uint8)
         relative = np.ones((len(clips), *(n // config.reduction for n in frame_shape)), np.float32)
+        floor = np.array([config.still_noise if len(clip) == 1 else config.noise_floor for clip in clips])
         for c, (clip, (width, height)) in enumerate(zip(clips, sizes, strict=True)):
             plate, _ = _learn_scene(clip)
             plates[c, :height, :width] = np.clip(plate.round(), 0, 255)
             small_plate, variance = _learn_scene(_reduced(clip, config.reduction))
             noise = _relative_noise(small_plate, variance, config)
             relative[c, : noise.shape[0], : noise.shape[1]] = noise
-        return cls(plates, relative, sizes, config)
+        return cls(plates, relative, sizes, config, floor)
 
     def segment(self, images: Images) -> Images:
         """Pictures (C, H, W, 3) uint8 BGR to masks (C, H, W) uint8, 0 or 255."""
@@ -355,7 +365,7 @@ class CollinearityForeground:
             self._small,
             self._small_scenes,
             self._weights,
-            np.array([1.0 / (variance + config.noise_floor) for _, variance in levels], np.float32),
+            (1.0 / (np.array([variance for _, variance in levels]) + self._noise_floor)).astype(np.float32),
             darkness_offset=config.darkness_offset,
             shadow_min=config.shadow_min,
             difference_min=config.difference_min,
