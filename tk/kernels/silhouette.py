@@ -24,7 +24,7 @@ from tk.kernels.cones import (
     point_on,
     unscaled,
 )
-from tk.kernels.kinematics import forward, load_rotation, load_translation, load_vector3, point_velocity
+from tk.kernels.kinematics import forward, load_rotation, load_translation, point_velocity
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, ti
 
@@ -555,14 +555,13 @@ def _overlap_kernel(real):
         step: ti.i32,  # pixels between rays; the first is at step // 2
         rays: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (V, H, W, 3) world; zero outside the picture
         mask: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (V, H, W)
-        draw: ti.i32,
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
         frames: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 12) scratch
         twists: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 6) scratch
         placed: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 12) scratch
         disc: ti.types.ndarray(dtype=real, ndim=4),  # (B, V, P, 3) scratch, centre and square radius in pixels
         counts: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B V H, 2) out: model without mask, mask without model
-        picture: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (B, V, H, W) out, if draw
+        picture: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (B, V, H, W) out
     ):
         B, V, H, W = pose.shape[0], rays.shape[0], rays.shape[1], rays.shape[2]
         P = part_dof.shape[0]
@@ -587,24 +586,30 @@ def _overlap_kernel(real):
         for c in range(B * V * H):
             b, v, j = c // (V * H), (c // H) % V, c % H
             eye = camera_center(camera, v)
+            for i in range(W):
+                picture[b, v, j, i] = ti.cast(0, ti.u8)
+            for p in range(P):
+                # the stretch of this row that the part's disc covers
+                across = disc[b, v, p, 2] - (j * step + step // 2 - disc[b, v, p, 1]) ** 2
+                if across > 0.0:
+                    half = ti.sqrt(across)
+                    middle = disc[b, v, p, 0] - step // 2
+                    first = ti.max(ti.cast(ti.ceil((middle - half) / step), ti.i32), 0)
+                    last = ti.min(ti.cast(ti.floor((middle + half) / step), ti.i32), W - 1)
+                    shape = _shape(part_shape, p)
+                    R = load_rotation(placed, b, p).transpose()
+                    local = R @ (eye - load_translation(placed, b, p))
+                    for i in range(first, last + 1):
+                        if picture[b, v, j, i] == 0:
+                            ray = ti.Vector([ti.cast(rays[v, j, i, a], real) for a in ti.static(range(3))])
+                            if ray.norm_sqr() > 0.0 and enter(part_kind[p], shape, local, R @ ray, 1.0) > 0.0:
+                                picture[b, v, j, i] = ti.cast(255, ti.u8)
             more, less = 0, 0
             for i in range(W):
-                ray = ti.Vector([ti.cast(rays[v, j, i, a], real) for a in ti.static(range(3))])
-                hit = False
-                if ray.norm_sqr() > 0.0:
-                    x, y = i * step + step // 2, j * step + step // 2
-                    for p in range(P):
-                        away = (x - disc[b, v, p, 0]) ** 2 + (y - disc[b, v, p, 1]) ** 2
-                        if not hit and away < disc[b, v, p, 2]:
-                            R = load_rotation(placed, b, p)
-                            local = R.transpose() @ (eye - load_translation(placed, b, p))
-                            hit = enter(part_kind[p], _shape(part_shape, p), local, R.transpose() @ ray, 1.0) > 0.0
-                if hit and mask[v, j, i] < 128:
+                if picture[b, v, j, i] > 0 and mask[v, j, i] < 128:
                     more += 1
-                if not hit and mask[v, j, i] >= 128:
+                if picture[b, v, j, i] == 0 and mask[v, j, i] >= 128:
                     less += 1
-                if draw == 1:
-                    picture[b, v, j, i] = ti.cast(ti.select(hit, 255, 0), ti.u8)
             counts[c, 0], counts[c, 1] = more, less
 
     return kernel
@@ -617,8 +622,7 @@ def overlap(
     rays: np.ndarray,
     masks: np.ndarray,
     poses: np.ndarray,
-    draw: bool = False,
-) -> tuple[NDArray[np.int64], NDArray[np.uint8] | None]:
+) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
     """Cast a ray through every pixel: the silhouettes of B poses against masks.
 
     Args:
@@ -628,11 +632,10 @@ def overlap(
         rays: (V, H, W, 3) float32 viewing directions, world frame; zero where a camera has no pixel.
         masks: (V, H, W) uint8.
         poses: (B, D).
-        draw: whether the silhouettes are wanted.
 
     Returns:
         counts (B, V, 2) of pixels in the model but not the mask, and in the mask but not the model; silhouettes
-        (B, V, H, W) uint8, 0 or 255, or None.
+        (B, V, H, W) uint8, 0 or 255.
     """
     ensure_runtime()
     dtype = body.axis.dtype
@@ -640,14 +643,13 @@ def overlap(
     B, D = poses.shape
     V, H, W = rays.shape[:3]
     counts = np.empty((B * V * H, 2), np.int32)
-    picture = np.empty((B, V, H, W) if draw else (1, 1, 1, 1), np.uint8)
+    picture = np.empty((B, V, H, W), np.uint8)
     _overlap_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
         *body[:8],
         np.ascontiguousarray(cameras, dtype),
         step,
         np.ascontiguousarray(rays, np.float32),
         np.ascontiguousarray(masks),
-        int(draw),
         poses,
         np.empty((B, D, 12), dtype),
         np.empty((B, D, 6), dtype),
@@ -656,4 +658,4 @@ def overlap(
         counts,
         picture,
     )
-    return counts.reshape(B, V, H, 2).sum(axis=2, dtype=np.int64), picture if draw else None
+    return counts.reshape(B, V, H, 2).sum(axis=2, dtype=np.int64), picture

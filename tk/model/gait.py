@@ -18,6 +18,14 @@ from tk.model.skeleton import Skeleton
 Float = NDArray[np.float64]
 
 
+# Where an arm may be, degrees: forward, to the side, elbow. Walking, then raised.
+_ARMS = [(forward, 7.0, elbow) for forward in (-30.0, -10.0, 15.0, 40.0) for elbow in (15.0, 45.0, 75.0)]
+_ARMS += [
+    (forward, aside, elbow) for forward, aside in ((80.0, 10.0), (130.0, 10.0), (0.0, 45.0)) for elbow in (20.0, 80.0)
+]
+_ARMS += [(0.0, 90.0, 10.0), (0.0, 90.0, 70.0), (180.0, 40.0, 20.0)]
+
+
 def hip_and_knee(phase: float) -> tuple[float, float]:
     """Hip flexion and knee flexion, radians, at a phase in [0, 1) of the leg's cycle; 0 is heel strike."""
     phase %= 1.0
@@ -51,19 +59,20 @@ def walking_pose(skeleton: Skeleton, phase: float | None) -> Float:
 
 
 def arm_variants(skeleton: Skeleton, pose: Float) -> Float:
-    """(B, D) copies of a pose with one arm elsewhere: swung to four angles, the elbow at three."""
+    """(B, D) copies of a pose with one arm elsewhere: hanging and swung, or raised, the elbow little or much bent."""
     variants = []
     for side in ("l", "r"):
-        for swing in np.radians([-30.0, -10.0, 15.0, 40.0]):
-            for elbow in np.radians([15.0, 45.0, 75.0]):
-                arm = np.array([np.sin(swing), 0.12, -np.cos(swing)])
-                changed = pose.copy()
-                yaw, pitch = shoulder_angles(arm / np.linalg.norm(arm))
-                changed[skeleton.index(f"shoulder_{side}_yaw")] = yaw
-                changed[skeleton.index(f"shoulder_{side}_pitch")] = pitch
-                changed[skeleton.index(f"shoulder_{side}_roll")] = 0.0
-                changed[skeleton.index(f"elbow_{side}_flexion")] = elbow
-                variants.append(changed)
+        for forward, aside, elbow in _ARMS:
+            changed = pose.copy()
+            f, a = np.radians([forward, aside])
+            # from hanging: swung forward about the shoulders' axis, then raised to the side
+            arm = np.array([np.sin(f) * np.cos(a), np.sin(a), -np.cos(f) * np.cos(a)])
+            yaw, pitch = shoulder_angles(arm)
+            changed[skeleton.index(f"shoulder_{side}_yaw")] = yaw
+            changed[skeleton.index(f"shoulder_{side}_pitch")] = pitch
+            changed[skeleton.index(f"shoulder_{side}_roll")] = 0.0
+            changed[skeleton.index(f"elbow_{side}_flexion")] = np.radians(elbow)
+            variants.append(changed)
     return np.array(variants)
 
 

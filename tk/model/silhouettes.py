@@ -179,6 +179,5 @@ def draw_silhouettes(body: ConeBody, rig: Rig, poses: Float) -> NDArray[np.uint8
     """(B, V, H, W) silhouettes of the body at poses (B, D), 0 or 255."""
     rays = pixel_rays(rig)
     empty = np.zeros(rays.shape[:3], np.uint8)
-    _, pictures = kernels.overlap(body.arrays, pack_rig(rig), 1, rays, empty, poses, draw=True)
-    assert pictures is not None
+    _, pictures = kernels.overlap(body.arrays, pack_rig(rig), 1, rays, empty, poses)
     return pictures
