@@ -82,7 +82,7 @@ class View:
         if not len(xy):
             return View.whole(camera, height)
         low, high = xy.min(axis=0), xy.max(axis=0)
-        span = (high - low) * 1.16
+        span = (high - low) * 1.2  # room for what the body misses
         scale = float(min(width / span[0], height / span[1], 4.0))
         size = np.array([width, height]) / scale
         most = np.maximum(np.array([camera.width, camera.height]) - size, 0)
@@ -202,14 +202,15 @@ def overlay_rows(
         for camera, image in zip(capture.rig, images, strict=True):
             joints, _ = camera.project(result.joints[row])
             segments = [] if body is None else outlines(body, result.pose[row], camera)
-            points = np.concatenate([joints, *(polygon for _, _, polygons in segments for polygon in polygons)])
+            true = [camera.project(positions)[0] for positions in marks]
+            points = np.concatenate([joints, *true, *(polygon for _, _, polygons in segments for polygon in polygons)])
             width = round(0.75 * tile_height)
             view = View.whole(camera, tile_height) if full else View.around(points, camera, width, tile_height)
             tile = view.cut(image[: camera.height, : camera.width])
             draw_body(tile, view, segments)
             draw_joints(tile, view.place(joints))
-            for positions in marks:
-                draw_truth(tile, view.place(camera.project(positions)[0]))
+            for xy in true:
+                draw_truth(tile, view.place(xy))
             state = Status(int(result.status[row])).name.lower()
             _label(tile, f"{camera.name}  {index}  {state}", (80, 80, 255) if lost else (255, 255, 255))
             tiles.append(tile)
