@@ -41,17 +41,21 @@ class TrackingConfig:
             predicts; at 15 Hz an arm turns by up to 31° between frames (its section 7.4).
         init_frames: frames from which the body is fitted.
         retry_ratio: a frame whose objective exceeds that of the usual frame by this factor is searched anew.
-        lost_value: the objective above which a frame is lost (it runs from 0 to 1 plus the coverage term's weight).
-        lost_share: a frame is lost, too, when more than this share of the hull's surface is farther than 10 cm from
+        retry_astray: the same for the share of the hull's surface farther than 10 cm from the body: this much more.
+        lost_ratio: a frame is lost whose objective exceeds that of the usual frame by this factor.
+        lost_astray: a frame is lost, too, when this much more of the hull's surface than usual is farther than 10 cm from
             the body: the body is somewhere, but the person is elsewhere.
+        lost_limb: and when more than this share of the samples of a limb, the head or the torso has no voxel near it.
         least_voxels: fewer surface voxels than this are no person.
     """
 
     prediction: float = 0.8
     init_frames: int = 4
     retry_ratio: float = 1.25
-    lost_value: float = 0.45
-    lost_share: float = 0.35
+    retry_astray: float = 0.015
+    lost_ratio: float = 3.0
+    lost_astray: float = 0.25
+    lost_limb: float = 0.6
     least_voxels: int = 60
 
     def __post_init__(self) -> None:

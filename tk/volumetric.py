@@ -27,7 +27,7 @@ from tk.model.body import Body, build_body
 from tk.model.camera import Rig
 from tk.model.fitting import fit_body
 from tk.model.hull import HullSurface, VisualHull
-from tk.model.objective import BodyObjective, Fit, FrameObjective
+from tk.model.objective import CHAIN_OF_SEGMENT, BodyObjective, Fit, FrameObjective
 from tk.model.skeleton import CHAINS, JOINTS, build_skeleton
 from tk.model.volume import Volume, VoxelGrid
 from tk.optim import schedule
@@ -77,7 +77,7 @@ class VolumetricTracker:
         self._appearance: Appearance
         self._pose = np.zeros(len(skeleton.names))
         self._previous = self._pose
-        self._usual = np.inf
+        self._usual, self._usual_astray = np.inf, 1.0
         self._lost_for = 0
         self._fresh = True
 
@@ -127,7 +127,7 @@ class VolumetricTracker:
         self._take_body(initialisation.at_rest(dimensions) if init is None else dimensions)
         self._pose = self._previous = poses[0]
         fit = FrameObjective(self._objective, indices[0], np.random.default_rng(0)).fit(poses[0])
-        self._usual = fit.value
+        self._usual, self._usual_astray = fit.value, fit.astray_share
         self._learn_colours(surfaces[0], indices[0], poses[0])
         self.hull.reset()
 
@@ -166,7 +166,7 @@ class VolumetricTracker:
             rng,
             config.schedule,
             config.smd,
-            good_enough=config.tracking.retry_ratio * self._usual,
+            good_enough=lambda pose: self._is_usual(problem.fit(pose)),
             alternatives=self._alternatives,
         )
         fit = problem.fit(result.pose)
@@ -176,6 +176,7 @@ class VolumetricTracker:
         if not lost:
             # slowly towards what a good frame of this person costs; a bad one may not pass for usual
             self._usual += 0.1 * (min(fit.value, 1.5 * self._usual) - self._usual)
+            self._usual_astray += 0.1 * (min(fit.astray_share, self._usual_astray + 0.05) - self._usual_astray)
             patch, colors = self._taught(surface, index, fit)
             self._appearance = self._appearance.updated(patch, colors, config.appearance)
         self._previous = result.pose if lost or self._lost_for else self._pose
@@ -234,10 +235,25 @@ class VolumetricTracker:
         shaken = [pose + spread * rng.normal(size=len(pose)) for _ in range(2)]
         return np.array([*swapped, limbs, straight, *shaken])
 
-    def _is_lost(self, fit: Fit) -> bool:
+    def _is_usual(self, fit: Fit) -> bool:
+        """Whether a frame is explained about as well as this person's frames usually are."""
         limits = self.config.tracking
-        astray = fit.astray
-        return fit.value > limits.lost_value or (len(astray) > 0 and float(astray.mean()) > limits.lost_share)
+        return (
+            fit.value <= limits.retry_ratio * self._usual
+            and fit.astray_share <= self._usual_astray + limits.retry_astray
+        )
+
+    def _is_lost(self, fit: Fit) -> bool:
+        """Whether the person, or one of the limbs, is elsewhere."""
+        limits = self.config.tracking
+        chain = CHAIN_OF_SEGMENT[self.body.segment[fit.samples]]
+        stranded = np.bincount(chain[fit.stranded] + 1, minlength=len(CHAINS) + 1)
+        everywhere = np.bincount(chain + 1, minlength=len(CHAINS) + 1)
+        return (
+            fit.value > limits.lost_ratio * self._usual
+            or fit.astray_share > self._usual_astray + limits.lost_astray
+            or bool((stranded > limits.lost_limb * everywhere).any())
+        )
 
     def _nothing_seen(self, frame: Observation, surface: HullSurface, watch: Stopwatch) -> Estimate:
         """Nobody is in the volume: the last pose stands, as lost."""
@@ -291,7 +307,7 @@ class VolumetricTracker:
         return {
             "pose": self._pose,
             "previous": self._previous,
-            "usual": self._usual,
+            "usual": np.array([self._usual, self._usual_astray]),
             "lost_for": self._lost_for,
             "mean_yuv": self._appearance.mean,
         }
@@ -312,6 +328,6 @@ class VolumetricTracker:
         self._appearance = replace(learned, mean=np.asarray(state["mean_yuv"]))
         self._pose = np.asarray(state["pose"])
         self._previous = np.asarray(state["previous"])
-        self._usual = float(state["usual"])
+        self._usual, self._usual_astray = (float(v) for v in state["usual"])
         self._lost_for = int(state["lost_for"])
         self._fresh = False

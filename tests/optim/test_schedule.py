@@ -153,7 +153,8 @@ def solve(
     previous = start if previous is None else previous
     rng = np.random.default_rng(seed)
     smd_config = smd_config or SmdConfig()
-    return optimise(problem, np.atleast_2d(start), previous, rng, config, smd_config, good_enough, alternatives)
+    enough = lambda pose: problem.value(pose) <= good_enough  # noqa: E731
+    return optimise(problem, np.atleast_2d(start), previous, rng, config, smd_config, enough, alternatives)
 
 
 def beside(pose: Float, chain: int, place: Float | float) -> Float:

@@ -5,7 +5,8 @@ Two terms share one form, ρ(e) = 1 − exp(−e / ν) with e = ½ (‖x − x̄
 surface
     model to data: a surface sample x and its nearest surface voxel x̄, which fits x's colour patch (6.1.1, 6.1.3).
 coverage
-    data to model: a surface voxel x̄ and the nearest point x of the nearest superellipsoid. Not in the paper: it keeps
+    data to model: a surface voxel x̄ and the nearest point x of the nearest superellipsoid that has the voxel's colour on
+    it. Not in the paper: it keeps
     a limb from hiding inside the trunk, where every sample of it still finds a voxel.
 
 Where the paper is silent: a sample without any candidate within reach counts as an outlier (ρ = 1, no gradient), and
@@ -37,6 +38,8 @@ def _nearest_piece(
     frames: ti.template(),
     c: int,
     pieces: ti.template(),  # (P, 21)
+    patches: ti.template(),  # (P,) bit mask of each piece's colour patches
+    fits: ti.i64,  # the voxel's
     y,  # voxel, world
     y_normal,
     min_cosine,
@@ -62,7 +65,7 @@ def _nearest_piece(
                 ti.max(ti.max(z_lower - q[2], q[2] - z_upper), 0.0),
             ]
         )
-        if over.norm_sqr() < best_d * best_d:
+        if over.norm_sqr() < best_d * best_d and (fits & patches[i]) != 0:
             s = project(q, radii, pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4], z_lower, z_upper)
             on = ti.Vector([s[0], s[1], s[2]])
             d = (q - on).norm()
@@ -153,6 +156,7 @@ def _objective_kernel(real):
         parent: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
         samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 9)
         pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 21)
+        patches: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (P,)
         voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 6)
         fits: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (V,)
         starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
@@ -200,7 +204,7 @@ def _objective_kernel(real):
                     if hold == 0:
                         y = ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
                         y_normal = ti.Vector([ti.cast(voxels[v, 3 + a], real) for a in ti.static(range(3))])
-                        i, x0 = _nearest_piece(frames, c, pieces, y, y_normal, settings[5], settings[6])
+                        i, x0 = _nearest_piece(frames, c, pieces, patches, fits[v], y, y_normal, settings[5], settings[6])
                         covering[b, q, 0] = ti.cast(i, real)
                         for a in ti.static(range(3)):
                             covering[b, q, 1 + a] = x0[a]
@@ -349,6 +353,8 @@ class ObjectiveKernel:
         piece_frame: (P, 3, 4) from its frame to the zero configuration.
         piece_shape: (P, 7) a1 a2 a3 ε1 ε2 z_lower z_upper.
         piece_sigma: (P,) σ of voxels that the piece covers, metres.
+        piece_patches: (P,) int64 bit masks of the colour patches on each piece: a voxel that fits none of them is not
+            covered by the piece. All patches by default.
         dtype: np.float32, or np.float64 for checks of derivatives.
     """
 
@@ -368,6 +374,7 @@ class ObjectiveKernel:
         piece_frame: np.ndarray,
         piece_shape: np.ndarray,
         piece_sigma: np.ndarray,
+        piece_patches: np.ndarray | None = None,
         dtype: type = np.float32,
     ) -> None:
         ensure_runtime()
@@ -388,6 +395,8 @@ class ObjectiveKernel:
         self._tree = real(axis), real(point), whole(prismatic), whole(parent)
         self._samples = real(np.column_stack([local, normal, last_dof, patch, weight]))
         self._pieces = real(np.column_stack([np.reshape(piece_frame, (-1, 12)), piece_shape, piece_dof, piece_weight]))
+        every = np.full(len(piece_dof), -1, np.int64)
+        self._patches = every if piece_patches is None else np.ascontiguousarray(piece_patches, np.int64)
         self._scratch: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def _scratch_of(self, rows: int) -> tuple[np.ndarray, np.ndarray]:
@@ -438,6 +447,7 @@ class ObjectiveKernel:
             *self._tree,
             self._samples,
             self._pieces,
+            self._patches,
             index.voxels,
             index.fits,
             index.starts,

@@ -88,6 +88,7 @@ class BodyObjective:
             piece_frame=np.array([(T_world_body @ p.T_body_piece)[:3] for p in pieces]),
             piece_shape=np.array([[*p.radii, p.e1, p.e2, p.z_lower, p.z_upper] for p in pieces]),
             piece_sigma=np.array([fixed or p.diameter_m for p in pieces]),
+            piece_patches=piece_patches(body),
             dtype=dtype,
         )
         chain = CHAIN_OF_SEGMENT[body.segment]
@@ -113,6 +114,17 @@ class BodyObjective:
         sigma = self.sampling.sigma_m or float(np.median(self.body.diameter))
         unit = (1 / s.nu + s.coverage_weight / s.coverage_nu) / sigma**2
         return unit * np.where(self.body.skeleton.prismatic, 1.0, lever_m**2)
+
+
+def piece_patches(body: Body) -> NDArray[np.int64]:
+    """(P,) bit masks of the colour patches on each piece; a piece without samples has those of its segment."""
+    masks = np.zeros(len(body.pieces), np.int64)
+    for index, piece in enumerate(body.pieces):
+        mine = body.piece == index
+        if not mine.any():
+            mine = body.segment == SEGMENTS.index(piece.segment)
+        masks[index] = np.bitwise_or.reduce(np.int64(1) << np.unique(body.patch[mine]).astype(np.int64))
+    return masks
 
 
 def pick(rng: np.random.Generator, samples: Ints, count: int) -> Ints:
@@ -174,6 +186,12 @@ class Fit:
         if len(self.linear.residual) == M:
             return np.zeros(len(self.voxels), bool)
         return (self.linear.partner[M:] < 0) | (np.linalg.norm(self.linear.residual[M:], axis=1) > ASTRAY_M)
+
+    @property
+    def astray_share(self) -> float:
+        """Share of the voxels that the body does not explain."""
+        astray = self.astray
+        return float(astray.mean()) if len(astray) else 0.0
 
 
 class FrameObjective:

@@ -91,6 +91,8 @@ class ScheduleConfig:
         hypotheses: starts of each chain, at least 1.
         spread_deg: standard deviation of the random ones.
         wide_hypotheses, wide_spread_deg: the same when a frame is searched anew.
+        candidates: random hypotheses of a chain that are looked at once then, before the best are followed.
+        gain: share by which the objective must fall for a pose found by a search anew: it breaks with the past.
         margin: by how much a hypothesis must be better than the first.
         max_step_deg, max_step_m: greatest change in one iteration; samples that happen to see little of a parameter ask
             for more.
@@ -112,8 +114,10 @@ class ScheduleConfig:
     retries: int = 2
     hypotheses: int = 2
     spread_deg: float = 17.0
-    wide_hypotheses: int = 16
+    wide_hypotheses: int = 8
     wide_spread_deg: float = 50.0
+    candidates: int = 96
+    gain: float = 0.08
     margin: float = 0.004
     max_step_deg: float = 20.0
     max_step_m: float = 0.15
@@ -147,7 +151,7 @@ def optimise(
     rng: np.random.Generator,
     config: ScheduleConfig,
     smd_config: smd.SmdConfig,
-    good_enough: float = np.inf,
+    good_enough: Callable[[Float], bool] | None = None,
     alternatives: Callable[[Float, np.random.Generator], Float] | None = None,
 ) -> ScheduleResult:
     """All passes; again from elsewhere while the objective stays high.
@@ -158,7 +162,7 @@ def optimise(
         previous: (D,) the last frame's pose.
         rng: for the random hypotheses.
         config, smd_config: settings.
-        good_enough: the value of the objective that ends the search.
+        good_enough: whether a pose (D,) ends the search; any does by default.
         alternatives: other starts (A, D), made from the best pose so far, for when it is not good enough.
     """
     tolerance = np.where(problem.angular, np.radians(config.tolerance_deg), config.tolerance_m)
@@ -166,7 +170,7 @@ def optimise(
     best = _passes(problem, _best(problem, starts), previous, tolerance, rng, config, smd_config)
     value = problem.value(best.pose)
     for _ in range(config.retries):
-        if alternatives is None or value <= good_enough:
+        if alternatives is None or good_enough is None or good_enough(best.pose):
             break
         others = problem.constrain(np.concatenate([best.pose[None], alternatives(best.pose, rng)]))
         limit = replace(smd_config, max_iterations=config.iterations)
@@ -175,9 +179,9 @@ def optimise(
         iterations = best.iterations + again.iterations
         iterations[0] += moved.iterations.max()
         found = problem.value(again.pose)
-        better = found < value
+        better = found < (1 - config.gain) * value
         best = ScheduleResult(again.pose if better else best.pose, iterations)
-        value = min(value, found)
+        value = found if better else value
     return best
 
 
@@ -250,15 +254,15 @@ def _chains(
     """The chains with the torso at ``pose``: the pose with each chain's best hypothesis, and their iterations (K,)."""
     free = problem.free
     K = len(free)
-    count, spread = config.hypotheses, config.spread_deg
-    if wide:
-        count, spread = max(config.wide_hypotheses, count), config.wide_spread_deg
+    count = max(config.wide_hypotheses, config.hypotheses) if wide else config.hypotheses
     owner = np.tile(np.arange(K), count)
     hypotheses = np.repeat(pose[None], len(owner), axis=0)
-    noise = rng.normal(scale=np.radians(spread), size=hypotheses.shape) * problem.angular
+    noise = rng.normal(scale=np.radians(config.spread_deg), size=hypotheses.shape) * problem.angular
     for row in range(K, len(owner)):
         mine = free[owner[row]]
         hypotheses[row, mine] = previous[mine] if row < 2 * K else pose[mine] + noise[row, mine]
+    if wide and count > 2:
+        hypotheses[2 * K :] = _screened(problem, pose, count - 2, rng, config)
     H = problem.curvature(pose, config.chain_soft)
     damping = problem.damping(config.chain_lever_m, config.chain_soft)
     pairs = [descent_basis(H, free[k], damping, config) for k in range(K)]
@@ -282,6 +286,18 @@ def _chains(
     for k in range(K):
         result[free[k]] = found.pose[best[k], free[k]]
     return result, found.iterations[best]
+
+
+def _screened(problem: Problem, pose: Float, count: int, rng: np.random.Generator, config: ScheduleConfig) -> Float:
+    """(count · K, D) the most promising of many random hypotheses of each chain; row b is of chain b mod K."""
+    free = problem.free
+    K = len(free)
+    owner = np.tile(np.arange(K), config.candidates)
+    noise = rng.normal(scale=np.radians(config.wide_spread_deg), size=(len(owner), len(pose))) * problem.angular
+    candidates = problem.constrain(np.where(free[owner], pose + noise, pose))
+    values = problem.chains(owner, pose, config.soft)(candidates, np.zeros_like(candidates), 0).value
+    order = np.argsort(values.reshape(config.candidates, K), axis=0, kind="stable")[:count]
+    return candidates[order * K + np.arange(K)].reshape(-1, len(pose))
 
 
 def descent_basis(
