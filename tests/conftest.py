@@ -13,7 +13,15 @@ import pytest
 from scripts.synthetic.capture import Options, plan_capture, write_capture
 
 FRAMES = 14
-VOXELS = "32"
+
+# coarse, and a short fit of the body: a whole run takes about a second
+QUICK = """
+voxels = 32
+[fit]
+rounds = 6
+[tracking]
+init_frames = 3
+"""
 
 
 @dataclass(frozen=True)
@@ -68,3 +76,41 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def copy(tiny: Path, tmp_path: Path) -> Path:
     """The tiny capture, to be spoilt."""
     return Path(shutil.copytree(tiny, tmp_path / "capture"))
+
+
+@pytest.fixture(scope="session")
+def tracked(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The result of an unbroken run over the tiny capture. Not to be changed."""
+    from tk.config import Config
+    from tk.io.capture import open_capture
+    from tk.sequence import track
+
+    path = tmp_path_factory.mktemp("results") / "unbroken.h5"
+    track(open_capture(tiny), path, Config.from_toml(QUICK), Silent(), store_hull=True)
+    return path
+
+
+@pytest.fixture(scope="session")
+def quick(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """:data:`QUICK` as a file for ``--config``."""
+    path = tmp_path_factory.mktemp("settings") / "quick.toml"
+    path.write_text(QUICK, encoding="utf-8")
+    return path
+
+
+class Silent:
+    """A reporter that remembers, for runs without a command line."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+        self.total = self.done = 0
+        self.frames: list[int] = []
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+    def begin(self, total: int, done: int) -> None:
+        self.total, self.done = total, done
+
+    def advance(self, frame: int, estimate: object) -> None:
+        self.frames.append(frame)

@@ -202,7 +202,7 @@ def _origin(capture: Capture, first: int, begin: int, init: InitPose | None, sto
         "cameras": ", ".join(capture.rig.names),
         "masks": "none" if masks is None else os.path.relpath(masks[0].path.parent, capture.path),
         "initial pose (its hash)": "none" if init is None else hashlib.sha256(repr(init).encode()).hexdigest()[:12],
-        "hull": "stored" if store_hull else "not stored",
+        "stored hull": "yes" if store_hull else "no",
     }
 
 

@@ -1,0 +1,361 @@
+"""The commands from outside: what they print, how they end, and what they say to bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+import tomli_w
+
+from tests.conftest import FRAMES, QUICK, Tk
+from tests.io.conftest import picture, write_picture, write_video
+from tk import __version__
+from tk.config import Config
+from tk.io.capture import open_capture
+from tk.model.skeleton import JOINTS
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+SIZE = (160, 120)
+
+
+def edit_toml(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    document = tomllib.loads(path.read_text(encoding="utf-8"))
+    change(document)
+    path.write_text(tomli_w.dumps(document), encoding="utf-8")
+
+
+# --- the main job -----------------------------------------------------------------------------------------------------
+
+
+def test_track_writes_what_the_contract_says(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    result = tmp_path / "result.h5"
+    ran = tk("track", tiny, "-o", result, "--config", quick, "--frames", "2:8", "--seed", "5")
+    assert ran.code == 0, ran.err
+    assert ran.out == ""  # progress is no result
+    lines = ran.err.splitlines()
+    assert all(line.isprintable() for line in lines)  # plain lines, no bar: this is no terminal
+    assert lines[-2].startswith("frame 7: 6/6, ") and lines[-1].startswith(f"6 frames in {result}, 0 lost, ")
+    shapes = {
+        "frames": ((6,), "int64"),
+        "time": ((6,), "float64"),
+        "pose": ((6, 24), "float64"),
+        "joints/position": ((6, 15, 3), "float64"),
+        "status": ((6,), "uint8"),
+        "objective": ((6,), "float64"),
+    }
+    with h5py.File(result, "r") as file:
+        for name, (shape, kind) in shapes.items():
+            assert (file[name].shape, file[name].dtype) == (shape, kind), name
+            assert np.isfinite(file[name][()]).all(), name
+        stages = list(file["iterations"].attrs["stages"])
+        assert file["iterations"].shape == (6, len(stages)) and file["iterations"].dtype == np.int32
+        np.testing.assert_array_equal(file["frames"], np.arange(2, 8))
+        np.testing.assert_allclose(file["time"], np.arange(2, 8) / 15.0)
+        assert len(file["pose"].attrs["names"]) == len(file["pose"].attrs["units"]) == 24
+        assert tuple(file["joints/position"].attrs["names"]) == JOINTS
+        assert file["status"].attrs["meaning"].size == 4
+        assert set(file["status"][()]) == {0}  # the initial frame was left out
+        for stage, seconds in file["timing"].items():
+            assert seconds.shape == (6,) and seconds.dtype == np.float64 and (seconds[()] >= 0).all(), stage
+        parts = sum(seconds[()] for stage, seconds in file["timing"].items() if stage != "total")
+        np.testing.assert_allclose(file["timing/total"], parts)
+        dimensions = {name: float(value[()]) for name, value in file["model/dimensions"].items()}
+        assert dimensions and all(0 < abs(value) < 2.5 for value in dimensions.values() if value)
+        assert file["model/patches/mean_yuv"].shape[1] == 3
+        assert "hull" not in file
+        attributes = dict(file.attrs)
+    assert {key: attributes[key] for key in ("format", "format_version", "fps", "units", "up", "capture")} == {
+        "format": "tk-result", "format_version": 1, "fps": 15.0, "units": "m", "up": "z", "capture": "demo",
+    }  # fmt: skip
+    assert (attributes["method"], attributes["seed"]) == ("volumetric", 5)
+    assert __version__ in attributes["software"] and attributes["created"].startswith("20")
+    config = Config.from_toml(attributes["config"])
+    assert (config.voxels, config.seed) == (32, 5)
+
+
+def test_track_finds_the_person(tk: Tk, tracked: Path, tiny: Path) -> None:
+    """Voxels of 7 cm and pictures of 160×120: this shows that all is connected, and not how well it works."""
+    ran = tk("evaluate", tracked, tiny / "truth.h5", "--json")
+    assert ran.code == 0 and ran.err == ""
+    found = json.loads(ran.out)
+    assert (found["judged"], found["lost"], found["nan_frames"]) == (FRAMES, 0, 0)
+    assert found["raw"]["all"]["median_cm"] < 12
+    table = tk("evaluate", tracked, tiny / "truth.h5")
+    assert table.code == 0 and table.err == ""
+    assert table.out.splitlines()[2].startswith("all 15")
+    assert f"{FRAMES} frames judged: 0 lost" in table.out
+
+
+def test_track_segments_the_videos_where_masks_are_not_wanted(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    result = tmp_path / "r.h5"
+    ran = tk("track", tiny, "-o", result, "--config", quick, "--frames", ":5", "--masks", "none")
+    assert ran.code == 0, ran.err
+    with h5py.File(result, "r") as file:
+        assert (file["timing/masks"][()] > 0).all()
+        assert (file["status"][()] < 3).all()
+
+
+def test_masks_and_cameras_of_ones_own_choice(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
+    shutil.move(copy / "masks", tmp_path / "mine")
+    shutil.rmtree(copy / "background")  # masks could not be made from the videos
+    first, second = tmp_path / "a.h5", tmp_path / "b.h5"
+    command = ["track", copy, "--config", quick, "--frames", ":5", "--masks", tmp_path / "mine"]
+    assert tk(*command, "-o", first).code == 0
+    assert tk(*command, "-o", second, "--cameras", "cam1, cam2,cam4").code == 0
+    with h5py.File(first, "r") as a, h5py.File(second, "r") as b:
+        assert np.abs(a["joints/position"][()] - b["joints/position"][()]).max() > 1e-6
+        assert (b["status"][()] < 3).all()
+
+
+def test_a_median_stands_for_the_missing_empty_scene(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
+    shutil.rmtree(copy / "masks")
+    shutil.rmtree(copy / "background")
+    ran = tk("reconstruct", copy, "-o", tmp_path / "h.h5", "--config", quick, "--frames", ":2")
+    assert ran.code == 0
+    assert "no masks and no background/" in ran.err.splitlines()[0]
+
+
+def test_settings_from_a_file_and_options_over_them(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    settings = tmp_path / "settings.toml"
+    settings.write_text(f"seed = 3\n{QUICK}prediction = 0\n".replace("32", "40"), encoding="utf-8")
+    result = tmp_path / "r.h5"
+    ran = tk("track", tiny, "-o", result, "--config", settings, "--voxels", "32", "--frames", ":1")
+    assert ran.code == 0, ran.err
+    with h5py.File(result, "r") as file:
+        config = Config.from_toml(file.attrs["config"])
+    assert (config.voxels, config.seed, config.tracking.prediction) == (32, 3, 0.0)
+
+
+def test_help_and_version(tk: Tk) -> None:
+    assert tk("--version").out.strip().endswith(__version__)
+    for command in ("track", "reconstruct", "evaluate", "demo"):
+        ran = tk(command, "--help")
+        assert ran.code == 0 and f"tk {command}" in ran.out and ran.err == ""
+
+
+def test_demo_tracks_and_says_how_well(tk: Tk, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`tk demo` on a stand-in for the capture that ships; that one has its test among the slow ones."""
+    package = tmp_path / "package"
+    shutil.copytree(tiny, package / "data" / "demo")
+    monkeypatch.setattr("importlib.resources.files", lambda name: package)
+    ran = tk("demo", "-o", tmp_path / "demo.h5", "--voxels", "32")
+    assert ran.code == 0, ran.err
+    assert f"{FRAMES} frames judged: 0 lost" in ran.out
+    assert ran.out.splitlines()[-1].startswith(f"The result is in {tmp_path / 'demo.h5'}")
+
+
+# --- bad usage --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["track"], ["CAPTURE", "tk track --help"]),
+        (["track", "x"], ["--output", "tk track --help"]),
+        (["track", "x", "-o", "r.h5", "--voxels", "many"], ["--voxels", "many"]),
+        (["track", "x", "-o", "r.h5", "--frame", "3"], ["--frame"]),
+        (["trak"], ["trak", "tk --help"]),
+        (["--verbose"], ["--verbose", "tk --help"]),
+        (["evaluate", "r.h5"], ["TRUTH"]),
+    ],
+)
+def test_bad_usage_is_one_line(tk: Tk, arguments: list[str], parts: list[str]) -> None:
+    tk(*arguments).complaint(*parts)
+
+
+@pytest.mark.parametrize(
+    ("options", "parts"),
+    [
+        (["--frames", "5"], ["--frames 5", "A:B"]),
+        (["--frames", "8:3"], ["--frames 8:3"]),
+        (["--frames", "a:b"], ["--frames a:b"]),
+        (["--frames", "-3:2"], ["--frames -3:2"]),
+        (["--frames", "50:"], ["--frames 50:", "0 to 13"]),
+        (["--frames", "14:20"], ["--frames 14:20", "0 to 13"]),
+        (["--voxels", "4"], ["--voxels 4", "8 to 512"]),
+        (["--seed", "-1"], ["--seed -1"]),
+        (["--cameras", "cam1,left"], ["--cameras", "'left'", "cam1, cam2, cam3, cam4"]),
+        (["--cameras", "cam1"], ["--cameras cam1", "at least 2"]),
+        (["--cameras", ","], ["--cameras", "at least 2"]),
+        (["--masks", "nowhere"], ["--masks nowhere"]),
+        (["--method", "magic"], ["--method magic", "volumetric"]),
+        (["--config", "none.toml"], ["none.toml"]),
+        (["--init-pose", "none.toml"], ["none.toml"]),
+    ],
+)
+def test_bad_options_are_one_line(
+    tk: Tk, quick: Path, tiny: Path, tmp_path: Path, options: list[str], parts: list[str]
+) -> None:
+    tk("track", tiny, "-o", tmp_path / "r.h5", "--config", quick, *options).complaint(*parts)
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- bad captures -----------------------------------------------------------------------------------------------------
+
+
+def _calibration(camera: str, **values: Any) -> Callable[[Path], None]:
+    return lambda folder: edit_toml(folder / "calibration.toml", lambda tables: tables[camera].update(values))
+
+
+def _volume(center: list[float], size: list[float]) -> Callable[[Path], None]:
+    volume = {"center": center, "size": size}
+    return lambda folder: edit_toml(folder / "capture.toml", lambda document: document.update(volume=volume))
+
+
+def _truncate(folder: Path) -> None:
+    path = folder / "videos" / "cam2.mp4"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def _empty_masks(folder: Path) -> None:
+    for path in (folder / "masks").rglob("*.png"):
+        write_picture(path, np.zeros(SIZE[::-1], np.uint8))
+
+
+def _squeezed(folder: Path) -> None:
+    """Only a pillar is left of the person, 30 cm wide: nobody with arms spread."""
+    capture = open_capture(folder)
+    box = np.stack(np.meshgrid(*[np.linspace(-0.15, 0.15, 7)] * 2, np.linspace(0, 1.75, 60)), axis=-1).reshape(-1, 3)
+    for camera in capture.rig:
+        pixels = np.rint(camera.project(box)[0]).astype(np.float32)
+        mask = np.zeros((camera.height, camera.width), np.uint8)
+        cv2.fillConvexPoly(mask, cv2.convexHull(pixels).astype(np.int32), 255)
+        for path in (folder / "masks" / camera.name).iterdir():
+            write_picture(path, mask)
+
+
+SPOILT: dict[str, tuple[Callable[[Path], object], list[str]]] = {
+    "no calibration": (lambda folder: (folder / "calibration.toml").unlink(), ["calibration.toml"]),
+    "calibration is no TOML": (
+        lambda folder: (folder / "calibration.toml").write_text("[cam1\n"), ["calibration.toml", "TOML"],
+    ),
+    "a camera without video": (lambda folder: (folder / "videos/cam3.mp4").unlink(), ["cam3.mp4", "no video"]),
+    "no videos at all": (lambda folder: shutil.rmtree(folder / "videos"), ["videos/"]),
+    "a singular matrix": (
+        _calibration("cam2", matrix=[[0.0, 0.0, 80.0], [0.0, 0.0, 60.0], [0.0, 0.0, 1.0]]),
+        ["calibration.toml", "cam2", "matrix"],
+    ),
+    "a NaN": (_calibration("cam1", translation=[0.0, float("nan"), 4.0]), ["calibration.toml", "cam1", "nan"]),
+    "an infinite rotation": (_calibration("cam1", rotation=[0.0, float("inf"), 4.0]), ["calibration.toml", "inf"]),
+    "another image size": (_calibration("cam4", size=[320, 240]), ["cam4.mp4", "160×120", "320×240"]),
+    "a truncated video": (_truncate, ["cam2.mp4", "cut off"]),
+    "a text file called mp4": (
+        lambda folder: (folder / "videos/cam1.mp4").write_text("minutes\n" * 9), ["cam1.mp4", "not a video"],
+    ),
+    "an empty file called mp4": (lambda folder: (folder / "videos/cam1.mp4").write_bytes(b""), ["cam1.mp4", "empty"]),
+    "an empty volume": (_volume([0.0, 0.0, 1.0], [1.0, 0.0, 1.0]), ["capture.toml", "empty"]),
+    "a volume out of sight": (_volume([0.0, 0.0, 90.0], [1.0, 1.0, 1.0]), ["capture.toml", "no two cameras"]),
+    "a NaN in the volume": (_volume([0.0, 0.0, float("nan")], [1.0, 1.0, 1.0]), ["capture.toml", "nan"]),
+    "a text for a mask": (
+        lambda folder: (folder / "masks/cam2/000000.png").write_text("white"), ["masks/cam2/000000.png"],
+    ),
+    "a camera without masks": (lambda folder: shutil.rmtree(folder / "masks/cam3"), ["masks", "cam3"]),
+    "nobody there": (_empty_masks, ["capture", "masks", "surface voxels"]),
+    "no Da Vinci pose": (_squeezed, ["capture", "no Da Vinci pose", "--init-pose"]),
+    "any pose": (
+        lambda folder: edit_toml(folder / "capture.toml", lambda d: d["init"].update(pose="any")),
+        ["capture.toml", "--init-pose"],
+    ),
+    "an initial frame past the end": (
+        lambda folder: edit_toml(folder / "capture.toml", lambda d: d["init"].update(frame=99)),
+        ["capture.toml", "99", "13"],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("spoil", SPOILT)
+def test_a_bad_capture_is_one_line_that_names_the_file(
+    tk: Tk, quick: Path, copy: Path, tmp_path: Path, spoil: str
+) -> None:
+    change, parts = SPOILT[spoil]
+    change(copy)
+    tk("track", copy, "-o", tmp_path / "r.h5", "--config", quick).complaint(str(copy), *parts)
+    assert list(tmp_path.iterdir()) == [copy]
+
+
+def test_a_missing_capture(tk: Tk, tmp_path: Path) -> None:
+    for command in ("track", "reconstruct"):
+        tk(command, tmp_path / "nowhere", "-o", tmp_path / "r.h5").complaint("nowhere", "not a folder")
+
+
+def test_videos_of_different_lengths_are_tracked_as_far_as_they_all_go(
+    tk: Tk, quick: Path, copy: Path, tmp_path: Path
+) -> None:
+    write_video(copy / "videos" / "cam2.mp4", [picture(1, k, SIZE) for k in range(6)])
+    ran = tk("track", copy, "-o", tmp_path / "r.h5", "--config", quick)
+    assert ran.code == 0
+    warning = ran.err.splitlines()[0]
+    assert "cam2.mp4" in warning and "only the first 6 are used" in warning
+    with h5py.File(tmp_path / "r.h5", "r") as file:
+        assert len(file["frames"]) == 6
+
+
+@pytest.mark.parametrize("broken", [2, 7])
+def test_what_is_finished_is_kept_when_the_input_breaks(
+    tk: Tk, quick: Path, copy: Path, tmp_path: Path, broken: int
+) -> None:
+    """At frame 2 as well, which is among those that the body is fitted to."""
+    mask = copy / "masks" / "cam2" / f"{broken:06d}.png"
+    good = mask.read_bytes()
+    mask.write_bytes(good[: len(good) // 3])
+    result = tmp_path / "r.h5"
+    command = ["track", copy, "-o", result, "--config", quick]
+    tk(*command).complaint(str(mask))
+    with h5py.File(result, "r") as file:
+        np.testing.assert_array_equal(file["frames"], np.arange(broken))
+    if broken > 4:
+        mask.write_bytes(good)
+        assert tk(*command, "--resume").code == 0
+        with h5py.File(result, "r") as file:
+            assert len(file["frames"]) == FRAMES
+
+
+# --- results that cannot be written -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", ["track", "reconstruct"])
+def test_results_that_cannot_be_written(tk: Tk, quick: Path, tiny: Path, tmp_path: Path, command: str) -> None:
+    def run(output: Path) -> Any:
+        return tk(command, tiny, "-o", output, "--config", quick, "--frames", ":1")
+
+    run(tmp_path / "missing" / "r.h5").complaint("r.h5", "does not exist")
+    run(tmp_path).complaint(str(tmp_path), "is a folder")
+    (tmp_path / "file").write_text("mine")
+    run(tmp_path / "file" / "r.h5").complaint("r.h5")
+    run(tmp_path / "file").complaint("not overwritten")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["data"] = 1
+    run(tmp_path / "other.h5").complaint("other.h5", "not overwritten")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "other.h5"]
+    assert (tmp_path / "file").read_text() == "mine"
+    if os.path.isdir("/proc"):  # where not even root may make a file
+        run(Path("/proc/r.h5")).complaint("/proc/r.h5", "cannot be written")
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="permissions do not bind root")
+@pytest.mark.parametrize("command", ["track", "reconstruct"])
+def test_a_folder_without_permission(tk: Tk, quick: Path, tiny: Path, tmp_path: Path, command: str) -> None:
+    locked = tmp_path / "locked"
+    locked.mkdir(mode=0o500)
+    tk(command, tiny, "-o", locked / "r.h5", "--config", quick).complaint("r.h5")
+
+
+def test_evaluate_names_what_it_cannot_read(tk: Tk, tracked: Path, tiny: Path, tmp_path: Path) -> None:
+    tk("evaluate", tmp_path / "r.h5", tiny / "truth.h5").complaint("r.h5", "no such file")
+    tk("evaluate", tracked, tiny / "calibration.toml").complaint("calibration.toml", "not an HDF5 file")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["data"] = 1
+    tk("evaluate", tracked, tmp_path / "other.h5").complaint("other.h5", "/frames")
