@@ -6,6 +6,7 @@ Each default stands with its unit and source in the dataclass of the part that i
 from __future__ import annotations
 
 import dataclasses
+import math
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -90,8 +91,8 @@ class Config:
     def __post_init__(self) -> None:
         if not 8 <= self.voxels <= 512:
             raise ConfigError(f"--voxels {self.voxels}: choose from 8 to 512")
-        if self.seed < 0:
-            raise ConfigError(f"--seed {self.seed}: must not be negative")
+        if not 0 <= self.seed < 2**63:  # the result file keeps it as an int64
+            raise ConfigError(f"--seed {self.seed}: choose from 0 to {2**63 - 1}")
         if self.segmentation not in SEGMENTATIONS:
             raise ConfigError(f'segmentation = "{self.segmentation}": choose one of {", ".join(SEGMENTATIONS)}')
 
@@ -138,6 +139,8 @@ def _build(default: T, values: dict[str, Any], where: str, path: str = "") -> T:
             changes[key] = float(value)
         elif type(value) is not type(old):
             raise ConfigError(f"{where}: {name} = {value!r} must be of type {type(old).__name__}, as {old!r} is")
+        elif isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"{where}: {name} = {value} must be a finite number")
         else:
             changes[key] = value
     try:

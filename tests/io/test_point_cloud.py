@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+import builtins
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import open3d
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.io.conftest import MakeCapture
+from tk.errors import CaptureError, ResultError
+from tk.io.capture import Capture, open_capture
+from tk.io.point_cloud import write_hulls, write_ply
+from tk.io.result import HullPoints
+from tk.model.volume import VoxelGrid
+
+
+def points(count: int, seed: int = 0) -> HullPoints:
+    rng = np.random.default_rng(seed)
+    return HullPoints(rng.normal(size=(count, 3)), rng.integers(0, 256, (count, 3), dtype=np.uint8))
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=20)
+@given(count=st.integers(0, 40), seed=st.integers(0, 1000))
+def test_ply_round_trip(tmp_path: Path, count: int, seed: int) -> None:
+    expected = points(count, seed)
+    write_ply(tmp_path / "a" / "b.ply", expected.positions, expected.colors)
+    cloud = open3d.io.read_point_cloud(tmp_path / "a" / "b.ply")
+    np.testing.assert_array_equal(np.asarray(cloud.points).reshape(-1, 3), expected.positions)
+    np.testing.assert_allclose(np.asarray(cloud.colors).reshape(-1, 3) * 255, expected.colors, atol=1e-6)
+
+
+def test_a_ply_that_cannot_be_written(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    cloud = points(2)
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(ResultError, match=r"file: cannot be made"):
+        write_ply(tmp_path / "file" / "a.ply", cloud.positions, cloud.colors)
+    with pytest.raises(ResultError, match="cannot be written"):
+        write_ply(tmp_path, cloud.positions, cloud.colors)
+    said = capfd.readouterr()
+    assert said.out == "" and said.err == ""  # Open3D warns on stdout
+
+
+def test_without_open3d(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def refuse(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name == "open3d":
+            raise ImportError("libGL.so.1: cannot open shared object file")
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(ResultError, match=r"a\.ply: PLY files need Open3D, which does not load here: libGL"):
+        write_ply(tmp_path / "a.ply", np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
+
+
+@pytest.fixture
+def capture(make_capture: MakeCapture) -> Capture:
+    return open_capture(make_capture())
+
+
+def grid(capture: Capture) -> VoxelGrid:
+    return VoxelGrid.cover(capture.volume, 16)
+
+
+def test_hulls_are_ragged(capture: Capture, tmp_path: Path) -> None:
+    frames = [(3, points(5)), (4, points(0)), (7, points(2, 1))]
+    path = tmp_path / "h.h5"
+    assert write_hulls(path, capture, grid(capture), frames) == 3
+    with h5py.File(path, "r") as file:
+        np.testing.assert_array_equal(file["frames"], [3, 4, 7])
+        np.testing.assert_allclose(file["time"], np.array([3, 4, 7]) / capture.fps)
+        np.testing.assert_array_equal(file["hull/offsets"], [0, 5, 5, 7])
+        np.testing.assert_array_equal(file["hull/positions"], np.vstack([p.positions for _, p in frames]).astype("f4"))
+        np.testing.assert_array_equal(file["hull/colors"], np.vstack([p.colors for _, p in frames]))
+        assert file.attrs["voxel_m"] == pytest.approx(1 / 16)
+
+
+@pytest.mark.parametrize("error", [CaptureError("frame 2 is broken"), KeyboardInterrupt()])
+def test_finished_frames_are_kept(capture: Capture, tmp_path: Path, error: BaseException) -> None:
+    def frames() -> Iterator[tuple[int, HullPoints]]:
+        yield 0, points(4)
+        yield 1, points(3)
+        raise error
+
+    with pytest.raises(type(error)):
+        write_hulls(tmp_path / "h.h5", capture, grid(capture), frames())
+    with h5py.File(tmp_path / "h.h5", "r") as file:
+        np.testing.assert_array_equal(file["hull/offsets"], [0, 4, 7])
+        assert len(file["frames"]) == len(file["time"]) == 2
+
+
+def test_an_older_file_stays_until_a_frame_is_finished(capture: Capture, tmp_path: Path) -> None:
+    def none() -> Iterator[tuple[int, HullPoints]]:
+        raise CaptureError("frame 0 is broken")
+        yield
+
+    path = tmp_path / "h.h5"
+    write_hulls(path, capture, grid(capture), [(0, points(4))])
+    before = path.read_bytes()
+    with pytest.raises(CaptureError):
+        write_hulls(path, capture, grid(capture), none())
+    assert path.read_bytes() == before
+    assert not [file for file in tmp_path.iterdir() if file.name.endswith(".tmp")]
+
+
+def test_files_of_others_are_left_alone(capture: Capture, tmp_path: Path) -> None:
+    path = tmp_path / "notes.txt"
+    path.write_text("mine")
+    with pytest.raises(ResultError, match=r"notes\.txt: exists and is not a tk-hull file"):
+        write_hulls(path, capture, grid(capture), [(0, points(4))])
+    assert path.read_text() == "mine"
+    with pytest.raises(ResultError, match="is a folder"):
+        write_hulls(tmp_path, capture, grid(capture), [])
+    with pytest.raises(ResultError, match="does not exist; make it first"):
+        write_hulls(tmp_path / "nowhere" / "h.h5", capture, grid(capture), [])

@@ -1,0 +1,137 @@
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tk.config import Config
+from tk.errors import ConfigError
+
+
+def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """(name with dots, default) of every setting."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from leaves(value, f"{prefix}{field.name}.")
+        else:
+            yield f"{prefix}{field.name}", value
+
+
+DEFAULTS = dict(leaves(Config()))
+NUMBERS = [name for name, value in DEFAULTS.items() if isinstance(value, float)]
+
+
+def toml(name: str, value: str) -> str:
+    table, _, key = name.rpartition(".")
+    return f"[{table}]\n{key} = {value}\n" if table else f"{key} = {value}\n"
+
+
+def test_defaults_round_trip() -> None:
+    assert Config.from_toml(Config().to_toml()) == Config()
+    assert Config.from_toml("") == Config()
+
+
+@given(
+    voxels=st.integers(8, 512),
+    seed=st.integers(0, 2**62),
+    prediction=st.floats(0, 1.5),
+    meta_step=st.floats(1e-6, 1.0),
+    enabled=st.booleans(),
+    segmentation=st.sampled_from(["collinearity", "mog2"]),
+)
+def test_values_round_trip(
+    voxels: int, seed: int, segmentation: str, prediction: float, meta_step: float, enabled: bool
+) -> None:
+    config = Config(voxels=voxels, seed=seed, segmentation=segmentation)
+    config = dataclasses.replace(
+        config,
+        tracking=dataclasses.replace(config.tracking, prediction=prediction),
+        smd=dataclasses.replace(config.smd, meta_step=meta_step),
+        appearance=dataclasses.replace(config.appearance, enabled=enabled),
+    )
+    assert Config.from_toml(config.to_toml()) == config
+
+
+def test_what_a_file_leaves_out_keeps_its_default() -> None:
+    config = Config.from_toml("voxels = 128\n[tracking]\nprediction = 1\n")
+    assert config.voxels == 128 and config.tracking.prediction == 1.0
+    assert isinstance(config.tracking.prediction, float)
+    changed = {name for name, value in leaves(config) if value != DEFAULTS[name]}
+    assert changed == {"voxels", "tracking.prediction"}
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("voxel = 3", ["unknown setting voxel", "voxels"]),
+        ("[tracking]\nspeed = 3", ["unknown setting tracking.speed", "prediction"]),
+        ("[traking]\n", ["unknown setting traking"]),
+        ('voxels = "64"', ["voxels", "int"]),
+        ("voxels = 64.0", ["voxels", "int"]),
+        ("voxels = true", ["voxels", "int"]),
+        ("[tracking]\nprediction = true", ["tracking.prediction", "float"]),
+        ("[appearance]\nenabled = 1", ["appearance.enabled", "bool"]),
+        ("tracking = 3", ["tracking", "table"]),
+        ("segmentation = 1", ["segmentation", "str"]),
+        ('segmentation = "magic"', ["magic", "collinearity", "mog2"]),
+        ("voxels = 2", ["--voxels 2", "8 to 512"]),
+        ("seed = -1", ["--seed -1"]),
+        ("[tracking]\nprediction = 7.0", ["prediction = 7.0"]),
+        ("[tracking]\ninit_frames = 0", ["init_frames = 0"]),
+        ("[smd]\nmemory = 3.0", ["smd.memory"]),
+        ("voxels = ", ["not valid TOML"]),
+        ("seed = 99999999999999999999", ["seed"]),
+    ],
+)
+def test_mistakes_are_one_line_that_names_file_and_setting(tmp_path: Path, text: str, parts: list[str]) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        Config.read(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ") and "\n" not in message
+    for part in parts:
+        assert part in message
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf"])
+@pytest.mark.parametrize("name", NUMBERS)
+def test_no_setting_takes_what_is_not_finite(name: str, value: str) -> None:
+    with pytest.raises(ConfigError, match=name.rpartition(".")[2]):
+        Config.from_toml(toml(name, value))
+
+
+@pytest.mark.parametrize("name", [name for name in DEFAULTS if name not in ("segmentation",)])
+@pytest.mark.parametrize("value", [-1, 0, 10**6])
+def test_extreme_values_are_taken_or_refused_as_the_users_mistake(name: str, value: int) -> None:
+    default = DEFAULTS[name]
+    text = str(bool(value)).lower() if isinstance(default, bool) else str(value)
+    try:
+        config = Config.from_toml(toml(name, text))
+    except ConfigError as error:
+        table, _, key = name.rpartition(".")
+        assert key in str(error) or f"{table}: " in str(error)  # it names the setting, or at least its table
+    else:
+        assert dict(leaves(config))[name] == value or isinstance(default, bool)
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"nowhere\.toml: cannot be read"):
+        Config.read(tmp_path / "nowhere.toml")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        Config.read(tmp_path)
+    (tmp_path / "latin.toml").write_bytes(b'segmentation = "\xe4"')
+    with pytest.raises(ConfigError, match=r"latin\.toml: cannot be read"):
+        Config.read(tmp_path / "latin.toml")
+
+
+def test_every_default_is_finite() -> None:
+    assert len(NUMBERS) > 30
+    assert all(math.isfinite(DEFAULTS[name]) for name in NUMBERS)
