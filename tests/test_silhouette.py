@@ -18,11 +18,11 @@ from tk.silhouette import SilhouetteConfig, SilhouetteTracker
 from tk.tracker import Observation
 
 STATURE = 1.75
-RIG = ring_of_cameras(3, width=160, height=200)
+RIG = ring_of_cameras(3, width=240, height=300)
 BODY = build_cone_body(BodyDimensions.from_stature(STATURE))
 NAMES = BODY.skeleton.names
-# A pixel is 2 cm wide at the subject; a joint rests on dozens of edgels in three views.
-CLOSE_M = 0.03
+# A pixel is 1 cm wide at the subject; a joint rests on dozens of edgels in three views.
+CLOSE_M = 0.015
 
 
 def walk(count: int, first: float = 0.0) -> np.ndarray:
@@ -87,7 +87,7 @@ def test_the_subject_is_found_without_any_hint():
     tracker = SilhouetteTracker(RIG, "z", config)
     tracker.start([observe(m, i) for i, m in enumerate(MASKS)], STATURE, None)
     estimate = tracker.step(observe(MASKS[0]))
-    assert errors(estimate, POSES[0]).mean() < 2 * CLOSE_M
+    assert errors(estimate, POSES[0]).mean() < CLOSE_M
     sides = [JOINTS.index(name) for name in ("ankle_l", "ankle_r")]
     truth = BODY.skeleton.joints(POSES[0])[sides]
     found = estimate.joints[sides]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -123,7 +123,7 @@ class SilhouetteTracker:
         Raises:
             CaptureError: fewer than two cameras see anybody in the first frame.
         """
-        pyramids = [self._pyramid(frame, self.config.solver.scales + 1) for frame in frames]
+        pyramids = [self._pyramid(frame, self.config.solver.scales) for frame in frames]
         if init is None:
             p_centroid = self._centroid(pyramids[0], frames[0].index)
             stature = height_m or self._stature(pyramids[0], p_centroid)
@@ -133,7 +133,8 @@ class SilhouetteTracker:
             stature_given = init.height_m or height_m
             dimensions, start = rough_pose(init.joints, init.angles, stature_given, self.up)
             self._body = build_cone_body(dimensions, self.up, self.config.body)
-            start = self._settle(pyramids[0], start[None], self.config.solver.scales + 1)[0]
+            start = self._settle(pyramids[0], start[None], self.config.solver.scales)[0]
+        start, _ = self._reconsider(pyramids[0], start)
         if self.config.adapt:
             start = self._adapt(pyramids, start, height_m or (init.height_m if init else None))
         self._pose = self._previous = start
@@ -144,7 +145,7 @@ class SilhouetteTracker:
         """Hypotheses settle on the first frame; the best are followed, and the one that keeps fitting is taken."""
         body = self.body
         poses = gait.hypotheses(body.skeleton, self.config.headings, self.config.phases, p_centroid)
-        poses = self._settle(pyramids[0], poses, self.config.solver.scales + 1)
+        poses = self._settle(pyramids[0], poses, self.config.solver.scales)
         error = self._fit_error(pyramids[0], poses)
         firsts = poses[_distinct(poses, error, self.config.finalists)]
         error = self._fit_error(pyramids[0], firsts)
@@ -157,8 +158,10 @@ class SilhouetteTracker:
     def _adapt(self, pyramids: Sequence[Pyramid], start: Float, stature: float | None) -> Float:
         """Track all frames with the average body, then fit dimensions and poses together."""
         poses = [start]
-        for pyramid in pyramids[1:]:
-            poses.append(self._settle(pyramid, poses[-1][None], self.config.solver.scales)[0])
+        every = self.config.second_thoughts
+        for i, pyramid in enumerate(pyramids[1:], 1):
+            pose = self._settle(pyramid, poses[-1][None], self.config.solver.scales)[0]
+            poses.append(self._reconsider(pyramid, pose)[0] if every and i % every == 0 else pose)
         count = min(self.config.fit.frames, len(pyramids))
         chosen = np.unique(np.linspace(0, len(pyramids) - 1, count).round().astype(int))
         self._body, fitted = fit_dimensions(
@@ -220,10 +223,11 @@ class SilhouetteTracker:
         start = self._pose + config.prediction * (self._pose - self._previous)
         pose = self._settle(pyramid, start[None], config.solver.scales)[0]
         watch.lap("optimise")
-        error = float(self._fit_error(pyramid, pose[None])[0])
         every = config.second_thoughts
-        if every and frame.index % every == 0 and config.body != "walker" and np.isfinite(error):
-            pose, error = self._reconsider(pyramid, pose, error)
+        if every and frame.index % every == 0:
+            pose, error = self._reconsider(pyramid, pose)
+        else:
+            error = float(self._fit_error(pyramid, pose[None])[0])
         lost = not error <= config.lost_error
         status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
         # nobody is in sight: the last pose stands
@@ -241,8 +245,11 @@ class SilhouetteTracker:
             timing=watch.laps,
         )
 
-    def _reconsider(self, pyramid: Pyramid, pose: Float, error: float) -> tuple[Float, float]:
+    def _reconsider(self, pyramid: Pyramid, pose: Float) -> tuple[Float, float]:
         """The pose or, if that explains the silhouettes better, one with an arm elsewhere; and its E_S."""
+        error = float(self._fit_error(pyramid, pose[None])[0])
+        if self.config.second_thoughts == 0 or self.config.body == "walker" or not np.isfinite(error):
+            return pose, error
         variants = gait.arm_variants(self.body.skeleton, pose)
         best = variants[np.argsort(self._fit_error(pyramid, variants), kind="stable")[:2]]
         settled = self._settle(pyramid, best, 1)
@@ -265,7 +272,7 @@ class SilhouetteTracker:
         body = self.body
         solver = self.config.solver
         if scales != solver.scales:
-            solver = GaussNewtonConfig(**{**asdict(solver), "scales": scales})
+            solver = replace(solver, scales=scales)
         return gauss_newton.minimise(
             lambda states, scale: self.views.equations(body, pyramid, states, scale, self.config.search),
             poses,
