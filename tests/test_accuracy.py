@@ -1,0 +1,87 @@
+"""How well whole captures are tracked: minutes, run by `make test-slow`."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.conftest import Silent, Tk
+from tk.config import Config
+from tk.evaluation import Evaluation, evaluate_files
+from tk.io.capture import open_capture
+from tk.io.result import read_result
+from tk.sequence import track
+
+pytestmark = pytest.mark.slow
+
+SHARED = Path(__file__).parents[2] / "shared" / "captures"
+DEMO = Path(__file__).parents[1] / "tk" / "data" / "demo"
+FRAMES = {"walk": 80, "dance": 120, "punch": 150}
+MEAN_CM = 6.0
+MEMORY_MIB = 2048
+
+# the peak memory of the command alone: this process has Open3D and a compiler's caches in it
+MEASURED = """
+import resource, sys
+from tk.cli import main
+try:
+    main(sys.argv[1:], prog_name="tk")
+finally:
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+def shared(name: str) -> Path:
+    folder = SHARED / name
+    if not folder.is_dir():
+        pytest.skip(f"the development captures are not here: {folder}")
+    return folder
+
+
+def assert_accurate(found: Evaluation, frames: int) -> None:
+    assert (found.judged, found.missing_outside, found.lost, found.nan_frames) == (frames, 0, 0, 0)
+    assert found.raw.all.mean_cm <= MEAN_CM, found.format_table()
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_captures_with_an_initial_pose_from_their_videos(name: str, tmp_path: Path) -> None:
+    """64³, five cameras, masks from the videos and the background clips."""
+    folder = shared(name)
+    result = tmp_path / "r.h5"
+    track(open_capture(folder, masks="none"), result, Config(), Silent())
+    assert_accurate(evaluate_files(result, folder / "truth.h5"), FRAMES[name])
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_the_same_seed_gives_the_same_poses(name: str, tmp_path: Path) -> None:
+    capture = open_capture(shared(name), masks="none")
+    poses = []
+    for run in ("a.h5", "b.h5"):
+        track(capture, tmp_path / run, Config(), Silent(), frames=(0, 30))
+        poses.append(read_result(tmp_path / run).pose)
+    assert len(poses[0]) == 30
+    np.testing.assert_array_equal(poses[0], poses[1])
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs getrusage")
+def test_memory_stays_below_two_gibibytes(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", MEASURED, "track", str(shared("walk")), "-o", str(tmp_path / "r.h5")]
+    ran = subprocess.run([*command, "--masks", "none"], capture_output=True, text=True, cwd=Path(__file__).parents[1])
+    assert ran.returncode == 0, ran.stderr
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    assert int(ran.stdout) / unit < MEMORY_MIB
+
+
+def test_the_capture_that_ships(tk: Tk, tmp_path: Path) -> None:
+    ran = tk("demo", "-o", tmp_path / "demo.h5")
+    assert ran.code == 0, ran.err
+    found = evaluate_files(tmp_path / "demo.h5", DEMO / "truth.h5")
+    assert found.format_table() in ran.out
+    assert_accurate(found, found.judged)
+    told = json.loads(tk("evaluate", tmp_path / "demo.h5", DEMO / "truth.h5", "--json").out)
+    assert told["lost"] == 0
