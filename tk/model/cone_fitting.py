@@ -53,7 +53,7 @@ class ConeFitConfig:
         edge_noise_px: standard deviation of an edgel. Besides ragged masks it stands for shapes that no cone has, which
             err alike in all frames: too small a value bends lengths to make up for shapes.
         correlation_px: along a contour this many pixels err together; edgels within them count as one.
-        stature_deviation: of the logarithm of the stature about the given one; the hair and the soles are in it.
+        stature_deviation: of the logarithm of the stature about the given one.
     """
 
     frames: int = 8
@@ -105,6 +105,8 @@ def fit_dimensions(
     poses = np.array(poses)
     F, D, K = len(poses), poses.shape[1], len(names)
     free = np.flatnonzero(body.free)
+    # with shoes, as the proportions have it
+    nominal = BodyDimensions.from_stature(stature_m).stature if stature_m is not None else 0.0
     # information of one pixel of contour
     information = 1.0 / (config.edge_noise_px**2 * config.correlation_px)
     for _ in range(config.rounds):
@@ -137,7 +139,7 @@ def fit_dimensions(
             d = here.dimensions
             row = np.array([_stature_rate(d, name) for name in names])
             H[shape, shape] += np.outer(row, row) / config.stature_deviation**2
-            g[shape] += row * np.log(stature_m / d.stature) / config.stature_deviation**2
+            g[shape] += row * np.log(nominal / d.stature) / config.stature_deviation**2
         chosen = np.concatenate([*(f * D + free for f in range(F)), F * D + np.arange(K)])
         delta = np.zeros(len(g))
         delta[chosen] = np.linalg.solve(H[np.ix_(chosen, chosen)], g[chosen])

@@ -1,0 +1,82 @@
+"""Dimensions from drawn silhouettes; derivatives by dimensions against finite differences."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from tests.model.ring import ring_of_cameras
+from tk.errors import ConfigError
+from tk.kernels.silhouette import SearchSettings
+from tk.model.anthropometry import BodyDimensions
+from tk.model.cone_body import build_cone_body
+from tk.model.cone_fitting import ConeFitConfig, dimension_rows, fit_dimensions, neighbours
+from tk.model.gait import walking_pose
+from tk.model.silhouettes import Views, draw_silhouettes
+
+STATURE = 1.75
+VIEWS = Views(ring_of_cameras(3, width=240, height=300))
+AVERAGE = build_cone_body(BodyDimensions.from_stature(STATURE))
+SEARCH = SearchSettings()
+
+
+def walk(body, count):
+    poses = np.array([walking_pose(body.skeleton, 0.05 + i / count) for i in range(count)])
+    poses[:, 2] = 0.93
+    return poses
+
+
+def pyramids_of(body, poses):
+    return [VIEWS.pyramid(masks, 1, None) for masks in draw_silhouettes(body, VIEWS.rig, poses)]
+
+
+def test_rows_by_dimensions_are_differences_of_the_surface():
+    poses = walk(AVERAGE, 1)
+    edgels = VIEWS.edgels(AVERAGE, pyramids_of(AVERAGE, poses)[0], poses[0], 0, SEARCH)
+    rows = dimension_rows(neighbours(AVERAGE, "z"), poses[0], edgels)
+    names = [field.name for field in fields(BodyDimensions)]
+    assert rows.shape == (len(edgels.view), len(names))
+    # a longer calf moves what hangs on it, and nothing above the knee
+    calf = rows[:, names.index("calf")]
+    parts = np.array([AVERAGE.parts[p].name[:-2] for p in edgels.part])
+    assert not calf[~np.isin(parts, ["calf", "foot"])].any() and np.abs(calf[parts == "foot"]).max() > 5
+    # a thicker thigh pushes its outline outwards, by the radius in pixels
+    thigh = rows[parts == "thigh", names.index("thigh_radius")]
+    grown = build_cone_body(AVERAGE.dimensions.scaled(thigh_radius=1.1))
+    moved = grown.place(poses[0], edgels.part, edgels.unscaled) - AVERAGE.place(poses[0], edgels.part, edgels.unscaled)
+    expected = np.einsum("na,na->n", edgels.row, moved)[parts == "thigh"] / np.log(1.1)
+    np.testing.assert_allclose(thigh, expected, rtol=0.06, atol=1e-6)
+    assert (thigh > 0).all()
+
+
+def test_lengths_and_girths_are_found_from_a_stride():
+    true = AVERAGE.dimensions.scaled(thigh=0.95, calf=1.06, thigh_radius=1.15, chest_half_width=0.93, forearm=1.05)
+    body = build_cone_body(true)
+    poses = walk(body, 6)
+    start = poses + np.random.default_rng(0).normal(0, 0.01, poses.shape)
+    config = ConeFitConfig(rounds=8, edge_noise_px=1.0)
+    found, fitted = fit_dimensions(AVERAGE, VIEWS, pyramids_of(body, poses), start, "z", SEARCH, None, config)
+    for name, tolerance in (("thigh", 0.03), ("calf", 0.03), ("thigh_radius", 0.05), ("forearm", 0.05)):
+        assert getattr(found.dimensions, name) == pytest.approx(getattr(true, name), rel=tolerance), name
+    off = [
+        np.linalg.norm(found.skeleton.joints(a) - body.skeleton.joints(b), axis=1).mean()
+        for a, b in zip(fitted, poses, strict=True)
+    ]
+    assert np.mean(off) < 0.012
+
+
+def test_without_rounds_nothing_changes():
+    poses = walk(AVERAGE, 1)
+    config = ConeFitConfig(rounds=0)
+    found, fitted = fit_dimensions(AVERAGE, VIEWS, pyramids_of(AVERAGE, poses), poses, "z", SEARCH, None, config)
+    np.testing.assert_array_equal(fitted, poses)
+    for field in fields(BodyDimensions):
+        expected = getattr(AVERAGE.dimensions, field.name)
+        assert getattr(found.dimensions, field.name) == pytest.approx(expected, rel=1e-12)
+
+
+def test_settings_out_of_range_are_told():
+    with pytest.raises(ConfigError, match="frames = 0"):
+        ConeFitConfig(frames=0)
+    with pytest.raises(ConfigError, match="edge_noise_px 0"):
+        ConeFitConfig(edge_noise_px=0.0)
