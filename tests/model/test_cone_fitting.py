@@ -52,9 +52,9 @@ def test_rows_by_dimensions_are_differences_of_the_surface():
 def test_lengths_and_girths_are_found_from_a_stride():
     true = AVERAGE.dimensions.scaled(thigh=0.95, calf=1.06, thigh_radius=1.15, chest_half_width=0.93, forearm=1.05)
     body = build_cone_body(true)
-    poses = walk(body, 6)
+    poses = walk(body, 4)
     start = poses + np.random.default_rng(0).normal(0, 0.01, poses.shape)
-    config = ConeFitConfig(rounds=8, edge_noise_px=1.0)
+    config = ConeFitConfig(rounds=6, edge_noise_px=1.0)
     found, fitted = fit_dimensions(AVERAGE, VIEWS, pyramids_of(body, poses), start, "z", SEARCH, None, config)
     for name, tolerance in (("thigh", 0.03), ("calf", 0.03), ("thigh_radius", 0.05), ("forearm", 0.05)):
         assert getattr(found.dimensions, name) == pytest.approx(getattr(true, name), rel=tolerance), name
