@@ -52,8 +52,8 @@ class TrackingConfig:
 
     prediction: float = 0.8
     init_frames: int = 4
-    retry_ratio: float = 1.25
-    retry_astray: float = 0.015
+    retry_ratio: float = 1.4
+    retry_astray: float = 0.02
     lost_ratio: float = 3.0
     lost_astray: float = 0.25
     lost_limb: float = 0.6

@@ -47,6 +47,11 @@ class _Frame:
     index: SurfaceIndex
 
 
+def _drift(usual: float, now: float) -> float:
+    """What is usual after one more frame: quick to learn that it can be better, slow to put up with worse."""
+    return usual + (0.1 if now < usual else 0.05) * (now - usual)
+
+
 class VolumetricTracker:
     """Tracks one person. :meth:`start` once, then :meth:`step` for every frame, the first included.
 
@@ -174,9 +179,8 @@ class VolumetricTracker:
         lost = self._is_lost(fit)
         status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
         if not lost:
-            # slowly towards what a good frame of this person costs; a bad one may not pass for usual
-            self._usual += 0.1 * (min(fit.value, 1.5 * self._usual) - self._usual)
-            self._usual_astray += 0.1 * (min(fit.astray_share, self._usual_astray + 0.05) - self._usual_astray)
+            self._usual = _drift(self._usual, fit.value)
+            self._usual_astray = _drift(self._usual_astray, fit.astray_share)
             patch, colors = self._taught(surface, index, fit)
             self._appearance = self._appearance.updated(patch, colors, config.appearance)
         self._previous = result.pose if lost or self._lost_for else self._pose

@@ -9,6 +9,8 @@ coverage
     it. Not in the paper: it keeps
     a limb from hiding inside the trunk, where every sample of it still finds a voxel.
 
+An arm's sample deep inside the trunk finds no voxel: upper arms used to fold into the trunk, whose surface fits them well.
+
 Where the paper is silent: a sample without any candidate within reach counts as an outlier (ρ = 1, no gradient), and
 the Hessian of eq. 19 is approximated, as Schraudolph does, by the positive semi-definite part Σ ρ'(e)/σ² JᵀJ.
 """
@@ -21,7 +23,7 @@ import numpy as np
 from tk.kernels.kinematics import forward, load_rotation, load_translation, load_vector3, point_velocity
 from tk.kernels.nearest import SurfaceIndex, nearest_voxel
 from tk.kernels.runtime import ensure_runtime, ti
-from tk.kernels.superellipsoid import project
+from tk.kernels.superellipsoid import implicit, project
 
 # Points that one parallel task handles: few enough to share 160 points among threads, many enough that each task's own
 # forward kinematics (about 2 µs) stays in the noise.
@@ -29,7 +31,15 @@ POINTS_PER_TASK = 16
 
 
 # Columns of the packed arrays. Every array that a launch is handed costs about 7 µs, so the body comes in few.
-SAMPLE_NORMAL, SAMPLE_DOF, SAMPLE_PATCH, SAMPLE_WEIGHT = 3, 6, 7, 8  # after the position; weight is 1/σ²
+SAMPLE_NORMAL, SAMPLE_DOF, SAMPLE_PATCH, SAMPLE_WEIGHT, SAMPLE_OUTSIDE = (
+    3,
+    6,
+    7,
+    8,
+    9,
+)  # after the position; weight is 1/σ²
+# Deep inside: G (1 on the surface, growing linearly from the centre) below this.
+BURIED = 0.8
 PIECE_SHAPE, PIECE_DOF, PIECE_WEIGHT = 12, 19, 20  # after the 3×4 frame: a1 a2 a3 ε1 ε2 z_lower z_upper
 
 
@@ -118,8 +128,32 @@ def _add_residual(
 
 
 @ti.func
+def _is_buried(
+    frames: ti.template(),
+    c: int,
+    pieces: ti.template(),  # (P, 21)
+    solid: int,
+    x,
+):
+    """Whether a world point lies deep inside one of the first ``solid`` pieces."""
+    buried = False
+    for i in range(solid):
+        k = ti.cast(pieces[i, PIECE_DOF], ti.i32)
+        Rp = ti.Matrix([[pieces[i, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
+        tp = ti.Vector([pieces[i, 4 * a + 3] for a in ti.static(range(3))])
+        q = Rp.transpose() @ (load_rotation(frames, c, k).transpose() @ (x - load_translation(frames, c, k)) - tp)
+        if q[2] > pieces[i, PIECE_SHAPE + 5] and q[2] < pieces[i, PIECE_SHAPE + 6]:
+            radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
+            if implicit(q, radii, pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4])[0] < BURIED:
+                buried = True
+    return buried
+
+
+@ti.func
 def _pair_sample(
     samples: ti.template(),
+    pieces: ti.template(),
+    solid: int,
     voxels: ti.template(),
     fits: ti.template(),
     starts: ti.template(),
@@ -132,18 +166,22 @@ def _pair_sample(
     """The voxel of surface sample n, or -1."""
     k = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
     R = load_rotation(frames, c, k)
-    normal = ti.Vector([samples[n, SAMPLE_NORMAL + a] for a in ti.static(range(3))])
-    return nearest_voxel(
-        voxels,
-        fits,
-        starts,
-        grid,
-        R @ load_vector3(samples, n) + load_translation(frames, c, k),
-        R @ normal,
-        ti.cast(samples[n, SAMPLE_PATCH], ti.i32),
-        ti.cast(settings[2], ti.f32),
-        ti.cast(settings[3], ti.f32),
-    )
+    x = R @ load_vector3(samples, n) + load_translation(frames, c, k)
+    v = -1
+    if samples[n, SAMPLE_OUTSIDE] == 0.0 or not _is_buried(frames, c, pieces, solid, x):
+        normal = ti.Vector([samples[n, SAMPLE_NORMAL + a] for a in ti.static(range(3))])
+        v = nearest_voxel(
+            voxels,
+            fits,
+            starts,
+            grid,
+            x,
+            R @ normal,
+            ti.cast(samples[n, SAMPLE_PATCH], ti.i32),
+            ti.cast(settings[2], ti.f32),
+            ti.cast(settings[3], ti.f32),
+        )
+    return v
 
 
 @functools.cache
@@ -154,7 +192,7 @@ def _objective_kernel(real):
         point: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
         prismatic: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
         parent: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
-        samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 9)
+        samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 10)
         pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 21)
         patches: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (P,)
         voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 6)
@@ -163,6 +201,7 @@ def _objective_kernel(real):
         grid: ti.types.ndarray(dtype=ti.f32, ndim=1),  # (7,)
         settings: ti.types.ndarray(dtype=real, ndim=1),  # (9,)
         hold: ti.i32,
+        solid: ti.i32,
         M: ti.i32,
         Q: ti.i32,
         chosen: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, M + Q) samples, then voxels of the coverage term
@@ -190,7 +229,7 @@ def _objective_kernel(real):
                     n = chosen[b, m]
                     v = assigned[b, m]
                     if hold == 0:
-                        v = _pair_sample(samples, voxels, fits, starts, grid, settings, frames, c, n)
+                        v = _pair_sample(samples, pieces, solid, voxels, fits, starts, grid, settings, frames, c, n)
                         assigned[b, m] = v
                     k = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
                     x0 = load_vector3(samples, n)
@@ -204,7 +243,9 @@ def _objective_kernel(real):
                     if hold == 0:
                         y = ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
                         y_normal = ti.Vector([ti.cast(voxels[v, 3 + a], real) for a in ti.static(range(3))])
-                        i, x0 = _nearest_piece(frames, c, pieces, patches, fits[v], y, y_normal, settings[5], settings[6])
+                        i, x0 = _nearest_piece(
+                            frames, c, pieces, patches, fits[v], y, y_normal, settings[5], settings[6]
+                        )
                         covering[b, q, 0] = ti.cast(i, real)
                         for a in ti.static(range(3)):
                             covering[b, q, 1 + a] = x0[a]
@@ -241,7 +282,7 @@ def _linearise_kernel(real):
         point: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
         prismatic: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
         parent: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
-        samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 9)
+        samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 10)
         pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 21)
         voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 6)
         settings: ti.types.ndarray(dtype=real, ndim=1),  # (9,)
@@ -355,6 +396,8 @@ class ObjectiveKernel:
         piece_sigma: (P,) σ of voxels that the piece covers, metres.
         piece_patches: (P,) int64 bit masks of the colour patches on each piece: a voxel that fits none of them is not
             covered by the piece. All patches by default.
+        outside: (N,) True for samples that may not lie inside the first ``solid`` pieces: there they find no voxel.
+        solid: how many of the first pieces are.
         dtype: np.float32, or np.float64 for checks of derivatives.
     """
 
@@ -375,6 +418,8 @@ class ObjectiveKernel:
         piece_shape: np.ndarray,
         piece_sigma: np.ndarray,
         piece_patches: np.ndarray | None = None,
+        outside: np.ndarray | None = None,
+        solid: int = 0,
         dtype: type = np.float32,
     ) -> None:
         ensure_runtime()
@@ -393,7 +438,9 @@ class ObjectiveKernel:
         piece_weight = 1.0 / np.asarray(piece_sigma, np.float64) ** 2
         self._weights = weight, piece_weight
         self._tree = real(axis), real(point), whole(prismatic), whole(parent)
-        self._samples = real(np.column_stack([local, normal, last_dof, patch, weight]))
+        barred = np.zeros(len(local)) if outside is None else np.asarray(outside, np.float64)
+        self._solid = solid
+        self._samples = real(np.column_stack([local, normal, last_dof, patch, weight, barred]))
         self._pieces = real(np.column_stack([np.reshape(piece_frame, (-1, 12)), piece_shape, piece_dof, piece_weight]))
         every = np.full(len(piece_dof), -1, np.int64)
         self._patches = every if piece_patches is None else np.ascontiguousarray(piece_patches, np.int64)
@@ -454,6 +501,7 @@ class ObjectiveKernel:
             index.grid,
             self._packed(settings, M, Q),
             int(held is not None),
+            self._solid,
             M,
             Q,
             np.ascontiguousarray(np.concatenate([chosen, voxels[:, :Q]], axis=1), np.int32),

@@ -89,6 +89,8 @@ class BodyObjective:
             piece_shape=np.array([[*p.radii, p.e1, p.e2, p.z_lower, p.z_upper] for p in pieces]),
             piece_sigma=np.array([fixed or p.diameter_m for p in pieces]),
             piece_patches=piece_patches(body),
+            outside=np.array(["arm" in name for name in SEGMENTS])[body.segment],
+            solid=sum(piece.segment == "torso" for piece in pieces),  # the torso's pieces come first
             dtype=dtype,
         )
         chain = CHAIN_OF_SEGMENT[body.segment]

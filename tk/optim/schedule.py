@@ -88,10 +88,11 @@ class ScheduleConfig:
         iterations, chain_iterations, polish_iterations: i_max (eq. 21) of the three passes; no polish with 0, as in the
             paper.
         retries: how often a frame whose objective stays high is searched anew from other starts.
-        hypotheses: starts of each chain, at least 1.
-        spread_deg: standard deviation of the random ones.
-        wide_hypotheses, wide_spread_deg: the same when a frame is searched anew.
-        candidates: random hypotheses of a chain that are looked at once then, before the best are followed.
+        hypotheses: starts of each chain: as the first pass left it, as the last frame had it, and the best of some random
+            candidates; at least 1.
+        wide_hypotheses: the same when a frame is searched anew, with three times the candidates.
+        candidates: random candidates of each chain, looked at once.
+        spread_deg: their standard deviation.
         gain: share by which the objective must fall for a pose found by a search anew: it breaks with the past.
         margin: by how much a hypothesis must be better than the first.
         max_step_deg, max_step_m: greatest change in one iteration; samples that happen to see little of a parameter ask
@@ -111,12 +112,11 @@ class ScheduleConfig:
     iterations: int = 10
     chain_iterations: int = 10
     polish_iterations: int = 6
-    retries: int = 2
-    hypotheses: int = 2
-    spread_deg: float = 17.0
+    retries: int = 1
+    hypotheses: int = 4
     wide_hypotheses: int = 8
-    wide_spread_deg: float = 50.0
-    candidates: int = 96
+    candidates: int = 32
+    spread_deg: float = 40.0
     gain: float = 0.08
     margin: float = 0.004
     max_step_deg: float = 20.0
@@ -257,12 +257,11 @@ def _chains(
     count = max(config.wide_hypotheses, config.hypotheses) if wide else config.hypotheses
     owner = np.tile(np.arange(K), count)
     hypotheses = np.repeat(pose[None], len(owner), axis=0)
-    noise = rng.normal(scale=np.radians(config.spread_deg), size=hypotheses.shape) * problem.angular
-    for row in range(K, len(owner)):
-        mine = free[owner[row]]
-        hypotheses[row, mine] = previous[mine] if row < 2 * K else pose[mine] + noise[row, mine]
-    if wide and count > 2:
-        hypotheses[2 * K :] = _screened(problem, pose, count - 2, rng, config)
+    if count > 1:
+        hypotheses[K : 2 * K] = np.where(free, previous, pose)
+    if count > 2:
+        scale = 3 if wide else 1
+        hypotheses[2 * K :] = _screened(problem, pose, count - 2, scale * config.candidates, rng, config)
     H = problem.curvature(pose, config.chain_soft)
     damping = problem.damping(config.chain_lever_m, config.chain_soft)
     pairs = [descent_basis(H, free[k], damping, config) for k in range(K)]
@@ -288,16 +287,18 @@ def _chains(
     return result, found.iterations[best]
 
 
-def _screened(problem: Problem, pose: Float, count: int, rng: np.random.Generator, config: ScheduleConfig) -> Float:
+def _screened(
+    problem: Problem, pose: Float, count: int, candidates: int, rng: np.random.Generator, config: ScheduleConfig
+) -> Float:
     """(count · K, D) the most promising of many random hypotheses of each chain; row b is of chain b mod K."""
     free = problem.free
     K = len(free)
-    owner = np.tile(np.arange(K), config.candidates)
-    noise = rng.normal(scale=np.radians(config.wide_spread_deg), size=(len(owner), len(pose))) * problem.angular
-    candidates = problem.constrain(np.where(free[owner], pose + noise, pose))
-    values = problem.chains(owner, pose, config.soft)(candidates, np.zeros_like(candidates), 0).value
-    order = np.argsort(values.reshape(config.candidates, K), axis=0, kind="stable")[:count]
-    return candidates[order * K + np.arange(K)].reshape(-1, len(pose))
+    owner = np.tile(np.arange(K), candidates)
+    noise = rng.normal(scale=np.radians(config.spread_deg), size=(len(owner), len(pose))) * problem.angular
+    tried = problem.constrain(np.where(free[owner], pose + noise, pose))
+    values = problem.chains(owner, pose, config.soft)(tried, np.zeros_like(tried), 0).value
+    order = np.argsort(values.reshape(candidates, K), axis=0, kind="stable")[:count]
+    return tried[order * K + np.arange(K)].reshape(-1, len(pose))
 
 
 def descent_basis(
