@@ -265,11 +265,18 @@ def test_starts_from_angles(tiny: Path, tracked: Path, tmp_path: Path) -> None:
 
 
 def test_an_initial_pose_past_the_end(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
-    joints = {name: [0.0, 0.1 * k, 1.0] for k, name in enumerate(JOINTS)}
+    joints = {name: [0.1 * (k % 2), 0.05 * k, 1.0] for k, name in enumerate(JOINTS)}
     file = pose_file(tmp_path / "pose.toml", {"frame": 99, "joints": joints})
     tk("track", tiny, "-o", tmp_path / "r.h5", "--config", quick, "--init-pose", file).complaint(
         "pose.toml", "99", "13"
     )
+
+
+def test_an_initial_pose_in_millimetres(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    joints = {name: [100.0 * (k % 2), 50.0 * k, 1000.0] for k, name in enumerate(JOINTS)}
+    file = pose_file(tmp_path / "pose.toml", {"joints": joints})
+    ran = tk("track", tiny, "-o", tmp_path / "r.h5", "--config", quick, "--init-pose", file)
+    ran.complaint("pose.toml", "outside the working volume", "metres")
 
 
 def test_frames_before_the_initial_one_are_left_out(copy: Path, tmp_path: Path) -> None:

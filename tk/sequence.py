@@ -134,6 +134,11 @@ def track(
         reporter.note(warning)
     tracker = make_tracker(method, capture, config)
     init = read_init_pose(init_pose, tracker.pose_names) if init_pose else None
+    if init and not ((capture.volume.lower <= init.center) & (init.center <= capture.volume.upper)).all():
+        raise CaptureError(
+            f"{init_pose}: the body is at {init.center.round(2).tolist()}, outside the working volume "
+            f"{capture.volume.lower.round(2).tolist()} to {capture.volume.upper.round(2).tolist()}; give metres"
+        )
     first = init.frame if init and init.frame is not None else frames[0] if init else capture.init_frame
     if init is None and capture.init_pose == "any":
         raise CaptureError(

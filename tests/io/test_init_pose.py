@@ -13,7 +13,7 @@ from tk.io.init_pose import LEAST_JOINTS, read_init_pose
 from tk.model.skeleton import JOINTS
 
 NAMES = ("torso_x", "torso_y", "torso_z", "torso_yaw", "elbow_l_pitch")
-PLACES = {name: [0.1 * k, 0.0, 1.0] for k, name in enumerate(JOINTS)}
+PLACES = {name: [0.1 * k, 0.2 * (k % 2), 1.0] for k, name in enumerate(JOINTS)}
 PLACE = {"torso_x": 0.1, "torso_y": -0.2, "torso_z": 1.0}
 
 
@@ -26,6 +26,7 @@ def test_joints(tmp_path: Path) -> None:
     assert set(pose.joints) == set(some)
     for name, position in some.items():
         np.testing.assert_array_equal(pose.joints[name], position)
+    np.testing.assert_allclose(pose.center, np.mean(list(some.values()), axis=0))
 
 
 def test_angles_are_in_degrees_and_places_in_metres(tmp_path: Path) -> None:
@@ -34,6 +35,7 @@ def test_angles_are_in_degrees_and_places_in_metres(tmp_path: Path) -> None:
     pose = read_init_pose(str(file), NAMES)
     assert pose.angles == pytest.approx({**PLACE, "torso_yaw": math.pi / 2, "elbow_l_pitch": -math.pi / 6})
     assert (pose.frame, pose.height_m, pose.joints) == (None, None, {})
+    np.testing.assert_array_equal(pose.center, list(PLACE.values()))
 
 
 @pytest.mark.parametrize(
@@ -47,6 +49,8 @@ def test_angles_are_in_degrees_and_places_in_metres(tmp_path: Path) -> None:
         ({"joints": {**PLACES, "neck": [0, 1, math.nan]}}, ["neck", "nan"]),
         ({"joints": {**PLACES, "neck": "here"}}, ["neck", "3 numbers"]),
         ({"joints": 3}, ["joints", "table"]),
+        ({"joints": {name: [0, 0, 1] for name in JOINTS}}, ["[joints] lie on a line"]),
+        ({"joints": {name: [0, 0.01 * k, 0.1 * k] for k, name in enumerate(JOINTS)}}, ["[joints] lie on a line"]),
         ({"angles": {**PLACE, "tail": 3.0}}, ["unknown angle tail", "torso_yaw"]),
         ({"angles": {"torso_yaw": 3.0}}, ["torso_x, torso_y and torso_z", "metres"]),
         ({"angles": {**PLACE, "torso_yaw": math.inf}}, ["torso_yaw", "finite"]),

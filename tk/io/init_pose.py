@@ -32,6 +32,11 @@ from tk.model.skeleton import JOINTS
 
 LEAST_JOINTS = 6
 
+# across the line that fits the joints best, root of the sum of squares
+LEAST_SPREAD_M = 0.05
+
+TRANSLATIONS = ("torso_x", "torso_y", "torso_z")
+
 # metres; the same for a height in capture.toml
 HEIGHT_RANGE_M = (0.3, 3.0)
 
@@ -47,6 +52,13 @@ class InitPose:
     angles: dict[str, float]
     frame: int | None = None
     height_m: float | None = None
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """(3,) where the body roughly is: the mean of the joints, or the pelvis."""
+        if self.joints:
+            return np.mean(list(self.joints.values()), axis=0)
+        return np.array([self.angles[name] for name in TRANSLATIONS])
 
 
 def read_init_pose(path: str | Path, pose_names: tuple[str, ...]) -> InitPose:
@@ -80,15 +92,17 @@ def read_init_pose(path: str | Path, pose_names: tuple[str, ...]) -> InitPose:
         found = {name: joints.array(name, (3,)) for name in JOINTS if name in joints}
         if len(found) < LEAST_JOINTS:
             raise CaptureError(f"{path}: {len(found)} joints are too few to place a body; give at least {LEAST_JOINTS}")
+        centered = np.array(list(found.values())) - np.mean(list(found.values()), axis=0)
+        if np.linalg.svd(centered, compute_uv=False)[1] < LEAST_SPREAD_M:
+            raise CaptureError(f"{path}: [joints] lie on a line, which places no body; give joints of both sides")
         return InitPose(found, {}, frame, height)
     angles = table.table("angles")
     unknown = sorted(set(angles.values) - set(pose_names))
     if unknown:
         raise CaptureError(f"{path}: unknown angle {unknown[0]}; known are {', '.join(pose_names)}")
-    translations = ("torso_x", "torso_y", "torso_z")
     values = {name: angles.number(name) for name in pose_names if name in angles}
-    if not all(name in values for name in translations):
+    if not all(name in values for name in TRANSLATIONS):
         raise CaptureError(
             f"{path}: [angles] must give torso_x, torso_y and torso_z, the place of the pelvis in metres"
         )
-    return InitPose({}, {n: v if n in translations else float(np.radians(v)) for n, v in values.items()}, frame, height)
+    return InitPose({}, {n: v if n in TRANSLATIONS else float(np.radians(v)) for n, v in values.items()}, frame, height)
