@@ -50,7 +50,7 @@ class TrackingConfig:
         least_voxels: fewer surface voxels than this are no person.
     """
 
-    prediction: float = 0.8
+    prediction: float = 0.9
     init_frames: int = 4
     retry_ratio: float = 1.4
     retry_astray: float = 0.02

@@ -208,8 +208,9 @@ class VolumetricTracker:
     def _starts(self, surface: HullSurface) -> Float:
         """(S, D) where the search may begin."""
         skeleton = self.body.skeleton
-        predicted = self._pose + self.config.tracking.prediction * (self._pose - self._previous)
-        starts = [predicted, self._pose]
+        # limbs swing on, or stop and turn: the objective tells which
+        motion = self.config.tracking.prediction * (self._pose - self._previous)
+        starts = [self._pose + motion, self._pose + motion / 2, self._pose]
         if self._lost_for:
             # the last pose, carried to where the person now is
             moved = self._pose.copy()
@@ -218,7 +219,7 @@ class VolumetricTracker:
             for i, pose in enumerate(turned):
                 pose[skeleton.index("torso_yaw")] += i * np.pi / 2
             starts += turned
-        elif np.array_equal(predicted, self._pose):
+        elif not motion.any():
             starts = starts[:1]
         return np.array(starts)
 

@@ -365,12 +365,12 @@ class ObjectiveSettings:
         coverage_nu, coverage_cosine, coverage_reach_m: the same for the coverage term.
     """
 
-    nu: float = 0.5
+    nu: float = 0.35
     tangential: float = 0.3
     min_cosine: float = 0.0
     reach_m: float = 0.3
     coverage_weight: float = 1.0
-    coverage_nu: float = 1.0
+    coverage_nu: float = 0.7
     coverage_cosine: float = 0.0
     coverage_reach_m: float = 0.5
 
