@@ -41,7 +41,7 @@ def test_defaults_round_trip() -> None:
 @given(
     voxels=st.integers(8, 512),
     seed=st.integers(0, 2**62),
-    prediction=st.floats(0, 1.5),
+    prediction=st.floats(0, 1.5, allow_subnormal=False),
     meta_step=st.floats(1e-6, 1.0),
     enabled=st.booleans(),
     segmentation=st.sampled_from(["collinearity", "mog2"]),

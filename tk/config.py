@@ -44,8 +44,8 @@ class TrackingConfig:
         retry_ratio: a frame whose objective exceeds that of the usual frame by this factor is searched anew.
         retry_astray: the same for the share of the hull's surface farther than 10 cm from the body: this much more.
         lost_ratio: a frame is lost whose objective exceeds that of the usual frame by this factor.
-        lost_astray: a frame is lost, too, when this much more of the hull's surface than usual is farther than 10 cm from
-            the body: the body is somewhere, but the person is elsewhere.
+        lost_astray: a frame is lost, too, when this much more of the hull's surface than usual is farther than 10 cm
+            from the body: the body is somewhere, but the person is elsewhere.
         lost_limb: and when more than this share of the samples of a limb, the head or the torso has no voxel near it.
         least_voxels: fewer surface voxels than this are no person.
     """

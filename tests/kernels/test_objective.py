@@ -256,7 +256,10 @@ def test_outliers_weigh_nothing_or_the_floor(kernel):
     assert np.linalg.eigvalsh(floored - plain).min() > -1e-9 * np.abs(plain).max()
     # with all decays at the floor, and the missing pairs still without weight
     weight = linear.scale / linear.nu * linear.inv_sigma2 * (linear.partner >= 0)
-    np.testing.assert_allclose(linear.gauss_newton(1.0), np.einsum("k,kai,kab,kbj->ij", weight, linear.jacobian, linear.metric, linear.jacobian))
+    np.testing.assert_allclose(
+        linear.gauss_newton(1.0),
+        np.einsum("k,kai,kab,kbj->ij", weight, linear.jacobian, linear.metric, linear.jacobian),
+    )
 
 
 @pytest.mark.parametrize("floor", [0.0, 0.1, 1.0])

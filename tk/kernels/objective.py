@@ -5,11 +5,10 @@ Two terms share one form, ρ(e) = 1 − exp(−e / ν) with e = ½ (‖x − x̄
 surface
     model to data: a surface sample x and its nearest surface voxel x̄, which fits x's colour patch (6.1.1, 6.1.3).
 coverage
-    data to model: a surface voxel x̄ and the nearest point x of the nearest superellipsoid that has the voxel's colour on
-    it. Not in the paper: it keeps
-    a limb from hiding inside the trunk, where every sample of it still finds a voxel.
+    data to model: a surface voxel x̄ and the nearest point x of the nearest superellipsoid that has the voxel's colour
+    on it. Not in the paper: it keeps a limb from hiding inside the trunk, where every sample of it still finds a voxel.
 
-An arm's sample deep inside the trunk finds no voxel: upper arms used to fold into the trunk, whose surface fits them well.
+An arm's sample deep inside the trunk finds no voxel: upper arms used to fold into the trunk, whose surface fits them.
 
 Where the paper is silent: a sample without any candidate within reach counts as an outlier (ρ = 1, no gradient), and
 the Hessian of eq. 19 is approximated, as Schraudolph does, by the positive semi-definite part Σ ρ'(e)/σ² JᵀJ.
@@ -25,9 +24,9 @@ from tk.kernels.nearest import SurfaceIndex, nearest_voxel
 from tk.kernels.runtime import ensure_runtime, ti
 from tk.kernels.superellipsoid import implicit, project
 
-# Points that one parallel task handles: few enough to share 160 points among threads, many enough that each task's own
-# forward kinematics (about 2 µs) stays in the noise.
-POINTS_PER_TASK = 16
+# Points that one parallel task handles: few enough to share 310 points among threads, and a chain's 50 in one; many
+# enough that each task's own forward kinematics (some µs) stays in the noise.
+POINTS_PER_TASK = 52
 
 
 # Columns of the packed arrays. Every array that a launch is handed costs about 7 µs, so the body comes in few.

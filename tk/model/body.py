@@ -206,7 +206,7 @@ def _limb(
     front: Float,
     begin: float = 0.0,
 ) -> None:
-    """A tapered limb from r0 to r1 along ``axis``, from ``begin`` of its length on, and the round cap at its far end."""
+    """A tapered limb from r0 to r1 along ``axis``, from ``begin`` of its length on, and its far cap."""
     slope = min(r1 / r0, 0.98)
     a3 = length / np.sqrt(1 - slope**2)  # the ellipsoid whose radius has fallen to r1 at the limb's end
     add(segment, origin, axis, (r0, r0, a3), (1.0, 1.0), (begin * length, length), 2 * r0, front)

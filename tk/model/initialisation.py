@@ -222,9 +222,9 @@ def shoulder_angles(direction: Float) -> tuple[float, float]:
 def at_rest(dimensions: BodyDimensions) -> BodyDimensions:
     """The dimensions with the shoulders where they are on average, and not where raised arms hold them.
 
-    With the arms level the collar bones point up by 5 to 10° more than with the arms down (Ludewig et al., J. Bone Joint
-    Surg. Am. 91, 2009, 378-389), which lifts the shoulders by some 2 to 3 cm. The trunk is rigid here, so they are put
-    half way.
+    With the arms level the collar bones point up by 5 to 10° more than with the arms down (Ludewig et al., J. Bone
+    Joint Surg. Am. 91, 2009, 378-389), which lifts the shoulders by some 2 to 3 cm. The trunk is rigid here, so they
+    are put half way.
     """
     return replace(dimensions, shoulder_drop=dimensions.shoulder_drop + RAISED_SHOULDERS / 2 * dimensions.stature)
 

@@ -269,8 +269,10 @@ class FrameObjective:
         return evaluate
 
     def chain_values(self, owner: NDArray[np.intp], poses: Float) -> Float:
-        """(B,) the chains' objectives on even samples, and on voxels of the whole hull: a limb that leaves the voxels it
-        lay on uncovered is no better for it."""
+        """(B,) the chains' objectives on even samples and on voxels of the whole hull.
+
+        A limb that leaves the voxels it lay on uncovered is no better for it.
+        """
         samples = np.stack([even(s, 60) if len(s) >= 60 else np.resize(s, 60) for s in self.objective.chain_samples])
         voxels = even(np.arange(self.voxel_count, dtype=np.int32), 400)
         return self._evaluate(

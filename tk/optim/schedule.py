@@ -88,8 +88,8 @@ class ScheduleConfig:
         iterations, chain_iterations, polish_iterations: i_max (eq. 21) of the three passes; no polish with 0, as in the
             paper.
         retries: how often a frame whose objective stays high is searched anew from other starts.
-        hypotheses: starts of each chain: as the first pass left it, as the last frame had it, and the best of some random
-            candidates; at least 1.
+        hypotheses: starts of each chain: as the first pass left it, as the last frame had it, and the best of some
+            random candidates; at least 1.
         wide_hypotheses: the same when a frame is searched anew, with three times the candidates.
         candidates: random candidates of each chain, looked at once.
         spread_deg: their standard deviation.
@@ -293,6 +293,7 @@ def _screened(
     """(count · K, D) the most promising of many random hypotheses of each chain; row b is of chain b mod K."""
     free = problem.free
     K = len(free)
+    candidates = max(candidates, count)
     owner = np.tile(np.arange(K), candidates)
     noise = rng.normal(scale=np.radians(config.spread_deg), size=(len(owner), len(pose))) * problem.angular
     tried = problem.constrain(np.where(free[owner], pose + noise, pose))
