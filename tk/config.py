@@ -52,8 +52,8 @@ class TrackingConfig:
 
     prediction: float = 0.9
     init_frames: int = 4
-    retry_ratio: float = 1.4
-    retry_astray: float = 0.02
+    retry_ratio: float = 2.0
+    retry_astray: float = 0.05
     lost_ratio: float = 3.0
     lost_astray: float = 0.25
     lost_limb: float = 0.6

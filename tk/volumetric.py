@@ -35,8 +35,8 @@ from tk.tracker import Estimate, Observation, Stopwatch
 
 Float = NDArray[np.float64]
 
-# Cells of the nearest-neighbour search, in voxels: about ten surface voxels a cell.
-CELL_VOXELS = 2.5
+# Cells of the nearest-neighbour search, in voxels: some twenty surface voxels a cell.
+CELL_VOXELS = 4.0
 
 
 @dataclass(frozen=True)

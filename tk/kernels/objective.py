@@ -58,12 +58,19 @@ def _nearest_piece(
     best = -1
     best_d = reach
     best_x = y * 0.0
+    # the voxel in the zero configuration; pieces of one segment follow each other and share it
+    segment = -1
+    local, local_normal = y, y_normal
     for i in range(pieces.shape[0]):
         k = ti.cast(pieces[i, PIECE_DOF], ti.i32)
-        R = load_rotation(frames, c, k)
+        if k != segment:
+            R = load_rotation(frames, c, k)
+            local = R.transpose() @ (y - load_translation(frames, c, k))
+            local_normal = R.transpose() @ y_normal
+            segment = k
         Rp = ti.Matrix([[pieces[i, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
         tp = ti.Vector([pieces[i, 4 * a + 3] for a in ti.static(range(3))])
-        q = Rp.transpose() @ (R.transpose() @ (y - load_translation(frames, c, k)) - tp)
+        q = Rp.transpose() @ (local - tp)
         radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
         z_lower, z_upper = pieces[i, PIECE_SHAPE + 5], pieces[i, PIECE_SHAPE + 6]
         # a box about the piece: what lies further outside it than the best so far cannot win
@@ -79,8 +86,8 @@ def _nearest_piece(
             on = ti.Vector([s[0], s[1], s[2]])
             d = (q - on).norm()
             if d < best_d:
-                n = R @ (Rp @ ti.Vector([s[3], s[4], s[5]]))
-                if n.dot(y_normal) >= min_cosine or y_normal.norm_sqr() == 0.0:
+                n = Rp @ ti.Vector([s[3], s[4], s[5]])
+                if n.dot(local_normal) >= min_cosine or y_normal.norm_sqr() == 0.0:
                     best = i
                     best_d = d
                     best_x = Rp @ on + tp

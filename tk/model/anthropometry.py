@@ -2,7 +2,7 @@
 
 The paper (section 6.3) takes its ratios from Dreyfuss, *The Measure of Man* (1959-67), and prints none of them. The
 book is not at hand either, so the table stands on two sources that give distances between joint centres as fractions of
-the stature: Drillis & Contini (1966; in Winter, *Biomechanics and Motor Control of Human Movement*, fig. 4.1) and de Leva
+the stature: Drillis & Contini (1966; in Winter, *Biomechanics and Motor Control of Human Movement*, fig. 4.1), de Leva
 (J. Biomech. 29, 1996, table 4: men and women averaged). They measure the shoulder, the hip and the neck at different
 points; where they disagree the value lies between them. The fit to the hull then moves each length within its scatter.
 """

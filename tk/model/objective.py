@@ -104,7 +104,7 @@ class BodyObjective:
         parts += [pick(rng, samples, scale * self.sampling.chain) for samples in self.chain_samples]
         return np.concatenate(parts)
 
-    def spread(self, scale: int = 3) -> Ints:
+    def spread(self, scale: int = 2) -> Ints:
         """(M,) surface samples evenly over the body, the same at every call."""
         parts = [even(self.torso_samples, scale * self.sampling.torso)]
         parts += [even(samples, scale * self.sampling.chain) for samples in self.chain_samples]
@@ -298,7 +298,7 @@ class FrameObjective:
         if key in self._fits:
             return self._fits[key]
         samples = self.objective.spread()
-        voxels = np.arange(0, self.voxel_count, max(self.voxel_count // 1000, 1), dtype=np.int32)
+        voxels = np.arange(0, self.voxel_count, max(self.voxel_count // 600, 1), dtype=np.int32)
         kernel, settings = self.objective.kernel, self.objective.settings
         value, _, _, held = kernel.evaluate(self.index, samples[None], voxels[None], pose[None], None, settings)
         linear = kernel.linearise(

@@ -115,7 +115,7 @@ class ScheduleConfig:
     retries: int = 1
     hypotheses: int = 4
     wide_hypotheses: int = 8
-    candidates: int = 32
+    candidates: int = 24
     spread_deg: float = 40.0
     gain: float = 0.08
     margin: float = 0.004
