@@ -225,7 +225,9 @@ def _frame(origin: Float, axis: Float, front: Float) -> Float:
     x = front - (front @ z) * z
     x = x / np.linalg.norm(x)
     T = np.eye(4)
-    T[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+    # written out: the fit builds bodies by the thousand, and np.cross takes longer than all the rest
+    y = (z[1] * x[2] - z[2] * x[1], z[2] * x[0] - z[0] * x[2], z[0] * x[1] - z[1] * x[0])
+    T[:3, 0], T[:3, 1], T[:3, 2] = x, y, z
     T[:3, 3] = origin
     return T
 
