@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tk.kernels.kinematics import forward, load_rotation, load_translation, load_vector3, point_velocity
+from tk.kernels.linearisation import Linearisation, metric_of
 from tk.kernels.nearest import SurfaceIndex, nearest_voxel
 from tk.kernels.runtime import ensure_runtime, ti
 from tk.kernels.superellipsoid import implicit, project
@@ -533,7 +534,7 @@ class ObjectiveKernel:
         settings: ObjectiveSettings,
         floor: float = 0.0,
         with_jacobian: bool = True,
-    ) -> "Linearisation":
+    ) -> Linearisation:
         """Residuals, their Jacobian and the Gauss-Newton Hessian at one pose.
 
         Args:
@@ -577,53 +578,9 @@ class ObjectiveKernel:
             residual=residual.astype(np.float64),
             jacobian=jacobian.transpose(0, 2, 1).astype(np.float64),
             hessian=lower + np.tril(lower, -1).T,
-            metric=_metric(index.normals[partner], np.repeat([settings.tangential, 1.0], [M, Q])),
+            metric=metric_of(index.normals[partner], np.repeat([settings.tangential, 1.0], [M, Q])),
             partner=partner,
             inv_sigma2=np.concatenate([weight[chosen], piece_weight[held.covering[0, :Q, 0].astype(np.int64)]]),
             nu=np.repeat([settings.nu, settings.coverage_nu], [M, Q]),
             scale=np.repeat([1.0 / max(M, 1), settings.coverage_weight / max(Q, 1)], [M, Q]),
         )
-
-
-@dataclass(frozen=True)
-class Linearisation:
-    """K = M + Q pairs at one pose.
-
-    Attributes:
-        residual: (K, 3) x − x̄, metres; zero where a pair is missing.
-        jacobian: (K, 3, D) ∂x/∂p; (1, 3, D) zeros where it was not asked for.
-        hessian: (D, D) Gauss-Newton Hessian of f, outliers weighing at least the floor asked for.
-        metric: (K, 3, 3) how directions count: the identity, or less along the data's surface.
-        partner: (K,) the voxel, -1 where missing.
-        inv_sigma2: (K,) 1/σ², 1/m².
-        nu: (K,) Leclerc's ν; scale: (K,) the pair's share of f.
-    """
-
-    residual: np.ndarray
-    jacobian: np.ndarray
-    hessian: np.ndarray
-    metric: np.ndarray
-    partner: np.ndarray
-    inv_sigma2: np.ndarray
-    nu: np.ndarray
-    scale: np.ndarray
-
-    @property
-    def decay(self) -> np.ndarray:
-        """(K,) exp(−e/ν): near 1 for inliers, 0 for outliers and missing pairs."""
-        e = 0.5 * np.einsum("ka,kab,kb->k", self.residual, self.metric, self.residual) * self.inv_sigma2
-        return np.where(self.partner >= 0, np.exp(-e / self.nu), 0.0)
-
-    def gauss_newton(self, floor: float = 0.0) -> np.ndarray:
-        """(D, D) the Gauss-Newton Hessian of f, outliers weighing at least ``floor``."""
-        weight = self.scale / self.nu * self.inv_sigma2 * np.maximum(self.decay, floor) * (self.partner >= 0)
-        weighted = np.einsum("k,kab,kbd->kad", weight, self.metric, self.jacobian)
-        D = self.jacobian.shape[2]
-        return self.jacobian.reshape(-1, D).T @ weighted.reshape(-1, D)
-
-
-def _metric(normals: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """(K, 3, 3) share·I + (1 − share)·n nᵀ; the identity where the normal is zero."""
-    n = normals.astype(np.float64)
-    share = np.where(n.any(axis=1), share, 1.0)[:, None, None]
-    return share * np.eye(3) + (1 - share) * n[:, :, None] * n[:, None, :]

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
+from tk.kernels.linearisation import Linearisation
 from tk.kernels.nearest import SurfaceIndex
-from tk.kernels.objective import Held, Linearisation, ObjectiveKernel, ObjectiveSettings
+from tk.kernels.objective import Held, ObjectiveKernel, ObjectiveSettings
 from tk.model.body import Body
 from tk.model.skeleton import CHAINS, SEGMENTS
 
