@@ -30,7 +30,8 @@ FOOT_LENGTH = 0.150
 CROTCH_DROP = 0.070  # lowest point of the trunk below the hip centres, in trousers
 
 # The trunk's surface lies forward of the line from the hip centres to C7/T1, which runs nearer to the back: how far the
-# middle of the chest and of the pelvis lies ahead of that line. Estimates: neither source gives them.
+# middle of the chest and of the pelvis lies ahead of that line. Estimates: neither source gives them; chosen with the
+# joints of the rendered development captures in view.
 CHEST_FORWARD = 0.014
 PELVIS_FORWARD = 0.008
 
