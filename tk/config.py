@@ -15,8 +15,10 @@ from typing import Any, TypeVar
 import tomli_w
 
 from tk.errors import ConfigError
+from tk.kernels.edges import EdgeConfig
 from tk.kernels.objective import ObjectiveSettings
 from tk.model.appearance import AppearanceConfig
+from tk.model.contour_term import ContourConfig
 from tk.model.fitting import FitConfig
 from tk.model.foreground import ForegroundConfig
 from tk.model.objective import SamplingConfig
@@ -83,6 +85,8 @@ class Config:
     appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
     objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    contours: ContourConfig = field(default_factory=ContourConfig)
+    edges: EdgeConfig = field(default_factory=EdgeConfig)
     smd: SmdConfig = field(default_factory=SmdConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     fit: FitConfig = field(default_factory=FitConfig)

@@ -25,6 +25,7 @@ from tk.model.anthropometry import BodyDimensions
 from tk.model.appearance import Appearance
 from tk.model.body import Body, build_body
 from tk.model.camera import Rig
+from tk.model.contour_term import ContourTerm, Pictures
 from tk.model.fitting import fit_body
 from tk.model.hull import HullSurface, VisualHull
 from tk.model.objective import CHAIN_OF_SEGMENT, BodyObjective, Fit, FrameObjective
@@ -73,6 +74,7 @@ class VolumetricTracker:
     def __init__(self, rig: Rig, volume: Volume, up: str, config: Config, cache_dir: Path | None = None) -> None:
         self.config = config
         self.up = up
+        self.rig = rig
         self.hull = VisualHull(rig, VoxelGrid.cover(volume, config.voxels), cache_dir)
         skeleton = build_skeleton(BodyDimensions.from_stature(1.7), up)
         self.pose_names = skeleton.names
@@ -129,16 +131,19 @@ class VolumetricTracker:
             anchor,
             self.config.fit,
         )
-        self._take_body(initialisation.at_rest(dimensions) if init is None else dimensions)
+        self._take_body(dimensions)
         self._pose = self._previous = poses[0]
-        fit = FrameObjective(self._objective, indices[0], np.random.default_rng(0)).fit(poses[0])
+        pictures = Pictures(frames[0].images, frames[0].masks)
+        fit = FrameObjective(self._objective, indices[0], np.random.default_rng(0), pictures=pictures).fit(poses[0])
         self._usual, self._usual_astray = fit.value, fit.astray_share
         self._learn_colours(surfaces[0], indices[0], poses[0])
         self.hull.reset()
 
     def _take_body(self, dimensions: BodyDimensions) -> None:
         self._body = build_body(dimensions, self.up)
-        self._objective = BodyObjective(self._body, self.config.objective, self.config.sampling)
+        cues = self.config.contours
+        contours = ContourTerm(self._body, self.rig, cues, self.config.edges) if cues.enabled else None
+        self._objective = BodyObjective(self._body, self.config.objective, self.config.sampling, contours)
 
     def _learn_colours(self, surface: HullSurface, index: SurfaceIndex, pose: Float) -> None:
         """Each patch takes the colours of the voxels under its samples."""
@@ -163,7 +168,9 @@ class VolumetricTracker:
         watch.lap("colour")
         # a generator of its own for every frame: a resumed run draws what an unbroken one would have drawn
         rng = np.random.default_rng([config.seed, frame.index])
-        problem = FrameObjective(self._objective, index, rng, config.schedule.outliers)
+        problem = FrameObjective(
+            self._objective, index, rng, config.schedule.outliers, pictures=Pictures(frame.images, frame.masks)
+        )
         result = schedule.optimise(
             problem,
             self._starts(surface),

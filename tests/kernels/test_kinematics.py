@@ -32,7 +32,7 @@ def points_of(rng, count):
 
 def place(local, segment, poses):
     s = SKELETON
-    return kinematics.place(s.axis, s.point, s.prismatic, s.parent, local, s.segment_dof[segment], poses)
+    return kinematics.place(s.axis, s.anchor, s.prismatic, s.parent, local, s.segment_dof[segment], poses)
 
 
 def place_oracle(local, segment, poses):
@@ -135,7 +135,7 @@ def test_velocity_of_a_point_is_the_derivative_of_its_place(seed):
     velocities = np.empty((len(local), D, 3))
     _velocities(
         s.axis,
-        s.point,
+        s.anchor,
         s.prismatic.astype(np.int32),
         s.parent,
         pose[None],

@@ -33,7 +33,7 @@ EXACT = 1e-11
 def kernel_of(dtype=np.float64):
     return ObjectiveKernel(
         axis=SKELETON.axis,
-        point=SKELETON.point,
+        point=SKELETON.anchor,
         prismatic=SKELETON.prismatic,
         parent=SKELETON.parent,
         local=BODY.points,
@@ -79,7 +79,7 @@ class Scene:
 
 def placed(local, last_dof, pose):
     s = SKELETON
-    return kinematics.place(s.axis, s.point, s.prismatic, s.parent, local, last_dof, pose[None])[0]
+    return kinematics.place(s.axis, s.anchor, s.prismatic, s.parent, local, last_dof, pose[None])[0]
 
 
 def pairs_oracle(scene, b, held, settings):

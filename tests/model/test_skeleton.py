@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from tk.errors import ConfigError
-from tk.model.anthropometry import BodyDimensions
+from tk.model.anthropometry import RAISED_SHOULDERS, TRUNK_LENGTH, BodyDimensions
 from tk.model.body import neutral_pose
 from tk.model.initialisation import shoulder_angles
 from tk.model.skeleton import CHAINS, DEGREES_OF_FREEDOM, JOINTS, SEGMENTS, build_skeleton, twist_exp, up_rotation
@@ -144,12 +144,39 @@ def test_lengths_do_not_depend_on_the_pose(seed):
     pelvis = (j["hip_l"] + j["hip_r"]) / 2
     np.testing.assert_allclose(j["pelvis"], pelvis, atol=EXACT)
     lengths = {("pelvis", "neck"): d.trunk, ("neck", "head_top"): d.head, ("hip_l", "hip_r"): 2 * d.hip_half_width}
-    lengths["shoulder_l", "shoulder_r"] = 2 * d.shoulder_half_width
     for s in "lr":
         lengths |= {(f"shoulder_{s}", f"elbow_{s}"): d.upper_arm, (f"elbow_{s}", f"wrist_{s}"): d.forearm}
         lengths |= {(f"hip_{s}", f"knee_{s}"): d.thigh, (f"knee_{s}", f"ankle_{s}"): d.calf}
     for (a, b), length in lengths.items():
         assert np.linalg.norm(j[a] - j[b]) == pytest.approx(length, abs=1e-12), (a, b)
+
+
+def test_shoulders_rise_with_the_arms():
+    """By the same amount from hanging to level as from level to upright; sideways or forward makes no difference."""
+    heights = {}
+    for name, direction in (("hanging", -UP), ("forward", FORWARD), ("sideways", LEFT), ("upright", UP)):
+        pose = np.zeros(D)
+        local = np.array([direction @ FORWARD, direction @ LEFT, direction @ UP])
+        pose[SKELETON.index("shoulder_l_yaw")], pose[SKELETON.index("shoulder_l_pitch")] = shoulder_angles(local)
+        heights[name] = joints(pose)["shoulder_l"] @ UP
+    lift = RAISED_SHOULDERS * DIMENSIONS.trunk / TRUNK_LENGTH
+    level = DIMENSIONS.trunk - DIMENSIONS.shoulder_drop
+    np.testing.assert_allclose(list(heights.values()), [level - lift, level, level, level + lift], atol=1e-12)
+
+
+@given(seeds)
+@many
+def test_twists_are_derivatives(seed):
+    pose = random_pose(seed)
+    x = SKELETON.joints(pose)
+    w, v = SKELETON.twists(pose)
+    h = 1e-6
+    for k in range(D):
+        step = h * np.eye(D)[k]
+        numeric = (SKELETON.joints(pose + step) - SKELETON.joints(pose - step)) / (2 * h)
+        moves = SKELETON.ancestors()[SKELETON.joint_segment, k]
+        np.testing.assert_allclose((np.cross(w[k], x) + v[k])[moves], numeric[moves], atol=1e-8)
+        np.testing.assert_array_equal(numeric[~moves], 0)
 
 
 # Anatomy: which way is positive

@@ -43,7 +43,11 @@ from tk.kernels.superellipsoid import power
 # Strips that one parallel task handles, each task with its own forward kinematics (some microseconds).
 STRIPS_PER_TASK = 10
 
-FOUND, VISIBLE = 1, 2  # bits of a point's flags
+FOUND, VISIBLE, OUTER = 1, 2, 4  # bits of a point's flags
+# How far beyond a contour point nothing of the body may be seen, before or behind, for it to lie on the outline.
+OUTER_MARGIN_M = 0.02
+# A ray is followed this far behind the point.
+BEHIND_M = 4.0
 
 
 @ti.func
@@ -146,7 +150,7 @@ def _contour_kernel(real):
         frames: ti.types.ndarray(dtype=real, ndim=3),  # (T, D, 12) scratch
         twists: ti.types.ndarray(dtype=real, ndim=3),  # (T, D, 6) scratch
         placed: ti.types.ndarray(dtype=real, ndim=3),  # (T, P, 19) scratch
-        geometry: ti.types.ndarray(dtype=real, ndim=3),  # (B C K, 2, 7) out: zero configuration 3, pixel 2, normal 2
+        geometry: ti.types.ndarray(dtype=real, ndim=3),  # (B C K, 2, 8) out: zero configuration 3, pixel 2, normal 2, scale
         flags: ti.types.ndarray(dtype=ti.u8, ndim=2),  # (B C K, 2) out
     ):
         for c in range(frames.shape[0]):
@@ -176,6 +180,10 @@ def _contour_kernel(real):
                             flag = FOUND
                             if is_occluded(placed, c, pieces, i, x, center) == 0:
                                 flag = FOUND | VISIBLE
+                                beyond = x + OUTER_MARGIN_M * n
+                                away = (beyond - center).normalized()
+                                if is_occluded(placed, c, pieces, i, beyond + BEHIND_M * away, center) == 0:
+                                    flag = FOUND | VISIBLE | OUTER
                             normal = image_normal(J, n)
                             x_zero = to_zero_configuration(pieces, i, q)
                             for a in ti.static(range(3)):
@@ -183,8 +191,9 @@ def _contour_kernel(real):
                             for a in ti.static(range(2)):
                                 geometry[row, slot, 3 + a] = pixel[a]
                                 geometry[row, slot, 5 + a] = normal[a]
+                            geometry[row, slot, 7] = ti.sqrt(0.5 * J.norm_sqr())
                     if flag == 0:
-                        for a in range(7):
+                        for a in range(8):
                             geometry[row, slot, a] = 0.0
                     flags[row, slot] = ti.cast(flag, ti.u8)
 
@@ -201,8 +210,11 @@ class ContourPoints:
         points_zero: (B, C, K, 2, 3) the points in the zero configuration, metres: they move with p as material points.
         pixels: (B, C, K, 2, 2) their images (x, y), lens distortion included; they may lie outside the picture.
         normals: (B, C, K, 2, 2) unit normals of the contour in the image, outward.
+        scale: (B, C, K, 2) pixels a metre there.
         found: (B, C, K, 2) uint8, 1 where the strip crosses the rim in front of the camera.
         visible: (B, C, K, 2) uint8, 1 where found and not hidden by another piece.
+        outer: (B, C, K, 2) uint8, 1 where visible and on the outline of the whole body: just beyond, no other piece is
+            seen.
     """
 
     strip: np.ndarray
@@ -211,8 +223,10 @@ class ContourPoints:
     points_zero: np.ndarray
     pixels: np.ndarray
     normals: np.ndarray
+    scale: np.ndarray
     found: np.ndarray
     visible: np.ndarray
+    outer: np.ndarray
 
     @property
     def occluded(self) -> np.ndarray:
@@ -298,7 +312,7 @@ class ContourKernel:
         C = len(self._cameras)
         if K and (chosen.min() < 0 or chosen.max() >= len(self._strips)):
             raise IndexError(f"strips {chosen.min()} to {chosen.max()}: there are 0 to {len(self._strips) - 1}")
-        geometry = np.empty((B * C * K, 2, 7), self.dtype)
+        geometry = np.empty((B * C * K, 2, 8), self.dtype)
         flags = np.empty((B * C * K, 2), np.uint8)
         if B * C * K:
             self._kernel(
@@ -313,7 +327,7 @@ class ContourKernel:
                 geometry,
                 flags,
             )
-        geometry = geometry.reshape(B, C, K, 2, 7)
+        geometry = geometry.reshape(B, C, K, 2, 8)
         flags = flags.reshape(B, C, K, 2)
         return ContourPoints(
             strip=chosen,
@@ -321,7 +335,9 @@ class ContourKernel:
             paired=self._strip_paired[chosen],
             points_zero=geometry[..., :3],
             pixels=geometry[..., 3:5],
-            normals=geometry[..., 5:],
+            normals=geometry[..., 5:7],
+            scale=geometry[..., 7],
             found=flags & FOUND,
-            visible=flags >> 1,
+            visible=flags >> 1 & 1,
+            outer=flags >> 2,
         )

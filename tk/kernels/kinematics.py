@@ -1,7 +1,12 @@
 """Forward kinematics of a tree of twists, as Taichi functions for the kernels that need it.
 
 Layout: ``frames (C, D, 12)`` holds the 3×4 transform after each degree of freedom, row by row; ``twists (C, D, 6)`` its
-world axis and a world point on it. C are scratch rows, one a parallel task, so that no task waits for another.
+world twist (ω, v): a point x below it moves at ω × x + v. C are scratch rows, one a parallel task, so that no task waits
+for another.
+
+The shoulder girdle has no degree of freedom of its own, but the shoulder rises as the arm does. So the first degree of
+freedom of a shoulder may carry a translation ``rise · u`` before its rotation, with u the sine of the arm's elevation
+over the horizontal in the trunk's frame, which its own angle and the next one make (:data:`ARM_UP`).
 """
 
 import functools
@@ -9,6 +14,13 @@ import functools
 import numpy as np
 
 from tk.kernels.runtime import ensure_runtime, ti
+
+
+# The arm's elevation u from a shoulder's first two angles, the arm being level in the zero configuration:
+# u = ARM_UP[0] cos(second) sin(first) + ARM_UP[1] sin(second).
+ARM_UP = (-np.sqrt(2 / 3), np.sqrt(1 / 3))
+# Columns of ``point``: the point, and the rise where there is one.
+RISE = 3
 
 
 @ti.func
@@ -44,9 +56,14 @@ def rodrigues(w, angle):
 
 
 @ti.func
+def _rises(point: ti.template(), k: int):
+    return point[k, RISE] != 0.0 or point[k, RISE + 1] != 0.0 or point[k, RISE + 2] != 0.0
+
+
+@ti.func
 def forward(
     axis: ti.template(),  # (D, 3)
-    point: ti.template(),  # (D, 3)
+    point: ti.template(),  # (D, 3), or (D, 6) with the rise
     prismatic: ti.template(),  # (D,) 0 or 1
     parent: ti.template(),  # (D,)
     pose: ti.template(),  # (B, D)
@@ -67,28 +84,45 @@ def forward(
             t = load_translation(frames, c, parent[k])
         w_world = R @ w
         q_world = R @ q + t
+        rate = q_world * zero
+        if point.shape[1] > 3:
+            first, second = k, k + 1
+            above = R
+            if parent[k] >= 0 and _rises(point, parent[k]):
+                first, second = parent[k], k
+                above = load_rotation(frames, c, parent[first])
+            if _rises(point, first):
+                rise = above @ ti.Vector([point[first, RISE + i] for i in ti.static(range(3))])
+                # of the pose's precision, which a literal need not have
+                a, d = -ti.sqrt((zero + 2.0) / 3.0), ti.sqrt((zero + 1.0) / 3.0)
+                s1, c1 = ti.sin(pose[b, first]), ti.cos(pose[b, first])
+                s2, c2 = ti.sin(pose[b, second]), ti.cos(pose[b, second])
+                if first == k:
+                    q_world += (a * c2 * s1 + d * s2) * rise
+                    rate = a * c2 * c1 * rise
+                else:
+                    rate = (d * c2 - a * s2 * s1) * rise
+        v_world = w_world
         if prismatic[k] == 1:
             t += w_world * pose[b, k]
+            w_world = w_world * 0.0
         else:
             R = R @ rodrigues(w, pose[b, k])
             t = q_world - R @ q
+            v_world = q_world.cross(w_world) + rate
         for i in ti.static(range(3)):
             for j in ti.static(range(3)):
                 frames[c, k, 4 * i + j] = R[i, j]
             frames[c, k, 4 * i + 3] = t[i]
             twists[c, k, i] = w_world[i]
-            twists[c, k, 3 + i] = q_world[i]
+            twists[c, k, 3 + i] = v_world[i]
 
 
 @ti.func
 def point_velocity(prismatic: ti.template(), twists: ti.template(), c: int, k: int, x):
     """∂x/∂p_k of a point x below degree of freedom k (silhouette paper, eq. 6)."""
     w = ti.Vector([twists[c, k, 0], twists[c, k, 1], twists[c, k, 2]])
-    q = ti.Vector([twists[c, k, 3], twists[c, k, 4], twists[c, k, 5]])
-    result = w
-    if prismatic[k] == 0:
-        result = w.cross(x - q)
-    return result
+    return w.cross(x) + ti.Vector([twists[c, k, 3], twists[c, k, 4], twists[c, k, 5]])
 
 
 @functools.cache
@@ -129,7 +163,7 @@ def place(
     """Points of the zero configuration carried to B poses.
 
     Args:
-        axis, point: (D, 3) twists in the zero configuration; prismatic, parent: (D,).
+        axis: (D, 3), point: (D, 3) or (D, 6), twists in the zero configuration; prismatic, parent: (D,).
         local: (N, 3) points, metres; last_dof: (N,) the last degree of freedom above each.
         pose: (B, D), float32 or float64: the precision of the computation.
 

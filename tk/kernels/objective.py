@@ -1,12 +1,14 @@
 """The objective f(p), its gradient and Gauss-Newton products, batched over poses: one launch an evaluation.
 
-Two terms share one form, ρ(e) = 1 − exp(−e / ν) with e = ½ (‖x − x̄‖ / σ)² (Kehl 2006, eqs. 8-10):
+Three terms share one form, ρ(e) = 1 − exp(−e / ν) with e = ½ (‖x − x̄‖ / σ)² (Kehl 2006, eqs. 8-10):
 
 surface
     model to data: a surface sample x and its nearest surface voxel x̄, which fits x's colour patch (6.1.1, 6.1.3).
 coverage
     data to model: a surface voxel x̄ and the nearest point x of the nearest superellipsoid that has the voxel's colour
     on it. Not in the paper: it keeps a limb from hiding inside the trunk, where every sample of it still finds a voxel.
+alignment
+    model contour to picture: entries made beforehand, see :mod:`tk.kernels.alignment` (6.1.2).
 
 An arm's sample deep inside the trunk finds no voxel: upper arms used to fold into the trunk, whose surface fits them.
 
@@ -19,9 +21,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tk.kernels.alignment import ENTRY_NUMBERS, add_alignment, add_curvature
 from tk.kernels.kinematics import forward, load_rotation, load_translation, load_vector3, point_velocity
 from tk.kernels.linearisation import Linearisation, metric_of
 from tk.kernels.nearest import SurfaceIndex, nearest_voxel
+from tk.kernels.projection import CAMERA_NUMBERS
 from tk.kernels.runtime import ensure_runtime, ti
 from tk.kernels.superellipsoid import implicit, project
 
@@ -218,6 +222,9 @@ def _objective_kernel(real):
         twists: ti.types.ndarray(dtype=real, ndim=3),  # (C, D, 6) scratch
         assigned: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, M) out, in when hold = 1
         covering: ti.types.ndarray(dtype=real, ndim=3),  # (B, Q, 4) piece and projection, out, in when hold = 1
+        E: ti.i32,
+        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
+        entries: ti.types.ndarray(dtype=real, ndim=3),  # (B, E, 17) of the alignment term
         sums: ti.types.ndarray(dtype=real, ndim=2),  # (C, 1 + 2 D) out
     ):
         for c in range(sums.shape[0]):
@@ -227,7 +234,10 @@ def _objective_kernel(real):
                 sums[c, s] = 0.0
             forward(axis, point, prismatic, parent, pose, b, c, frames, twists)
             first = (c % tasks) * POINTS_PER_TASK
-            for m in range(first, ti.min(first + POINTS_PER_TASK, M + Q)):
+            last = ti.min(first + POINTS_PER_TASK, M + Q + E)
+            for e in range(ti.max(first - M - Q, 0), last - M - Q):
+                add_alignment(prismatic, parent, frames, twists, direction, cameras, entries, sums, b, c, e)
+            for m in range(first, ti.min(last, M + Q)):
                 v = -1
                 k = 0
                 x0 = ti.Vector([settings[0] * 0.0, settings[0] * 0.0, settings[0] * 0.0])
@@ -303,6 +313,9 @@ def _linearise_kernel(real):
         twists: ti.types.ndarray(dtype=real, ndim=3),  # (C, D, 6) scratch
         assigned: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M,)
         covering: ti.types.ndarray(dtype=real, ndim=2),  # (Q, 4)
+        E: ti.i32,
+        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
+        entries: ti.types.ndarray(dtype=real, ndim=3),  # (1, E, 17)
         residual: ti.types.ndarray(dtype=real, ndim=2),  # (M + Q, 3) out, metres
         partner: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M + Q,) out, the voxel or -1
         jacobian: ti.types.ndarray(dtype=real, ndim=3),  # (M + Q, D, 3) out if wanted, zeroed by the caller
@@ -310,7 +323,10 @@ def _linearise_kernel(real):
     ):
         for c in range(hessian.shape[0]):
             forward(axis, point, prismatic, parent, pose, 0, c, frames, twists)
-            for m in range(c * PAIRS_PER_TASK, ti.min((c + 1) * PAIRS_PER_TASK, M + Q)):
+            last = ti.min((c + 1) * PAIRS_PER_TASK, M + Q + E)
+            for e in range(ti.max(c * PAIRS_PER_TASK - M - Q, 0), last - M - Q):
+                add_curvature(prismatic, parent, frames, twists, cameras, entries, hessian, c, e, floor)
+            for m in range(c * PAIRS_PER_TASK, ti.min(last, M + Q)):
                 k_last = 0
                 v = -1
                 x0 = ti.Vector([pose[0, 0] * 0.0, pose[0, 0] * 0.0, pose[0, 0] * 0.0])
@@ -405,6 +421,7 @@ class ObjectiveKernel:
             covered by the piece. All patches by default.
         outside: (N,) True for samples that may not lie inside the first ``solid`` pieces: there they find no voxel.
         solid: how many of the first pieces are.
+        cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_camera`, for the alignment term.
         dtype: np.float32, or np.float64 for checks of derivatives.
     """
 
@@ -427,6 +444,7 @@ class ObjectiveKernel:
         piece_patches: np.ndarray | None = None,
         outside: np.ndarray | None = None,
         solid: int = 0,
+        cameras: np.ndarray | None = None,
         dtype: type = np.float32,
     ) -> None:
         ensure_runtime()
@@ -451,6 +469,8 @@ class ObjectiveKernel:
         self._pieces = real(np.column_stack([np.reshape(piece_frame, (-1, 12)), piece_shape, piece_dof, piece_weight]))
         every = np.full(len(piece_dof), -1, np.int64)
         self._patches = every if piece_patches is None else np.ascontiguousarray(piece_patches, np.int64)
+        self._cameras = real(np.zeros((1, CAMERA_NUMBERS)) if cameras is None else cameras)
+        self._no_entries: np.ndarray = np.zeros((1, 1, ENTRY_NUMBERS), dtype)
         self._scratch: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def _scratch_of(self, rows: int) -> tuple[np.ndarray, np.ndarray]:
@@ -458,6 +478,9 @@ class ObjectiveKernel:
             D = self.degrees
             self._scratch[rows] = np.empty((rows, D, 12), self.dtype), np.empty((rows, D, 6), self.dtype)
         return self._scratch[rows]
+
+    def _entries(self, entries: np.ndarray | None) -> np.ndarray:
+        return self._no_entries if entries is None or not entries.shape[1] else np.ascontiguousarray(entries, self.dtype)
 
     def _packed(self, s: ObjectiveSettings, M: int, Q: int) -> np.ndarray:
         """The settings in the order in which the kernels read them."""
@@ -473,6 +496,7 @@ class ObjectiveKernel:
         direction: np.ndarray | None,
         settings: ObjectiveSettings,
         held: Held | None = None,
+        entries: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Held]:
         """Value, gradient and Hessian-vector product at B poses.
 
@@ -484,14 +508,16 @@ class ObjectiveKernel:
             direction: (B, D) the v of H·v; None for zeros.
             settings: constants.
             held: assignments to keep instead of searching anew.
+            entries: (B, E, 17) of the alignment term (:mod:`tk.kernels.alignment`), if any.
 
         Returns:
-            f (B,): mean ρ over the samples plus ``coverage_weight`` times mean ρ over the voxels; its gradient (B, D);
-            H·v (B, D); the assignments made.
+            f (B,): mean ρ over the samples plus ``coverage_weight`` times mean ρ over the voxels, plus the entries'
+            shares; its gradient (B, D); H·v (B, D); the assignments made.
         """
+        E = 0 if entries is None else entries.shape[1]
         B, D = pose.shape
         M, Q = chosen.shape[1], voxels.shape[1] if settings.coverage_weight > 0 else 0
-        tasks = -(-(M + Q) // POINTS_PER_TASK)
+        tasks = -(-(M + Q + E) // POINTS_PER_TASK)
         sums = np.empty((B * tasks, 1 + 2 * D), self.dtype)
         if held is None:
             found = Held(np.empty((B, M), np.int32), np.empty((B, max(Q, 1), 4), self.dtype))
@@ -517,6 +543,9 @@ class ObjectiveKernel:
             *self._scratch_of(B * tasks),
             found.assigned,
             found.covering,
+            E,
+            self._cameras,
+            self._entries(entries),
             sums,
         )
         self.launches += 1
@@ -534,6 +563,7 @@ class ObjectiveKernel:
         settings: ObjectiveSettings,
         floor: float = 0.0,
         with_jacobian: bool = True,
+        entries: np.ndarray | None = None,
     ) -> Linearisation:
         """Residuals, their Jacobian and the Gauss-Newton Hessian at one pose.
 
@@ -543,9 +573,11 @@ class ObjectiveKernel:
             held: assignments of :meth:`evaluate` at this pose, with B = 1.
             floor: least weight of an outlier in the Hessian.
             with_jacobian: False leaves the Jacobian out; the Hessian is summed in the kernel either way.
+            entries: (1, E, 17) of the alignment term: they count in the Hessian, and are no pairs.
         """
+        E = 0 if entries is None else entries.shape[1]
         M, Q = len(chosen), len(voxels) if settings.coverage_weight > 0 else 0
-        tasks = max(-(-(M + Q) // PAIRS_PER_TASK), 1)
+        tasks = max(-(-(M + Q + E) // PAIRS_PER_TASK), 1)
         D = self.degrees
         residual: np.ndarray = np.zeros((M + Q, 3), self.dtype)
         jacobian: np.ndarray = np.zeros((M + Q if with_jacobian else 1, D, 3), self.dtype)
@@ -566,6 +598,9 @@ class ObjectiveKernel:
             *self._scratch_of(tasks),
             np.ascontiguousarray(held.assigned[0], np.int32),
             np.ascontiguousarray(held.covering[0], self.dtype),
+            E,
+            self._cameras,
+            self._entries(entries),
             residual,
             partner,
             jacobian,

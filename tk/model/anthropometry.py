@@ -17,7 +17,7 @@ from tk.errors import ConfigError
 PELVIS_HEIGHT = 0.525  # floor to the hip centres
 TRUNK_LENGTH = 0.328  # hip centres to C7/T1
 HEAD_LENGTH = 0.142  # C7/T1 to the crown
-SHOULDER_DROP = 0.044  # shoulder centres below C7/T1
+SHOULDER_DROP = 0.044  # shoulder centres below C7/T1, the arms level
 SHOULDER_HALF_WIDTH = 0.106  # glenohumeral centre to the median plane
 HIP_HALF_WIDTH = 0.060  # hip centre to the median plane
 UPPER_ARM_LENGTH = 0.149
@@ -25,15 +25,23 @@ FOREARM_LENGTH = 0.149
 HAND_LENGTH = 0.108  # wrist to the tip of the middle finger
 THIGH_LENGTH = 0.245
 CALF_LENGTH = 0.246
-ANKLE_HEIGHT = 0.052  # ankle centre above the sole of a shoe; 0.039 barefoot
+ANKLE_HEIGHT = 0.049  # ankle centre above the sole of a shoe; 0.039 barefoot
 FOOT_LENGTH = 0.150
+# How far an arm raised from hanging to level lifts its shoulder: the collar bone points up by 5 to 10° more (Ludewig et
+# al., J. Bone Joint Surg. Am. 91, 2009, 378-389), which is 2 to 3 cm at its end. SHOULDER_DROP is that of level arms.
+RAISED_SHOULDERS = 0.016
 CROTCH_DROP = 0.070  # lowest point of the trunk below the hip centres, in trousers
 
 # The trunk's surface lies forward of the line from the hip centres to C7/T1, which runs nearer to the back: how far the
 # middle of the chest and of the pelvis lies ahead of that line. Estimates: neither source gives them; chosen with the
 # joints of the rendered development captures in view.
 CHEST_FORWARD = 0.014
-PELVIS_FORWARD = 0.008
+PELVIS_FORWARD = 0.016
+# The same for other parts, and with the same reservation: the spine meets the skull behind its middle; the calf's muscle
+# and the heel's tendon lie behind the line from knee to ankle; hair stands on the crown.
+SKULL_FORWARD = 0.007
+ANKLE_BACK = 0.010
+HAIR = 0.008
 
 # Half widths and girths as radii, fractions of the stature, over light clothes.
 CHEST_HALF_WIDTH = 0.098

@@ -14,7 +14,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.anthropometry import CHEST_FORWARD, CROTCH_DROP, HIP_HALF_WIDTH, PELVIS_FORWARD, BodyDimensions
+from tk.model.anthropometry import (
+    ANKLE_BACK,
+    CHEST_FORWARD,
+    CROTCH_DROP,
+    HAIR,
+    HIP_HALF_WIDTH,
+    PELVIS_FORWARD,
+    SKULL_FORWARD,
+    BodyDimensions,
+)
 from tk.model.skeleton import SEGMENTS, Skeleton, build_skeleton
 from tk.model.superellipsoid import Superellipsoid
 
@@ -119,7 +128,7 @@ def build_pieces(d: BodyDimensions, extremities: bool = True) -> tuple[Superelli
     # The trunk: two halves that meet at the waist; the lower reaches down to the crotch, the upper to the shoulders'
     # top.
     waist = 0.42 * d.trunk
-    top = d.trunk - 0.25 * d.shoulder_drop
+    top = d.trunk
     bottom = -CROTCH_DROP / HIP_HALF_WIDTH * d.hip_half_width
     trunk_width = d.chest_half_width + d.hips_half_width
     stature = d.stature
@@ -133,7 +142,7 @@ def build_pieces(d: BodyDimensions, extremities: bool = True) -> tuple[Superelli
     skull = 0.46 * d.head
     add(
         "head",
-        (d.trunk + d.head - skull) * z,
+        (d.trunk + d.head + HAIR * stature - skull) * z + SKULL_FORWARD * stature * x,
         z,
         (1.12 * d.head_radius, d.head_radius, skull),
         (1.0, 1.0),
@@ -179,7 +188,8 @@ def build_pieces(d: BodyDimensions, extremities: bool = True) -> tuple[Superelli
         # the thigh begins below the crotch: beside the hip joint the body is no wider than the trunk
         _limb(add, f"thigh_{side}", hip, -z, d.thigh, d.thigh_radius, d.knee_radius, x, begin=0.2)
         _cap(add, f"thigh_{side}", hip, z, 0.65 * d.thigh_radius, x)
-        _limb(add, f"calf_{side}", knee, -z, d.calf, d.knee_radius, d.ankle_radius, x)
+        shin = -d.calf * z - ANKLE_BACK * stature * x
+        _limb(add, f"calf_{side}", knee, shin / np.linalg.norm(shin), d.calf, d.knee_radius, d.ankle_radius, x)
         if extremities:
             half = 0.5 * d.foot
             add(

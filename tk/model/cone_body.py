@@ -139,7 +139,7 @@ class ConeBody:
             curves += [(p, kind) for kind, tracked in zip((END_NEAR, END_FAR), part.ends, strict=True) if tracked]
         return ConeArrays(
             axis=np.ascontiguousarray(s.axis, dtype),
-            point=np.ascontiguousarray(s.point, dtype),
+            point=np.ascontiguousarray(s.anchor, dtype),
             prismatic=s.prismatic.astype(np.int32),
             parent=s.parent.astype(np.int32),
             part_kind=np.array([part.kind for part in self.parts], np.int32),

@@ -151,19 +151,13 @@ def fit_dimensions(
 def pose_rows(body: ConeBody, pose: Float, edgels: Edgels) -> Float:
     """(N, D) derivative of the contour's position along its normal by the pose, pixels."""
     s = body.skeleton
-    T = s.transforms(pose)
+    w, v = s.twists(pose)
     x = body.place(pose, edgels.part, edgels.unscaled)
     moved = body.pack(np.float64).chain[edgels.part]
     rows = np.zeros((len(x), len(s.names)))
     for k in range(len(s.names)):
         below = (moved == k).any(axis=1)
-        above = T[s.parent[k]] if s.parent[k] >= 0 else np.eye(4)
-        axis = above[:3, :3] @ s.axis[k]
-        if s.prismatic[k]:
-            rows[below, k] = edgels.row[below] @ axis
-        else:
-            q = above[:3, :3] @ s.point[k] + above[:3, 3]
-            rows[below, k] = np.einsum("na,na->n", edgels.row[below], np.cross(axis, x[below] - q))
+        rows[below, k] = np.einsum("na,na->n", edgels.row[below], np.cross(w[k], x[below]) + v[k])
     return rows
 
 

@@ -9,7 +9,7 @@ of the legs.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +38,6 @@ Float = NDArray[np.float64]
 
 # A person is between these two tall, standing on the feet (metres).
 LEAST_STATURE, GREATEST_STATURE = 0.8, 2.4
-
-
-# How far level arms lift the shoulders, as a share of the stature.
-RAISED_SHOULDERS = 0.016
 
 
 @dataclass(frozen=True)
@@ -217,16 +213,6 @@ def shoulder_angles(direction: Float) -> tuple[float, float]:
     third = np.cross(pole, arm)
     pitch = float(np.arcsin(np.clip(direction @ pole, -1, 1)))
     return float(np.arctan2(direction @ third, direction @ arm)), pitch
-
-
-def at_rest(dimensions: BodyDimensions) -> BodyDimensions:
-    """The dimensions with the shoulders where they are on average, and not where raised arms hold them.
-
-    With the arms level the collar bones point up by 5 to 10° more than with the arms down (Ludewig et al., J. Bone
-    Joint Surg. Am. 91, 2009, 378-389), which lifts the shoulders by some 2 to 3 cm. The trunk is rigid here, so they
-    are put half way.
-    """
-    return replace(dimensions, shoulder_drop=dimensions.shoulder_drop + RAISED_SHOULDERS / 2 * dimensions.stature)
 
 
 def certainty(skeleton: Skeleton) -> Float:

@@ -14,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
+from tk.kernels.alignment import NU
 from tk.kernels.linearisation import Linearisation
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective import Held, ObjectiveKernel, ObjectiveSettings
 from tk.model.body import Body
+from tk.model.contour_term import ContourTerm, Pictures
 from tk.model.skeleton import CHAINS, SEGMENTS
 
 Float = NDArray[np.float64]
@@ -61,15 +63,22 @@ class BodyObjective:
         body: the person.
         settings: constants of the objective.
         sampling: numbers of points.
+        contours: the contour cues, if any.
         dtype: precision of the kernel.
     """
 
     def __init__(
-        self, body: Body, settings: ObjectiveSettings, sampling: SamplingConfig, dtype: type = np.float32
+        self,
+        body: Body,
+        settings: ObjectiveSettings,
+        sampling: SamplingConfig,
+        contours: ContourTerm | None = None,
+        dtype: type = np.float32,
     ) -> None:
         self.body = body
         self.settings = settings
         self.sampling = sampling
+        self.contours = contours
         skeleton, pieces = body.skeleton, body.pieces
         T_world_body = np.eye(4)
         T_world_body[:3, :3] = skeleton.T_world_body
@@ -77,7 +86,7 @@ class BodyObjective:
         self.piece_segment = np.array([SEGMENTS.index(p.segment) for p in pieces])
         self.kernel = ObjectiveKernel(
             axis=skeleton.axis,
-            point=skeleton.point,
+            point=skeleton.anchor,
             prismatic=skeleton.prismatic,
             parent=skeleton.parent,
             local=body.points,
@@ -92,6 +101,7 @@ class BodyObjective:
             piece_patches=piece_patches(body),
             outside=np.array(["arm" in name for name in SEGMENTS])[body.segment],
             solid=sum(piece.segment == "torso" for piece in pieces),  # the torso's pieces come first
+            cameras=None if contours is None else contours.cameras,
             dtype=dtype,
         )
         chain = CHAIN_OF_SEGMENT[body.segment]
@@ -167,6 +177,7 @@ class Fit:
         value: the objective over evenly spread samples and voxels.
         linear: the linearisation at the pose (M + Q pairs); held: its assignments.
         samples: (M,) the samples used; voxels: (Q,) the voxels used.
+        entries: (1, E, 17) of the contour cues, if any.
     """
 
     value: float
@@ -174,6 +185,7 @@ class Fit:
     held: Held
     samples: Ints
     voxels: Ints
+    entries: NDArray[np.floating] | None = None
 
     @property
     def stranded(self) -> NDArray[np.bool_]:
@@ -206,6 +218,7 @@ class FrameObjective:
         rng: where samples are drawn from.
         outliers: least weight of a pair in the Hessian.
         with_jacobian: whether :meth:`fit` keeps the pairs' Jacobian.
+        pictures: what the contour cues look at; without it, or without those cues, the hull alone counts.
     """
 
     def __init__(
@@ -215,12 +228,15 @@ class FrameObjective:
         rng: np.random.Generator,
         outliers: float = 0.1,
         with_jacobian: bool = False,
+        pictures: Pictures | None = None,
     ) -> None:
         self.objective = objective
         self.index = index
         self.rng = rng
         self.outliers = outliers
         self.with_jacobian = with_jacobian
+        self.contours = None if pictures is None else objective.contours
+        self.pictures = pictures
         self.voxel_count = len(index.positions)
         self.free = objective.chain_free
         self.angular = ~objective.body.skeleton.prismatic
@@ -239,12 +255,13 @@ class FrameObjective:
         """All degrees of freedom: new samples for every iteration number, the same in all rows."""
         draws = _Draws(self._draw_full)
         settings = self._softened(softness)
+        renewed = self._renewing(lambda B: np.repeat(self._term.draw(self.rng)[None], B, 0), softness)
 
         def evaluate(poses: Float, directions: Float, iteration: int) -> Evaluation:
             samples, voxels = draws(iteration)
             B = len(poses)
             rows = np.repeat(samples[None], B, 0), np.repeat(voxels[None], B, 0)
-            return self._evaluate(*rows, poses, directions, settings)
+            return self._evaluate(*rows, poses, directions, settings, renewed(poses, iteration))
 
         return evaluate
 
@@ -263,9 +280,10 @@ class FrameObjective:
             return np.stack(samples)[owner], np.stack(voxels)[owner]
 
         draws = _Draws(draw)
+        renewed = self._renewing(lambda _: self._term.draw_chains(self.rng)[owner], softness)
 
         def evaluate(poses: Float, directions: Float, iteration: int) -> Evaluation:
-            return self._evaluate(*draws(iteration), poses, directions, settings)
+            return self._evaluate(*draws(iteration), poses, directions, settings, renewed(poses, iteration))
 
         return evaluate
 
@@ -276,8 +294,9 @@ class FrameObjective:
         """
         samples = np.stack([even(s, 60) if len(s) >= 60 else np.resize(s, 60) for s in self.objective.chain_samples])
         voxels = even(np.arange(self.voxel_count, dtype=np.int32), 400)
+        entries = self._entries(poses, self._term.draw_chains(None)[owner]) if self.contours else None
         return self._evaluate(
-            samples[owner], np.repeat(voxels[None], len(owner), 0), poses, None, self.objective.settings
+            samples[owner], np.repeat(voxels[None], len(owner), 0), poses, None, self.objective.settings, entries
         ).value
 
     def value(self, pose: Float) -> float:
@@ -289,8 +308,20 @@ class FrameObjective:
         fit = self.fit(pose)
         settings = self._softened(softness)
         kernel = self.objective.kernel
+        entries = fit.entries
+        if entries is not None and softness != 1:
+            entries = entries.copy()
+            entries[:, :, NU] *= softness
         return kernel.linearise(
-            self.index, fit.samples, fit.voxels, pose, fit.held, settings, self.outliers, with_jacobian=False
+            self.index,
+            fit.samples,
+            fit.voxels,
+            pose,
+            fit.held,
+            settings,
+            self.outliers,
+            with_jacobian=False,
+            entries=entries,
         ).hessian
 
     def fit(self, pose: Float) -> Fit:
@@ -301,11 +332,22 @@ class FrameObjective:
         samples = self.objective.spread()
         voxels = np.arange(0, self.voxel_count, max(self.voxel_count // 600, 1), dtype=np.int32)
         kernel, settings = self.objective.kernel, self.objective.settings
-        value, _, _, held = kernel.evaluate(self.index, samples[None], voxels[None], pose[None], None, settings)
-        linear = kernel.linearise(
-            self.index, samples, voxels, pose, held, settings, self.outliers, with_jacobian=self.with_jacobian
+        entries = self._entries(pose[None], self._term.draw(None)[None]) if self.contours else None
+        value, _, _, held = kernel.evaluate(
+            self.index, samples[None], voxels[None], pose[None], None, settings, entries=entries
         )
-        self._fits[key] = Fit(float(value[0]), linear, held, samples, voxels)
+        linear = kernel.linearise(
+            self.index,
+            samples,
+            voxels,
+            pose,
+            held,
+            settings,
+            self.outliers,
+            with_jacobian=self.with_jacobian,
+            entries=entries,
+        )
+        self._fits[key] = Fit(float(value[0]), linear, held, samples, voxels, entries)
         return self._fits[key]
 
     def _chain_pools(self, fit: Fit) -> list[Ints]:
@@ -327,11 +369,41 @@ class FrameObjective:
         s = self.objective.settings
         return replace(s, nu=softness * s.nu, coverage_nu=softness * s.coverage_nu)
 
+    @property
+    def _term(self) -> ContourTerm:
+        assert self.contours is not None
+        return self.contours
+
+    def _entries(self, poses: Float, chosen: Ints, softness: float = 1.0) -> NDArray[np.floating]:
+        assert self.pictures is not None
+        return self._term.assign(self.pictures, poses, chosen, softness)
+
+    def _renewing(
+        self, draw: Callable[[int], Ints], softness: float
+    ) -> Callable[[Float, int], NDArray[np.floating] | None]:
+        """The contour cues' entries at an iteration: held for some iterations, then made anew at the poses as they are."""
+        last: dict[str, NDArray[np.floating]] = {}
+
+        def entries(poses: Float, iteration: int) -> NDArray[np.floating] | None:
+            if self.contours is None:
+                return None
+            if iteration % self._term.config.renew == 0 or "entries" not in last:
+                last["entries"] = self._entries(poses, draw(len(poses)), softness)
+            return last["entries"]
+
+        return entries
+
     def _evaluate(
-        self, samples: Ints, voxels: Ints, poses: Float, directions: Float | None, settings: ObjectiveSettings
+        self,
+        samples: Ints,
+        voxels: Ints,
+        poses: Float,
+        directions: Float | None,
+        settings: ObjectiveSettings,
+        entries: NDArray[np.floating] | None = None,
     ) -> Evaluation:
         value, gradient, product, _ = self.objective.kernel.evaluate(
-            self.index, samples, voxels, poses, directions, settings
+            self.index, samples, voxels, poses, directions, settings, entries=entries
         )
         return Evaluation(value, gradient, product)
 

@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
-from tk.model.anthropometry import BodyDimensions
+from tk.kernels.kinematics import ARM_UP
+from tk.model.anthropometry import RAISED_SHOULDERS, TRUNK_LENGTH, BodyDimensions
 
 Float = NDArray[np.float64]
 
@@ -108,6 +109,8 @@ class Skeleton:
         units: (D,) "m" or "rad".
         axis: (D, 3) unit axes in the zero configuration, world frame.
         point: (D, 3) a point on each axis, metres; unused for translations.
+        rise: (D, 3) how far a level arm that is raised upright lifts its shoulder, metres, in the first degree of freedom
+            of each shoulder; zero elsewhere. See :attr:`anchor`.
         prismatic: (D,) True for translations.
         parent: (D,) index of the degree of freedom before, -1 at the root.
         lower, upper: (D,) limits, radians; infinite where there is none.
@@ -121,6 +124,7 @@ class Skeleton:
     units: tuple[str, ...]
     axis: Float
     point: Float
+    rise: Float
     prismatic: NDArray[np.bool_]
     parent: NDArray[np.int32]
     lower: Float
@@ -140,15 +144,43 @@ class Skeleton:
 
     def transforms(self, pose: Float) -> Float:
         """(D, 4, 4) transforms T_k after each degree of freedom, float64. Kernels have their own."""
+        pose = np.asarray(pose, dtype=np.float64)
         result = np.empty((len(self.names), 4, 4))
-        for k, angle in enumerate(np.asarray(pose, dtype=np.float64)):
+        for k, angle in enumerate(pose):
             step = np.eye(4)
             if self.prismatic[k]:
                 step[:3, 3] = self.axis[k] * angle
             else:
                 step = twist_exp(self.axis[k], self.point[k], angle)
+                if self.rise[k].any():
+                    step[:3, 3] += self.rise[k] * arm_elevation(angle, pose[k + 1])
             result[k] = step if self.parent[k] < 0 else result[self.parent[k]] @ step
         return result
+
+    @property
+    def anchor(self) -> Float:
+        """(D, 6) point and rise, as the kernels take them (:func:`tk.kernels.kinematics.forward`)."""
+        return np.concatenate([self.point, self.rise], axis=1)
+
+    def twists(self, pose: Float) -> tuple[Float, Float]:
+        """World twists (ω, v), each (D, 3): a point x below degree of freedom k moves at ω_k × x + v_k (eqs. 6-8)."""
+        T = self.transforms(pose)
+        w, v = np.zeros((2, len(self.names), 3))
+        for k, parent in enumerate(self.parent):
+            above = T[parent] if parent >= 0 else np.eye(4)
+            axis = above[:3, :3] @ self.axis[k]
+            if self.prismatic[k]:
+                v[k] = axis
+                continue
+            w[k] = axis
+            # the joint's place, its rise included, does not move when it turns
+            q = T[k, :3, :3] @ self.point[k] + T[k, :3, 3]
+            v[k] = np.cross(q, axis)
+            first = parent if parent >= 0 and self.rise[parent].any() else k
+            if self.rise[first].any():
+                root = T[self.parent[first], :3, :3] if self.parent[first] >= 0 else np.eye(3)
+                v[k] += root @ self.rise[first] * arm_elevation(pose[first], pose[first + 1], by=k - first)
+        return w, v
 
     def segment_transforms(self, pose: Float) -> Float:
         """(S, 4, 4) transforms of the segments."""
@@ -178,6 +210,20 @@ class Skeleton:
             "leg_r": ("hip_r", "knee_r"),
         }[chain]
         return np.array([name.startswith(prefixes) for name in self.names])
+
+
+def arm_elevation(first: float, second: float, by: int | None = None) -> float:
+    """Sine of the arm's elevation over the horizontal in the trunk's frame, from a shoulder's first two angles.
+
+    Args:
+        by: 0 or 1 for the derivative by the first or the second angle.
+    """
+    a, b = ARM_UP
+    if by == 0:
+        return float(a * np.cos(second) * np.cos(first))
+    if by == 1:
+        return float(b * np.cos(second) - a * np.sin(second) * np.sin(first))
+    return float(a * np.cos(second) * np.sin(first) + b * np.sin(second))
 
 
 def twist_exp(axis: Float, point: Float, angle: float) -> Float:
@@ -248,7 +294,7 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z") -> Skeleton:
         segment_dof[f"forearm_{side}"] = add(
             f"elbow_{side}_flexion", spin * M @ _ELBOW, e, segment_dof[f"upper_arm_{side}"]
         )
-        joints[f"shoulder_{side}"] = ("torso", s)
+        joints[f"shoulder_{side}"] = (f"upper_arm_{side}", s)
         joints[f"elbow_{side}"] = (f"upper_arm_{side}", e)
         joints[f"wrist_{side}"] = (f"forearm_{side}", e + d.forearm * arm)
     for side in ("l", "r"):
@@ -265,6 +311,8 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z") -> Skeleton:
         joints[f"ankle_{side}"] = (f"calf_{side}", knee - d.calf * z)
 
     names = tuple(row[0] for row in rows)
+    lift = RAISED_SHOULDERS / TRUNK_LENGTH * d.trunk * z
+    rise = np.array([lift * (n.startswith("shoulder") and n.endswith("yaw")) for n in names])
     prismatic = np.array([name in ("torso_x", "torso_y", "torso_z") for name in names])
     limits = np.array([_limits(name) for name in names])
     axis = np.array([row[1] for row in rows])
@@ -274,6 +322,7 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z") -> Skeleton:
         units=tuple("m" if p else "rad" for p in prismatic),
         axis=axis,
         point=np.array([row[2] for row in rows]) @ B.T,
+        rise=rise @ B.T,
         prismatic=prismatic,
         parent=np.array([row[3] for row in rows], dtype=np.int32),
         lower=limits[:, 0],

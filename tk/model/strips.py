@@ -123,7 +123,7 @@ def contour_kernel(body: Body, strips: Strips, rig: Rig, dtype: type = np.float3
     T_world_body[:3, :3] = skeleton.T_world_body
     return ContourKernel(
         axis=skeleton.axis,
-        point=skeleton.point,
+        point=skeleton.anchor,
         prismatic=skeleton.prismatic,
         parent=skeleton.parent,
         piece_dof=skeleton.segment_dof[[SEGMENTS.index(p.segment) for p in body.pieces]],
