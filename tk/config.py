@@ -50,6 +50,7 @@ class TrackingConfig:
             from the body: the body is somewhere, but the person is elsewhere.
         lost_limb: and when more than this share of the samples of a limb, the head or the torso has no voxel near it.
         least_voxels: fewer surface voxels than this are no person.
+        overrule: voxels about the expected body in which one camera that carves is overruled by all others; -1 never.
     """
 
     prediction: float = 0.9
@@ -60,6 +61,7 @@ class TrackingConfig:
     lost_astray: float = 0.25
     lost_limb: float = 0.6
     least_voxels: int = 60
+    overrule: int = 0
 
     def __post_init__(self) -> None:
         if not 0 <= self.prediction <= 1.5 or self.init_frames < 1:

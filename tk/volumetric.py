@@ -23,7 +23,7 @@ from tk.kernels.nearest import SurfaceIndex
 from tk.model import initialisation
 from tk.model.anthropometry import BodyDimensions
 from tk.model.appearance import Appearance
-from tk.model.body import Body, build_body
+from tk.model.body import Body, build_body, filling
 from tk.model.camera import Rig
 from tk.model.contour_term import ContourTerm, Pictures
 from tk.model.fitting import fit_body
@@ -141,6 +141,7 @@ class VolumetricTracker:
 
     def _take_body(self, dimensions: BodyDimensions) -> None:
         self._body = build_body(dimensions, self.up)
+        self._filling = filling(self._body)
         cues = self.config.contours
         contours = ContourTerm(self._body, self.rig, cues, self.config.edges) if cues.enabled else None
         self._objective = BodyObjective(self._body, self.config.objective, self.config.sampling, contours)
@@ -159,6 +160,9 @@ class VolumetricTracker:
         watch = Stopwatch()
         config = self.config
         self.hull.update(frame.masks)
+        if config.tracking.overrule >= 0 and not self._lost_for:
+            expected = self._pose + config.tracking.prediction * (self._pose - self._previous)
+            self.hull.overrule(self._filled(expected), config.tracking.overrule)
         watch.lap("hull")
         surface = self.hull.surface(frame.images)
         watch.lap("surface")
@@ -211,6 +215,12 @@ class VolumetricTracker:
         if self._body is None:
             raise RuntimeError("the tracker has no body yet: call start() or restore() first")
         return self._body
+
+    def _filled(self, pose: Float) -> Float:
+        """(N, 3) points on the body's surface and inside it."""
+        points, segment = self._filling
+        T = self.body.skeleton.segment_transforms(pose)[segment]
+        return np.einsum("nab,nb->na", T[:, :3, :3], points) + T[:, :3, 3]
 
     def _starts(self, surface: HullSurface) -> Float:
         """(S, D) where the search may begin."""

@@ -10,7 +10,8 @@ coverage
 alignment
     model contour to picture: entries made beforehand, see :mod:`tk.kernels.alignment` (6.1.2).
 
-An arm's sample deep inside the trunk finds no voxel: upper arms used to fold into the trunk, whose surface fits them.
+No two parts of a body are in one place: a sample deep inside a part that it may not enter finds no voxel. Without this,
+upper arms fold into the trunk, whose surface fits them, and a leg that the hull has lost goes to the other one.
 
 Where the paper is silent: a sample without any candidate within reach counts as an outlier (ρ = 1, no gradient), and
 the Hessian of eq. 19 is approximated, as Schraudolph does, by the positive semi-definite part Σ ρ'(e)/σ² JᵀJ.
@@ -35,7 +36,7 @@ POINTS_PER_TASK = 52
 
 
 # Columns of the packed arrays. Every array that a launch is handed costs about 7 µs, so the body comes in few.
-SAMPLE_NORMAL, SAMPLE_DOF, SAMPLE_PATCH, SAMPLE_WEIGHT, SAMPLE_OUTSIDE = (
+SAMPLE_NORMAL, SAMPLE_DOF, SAMPLE_PATCH, SAMPLE_WEIGHT, SAMPLE_BARRED = (
     3,
     6,
     7,
@@ -44,14 +45,14 @@ SAMPLE_NORMAL, SAMPLE_DOF, SAMPLE_PATCH, SAMPLE_WEIGHT, SAMPLE_OUTSIDE = (
 )  # after the position; weight is 1/σ²
 # Deep inside: G (1 on the surface, growing linearly from the centre) below this.
 BURIED = 0.8
-PIECE_SHAPE, PIECE_DOF, PIECE_WEIGHT = 12, 19, 20  # after the 3×4 frame: a1 a2 a3 ε1 ε2 z_lower z_upper
+PIECE_SHAPE, PIECE_DOF, PIECE_WEIGHT, PIECE_PART = 12, 19, 20, 21  # after the 3×4 frame: a1 a2 a3 ε1 ε2 z_lower z_upper
 
 
 @ti.func
 def _nearest_piece(
     frames: ti.template(),
     c: int,
-    pieces: ti.template(),  # (P, 21)
+    pieces: ti.template(),  # (P, 22)
     patches: ti.template(),  # (P,) bit mask of each piece's colour patches
     fits: ti.i64,  # the voxel's
     y,  # voxel, world
@@ -142,17 +143,25 @@ def _add_residual(
 def _is_buried(
     frames: ti.template(),
     c: int,
-    pieces: ti.template(),  # (P, 21)
-    solid: int,
+    pieces: ti.template(),  # (P, 22)
+    barred: int,
     x,
 ):
-    """Whether a world point lies deep inside one of the first ``solid`` pieces."""
+    """Whether a world point lies deep inside a piece of one of the parts of the bit mask ``barred``."""
     buried = False
-    for i in range(solid):
+    # pieces of one segment follow each other and share the point in the zero configuration
+    segment = -1
+    local = x
+    for i in range(pieces.shape[0]):
+        if barred >> ti.cast(pieces[i, PIECE_PART], ti.i32) & 1 == 0:
+            continue
         k = ti.cast(pieces[i, PIECE_DOF], ti.i32)
+        if k != segment:
+            local = load_rotation(frames, c, k).transpose() @ (x - load_translation(frames, c, k))
+            segment = k
         Rp = ti.Matrix([[pieces[i, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
         tp = ti.Vector([pieces[i, 4 * a + 3] for a in ti.static(range(3))])
-        q = Rp.transpose() @ (load_rotation(frames, c, k).transpose() @ (x - load_translation(frames, c, k)) - tp)
+        q = Rp.transpose() @ (local - tp)
         if q[2] > pieces[i, PIECE_SHAPE + 5] and q[2] < pieces[i, PIECE_SHAPE + 6]:
             radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
             if implicit(q, radii, pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4])[0] < BURIED:
@@ -164,7 +173,6 @@ def _is_buried(
 def _pair_sample(
     samples: ti.template(),
     pieces: ti.template(),
-    solid: int,
     voxels: ti.template(),
     fits: ti.template(),
     starts: ti.template(),
@@ -179,7 +187,8 @@ def _pair_sample(
     R = load_rotation(frames, c, k)
     x = R @ load_vector3(samples, n) + load_translation(frames, c, k)
     v = -1
-    if samples[n, SAMPLE_OUTSIDE] == 0.0 or not _is_buried(frames, c, pieces, solid, x):
+    barred = ti.cast(samples[n, SAMPLE_BARRED], ti.i32)
+    if barred == 0 or not _is_buried(frames, c, pieces, barred, x):
         normal = ti.Vector([samples[n, SAMPLE_NORMAL + a] for a in ti.static(range(3))])
         v = nearest_voxel(
             voxels,
@@ -204,7 +213,7 @@ def _objective_kernel(real):
         prismatic: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
         parent: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
         samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 10)
-        pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 21)
+        pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 22)
         patches: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (P,)
         voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 6)
         fits: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (V,)
@@ -212,7 +221,6 @@ def _objective_kernel(real):
         grid: ti.types.ndarray(dtype=ti.f32, ndim=1),  # (7,)
         settings: ti.types.ndarray(dtype=real, ndim=1),  # (9,)
         hold: ti.i32,
-        solid: ti.i32,
         M: ti.i32,
         Q: ti.i32,
         chosen: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, M + Q) samples, then voxels of the coverage term
@@ -246,7 +254,7 @@ def _objective_kernel(real):
                     n = chosen[b, m]
                     v = assigned[b, m]
                     if hold == 0:
-                        v = _pair_sample(samples, pieces, solid, voxels, fits, starts, grid, settings, frames, c, n)
+                        v = _pair_sample(samples, pieces, voxels, fits, starts, grid, settings, frames, c, n)
                         assigned[b, m] = v
                     k = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
                     x0 = load_vector3(samples, n)
@@ -300,7 +308,7 @@ def _linearise_kernel(real):
         prismatic: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
         parent: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
         samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 10)
-        pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 21)
+        pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 22)
         voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 6)
         settings: ti.types.ndarray(dtype=real, ndim=1),  # (9,)
         floor: real,
@@ -419,8 +427,9 @@ class ObjectiveKernel:
         piece_sigma: (P,) σ of voxels that the piece covers, metres.
         piece_patches: (P,) int64 bit masks of the colour patches on each piece: a voxel that fits none of them is not
             covered by the piece. All patches by default.
-        outside: (N,) True for samples that may not lie inside the first ``solid`` pieces: there they find no voxel.
-        solid: how many of the first pieces are.
+        barred: (N,) bit masks of the parts of the body in which a sample may not lie: there it finds no voxel. None by
+            default.
+        piece_part: (P,) the part, 0 to 23, that each piece belongs to.
         cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_camera`, for the alignment term.
         dtype: np.float32, or np.float64 for checks of derivatives.
     """
@@ -442,8 +451,8 @@ class ObjectiveKernel:
         piece_shape: np.ndarray,
         piece_sigma: np.ndarray,
         piece_patches: np.ndarray | None = None,
-        outside: np.ndarray | None = None,
-        solid: int = 0,
+        barred: np.ndarray | None = None,
+        piece_part: np.ndarray | None = None,
         cameras: np.ndarray | None = None,
         dtype: type = np.float32,
     ) -> None:
@@ -463,10 +472,12 @@ class ObjectiveKernel:
         piece_weight = 1.0 / np.asarray(piece_sigma, np.float64) ** 2
         self._weights = weight, piece_weight
         self._tree = real(axis), real(point), whole(prismatic), whole(parent)
-        barred = np.zeros(len(local)) if outside is None else np.asarray(outside, np.float64)
-        self._solid = solid
-        self._samples = real(np.column_stack([local, normal, last_dof, patch, weight, barred]))
-        self._pieces = real(np.column_stack([np.reshape(piece_frame, (-1, 12)), piece_shape, piece_dof, piece_weight]))
+        bars = np.zeros(len(local)) if barred is None else barred
+        parts = np.zeros(len(piece_dof)) if piece_part is None else piece_part
+        self._samples = real(np.column_stack([local, normal, last_dof, patch, weight, bars]))
+        self._pieces = real(
+            np.column_stack([np.reshape(piece_frame, (-1, 12)), piece_shape, piece_dof, piece_weight, parts])
+        )
         every = np.full(len(piece_dof), -1, np.int64)
         self._patches = every if piece_patches is None else np.ascontiguousarray(piece_patches, np.int64)
         self._cameras = real(np.zeros((1, CAMERA_NUMBERS)) if cameras is None else cameras)
@@ -534,7 +545,6 @@ class ObjectiveKernel:
             index.grid,
             self._packed(settings, M, Q),
             int(held is not None),
-            self._solid,
             M,
             Q,
             np.ascontiguousarray(np.concatenate([chosen, voxels[:, :Q]], axis=1), np.int32),

@@ -32,6 +32,16 @@ CHAIN_OF_SEGMENT = np.array(
 )
 
 
+def _barred() -> Ints:
+    """(S,) bit masks of the parts (0 the torso, 1 + c chain c) that a segment's surface may not enter."""
+    bits = {name: 1 << 1 + c for c, name in enumerate(CHAIN_NAMES)}
+    enters_not = {"arm_l": 1 | bits["arm_r"], "arm_r": 1 | bits["arm_l"], "leg_l": bits["leg_r"], "leg_r": bits["leg_l"]}
+    return np.array([enters_not.get(CHAIN_NAMES[c], 0) if c >= 0 else 0 for c in CHAIN_OF_SEGMENT], np.int32)
+
+
+BARRED = _barred()
+
+
 @dataclass(frozen=True)
 class SamplingConfig:
     """How many points an evaluation uses (section 6.4: 60 on the torso, 20 on each limb and the head).
@@ -99,8 +109,8 @@ class BodyObjective:
             piece_shape=np.array([[*p.radii, p.e1, p.e2, p.z_lower, p.z_upper] for p in pieces]),
             piece_sigma=np.array([fixed or p.diameter_m for p in pieces]),
             piece_patches=piece_patches(body),
-            outside=np.array(["arm" in name for name in SEGMENTS])[body.segment],
-            solid=sum(piece.segment == "torso" for piece in pieces),  # the torso's pieces come first
+            barred=BARRED[body.segment],
+            piece_part=CHAIN_OF_SEGMENT[self.piece_segment] + 1,
             cameras=None if contours is None else contours.cameras,
             dtype=dtype,
         )
