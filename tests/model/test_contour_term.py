@@ -1,0 +1,201 @@
+"""The contour cues of a body: which points, views and weights; and that the truth explains its own pictures."""
+
+import functools
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.kernels.test_contour import BODY, RIG, piece_transforms, some_poses
+from tk.errors import ConfigError
+from tk.kernels import alignment as a
+from tk.kernels.edges import EdgeConfig
+from tk.kernels.nearest import SurfaceIndex
+from tk.kernels.objective import ObjectiveSettings
+from tk.model.camera import Camera, Rig
+from tk.model.contour_term import ContourConfig, ContourTerm, Pictures
+from tk.model.objective import BodyObjective, FrameObjective, SamplingConfig
+from tk.model.skeleton import CHAINS, SEGMENTS
+from tk.model.strips import LIMBS
+
+EDGES = ContourConfig(edge_weight=1.0, outline_weight=0.0)
+OUTLINE = ContourConfig(edge_weight=0.0, outline_weight=1.0)
+BOTH = ContourConfig(edge_weight=0.7, outline_weight=1.3)
+TRUTH = some_poses(1, seed=21)[0]
+# rendered from 3 × 10⁴ triangles a piece, sampled at whole pixels, searched at half pixels
+NEAR_PX = 1.5
+
+
+def term_of(config=BOTH, rig=RIG):
+    return ContourTerm(BODY, rig, config, EdgeConfig())
+
+
+@functools.cache
+def pictures():
+    """The body's pieces as filled polygons on a dark ground: each limb a colour, nearest last."""
+    H, W = RIG.frame_shape
+    images, masks = np.full((len(RIG), H, W, 3), 30, np.uint8), np.zeros((len(RIG), H, W), np.uint8)
+    colors = np.random.default_rng(0).integers(90, 256, (len(SEGMENTS), 3))
+    T = piece_transforms(BODY, TRUTH)
+    for c, camera in enumerate(RIG):
+        for i in np.argsort([-np.linalg.norm(t[:3, 3] - camera.center) for t in T]):
+            piece = BODY.pieces[i]
+            eta, omega = np.linspace(*piece.eta_range, 60), np.linspace(-np.pi, np.pi, 120)
+            x = piece.point(*np.meshgrid(eta, omega, indexing="ij")).reshape(-1, 3)
+            hull = cv2.convexHull(camera.project(x @ T[i][:3, :3].T + T[i][:3, 3])[0].astype(np.float32))
+            polygon = np.rint(hull * 16).astype(np.int32)
+            cv2.fillPoly(images[c], [polygon], colors[SEGMENTS.index(piece.segment)].tolist(), shift=4)
+            cv2.fillPoly(masks[c], [polygon], 255, shift=4)
+    return Pictures(images, masks)
+
+
+def residual_px(entries, pose, b=0):
+    """(E,) distance across the contour from each assigned entry to its target, pixels; NaN elsewhere."""
+    result = np.full(len(entries[b]), np.nan)
+    T = BODY.skeleton.segment_transforms(pose)
+    segment_of = {int(dof): s for s, dof in enumerate(BODY.skeleton.segment_dof)}
+    for e, row in enumerate(entries[b]):
+        if row[a.STATE] == a.ASSIGNED:
+            M = T[segment_of[int(row[a.LAST_DOF])]]
+            camera = RIG[int(row[a.CAMERA])]
+            ends = [M[:3, :3] @ row[first : first + 3] + M[:3, 3] for first in (a.POINT_A, a.POINT_B)]
+            pixel = np.mean([camera.project(x[None])[0][0] for x in ends], axis=0)
+            result[e] = abs((pixel - row[a.TARGET : a.TARGET + 2]) @ row[a.NORMAL : a.NORMAL + 2])
+    return result
+
+
+def assigned(term, poses, chosen=None):
+    poses = np.atleast_2d(poses)
+    chosen = np.repeat(term.draw(None)[None], len(poses), 0) if chosen is None else chosen
+    return term.assign(pictures(), poses, chosen), term.kernel(poses, chosen)
+
+
+def test_colour_edges_are_looked_for_in_the_views_with_the_fewest_hidden_points():
+    poses = some_poses(6, seed=22)
+    entries, points = assigned(term_of(EDGES), poses)
+    limb = np.isin(points.segment, [SEGMENTS.index(s) for s in LIMBS])
+    hidden = np.sum((points.found != points.visible) & limb[:, None, :, None], axis=(2, 3))
+    fewer = False
+    for b in range(len(poses)):
+        used = {int(c) for c in entries[b, entries[b, :, a.STATE] != a.ABSENT, a.CAMERA]}
+        assert len(used) == EDGES.views
+        rest = set(range(len(RIG))) - used
+        assert max(hidden[b, list(used)]) <= min(hidden[b, list(rest)])
+        fewer |= max(hidden[b, list(used)]) < min(hidden[b, list(rest)])
+    assert fewer, "all views were alike: nothing was tested"
+
+
+def test_limbs_only_have_colour_edges_and_all_parts_an_outline():
+    limbs = {int(BODY.skeleton.segment_dof[SEGMENTS.index(s)]) for s in LIMBS}
+    edges, outline = assigned(term_of(EDGES), TRUTH)[0], assigned(term_of(OUTLINE), TRUTH)[0]
+    assert {int(k) for k in edges[0, :, a.LAST_DOF]} == limbs
+    trunk = {int(BODY.skeleton.segment_dof[SEGMENTS.index(s)]) for s in ("torso", "head")}
+    assert trunk <= {int(k) for k in outline[0, :, a.LAST_DOF]}
+
+
+@pytest.mark.parametrize("hidden", [1.0, 0.25])
+def test_hidden_points_cost_and_pull_nowhere(hidden):
+    """6.1.2: 1 each. A circle with both points hidden is two points and counts as a pair does."""
+    term = term_of(replace(EDGES, hidden=hidden))
+    poses = some_poses(6, seed=23)
+    entries, points = assigned(term, poses)
+    lost = 0
+    for b in range(len(poses)):
+        rows = entries[b][entries[b, :, a.STATE] != a.ABSENT]
+        used = sorted({int(c) for c in rows[:, a.CAMERA]})
+        limb = np.isin(points.segment[b], [SEGMENTS.index(s) for s in LIMBS])
+        both_hidden = (points.found[b].any(axis=2) & ~points.visible[b].any(axis=2))[used][:, limb].sum()
+        lost += both_hidden
+        per_pair = rows[:, a.SCALE].max()
+        at_least = hidden * per_pair * both_hidden
+        assert rows[rows[:, a.STATE] == a.UNASSIGNABLE][:, a.SCALE].sum() >= at_least - 1e-6
+    assert lost > 0
+
+
+@pytest.mark.parametrize("config", [EDGES, OUTLINE, BOTH])
+def test_weights_sum_to_the_cues_weights(config):
+    entries, _ = assigned(term_of(config), some_poses(3, seed=24))
+    scale = np.where(entries[..., a.STATE] == a.ABSENT, 0, entries[..., a.SCALE])
+    np.testing.assert_allclose(scale.sum(axis=1), config.edge_weight + config.outline_weight, rtol=1e-5)
+    assert (scale >= 0).all()
+
+
+def test_the_truth_explains_its_own_outline_and_edges():
+    for config, near, unfound in ((OUTLINE, 0.95, 0.02), (EDGES, 0.75, 0.4)):
+        entries, _ = assigned(term_of(config), TRUTH)
+        distance = residual_px(entries, TRUTH)
+        assert np.isnan(distance).mean() <= unfound
+        assert np.mean(distance[~np.isnan(distance)] < NEAR_PX) > near
+
+
+def test_pictures_pull_a_displaced_body_back():
+    """Each cue's value grows, and its gradient points uphill, as an arm is turned away."""
+    index = SurfaceIndex.build(np.full((1, 3), 50.0), np.zeros((1, 3)), np.full(1, -1), 0.1)
+    silent = ObjectiveSettings(coverage_weight=0.0, reach_m=1e-6)
+    for config in (OUTLINE, EDGES):
+        body = BodyObjective(BODY, silent, SamplingConfig(), term_of(config))
+        frame = FrameObjective(body, index, np.random.default_rng(0), pictures=pictures())
+        for axis in (0, 2):
+            for sign in (-1, 1):
+                pose = TRUTH.copy()
+                pose[axis] += sign * 0.04
+                assert frame.value(pose) > frame.value(TRUTH)
+                gradient = frame.full()(pose[None], np.zeros((1, len(pose))), 0).gradient[0]
+                assert sign * gradient[axis] > 0, (config, axis, sign)
+
+
+def test_a_batch_is_its_poses_one_by_one():
+    term = term_of(BOTH)
+    poses = some_poses(3, seed=25)
+    chosen = np.stack([term.draw(np.random.default_rng(i)) for i in range(3)])
+    together = term.assign(pictures(), poses, chosen)
+    for b in range(3):
+        alone = term.assign(pictures(), poses[b : b + 1], chosen[b : b + 1])[0]
+        np.testing.assert_array_equal(together[b, : len(alone)], alone)
+        assert not together[b, len(alone) :].any()
+
+
+def test_strips_of_the_chains_are_their_own():
+    term = term_of()
+    for generator in (None, np.random.default_rng(0)):
+        drawn = term.draw_chains(generator)
+        for row, chain in zip(drawn, CHAINS.values(), strict=True):
+            assert {SEGMENTS[s] for s in term.strips.segment[row]} == set(chain)
+            assert len(set(row.tolist())) == len(row)
+    np.testing.assert_array_equal(term.draw(None), term.draw(None))
+    draws = [term.draw(np.random.default_rng(i)) for i in (0, 0, 1)]
+    np.testing.assert_array_equal(draws[0], draws[1])
+    assert not np.array_equal(draws[0], draws[2])
+
+
+def test_softness_widens_the_potential():
+    term = term_of()
+    chosen = term.draw(None)[None]
+    hard, soft = (term.assign(pictures(), TRUTH[None], chosen, s) for s in (1.0, 3.0))
+    np.testing.assert_allclose(soft[..., a.NU], 3 * hard[..., a.NU], rtol=1e-6)
+
+
+def test_a_body_that_nobody_sees_has_no_entries():
+    looks_away = RIG[0]
+    turned = Camera(
+        "away",
+        looks_away.width,
+        looks_away.height,
+        looks_away.matrix,
+        looks_away.distortions,
+        np.diag([-1.0, 1, -1]) @ looks_away.rotation,
+        np.diag([-1.0, 1, -1]) @ looks_away.translation,
+    )
+    term = term_of(BOTH, Rig((turned,)))
+    nothing = Pictures(pictures().images[:1], pictures().masks[:1])
+    entries = term.assign(nothing, TRUTH[None], term.draw(None)[None])
+    assert not (entries[..., a.STATE] != a.ABSENT).any()
+
+
+@pytest.mark.parametrize(
+    "bad", [{"edge_weight": -1.0}, {"views": 0}, {"pairs": 0}, {"reach_m": 0.0}, {"along": 1.5}, {"outline_nu": 0.0}]
+)
+def test_bad_settings_are_refused(bad):
+    with pytest.raises(ConfigError, match=f"contours.{next(iter(bad))}"):
+        ContourConfig(**bad)
