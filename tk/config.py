@@ -22,6 +22,7 @@ from tk.model.contour_term import ContourConfig
 from tk.model.fitting import FitConfig
 from tk.model.foreground import ForegroundConfig
 from tk.model.objective import SamplingConfig
+from tk.optim.levenberg_marquardt import LmConfig
 from tk.optim.schedule import ScheduleConfig
 from tk.optim.smd import SmdConfig
 
@@ -90,6 +91,7 @@ class Config:
     contours: ContourConfig = field(default_factory=ContourConfig)
     edges: EdgeConfig = field(default_factory=EdgeConfig)
     smd: SmdConfig = field(default_factory=SmdConfig)
+    lm: LmConfig = field(default_factory=LmConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)

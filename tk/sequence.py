@@ -23,12 +23,13 @@ from tk.io.result import FrameResult, HullPoints, ResultMeta, ResultWriter, Stat
 from tk.model.foreground import CollinearityForeground, Mog2Foreground, median_plate
 from tk.model.hull import HullSurface
 from tk.tracker import Estimate, Observation, Stopwatch, Tracker
-from tk.volumetric import VolumetricTracker
+from tk.volumetric import LevenbergMarquardtTracker, VolumetricTracker
 
 Segmenter = Callable[[FrameSet], NDArray[np.uint8]]
 Observations = Iterator[tuple[Observation, Stopwatch]]
 
-METHODS = ("volumetric",)
+TRACKERS = {tracker.method: tracker for tracker in (VolumetricTracker, LevenbergMarquardtTracker)}
+METHODS = tuple(TRACKERS)
 
 # frames from which a background is made where there is no recording of the empty scene
 PLATE_FRAMES = 25
@@ -71,9 +72,9 @@ class Summary:
 
 def make_tracker(method: str, capture: Capture, config: Config) -> Tracker:
     """The tracker of this name for a capture."""
-    if method == "volumetric":
-        return VolumetricTracker(capture.rig, capture.volume, capture.up, config)
-    raise ConfigError(f"--method {method}: choose one of {', '.join(METHODS)}")
+    if method not in TRACKERS:
+        raise ConfigError(f"--method {method}: choose one of {', '.join(METHODS)}")
+    return TRACKERS[method](capture.rig, capture.volume, capture.up, config)
 
 
 def make_segmenter(capture: Capture, config: Config, note: Callable[[str], None]) -> Segmenter:

@@ -31,7 +31,7 @@ from tk.model.hull import HullSurface, VisualHull
 from tk.model.objective import CHAIN_OF_SEGMENT, BodyObjective, Fit, FrameObjective
 from tk.model.skeleton import CHAINS, JOINTS, build_skeleton
 from tk.model.volume import Volume, VoxelGrid
-from tk.optim import schedule
+from tk.optim import lm_schedule, schedule
 from tk.tracker import Estimate, Observation, Stopwatch
 
 Float = NDArray[np.float64]
@@ -143,6 +143,7 @@ class VolumetricTracker:
         self._body = build_body(dimensions, self.up)
         self._filling = filling(self._body)
         cues = self.config.contours
+        cues = cues.scaled(self.config.sampling.scale)
         contours = ContourTerm(self._body, self.rig, cues, self.config.edges) if cues.enabled else None
         self._objective = BodyObjective(self._body, self.config.objective, self.config.sampling, contours)
 
@@ -175,16 +176,7 @@ class VolumetricTracker:
         problem = FrameObjective(
             self._objective, index, rng, config.schedule.outliers, pictures=Pictures(frame.images, frame.masks)
         )
-        result = schedule.optimise(
-            problem,
-            self._starts(surface),
-            self._pose,
-            rng,
-            config.schedule,
-            config.smd,
-            good_enough=lambda pose: self._is_usual(problem.fit(pose)),
-            alternatives=self._alternatives,
-        )
+        result = self._search(problem, self._starts(surface), rng)
         fit = problem.fit(result.pose)
         watch.lap("optimise")
         lost = self._is_lost(fit)
@@ -207,6 +199,19 @@ class VolumetricTracker:
             iterations=result.iterations,
             timing=watch.laps,
             surface=surface,
+        )
+
+    def _search(self, problem: FrameObjective, starts: Float, rng: np.random.Generator) -> schedule.ScheduleResult:
+        """The pose that explains a frame best, from the starts (S, D)."""
+        return schedule.optimise(
+            problem,
+            starts,
+            self._pose,
+            rng,
+            self.config.schedule,
+            self.config.smd,
+            good_enough=lambda pose: self._is_usual(problem.fit(pose)),
+            alternatives=self._alternatives,
         )
 
     @property
@@ -353,3 +358,12 @@ class VolumetricTracker:
         self._usual, self._usual_astray = (float(v) for v in state["usual"])
         self._lost_for = int(state["lost_for"])
         self._fresh = False
+
+
+class LevenbergMarquardtTracker(VolumetricTracker):
+    """The same tracker with Levenberg-Marquardt in the place of SMD: the comparison of section 7.3."""
+
+    method = "lm"
+
+    def _search(self, problem: FrameObjective, starts: Float, rng: np.random.Generator) -> schedule.ScheduleResult:
+        return lm_schedule.optimise(problem, starts, self.config.schedule, self.config.lm)

@@ -394,6 +394,7 @@ class ObjectiveSettings:
         reach_m: greatest distance at which a voxel is looked for.
         coverage_weight: w_c of the coverage term beside the surface term's 1; 0 leaves it out, as the paper does.
         coverage_nu, coverage_cosine, coverage_reach_m: the same for the coverage term.
+        surface_weight: w_s of eq. 8; 0 leaves the surface term out.
     """
 
     nu: float = 0.35
@@ -404,6 +405,7 @@ class ObjectiveSettings:
     coverage_nu: float = 0.7
     coverage_cosine: float = 0.0
     coverage_reach_m: float = 0.5
+    surface_weight: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -496,7 +498,7 @@ class ObjectiveKernel:
     def _packed(self, s: ObjectiveSettings, M: int, Q: int) -> np.ndarray:
         """The settings in the order in which the kernels read them."""
         values = [s.nu, s.tangential, s.min_cosine, s.reach_m, s.coverage_nu, s.coverage_cosine, s.coverage_reach_m]
-        return np.array([*values, 1.0 / max(M, 1), s.coverage_weight / max(Q, 1)], self.dtype)
+        return np.array([*values, s.surface_weight / max(M, 1), s.coverage_weight / max(Q, 1)], self.dtype)
 
     def evaluate(
         self,
@@ -522,7 +524,7 @@ class ObjectiveKernel:
             entries: (B, E, 17) of the alignment term (:mod:`tk.kernels.alignment`), if any.
 
         Returns:
-            f (B,): mean ρ over the samples plus ``coverage_weight`` times mean ρ over the voxels, plus the entries'
+            f (B,): ``surface_weight`` times mean ρ over the samples plus ``coverage_weight`` times mean ρ over the voxels, plus the entries'
             shares; its gradient (B, D); H·v (B, D); the assignments made.
         """
         E = 0 if entries is None else entries.shape[1]
@@ -627,5 +629,5 @@ class ObjectiveKernel:
             partner=partner,
             inv_sigma2=np.concatenate([weight[chosen], piece_weight[held.covering[0, :Q, 0].astype(np.int64)]]),
             nu=np.repeat([settings.nu, settings.coverage_nu], [M, Q]),
-            scale=np.repeat([1.0 / max(M, 1), settings.coverage_weight / max(Q, 1)], [M, Q]),
+            scale=np.repeat([settings.surface_weight / max(M, 1), settings.coverage_weight / max(Q, 1)], [M, Q]),
         )

@@ -13,7 +13,7 @@ Both come out as entries (:mod:`tk.kernels.alignment`) that hold until they are 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,6 +90,11 @@ class ContourConfig:
                 raise ConfigError(f"contours.{name} = {getattr(self, name)} must be positive")
         if not 0 <= self.along <= 1:
             raise ConfigError(f"contours.along = {self.along} must lie in [0, 1]")
+
+    def scaled(self, scale: int) -> ContourConfig:
+        """The same with ``scale`` times as many contour points."""
+        circles = {name: scale * getattr(self, name) for name in ("pairs", "trunk_circles", "head_circles")}
+        return replace(self, **circles)
 
     @property
     def enabled(self) -> bool:
@@ -267,7 +272,8 @@ def _some(row: NDArray[np.int64], count: int, rng: np.random.Generator | None) -
     if rng is None:
         picked = ((np.arange(count) + 0.5) * len(row) / count).astype(np.int64)
     else:
-        picked = np.sort(rng.permutation(len(row))[:count])
+        # some strips twice where there are fewer than asked for: rows are of one length
+        picked = np.sort(np.resize(rng.permutation(len(row)), count))
     return row[picked].astype(np.int32)
 
 

@@ -53,6 +53,7 @@ class SamplingConfig:
         sigma_m: σ of eq. 10 for every sample, metres; 0 takes the limb's diameter, as the paper does. Distances are
             as uncertain on the trunk as on an arm: both come from the same voxels. In units of the diameter the trunk,
             five times as thick, weighs a twenty-fifth and follows the arms.
+        scale: so many times as many of all points, contour points included, in the optimisation (section 7.3).
     """
 
     torso: int = 60
@@ -60,10 +61,11 @@ class SamplingConfig:
     voxels: int = 150
     chain_voxels: int = 30
     sigma_m: float = 0.1
+    scale: int = 1
 
     def __post_init__(self) -> None:
-        if min(self.torso, self.chain, self.voxels, self.chain_voxels) < 1 or self.sigma_m < 0:
-            raise ConfigError("sampling: numbers of points must be at least 1, sigma_m at least 0")
+        if min(self.torso, self.chain, self.voxels, self.chain_voxels, self.scale) < 1 or self.sigma_m < 0:
+            raise ConfigError("sampling: numbers of points and scale must be at least 1, sigma_m at least 0")
 
 
 class BodyObjective:
@@ -279,14 +281,11 @@ class FrameObjective:
         self, owner: NDArray[np.intp], pose: Float, softness: float = 1.0
     ) -> Callable[[Float, Float, int], Evaluation]:
         """Row b is chain ``owner[b]`` with its own samples, and voxels that are its own or nobody's at ``pose``."""
-        s = self.objective.sampling
         self._pools = self._chain_pools(self.fit(pose))
         settings = self._softened(softness)
 
         def draw() -> tuple[Ints, Ints]:
-            # a chain with fewer samples than asked for gives some of them twice: rows are of one length
-            samples = [np.resize(pick(self.rng, own, s.chain), s.chain) for own in self.objective.chain_samples]
-            voxels = [pool[self.rng.integers(len(pool), size=s.chain_voxels)] for pool in self._pools]
+            samples, voxels = zip(*(self._draw_chain(c) for c in range(len(CHAINS))), strict=True)
             return np.stack(samples)[owner], np.stack(voxels)[owner]
 
         draws = _Draws(draw)
@@ -296,6 +295,17 @@ class FrameObjective:
             return self._evaluate(*draws(iteration), poses, directions, settings, renewed(poses, iteration))
 
         return evaluate
+
+    def fixed(self, softness: float = 1.0) -> FixedObjective:
+        """All degrees of freedom on one draw of points that stays: what Levenberg-Marquardt minimises (section 7.3)."""
+        strips = None if self.contours is None else self._term.draw(self.rng)
+        return FixedObjective(self, *self._draw_full(), strips, softness)
+
+    def fixed_chain(self, chain: int, pose: Float, softness: float = 1.0) -> FixedObjective:
+        """The same for one chain, the rest of the body being at ``pose``; points as in :meth:`chains`."""
+        self._pools = self._chain_pools(self.fit(pose))
+        strips = None if self.contours is None else self._term.draw_chains(self.rng)[chain]
+        return FixedObjective(self, *self._draw_chain(chain), strips, softness)
 
     def chain_values(self, owner: NDArray[np.intp], poses: Float) -> Float:
         """(B,) the chains' objectives on even samples and on voxels of the whole hull.
@@ -373,7 +383,16 @@ class FrameObjective:
 
     def _draw_full(self) -> tuple[Ints, Ints]:
         s = self.objective.sampling
-        return self.objective.draw(self.rng), self.rng.integers(self.voxel_count, size=s.voxels).astype(np.int32)
+        voxels = self.rng.integers(self.voxel_count, size=s.scale * s.voxels).astype(np.int32)
+        return self.objective.draw(self.rng, s.scale), voxels
+
+    def _draw_chain(self, chain: int) -> tuple[Ints, Ints]:
+        s = self.objective.sampling
+        # a chain with fewer samples than asked for gives some of them twice: rows are of one length
+        count = s.scale * s.chain
+        samples = np.resize(pick(self.rng, self.objective.chain_samples[chain], count), count)
+        pool = self._pools[chain]
+        return samples, pool[self.rng.integers(len(pool), size=s.scale * s.chain_voxels)]
 
     def _softened(self, softness: float) -> ObjectiveSettings:
         s = self.objective.settings
@@ -391,15 +410,22 @@ class FrameObjective:
     def _renewing(
         self, draw: Callable[[int], Ints], softness: float
     ) -> Callable[[Float, int], NDArray[np.floating] | None]:
-        """The contour cues' entries at an iteration: held for some iterations, then made anew at the poses as they are."""
-        last: dict[str, NDArray[np.floating]] = {}
+        """The contour cues' entries at an iteration: held for some, then made anew at the poses as they are."""
+        drawn: tuple[int, Ints] | None = None
+        last: NDArray[np.floating] | None = None
+        calls = 0
 
         def entries(poses: Float, iteration: int) -> NDArray[np.floating] | None:
+            nonlocal drawn, last, calls
             if self.contours is None:
                 return None
-            if iteration % self._term.config.renew == 0 or "entries" not in last:
-                last["entries"] = self._entries(poses, draw(len(poses)), softness)
-            return last["entries"]
+            # calls are counted, as the iteration's number stands still where points are not shuffled
+            if last is None or calls % self._term.config.renew == 0:
+                if drawn is None or drawn[0] != iteration:
+                    drawn = iteration, draw(len(poses))
+                last = self._entries(poses, drawn[1], softness)
+            calls += 1
+            return last
 
         return entries
 
@@ -416,6 +442,52 @@ class FrameObjective:
             self.index, samples, voxels, poses, directions, settings, entries=entries
         )
         return Evaluation(value, gradient, product)
+
+
+class FixedObjective:
+    """The objective of a frame on points that stay the same; their voxels and edges are found anew at every pose.
+
+    Args:
+        frame: the frame.
+        samples: (M,); voxels: (Q,); strips: (K,) of the contour cues, if they count.
+        softness: see :meth:`FrameObjective.full`.
+    """
+
+    def __init__(
+        self, frame: FrameObjective, samples: Ints, voxels: Ints, strips: Ints | None, softness: float
+    ) -> None:
+        self._frame = frame
+        self._points = samples, voxels
+        self._strips = strips
+        self._softness = softness
+        self._settings = frame._softened(softness)
+
+    def value(self, pose: Float) -> float:
+        """The objective at ``pose`` (D,)."""
+        return float(self._evaluate(pose)[0][0][0])
+
+    def model(self, pose: Float) -> tuple[float, Float, Float]:
+        """Value, gradient (D,) and Gauss-Newton Hessian (D, D) at ``pose`` (D,), outliers weighing as for SMD's."""
+        (value, gradient, _, held), entries = self._evaluate(pose)
+        linear = self._frame.objective.kernel.linearise(
+            self._frame.index,
+            *self._points,
+            pose,
+            held,
+            self._settings,
+            self._frame.outliers,
+            with_jacobian=False,
+            entries=entries,
+        )
+        return float(value[0]), gradient[0], linear.hessian
+
+    def _evaluate(self, pose: Float) -> tuple[tuple[Float, Float, Float, Held], NDArray[np.floating] | None]:
+        frame, (samples, voxels) = self._frame, self._points
+        entries = None if self._strips is None else frame._entries(pose[None], self._strips[None], self._softness)
+        found = frame.objective.kernel.evaluate(
+            frame.index, samples[None], voxels[None], pose[None], None, self._settings, entries=entries
+        )
+        return found, entries
 
 
 class _Draws:

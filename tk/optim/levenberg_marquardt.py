@@ -43,7 +43,7 @@ class LmConfig:
     def __post_init__(self) -> None:
         if not self.damping > 0 or not self.tolerance >= 0 or self.max_iterations < 1:
             raise ConfigError(
-                f"levenberg_marquardt: damping {self.damping} must be positive, "
+                f"lm: damping {self.damping} must be positive, "
                 f"tolerance {self.tolerance} not negative, max_iterations {self.max_iterations} at least 1"
             )
 

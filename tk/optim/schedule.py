@@ -97,6 +97,7 @@ class ScheduleConfig:
         margin: by how much a hypothesis must be better than the first.
         max_step_deg, max_step_m: greatest change in one iteration; samples that happen to see little of a parameter ask
             for more.
+        hierarchical: the earlier tracker of section 6.4: the torso alone first, then the chains, and no last pass.
     """
 
     tolerance_deg: float = 0.2
@@ -121,6 +122,7 @@ class ScheduleConfig:
     margin: float = 0.004
     max_step_deg: float = 20.0
     max_step_m: float = 0.15
+    hierarchical: bool = False
 
     def __post_init__(self) -> None:
         lengths = ("tolerance_deg", "tolerance_m", "max_step_deg", "max_step_m", "lever_m", "chain_lever_m")
@@ -204,7 +206,7 @@ def _passes(
     first = _all(problem, start[None], tolerance, config.soft, config, limit)
     pose, winners = _chains(problem, first.pose[0], previous, tolerance * config.refine, rng, config, smd_config, wide)
     made = first.iterations
-    if config.polish_iterations:
+    if config.polish_iterations and not config.hierarchical:
         limit = replace(smd_config, max_iterations=config.polish_iterations)
         last = _all(problem, pose[None], tolerance * config.refine, 1.0, config, limit)
         pose = last.pose[0]
@@ -220,10 +222,11 @@ def _all(
     config: ScheduleConfig,
     smd_config: smd.SmdConfig,
 ) -> smd.SmdResult:
-    """One pass over all parameters, from each of the starts (B, D)."""
-    everything = np.ones(starts.shape[1], bool)
+    """One pass over all parameters, or over the torso's, from each of the starts (B, D)."""
+    torso = np.logical_not(np.asarray(problem.free.any(axis=0)))
+    free = torso if config.hierarchical else np.ones_like(torso)
     damping = problem.damping(config.lever_m, softness)
-    pairs = [descent_basis(problem.curvature(start, softness), everything, damping, config) for start in starts]
+    pairs = [descent_basis(problem.curvature(start, softness), free, damping, config) for start in starts]
     return smd.minimise(
         problem.full(softness),
         starts,
