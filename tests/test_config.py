@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tk.config import Config
+from tk.config import PRESETS, Config
 from tk.errors import ConfigError
 
 
@@ -135,3 +135,32 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
 def test_every_default_is_finite() -> None:
     assert len(NUMBERS) > 30
     assert all(math.isfinite(DEFAULTS[name]) for name in NUMBERS)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_are_valid_and_unlike_the_defaults(name: str) -> None:
+    config = Config.preset(name)
+    assert config != Config()
+    assert Config.from_toml(config.to_toml()) == config
+
+
+def test_the_papers_preset_has_the_papers_numbers() -> None:
+    c = Config.preset("kehl2006")
+    assert (c.objective.coverage_weight, c.contours.outline_weight) == (0, 0)
+    assert (c.objective.tangential, c.objective.min_cosine, c.sampling.sigma_m, c.contours.sigma_m) == (1, -1, 0, 0)
+    assert (c.contours.views, c.contours.pairs, c.sampling.torso, c.sampling.chain) == (3, 5, 60, 20)
+    assert (c.schedule.tolerance_deg, c.schedule.tolerance_m, c.schedule.refine) == (2, 0.02, 0.5)
+    assert (c.schedule.hypotheses, c.schedule.retries, c.schedule.polish_iterations) == (1, 0, 0)
+    assert (c.smd.memory, c.smd.max_iterations, c.smd.window, c.smd.shuffle) == (0.3, 40, 3, True)
+
+
+def test_a_file_wins_over_a_preset(tmp_path: Path) -> None:
+    file = tmp_path / "own.toml"
+    file.write_text("voxels = 128\n[contours]\nviews = 2\n")
+    config = Config.read(file, Config.preset("kehl2006"))
+    assert (config.voxels, config.contours.views, config.contours.pairs) == (128, 2, 5)
+
+
+def test_an_unknown_preset_is_named() -> None:
+    with pytest.raises(ConfigError, match="--preset mine: choose one of kehl2006"):
+        Config.preset("mine")

@@ -65,12 +65,13 @@ _masks = click.option(
 )  # fmt: skip
 _voxels = click.option("--voxels", type=int, help="Voxels along the working volume's longest side.  [default: 64]")
 _config = click.option("--config", "config_file", type=click.Path(path_type=Path), help="Settings, TOML.")
+_preset = click.option("--preset", metavar="NAME", help="Settings to begin with: kehl2006, the paper's own.")
 
 
 @main.command()
 @_capture
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="RESULT.h5")
-@click.option("--method", default="volumetric", show_default=True, help="The tracker: volumetric.")
+@click.option("--method", default="volumetric", show_default=True, help="The tracker: volumetric, or lm, the same by Levenberg-Marquardt.")
 @_voxels
 @_cameras
 @_frames
@@ -79,6 +80,7 @@ _config = click.option("--config", "config_file", type=click.Path(path_type=Path
 @click.option("--init-pose", type=click.Path(path_type=Path), metavar="FILE", help="Start from this rough pose (TOML).")
 @click.option("--resume", is_flag=True, help="Go on where an earlier run of the same command stopped.")
 @click.option("--store-hull", is_flag=True, help="Keep the hull's coloured surface in the result.")
+@_preset
 @_config
 def track(
     capture: Path,
@@ -92,6 +94,7 @@ def track(
     init_pose: Path | None,
     resume: bool,
     store_hull: bool,
+    preset: str | None,
     config_file: Path | None,
 ) -> None:
     """Track the person in CAPTURE and write the pose of every frame to RESULT.h5."""
@@ -99,7 +102,7 @@ def track(
     from tk.io.capture import open_capture
 
     span = _span(frames)
-    config = _configuration(config_file, voxels=voxels, seed=seed)
+    config = _configuration(config_file, preset, voxels=voxels, seed=seed)
     opened = open_capture(capture, _names(cameras), masks)
     with _Report() as report:
         summary = sequence.track(opened, output, config, report, method, span, init_pose, resume, store_hull)
@@ -194,12 +197,13 @@ def _span(frames: str | None) -> tuple[int, int | None]:
     return start, stop
 
 
-def _configuration(file: Path | None, **overrides: Any) -> Config:
+def _configuration(file: Path | None, preset: str | None = None, **overrides: Any) -> Config:
     from dataclasses import replace
 
     from tk.config import Config
 
-    config = Config.read(file) if file else Config()
+    base = Config.preset(preset) if preset else Config()
+    config = Config.read(file, base) if file else base
     return replace(config, **{name: value for name, value in overrides.items() if value is not None})
 
 

@@ -9,6 +9,7 @@ import dataclasses
 import math
 import sys
 from dataclasses import dataclass, field
+from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -34,6 +35,7 @@ else:
 T = TypeVar("T")
 
 SEGMENTATIONS = ("collinearity", "mog2")
+PRESETS = ("kehl2006",)
 
 
 @dataclass(frozen=True)
@@ -109,8 +111,8 @@ class Config:
         return tomli_w.dumps(dataclasses.asdict(self))
 
     @staticmethod
-    def from_toml(text: str, where: str = "configuration") -> Config:
-        """A configuration from TOML text; what it leaves out keeps its default.
+    def from_toml(text: str, where: str = "configuration", base: Config | None = None) -> Config:
+        """A configuration from TOML text; what it leaves out is as in ``base``, the defaults if None.
 
         Raises:
             ConfigError: unknown names, wrong types, values out of range; ``where`` names the source.
@@ -119,13 +121,25 @@ class Config:
             values = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
             raise ConfigError(f"{where}: not valid TOML: {error}") from None
-        return _build(Config(), values, where)
+        return _build(base or Config(), values, where)
 
     @staticmethod
-    def read(path: Path) -> Config:
-        """A configuration file."""
+    def preset(name: str) -> Config:
+        """One of the :data:`PRESETS`: the settings of ``tk/data/presets/``.
+
+        Raises:
+            ConfigError: there is none of this name.
+        """
+        if name not in PRESETS:
+            raise ConfigError(f"--preset {name}: choose one of {', '.join(PRESETS)}")
+        text = (resources.files("tk") / "data" / "presets" / f"{name}.toml").read_text(encoding="utf-8")
+        return Config.from_toml(text, f"preset {name}")
+
+    @staticmethod
+    def read(path: Path, base: Config | None = None) -> Config:
+        """A configuration file; what it leaves out is as in ``base``, the defaults if None."""
         try:
-            return Config.from_toml(path.read_text(encoding="utf-8"), str(path))
+            return Config.from_toml(path.read_text(encoding="utf-8"), str(path), base)
         except (OSError, UnicodeDecodeError) as error:
             raise ConfigError(f"{path}: cannot be read: {error}") from None
 
