@@ -26,6 +26,7 @@ from tk.model.objective import SamplingConfig
 from tk.optim.levenberg_marquardt import LmConfig
 from tk.optim.schedule import ScheduleConfig
 from tk.optim.smd import SmdConfig
+from tk.silhouette import SilhouetteConfig
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -46,6 +47,8 @@ class TrackingConfig:
         prediction: share of the last frame's motion that the next is expected to repeat. The paper does not say how it
             predicts; at 15 Hz an arm turns by up to 31° between frames (its section 7.4).
         init_frames: frames from which the body is fitted.
+        settled_ratio: limbs are looked for elsewhere only in a frame whose objective, after the first pass, exceeds that
+            of the usual frame by this factor; 0 looks in every frame.
         retry_ratio: a frame whose objective exceeds that of the usual frame by this factor is searched anew.
         retry_astray: the same for the share of the hull's surface farther than 10 cm from the body: this much more.
         lost_ratio: a frame is lost whose objective exceeds that of the usual frame by this factor.
@@ -58,6 +61,7 @@ class TrackingConfig:
 
     prediction: float = 0.9
     init_frames: int = 4
+    settled_ratio: float = 1.25
     retry_ratio: float = 2.0
     retry_astray: float = 0.05
     lost_ratio: float = 3.0
@@ -97,6 +101,7 @@ class Config:
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    silhouette: SilhouetteConfig = field(default_factory=SilhouetteConfig)
 
     def __post_init__(self) -> None:
         if not 8 <= self.voxels <= 512:

@@ -211,6 +211,7 @@ class VolumetricTracker:
             self.config.schedule,
             self.config.smd,
             good_enough=lambda pose: self._is_usual(problem.fit(pose)),
+            settled=lambda pose: problem.value(pose) <= self.config.tracking.settled_ratio * self._usual,
             alternatives=self._alternatives,
         )
 

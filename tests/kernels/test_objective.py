@@ -286,7 +286,7 @@ def test_nothing_within_reach_is_all_outliers(kernel):
     case = replace(BOTH, reach_m=1e-6, coverage_reach_m=1e-6)
     value, gradient, product, held = scene.evaluate(kernel, case, direction=scene.direction)
     assert (held.assigned == -1).all() and (held.covering[:, :, 0] == -1).all()
-    np.testing.assert_allclose(value, 2.0, rtol=1e-12)
+    np.testing.assert_allclose(value, 1 + case.coverage_weight, rtol=1e-12)
     np.testing.assert_array_equal(gradient, 0)
     np.testing.assert_array_equal(product, 0)
 

@@ -22,7 +22,15 @@ TARGET = np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.3, 0.2, -0.5, 0.3, 0.6])
 LIMIT = 3.0
 # the paper's two passes, each long enough to converge: one hypothesis, one error potential, no polish
 PAPER = ScheduleConfig(
-    soft=1.0, chain_soft=1.0, iterations=60, chain_iterations=60, polish_iterations=0, hypotheses=1, rate=0.5
+    newton_iterations=0,
+    inertia=0.0,
+    soft=1.0,
+    chain_soft=1.0,
+    iterations=60,
+    chain_iterations=60,
+    polish_iterations=0,
+    hypotheses=1,
+    rate=0.5,
 )
 
 
@@ -127,6 +135,12 @@ class Toy:
 
     def value(self, pose: Float) -> float:
         return self._whole(pose)[0]
+
+    def values(self, poses: Float) -> Float:
+        return np.array([self.value(pose) for pose in poses])
+
+    def gradient(self, pose: Float) -> Float:
+        return self._whole(pose, chains=self.full_moves_chains)[1]
 
     def curvature(self, pose: Float, softness: float) -> Float:
         rows = np.eye(D)  # the residuals' Jacobian: at the target the wells are bowls
@@ -482,3 +496,30 @@ def test_the_descent_basis_makes_the_curvature_of_the_free_parameters_one(seed: 
 def test_impossible_settings_are_refused(name: str, value: float) -> None:
     with pytest.raises(ConfigError, match=name):
         replace(ScheduleConfig(), **{name: value})
+
+
+def test_newton_steps_reach_what_noise_hides() -> None:
+    """SMD stops where the draws' noise drowns the gradient; the steps on fixed samples go on, and only downhill."""
+    rough = replace(PAPER, iterations=8, chain_iterations=8)
+    noisy = optimise(Toy(noise=0.3), np.zeros((1, D)), np.zeros(D), np.random.default_rng(0), rough, SmdConfig())
+    config = replace(rough, newton_iterations=4)
+    refined = optimise(Toy(noise=0.3), np.zeros((1, D)), np.zeros(D), np.random.default_rng(0), config, SmdConfig())
+    toy = Toy()
+    assert toy.value(refined.pose) < toy.value(noisy.pose)
+    np.testing.assert_allclose(refined.pose, TARGET, atol=0.02)
+
+
+def test_a_settled_frame_asks_for_no_other_hypotheses() -> None:
+    several = replace(PAPER, hypotheses=4)
+    for settled, rows in ((True, 2), (False, 8)):
+        toy = Toy()
+        optimise(
+            toy,
+            np.zeros((1, D)),
+            np.zeros(D),
+            np.random.default_rng(0),
+            several,
+            SmdConfig(),
+            settled=lambda _, s=settled: s,
+        )
+        assert len(toy.held[-1][0]) == rows

@@ -150,7 +150,9 @@ def _contour_kernel(real):
         frames: ti.types.ndarray(dtype=real, ndim=3),  # (T, D, 12) scratch
         twists: ti.types.ndarray(dtype=real, ndim=3),  # (T, D, 6) scratch
         placed: ti.types.ndarray(dtype=real, ndim=3),  # (T, P, 19) scratch
-        geometry: ti.types.ndarray(dtype=real, ndim=3),  # (B C K, 2, 8) out: zero configuration 3, pixel 2, normal 2, scale
+        geometry: ti.types.ndarray(
+            dtype=real, ndim=3
+        ),  # (B C K, 2, 8) out: zero configuration 3, pixel 2, normal 2, scale
         flags: ti.types.ndarray(dtype=ti.u8, ndim=2),  # (B C K, 2) out
     ):
         for c in range(frames.shape[0]):

@@ -401,7 +401,7 @@ class ObjectiveSettings:
     tangential: float = 0.3
     min_cosine: float = 0.0
     reach_m: float = 0.3
-    coverage_weight: float = 1.0
+    coverage_weight: float = 0.7
     coverage_nu: float = 0.7
     coverage_cosine: float = 0.0
     coverage_reach_m: float = 0.5
@@ -493,7 +493,9 @@ class ObjectiveKernel:
         return self._scratch[rows]
 
     def _entries(self, entries: np.ndarray | None) -> np.ndarray:
-        return self._no_entries if entries is None or not entries.shape[1] else np.ascontiguousarray(entries, self.dtype)
+        return (
+            self._no_entries if entries is None or not entries.shape[1] else np.ascontiguousarray(entries, self.dtype)
+        )
 
     def _packed(self, s: ObjectiveSettings, M: int, Q: int) -> np.ndarray:
         """The settings in the order in which the kernels read them."""

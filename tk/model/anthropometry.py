@@ -40,7 +40,8 @@ PELVIS_FORWARD = 0.016
 # The same for other parts, and with the same reservation: the spine meets the skull behind its middle; the calf's muscle
 # and the heel's tendon lie behind the line from knee to ankle; hair stands on the crown.
 SKULL_FORWARD = 0.007
-ANKLE_BACK = 0.010
+ANKLE_BACK = 0.013
+ANKLE_OUTWARD = 0.006
 HAIR = 0.008
 
 # Half widths and girths as radii, fractions of the stature, over light clothes.

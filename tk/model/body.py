@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from tk.model.anthropometry import (
     ANKLE_BACK,
+    ANKLE_OUTWARD,
     CHEST_FORWARD,
     CROTCH_DROP,
     HAIR,
@@ -205,7 +206,7 @@ def build_pieces(d: BodyDimensions, extremities: bool = True) -> tuple[Superelli
         # the thigh begins below the crotch: beside the hip joint the body is no wider than the trunk
         _limb(add, f"thigh_{side}", hip, -z, d.thigh, d.thigh_radius, d.knee_radius, x, begin=0.2)
         _cap(add, f"thigh_{side}", hip, z, 0.65 * d.thigh_radius, x)
-        shin = -d.calf * z - ANKLE_BACK * stature * x
+        shin = -d.calf * z + stature * (M @ np.array([-ANKLE_BACK, ANKLE_OUTWARD, 0.0]))
         _limb(add, f"calf_{side}", knee, shin / np.linalg.norm(shin), d.calf, d.knee_radius, d.ankle_radius, x)
         if extremities:
             half = 0.5 * d.foot

@@ -55,7 +55,7 @@ class ContourConfig:
     """
 
     edge_weight: float = 0.0
-    outline_weight: float = 1.0
+    outline_weight: float = 1.5
     views: int = 3
     pairs: int = 3
     trunk_circles: int = 3
@@ -69,7 +69,7 @@ class ContourConfig:
     outline_nu: float = 0.1
     along: float = 0.0
     hidden: float = 1.0
-    renew: int = 3
+    renew: int = 5
 
     def __post_init__(self) -> None:
         for name in ("edge_weight", "outline_weight", "threshold", "mask_edge", "sigma_m"):

@@ -35,7 +35,13 @@ CHAIN_OF_SEGMENT = np.array(
 def _barred() -> Ints:
     """(S,) bit masks of the parts (0 the torso, 1 + c chain c) that a segment's surface may not enter."""
     bits = {name: 1 << 1 + c for c, name in enumerate(CHAIN_NAMES)}
-    enters_not = {"arm_l": 1 | bits["arm_r"], "arm_r": 1 | bits["arm_l"], "leg_l": bits["leg_r"], "leg_r": bits["leg_l"]}
+    trunk = 1 | bits["head"]
+    enters_not = {
+        "arm_l": trunk | bits["arm_r"],
+        "arm_r": trunk | bits["arm_l"],
+        "leg_l": bits["leg_r"],
+        "leg_r": bits["leg_l"],
+    }
     return np.array([enters_not.get(CHAIN_NAMES[c], 0) if c >= 0 else 0 for c in CHAIN_OF_SEGMENT], np.int32)
 
 
@@ -221,6 +227,15 @@ class Fit:
         return float(astray.mean()) if len(astray) else 0.0
 
 
+class _Look(NamedTuple):
+    """A pose's value on the even samples, its gradient (D,), and the assignments that they rest on."""
+
+    value: float
+    gradient: Float
+    held: Held
+    entries: NDArray[np.floating] | None
+
+
 class FrameObjective:
     """The objective of one body in one frame; what :class:`tk.optim.schedule.Problem` asks for.
 
@@ -252,6 +267,9 @@ class FrameObjective:
         self.voxel_count = len(index.positions)
         self.free = objective.chain_free
         self.angular = ~objective.body.skeleton.prismatic
+        self._even_samples = objective.spread()
+        self._even_voxels = np.arange(0, self.voxel_count, max(self.voxel_count // 600, 1), dtype=np.int32)
+        self._looks: dict[bytes, _Look] = {}
         self._fits: dict[bytes, Fit] = {}
         self._pools: list[Ints] = []
 
@@ -308,67 +326,83 @@ class FrameObjective:
         return FixedObjective(self, *self._draw_chain(chain), strips, softness)
 
     def chain_values(self, owner: NDArray[np.intp], poses: Float) -> Float:
-        """(B,) the chains' objectives on even samples and on voxels of the whole hull.
+        """(B,) the chains' objectives on even samples, and on the voxels it may have to cover (:meth:`chains`).
 
         A limb that leaves the voxels it lay on uncovered is no better for it.
         """
-        samples = np.stack([even(s, 60) if len(s) >= 60 else np.resize(s, 60) for s in self.objective.chain_samples])
-        voxels = even(np.arange(self.voxel_count, dtype=np.int32), 400)
+        samples = np.stack([np.resize(even(s, 60), 60) for s in self.objective.chain_samples])
+        voxels = np.stack([np.resize(even(pool, 120), 120) for pool in self._pools])
         entries = self._entries(poses, self._term.draw_chains(None)[owner]) if self.contours else None
-        return self._evaluate(
-            samples[owner], np.repeat(voxels[None], len(owner), 0), poses, None, self.objective.settings, entries
-        ).value
+        return self._evaluate(samples[owner], voxels[owner], poses, None, self.objective.settings, entries).value
 
     def value(self, pose: Float) -> float:
-        """The objective at ``pose`` (D,) on even samples and all voxels."""
-        return self.fit(pose).value
+        """The objective at ``pose`` (D,) on even samples and evenly spread voxels."""
+        return float(self.values(pose[None])[0])
+
+    def values(self, poses: Float) -> Float:
+        """(B,) the same of poses (B, D), in one go."""
+        unknown = [pose for pose in poses if pose.tobytes() not in self._looks]
+        if unknown:
+            self._look(np.array(unknown))
+        return np.array([self._looks[pose.tobytes()].value for pose in poses])
+
+    def gradient(self, pose: Float) -> Float:
+        """(D,) gradient of :meth:`value`, with the assignments held."""
+        self.values(pose[None])
+        return self._looks[pose.tobytes()].gradient
 
     def curvature(self, pose: Float, softness: float = 1.0) -> Float:
         """(D, D) Gauss-Newton Hessian at ``pose`` (D,), outliers weighing at least :attr:`outliers`."""
-        fit = self.fit(pose)
-        settings = self._softened(softness)
-        kernel = self.objective.kernel
-        entries = fit.entries
-        if entries is not None and softness != 1:
-            entries = entries.copy()
-            entries[:, :, NU] *= softness
-        return kernel.linearise(
-            self.index,
-            fit.samples,
-            fit.voxels,
-            pose,
-            fit.held,
-            settings,
-            self.outliers,
-            with_jacobian=False,
-            entries=entries,
-        ).hessian
+        return self._linearise(pose, softness, with_jacobian=False).hessian
 
     def fit(self, pose: Float) -> Fit:
         """How well ``pose`` (D,) explains the frame, on samples that do not change from call to call."""
-        key = np.asarray(pose, np.float64).tobytes()
-        if key in self._fits:
-            return self._fits[key]
-        samples = self.objective.spread()
-        voxels = np.arange(0, self.voxel_count, max(self.voxel_count // 600, 1), dtype=np.int32)
-        kernel, settings = self.objective.kernel, self.objective.settings
-        entries = self._entries(pose[None], self._term.draw(None)[None]) if self.contours else None
-        value, _, _, held = kernel.evaluate(
-            self.index, samples[None], voxels[None], pose[None], None, settings, entries=entries
-        )
-        linear = kernel.linearise(
+        key = pose.tobytes()
+        if key not in self._fits:
+            linear = self._linearise(pose, 1.0, self.with_jacobian)
+            look = self._looks[key]
+            self._fits[key] = Fit(look.value, linear, look.held, self._even_samples, self._even_voxels, look.entries)
+        return self._fits[key]
+
+    def _look(self, poses: Float) -> None:
+        """Evaluate poses (B, D) on the even samples and keep what was found."""
+        B = len(poses)
+        entries = None
+        if self.contours:
+            entries = self._entries(poses, np.repeat(self._term.draw(None)[None], B, 0))
+        value, gradient, _, held = self.objective.kernel.evaluate(
             self.index,
-            samples,
-            voxels,
-            pose,
-            held,
-            settings,
-            self.outliers,
-            with_jacobian=self.with_jacobian,
+            np.repeat(self._even_samples[None], B, 0),
+            np.repeat(self._even_voxels[None], B, 0),
+            poses,
+            None,
+            self.objective.settings,
             entries=entries,
         )
-        self._fits[key] = Fit(float(value[0]), linear, held, samples, voxels, entries)
-        return self._fits[key]
+        for b, pose in enumerate(poses):
+            own = Held(held.assigned[b : b + 1], held.covering[b : b + 1])
+            self._looks[pose.tobytes()] = _Look(
+                float(value[b]), gradient[b], own, None if entries is None else entries[b : b + 1]
+            )
+
+    def _linearise(self, pose: Float, softness: float, with_jacobian: bool) -> Linearisation:
+        self.values(pose[None])
+        look = self._looks[pose.tobytes()]
+        entries = look.entries
+        if entries is not None and softness != 1:
+            entries = entries.copy()
+            entries[:, :, NU] *= softness
+        return self.objective.kernel.linearise(
+            self.index,
+            self._even_samples,
+            self._even_voxels,
+            pose,
+            look.held,
+            self._softened(softness),
+            self.outliers,
+            with_jacobian=with_jacobian,
+            entries=entries,
+        )
 
     def _chain_pools(self, fit: Fit) -> list[Ints]:
         """For each chain the voxels it may have to cover: those nearest to it, and those that nothing covers."""

@@ -54,6 +54,14 @@ class Problem(Protocol):
         """The objective at a pose (D,) on samples that do not change from call to call."""
         ...
 
+    def values(self, poses: Float) -> Float:
+        """(B,) the same at poses (B, D)."""
+        ...
+
+    def gradient(self, pose: Float) -> Float:
+        """(D,) the derivative of :meth:`value`."""
+        ...
+
     def curvature(self, pose: Float, softness: float) -> Float:
         """(D, D) Gauss-Newton Hessian at a pose."""
         ...
@@ -87,6 +95,8 @@ class ScheduleConfig:
         soft, chain_soft: by how much Leclerc's ν is multiplied in the first pass and for the chains; 1 is the paper's.
         iterations, chain_iterations, polish_iterations: i_max (eq. 21) of the three passes; no polish with 0, as in the
             paper.
+        newton_iterations: damped Gauss-Newton steps after all, on samples that do not change: the last centimetre, which the
+            draws' noise hides from SMD; 0 for the paper's.
         retries: how often a frame whose objective stays high is searched anew from other starts.
         hypotheses: starts of each chain: as the first pass left it, as the last frame had it, and the best of some
             random candidates; at least 1.
@@ -95,6 +105,7 @@ class ScheduleConfig:
         spread_deg: their standard deviation.
         gain: share by which the objective must fall for a pose found by a search anew: it breaks with the past.
         margin: by how much a hypothesis must be better than the first.
+        inertia: by how much more, for each radian that its angles lie from the last frame's on average.
         max_step_deg, max_step_m: greatest change in one iteration; samples that happen to see little of a parameter ask
             for more.
         hierarchical: the earlier tracker of section 6.4: the torso alone first, then the chains, and no last pass.
@@ -110,9 +121,10 @@ class ScheduleConfig:
     outliers: float = 0.1
     soft: float = 4.0
     chain_soft: float = 2.0
-    iterations: int = 10
-    chain_iterations: int = 10
-    polish_iterations: int = 6
+    iterations: int = 8
+    chain_iterations: int = 6
+    polish_iterations: int = 5
+    newton_iterations: int = 2
     retries: int = 1
     hypotheses: int = 4
     wide_hypotheses: int = 8
@@ -120,6 +132,7 @@ class ScheduleConfig:
     spread_deg: float = 40.0
     gain: float = 0.08
     margin: float = 0.004
+    inertia: float = 0.05
     max_step_deg: float = 20.0
     max_step_m: float = 0.15
     hierarchical: bool = False
@@ -129,7 +142,15 @@ class ScheduleConfig:
         for name in (*lengths, "refine", "soft", "chain_soft", "iterations", "chain_iterations"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"schedule.{name} = {getattr(self, name)} must be positive")
-        for name in ("outliers", "spread_deg", "margin", "polish_iterations", "retries"):
+        for name in (
+            "outliers",
+            "spread_deg",
+            "margin",
+            "inertia",
+            "polish_iterations",
+            "newton_iterations",
+            "retries",
+        ):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"schedule.{name} = {getattr(self, name)} must not be negative")
         if self.hypotheses < 1 or not 0 < self.rate <= 2:
@@ -155,6 +176,7 @@ def optimise(
     smd_config: smd.SmdConfig,
     good_enough: Callable[[Float], bool] | None = None,
     alternatives: Callable[[Float, np.random.Generator], Float] | None = None,
+    settled: Callable[[Float], bool] | None = None,
 ) -> ScheduleResult:
     """All passes; again from elsewhere while the objective stays high.
 
@@ -166,10 +188,12 @@ def optimise(
         config, smd_config: settings.
         good_enough: whether a pose (D,) ends the search; any does by default.
         alternatives: other starts (A, D), made from the best pose so far, for when it is not good enough.
+        settled: whether a pose (D,) after the first pass is so good that the chains need no hypotheses beside it; none is
+            by default.
     """
     tolerance = np.where(problem.angular, np.radians(config.tolerance_deg), config.tolerance_m)
     starts = problem.constrain(starts)
-    best = _passes(problem, _best(problem, starts), previous, tolerance, rng, config, smd_config)
+    best = _passes(problem, _best(problem, starts), previous, tolerance, rng, config, smd_config, settled)
     value = problem.value(best.pose)
     for _ in range(config.retries):
         if alternatives is None or good_enough is None or good_enough(best.pose):
@@ -188,7 +212,7 @@ def optimise(
 
 
 def _best(problem: Problem, poses: Float) -> Float:
-    return poses[0] if len(poses) == 1 else min(poses, key=problem.value)
+    return poses[0] if len(poses) == 1 else poses[int(np.argmin(problem.values(poses)))]
 
 
 def _passes(
@@ -199,18 +223,27 @@ def _passes(
     rng: np.random.Generator,
     config: ScheduleConfig,
     smd_config: smd.SmdConfig,
+    settled: Callable[[Float], bool] | None = None,
     wide: bool = False,
 ) -> ScheduleResult:
     """All parameters, the chains, all parameters."""
     limit = replace(smd_config, max_iterations=config.iterations)
     first = _all(problem, start[None], tolerance, config.soft, config, limit)
-    pose, winners = _chains(problem, first.pose[0], previous, tolerance * config.refine, rng, config, smd_config, wide)
+    count = config.wide_hypotheses if wide else config.hypotheses
+    if settled is not None and settled(first.pose[0]):
+        count = 1
+    pose, winners = _chains(
+        problem, first.pose[0], previous, tolerance * config.refine, rng, config, smd_config, count, wide
+    )
     made = first.iterations
     if config.polish_iterations and not config.hierarchical:
         limit = replace(smd_config, max_iterations=config.polish_iterations)
         last = _all(problem, pose[None], tolerance * config.refine, 1.0, config, limit)
         pose = last.pose[0]
         made = made + last.iterations
+    if config.newton_iterations:
+        pose, newton = _newton(problem, pose, config)
+        made = made + newton
     return ScheduleResult(pose, np.concatenate([made, winners]).astype(np.int32))
 
 
@@ -240,6 +273,21 @@ def _all(
     )
 
 
+def _newton(problem: Problem, pose: Float, config: ScheduleConfig) -> tuple[Float, int]:
+    """Damped Gauss-Newton steps on samples that do not change, as long as they lead down; how many were made."""
+    damping = np.diag(problem.damping(config.lever_m, 1.0))
+    limit = _max_step(problem, config)
+    for made in range(config.newton_iterations):
+        step = np.linalg.solve(problem.curvature(pose, 1.0) + damping, -problem.gradient(pose))
+        step = np.clip(step, -limit, limit)
+        tried = problem.constrain(pose + np.array([1.0, 0.4])[:, None] * step)
+        values = problem.values(tried)
+        if values.min() >= problem.value(pose):
+            return pose, made
+        pose = tried[int(values.argmin())]
+    return pose, config.newton_iterations
+
+
 def _max_step(problem: Problem, config: ScheduleConfig) -> Float:
     return np.where(problem.angular, np.radians(config.max_step_deg), config.max_step_m)
 
@@ -252,12 +300,12 @@ def _chains(
     rng: np.random.Generator,
     config: ScheduleConfig,
     smd_config: smd.SmdConfig,
+    count: int,
     wide: bool = False,
 ) -> tuple[Float, NDArray[np.int32]]:
     """The chains with the torso at ``pose``: the pose with each chain's best hypothesis, and their iterations (K,)."""
     free = problem.free
     K = len(free)
-    count = max(config.wide_hypotheses, config.hypotheses) if wide else config.hypotheses
     owner = np.tile(np.arange(K), count)
     hypotheses = np.repeat(pose[None], len(owner), axis=0)
     if count > 1:
@@ -283,6 +331,8 @@ def _chains(
     if count > 1:
         values = problem.chain_values(owner, found.pose).reshape(count, K)
         values[1:] += config.margin
+        turned = np.abs(np.where(problem.angular & free[owner], found.pose - previous, 0.0))
+        values += config.inertia * (turned.sum(axis=1) / free[owner].sum(axis=1)).reshape(count, K)
         best = values.argmin(axis=0) * K + np.arange(K)
     result = pose.copy()
     for k in range(K):
