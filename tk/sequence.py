@@ -22,6 +22,7 @@ from tk.io.init_pose import InitPose, read_init_pose
 from tk.io.result import FrameResult, HullPoints, ResultMeta, ResultWriter, Status, Value
 from tk.model.foreground import CollinearityForeground, Mog2Foreground, median_plate
 from tk.model.hull import HullSurface
+from tk.silhouette import SilhouetteTracker
 from tk.tracker import Estimate, Observation, Stopwatch, Tracker
 from tk.volumetric import LevenbergMarquardtTracker, VolumetricTracker
 
@@ -29,7 +30,7 @@ Segmenter = Callable[[FrameSet], NDArray[np.uint8]]
 Observations = Iterator[tuple[Observation, Stopwatch]]
 
 TRACKERS = {tracker.method: tracker for tracker in (VolumetricTracker, LevenbergMarquardtTracker)}
-METHODS = tuple(TRACKERS)
+METHODS = (*TRACKERS, SilhouetteTracker.method)
 
 # frames from which a background is made where there is no recording of the empty scene
 PLATE_FRAMES = 25
@@ -72,6 +73,8 @@ class Summary:
 
 def make_tracker(method: str, capture: Capture, config: Config) -> Tracker:
     """The tracker of this name for a capture."""
+    if method == SilhouetteTracker.method:
+        return SilhouetteTracker(capture.rig, capture.up, config.silhouette)
     if method not in TRACKERS:
         raise ConfigError(f"--method {method}: choose one of {', '.join(METHODS)}")
     return TRACKERS[method](capture.rig, capture.volume, capture.up, config)
@@ -142,10 +145,12 @@ def track(
         )
     first = init.frame if init and init.frame is not None else frames[0] if init else capture.init_frame
     if init is None and capture.init_pose == "any":
-        raise CaptureError(
-            f'{capture.path / "capture.toml"}: init.pose = "any", so nobody stands in the Da Vinci pose; '
-            "give a rough pose with --init-pose FILE"
-        )
+        if method != SilhouetteTracker.method:
+            raise CaptureError(
+                f'{capture.path / "capture.toml"}: init.pose = "any", so nobody stands in the Da Vinci pose; '
+                f"give a rough pose with --init-pose FILE, or use --method {SilhouetteTracker.method}"
+            )
+        first = max(first, frames[0])  # no frame is better than another
     start, stop = choose_frames(capture, frames, reporter.note)
     if not first < capture.frame_count:
         raise CaptureError(f"{init_pose}: frame = {first} is past the capture's last, {capture.frame_count - 1}")
@@ -238,6 +243,8 @@ class _Run:
         self.store_hull = store_hull
         self.tracked = 0
         self.lost = 0
+        # dozens of frames are held while the silhouette tracker starts
+        self._keeps_images = tracker.method != SilhouetteTracker.method
 
     def go(self, init: InitPose | None) -> None:
         """Start or restore the tracker, and step it to the end."""
@@ -251,13 +258,15 @@ class _Run:
         if self.done:
             self.tracker.restore(self.writer.model, self.writer.state)
             with self.capture.frames(self.begin + self.done, self.stop) as frames:
-                self._step_through(_observe(frames, segment))
+                self._step_through(_observe(frames, segment, self._keeps_images))
             return
         # The body is fitted to the same frames however few are asked for, so that a run may be prolonged by --resume.
-        opening_stop = self.first + self.config.tracking.init_frames
+        silhouette = self.tracker.method == SilhouetteTracker.method
+        opening_frames = (self.config.silhouette if silhouette else self.config.tracking).init_frames
+        opening_stop = self.first + opening_frames
         with self.capture.frames(self.first, max(self.stop, opening_stop)) as frames:
-            observations = _observe(frames, segment)
-            opening, broken = _take(observations, self.config.tracking.init_frames)
+            observations = _observe(frames, segment, self._keeps_images)
+            opening, broken = _take(observations, opening_frames)
             try:
                 self.tracker.start([o for o, _ in opening], self.capture.subject_height_m, init)
             except CaptureError as error:
@@ -314,8 +323,8 @@ def _raising(error: TkError) -> Observations:
     yield
 
 
-def _observe(frames: Iterator[FrameSet], segment: Segmenter) -> Observations:
-    """Frames with their masks, and what it took to get them."""
+def _observe(frames: Iterator[FrameSet], segment: Segmenter, keep_images: bool) -> Observations:
+    """Frames with their masks, and what it took to get them; without pictures (C, 0, 0, 3) if nobody needs them."""
     while True:
         watch = Stopwatch()
         frame = next(frames, None)
@@ -324,7 +333,8 @@ def _observe(frames: Iterator[FrameSet], segment: Segmenter) -> Observations:
         watch.lap("decode")
         masks = segment(frame)
         watch.lap("masks")
-        yield Observation(frame.index, frame.images, masks), watch
+        images = frame.images if keep_images else np.empty((len(masks), 0, 0, 3), np.uint8)
+        yield Observation(frame.index, images, masks), watch
 
 
 def _row(index: int, fps: float, estimate: Estimate, timing: dict[str, float], store_hull: bool) -> FrameResult:

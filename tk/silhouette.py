@@ -21,7 +21,7 @@ from tk.kernels.silhouette import SearchSettings
 from tk.model import gait
 from tk.model.anthropometry import BodyDimensions
 from tk.model.camera import Rig
-from tk.model.cone_body import ConeBody, build_cone_body
+from tk.model.cone_body import PRESETS, ConeBody, build_cone_body
 from tk.model.cone_fitting import ConeFitConfig, fit_dimensions
 from tk.model.initialisation import rough_pose
 from tk.model.silhouettes import CleaningConfig, Pyramid, Views
@@ -73,6 +73,8 @@ class SilhouetteConfig:
     fit: ConeFitConfig = field(default_factory=ConeFitConfig)
 
     def __post_init__(self) -> None:
+        if self.body not in PRESETS:
+            raise ConfigError(f'silhouette: body = "{self.body}": choose one of {", ".join(PRESETS)}')
         if min(self.headings, self.phases, self.finalists, self.init_frames) < 1:
             raise ConfigError("silhouette: headings, phases, finalists and init_frames must be at least 1")
         if min(self.ray_step, self.second_thoughts) < 0:
@@ -94,7 +96,7 @@ class SilhouetteTracker:
     """
 
     method = "silhouette"
-    timing_stages = ("masks_clean", "optimise", "check")
+    timing_stages: tuple[str, ...] = ("masks_clean", "optimise", "check")
 
     def __init__(self, rig: Rig, up: str, config: SilhouetteConfig | None = None) -> None:
         self.config = config or SilhouetteConfig()
