@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tk.config import PRESETS, Config
@@ -38,6 +38,7 @@ def test_defaults_round_trip() -> None:
     assert Config.from_toml("") == Config()
 
 
+@settings(deadline=None)
 @given(
     voxels=st.integers(8, 512),
     seed=st.integers(0, 2**62),

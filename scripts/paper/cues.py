@@ -1,0 +1,46 @@
+"""Section 7.2: the surface alone against surface and edges, arms close to the body."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from scripts.paper.common import Options, contours, over_seeds, plt, save, spread, table
+from tk.config import Config
+
+
+def variants() -> dict[str, Config]:
+    """The cues by name."""
+    default = Config()
+    hull = contours(default, edge_weight=0.0, outline_weight=0.0)
+    paper = Config.preset("kehl2006")
+    return {
+        "surface": replace(hull, objective=replace(hull.objective, coverage_weight=0.0)),
+        "surface, coverage": hull,
+        "surface, coverage, colour edges": contours(hull, edge_weight=1.0),
+        "surface, coverage, outline": contours(hull, outline_weight=1.0),
+        "surface, coverage, outline, colour edges": contours(hull, outline_weight=1.0, edge_weight=1.0),
+        "kehl2006, surface": contours(paper, edge_weight=0.0),
+        "kehl2006, surface, colour edges": paper,
+    }
+
+
+def run(options: Options) -> str:
+    """Write the figure and give the table."""
+    figure, axes = plt.subplots(figsize=(9, 4))
+    rows = []
+    for name, config in variants().items():
+        tracks = over_seeds(options, config)
+        rows.append(
+            {
+                "cues": name,
+                "15 joints: mean [cm]": spread([t.mean_cm for t in tracks]),
+                "elbows, wrists [cm]": spread([t.arms_cm for t in tracks]),
+                "frames > 10 cm": spread([t.astray for t in tracks], 0),
+                "optimisation [ms]": spread([float(sorted(t.optimise_ms)[len(t.optimise_ms) // 2]) for t in tracks], 0),
+            }
+        )
+        axes.plot(tracks[0].frame_cm, label=name, linewidth=1)
+    axes.set(xlabel="frame", ylabel="mean joint error [cm]", title=options.capture.name, ylim=(0, 25))
+    axes.legend(fontsize=7)
+    save(figure, options.figure)
+    return table(rows)

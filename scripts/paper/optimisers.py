@@ -1,0 +1,44 @@
+"""Section 7.3: SMD against Levenberg-Marquardt, at the same and at five times as many points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from scripts.paper.common import Options, over_seeds, plain, plt, save, spread, table
+from tk.config import Config
+
+VARIANTS = (
+    ("SMD, 1× points", "volumetric", 1, plain(Config())),
+    ("SMD, 5× points", "volumetric", 5, plain(Config())),
+    ("LM, 1× points", "lm", 1, plain(Config())),
+    ("LM, 5× points", "lm", 5, plain(Config())),
+    ("SMD, the default: hypotheses, search anew, Gauss-Newton", "volumetric", 1, Config()),
+)
+
+
+def run(options: Options) -> str:
+    """Write the figure and give the table."""
+    figure, (above, below) = plt.subplots(2, 1, figsize=(9, 6), sharex=True)
+    rows = []
+    for name, method, scale, base in VARIANTS:
+        config = replace(base, sampling=replace(base.sampling, scale=scale))
+        tracks = over_seeds(options, config, method)
+        rows.append(
+            {
+                "optimiser": name,
+                "15 joints: mean [cm]": spread([t.mean_cm for t in tracks]),
+                "frames > 10 cm": spread([t.astray for t in tracks], 0),
+                "median [ms]": spread([float(np.median(t.optimise_ms)) for t in tracks], 0),
+                "90th percentile [ms]": spread([float(np.quantile(t.optimise_ms, 0.9)) for t in tracks], 0),
+                "iterations of a descent": spread([float(t.iterations.mean()) for t in tracks], 1),
+            }
+        )
+        above.plot(tracks[0].optimise_ms, label=rows[-1]["optimiser"], linewidth=1)
+        below.plot(tracks[0].frame_cm, linewidth=1)
+    above.set(ylabel="optimisation [ms]", yscale="log", title=options.capture.name)
+    above.legend(fontsize=7)
+    below.set(xlabel="frame", ylabel="mean joint error [cm]", ylim=(0, 20))
+    save(figure, options.figure)
+    return table(rows)

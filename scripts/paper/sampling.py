@@ -1,0 +1,171 @@
+"""Section 7.1: an arm is displaced; stochastic and deterministic points bring it back, or do not.
+
+As in the paper two angles are moved, by its 18.3° and 5.7°, and optimised, the rest of the body being held: the right
+shoulder's and the right elbow's. The paper shows one run of either; here there are as many as seeds, to each of four
+sides. The place to come back to is the minimum near the tracked pose of the objective averaged over many draws.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scripts.paper.common import Float, Options, plt, save, table
+from tk.config import Config
+from tk.io.capture import open_capture
+from tk.kernels.nearest import SurfaceIndex
+from tk.model.contour_term import ContourTerm, Pictures
+from tk.model.objective import CHAIN_NAMES, BodyObjective, FrameObjective
+from tk.optim import smd
+from tk.optim.schedule import descent_basis
+from tk.sequence import make_segmenter
+from tk.tracker import Observation
+from tk.volumetric import CELL_VOXELS, VolumetricTracker
+
+ANGLES = ("shoulder_r_pitch", "elbow_r_flexion")
+MOVED_DEG = np.array([18.3, 5.7])
+SIDES = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+BACK_DEG = 5.0
+CHAIN = CHAIN_NAMES.index("arm_r")
+AVERAGED = 40  # draws
+WIDTH_DEG, STEP_DEG = 36.0, 2.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A tracked frame and the objective of one arm in it.
+
+    Attributes:
+        frame: a new frame objective for every seed comes from :meth:`fresh`.
+        pose: (D,) the tracked pose; two: the positions of :data:`ANGLES` in it.
+    """
+
+    frame: FrameObjective
+    pose: Float
+    two: NDArray[np.intp]
+
+    def fresh(self, seed: int) -> FrameObjective:
+        """The same frame with draws of this seed."""
+        f = self.frame
+        return FrameObjective(f.objective, f.index, np.random.default_rng(seed), f.outliers, pictures=f.pictures)
+
+
+def look(options: Options, paper: Config) -> Scene:
+    """Track to the last of the frames with the defaults, and set up ``paper``'s objective there."""
+    capture = open_capture(options.capture)
+    config = Config()
+    segment = make_segmenter(capture, config, lambda _: None)
+    tracker = VolumetricTracker(capture.rig, capture.volume, capture.up, config)
+    opening = config.tracking.init_frames
+    with capture.frames(0, options.frames) as frames:
+        seen = (Observation(f.index, f.images.copy(), segment(f).copy()) for f in frames)
+        first = list(islice(seen, opening))
+        tracker.start(first, capture.subject_height_m, None)
+        for observation in (*first, *seen):
+            estimate = tracker.step(observation)
+    surface = estimate.surface
+    assert surface is not None
+    body = tracker.body
+    # colours do not confine the neighbours here: the arm's own are what it could not mistake
+    every = np.full(len(surface), -1, np.int64)
+    index = SurfaceIndex.build(surface.positions, surface.normals, every, CELL_VOXELS * tracker.hull.grid.voxel_m)
+    term = ContourTerm(body, capture.rig, paper.contours, paper.edges) if paper.contours.enabled else None
+    objective = BodyObjective(body, paper.objective, paper.sampling, term)
+    pictures = Pictures(observation.images, observation.masks)
+    frame = FrameObjective(objective, index, np.random.default_rng(0), pictures=pictures)
+    two = np.array([body.skeleton.index(name) for name in ANGLES])
+    return Scene(frame, estimate.pose, two)
+
+
+def landscape(scene: Scene, seed: int, poses: Float, iteration: int = 0) -> Float:
+    """(B,) the arm's objective at poses (B, D) on one draw."""
+    owner = np.full(len(poses), CHAIN)
+    return scene.fresh(seed).chains(owner, scene.pose)(poses, np.zeros_like(poses), iteration).value
+
+
+def moved(scene: Scene, offsets_deg: Float) -> Float:
+    """(B, D) poses with the two angles turned by (B, 2) degrees, within the limits."""
+    poses = np.repeat(scene.pose[None], len(offsets_deg), 0)
+    poses[:, scene.two] += np.radians(offsets_deg)
+    return scene.frame.constrain(poses)
+
+
+def descend(scene: Scene, start: Float, seed: int, shuffle: bool, config: Config) -> tuple[Float, int]:
+    """Path (I + 1, 2) of the two angles in degrees, and the iterations."""
+    frame = scene.fresh(seed)
+    free = np.zeros(len(start), bool)
+    free[scene.two] = True
+    s = config.schedule
+    basis, inverse = descent_basis(
+        frame.curvature(start), free, frame.damping(s.chain_lever_m), replace(s, whiten=False)
+    )
+    tolerance = s.refine * np.where(frame.angular, np.radians(s.tolerance_deg), s.tolerance_m)
+    found = smd.minimise(
+        frame.chains(np.array([CHAIN]), scene.pose),
+        start[None],
+        s.rate,
+        tolerance,
+        frame.constrain,
+        basis[None],
+        replace(config.smd, shuffle=shuffle),
+        keep_path=True,
+        max_step=np.where(frame.angular, np.radians(s.max_step_deg), s.max_step_m),
+        basis_inverse=inverse[None],
+    )
+    assert found.path is not None
+    path = np.vstack([found.path[:, 0], found.pose])
+    return np.degrees(path[:, scene.two]), int(found.iterations[0])
+
+
+def run(options: Options) -> str:
+    """Write the figure and give the table."""
+    paper = Config.preset("kehl2006")
+    # 7.1: 10 points on the arm's surface and 10 on each projected contour
+    paper = replace(paper, sampling=replace(paper.sampling, chain=10))
+    scene = look(options, paper)
+    axis = np.arange(-WIDTH_DEG, WIDTH_DEG + 0.1, STEP_DEG)
+    grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    poses = moved(scene, grid)
+    mean = np.mean([landscape(scene, seed, poses) for seed in range(AVERAGED)], axis=0)
+    near = np.abs(grid).max(axis=1) <= 20
+    best = poses[near][mean[near].argmin()]
+    goal = np.degrees(best[scene.two])
+    rows, paths = [], {}
+    for shuffle, name in ((True, "stochastic"), (False, "deterministic")):
+        back, count, distance, made = 0, 0, [], []
+        for side in SIDES:
+            start = best.copy()
+            start[scene.two] += np.radians(MOVED_DEG * side)
+            start = scene.frame.constrain(start[None])[0]
+            for seed in range(options.seeds):
+                path, iterations = descend(scene, start, seed, shuffle, paper)
+                paths.setdefault(name, path)
+                left = np.abs(path[-1] - goal)
+                back += bool(left.max() <= BACK_DEG)
+                count += 1
+                distance.append(left)
+                made.append(iterations)
+        shoulder, elbow = np.mean(distance, axis=0)
+        rows.append(
+            {
+                "points": name,
+                "back within 5°": f"{back} of {count}",
+                "left, shoulder and elbow [°]": f"{shoulder:.1f}, {elbow:.1f}",
+                "iterations": f"{np.mean(made):.1f}",
+            }
+        )
+    figure, panels = plt.subplots(1, 2, figsize=(10, 4.5), sharey=True)
+    x, y = (np.degrees(scene.pose[k]) + axis for k in scene.two)
+    fields = {"deterministic": landscape(scene, 0, poses), "stochastic": mean}
+    for panel, (name, values) in zip(panels, fields.items(), strict=True):
+        panel.contourf(x, y, values.reshape(len(axis), -1).T, 24)
+        panel.plot(*paths[name].T, "w.-", linewidth=1, markersize=4)
+        panel.plot(*goal, "ko", fillstyle="none")
+        shown = "one draw" if name == "deterministic" else f"mean of {AVERAGED} draws"
+        panel.set(title=f"{name}; objective of {shown}", xlabel=f"{ANGLES[0]} [°]")
+    panels[0].set_ylabel(f"{ANGLES[1]} [°]")
+    save(figure, options.figure)
+    return table(rows)

@@ -1,0 +1,129 @@
+"""The paper's experiments at a small size: what their tables and figures are of, not how large the numbers are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scripts.experiments import EXPERIMENTS, main
+from scripts.paper import common, cues, sampling, views
+from scripts.paper.common import Options, Track, plain, spread, table
+from scripts.paper.motion import turned_deg
+from tk.config import Config
+from tk.model.skeleton import JOINTS
+
+DEMO = Path(__file__).resolve().parents[2] / "tk" / "data" / "demo"
+
+
+def made_up(error: float = 2.0, frames: int = 6) -> Track:
+    pose = np.zeros((frames, 3))
+    pose[:, 2] = np.radians(7.0) * np.arange(frames)
+    return Track(
+        np.full((frames, 15), error),
+        pose,
+        ("m", "rad", "rad"),
+        np.full((frames, 6), 5),
+        np.full(frames, 20.0),
+        np.zeros(frames, bool),
+    )
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    """Tracking replaced by numbers made up; what was asked for."""
+    calls: list[tuple[Any, ...]] = []
+
+    def track(
+        capture: Path, config: Config, frames: int | None, method: str = "volumetric", cameras: Any = None
+    ) -> Track:
+        calls.append((config, frames, method, cameras))
+        return made_up()
+
+    monkeypatch.setattr(common, "track", track)
+    return calls
+
+
+@pytest.mark.parametrize("name", [name for name in EXPERIMENTS if name != "sampling"])
+def test_every_experiment_writes_a_figure_and_a_table(
+    name: str, asked: list[tuple[Any, ...]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main([name, str(DEMO), "--frames", "6", "--seeds", "2", "--out", str(tmp_path)])
+    printed = capsys.readouterr().out
+    assert EXPERIMENTS[name].paper in printed and "2 seeds" in printed
+    assert printed.count("|\n") >= 3 and "2.00" in printed
+    assert 0 < (tmp_path / f"{name}.png").stat().st_size < 200_000
+    assert all(frames == 6 for _, frames, _, _ in asked)
+    assert {config.seed for config, *_ in asked} == {0, 1}
+
+
+def test_optimisers_differ_in_method_and_points_alone(asked: list[tuple[Any, ...]], tmp_path: Path) -> None:
+    main(["optimisers", str(DEMO), "--seeds", "1", "--out", str(tmp_path)])
+    assert [(method, config.sampling.scale) for config, _, method, _ in asked] == [
+        ("volumetric", 1), ("volumetric", 5), ("lm", 1), ("lm", 5), ("volumetric", 1),
+    ]  # fmt: skip
+    same = {replace(config, sampling=Config().sampling) for config, *_ in asked[:4]}
+    assert same == {plain(Config())} and asked[4][0] == Config()
+
+
+def test_cues_are_what_their_names_say() -> None:
+    found = cues.variants()
+    assert not found["surface"].contours.enabled and found["surface"].objective.coverage_weight == 0
+    assert found["surface, coverage, colour edges"].contours.edge_weight > 0
+    assert all(config.contours.edge_weight > 0 for name, config in found.items() if "edges" in name)
+    assert found["kehl2006, surface, colour edges"] == Config.preset("kehl2006")
+    assert len(set(found.values())) == len(found)
+
+
+def test_views_are_as_many_as_named(asked: list[tuple[Any, ...]], tmp_path: Path) -> None:
+    views.run(Options(DEMO, 6, 1, tmp_path / "views.png"))
+    assert [len(set(cameras)) for *_, cameras in asked] == [4, 5, 5], "the demo has five cameras"
+
+
+def test_turns_are_the_greatest_of_a_frame_and_lengths_do_not_count() -> None:
+    track = made_up()
+    track.pose[3, 0] += 5.0
+    np.testing.assert_allclose(turned_deg(track), 7.0)
+    track.pose[:, 1] = np.pi * np.array([0.99, -0.99, 0.99, -0.99, 0.99, -0.99])
+    np.testing.assert_allclose(turned_deg(track), 7.0, err_msg="3.6° through ±180°")
+
+
+def test_a_table_is_markdown() -> None:
+    assert table([{"a": "1", "b": "2"}, {"a": "3", "b": "4"}]).splitlines() == [
+        "| a | b |", "| --- | --- |", "| 1 | 2 |", "| 3 | 4 |",
+    ]  # fmt: skip
+    assert spread([1.0]) == "1.00" and spread([1.0, 3.0], 1) == "2.0 (1.0-3.0)"
+
+
+def test_a_track_is_of_the_capture() -> None:
+    track = common.track(DEMO, plain(Config(voxels=48)), 4)
+    assert track.error_cm.shape == (4, len(JOINTS)) and track.pose.shape[0] == 4
+    assert 0.5 < track.mean_cm < 15 and track.astray <= 4
+    assert (track.optimise_ms > 0).all() and (track.iterations > 0).all()
+
+
+def test_an_arm_is_displaced_and_comes_back_or_not(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(sampling, "AVERAGED", 2)
+    monkeypatch.setattr(sampling, "STEP_DEG", 12.0)
+    text = sampling.run(Options(DEMO, 5, 2, tmp_path / "sampling.png"))
+    assert "of 8" in text and "stochastic" in text and "deterministic" in text
+    assert (tmp_path / "sampling.png").stat().st_size < 200_000
+
+
+def test_deterministic_points_stay_and_stochastic_ones_do_not() -> None:
+    scene = sampling.look(Options(DEMO, 5, 1, Path("none.png")), Config.preset("kehl2006"))
+    start = sampling.moved(scene, np.array([[10.0, 5.0]]))
+    values = [sampling.landscape(scene, 3, start)[0] for _ in range(2)]
+    assert values[0] == values[1] != sampling.landscape(scene, 4, start)[0]
+    ends = [sampling.descend(scene, start[0], 3, False, Config.preset("kehl2006"))[0][-1] for _ in range(2)]
+    np.testing.assert_array_equal(ends[0], ends[1])
+    held = np.setdiff1d(np.arange(len(scene.pose)), scene.two)
+    np.testing.assert_array_equal(start[0, held], scene.pose[held])
+
+
+def test_a_capture_that_is_none_is_named(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="nowhere"):
+        main(["views", str(tmp_path / "nowhere"), "--out", str(tmp_path)])
