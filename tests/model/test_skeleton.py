@@ -9,7 +9,7 @@ from scipy.linalg import expm
 from tk.errors import ConfigError
 from tk.model.anthropometry import RAISED_SHOULDERS, TRUNK_LENGTH, BodyDimensions
 from tk.model.body import neutral_pose
-from tk.model.initialisation import shoulder_angles
+from tk.model.skeleton import shoulder_angles
 from tk.model.skeleton import CHAINS, DEGREES_OF_FREEDOM, JOINTS, SEGMENTS, build_skeleton, twist_exp, up_rotation
 
 DIMENSIONS = BodyDimensions.from_stature(1.75)

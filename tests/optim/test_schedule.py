@@ -73,6 +73,10 @@ class Toy:
     def angular(self) -> NDArray[np.bool_]:
         return np.arange(D) >= 3
 
+    @property
+    def postures(self) -> Float:
+        return np.zeros((0, D))
+
     def constrain(self, poses: Float) -> Float:
         return np.clip(poses, -LIMIT, LIMIT)
 
@@ -510,7 +514,7 @@ def test_newton_steps_reach_what_noise_hides() -> None:
 
 
 def test_a_settled_frame_asks_for_no_other_hypotheses() -> None:
-    several = replace(PAPER, hypotheses=4)
+    several = replace(PAPER, hypotheses=4, searched=0)
     for settled, rows in ((True, 2), (False, 8)):
         toy = Toy()
         optimise(

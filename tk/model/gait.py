@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.body import neutral_pose
-from tk.model.initialisation import shoulder_angles
+from tk.model.skeleton import shoulder_angles
 from tk.model.skeleton import Skeleton
 
 Float = NDArray[np.float64]

@@ -31,7 +31,7 @@ from tk.model.anthropometry import (
     BodyDimensions,
 )
 from tk.model.body import neutral_pose
-from tk.model.skeleton import JOINTS, Skeleton, build_skeleton, up_rotation
+from tk.model.skeleton import JOINTS, Skeleton, build_skeleton, shoulder_angles, up_rotation
 from tk.model.volume import VoxelGrid
 
 Float = NDArray[np.float64]
@@ -204,15 +204,6 @@ def da_vinci_pose(marks: Landmarks, stature_m: float | None, up: str) -> tuple[B
         pose[skeleton.index(f"shoulder_{side}_yaw")] = yaw
         pose[skeleton.index(f"shoulder_{side}_pitch")] = pitch
     return dimensions, skeleton.clip(pose)
-
-
-def shoulder_angles(direction: Float) -> tuple[float, float]:
-    """Yaw and pitch of the shoulder that point the arm along ``direction`` (3,): forward, outward, up."""
-    arm = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
-    pole = np.array([-1.0, 1.0, 1.0]) / np.sqrt(3)
-    third = np.cross(pole, arm)
-    pitch = float(np.arcsin(np.clip(direction @ pole, -1, 1)))
-    return float(np.arctan2(direction @ third, direction @ arm)), pitch
 
 
 def certainty(skeleton: Skeleton) -> Float:

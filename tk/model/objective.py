@@ -20,6 +20,7 @@ from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective import Held, ObjectiveKernel, ObjectiveSettings
 from tk.model.body import Body
 from tk.model.contour_term import ContourTerm, Pictures
+from tk.model.postures import limb_postures
 from tk.model.skeleton import CHAINS, SEGMENTS
 
 Float = NDArray[np.float64]
@@ -125,6 +126,7 @@ class BodyObjective:
         chain = CHAIN_OF_SEGMENT[body.segment]
         self.torso_samples = np.flatnonzero(chain < 0).astype(np.int32)
         self.chain_samples = [np.flatnonzero(chain == c).astype(np.int32) for c in range(len(CHAINS))]
+        self.postures = limb_postures(skeleton)
         self.chain_free = np.array([skeleton.chain_dofs(c) for c in CHAIN_NAMES])
 
     def draw(self, rng: np.random.Generator, scale: int = 1) -> Ints:
@@ -266,6 +268,7 @@ class FrameObjective:
         self.pictures = pictures
         self.voxel_count = len(index.positions)
         self.free = objective.chain_free
+        self.postures = objective.postures
         self.angular = ~objective.body.skeleton.prismatic
         self._even_samples = objective.spread()
         self._even_voxels = np.arange(0, self.voxel_count, max(self.voxel_count // 600, 1), dtype=np.int32)

@@ -212,6 +212,15 @@ class Skeleton:
         return np.array([name.startswith(prefixes) for name in self.names])
 
 
+def shoulder_angles(direction: Float) -> tuple[float, float]:
+    """Yaw and pitch of the shoulder that point the arm along ``direction`` (3,): forward, outward, up."""
+    arm = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
+    pole = np.array([-1.0, 1.0, 1.0]) / np.sqrt(3)
+    third = np.cross(pole, arm)
+    pitch = float(np.arcsin(np.clip(direction @ pole, -1, 1)))
+    return float(np.arctan2(direction @ third, direction @ arm)), pitch
+
+
 def arm_elevation(first: float, second: float, by: int | None = None) -> float:
     """Sine of the arm's elevation over the horizontal in the trunk's frame, from a shoulder's first two angles.
 

@@ -42,6 +42,11 @@ class Problem(Protocol):
         """(D,) True for angles, False for lengths."""
         ...
 
+    @property
+    def postures(self) -> Float:
+        """(L, D) where the chains may be looked for, beside random places; L may be 0."""
+        ...
+
     def constrain(self, poses: Float) -> Float:
         """Poses (B, D) mapped into the limits."""
         ...
@@ -100,6 +105,7 @@ class ScheduleConfig:
         retries: how often a frame whose objective stays high is searched anew from other starts.
         hypotheses: starts of each chain: as the first pass left it, as the last frame had it, and the best of some
             random candidates; at least 1.
+        searched: how many of the chains, drawn anew for each frame, have hypotheses in a frame that looks as usual.
         wide_hypotheses: the same when a frame is searched anew, with three times the candidates.
         candidates: random candidates of each chain, looked at once.
         spread_deg: their standard deviation.
@@ -127,12 +133,13 @@ class ScheduleConfig:
     newton_iterations: int = 2
     retries: int = 1
     hypotheses: int = 4
+    searched: int = 2
     wide_hypotheses: int = 8
-    candidates: int = 24
+    candidates: int = 48
     spread_deg: float = 40.0
     gain: float = 0.08
     margin: float = 0.004
-    inertia: float = 0.05
+    inertia: float = 0.02
     max_step_deg: float = 20.0
     max_step_m: float = 0.15
     hierarchical: bool = False
@@ -229,11 +236,12 @@ def _passes(
     """All parameters, the chains, all parameters."""
     limit = replace(smd_config, max_iterations=config.iterations)
     first = _all(problem, start[None], tolerance, config.soft, config, limit)
-    count = config.wide_hypotheses if wide else config.hypotheses
+    searched = np.arange(len(problem.free))
     if settled is not None and settled(first.pose[0]):
-        count = 1
+        # a limb in the wrong place can look as usual: one is looked for elsewhere in any frame
+        searched = rng.permutation(searched)[: config.searched]
     pose, winners = _chains(
-        problem, first.pose[0], previous, tolerance * config.refine, rng, config, smd_config, count, wide
+        problem, first.pose[0], previous, tolerance * config.refine, rng, config, smd_config, searched, wide
     )
     made = first.iterations
     if config.polish_iterations and not config.hierarchical:
@@ -300,25 +308,31 @@ def _chains(
     rng: np.random.Generator,
     config: ScheduleConfig,
     smd_config: smd.SmdConfig,
-    count: int,
+    searched: NDArray[np.intp],
     wide: bool = False,
 ) -> tuple[Float, NDArray[np.int32]]:
-    """The chains with the torso at ``pose``: the pose with each chain's best hypothesis, and their iterations (K,)."""
+    """The chains with the torso at ``pose``: the pose with each chain's best hypothesis, and their iterations (K,).
+
+    ``searched`` are the chains that are tried at more than one place.
+    """
     free = problem.free
     K = len(free)
-    owner = np.tile(np.arange(K), count)
-    hypotheses = np.repeat(pose[None], len(owner), axis=0)
-    if count > 1:
-        hypotheses[K : 2 * K] = np.where(free, previous, pose)
-    if count > 2:
-        scale = 3 if wide else 1
-        hypotheses[2 * K :] = _screened(problem, pose, count - 2, scale * config.candidates, rng, config)
+    count = config.wide_hypotheses if wide else config.hypotheses
+    owners, starts = [np.arange(K)], [np.repeat(pose[None], K, axis=0)]
+    if count > 1 and len(searched):
+        owners.append(searched)
+        starts.append(np.where(free[searched], previous, pose))
+    if count > 2 and len(searched):
+        owners.append(np.tile(searched, count - 2))
+        candidates = (3 if wide else 1) * config.candidates
+        starts.append(_screened(problem, pose, previous, searched, count - 2, candidates, rng, config))
+    owner = np.concatenate(owners)
     H = problem.curvature(pose, config.chain_soft)
     damping = problem.damping(config.chain_lever_m, config.chain_soft)
     pairs = [descent_basis(H, free[k], damping, config) for k in range(K)]
     found = smd.minimise(
         problem.chains(owner, pose, config.chain_soft),
-        problem.constrain(hypotheses),
+        problem.constrain(np.concatenate(starts)),
         config.rate,
         tolerance,
         problem.constrain,
@@ -328,31 +342,54 @@ def _chains(
         basis_inverse=np.stack([inverse for _, inverse in pairs])[owner],
     )
     best = np.arange(K)
-    if count > 1:
-        values = problem.chain_values(owner, found.pose).reshape(count, K)
-        values[1:] += config.margin
-        turned = np.abs(np.where(problem.angular & free[owner], found.pose - previous, 0.0))
-        values += config.inertia * (turned.sum(axis=1) / free[owner].sum(axis=1)).reshape(count, K)
-        best = values.argmin(axis=0) * K + np.arange(K)
+    if len(owner) > K:
+        values = problem.chain_values(owner, found.pose) + _reluctance(problem, owner, found.pose, previous, config)
+        values[K:] += config.margin
+        for k in range(K):
+            rows = np.flatnonzero(owner == k)
+            best[k] = rows[values[rows].argmin()]
     result = pose.copy()
     for k in range(K):
         result[free[k]] = found.pose[best[k], free[k]]
     return result, found.iterations[best]
 
 
-def _screened(
-    problem: Problem, pose: Float, count: int, candidates: int, rng: np.random.Generator, config: ScheduleConfig
+def _reluctance(
+    problem: Problem, owner: NDArray[np.intp], poses: Float, previous: Float, config: ScheduleConfig
 ) -> Float:
-    """(count · K, D) the most promising of many random hypotheses of each chain; row b is of chain b mod K."""
+    """(B,) what hypotheses (B, D) must make up for by their objective: the farther from the last frame, the more."""
+    free = problem.free[owner]
+    turned = np.abs(np.where(problem.angular & free, poses - previous, 0.0))
+    cost: Float = config.inertia * turned.sum(axis=1) / free.sum(axis=1)
+    return cost
+
+
+def _screened(
+    problem: Problem,
+    pose: Float,
+    previous: Float,
+    searched: NDArray[np.intp],
+    count: int,
+    candidates: int,
+    rng: np.random.Generator,
+    config: ScheduleConfig,
+) -> Float:
+    """(count · S, D) the most promising of many hypotheses of each of S chains; row b is of chain ``searched[b mod S]``.
+
+    Half of them are common postures, drawn for this frame, the others random places about the pose.
+    """
     free = problem.free
-    K = len(free)
     candidates = max(candidates, count)
-    owner = np.tile(np.arange(K), candidates)
+    drawn = rng.permutation(len(problem.postures))[: candidates // 2]
+    owner = np.tile(searched, candidates)
     noise = rng.normal(scale=np.radians(config.spread_deg), size=(len(owner), len(pose))) * problem.angular
-    tried = problem.constrain(np.where(free[owner], pose + noise, pose))
+    places = pose + noise
+    places[: len(drawn) * len(searched)] = np.repeat(problem.postures[drawn], len(searched), axis=0)
+    tried = problem.constrain(np.where(free[owner], places, pose))
     values = problem.chains(owner, pose, config.soft)(tried, np.zeros_like(tried), 0).value
-    order = np.argsort(values.reshape(candidates, K), axis=0, kind="stable")[:count]
-    return tried[order * K + np.arange(K)].reshape(-1, len(pose))
+    values = values + _reluctance(problem, owner, tried, previous, config)
+    order = np.argsort(values.reshape(candidates, -1), axis=0, kind="stable")[:count]
+    return tried[order * len(searched) + np.arange(len(searched))].reshape(-1, len(pose))
 
 
 def descent_basis(
