@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from tk import __version__
-from tk.errors import ConfigError, TkError
+from tk.errors import CaptureError, ConfigError, TkError
 
 if TYPE_CHECKING:
     from tk.config import Config
@@ -149,13 +149,34 @@ def reconstruct(
 @main.command()
 @click.argument("result", type=click.Path(path_type=Path))
 @click.argument("truth", type=click.Path(path_type=Path))
+@click.option(
+    "--capture", type=click.Path(path_type=Path), metavar="DIR",
+    help="Judge in the pictures, too: pixels and silhouettes.  [default: the folder of TRUTH.h5, if a capture]",
+)  # fmt: skip
+@click.option("--joints", default="ankle_l,ankle_r", show_default=True, help="Whose distance is told in pixels.")
+@_masks
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def evaluate(result: Path, truth: Path, as_json: bool) -> None:
-    """Compare RESULT.h5 with TRUTH.h5: joint distances, PCK, lost frames, frames/s."""
+def evaluate(result: Path, truth: Path, capture: Path | None, joints: str, masks: str, as_json: bool) -> None:
+    """Compare RESULT.h5 with TRUTH.h5: joint distances, PCK, lost frames, frames/s; pixels and silhouettes by view."""
+    import json
+
     from tk.evaluation import evaluate_files
+    from tk.view_evaluation import capture_of, evaluate_views
 
     found = evaluate_files(result, truth)
-    click.echo(found.to_json() if as_json else found.format_table())
+    folder = capture or capture_of(truth)
+    try:
+        seen = evaluate_views(result, truth, folder, _names(joints) or (), masks) if folder else None
+    except CaptureError as error:
+        if capture is not None:
+            raise
+        click.echo(f"note: not judged in the pictures: {error}", err=True)
+        seen = None
+    if as_json:
+        views = {"views": seen.to_dict()} if seen else {}
+        click.echo(json.dumps(found.to_dict() | views, indent=2, allow_nan=False))
+    else:
+        click.echo(found.format_table() + (f"\n\n{seen.format_table()}" if seen else ""))
 
 
 @main.command()

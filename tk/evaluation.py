@@ -104,7 +104,7 @@ class Evaluation:
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON: shares added, infinite and NaN as None."""
         values = asdict(self) | {"lost_share": self.lost_share, "nan_share": self.nan_frames / self.judged}
-        plain = _plain(values)
+        plain = plain_values(values)
         assert isinstance(plain, dict)
         return plain
 
@@ -256,12 +256,12 @@ def _format_score(score: Score) -> str:
     return f"{score.mean_cm:8.2f}{score.median_cm:8.2f}{shares}"
 
 
-def _plain(value: Any) -> Any:
+def plain_values(value: Any) -> Any:
     """JSON has no infinity and no NaN."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain_values(item) for key, item in value.items()}
     if isinstance(value, (tuple, list)):
-        return [_plain(item) for item in value]
+        return [plain_values(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

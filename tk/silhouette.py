@@ -22,7 +22,7 @@ from tk.model import gait
 from tk.model.anthropometry import BodyDimensions
 from tk.model.camera import Rig
 from tk.model.cone_body import PRESETS, ConeBody, build_cone_body
-from tk.model.cone_fitting import ConeFitConfig, fit_dimensions
+from tk.model.cone_fitting import ConeFitConfig, fit_dimensions, fit_shapes
 from tk.model.initialisation import rough_pose
 from tk.model.silhouettes import CleaningConfig, Pyramid, Views
 from tk.model.skeleton import build_skeleton, up_rotation
@@ -166,16 +166,13 @@ class SilhouetteTracker:
             poses.append(self._reconsider(pyramid, pose)[0] if every and i % every == 0 else pose)
         count = min(self.config.fit.frames, len(pyramids))
         chosen = np.unique(np.linspace(0, len(pyramids) - 1, count).round().astype(int))
+        seen = [pyramids[i] for i in chosen]
+        search, fit = self.config.search, self.config.fit
         self._body, fitted = fit_dimensions(
-            self.body,
-            self.views,
-            [pyramids[i] for i in chosen],
-            np.array(poses)[chosen],
-            self.up,
-            self.config.search,
-            stature,
-            self.config.fit,
+            self.body, self.views, seen, np.array(poses)[chosen], self.up, search, stature, fit
         )
+        if fit.shapes:
+            self._body, fitted = fit_shapes(self._body, self.views, seen, fitted, search, fit)
         return np.asarray(fitted[0])
 
     def _centroid(self, pyramid: Pyramid, index: int) -> Float:
@@ -311,13 +308,23 @@ class SilhouetteTracker:
 
     def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
         """Take up where a run with this model and state stopped."""
-        prefix = "dimensions/"
-        dimensions = BodyDimensions(**{k[len(prefix) :]: float(v) for k, v in model.items() if k.startswith(prefix)})
-        self._body = build_cone_body(dimensions, self.up, str(model["body"]))
+        self._body = restore_body(model, self.up)
         self._pose = np.asarray(state["pose"])
         self._previous = np.asarray(state["previous"])
         self._lost_for = int(state["lost_for"])
         self._fresh = False
+
+
+def restore_body(model: Mapping[str, Any], up: str) -> ConeBody:
+    """The body that :meth:`SilhouetteTracker.model` wrote down."""
+    prefix = "dimensions/"
+    dimensions = BodyDimensions(**{k[len(prefix) :]: float(v) for k, v in model.items() if k.startswith(prefix)})
+    body = build_cone_body(dimensions, up, str(model["body"]))
+    parts = []
+    for part, shape, T in zip(body.parts, model["parts/shape"], model["parts/T_body_part"], strict=True):
+        a, b, h, m = (float(value) for value in shape)
+        parts.append(replace(part, shape=(a, b, h, m), T_body_part=np.asarray(T)))
+    return replace(body, parts=tuple(parts))
 
 
 def _distinct(poses: Float, error: Float, count: int) -> NDArray[np.int64]:

@@ -10,7 +10,7 @@ from tk.errors import ConfigError
 from tk.kernels.silhouette import SearchSettings
 from tk.model.anthropometry import BodyDimensions
 from tk.model.cone_body import build_cone_body
-from tk.model.cone_fitting import ConeFitConfig, dimension_rows, fit_dimensions, neighbours
+from tk.model.cone_fitting import ConeFitConfig, dimension_neighbours, fit_dimensions, fit_shapes, parameter_rows
 from tk.model.gait import walking_pose
 from tk.model.silhouettes import Views, draw_silhouettes
 
@@ -33,7 +33,7 @@ def pyramids_of(body, poses):
 def test_rows_by_dimensions_are_differences_of_the_surface():
     poses = walk(AVERAGE, 1)
     edgels = VIEWS.edgels(AVERAGE, pyramids_of(AVERAGE, poses)[0], poses[0], 0, SEARCH)
-    rows = dimension_rows(neighbours(AVERAGE, "z"), poses[0], edgels)
+    rows = parameter_rows(dimension_neighbours(AVERAGE, "z"), poses[0], edgels)
     names = [field.name for field in fields(BodyDimensions)]
     assert rows.shape == (len(edgels.view), len(names))
     # a longer calf moves what hangs on it, and nothing above the knee
@@ -52,9 +52,9 @@ def test_rows_by_dimensions_are_differences_of_the_surface():
 def test_lengths_and_girths_are_found_from_a_stride():
     true = AVERAGE.dimensions.scaled(thigh=0.95, calf=1.06, thigh_radius=1.15, chest_half_width=0.93, forearm=1.05)
     body = build_cone_body(true)
-    poses = walk(body, 4)
+    poses = walk(body, 6)
     start = poses + np.random.default_rng(0).normal(0, 0.01, poses.shape)
-    config = ConeFitConfig(rounds=6, edge_noise_px=1.0)
+    config = ConeFitConfig(rounds=8, edge_noise_px=0.5)
     found, fitted = fit_dimensions(AVERAGE, VIEWS, pyramids_of(body, poses), start, "z", SEARCH, None, config)
     for name, tolerance in (("thigh", 0.03), ("calf", 0.03), ("thigh_radius", 0.05), ("forearm", 0.05)):
         assert getattr(found.dimensions, name) == pytest.approx(getattr(true, name), rel=tolerance), name
@@ -78,5 +78,35 @@ def test_without_rounds_nothing_changes():
 def test_settings_out_of_range_are_told():
     with pytest.raises(ConfigError, match="frames = 0"):
         ConeFitConfig(frames=0)
-    with pytest.raises(ConfigError, match="edge_noise_px 0"):
+    with pytest.raises(ConfigError, match="edge_noise_px = 0"):
         ConeFitConfig(edge_noise_px=0.0)
+
+
+def test_shapes_are_found_and_the_skeleton_stays():
+    groups = AVERAGE.shape_groups
+    change = np.zeros((len(groups), 5))
+    change[groups.index("thigh_")] = [0.2, 0.1, -0.1, 0.01, 0.0]
+    change[groups.index("calf_"), 4] = 0.01
+    true = AVERAGE.reshaped(change)
+    poses = walk(true, 4)
+    masks = pyramids_of(true, poses)
+    before = np.mean([VIEWS.fit_error(AVERAGE, m.masks[0], p[None]) for m, p in zip(masks, poses, strict=True)])
+    config = ConeFitConfig(rounds=5, shape_noise_px=0.5)
+    found, fitted = fit_shapes(AVERAGE, VIEWS, masks, poses, SEARCH, config)
+    after = np.mean([VIEWS.fit_error(found, m.masks[0], p[None]) for m, p in zip(masks, fitted, strict=True)])
+    assert after < 0.6 * before
+    for name in ("thigh_l", "thigh_r"):
+        a, b, h, m = next(part for part in found.parts if part.name == name).shape
+        a_true, b_true, h_true, m_true = next(part for part in true.parts if part.name == name).shape
+        assert h == h_true and [a, b, m] == pytest.approx([a_true, b_true, m_true], rel=0.06)
+    np.testing.assert_array_equal(found.skeleton.anchor, AVERAGE.skeleton.anchor)
+
+
+def test_shapes_are_mirrored():
+    change = np.zeros((len(AVERAGE.shape_groups), 5))
+    change[AVERAGE.shape_groups.index("upper_arm_")] = [0.0, 0.0, 0.0, 0.01, 0.02]
+    body = AVERAGE.reshaped(change)
+    left, right = (next(p for p in body.parts if p.name == f"upper_arm_{s}").T_body_part[:3, 3] for s in "lr")
+    np.testing.assert_allclose(left, right * [1, -1, 1], atol=1e-12)
+    same = AVERAGE.reshaped(np.zeros_like(change))
+    assert [part.shape for part in same.parts] == [part.shape for part in AVERAGE.parts]

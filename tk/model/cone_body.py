@@ -7,7 +7,7 @@ and calf: the skeleton has no joints for them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,6 +23,9 @@ Float = NDArray[np.float64]
 
 # How much of a body is modelled: all fourteen components; without hands and feet; the paper's six-part walker.
 PRESETS = ("full", "limbs", "walker")
+
+# What :meth:`ConeBody.reshaped` changes of a part: logarithms of a, b and m; offsets along x and y.
+SHAPE_NUMBERS = 5
 
 # Edges of different limbs can be mistaken for one another (section 4.4).
 _LIMBS = {
@@ -151,6 +154,31 @@ class ConeBody:
             curve_part=np.array([p for p, _ in curves], np.int32),
             curve_kind=np.array([kind for _, kind in curves], np.int32),
         )
+
+    @property
+    def shape_groups(self) -> tuple[str, ...]:
+        """Parts that are shaped alike: a name for each, "thigh_" for the left and right thigh."""
+        return tuple(dict.fromkeys(_group(part.name) for part in self.parts))
+
+    def reshaped(self, change: Float) -> ConeBody:
+        """A body whose parts are thicker and lie elsewhere about their bones; skeleton and lengths are the same.
+
+        Args:
+            change: (G, 5) for each of :attr:`shape_groups` what the logarithms of a, b, m grow by (of an ellipsoid: of
+                the first two semi-axes), and how far the part moves along its x and y, metres; the right side's is
+                the left's in a mirror.
+        """
+        rows = dict(zip(self.shape_groups, change, strict=True))
+        parts = []
+        for part in self.parts:
+            log_a, log_b, log_m, x, y = (float(value) for value in rows[_group(part.name)])
+            a, b, h, m = part.shape
+            T = part.T_body_part.copy()
+            T[:3, 3] += x * T[:3, 0] + (-y if part.name.endswith("_r") else y) * T[:3, 1]
+            m = m * float(np.exp(log_m)) if part.kind == CONE else m
+            shape = (a * float(np.exp(log_a)), b * float(np.exp(log_b)), h, m)
+            parts.append(replace(part, shape=shape, T_body_part=T))
+        return replace(self, parts=tuple(parts))
 
     def place(self, pose: Float, part: NDArray[np.integer], unscaled: Float) -> Float:
         """World points (N, 3) on the surface of parts (N,), from coordinates as :meth:`ConePart.surface` takes them."""
@@ -282,6 +310,11 @@ def _head(d: BodyDimensions) -> ConePart:
     shape = (1.12 * d.head_radius, d.head_radius, half, 1.0)
     center = (d.trunk + d.head - half) * z + 0.1 * d.head * x
     return ConePart("head", "head", ELLIPSOID, shape, _frame(center, z, x))
+
+
+def _group(name: str) -> str:
+    """A part's name without its side; it ends with an underscore if there are two."""
+    return name[:-1] if name.endswith(("_l", "_r")) else name
 
 
 def _limb(

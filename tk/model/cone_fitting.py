@@ -1,13 +1,15 @@
-"""Adapts a cone body's dimensions to observed silhouettes (the silhouette paper's future work).
+"""Adapts a cone body to observed silhouettes (the silhouette paper's future work): its dimensions, then its shapes.
 
-Gauss-Newton on the poses of several frames and the logarithms of shared dimensions at once. An edgel's row by a
+Gauss-Newton on the poses of several frames and shared parameters of the body at once: first the logarithms of the
+dimensions; then, with the skeleton as it is, each part's own cross-sections and where they lie about its bone, which no
+table of proportions knows. An edgel's row by a
 dimension is n·Jπ·∂x/∂δ at the material point x of the contour, as it is by a degree of freedom: along an occluding
 contour the surface slides in the image's tangent only.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 from tk.errors import ConfigError
 from tk.kernels.silhouette import Edgels, SearchSettings
 from tk.model.anthropometry import BodyDimensions
-from tk.model.cone_body import ConeBody, build_cone_body
+from tk.model.cone_body import SHAPE_NUMBERS, ConeBody, build_cone_body
 from tk.model.silhouettes import Pyramid, Views
 
 Float = NDArray[np.float64]
@@ -39,7 +41,11 @@ _LENGTHS = {
 }
 _RADII = 0.2
 
-# Step of the differences by the logarithm of a dimension.
+# One standard deviation of what changes a part, see ConeBody.reshaped: logarithms of a, b and m about what
+# the dimensions make them, and metres off the bone along x and y.
+_SHAPES = (0.15, 0.15, 0.15, 0.005, 0.005)
+
+# Step of the differences by a parameter.
 _STEP = 1e-4
 
 
@@ -52,6 +58,8 @@ class ConeFitConfig:
         rounds: Gauss-Newton iterations.
         edge_noise_px: standard deviation of an edgel. Besides ragged masks it stands for shapes that no cone has, which
             err alike in all frames: too small a value bends lengths to make up for shapes.
+        shapes: whether each part's own shape is adapted after the dimensions.
+        shape_noise_px: edge_noise_px while shapes are adapted: what is left of it once they suit.
         correlation_px: along a contour this many pixels err together; edgels within them count as one.
         stature_deviation: of the logarithm of the stature about the given one.
     """
@@ -59,17 +67,17 @@ class ConeFitConfig:
     frames: int = 8
     rounds: int = 8
     edge_noise_px: float = 6.0
+    shapes: bool = True
+    shape_noise_px: float = 2.0
     correlation_px: float = 10.0
     stature_deviation: float = 0.01
 
     def __post_init__(self) -> None:
         if self.frames < 1 or self.rounds < 0:
             raise ConfigError(f"cone fit: frames = {self.frames} must be at least 1, rounds = {self.rounds} at least 0")
-        if min(self.edge_noise_px, self.correlation_px, self.stature_deviation) <= 0:
-            raise ConfigError(
-                f"cone fit: edge_noise_px {self.edge_noise_px}, correlation_px {self.correlation_px} and "
-                f"stature_deviation {self.stature_deviation} must be positive"
-            )
+        for name in ("edge_noise_px", "shape_noise_px", "correlation_px", "stature_deviation"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"cone fit: {name} = {getattr(self, name)} must be positive")
 
 
 def fit_dimensions(
@@ -99,25 +107,98 @@ def fit_dimensions(
     """
     config = config or ConeFitConfig()
     names = [field.name for field in fields(BodyDimensions)]
-    prior = np.array([_LENGTHS.get(name, _RADII) for name in names])
-    mean = _log(body.dimensions)
-    log = mean.copy()
+    extra = None
+    if stature_m is not None:
+        # with shoes, as the proportions have it
+        nominal = BodyDimensions.from_stature(stature_m).stature
+
+        def extra(log: Float) -> tuple[Float, float]:
+            d = _dimensions(log)
+            row = np.array([_stature_rate(d, name) for name in names]) / config.stature_deviation
+            return row, float(np.log(nominal / d.stature)) / config.stature_deviation
+
+    problem = _Problem(
+        build=lambda log: build_cone_body(_dimensions(log), up, body.preset),
+        mean=_log(body.dimensions),
+        deviation=np.array([_LENGTHS.get(name, _RADII) for name in names]),
+        extra=extra,
+    )
+    log, poses = _adapt(problem, views, pyramids, poses, settings, config.edge_noise_px, config)
+    return problem.build(log), poses
+
+
+def fit_shapes(
+    body: ConeBody,
+    views: Views,
+    pyramids: Sequence[Pyramid],
+    poses: Float,
+    settings: SearchSettings,
+    config: ConeFitConfig | None = None,
+) -> tuple[ConeBody, Float]:
+    """Cross-sections of the parts that suit several frames, with their poses; arguments as for :func:`fit_dimensions`.
+
+    The skeleton stays: only :meth:`~tk.model.cone_body.ConeBody.reshaped` is used. Left and right are alike.
+    """
+    config = config or ConeFitConfig()
+    groups = body.shape_groups
+    deviation = np.tile(_SHAPES, (len(groups), 1))
+    # what lies in the middle is symmetric
+    deviation[[not name.endswith("_") for name in groups], 4] = 1e-6
+    problem = _Problem(
+        build=lambda change: body.reshaped(change.reshape(len(groups), SHAPE_NUMBERS)),
+        mean=np.zeros(deviation.size),
+        deviation=deviation.ravel(),
+    )
+    change, poses = _adapt(problem, views, pyramids, poses, settings, config.shape_noise_px, config)
+    return problem.build(change), poses
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """A family of bodies with K parameters.
+
+    Attributes:
+        build: the body with these parameters.
+        mean, deviation: (K,) of the normal prior; a descent starts from the mean.
+        extra: one more residual at some parameters, in standard deviations: its derivative (K,) and what it lacks.
+    """
+
+    build: Callable[[Float], ConeBody]
+    mean: Float
+    deviation: Float
+    extra: Callable[[Float], tuple[Float, float]] | None = None
+
+    def neighbours(self, here: Float) -> list[tuple[ConeBody, ConeBody]]:
+        """(K) bodies with each parameter a little larger and a little smaller."""
+        steps = _STEP * np.eye(len(here))
+        return [(self.build(here + step), self.build(here - step)) for step in steps]
+
+
+def _adapt(
+    problem: _Problem,
+    views: Views,
+    pyramids: Sequence[Pyramid],
+    poses: Float,
+    settings: SearchSettings,
+    noise_px: float,
+    config: ConeFitConfig,
+) -> tuple[Float, Float]:
+    """Gauss-Newton on the parameters (K,) and the poses (F, D)."""
+    shared = problem.mean.copy()
     poses = np.array(poses)
-    F, D, K = len(poses), poses.shape[1], len(names)
-    free = np.flatnonzero(body.free)
-    # with shoes, as the proportions have it
-    nominal = BodyDimensions.from_stature(stature_m).stature if stature_m is not None else 0.0
+    F, D, K = len(poses), poses.shape[1], len(shared)
     # information of one pixel of contour
-    information = 1.0 / (config.edge_noise_px**2 * config.correlation_px)
+    information = 1.0 / (noise_px**2 * config.correlation_px)
+    shape = slice(F * D, F * D + K)
     for _ in range(config.rounds):
-        here = build_cone_body(_dimensions(log), up, body.preset)
-        pairs = neighbours(here, up)
+        here = problem.build(shared)
+        free = np.flatnonzero(here.free)
+        pairs = problem.neighbours(shared)
         H = np.zeros((F * D + K, F * D + K))
         g = np.zeros(F * D + K)
-        shape = slice(F * D, F * D + K)
         for f in range(F):
             edgels = views.edgels(here, pyramids[f], poses[f], 0, settings)
-            rows = np.hstack([pose_rows(here, poses[f], edgels), dimension_rows(pairs, poses[f], edgels)])
+            rows = np.hstack([pose_rows(here, poses[f], edgels), parameter_rows(pairs, poses[f], edgels)])
             weight = edgels.weight * information
             A = rows.T @ (weight[:, None] * rows)
             y = rows.T @ (weight * edgels.distance)
@@ -133,19 +214,18 @@ def fit_dimensions(
             stay = np.where(excess != 0, 1e3, 10.0)
             H[at, at] += np.diag(stay)
             g[at] += np.where(excess != 0, stay * excess, 0.0)
-        H[shape, shape] += np.diag(prior**-2)
-        g[shape] += (mean - log) / prior**2
-        if stature_m is not None:
-            d = here.dimensions
-            row = np.array([_stature_rate(d, name) for name in names])
-            H[shape, shape] += np.outer(row, row) / config.stature_deviation**2
-            g[shape] += row * np.log(nominal / d.stature) / config.stature_deviation**2
+        H[shape, shape] += np.diag(problem.deviation**-2)
+        g[shape] += (problem.mean - shared) / problem.deviation**2
+        if problem.extra is not None:
+            row, lack = problem.extra(shared)
+            H[shape, shape] += np.outer(row, row)
+            g[shape] += row * lack
         chosen = np.concatenate([*(f * D + free for f in range(F)), F * D + np.arange(K)])
         delta = np.zeros(len(g))
         delta[chosen] = np.linalg.solve(H[np.ix_(chosen, chosen)], g[chosen])
         poses += np.clip(delta[: F * D].reshape(F, D), -0.3, 0.3)
-        log += np.clip(delta[shape], -0.1, 0.1)
-    return build_cone_body(_dimensions(log), up, body.preset), poses
+        shared += np.clip(delta[shape], -0.1, 0.1)
+    return shared, poses
 
 
 def pose_rows(body: ConeBody, pose: Float, edgels: Edgels) -> Float:
@@ -161,24 +241,20 @@ def pose_rows(body: ConeBody, pose: Float, edgels: Edgels) -> Float:
     return rows
 
 
-def neighbours(body: ConeBody, up: str) -> list[tuple[ConeBody, ConeBody]]:
-    """(K) bodies with each dimension a little larger and a little smaller: what :func:`dimension_rows` differs."""
-    return [
-        (
-            build_cone_body(body.dimensions.scaled(**{field.name: np.exp(_STEP)}), up, body.preset),
-            build_cone_body(body.dimensions.scaled(**{field.name: np.exp(-_STEP)}), up, body.preset),
-        )
-        for field in fields(BodyDimensions)
-    ]
-
-
-def dimension_rows(pairs: Sequence[tuple[ConeBody, ConeBody]], pose: Float, edgels: Edgels) -> Float:
-    """(N, K) the same by the logarithms of the dimensions, by central differences of the surface points."""
+def parameter_rows(pairs: Sequence[tuple[ConeBody, ConeBody]], pose: Float, edgels: Edgels) -> Float:
+    """(N, K) the same by shared parameters, by central differences of the surface points."""
     columns = []
     for larger, smaller in pairs:
         moved = larger.place(pose, edgels.part, edgels.unscaled) - smaller.place(pose, edgels.part, edgels.unscaled)
         columns.append(np.einsum("na,na->n", edgels.row, moved) / (2 * _STEP))
     return np.column_stack(columns)
+
+
+def dimension_neighbours(body: ConeBody, up: str) -> list[tuple[ConeBody, ConeBody]]:
+    """(K) bodies with each dimension a little larger and a little smaller: what :func:`parameter_rows` differs."""
+    log = _log(body.dimensions)
+    problem = _Problem(lambda x: build_cone_body(_dimensions(x), up, body.preset), log, np.ones(len(log)))
+    return problem.neighbours(log)
 
 
 def _log(dimensions: BodyDimensions) -> Float:

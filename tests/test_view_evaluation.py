@@ -1,0 +1,86 @@
+"""Pixels and silhouettes by view, against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.conftest import Silent, Tk
+from tk.config import Config
+from tk.io.capture import open_capture
+from tk.io.result import read_joints, read_result
+from tk.model.silhouettes import draw_silhouettes
+from tk.model.skeleton import JOINTS
+from tk.sequence import track
+from tk.silhouette import restore_body
+from tk.view_evaluation import capture_of, evaluate_views
+
+SETTINGS = """
+[silhouette]
+headings = 4
+phases = 1
+finalists = 1
+init_frames = 2
+[silhouette.fit]
+frames = 2
+rounds = 2
+"""
+
+
+@pytest.fixture(scope="module")
+def three_views(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("views") / "r.h5"
+    capture = open_capture(tiny, open_capture(tiny).rig.names[:3])
+    track(capture, path, Config.from_toml(SETTINGS), Silent(), method="silhouette", frames=(0, 3))
+    return path
+
+
+def test_every_view_is_judged_as_by_hand(tiny: Path, three_views: Path) -> None:
+    found = evaluate_views(three_views, tiny / "truth.h5", tiny, ("wrist_l",))
+    result, truth = read_result(three_views), read_joints(tiny / "truth.h5")
+    capture = open_capture(tiny)
+    body = restore_body(result.model, "z")
+    with capture.frames(0, 3) as frames:
+        masks = np.array([frame.masks for frame in frames])
+    drawn = draw_silhouettes(body, capture.rig, result.pose)
+    wrist = JOINTS.index("wrist_l")
+    assert [view.tracked for view in found.views] == [True, True, True, False]
+    for v, (camera, view) in enumerate(zip(capture.rig, found.views, strict=True)):
+        a, b = (camera.project(p[:, wrist])[0] for p in (result.joints, truth.positions[:3]))
+        assert view.joint_px == pytest.approx(np.linalg.norm(a - b, axis=1).mean())
+        wrong = [(drawn[i, v] >= 128) != (masks[i, v] >= 128) for i in range(3)]
+        shares = [w.sum() / (masks[i, v] >= 128).sum() for i, w in enumerate(wrong)]
+        assert view.silhouette_error == pytest.approx(np.mean(shares))
+    assert found.joint_px == pytest.approx(np.mean([view.joint_px for view in found.views[:3]]))
+    assert found.silhouette_error == pytest.approx(np.mean([view.silhouette_error for view in found.views]))
+
+
+def test_the_command_finds_the_capture_beside_the_truth(tk: Tk, tiny: Path, three_views: Path, tmp_path: Path) -> None:
+    ran = tk("evaluate", three_views, tiny / "truth.h5", "--json")
+    views = json.loads(ran.out)["views"]
+    assert ran.code == 0 and len(views["views"]) == 4 and views["joints"] == ["ankle_l", "ankle_r"]
+    assert "E_S %" in tk("evaluate", three_views, tiny / "truth.h5").out
+    shutil.copy(tiny / "truth.h5", tmp_path)
+    assert capture_of(tmp_path / "truth.h5") is None
+    assert "E_S" not in tk("evaluate", three_views, tmp_path / "truth.h5").out
+    assert "E_S %" in tk("evaluate", three_views, tmp_path / "truth.h5", "--capture", tiny).out
+
+
+def test_other_bodies_have_pixels_only(tk: Tk, tiny: Path, tracked: Path) -> None:
+    found = evaluate_views(tracked, tiny / "truth.h5", tiny)
+    assert found.silhouette_error is None and "volumetric" in found.note and found.joint_px > 0
+
+
+def test_what_cannot_be_judged_is_told(tk: Tk, tiny: Path, three_views: Path, copy: Path, tmp_path: Path) -> None:
+    tk("evaluate", three_views, tiny / "truth.h5", "--joints", "toe").complaint("--joints toe")
+    tk("evaluate", three_views, tiny / "truth.h5", "--capture", tmp_path).complaint(str(tmp_path))
+    shutil.rmtree(copy / "videos")
+    ran = tk("evaluate", three_views, copy / "truth.h5")
+    assert ran.code == 0 and "not judged in the pictures" in ran.err and "PCK5" in ran.out
+    with h5py.File(three_views) as file:
+        assert "state" in file["resume"]
