@@ -375,3 +375,38 @@ def test_a_person_is_followed_exactly(name):
     assert 50 < litres < 200
     surface = followed.surface()
     assert (surface.seen != 0).mean() > 0.8
+
+
+def test_one_camera_is_overruled_near_the_given_points():
+    """Against counting, voxel by voxel, which cameras carve: at most one, near a point, and two cameras see it."""
+    rig, grid = make_rig(5), VoxelGrid.cover(VOLUME, 24)
+    masks = silhouettes(rig, ball())
+    masks[2] = 0  # this camera has lost the ball
+    hull = VisualHull(rig, grid)
+    hull.update(masks)
+    before = hull.occupancy
+    points = ball(count=3000, seed=1) * [1, 1, 1]
+    points = points[points[:, 0] > 0.05]
+    hull.overrule(points, margin=1)
+    carving = sum((hull.camera_bits >> c & 1) == 0 for c in range(len(rig)))
+    near = np.zeros(grid.shape, bool)
+    for cell in np.rint((points - grid.origin) / grid.voxel_m).astype(int):
+        low = np.maximum(cell - 1, 0)
+        near[low[0] : cell[0] + 2, low[1] : cell[1] + 2, low[2] : cell[2] + 2] = True
+    holders = sum(camera.sees(grid.centers()) for camera in rig).reshape(grid.shape)
+    np.testing.assert_array_equal(hull.occupancy, before | (near & (carving <= 1) & (holders >= 2)))
+    assert hull.occupancy.sum() > before.sum()
+    # nothing of it is left when the masks change
+    hull.update(masks)
+    np.testing.assert_array_equal(hull.occupancy, before)
+
+
+def test_three_cameras_overrule_nobody():
+    rig, grid = make_rig(3), VoxelGrid.cover(VOLUME, 16)
+    masks = silhouettes(rig, ball())
+    masks[0] = 0
+    hull = VisualHull(rig, grid)
+    hull.update(masks)
+    before = hull.occupancy
+    hull.overrule(ball())
+    np.testing.assert_array_equal(hull.occupancy, before)

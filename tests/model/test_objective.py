@@ -21,7 +21,7 @@ from tk.model.objective import (
     even,
     pick,
 )
-from tk.model.skeleton import CHAINS, SEGMENTS
+from tk.model.skeleton import CHAINS, JOINTS, SEGMENTS
 
 BODY = build_body(BodyDimensions.from_stature(1.75))
 SKELETON = BODY.skeleton
@@ -315,3 +315,25 @@ def test_a_frame_of_one_voxel(objective, truth):
     assert np.isfinite(frame.value(truth)) and np.isfinite(frame.curvature(truth)).all()
     result = frame.chains(ALL_CHAINS, truth)(np.repeat(truth[None], 5, 0), np.zeros((5, D)), 0)
     assert np.isfinite(result.value).all()
+
+
+def test_a_leg_inside_the_other_finds_no_voxel(frame, index, truth, monkeypatch):
+    """Two limbs cannot be in one place. Where the legs cross, the right one's samples are stranded; allowed in, none is."""
+    folded = truth.copy()
+    knee_l = SKELETON.joints(truth)[JOINTS.index("knee_l")]
+
+    def miss(yaw):
+        folded[SKELETON.index("hip_r_yaw")] = yaw
+        return np.linalg.norm(SKELETON.joints(folded)[JOINTS.index("knee_r")] - knee_l)
+
+    folded[SKELETON.index("hip_r_yaw")] = min(np.linspace(-1, 0.5, 200), key=miss)
+    leg = CHAIN_OF_SEGMENT[BODY.segment] == CHAIN_NAMES.index("leg_r")
+
+    def stranded(problem, pose):
+        fit = problem.fit(pose)
+        return (fit.linear.partner[: len(fit.samples)][leg[fit.samples]] < 0).mean()
+
+    monkeypatch.setattr("tk.model.objective.BARRED", np.zeros(len(SEGMENTS), np.int32))
+    free = FrameObjective(BodyObjective(BODY, ObjectiveSettings(), SAMPLING), index, np.random.default_rng(0))
+    assert stranded(frame, truth) == stranded(free, truth) == stranded(free, folded) == 0
+    assert stranded(frame, folded) > 0.15
