@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError, VideoError, VolumeError
 from tk.io.calibration import Calibration, match_camera, read_calibration
 from tk.io.frames import FrameReader, FrameSet
+from tk.io.mobo import SETTINGS as MOBO_SETTINGS
+from tk.io.mobo import find_walk, read_cameras
 from tk.io.settings import CaptureSettings, read_settings
 from tk.io.video import Clip, Image, list_clips, probe
 from tk.model.camera import Camera, Rig
@@ -124,11 +126,16 @@ def open_capture(path: str | Path, cameras: Sequence[str] | None = None, masks: 
     path = Path(path)
     if not path.is_dir():
         raise CaptureError(f"{path}: is not a folder; a capture is a folder with calibration.toml and videos/")
-    calibration = read_calibration(path / "calibration.toml").select(cameras)
+    walk = find_walk(path)
+    calibration = (read_cameras(walk) if walk else read_calibration(path / "calibration.toml")).select(cameras)
     rig = calibration.rig
     settings = read_settings(path / "capture.toml")
+    if walk and not (path / "capture.toml").exists():
+        settings = MOBO_SETTINGS
 
-    clips = _open_clips(calibration, path)
+    clips = _clips_of(calibration, path, "folder of pictures", "jpg") if walk else _open_clips(calibration, path)
+    if walk and walk.masks is not None and masks == "auto":
+        masks = str(walk.masks)
     mask_clips = _open_masks(calibration, path, masks)
     warnings: list[str] = []
     if settings.unknown:

@@ -17,7 +17,7 @@ from tk.errors import VideoError
 Image = NDArray[np.uint8]
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv")
-PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pbm", ".pgm", ".ppm")
 
 #: a mask's pixel is foreground from this grey value on
 MASK_THRESHOLD = 128
