@@ -2,7 +2,7 @@
 
     python -m scripts.ablation CAPTURE [CAPTURE ...] --seeds 2
 
-The masks are made once a capture, from the videos; every row then tracks the whole capture from its first frame, body fit
+The masks are made once a capture, from the videos; every row then tracks the whole capture, body fit
 included, with each seed. Prints a Markdown table.
 """
 
@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.config import Config
-from tk.io.result_data import read_joints
 from tk.io.capture import Capture, open_capture
+from tk.io.result_data import read_joints
 from tk.sequence import make_segmenter
 from tk.tracker import Observation
 from tk.volumetric import VolumetricTracker

@@ -336,4 +336,4 @@ def test_a_leg_inside_the_other_finds_no_voxel(frame, index, truth, monkeypatch)
     monkeypatch.setattr("tk.model.objective.BARRED", np.zeros(len(SEGMENTS), np.int32))
     free = FrameObjective(BodyObjective(BODY, ObjectiveSettings(), SAMPLING), index, np.random.default_rng(0))
     assert stranded(frame, truth) == stranded(free, truth) == stranded(free, folded) == 0
-    assert stranded(frame, folded) > 0.15
+    assert stranded(frame, folded) > 0.1
