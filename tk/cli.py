@@ -71,7 +71,12 @@ _preset = click.option("--preset", metavar="NAME", help="Settings to begin with:
 @main.command()
 @_capture
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="RESULT.h5")
-@click.option("--method", default="volumetric", show_default=True, help="The tracker: volumetric, lm (the same by Levenberg-Marquardt), or silhouette.")
+@click.option(
+    "--method",
+    default="volumetric",
+    show_default=True,
+    help="The tracker: volumetric, lm (the same by Levenberg-Marquardt), or silhouette.",
+)
 @_voxels
 @_cameras
 @_frames

@@ -47,8 +47,8 @@ class TrackingConfig:
         prediction: share of the last frame's motion that the next is expected to repeat. The paper does not say how it
             predicts; at 15 Hz an arm turns by up to 31° between frames (its section 7.4).
         init_frames: frames from which the body is fitted.
-        settled_ratio: limbs are looked for elsewhere only in a frame whose objective, after the first pass, exceeds that
-            of the usual frame by this factor; 0 looks in every frame.
+        settled_ratio: limbs are looked for elsewhere only in a frame whose objective, after the first pass, exceeds
+            that of the usual frame by this factor; 0 looks in every frame.
         retry_ratio: a frame whose objective exceeds that of the usual frame by this factor is searched anew.
         retry_astray: the same for the share of the hull's surface farther than 10 cm from the body: this much more.
         lost_ratio: a frame is lost whose objective exceeds that of the usual frame by this factor.

@@ -318,7 +318,8 @@ def test_a_frame_of_one_voxel(objective, truth):
 
 
 def test_a_leg_inside_the_other_finds_no_voxel(frame, index, truth, monkeypatch):
-    """Two limbs cannot be in one place. Where the legs cross, the right one's samples are stranded; allowed in, none is."""
+    """Two limbs cannot be in one place. Where the legs cross, the right one's samples are stranded; allowed in, none
+    is."""
     folded = truth.copy()
     knee_l = SKELETON.joints(truth)[JOINTS.index("knee_l")]
 

@@ -9,8 +9,16 @@ from scipy.linalg import expm
 from tk.errors import ConfigError
 from tk.model.anthropometry import RAISED_SHOULDERS, TRUNK_LENGTH, BodyDimensions
 from tk.model.body import neutral_pose
-from tk.model.skeleton import shoulder_angles
-from tk.model.skeleton import CHAINS, DEGREES_OF_FREEDOM, JOINTS, SEGMENTS, build_skeleton, twist_exp, up_rotation
+from tk.model.skeleton import (
+    CHAINS,
+    DEGREES_OF_FREEDOM,
+    JOINTS,
+    SEGMENTS,
+    build_skeleton,
+    shoulder_angles,
+    twist_exp,
+    up_rotation,
+)
 
 DIMENSIONS = BodyDimensions.from_stature(1.75)
 SKELETON = build_skeleton(DIMENSIONS)

@@ -3,20 +3,20 @@
 Three kinds of search, all along a straight line of pixels (Bresenham's: a pixel a step along the longer axis):
 
 pair
-    through two contour points symmetric about the limb's axis, and ``reach`` beyond each. Of all pairs of edges on it the
-    one with the least ``|length difference| / (s_a s_b)`` is taken (eq. 12), with the gradient score s of eq. 11.
+    through two contour points symmetric about the limb's axis, and ``reach`` beyond each. Of all pairs of edges on it
+    the one with the least ``|length difference| / (s_a s_b)`` is taken (eq. 12), with the gradient score s of eq. 11.
 single
     through one point along the contour's normal, the edge with the greatest score (eq. 14).
 outline
-    the same line, for the nearest change of the foreground mask from person to background. Not in the paper, whose masks
-    end with the hull: the hull's voxels are some centimetres wide, the mask's edge is known to a pixel or two.
+    the same line, for the nearest change of the foreground mask from person to background. Not in the paper, whose
+    masks end with the hull: the hull's voxels are some centimetres wide, the mask's edge is known to a pixel or two.
 
 An edge is a pixel whose colour gradient (section 4.2) is at least ``threshold`` and the greatest along the line. The
 gradient is evaluated here, on demand. A mask's change counts as an edge of strength ``mask_edge`` in the paper's two
 searches as well, 0 leaves it out: masks are noisy but know what is person.
 
-Where the paper is silent, or cannot be meant: equal lengths alone would win in eq. 12 with any gradient, as its numerator
-is 0 then; a length is known to about a pixel, so one pixel is added. Lines end at the picture's border.
+Where the paper is silent, or cannot be meant: equal lengths alone would win in eq. 12 with any gradient, as its
+numerator is 0 then; a length is known to about a pixel, so one pixel is added. Lines end at the picture's border.
 """
 
 import numpy as np

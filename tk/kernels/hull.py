@@ -200,7 +200,8 @@ def carve(
 
 
 def missing_at_most_one(planes: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """(W,) the voxels that at most one camera carves, from ``planes`` (2C, W): bitwise, all voxels of a word at once."""
+    """(W,) the voxels that at most one camera carves, from ``planes`` (2C, W): bitwise, all voxels of a word at
+    once."""
     once = np.zeros(planes.shape[1], np.uint32)
     twice = np.zeros(planes.shape[1], np.uint32)
     for shares in planes.reshape(-1, SHARES, planes.shape[1]):

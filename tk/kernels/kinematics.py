@@ -1,8 +1,8 @@
 """Forward kinematics of a tree of twists, as Taichi functions for the kernels that need it.
 
 Layout: ``frames (C, D, 12)`` holds the 3×4 transform after each degree of freedom, row by row; ``twists (C, D, 6)`` its
-world twist (ω, v): a point x below it moves at ω × x + v. C are scratch rows, one a parallel task, so that no task waits
-for another.
+world twist (ω, v): a point x below it moves at ω × x + v. C are scratch rows, one a parallel task, so that no task
+waits for another.
 
 The shoulder girdle has no degree of freedom of its own, but the shoulder rises as the arm does. So the first degree of
 freedom of a shoulder may carry a translation ``rise · u`` before its rotation, with u the sine of the arm's elevation
@@ -14,7 +14,6 @@ import functools
 import numpy as np
 
 from tk.kernels.runtime import ensure_runtime, ti
-
 
 # The arm's elevation u from a shoulder's first two angles, the arm being level in the zero configuration:
 # u = ARM_UP[0] cos(second) sin(first) + ARM_UP[1] sin(second).

@@ -526,8 +526,8 @@ class ObjectiveKernel:
             entries: (B, E, 17) of the alignment term (:mod:`tk.kernels.alignment`), if any.
 
         Returns:
-            f (B,): ``surface_weight`` times mean ρ over the samples plus ``coverage_weight`` times mean ρ over the voxels, plus the entries'
-            shares; its gradient (B, D); H·v (B, D); the assignments made.
+            f (B,): ``surface_weight`` times mean ρ over the samples plus ``coverage_weight`` times mean ρ over the
+            voxels, plus the entries' shares; its gradient (B, D); H·v (B, D); the assignments made.
         """
         E = 0 if entries is None else entries.shape[1]
         B, D = pose.shape

@@ -147,9 +147,15 @@ class ContourTerm:
         # Strips come from these rows: so many of each
         limb = {s: [(circles(s, 1)[0], config.pairs)] for s in LIMBS}
         head = [(circles("head", 1)[0], config.head_circles)]
-        self._all = [(row, config.trunk_circles) for row in circles("torso", 2)] + head + sum(limb.values(), [])
+        self._all = (
+            [(row, config.trunk_circles) for row in circles("torso", 2)]
+            + head
+            + [row for s in LIMBS for row in limb[s]]
+        )
         self._chains = [
-            [(circles("head", 1)[0], 2 * config.pairs)] if chain == ("head",) else sum((limb[s] for s in chain), [])
+            [(circles("head", 1)[0], 2 * config.pairs)]
+            if chain == ("head",)
+            else [row for s in chain for row in limb[s]]
             for chain in CHAINS.values()
         ]
 
@@ -249,7 +255,8 @@ class ContourTerm:
         first: NDArray[np.intp],
         second: NDArray[np.intp],
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Entries with points, camera, normal; their SHARE holds the pixels a metre. And the lines of the same points."""
+        """Entries with points, camera, normal; their SHARE holds the pixels a metre. And the lines of the same
+        points."""
         entries = np.zeros((len(b), alignment.ENTRY_NUMBERS), np.float32)
         lines = np.zeros((len(b), LINE_NUMBERS), np.float32)
         a = alignment

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.body import neutral_pose
-from tk.model.skeleton import shoulder_angles
-from tk.model.skeleton import Skeleton
+from tk.model.skeleton import Skeleton, shoulder_angles
 
 Float = NDArray[np.float64]
 

@@ -108,9 +108,9 @@ class VisualHull:
     def overrule(self, p_world: NDArray[np.floating], margin: int = 1) -> None:
         """Activate voxels near the given points that all cameras but one leave standing.
 
-        Not in the paper. A sleeve of the floor's colour is missing in the picture of the one camera that looks down on it,
-        and the hull then misses the arm. Where a body is expected, the others outvote that camera. Needs four cameras.
-        What :meth:`update` makes of the next masks does not depend on it.
+        Not in the paper. A sleeve of the floor's colour is missing in the picture of the one camera that looks down on
+        it, and the hull then misses the arm. Where a body is expected, the others outvote that camera. Needs four
+        cameras. What :meth:`update` makes of the next masks does not depend on it.
 
         Args:
             p_world: (N, 3) points at most a voxel apart, in and on the body as it is expected; metres.

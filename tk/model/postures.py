@@ -1,8 +1,8 @@
 """Postures of the limbs that people take: where to look for a limb that has been lost.
 
 Random angles about where a limb was seldom reach one that is elsewhere. These few directions of the upper arm and the
-thigh, each with the elbow or knee straight and bent, cover what a limb can do to within about 45°; the optimiser does the
-rest. They are no prior: nothing draws a limb to them.
+thigh, each with the elbow or knee straight and bent, cover what a limb can do to within about 45°; the optimiser does
+the rest. They are no prior: nothing draws a limb to them.
 """
 
 from __future__ import annotations

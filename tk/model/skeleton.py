@@ -109,8 +109,8 @@ class Skeleton:
         units: (D,) "m" or "rad".
         axis: (D, 3) unit axes in the zero configuration, world frame.
         point: (D, 3) a point on each axis, metres; unused for translations.
-        rise: (D, 3) how far a level arm that is raised upright lifts its shoulder, metres, in the first degree of freedom
-            of each shoulder; zero elsewhere. See :attr:`anchor`.
+        rise: (D, 3) how far a level arm that is raised upright lifts its shoulder, metres, in the first degree of
+            freedom of each shoulder; zero elsewhere. See :attr:`anchor`.
         prismatic: (D,) True for translations.
         parent: (D,) index of the degree of freedom before, -1 at the root.
         lower, upper: (D,) limits, radians; infinite where there is none.

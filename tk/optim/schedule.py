@@ -100,8 +100,8 @@ class ScheduleConfig:
         soft, chain_soft: by how much Leclerc's ν is multiplied in the first pass and for the chains; 1 is the paper's.
         iterations, chain_iterations, polish_iterations: i_max (eq. 21) of the three passes; no polish with 0, as in the
             paper.
-        newton_iterations: damped Gauss-Newton steps after all, on samples that do not change: the last centimetre, which the
-            draws' noise hides from SMD; 0 for the paper's.
+        newton_iterations: damped Gauss-Newton steps after all, on samples that do not change: the last centimetre,
+            which the draws' noise hides from SMD; 0 for the paper's.
         retries: how often a frame whose objective stays high is searched anew from other starts.
         hypotheses: starts of each chain: as the first pass left it, as the last frame had it, and the best of some
             random candidates; at least 1.
@@ -195,8 +195,8 @@ def optimise(
         config, smd_config: settings.
         good_enough: whether a pose (D,) ends the search; any does by default.
         alternatives: other starts (A, D), made from the best pose so far, for when it is not good enough.
-        settled: whether a pose (D,) after the first pass is so good that the chains need no hypotheses beside it; none is
-            by default.
+        settled: whether a pose (D,) after the first pass is so good that the chains need no hypotheses beside it; none
+            is by default.
     """
     tolerance = np.where(problem.angular, np.radians(config.tolerance_deg), config.tolerance_m)
     starts = problem.constrain(starts)
@@ -374,7 +374,7 @@ def _screened(
     rng: np.random.Generator,
     config: ScheduleConfig,
 ) -> Float:
-    """(count · S, D) the most promising of many hypotheses of each of S chains; row b is of chain ``searched[b mod S]``.
+    """(count · S, D) the best of many hypotheses of each of S chains; row b is of chain ``searched[b mod S]``.
 
     Half of them are common postures, drawn for this frame, the others random places about the pose.
     """
