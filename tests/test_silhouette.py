@@ -123,6 +123,19 @@ def test_an_empty_picture_is_a_lost_frame_and_the_next_one_is_recovered():
     assert tracker.step(observe(MASKS[2], 3)).status == "tracked"
 
 
+def test_somebody_who_comes_back_elsewhere_is_found():
+    tracker = tracker_at(POSES[0])
+    tracker.step(observe(MASKS[0]))
+    tracker.step(observe(np.zeros_like(MASKS[0]), 1))
+    away = POSES[:3].copy()
+    away[:, 0] += 0.45
+    away[:, NAMES.index("torso_yaw")] += 2.0
+    estimates = [tracker.step(observe(m, i)) for i, m in enumerate(draw_silhouettes(BODY, RIG, away), 2)]
+    assert "recovered" in [e.status for e in estimates]
+    assert estimates[-1].status in ("recovered", "tracked")
+    assert errors(estimates[-1], away[-1]).mean() < 2 * CLOSE_M
+
+
 def test_the_walker_moves_only_its_seven_degrees_of_freedom():
     tracker = tracker_at(POSES[0], body="walker")
     start = tracker.state()["pose"]

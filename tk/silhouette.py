@@ -53,6 +53,8 @@ class SilhouetteConfig:
             means of its section 4.6).
         gain: the fall of E_S that makes one of them the pose.
         lost_error: a frame whose E_S, averaged over the views, is above this is lost.
+        relocate_every: a lost frame is searched for the person from the silhouettes' centroid, as the first frame is;
+            of several lost ones every so many.
         ray_step: every how many pixels E_S is taken during tracking; 0: a 54th of the picture's height.
     """
 
@@ -66,6 +68,7 @@ class SilhouetteConfig:
     second_thoughts: int = 3
     gain: float = 0.002
     lost_error: float = 0.6
+    relocate_every: int = 3
     ray_step: int = 0
     search: SearchSettings = field(default_factory=SearchSettings)
     solver: GaussNewtonConfig = field(default_factory=lambda: GaussNewtonConfig(scales=3))
@@ -75,8 +78,9 @@ class SilhouetteConfig:
     def __post_init__(self) -> None:
         if self.body not in PRESETS:
             raise ConfigError(f'silhouette: body = "{self.body}": choose one of {", ".join(PRESETS)}')
-        if min(self.headings, self.phases, self.finalists, self.init_frames) < 1:
-            raise ConfigError("silhouette: headings, phases, finalists and init_frames must be at least 1")
+        for name in ("headings", "phases", "finalists", "init_frames", "relocate_every"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"silhouette: {name} = {getattr(self, name)} must be at least 1")
         if min(self.ray_step, self.second_thoughts) < 0:
             raise ConfigError("silhouette: ray_step and second_thoughts must not be negative")
         if not 0 <= self.prediction <= 1.5 or not self.lost_error > 0:
@@ -227,6 +231,10 @@ class SilhouetteTracker:
             pose, error = self._reconsider(pyramid, pose)
         else:
             error = float(self._fit_error(pyramid, pose[None])[0])
+        # after a loss the last pose is no evidence, however well the pose near it fits
+        due = self._lost_for > 0 if error <= config.lost_error else self._lost_for % config.relocate_every == 0
+        if due and np.isfinite(error):
+            pose, error = self._relocate(pyramid, pose, error)
         lost = not error <= config.lost_error
         status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
         # nobody is in sight: the last pose stands
@@ -255,6 +263,18 @@ class SilhouetteTracker:
         errors = self._fit_error(pyramid, settled)
         i = int(np.argmin(errors))
         return (settled[i], float(errors[i])) if errors[i] < error - self.config.gain else (pose, error)
+
+    def _relocate(self, pyramid: Pyramid, pose: Float, error: float) -> tuple[Float, float]:
+        """The pose or, if that explains the silhouettes better, one found as at the start; and its E_S."""
+        try:
+            p_centroid = self._centroid(pyramid, 0)
+        except CaptureError:
+            return pose, error
+        starts = gait.hypotheses(self.body.skeleton, self.config.headings, self.config.phases, p_centroid)
+        settled = self._settle(pyramid, starts, self.config.solver.scales)
+        errors = self._fit_error(pyramid, settled)
+        i = int(np.argmin(errors))
+        return (settled[i], float(errors[i])) if errors[i] < error else (pose, error)
 
     @property
     def body(self) -> ConeBody:
