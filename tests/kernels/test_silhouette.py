@@ -13,6 +13,7 @@ from tests.model.ring import ring_of_cameras
 from tk.errors import ConfigError
 from tk.kernels import silhouette
 from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A, SIDE_B, curve_of, enter, point_on
+from tk.kernels.overlap import overlap
 from tk.kernels.runtime import ensure_runtime, ti
 from tk.kernels.silhouette import SearchSettings
 from tk.model import gait
@@ -306,7 +307,7 @@ def test_a_body_that_no_camera_sees_has_no_equations():
 def test_overlap_counts_what_it_draws():
     poses = np.stack([POSE, POSE + 0.1])
     seen = MASKS[:, 2::4, 2::4]
-    counts, pictures = silhouette.overlap(BODY.arrays, VIEWS.cameras, 4, VIEWS.rays, seen, poses)
+    counts, pictures = overlap(BODY.arrays, VIEWS.cameras, 4, VIEWS.rays, seen, poses)
     drawn, masks = pictures > 0, MASKS[None, :, 2::4, 2::4] > 0
     np.testing.assert_array_equal(counts[..., 0], (drawn & ~masks).sum(axis=(2, 3)))
     np.testing.assert_array_equal(counts[..., 1], (masks & ~drawn).sum(axis=(2, 3)))

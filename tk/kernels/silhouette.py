@@ -1,4 +1,4 @@
-"""Occluding contours of a cone body against silhouettes: search along normals, normal equations, overlap.
+"""Occluding contours of a cone body against silhouettes: search along normals, normal equations.
 
 The silhouette paper, sections 4.1, 4.3 and 4.4. A sample of a contour looks for the silhouette along its normal, in one
 direction: outwards where it lies in the mask, inwards where it does not, so that only foreground-to-background
@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
+from tk.kernels.cone_arrays import LONGEST_CHAIN, NEAREST_M, ConeArrays, keep, place_part, shape_of
 from tk.kernels.cones import (
     SIDE_B,
     curve_of,
-    enclosing_radius,
     enter,
     interior_point,
     point_on,
@@ -28,16 +28,10 @@ from tk.kernels.kinematics import forward, load_rotation, load_translation, poin
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, ti
 
-# Degrees of freedom above a part: the trunk's six and at most four of a limb.
-LONGEST_CHAIN = 10
 # Chords that stand for a curve when its length is measured and when edgels are compared with it.
 CHORDS = 12
 # A sample is hidden by another part if it lies this far inside its cross-section: neighbours at a joint touch.
 HIDING_SHRINK = 0.95
-# Nearer than this to a camera nothing is projected, metres.
-NEAREST_M = 0.1
-# How much larger than its first-order size a part's disc is taken when rays are cast.
-DISC_MARGIN = 1.1
 # Columns of a task's sums: cost, weight of the edgels found, weight of all samples, gradient, upper triangle of JᵀWJ.
 _SUMS = 3 + LONGEST_CHAIN + LONGEST_CHAIN * (LONGEST_CHAIN + 1) // 2
 # Columns of an exported sample: see Edgels.
@@ -87,35 +81,6 @@ class SearchSettings:
         ):
             if not valid:
                 raise ConfigError(f"silhouette search: {name} = {value} must lie {expected}")
-
-
-class ConeArrays(NamedTuple):
-    """A cone body as plain arrays (D degrees of freedom, P parts, Q curves), all of one real type.
-
-    Attributes:
-        axis, point: (D, 3) twists in the zero configuration.
-        prismatic, parent: (D,) int32.
-        part_kind: (P,) int32, CONE or ELLIPSOID.
-        part_shape: (P, 4) a, b, h, m.
-        part_frame: (P, 12) 3×4 transform from the part to the zero configuration.
-        part_dof: (P,) int32 the last degree of freedom above each part.
-        part_limb: (P,) int32 parts of one limb never make each other's edges ambiguous.
-        chain: (P, LONGEST_CHAIN) int32 the degrees of freedom above each part, -1 behind the last.
-        curve_part, curve_kind: (Q,) int32.
-    """
-
-    axis: NDArray
-    point: NDArray
-    prismatic: NDArray[np.int32]
-    parent: NDArray[np.int32]
-    part_kind: NDArray[np.int32]
-    part_shape: NDArray
-    part_frame: NDArray
-    part_dof: NDArray[np.int32]
-    part_limb: NDArray[np.int32]
-    chain: NDArray[np.int32]
-    curve_part: NDArray[np.int32]
-    curve_kind: NDArray[np.int32]
 
 
 class NormalEquations(NamedTuple):
@@ -205,28 +170,6 @@ def _to_segment(e, a, b):
     return (e - a - t * ab).norm_sqr()
 
 
-@ti.func
-def _shape(part_shape: ti.template(), p: int):
-    return ti.Vector([part_shape[p, i] for i in ti.static(range(4))])
-
-
-@ti.func
-def _place_part(frames: ti.template(), part_dof: ti.template(), part_frame: ti.template(), b: int, p: int):
-    """Rotation and translation from part p to the world at pose b."""
-    R0 = ti.Matrix([[part_frame[p, 4 * i + j] for j in ti.static(range(3))] for i in ti.static(range(3))])
-    t0 = ti.Vector([part_frame[p, 4 * i + 3] for i in ti.static(range(3))])
-    R = load_rotation(frames, b, part_dof[p])
-    return R @ R0, R @ t0 + load_translation(frames, b, part_dof[p])
-
-
-@ti.func
-def _keep(placed: ti.template(), b: int, p: int, R, t):
-    for i in ti.static(range(3)):
-        for j in ti.static(range(3)):
-            placed[b, p, 4 * i + j] = R[i, j]
-        placed[b, p, 4 * i + 3] = t[i]
-
-
 @functools.cache
 def _equations_kernel(real):
     @ti.kernel
@@ -271,13 +214,13 @@ def _equations_kernel(real):
         for b in range(B):
             forward(axis, point, prismatic, parent, pose, b, b, frames, twists)
             for p in range(P):
-                R, t = _place_part(frames, part_dof, part_frame, b, p)
-                _keep(placed, b, p, R, t)
+                R, t = place_part(frames, part_dof, part_frame, b, p)
+                keep(placed, b, p, R, t)
 
         for c in range(B * V * Q):
             b, v, q = c // (V * Q), (c // Q) % V, c % Q
             p, kind = curve_part[q], curve_kind[q]
-            shape = _shape(part_shape, p)
+            shape = shape_of(part_shape, p)
             R, t = load_rotation(placed, b, p), load_translation(placed, b, p)
             center = R.transpose() @ (camera_center(camera, v) - t)
             visible, params = curve_of(kind, shape, center)
@@ -320,7 +263,7 @@ def _equations_kernel(real):
                 for i in range(most_samples):
                     samples[c, i, 0] = 0.0
             if facts[c, 0] > 0.0:
-                shape = _shape(part_shape, p)
+                shape = shape_of(part_shape, p)
                 R, t = load_rotation(placed, b, p), load_translation(placed, b, p)
                 eye = camera_center(camera, v)
                 center = R.transpose() @ (eye - t)
@@ -346,7 +289,7 @@ def _equations_kernel(real):
                                 Ro = load_rotation(placed, b, o)
                                 co = Ro.transpose() @ (eye - load_translation(placed, b, o))
                                 t_o = enter(
-                                    part_kind[o], _shape(part_shape, o), co, Ro.transpose() @ ray, HIDING_SHRINK
+                                    part_kind[o], shape_of(part_shape, o), co, Ro.transpose() @ ray, HIDING_SHRINK
                                 )
                                 # behind another part it is not seen; before one it is no edge of the silhouette
                                 if t_o > 0.0 and (interior == 0 or t_o < 1.0):
@@ -538,125 +481,3 @@ def find_edgels(
         row=chosen[:, 6:9],
         pixel=chosen[:, 9:11],
     )
-
-
-@functools.cache
-def _overlap_kernel(real):
-    @ti.kernel
-    def kernel(
-        axis: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
-        point: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
-        prismatic: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
-        parent: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
-        part_kind: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
-        part_shape: ti.types.ndarray(dtype=real, ndim=2),  # (P, 4)
-        part_frame: ti.types.ndarray(dtype=real, ndim=2),  # (P, 12)
-        part_dof: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
-        camera: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
-        step: ti.i32,  # pixels between rays; the first is at step // 2
-        rays: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (V, H, W, 3) world; zero outside the picture
-        mask: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (V, H, W)
-        pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
-        frames: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 12) scratch
-        twists: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 6) scratch
-        placed: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 12) scratch
-        disc: ti.types.ndarray(dtype=real, ndim=4),  # (B, V, P, 3) scratch, centre and square radius in pixels
-        counts: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B V H, 2) out: model without mask, mask without model
-        picture: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (B, V, H, W) out
-    ):
-        B, V, H, W = pose.shape[0], rays.shape[0], rays.shape[1], rays.shape[2]
-        P = part_dof.shape[0]
-        for b in range(B):
-            forward(axis, point, prismatic, parent, pose, b, b, frames, twists)
-            for p in range(P):
-                R, t = _place_part(frames, part_dof, part_frame, b, p)
-                _keep(placed, b, p, R, t)
-                # a disc in each picture that holds the part: most pixels are far from most parts
-                shape = _shape(part_shape, p)
-                middle = R @ interior_point(part_kind[p], shape) + t
-                reach = enclosing_radius(part_kind[p], shape)
-                for v in range(V):
-                    pixel, J, z = project(camera, v, middle)
-                    radius = 0.0 * z
-                    if z > 1.5 * reach + NEAREST_M:
-                        # the Frobenius norm of the derivative is at least its growth in any direction
-                        radius = DISC_MARGIN * J.norm() * reach * z / (z - reach)
-                    elif z > -reach:
-                        radius = 1e6 + 0.0 * z
-                    disc[b, v, p, 0], disc[b, v, p, 1], disc[b, v, p, 2] = pixel[0], pixel[1], radius * radius
-        for c in range(B * V * H):
-            b, v, j = c // (V * H), (c // H) % V, c % H
-            eye = camera_center(camera, v)
-            for i in range(W):
-                picture[b, v, j, i] = ti.cast(0, ti.u8)
-            for p in range(P):
-                # the stretch of this row that the part's disc covers
-                across = disc[b, v, p, 2] - (j * step + step // 2 - disc[b, v, p, 1]) ** 2
-                if across > 0.0:
-                    half = ti.sqrt(across)
-                    middle = disc[b, v, p, 0] - step // 2
-                    first = ti.max(ti.cast(ti.ceil((middle - half) / step), ti.i32), 0)
-                    last = ti.min(ti.cast(ti.floor((middle + half) / step), ti.i32), W - 1)
-                    shape = _shape(part_shape, p)
-                    R = load_rotation(placed, b, p).transpose()
-                    local = R @ (eye - load_translation(placed, b, p))
-                    for i in range(first, last + 1):
-                        if picture[b, v, j, i] == 0:
-                            ray = ti.Vector([ti.cast(rays[v, j, i, a], real) for a in ti.static(range(3))])
-                            if ray.norm_sqr() > 0.0 and enter(part_kind[p], shape, local, R @ ray, 1.0) > 0.0:
-                                picture[b, v, j, i] = ti.cast(255, ti.u8)
-            more, less = 0, 0
-            for i in range(W):
-                if picture[b, v, j, i] > 0 and mask[v, j, i] < 128:
-                    more += 1
-                if picture[b, v, j, i] == 0 and mask[v, j, i] >= 128:
-                    less += 1
-            counts[c, 0], counts[c, 1] = more, less
-
-    return kernel
-
-
-def overlap(
-    body: ConeArrays,
-    cameras: np.ndarray,
-    step: int,
-    rays: np.ndarray,
-    masks: np.ndarray,
-    poses: np.ndarray,
-) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Cast a ray through every pixel: the silhouettes of B poses against masks.
-
-    Args:
-        body: the cone body.
-        cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_camera`.
-        step: pixels between rays; the first goes through pixel ``step // 2``.
-        rays: (V, H, W, 3) float32 viewing directions, world frame; zero where a camera has no pixel.
-        masks: (V, H, W) uint8.
-        poses: (B, D).
-
-    Returns:
-        counts (B, V, 2) of pixels in the model but not the mask, and in the mask but not the model; silhouettes
-        (B, V, H, W) uint8, 0 or 255.
-    """
-    ensure_runtime()
-    dtype = body.axis.dtype
-    poses = np.ascontiguousarray(poses, dtype)
-    B, D = poses.shape
-    V, H, W = rays.shape[:3]
-    counts = np.empty((B * V * H, 2), np.int32)
-    picture = np.empty((B, V, H, W), np.uint8)
-    _overlap_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
-        *body[:8],
-        np.ascontiguousarray(cameras, dtype),
-        step,
-        np.ascontiguousarray(rays, np.float32),
-        np.ascontiguousarray(masks),
-        poses,
-        np.empty((B, D, 12), dtype),
-        np.empty((B, D, 6), dtype),
-        np.empty((B, len(body.part_kind), 12), dtype),
-        np.empty((B, V, len(body.part_kind), 3), dtype),
-        counts,
-        picture,
-    )
-    return counts.reshape(B, V, H, 2).sum(axis=2, dtype=np.int64), picture

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
+from tk.kernels.cone_arrays import LONGEST_CHAIN, ConeArrays
 from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A, SIDE_B
-from tk.kernels.silhouette import LONGEST_CHAIN, ConeArrays
 from tk.model.anthropometry import CROTCH_DROP, HIP_HALF_WIDTH, BodyDimensions
 from tk.model.skeleton import SEGMENTS, Skeleton, build_skeleton
 

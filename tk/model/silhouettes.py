@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tk.errors import ConfigError
 from tk.kernels import silhouette as kernels
+from tk.kernels.overlap import overlap
 from tk.kernels.projection import pack_camera
 from tk.kernels.silhouette import Edgels, NormalEquations, SearchSettings
 from tk.model.camera import Rig
@@ -169,7 +170,7 @@ def silhouette_error(
         rays = pixel_rays(rig, step)
     offset = step // 2
     seen = np.ascontiguousarray(masks[:, offset::step, offset::step])
-    counts, _ = kernels.overlap(body.arrays, pack_rig(rig), step, rays, seen, poses)
+    counts, _ = overlap(body.arrays, pack_rig(rig), step, rays, seen, poses)
     total = np.count_nonzero(seen >= 128, axis=(1, 2))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(total > 0, counts.sum(axis=2) / total, np.inf)
@@ -179,5 +180,5 @@ def draw_silhouettes(body: ConeBody, rig: Rig, poses: Float) -> NDArray[np.uint8
     """(B, V, H, W) silhouettes of the body at poses (B, D), 0 or 255."""
     rays = pixel_rays(rig)
     empty = np.zeros(rays.shape[:3], np.uint8)
-    _, pictures = kernels.overlap(body.arrays, pack_rig(rig), 1, rays, empty, poses)
+    _, pictures = overlap(body.arrays, pack_rig(rig), 1, rays, empty, poses)
     return pictures
