@@ -223,10 +223,19 @@ class ContourTerm:
         entries[:, alignment.STATE] = np.where(any_seen, alignment.ASSIGNED, alignment.UNASSIGNABLE)
         entries[:, alignment.SHARE] = c.along
         entries[:, alignment.NU] = c.edge_nu
-        # a pair is two points
-        weight = np.where(both, 1.0, np.where(any_seen, 0.5, 1.0))
-        total = np.bincount(b, weight, minlength=B)
-        entries[:, alignment.SCALE] = c.edge_weight * weight / total[b] * np.where(any_seen, 1.0, c.hidden)
+        # every contour point counts the same, whether it stands for itself or in a pair; the hidden half of a half-hidden
+        # pair has an entry of its own
+        found = points.found[b, v, k].sum(axis=1)
+        total = np.bincount(b, found, minlength=B)
+        share = c.edge_weight / total[b]
+        entries[:, alignment.SCALE] = share * np.where(any_seen, seen.sum(axis=1), c.hidden * found)
+        half = any_seen & (seen.sum(axis=1) < found)
+        concealed = entries[half]
+        concealed[:, alignment.STATE] = alignment.UNASSIGNABLE
+        concealed[:, alignment.SCALE] = c.hidden * share[half]
+        b = np.concatenate([b, b[half]])
+        entries = np.concatenate([entries, concealed])
+        lines = np.concatenate([lines, lines[half]])
         return (b.astype(np.int32), entries), lines
 
     def _outline(self, points: ContourPoints) -> tuple[tuple[Ints, NDArray[np.float32]], NDArray[np.float32]]:
