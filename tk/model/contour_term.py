@@ -223,8 +223,8 @@ class ContourTerm:
         entries[:, alignment.STATE] = np.where(any_seen, alignment.ASSIGNED, alignment.UNASSIGNABLE)
         entries[:, alignment.SHARE] = c.along
         entries[:, alignment.NU] = c.edge_nu
-        # every contour point counts the same, whether it stands for itself or in a pair; the hidden half of a half-hidden
-        # pair has an entry of its own
+        # every contour point counts the same, whether it stands for itself or in a pair;
+        # the hidden half of a half-hidden pair has an entry of its own
         found = points.found[b, v, k].sum(axis=1)
         total = np.bincount(b, found, minlength=B)
         share = c.edge_weight / total[b]
