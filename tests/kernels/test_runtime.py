@@ -8,7 +8,7 @@ import textwrap
 import numpy as np
 import pytest
 
-from tk.kernels.runtime import ensure_runtime, ti
+from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
 
 def run(code, **environment):
@@ -76,3 +76,23 @@ def test_nan_and_infinity_keep_their_meaning():
 def test_importing_starts_nothing(module):
     code = f"import {module}; from tk.kernels.runtime import ti; print(ti.lang.impl.get_runtime().prog is None)"
     assert run(code) == ["True"]
+
+
+@ti.kernel
+def _count_kernel(spread: ti.i32, done: ti.types.ndarray(dtype=ti.i32, ndim=1)):
+    for turn in range(spread * done.shape[0]):
+        if turn % spread != 0:
+            continue
+        task = turn // spread
+        done[task] = done[task] + 1
+
+
+@pytest.mark.parametrize("tasks", [1, 2, 3, 11, 511, 512, 513, 5000])
+def test_spread_tasks_are_done_once_each_by_all_threads(tasks: int) -> None:
+    spread = spread_of(tasks)
+    threads = ti.cfg.cpu_max_num_threads
+    assert spread * tasks >= 512 * threads  # Taichi gives a thread 512 turns before it asks another
+    assert spread == 1 or (spread - 1) * tasks < 512 * threads
+    done = np.zeros(tasks, np.int32)
+    _count_kernel(spread, done)
+    np.testing.assert_array_equal(done, 1)

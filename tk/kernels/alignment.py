@@ -69,31 +69,31 @@ def add_alignment(
     state = ti.cast(entries[b, e, STATE], ti.i32)
     scale = entries[b, e, SCALE]
     if state == UNASSIGNABLE:
-        sums[c, 0] += scale
+        sums[c, 0] = sums[c, 0] + scale
     elif state == ASSIGNED:
         D = (sums.shape[1] - 1) // 2
         valid, r, xa, xb, Ja, Jb = image_residual(frames, c, cameras, entries, b, e)
         if valid == 0:
-            sums[c, 0] += scale
+            sums[c, 0] = sums[c, 0] + scale
         else:
             nu, inv_sigma2 = entries[b, e, NU], entries[b, e, INV_SIGMA2]
             Mr = metric_product(entries, b, e, r)
             decay = ti.exp(-0.5 * r.dot(Mr) * inv_sigma2 / nu)
-            sums[c, 0] += scale * (1.0 - decay)
+            sums[c, 0] = sums[c, 0] + scale * (1.0 - decay)
             weight = scale * decay / nu * inv_sigma2
             Jv = r * 0.0
             k_last = ti.cast(entries[b, e, LAST_DOF], ti.i32)
             k = k_last
             while k >= 0:
                 J = Ja @ point_velocity(prismatic, twists, c, k, xa) + Jb @ point_velocity(prismatic, twists, c, k, xb)
-                sums[c, 1 + k] += weight * J.dot(Mr)
+                sums[c, 1 + k] = sums[c, 1 + k] + weight * J.dot(Mr)
                 Jv += J * direction[b, k]
                 k = parent[k]
             MJv = metric_product(entries, b, e, Jv)
             k = k_last
             while k >= 0:
                 J = Ja @ point_velocity(prismatic, twists, c, k, xa) + Jb @ point_velocity(prismatic, twists, c, k, xb)
-                sums[c, 1 + D + k] += weight * J.dot(MJv)
+                sums[c, 1 + D + k] = sums[c, 1 + D + k] + weight * J.dot(MJv)
                 k = parent[k]
 
 
@@ -126,6 +126,6 @@ def add_curvature(
                     Jj = Ja @ point_velocity(prismatic, twists, c, j, xa) + Jb @ point_velocity(
                         prismatic, twists, c, j, xb
                     )
-                    hessian[c, k, j] += MJ.dot(Jj)
+                    hessian[c, k, j] = hessian[c, k, j] + MJ.dot(Jj)
                     j = parent[j]
                 k = parent[k]

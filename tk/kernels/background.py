@@ -16,7 +16,7 @@ the picture adds nothing to a sum.
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.runtime import ensure_runtime, ti
+from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
 PAD = 2
 """Zero pixels around each picture in a plane, on all four sides."""
@@ -74,6 +74,7 @@ def _statistic_kernel(
     precision: ti.types.ndarray(dtype=ti.f32, ndim=1),  # [C] 1 / noise variance
     height: ti.i32,
     width: ti.i32,
+    spread: ti.i32,
     offset_squared: ti.i32,
     shadow_min: ti.f32,
     difference_min: ti.f32,  # noise variances, summed over the window
@@ -83,7 +84,10 @@ def _statistic_kernel(
 ):
     strips = (height + STRIP - 1) // STRIP
     line = width + 2
-    for strip in range(precision.shape[0] * strips):
+    for turn in range(spread * (precision.shape[0] * strips)):
+        if turn % spread != 0:
+            continue
+        strip = turn // spread
         c = strip // strips
         first = (strip - c * strips) * STRIP
         rows = ti.min(STRIP, height - first)
@@ -234,6 +238,7 @@ class Planes:
             precision,
             height,
             width,
+            spread_of(len(images) * -(-height // STRIP)),
             max(round(darkness_offset**2), 1),
             shadow_min,
             54.0 * difference_min,

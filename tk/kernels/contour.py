@@ -37,7 +37,7 @@ from tk.kernels.occlusion import (
     place_pieces,
 )
 from tk.kernels.projection import camera_center, project
-from tk.kernels.runtime import ensure_runtime, ti
+from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.superellipsoid import power
 
 # Strips that one parallel task handles, each task with its own forward kinematics (some microseconds).
@@ -145,6 +145,7 @@ def _contour_kernel(real):
         strips: ti.types.ndarray(dtype=real, ndim=3),  # (S, N, 5) η, ω, n_d
         strip_piece: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (S,)
         cameras: ti.types.ndarray(dtype=real, ndim=2),  # (C, 22)
+        spread: ti.i32,
         chosen: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, K)
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
         frames: ti.types.ndarray(dtype=real, ndim=3),  # (T, D, 12) scratch
@@ -155,7 +156,10 @@ def _contour_kernel(real):
         ),  # (B C K, 2, 8) out: zero configuration 3, pixel 2, normal 2, scale
         flags: ti.types.ndarray(dtype=ti.u8, ndim=2),  # (B C K, 2) out
     ):
-        for c in range(frames.shape[0]):
+        for turn in range(spread * (frames.shape[0])):
+            if turn % spread != 0:
+                continue
+            c = turn // spread
             C, K = cameras.shape[0], chosen.shape[1]
             blocks = (K + STRIPS_PER_TASK - 1) // STRIPS_PER_TASK
             b = c // (C * blocks)
@@ -317,15 +321,17 @@ class ContourKernel:
         geometry = np.empty((B * C * K, 2, 8), self.dtype)
         flags = np.empty((B * C * K, 2), np.uint8)
         if B * C * K:
+            tasks = B * C * -(-K // STRIPS_PER_TASK)
             self._kernel(
                 *self._tree,
                 self._pieces,
                 self._strips,
                 self._strip_piece,
                 self._cameras,
+                spread_of(tasks),
                 chosen,
                 np.ascontiguousarray(pose, self.dtype),
-                *self._scratch_of(B * C * -(-K // STRIPS_PER_TASK)),
+                *self._scratch_of(tasks),
                 geometry,
                 flags,
             )

@@ -22,7 +22,7 @@ numerator is 0 then; a length is known to about a pixel, so one pixel is added. 
 import numpy as np
 
 from tk.kernels.edges import EdgeConfig, rgb_gradient_at
-from tk.kernels.runtime import ensure_runtime, ti
+from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
 PAIR, SINGLE, OUTLINE = 0, 1, 2
 # Columns of a line: kind, camera, the pixels a and b (b = a unless PAIR), a's outward unit normal, b's, and how far
@@ -68,6 +68,7 @@ def _search_kernel(
     angle_share: ti.f32,
     threshold: ti.f32,
     mask_edge: ti.f32,
+    spread: ti.i32,
     sizes: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (C, 2) height, width
     images: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (C, H, W, 3)
     masks: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (C, H, W)
@@ -75,7 +76,10 @@ def _search_kernel(
     edges: ti.types.ndarray(dtype=ti.f32, ndim=3),  # (R, MOST_EDGES, 3) scratch: position, score for a, for b
     found: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (R, 5) out: 1 or 0, the edges' pixels for a and for b
 ):
-    for r in range(lines.shape[0]):
+    for turn in range(spread * (lines.shape[0])):
+        if turn % spread != 0:
+            continue
+        r = turn // spread
         kind = ti.cast(lines[r, 0], ti.i32)
         c = ti.cast(lines[r, 1], ti.i32)
         ax, ay, bx, by = lines[r, 2], lines[r, 3], lines[r, 4], lines[r, 5]
@@ -185,6 +189,7 @@ def search_edges(
             *config.constants,
             threshold,
             mask_edge,
+            spread_of(R),
             sizes,
             images,
             masks,

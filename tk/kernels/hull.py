@@ -22,7 +22,7 @@ All of it is integers: results are exact and do not depend on the order in which
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.runtime import ensure_runtime, ti
+from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
 __all__ = [
     "SHARES",
@@ -37,7 +37,7 @@ __all__ = [
     "words_per_column",
 ]
 
-SHARES = 2  # threads, and planes, a camera
+SHARES = 2  # tasks, and planes, a camera
 _STRETCH = 128  # mask words, 1024 pixels, that fall to one thread before it is the other's turn
 _WINDOW = 2  # normals come from the voxels within a ball around a voxel: half width of its box ...
 _BALL = 6  # ... and squared radius, both in voxels
@@ -131,6 +131,7 @@ def _carve_kernel(
     row_offsets: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (C * M + 1,)
     entries: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (L,)
     cameras: ti.i32,  # C
+    spread: ti.i32,
     enough: ti.types.ndarray(dtype=ti.u32, ndim=1),  # (W,)
     current: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (C * M,) masks, eight pixels a word
     previous: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (C * M,) in and out
@@ -140,13 +141,15 @@ def _carve_kernel(
     # arrays are flat here: the shape of another would be read again at every access
     mask_words = current.shape[0] // cameras
     plane_words = enough.shape[0]
-    turns = (mask_words + SHARES * _STRETCH - 1) // (SHARES * _STRETCH)
-    ti.loop_config(block_dim=1)  # few long tasks
-    for task in range(cameras * SHARES):
+    stretches = (mask_words + SHARES * _STRETCH - 1) // (SHARES * _STRETCH)
+    for turn in range(spread * (cameras * SHARES)):
+        if turn % spread != 0:
+            continue
+        task = turn // spread
         first = task // SHARES * mask_words
         plane = task * plane_words
-        for turn in range(turns):
-            start = (turn * SHARES + task % SHARES) * _STRETCH
+        for stretch in range(stretches):
+            start = (stretch * SHARES + task % SHARES) * _STRETCH
             for word in range(first + start, first + ti.min(start + _STRETCH, mask_words)):
                 now = current[word]
                 before = previous[word]
@@ -196,7 +199,7 @@ def carve(
     ensure_runtime()
     cameras = len(current)
     flat = (current.reshape(-1), previous.reshape(-1), planes.reshape(-1))
-    _carve_kernel(row_offsets, entries, cameras, enough, *flat, occupied)
+    _carve_kernel(row_offsets, entries, cameras, spread_of(cameras * SHARES), enough, *flat, occupied)
 
 
 def missing_at_most_one(planes: NDArray[np.uint32]) -> NDArray[np.uint32]:
@@ -218,11 +221,15 @@ def missing_at_most_one(planes: NDArray[np.uint32]) -> NDArray[np.uint32]:
 def _surface_kernel(
     occupied: ti.types.ndarray(dtype=ti.u32, ndim=3),  # (nx, ny, nw)
     nz: ti.i32,
+    spread: ti.i32,
     found: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (V,) out: each slab's surface voxels from its own start on
     slabs: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (nx, 5) out: count, y and z range in which they lie
 ):
     nx, ny, nw = occupied.shape[0], occupied.shape[1], occupied.shape[2]
-    for x in range(nx):
+    for turn in range(spread * (nx)):
+        if turn % spread != 0:
+            continue
+        x = turn // spread
         start = x * ny * nz
         count = 0
         y_min, y_max, z_min, z_max = ny, -1, nz, -1
@@ -272,7 +279,7 @@ def surface_voxels(
     ensure_runtime()
     nx, ny, nz = shape
     slabs = np.empty((nx, 5), dtype=np.int32)
-    _surface_kernel(occupied.reshape(nx, ny, -1), nz, found, slabs)
+    _surface_kernel(occupied.reshape(nx, ny, -1), nz, spread_of(nx), found, slabs)
     used = np.flatnonzero(slabs[:, 0])
     if len(used) == 0:
         return np.zeros(0, dtype=np.int32), np.zeros((2, 3), dtype=np.int32)

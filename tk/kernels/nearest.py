@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tk.kernels.runtime import ensure_runtime, ti
+from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
 
 @dataclass(frozen=True)
@@ -130,9 +130,13 @@ def _nearest_kernel(
     patch: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,)
     min_cosine: ti.f32,
     reach: ti.f32,
+    spread: ti.i32,
     found: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,) out
 ):
-    for q in range(points.shape[0]):
+    for turn in range(spread * (points.shape[0])):
+        if turn % spread != 0:
+            continue
+        q = turn // spread
         x = ti.Vector([points[q, a] for a in ti.static(range(3))])
         n = ti.Vector([point_normals[q, a] for a in ti.static(range(3))])
         found[q] = nearest_voxel(voxels, fits, starts, grid, x, n, patch[q], min_cosine, reach)
@@ -170,6 +174,7 @@ def nearest(
         np.ascontiguousarray(patch, np.int32),
         min_cosine,
         reach_m,
+        spread_of(len(points)),
         found,
     )
     return found

@@ -27,7 +27,7 @@ from tk.kernels.kinematics import forward, load_rotation, load_translation, load
 from tk.kernels.linearisation import Linearisation, metric_of
 from tk.kernels.nearest import SurfaceIndex, nearest_voxel
 from tk.kernels.projection import CAMERA_NUMBERS
-from tk.kernels.runtime import ensure_runtime, ti
+from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.superellipsoid import implicit, project
 
 # Points that one parallel task handles: few enough to share 310 points among threads, and a chain's 50 in one; many
@@ -123,19 +123,19 @@ def _add_residual(
     # Mr = (share·I + (1 − share)·y yᵀ) r: with share = 1 the paper's distance, with 0 the one along the normal
     Mr = share * r + (1.0 - share) * y_normal.dot(r) * y_normal
     decay = ti.exp(-0.5 * r.dot(Mr) * inv_sigma2 / nu)
-    sums[c, 0] += scale * (1.0 - decay)
+    sums[c, 0] = sums[c, 0] + scale * (1.0 - decay)
     weight = scale * decay / nu * inv_sigma2
     Jv = x * 0.0
     k = k_last
     while k >= 0:
         J = point_velocity(prismatic, twists, c, k, x)
-        sums[c, 1 + k] += weight * J.dot(Mr)
+        sums[c, 1 + k] = sums[c, 1 + k] + weight * J.dot(Mr)
         Jv += J * direction[b, k]
         k = parent[k]
     MJv = share * Jv + (1.0 - share) * y_normal.dot(Jv) * y_normal
     k = k_last
     while k >= 0:
-        sums[c, 1 + D + k] += weight * point_velocity(prismatic, twists, c, k, x).dot(MJv)
+        sums[c, 1 + D + k] = sums[c, 1 + D + k] + weight * point_velocity(prismatic, twists, c, k, x).dot(MJv)
         k = parent[k]
 
 
@@ -220,6 +220,7 @@ def _objective_kernel(real):
         starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
         grid: ti.types.ndarray(dtype=ti.f32, ndim=1),  # (7,)
         settings: ti.types.ndarray(dtype=real, ndim=1),  # (9,)
+        spread: ti.i32,
         hold: ti.i32,
         M: ti.i32,
         Q: ti.i32,
@@ -235,7 +236,10 @@ def _objective_kernel(real):
         entries: ti.types.ndarray(dtype=real, ndim=3),  # (B, E, 17) of the alignment term
         sums: ti.types.ndarray(dtype=real, ndim=2),  # (C, 1 + 2 D) out
     ):
-        for c in range(sums.shape[0]):
+        for turn in range(spread * (sums.shape[0])):
+            if turn % spread != 0:
+                continue
+            c = turn // spread
             tasks = sums.shape[0] // pose.shape[0]
             b = c // tasks
             for s in range(sums.shape[1]):
@@ -280,7 +284,7 @@ def _objective_kernel(real):
                         k = ti.cast(pieces[i, PIECE_DOF], ti.i32)
                         inv_sigma2 = pieces[i, PIECE_WEIGHT]
                 if v < 0:
-                    sums[c, 0] += scale
+                    sums[c, 0] = sums[c, 0] + scale
                 else:
                     y = ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
                     y_normal = ti.Vector([ti.cast(voxels[v, 3 + a], real) for a in ti.static(range(3))])
@@ -311,6 +315,7 @@ def _linearise_kernel(real):
         pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 22)
         voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 6)
         settings: ti.types.ndarray(dtype=real, ndim=1),  # (9,)
+        spread: ti.i32,
         floor: real,
         want_jacobian: ti.i32,
         M: ti.i32,
@@ -329,7 +334,10 @@ def _linearise_kernel(real):
         jacobian: ti.types.ndarray(dtype=real, ndim=3),  # (M + Q, D, 3) out if wanted, zeroed by the caller
         hessian: ti.types.ndarray(dtype=real, ndim=3),  # (C, D, D) out, zeroed by the caller; the lower triangle
     ):
-        for c in range(hessian.shape[0]):
+        for turn in range(spread * (hessian.shape[0])):
+            if turn % spread != 0:
+                continue
+            c = turn // spread
             forward(axis, point, prismatic, parent, pose, 0, c, frames, twists)
             last = ti.min((c + 1) * PAIRS_PER_TASK, M + Q + E)
             for e in range(ti.max(c * PAIRS_PER_TASK - M - Q, 0), last - M - Q):
@@ -376,7 +384,7 @@ def _linearise_kernel(real):
                         MJ = weight * (share * J + (1.0 - share) * y_normal.dot(J) * y_normal)
                         j = k
                         while j >= 0:
-                            hessian[c, k, j] += MJ.dot(point_velocity(prismatic, twists, c, j, x))
+                            hessian[c, k, j] = hessian[c, k, j] + MJ.dot(point_velocity(prismatic, twists, c, j, x))
                             j = parent[j]
                         k = parent[k]
 
@@ -548,6 +556,7 @@ class ObjectiveKernel:
             index.starts,
             index.grid,
             self._packed(settings, M, Q),
+            spread_of(len(sums)),
             int(held is not None),
             M,
             Q,
@@ -603,6 +612,7 @@ class ObjectiveKernel:
             self._pieces,
             index.voxels,
             self._packed(settings, M, Q),
+            spread_of(tasks),
             floor,
             int(with_jacobian),
             M,

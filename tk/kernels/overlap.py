@@ -9,7 +9,7 @@ from tk.kernels.cone_arrays import NEAREST_M, ConeArrays, keep, place_part, shap
 from tk.kernels.cones import enclosing_radius, enter, interior_point
 from tk.kernels.kinematics import forward, load_rotation, load_translation
 from tk.kernels.projection import camera_center, project
-from tk.kernels.runtime import ensure_runtime, ti
+from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
 # How much larger than its first-order size a part's disc is taken when rays are cast.
 DISC_MARGIN = 1.1
@@ -28,6 +28,7 @@ def _overlap_kernel(real):
         part_frame: ti.types.ndarray(dtype=real, ndim=2),  # (P, 12)
         part_dof: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
         camera: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
+        spread: ti.i32,
         step: ti.i32,  # pixels between rays; the first is at step // 2
         rays: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (V, H, W, 3) world; zero outside the picture
         mask: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (V, H, W)
@@ -59,7 +60,10 @@ def _overlap_kernel(real):
                     elif z > -reach:
                         radius = 1e6 + 0.0 * z
                     disc[b, v, p, 0], disc[b, v, p, 1], disc[b, v, p, 2] = pixel[0], pixel[1], radius * radius
-        for c in range(B * V * H):
+        for turn in range(spread * (B * V * H)):
+            if turn % spread != 0:
+                continue
+            c = turn // spread
             b, v, j = c // (V * H), (c // H) % V, c % H
             eye = camera_center(camera, v)
             for i in range(W):
@@ -123,6 +127,7 @@ def overlap(
     _overlap_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
         *body[:8],
         np.ascontiguousarray(cameras, dtype),
+        spread_of(B * V * H),
         step,
         np.ascontiguousarray(rays, np.float32),
         np.ascontiguousarray(masks),

@@ -8,6 +8,7 @@ Never ``fork`` after it has started: use the ``spawn`` start method for worker p
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import os
 import warnings
@@ -20,7 +21,10 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # taichi's own deprecation notices are not ours to mend
     import taichi as ti
 
-__all__ = ["ensure_runtime", "ti"]
+__all__ = ["ensure_runtime", "spread_of", "ti"]
+
+# Taichi hands a CPU thread at least so many turns of a loop; what loop_config says of block_dim changes nothing.
+_LEAST_TURNS = 512
 
 
 def ensure_runtime() -> None:
@@ -44,3 +48,23 @@ def ensure_runtime() -> None:
         options["cpu_max_num_threads"] = int(threads)
     with contextlib.redirect_stdout(io.StringIO()):  # it prints that it starts, whatever the log level
         ti.init(**options)
+
+
+def spread_of(tasks: int) -> int:
+    """How many turns of a kernel's loop to give to each of a few long tasks, so that they go to all threads.
+
+    A loop of fewer than 512 turns runs on one thread, however long a turn takes. So a loop over tasks is written as one
+    over ``spread * tasks`` turns of which every ``spread``-th does a task::
+
+        for turn in range(spread * tasks):
+            if turn % spread != 0:
+                continue
+            task = turn // spread
+    """
+    return max(-(-_LEAST_TURNS * _threads() // max(tasks, 1)), 1)
+
+
+@functools.cache
+def _threads() -> int:
+    ensure_runtime()
+    return int(ti.lang.impl.get_runtime().prog.config().cpu_max_num_threads)

@@ -26,7 +26,7 @@ from tk.kernels.cones import (
 )
 from tk.kernels.kinematics import forward, load_rotation, load_translation, point_velocity
 from tk.kernels.projection import camera_center, project
-from tk.kernels.runtime import ensure_runtime, ti
+from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
 # Chords that stand for a curve when its length is measured and when edgels are compared with it.
 CHORDS = 12
@@ -193,6 +193,7 @@ def _equations_kernel(real):
         mask: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (V, H, W) at this scale
         # settings; scale: pixels of the full picture in one of this scale
         numbers: ti.types.ndarray(dtype=real, ndim=1),  # scale, window, spacing, ambiguous, tangential, robust, lost
+        spread: ti.i32,
         most_samples: ti.i32,
         interior: ti.i32,
         export: ti.i32,
@@ -217,7 +218,10 @@ def _equations_kernel(real):
                 R, t = place_part(frames, part_dof, part_frame, b, p)
                 keep(placed, b, p, R, t)
 
-        for c in range(B * V * Q):
+        for turn in range(spread * (B * V * Q)):
+            if turn % spread != 0:
+                continue
+            c = turn // spread
             b, v, q = c // (V * Q), (c // Q) % V, c % Q
             p, kind = curve_part[q], curve_kind[q]
             shape = shape_of(part_shape, p)
@@ -252,7 +256,10 @@ def _equations_kernel(real):
             facts[c, 0] = visible
             facts[c, 1], facts[c, 2], facts[c, 3], facts[c, 4] = params[0], params[1], length, sign
 
-        for c in range(B * V * Q):
+        for turn in range(spread * (B * V * Q)):
+            if turn % spread != 0:
+                continue
+            c = turn // spread
             b, v, q = c // (V * Q), (c // Q) % V, c % Q
             p, kind = curve_part[q], curve_kind[q]
             scale, window, spacing, ambiguous = numbers[0], numbers[1], numbers[2], numbers[3]
@@ -299,8 +306,8 @@ def _equations_kernel(real):
                         d *= scale
                         weight = share
                         if found == 0:
-                            sums[c, 0] += share * lost * lost
-                            sums[c, 2] += share
+                            sums[c, 0] = sums[c, 0] + share * lost * lost
+                            sums[c, 2] = sums[c, 2] + share
                         else:
                             if ambiguous > 0.0:
                                 edgel = pixel + d * n
@@ -327,9 +334,9 @@ def _equations_kernel(real):
                                     weight *= 0.5 * other / ti.max(other + ti.abs(d), 1e-6)
                             if robust > 0.0:
                                 weight *= 1.0 / (1.0 + (d / robust) ** 2) ** 2
-                            sums[c, 0] += share * ti.min(d * d, lost * lost)
-                            sums[c, 1] += share
-                            sums[c, 2] += share
+                            sums[c, 0] = sums[c, 0] + share * ti.min(d * d, lost * lost)
+                            sums[c, 1] = sums[c, 1] + share
+                            sums[c, 2] = sums[c, 2] + share
                             g = J.transpose() @ n
                             h = J.transpose() @ ti.Vector([-n[1], n[0]])
                             L = 0
@@ -340,11 +347,12 @@ def _equations_kernel(real):
                                 L += 1
                             at_sum = 3 + LONGEST_CHAIN
                             for k in range(L):
-                                sums[c, 3 + k] += weight * d * row[c, 0, k]
+                                sums[c, 3 + k] = sums[c, 3 + k] + weight * d * row[c, 0, k]
                                 for m in range(k, L):
-                                    sums[c, at_sum] += weight * row[c, 0, k] * row[c, 0, m]
+                                    sums[c, at_sum] = sums[c, at_sum] + weight * row[c, 0, k] * row[c, 0, m]
                                     if tangential > 0.0:
-                                        sums[c, at_sum] += weight * tangential * row[c, 1, k] * row[c, 1, m]
+                                        across = weight * tangential * row[c, 1, k] * row[c, 1, m]
+                                        sums[c, at_sum] = sums[c, at_sum] + across
                                     at_sum += 1
                             if export == 1:
                                 s = unscaled(kind, shape, x_part)
@@ -365,18 +373,18 @@ def _equations_kernel(real):
                 if sums[c, 2] > 0.0:
                     p = curve_part[j % Q]
                     for i in ti.static(range(3)):
-                        total[b, i] += sums[c, i]
+                        total[b, i] = total[b, i] + sums[c, i]
                     L = 0
                     while L < LONGEST_CHAIN and chain[p, L] >= 0:
                         L += 1
                     at_sum = 3 + LONGEST_CHAIN
                     for k in range(L):
-                        total[b, 3 + chain[p, k]] += sums[c, 3 + k]
+                        total[b, 3 + chain[p, k]] = total[b, 3 + chain[p, k]] + sums[c, 3 + k]
                         for m in range(k, L):
                             r, s = chain[p, k], chain[p, m]
-                            total[b, 3 + D + r * D + s] += sums[c, at_sum]
+                            total[b, 3 + D + r * D + s] = total[b, 3 + D + r * D + s] + sums[c, at_sum]
                             if r != s:
-                                total[b, 3 + D + s * D + r] += sums[c, at_sum]
+                                total[b, 3 + D + s * D + r] = total[b, 3 + D + s * D + r] + sums[c, at_sum]
                             at_sum += 1
 
     return kernel
@@ -408,6 +416,7 @@ def _launch(
         np.ascontiguousarray(sizes, np.int32),
         np.ascontiguousarray(masks),
         np.array(numbers, dtype),
+        spread_of(tasks),
         settings.most_samples,
         int(settings.interior),
         int(export),

@@ -304,18 +304,18 @@ class FrameObjective:
         """Row b is chain ``owner[b]`` with its own samples, and voxels that are its own or nobody's at ``pose``."""
         self._pools = self._chain_pools(self.fit(pose))
         settings = self._softened(softness)
-
-        def draw() -> tuple[Ints, Ints]:
-            samples, voxels = zip(*(self._draw_chain(c) for c in range(len(CHAINS))), strict=True)
-            return np.stack(samples)[owner], np.stack(voxels)[owner]
-
-        draws = _Draws(draw)
+        draws = _Draws(lambda: self._draw_chains(owner))
         renewed = self._renewing(lambda _: self._term.draw_chains(self.rng)[owner], softness)
 
         def evaluate(poses: Float, directions: Float, iteration: int) -> Evaluation:
             return self._evaluate(*draws(iteration), poses, directions, settings, renewed(poses, iteration))
 
         return evaluate
+
+    def screen(self, owner: NDArray[np.intp], pose: Float, poses: Float, softness: float = 1.0) -> Float:
+        """(B,) the chains' objectives at ``poses`` (B, D) by the hull alone, on few points: rough, and cheap."""
+        self._pools = self._chain_pools(self.fit(pose))
+        return self._evaluate(*self._draw_chains(owner), poses, None, self._softened(softness)).value
 
     def fixed(self, softness: float = 1.0) -> FixedObjective:
         """All degrees of freedom on one draw of points that stays: what Levenberg-Marquardt minimises (section 7.3)."""
@@ -430,6 +430,10 @@ class FrameObjective:
         samples = np.resize(pick(self.rng, self.objective.chain_samples[chain], count), count)
         pool = self._pools[chain]
         return samples, pool[self.rng.integers(len(pool), size=s.scale * s.chain_voxels)]
+
+    def _draw_chains(self, owner: NDArray[np.intp]) -> tuple[Ints, Ints]:
+        samples, voxels = zip(*(self._draw_chain(c) for c in range(len(CHAINS))), strict=True)
+        return np.stack(samples)[owner], np.stack(voxels)[owner]
 
     def _softened(self, softness: float) -> ObjectiveSettings:
         s = self.objective.settings

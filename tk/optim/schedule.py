@@ -79,6 +79,10 @@ class Problem(Protocol):
         """The objective whose row b is chain ``owner[b]``, the rest of the body being at ``pose``."""
         ...
 
+    def screen(self, owner: NDArray[np.intp], pose: Float, poses: Float, softness: float) -> Float:
+        """(B,) the same objectives at ``poses`` (B, D), roughly and cheaply: for very many of them."""
+        ...
+
     def chain_values(self, owner: NDArray[np.intp], poses: Float) -> Float:
         """(B,) the chains' objectives on samples that do not change from call to call."""
         ...
@@ -386,7 +390,7 @@ def _screened(
     places = pose + noise
     places[: len(drawn) * len(searched)] = np.repeat(problem.postures[drawn], len(searched), axis=0)
     tried = problem.constrain(np.where(free[owner], places, pose))
-    values = problem.chains(owner, pose, config.soft)(tried, np.zeros_like(tried), 0).value
+    values = problem.screen(owner, pose, tried, config.soft)
     values = values + _reluctance(problem, owner, tried, previous, config)
     order = np.argsort(values.reshape(candidates, -1), axis=0, kind="stable")[:count]
     return tried[order * len(searched) + np.arange(len(searched))].reshape(-1, len(pose))
