@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tk.kernels.kinematics import forward
+from tk.kernels.kinematics import JOINT_NUMBERS, forward_tree, pack_tree
 from tk.kernels.objective import PIECE_SHAPE
 from tk.kernels.occlusion import (
     PLACED_CAMERA,
@@ -53,7 +53,12 @@ BEHIND_M = 4.0
 @ti.func
 def signed_power(base, exponent):
     """sign(b)·|b|^e."""
-    return ti.select(base < 0, -power(base, exponent), power(base, exponent))
+    result = base
+    if exponent != 1.0:
+        result = power(base, exponent)
+        if base < 0:
+            result = -result
+    return result
 
 
 @ti.func
@@ -83,12 +88,18 @@ def surface_normal(eta, omega, radii, e1, e2):
 
 
 @ti.func
-def rim_crossings(strips: ti.template(), s: int, camera):  # (S, N, 5), camera centre in the piece's frame
+def strip_piece(strips: ti.template(), s: int):
+    """The piece of strip s."""
+    return ti.cast(strips[s, strips.shape[1] - 1, 0], ti.i32)
+
+
+@ti.func
+def rim_crossings(strips: ti.template(), s: int, camera):  # (S, N + 1, 5), camera centre in the piece's frame
     """Where strip s crosses the rim: (found₀, η₀, ω₀, found₁, η₁, ω₁), slots as in the module's docstring."""
     zero = camera[0] * 0.0
     result = ti.Vector([zero, zero, zero, zero, zero, zero])
     before = zero
-    for i in range(strips.shape[1]):
+    for i in range(strips.shape[1] - 1):
         t = 1.0 - (strips[s, i, 2] * camera[0] + strips[s, i, 3] * camera[1] + strips[s, i, 4] * camera[2])
         if i > 0 and (t < 0) != (before < 0):
             share = ti.abs(before) / (ti.abs(before) + ti.abs(t))
@@ -133,30 +144,32 @@ def image_normal(J, n):
     return m / ti.sqrt(ti.max(m.norm_sqr(), 1e-30))
 
 
+@ti.func
+def behind(x, n, center):
+    """Where the ray from the camera just beyond a point x of the rim, with normal n, has passed the whole body."""
+    beyond = x + OUTER_MARGIN_M * n
+    return beyond + BEHIND_M * (beyond - center).normalized()
+
+
 @functools.cache
 def _contour_kernel(real):
     @ti.kernel
     def contour(
-        axis: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
-        point: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
-        prismatic: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
-        parent: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
+        tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
         pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 20)
-        strips: ti.types.ndarray(dtype=real, ndim=3),  # (S, N, 5) η, ω, n_d
-        strip_piece: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (S,)
+        strips: ti.types.ndarray(dtype=real, ndim=3),  # (S, N + 1, 5) η, ω, n_d; in the last row the piece
         cameras: ti.types.ndarray(dtype=real, ndim=2),  # (C, 22)
         spread: ti.i32,
         chosen: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, K)
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
-        frames: ti.types.ndarray(dtype=real, ndim=3),  # (T, D, 12) scratch
-        twists: ti.types.ndarray(dtype=real, ndim=3),  # (T, D, 6) scratch
-        placed: ti.types.ndarray(dtype=real, ndim=3),  # (T, P, 19) scratch
+        joints: ti.types.ndarray(dtype=real, ndim=3),  # (T, D, 18) scratch
+        placed: ti.types.ndarray(dtype=real, ndim=3),  # (T, P, 20) scratch
         geometry: ti.types.ndarray(
             dtype=real, ndim=3
         ),  # (B C K, 2, 8) out: zero configuration 3, pixel 2, normal 2, scale
         flags: ti.types.ndarray(dtype=ti.u8, ndim=2),  # (B C K, 2) out
     ):
-        for turn in range(spread * (frames.shape[0])):
+        for turn in range(spread * joints.shape[0]):
             if turn % spread != 0:
                 continue
             c = turn // spread
@@ -165,12 +178,12 @@ def _contour_kernel(real):
             b = c // (C * blocks)
             v = c // blocks % C
             first = c % blocks * STRIPS_PER_TASK
-            forward(axis, point, prismatic, parent, pose, b, c, frames, twists)
+            forward_tree(tree, pose, b, c, joints)
             center = camera_center(cameras, v)
-            place_pieces(frames, c, pieces, center, placed)
+            place_pieces(joints, c, pieces, center, placed)
             for m in range(first, ti.min(first + STRIPS_PER_TASK, K)):
                 s = chosen[b, m]
-                i = strip_piece[s]
+                i = strip_piece(strips, s)
                 crossings = rim_crossings(strips, s, load_placed_vector(placed, c, i, PLACED_CAMERA))
                 row = (b * C + v) * K + m
                 for slot in range(2):
@@ -186,9 +199,7 @@ def _contour_kernel(real):
                             flag = FOUND
                             if is_occluded(placed, c, pieces, i, x, center) == 0:
                                 flag = FOUND | VISIBLE
-                                beyond = x + OUTER_MARGIN_M * n
-                                away = (beyond - center).normalized()
-                                if is_occluded(placed, c, pieces, i, beyond + BEHIND_M * away, center) == 0:
+                                if is_occluded(placed, c, pieces, i, behind(x, n, center), center) == 0:
                                     flag = FOUND | VISIBLE | OUTER
                             normal = image_normal(J, n)
                             x_zero = to_zero_configuration(pieces, i, q)
@@ -257,6 +268,9 @@ class ContourKernel:
         strip_paired: (S,) True for circles of latitude.
         cameras: (C, 22) rows of :func:`tk.kernels.projection.pack_camera`.
         dtype: np.float32, or np.float64 for checks.
+
+    Attributes:
+        tree: (D, 11); pieces: (P, 20); strips: (S, N + 1, 5); cameras: (C, 22): the constants as kernels take them.
     """
 
     def __init__(
@@ -287,24 +301,31 @@ class ContourKernel:
         def whole(array: np.ndarray) -> np.ndarray:
             return np.ascontiguousarray(array, np.int32)
 
-        self._tree = real(axis), real(point), whole(prismatic), whole(parent)
-        self._pieces = real(np.column_stack([np.reshape(piece_frame, (-1, 12)), piece_shape, piece_dof]))
-        self._strips = real(np.concatenate([strip_angles, strip_normals], axis=2))
-        self._strip_piece = whole(strip_piece)
+        self.tree = real(pack_tree(axis, point, prismatic, parent))
+        self.pieces = real(np.column_stack([np.reshape(piece_frame, (-1, 12)), piece_shape, piece_dof]))
+        samples = np.concatenate([strip_angles, strip_normals], axis=2)
+        self.strips = real(np.concatenate([samples, np.zeros_like(samples[:, :1])], axis=1))
+        self.strips[:, -1, 0] = strip_piece
         self._strip_segment = whole(strip_segment)
         self._strip_paired = np.asarray(strip_paired, bool)
-        self._cameras = real(cameras)
-        self._scratch: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+        self.cameras = real(cameras)
+        self._scratch: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
-    def _scratch_of(self, rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        if rows not in self._scratch:
-            D, P = len(self._tree[0]), len(self._pieces)
-            self._scratch[rows] = (
-                np.empty((rows, D, 12), self.dtype),
-                np.empty((rows, D, 6), self.dtype),
-                np.empty((rows, P, PLACED_NUMBERS), self.dtype),
+    def scratch_of(self, tasks: int) -> tuple[np.ndarray, np.ndarray]:
+        """(T, D, 18) joints and (T, P, 20) placed pieces of T tasks; kept."""
+        if tasks not in self._scratch:
+            self._scratch[tasks] = (
+                np.empty((tasks, len(self.tree), JOINT_NUMBERS), self.dtype),
+                np.empty((tasks, len(self.pieces), PLACED_NUMBERS), self.dtype),
             )
-        return self._scratch[rows]
+        return self._scratch[tasks]
+
+    def checked(self, chosen: np.ndarray) -> np.ndarray:
+        """Strips (B, K) as a kernel takes them; IndexError where there is no such strip."""
+        chosen = np.ascontiguousarray(chosen, np.int32)
+        if chosen.size and (chosen.min() < 0 or chosen.max() >= len(self.strips)):
+            raise IndexError(f"strips {chosen.min()} to {chosen.max()}: there are 0 to {len(self.strips) - 1}")
+        return chosen
 
     def __call__(self, pose: np.ndarray, chosen: np.ndarray) -> ContourPoints:
         """Contour points of B poses in all C cameras, occlusion included; one launch.
@@ -313,25 +334,22 @@ class ContourKernel:
             pose: (B, D).
             chosen: (B, K) strips of each pose.
         """
-        chosen = np.ascontiguousarray(chosen, np.int32)
+        chosen = self.checked(chosen)
         B, K = chosen.shape
-        C = len(self._cameras)
-        if K and (chosen.min() < 0 or chosen.max() >= len(self._strips)):
-            raise IndexError(f"strips {chosen.min()} to {chosen.max()}: there are 0 to {len(self._strips) - 1}")
+        C = len(self.cameras)
         geometry = np.empty((B * C * K, 2, 8), self.dtype)
         flags = np.empty((B * C * K, 2), np.uint8)
         if B * C * K:
             tasks = B * C * -(-K // STRIPS_PER_TASK)
             self._kernel(
-                *self._tree,
-                self._pieces,
-                self._strips,
-                self._strip_piece,
-                self._cameras,
+                self.tree,
+                self.pieces,
+                self.strips,
+                self.cameras,
                 spread_of(tasks),
                 chosen,
                 np.ascontiguousarray(pose, self.dtype),
-                *self._scratch_of(tasks),
+                *self.scratch_of(tasks),
                 geometry,
                 flags,
             )

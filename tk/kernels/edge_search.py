@@ -38,7 +38,7 @@ def _inside(masks: ti.template(), c: int, x: int, y: int):
 
 
 @ti.func
-def _outline(masks: ti.template(), c: int, width: int, height: int, x, y, nx, ny, reach):
+def outline_at(masks: ti.template(), c: int, width: int, height: int, x, y, nx, ny, reach):
     """(found, signed distance along the normal) of the nearest change from person to background."""
     found = 0
     at = x * 0.0
@@ -89,7 +89,7 @@ def _search_kernel(
         for k in range(5):
             found[r, k] = 0.0
         if kind == OUTLINE:
-            hit, at = _outline(masks, c, width, height, ax, ay, nax, nay, reach)
+            hit, at = outline_at(masks, c, width, height, ax, ay, nax, nay, reach)
             if hit == 1:
                 found[r, 0] = 1.0
                 found[r, 1], found[r, 2] = ax + at * nax, ay + at * nay

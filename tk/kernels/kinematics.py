@@ -1,8 +1,8 @@
 """Forward kinematics of a tree of twists, as Taichi functions for the kernels that need it.
 
 Layout: ``frames (C, D, 12)`` holds the 3×4 transform after each degree of freedom, row by row; ``twists (C, D, 6)`` its
-world twist (ω, v): a point x below it moves at ω × x + v. C are scratch rows, one a parallel task, so that no task
-waits for another.
+world twist (ω, v): a point x below it moves at ω × x + v; ``joints (C, D, 18)`` both. C are scratch rows, one a
+parallel task, so that no task waits for another.
 
 The shoulder girdle has no degree of freedom of its own, but the shoulder rises as the arm does. So the first degree of
 freedom of a shoulder may carry a translation ``rise · u`` before its rotation, with u the sine of the arm's elevation
@@ -20,6 +20,25 @@ from tk.kernels.runtime import ensure_runtime, ti
 ARM_UP = (-np.sqrt(2 / 3), np.sqrt(1 / 3))
 # Columns of ``point``: the point, and the rise where there is one.
 RISE = 3
+# Columns of a tree in one array: axis, point, rise, 1 where prismatic, parent. A launch pays 6 µs for each array.
+TREE_POINT, TREE_RISE, TREE_PRISMATIC, TREE_PARENT, TREE_NUMBERS = 3, 6, 9, 10, 11
+# Columns of its scratch: frame and twist.
+TWIST, JOINT_NUMBERS = 12, 18
+
+
+def pack_tree(axis: np.ndarray, point: np.ndarray, prismatic: np.ndarray, parent: np.ndarray) -> np.ndarray:
+    """(D, 11) float64, a tree in one array.
+
+    Args:
+        axis: (D, 3), point: (D, 3) or (D, 6) with the rise, twists in the zero configuration.
+        prismatic, parent: (D,).
+    """
+    tree = np.zeros((len(axis), TREE_NUMBERS))
+    tree[:, :TREE_POINT] = axis
+    tree[:, TREE_POINT : TREE_POINT + point.shape[1]] = point
+    tree[:, TREE_PRISMATIC] = prismatic
+    tree[:, TREE_PARENT] = parent
+    return tree
 
 
 @ti.func
@@ -44,6 +63,17 @@ def load_vector3(array: ti.template(), i: int):
 
 
 @ti.func
+def _load_columns(array: ti.template(), i: int, first: ti.template()):
+    return ti.Vector([array[i, first + a] for a in ti.static(range(3))])
+
+
+@ti.func
+def parent_of(tree: ti.template(), k: int):
+    """The degree of freedom above k, or -1."""
+    return ti.cast(tree[k, TREE_PARENT], ti.i32)
+
+
+@ti.func
 def rodrigues(w, angle):
     """exp of the skew matrix of ``angle·w``, with w a unit axis."""
     s, c = ti.sin(angle), ti.cos(angle)
@@ -55,8 +85,83 @@ def rodrigues(w, angle):
 
 
 @ti.func
-def _rises(point: ti.template(), k: int):
-    return point[k, RISE] != 0.0 or point[k, RISE + 1] != 0.0 or point[k, RISE + 2] != 0.0
+def _move(
+    w,  # the degree of freedom's axis and point, zero configuration
+    q,
+    slides: int,  # 1 for a translation along the axis
+    up: int,  # its parent, or -1
+    rise,  # of the shoulder that it belongs to, or zero
+    first: int,  # that shoulder's first degree of freedom
+    above: int,  # the parent of that one
+    pose: ti.template(),  # (B, D)
+    b: int,
+    c: int,
+    k: int,
+    frames: ti.template(),  # (C, D, 12 or more) out
+    twists: ti.template(),  # (C, D, from + 6) out
+    start: ti.template(),  # the twist's first column
+):
+    """Place degree of freedom k at pose b, in row c of the scratch."""
+    zero = pose[b, k] * 0.0
+    R = ti.Matrix([[1.0 + zero, zero, zero], [zero, 1.0 + zero, zero], [zero, zero, 1.0 + zero]])
+    t = ti.Vector([zero, zero, zero])
+    if up >= 0:
+        R = load_rotation(frames, c, up)
+        t = load_translation(frames, c, up)
+    w_world = R @ w
+    q_world = R @ q + t
+    rate = q_world * zero
+    if rise[0] != 0.0 or rise[1] != 0.0 or rise[2] != 0.0:
+        second = ti.select(first == k, k + 1, k)
+        lifted = R @ rise
+        if first != k and above >= 0:
+            lifted = load_rotation(frames, c, above) @ rise
+        # of the pose's precision, which a literal need not have
+        a, d = -ti.sqrt((zero + 2.0) / 3.0), ti.sqrt((zero + 1.0) / 3.0)
+        s1, c1 = ti.sin(pose[b, first]), ti.cos(pose[b, first])
+        s2, c2 = ti.sin(pose[b, second]), ti.cos(pose[b, second])
+        if first == k:
+            q_world += (a * c2 * s1 + d * s2) * lifted
+            rate = a * c2 * c1 * lifted
+        else:
+            rate = (d * c2 - a * s2 * s1) * lifted
+    v_world = w_world
+    if slides == 1:
+        t += w_world * pose[b, k]
+        w_world = w_world * 0.0
+    else:
+        R = R @ rodrigues(w, pose[b, k])
+        t = q_world - R @ q
+        v_world = q_world.cross(w_world) + rate
+    for i in ti.static(range(3)):
+        for j in ti.static(range(3)):
+            frames[c, k, 4 * i + j] = R[i, j]
+        frames[c, k, 4 * i + 3] = t[i]
+        twists[c, k, start + i] = w_world[i]
+        twists[c, k, start + 3 + i] = v_world[i]
+
+
+@ti.func
+def forward_tree(
+    tree: ti.template(),  # (D, 11) of pack_tree
+    pose: ti.template(),  # (B, D)
+    b: int,
+    c: int,
+    joints: ti.template(),  # (C, D, 18) out: frames and twists
+):
+    """Fill row c of the scratch with the tree at pose b. Parents come before children."""
+    for k in range(tree.shape[0]):
+        up = parent_of(tree, k)
+        first = k
+        rise = _load_columns(tree, k, TREE_RISE)
+        if up >= 0:
+            its = _load_columns(tree, up, TREE_RISE)
+            if its.norm_sqr() > 0.0:
+                first, rise = up, its
+        _move(
+            _load_columns(tree, k, 0), _load_columns(tree, k, TREE_POINT), ti.cast(tree[k, TREE_PRISMATIC], ti.i32),
+            up, rise, first, parent_of(tree, first), pose, b, c, k, joints, joints, TWIST,
+        )  # fmt: skip
 
 
 @ti.func
@@ -71,50 +176,28 @@ def forward(
     frames: ti.template(),  # (C, D, 12) out
     twists: ti.template(),  # (C, D, 6) out
 ):
-    """Fill row c of the scratch with the tree at pose b. Parents come before children."""
+    """The same from a tree in four arrays, into two."""
     for k in range(axis.shape[0]):
-        w = load_vector3(axis, k)
-        q = load_vector3(point, k)
-        zero = pose[b, k] * 0.0
-        R = ti.Matrix([[1.0 + zero, zero, zero], [zero, 1.0 + zero, zero], [zero, zero, 1.0 + zero]])
-        t = ti.Vector([zero, zero, zero])
-        if parent[k] >= 0:
-            R = load_rotation(frames, c, parent[k])
-            t = load_translation(frames, c, parent[k])
-        w_world = R @ w
-        q_world = R @ q + t
-        rate = q_world * zero
+        up = parent[k]
+        first = k
+        rise = load_vector3(axis, k) * 0.0
         if point.shape[1] > 3:
-            first, second = k, k + 1
-            above = R
-            if parent[k] >= 0 and _rises(point, parent[k]):
-                first, second = parent[k], k
-                above = load_rotation(frames, c, parent[first])
-            if _rises(point, first):
-                rise = above @ ti.Vector([point[first, RISE + i] for i in ti.static(range(3))])
-                # of the pose's precision, which a literal need not have
-                a, d = -ti.sqrt((zero + 2.0) / 3.0), ti.sqrt((zero + 1.0) / 3.0)
-                s1, c1 = ti.sin(pose[b, first]), ti.cos(pose[b, first])
-                s2, c2 = ti.sin(pose[b, second]), ti.cos(pose[b, second])
-                if first == k:
-                    q_world += (a * c2 * s1 + d * s2) * rise
-                    rate = a * c2 * c1 * rise
-                else:
-                    rate = (d * c2 - a * s2 * s1) * rise
-        v_world = w_world
-        if prismatic[k] == 1:
-            t += w_world * pose[b, k]
-            w_world = w_world * 0.0
-        else:
-            R = R @ rodrigues(w, pose[b, k])
-            t = q_world - R @ q
-            v_world = q_world.cross(w_world) + rate
-        for i in ti.static(range(3)):
-            for j in ti.static(range(3)):
-                frames[c, k, 4 * i + j] = R[i, j]
-            frames[c, k, 4 * i + 3] = t[i]
-            twists[c, k, i] = w_world[i]
-            twists[c, k, 3 + i] = v_world[i]
+            rise = _load_columns(point, k, RISE)
+            if up >= 0:
+                its = _load_columns(point, up, RISE)
+                if its.norm_sqr() > 0.0:
+                    first, rise = up, its
+        _move(
+            load_vector3(axis, k), load_vector3(point, k), prismatic[k],
+            up, rise, first, parent[first], pose, b, c, k, frames, twists, 0,
+        )  # fmt: skip
+
+
+@ti.func
+def velocity(joints: ti.template(), c: int, k: int, x):
+    """∂x/∂p_k of a point x below degree of freedom k, from :func:`forward_tree`'s scratch."""
+    w = ti.Vector([joints[c, k, TWIST + i] for i in ti.static(range(3))])
+    return w.cross(x) + ti.Vector([joints[c, k, TWIST + 3 + i] for i in ti.static(range(3))])
 
 
 @ti.func
@@ -128,22 +211,18 @@ def point_velocity(prismatic: ti.template(), twists: ti.template(), c: int, k: i
 def _place_kernel(real):
     @ti.kernel
     def place(
-        axis: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
-        point: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
-        prismatic: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
-        parent: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
+        tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
         local: ti.types.ndarray(dtype=real, ndim=2),  # (N, 3)
         last_dof: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,)
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
-        frames: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 12) scratch
-        twists: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 6) scratch
+        joints: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 18) scratch
         world: ti.types.ndarray(dtype=real, ndim=3),  # (B, N, 3) out
     ):
         for b in range(pose.shape[0]):
-            forward(axis, point, prismatic, parent, pose, b, b, frames, twists)
+            forward_tree(tree, pose, b, b, joints)
             for n in range(local.shape[0]):
                 k = last_dof[n]
-                x = load_rotation(frames, b, k) @ load_vector3(local, n) + load_translation(frames, b, k)
+                x = load_rotation(joints, b, k) @ load_vector3(local, n) + load_translation(joints, b, k)
                 for i in ti.static(range(3)):
                     world[b, n, i] = x[i]
 
@@ -171,18 +250,14 @@ def place(
     """
     ensure_runtime()
     dtype = pose.dtype
-    real = ti.f64 if dtype == np.float64 else ti.f32
     B, D = pose.shape
     world = np.empty((B, len(local), 3), dtype)
-    _place_kernel(real)(
-        *(np.ascontiguousarray(a, dtype) for a in (axis, point)),
-        np.ascontiguousarray(prismatic, np.int32),
-        np.ascontiguousarray(parent, np.int32),
+    _place_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
+        pack_tree(axis, point, prismatic, parent).astype(dtype),
         np.ascontiguousarray(local, dtype),
         np.ascontiguousarray(last_dof, np.int32),
         np.ascontiguousarray(pose),
-        np.empty((B, D, 12), dtype),
-        np.empty((B, D, 6), dtype),
+        np.empty((B, D, JOINT_NUMBERS), dtype),
         world,
     )
     return world

@@ -1,9 +1,11 @@
 """Does a piece of the body hide a point from a camera? Taichi functions (Kehl 2006, section 5.3, eqs. 6 and 7).
 
 The paper's three steps for each other superellipsoid: clip the viewing ray to its bounding box, test whether the point
-itself lies inside, search the clipped ray recursively from the middle. A bounding sphere is asked before all three.
+itself lies inside, search the clipped ray recursively from the middle. Before all three, a ray outside the cone in
+which the camera sees the piece's bounding sphere is done with: all rays end in the camera, so that is one product.
 
-The recursion becomes a bisection here. G = F^(ε₁/2) is a norm for exponents in (0, 2), so along a ray it is convex:
+An ellipsoid is asked for its nearest approach to the ray, which is known in closed form. For the others the recursion
+becomes a bisection. G = F^(ε₁/2) is a norm for exponents in (0, 2), so along a ray it is convex:
 only the half towards which it falls can hold a point inside, and the tangent in the middle bounds G on it from below.
 Most rays are decided by the first or second middle.
 
@@ -14,7 +16,7 @@ not hide each other, or every seam of the model would flicker.
 from tk.kernels.kinematics import load_rotation, load_translation
 from tk.kernels.objective import PIECE_DOF, PIECE_SHAPE
 from tk.kernels.runtime import ti
-from tk.kernels.superellipsoid import implicit, inside_outside, power
+from tk.kernels.superellipsoid import implicit, inside_outside, is_quadric, power
 
 # Rounds of the bisection. A ray undecided after them runs less than 1/4096 of its clipped length inside the piece.
 DEPTH = 12
@@ -22,8 +24,11 @@ DEPTH = 12
 TOUCH = 1e-3
 
 # Columns of a placed piece: rotation (9, row by row) and translation (3) to the world, the camera's centre in the
-# piece's frame (3), the bounding sphere's centre in the world (3) and its squared radius.
-PLACED_TRANSLATION, PLACED_CAMERA, PLACED_SPHERE, PLACED_NUMBERS = 9, 12, 15, 19
+# piece's frame (3); of its bounding sphere the direction in which the camera sees it (3), the cosine of the half angle
+# of its cone, and how near it comes to the camera.
+PLACED_TRANSLATION, PLACED_CAMERA, PLACED_CONE, PLACED_NEAR, PLACED_NUMBERS = 9, 12, 15, 19, 20
+# The cone is opened by this much of a cosine, for rounding: half a millimetre at the least of a body's pieces.
+_SLACK = 1e-6
 
 
 @ti.func
@@ -32,7 +37,7 @@ def place_pieces(
     c: int,
     pieces: ti.template(),  # (P, 20 or more) as in tk.kernels.objective
     center,  # camera centre, world
-    placed: ti.template(),  # (T, P, 19) out
+    placed: ti.template(),  # (T, P, 20) out
 ):
     """Fill row c of the scratch with the pieces at a pose, as one camera sees them."""
     for i in range(pieces.shape[0]):
@@ -46,15 +51,20 @@ def place_pieces(
         lower, upper = pieces[i, PIECE_SHAPE + 5], pieces[i, PIECE_SHAPE + 6]
         half = 0.5 * (upper - lower)
         middle = 0.5 * (upper + lower)
+        radius = ti.sqrt(pieces[i, PIECE_SHAPE] ** 2 + pieces[i, PIECE_SHAPE + 1] ** 2 + half * half)
+        sphere = t_world + middle * ti.Vector([R_world[a, 2] for a in ti.static(range(3))]) - center
+        distance = ti.max(sphere.norm(), 1e-6)
         for a in ti.static(range(3)):
             for b in ti.static(range(3)):
                 placed[c, i, 3 * a + b] = R_world[a, b]
             placed[c, i, PLACED_TRANSLATION + a] = t_world[a]
             placed[c, i, PLACED_CAMERA + a] = camera[a]
-            placed[c, i, PLACED_SPHERE + a] = t_world[a] + middle * R_world[a, 2]
-        placed[c, i, PLACED_SPHERE + 3] = (
-            pieces[i, PIECE_SHAPE] * pieces[i, PIECE_SHAPE] + pieces[i, PIECE_SHAPE + 1] * pieces[i, PIECE_SHAPE + 1]
-        ) + half * half
+            placed[c, i, PLACED_CONE + a] = sphere[a] / distance
+        sine = radius / distance
+        placed[c, i, PLACED_CONE + 3] = -2.0
+        if sine < 1.0:
+            placed[c, i, PLACED_CONE + 3] = ti.sqrt(1.0 - sine * sine) - _SLACK
+        placed[c, i, PLACED_NEAR] = distance - radius
 
 
 @ti.func
@@ -80,7 +90,11 @@ def segment_enters(q, d, radii, e1, e2, z_lower, z_upper):
         start = ti.max(start, ti.min(first, second))
         end = ti.min(end, ti.max(first, second))
     hit = 0
-    if start < end:
+    if start < end and is_quadric(e1, e2):
+        u, v = q / radii, d / radii
+        nearest = ti.min(ti.max(-u.dot(v) / ti.max(v.norm_sqr(), 1e-12), start), end)
+        hit = ti.cast((u + nearest * v).norm() < 1.0 - TOUCH, ti.i32)
+    elif start < end:
         if start == 0.0 and power(inside_outside(q, radii, e1, e2), 0.5 * e1) < 1.0 - TOUCH:
             hit = 1
         level = 0
@@ -102,7 +116,7 @@ def segment_enters(q, d, radii, e1, e2, z_lower, z_upper):
 
 @ti.func
 def is_occluded(
-    placed: ti.template(),  # (T, P, 19)
+    placed: ti.template(),  # (T, P, 20)
     c: int,
     pieces: ti.template(),  # (P, 20 or more)
     own: int,  # the piece that the point lies on; its rim cannot hide from itself, it is convex
@@ -110,14 +124,17 @@ def is_occluded(
     center,  # camera centre, world
 ):
     """1 if another piece lies between a point and the camera that row c of the scratch was placed for."""
-    d = center - x
-    inv_square = 1.0 / ti.max(d.norm_sqr(), 1e-12)
+    ray = x - center
+    distance = ti.max(ray.norm(), 1e-6)
+    ray = ray / distance
     hit = 0
     i = 0
     while hit == 0 and i < pieces.shape[0]:
-        w = load_placed_vector(placed, c, i, PLACED_SPHERE) - x
-        nearest = ti.min(ti.max(w.dot(d) * inv_square, 0.0), 1.0)
-        if i != own and (w - nearest * d).norm_sqr() < placed[c, i, PLACED_SPHERE + 3]:
+        if (
+            ray.dot(load_placed_vector(placed, c, i, PLACED_CONE)) > placed[c, i, PLACED_CONE + 3]
+            and placed[c, i, PLACED_NEAR] < distance
+            and i != own
+        ):
             R = load_placed_rotation(placed, c, i)
             q = R.transpose() @ (x - load_placed_vector(placed, c, i, PLACED_TRANSLATION))
             hit = segment_enters(

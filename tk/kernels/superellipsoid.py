@@ -14,15 +14,34 @@ def power(base, exponent):
 
 
 @ti.func
+def is_quadric(e1, e2):
+    """An ellipsoid needs no powers, and most pieces of a body are ellipsoids."""
+    return e1 == 1.0 and e2 == 1.0
+
+
+@ti.func
 def inside_outside(q, radii, e1, e2):
     """F(q): below 1 inside, above 1 outside."""
-    xy = power(q[0] / radii[0], 2.0 / e2) + power(q[1] / radii[1], 2.0 / e2)
-    return power(xy, e2 / e1) + power(q[2] / radii[2], 2.0 / e1)
+    F = (q / radii).norm_sqr()
+    if not is_quadric(e1, e2):
+        xy = power(q[0] / radii[0], 2.0 / e2) + power(q[1] / radii[1], 2.0 / e2)
+        F = power(xy, e2 / e1) + power(q[2] / radii[2], 2.0 / e1)
+    return F
 
 
 @ti.func
 def implicit(q, radii, e1, e2):
     """G(q) and its gradient, as one vector (G, ∂x, ∂y, ∂z)."""
+    u = q / radii
+    G = ti.sqrt(ti.max(u.norm_sqr(), 1e-12))
+    result = ti.Vector([G, u[0] / (radii[0] * G), u[1] / (radii[1] * G), u[2] / (radii[2] * G)])
+    if not is_quadric(e1, e2):
+        result = _implicit(q, radii, e1, e2)
+    return result
+
+
+@ti.func
+def _implicit(q, radii, e1, e2):
     ax = power(q[0] / radii[0], 2.0 / e2)
     ay = power(q[1] / radii[1], 2.0 / e2)
     xy = ti.max(ax + ay, 1e-12)

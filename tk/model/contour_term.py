@@ -1,12 +1,13 @@
 """The model's contours against the pictures: which contour points are used, and what edges they get (Kehl 2006, 6.1.2).
 
-Two cues share the contour points (:mod:`tk.kernels.contour`) and the search (:mod:`tk.kernels.edge_search`):
+Two cues share the contour points (:mod:`tk.kernels.contour`):
 
 edges
     the paper's: colour edges for the limbs' symmetric pairs, in the three views with the fewest hidden points.
 outline
     the foreground masks' boundary for contour points on the outline of the whole body, trunk and head too, in every
-    view. Not in the paper: what the hull says of a limb is as coarse as its voxels, and bulky where views are few.
+    view (:mod:`tk.kernels.outline`). Not in the paper: what the hull says of a limb is as coarse as its voxels, and
+    bulky where views are few.
 
 Both come out as entries (:mod:`tk.kernels.alignment`) that hold until they are assigned anew.
 """
@@ -21,8 +22,9 @@ from numpy.typing import NDArray
 from tk.errors import ConfigError
 from tk.kernels import alignment
 from tk.kernels.contour import ContourPoints
-from tk.kernels.edge_search import LINE_NUMBERS, OUTLINE, PAIR, SINGLE, search_edges
+from tk.kernels.edge_search import LINE_NUMBERS, PAIR, SINGLE, search_edges
 from tk.kernels.edges import EdgeConfig
+from tk.kernels.outline import OutlineKernel, OutlineSettings
 from tk.kernels.projection import pack_camera
 from tk.model.body import Body
 from tk.model.camera import Rig
@@ -132,7 +134,9 @@ class ContourTerm:
         )
         self.sizes = np.array([(c.height, c.width) for c in rig], np.int32)
         self._last_dof = body.skeleton.segment_dof[self.strips.segment]
-        self._diameter = np.array([p.diameter_m for p in body.pieces])[self.strips.piece]
+        diameter = np.array([p.diameter_m for p in body.pieces])
+        self.outline = OutlineKernel(self.kernel, self.sizes, diameter)
+        self._diameter = diameter[self.strips.piece]
         self._is_limb = np.isin(self.strips.segment, [SEGMENTS.index(s) for s in LIMBS])
         per_piece = self.strips.circles + self.strips.meridians
 
@@ -170,25 +174,24 @@ class ContourTerm:
     def assign(self, pictures: Pictures, poses: Float, chosen: Ints, softness: float = 1.0) -> NDArray[np.floating]:
         """(B, E, 17) entries at poses (B, D) from strips (B, K)."""
         c = self.config
-        points = self.kernel(poses, chosen)
-        blocks, lines = [], []
-        if c.edge_weight > 0:
-            rows, searched = self._pairs(points)
-            blocks.append(rows)
-            lines.append(searched)
+        cues = []
         if c.outline_weight > 0:
-            rows, searched = self._outline(points)
-            blocks.append(rows)
-            lines.append(searched)
-        pose_of = np.concatenate([block[0] for block in blocks])
-        entries = np.concatenate([block[1] for block in blocks])
+            settings = OutlineSettings(c.outline_reach_m, c.sigma_m, softness * c.outline_nu, c.outline_weight)
+            cues.append(self.outline(pictures.masks, poses, chosen, settings))
+        if c.edge_weight > 0:
+            cues.append(self._edge_entries(pictures, poses, chosen, softness))
+        return cues[0] if len(cues) == 1 else np.concatenate(cues, axis=1)
+
+    def _edge_entries(self, pictures: Pictures, poses: Float, chosen: Ints, softness: float) -> NDArray[np.floating]:
+        """The colour edges' entries."""
+        (pose_of, entries), lines = self._pairs(self.kernel(poses, chosen))
         found = search_edges(
             pictures.images,
             pictures.masks,
             self.sizes,
-            np.concatenate(lines),
-            c.threshold,
-            c.mask_edge,
+            lines,
+            self.config.threshold,
+            self.config.mask_edge,
             self.edges,
         )
         wanted = entries[:, alignment.STATE] == alignment.ASSIGNED
@@ -236,23 +239,6 @@ class ContourTerm:
         b = np.concatenate([b, b[half]])
         entries = np.concatenate([entries, concealed])
         lines = np.concatenate([lines, lines[half]])
-        return (b.astype(np.int32), entries), lines
-
-    def _outline(self, points: ContourPoints) -> tuple[tuple[Ints, NDArray[np.float32]], NDArray[np.float32]]:
-        """Entries and search lines of the masks' outline."""
-        c = self.config
-        b, v, k, slot = np.nonzero(points.outer)
-        entries, lines = self._rows(points, b, v, k, slot, slot)
-        lines[:, 0] = OUTLINE
-        pixels_a_metre = entries[:, alignment.SHARE].copy()
-        lines[:, 10] = c.outline_reach_m * pixels_a_metre
-        sigma = (c.sigma_m or self._diameter[points.strip[b, k]]) * pixels_a_metre
-        entries[:, alignment.INV_SIGMA2] = 1 / sigma**2
-        entries[:, alignment.STATE] = alignment.ASSIGNED
-        entries[:, alignment.SHARE] = 0.0
-        entries[:, alignment.NU] = c.outline_nu
-        total = np.bincount(b, minlength=len(points.strip))
-        entries[:, alignment.SCALE] = c.outline_weight / total[b]
         return (b.astype(np.int32), entries), lines
 
     def _rows(

@@ -25,7 +25,7 @@ from tk.model.superellipsoid import Superellipsoid, signed_power
 Float = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
-LIMBS = SEGMENTS[2:]  # all but torso and head
+LIMBS = tuple(s for s in SEGMENTS if s not in ("torso", "pelvis", "head"))
 
 
 @dataclass(frozen=True)
