@@ -38,7 +38,6 @@ from rich.table import Table
 from scipy.spatial import cKDTree
 
 from scripts import bench_hull
-from scripts.overlay import body_of
 from tk import __version__, sequence
 from tk.config import Config
 from tk.errors import TkError
@@ -53,7 +52,7 @@ from tk.model.objective import BodyObjective
 from tk.model.skeleton import CHAINS
 from tk.model.volume import VoxelGrid
 from tk.tracker import Estimate
-from tk.volumetric import CELL_VOXELS
+from tk.volumetric import CELL_VOXELS, restore_body
 
 DEMO = Path(__file__).resolve().parents[1] / "tk" / "data" / "demo"
 WINDOW = 12  # frames that the stages alone are measured on
@@ -269,10 +268,11 @@ def _search_stages(
     capture: Capture, config: Config, frame: FrameSet, masks: np.ndarray, result: Result
 ) -> Iterator[Stage]:
     """Colour segmentation, nearest neighbours and the objective, at the tracked pose of a frame."""
-    body = body_of(result)
-    if body is None:
+    restored = restore_body(result)
+    if restored is None:
         raise SystemExit(f"{result.path}: has no body of superellipsoids in /model")
-    pose = result.pose[np.flatnonzero(result.frames == frame.index)[0]]
+    body, poses = restored
+    pose = poses[np.flatnonzero(result.frames == frame.index)[0]]
     hull = VisualHull(capture.rig, VoxelGrid.cover(capture.volume, config.voxels))
     hull.carve(masks)
     surface = hull.surface(frame.images)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from tk.errors import TkError
 from tk.io.capture import Capture, open_capture
 from tk.io.result import Result, Status, read_joints, read_result
-from tk.model.anthropometry import BodyDimensions
-from tk.model.body import Body, build_body
+from tk.model.body import Body
 from tk.model.camera import Camera
 from tk.model.skeleton import JOINTS, SEGMENTS
 from tk.model.superellipsoid import Superellipsoid
+from tk.volumetric import restore_body
 
 Float = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -42,6 +42,7 @@ BONES = (
 # BGR; the far half of a limb is the lighter one
 _COLORS: dict[str, Color] = {
     "torso": (90, 170, 60),
+    "pelvis": (60, 140, 40),
     "head": (120, 210, 120),
     "upper_arm_l": (30, 110, 240),
     "forearm_l": (70, 190, 250),
@@ -55,15 +56,6 @@ _COLORS: dict[str, Color] = {
 _OPACITY = 0.35
 _SUBPIXEL = 4  # bits of a fraction of a pixel that OpenCV draws with
 _GAP = 6  # pixels between tiles
-
-
-def body_of(result: Result) -> Body | None:
-    """The fitted body of a result; None where its `/model` does not hold one of superellipsoids."""
-    prefix = "dimensions/"
-    values = {field.name: result.model.get(prefix + field.name) for field in fields(BodyDimensions)}
-    if any(value is None for value in values.values()):
-        return None
-    return build_body(BodyDimensions(**{name: float(value) for name, value in values.items()}), result.meta.up)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -190,7 +182,7 @@ def overlay_rows(
         tile_height: pixels.
         full: whole pictures, not the person cut out.
     """
-    body = body_of(result)
+    restored = restore_body(result)
     truth_file = capture.path / "truth.h5"
     truth = read_joints(truth_file) if truth_file.is_file() else None
     row_of = {int(frame): row for row, frame in enumerate(result.frames)}
@@ -201,7 +193,7 @@ def overlay_rows(
         tiles = []
         for camera, image in zip(capture.rig, images, strict=True):
             joints, _ = camera.project(result.joints[row])
-            segments = [] if body is None else outlines(body, result.pose[row], camera)
+            segments = [] if restored is None else outlines(restored[0], restored[1][row], camera)
             true = [camera.project(positions)[0] for positions in marks]
             points = np.concatenate([joints, *true, *(polygon for _, _, polygons in segments for polygon in polygons)])
             width = round(0.75 * tile_height)

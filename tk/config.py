@@ -19,6 +19,7 @@ from tk.errors import ConfigError
 from tk.kernels.edges import EdgeConfig
 from tk.kernels.objective import ObjectiveSettings
 from tk.model.appearance import AppearanceConfig
+from tk.model.body import BodyConfig
 from tk.model.contour_term import ContourConfig
 from tk.model.fitting import FitConfig
 from tk.model.foreground import ForegroundConfig
@@ -92,6 +93,7 @@ class Config:
     segmentation: str = "collinearity"
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
     appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
+    body: BodyConfig = field(default_factory=BodyConfig)
     objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     contours: ContourConfig = field(default_factory=ContourConfig)

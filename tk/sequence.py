@@ -175,6 +175,7 @@ def track(
         method=method,
         seed=config.seed,
         config_toml=config.to_toml(),
+        waist_names=tracker.waist_names,
     )
     origin = _origin(capture, first, begin, init, store_hull)
     writer, done = ResultWriter.resume(output, meta) if resume else (ResultWriter.create(output, meta), 0)
@@ -342,6 +343,7 @@ def _row(index: int, fps: float, estimate: Estimate, timing: dict[str, float], s
         frame=index,
         time=index / fps,
         pose=estimate.pose,
+        waist=estimate.waist,
         joints=estimate.joints,
         status=int(Status[estimate.status.upper()]),
         objective=estimate.objective,

@@ -100,6 +100,7 @@ class SilhouetteTracker:
     """
 
     method = "silhouette"
+    waist_names: tuple[str, ...] = ()
     timing_stages: tuple[str, ...] = ("masks_clean", "optimise", "check")
 
     def __init__(self, rig: Rig, up: str, config: SilhouetteConfig | None = None) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -30,7 +30,7 @@ class Estimate:
     """A tracker's answer for one frame.
 
     Attributes:
-        pose: (D,) configuration vector.
+        pose: (D,) configuration vector; waist: (W,) angles beyond it, in the order of the tracker's names.
         joints: (15, 3) joint centres, metres.
         status: "tracked", "initialised", "recovered" or "lost".
         objective: the objective's final value.
@@ -46,6 +46,7 @@ class Estimate:
     iterations: NDArray[np.int32]
     timing: Mapping[str, float]
     surface: HullSurface | None = None
+    waist: Float = field(default_factory=lambda: np.zeros(0))
 
 
 class Tracker(Protocol):
@@ -56,6 +57,7 @@ class Tracker(Protocol):
     timing_stages: tuple[str, ...]
     pose_names: tuple[str, ...]
     pose_units: tuple[str, ...]
+    waist_names: tuple[str, ...]
 
     def start(self, frames: Sequence[Observation], height_m: float | None, init: InitPose | None) -> None:
         """Find the subject in the first of the frames; nothing is returned, :meth:`step` begins with that frame."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from tk.config import Config
 from tk.errors import CaptureError
 from tk.io.init_pose import InitPose
+from tk.io.result_data import Result
 from tk.kernels.nearest import SurfaceIndex
 from tk.model import initialisation
 from tk.model.anthropometry import BodyDimensions
@@ -29,7 +30,7 @@ from tk.model.contour_term import ContourTerm, Pictures
 from tk.model.fitting import fit_body
 from tk.model.hull import HullSurface, VisualHull
 from tk.model.objective import CHAIN_OF_SEGMENT, BodyObjective, Fit, FrameObjective
-from tk.model.skeleton import CHAINS, JOINTS, build_skeleton
+from tk.model.skeleton import CHAINS, JOINTS, WAIST, build_skeleton, with_waist, without_waist
 from tk.model.volume import Volume, VoxelGrid
 from tk.optim import lm_schedule, schedule
 from tk.tracker import Estimate, Observation, Stopwatch
@@ -76,9 +77,11 @@ class VolumetricTracker:
         self.up = up
         self.rig = rig
         self.hull = VisualHull(rig, VoxelGrid.cover(volume, config.voxels), cache_dir)
-        skeleton = build_skeleton(BodyDimensions.from_stature(1.7), up)
-        self.pose_names = skeleton.names
-        self.pose_units = skeleton.units
+        skeleton = build_skeleton(BodyDimensions.from_stature(1.7), up, config.body.waist)
+        told = np.flatnonzero(~skeleton.is_waist)
+        self.pose_names = tuple(skeleton.names[k] for k in told)
+        self.pose_units = tuple(skeleton.units[k] for k in told)
+        self.waist_names = tuple(name for name in skeleton.names if name in WAIST)
         self._body: Body | None = None
         self._objective: BodyObjective
         self._appearance: Appearance
@@ -132,20 +135,30 @@ class VolumetricTracker:
             self.config.fit,
         )
         self._take_body(dimensions)
-        self._pose = self._previous = poses[0]
+        # people stand upright for the fit: their waist is straight
+        waist = self.body.skeleton.is_waist
+        pose = np.zeros(len(waist))
+        pose[~waist] = poses[0]
+        self._pose = self._previous = pose
         pictures = Pictures(frames[0].images, frames[0].masks)
-        fit = FrameObjective(self._objective, indices[0], np.random.default_rng(0), pictures=pictures).fit(poses[0])
+        fit = FrameObjective(self._objective, indices[0], np.random.default_rng(0), pictures=pictures).fit(pose)
         self._usual, self._usual_astray = fit.value, fit.astray_share
-        self._learn_colours(surfaces[0], indices[0], poses[0])
+        self._learn_colours(surfaces[0], indices[0], pose)
         self.hull.reset()
 
     def _take_body(self, dimensions: BodyDimensions) -> None:
-        self._body = build_body(dimensions, self.up)
+        self._body = build_body(dimensions, self.up, waist=self.config.body.waist)
         self._filling = filling(self._body)
         cues = self.config.contours
         cues = cues.scaled(self.config.sampling.scale)
         contours = ContourTerm(self._body, self.rig, cues, self.config.edges) if cues.enabled else None
-        self._objective = BodyObjective(self._body, self.config.objective, self.config.sampling, contours)
+        self._objective = BodyObjective(
+            self._body,
+            self.config.objective,
+            self.config.sampling,
+            contours,
+            waist_stiffness=self.config.body.waist_stiffness,
+        )
 
     def _learn_colours(self, surface: HullSurface, index: SurfaceIndex, pose: Float) -> None:
         """Each patch takes the colours of the voxels under its samples."""
@@ -191,8 +204,10 @@ class VolumetricTracker:
         self._lost_for = self._lost_for + 1 if lost else 0
         self._fresh = False
         watch.lap("update")
+        pose, waist = without_waist(self.body.skeleton, result.pose)
         return Estimate(
-            pose=result.pose,
+            pose=pose,
+            waist=waist,
             joints=self.body.skeleton.joints(result.pose),
             status=status,
             objective=fit.value,
@@ -289,8 +304,10 @@ class VolumetricTracker:
         self._lost_for += 1
         for stage in ("colour", "optimise", "update"):
             watch.lap(stage)
+        pose, waist = without_waist(self.body.skeleton, self._pose)
         return Estimate(
-            pose=self._pose,
+            pose=pose,
+            waist=waist,
             joints=self.body.skeleton.joints(self._pose),
             status="lost",
             objective=1.0 + self.config.objective.coverage_weight,
@@ -359,6 +376,22 @@ class VolumetricTracker:
         self._usual, self._usual_astray = (float(v) for v in state["usual"])
         self._lost_for = int(state["lost_for"])
         self._fresh = False
+
+
+def restore_body(result: Result) -> tuple[Body, Float] | None:
+    """The fitted body of a result file, and its poses (F, D) with the waist's angles in their place.
+
+    None where `/model` does not hold a body of superellipsoids.
+    """
+    prefix = "dimensions/"
+    values = {field.name: result.model.get(prefix + field.name) for field in fields(BodyDimensions)}
+    if any(value is None for value in values.values()):
+        return None
+    dimensions = BodyDimensions(**{name: float(value) for name, value in values.items()})  # type: ignore[arg-type]
+    body = build_body(dimensions, result.meta.up, waist=result.waist is not None)
+    if result.waist is None:
+        return body, result.pose
+    return body, np.array([with_waist(body.skeleton, *row) for row in zip(result.pose, result.waist, strict=True)])
 
 
 class LevenbergMarquardtTracker(VolumetricTracker):

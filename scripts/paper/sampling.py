@@ -19,6 +19,7 @@ from tk.io.capture import open_capture
 from tk.kernels.nearest import SurfaceIndex
 from tk.model.contour_term import ContourTerm, Pictures
 from tk.model.objective import CHAIN_NAMES, BodyObjective, FrameObjective
+from tk.model.skeleton import with_waist
 from tk.optim import smd
 from tk.optim.schedule import descent_basis
 from tk.sequence import make_segmenter
@@ -77,7 +78,7 @@ def look(options: Options, paper: Config) -> Scene:
     pictures = Pictures(observation.images, observation.masks)
     frame = FrameObjective(objective, index, np.random.default_rng(0), pictures=pictures)
     two = np.array([body.skeleton.index(name) for name in ANGLES])
-    return Scene(frame, estimate.pose, two)
+    return Scene(frame, with_waist(body.skeleton, estimate.pose, estimate.waist), two)
 
 
 def landscape(scene: Scene, seed: int, poses: Float, iteration: int = 0) -> Float:

@@ -102,7 +102,7 @@ def test_bad_sampling_is_refused(bad):
 
 
 def test_chains_of_segments():
-    assert [s for s, c in zip(SEGMENTS, CHAIN_OF_SEGMENT, strict=True) if c < 0] == ["torso"]
+    assert [s for s, c in zip(SEGMENTS, CHAIN_OF_SEGMENT, strict=True) if c < 0] == ["torso", "pelvis"]
     for c, name in enumerate(CHAIN_NAMES):
         assert tuple(s for s, k in zip(SEGMENTS, CHAIN_OF_SEGMENT, strict=True) if k == c) == CHAINS[name]
 
@@ -338,3 +338,24 @@ def test_a_leg_inside_the_other_finds_no_voxel(frame, index, truth, monkeypatch)
     free = FrameObjective(BodyObjective(BODY, ObjectiveSettings(), SAMPLING), index, np.random.default_rng(0))
     assert stranded(frame, truth) == stranded(free, truth) == stranded(free, folded) == 0
     assert stranded(frame, folded) > 0.1
+
+
+def test_a_stiff_waist_costs_its_square_with_the_derivatives_to_it(index, truth):
+    """Against the same body without stiffness: value, gradient, product and curvature."""
+    body = build_body(BODY.dimensions, waist=True)
+    soft, stiff = (
+        BodyObjective(body, ObjectiveSettings(), SAMPLING, waist_stiffness=w, dtype=np.float64) for w in (0.0, 0.7)
+    )
+    pose = np.zeros((1, 27))
+    pose[0, body.skeleton.is_waist] = [0.2, -0.1, 0.3]
+    pose[0, ~body.skeleton.is_waist] = truth
+    k = 0.7 * body.skeleton.is_waist
+    v = np.random.default_rng(0).normal(size=(1, 27))
+    plain, bent = (FrameObjective(o, index, np.random.default_rng(0)).full()(pose, v, 0) for o in (soft, stiff))
+    np.testing.assert_allclose(bent.value - plain.value, 0.5 * 0.7 * 0.14, atol=1e-12)
+    np.testing.assert_allclose(bent.gradient - plain.gradient, k * pose, atol=1e-12)
+    np.testing.assert_allclose(bent.hessian_vector - plain.hessian_vector, k * v, atol=1e-12)
+    a, b = (FrameObjective(o, index, np.random.default_rng(0)) for o in (soft, stiff))
+    np.testing.assert_allclose(b.curvature(pose[0]) - a.curvature(pose[0]), np.diag(k), atol=1e-12)
+    np.testing.assert_allclose(b.value(pose[0]) - a.value(pose[0]), 0.5 * 0.7 * 0.14, atol=1e-12)
+    np.testing.assert_allclose(b.gradient(pose[0]) - a.gradient(pose[0]), k * pose[0], atol=1e-12)

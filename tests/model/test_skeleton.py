@@ -14,10 +14,13 @@ from tk.model.skeleton import (
     DEGREES_OF_FREEDOM,
     JOINTS,
     SEGMENTS,
+    WAIST,
     build_skeleton,
     shoulder_angles,
     twist_exp,
     up_rotation,
+    with_waist,
+    without_waist,
 )
 
 DIMENSIONS = BodyDimensions.from_stature(1.75)
@@ -116,7 +119,54 @@ def test_layout():
         "knee_l_flexion",
         "hip_r_roll",
         "knee_r_flexion",
+        "torso_pitch",  # the pelvis, part of the trunk
     ]
+
+
+# The waist
+
+WAISTED = build_skeleton(DIMENSIONS, waist=True)
+
+
+def waisted_poses(count=20, up="z"):
+    skeleton = build_skeleton(DIMENSIONS, up, waist=True)
+    poses = np.random.default_rng(3).normal(0, 0.4, (count, len(skeleton.names)))
+    return skeleton, skeleton.clip(poses)
+
+
+def test_a_waist_is_three_more_degrees_of_freedom_between_trunk_and_pelvis():
+    assert tuple(np.array(WAISTED.names)[~WAISTED.is_waist]) == SKELETON.names
+    assert tuple(np.array(WAISTED.names)[WAISTED.is_waist]) == WAIST
+    assert (WAISTED.parent < np.arange(27)).all()
+    moved = WAISTED.ancestors()[:, WAISTED.is_waist]
+    below = {SEGMENTS[s] for s in np.flatnonzero(moved.all(axis=1))}
+    assert (
+        below == {"pelvis", "thigh_l", "calf_l", "thigh_r", "calf_r"} and (moved.any(axis=1) == moved.all(axis=1)).all()
+    )
+    assert not np.array([WAISTED.chain_dofs(c) for c in CHAINS])[:, WAISTED.is_waist].any()
+
+
+def test_a_straight_waist_changes_nothing():
+    _, poses = waisted_poses()
+    poses[:, WAISTED.is_waist] = 0
+    for pose in poses:
+        np.testing.assert_allclose(WAISTED.joints(pose), SKELETON.joints(pose[~WAISTED.is_waist]), atol=EXACT)
+
+
+@pytest.mark.parametrize("up", ["z", "-y"])
+def test_without_a_waist_all_limbs_keep_their_directions(up):
+    skeleton, poses = waisted_poses(up=up)
+    plain = build_skeleton(DIMENSIONS, up)
+    for pose in poses:
+        told, waist = without_waist(skeleton, pose)
+        np.testing.assert_array_equal(waist, pose[skeleton.is_waist])
+        R, R_told = (s.segment_transforms(p)[:, :3, :3] for s, p in ((skeleton, pose), (plain, told)))
+        limbs = [SEGMENTS.index(s) for s in SEGMENTS if s != "pelvis"]
+        np.testing.assert_allclose(R_told[limbs], R[limbs], atol=1e-9)
+        # the sockets are moved by less than the waist's angle times their distance from it
+        away = np.linalg.norm(plain.joints(told) - skeleton.joints(pose), axis=1).max()
+        assert away < 0.25 * np.linalg.norm(waist) + 1e-9
+        np.testing.assert_allclose(with_waist(skeleton, told, waist), pose, atol=1e-9)
 
 
 def test_chains_and_torso_share_out_the_degrees_of_freedom():

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 from scripts import overlay
-from scripts.overlay import BONES, View, body_of, draw_body, main, outlines
+from scripts.overlay import BONES, View, draw_body, main, outlines
 from tk.config import Config
 from tk.io.result import FrameResult, ResultMeta, ResultWriter, Status, read_joints, read_result
 from tk.model.anthropometry import BodyDimensions
 from tk.model.body import build_body, neutral_pose
 from tk.model.camera import Camera
 from tk.model.skeleton import JOINTS
+from tk.volumetric import restore_body
 
 DEMO = Path(__file__).resolve().parents[2] / "tk" / "data" / "demo"
 BODY = build_body(BodyDimensions.from_stature(1.7))
@@ -54,8 +55,10 @@ def test_bones_join_all_joints_into_one_tree() -> None:
 
 
 def test_body_is_built_anew_from_the_model(result: Path) -> None:
-    body = body_of(read_result(result))
-    assert body is not None and body.dimensions == BODY.dimensions
+    restored = restore_body(read_result(result))
+    assert restored is not None
+    body, poses = restored
+    assert poses.shape == (3, 24) and body.dimensions == BODY.dimensions
     np.testing.assert_array_equal(body.points, BODY.points)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
@@ -68,6 +68,7 @@ class ResultMeta:
     seed: int
     config_toml: str
     joint_names: tuple[str, ...] = JOINTS
+    waist_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.pose_names) != len(self.pose_units):
@@ -83,7 +84,7 @@ class ResultMeta:
         for name in ("capture", "method", "seed", "fps", "up"):
             if getattr(self, name) != getattr(other, name):
                 return f"{name} is {getattr(self, name)}, not {getattr(other, name)}"
-        for name in ("pose_names", "pose_units", "stages", "timing_stages", "joint_names"):
+        for name in ("pose_names", "pose_units", "stages", "timing_stages", "joint_names", "waist_names"):
             if getattr(self, name) != getattr(other, name):
                 return f"{name} are {', '.join(getattr(self, name))}; not {', '.join(getattr(other, name))}"
         return _config_difference(tomllib.loads(self.config_toml), tomllib.loads(other.config_toml))
@@ -111,6 +112,7 @@ class FrameResult:
         iterations: (S,) optimiser iterations a stage.
         timing: seconds a stage; a stage that is not mentioned took none.
         hull: the surface voxels, if they are to be stored.
+        waist: (W,) angles beyond the pose's, radians; none by default.
     """
 
     frame: int
@@ -122,6 +124,7 @@ class FrameResult:
     iterations: NDArray[np.integer]
     timing: Mapping[str, float]
     hull: HullPoints | None = None
+    waist: Float = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -149,6 +152,7 @@ class Result:
     frames: NDArray[np.int64]  # (F,)
     time: Float  # (F,) seconds
     pose: Float  # (F, D)
+    waist: Float | None  # (F, W) radians
     joints: Float  # (F, J, 3) metres
     status: NDArray[np.uint8]  # (F,)
     objective: Float  # (F,)
@@ -200,6 +204,7 @@ def read_result(path: str | os.PathLike[str]) -> Result:
             time=_read(file, "time", path),
             pose=_read(file, "pose", path),
             joints=_read(file, "joints/position", path),
+            waist=_read(file, "waist", path) if meta.waist_names else None,
             status=_read(file, "status", path),
             objective=_read(file, "objective", path),
             iterations=_read(file, "iterations", path),
@@ -215,6 +220,7 @@ def read_result(path: str | os.PathLike[str]) -> Result:
     columns: dict[str, NDArray[Any]] = {
         "time": result.time,
         "pose": result.pose,
+        **({} if result.waist is None else {"waist": result.waist}),
         "joints/position": result.joints,
         "status": result.status,
         "objective": result.objective,
@@ -315,6 +321,7 @@ def read_meta(file: h5py.File, path: Path) -> ResultMeta:
         seed=int(attribute("/", "seed")),
         config_toml=attribute("/", "config"),
         joint_names=names("/joints/position", "names"),
+        waist_names=names("/waist", "names") if "waist" in file else (),
     )
 
 

@@ -51,6 +51,7 @@ class Row:
             "frames": result.frame,
             "time": result.time,
             "pose": result.pose,
+            "waist": result.waist,
             "joints/position": result.joints,
             "status": int(result.status),
             "objective": result.objective,
@@ -112,7 +113,16 @@ class Twin:
         if "resume/rows" not in self.file or self.file["resume/rows"][()] >= self.rows:
             return
         self.rows = int(self.file["resume/rows"][()])
-        growing = ["frames", "time", "pose", "joints/position", "status", "objective", "iterations"]
+        growing = [
+            "frames",
+            "time",
+            "pose",
+            *(["waist"] if "waist" in self.file else []),
+            "joints/position",
+            "status",
+            "objective",
+            "iterations",
+        ]
         for name in [*growing, *(f"timing/{stage}" for stage in self.file["timing"])]:
             self.file[name].resize(self.rows, axis=0)
         if "hull" in self.file:
@@ -209,6 +219,9 @@ def write_layout(file: h5py.File, meta: ResultMeta) -> None:
         _create_growing(file, name, shape, dtype, rows)
     file["pose"].attrs["names"] = _strings(meta.pose_names)
     file["pose"].attrs["units"] = _strings(meta.pose_units)
+    if meta.waist_names:
+        file["waist"].attrs["names"] = _strings(meta.waist_names)
+        file["waist"].attrs["units"] = _strings(["rad"] * len(meta.waist_names))
     file["joints/position"].attrs["names"] = _strings(meta.joint_names)
     file["iterations"].attrs["stages"] = _strings(meta.stages)
     file["status"].attrs["meaning"] = _strings(f"{value}: {text}" for value, text in enumerate(STATUS_MEANING))
@@ -220,6 +233,7 @@ def _columns(meta: ResultMeta) -> dict[str, tuple[tuple[int, ...], str]]:
         "frames": ((), "i8"),
         "time": ((), "f8"),
         "pose": ((len(meta.pose_names),), "f8"),
+        **({"waist": ((len(meta.waist_names),), "f8")} if meta.waist_names else {}),
         "joints/position": ((len(meta.joint_names), 3), "f8"),
         "status": ((), "u1"),
         "objective": ((), "f8"),

@@ -28,7 +28,7 @@ from tk.kernels.outline import OutlineKernel, OutlineSettings
 from tk.kernels.projection import pack_camera
 from tk.model.body import Body
 from tk.model.camera import Rig
-from tk.model.skeleton import CHAINS, SEGMENTS
+from tk.model.skeleton import CHAINS
 from tk.model.strips import LIMBS, Strips, build_strips, contour_kernel
 
 Float = NDArray[np.float64]
@@ -45,6 +45,7 @@ class ContourConfig:
         views: how many views colour edges are looked for in: those with the fewest hidden contour points.
         pairs: circles of latitude on each limb; the paper takes 10 contour points a limb and view.
         trunk_circles, head_circles: circles on each half of the trunk and on the head, for the outline.
+        extremity_circles: on each hand and foot, for the outline; 0 for bodies without.
         reach_m: how far from the contour edges are looked for, metres at the limb.
         outline_reach_m: the same for the outline.
         threshold: least colour gradient of an edge, 0…1.
@@ -62,6 +63,7 @@ class ContourConfig:
     pairs: int = 3
     trunk_circles: int = 3
     head_circles: int = 3
+    extremity_circles: int = 2
     reach_m: float = 0.08
     outline_reach_m: float = 0.15
     threshold: float = 0.12
@@ -74,7 +76,7 @@ class ContourConfig:
     renew: int = 5
 
     def __post_init__(self) -> None:
-        for name in ("edge_weight", "outline_weight", "threshold", "mask_edge", "sigma_m"):
+        for name in ("edge_weight", "outline_weight", "threshold", "mask_edge", "sigma_m", "extremity_circles"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"contours.{name} = {getattr(self, name)} must not be negative")
         for name in (
@@ -95,7 +97,10 @@ class ContourConfig:
 
     def scaled(self, scale: int) -> ContourConfig:
         """The same with ``scale`` times as many contour points."""
-        circles = {name: scale * getattr(self, name) for name in ("pairs", "trunk_circles", "head_circles")}
+        circles = {
+            name: scale * getattr(self, name)
+            for name in ("pairs", "trunk_circles", "head_circles", "extremity_circles")
+        }
         return replace(self, **circles)
 
     @property
@@ -137,7 +142,7 @@ class ContourTerm:
         diameter = np.array([p.diameter_m for p in body.pieces])
         self.outline = OutlineKernel(self.kernel, self.sizes, diameter)
         self._diameter = diameter[self.strips.piece]
-        self._is_limb = np.isin(self.strips.segment, [SEGMENTS.index(s) for s in LIMBS])
+        self._is_limb = np.isin(self.strips.piece, self.strips.limb_piece)  # hands and feet are not
         per_piece = self.strips.circles + self.strips.meridians
 
         def circles(segment: str, pieces: int) -> NDArray[np.int64]:
@@ -150,14 +155,19 @@ class ContourTerm:
 
         # Strips come from these rows: so many of each
         limb = {s: [(circles(s, 1)[0], config.pairs)] for s in LIMBS}
+        for s in LIMBS if config.extremity_circles else ():
+            if s.startswith(("forearm", "calf")):  # the hand and the foot are the second longest pieces there
+                limb[s].append((circles(s, 2)[1], config.extremity_circles))
+            else:  # rows of one length for all chains but the head's
+                limb[s].append((circles(s, 1)[0], 0))
         head = [(circles("head", 1)[0], config.head_circles)]
         self._all = (
-            [(row, config.trunk_circles) for row in circles("torso", 2)]
+            [(row, config.trunk_circles) for row in np.concatenate([circles("torso", 1), circles("pelvis", 1)])]
             + head
             + [row for s in LIMBS for row in limb[s]]
         )
         self._chains = [
-            [(circles("head", 1)[0], 2 * config.pairs)]
+            [(circles("head", 1)[0], 2 * config.pairs + config.extremity_circles)]
             if chain == ("head",)
             else [row for s in chain for row in limb[s]]
             for chain in CHAINS.values()

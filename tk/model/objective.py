@@ -84,6 +84,7 @@ class BodyObjective:
         sampling: numbers of points.
         contours: the contour cues, if any.
         dtype: precision of the kernel.
+        waist_stiffness: see :class:`~tk.model.body.BodyConfig`.
     """
 
     def __init__(
@@ -93,8 +94,10 @@ class BodyObjective:
         sampling: SamplingConfig,
         contours: ContourTerm | None = None,
         dtype: type = np.float32,
+        waist_stiffness: float = 0.0,
     ) -> None:
         self.body = body
+        self.stiffness = waist_stiffness * body.skeleton.is_waist
         self.settings = settings
         self.sampling = sampling
         self.contours = contours
@@ -147,6 +150,19 @@ class BodyObjective:
         sigma = self.sampling.sigma_m or float(np.median(self.body.diameter))
         unit = (1 / s.nu + s.coverage_weight / s.coverage_nu) / sigma**2
         return unit * np.where(self.body.skeleton.prismatic, 1.0, lever_m**2)
+
+    def with_stiffness(
+        self, poses: Float, directions: Float | None, value: Float, gradient: Float, product: Float
+    ) -> Evaluation:
+        """An evaluation at poses (B, D), with the waist's stiffness added."""
+        k = self.stiffness
+        if not k.any():
+            return Evaluation(value, gradient, product)
+        return Evaluation(
+            value + 0.5 * np.square(poses) @ k,
+            gradient + k * poses,
+            product if directions is None else product + k * directions,
+        )
 
 
 def piece_patches(body: Body) -> NDArray[np.int64]:
@@ -356,7 +372,7 @@ class FrameObjective:
 
     def curvature(self, pose: Float, softness: float = 1.0) -> Float:
         """(D, D) Gauss-Newton Hessian at ``pose`` (D,), outliers weighing at least :attr:`outliers`."""
-        return self._linearise(pose, softness, with_jacobian=False).hessian
+        return self._linearise(pose, softness, with_jacobian=False).hessian + np.diag(self.objective.stiffness)
 
     def fit(self, pose: Float) -> Fit:
         """How well ``pose`` (D,) explains the frame, on samples that do not change from call to call."""
@@ -382,6 +398,7 @@ class FrameObjective:
             self.objective.settings,
             entries=entries,
         )
+        value, gradient, _ = self.objective.with_stiffness(poses, None, value, gradient, gradient)
         for b, pose in enumerate(poses):
             own = Held(held.assigned[b : b + 1], held.covering[b : b + 1])
             self._looks[pose.tobytes()] = _Look(
@@ -482,7 +499,7 @@ class FrameObjective:
         value, gradient, product, _ = self.objective.kernel.evaluate(
             self.index, samples, voxels, poses, directions, settings, entries=entries
         )
-        return Evaluation(value, gradient, product)
+        return self.objective.with_stiffness(poses, directions, value, gradient, product)
 
 
 class FixedObjective:
@@ -520,15 +537,15 @@ class FixedObjective:
             with_jacobian=False,
             entries=entries,
         )
-        return float(value[0]), gradient[0], linear.hessian
+        return float(value[0]), gradient[0], linear.hessian + np.diag(self._frame.objective.stiffness)
 
     def _evaluate(self, pose: Float) -> tuple[tuple[Float, Float, Float, Held], NDArray[np.floating] | None]:
         frame, (samples, voxels) = self._frame, self._points
         entries = None if self._strips is None else frame._entries(pose[None], self._strips[None], self._softness)
-        found = frame.objective.kernel.evaluate(
+        value, gradient, product, held = frame.objective.kernel.evaluate(
             frame.index, samples[None], voxels[None], pose[None], None, self._settings, entries=entries
         )
-        return found, entries
+        return (*frame.objective.with_stiffness(pose[None], None, value, gradient, product), held), entries
 
 
 class _Draws:

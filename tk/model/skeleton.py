@@ -1,4 +1,5 @@
-"""The skeleton: a tree of exponential twists with 24 degrees of freedom (Kehl 2006, section 5.1, figure 5a).
+"""The skeleton: a tree of exponential twists with 24 degrees of freedom (Kehl 2006, section 5.1, figure 5a), and three
+more for the waist if wanted.
 
 A pose is a configuration vector p. The transform after degree of freedom k is
 
@@ -12,6 +13,10 @@ straight, both arms point horizontally forward and outward at 45°. Ball joints 
 middle angle must stay within ±90°. The paper does not give its axes. Here they are chosen so that the singular
 directions are hardly ever taken: a leg straight to the side, the trunk lying on its side, and, for an arm, the diagonal
 back-out-up / forward-in-down, which is at least 54° away from hanging, raised, forward, backward and sideways.
+
+Beyond the paper: a waist, three rotations between trunk and pelvis about the lumbar spine. A dancer's hips stay level
+while the trunk leans; the paper's torso takes them along. :func:`without_waist` tells the same pose in the paper's 24
+degrees of freedom.
 """
 
 from __future__ import annotations
@@ -56,6 +61,7 @@ SEGMENTS = (
     "calf_l",
     "thigh_r",
     "calf_r",
+    "pelvis",
 )
 
 # The five chains that are refined one by one with the torso held (section 6.4): the segments of each.
@@ -80,11 +86,15 @@ _ELBOW = np.cross(_ARM, [0.5, -0.5, np.sqrt(0.5)])
 # 143±5; elbow 143±6. The shoulder's ranges (flexion 167±5, extension 62±10, abduction 184±7, rotation 69/104) are given
 # about other axes than ours: the box below holds them, and every direction of the arm but a cone of 10° about the
 # singular diagonal (tests/model/test_skeleton.py samples them). Neck: Youdas et al., Phys. Ther. 72 (1992) 770-780:
-# flexion and extension 60-70 together with the upper spine, lateral bending 40-45.
+# flexion and extension 60-70 together with the upper spine, lateral bending 40-45. Waist: what textbooks give for the
+# lumbar spine (flexion 50, extension 15, bending 20-25, rotation 5-10), more for what the chest above it turns.
 _LIMITS_DEG: dict[str, tuple[float, float]] = {
     "torso_yaw": (-np.inf, np.inf),
     "torso_roll": (-80.0, 80.0),
     "torso_pitch": (-np.inf, np.inf),
+    "waist_pitch": (-25.0, 50.0),
+    "waist_roll": (-30.0, 30.0),
+    "waist_yaw": (-35.0, 35.0),
     "neck_pitch": (-70.0, 65.0),
     "neck_yaw": (-50.0, 50.0),
     "shoulder_yaw": (-180.0, 180.0),
@@ -97,12 +107,15 @@ _LIMITS_DEG: dict[str, tuple[float, float]] = {
     "knee_flexion": (-10.0, 160.0),
 }
 
-DEGREES_OF_FREEDOM = 24
+DEGREES_OF_FREEDOM = 24  # of the paper's body
+WAIST = ("waist_roll", "waist_pitch", "waist_yaw")
+# Where the waist bends, as a share of the trunk's length above the hip centres: about L4, in the middle of what bends.
+WAIST_HEIGHT = 0.25
 
 
 @dataclass(frozen=True)
 class Skeleton:
-    """The kinematic tree as plain arrays (D = 24 degrees of freedom, S = 10 segments, J = 15 joints).
+    """The kinematic tree as plain arrays: D = 24 degrees of freedom (27 with a waist), S = 11 segments, J = 15 joints.
 
     Attributes:
         names: (D,) names of the degrees of freedom; translations first.
@@ -133,6 +146,11 @@ class Skeleton:
     joint_segment: NDArray[np.int32]
     joint_position: Float
     T_world_body: Float
+
+    @property
+    def is_waist(self) -> NDArray[np.bool_]:
+        """(D,) True for the waist's degrees of freedom, where there are any."""
+        return np.isin(self.names, WAIST)
 
     def index(self, name: str) -> int:
         """The position of a degree of freedom in p."""
@@ -246,6 +264,50 @@ def twist_exp(axis: Float, point: Float, angle: float) -> Float:
     return T
 
 
+def without_waist(skeleton: Skeleton, pose: Float) -> tuple[Float, Float]:
+    """A pose (27,) as (24,) of the paper's body, and the waist's angles (3,) in the order of :data:`WAIST`.
+
+    The hips' angles become those between thigh and trunk: all limbs, trunk and head keep their orientation; the legs
+    are moved by what the waist moves their sockets.
+    """
+    waist = skeleton.is_waist
+    return _turn_hips(skeleton, pose, _waist_rotation(skeleton, pose))[~waist], pose[waist]
+
+
+def with_waist(skeleton: Skeleton, pose: Float, waist: Float) -> Float:
+    """(27,) the inverse of :func:`without_waist`."""
+    whole = np.empty(len(skeleton.names))
+    whole[skeleton.is_waist] = waist
+    whole[~skeleton.is_waist] = pose
+    return _turn_hips(skeleton, whole, _waist_rotation(skeleton, whole).T)
+
+
+def _waist_rotation(skeleton: Skeleton, pose: Float) -> Float:
+    R = np.eye(3)
+    for k in np.flatnonzero(skeleton.is_waist):
+        R = R @ twist_exp(skeleton.axis[k], np.zeros(3), pose[k])[:3, :3]
+    return R
+
+
+def _turn_hips(skeleton: Skeleton, pose: Float, R: Float) -> Float:
+    """The pose whose hips' rotations have R (3, 3) before them."""
+    result = pose.copy()
+    B = skeleton.T_world_body
+    for side, spin in (("l", 1.0), ("r", -1.0)):
+        dofs = [skeleton.index(f"hip_{side}_{name}") for name in ("pitch", "yaw", "roll")]
+        hip = R
+        for k in dofs:
+            hip = hip @ twist_exp(skeleton.axis[k], np.zeros(3), pose[k])[:3, :3]
+        M = B.T @ hip @ B  # rotations about y, then spin x, then -spin z
+        angles = (
+            np.arctan2(M[0, 2], M[2, 2]),
+            -spin * np.arcsin(np.clip(M[1, 2], -1.0, 1.0)),
+            -spin * np.arctan2(M[1, 0], M[1, 1]),
+        )
+        result[dofs] = angles
+    return result
+
+
 def up_rotation(up: str) -> Float:
     """(3, 3) rotation of the body frame such that its z axis is the world axis ``up`` ("z", "-y", …)."""
     name = up.strip().lower()
@@ -260,8 +322,8 @@ def up_rotation(up: str) -> Float:
     return np.column_stack([x, np.cross(z, x), z])
 
 
-def build_skeleton(dimensions: BodyDimensions, up: str = "z") -> Skeleton:
-    """The 24-DOF skeleton with these dimensions, standing upright along ``up``."""
+def build_skeleton(dimensions: BodyDimensions, up: str = "z", waist: bool = False) -> Skeleton:
+    """The skeleton with these dimensions, standing upright along ``up``: 24 degrees of freedom, 27 with a waist."""
     d = dimensions
     B = up_rotation(up) if up != "z" else np.eye(3)
     x, y, z = np.eye(3)
@@ -283,12 +345,16 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z") -> Skeleton:
     for name, axis in (("torso_yaw", z), ("torso_roll", x), ("torso_pitch", y)):
         last = add(name, axis, pelvis, last)
     torso = last
+    lumbar = np.array([0.0, 0.0, WAIST_HEIGHT * d.trunk])
+    for name, axis in zip(WAIST, (x, -y, z), strict=True) if waist else ():
+        last = add(name, axis, lumbar, last)
+    hips = last
     last = add("neck_pitch", y, neck, torso)
     head = add("neck_yaw", x, neck, last)
-    segment_dof = {"torso": torso, "head": head}
+    segment_dof = {"torso": torso, "pelvis": hips, "head": head}
 
     joints: dict[str, tuple[str, Float]] = {
-        "pelvis": ("torso", pelvis),
+        "pelvis": ("pelvis", pelvis),
         "neck": ("torso", neck),
         "head_top": ("head", neck + d.head * z),
     }
@@ -311,11 +377,11 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z") -> Skeleton:
         spin = 1.0 if side == "l" else -1.0
         h = M @ hip
         knee = h - d.thigh * z
-        last = add(f"hip_{side}_pitch", y, h, torso)
+        last = add(f"hip_{side}_pitch", y, h, hips)
         last = add(f"hip_{side}_yaw", spin * x, h, last)
         segment_dof[f"thigh_{side}"] = add(f"hip_{side}_roll", -spin * z, h, last)
         segment_dof[f"calf_{side}"] = add(f"knee_{side}_flexion", y, knee, segment_dof[f"thigh_{side}"])
-        joints[f"hip_{side}"] = ("torso", h)
+        joints[f"hip_{side}"] = ("pelvis", h)
         joints[f"knee_{side}"] = (f"thigh_{side}", knee)
         joints[f"ankle_{side}"] = (f"calf_{side}", knee - d.calf * z)
 
