@@ -71,10 +71,16 @@ def assigned(term, poses, chosen=None):
     return term.assign(pictures(), poses, chosen), term.kernel(poses, chosen)
 
 
+def on_limbs(term, points):
+    """(B, K) whether each strip lies on a limb's tapered piece: hands and feet have no colour edges."""
+    return np.isin(term.strips.piece[points.strip], term.strips.limb_piece)
+
+
 def test_colour_edges_are_looked_for_in_the_views_with_the_fewest_hidden_points():
     poses = some_poses(6, seed=22)
-    entries, points = assigned(term_of(EDGES), poses)
-    limb = np.isin(points.segment, [SEGMENTS.index(s) for s in LIMBS])
+    term = term_of(EDGES)
+    entries, points = assigned(term, poses)
+    limb = on_limbs(term, points)
     hidden = np.sum((points.found != points.visible) & limb[:, None, :, None], axis=(2, 3))
     fewer = False
     for b in range(len(poses)):
@@ -104,7 +110,7 @@ def test_hidden_points_cost_and_pull_nowhere(hidden):
     for b in range(len(poses)):
         rows = entries[b][entries[b, :, a.STATE] != a.ABSENT]
         used = sorted({int(c) for c in rows[:, a.CAMERA]})
-        limb = np.isin(points.segment[b], [SEGMENTS.index(s) for s in LIMBS])
+        limb = on_limbs(term, points)[b]
         both_hidden = (points.found[b].any(axis=2) & ~points.visible[b].any(axis=2))[used][:, limb].sum()
         lost += both_hidden
         per_pair = rows[:, a.SCALE].max()

@@ -12,7 +12,7 @@ distance along the contour may count less (``share``): edges do not tell how far
 A hidden contour point, or one without an edge, is an entry that costs ρ = 1 and pulls nowhere (6.1.2).
 """
 
-from tk.kernels.kinematics import load_rotation, load_translation, point_velocity
+from tk.kernels.kinematics import load_rotation, load_translation, parent_of, velocity
 from tk.kernels.projection import project
 from tk.kernels.runtime import ti
 
@@ -53,11 +53,9 @@ def metric_product(entries: ti.template(), b: int, e: int, r):
 
 @ti.func
 def add_alignment(
-    prismatic: ti.template(),
-    parent: ti.template(),
-    frames: ti.template(),
-    twists: ti.template(),
-    direction: ti.template(),
+    tree: ti.template(),
+    frames: ti.template(),  # (C, D or more, 18) scratch
+    state: ti.template(),  # (2 B, D) poses, then directions
     cameras: ti.template(),
     entries: ti.template(),
     sums: ti.template(),
@@ -66,11 +64,11 @@ def add_alignment(
     e: int,
 ):
     """Add scale·ρ(e) of entry e, its gradient and its Gauss-Newton product to row c of the sums."""
-    state = ti.cast(entries[b, e, STATE], ti.i32)
+    kind = ti.cast(entries[b, e, STATE], ti.i32)
     scale = entries[b, e, SCALE]
-    if state == UNASSIGNABLE:
+    if kind == UNASSIGNABLE:
         sums[c, 0] = sums[c, 0] + scale
-    elif state == ASSIGNED:
+    elif kind == ASSIGNED:
         D = (sums.shape[1] - 1) // 2
         valid, r, xa, xb, Ja, Jb = image_residual(frames, c, cameras, entries, b, e)
         if valid == 0:
@@ -82,27 +80,26 @@ def add_alignment(
             sums[c, 0] = sums[c, 0] + scale * (1.0 - decay)
             weight = scale * decay / nu * inv_sigma2
             Jv = r * 0.0
+            toward = state.shape[0] // 2 + b
             k_last = ti.cast(entries[b, e, LAST_DOF], ti.i32)
             k = k_last
             while k >= 0:
-                J = Ja @ point_velocity(prismatic, twists, c, k, xa) + Jb @ point_velocity(prismatic, twists, c, k, xb)
+                J = Ja @ velocity(frames, c, k, xa) + Jb @ velocity(frames, c, k, xb)
                 sums[c, 1 + k] = sums[c, 1 + k] + weight * J.dot(Mr)
-                Jv += J * direction[b, k]
-                k = parent[k]
+                Jv += J * state[toward, k]
+                k = parent_of(tree, k)
             MJv = metric_product(entries, b, e, Jv)
             k = k_last
             while k >= 0:
-                J = Ja @ point_velocity(prismatic, twists, c, k, xa) + Jb @ point_velocity(prismatic, twists, c, k, xb)
+                J = Ja @ velocity(frames, c, k, xa) + Jb @ velocity(frames, c, k, xb)
                 sums[c, 1 + D + k] = sums[c, 1 + D + k] + weight * J.dot(MJv)
-                k = parent[k]
+                k = parent_of(tree, k)
 
 
 @ti.func
 def add_curvature(
-    prismatic: ti.template(),
-    parent: ti.template(),
+    tree: ti.template(),
     frames: ti.template(),
-    twists: ti.template(),
     cameras: ti.template(),
     entries: ti.template(),
     hessian: ti.template(),
@@ -119,13 +116,11 @@ def add_curvature(
             weight = entries[0, e, SCALE] * ti.max(decay, floor) / nu * inv_sigma2
             k = ti.cast(entries[0, e, LAST_DOF], ti.i32)
             while k >= 0:
-                J = Ja @ point_velocity(prismatic, twists, c, k, xa) + Jb @ point_velocity(prismatic, twists, c, k, xb)
+                J = Ja @ velocity(frames, c, k, xa) + Jb @ velocity(frames, c, k, xb)
                 MJ = weight * metric_product(entries, 0, e, J)
                 j = k
                 while j >= 0:
-                    Jj = Ja @ point_velocity(prismatic, twists, c, j, xa) + Jb @ point_velocity(
-                        prismatic, twists, c, j, xb
-                    )
+                    Jj = Ja @ velocity(frames, c, j, xa) + Jb @ velocity(frames, c, j, xb)
                     hessian[c, k, j] = hessian[c, k, j] + MJ.dot(Jj)
-                    j = parent[j]
-                k = parent[k]
+                    j = parent_of(tree, j)
+                k = parent_of(tree, k)

@@ -67,7 +67,8 @@ def nearest_voxel(
     voxels: ti.template(),  # (V, 6)
     fits: ti.template(),  # (V,)
     starts: ti.template(),
-    grid: ti.template(),  # (7,)
+    grid: ti.template(),  # (first + 7,)
+    first: ti.template(),  # where grid's numbers begin
     x,  # query point
     n,  # query normal
     patch: int,
@@ -77,9 +78,12 @@ def nearest_voxel(
     """Index of the nearest candidate within ``reach`` metres, or -1."""
     best = -1
     best_d2 = reach * reach
-    cell_m = grid[3]
-    cells = ti.Vector([ti.cast(grid[4 + a], ti.i32) for a in ti.static(range(3))])
-    local = ti.Vector([ti.cast(x[i], ti.f32) - grid[i] for i in ti.static(range(3))]) / cell_m
+    cell_m = ti.cast(grid[first + 3], ti.f32)
+    cells = ti.Vector([ti.cast(grid[first + 4 + a], ti.i32) for a in ti.static(range(3))])
+    origin = ti.Vector([ti.cast(grid[first + a], ti.f32) for a in ti.static(range(3))])
+    point = ti.Vector([ti.cast(x[a], ti.f32) for a in ti.static(range(3))])
+    normal = ti.Vector([ti.cast(n[a], ti.f32) for a in ti.static(range(3))])
+    local = (point - origin) / cell_m
     home = ti.cast(ti.floor(local), ti.i32)
     # distance from the query to the nearest wall of its own cell: ring r lies at least (r - 1)·cell + margin away
     inner = local - ti.cast(home, ti.f32)
@@ -90,31 +94,24 @@ def nearest_voxel(
         nearest_possible = (ring - 1) * cell_m + margin
         if ring > 0 and nearest_possible > 0 and nearest_possible * nearest_possible >= best_d2:
             break
-        i0, i1 = ti.max(home[0] - ring, 0), ti.min(home[0] + ring, cells[0] - 1)
-        j0, j1 = ti.max(home[1] - ring, 0), ti.min(home[1] + ring, cells[1] - 1)
-        for i in range(i0, i1 + 1):
-            for j in range(j0, j1 + 1):
-                on_side = ti.abs(i - home[0]) == ring or ti.abs(j - home[1]) == ring
-                step = ti.select(on_side or ring == 0, 1, 2 * ring)
-                k = home[2] - ring
-                while k <= home[2] + ring:
-                    if k >= 0 and k < cells[2]:
-                        cell = (i * cells[1] + j) * cells[2] + k
-                        for v in range(starts[cell], starts[cell + 1]):
+        low, high = home[2] - ring, home[2] + ring
+        for i in range(ti.max(home[0] - ring, 0), ti.min(home[0] + ring, cells[0] - 1) + 1):
+            for j in range(ti.max(home[1] - ring, 0), ti.min(home[1] + ring, cells[1] - 1) + 1):
+                # a column of cells is one run of voxels; of an inner column the ring has its two ends only
+                whole = ring == 0 or ti.abs(i - home[0]) == ring or ti.abs(j - home[1]) == ring
+                column = (i * cells[1] + j) * cells[2]
+                for run in range(ti.select(whole, 1, 2)):
+                    k0 = ti.max(ti.select(run == 0, low, high), 0)
+                    k1 = ti.min(ti.select(whole or run == 1, high, low), cells[2] - 1)
+                    if k0 <= k1:
+                        for v in range(starts[column + k0], starts[column + k1 + 1]):
                             if (fits[v] >> patch) & 1 == 1:
-                                d = ti.Vector([voxels[v, a] - ti.cast(x[a], ti.f32) for a in ti.static(range(3))])
-                                d2 = d.norm_sqr()
+                                d2 = (ti.Vector([voxels[v, a] for a in ti.static(range(3))]) - point).norm_sqr()
                                 if d2 < best_d2:
                                     m = ti.Vector([voxels[v, 3 + a] for a in ti.static(range(3))])
-                                    cosine = (
-                                        ti.cast(n[0], ti.f32) * m[0]
-                                        + ti.cast(n[1], ti.f32) * m[1]
-                                        + ti.cast(n[2], ti.f32) * m[2]
-                                    )
-                                    if cosine >= min_cosine or m.norm_sqr() == 0.0:
+                                    if normal.dot(m) >= min_cosine or m.norm_sqr() == 0.0:
                                         best_d2 = d2
                                         best = v
-                    k += step
         ring += 1
     return best
 
@@ -139,7 +136,7 @@ def _nearest_kernel(
         q = turn // spread
         x = ti.Vector([points[q, a] for a in ti.static(range(3))])
         n = ti.Vector([point_normals[q, a] for a in ti.static(range(3))])
-        found[q] = nearest_voxel(voxels, fits, starts, grid, x, n, patch[q], min_cosine, reach)
+        found[q] = nearest_voxel(voxels, fits, starts, grid, 0, x, n, patch[q], min_cosine, reach)
 
 
 def nearest(

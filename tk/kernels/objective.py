@@ -23,7 +23,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from tk.kernels.alignment import ENTRY_NUMBERS, add_alignment, add_curvature
-from tk.kernels.kinematics import forward, load_rotation, load_translation, load_vector3, point_velocity
+from tk.kernels.kinematics import (
+    JOINT_NUMBERS,
+    forward_tree,
+    load_rotation,
+    load_translation,
+    load_vector3,
+    pack_tree,
+    parent_of,
+    velocity,
+)
 from tk.kernels.linearisation import Linearisation, metric_of
 from tk.kernels.nearest import SurfaceIndex, nearest_voxel
 from tk.kernels.projection import CAMERA_NUMBERS
@@ -31,29 +40,72 @@ from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.superellipsoid import implicit, project
 
 # Points that one parallel task handles: few enough to share 310 points among threads, and a chain's 50 in one; many
-# enough that each task's own forward kinematics (some µs) stays in the noise.
+# enough that each task's own forward kinematics (some µs) stays in the noise. An entry of the alignment term, of which
+# many are absent, counts a quarter.
 POINTS_PER_TASK = 52
+ENTRIES_PER_POINT = 4
 
-
-# Columns of the packed arrays. Every array that a launch is handed costs about 7 µs, so the body comes in few.
-SAMPLE_NORMAL, SAMPLE_DOF, SAMPLE_PATCH, SAMPLE_WEIGHT, SAMPLE_BARRED = (
-    3,
-    6,
-    7,
-    8,
-    9,
-)  # after the position; weight is 1/σ²
+# Columns of the packed arrays. Every array that a launch is handed costs about 6 µs, so the body comes in few.
+# Of a sample, after its position; the weight is 1/σ²:
+SAMPLE_NORMAL, SAMPLE_DOF, SAMPLE_PATCH, SAMPLE_WEIGHT, SAMPLE_BARRED = 3, 6, 7, 8, 9
+# Of a piece, after the 3×4 frame: a1 a2 a3 ε1 ε2 z_lower z_upper, and so on. Its colour patches, a bit mask of 63, are
+# in three numbers of 21 bits, which a float32 holds.
+PIECE_SHAPE, PIECE_DOF, PIECE_WEIGHT, PIECE_PART, PIECE_PATCHES, PIECE_NUMBERS = 12, 19, 20, 21, 22, 25
+PATCH_BITS = 21
+# Of the scratch's rows after the joints, one a piece: after the 3×4 frame in the world the bounding sphere.
+SPHERE, SPHERE_RADIUS = 12, 15
 # Deep inside: G (1 on the surface, growing linearly from the centre) below this.
 BURIED = 0.8
-PIECE_SHAPE, PIECE_DOF, PIECE_WEIGHT, PIECE_PART = 12, 19, 20, 21  # after the 3×4 frame: a1 a2 a3 ε1 ε2 z_lower z_upper
+# Places in the packed settings; what grid (tk.kernels.nearest) follows.
+NU, TANGENTIAL, MIN_COSINE, REACH, COVERAGE_NU, COVERAGE_COSINE, COVERAGE_REACH, SCALE, COVERAGE_SCALE, GRID = range(10)
+
+
+@ti.func
+def _place_pieces(
+    scratch: ti.template(),  # (C, D + P, 18), joints placed
+    c: int,
+    D: int,
+    pieces: ti.template(),  # (P, 25)
+):
+    """Fill the scratch's rows of the pieces: frames in the world, bounding spheres."""
+    for i in range(pieces.shape[0]):
+        k = ti.cast(pieces[i, PIECE_DOF], ti.i32)
+        R, t = load_rotation(scratch, c, k), load_translation(scratch, c, k)
+        Rp = ti.Matrix([[pieces[i, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
+        tp = ti.Vector([pieces[i, 4 * a + 3] for a in ti.static(range(3))])
+        R_world, t_world = R @ Rp, R @ tp + t
+        low, high = pieces[i, PIECE_SHAPE + 5], pieces[i, PIECE_SHAPE + 6]
+        half = 0.5 * (high - low)
+        for a in ti.static(range(3)):
+            for b in ti.static(range(3)):
+                scratch[c, D + i, 4 * a + b] = R_world[a, b]
+            scratch[c, D + i, 4 * a + 3] = t_world[a]
+            scratch[c, D + i, SPHERE + a] = t_world[a] + 0.5 * (low + high) * R_world[a, 2]
+        a1, a2 = pieces[i, PIECE_SHAPE], pieces[i, PIECE_SHAPE + 1]
+        scratch[c, D + i, SPHERE_RADIUS] = ti.sqrt(a1 * a1 + a2 * a2 + half * half)
+
+
+@ti.func
+def _sphere(scratch: ti.template(), c: int, row: int):
+    return ti.Vector([scratch[c, row, SPHERE + a] for a in ti.static(range(3))])
+
+
+@ti.func
+def _has_patch(pieces: ti.template(), i: int, fits: ti.i64):
+    """Whether piece i has any of the patches of a bit mask."""
+    common = 0
+    for part in ti.static(range(3)):
+        patches = ti.cast(pieces[i, PIECE_PATCHES + part], ti.i32)
+        common |= patches & ti.cast((fits >> (PATCH_BITS * part)) & ((1 << PATCH_BITS) - 1), ti.i32)
+    return common != 0
 
 
 @ti.func
 def _nearest_piece(
-    frames: ti.template(),
+    scratch: ti.template(),  # (C, D + P, 18), joints and pieces placed
     c: int,
-    pieces: ti.template(),  # (P, 22)
-    patches: ti.template(),  # (P,) bit mask of each piece's colour patches
+    D: int,
+    pieces: ti.template(),  # (P, 25)
     fits: ti.i64,  # the voxel's
     y,  # voxel, world
     y_normal,
@@ -63,20 +115,22 @@ def _nearest_piece(
     """(index or -1, x, y, z of the projection in the zero configuration) of the piece nearest to a voxel."""
     best = -1
     best_d = reach
-    best_x = y * 0.0
-    # the voxel in the zero configuration; pieces of one segment follow each other and share it
-    segment = -1
-    local, local_normal = y, y_normal
+    best_on = y * 0.0
+    # the piece that the voxel is deepest in or least outside of, by its bounding sphere, bounds the others' distances
+    likely = 0
+    least = y[0] * 0.0 + 1e30
     for i in range(pieces.shape[0]):
-        k = ti.cast(pieces[i, PIECE_DOF], ti.i32)
-        if k != segment:
-            R = load_rotation(frames, c, k)
-            local = R.transpose() @ (y - load_translation(frames, c, k))
-            local_normal = R.transpose() @ y_normal
-            segment = k
-        Rp = ti.Matrix([[pieces[i, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
-        tp = ti.Vector([pieces[i, 4 * a + 3] for a in ti.static(range(3))])
-        q = Rp.transpose() @ (local - tp)
+        radius = scratch[c, D + i, SPHERE_RADIUS]
+        power = (y - _sphere(scratch, c, D + i)).norm_sqr() - radius * radius
+        if power < least:
+            least, likely = power, i
+    for turn in range(pieces.shape[0] + 1):
+        i = ti.select(turn == 0, likely, turn - 1)
+        within = best_d + scratch[c, D + i, SPHERE_RADIUS]
+        if turn > 0 and (i == likely or (y - _sphere(scratch, c, D + i)).norm_sqr() >= within * within):
+            continue
+        R = load_rotation(scratch, c, D + i)
+        q = R.transpose() @ (y - load_translation(scratch, c, D + i))
         radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
         z_lower, z_upper = pieces[i, PIECE_SHAPE + 5], pieces[i, PIECE_SHAPE + 6]
         # a box about the piece: what lies further outside it than the best so far cannot win
@@ -87,25 +141,29 @@ def _nearest_piece(
                 ti.max(ti.max(z_lower - q[2], q[2] - z_upper), 0.0),
             ]
         )
-        if over.norm_sqr() < best_d * best_d and (fits & patches[i]) != 0:
+        if over.norm_sqr() < best_d * best_d and _has_patch(pieces, i, fits):
             s = project(q, radii, pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4], z_lower, z_upper)
             on = ti.Vector([s[0], s[1], s[2]])
             d = (q - on).norm()
-            if d < best_d:
-                n = Rp @ ti.Vector([s[3], s[4], s[5]])
-                if n.dot(local_normal) >= min_cosine or y_normal.norm_sqr() == 0.0:
+            # of two pieces as near as each other the first, in whatever order they are visited
+            if d < best_d or (d == best_d and i < best):
+                n = R @ ti.Vector([s[3], s[4], s[5]])
+                if n.dot(y_normal) >= min_cosine or y_normal.norm_sqr() == 0.0:
                     best = i
                     best_d = d
-                    best_x = Rp @ on + tp
+                    best_on = on
+    best_x = best_on
+    if best >= 0:
+        Rp = ti.Matrix([[pieces[best, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
+        best_x = Rp @ best_on + ti.Vector([pieces[best, 4 * a + 3] for a in ti.static(range(3))])
     return best, best_x
 
 
 @ti.func
 def _add_residual(
-    prismatic: ti.template(),
-    parent: ti.template(),
-    twists: ti.template(),
-    direction: ti.template(),
+    tree: ti.template(),
+    scratch: ti.template(),
+    state: ti.template(),
     sums: ti.template(),
     b: int,
     c: int,
@@ -126,46 +184,48 @@ def _add_residual(
     sums[c, 0] = sums[c, 0] + scale * (1.0 - decay)
     weight = scale * decay / nu * inv_sigma2
     Jv = x * 0.0
+    toward = state.shape[0] // 2 + b
     k = k_last
     while k >= 0:
-        J = point_velocity(prismatic, twists, c, k, x)
+        J = velocity(scratch, c, k, x)
         sums[c, 1 + k] = sums[c, 1 + k] + weight * J.dot(Mr)
-        Jv += J * direction[b, k]
-        k = parent[k]
+        Jv += J * state[toward, k]
+        k = parent_of(tree, k)
     MJv = share * Jv + (1.0 - share) * y_normal.dot(Jv) * y_normal
     k = k_last
     while k >= 0:
-        sums[c, 1 + D + k] = sums[c, 1 + D + k] + weight * point_velocity(prismatic, twists, c, k, x).dot(MJv)
-        k = parent[k]
+        sums[c, 1 + D + k] = sums[c, 1 + D + k] + weight * velocity(scratch, c, k, x).dot(MJv)
+        k = parent_of(tree, k)
 
 
 @ti.func
 def _is_buried(
-    frames: ti.template(),
+    scratch: ti.template(),  # (C, D + P, 18), joints and pieces placed
     c: int,
-    pieces: ti.template(),  # (P, 22)
+    D: int,
+    pieces: ti.template(),  # (P, 25)
     barred: int,
     x,
 ):
     """Whether a world point lies deep inside a piece of one of the parts of the bit mask ``barred``."""
     buried = False
-    # pieces of one segment follow each other and share the point in the zero configuration
-    segment = -1
-    local = x
-    for i in range(pieces.shape[0]):
-        if barred >> ti.cast(pieces[i, PIECE_PART], ti.i32) & 1 == 0:
-            continue
-        k = ti.cast(pieces[i, PIECE_DOF], ti.i32)
-        if k != segment:
-            local = load_rotation(frames, c, k).transpose() @ (x - load_translation(frames, c, k))
-            segment = k
-        Rp = ti.Matrix([[pieces[i, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
-        tp = ti.Vector([pieces[i, 4 * a + 3] for a in ti.static(range(3))])
-        q = Rp.transpose() @ (local - tp)
-        if q[2] > pieces[i, PIECE_SHAPE + 5] and q[2] < pieces[i, PIECE_SHAPE + 6]:
+    i = 0
+    while not buried and i < pieces.shape[0]:
+        radius = scratch[c, D + i, SPHERE_RADIUS]
+        if (
+            barred >> ti.cast(pieces[i, PIECE_PART], ti.i32) & 1 == 1
+            and (x - _sphere(scratch, c, D + i)).norm_sqr() < radius * radius
+        ):
+            q = load_rotation(scratch, c, D + i).transpose() @ (x - load_translation(scratch, c, D + i))
             radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
-            if implicit(q, radii, pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4])[0] < BURIED:
-                buried = True
+            # G is at least the greatest of |q| / a
+            if (
+                q[2] > pieces[i, PIECE_SHAPE + 5]
+                and q[2] < pieces[i, PIECE_SHAPE + 6]
+                and ti.abs(q / radii).max() < BURIED
+            ):
+                buried = implicit(q, radii, pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4])[0] < BURIED
+        i += 1
     return buried
 
 
@@ -176,30 +236,31 @@ def _pair_sample(
     voxels: ti.template(),
     fits: ti.template(),
     starts: ti.template(),
-    grid: ti.template(),
     settings: ti.template(),
-    frames: ti.template(),
+    scratch: ti.template(),
     c: int,
+    D: int,
     n: int,
 ):
     """The voxel of surface sample n, or -1."""
     k = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
-    R = load_rotation(frames, c, k)
-    x = R @ load_vector3(samples, n) + load_translation(frames, c, k)
+    R = load_rotation(scratch, c, k)
+    x = R @ load_vector3(samples, n) + load_translation(scratch, c, k)
     v = -1
     barred = ti.cast(samples[n, SAMPLE_BARRED], ti.i32)
-    if barred == 0 or not _is_buried(frames, c, pieces, barred, x):
+    if barred == 0 or not _is_buried(scratch, c, D, pieces, barred, x):
         normal = ti.Vector([samples[n, SAMPLE_NORMAL + a] for a in ti.static(range(3))])
         v = nearest_voxel(
             voxels,
             fits,
             starts,
-            grid,
+            settings,
+            GRID,
             x,
             R @ normal,
             ti.cast(samples[n, SAMPLE_PATCH], ti.i32),
-            ti.cast(settings[2], ti.f32),
-            ti.cast(settings[3], ti.f32),
+            ti.cast(settings[MIN_COSINE], ti.f32),
+            ti.cast(settings[REACH], ti.f32),
         )
     return v
 
@@ -208,76 +269,74 @@ def _pair_sample(
 def _objective_kernel(real):
     @ti.kernel
     def objective(
-        axis: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
-        point: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
-        prismatic: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
-        parent: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
+        tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
         samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 10)
-        pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 22)
-        patches: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (P,)
+        pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 25)
+        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
         voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 6)
         fits: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (V,)
         starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        grid: ti.types.ndarray(dtype=ti.f32, ndim=1),  # (7,)
-        settings: ti.types.ndarray(dtype=real, ndim=1),  # (9,)
+        settings: ti.types.ndarray(dtype=real, ndim=1),  # (16,)
         spread: ti.i32,
         hold: ti.i32,
         M: ti.i32,
         Q: ti.i32,
+        E: ti.i32,
         chosen: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, M + Q) samples, then voxels of the coverage term
-        pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
-        direction: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
-        frames: ti.types.ndarray(dtype=real, ndim=3),  # (C, D, 12) scratch
-        twists: ti.types.ndarray(dtype=real, ndim=3),  # (C, D, 6) scratch
+        entries: ti.types.ndarray(dtype=real, ndim=3),  # (B, E, 17) of the alignment term
+        state: ti.types.ndarray(dtype=real, ndim=2),  # (2 B, D) poses, then directions
+        scratch: ti.types.ndarray(dtype=real, ndim=3),  # (C, D + P, 18)
         assigned: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, M) out, in when hold = 1
         covering: ti.types.ndarray(dtype=real, ndim=3),  # (B, Q, 4) piece and projection, out, in when hold = 1
-        E: ti.i32,
-        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
-        entries: ti.types.ndarray(dtype=real, ndim=3),  # (B, E, 17) of the alignment term
         sums: ti.types.ndarray(dtype=real, ndim=2),  # (C, 1 + 2 D) out
     ):
-        for turn in range(spread * (sums.shape[0])):
+        for turn in range(spread * sums.shape[0]):
             if turn % spread != 0:
                 continue
             c = turn // spread
-            tasks = sums.shape[0] // pose.shape[0]
-            b = c // tasks
+            D = tree.shape[0]
+            tasks = sums.shape[0] // (state.shape[0] // 2)
+            b, part = c // tasks, c % tasks
             for s in range(sums.shape[1]):
                 sums[c, s] = 0.0
-            forward(axis, point, prismatic, parent, pose, b, c, frames, twists)
-            first = (c % tasks) * POINTS_PER_TASK
-            last = ti.min(first + POINTS_PER_TASK, M + Q + E)
-            for e in range(ti.max(first - M - Q, 0), last - M - Q):
-                add_alignment(prismatic, parent, frames, twists, direction, cameras, entries, sums, b, c, e)
-            for m in range(first, ti.min(last, M + Q)):
+            forward_tree(tree, state, b, c, scratch)
+            if hold == 0:
+                _place_pieces(scratch, c, D, pieces)
+            for e in range(E * part // tasks, E * (part + 1) // tasks):
+                add_alignment(tree, scratch, state, cameras, entries, sums, b, c, e)
+            for m in range((M + Q) * part // tasks, (M + Q) * (part + 1) // tasks):
                 v = -1
                 k = 0
                 x0 = ti.Vector([settings[0] * 0.0, settings[0] * 0.0, settings[0] * 0.0])
-                inv_sigma2, nu, share, scale = x0[0], settings[0], settings[1], settings[7]
+                inv_sigma2, nu, share, scale = x0[0], settings[NU], settings[TANGENTIAL], settings[SCALE]
                 if m < M:
                     n = chosen[b, m]
-                    v = assigned[b, m]
                     if hold == 0:
-                        v = _pair_sample(samples, pieces, voxels, fits, starts, grid, settings, frames, c, n)
+                        v = _pair_sample(samples, pieces, voxels, fits, starts, settings, scratch, c, D, n)
                         assigned[b, m] = v
+                    else:
+                        v = assigned[b, m]
                     k = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
                     x0 = load_vector3(samples, n)
                     inv_sigma2 = samples[n, SAMPLE_WEIGHT]
                 else:
-                    scale, nu, share = settings[8], settings[4], x0[0] + 1.0
+                    scale, nu, share = settings[COVERAGE_SCALE], settings[COVERAGE_NU], x0[0] + 1.0
                     q = m - M
                     v = chosen[b, m]
-                    i = ti.cast(covering[b, q, 0], ti.i32)
-                    x0 = ti.Vector([covering[b, q, 1 + a] for a in ti.static(range(3))])
+                    i = -1
                     if hold == 0:
                         y = ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
                         y_normal = ti.Vector([ti.cast(voxels[v, 3 + a], real) for a in ti.static(range(3))])
                         i, x0 = _nearest_piece(
-                            frames, c, pieces, patches, fits[v], y, y_normal, settings[5], settings[6]
-                        )
+                            scratch, c, D, pieces, fits[v], y, y_normal,
+                            settings[COVERAGE_COSINE], settings[COVERAGE_REACH],
+                        )  # fmt: skip
                         covering[b, q, 0] = ti.cast(i, real)
                         for a in ti.static(range(3)):
                             covering[b, q, 1 + a] = x0[a]
+                    else:
+                        i = ti.cast(covering[b, q, 0], ti.i32)
+                        x0 = ti.Vector([covering[b, q, 1 + a] for a in ti.static(range(3))])
                     if i < 0:
                         v = -1
                     else:
@@ -288,13 +347,10 @@ def _objective_kernel(real):
                 else:
                     y = ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
                     y_normal = ti.Vector([ti.cast(voxels[v, 3 + a], real) for a in ti.static(range(3))])
-                    x = load_rotation(frames, c, k) @ x0 + load_translation(frames, c, k)
+                    x = load_rotation(scratch, c, k) @ x0 + load_translation(scratch, c, k)
                     if y_normal.norm_sqr() == 0.0:
                         share = share * 0.0 + 1.0
-                    _add_residual(
-                        prismatic, parent, twists, direction, sums, b, c, k, x, x - y, y_normal, share,
-                        inv_sigma2, nu, scale,
-                    )  # fmt: skip
+                    _add_residual(tree, scratch, state, sums, b, c, k, x, x - y, y_normal, share, inv_sigma2, nu, scale)
 
     return objective
 
@@ -307,46 +363,41 @@ PAIRS_PER_TASK = 128
 def _linearise_kernel(real):
     @ti.kernel
     def linearise(
-        axis: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
-        point: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
-        prismatic: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
-        parent: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
+        tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
         samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 10)
-        pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 22)
+        pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 25)
+        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
         voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 6)
-        settings: ti.types.ndarray(dtype=real, ndim=1),  # (9,)
+        settings: ti.types.ndarray(dtype=real, ndim=1),  # (16,)
         spread: ti.i32,
         floor: real,
         want_jacobian: ti.i32,
         M: ti.i32,
         Q: ti.i32,
+        E: ti.i32,
         chosen: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M + Q,)
+        entries: ti.types.ndarray(dtype=real, ndim=3),  # (1, E, 17)
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (1, D)
-        frames: ti.types.ndarray(dtype=real, ndim=3),  # (C, D, 12) scratch
-        twists: ti.types.ndarray(dtype=real, ndim=3),  # (C, D, 6) scratch
+        scratch: ti.types.ndarray(dtype=real, ndim=3),  # (C, D or more, 18)
         assigned: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M,)
         covering: ti.types.ndarray(dtype=real, ndim=2),  # (Q, 4)
-        E: ti.i32,
-        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
-        entries: ti.types.ndarray(dtype=real, ndim=3),  # (1, E, 17)
-        residual: ti.types.ndarray(dtype=real, ndim=2),  # (M + Q, 3) out, metres
-        partner: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M + Q,) out, the voxel or -1
+        residual: ti.types.ndarray(dtype=real, ndim=2),  # (M + Q, 4) out, metres, and the voxel or -1
         jacobian: ti.types.ndarray(dtype=real, ndim=3),  # (M + Q, D, 3) out if wanted, zeroed by the caller
         hessian: ti.types.ndarray(dtype=real, ndim=3),  # (C, D, D) out, zeroed by the caller; the lower triangle
     ):
-        for turn in range(spread * (hessian.shape[0])):
+        for turn in range(spread * hessian.shape[0]):
             if turn % spread != 0:
                 continue
             c = turn // spread
-            forward(axis, point, prismatic, parent, pose, 0, c, frames, twists)
-            last = ti.min((c + 1) * PAIRS_PER_TASK, M + Q + E)
-            for e in range(ti.max(c * PAIRS_PER_TASK - M - Q, 0), last - M - Q):
-                add_curvature(prismatic, parent, frames, twists, cameras, entries, hessian, c, e, floor)
-            for m in range(c * PAIRS_PER_TASK, ti.min(last, M + Q)):
+            tasks = hessian.shape[0]
+            forward_tree(tree, pose, 0, c, scratch)
+            for e in range(E * c // tasks, E * (c + 1) // tasks):
+                add_curvature(tree, scratch, cameras, entries, hessian, c, e, floor)
+            for m in range((M + Q) * c // tasks, (M + Q) * (c + 1) // tasks):
                 k_last = 0
                 v = -1
                 x0 = ti.Vector([pose[0, 0] * 0.0, pose[0, 0] * 0.0, pose[0, 0] * 0.0])
-                inv_sigma2, nu, scale, share = x0[0], settings[0], settings[7], settings[1]
+                inv_sigma2, nu, scale, share = x0[0], settings[NU], settings[SCALE], settings[TANGENTIAL]
                 if m < M:
                     n = chosen[m]
                     k_last = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
@@ -359,10 +410,10 @@ def _linearise_kernel(real):
                         k_last = ti.cast(pieces[i, PIECE_DOF], ti.i32)
                         v = chosen[m]
                         x0 = ti.Vector([covering[m - M, 1 + a] for a in ti.static(range(3))])
-                        nu, scale = settings[4], settings[8]
+                        nu, scale = settings[COVERAGE_NU], settings[COVERAGE_SCALE]
                         inv_sigma2 = pieces[i, PIECE_WEIGHT]
-                partner[m] = v
-                x = load_rotation(frames, c, k_last) @ x0 + load_translation(frames, c, k_last)
+                residual[m, 3] = ti.cast(v, real)
+                x = load_rotation(scratch, c, k_last) @ x0 + load_translation(scratch, c, k_last)
                 for a in ti.static(range(3)):
                     residual[m, a] = 0.0
                 if v >= 0:
@@ -377,16 +428,16 @@ def _linearise_kernel(real):
                     weight = scale * inv_sigma2 / nu * ti.max(decay, floor)
                     k = k_last
                     while k >= 0:
-                        J = point_velocity(prismatic, twists, c, k, x)
+                        J = velocity(scratch, c, k, x)
                         if want_jacobian == 1:
                             for a in ti.static(range(3)):
                                 jacobian[m, k, a] = J[a]
                         MJ = weight * (share * J + (1.0 - share) * y_normal.dot(J) * y_normal)
                         j = k
                         while j >= 0:
-                            hessian[c, k, j] = hessian[c, k, j] + MJ.dot(point_velocity(prismatic, twists, c, j, x))
-                            j = parent[j]
-                        k = parent[k]
+                            hessian[c, k, j] = hessian[c, k, j] + MJ.dot(velocity(scratch, c, j, x))
+                            j = parent_of(tree, j)
+                        k = parent_of(tree, k)
 
     return linearise
 
@@ -475,40 +526,40 @@ class ObjectiveKernel:
         def real(array: np.ndarray) -> np.ndarray:
             return np.ascontiguousarray(array, dtype)
 
-        def whole(array: np.ndarray) -> np.ndarray:
-            return np.ascontiguousarray(array, np.int32)
-
+        self._tree = real(pack_tree(axis, point, prismatic, parent))
         weight = 1.0 / np.asarray(sigma, np.float64) ** 2
         piece_weight = 1.0 / np.asarray(piece_sigma, np.float64) ** 2
         self._weights = weight, piece_weight
-        self._tree = real(axis), real(point), whole(prismatic), whole(parent)
-        bars = np.zeros(len(local)) if barred is None else barred
-        parts = np.zeros(len(piece_dof)) if piece_part is None else piece_part
-        self._samples = real(np.column_stack([local, normal, last_dof, patch, weight, bars]))
-        self._pieces = real(
-            np.column_stack([np.reshape(piece_frame, (-1, 12)), piece_shape, piece_dof, piece_weight, parts])
-        )
-        every = np.full(len(piece_dof), -1, np.int64)
-        self._patches = every if piece_patches is None else np.ascontiguousarray(piece_patches, np.int64)
+        if barred is None:
+            barred = np.zeros(len(local), np.int32)
+        if piece_part is None:
+            piece_part = np.zeros(len(piece_dof), np.int32)
+        if piece_patches is None:
+            piece_patches = np.full(len(piece_dof), 2**63 - 1, np.int64)
+        patches = [piece_patches >> PATCH_BITS * part & (1 << PATCH_BITS) - 1 for part in range(3)]
+        self._samples = real(np.column_stack([local, normal, last_dof, patch, weight, barred]))
+        frame = np.reshape(piece_frame, (-1, 12))
+        self._pieces = real(np.column_stack([frame, piece_shape, piece_dof, piece_weight, piece_part, *patches]))
         self._cameras = real(np.zeros((1, CAMERA_NUMBERS)) if cameras is None else cameras)
         self._no_entries: np.ndarray = np.zeros((1, 1, ENTRY_NUMBERS), dtype)
-        self._scratch: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._scratch: dict[int, np.ndarray] = {}
 
-    def _scratch_of(self, rows: int) -> tuple[np.ndarray, np.ndarray]:
-        if rows not in self._scratch:
-            D = self.degrees
-            self._scratch[rows] = np.empty((rows, D, 12), self.dtype), np.empty((rows, D, 6), self.dtype)
-        return self._scratch[rows]
+    def _scratch_of(self, tasks: int) -> np.ndarray:
+        """(T, D + P, 18) joints and pieces of T tasks; kept."""
+        if tasks not in self._scratch:
+            self._scratch[tasks] = np.empty((tasks, self.degrees + len(self._pieces), JOINT_NUMBERS), self.dtype)
+        return self._scratch[tasks]
 
     def _entries(self, entries: np.ndarray | None) -> np.ndarray:
         return (
             self._no_entries if entries is None or not entries.shape[1] else np.ascontiguousarray(entries, self.dtype)
         )
 
-    def _packed(self, s: ObjectiveSettings, M: int, Q: int) -> np.ndarray:
+    def _packed(self, s: ObjectiveSettings, M: int, Q: int, index: SurfaceIndex) -> np.ndarray:
         """The settings in the order in which the kernels read them."""
         values = [s.nu, s.tangential, s.min_cosine, s.reach_m, s.coverage_nu, s.coverage_cosine, s.coverage_reach_m]
-        return np.array([*values, s.surface_weight / max(M, 1), s.coverage_weight / max(Q, 1)], self.dtype)
+        shares = [s.surface_weight / max(M, 1), s.coverage_weight / max(Q, 1)]
+        return np.array([*values, *shares, *index.grid.tolist()], self.dtype)
 
     def evaluate(
         self,
@@ -540,35 +591,36 @@ class ObjectiveKernel:
         E = 0 if entries is None else entries.shape[1]
         B, D = pose.shape
         M, Q = chosen.shape[1], voxels.shape[1] if settings.coverage_weight > 0 else 0
-        tasks = -(-(M + Q + E) // POINTS_PER_TASK)
+        tasks = max(-(-(M + Q + E // ENTRIES_PER_POINT) // POINTS_PER_TASK), 1)
         sums = np.empty((B * tasks, 1 + 2 * D), self.dtype)
+        state: np.ndarray = np.zeros((2 * B, D), self.dtype)
+        state[:B] = pose
+        if direction is not None:
+            state[B:] = direction
         if held is None:
             found = Held(np.empty((B, M), np.int32), np.empty((B, max(Q, 1), 4), self.dtype))
         else:
             found = Held(np.array(held.assigned, np.int32), np.array(held.covering, self.dtype))
         self._kernel(
-            *self._tree,
+            self._tree,
             self._samples,
             self._pieces,
-            self._patches,
+            self._cameras,
             index.voxels,
             index.fits,
             index.starts,
-            index.grid,
-            self._packed(settings, M, Q),
+            self._packed(settings, M, Q, index),
             spread_of(len(sums)),
             int(held is not None),
             M,
             Q,
+            E,
             np.ascontiguousarray(np.concatenate([chosen, voxels[:, :Q]], axis=1), np.int32),
-            np.ascontiguousarray(pose, self.dtype),
-            np.zeros((B, D), self.dtype) if direction is None else np.ascontiguousarray(direction, self.dtype),
-            *self._scratch_of(B * tasks),
+            self._entries(entries),
+            state,
+            self._scratch_of(B * tasks),
             found.assigned,
             found.covering,
-            E,
-            self._cameras,
-            self._entries(entries),
             sums,
         )
         self.launches += 1
@@ -600,41 +652,40 @@ class ObjectiveKernel:
         """
         E = 0 if entries is None else entries.shape[1]
         M, Q = len(chosen), len(voxels) if settings.coverage_weight > 0 else 0
-        tasks = max(-(-(M + Q + E) // PAIRS_PER_TASK), 1)
+        tasks = max(-(-(M + Q + E // ENTRIES_PER_POINT) // PAIRS_PER_TASK), 1)
         D = self.degrees
-        residual: np.ndarray = np.zeros((M + Q, 3), self.dtype)
+        found: np.ndarray = np.empty((M + Q, 4), self.dtype)
         jacobian: np.ndarray = np.zeros((M + Q if with_jacobian else 1, D, 3), self.dtype)
         hessian: np.ndarray = np.zeros((tasks, D, D), self.dtype)
-        partner = np.empty(M + Q, np.int32)
         _linearise_kernel(ti.f64 if self.dtype == np.float64 else ti.f32)(
-            *self._tree,
+            self._tree,
             self._samples,
             self._pieces,
+            self._cameras,
             index.voxels,
-            self._packed(settings, M, Q),
+            self._packed(settings, M, Q, index),
             spread_of(tasks),
             floor,
             int(with_jacobian),
             M,
             Q,
+            E,
             np.ascontiguousarray(np.concatenate([chosen, voxels[:Q]]), np.int32),
+            self._entries(entries),
             np.ascontiguousarray(pose[None], self.dtype),
-            *self._scratch_of(tasks),
+            self._scratch_of(tasks),
             np.ascontiguousarray(held.assigned[0], np.int32),
             np.ascontiguousarray(held.covering[0], self.dtype),
-            E,
-            self._cameras,
-            self._entries(entries),
-            residual,
-            partner,
+            found,
             jacobian,
             hessian,
         )
         self.launches += 1
         lower = hessian.sum(axis=0, dtype=np.float64)
         weight, piece_weight = self._weights
+        partner = found[:, 3].astype(np.int32)
         return Linearisation(
-            residual=residual.astype(np.float64),
+            residual=found[:, :3].astype(np.float64),
             jacobian=jacobian.transpose(0, 2, 1).astype(np.float64),
             hessian=lower + np.tril(lower, -1).T,
             metric=metric_of(index.normals[partner], np.repeat([settings.tangential, 1.0], [M, Q])),
