@@ -33,6 +33,7 @@ from tk.kernels.kinematics import (
     parent_of,
     velocity,
 )
+from tk.kernels.launch import Launcher
 from tk.kernels.linearisation import Linearisation, metric_of
 from tk.kernels.nearest import SurfaceIndex, nearest_voxel
 from tk.kernels.projection import CAMERA_NUMBERS
@@ -521,12 +522,11 @@ class ObjectiveKernel:
         self.dtype = dtype
         self.degrees = len(axis)
         self.launches = 0
-        self._kernel = _objective_kernel(ti.f64 if dtype == np.float64 else ti.f32)
 
         def real(array: np.ndarray) -> np.ndarray:
             return np.ascontiguousarray(array, dtype)
 
-        self._tree = real(pack_tree(axis, point, prismatic, parent))
+        tree = real(pack_tree(axis, point, prismatic, parent))
         weight = 1.0 / np.asarray(sigma, np.float64) ** 2
         piece_weight = 1.0 / np.asarray(piece_sigma, np.float64) ** 2
         self._weights = weight, piece_weight
@@ -537,10 +537,14 @@ class ObjectiveKernel:
         if piece_patches is None:
             piece_patches = np.full(len(piece_dof), 2**63 - 1, np.int64)
         patches = [piece_patches >> PATCH_BITS * part & (1 << PATCH_BITS) - 1 for part in range(3)]
-        self._samples = real(np.column_stack([local, normal, last_dof, patch, weight, barred]))
+        samples = real(np.column_stack([local, normal, last_dof, patch, weight, barred]))
         frame = np.reshape(piece_frame, (-1, 12))
         self._pieces = real(np.column_stack([frame, piece_shape, piece_dof, piece_weight, piece_part, *patches]))
-        self._cameras = real(np.zeros((1, CAMERA_NUMBERS)) if cameras is None else cameras)
+        packed_cameras = real(np.zeros((1, CAMERA_NUMBERS)) if cameras is None else cameras)
+        precision = ti.f64 if dtype == np.float64 else ti.f32
+        constants = tree, samples, self._pieces, packed_cameras
+        self._kernel = Launcher(_objective_kernel(precision), *constants)
+        self._linearise = Launcher(_linearise_kernel(precision), *constants)
         self._no_entries: np.ndarray = np.zeros((1, 1, ENTRY_NUMBERS), dtype)
         self._scratch: dict[int, np.ndarray] = {}
 
@@ -602,10 +606,6 @@ class ObjectiveKernel:
         else:
             found = Held(np.array(held.assigned, np.int32), np.array(held.covering, self.dtype))
         self._kernel(
-            self._tree,
-            self._samples,
-            self._pieces,
-            self._cameras,
             index.voxels,
             index.fits,
             index.starts,
@@ -657,11 +657,7 @@ class ObjectiveKernel:
         found: np.ndarray = np.empty((M + Q, 4), self.dtype)
         jacobian: np.ndarray = np.zeros((M + Q if with_jacobian else 1, D, 3), self.dtype)
         hessian: np.ndarray = np.zeros((tasks, D, D), self.dtype)
-        _linearise_kernel(ti.f64 if self.dtype == np.float64 else ti.f32)(
-            self._tree,
-            self._samples,
-            self._pieces,
-            self._cameras,
+        self._linearise(
             index.voxels,
             self._packed(settings, M, Q, index),
             spread_of(tasks),

@@ -23,6 +23,7 @@ from tk.kernels.contour import (
 )
 from tk.kernels.edge_search import outline_at
 from tk.kernels.kinematics import forward_tree
+from tk.kernels.launch import Launcher
 from tk.kernels.objective import PIECE_DOF
 from tk.kernels.occlusion import PLACED_CAMERA, is_occluded, load_placed_vector, place_pieces
 from tk.kernels.projection import CAMERA_NUMBERS, camera_center, project
@@ -142,9 +143,13 @@ class OutlineKernel:
         ensure_runtime()
         dtype = contours.dtype
         self._contours = contours
-        self._kernel = _outline_kernel(ti.f64 if dtype == np.float64 else ti.f32)
-        self._pieces: np.ndarray = np.ascontiguousarray(np.column_stack([contours.pieces, diameter]), dtype)
-        self._cameras: np.ndarray = np.ascontiguousarray(np.column_stack([contours.cameras, sizes]), dtype)
+        self._launch = Launcher(
+            _outline_kernel(ti.f64 if dtype == np.float64 else ti.f32),
+            contours.tree,
+            np.ascontiguousarray(np.column_stack([contours.pieces, diameter]), dtype),
+            contours.strips,
+            np.ascontiguousarray(np.column_stack([contours.cameras, sizes]), dtype),
+        )
 
     def __call__(
         self, masks: np.ndarray, pose: np.ndarray, chosen: np.ndarray, settings: OutlineSettings
@@ -159,16 +164,12 @@ class OutlineKernel:
         """
         chosen = self._contours.checked(chosen)
         B, K = chosen.shape
-        C = len(self._cameras)
+        C = len(self._contours.cameras)
         dtype = self._contours.dtype
         entries = np.empty((B, C * K * 2, alignment.ENTRY_NUMBERS), dtype)
         if entries.size:
             tasks = B * C * -(-K // STRIPS_PER_TASK)
-            self._kernel(
-                self._contours.tree,
-                self._pieces,
-                self._contours.strips,
-                self._cameras,
+            self._launch(
                 spread_of(tasks),
                 settings.reach_m,
                 settings.sigma_m,
