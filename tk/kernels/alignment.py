@@ -12,9 +12,10 @@ distance along the contour may count less (``share``): edges do not tell how far
 A hidden contour point, or one without an edge, is an entry that costs ρ = 1 and pulls nowhere (6.1.2).
 """
 
-from tk.kernels.kinematics import load_rotation, load_translation, parent_of, velocity
+from tk.kernels.kinematics import TWIST, load_rotation, load_translation, parent_of
 from tk.kernels.projection import project
 from tk.kernels.runtime import ti
+from tk.kernels.wrench import MOTION, WRENCH, add_wrench, load_wrench
 
 # Columns of an entry. Points a and b are in the zero configuration (metres), target and unit normal in the picture.
 POINT_A, POINT_B, LAST_DOF, CAMERA, TARGET, NORMAL = 0, 3, 6, 7, 8, 10
@@ -30,17 +31,31 @@ def load_entry(entries: ti.template(), b: int, e: int, first: ti.template()):
 
 @ti.func
 def image_residual(frames: ti.template(), c: int, cameras: ti.template(), entries: ti.template(), b: int, e: int):
-    """(valid, residual (2,), world points a and b, their projections' derivatives ½J_a, ½J_b (2, 3))."""
+    """(valid, residual (2,), L (2, 3), T (2, 3)): a twist (ω, v) of the segment moves the image by L ω + T v."""
     k = ti.cast(entries[b, e, LAST_DOF], ti.i32)
     v = ti.cast(entries[b, e, CAMERA], ti.i32)
     R, t = load_rotation(frames, c, k), load_translation(frames, c, k)
-    xa = R @ load_entry(entries, b, e, POINT_A) + t
-    xb = R @ load_entry(entries, b, e, POINT_B) + t
-    pa, Ja, za = project(cameras, v, xa)
-    pb, Jb, zb = project(cameras, v, xb)
     target = ti.Vector([entries[b, e, TARGET], entries[b, e, TARGET + 1]])
-    valid = 1 if za > 1e-3 and zb > 1e-3 else 0
-    return valid, 0.5 * (pa + pb) - target, xa, xb, 0.5 * Ja, 0.5 * Jb
+    x = R @ load_entry(entries, b, e, POINT_A) + t
+    pixel, T, z = project(cameras, v, x)
+    L = _turned(T, x)
+    valid = z > 1e-3
+    if (load_entry(entries, b, e, POINT_A) - load_entry(entries, b, e, POINT_B)).norm_sqr() > 0.0:
+        x = R @ load_entry(entries, b, e, POINT_B) + t
+        other, J, depth = project(cameras, v, x)
+        pixel = 0.5 * (pixel + other)
+        L = 0.5 * (L + _turned(J, x))
+        T = 0.5 * (T + J)
+        valid = valid and depth > 1e-3
+    return valid, pixel - target, L, T
+
+
+@ti.func
+def _turned(J, x):
+    """L (2, 3) with L ω = J (ω × x)."""
+    first = x.cross(ti.Vector([J[0, a] for a in ti.static(range(3))]))
+    second = x.cross(ti.Vector([J[1, a] for a in ti.static(range(3))]))
+    return ti.Matrix.rows([first, second])
 
 
 @ti.func
@@ -53,9 +68,7 @@ def metric_product(entries: ti.template(), b: int, e: int, r):
 
 @ti.func
 def add_alignment(
-    tree: ti.template(),
-    frames: ti.template(),  # (C, D or more, 18) scratch
-    state: ti.template(),  # (2 B, D) poses, then directions
+    scratch: ti.template(),  # (C, D or more, 36)
     cameras: ti.template(),
     entries: ti.template(),
     sums: ti.template(),
@@ -63,15 +76,14 @@ def add_alignment(
     c: int,
     e: int,
 ):
-    """Add scale·ρ(e) of entry e, its gradient and its Gauss-Newton product to row c of the sums."""
+    """Add scale·ρ(e) of entry e to row c of the sums, its gradient and Gauss-Newton product to the wrenches."""
     kind = ti.cast(entries[b, e, STATE], ti.i32)
     scale = entries[b, e, SCALE]
     if kind == UNASSIGNABLE:
         sums[c, 0] = sums[c, 0] + scale
     elif kind == ASSIGNED:
-        D = (sums.shape[1] - 1) // 2
-        valid, r, xa, xb, Ja, Jb = image_residual(frames, c, cameras, entries, b, e)
-        if valid == 0:
+        valid, r, L, T = image_residual(scratch, c, cameras, entries, b, e)
+        if not valid:
             sums[c, 0] = sums[c, 0] + scale
         else:
             nu, inv_sigma2 = entries[b, e, NU], entries[b, e, INV_SIGMA2]
@@ -79,21 +91,18 @@ def add_alignment(
             decay = ti.exp(-0.5 * r.dot(Mr) * inv_sigma2 / nu)
             sums[c, 0] = sums[c, 0] + scale * (1.0 - decay)
             weight = scale * decay / nu * inv_sigma2
-            Jv = r * 0.0
-            toward = state.shape[0] // 2 + b
-            k_last = ti.cast(entries[b, e, LAST_DOF], ti.i32)
-            k = k_last
-            while k >= 0:
-                J = Ja @ velocity(frames, c, k, xa) + Jb @ velocity(frames, c, k, xb)
-                sums[c, 1 + k] = sums[c, 1 + k] + weight * J.dot(Mr)
-                Jv += J * state[toward, k]
-                k = parent_of(tree, k)
+            k = ti.cast(entries[b, e, LAST_DOF], ti.i32)
+            Jv = L @ load_wrench(scratch, c, k, MOTION) + T @ load_wrench(scratch, c, k, MOTION + 3)
             MJv = metric_product(entries, b, e, Jv)
-            k = k_last
-            while k >= 0:
-                J = Ja @ velocity(frames, c, k, xa) + Jb @ velocity(frames, c, k, xb)
-                sums[c, 1 + D + k] = sums[c, 1 + D + k] + weight * J.dot(MJv)
-                k = parent_of(tree, k)
+            add_wrench(scratch, c, k, WRENCH, weight * (L.transpose() @ Mr), weight * (T.transpose() @ Mr))
+            add_wrench(scratch, c, k, WRENCH + 6, weight * (L.transpose() @ MJv), weight * (T.transpose() @ MJv))
+
+
+@ti.func
+def _image_velocity(frames: ti.template(), c: int, k: int, L, T):
+    w = ti.Vector([frames[c, k, TWIST + a] for a in ti.static(range(3))])
+    v = ti.Vector([frames[c, k, TWIST + 3 + a] for a in ti.static(range(3))])
+    return L @ w + T @ v
 
 
 @ti.func
@@ -109,18 +118,16 @@ def add_curvature(
 ):
     """Add entry e of pose 0 to the lower triangle of the Gauss-Newton Hessian in row c; outliers weigh ``floor``."""
     if ti.cast(entries[0, e, STATE], ti.i32) == ASSIGNED:
-        valid, r, xa, xb, Ja, Jb = image_residual(frames, c, cameras, entries, 0, e)
-        if valid == 1:
+        valid, r, L, T = image_residual(frames, c, cameras, entries, 0, e)
+        if valid:
             nu, inv_sigma2 = entries[0, e, NU], entries[0, e, INV_SIGMA2]
             decay = ti.exp(-0.5 * r.dot(metric_product(entries, 0, e, r)) * inv_sigma2 / nu)
             weight = entries[0, e, SCALE] * ti.max(decay, floor) / nu * inv_sigma2
             k = ti.cast(entries[0, e, LAST_DOF], ti.i32)
             while k >= 0:
-                J = Ja @ velocity(frames, c, k, xa) + Jb @ velocity(frames, c, k, xb)
-                MJ = weight * metric_product(entries, 0, e, J)
+                MJ = weight * metric_product(entries, 0, e, _image_velocity(frames, c, k, L, T))
                 j = k
                 while j >= 0:
-                    Jj = Ja @ velocity(frames, c, j, xa) + Jb @ velocity(frames, c, j, xb)
-                    hessian[c, k, j] = hessian[c, k, j] + MJ.dot(Jj)
+                    hessian[c, k, j] = hessian[c, k, j] + MJ.dot(_image_velocity(frames, c, j, L, T))
                     j = parent_of(tree, j)
                 k = parent_of(tree, k)

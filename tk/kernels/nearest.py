@@ -63,6 +63,12 @@ class SurfaceIndex:
 
 
 @ti.func
+def _gap(cell: int, at: ti.f32):
+    """How far a coordinate is from the cell, in cells; 0 inside."""
+    return ti.max(ti.max(cell - at, at - cell - 1.0), 0.0)
+
+
+@ti.func
 def nearest_voxel(
     voxels: ti.template(),  # (V, 6)
     fits: ti.template(),  # (V,)
@@ -89,6 +95,7 @@ def nearest_voxel(
     inner = local - ti.cast(home, ti.f32)
     margin = ti.min(inner.min(), 1.0 - inner.max()) * cell_m
     rings = ti.cast(ti.ceil(reach / cell_m), ti.i32)
+    nearly_cell2 = 0.9999 * cell_m * cell_m  # room for rounding
     ring = 0
     while ring <= rings:
         nearest_possible = (ring - 1) * cell_m + margin
@@ -100,10 +107,12 @@ def nearest_voxel(
                 # a column of cells is one run of voxels; of an inner column the ring has its two ends only
                 whole = ring == 0 or ti.abs(i - home[0]) == ring or ti.abs(j - home[1]) == ring
                 column = (i * cells[1] + j) * cells[2]
+                aside = _gap(i, local[0]) ** 2 + _gap(j, local[1]) ** 2
                 for run in range(ti.select(whole, 1, 2)):
                     k0 = ti.max(ti.select(run == 0, low, high), 0)
                     k1 = ti.min(ti.select(whole or run == 1, high, low), cells[2] - 1)
-                    if k0 <= k1:
+                    away = ti.select(whole, 0.0, ti.min(_gap(low, local[2]), _gap(high, local[2])))
+                    if k0 <= k1 and (aside + away * away) * nearly_cell2 < best_d2:
                         for v in range(starts[column + k0], starts[column + k1 + 1]):
                             if (fits[v] >> patch) & 1 == 1:
                                 d2 = (ti.Vector([voxels[v, a] for a in ti.static(range(3))]) - point).norm_sqr()

@@ -24,7 +24,6 @@ import numpy as np
 
 from tk.kernels.alignment import ENTRY_NUMBERS, add_alignment, add_curvature
 from tk.kernels.kinematics import (
-    JOINT_NUMBERS,
     forward_tree,
     load_rotation,
     load_translation,
@@ -39,6 +38,7 @@ from tk.kernels.nearest import SurfaceIndex, nearest_voxel
 from tk.kernels.projection import CAMERA_NUMBERS
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.superellipsoid import implicit, project
+from tk.kernels.wrench import MOTION, WRENCH, WRENCH_NUMBERS, add_wrench, collect_wrenches, load_wrench, start_wrenches
 
 # Points that one parallel task handles: few enough to share 310 points among threads, and a chain's 50 in one; many
 # enough that each task's own forward kinematics (some µs) stays in the noise. An entry of the alignment term, of which
@@ -63,7 +63,7 @@ NU, TANGENTIAL, MIN_COSINE, REACH, COVERAGE_NU, COVERAGE_COSINE, COVERAGE_REACH,
 
 @ti.func
 def _place_pieces(
-    scratch: ti.template(),  # (C, D + P, 18), joints placed
+    scratch: ti.template(),  # (C, D + P, 36), joints placed
     c: int,
     D: int,
     pieces: ti.template(),  # (P, 25)
@@ -103,7 +103,7 @@ def _has_patch(pieces: ti.template(), i: int, fits: ti.i64):
 
 @ti.func
 def _nearest_piece(
-    scratch: ti.template(),  # (C, D + P, 18), joints and pieces placed
+    scratch: ti.template(),  # (C, D + P, 36), joints and pieces placed
     c: int,
     D: int,
     pieces: ti.template(),  # (P, 25)
@@ -162,13 +162,10 @@ def _nearest_piece(
 
 @ti.func
 def _add_residual(
-    tree: ti.template(),
     scratch: ti.template(),
-    state: ti.template(),
     sums: ti.template(),
-    b: int,
     c: int,
-    k_last: int,
+    k: int,  # last degree of freedom above x
     x,
     r,
     y_normal,
@@ -177,31 +174,21 @@ def _add_residual(
     nu,
     scale,
 ):
-    """Add scale·ρ(e) of one pair, its gradient and its Hessian-vector product to row c of the sums."""
-    D = (sums.shape[1] - 1) // 2
+    """Add scale·ρ(e) of one pair to row c of the sums, its gradient and Hessian-vector product to the wrenches."""
     # Mr = (share·I + (1 − share)·y yᵀ) r: with share = 1 the paper's distance, with 0 the one along the normal
     Mr = share * r + (1.0 - share) * y_normal.dot(r) * y_normal
     decay = ti.exp(-0.5 * r.dot(Mr) * inv_sigma2 / nu)
     sums[c, 0] = sums[c, 0] + scale * (1.0 - decay)
     weight = scale * decay / nu * inv_sigma2
-    Jv = x * 0.0
-    toward = state.shape[0] // 2 + b
-    k = k_last
-    while k >= 0:
-        J = velocity(scratch, c, k, x)
-        sums[c, 1 + k] = sums[c, 1 + k] + weight * J.dot(Mr)
-        Jv += J * state[toward, k]
-        k = parent_of(tree, k)
+    Jv = load_wrench(scratch, c, k, MOTION).cross(x) + load_wrench(scratch, c, k, MOTION + 3)
     MJv = share * Jv + (1.0 - share) * y_normal.dot(Jv) * y_normal
-    k = k_last
-    while k >= 0:
-        sums[c, 1 + D + k] = sums[c, 1 + D + k] + weight * velocity(scratch, c, k, x).dot(MJv)
-        k = parent_of(tree, k)
+    add_wrench(scratch, c, k, WRENCH, weight * x.cross(Mr), weight * Mr)
+    add_wrench(scratch, c, k, WRENCH + 6, weight * x.cross(MJv), weight * MJv)
 
 
 @ti.func
 def _is_buried(
-    scratch: ti.template(),  # (C, D + P, 18), joints and pieces placed
+    scratch: ti.template(),  # (C, D + P, 36), joints and pieces placed
     c: int,
     D: int,
     pieces: ti.template(),  # (P, 25)
@@ -286,7 +273,7 @@ def _objective_kernel(real):
         chosen: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, M + Q) samples, then voxels of the coverage term
         entries: ti.types.ndarray(dtype=real, ndim=3),  # (B, E, 17) of the alignment term
         state: ti.types.ndarray(dtype=real, ndim=2),  # (2 B, D) poses, then directions
-        scratch: ti.types.ndarray(dtype=real, ndim=3),  # (C, D + P, 18)
+        scratch: ti.types.ndarray(dtype=real, ndim=3),  # (C, D + P, 36)
         assigned: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, M) out, in when hold = 1
         covering: ti.types.ndarray(dtype=real, ndim=3),  # (B, Q, 4) piece and projection, out, in when hold = 1
         sums: ti.types.ndarray(dtype=real, ndim=2),  # (C, 1 + 2 D) out
@@ -298,13 +285,13 @@ def _objective_kernel(real):
             D = tree.shape[0]
             tasks = sums.shape[0] // (state.shape[0] // 2)
             b, part = c // tasks, c % tasks
-            for s in range(sums.shape[1]):
-                sums[c, s] = 0.0
+            sums[c, 0] = 0.0
             forward_tree(tree, state, b, c, scratch)
+            start_wrenches(tree, state, state.shape[0] // 2 + b, c, scratch)
             if hold == 0:
                 _place_pieces(scratch, c, D, pieces)
             for e in range(E * part // tasks, E * (part + 1) // tasks):
-                add_alignment(tree, scratch, state, cameras, entries, sums, b, c, e)
+                add_alignment(scratch, cameras, entries, sums, b, c, e)
             for m in range((M + Q) * part // tasks, (M + Q) * (part + 1) // tasks):
                 v = -1
                 k = 0
@@ -351,7 +338,8 @@ def _objective_kernel(real):
                     x = load_rotation(scratch, c, k) @ x0 + load_translation(scratch, c, k)
                     if y_normal.norm_sqr() == 0.0:
                         share = share * 0.0 + 1.0
-                    _add_residual(tree, scratch, state, sums, b, c, k, x, x - y, y_normal, share, inv_sigma2, nu, scale)
+                    _add_residual(scratch, sums, c, k, x, x - y, y_normal, share, inv_sigma2, nu, scale)
+            collect_wrenches(tree, c, scratch, sums)
 
     return objective
 
@@ -379,7 +367,7 @@ def _linearise_kernel(real):
         chosen: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M + Q,)
         entries: ti.types.ndarray(dtype=real, ndim=3),  # (1, E, 17)
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (1, D)
-        scratch: ti.types.ndarray(dtype=real, ndim=3),  # (C, D or more, 18)
+        scratch: ti.types.ndarray(dtype=real, ndim=3),  # (C, D or more, 36)
         assigned: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M,)
         covering: ti.types.ndarray(dtype=real, ndim=2),  # (Q, 4)
         residual: ti.types.ndarray(dtype=real, ndim=2),  # (M + Q, 4) out, metres, and the voxel or -1
@@ -549,9 +537,9 @@ class ObjectiveKernel:
         self._scratch: dict[int, np.ndarray] = {}
 
     def _scratch_of(self, tasks: int) -> np.ndarray:
-        """(T, D + P, 18) joints and pieces of T tasks; kept."""
+        """(T, D + P, 36) joints and pieces of T tasks; kept."""
         if tasks not in self._scratch:
-            self._scratch[tasks] = np.empty((tasks, self.degrees + len(self._pieces), JOINT_NUMBERS), self.dtype)
+            self._scratch[tasks] = np.empty((tasks, self.degrees + len(self._pieces), WRENCH_NUMBERS), self.dtype)
         return self._scratch[tasks]
 
     def _entries(self, entries: np.ndarray | None) -> np.ndarray:
