@@ -12,10 +12,10 @@ distance along the contour may count less (``share``): edges do not tell how far
 A hidden contour point, or one without an edge, is an entry that costs ρ = 1 and pulls nowhere (6.1.2).
 """
 
-from tk.kernels.kinematics import TWIST, load_rotation, load_translation, parent_of
+from tk.kernels.kinematics import load_rotation, load_translation
 from tk.kernels.projection import project
 from tk.kernels.runtime import ti
-from tk.kernels.wrench import MOTION, WRENCH, add_wrench, load_wrench
+from tk.kernels.wrench import MOTION, WRENCH, add_direction, add_wrench, load_wrench
 
 # Columns of an entry. Points a and b are in the zero configuration (metres), target and unit normal in the picture.
 POINT_A, POINT_B, LAST_DOF, CAMERA, TARGET, NORMAL = 0, 3, 6, 7, 8, 10
@@ -30,21 +30,23 @@ def load_entry(entries: ti.template(), b: int, e: int, first: ti.template()):
 
 
 @ti.func
-def image_residual(frames: ti.template(), c: int, cameras: ti.template(), entries: ti.template(), b: int, e: int):
-    """(valid, residual (2,), L (2, 3), T (2, 3)): a twist (ω, v) of the segment moves the image by L ω + T v."""
+def image_residual(
+    frames: ti.template(), c: int, cameras: ti.template(), entries: ti.template(), b: int, e: int, origin
+):
+    """(valid, residual (2,), L (2, 3), T (2, 3)): a twist (ω, v) about the origin moves the image by L ω + T v."""
     k = ti.cast(entries[b, e, LAST_DOF], ti.i32)
     v = ti.cast(entries[b, e, CAMERA], ti.i32)
     R, t = load_rotation(frames, c, k), load_translation(frames, c, k)
     target = ti.Vector([entries[b, e, TARGET], entries[b, e, TARGET + 1]])
     x = R @ load_entry(entries, b, e, POINT_A) + t
     pixel, T, z = project(cameras, v, x)
-    L = _turned(T, x)
+    L = _turned(T, x - origin)
     valid = z > 1e-3
     if (load_entry(entries, b, e, POINT_A) - load_entry(entries, b, e, POINT_B)).norm_sqr() > 0.0:
         x = R @ load_entry(entries, b, e, POINT_B) + t
         other, J, depth = project(cameras, v, x)
         pixel = 0.5 * (pixel + other)
-        L = 0.5 * (L + _turned(J, x))
+        L = 0.5 * (L + _turned(J, x - origin))
         T = 0.5 * (T + J)
         valid = valid and depth > 1e-3
     return valid, pixel - target, L, T
@@ -68,7 +70,7 @@ def metric_product(entries: ti.template(), b: int, e: int, r):
 
 @ti.func
 def add_alignment(
-    scratch: ti.template(),  # (C, D or more, 36)
+    scratch: ti.template(),  # (C, D or more, 39)
     cameras: ti.template(),
     entries: ti.template(),
     sums: ti.template(),
@@ -82,7 +84,7 @@ def add_alignment(
     if kind == UNASSIGNABLE:
         sums[c, 0] = sums[c, 0] + scale
     elif kind == ASSIGNED:
-        valid, r, L, T = image_residual(scratch, c, cameras, entries, b, e)
+        valid, r, L, T = image_residual(scratch, c, cameras, entries, b, e, ti.Vector([0.0, 0.0, 0.0]))
         if not valid:
             sums[c, 0] = sums[c, 0] + scale
         else:
@@ -99,35 +101,27 @@ def add_alignment(
 
 
 @ti.func
-def _image_velocity(frames: ti.template(), c: int, k: int, L, T):
-    w = ti.Vector([frames[c, k, TWIST + a] for a in ti.static(range(3))])
-    v = ti.Vector([frames[c, k, TWIST + 3 + a] for a in ti.static(range(3))])
-    return L @ w + T @ v
-
-
-@ti.func
 def add_curvature(
-    tree: ti.template(),
-    frames: ti.template(),
+    scratch: ti.template(),  # (C, D or more, 39)
     cameras: ti.template(),
     entries: ti.template(),
-    hessian: ti.template(),
     c: int,
     e: int,
     floor,
+    origin,
 ):
-    """Add entry e of pose 0 to the lower triangle of the Gauss-Newton Hessian in row c; outliers weigh ``floor``."""
+    """Add entry e of pose 0 to the inertias; outliers weigh ``floor``."""
     if ti.cast(entries[0, e, STATE], ti.i32) == ASSIGNED:
-        valid, r, L, T = image_residual(frames, c, cameras, entries, 0, e)
+        valid, r, L, T = image_residual(scratch, c, cameras, entries, 0, e, origin)
         if valid:
-            nu, inv_sigma2 = entries[0, e, NU], entries[0, e, INV_SIGMA2]
+            nu, inv_sigma2, share = entries[0, e, NU], entries[0, e, INV_SIGMA2], entries[0, e, SHARE]
             decay = ti.exp(-0.5 * r.dot(metric_product(entries, 0, e, r)) * inv_sigma2 / nu)
             weight = entries[0, e, SCALE] * ti.max(decay, floor) / nu * inv_sigma2
             k = ti.cast(entries[0, e, LAST_DOF], ti.i32)
-            while k >= 0:
-                MJ = weight * metric_product(entries, 0, e, _image_velocity(frames, c, k, L, T))
-                j = k
-                while j >= 0:
-                    hessian[c, k, j] = hessian[c, k, j] + MJ.dot(_image_velocity(frames, c, j, L, T))
-                    j = parent_of(tree, j)
-                k = parent_of(tree, k)
+            n = ti.Vector([entries[0, e, NORMAL], entries[0, e, NORMAL + 1]])
+            add_direction(scratch, c, k, L.transpose() @ n, T.transpose() @ n, (1.0 - share) * weight)
+            if share > 0.0:
+                for i in ti.static(range(2)):
+                    moment = ti.Vector([L[i, a] for a in ti.static(range(3))])
+                    force = ti.Vector([T[i, a] for a in ti.static(range(3))])
+                    add_direction(scratch, c, k, moment, force, share * weight)

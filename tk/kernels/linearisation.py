@@ -1,5 +1,6 @@
 """What the objective's kernel says of one pose beside its value: pairs, their Jacobian, the Gauss-Newton Hessian."""
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +14,8 @@ class Linearisation:
         residual: (K, 3) x − x̄, metres; zero where a pair is missing.
         jacobian: (K, 3, D) ∂x/∂p; (1, 3, D) zeros where it was not asked for.
         hessian: (D, D) Gauss-Newton Hessian of f, outliers weighing at least the floor asked for.
-        metric: (K, 3, 3) how directions count: the identity, or less along the data's surface.
         partner: (K,) the voxel, -1 where missing.
+        voxel_normals: (V, 3) of all voxels; share: (K,) weight of the distance along the data's surface.
         inv_sigma2: (K,) 1/σ², 1/m².
         nu: (K,) Leclerc's ν; scale: (K,) the pair's share of f.
     """
@@ -22,11 +23,17 @@ class Linearisation:
     residual: np.ndarray
     jacobian: np.ndarray
     hessian: np.ndarray
-    metric: np.ndarray
     partner: np.ndarray
+    voxel_normals: np.ndarray
+    share: np.ndarray
     inv_sigma2: np.ndarray
     nu: np.ndarray
     scale: np.ndarray
+
+    @functools.cached_property
+    def metric(self) -> np.ndarray:
+        """(K, 3, 3) how directions count: the identity, or less along the data's surface."""
+        return metric_of(self.voxel_normals[self.partner], self.share)
 
     @property
     def decay(self) -> np.ndarray:

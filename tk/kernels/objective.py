@@ -33,12 +33,24 @@ from tk.kernels.kinematics import (
     velocity,
 )
 from tk.kernels.launch import Launcher
-from tk.kernels.linearisation import Linearisation, metric_of
+from tk.kernels.linearisation import Linearisation
 from tk.kernels.nearest import SurfaceIndex, nearest_voxel
 from tk.kernels.projection import CAMERA_NUMBERS
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.superellipsoid import implicit, project
-from tk.kernels.wrench import MOTION, WRENCH, WRENCH_NUMBERS, add_wrench, collect_wrenches, load_wrench, start_wrenches
+from tk.kernels.wrench import (
+    MOTION,
+    SCRATCH_NUMBERS,
+    WRENCH,
+    add_direction,
+    add_inertia,
+    add_wrench,
+    collect_inertias,
+    collect_wrenches,
+    load_wrench,
+    start_inertias,
+    start_wrenches,
+)
 
 # Points that one parallel task handles: few enough to share 310 points among threads, and a chain's 50 in one; many
 # enough that each task's own forward kinematics (some µs) stays in the noise. An entry of the alignment term, of which
@@ -63,7 +75,7 @@ NU, TANGENTIAL, MIN_COSINE, REACH, COVERAGE_NU, COVERAGE_COSINE, COVERAGE_REACH,
 
 @ti.func
 def _place_pieces(
-    scratch: ti.template(),  # (C, D + P, 36), joints placed
+    scratch: ti.template(),  # (C, D + P, 39), joints placed
     c: int,
     D: int,
     pieces: ti.template(),  # (P, 25)
@@ -103,7 +115,7 @@ def _has_patch(pieces: ti.template(), i: int, fits: ti.i64):
 
 @ti.func
 def _nearest_piece(
-    scratch: ti.template(),  # (C, D + P, 36), joints and pieces placed
+    scratch: ti.template(),  # (C, D + P, 39), joints and pieces placed
     c: int,
     D: int,
     pieces: ti.template(),  # (P, 25)
@@ -188,7 +200,7 @@ def _add_residual(
 
 @ti.func
 def _is_buried(
-    scratch: ti.template(),  # (C, D + P, 36), joints and pieces placed
+    scratch: ti.template(),  # (C, D + P, 39), joints and pieces placed
     c: int,
     D: int,
     pieces: ti.template(),  # (P, 25)
@@ -273,7 +285,7 @@ def _objective_kernel(real):
         chosen: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, M + Q) samples, then voxels of the coverage term
         entries: ti.types.ndarray(dtype=real, ndim=3),  # (B, E, 17) of the alignment term
         state: ti.types.ndarray(dtype=real, ndim=2),  # (2 B, D) poses, then directions
-        scratch: ti.types.ndarray(dtype=real, ndim=3),  # (C, D + P, 36)
+        scratch: ti.types.ndarray(dtype=real, ndim=3),  # (C, D + P, 39)
         assigned: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, M) out, in when hold = 1
         covering: ti.types.ndarray(dtype=real, ndim=3),  # (B, Q, 4) piece and projection, out, in when hold = 1
         sums: ti.types.ndarray(dtype=real, ndim=2),  # (C, 1 + 2 D) out
@@ -344,8 +356,8 @@ def _objective_kernel(real):
     return objective
 
 
-# The Hessian's task holds D² sums: fewer and longer tasks.
-PAIRS_PER_TASK = 128
+# Fewer and longer tasks: each hands its inertias down the tree.
+PAIRS_PER_TASK = 256
 
 
 @functools.cache
@@ -367,7 +379,7 @@ def _linearise_kernel(real):
         chosen: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M + Q,)
         entries: ti.types.ndarray(dtype=real, ndim=3),  # (1, E, 17)
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (1, D)
-        scratch: ti.types.ndarray(dtype=real, ndim=3),  # (C, D or more, 36)
+        scratch: ti.types.ndarray(dtype=real, ndim=3),  # (C, D or more, 39)
         assigned: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M,)
         covering: ti.types.ndarray(dtype=real, ndim=2),  # (Q, 4)
         residual: ti.types.ndarray(dtype=real, ndim=2),  # (M + Q, 4) out, metres, and the voxel or -1
@@ -380,8 +392,11 @@ def _linearise_kernel(real):
             c = turn // spread
             tasks = hessian.shape[0]
             forward_tree(tree, pose, 0, c, scratch)
+            start_inertias(tree, c, scratch)
+            # near the body, once the root has been translated; any point would do
+            origin = load_translation(scratch, c, ti.min(2, tree.shape[0] - 1))
             for e in range(E * c // tasks, E * (c + 1) // tasks):
-                add_curvature(tree, scratch, cameras, entries, hessian, c, e, floor)
+                add_curvature(scratch, cameras, entries, c, e, floor, origin)
             for m in range((M + Q) * c // tasks, (M + Q) * (c + 1) // tasks):
                 k_last = 0
                 v = -1
@@ -415,18 +430,17 @@ def _linearise_kernel(real):
                     across = y_normal.dot(r)
                     decay = ti.exp(-0.5 * (share * r.norm_sqr() + (1.0 - share) * across * across) * inv_sigma2 / nu)
                     weight = scale * inv_sigma2 / nu * ti.max(decay, floor)
+                    seen = x - origin
+                    add_inertia(scratch, c, k_last, seen, share * weight)
+                    if share != 1.0:
+                        add_direction(scratch, c, k_last, seen.cross(y_normal), y_normal, (1.0 - share) * weight)
                     k = k_last
-                    while k >= 0:
+                    while want_jacobian == 1 and k >= 0:
                         J = velocity(scratch, c, k, x)
-                        if want_jacobian == 1:
-                            for a in ti.static(range(3)):
-                                jacobian[m, k, a] = J[a]
-                        MJ = weight * (share * J + (1.0 - share) * y_normal.dot(J) * y_normal)
-                        j = k
-                        while j >= 0:
-                            hessian[c, k, j] = hessian[c, k, j] + MJ.dot(velocity(scratch, c, j, x))
-                            j = parent_of(tree, j)
+                        for a in ti.static(range(3)):
+                            jacobian[m, k, a] = J[a]
                         k = parent_of(tree, k)
+            collect_inertias(tree, c, scratch, origin, hessian)
 
     return linearise
 
@@ -537,9 +551,9 @@ class ObjectiveKernel:
         self._scratch: dict[int, np.ndarray] = {}
 
     def _scratch_of(self, tasks: int) -> np.ndarray:
-        """(T, D + P, 36) joints and pieces of T tasks; kept."""
+        """(T, D + P, 39) joints and pieces of T tasks; kept."""
         if tasks not in self._scratch:
-            self._scratch[tasks] = np.empty((tasks, self.degrees + len(self._pieces), WRENCH_NUMBERS), self.dtype)
+            self._scratch[tasks] = np.empty((tasks, self.degrees + len(self._pieces), SCRATCH_NUMBERS), self.dtype)
         return self._scratch[tasks]
 
     def _entries(self, entries: np.ndarray | None) -> np.ndarray:
@@ -672,8 +686,9 @@ class ObjectiveKernel:
             residual=found[:, :3].astype(np.float64),
             jacobian=jacobian.transpose(0, 2, 1).astype(np.float64),
             hessian=lower + np.tril(lower, -1).T,
-            metric=metric_of(index.normals[partner], np.repeat([settings.tangential, 1.0], [M, Q])),
             partner=partner,
+            voxel_normals=index.normals,
+            share=np.repeat([settings.tangential, 1.0], [M, Q]),
             inv_sigma2=np.concatenate([weight[chosen], piece_weight[held.covering[0, :Q, 0].astype(np.int64)]]),
             nu=np.repeat([settings.nu, settings.coverage_nu], [M, Q]),
             scale=np.repeat([settings.surface_weight / max(M, 1), settings.coverage_weight / max(Q, 1)], [M, Q]),

@@ -10,14 +10,22 @@ of a segment are added up, and at the end handed down the tree once, from the le
 Newton-Euler algorithm; Featherstone, Rigid Body Dynamics Algorithms, 2008, chapter 5). In the same way the velocity of
 a point along a direction in p, the J·v of H·v = JᵀM J v, comes from its segment's one twist.
 
-Columns of the scratch ``(C, D, 36)``, after frames and twists (:mod:`tk.kernels.kinematics`): the twist of the segment
-along the direction, and two wrenches: of the gradient, of the Hessian-vector product.
+The Gauss-Newton Hessian Σ JᵀMJ needs of a segment's points the 6×6 sum of PᵀMP, where P (3, 6) takes a twist to the
+point's velocity: an inertia, and handed down the tree like one (the composite rigid body algorithm; chapter 6 there).
+It holds squares of distances, which cost digits where they are long, so all is about an origin near the body.
+
+Columns of the scratch ``(C, D, 39)``, after frames and twists (:mod:`tk.kernels.kinematics`): the twist of the segment
+along the direction, and two wrenches, of the gradient and of the Hessian-vector product; or, in their place, the lower
+triangle of the inertia, row by row.
 """
 
 from tk.kernels.kinematics import JOINT_NUMBERS, TWIST, parent_of
 from tk.kernels.runtime import ti
 
-MOTION, WRENCH, WRENCH_NUMBERS = JOINT_NUMBERS, JOINT_NUMBERS + 6, JOINT_NUMBERS + 18
+MOTION, WRENCH = JOINT_NUMBERS, JOINT_NUMBERS + 6
+INERTIA = JOINT_NUMBERS
+INERTIA_NUMBERS = 21
+SCRATCH_NUMBERS = INERTIA + INERTIA_NUMBERS
 
 
 @ti.func
@@ -64,3 +72,66 @@ def collect_wrenches(tree: ti.template(), c: int, scratch: ti.template(), sums: 
         if up >= 0:
             for a in range(12):
                 scratch[c, up, WRENCH + a] = scratch[c, up, WRENCH + a] + scratch[c, k, WRENCH + a]
+
+
+@ti.func
+def start_inertias(tree: ti.template(), c: int, scratch: ti.template()):
+    """Inertias to zero."""
+    for k in range(tree.shape[0]):
+        for a in range(INERTIA_NUMBERS):
+            scratch[c, k, INERTIA + a] = 0.0
+
+
+@ti.func
+def add_inertia(scratch: ti.template(), c: int, k: int, x, weight):
+    """Add weight·PᵀP of a point x, seen from the origin, to row k."""
+    square = x.norm_sqr()
+    for i in ti.static(range(3)):
+        for j in ti.static(range(i + 1)):
+            a = INERTIA + i * (i + 1) // 2 + j
+            scratch[c, k, a] = scratch[c, k, a] + weight * ((square if i == j else 0.0) - x[i] * x[j])
+        # the translation's rows: the identity, and e_j × x
+        b = INERTIA + (3 + i) * (4 + i) // 2
+        scratch[c, k, b + 3 + i] = scratch[c, k, b + 3 + i] + weight
+        ahead, behind = (i + 1) % 3, (i + 2) % 3
+        scratch[c, k, b + ahead] = scratch[c, k, b + ahead] + weight * x[behind]
+        scratch[c, k, b + behind] = scratch[c, k, b + behind] - weight * x[ahead]
+
+
+@ti.func
+def add_direction(scratch: ti.template(), c: int, k: int, moment, force, weight):
+    """Add weight·g gᵀ with g = (moment, force) to row k."""
+    g = ti.Vector([moment[0], moment[1], moment[2], force[0], force[1], force[2]])
+    for i in ti.static(range(6)):
+        for j in ti.static(range(i + 1)):
+            a = INERTIA + i * (i + 1) // 2 + j
+            scratch[c, k, a] = scratch[c, k, a] + weight * g[i] * g[j]
+
+
+@ti.func
+def _twist_about(scratch: ti.template(), c: int, k: int, origin):
+    w, v = load_wrench(scratch, c, k, TWIST), load_wrench(scratch, c, k, TWIST + 3)
+    v += w.cross(origin)
+    return ti.Vector([w[0], w[1], w[2], v[0], v[1], v[2]])
+
+
+@ti.func
+def collect_inertias(tree: ti.template(), c: int, scratch: ti.template(), origin, hessian: ti.template()):
+    """The Hessian's lower triangle into row c; what no two degrees of freedom share is left as it is."""
+    D = tree.shape[0]
+    for back in range(D):
+        k = D - 1 - back
+        s = _twist_about(scratch, c, k, origin)
+        force = s * 0.0
+        for i in ti.static(range(6)):
+            for j in ti.static(range(6)):
+                low, high = min(i, j), max(i, j)
+                force[i] += scratch[c, k, INERTIA + high * (high + 1) // 2 + low] * s[j]
+        j = k
+        while j >= 0:
+            hessian[c, k, j] = force.dot(_twist_about(scratch, c, j, origin))
+            j = parent_of(tree, j)
+        up = parent_of(tree, k)
+        if up >= 0:
+            for a in range(INERTIA_NUMBERS):
+                scratch[c, up, INERTIA + a] = scratch[c, up, INERTIA + a] + scratch[c, k, INERTIA + a]
