@@ -34,6 +34,7 @@ from tk.kernels.occlusion import (
     is_occluded,
     load_placed_rotation,
     load_placed_vector,
+    pieces_beside,
     place_pieces,
 )
 from tk.kernels.projection import camera_center, project
@@ -62,27 +63,27 @@ def signed_power(base, exponent):
 
 
 @ti.func
-def surface_point(eta, omega, radii, e1, e2):
-    """r(η, ω) (eq. 1)."""
-    ring = signed_power(ti.cos(eta), e1)
+def surface_point(turns, radii, e1, e2):
+    """r(η, ω) (eq. 1); ``turns`` are cos η, sin η, cos ω, sin ω."""
+    ring = signed_power(turns[0], e1)
     return ti.Vector(
         [
-            radii[0] * ring * signed_power(ti.cos(omega), e2),
-            radii[1] * ring * signed_power(ti.sin(omega), e2),
-            radii[2] * signed_power(ti.sin(eta), e1),
+            radii[0] * ring * signed_power(turns[2], e2),
+            radii[1] * ring * signed_power(turns[3], e2),
+            radii[2] * signed_power(turns[1], e1),
         ]
     )
 
 
 @ti.func
-def surface_normal(eta, omega, radii, e1, e2):
+def surface_normal(turns, radii, e1, e2):
     """n_d(η, ω), outward, not of unit length (eq. 2)."""
-    ring = signed_power(ti.cos(eta), 2.0 - e1)
+    ring = signed_power(turns[0], 2.0 - e1)
     return ti.Vector(
         [
-            ring * signed_power(ti.cos(omega), 2.0 - e2) / radii[0],
-            ring * signed_power(ti.sin(omega), 2.0 - e2) / radii[1],
-            signed_power(ti.sin(eta), 2.0 - e1) / radii[2],
+            ring * signed_power(turns[2], 2.0 - e2) / radii[0],
+            ring * signed_power(turns[3], 2.0 - e2) / radii[1],
+            signed_power(turns[1], 2.0 - e1) / radii[2],
         ]
     )
 
@@ -119,8 +120,9 @@ def rim_point(placed: ti.template(), c: int, pieces: ti.template(), i: int, eta,
     radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
     e1, e2 = pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4]
     R = load_placed_rotation(placed, c, i)
-    q = surface_point(eta, omega, radii, e1, e2)
-    n = R @ surface_normal(eta, omega, radii, e1, e2).normalized()
+    turns = ti.Vector([ti.cos(eta), ti.sin(eta), ti.cos(omega), ti.sin(omega)])
+    q = surface_point(turns, radii, e1, e2)
+    n = R @ surface_normal(turns, radii, e1, e2).normalized()
     return q, R @ q + load_placed_vector(placed, c, i, PLACED_TRANSLATION), n
 
 
@@ -181,9 +183,13 @@ def _contour_kernel(real):
             forward_tree(tree, pose, b, c, joints)
             center = camera_center(cameras, v)
             place_pieces(joints, c, pieces, center, placed)
+            near = ti.cast(0, ti.i64)
+            near_to = -1
             for m in range(first, ti.min(first + STRIPS_PER_TASK, K)):
                 s = chosen[b, m]
                 i = strip_piece(strips, s)
+                if i != near_to:
+                    near, near_to = pieces_beside(placed, c, pieces, i, OUTER_MARGIN_M), i
                 crossings = rim_crossings(strips, s, load_placed_vector(placed, c, i, PLACED_CAMERA))
                 row = (b * C + v) * K + m
                 for slot in range(2):
@@ -197,9 +203,9 @@ def _contour_kernel(real):
                         pixel, J, depth = project(cameras, v, x)
                         if depth > 1e-6:
                             flag = FOUND
-                            if is_occluded(placed, c, pieces, i, x, center) == 0:
+                            if is_occluded(placed, c, pieces, near, x, center) == 0:
                                 flag = FOUND | VISIBLE
-                                if is_occluded(placed, c, pieces, i, behind(x, n, center), center) == 0:
+                                if is_occluded(placed, c, pieces, near, behind(x, n, center), center) == 0:
                                     flag = FOUND | VISIBLE | OUTER
                             normal = image_normal(J, n)
                             x_zero = to_zero_configuration(pieces, i, q)

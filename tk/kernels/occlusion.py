@@ -115,25 +115,55 @@ def segment_enters(q, d, radii, e1, e2, z_lower, z_upper):
 
 
 @ti.func
+def pieces_beside(
+    placed: ti.template(),  # (T, P, 20)
+    c: int,
+    pieces: ti.template(),  # (P, 20 or more), at most 63
+    own: int,
+    margin_m: float,
+):
+    """Bit mask of the other pieces that rays through piece ``own``, or past it within the margin, may meet.
+
+    The points of one piece share it: the cones in which the camera sees the two bounding spheres overlap.
+    """
+    beside = ti.cast(0, ti.i64)
+    u = load_placed_vector(placed, c, own, PLACED_CONE)
+    cosine = placed[c, own, PLACED_CONE + 3]
+    sine = ti.sqrt(ti.max(1.0 - cosine * cosine, 0.0))
+    # near = distance (1 − sine)
+    sine += margin_m * (1.0 - sine) / ti.max(placed[c, own, PLACED_NEAR], 1e-6)
+    inside = cosine < 0.0 or sine >= 1.0
+    cosine = ti.sqrt(ti.max(1.0 - sine * sine, 0.0))
+    for i in range(pieces.shape[0]):
+        other = placed[c, i, PLACED_CONE + 3]
+        limit = cosine * other - sine * ti.sqrt(ti.max(1.0 - other * other, 0.0)) - _SLACK
+        meets = u.dot(load_placed_vector(placed, c, i, PLACED_CONE)) > limit
+        if i != own and (inside or other < 0.0 or meets):
+            beside |= ti.cast(1, ti.i64) << ti.cast(i, ti.i64)
+    return beside
+
+
+@ti.func
 def is_occluded(
     placed: ti.template(),  # (T, P, 20)
     c: int,
     pieces: ti.template(),  # (P, 20 or more)
-    own: int,  # the piece that the point lies on; its rim cannot hide from itself, it is convex
+    among: ti.i64,  # bit mask of the pieces asked; a piece's own rim cannot hide from itself, it is convex
     x,  # world
     center,  # camera centre, world
 ):
-    """1 if another piece lies between a point and the camera that row c of the scratch was placed for."""
+    """1 if one of some pieces lies between a point and the camera that row c of the scratch was placed for."""
     ray = x - center
     distance = ti.max(ray.norm(), 1e-6)
     ray = ray / distance
     hit = 0
     i = 0
-    while hit == 0 and i < pieces.shape[0]:
+    rest = among
+    while hit == 0 and rest != 0:
         if (
-            ray.dot(load_placed_vector(placed, c, i, PLACED_CONE)) > placed[c, i, PLACED_CONE + 3]
+            rest & 1 == 1
+            and ray.dot(load_placed_vector(placed, c, i, PLACED_CONE)) > placed[c, i, PLACED_CONE + 3]
             and placed[c, i, PLACED_NEAR] < distance
-            and i != own
         ):
             R = load_placed_rotation(placed, c, i)
             q = R.transpose() @ (x - load_placed_vector(placed, c, i, PLACED_TRANSLATION))
@@ -146,5 +176,6 @@ def is_occluded(
                 pieces[i, PIECE_SHAPE + 5],
                 pieces[i, PIECE_SHAPE + 6],
             )
+        rest >>= 1
         i += 1
     return hit

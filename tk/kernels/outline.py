@@ -13,6 +13,7 @@ import numpy as np
 
 from tk.kernels import alignment
 from tk.kernels.contour import (
+    OUTER_MARGIN_M,
     ContourKernel,
     behind,
     image_normal,
@@ -25,12 +26,12 @@ from tk.kernels.edge_search import outline_at
 from tk.kernels.kinematics import forward_tree
 from tk.kernels.launch import Launcher
 from tk.kernels.objective import PIECE_DOF
-from tk.kernels.occlusion import PLACED_CAMERA, is_occluded, load_placed_vector, place_pieces
+from tk.kernels.occlusion import PLACED_CAMERA, is_occluded, load_placed_vector, pieces_beside, place_pieces
 from tk.kernels.projection import CAMERA_NUMBERS, camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
-# Strips that one parallel task handles, each task with its own forward kinematics (some microseconds).
-STRIPS_PER_TASK = 20
+# Parallel tasks that a launch is divided into, or more: at least one a pose, each with its own forward kinematics.
+TASKS = 8
 
 
 @dataclass(frozen=True)
@@ -72,20 +73,27 @@ def _outline_kernel(real):
             if turn % spread != 0:
                 continue
             c = turn // spread
-            C, K = cameras.shape[0], chosen.shape[1]
-            blocks = (K + STRIPS_PER_TASK - 1) // STRIPS_PER_TASK
-            b = c // (C * blocks)
-            v = c // blocks % C
-            first = c % blocks * STRIPS_PER_TASK
+            K = chosen.shape[1]
+            lines = cameras.shape[0] * K  # a camera's strips, then the next one's
+            tasks = joints.shape[0] // pose.shape[0]
+            b, part = c // tasks, c % tasks
             forward_tree(tree, pose, b, c, joints)
-            center = camera_center(cameras, v)
-            place_pieces(joints, c, pieces, center, placed)
-            for m in range(first, ti.min(first + STRIPS_PER_TASK, K)):
+            center = camera_center(cameras, 0)
+            near = ti.cast(0, ti.i64)
+            placed_for, near_to = -1, -1
+            for line in range(lines * part // tasks, lines * (part + 1) // tasks):
+                v, m = line // K, line % K
+                if v != placed_for:
+                    center = camera_center(cameras, v)
+                    place_pieces(joints, c, pieces, center, placed)
+                    placed_for, near_to = v, -1
                 s = chosen[b, m]
                 i = strip_piece(strips, s)
+                if i != near_to:
+                    near, near_to = pieces_beside(placed, c, pieces, i, OUTER_MARGIN_M), i
                 crossings = rim_crossings(strips, s, load_placed_vector(placed, c, i, PLACED_CAMERA))
                 for slot in range(2):
-                    e = (v * K + m) * 2 + slot
+                    e = line * 2 + slot
                     for a in range(alignment.ENTRY_NUMBERS):
                         entries[b, e, a] = 0.0
                     # a dynamic index into a vector would spill it to memory
@@ -100,7 +108,7 @@ def _outline_kernel(real):
                         for end in range(2):
                             if clear:
                                 target = ti.select(end == 0, behind(x, n, center), x)
-                                clear = is_occluded(placed, c, pieces, i, target, center) == 0
+                                clear = is_occluded(placed, c, pieces, near, target, center) == 0
                         if clear:
                             normal = image_normal(J, n)
                             pixels_a_metre = ti.sqrt(0.5 * J.norm_sqr())
@@ -168,7 +176,7 @@ class OutlineKernel:
         dtype = self._contours.dtype
         entries = np.empty((B, C * K * 2, alignment.ENTRY_NUMBERS), dtype)
         if entries.size:
-            tasks = B * C * -(-K // STRIPS_PER_TASK)
+            tasks = B * min(-(-TASKS // B), C * K)
             self._launch(
                 spread_of(tasks),
                 settings.reach_m,
