@@ -38,7 +38,7 @@ ANKLES = [JOINTS.index("ankle_l"), JOINTS.index("ankle_r")]
 PAPER = SilhouetteConfig(
     prediction=0.0,
     second_thoughts=0,
-    search=SearchSettings(interior=True, ambiguous_px=8.0, tangential=1.0, spacing_px=1.0),
+    search=SearchSettings(interior=True, ambiguous_px=8.0, tangential=1.0, spacing_px=1.0, robust_px=0.0),
     solver=GaussNewtonConfig(scales=2),
 )
 

@@ -21,7 +21,7 @@ from tk.kernels.silhouette import SearchSettings
 from tk.model import gait
 from tk.model.anthropometry import BodyDimensions
 from tk.model.camera import Rig
-from tk.model.cone_body import PRESETS, ConeBody, build_cone_body
+from tk.model.cone_body import PRESETS, ConeBody, ConePart, build_cone_body
 from tk.model.cone_fitting import ConeFitConfig, fit_dimensions, fit_shapes
 from tk.model.initialisation import rough_pose
 from tk.model.silhouettes import CleaningConfig, Pyramid, Views
@@ -240,7 +240,8 @@ class SilhouetteTracker:
         status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
         # nobody is in sight: the last pose stands
         pose = pose if np.isfinite(error) else self._pose
-        self._previous, self._pose = self._pose, pose
+        # whoever was lost has jumped, not moved
+        self._previous, self._pose = pose if self._lost_for else self._pose, pose
         self._lost_for = self._lost_for + 1 if lost else 0
         self._fresh = False
         watch.lap("check")
@@ -341,10 +342,19 @@ def restore_body(model: Mapping[str, Any], up: str) -> ConeBody:
     prefix = "dimensions/"
     dimensions = BodyDimensions(**{k[len(prefix) :]: float(v) for k, v in model.items() if k.startswith(prefix)})
     body = build_cone_body(dimensions, up, str(model["body"]))
+    # parts as they were written down: other versions of this program may lay the body out in other ones
+    ends = {part.name: part.ends for part in body.parts}
     parts = []
-    for part, shape, T in zip(body.parts, model["parts/shape"], model["parts/T_body_part"], strict=True):
+    for name, segment, kind, shape, T in zip(
+        json.loads(str(model["parts/name"])),
+        json.loads(str(model["parts/segment"])),
+        model["parts/kind"],
+        model["parts/shape"],
+        model["parts/T_body_part"],
+        strict=True,
+    ):
         a, b, h, m = (float(value) for value in shape)
-        parts.append(replace(part, shape=(a, b, h, m), T_body_part=np.asarray(T)))
+        parts.append(ConePart(name, segment, int(kind), (a, b, h, m), np.asarray(T), ends.get(name, (False, False))))
     return replace(body, parts=tuple(parts))
 
 

@@ -181,7 +181,7 @@ def equations_of(body, masks, poses, settings, dtype=np.float64):
 
 POSE = standing(hip_l_pitch=-0.5, knee_l_flexion=0.6, hip_r_pitch=0.2, torso_yaw=0.3)
 MASKS = draw_silhouettes(BODY, RIG, POSE[None])[0]
-PLAIN = SearchSettings(tangential=0.0)
+PLAIN = SearchSettings(tangential=0.0, robust_px=0.0)
 
 
 def test_equations_are_the_sums_of_the_edgels_rows():

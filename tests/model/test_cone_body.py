@@ -5,7 +5,7 @@ import pytest
 
 from tk.errors import ConfigError
 from tk.kernels.cones import CONE, ELLIPSOID
-from tk.model.anthropometry import BodyDimensions
+from tk.model.anthropometry import HAIR, BodyDimensions
 from tk.model.cone_body import PRESETS, ConePart, build_cone_body
 from tk.model.gait import standing_pose, walking_pose
 from tk.model.skeleton import JOINTS, up_rotation
@@ -50,7 +50,16 @@ def test_a_standing_body_is_as_tall_as_its_dimensions_say(preset):
     for name in ("knee_l_flexion", "knee_r_flexion"):
         pose[body.skeleton.index(name)] = 0.0
     z = points_of(body, pose)[1][:, 2]
-    assert np.ptp(z) == pytest.approx(DIMENSIONS.stature, abs=0.01)
+    hair = HAIR * 1.75 if preset == "full" else 0.0
+    assert np.ptp(z) == pytest.approx(DIMENSIONS.stature + hair, abs=0.01)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_frames_of_parts_are_rotations(preset):
+    for part in build_cone_body(DIMENSIONS, preset=preset).parts:
+        R = part.T_body_part[:3, :3]
+        np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12, err_msg=part.name)
+        assert np.linalg.det(R) > 0
 
 
 def test_left_and_right_are_mirror_images():

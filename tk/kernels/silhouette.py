@@ -50,7 +50,8 @@ class SearchSettings:
         ambiguous_px: an edgel nearer than this, in pixels of the scale, to a model edge of another limb is shared with
             it (4.4); 0 gives every edgel its full weight. The paper does not say how near; 8, its window, suits.
         tangential: weight of the row along the contour (1: the paper's dx and dy; 0: the distance along the normal).
-        robust_px: scale of the Geman-McClure weights (1 + (d/s)²)⁻², in pixels of the full picture; 0: least squares.
+        robust_px: scale of the Geman-McClure weights (1 + (d/s)²)⁻², in pixels of the full picture; 0: the paper's
+            least squares, which shadows at the feet pull at. 8, the window, was chosen on the treadmill capture.
         lost_px: what a sample costs, as a distance, that finds no edge. Only poses are compared by it.
         interior: whether contours before another part are searched, too, as in the paper. No silhouette edge is
             expected there, and most of what they find belongs to others: sharing ambiguous edgels (4.4) mends part of
@@ -65,7 +66,7 @@ class SearchSettings:
     most_samples: int = 64
     ambiguous_px: float = 0.0
     tangential: float = 0.3
-    robust_px: float = 0.0
+    robust_px: float = 8.0
     lost_px: float = 16.0
     interior: bool = False
 

@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 from tk.errors import ConfigError
 from tk.kernels.cone_arrays import LONGEST_CHAIN, ConeArrays
 from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A, SIDE_B
-from tk.model.anthropometry import CROTCH_DROP, HIP_HALF_WIDTH, BodyDimensions
+from tk.model.anthropometry import (
+    ANKLE_OUTWARD,
+    CALF_LENGTH,
+    CROTCH_DROP,
+    HAIR,
+    HEAD_LENGTH,
+    HIP_HALF_WIDTH,
+    BodyDimensions,
+)
 from tk.model.skeleton import SEGMENTS, Skeleton, build_skeleton
 
 Float = NDArray[np.float64]
@@ -24,8 +32,17 @@ Float = NDArray[np.float64]
 # How much of a body is modelled: all fourteen components; without hands and feet; the paper's six-part walker.
 PRESETS = ("full", "limbs", "walker")
 
-# What :meth:`ConeBody.reshaped` changes of a part: logarithms of a, b and m; offsets along x and y.
-SHAPE_NUMBERS = 5
+# The calf at its thickest against a straight line from knee to ankle.
+CALF_BELLY = 1.1
+
+# How far the head's longest axis, from the chin to the back of the crown, leans back; an estimate, degrees.
+SKULL_TILT_DEG = 15.0
+
+# Of the left arm in the zero configuration.
+ELBOW_AXIS = np.cross(np.array([1.0, 1.0, 0.0]) / np.sqrt(2), [0.5, -0.5, np.sqrt(0.5)])
+
+# What :meth:`ConeBody.reshaped` changes of a part: logarithms of a, b, m and h; offsets of either end along x and y.
+SHAPE_NUMBERS = 8
 
 # Edges of different limbs can be mistaken for one another (section 4.4).
 _LIMBS = {
@@ -77,8 +94,9 @@ class ConePart:
 
     @property
     def component(self) -> str:
-        """The rigid component that it is a part of: "torso", "head", or its own name."""
-        return self.segment if self.segment in ("torso", "head") else self.name
+        """The rigid component that it is a part of: its segment, or its own name if it is a hand or a foot."""
+        name = self.name.replace("instep_", "foot_")
+        return name if name.startswith(("hand_", "foot_")) else self.segment
 
     def __post_init__(self) -> None:
         if not all(0 < value < 3 for value in self.shape):
@@ -161,36 +179,55 @@ class ConeBody:
         return tuple(dict.fromkeys(_group(part.name) for part in self.parts))
 
     def reshaped(self, change: Float) -> ConeBody:
-        """A body whose parts are thicker and lie elsewhere about their bones; skeleton and lengths are the same.
+        """A body whose parts have other sizes and lie elsewhere about their bones; the skeleton is the same.
 
         Args:
-            change: (G, 5) for each of :attr:`shape_groups` what the logarithms of a, b, m grow by (of an ellipsoid: of
-                the first two semi-axes), and how far the part moves along its x and y, metres; the right side's is
-                the left's in a mirror.
+            change: (G, 8) for each of :attr:`shape_groups` what the logarithms of a, b, m and h grow by (of an
+                ellipsoid: of the three semi-axes), and how far the axis moves along the part's x and y, metres: two
+                numbers where it begins (a cone's z = 0, an ellipsoid's lower pole), two where it ends. The right
+                side's is the left's in a mirror.
         """
         rows = dict(zip(self.shape_groups, change, strict=True))
-        parts = []
-        for part in self.parts:
-            log_a, log_b, log_m, x, y = (float(value) for value in rows[_group(part.name)])
-            a, b, h, m = part.shape
-            T = part.T_body_part.copy()
-            T[:3, 3] += x * T[:3, 0] + (-y if part.name.endswith("_r") else y) * T[:3, 1]
-            m = m * float(np.exp(log_m)) if part.kind == CONE else m
-            shape = (a * float(np.exp(log_a)), b * float(np.exp(log_b)), h, m)
-            parts.append(replace(part, shape=shape, T_body_part=T))
-        return replace(self, parts=tuple(parts))
+        return replace(
+            self, parts=tuple(_reshape(part, rows[_group(part.name)], part.name.endswith("_r")) for part in self.parts)
+        )
 
-    def place(self, pose: Float, part: NDArray[np.integer], unscaled: Float) -> Float:
-        """World points (N, 3) on the surface of parts (N,), from coordinates as :meth:`ConePart.surface` takes them."""
-        T_world_segment = self.skeleton.segment_transforms(pose)
+    def place(
+        self, pose: Float, part: NDArray[np.integer], unscaled: Float, T_world_segment: Float | None = None
+    ) -> Float:
+        """World points (N, 3) on the surface of parts (N,), from coordinates as :meth:`ConePart.surface` takes them.
+
+        ``T_world_segment`` is what the skeleton says of the segments at this pose, if at hand.
+        """
+        if T_world_segment is None:
+            T_world_segment = self.skeleton.segment_transforms(pose)
         B = np.eye(4)
         B[:3, :3] = self.skeleton.T_world_body
         result = np.empty((len(part), 3))
-        for p, here in enumerate(self.parts):
+        for p in np.unique(part):
+            here = self.parts[p]
             chosen = part == p
             T = T_world_segment[SEGMENTS.index(here.segment)] @ B @ here.T_body_part
             result[chosen] = here.surface(unscaled[chosen]) @ T[:3, :3].T + T[:3, 3]
         return result
+
+
+def _reshape(part: ConePart, row: Float, right: bool) -> ConePart:
+    """What :meth:`ConeBody.reshaped` makes of a part."""
+    by_a, by_b, by_m, by_h = np.exp(row[:4]).tolist()
+    a, b, h, m = part.shape
+    side = -1.0 if right else 1.0
+    T = part.T_body_part
+    low = 0.0 if part.kind == CONE else -h
+    begin = T[:3, :3] @ [row[4], side * row[5], low] + T[:3, 3]
+    end = T[:3, :3] @ [row[6], side * row[7], h] + T[:3, 3]
+    axis = (end - begin) / np.linalg.norm(end - begin)
+    front = T[:3, 0] - (T[:3, 0] @ axis) * axis
+    return replace(
+        part,
+        shape=(a * by_a, b * by_b, h * by_h, m * by_m if part.kind == CONE else m),
+        T_body_part=_frame(begin if part.kind == CONE else 0.5 * (begin + end), axis, front / np.linalg.norm(front)),
+    )
 
 
 def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "full") -> ConeBody:
@@ -201,8 +238,8 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
         up: the world axis that points up.
         preset: "full" (14 rigid components: torso, head, upper and lower arms, hands, thighs, calves, feet), "limbs"
             (10, without hands and feet), or "walker" (6: torso, head, thighs, calves; seven degrees of freedom are
-            free). In the full body the torso consists of three frusta and the head has a neck ("variable resolution",
-            section 3); in the others every component is one solid.
+            free). In the full body the torso consists of four frusta, the calf of two, the head has a neck and the foot
+            an instep ("variable resolution", section 3); in the others every component is one solid.
 
     Raises:
         ConfigError: an unknown preset.
@@ -222,24 +259,61 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
             parts.append(_limb(f"upper_arm_{side}", shoulder, u, d.upper_arm, d.upper_arm_radius, d.elbow_radius, z))
             parts.append(_limb(f"forearm_{side}", elbow, u, d.forearm, d.elbow_radius, d.wrist_radius, z))
         if preset == "full":
-            # half open: a little shorter than the stretched hand, wider than the wrist across the palm
+            # half open: a little shorter than the stretched hand, wider than the wrist across the palm; the thumb's
+            # side is that to which the elbow bends
             shape = (0.9 * d.wrist_radius, 1.4 * d.wrist_radius, 0.95 * d.hand, 0.6)
+            thin = M @ ELBOW_AXIS
             parts.append(
-                ConePart(f"hand_{side}", f"forearm_{side}", CONE, shape, _frame(wrist, u, z), ends=(False, True))
+                ConePart(f"hand_{side}", f"forearm_{side}", CONE, shape, _frame(wrist, u, thin), ends=(False, True))
             )
         hip = M @ np.array([0.0, d.hip_half_width, 0.0])
         knee = hip - d.thigh * z
         ankle = knee - d.calf * z
-        # without a foot the calf reaches the ground
-        shin = d.calf if preset == "full" else d.calf + d.ankle_height
         parts.append(_limb(f"thigh_{side}", hip, -z, d.thigh, d.thigh_radius, d.knee_radius, x))
-        parts.append(_limb(f"calf_{side}", knee, -z, shin, d.knee_radius, d.ankle_radius, x, (False, preset != "full")))
         if preset == "full":
-            half = 0.55 * d.ankle_height
-            heel = ankle - (d.ankle_height - half) * z - 0.2 * d.foot * x
-            shape = (half, 0.18 * d.foot, d.foot, 0.75)
-            parts.append(ConePart(f"foot_{side}", f"calf_{side}", CONE, shape, _frame(heel, x, z), ends=(True, True)))
+            # the flesh lies outside the line from knee to ankle
+            outside = ankle + M @ np.array([0.0, ANKLE_OUTWARD / CALF_LENGTH * d.calf, 0.0])
+            parts += _calf(side, knee, outside, d) + _foot(side, ankle, d)
+        else:  # without a foot the calf reaches the ground
+            reach = d.calf + d.ankle_height
+            parts.append(_limb(f"calf_{side}", knee, -z, reach, d.knee_radius, d.ankle_radius, x, (False, True)))
     return ConeBody(d, build_skeleton(d, up), tuple(parts), preset)
+
+
+def _calf(side: str, knee: Float, ankle: Float, d: BodyDimensions) -> list[ConePart]:
+    """Two frusta that meet where the muscle is thickest."""
+    x = np.array([1.0, 0.0, 0.0])
+    length = float(np.linalg.norm(ankle - knee))
+    axis = (ankle - knee) / length
+    front = x - (x @ axis) * axis
+    front /= np.linalg.norm(front)
+    share = 0.35
+    radius = CALF_BELLY * (d.knee_radius + share * (d.ankle_radius - d.knee_radius))
+    upper = _limb(f"calf_{side}", knee, axis, share * length, d.knee_radius, radius, front)
+    lower = _limb(
+        f"calf_{side}", knee + share * length * axis, axis, (1 - share) * length, radius, d.ankle_radius, front
+    )
+    return [upper, replace(lower, name=f"shin_{side}")]
+
+
+def _foot(side: str, ankle: Float, d: BodyDimensions) -> list[ConePart]:
+    """A flat sole from heel to toes and the instep from the ankle down to the ball."""
+    x, y, z = np.eye(3)
+    ground = ankle - d.ankle_height * z
+    thick, thin = 0.45 * d.ankle_height, 0.3 * d.ankle_height
+
+    def between(name: str, start: Float, end: Float, sizes: tuple[float, float], m: float, far: bool) -> ConePart:
+        length = float(np.linalg.norm(end - start))
+        axis = (end - start) / length
+        frame = _frame(start, axis, np.cross(axis, y))
+        return ConePart(f"{name}_{side}", f"calf_{side}", CONE, (*sizes, length, m), frame, ends=(far, far))
+
+    heel, toes = ground + thick * z - 0.2 * d.foot * x, ground + thin * z + 0.8 * d.foot * x
+    ball = ground + thick * z + 0.45 * d.foot * x
+    return [
+        between("foot", heel, toes, (thick, 0.17 * d.foot), 0.8, True),
+        between("instep", ankle, ball, (d.ankle_radius, d.ankle_radius), 0.6, False),
+    ]
 
 
 def _torso(d: BodyDimensions) -> ConePart:
@@ -254,48 +328,45 @@ def _torso(d: BodyDimensions) -> ConePart:
 
 
 def _trunk_and_head(d: BodyDimensions) -> list[ConePart]:
-    """Torso and head in more detail: abdomen, chest, shoulders; skull, neck."""
+    """Torso and head in more detail: abdomen, belly, chest, shoulders; skull, neck.
+
+    The trunk lies about the line of the joints; hair stands on the crown.
+    """
     x, _, z = np.eye(3)
     bottom = -0.9 * CROTCH_DROP / HIP_HALF_WIDTH * d.hip_half_width
     waist, shoulders = 0.42 * d.trunk, d.trunk - 0.7 * d.shoulder_drop
+    breast = 0.5 * (waist + shoulders)
     taper = 0.93
-    skull = 0.44 * d.head
-    lean = 0.1 * d.head
+    hips = (d.hips_half_depth, d.hips_half_width)
+    chest = (d.chest_half_depth, d.chest_half_width)
+
+    def slice_of(name: str, low: float, high: float, sizes: tuple[float, float], m: float) -> ConePart:
+        return ConePart(name, "torso", CONE, (*sizes, high - low, m), _frame(low * z, z, x))
+
+    skull = 0.46 * d.head
+    forward = 0.1 * d.head
+    # its long axis goes from the chin to the back of the crown
+    lean = float(np.radians(SKULL_TILT_DEG))
+    vertex, face = np.cos(lean) * z - np.sin(lean) * x, np.cos(lean) * x + np.sin(lean) * z
+    crown = d.trunk + (1 + HAIR / HEAD_LENGTH) * d.head
     return [
-        ConePart(
-            "abdomen",
-            "torso",
-            CONE,
-            (d.hips_half_depth, d.hips_half_width, waist - bottom, taper),
-            _frame(bottom * z, z, x),
-        ),
-        ConePart(
-            "chest",
-            "torso",
-            CONE,
-            (taper * d.chest_half_depth, taper * d.chest_half_width, shoulders - waist, 1 / taper),
-            _frame(waist * z, z, x),
-        ),
-        ConePart(
-            "shoulders",
-            "torso",
-            CONE,
-            (0.85 * d.chest_half_depth, d.chest_half_width, d.trunk - shoulders, 0.5),
-            _frame(shoulders * z, z, x),
-        ),
+        slice_of("abdomen", bottom, waist, hips, taper),
+        slice_of("belly", waist, breast, (taper * chest[0], taper * chest[1]), 1 / taper),
+        slice_of("chest", breast, shoulders, chest, 0.95),
+        slice_of("shoulders", shoulders, d.trunk, (0.85 * chest[0], chest[1]), 0.5),
         ConePart(
             "head",
             "head",
             ELLIPSOID,
             (1.12 * d.head_radius, d.head_radius, skull, 1.0),
-            _frame((d.trunk + d.head - skull) * z + lean * x, z, x),
+            _frame((crown - skull) * z + forward * x, vertex, face),
         ),
         ConePart(
             "neck",
             "head",
             CONE,
             (d.neck_radius, d.neck_radius, 0.5 * d.head, 0.95),
-            _frame((d.trunk - 0.15 * d.head) * z + 0.3 * lean * x, z, x),
+            _frame((d.trunk - 0.15 * d.head) * z + 0.5 * forward * x, z, x),
         ),
     ]
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,9 +42,18 @@ _LENGTHS = {
 }
 _RADII = 0.2
 
-# One standard deviation of what changes a part, see ConeBody.reshaped: logarithms of a, b and m about what
-# the dimensions make them, and metres off the bone along x and y.
-_SHAPES = (0.15, 0.15, 0.15, 0.005, 0.005)
+# One standard deviation of what changes a part, see ConeBody.reshaped: logarithms of a, b, m and h about what the
+# dimensions make them, and metres off the bone along x and y, where the axis begins and where it ends. Parts between
+# joints keep their lengths; what ends a limb has no joint behind it, so its length and direction are open. Half a
+# centimetre for flesh about a limb's bone was chosen with the joints of the treadmill capture in view.
+_FIXED = 1e-6
+_LIMB = (0.15, 0.15, 0.15, _FIXED, 0.005, 0.005, 0.005, 0.005)
+_TRUNK = (0.15, 0.15, 0.15, _FIXED, 0.01, _FIXED, 0.01, _FIXED)
+_SHAPES = {
+    "hand_": (0.15, 0.15, 0.15, 0.1, 0.005, 0.005, 0.02, 0.01),
+    "foot_": (0.15, 0.15, 0.15, 0.1, 0.005, 0.005, 0.02, 0.01),
+    "head": (0.15, 0.15, 0.15, 0.1, 0.005, _FIXED, 0.02, _FIXED),
+}
 
 # Step of the differences by a parameter.
 _STEP = 1e-4
@@ -62,20 +72,23 @@ class ConeFitConfig:
         shape_noise_px: edge_noise_px while shapes are adapted: what is left of it once they suit.
         correlation_px: along a contour this many pixels err together; edgels within them count as one.
         stature_deviation: of the logarithm of the stature about the given one.
+        pose_deviation: of a degree of freedom, radians or metres, while shapes are adapted. A head that leans and a
+            neck that bends look alike: the joints were found with the average shapes, and shapes make up for the rest.
     """
 
-    frames: int = 8
-    rounds: int = 8
+    frames: int = 16
+    rounds: int = 4
     edge_noise_px: float = 6.0
     shapes: bool = True
     shape_noise_px: float = 2.0
     correlation_px: float = 10.0
     stature_deviation: float = 0.01
+    pose_deviation: float = 0.03
 
     def __post_init__(self) -> None:
         if self.frames < 1 or self.rounds < 0:
             raise ConfigError(f"cone fit: frames = {self.frames} must be at least 1, rounds = {self.rounds} at least 0")
-        for name in ("edge_noise_px", "shape_noise_px", "correlation_px", "stature_deviation"):
+        for name in ("edge_noise_px", "shape_noise_px", "correlation_px", "stature_deviation", "pose_deviation"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"cone fit: {name} = {getattr(self, name)} must be positive")
 
@@ -141,16 +154,37 @@ def fit_shapes(
     """
     config = config or ConeFitConfig()
     groups = body.shape_groups
-    deviation = np.tile(_SHAPES, (len(groups), 1))
     # what lies in the middle is symmetric
-    deviation[[not name.endswith("_") for name in groups], 4] = 1e-6
+    deviation = np.array([_SHAPES.get(name, _LIMB if name.endswith("_") else _TRUNK) for name in groups])
     problem = _Problem(
         build=lambda change: body.reshaped(change.reshape(len(groups), SHAPE_NUMBERS)),
         mean=np.zeros(deviation.size),
         deviation=deviation.ravel(),
     )
-    change, poses = _adapt(problem, views, pyramids, poses, settings, config.shape_noise_px, config)
+    change, poses = _adapt(
+        problem, views, pyramids, poses, settings, config.shape_noise_px, config, config.pose_deviation
+    )
     return problem.build(change), poses
+
+
+class Neighbours(NamedTuple):
+    """Bodies with one parameter a little larger and a little smaller.
+
+    ``moved`` (P,) says which parts have another shape or place about their bone.
+    """
+
+    larger: ConeBody
+    smaller: ConeBody
+    moved: NDArray[np.bool_]
+
+
+def neighbours(larger: ConeBody, smaller: ConeBody) -> Neighbours:
+    """Two bodies, compared part by part."""
+    moved = [
+        a.shape != b.shape or not np.array_equal(a.T_body_part, b.T_body_part)
+        for a, b in zip(larger.parts, smaller.parts, strict=True)
+    ]
+    return Neighbours(larger, smaller, np.array(moved))
 
 
 @dataclass(frozen=True)
@@ -168,10 +202,10 @@ class _Problem:
     deviation: Float
     extra: Callable[[Float], tuple[Float, float]] | None = None
 
-    def neighbours(self, here: Float) -> list[tuple[ConeBody, ConeBody]]:
+    def neighbours(self, here: Float) -> list[Neighbours]:
         """(K) bodies with each parameter a little larger and a little smaller."""
         steps = _STEP * np.eye(len(here))
-        return [(self.build(here + step), self.build(here - step)) for step in steps]
+        return [neighbours(self.build(here + step), self.build(here - step)) for step in steps]
 
 
 def _adapt(
@@ -182,10 +216,12 @@ def _adapt(
     settings: SearchSettings,
     noise_px: float,
     config: ConeFitConfig,
+    pose_deviation: float = np.inf,
 ) -> tuple[Float, Float]:
-    """Gauss-Newton on the parameters (K,) and the poses (F, D)."""
+    """Gauss-Newton on the parameters (K,) and the poses (F, D), the latter held near their start."""
     shared = problem.mean.copy()
     poses = np.array(poses)
+    start = poses.copy()
     F, D, K = len(poses), poses.shape[1], len(shared)
     # information of one pixel of contour
     information = 1.0 / (noise_px**2 * config.correlation_px)
@@ -212,7 +248,8 @@ def _adapt(
             # joints that the silhouettes leave open stay; those beyond a limit are pulled back
             excess = here.skeleton.clip(poses[f]) - poses[f]
             stay = np.where(excess != 0, 1e3, 10.0)
-            H[at, at] += np.diag(stay)
+            H[at, at] += np.diag(stay) + pose_deviation**-2 * np.eye(D)
+            g[at] += (start[f] - poses[f]) * pose_deviation**-2
             g[at] += np.where(excess != 0, stay * excess, 0.0)
         H[shape, shape] += np.diag(problem.deviation**-2)
         g[shape] += (problem.mean - shared) / problem.deviation**2
@@ -241,16 +278,27 @@ def pose_rows(body: ConeBody, pose: Float, edgels: Edgels) -> Float:
     return rows
 
 
-def parameter_rows(pairs: Sequence[tuple[ConeBody, ConeBody]], pose: Float, edgels: Edgels) -> Float:
-    """(N, K) the same by shared parameters, by central differences of the surface points."""
-    columns = []
-    for larger, smaller in pairs:
-        moved = larger.place(pose, edgels.part, edgels.unscaled) - smaller.place(pose, edgels.part, edgels.unscaled)
-        columns.append(np.einsum("na,na->n", edgels.row, moved) / (2 * _STEP))
-    return np.column_stack(columns)
+def parameter_rows(pairs: Sequence[Neighbours], pose: Float, edgels: Edgels) -> Float:
+    """(N, K) the same by shared parameters, by central differences of the surface points.
+
+    Two bodies that share a skeleton differ in a few parts; only edgels on those are looked at.
+    """
+    rows = np.zeros((len(edgels.part), len(pairs)))
+    shared, segments = None, None
+    for k, (larger, smaller, moved) in enumerate(pairs):
+        chosen = np.arange(len(edgels.part))
+        if larger.skeleton is smaller.skeleton:
+            if larger.skeleton is not shared:
+                shared, segments = larger.skeleton, larger.skeleton.segment_transforms(pose)
+            chosen = np.flatnonzero(moved[edgels.part])
+        part, unscaled = edgels.part[chosen], edgels.unscaled[chosen]
+        same = larger.skeleton is shared
+        ends = [body.place(pose, part, unscaled, segments if same else None) for body in (larger, smaller)]
+        rows[chosen, k] = np.einsum("na,na->n", edgels.row[chosen], ends[0] - ends[1]) / (2 * _STEP)
+    return rows
 
 
-def dimension_neighbours(body: ConeBody, up: str) -> list[tuple[ConeBody, ConeBody]]:
+def dimension_neighbours(body: ConeBody, up: str) -> list[Neighbours]:
     """(K) bodies with each dimension a little larger and a little smaller: what :func:`parameter_rows` differs."""
     log = _log(body.dimensions)
     problem = _Problem(lambda x: build_cone_body(_dimensions(x), up, body.preset), log, np.ones(len(log)))

@@ -52,7 +52,7 @@ class GaussNewtonConfig:
     scales: int = 2
     iterations: int = 3
     damping: float = 0.02
-    stiffness: float = 0.005
+    stiffness: float = 0.0005
     limit_weight: float = 1.0
     longest_step: float = 0.5
 
