@@ -50,8 +50,9 @@ class SearchSettings:
         ambiguous_px: an edgel nearer than this, in pixels of the scale, to a model edge of another limb is shared with
             it (4.4); 0 gives every edgel its full weight. The paper does not say how near; 8, its window, suits.
         tangential: weight of the row along the contour (1: the paper's dx and dy; 0: the distance along the normal).
-        robust_px: scale of the Geman-McClure weights (1 + (d/s)²)⁻², in pixels of the full picture; 0: the paper's
-            least squares, which shadows at the feet pull at. 8, the window, was chosen on the treadmill capture.
+        robust_px: where the Geman-McClure weights (1 + (d/s)²)⁻² have fallen to a quarter, in pixels of the scale; 0:
+            the paper's least squares, which shadows at the feet pull at. 8, the window, was chosen with the treadmill
+            and dance captures in view.
         lost_px: what a sample costs, as a distance, that finds no edge. Only poses are compared by it.
         interior: whether contours before another part are searched, too, as in the paper. No silhouette edge is
             expected there, and most of what they find belongs to others: sharing ambiguous edgels (4.4) mends part of
@@ -334,7 +335,7 @@ def _equations_kernel(real):
                                     other = ti.sqrt(nearest)
                                     weight *= 0.5 * other / ti.max(other + ti.abs(d), 1e-6)
                             if robust > 0.0:
-                                weight *= 1.0 / (1.0 + (d / robust) ** 2) ** 2
+                                weight *= 1.0 / (1.0 + (d / (robust * scale)) ** 2) ** 2
                             sums[c, 0] = sums[c, 0] + share * ti.min(d * d, lost * lost)
                             sums[c, 1] = sums[c, 1] + share
                             sums[c, 2] = sums[c, 2] + share
