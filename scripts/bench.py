@@ -44,6 +44,7 @@ from tk.errors import TkError
 from tk.io.capture import Capture, open_capture
 from tk.io.frames import FrameSet
 from tk.io.result import Result, read_result
+from tk.kernels.launch import Launcher
 from tk.kernels.nearest import SurfaceIndex, nearest
 from tk.kernels.runtime import ti
 from tk.model.appearance import Appearance
@@ -77,18 +78,24 @@ class Options:
 def counted_launches() -> Iterator[Counter[str]]:
     """Kernel launches by name while the block runs. Reaches into Taichi, which has no such count of its own."""
     kernel_class = ti.lang.kernel_impl.Kernel
-    launch = kernel_class.launch_kernel
+    ordinary, remembered = kernel_class.launch_kernel, Launcher._launch
     counts: Counter[str] = Counter()
 
-    def counting(self: Any, *args: Any, **kwargs: Any) -> Any:
+    def count_ordinary(self: Any, *args: Any, **kwargs: Any) -> Any:
         counts[self.func.__name__.strip("_")] += 1
-        return launch(self, *args, **kwargs)
+        return ordinary(self, *args, **kwargs)
 
-    kernel_class.launch_kernel = counting
+    def count_remembered(self: Any, *args: Any) -> None:
+        counts[self._kernel.__name__.strip("_")] += 1
+        remembered(self, *args)
+
+    kernel_class.launch_kernel = count_ordinary
+    Launcher._launch = count_remembered  # type: ignore[method-assign]
     try:
         yield counts
     finally:
-        kernel_class.launch_kernel = launch
+        kernel_class.launch_kernel = ordinary
+        Launcher._launch = remembered  # type: ignore[method-assign]
 
 
 class _Clock(sequence.Reporter):

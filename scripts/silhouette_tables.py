@@ -2,8 +2,8 @@
 
 Table 1: E_S and the ankles' error with 2, 3 and 4 views, 2, 3 and 5 iterations, without ambiguity weighting, with a
 single scale. E_S is averaged over all views, tracked or not; the ankles' error over the tracked ones, pixels. "paper"
-rows search contours inside the outline, too, and use no prediction and no second thoughts about the arms; "tk" rows are
-the defaults. Table 2: milliseconds a frame. Figure 6: the ankles' x in one view against the truth.
+rows search contours inside the outline, too, by plain least squares, and use no prediction and no second thoughts about
+the arms; "tk" rows are the defaults. Table 2: milliseconds a frame. Figure 6: the ankles' x in one view against truth.
 
     python -m scripts.silhouette_tables CAPTURE [--cameras a,b,c,d] [--frames 340] [--figure FILE.png] [--json FILE]
 """

@@ -63,7 +63,7 @@ class TrackingConfig:
     prediction: float = 0.9
     init_frames: int = 4
     settled_ratio: float = 1.25
-    retry_ratio: float = 2.0
+    retry_ratio: float = 1.25
     retry_astray: float = 0.05
     lost_ratio: float = 3.0
     lost_astray: float = 0.25

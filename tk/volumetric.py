@@ -30,7 +30,7 @@ from tk.model.contour_term import ContourTerm, Pictures
 from tk.model.fitting import fit_body
 from tk.model.hull import HullSurface, VisualHull
 from tk.model.objective import CHAIN_OF_SEGMENT, BodyObjective, Fit, FrameObjective
-from tk.model.skeleton import CHAINS, JOINTS, WAIST, build_skeleton, with_waist, without_waist
+from tk.model.skeleton import CHAINS, JOINTS, WAIST, build_skeleton, turn_trunk, with_waist, without_waist
 from tk.model.volume import Volume, VoxelGrid
 from tk.optim import lm_schedule, schedule
 from tk.tracker import Estimate, Observation, Stopwatch
@@ -261,9 +261,12 @@ class VolumetricTracker:
             starts = starts[:1]
         return np.array(starts)
 
-    def _alternatives(self, pose: Float, rng: np.random.Generator) -> Float:
-        """(A, D) other places to look from when ``pose`` explains the frame badly."""
+    def _alternatives(self, pose: Float, rng: np.random.Generator, attempt: int) -> Float:
+        """(A, D) other places to look from when ``pose`` explains the frame badly: first other limbs, then the trunk
+        turned above the legs, which takes both arms elsewhere."""
         skeleton = self.body.skeleton
+        if attempt % 2:
+            return np.array([turn_trunk(skeleton, pose, angle) for angle in np.radians([-80.0, -40.0, 40.0, 80.0])])
         side = {
             k: name.replace("_l_", "_r_") if "_l_" in name else name.replace("_r_", "_l_")
             for k, name in enumerate(skeleton.names)
@@ -276,7 +279,7 @@ class VolumetricTracker:
         straight = self._pose + (self._pose - self._previous)  # all of the last motion again
         spread = np.radians(25.0) * (legs | arms)
         shaken = [pose + spread * rng.normal(size=len(pose)) for _ in range(2)]
-        return np.array([*swapped, limbs, straight, *shaken])
+        return np.array([pose, *swapped, limbs, straight, *shaken])
 
     def _is_usual(self, fit: Fit) -> bool:
         """Whether a frame is explained about as well as this person's frames usually are."""

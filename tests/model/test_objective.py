@@ -21,7 +21,7 @@ from tk.model.objective import (
     even,
     pick,
 )
-from tk.model.skeleton import CHAINS, JOINTS, SEGMENTS
+from tk.model.skeleton import CHAINS, JOINTS, SEGMENTS, WAIST_STIFFNESS
 
 BODY = build_body(BodyDimensions.from_stature(1.75))
 SKELETON = BODY.skeleton
@@ -349,13 +349,15 @@ def test_a_stiff_waist_costs_its_square_with_the_derivatives_to_it(index, truth)
     pose = np.zeros((1, 27))
     pose[0, body.skeleton.is_waist] = [0.2, -0.1, 0.3]
     pose[0, ~body.skeleton.is_waist] = truth
-    k = 0.7 * body.skeleton.is_waist
+    k = np.zeros(27)
+    k[body.skeleton.is_waist] = 0.7 * np.array(WAIST_STIFFNESS)
+    cost = 0.5 * float(k @ pose[0] ** 2)
     v = np.random.default_rng(0).normal(size=(1, 27))
     plain, bent = (FrameObjective(o, index, np.random.default_rng(0)).full()(pose, v, 0) for o in (soft, stiff))
-    np.testing.assert_allclose(bent.value - plain.value, 0.5 * 0.7 * 0.14, atol=1e-12)
+    np.testing.assert_allclose(bent.value - plain.value, cost, atol=1e-12)
     np.testing.assert_allclose(bent.gradient - plain.gradient, k * pose, atol=1e-12)
     np.testing.assert_allclose(bent.hessian_vector - plain.hessian_vector, k * v, atol=1e-12)
     a, b = (FrameObjective(o, index, np.random.default_rng(0)) for o in (soft, stiff))
     np.testing.assert_allclose(b.curvature(pose[0]) - a.curvature(pose[0]), np.diag(k), atol=1e-12)
-    np.testing.assert_allclose(b.value(pose[0]) - a.value(pose[0]), 0.5 * 0.7 * 0.14, atol=1e-12)
+    np.testing.assert_allclose(b.value(pose[0]) - a.value(pose[0]), cost, atol=1e-12)
     np.testing.assert_allclose(b.gradient(pose[0]) - a.gradient(pose[0]), k * pose[0], atol=1e-12)

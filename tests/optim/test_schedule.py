@@ -169,7 +169,7 @@ def solve(
     seed: int = 0,
     smd_config: SmdConfig | None = None,
     good_enough: float = np.inf,
-    alternatives: Callable[[Float, np.random.Generator], Float] | None = None,
+    alternatives: Callable[[Float, np.random.Generator, int], Float] | None = None,
 ) -> ScheduleResult:
     problem: Problem = toy
     start = toy.target + 0.2 if start is None else start
@@ -397,7 +397,8 @@ class Elsewhere:
         self.places = places
         self.asked: list[Float] = []
 
-    def __call__(self, pose: Float, rng: np.random.Generator) -> Float:
+    def __call__(self, pose: Float, rng: np.random.Generator, attempt: int) -> Float:
+        assert attempt == len(self.asked), "searches anew are numbered"
         self.asked.append(pose.copy())
         return np.stack([beside(pose, 0, place) for place in self.places])
 

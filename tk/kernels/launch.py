@@ -59,6 +59,9 @@ class Launcher:
                     f"argument {slot[0]} is {value.dtype} of {value.ndim} dimensions, "
                     f"contiguous: {value.flags.c_contiguous}; the first call had {kind} of {ndim}"
                 )
+        self._launch(program, context)
+
+    def _launch(self, program: Any, context: Any) -> None:
         program.launch_kernel(self._compiled, context)
 
     def _remember(self, arguments: tuple[Any, ...]) -> None:

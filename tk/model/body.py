@@ -39,8 +39,9 @@ class BodyConfig:
     Attributes:
         waist: whether the pelvis turns against the trunk, by three angles beyond the paper's 24 degrees of freedom. A
             dancer's hips stay level while the trunk leans; a rigid trunk takes them along.
-        waist_stiffness: what a waist bent by θ radians costs: half of this times θ², in units of the objective. The
-            lumbar spine bends where the picture asks for it, and not where nothing does.
+        waist_stiffness: what a waist bent to the side by θ radians costs: half of this times θ², in units of the
+            objective; bending forward costs three times as much, twisting five times. The lumbar spine bends where the
+            picture asks for it, and not where nothing does.
     """
 
     waist: bool = True

@@ -21,7 +21,7 @@ from tk.kernels.objective import Held, ObjectiveKernel, ObjectiveSettings
 from tk.model.body import Body
 from tk.model.contour_term import ContourTerm, Pictures
 from tk.model.postures import limb_postures
-from tk.model.skeleton import CHAINS, SEGMENTS
+from tk.model.skeleton import CHAINS, SEGMENTS, WAIST_STIFFNESS
 
 Float = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -97,7 +97,10 @@ class BodyObjective:
         waist_stiffness: float = 0.0,
     ) -> None:
         self.body = body
-        self.stiffness = waist_stiffness * body.skeleton.is_waist
+        self.stiffness = np.zeros(len(body.skeleton.names))
+        self.stiffness[body.skeleton.is_waist] = (
+            waist_stiffness * np.array(WAIST_STIFFNESS)[: body.skeleton.is_waist.sum()]
+        )
         self.settings = settings
         self.sampling = sampling
         self.contours = contours

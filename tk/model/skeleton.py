@@ -109,6 +109,8 @@ _LIMITS_DEG: dict[str, tuple[float, float]] = {
 
 DEGREES_OF_FREEDOM = 24  # of the paper's body
 WAIST = ("waist_roll", "waist_pitch", "waist_yaw")
+# How stiff each is beside the first: nothing outlines the pelvis from the front, and a hip can turn as well as it.
+WAIST_STIFFNESS = (1.0, 3.0, 5.0)
 # Where the waist bends, as a share of the trunk's length above the hip centres: about L4, in the middle of what bends.
 WAIST_HEIGHT = 0.25
 
@@ -280,6 +282,15 @@ def with_waist(skeleton: Skeleton, pose: Float, waist: Float) -> Float:
     whole[skeleton.is_waist] = waist
     whole[~skeleton.is_waist] = pose
     return _turn_hips(skeleton, whole, _waist_rotation(skeleton, whole).T)
+
+
+def turn_trunk(skeleton: Skeleton, pose: Float, angle: float) -> Float:
+    """The pose (D,) with trunk, head and arms turned by an angle about the upright axis, and the legs as they stand."""
+    torso, waist = skeleton.segment_dof[SEGMENTS.index("torso")], _waist_rotation(skeleton, pose)
+    result = pose.copy()
+    result[skeleton.index("torso_yaw")] += angle
+    before, after = (skeleton.transforms(p)[torso, :3, :3] for p in (pose, result))
+    return _turn_hips(skeleton, result, waist.T @ after.T @ before @ waist)
 
 
 def _waist_rotation(skeleton: Skeleton, pose: Float) -> Float:

@@ -135,7 +135,7 @@ class ScheduleConfig:
     chain_iterations: int = 6
     polish_iterations: int = 5
     newton_iterations: int = 2
-    retries: int = 1
+    retries: int = 2
     hypotheses: int = 4
     searched: int = 2
     wide_hypotheses: int = 8
@@ -186,7 +186,7 @@ def optimise(
     config: ScheduleConfig,
     smd_config: smd.SmdConfig,
     good_enough: Callable[[Float], bool] | None = None,
-    alternatives: Callable[[Float, np.random.Generator], Float] | None = None,
+    alternatives: Callable[[Float, np.random.Generator, int], Float] | None = None,
     settled: Callable[[Float], bool] | None = None,
 ) -> ScheduleResult:
     """All passes; again from elsewhere while the objective stays high.
@@ -198,7 +198,8 @@ def optimise(
         rng: for the random hypotheses.
         config, smd_config: settings.
         good_enough: whether a pose (D,) ends the search; any does by default.
-        alternatives: other starts (A, D), made from the best pose so far, for when it is not good enough.
+        alternatives: other starts (A, D), made from the best pose so far, for when it is not good enough; the number
+            of the search anew, from 0 on, is its last argument.
         settled: whether a pose (D,) after the first pass is so good that the chains need no hypotheses beside it; none
             is by default.
     """
@@ -206,10 +207,10 @@ def optimise(
     starts = problem.constrain(starts)
     best = _passes(problem, _best(problem, starts), previous, tolerance, rng, config, smd_config, settled)
     value = problem.value(best.pose)
-    for _ in range(config.retries):
+    for attempt in range(config.retries):
         if alternatives is None or good_enough is None or good_enough(best.pose):
             break
-        others = problem.constrain(np.concatenate([best.pose[None], alternatives(best.pose, rng)]))
+        others = problem.constrain(alternatives(best.pose, rng, attempt))
         limit = replace(smd_config, max_iterations=config.iterations)
         moved = _all(problem, others, tolerance, config.soft, config, limit)
         again = _passes(problem, _best(problem, moved.pose), previous, tolerance, rng, config, smd_config, wide=True)
