@@ -16,9 +16,11 @@ from tk.io.capture import open_capture
 from tk.io.result import read_joints, read_result
 from tk.model.silhouettes import draw_silhouettes
 from tk.model.skeleton import JOINTS
+from tk.model.superellipsoid_silhouettes import draw_body
 from tk.sequence import track
 from tk.silhouette import restore_body
 from tk.view_evaluation import capture_of, evaluate_views
+from tk.volumetric import restore_body as restore_superellipsoids
 
 SETTINGS = """
 [silhouette]
@@ -71,9 +73,31 @@ def test_the_command_finds_the_capture_beside_the_truth(tk: Tk, tiny: Path, thre
     assert "E_S %" in tk("evaluate", three_views, tmp_path / "truth.h5", "--capture", tiny).out
 
 
-def test_other_bodies_have_pixels_only(tk: Tk, tiny: Path, tracked: Path) -> None:
+def test_superellipsoids_are_judged_like_cones(tk: Tk, tiny: Path, tracked: Path) -> None:
     found = evaluate_views(tracked, tiny / "truth.h5", tiny)
-    assert found.silhouette_error is None and "volumetric" in found.note and found.joint_px > 0
+    capture, result = open_capture(tiny), read_result(tracked)
+    restored = restore_superellipsoids(result)
+    assert restored is not None
+    body, poses = restored
+    with capture.frames(int(result.frames[0]), int(result.frames[-1]) + 1) as frames:
+        masks = [frame.masks for frame in frames if frame.masks is not None]
+    drawn = [draw_body(body, capture.rig, pose) for pose in poses]
+    for v, view in enumerate(found.views):
+        wrong = [
+            ((d[v] >= 128) != (m[v] >= 128)).sum() / (m[v] >= 128).sum() for d, m in zip(drawn, masks, strict=True)
+        ]
+        assert view.silhouette_error == pytest.approx(np.mean(wrong)) and 0 < np.mean(wrong) < 0.5
+    assert found.note == "" and found.joint_px > 0
+    assert "E_S %" in tk("evaluate", tracked, tiny / "truth.h5").out
+
+
+def test_results_without_a_body_have_pixels_only(tiny: Path, tracked: Path, tmp_path: Path) -> None:
+    bare = Path(shutil.copy(tracked, tmp_path / "bare.h5"))
+    with h5py.File(bare, "a") as file:
+        del file["model"]
+        file.create_group("model")
+    found = evaluate_views(bare, tiny / "truth.h5", tiny)
+    assert found.silhouette_error is None and str(bare) in found.note and found.joint_px > 0
 
 
 def test_what_cannot_be_judged_is_told(tk: Tk, tiny: Path, three_views: Path, copy: Path, tmp_path: Path) -> None:

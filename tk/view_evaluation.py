@@ -1,7 +1,7 @@
 """How well a result fits the pictures: the silhouette paper's two measures (its section 5), view by view.
 
-- E_S (eq. 12), the share of wrongly classified pixels, against the capture's masks as they are given. It needs a result
-  that says what its body looks like: of the silhouette tracker.
+- E_S (eq. 12), the share of wrongly classified pixels, against the capture's masks as they are given: the body that the
+  result holds, cones or superellipsoids, is drawn into every view.
 - The distance of chosen joints from the truth in pixels: "averaged across both feet and all marked frames, and averaged
   across all the views used for tracking". The paper says "mean squared" and gives
   pixels; here it is the mean distance.
@@ -12,7 +12,7 @@ Views that were not used for tracking are judged, too, and said to be so.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -25,10 +25,11 @@ from tk.evaluation import plain_values
 from tk.io.capture import Capture, open_capture
 from tk.io.result import Result, read_joints, read_result
 from tk.model.camera import Rig
-from tk.model.cone_body import ConeBody
-from tk.model.silhouettes import pixel_rays, silhouette_error
+from tk.model.silhouettes import draw_silhouettes, share_wrong
 from tk.model.skeleton import JOINTS
-from tk.silhouette import restore_body
+from tk.model.superellipsoid_silhouettes import draw_body
+from tk.silhouette import restore_body as restore_cones
+from tk.volumetric import restore_body as restore_superellipsoids
 
 Float = NDArray[np.float64]
 
@@ -44,7 +45,7 @@ class ViewScore:
         tracked: whether the result was made with it; None if the result does not say.
         joint_px: mean distance of the chosen joints, pixels.
         joint_share: the same as a share of the subject's height in this view.
-        silhouette_error: E_S, averaged over the frames; None without masks or without the body's shape.
+        silhouette_error: E_S, averaged over the frames; None without masks or body.
     """
 
     camera: str
@@ -167,29 +168,36 @@ def _pixel_error(view: Rig, estimate: Float, truth: Float, joints: Sequence[str]
 
 def _silhouette_errors(result: Result, capture: Capture) -> tuple[list[float] | None, str]:
     """E_S by view over the frames of the result, or why there is none."""
-    body = _body_of(result)
-    if body is None:
-        return None, f"no E_S: {result.path} is of method {result.meta.method}, whose body has no silhouettes here"
+    draw = _drawn(result, capture.rig)
+    if draw is None:
+        return None, f"no E_S: {result.path} does not hold the body that it tracked with"
     if not capture.has_masks:
         return None, f"no E_S: {capture.path} has no masks/"
-    rays = pixel_rays(capture.rig)
-    pose_of = dict(zip(result.frames.tolist(), result.pose, strict=True))
+    row_of = {int(frame): row for row, frame in enumerate(result.frames)}
     first, last = int(result.frames.min()), int(result.frames.max())
     errors = []
     with capture.frames(first, last + 1) as frames:
         for frame in frames:
-            pose = pose_of.get(frame.index)
-            if pose is not None and frame.masks is not None:
-                errors.append(silhouette_error(body, capture.rig, frame.masks, pose[None], 1, rays)[0])
-    values = np.array(errors)
+            row = row_of.get(frame.index)
+            if row is not None and frame.masks is not None and np.isfinite(result.pose[row]).all():
+                errors.append(share_wrong(draw(row), frame.masks))
+    values = np.array(errors).reshape(-1, len(capture.rig))
     seen = np.isfinite(values)  # an empty mask has no share
+    if not seen.any(axis=0).all():
+        return None, f"no E_S: {capture.path} has a view whose masks are all empty"
     return [float(values[seen[:, v], v].mean()) for v in range(len(capture.rig))], ""
 
 
-def _body_of(result: Result) -> ConeBody | None:
-    return (
-        restore_body(result.model, result.meta.up) if "parts/shape" in result.model and "body" in result.model else None
-    )
+def _drawn(result: Result, rig: Rig) -> Callable[[int], NDArray[np.uint8]] | None:
+    """What draws a row's body, (V, H, W) 0 or 255; None if the result has no body."""
+    if "parts/shape" in result.model and "body" in result.model:
+        cones = restore_cones(result.model, result.meta.up)
+        return lambda row: draw_silhouettes(cones, rig, result.pose[row][None])[0]
+    restored = restore_superellipsoids(result)
+    if restored is None:
+        return None
+    body, poses = restored
+    return lambda row: draw_body(body, rig, poses[row])
 
 
 def capture_of(truth: str | os.PathLike[str]) -> Path | None:

@@ -176,6 +176,14 @@ def silhouette_error(
         return np.where(total > 0, counts.sum(axis=2) / total, np.inf)
 
 
+def share_wrong(drawn: Masks, seen: Masks) -> Float:
+    """(V,) E_S (eq. 12) of silhouettes (V, H, W) against masks (V, H, W), S_T; inf where the mask is empty."""
+    wrong = np.count_nonzero((drawn >= 128) != (seen >= 128), axis=(1, 2))
+    total = np.count_nonzero(seen >= 128, axis=(1, 2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(total > 0, wrong / total, np.inf)
+
+
 def draw_silhouettes(body: ConeBody, rig: Rig, poses: Float) -> NDArray[np.uint8]:
     """(B, V, H, W) silhouettes of the body at poses (B, D), 0 or 255."""
     rays = pixel_rays(rig)
