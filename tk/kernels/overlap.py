@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from tk.kernels.cone_arrays import NEAREST_M, ConeArrays, keep, place_part, shape_of
 from tk.kernels.cones import enclosing_radius, enter, interior_point
 from tk.kernels.kinematics import forward, load_rotation, load_translation
+from tk.kernels.launch import Launcher
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
@@ -18,7 +19,7 @@ DISC_MARGIN = 1.1
 @functools.cache
 def _overlap_kernel(real):
     @ti.kernel
-    def kernel(
+    def overlap_rows(
         axis: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
         point: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
         prismatic: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
@@ -92,7 +93,7 @@ def _overlap_kernel(real):
                     less += 1
             counts[c, 0], counts[c, 1] = more, less
 
-    return kernel
+    return Launcher(overlap_rows)
 
 
 def overlap(

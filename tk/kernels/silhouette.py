@@ -25,6 +25,7 @@ from tk.kernels.cones import (
     unscaled,
 )
 from tk.kernels.kinematics import forward, load_rotation, load_translation, point_velocity
+from tk.kernels.launch import Launcher
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
@@ -175,7 +176,7 @@ def _to_segment(e, a, b):
 @functools.cache
 def _equations_kernel(real):
     @ti.kernel
-    def kernel(
+    def silhouette_equations(
         # the body
         axis: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
         point: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
@@ -389,7 +390,7 @@ def _equations_kernel(real):
                                 total[b, 3 + D + s * D + r] = total[b, 3 + D + s * D + r] + sums[c, at_sum]
                             at_sum += 1
 
-    return kernel
+    return Launcher(silhouette_equations)
 
 
 def _launch(
