@@ -8,7 +8,10 @@ Three kinds of figures, all medians:
   the hull, SciPy's cKDTree for the nearest neighbours. All in one process, so that they share the machine's mood.
 * *growth* (with `--growth`): the hull from 4, 5 and 9 cameras, as table 1 of Kehl & Van Gool 2006.
 
+With ``--method silhouette`` the same of the other tracker, which has no voxels.
+
     python -m scripts.bench [CAPTURE] [--voxels 64 128] [--repeat 3] [--growth CAPTURE] [--json FILE]
+    python -m scripts.bench CAPTURE --method silhouette --masks auto --cameras a,b,c
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -38,6 +41,7 @@ from rich.table import Table
 from scipy.spatial import cKDTree
 
 from scripts import bench_hull
+from scripts.bench_stages import Stage, contour_stages, median_ms, silhouette_stages
 from tk import __version__, sequence
 from tk.config import Config
 from tk.errors import TkError
@@ -52,6 +56,7 @@ from tk.model.hull import VisualHull
 from tk.model.objective import BodyObjective
 from tk.model.skeleton import CHAINS
 from tk.model.volume import VoxelGrid
+from tk.silhouette import SilhouetteTracker
 from tk.tracker import Estimate
 from tk.volumetric import CELL_VOXELS, restore_body
 
@@ -69,6 +74,21 @@ class Options:
     repeat: int = 3
     masks: str = "none"
     init_pose: Path | None = None
+    method: str = "volumetric"
+    cameras: tuple[str, ...] | None = None
+
+    def open(self) -> Capture:
+        """The capture with the cameras and masks that were asked for."""
+        return open_capture(self.capture, self.cameras, self.masks)
+
+    @property
+    def config(self) -> Config:
+        return Config(voxels=self.voxels) if self.voxels else Config()
+
+    @property
+    def title(self) -> str:
+        volumetric = self.method != SilhouetteTracker.method
+        return f"{self.capture.name} at {self.voxels}³" if volumetric else f"{self.capture.name}, silhouettes"
 
 
 # --- end to end ---------------------------------------------------------------------------------------------------
@@ -149,12 +169,13 @@ def run_once(options: Options, output: Path) -> Run:
     with counted_launches() as counts:
         clock = _Clock(counts)
         summary = sequence.track(
-            open_capture(options.capture, masks=options.masks),
+            options.open(),
             output,
-            Config(voxels=options.voxels),
+            options.config,
             clock,
             frames=(0, options.frames),
             init_pose=options.init_pose,
+            method=options.method,
         )
     seconds = time.perf_counter() - started
     loop = np.diff(clock.times)
@@ -209,35 +230,10 @@ def end_to_end(options: Options, folder: Path) -> tuple[Run, dict[str, float], R
 # --- stages alone -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Stage:
-    """Milliseconds of one piece of work, and of the same work by ``peers``: name → milliseconds."""
-
-    name: str
-    ms: float
-    peers: dict[str, float]
-
-    @property
-    def ratios(self) -> dict[str, float]:
-        """How many times longer each peer takes."""
-        return {name: ms / self.ms for name, ms in self.peers.items()}
-
-
-def median_ms(call: Callable[[], object], repeats: int = 20) -> float:
-    """Median milliseconds of a call, after one that does not count."""
-    call()
-    seconds = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - started)
-    return 1e3 * statistics.median(seconds)
-
-
-def stages_alone(options: Options, result: Result) -> tuple[list[Stage], bench_hull.HullTimes]:
-    """Each stage on frames from the middle of a tracked recording."""
-    capture = open_capture(options.capture, masks=options.masks)
-    config = Config(voxels=options.voxels)
+def stages_alone(options: Options, result: Result) -> tuple[list[Stage], bench_hull.HullTimes | None]:
+    """Each stage on frames from the middle of a tracked recording; of the hull none without voxels."""
+    capture = options.open()
+    config = options.config
     middle = int(result.frames[len(result) // 2])
     stop = min(int(result.frames[-1]) + 1, max(middle, int(result.frames[0]) + WINDOW))
     first = max(stop - WINDOW, int(result.frames[0]))
@@ -245,13 +241,17 @@ def stages_alone(options: Options, result: Result) -> tuple[list[Stage], bench_h
         frames = list(reader)
     segment = sequence.make_segmenter(capture, config, lambda _: None)
     masks = [segment(frame) for frame in frames]
+    decoding = Stage("decode", _decode_ms(capture, first, stop, options.repeat), {})
+    masking = Stage("masks", statistics.median(median_ms(partial(segment, frame), 1) for frame in frames), {})
+    if options.method == SilhouetteTracker.method:
+        return [decoding, masking, *silhouette_stages(capture, config, frames, masks, result)], None
     masked = bench_hull.MaskedCapture(capture.name, capture.rig, capture.volume, np.stack(masks))
     hull_times = bench_hull.measure(masked, options.voxels, options.repeat)
     theirs = {"Open3D carve_silhouette": hull_times.open3d, "NumPy projection": hull_times.numpy}
     peers = {name: ms for name, ms in theirs.items() if ms is not None}
     stages = [
-        Stage("decode", _decode_ms(capture, first, stop, options.repeat), {}),
-        Stage("masks", statistics.median(median_ms(partial(segment, frame), 1) for frame in frames), {}),
+        decoding,
+        masking,
         Stage("hull, from scratch", hull_times.scratch, peers),
         Stage("hull, incremental", hull_times.incremental, peers),
         Stage("surface, normals, visibility, colours", hull_times.surface, {}),
@@ -339,6 +339,7 @@ def _search_stages(
         poses = np.repeat(pose[None], B, axis=0)
         call = partial(objective.kernel.evaluate, index, chosen, voxels, poses, np.ones_like(poses), config.objective)
         yield Stage(name, median_ms(call), {})
+    yield from contour_stages(objective, capture, config, frame, masks, pose, index)
 
 
 # --- printing -----------------------------------------------------------------------------------------------------
@@ -369,7 +370,7 @@ def _number(value: float) -> str:
 
 
 def print_run(console: Console, options: Options, run: Run, stages: dict[str, float]) -> None:
-    table = Table(title=f"{options.capture.name} at {options.voxels}³, end to end: ms a frame", title_justify="left")
+    table = Table(title=f"{options.title}, end to end: ms a frame", title_justify="left")
     table.add_column("stage")
     table.add_column("ms", justify="right")
     table.add_column("share", justify="right")
@@ -380,6 +381,8 @@ def print_run(console: Console, options: Options, run: Run, stages: dict[str, fl
     table.add_row("writing and the rest", _number(max(rest, 0.0)), f"{100 * max(rest, 0.0) / run.loop_ms:.0f} %")
     table.add_row("loop", _number(run.loop_ms), "", style="bold")
     console.print(table)
+    if options.method == SilhouetteTracker.method:
+        console.print(f"fitting alone: {1e3 / stages['optimise']:.0f} frames/s")
     kernels = ", ".join(f"{name} {count:g}" for name, count in run.launches.items() if count)
     console.print(
         f"{run.frames_per_second:.1f} frames/s over {run.frames} frames ({run.lost} lost) after the first; first frame "
@@ -390,7 +393,7 @@ def print_run(console: Console, options: Options, run: Run, stages: dict[str, fl
 
 
 def print_stages(console: Console, options: Options, stages: Sequence[Stage]) -> None:
-    table = Table(title=f"{options.capture.name} at {options.voxels}³, stages alone: ms", title_justify="left")
+    table = Table(title=f"{options.title}, stages alone: ms", title_justify="left")
     for heading in ("stage", "tk", "peer", "ms", "peer / tk"):
         table.add_column(heading, justify="left" if heading in ("stage", "peer") else "right")
     for stage in stages:
@@ -408,20 +411,22 @@ class Measurement:
     run: Run
     stages: dict[str, float]
     alone: list[Stage]
-    hull: bench_hull.HullTimes
+    hull: bench_hull.HullTimes | None
+    cameras: int
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
         return {
-            "capture": self.hull.capture,
-            "cameras": self.hull.cameras,
-            "voxels": self.options.voxels,
+            "capture": self.options.capture.name,
+            "method": self.options.method,
+            "cameras": self.cameras,
+            "voxels": self.options.voxels if self.hull else None,
             "repeat": self.options.repeat,
             "masks": self.options.masks,
             "end_to_end": asdict(self.run),
             "stages_ms": self.stages,
             "alone": [asdict(stage) | {"ratios": stage.ratios} for stage in self.alone],
-            "hull_ms": asdict(self.hull),
+            "hull_ms": asdict(self.hull) if self.hull else None,
         }
 
 
@@ -431,11 +436,15 @@ def measure(options: Options) -> Measurement:
     Raises:
         TkError: the capture cannot be tracked.
     """
-    open_capture(options.capture, masks=options.masks)  # complains before a process is started
+    cameras = len(options.open().rig)  # complains before a process is started
     with tempfile.TemporaryDirectory() as folder:
         run, stages, result = end_to_end(options, Path(folder))
     alone, hull = stages_alone(options, result)
-    return Measurement(options, run, stages, alone, hull)
+    return Measurement(options, run, stages, alone, hull, cameras)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -445,6 +454,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--repeat", type=int, default=3, help="runs; medians are taken over them")
     parser.add_argument("--frames", type=int, help="only so many frames")
     parser.add_argument("--masks", default="none", help="as of tk track, but none (segment the videos) by default")
+    parser.add_argument("--method", default="volumetric", help="the tracker: as of tk track")
+    parser.add_argument("--cameras", type=_names, metavar="A,B,C", help="only these")
     parser.add_argument("--init-pose", type=Path, metavar="FILE", help="as of tk track")
     parser.add_argument("--growth", type=Path, metavar="CAPTURE", help="with masks of up to nine cameras: table 1")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here too")
@@ -452,13 +463,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if given.repeat < 1 or (given.frames is not None and given.frames < 3):
         parser.error("--repeat must be at least 1, --frames at least 3")
     console = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 120)
-    options = Options(given.capture, 0, given.frames, given.repeat, given.masks, given.init_pose)
+    options = Options(
+        given.capture, 0, given.frames, given.repeat, given.masks, given.init_pose, given.method, given.cameras
+    )
+    resolutions = given.voxels if given.method != SilhouetteTracker.method else [0]  # it has no voxels
     report: dict[str, Any] = {"machine": machine(), "runs": [], "growth": []}
     console.print(
         "{cpu}, {cores} cores (load {load:.1f}), Python {python}, Taichi {taichi}".format(**report["machine"])
     )
     try:
-        for voxels in given.voxels:
+        for voxels in resolutions:
             one = replace(options, voxels=voxels)
             found = measure(one)
             print_run(console, one, found.run, found.stages)

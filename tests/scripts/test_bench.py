@@ -54,8 +54,26 @@ def test_the_demo_at_a_small_size(tmp_path: Path, capsys: pytest.CaptureFixture[
         assert ratio == pytest.approx(hull["peers"][peer] / hull["ms"])
     assert set(hull["peers"]) == {"Open3D carve_silhouette", "NumPy projection"}
     assert alone["neighbours: build and query"]["peers"].keys() == {"SciPy cKDTree"}
+    contours = [name for name in alone if name.startswith(("contours:", "colour edges:", "outline cue:", "objective "))]
+    assert len(contours) == 8 and all(alone[name]["ms"] > 0 for name in contours)
     for text in ("kernel launches a frame", "peak memory", "Open3D carve_silhouette", "demo at 40³"):
         assert text in printed
+
+
+def test_the_silhouette_tracker_has_stages_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "bench.json"
+    cameras = "cam1,cam2,cam4"
+    main(["--method", "silhouette", "--cameras", cameras, "--repeat", "1", "--frames", "4", "--json", str(file)])
+    (found,) = json.loads(file.read_text(encoding="utf-8"))["runs"]
+    assert found["method"] == "silhouette" and found["cameras"] == 3 and found["voxels"] is found["hull_ms"] is None
+    run = Run(**found["end_to_end"])
+    assert run.launches["silhouette_equations"] == 9, "three scales of three iterations"
+    assert {"masks_clean", "optimise", "check"} < found["stages_ms"].keys()
+    alone = {stage["name"]: stage["ms"] for stage in found["alone"]}
+    assert sum(name.startswith("contours, search, equations") for name in alone) == 3
+    assert all(ms > 0 for name, ms in alone.items() if name != "masks")
+    printed = capsys.readouterr().out
+    assert "fitting alone: " in printed and "demo, silhouettes" in printed
 
 
 def test_a_capture_that_is_not_there_is_named(tmp_path: Path) -> None:

@@ -1,0 +1,163 @@
+"""Single stages of both trackers on a frame in memory, for :mod:`scripts.bench`: contour cues, silhouette solver."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from tk.config import Config
+from tk.io.capture import Capture
+from tk.io.frames import FrameSet
+from tk.io.result import Result
+from tk.kernels.edge_search import search_edges
+from tk.kernels.nearest import SurfaceIndex
+from tk.model import gait
+from tk.model.contour_term import ContourTerm, Pictures
+from tk.model.objective import BodyObjective
+from tk.model.silhouettes import Pyramid, Views
+from tk.optim import gauss_newton
+from tk.silhouette import restore_body
+
+Float = np.ndarray
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Milliseconds of one piece of work, and of the same work by ``peers``: name → milliseconds."""
+
+    name: str
+    ms: float
+    peers: dict[str, float]
+
+    @property
+    def ratios(self) -> dict[str, float]:
+        """How many times longer each peer takes."""
+        return {name: ms / self.ms for name, ms in self.peers.items()}
+
+
+def median_ms(call: Callable[[], object], repeats: int = 20) -> float:
+    """Median milliseconds of a call, after one that does not count."""
+    call()
+    seconds = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - started)
+    return 1e3 * statistics.median(seconds)
+
+
+def contour_stages(
+    objective: BodyObjective,
+    capture: Capture,
+    config: Config,
+    frame: FrameSet,
+    masks: np.ndarray,
+    pose: Float,
+    index: SurfaceIndex,
+) -> Iterator[Stage]:
+    """The volumetric tracker's contour cues at a pose (D,): contours, both searches, and what their entries cost."""
+    poses = pose[None]
+    pictures = Pictures(frame.images, masks)
+    # both cues are measured, whichever of them counts
+    outlines = replace(config.contours, edge_weight=0.0, outline_weight=config.contours.outline_weight or 1.0)
+    colours = replace(config.contours, edge_weight=config.contours.edge_weight or 1.0, outline_weight=0.0)
+    term, edges = (ContourTerm(objective.body, capture.rig, c, config.edges) for c in (outlines, colours))
+    chosen = term.draw(None)[None]
+    views = len(capture.rig)
+    yield Stage(
+        f"contours: {chosen.size} strips in {views} views, one launch",
+        median_ms(lambda: term.kernel(poses, chosen)),
+        {},
+    )
+    points = edges.kernel(poses, chosen)
+    _, lines = edges._pairs(points)
+    search = partial(
+        search_edges, pictures.images, pictures.masks, edges.sizes, lines, colours.threshold, colours.mask_edge,
+        config.edges,
+    )  # fmt: skip
+    yield Stage(f"colour edges: search on demand along {len(lines)} lines", median_ms(search), {})
+    yield Stage(
+        "colour edges: contours, pairs, search and entries",
+        median_ms(lambda: edges.assign(pictures, poses, chosen)),
+        {},
+    )
+    yield Stage(
+        "outline cue: contours, tests, search and entries, one launch",
+        median_ms(lambda: term.assign(pictures, poses, chosen)),
+        {},
+    )
+    entries = term.assign(pictures, poses, chosen)
+    rng = np.random.default_rng(0)
+    samples, voxels = objective.draw(rng), rng.integers(len(index.positions), size=config.sampling.voxels)
+    rows = samples[None].astype(np.int32), voxels[None].astype(np.int32)
+    for text, given in (("without entries", None), (f"and {entries.shape[1]} alignment entries", entries)):
+        *_, held = objective.kernel.evaluate(index, *rows, poses, poses, config.objective, entries=given)
+        evaluate = partial(objective.kernel.evaluate, index, *rows, poses, poses, config.objective, entries=given)
+        linearise = partial(
+            objective.kernel.linearise, index, rows[0][0], rows[1][0], pose, held, config.objective,
+            with_jacobian=False, entries=given,
+        )  # fmt: skip
+        yield Stage(f"objective {text}: value, gradient, H·v", median_ms(evaluate), {})
+        yield Stage(f"objective {text}: Gauss-Newton Hessian", median_ms(linearise), {})
+
+
+def silhouette_stages(
+    capture: Capture, config: Config, frames: Sequence[FrameSet], masks: Sequence[np.ndarray], result: Result
+) -> list[Stage]:
+    """The silhouette tracker's work on consecutive frames with masks (V, H, W) each, two frames at least.
+
+    Every frame but the first starts where the tracker would: at the pose before it.
+    """
+    settings = config.silhouette
+    body = restore_body(result.model, result.meta.up)
+    views = Views(capture.rig, settings.ray_step or max(1, round(capture.rig.frame_shape[0] / 54)))
+    scales = settings.solver.scales
+    pyramids = [views.pyramid(frame, scales, settings.cleaning) for frame in masks[1:]]
+    row_of = {int(index): row for row, index in enumerate(result.frames)}
+    poses = result.pose[[row_of[frame.index] for frame in frames[:-1]]]
+    last, pose = pyramids[-1], poses[-1][None]
+    variants = gait.arm_variants(body.skeleton, pose[0])
+    here = views.equations(body, last, pose, 0, settings.search)
+    limits = body.free, body.skeleton.lower, body.skeleton.upper
+
+    def fit(start: Float, pyramid: Pyramid) -> Float:
+        return gauss_newton.minimise(
+            lambda states, scale: views.equations(body, pyramid, states, scale, settings.search),
+            start[None], *limits, settings.solver,
+        )  # fmt: skip
+
+    def equations(scale: int, window_px: float) -> float:
+        search = replace(settings.search, window_px=window_px)
+        return median_ms(lambda: views.equations(body, last, pose, scale, search))
+
+    window = settings.search.window_px
+    found = [Stage("masks cleaned, scales", median_ms(lambda: views.pyramid(masks[-1], scales, settings.cleaning)), {})]
+    found += [
+        Stage(f"contours, search, equations: 1/{2**scale} scale, one launch", equations(scale, window), {})
+        for scale in reversed(range(scales))
+    ]
+    found += [
+        Stage("the same in full scale, search one pixel far", equations(0, 1.0), {}),
+        Stage(
+            "damped step",
+            median_ms(lambda: gauss_newton.step(here.hessian, here.gradient, pose, *limits, settings.solver)),
+            {},
+        ),
+        Stage(
+            f"fit: {scales} scales of {settings.solver.iterations} iterations",
+            statistics.median(median_ms(partial(fit, *frame), 3) for frame in zip(poses, pyramids, strict=True)),
+            {},
+        ),
+        Stage("E_S of a pose", median_ms(lambda: views.fit_error(body, last.masks[0], pose)), {}),
+        Stage(
+            f"E_S of {len(variants)} places of an arm",
+            median_ms(lambda: views.fit_error(body, last.masks[0], variants)),
+            {},
+        ),
+    ]
+    return found
