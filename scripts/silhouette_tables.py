@@ -5,7 +5,7 @@ single scale. E_S is averaged over all views, tracked or not; the ankles' error 
 rows search contours inside the outline, too, by plain least squares, and use no prediction and no second thoughts about
 the arms; "tk" rows are the defaults. Table 2: milliseconds a frame. Figure 6: the ankles' x in one view against truth.
 
-    python -m scripts.silhouette_tables CAPTURE [--cameras a,b,c,d] [--frames 340] [--figure FILE.png] [--json FILE]
+    python -m scripts.silhouette_tables CAPTURE [--cameras a,b,c,d] [--frames 340] [--every 1] [--figure FILE.png]
 """
 
 from __future__ import annotations
@@ -71,15 +71,15 @@ class Row:
     all_ms: float
 
 
-def load(folder: Path, cameras: Sequence[str], frames: int) -> Sequence3D:
-    """Masks and truth of the first frames, views in the order of ``cameras``."""
+def load(folder: Path, cameras: Sequence[str], frames: int, every: int = 1) -> Sequence3D:
+    """Masks and truth of every so many of the first frames, views in the order of ``cameras``."""
     capture = open_capture(folder, cameras=list(cameras))
     order = [capture.rig.names.index(name) for name in cameras]
     with capture.frames(0, frames) as reader:
-        masks = np.array([frame.masks[order] for frame in reader if frame.masks is not None])
+        masks = np.array([frame.masks[order] for frame in reader if frame.masks is not None][::every])
     truth = read_joints(folder / "truth.h5")
     rig = Rig(tuple(capture.rig[i] for i in order))
-    return Sequence3D(rig, capture.up, masks, truth.positions[: len(masks)], capture.subject_height_m)
+    return Sequence3D(rig, capture.up, masks, truth.positions[:frames:every], capture.subject_height_m)
 
 
 def variants() -> list[tuple[str, int, SilhouetteConfig]]:
@@ -188,11 +188,12 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
         "--cameras", default=",".join(CAMERAS), help="four cameras, in the order in which they are added"
     )
     parser.add_argument("--frames", type=int, default=340)
+    parser.add_argument("--every", type=int, default=1, help="only every so many frames: faster motion")
     parser.add_argument("--only", help="rows whose name begins with this")
     parser.add_argument("--figure", type=Path, help="write figure 6 here")
     parser.add_argument("--json", type=Path, help="write the rows here too")
     options = parser.parse_args(arguments)
-    data = load(options.capture, options.cameras.split(","), options.frames)
+    data = load(options.capture, options.cameras.split(","), options.frames, options.every)
     rows = []
     for name, views, config in variants():
         if options.only is None or name.startswith(options.only):
