@@ -4,6 +4,7 @@ Three kinds of figures, all medians:
 
 * *end to end*: `tk track` from the video files to the HDF5 file, each repetition in a process of its own. "loop" is the
   time from one finished frame to the next, everything included; the stages are what the tracker's own clock says.
+  Pictures are decoded and segmented in a process of their own; the loop has only what it had to wait for them.
 * *alone*: one stage on frames in memory, beside Open3D's `VoxelGrid.carve_silhouette` and a plain NumPy projection for
   the hull, SciPy's cKDTree for the nearest neighbours. All in one process, so that they share the machine's mood.
 * *growth* (with `--growth`): the hull from 4, 5 and 9 cameras, as table 1 of Kehl & Van Gool 2006.
@@ -374,10 +375,12 @@ def print_run(console: Console, options: Options, run: Run, stages: dict[str, fl
     table.add_column("stage")
     table.add_column("ms", justify="right")
     table.add_column("share", justify="right")
-    for name, ms in stages.items():
-        if name != "total":
-            table.add_row(name, _number(ms), f"{100 * ms / run.loop_ms:.0f} %")
-    rest = run.loop_ms - sum(ms for name, ms in stages.items() if name != "total")
+    parts = {name: ms for name, ms in stages.items() if name not in ("decode", "masks", "total")}
+    for name in ("decode", "masks"):
+        table.add_row(f"({name}, ahead of the loop)", _number(stages[name]), "")
+    for name, ms in parts.items():
+        table.add_row(name, _number(ms), f"{100 * ms / run.loop_ms:.0f} %")
+    rest = run.loop_ms - sum(parts.values())
     table.add_row("writing and the rest", _number(max(rest, 0.0)), f"{100 * max(rest, 0.0) / run.loop_ms:.0f} %")
     table.add_row("loop", _number(run.loop_ms), "", style="bold")
     console.print(table)

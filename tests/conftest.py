@@ -14,9 +14,10 @@ from scripts.synthetic.capture import Options, plan_capture, write_capture
 
 FRAMES = 14
 
-# coarse, and a short fit of the body: a whole run takes about a second
+# coarse, a short fit of the body, and no second process to be started: a whole run takes about a second
 QUICK = """
 voxels = 32
+ahead = 0
 [fit]
 rounds = 6
 [tracking]

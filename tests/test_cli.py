@@ -70,8 +70,9 @@ def test_track_writes_what_the_contract_says(tk: Tk, quick: Path, tiny: Path, tm
         assert set(file["status"][()]) == {0}  # the initial frame was left out
         for stage, seconds in file["timing"].items():
             assert seconds.shape == (6,) and seconds.dtype == np.float64 and (seconds[()] >= 0).all(), stage
-        parts = sum(seconds[()] for stage, seconds in file["timing"].items() if stage != "total")
-        np.testing.assert_allclose(file["timing/total"], parts)
+        apart = ("decode", "masks", "total")
+        parts = sum(seconds[()] for stage, seconds in file["timing"].items() if stage not in apart)
+        assert (file["timing/total"][()] >= parts - 1e-9).all()  # writing is in it, too
         dimensions = {name: float(value[()]) for name, value in file["model/dimensions"].items()}
         assert dimensions and all(0 < abs(value) < 2.5 for value in dimensions.values() if value)
         assert file["model/patches/mean_yuv"].shape[1] == 3

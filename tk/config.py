@@ -86,11 +86,14 @@ class Config:
         voxels: voxels along the working volume's longest side (the paper: 64 and 128).
         seed: of the one random generator.
         segmentation: "collinearity" (the paper's) or "mog2".
+        ahead: frames that a process of its own decodes and segments ahead of the tracker; 0: no such process, each
+            frame when the tracker asks for it. The result is the same.
     """
 
     voxels: int = 64
     seed: int = 0
     segmentation: str = "collinearity"
+    ahead: int = 4
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
     appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
     body: BodyConfig = field(default_factory=BodyConfig)
@@ -112,6 +115,8 @@ class Config:
             raise ConfigError(f"--seed {self.seed}: choose from 0 to {2**63 - 1}")
         if self.segmentation not in SEGMENTATIONS:
             raise ConfigError(f'segmentation = "{self.segmentation}": choose one of {", ".join(SEGMENTATIONS)}')
+        if not 0 <= self.ahead <= 64:
+            raise ConfigError(f"ahead = {self.ahead}: choose from 0 to 64 frames")
 
     def to_toml(self) -> str:
         """The whole configuration as TOML text."""

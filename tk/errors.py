@@ -31,3 +31,7 @@ class ResultError(TkError):
 
 class ConfigError(TkError):
     """A configuration value or command-line option is out of range."""
+
+
+class WorkerError(TkError):
+    """A process that worked for this one has been killed."""

@@ -13,7 +13,8 @@ from tk.io.point_cloud import check_hull_path, write_hulls, write_ply
 from tk.io.result import HullPoints
 from tk.model.hull import VisualHull
 from tk.model.volume import VoxelGrid
-from tk.sequence import Reporter, choose_frames, make_segmenter, points_of
+from tk.segmentation import make_segmenter
+from tk.sequence import Reporter, choose_frames, points_of
 
 
 def reconstruct(

@@ -12,28 +12,21 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tk.ahead import TIMING_STAGES, Observed, Source, open_source
 from tk.config import Config
 from tk.errors import CaptureError, ConfigError, ResultError, TkError
 from tk.io.capture import Capture
-from tk.io.frames import FrameSet
 from tk.io.init_pose import InitPose, read_init_pose
 from tk.io.result import FrameResult, HullPoints, ResultMeta, ResultWriter, Status, Value
-from tk.model.foreground import CollinearityForeground, Mog2Foreground, median_plate
 from tk.model.hull import HullSurface
+from tk.segmentation import make_segmenter as make_segmenter
 from tk.silhouette import SilhouetteTracker
-from tk.tracker import Estimate, Observation, Stopwatch, Tracker
+from tk.tracker import Estimate, Tracker
 from tk.volumetric import LevenbergMarquardtTracker, VolumetricTracker
-
-Segmenter = Callable[[FrameSet], NDArray[np.uint8]]
-Observations = Iterator[tuple[Observation, Stopwatch]]
 
 TRACKERS = {tracker.method: tracker for tracker in (VolumetricTracker, LevenbergMarquardtTracker)}
 METHODS = (*TRACKERS, SilhouetteTracker.method)
-
-# frames from which a background is made where there is no recording of the empty scene
-PLATE_FRAMES = 25
 
 
 class Reporter(Protocol):
@@ -80,30 +73,6 @@ def make_tracker(method: str, capture: Capture, config: Config) -> Tracker:
     return TRACKERS[method](capture.rig, capture.volume, capture.up, config)
 
 
-def make_segmenter(capture: Capture, config: Config, note: Callable[[str], None]) -> Segmenter:
-    """Masks of each frame: the capture's own, or a segmentation learned from its background."""
-    if capture.has_masks:
-        return _given_masks
-    sizes = [(camera.width, camera.height) for camera in capture.rig]
-    clips = capture.background()
-    if clips is None:
-        note(
-            f"{capture.path}: no masks and no background/; the median of up to {PLATE_FRAMES} frames is the empty scene"
-        )
-        step = -(-capture.frame_count // PLATE_FRAMES)
-        with capture.frames() as frames:
-            samples = [frame.images.copy() for frame in frames if frame.index % step == 0]
-        clips = median_plate(samples, sizes)
-    learner = CollinearityForeground if config.segmentation == "collinearity" else Mog2Foreground
-    foreground = learner.learn(clips, capture.rig.frame_shape, sizes, config.foreground)
-    return lambda frame: foreground.segment(frame.images)
-
-
-def _given_masks(frame: FrameSet) -> NDArray[np.uint8]:
-    assert frame.masks is not None
-    return frame.masks
-
-
 def track(
     capture: Capture,
     output: Path,
@@ -136,58 +105,62 @@ def track(
     """
     for warning in capture.warnings:
         reporter.note(warning)
-    tracker = make_tracker(method, capture, config)
-    init = read_init_pose(init_pose, tracker.pose_names) if init_pose else None
-    if init and not ((capture.volume.lower <= init.center) & (init.center <= capture.volume.upper)).all():
-        raise CaptureError(
-            f"{init_pose}: the body is at {init.center.round(2).tolist()}, outside the working volume "
-            f"{capture.volume.lower.round(2).tolist()} to {capture.volume.upper.round(2).tolist()}; give metres"
-        )
-    first = init.frame if init and init.frame is not None else frames[0] if init else capture.init_frame
-    if init is None and capture.init_pose == "any":
-        if method != SilhouetteTracker.method:
+    # its process starts while this one makes tables and compiles
+    with open_source(capture, config, reporter.note, keep_images=method != SilhouetteTracker.method) as source:
+        tracker = make_tracker(method, capture, config)
+        init = read_init_pose(init_pose, tracker.pose_names) if init_pose else None
+        if init and not ((capture.volume.lower <= init.center) & (init.center <= capture.volume.upper)).all():
             raise CaptureError(
-                f'{capture.path / "capture.toml"}: init.pose = "any", so nobody stands in the Da Vinci pose; '
-                f"give a rough pose with --init-pose FILE, or use --method {SilhouetteTracker.method}"
+                f"{init_pose}: the body is at {init.center.round(2).tolist()}, outside the working volume "
+                f"{capture.volume.lower.round(2).tolist()} to {capture.volume.upper.round(2).tolist()}; give metres"
             )
-        first = max(first, frames[0])  # no frame is better than another
-    start, stop = choose_frames(capture, frames, reporter.note)
-    if not first < capture.frame_count:
-        raise CaptureError(f"{init_pose}: frame = {first} is past the capture's last, {capture.frame_count - 1}")
-    if first >= stop:
-        raise ConfigError(
-            f"--frames {start}:{stop}: the subject is found in frame {first} and followed forwards; "
-            f"end after frame {first}, or start elsewhere with --init-pose FILE"
+        first = init.frame if init and init.frame is not None else frames[0] if init else capture.init_frame
+        if init is None and capture.init_pose == "any":
+            if method != SilhouetteTracker.method:
+                raise CaptureError(
+                    f'{capture.path / "capture.toml"}: init.pose = "any", so nobody stands in the Da Vinci pose; '
+                    f"give a rough pose with --init-pose FILE, or use --method {SilhouetteTracker.method}"
+                )
+            first = max(first, frames[0])  # no frame is better than another
+        start, stop = choose_frames(capture, frames, reporter.note)
+        if not first < capture.frame_count:
+            raise CaptureError(f"{init_pose}: frame = {first} is past the capture's last, {capture.frame_count - 1}")
+        if first >= stop:
+            raise ConfigError(
+                f"--frames {start}:{stop}: the subject is found in frame {first} and followed forwards; "
+                f"end after frame {first}, or start elsewhere with --init-pose FILE"
+            )
+        begin = max(start, first)
+        if start < first:
+            reporter.note(
+                f"frames before {first} are left out: the subject is found in frame {first} and followed forwards"
+            )
+        meta = ResultMeta(
+            pose_names=tracker.pose_names,
+            pose_units=tracker.pose_units,
+            stages=tracker.stages,
+            timing_stages=(*TIMING_STAGES, *tracker.timing_stages, "total"),
+            fps=capture.fps,
+            up=capture.up,
+            capture=capture.name,
+            method=method,
+            seed=config.seed,
+            config_toml=config.to_toml(),
+            waist_names=tracker.waist_names,
         )
-    begin = max(start, first)
-    if start < first:
-        reporter.note(
-            f"frames before {first} are left out: the subject is found in frame {first} and followed forwards"
-        )
-    meta = ResultMeta(
-        pose_names=tracker.pose_names,
-        pose_units=tracker.pose_units,
-        stages=tracker.stages,
-        timing_stages=("decode", "masks", *tracker.timing_stages, "total"),
-        fps=capture.fps,
-        up=capture.up,
-        capture=capture.name,
-        method=method,
-        seed=config.seed,
-        config_toml=config.to_toml(),
-        waist_names=tracker.waist_names,
-    )
-    origin = _origin(capture, first, begin, init, store_hull)
-    writer, done = ResultWriter.resume(output, meta) if resume else (ResultWriter.create(output, meta), 0)
-    run = _Run(capture, tracker, writer, config, reporter, (first, begin, stop), done, origin, store_hull)
-    started = time.perf_counter()
-    interrupted = False
-    try:
-        with writer:
-            run.go(init)
-    except KeyboardInterrupt:  # caught outside the writer, which then leaves an older result alone if nothing is done
-        interrupted = True
-    return Summary(done + run.tracked, run.lost, time.perf_counter() - started, run.tracked, interrupted)
+        origin = _origin(capture, first, begin, init, store_hull)
+        writer, done = ResultWriter.resume(output, meta) if resume else (ResultWriter.create(output, meta), 0)
+        run = _Run(capture, source, tracker, writer, config, reporter, (first, begin, stop), done, origin, store_hull)
+        started = time.perf_counter()
+        interrupted = False
+        try:
+            with writer:
+                run.go(init)
+        except (
+            KeyboardInterrupt
+        ):  # caught outside the writer, which then leaves an older result alone if nothing is done
+            interrupted = True
+        return Summary(done + run.tracked, run.lost, time.perf_counter() - started, run.tracked, interrupted)
 
 
 def choose_frames(capture: Capture, frames: tuple[int, int | None], note: Callable[[str], None]) -> tuple[int, int]:
@@ -227,6 +200,7 @@ class _Run:
     def __init__(
         self,
         capture: Capture,
+        source: Source,
         tracker: Tracker,
         writer: ResultWriter,
         config: Config,
@@ -236,7 +210,7 @@ class _Run:
         origin: Mapping[str, str],
         store_hull: bool,
     ) -> None:
-        self.capture, self.tracker, self.writer = capture, tracker, writer
+        self.capture, self.source, self.tracker, self.writer = capture, source, tracker, writer
         self.config, self.reporter = config, reporter
         self.first, self.begin, self.stop = span
         self.done = done
@@ -244,8 +218,6 @@ class _Run:
         self.store_hull = store_hull
         self.tracked = 0
         self.lost = 0
-        # dozens of frames are held while the silhouette tracker starts
-        self._keeps_images = tracker.method != SilhouetteTracker.method
 
     def go(self, init: InitPose | None) -> None:
         """Start or restore the tracker, and step it to the end."""
@@ -255,25 +227,21 @@ class _Run:
         self.reporter.begin(self.stop - self.begin, min(self.done, self.stop - self.begin))
         if self.begin + self.done >= self.stop:
             return
-        segment = make_segmenter(self.capture, self.config, self.reporter.note)
         if self.done:
             self.tracker.restore(self.writer.model, self.writer.state)
-            with self.capture.frames(self.begin + self.done, self.stop) as frames:
-                self._step_through(_observe(frames, segment, self._keeps_images))
+            self._step_through(self.source.frames(self.begin + self.done, self.stop))
             return
         # The body is fitted to the same frames however few are asked for, so that a run may be prolonged by --resume.
         silhouette = self.tracker.method == SilhouetteTracker.method
         opening_frames = (self.config.silhouette if silhouette else self.config.tracking).init_frames
-        opening_stop = self.first + opening_frames
-        with self.capture.frames(self.first, max(self.stop, opening_stop)) as frames:
-            observations = _observe(frames, segment, self._keeps_images)
-            opening, broken = _take(observations, opening_frames)
-            try:
-                self.tracker.start([o for o, _ in opening], self.capture.subject_height_m, init)
-            except CaptureError as error:
-                raise CaptureError(f"{self.capture.path}: {error}") from None
-            self.writer.write_model(self.tracker.model())
-            self._step_through(chain(opening, broken or observations))
+        observations = self.source.frames(self.first, max(self.stop, self.first + opening_frames))
+        opening, broken = _take(observations, opening_frames)
+        try:
+            self.tracker.start([o for o, _ in opening], self.capture.subject_height_m, init)
+        except CaptureError as error:
+            raise CaptureError(f"{self.capture.path}: {error}") from None
+        self.writer.write_model(self.tracker.model())
+        self._step_through(chain(_emptied(opening), broken or observations))
 
     def _check_origin(self) -> None:
         for name, value in self.origin.items():
@@ -284,29 +252,33 @@ class _Run:
                     "run without --resume to start afresh"
                 )
 
-    def _step_through(self, observations: Observations) -> None:
-        for observation, watch in observations:
+    def _step_through(self, observations: Iterator[Observed]) -> None:
+        writing = 0.0
+        for observation, laps in observations:
             if observation.index >= self.stop:
                 return
+            started = time.perf_counter()
             estimate = self.tracker.step(observation)
+            finished = time.perf_counter()
             if observation.index < self.begin:
                 continue
-            timing = {**watch.laps, **estimate.timing}
-            timing["total"] = sum(timing.values())
+            total = laps["wait"] + writing + finished - started
+            timing = {**laps, **estimate.timing, "total": total}
             row = _row(observation.index, self.capture.fps, estimate, timing, self.store_hull)
             self.writer.append(row, self._state(self.lost + (estimate.status == "lost")))
             self.tracked += 1
             self.lost += estimate.status == "lost"
             self.reporter.advance(observation.index, estimate)
+            writing = time.perf_counter() - finished
 
     def _state(self, lost: int) -> Mapping[str, Value]:
         origin = {_ORIGIN + name: value for name, value in self.origin.items()}
         return {**self.tracker.state(), **origin, _ORIGIN + _LOST: lost}
 
 
-def _take(observations: Observations, count: int) -> tuple[list[tuple[Observation, Stopwatch]], Observations | None]:
+def _take(observations: Iterator[Observed], count: int) -> tuple[list[Observed], Iterator[Observed] | None]:
     """The first ``count`` observations; if one after the first cannot be read, those before it and what raises then."""
-    taken: list[tuple[Observation, Stopwatch]] = []
+    taken: list[Observed] = []
     try:
         for observation in observations:
             taken.append(observation)
@@ -319,23 +291,16 @@ def _take(observations: Observations, count: int) -> tuple[list[tuple[Observatio
     return taken, None
 
 
-def _raising(error: TkError) -> Observations:
+def _emptied(opening: list[Observed]) -> Iterator[Observed]:
+    """Hands the opening out and keeps none of it, for pictures are large."""
+    opening.reverse()
+    while opening:
+        yield opening.pop()
+
+
+def _raising(error: TkError) -> Iterator[Observed]:
     raise error
     yield
-
-
-def _observe(frames: Iterator[FrameSet], segment: Segmenter, keep_images: bool) -> Observations:
-    """Frames with their masks, and what it took to get them; without pictures (C, 0, 0, 3) if nobody needs them."""
-    while True:
-        watch = Stopwatch()
-        frame = next(frames, None)
-        if frame is None:
-            return
-        watch.lap("decode")
-        masks = segment(frame)
-        watch.lap("masks")
-        images = frame.images if keep_images else np.empty((len(masks), 0, 0, 3), np.uint8)
-        yield Observation(frame.index, images, masks), watch
 
 
 def _row(index: int, fps: float, estimate: Estimate, timing: dict[str, float], store_hull: bool) -> FrameResult:

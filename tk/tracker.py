@@ -18,11 +18,20 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Observation:
-    """What the cameras saw at one instant: images (C, H, W, 3) uint8 BGR and masks (C, H, W) uint8, 0 or 255."""
+    """What the cameras saw at one instant.
+
+    Attributes:
+        index: the frame's number.
+        images: (C, H, W, 3) uint8 BGR.
+        masks: (C, H, W) uint8, 0 or 255.
+        doubtful: (C, H, W) bool, where a mask is 0 and what is seen may be the person all the same, or a shadow; None
+            where nobody says.
+    """
 
     index: int
     images: NDArray[np.uint8]
     masks: NDArray[np.uint8]
+    doubtful: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)

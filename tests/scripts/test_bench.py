@@ -47,7 +47,8 @@ def test_the_demo_at_a_small_size(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert run.launches["carve_kernel"] == 1, "one launch a frame for all cameras"
     assert run.launches["objective"] > 1
     stages = found["stages_ms"]
-    assert stages["total"] == pytest.approx(sum(ms for name, ms in stages.items() if name != "total"), rel=0.5)
+    parts = sum(ms for name, ms in stages.items() if name not in ("decode", "masks", "total"))
+    assert stages["total"] == pytest.approx(parts, rel=0.5)
     alone = {stage["name"]: stage for stage in found["alone"]}
     hull = alone["hull, from scratch"]
     for peer, ratio in hull["ratios"].items():

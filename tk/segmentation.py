@@ -1,0 +1,42 @@
+"""Which segmentation a capture gets: its own masks, or one learned from its background."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.config import Config
+from tk.io.capture import Capture
+from tk.io.frames import FrameSet
+from tk.model.foreground import CollinearityForeground, Mog2Foreground, median_plate
+
+Segmenter = Callable[[FrameSet], NDArray[np.uint8]]
+
+# frames from which a background is made where there is no recording of the empty scene
+PLATE_FRAMES = 25
+
+
+def make_segmenter(capture: Capture, config: Config, note: Callable[[str], None]) -> Segmenter:
+    """Masks of each frame: the capture's own, or a segmentation learned from its background."""
+    if capture.has_masks:
+        return _given_masks
+    sizes = [(camera.width, camera.height) for camera in capture.rig]
+    clips = capture.background()
+    if clips is None:
+        note(
+            f"{capture.path}: no masks and no background/; the median of up to {PLATE_FRAMES} frames is the empty scene"
+        )
+        step = -(-capture.frame_count // PLATE_FRAMES)
+        with capture.frames() as frames:
+            samples = [frame.images.copy() for frame in frames if frame.index % step == 0]
+        clips = median_plate(samples, sizes)
+    learner = CollinearityForeground if config.segmentation == "collinearity" else Mog2Foreground
+    foreground = learner.learn(clips, capture.rig.frame_shape, sizes, config.foreground)
+    return lambda frame: foreground.segment(frame.images)
+
+
+def _given_masks(frame: FrameSet) -> NDArray[np.uint8]:
+    assert frame.masks is not None
+    return frame.masks
