@@ -55,6 +55,18 @@ def test_leaves_the_callers_runtime_alone():
     assert printed[-2:] == ["True", "7"]
 
 
+@pytest.mark.parametrize(("age_s", "stays"), [(3600, False), (1, True)])
+def test_a_killed_process_does_not_switch_the_cache_off_for_good(tmp_path, age_s, stays):
+    lock = tmp_path / "ticache.lock"
+    lock.touch()
+    os.utime(lock, (lock.stat().st_mtime - age_s,) * 2)
+    run(
+        "from tk.kernels.runtime import _break_stale_lock; _break_stale_lock()",
+        TI_OFFLINE_CACHE_FILE_PATH=str(tmp_path),
+    )
+    assert lock.exists() == stays
+
+
 @ti.kernel
 def _count_odd(values: ti.types.ndarray(dtype=ti.f32, ndim=1), found: ti.types.ndarray(dtype=ti.i32, ndim=1)):
     for _ in range(1):

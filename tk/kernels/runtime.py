@@ -11,7 +11,9 @@ import contextlib
 import functools
 import io
 import os
+import time
 import warnings
+from pathlib import Path
 
 # Taichi greets on import unless told otherwise; a library has no business on the user's stdout.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
@@ -25,6 +27,9 @@ __all__ = ["ensure_runtime", "spread_of", "ti"]
 
 # Taichi hands a CPU thread at least so many turns of a loop; what loop_config says of block_dim changes nothing.
 _LEAST_TURNS = 512
+
+# Taichi locks its cache of compiled kernels for milliseconds; an older lock was left by a process that was killed
+_STALE_S = 60.0
 
 
 def ensure_runtime() -> None:
@@ -46,8 +51,23 @@ def ensure_runtime() -> None:
     threads = os.environ.get("TK_THREADS")
     if threads:
         options["cpu_max_num_threads"] = int(threads)
+    _break_stale_lock()
     with contextlib.redirect_stdout(io.StringIO()):  # it prints that it starts, whatever the log level
         ti.init(**options)
+
+
+def _break_stale_lock() -> None:
+    """Remove the lock that a killed process has left on Taichi's cache of compiled kernels.
+
+    Taichi itself never does: from then on nothing is cached any more, and every start compiles all kernels again.
+    """
+    with contextlib.suppress(OSError, AttributeError):  # no lock, somebody else's folder, or another Taichi
+        folder = Path(
+            os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or ti.lang.impl.default_cfg().offline_cache_file_path
+        )
+        lock = folder / "ticache.lock"
+        if time.time() - lock.stat().st_mtime > _STALE_S:
+            lock.unlink()
 
 
 def spread_of(tasks: int) -> int:
