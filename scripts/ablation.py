@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from tk.config import Config
 from tk.io.capture import Capture, open_capture
 from tk.io.result_data import read_joints
-from tk.sequence import make_segmenter
+from tk.model.objective import BARRED
+from tk.segmentation import make_labeller
 from tk.tracker import Observation
 from tk.volumetric import VolumetricTracker
 
@@ -38,11 +39,16 @@ ROWS: tuple[tuple[str, Changes], ...] = (
     ("no coverage (data to model)", {"objective": {"coverage_weight": 0.0}}),
     ("normals ignored", {"objective": {"min_cosine": -1.0, "coverage_cosine": -1.0}}),
     ("colours ignored", {"appearance": {"enabled": False}}),
-    ("no camera is overruled", {"tracking": {"overrule": -1}}),
+    ("no camera is overruled", {"tracking": {"overrule": -1, "overrule_doubt": -1}}),
+    ("a camera in doubt carves", {"tracking": {"overrule_doubt": -1}}),
+    ("no waist", {"body": {"waist": False}}),
+    ("no outline of hands and feet", {"contours": {"extremity_circles": 0}}),
+    ("limbs compared by the contour points of an iteration", {"": {"compared": 1}}),
     ("no Gauss-Newton steps at the end", {"schedule": {"newton_iterations": 0}}),
     ("no last pass and no Gauss-Newton steps", {"schedule": {"newton_iterations": 0, "polish_iterations": 0}}),
     ("limbs searched in every frame", {"tracking": {"settled_ratio": 0.0}}),
     ("limbs searched in unusual frames only", {"schedule": {"searched": 0}}),
+    ("2 limbs searched in usual frames, 4 hypotheses", {"schedule": {"searched": 2, "hypotheses": 4}}),
     ("no hypotheses at all", {"schedule": {"hypotheses": 1, "wide_hypotheses": 1}}),
     ("no search anew", {"schedule": {"retries": 0}}),
     ("no prediction", {"tracking": {"prediction": 0.0}}),
@@ -57,10 +63,11 @@ class Recorded:
 
     def __init__(self, path: Path) -> None:
         self.capture: Capture = open_capture(path, None, "none")
-        segment = make_segmenter(self.capture, Config(), lambda _: None)
+        label = make_labeller(self.capture, Config(), lambda _: None)
         with self.capture.frames() as frames:
             self.frames = [
-                Observation(frame.index, np.array(frame.images), np.array(segment(frame))) for frame in frames
+                Observation(frame.index, np.array(frame.images), *(np.array(layer) for layer in label(frame)))
+                for frame in frames
             ]
         self.truth = read_joints(path / "truth.h5").positions
 
@@ -79,12 +86,14 @@ def changed(changes: Changes) -> Iterator[Config]:
     other = changes.get("", {})
     config = Config()
     config = replace(config, **{k: replace(getattr(config, k), **v) for k, v in changes.items() if k})
-    with mock.patch("tk.model.skeleton.RAISED_SHOULDERS", 0.0) if "rise" in other else mock.MagicMock():
+    with ExitStack() as stack:
+        if "rise" in other:
+            stack.enter_context(mock.patch("tk.model.skeleton.RAISED_SHOULDERS", 0.0))
         if "exclusion" in other:
-            with mock.patch("tk.model.objective.BARRED", np.zeros(10, np.int32)):
-                yield config
-        else:
-            yield config
+            stack.enter_context(mock.patch("tk.model.objective.BARRED", np.zeros_like(BARRED)))
+        if "compared" in other:
+            stack.enter_context(mock.patch("tk.model.objective.COMPARED", other["compared"]))
+        yield config
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -50,6 +50,21 @@ def test_frames_are_the_same(tiny: Path, masks: str, keep_images: bool) -> None:
         np.testing.assert_array_equal(a[2], b[2], strict=True)
 
 
+@pytest.mark.parametrize("masks", ["auto", "none"])
+def test_doubts_are_the_same_where_masks_are_made_here(tiny: Path, masks: str) -> None:
+    capture = open_capture(tiny, masks=masks)
+    layers = []
+    for source in (Ahead(capture, AHEAD, nobody), Serial(capture, AHEAD, nobody)):
+        with source:
+            layers.append([None if o.doubtful is None else o.doubtful.copy() for o, _ in source.frames(0, 4)])
+    for a, b in zip(*layers, strict=True):
+        if masks == "auto":
+            assert a is None and b is None, "given masks are not in doubt"
+        else:
+            assert a is not None and b is not None and a.any()
+            np.testing.assert_array_equal(a, b, strict=True)
+
+
 def test_frames_stay_as_they_are_while_they_are_held(tiny: Path) -> None:
     """More of them than the ring has slots, some dropped in between, and views after their frame."""
     capture = open_capture(tiny)

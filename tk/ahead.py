@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from tk.config import Config
 from tk.errors import TkError, WorkerError
 from tk.io.capture import Capture
-from tk.segmentation import Segmenter, make_segmenter
+from tk.segmentation import Labeller, make_labeller
 from tk.tracker import Observation, Stopwatch
 
 Note = Callable[[str], None]
@@ -92,7 +92,7 @@ def _cores() -> int:
 
 
 def observe(
-    capture: Capture, segment: Segmenter, span: tuple[int, int], keep_images: bool
+    capture: Capture, label: Labeller, span: tuple[int, int], keep_images: bool
 ) -> Iterator[tuple[Observation, Stopwatch]]:
     """Decode and segment here and now; ``span``: the first frame and the one to stop before."""
     with capture.frames(*span) as frames:
@@ -102,10 +102,10 @@ def observe(
             if frame is None:
                 return
             watch.lap("decode")
-            masks = segment(frame)
+            masks, doubtful = label(frame)
             images = frame.images if keep_images else np.empty((len(masks), 0, 0, 3), np.uint8)
             watch.lap("masks")
-            yield Observation(frame.index, images, masks), watch
+            yield Observation(frame.index, images, masks, doubtful if keep_images else None), watch
 
 
 @dataclass(frozen=True)
@@ -118,8 +118,8 @@ class Serial:
     keep_images: bool = True
 
     def frames(self, start: int, stop: int) -> Iterator[Observed]:
-        segment = make_segmenter(self.capture, self.config, self.note)
-        for observation, watch in observe(self.capture, segment, (start, stop), self.keep_images):
+        label = make_labeller(self.capture, self.config, self.note)
+        for observation, watch in observe(self.capture, label, (start, stop), self.keep_images):
             yield observation, {**watch.laps, "wait": sum(watch.laps.values())}
 
     def __enter__(self) -> Serial:
@@ -346,9 +346,9 @@ def serve(socket: int, handle: int) -> None:
 
 def _serve(tracker: Connection, memory: mmap.mmap) -> None:
     task: _Task = tracker.recv()
-    segment = make_segmenter(task.capture, task.config, tracker.send)
+    label = make_labeller(task.capture, task.config, tracker.send)
     ring = _Ring(tracker, memory, task)
     span: tuple[int, int] = tracker.recv()
-    for observation, watch in observe(task.capture, segment, span, task.keep_images):
+    for observation, watch in observe(task.capture, label, span, task.keep_images):
         ring.put(observation, watch)
     tracker.send(None)

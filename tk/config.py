@@ -58,6 +58,7 @@ class TrackingConfig:
         lost_limb: and when more than this share of the samples of a limb, the head or the torso has no voxel near it.
         least_voxels: fewer surface voxels than this are no person.
         overrule: voxels about the expected body in which one camera that carves is overruled by all others; -1 never.
+        overrule_doubt: the same where that camera's pixel may be a shadow as well as the person.
     """
 
     prediction: float = 0.9
@@ -70,6 +71,7 @@ class TrackingConfig:
     lost_limb: float = 0.6
     least_voxels: int = 60
     overrule: int = 0
+    overrule_doubt: int = 2
 
     def __post_init__(self) -> None:
         if not 0 <= self.prediction <= 1.5 or self.init_frames < 1:

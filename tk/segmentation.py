@@ -13,6 +13,8 @@ from tk.io.frames import FrameSet
 from tk.model.foreground import CollinearityForeground, Mog2Foreground, median_plate
 
 Segmenter = Callable[[FrameSet], NDArray[np.uint8]]
+#: masks, and where they are 0 for what may be the person all the same; None where nobody says
+Labeller = Callable[[FrameSet], tuple[NDArray[np.uint8], NDArray[np.bool_] | None]]
 
 # frames from which a background is made where there is no recording of the empty scene
 PLATE_FRAMES = 25
@@ -20,6 +22,12 @@ PLATE_FRAMES = 25
 
 def make_segmenter(capture: Capture, config: Config, note: Callable[[str], None]) -> Segmenter:
     """Masks of each frame: the capture's own, or a segmentation learned from its background."""
+    label = make_labeller(capture, config, note)
+    return lambda frame: label(frame)[0]
+
+
+def make_labeller(capture: Capture, config: Config, note: Callable[[str], None]) -> Labeller:
+    """The same, and what is doubtful in them (:attr:`tk.tracker.Observation.doubtful`)."""
     if capture.has_masks:
         return _given_masks
     sizes = [(camera.width, camera.height) for camera in capture.rig]
@@ -34,9 +42,9 @@ def make_segmenter(capture: Capture, config: Config, note: Callable[[str], None]
         clips = median_plate(samples, sizes)
     learner = CollinearityForeground if config.segmentation == "collinearity" else Mog2Foreground
     foreground = learner.learn(clips, capture.rig.frame_shape, sizes, config.foreground)
-    return lambda frame: foreground.segment(frame.images)
+    return lambda frame: foreground.label(frame.images)
 
 
-def _given_masks(frame: FrameSet) -> NDArray[np.uint8]:
+def _given_masks(frame: FrameSet) -> tuple[NDArray[np.uint8], None]:
     assert frame.masks is not None
-    return frame.masks
+    return frame.masks, None

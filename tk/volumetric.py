@@ -20,6 +20,7 @@ from tk.config import Config
 from tk.errors import CaptureError
 from tk.io.init_pose import InitPose
 from tk.io.result_data import Result
+from tk.kernels.edge_search import DOUBTFUL
 from tk.kernels.nearest import SurfaceIndex
 from tk.model import initialisation
 from tk.model.anthropometry import BodyDimensions
@@ -47,6 +48,14 @@ class _Frame:
 
     surface: HullSurface
     index: SurfaceIndex
+
+
+def _pictures(frame: Observation) -> Pictures:
+    """What the contour cues look at."""
+    masks = frame.masks
+    if frame.doubtful is not None:
+        masks = masks | frame.doubtful.view(np.uint8) * np.uint8(DOUBTFUL)
+    return Pictures(frame.images, masks)
 
 
 def _drift(usual: float, now: float) -> float:
@@ -140,8 +149,8 @@ class VolumetricTracker:
         pose = np.zeros(len(waist))
         pose[~waist] = poses[0]
         self._pose = self._previous = pose
-        pictures = Pictures(frames[0].images, frames[0].masks)
-        fit = FrameObjective(self._objective, indices[0], np.random.default_rng(0), pictures=pictures).fit(pose)
+        first = FrameObjective(self._objective, indices[0], np.random.default_rng(0), pictures=_pictures(frames[0]))
+        fit = first.fit(pose)
         self._usual, self._usual_astray = fit.value, fit.astray_share
         self._learn_colours(surfaces[0], indices[0], pose)
         self.hull.reset()
@@ -176,7 +185,10 @@ class VolumetricTracker:
         self.hull.update(frame.masks)
         if config.tracking.overrule >= 0 and not self._lost_for:
             expected = self._pose + config.tracking.prediction * (self._pose - self._previous)
-            self.hull.overrule(self._filled(expected), config.tracking.overrule)
+            filled = self._filled(expected)
+            self.hull.overrule(filled, config.tracking.overrule)
+            if frame.doubtful is not None and config.tracking.overrule_doubt >= 0:
+                self.hull.overrule_doubt(filled, frame.doubtful, config.tracking.overrule_doubt)
         watch.lap("hull")
         surface = self.hull.surface(frame.images)
         watch.lap("surface")
@@ -186,9 +198,7 @@ class VolumetricTracker:
         watch.lap("colour")
         # a generator of its own for every frame: a resumed run draws what an unbroken one would have drawn
         rng = np.random.default_rng([config.seed, frame.index])
-        problem = FrameObjective(
-            self._objective, index, rng, config.schedule.outliers, pictures=Pictures(frame.images, frame.masks)
-        )
+        problem = FrameObjective(self._objective, index, rng, config.schedule.outliers, pictures=_pictures(frame))
         result = self._search(problem, self._starts(surface), rng)
         fit = problem.fit(result.pose)
         watch.lap("optimise")

@@ -7,7 +7,7 @@ import pytest
 
 from tests.kernels.test_contour import BODY, RIG, STRIPS, some_poses
 from tk.kernels import alignment as a
-from tk.kernels.edge_search import LINE_NUMBERS, OUTLINE, search_edges
+from tk.kernels.edge_search import DOUBTFUL, LINE_NUMBERS, OUTLINE, search_edges
 from tk.kernels.edges import EdgeConfig
 from tk.kernels.outline import OutlineKernel, OutlineSettings
 from tk.model.strips import contour_kernel
@@ -62,6 +62,28 @@ def test_entries_are_those_of_contour_and_search(settings):
     states = np.bincount(expected[..., a.STATE].astype(int).ravel(), minlength=3)
     assert states.min() > 20, "all states occur"
     np.testing.assert_allclose(got, expected, rtol=2e-6)
+
+
+def test_where_the_mask_is_in_doubt_beyond_its_edge_there_is_no_entry():
+    """Doubtful pixels are background for the search; an edge with one within three pixels beyond it is dropped."""
+    poses, chosen = some_poses(2, seed=31), STRIPS.draw(np.random.default_rng(0), batch=2, pairs=2, singles=1)
+    masks = masks_of(1)
+    sure = KERNEL(masks, poses, chosen, SETTINGS)
+    levels = masks.copy()
+    levels[:, :, ::2][masks[:, :, ::2] == 0] = DOUBTFUL
+    levels[0] = masks[0]
+    found = KERNEL(levels, poses, chosen, SETTINGS)
+    dropped = (sure[..., a.STATE] == a.ASSIGNED) & (found[..., a.STATE] == a.ABSENT)
+    for b, e in np.argwhere(sure[..., a.STATE] == a.ASSIGNED):
+        row = sure[b, e]
+        beyond = row[a.TARGET : a.TARGET + 2] + np.array([[0.5], [1.5], [2.5]]) * row[a.NORMAL : a.NORMAL + 2]
+        x, y = np.clip(np.rint(beyond).astype(int), 0, np.array(masks.shape[:0:-1]) - 1).T
+        assert dropped[b, e] == (levels[int(row[a.CAMERA]), y, x] == DOUBTFUL).any()
+    assert dropped.sum() > 20 and (found[..., a.STATE] == a.ASSIGNED).sum() > 20
+    # the others share the weight among them
+    np.testing.assert_allclose(found[..., a.SCALE].sum(axis=1), SETTINGS.weight, rtol=1e-5)
+    same = (found[..., a.STATE] != a.ABSENT)[..., None] & (np.arange(a.ENTRY_NUMBERS) != a.SCALE)
+    np.testing.assert_array_equal(found[same], sure[same])
 
 
 def test_points_outside_of_a_picture_are_unassignable():

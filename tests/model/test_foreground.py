@@ -85,6 +85,26 @@ def test_clothes_of_the_wall_s_colour_leave_no_hole(learned):
     assert iou(masks[0], truth[0]) > 0.85
 
 
+@pytest.mark.parametrize("learner", [CollinearityForeground, Mog2Foreground])
+def test_a_shadow_is_doubtful_and_the_scene_and_the_person_are_not(learner):
+    """A shadow may be a cloth as well: one camera cannot tell. What equals the scene, and the person, it can."""
+    rng = np.random.default_rng(4)
+    scene, clips = background(rng)
+    image, truth = with_person(scene, (40, 40, 200), shadow=0.75)
+    picture = expose(image, rng)
+    foreground = learner.learn(clips, SHAPE, SIZES)
+    masks, doubtful = foreground.label(picture)
+    np.testing.assert_array_equal(masks, foreground.segment(picture))
+    assert doubtful.shape == masks.shape and doubtful.dtype == bool
+    assert not (doubtful & (masks > 0)).any()
+    assert not doubtful[1, :, SIZES[1][0] :].any() and not doubtful[1, SIZES[1][1] :].any()
+    shade, elsewhere = np.zeros(SHAPE, bool), np.ones(SHAPE, bool)
+    shade[82:91, 24:56] = True  # without its soft edge
+    elsewhere[65:105, :95] = False
+    assert doubtful[0][shade].mean() > 0.9
+    assert doubtful[0][elsewhere & ~truth[0]].mean() < 0.02
+
+
 def test_a_sleeve_brighter_than_the_floor_by_less_than_its_noise_is_found():
     rng = np.random.default_rng(11)
     scene, clips = background(rng, noise=2.0)

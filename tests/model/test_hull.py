@@ -401,6 +401,42 @@ def test_one_camera_is_overruled_near_the_given_points():
     np.testing.assert_array_equal(hull.occupancy, before)
 
 
+def test_one_camera_in_doubt_is_overruled_near_the_given_points():
+    """Against counting: exactly one camera carves, near a point, and its pixel of the voxel's centre is doubtful."""
+    rig, grid = make_rig(5), VoxelGrid.cover(VOLUME, 24)
+    masks = silhouettes(rig, ball())
+    lost = masks[2] > 0
+    lost[:, : lost.shape[1] // 2] = False  # this camera doubts half of what it sees of the ball
+    masks[2] = 0
+    doubtful = np.zeros(masks.shape, bool)
+    doubtful[2] = lost
+    doubtful[0] = masks[0] == 0  # and that one all that it denies
+    hull = VisualHull(rig, grid)
+    hull.update(masks)
+    before = hull.occupancy
+    points = ball(count=3000, seed=1)
+    hull.overrule_doubt(points, doubtful, margin=2)
+    near = np.zeros(grid.shape, bool)
+    for cell in np.rint((points - grid.origin) / grid.voxel_m).astype(int):
+        low = np.maximum(cell - 2, 0)
+        near[low[0] : cell[0] + 3, low[1] : cell[1] + 3, low[2] : cell[2] + 3] = True
+    centers = grid.centers()
+    denied, doubted = [], []
+    for c, camera in enumerate(rig):
+        inside = camera.sees(centers)
+        x, y = np.rint(camera.project(centers)[0][inside]).astype(int).T
+        for flags, picture in ((denied, masks[c] == 0), (doubted, doubtful[c])):
+            flag = np.zeros(len(centers), bool)
+            flag[inside] = picture[y, x]
+            flags.append(flag)
+    holders = sum(camera.sees(centers) for camera in rig) >= 2
+    expected = (np.sum(denied, axis=0) == 1) & np.any(np.array(denied) & np.array(doubted), axis=0) & holders
+    np.testing.assert_array_equal(hull.occupancy, before | (near & expected.reshape(grid.shape)))
+    assert hull.occupancy.sum() > before.sum()
+    hull.update(masks)
+    np.testing.assert_array_equal(hull.occupancy, before)
+
+
 def test_three_cameras_overrule_nobody():
     rig, grid = make_rig(3), VoxelGrid.cover(VOLUME, 16)
     masks = silhouettes(rig, ball())
@@ -409,4 +445,5 @@ def test_three_cameras_overrule_nobody():
     hull.update(masks)
     before = hull.occupancy
     hull.overrule(ball())
+    hull.overrule_doubt(ball(), masks == 0)
     np.testing.assert_array_equal(hull.occupancy, before)

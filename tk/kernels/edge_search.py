@@ -30,11 +30,26 @@ PAIR, SINGLE, OUTLINE = 0, 1, 2
 LINE_NUMBERS = 11
 # Edges kept along one line. More are met on clutter only; the first are kept.
 MOST_EDGES = 24
+# A mask's value where person and scene cannot be told apart, and how far beyond an edge it makes the edge worthless.
+DOUBTFUL = 127
+BEYOND = 3
 
 
 @ti.func
 def _inside(masks: ti.template(), c: int, x: int, y: int):
     return 1 if masks[c, y, x] > 127 else 0
+
+
+@ti.func
+def is_doubtful(masks: ti.template(), c: int, width: int, height: int, edge, normal):
+    """1 where just beyond an outline's edge, (2,) pixels, the mask cannot tell person and scene apart."""
+    result = 0
+    for i in ti.static(range(BEYOND)):
+        x = ti.cast(ti.round(edge[0] + (i + 0.5) * normal[0]), ti.i32)
+        y = ti.cast(ti.round(edge[1] + (i + 0.5) * normal[1]), ti.i32)
+        if 0 <= x < width and 0 <= y < height and masks[c, y, x] == DOUBTFUL:
+            result = 1
+    return result
 
 
 @ti.func

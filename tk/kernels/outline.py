@@ -2,6 +2,7 @@
 
 For each pose, camera and strip this finds the contour points (:mod:`tk.kernels.contour`), keeps those on the outline of
 the whole body, and looks from each along the contour's normal for the mask's boundary (:mod:`tk.kernels.edge_search`).
+Where the mask ends in pixels that may be a shadow or a cloth, its boundary is not the body's, and there is no entry.
 A point's entry (:mod:`tk.kernels.alignment`) has a place of its own, by camera, strip and slot, and is absent where the
 strip has no such point: nothing is gathered, and an absent entry costs its readers a comparison.
 """
@@ -22,7 +23,7 @@ from tk.kernels.contour import (
     strip_piece,
     to_zero_configuration,
 )
-from tk.kernels.edge_search import outline_at
+from tk.kernels.edge_search import is_doubtful, outline_at
 from tk.kernels.kinematics import forward_tree
 from tk.kernels.launch import Launcher
 from tk.kernels.objective import PIECE_DOF
@@ -109,14 +110,21 @@ def _outline_kernel(real):
                             if clear:
                                 target = ti.select(end == 0, behind(x, n, center), x)
                                 clear = is_occluded(placed, c, pieces, near, target, center) == 0
+                        zero = 0.0 * depth  # of the kernel's type
+                        normal = ti.Vector([zero, zero])
+                        pixels_a_metre, at, found = zero, zero, 0
                         if clear:
                             normal = image_normal(J, n)
                             pixels_a_metre = ti.sqrt(0.5 * J.norm_sqr())
-                            width, height = cameras[v, CAMERA_NUMBERS + 1], cameras[v, CAMERA_NUMBERS]
+                            width = ti.cast(cameras[v, CAMERA_NUMBERS + 1], ti.i32)
+                            height = ti.cast(cameras[v, CAMERA_NUMBERS], ti.i32)
                             found, at = outline_at(
-                                masks, v, ti.cast(width, ti.i32), ti.cast(height, ti.i32),
+                                masks, v, width, height,
                                 pixel[0], pixel[1], normal[0], normal[1], reach_m * pixels_a_metre,
                             )  # fmt: skip
+                            if found == 1:
+                                clear = is_doubtful(masks, v, width, height, pixel + at * normal, normal) == 0
+                        if clear:
                             x_zero = to_zero_configuration(pieces, i, q)
                             for a in ti.static(range(3)):
                                 entries[b, e, alignment.POINT_A + a] = x_zero[a]
@@ -165,7 +173,7 @@ class OutlineKernel:
         """Entries (B, C·K·2, 17) of B poses, by camera, strip and slot; absent where a strip has no outline there.
 
         Args:
-            masks: (C, H, W) uint8, 0 or 255.
+            masks: (C, H, W) uint8: 255 the person, 0 the scene, :data:`~tk.kernels.edge_search.DOUBTFUL` either.
             pose: (B, D).
             chosen: (B, K) strips of each pose.
             settings: constants.

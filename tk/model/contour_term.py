@@ -111,7 +111,8 @@ class ContourConfig:
 
 @dataclass(frozen=True)
 class Pictures:
-    """One frame's pictures (C, H, W, 3) uint8 and foreground masks (C, H, W) uint8, 0 or 255."""
+    """One frame's pictures (C, H, W, 3) uint8 and foreground masks (C, H, W) uint8: 255 the person, 0 the scene,
+    :data:`~tk.kernels.edge_search.DOUBTFUL` either."""
 
     images: NDArray[np.uint8]
     masks: NDArray[np.uint8]
@@ -177,9 +178,11 @@ class ContourTerm:
         """(K,) strips of the whole body: at random, or evenly spread without a generator."""
         return np.concatenate([_some(row, count, rng) for row, count in self._all])
 
-    def draw_chains(self, rng: np.random.Generator | None) -> Ints:
-        """(chains, K) strips of each chain."""
-        return np.stack([np.concatenate([_some(row, count, rng) for row, count in chain]) for chain in self._chains])
+    def draw_chains(self, rng: np.random.Generator | None, scale: int = 1) -> Ints:
+        """(chains, K) strips of each chain, ``scale`` times as many."""
+        return np.stack(
+            [np.concatenate([_some(row, scale * count, rng) for row, count in chain]) for chain in self._chains]
+        )
 
     def assign(self, pictures: Pictures, poses: Float, chosen: Ints, softness: float = 1.0) -> NDArray[np.floating]:
         """(B, E, 17) entries at poses (B, D) from strips (B, K)."""

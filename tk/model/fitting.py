@@ -25,7 +25,8 @@ Float = NDArray[np.float64]
 
 # Parameters of the fit: dimensions that share a factor, and the prior's standard deviation of its logarithm. Lengths of
 # a stature scatter by some 4 % (NASA-STD-3000, vol. 1, sec. 3.3); an arm's or leg's two lengths keep their ratio
-# better.
+# better. So do a trunk's depth and width, by some 10 %: four cameras at the corners of a room see all but the sum of
+# their squares.
 GROUPS: tuple[tuple[tuple[str, ...], float], ...] = (
     (("trunk",), 0.03),
     (("head",), 0.06),
@@ -37,10 +38,10 @@ GROUPS: tuple[tuple[tuple[str, ...], float], ...] = (
     (("hand",), 0.15),
     (("thigh", "calf"), 0.03),
     (("thigh",), 0.02),
-    (("chest_half_width",), 0.15),
-    (("chest_half_depth",), 0.2),
-    (("hips_half_width",), 0.15),
-    (("hips_half_depth",), 0.2),
+    (("chest_half_width", "chest_half_depth"), 0.15),
+    (("chest_half_depth",), 0.1),
+    (("hips_half_width", "hips_half_depth"), 0.15),
+    (("hips_half_depth",), 0.1),
     (("head_radius",), 0.15),
     (("neck_radius",), 0.1),
     (("upper_arm_radius",), 0.2),

@@ -174,6 +174,14 @@ class Foreground(Protocol):
         """Pictures (C, H, W, 3) uint8 BGR to masks (C, H, W) uint8, 0 or 255."""
         ...
 
+    def label(self, images: Images) -> tuple[Images, NDArray[np.bool_]]:
+        """The masks, and where they are 0 for a shadow that may be the person all the same: (C, H, W) bool.
+
+        A cloth of the floor's colour is darker than the floor where it faces away from the lamp, as a shadow is. One
+        camera cannot tell, all of them together can.
+        """
+        ...
+
 
 def median_plate(frames: Sequence[Images], sizes: ArrayLike) -> tuple[Images, ...]:
     """An empty scene from a recording without one: the median over frames that are spread over it.
@@ -357,6 +365,13 @@ class CollinearityForeground:
 
     def segment(self, images: Images) -> Images:
         """Pictures (C, H, W, 3) uint8 BGR to masks (C, H, W) uint8, 0 or 255."""
+        return self.label(images)[0]
+
+    def label(self, images: Images) -> tuple[Images, NDArray[np.bool_]]:
+        """Masks (C, H, W) uint8, and where they are 0 for what differs from the scene as a shadow does (C, H, W) bool.
+
+        What differs is looked for about the person, as far as :meth:`segment` looks.
+        """
         config = self.config
         cameras = range(len(images))
         # OpenCV lets go of the interpreter: cameras run side by side, each with its own memory
@@ -372,8 +387,19 @@ class CollinearityForeground:
         )
         self._planes.relax(config.threshold, config.neighbour_octaves, config.iterations)
         masks = np.zeros(images.shape[:3], np.uint8)
-        list(self._pool.map(lambda c: self._outline(images[c], c, levels[c][0], self._decide(c), masks[c]), cameras))
-        return masks
+        doubtful = np.zeros(images.shape[:3], np.bool_)
+        list(self._pool.map(lambda c: self._draw(images[c], c, levels[c][0], masks[c], doubtful[c]), cameras))
+        return masks, doubtful
+
+    def _draw(
+        self, image: Images, c: int, gain: NDArray[np.float64], mask: Images, doubtful: NDArray[np.bool_]
+    ) -> None:
+        """Decide on camera ``c``'s reduced picture; the results in full go to ``mask`` and ``doubtful`` (H, W)."""
+        decision, doubt = self._decide(c)
+        self._outline(image, c, gain, decision, mask)
+        height, width = mask.shape
+        whole = cv2.resize(doubt, (width, height), interpolation=cv2.INTER_NEAREST)
+        np.greater(whole, mask, out=doubtful)  # 1 where the mask is 0
 
     def _expose(self, c: int, image: Images) -> tuple[NDArray[np.float64], float]:
         """Reduce camera ``c``'s picture and bring its reduced plate to the same gain; the gain (3,) and the noise."""
@@ -383,17 +409,18 @@ class CollinearityForeground:
         cv2.transform(self._small_plates[c], np.diag(gain), dst=self._small_scenes[c])
         return gain, variance
 
-    def _decide(self, c: int) -> Images:
-        """(h, w) uint8, 0 or 255: which pixels of camera ``c``'s reduced picture show the person."""
+    def _decide(self, c: int) -> tuple[Images, Images]:
+        """(h, w) uint8, 0 or 255: which pixels of camera ``c``'s reduced picture show the person; 0 or 1: may do so."""
         config, planes = self.config, self._planes
         mask = np.zeros(self._small.shape[1:3], np.uint8)
+        doubt = np.zeros_like(mask)
         height = int(self.sizes[c, 1]) // config.reduction
         area = int(np.prod(self.sizes[c])) / config.reduction**2
         reach = 2 * round(config.bridge * height / 2) + 1
         # the window widens whatever shows the person: what vanishes under erosion is noise
         x, y, w, h = cv2.boundingRect(cv2.erode(planes.labels[c], _SQUARE3))
         if w == 0:
-            return mask
+            return mask, doubt
         margin = reach + height // 10  # shows enough of a shadow to tell it from a cloth
         crop = (slice(max(y - margin, 0), y + h + margin), slice(max(x - margin, 0), x + w + margin))
         difference = np.ascontiguousarray(planes.difference[c][crop])
@@ -413,8 +440,9 @@ class CollinearityForeground:
         foreground = joined(
             foreground, difference > 0, collinearity, config.seed, config.speck_area * area, config.gap * height, bar
         )
+        doubt[crop] = (difference > 0) & ~foreground
         mask[crop] = clean_by_area(foreground, config.speck_area * area, config.hole_area * area)
-        return mask
+        return mask, doubt
 
     def _brightness(self, c: int) -> tuple[NDArray[np.float32], float, NDArray[Any]]:
         """Of camera ``c``'s reduced picture: mean over 3×3 pixels less the scene's, its noise, and the scene (h, w)."""
@@ -478,11 +506,18 @@ class Mog2Foreground:
 
     def segment(self, images: Images) -> Images:
         """Pictures (C, H, W, 3) uint8 BGR to masks (C, H, W) uint8, 0 or 255."""
+        return self.label(images)[0]
+
+    def label(self, images: Images) -> tuple[Images, NDArray[np.bool_]]:
+        """Masks (C, H, W) uint8, and where OpenCV says shadow (C, H, W) bool."""
         masks = np.zeros(images.shape[:3], np.uint8)
+        doubtful = np.zeros(images.shape[:3], np.bool_)
         for c, (model, (width, height)) in enumerate(zip(self._models, self.sizes, strict=True)):
             labels = model.apply(np.ascontiguousarray(images[c, :height, :width]), learningRate=0)
             area = width * height
             masks[c, :height, :width] = clean_by_area(
                 labels == 255, self.config.speck_area * area, self.config.hole_area * area
             )
-        return masks
+            shadow = labels == model.getShadowValue()
+            doubtful[c, :height, :width] = shadow & (masks[c, :height, :width] == 0)
+        return masks, doubtful

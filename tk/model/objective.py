@@ -204,6 +204,9 @@ class Evaluation(NamedTuple):
 
 # A voxel farther from the body than this is not explained by it, metres.
 ASTRAY_M = 0.1
+# So many times the contour points of an iteration when hypotheses of a limb are compared: a limb has but a few on the
+# outline of the whole body, and one that met a wrong boundary would decide.
+COMPARED = 5
 # A voxel this far from the nearest piece may belong to another: voxels lie 2 to 3 cm off the piece they belong to.
 UNCLAIMED_M = 0.05
 
@@ -354,7 +357,7 @@ class FrameObjective:
         """
         samples = np.stack([np.resize(even(s, 60), 60) for s in self.objective.chain_samples])
         voxels = np.stack([np.resize(even(pool, 120), 120) for pool in self._pools])
-        entries = self._entries(poses, self._term.draw_chains(None)[owner]) if self.contours else None
+        entries = self._entries(poses, self._term.draw_chains(None, COMPARED)[owner]) if self.contours else None
         return self._evaluate(samples[owner], voxels[owner], poses, None, self.objective.settings, entries).value
 
     def value(self, pose: Float) -> float:

@@ -136,8 +136,8 @@ class ScheduleConfig:
     polish_iterations: int = 5
     newton_iterations: int = 2
     retries: int = 2
-    hypotheses: int = 4
-    searched: int = 2
+    hypotheses: int = 6
+    searched: int = 3
     wide_hypotheses: int = 8
     candidates: int = 48
     spread_deg: float = 40.0
