@@ -30,6 +30,7 @@ from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -89,6 +90,13 @@ def open_source(capture: Capture, config: Config, note: Note, keep_images: bool 
 
 def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _threads() -> str:
+    """For the process's kernels: half the cores, for the tracker is what should not wait. Fewer if the user says so."""
+    asked = os.environ.get("TK_THREADS")
+    half = max(_cores() // 2, 1)
+    return str(min(half, int(asked)) if asked else half)
 
 
 def observe(
@@ -209,6 +217,7 @@ class Ahead:
         try:
             self._process = subprocess.Popen(
                 [sys.executable, "-c", _START, str(theirs.fileno()), str(handle), *sys.path],
+                env={**os.environ, "TK_THREADS": _threads()},
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=(theirs.fileno(), handle),
@@ -330,6 +339,7 @@ def serve(socket: int, handle: int) -> None:
     Args:
         socket, handle: descriptors of the socket to the tracker and of the memory that both share.
     """
+    cv2.setNumThreads(1)  # the cameras are segmented side by side already
     with Connection(socket) as tracker, mmap.mmap(handle, 0) as memory:
         os.close(handle)
         # the other end closed: the tracker has ended, or has stopped asking
