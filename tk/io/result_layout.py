@@ -87,6 +87,7 @@ class Twin:
         self.model_version = 0
         self._open: dict[str, h5py.h5d.DatasetID] = {}
         self._state_names = set(read_values(file, "resume/state"))
+        self._put_last: dict[str, tuple[object, bytes]] = {}  # most of a state is the same in every frame
 
     def append(self, news: Sequence[Row]) -> None:
         """Add frames, and the latest state among them. Nothing is flushed."""
@@ -158,6 +159,10 @@ class Twin:
         """Overwrite a small dataset, in place where the new value fits."""
         array = np.ascontiguousarray(encode(value)).reshape(np.shape(encode(value)))
         is_text = isinstance(value, str)
+        content = ((array.dtype, array.shape, is_text), array.tobytes())
+        if self._put_last.get(name) == content:
+            return
+        self._put_last[name] = content
         if name in self._open or name in self.file:
             dataset = self._dataset(name)
             growing = dataset.get_create_plist().get_layout() == h5py.h5d.CHUNKED
@@ -193,6 +198,7 @@ class Twin:
 
     def _drop(self, name: str) -> None:
         self._open = {key: handle for key, handle in self._open.items() if not f"{key}/".startswith(f"{name}/")}
+        self._put_last = {key: last for key, last in self._put_last.items() if key in self._open}
         del self.file[name]
 
 
