@@ -62,7 +62,7 @@ def send(number: int, frame: int, *arguments: Any) -> subprocess.CompletedProces
     return subprocess.run(
         [sys.executable, "-c", VICTIM, *map(str, arguments)],
         cwd=ROOT,
-        env={**os.environ, "TEST_FRAME": str(frame), "TEST_SIGNAL": str(number)},
+        env={**os.environ, "TEST_FRAME": str(frame), "TEST_SIGNAL": str(int(number))},
         capture_output=True,
         text=True,
         timeout=120,
