@@ -22,7 +22,9 @@ pytestmark = pytest.mark.slow
 SHARED = Path(__file__).parents[2] / "shared" / "captures"
 DEMO = Path(__file__).parents[1] / "tk" / "data" / "demo"
 FRAMES = {"walk": 80, "dance": 120, "punch": 150}
-MEAN_CM = 6.0
+SEEDS = 5
+MEAN_CM = 2.9  # Kehl & Van Gool 2006, section 7.3
+DEMO_CM = 6.0  # a body of other proportions
 MEMORY_MIB = 2048
 
 # the peak memory of the command alone: this process has Open3D and a compiler's caches in it
@@ -43,22 +45,22 @@ def shared(name: str) -> Path:
     return folder
 
 
-def assert_accurate(found: Evaluation, frames: int) -> None:
+def assert_complete(found: Evaluation, frames: int) -> None:
     assert (found.judged, found.missing_outside, found.lost, found.nan_frames) == (frames, 0, 0, 0)
-    assert found.raw.all.mean_cm <= MEAN_CM, found.format_table()
 
 
-# The bar stands; punch misses it (8.4 cm with seed 0, 6.6 with seed 1): docs/results.md says why and what was tried.
-MISSED = pytest.mark.xfail(reason="grey clothes, arms before the chest: the hull does not show them", strict=False)
-
-
-@pytest.mark.parametrize("name", ["walk", "dance", pytest.param("punch", marks=MISSED)])
+@pytest.mark.parametrize("name", FRAMES)
 def test_captures_with_an_initial_pose_from_their_videos(name: str, tmp_path: Path) -> None:
-    """64³, five cameras, masks from the videos and the background clips."""
+    """64³, five cameras, masks from the videos and the background clips; the mean over the seeds."""
     folder = shared(name)
-    result = tmp_path / "r.h5"
-    track(open_capture(folder, masks="none"), result, Config(), Silent())
-    assert_accurate(evaluate_files(result, folder / "truth.h5"), FRAMES[name])
+    means = []
+    for seed in range(SEEDS):
+        result = tmp_path / f"{seed}.h5"
+        track(open_capture(folder, masks="none"), result, Config(seed=seed), Silent())
+        found = evaluate_files(result, folder / "truth.h5")
+        assert_complete(found, FRAMES[name])
+        means.append(found.raw.all.mean_cm)
+    assert np.mean(means) <= MEAN_CM, means
 
 
 @pytest.mark.parametrize("name", FRAMES)
@@ -86,6 +88,7 @@ def test_the_capture_that_ships(tk: Tk, tmp_path: Path) -> None:
     assert ran.code == 0, ran.err
     found = evaluate_files(tmp_path / "demo.h5", DEMO / "truth.h5")
     assert found.format_table() in ran.out
-    assert_accurate(found, found.judged)
+    assert_complete(found, found.judged)
+    assert found.raw.all.mean_cm <= DEMO_CM, found.format_table()
     told = json.loads(tk("evaluate", tmp_path / "demo.h5", DEMO / "truth.h5", "--json").out)
     assert told["lost"] == 0

@@ -155,6 +155,11 @@ def test_the_papers_preset_has_the_papers_numbers() -> None:
     assert (c.smd.memory, c.smd.max_iterations, c.smd.window, c.smd.shuffle) == (0.3, 40, 3, True)
 
 
+def test_the_fast_preset_searches_less() -> None:
+    fast, usual = Config.preset("fast").schedule, Config().schedule
+    assert fast.retries == 0 and fast.hypotheses < usual.hypotheses and fast.searched < usual.searched
+
+
 def test_a_file_wins_over_a_preset(tmp_path: Path) -> None:
     file = tmp_path / "own.toml"
     file.write_text("voxels = 128\n[contours]\nviews = 2\n")

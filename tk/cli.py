@@ -65,7 +65,7 @@ _masks = click.option(
 )  # fmt: skip
 _voxels = click.option("--voxels", type=int, help="Voxels along the working volume's longest side.  [default: 64]")
 _config = click.option("--config", "config_file", type=click.Path(path_type=Path), help="Settings, TOML.")
-_preset = click.option("--preset", metavar="NAME", help="Settings to begin with: kehl2006, the paper's own.")
+_preset = click.option("--preset", metavar="NAME", help="Settings to begin with: kehl2006, the paper's own; fast.")
 
 
 @main.command()

@@ -37,7 +37,7 @@ else:
 T = TypeVar("T")
 
 SEGMENTATIONS = ("collinearity", "mog2")
-PRESETS = ("kehl2006",)
+PRESETS = ("kehl2006", "fast")
 
 
 @dataclass(frozen=True)
