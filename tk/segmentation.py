@@ -27,7 +27,7 @@ def make_segmenter(capture: Capture, config: Config, note: Callable[[str], None]
 
 
 def make_labeller(capture: Capture, config: Config, note: Callable[[str], None]) -> Labeller:
-    """The same, and what is doubtful in them (:attr:`tk.tracker.Observation.doubtful`)."""
+    """The same, and what is doubtful in them (:attr:`tk.trackers.base.Observation.doubtful`)."""
     if capture.has_masks:
         return _given_masks
     sizes = [(camera.width, camera.height) for camera in capture.rig]

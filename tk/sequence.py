@@ -22,7 +22,7 @@ from tk.io.result import FrameResult, HullPoints, ResultMeta, ResultWriter, Stat
 from tk.model.hull import HullSurface
 from tk.segmentation import make_segmenter as make_segmenter
 from tk.silhouette import SilhouetteTracker
-from tk.tracker import Estimate, Tracker
+from tk.trackers.base import Estimate, Tracker
 from tk.volumetric import LevenbergMarquardtTracker, VolumetricTracker
 
 TRACKERS = {tracker.method: tracker for tracker in (VolumetricTracker, LevenbergMarquardtTracker)}

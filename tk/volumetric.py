@@ -34,7 +34,7 @@ from tk.model.objective import CHAIN_OF_SEGMENT, BodyObjective, Fit, FrameObject
 from tk.model.skeleton import CHAINS, JOINTS, WAIST, build_skeleton, turn_trunk, with_waist, without_waist
 from tk.model.volume import Volume, VoxelGrid
 from tk.optim import lm_schedule, schedule
-from tk.tracker import Estimate, Observation, Stopwatch
+from tk.trackers.base import Estimate, Observation, Stopwatch
 
 Float = NDArray[np.float64]
 
