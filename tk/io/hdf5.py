@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import contextlib
 import math
+import mmap
 import os
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
@@ -29,6 +31,8 @@ FILTERS = (1, 2, 3, 32000)
 
 #: what compressed data may unfold to: so many times what is stored, or at least so many bytes
 MOST_UNFOLDED, ALWAYS_UNFOLDED_BYTES = 100, 2**20
+
+_HEAP = b"GCOL\x01\x00\x00\x00"  # how a heap of texts begins: signature, version, reserved
 
 _NUMBERS = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.ENUM)  # h5py stores bool as an enumeration
 _KINDS = {"f": "fiu", "i": "iuf", "u": "iuf", "b": "biu"}  # what may be stored where a kind is asked for
@@ -50,6 +54,7 @@ class Hdf5Reader:
         self._file = file
         self._bytes = path.stat().st_size
         with self._guarded("/"):
+            _check_text_heaps(path, file)
             self._survey()
 
     def __contains__(self, name: str) -> bool:
@@ -223,6 +228,33 @@ class Hdf5Reader:
         if stored > self._bytes or declared > most:
             self.fail(f"/{name} declares {declared} bytes, and {stored} are stored; the file is damaged")
         return shape
+
+
+def _check_text_heaps(path: Path, file: h5py.File) -> None:
+    """Walk through the heaps that hold texts of any length, as HDF5 will.
+
+    HDF5 (2.0.0 and before) goes round for ever in a heap with an object of no size. The layout: section III.E of the
+    HDF5 file format specification.
+
+    Raises:
+        ResultError: a heap is damaged.
+    """
+    if file.id.get_create_plist().get_sizes() != (8, 8):
+        raise ResultError(f"{path}: has addresses of another length than 8 bytes; write it anew with another HDF5")
+    with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        start = data.find(_HEAP)
+        while start >= 0:
+            if len(data) - start >= 16:
+                (size,) = struct.unpack_from("<Q", data, start + 8)
+                end = start + min(size, len(data) - start)
+                at = start + 16
+                while end - at >= 16:
+                    index, length = struct.unpack_from("<H6xQ", data, at)
+                    taken = 16 + (length + 7) // 8 * 8 if index else length  # object 0 is the free space
+                    if not 0 < taken <= end - at:
+                        raise ResultError(f"{path}: the heap of its texts is damaged")
+                    at += taken
+            start = data.find(_HEAP, start + 1)
 
 
 @contextlib.contextmanager

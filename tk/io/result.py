@@ -36,9 +36,17 @@ from tk.io.result_data import (
     UsedCameras,
     Value,
 )
-from tk.io.result_files import Workshop, as_result_error, check_is_result, move_to_memory, open_for_writing, writable
+from tk.io.result_files import (
+    WRITE_ERRORS,
+    Workshop,
+    as_result_error,
+    check_is_result,
+    move_to_memory,
+    open_for_writing,
+    writable,
+)
 from tk.io.result_layout import Row, Twin, put_cameras, put_model, write_layout
-from tk.io.result_read import check_format, count_rows, read_joints, read_meta, read_result, read_values
+from tk.io.result_read import check_format, check_hull, count_rows, read_joints, read_meta, read_result, read_values
 from tk.io.result_revision import revise_result
 
 __all__ = [
@@ -129,6 +137,7 @@ class ResultWriter:
             if difference:
                 done.fail(f"was made differently: {difference}; run without --resume to start afresh")
             rows = count_rows(done, found)
+            check_hull(done, rows)
             if "resume/rows" in done:
                 done.array("resume/rows", "int64", (), most=rows)
             state, model = read_values(done, "resume/state"), read_values(done, "model")
@@ -242,6 +251,6 @@ class ResultWriter:
             if news:
                 twin.append(news)
             twin.file.flush()
-        except (OSError, RuntimeError):
+        except WRITE_ERRORS:
             move_to_memory(twin.file)
             raise

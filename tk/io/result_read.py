@@ -172,6 +172,21 @@ def count_rows(file: Hdf5Reader, meta: ResultMeta) -> int:
     return rows
 
 
+def check_hull(file: Hdf5Reader, rows: int) -> NDArray[np.int64] | None:
+    """`/hull/offsets`, which divide the voxels into frames; None if there is no hull.
+
+    Raises:
+        ResultError: they do not, or colours or positions are missing.
+    """
+    if "hull" not in file:
+        return None
+    offsets = file.array("hull/offsets", "int64", (rows + 1,))
+    shapes = [file.shapes.get(name) for name in ("hull/positions", "hull/colors")]
+    if offsets[0] != 0 or (np.diff(offsets) < 0).any() or shapes != [(offsets[-1], 3)] * 2:
+        file.fail("/hull/offsets does not divide /hull/positions and /hull/colors into frames; the file is damaged")
+    return offsets
+
+
 def read_values(file: Hdf5Reader, group: str) -> dict[str, Value]:
     """All datasets below a group as a flat mapping; {} if there is no such group.
 
@@ -243,11 +258,10 @@ def _read_smoothed(file: Hdf5Reader, meta: ResultMeta, rows: int) -> dict[str, N
 
 
 def _read_hull(file: Hdf5Reader, rows: int) -> Hull | None:
-    if "hull" not in file:
+    offsets = check_hull(file, rows)
+    if offsets is None:
         return None
-    positions = file.array("hull/positions", "float32", (None, 3), FAR_M)
-    colors = file.array("hull/colors", "uint8", positions.shape)
-    offsets = file.array("hull/offsets", "int64", (rows + 1,))
-    if offsets[0] != 0 or (np.diff(offsets) < 0).any() or offsets[-1] != len(positions):
-        file.fail("/hull/offsets does not divide /hull/positions into frames; the file is damaged")
-    return Hull(positions, colors, offsets)
+    shape = (int(offsets[-1]), 3)
+    return Hull(
+        file.array("hull/positions", "float32", shape, FAR_M), file.array("hull/colors", "uint8", shape), offsets
+    )

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from tk.io.hdf5 import open_hdf5
 from tk.io.result_columns import Column, columns_of, put_attributes
 from tk.io.result_data import FORMAT_VERSION, ResultMeta, UsedCameras, Value, can_be_smoothed
-from tk.io.result_files import Workshop, as_result_error, move_to_memory, open_for_writing, writable
+from tk.io.result_files import WRITE_ERRORS, Workshop, as_result_error, move_to_memory, open_for_writing, writable
 from tk.io.result_layout import put_cameras, put_model
 from tk.io.result_read import check_format, count_rows, read_meta
 
@@ -77,7 +77,7 @@ def revise_result(
                 if cameras is not None:
                     put_cameras(copy, cameras)
                 copy.flush()
-            except (OSError, RuntimeError):
+            except WRITE_ERRORS:
                 move_to_memory(copy)
                 raise
         with revised.open("rb") as stream:
