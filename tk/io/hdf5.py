@@ -29,8 +29,9 @@ MOST_OBJECTS, DEEPEST, MOST_ATTRIBUTE_BYTES = 10_000, 12, 2**20
 #: filters that only compress or check: deflate, shuffle, Fletcher's checksum, and h5py's LZF
 FILTERS = (1, 2, 3, 32000)
 
-#: what compressed data may unfold to: so many times what is stored, or at least so many bytes
-MOST_UNFOLDED, ALWAYS_UNFOLDED_BYTES = 100, 2**20
+#: compressed data may unfold to so many times what is stored; so many bytes may be declared though nothing is stored
+#: (HDF5 stores no parts that nobody wrote)
+MOST_UNFOLDED, MOST_UNWRITTEN_BYTES = 100, 2**16
 
 _HEAP = b"GCOL\x01\x00\x00\x00"  # how a heap of texts begins: signature, version, reserved
 
@@ -221,7 +222,7 @@ class Hdf5Reader:
         filters = [made.get_filter(index)[0] for index in range(made.get_nfilters())]
         if any(code not in FILTERS for code in filters):
             self.fail(f"/{name} is compressed in a way that is not read here; write it with gzip or without")
-        most = stored if not filters else max(MOST_UNFOLDED * stored, ALWAYS_UNFOLDED_BYTES)
+        most = max(stored * (MOST_UNFOLDED if filters else 1), MOST_UNWRITTEN_BYTES)
         declared = item * math.prod(shape)
         if layout == h5py.h5d.CHUNKED and declared:
             declared = max(declared, item * math.prod(made.get_chunk()))

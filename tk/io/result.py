@@ -132,8 +132,8 @@ class ResultWriter:
             found = read_meta(done)
             try:
                 difference = found.difference(meta)
-            except (ValueError, RecursionError):
-                done.fail("its configuration is not TOML; run without --resume to start afresh")
+            except ResultError as reason:
+                done.fail(f"{reason}; run without --resume to start afresh")
             if difference:
                 done.fail(f"was made differently: {difference}; run without --resume to start afresh")
             rows = count_rows(done, found)
