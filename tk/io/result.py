@@ -46,7 +46,16 @@ from tk.io.result_files import (
     writable,
 )
 from tk.io.result_layout import Row, Twin, put_cameras, put_model, write_layout
-from tk.io.result_read import check_format, check_hull, count_rows, read_joints, read_meta, read_result, read_values
+from tk.io.result_read import (
+    blamed_on,
+    check_format,
+    check_hull,
+    count_rows,
+    read_joints,
+    read_meta,
+    read_result,
+    read_values,
+)
 from tk.io.result_revision import revise_result
 
 __all__ = [
@@ -64,6 +73,7 @@ __all__ = [
     "Status",
     "UsedCameras",
     "Value",
+    "blamed_on",
     "read_joints",
     "read_result",
     "revise_result",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +112,21 @@ def read_joints(path: str | os.PathLike[str]) -> JointTrack:
     if timing:
         seconds = timing["total"] if "total" in timing else np.sum(list(timing.values()), axis=0)
     return JointTrack(path, frames, positions, status, seconds, None if sigma is None else sigma[:, order])
+
+
+@contextlib.contextmanager
+def blamed_on(path: Path, what: str) -> Iterator[None]:
+    """Whatever goes wrong inside is the fault of ``what`` in a result: of a body or a state that no tracker wrote.
+
+    Raises:
+        ResultError: in the place of the exceptions that values of a wrong kind, shape or size cause.
+    """
+    try:
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            yield
+    except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, AssertionError) as error:
+        detail = " ".join(str(error).split())[:100]
+        raise ResultError(f"{path}: {what} cannot be used; the file is damaged ({detail})") from error
 
 
 # --- shared with the writer -------------------------------------------------------------------------------------------
