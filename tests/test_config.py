@@ -87,7 +87,12 @@ def test_what_a_file_leaves_out_keeps_its_default() -> None:
         ("[tracking]\nprediction = 7.0", ["prediction = 7.0"]),
         ("[tracking]\ninit_frames = 0", ["init_frames = 0"]),
         ("[smd]\nmemory = 3.0", ["smd.memory"]),
-        ("voxels = ", ["not valid TOML"]),
+        ("voxels = ", ["invalid TOML"]),
+        ("tracking = " + 3000 * "[", ["invalid TOML"]),
+        ("[tracking]\ninit_frames = 1000000000\n", ["tracking.init_frames = 1000000000 is too large"]),
+        ("[smd]\nmeta_step = 1e300\n", ["smd.meta_step = 1e+300 is too large"]),
+        (f"[smd]\nmeta_step = 1{400 * '0'}\n", ["smd.meta_step = 1000", "is too large"]),
+        (f"voxels = 1{5000 * '0'}\n", ["invalid TOML"]),
         ("seed = 99999999999999999999", ["seed"]),
     ],
 )
@@ -129,7 +134,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         Config.read(tmp_path)
     (tmp_path / "latin.toml").write_bytes(b'segmentation = "\xe4"')
-    with pytest.raises(ConfigError, match=r"latin\.toml: cannot be read"):
+    with pytest.raises(ConfigError, match=r"latin\.toml: is not UTF-8"):
         Config.read(tmp_path / "latin.toml")
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import sys
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any, TypeVar
 import tomli_w
 
 from tk.errors import ConfigError
+from tk.io.toml import LARGE, parse_toml, read_text, shown
 from tk.kernels.edges import EdgeConfig
 from tk.kernels.objective import ObjectiveSettings
 from tk.model.appearance import AppearanceConfig
@@ -29,15 +29,13 @@ from tk.optim.schedule import ScheduleConfig
 from tk.optim.smd import SmdConfig
 from tk.silhouette import SilhouetteConfig
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
 T = TypeVar("T")
 
 SEGMENTATIONS = ("collinearity", "mog2")
 PRESETS = ("kehl2006", "fast")
+
+#: of whatever a configuration counts: frames, points, rounds
+MOST_COUNT = 100_000
 
 
 @dataclass(frozen=True)
@@ -131,11 +129,7 @@ class Config:
         Raises:
             ConfigError: unknown names, wrong types, values out of range; ``where`` names the source.
         """
-        try:
-            values = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
-            raise ConfigError(f"{where}: not valid TOML: {error}") from None
-        return _build(base or Config(), values, where)
+        return _build(base or Config(), parse_toml(text, where, ConfigError), where)
 
     @staticmethod
     def preset(name: str) -> Config:
@@ -152,10 +146,7 @@ class Config:
     @staticmethod
     def read(path: Path, base: Config | None = None) -> Config:
         """A configuration file; what it leaves out is as in ``base``, the defaults if None."""
-        try:
-            return Config.from_toml(path.read_text(encoding="utf-8"), str(path), base)
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path}: cannot be read: {error}") from None
+        return Config.from_toml(read_text(path, ConfigError), str(path), base)
 
 
 def _build(default: T, values: dict[str, Any], where: str, path: str = "") -> T:
@@ -167,6 +158,10 @@ def _build(default: T, values: dict[str, Any], where: str, path: str = "") -> T:
         if key not in known:
             raise ConfigError(f"{where}: unknown setting {name}; known here: {', '.join(known)}")
         old = known[key]
+        if isinstance(value, int) and name != "seed" and abs(value) > MOST_COUNT:
+            raise ConfigError(f"{where}: {name} = {shown(value)} is too large; give {MOST_COUNT} at most")
+        if isinstance(value, float) and math.isfinite(value) and abs(value) > LARGE:
+            raise ConfigError(f"{where}: {name} = {value:g} is too large; give {LARGE:g} at most")
         if dataclasses.is_dataclass(old):
             if not isinstance(value, dict):
                 raise ConfigError(f"{where}: {name} must be a table")
@@ -174,7 +169,7 @@ def _build(default: T, values: dict[str, Any], where: str, path: str = "") -> T:
         elif isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
             changes[key] = float(value)
         elif type(value) is not type(old):
-            raise ConfigError(f"{where}: {name} = {value!r} must be of type {type(old).__name__}, as {old!r} is")
+            raise ConfigError(f"{where}: {name} = {shown(value)} must be of type {type(old).__name__}, as {old!r} is")
         elif isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"{where}: {name} = {value} must be a finite number")
         else:

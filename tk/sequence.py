@@ -18,7 +18,7 @@ from tk.config import Config
 from tk.errors import CaptureError, ConfigError, ResultError, TkError
 from tk.io.capture import Capture
 from tk.io.init_pose import InitPose, read_init_pose
-from tk.io.result import FrameResult, HullPoints, ResultMeta, ResultWriter, Status, Value
+from tk.io.result import FrameResult, HullPoints, ResultMeta, ResultWriter, Status, Value, blamed_on
 from tk.model.hull import HullSurface
 from tk.segmentation import make_segmenter as make_segmenter
 from tk.silhouette import SilhouetteTracker
@@ -223,12 +223,14 @@ class _Run:
         """Start or restore the tracker, and step it to the end."""
         if self.done:
             self._check_origin()
-            self.lost = int(np.asarray(self.writer.state[_ORIGIN + _LOST]))
+            with blamed_on(self.writer.path, "the state of the run"):
+                self.lost = int(np.asarray(self.writer.state[_ORIGIN + _LOST]))
         self.reporter.begin(self.stop - self.begin, min(self.done, self.stop - self.begin))
         if self.begin + self.done >= self.stop:
             return
         if self.done:
-            self.tracker.restore(self.writer.model, self.writer.state)
+            with blamed_on(self.writer.path, "the state of the run"):
+                self.tracker.restore(self.writer.model, self.writer.state)
             self._step_through(self.source.frames(self.begin + self.done, self.stop))
             return
         # The body is fitted to the same frames however few are asked for, so that a run may be prolonged by --resume.
