@@ -25,8 +25,8 @@ from tk.io.capture import Capture, open_capture
 from tk.io.result import read_joints
 from tk.model.objective import BARRED
 from tk.segmentation import make_labeller
-from tk.tracker import Observation
-from tk.volumetric import VolumetricTracker
+from tk.trackers.base import Observation
+from tk.trackers.volumetric import VolumetricTracker
 
 Changes = dict[str, dict[str, Any]]
 

@@ -57,9 +57,9 @@ from tk.model.hull import VisualHull
 from tk.model.objective import BodyObjective
 from tk.model.skeleton import CHAINS
 from tk.model.volume import VoxelGrid
-from tk.silhouette import SilhouetteTracker
-from tk.tracker import Estimate
-from tk.volumetric import CELL_VOXELS, restore_body
+from tk.trackers.silhouette import SilhouetteTracker
+from tk.trackers.base import Estimate
+from tk.trackers.volumetric import CELL_VOXELS, restore_body
 
 DEMO = Path(__file__).resolve().parents[1] / "tk" / "data" / "demo"
 WINDOW = 12  # frames that the stages alone are measured on
@@ -169,7 +169,7 @@ def run_once(options: Options, output: Path) -> Run:
     started = time.perf_counter()
     with counted_launches() as counts:
         clock = _Clock(counts)
-        summary = sequence.track(
+        summary = session.track(
             options.open(),
             output,
             options.config,

@@ -21,7 +21,7 @@ from tk.model.contour_term import ContourTerm, Pictures
 from tk.model.objective import BodyObjective
 from tk.model.silhouettes import Pyramid, Views
 from tk.optim import gauss_newton
-from tk.silhouette import restore_body
+from tk.trackers.silhouette import restore_body
 
 Float = np.ndarray
 

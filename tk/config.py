@@ -27,7 +27,8 @@ from tk.model.objective import SamplingConfig
 from tk.optim.levenberg_marquardt import LmConfig
 from tk.optim.schedule import ScheduleConfig
 from tk.optim.smd import SmdConfig
-from tk.silhouette import SilhouetteConfig
+from tk.trackers.contours import SilhouetteConfig
+from tk.trackers.region import RegionConfig
 
 T = TypeVar("T")
 
@@ -107,6 +108,7 @@ class Config:
     fit: FitConfig = field(default_factory=FitConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     silhouette: SilhouetteConfig = field(default_factory=SilhouetteConfig)
+    region: RegionConfig = field(default_factory=RegionConfig)
 
     def __post_init__(self) -> None:
         if not 8 <= self.voxels <= 512:

@@ -28,8 +28,8 @@ from tk.model.camera import Rig
 from tk.model.silhouettes import draw_silhouettes, share_wrong
 from tk.model.skeleton import JOINTS, Skeleton
 from tk.model.superellipsoid_silhouettes import draw_body
-from tk.silhouette import restore_body as restore_cones
-from tk.volumetric import restore_body as restore_superellipsoids
+from tk.trackers.silhouette import restore_body as restore_cones
+from tk.trackers.volumetric import restore_body as restore_superellipsoids
 
 Float = NDArray[np.float64]
 

@@ -13,12 +13,12 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
-from tk import sequence
+from tk import session
 from tk.config import Config
 from tk.io.capture import open_capture
 from tk.io.result import read_joints
 from tk.model.skeleton import JOINTS
-from tk.tracker import Estimate
+from tk.trackers.base import Estimate
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -108,7 +108,7 @@ def track(
     truth = read_joints(capture / "truth.h5")
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "result.h5"
-        sequence.track(open_capture(capture, cameras), out, config, _Silent(), method, (0, frames))
+        session.track(open_capture(capture, cameras), out, config, _Silent(), method, (0, frames))
         result = read_joints(out)
         with h5py.File(out) as file:
             pose, units = file["pose"][:], tuple(file["pose"].attrs["units"])

@@ -22,9 +22,9 @@ from tk.model.objective import CHAIN_NAMES, BodyObjective, FrameObjective
 from tk.model.skeleton import with_waist
 from tk.optim import smd
 from tk.optim.schedule import descent_basis
-from tk.sequence import make_segmenter
-from tk.tracker import Observation
-from tk.volumetric import CELL_VOXELS, VolumetricTracker
+from tk.session import make_segmenter
+from tk.trackers.base import Observation
+from tk.trackers.volumetric import CELL_VOXELS, VolumetricTracker
 
 ANGLES = ("shoulder_r_pitch", "elbow_r_flexion")
 MOVED_DEG = np.array([18.3, 5.7])

@@ -11,7 +11,7 @@ dimensions may give way. (The silhouette paper leaves the adaptation of the body
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,10 +64,12 @@ _STEP = 1e-4  # of the differences by a dimension's logarithm
 _EDGE_NOISE_PX = 3.0
 # Along a contour this many pixels err together.
 _CORRELATION_PX = 10.0
+# Between samples of a contour, pixels: no more than these are independent.
+_SPACING_PX = 6.0
 # Of a degree of freedom about the pose that the fit was given, radians or metres.
-_POSE_DEVIATION = 0.1
+_POSE_DEVIATION = 0.3
 # Of the waist and the ankles about a straight one, radians: a bent waist and another trunk look alike.
-_STRAIGHT_DEVIATION = 0.15
+_STRAIGHT_DEVIATION = 0.3
 _DIMENSIONS = tuple(field.name for field in fields(BodyDimensions))
 
 
@@ -120,6 +122,7 @@ def fit_body(
         The body, and poses (F, D).
     """
     config = config or BodyFitConfig()
+    settings = replace(settings, spacing_px=_SPACING_PX)
     problem = _Problem(preset, up, BodyDimensions.from_stature(stature_m), config.stature_deviation)
     shared = problem.mean.copy()
     poses, start = np.array(poses), np.array(poses)
@@ -185,19 +188,24 @@ class _Problem:
 
     def dimension_rows(self, shared: Float, poses: Float, seen: Sequence[Edgels]) -> list[Float]:
         """For each frame (N, 24): rows by the dimensions, by central differences of the surface points."""
-        rows = [np.zeros((len(edgels.part), len(_DIMENSIONS))) for edgels in seen]
+        ends = np.cumsum([len(edgels.part) for edgels in seen])
+        frame = np.repeat(np.arange(len(seen)), [len(edgels.part) for edgels in seen])
+        part = np.concatenate([edgels.part for edgels in seen])
+        unscaled = np.concatenate([edgels.unscaled for edgels in seen])
+        row = np.concatenate([edgels.row for edgels in seen])
+        rows = np.zeros((len(part), len(_DIMENSIONS)))
         for k in range(len(_DIMENSIONS)):
             step = np.zeros(len(shared))
             step[k] = _STEP
-            ends = [self.build(shared + sign * step) for sign in (1.0, -1.0)]
-            transforms = [segment_transforms(body.skeleton, poses) for body in ends]
-            for f, edgels in enumerate(seen):
-                larger, smaller = (
-                    surface_points(body, T[f], edgels.part, edgels.unscaled)
-                    for body, T in zip(ends, transforms, strict=True)
+            larger, smaller = (
+                _surface_points(body, part_transforms(body, T)[frame, part], part, unscaled)
+                for body, T in (
+                    (body, segment_transforms(body.skeleton, poses))
+                    for body in (self.build(shared + step), self.build(shared - step))
                 )
-                rows[f][:, k] = np.einsum("na,na->n", edgels.row, larger - smaller) / (2 * _STEP)
-        return rows
+            )
+            rows[:, k] = np.einsum("na,na->n", row, larger - smaller) / (2 * _STEP)
+        return np.split(rows, ends[:-1])
 
     def add_prior(self, shared: Float, H: Float, g: Float) -> None:
         """Add what is known of bodies to the equations (K, K), (K,) of the parameters."""
@@ -228,11 +236,12 @@ def segment_transforms(skeleton: Skeleton, poses: Float) -> Float:
 
 
 def part_transforms(body: ConeBody, T_world_segment: Float) -> Float:
-    """(P, 4, 4) from each part to the world, from the segments' (S, 4, 4)."""
+    """(..., P, 4, 4) from each part to the world, from the segments' (..., S, 4, 4)."""
     B = np.eye(4)
     B[:3, :3] = body.skeleton.T_world_body
     segments = [SEGMENTS.index(part.segment) for part in body.parts]
-    return np.asarray(T_world_segment[segments] @ B @ np.array([part.T_body_part for part in body.parts]))
+    inside = B @ np.array([part.T_body_part for part in body.parts])
+    return np.asarray(T_world_segment[..., segments, :, :] @ inside)
 
 
 def _local(body: ConeBody, part: NDArray[np.integer], unscaled: Float) -> tuple[Float, Float, Float]:
@@ -243,11 +252,10 @@ def _local(body: ConeBody, part: NDArray[np.integer], unscaled: Float) -> tuple[
     return shape, r, unscaled * np.column_stack([shape[:, 0] * r, shape[:, 1] * r, shape[:, 2]])
 
 
-def surface_points(body: ConeBody, T_world_segment: Float, part: NDArray[np.integer], unscaled: Float) -> Float:
-    """(N, 3) world points of the surface, see :meth:`ConeBody.place`, from the segments' transforms (S, 4, 4)."""
-    T = part_transforms(body, T_world_segment)[part]
+def _surface_points(body: ConeBody, T_world_part: Float, part: NDArray[np.integer], unscaled: Float) -> Float:
+    """(N, 3) world points of the surface, see :meth:`ConeBody.place`, from each one's part's transform (N, 4, 4)."""
     local = _local(body, part, unscaled)[2]
-    return np.einsum("nab,nb->na", T[:, :3, :3], local) + T[:, :3, 3]
+    return (T_world_part[:, :3, :3] @ local[:, :, None])[:, :, 0] + T_world_part[:, :3, 3]
 
 
 def pose_rows(body: ConeBody, pose: Float, edgels: Edgels) -> Float:

@@ -22,6 +22,7 @@ degrees of freedom.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -182,19 +183,31 @@ class Skeleton:
         """Poses (..., D) mapped into the limits (eq. 22)."""
         return np.clip(poses, self.lower, self.upper)
 
+    @cached_property
+    def _generators(self) -> tuple[Float, Float]:
+        """(D, 3, 3) the skew matrices of the axes, zero for translations, and their squares."""
+        K = np.zeros((len(self.names), 3, 3))
+        for k, (x, y, z) in enumerate(self.axis):
+            if not self.prismatic[k]:
+                K[k] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+        return K, K @ K
+
     def transforms(self, pose: Float) -> Float:
         """(D, 4, 4) transforms T_k after each degree of freedom, float64. Kernels have their own."""
         pose = np.asarray(pose, dtype=np.float64)
-        result = np.empty((len(self.names), 4, 4))
-        for k, angle in enumerate(pose):
-            step = np.eye(4)
-            if self.prismatic[k]:
-                step[:3, 3] = self.axis[k] * angle
-            else:
-                step = twist_exp(self.axis[k], self.point[k], angle)
-                if self.rise[k].any():
-                    step[:3, 3] += self.rise[k] * arm_elevation(angle, pose[k + 1])
-            result[k] = step if self.parent[k] < 0 else result[self.parent[k]] @ step
+        K, squares = self._generators
+        steps = np.zeros((len(pose), 4, 4))
+        R = np.eye(3) + np.sin(pose)[:, None, None] * K + (1 - np.cos(pose))[:, None, None] * squares
+        steps[:, :3, :3] = R
+        steps[:, :3, 3] = np.where(
+            self.prismatic[:, None], self.axis * pose[:, None], self.point - np.einsum("kab,kb->ka", R, self.point)
+        )
+        for k in np.flatnonzero(self.rise.any(axis=1)):
+            steps[k, :3, 3] += self.rise[k] * arm_elevation(pose[k], pose[k + 1])
+        steps[:, 3, 3] = 1.0
+        result = np.empty_like(steps)
+        for k, parent in enumerate(self.parent):
+            result[k] = steps[k] if parent < 0 else result[parent] @ steps[k]
         return result
 
     @property

@@ -50,6 +50,7 @@ class Estimate:
         sigma: (15,) one standard deviation of each joint's position along an axis, metres; None where the tracker does
             not say.
         fit_error: (C,) E_S of each camera; None where the tracker does not say.
+        frame, time: the frame's number in the capture, and seconds; whoever steps the tracker knows them.
     """
 
     pose: Float
@@ -63,6 +64,8 @@ class Estimate:
     ankles: Float = field(default_factory=lambda: np.zeros(0))
     sigma: Float | None = None
     fit_error: Float | None = None
+    frame: int = -1
+    time: float = 0.0
 
 
 class Tracker(Protocol):
@@ -75,6 +78,13 @@ class Tracker(Protocol):
     pose_units: tuple[str, ...]
     waist_names: tuple[str, ...]
     ankle_names: tuple[str, ...]
+    any_pose: bool
+    """Whether the person is found in any pose, not only in the Da Vinci pose."""
+
+    @property
+    def opening_frames(self) -> int:
+        """Frames that :meth:`start` wants to look at."""
+        ...
 
     def start(self, frames: Sequence[Observation], height_m: float | None, init: InitPose | None) -> None:
         """Find the subject in the first of the frames; nothing is returned, :meth:`step` begins with that frame."""

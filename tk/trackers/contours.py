@@ -48,7 +48,7 @@ SCREEN_ROWS, CHOICE_ROWS = 60, 120
 
 
 @dataclass(frozen=True)
-class ContourConfig:
+class SilhouetteConfig:
     """How contours are followed; both trackers of contours have these.
 
     Attributes:
@@ -75,15 +75,15 @@ class ContourConfig:
 
     def __post_init__(self) -> None:
         if self.body not in PRESETS:
-            raise ConfigError(f'contours: body = "{self.body}": choose one of {", ".join(PRESETS)}')
+            raise ConfigError(f'silhouette: body = "{self.body}": choose one of {", ".join(PRESETS)}')
         if not 1 <= self.init_frames <= 1000 or not 0 <= self.search_every <= 1_000_000:
             raise ConfigError(
-                f"contours: init_frames = {self.init_frames} must lie in [1, 1000], search_every = "
+                f"silhouette: init_frames = {self.init_frames} must lie in [1, 1000], search_every = "
                 f"{self.search_every} in [0, 1000000]"
             )
         if not 0 <= self.prediction <= 1.5 or not 0 < self.lost_error <= 10:
             raise ConfigError(
-                f"contours: prediction = {self.prediction} must lie in [0, 1.5], lost_error = {self.lost_error} "
+                f"silhouette: prediction = {self.prediction} must lie in [0, 1.5], lost_error = {self.lost_error} "
                 "in (0, 10]"
             )
 
@@ -94,10 +94,12 @@ class ContourTracker:
     Args:
         rig: the cameras.
         up: the world axis that points up.
-        config: see :class:`ContourConfig`.
+        config: see :class:`SilhouetteConfig`.
     """
 
-    def __init__(self, rig: Rig, up: str, config: ContourConfig) -> None:
+    any_pose = True
+
+    def __init__(self, rig: Rig, up: str, config: SilhouetteConfig) -> None:
         self.contours = config
         self.up = up
         self.views = Views(rig)
@@ -112,6 +114,11 @@ class ContourTracker:
         self._body: ConeBody | None = None
         self.colors: PartColors
         self.limbs: tuple[Limb, ...]
+
+    @property
+    def opening_frames(self) -> int:
+        """Frames that the person is found in."""
+        return self.contours.init_frames
 
     @property
     def body(self) -> ConeBody:
@@ -243,6 +250,16 @@ class ContourTracker:
                 level.append((camera.center + ray * (away @ flat) / (flat @ flat)) @ up)
             heights.append(abs(level[0] - level[1]))
         return float(np.clip(np.median(heights), 0.8, 2.4))
+
+    def start(
+        self,
+        frames: Sequence[Observation],
+        height_m: float | None,
+        init: InitPose | None,
+        body: ConeBody | None = None,
+    ) -> None:
+        """Find the subject in the first frame; what is kept of it, a subclass says."""
+        self.find(frames, height_m, init, body)
 
     # --- one frame ----------------------------------------------------------------------------------------------
 

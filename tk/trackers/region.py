@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from tk.errors import ConfigError
 from tk.io.init_pose import InitPose
+from tk.model.body_fit import BodyFitConfig
 from tk.model.camera import Rig
 from tk.model.cone_body import ConeBody
 from tk.model.evidence import Evidence, mean_of_views
@@ -32,7 +33,7 @@ from tk.model.silhouettes import Pyramid
 from tk.model.skeleton import JOINTS
 from tk.optim.gauss_newton import Prior
 from tk.trackers.base import Estimate, Observation, Stopwatch
-from tk.trackers.contours import GAIN, RELOCATE_EVERY, ContourConfig, ContourTracker, restore_body
+from tk.trackers.contours import GAIN, RELOCATE_EVERY, SilhouetteConfig, ContourTracker, restore_body
 
 Float = NDArray[np.float64]
 
@@ -48,6 +49,9 @@ MARGIN = 0.02
 APART_M = 0.05
 # Colours are learned only in frames that are explained about as well as is usual.
 LEARN_RATIO = 1.15
+# The second pass: what the body is fitted to, and how near a frame stays to its pose of the first pass.
+SECOND_FIT = BodyFitConfig(frames=24, rounds=4)
+SECOND_ANGLE_DEG = 15.0
 # What a joint's position errs by beside what the contours' noise tells: joints of people are not where a model's are.
 # Chosen on the development captures such that as many errors are within 1 and 2 σ as are of a normal's.
 JOINT_FLOOR_M = 0.008
@@ -98,9 +102,9 @@ class RegionTracker(ContourTracker):
     timing_stages: tuple[str, ...] = ("masks_clean", "optimise", "check", "search")
 
     def __init__(
-        self, rig: Rig, up: str, contours: ContourConfig | None = None, config: RegionConfig | None = None
+        self, rig: Rig, up: str, contours: SilhouetteConfig | None = None, config: RegionConfig | None = None
     ) -> None:
-        super().__init__(rig, up, contours or ContourConfig())
+        super().__init__(rig, up, contours or SilhouetteConfig())
         self.config = config or RegionConfig()
         self._alive: list[Hypothesis] = []
         self._usual = np.inf
@@ -173,10 +177,10 @@ class RegionTracker(ContourTracker):
     def _best(self) -> Hypothesis:
         return self._alive[0]
 
-    def _prior(self, mean: Float) -> Prior:
+    def _prior(self, mean: Float, angle_deg: float = ANGLE_DEG) -> Prior:
         """Waist and ankles are about straight, all else is about where it was expected."""
         skeleton = self.body.skeleton
-        deviation = np.where(skeleton.prismatic, TRANSLATION_M, np.radians(ANGLE_DEG))
+        deviation = np.where(skeleton.prismatic, TRANSLATION_M, np.radians(angle_deg))
         deviation[skeleton.is_waist] = np.radians(WAIST_DEG)
         deviation[skeleton.is_ankle] = np.radians(ANKLE_DEG)
         straight = skeleton.is_waist | skeleton.is_ankle
@@ -269,6 +273,52 @@ class RegionTracker(ContourTracker):
             variance += np.einsum("h,hja->j", weight / weight.sum(), (places - mean) ** 2) / 3
         return np.asarray(np.sqrt(variance + JOINT_FLOOR_M**2))
 
+    def second_pass(
+        self,
+        masks: Sequence[NDArray[np.uint8]],
+        poses: Float,
+        lost: NDArray[np.bool_],
+        error: Float,
+        height_m: float | None,
+        keep_body: bool = False,
+    ) -> tuple[Float, Float]:
+        """Fit the body to frames of the whole recording, and settle every frame anew with it.
+
+        Frames of differing poses show what the opening ones do not: where a knee or an elbow is, only a bent one tells.
+        Each frame stays near the pose that the first pass found, so that what colours told of a limb inside the
+        silhouette is not lost.
+
+        Args:
+            masks: (C, H, W) of F frames.
+            poses: (F, D) of the first pass.
+            lost: (F,) bool; such frames neither teach nor change.
+            error: (F, C) E_S of the first pass.
+            height_m: the subject's height, if known.
+            keep_body: leave the body as it is.
+
+        Returns:
+            Poses (F, D) and E_S (F, C). The tracker has the new body.
+        """
+        cleaning, scales = self.contours.cleaning, 1
+        tracked = np.flatnonzero(~lost)
+        if not len(tracked):
+            return poses, error
+        if not keep_body and self.contours.adapt:
+            chosen = _spread(tracked, np.nanmean(error[tracked], axis=1), SECOND_FIT.frames)
+            seen = [self.views.pyramid(masks[i], scales, cleaning) for i in chosen]
+            stature = height_m or self.body.dimensions.stature
+            fit = SECOND_FIT if height_m else replace(SECOND_FIT, stature_deviation=0.03)
+            body, _ = self.fit(seen, poses[chosen], np.arange(len(chosen)), stature, fit)
+            self.take_body(body)
+        result, errors = poses.copy(), np.array(error)
+        for i in tracked:
+            pyramid = self.views.pyramid(masks[i], scales, cleaning)
+            prior = self._prior(poses[i], SECOND_ANGLE_DEG)
+            settled = self.settle(pyramid, poses[i][None], scales, prior=prior)
+            evidence = Evidence.of(self.screen, pyramid.masks[0])
+            result[i], errors[i] = settled[0], evidence.cast(self.body, self.colors.group, settled)[0][0]
+        return result, errors
+
     def _nobody(self, frame: Observation, watch: Stopwatch) -> Estimate:
         """Nobody is in sight: the last pose stands, as lost."""
         self._lost_for += 1
@@ -307,3 +357,9 @@ class RegionTracker(ContourTracker):
         self._lost_for = int(state["lost_for"])
         self.colors.restore(state)
         self._fresh = False
+
+
+def _spread(frames: NDArray[np.int64], error: Float, count: int) -> NDArray[np.int64]:
+    """Of each of ``count`` stretches of the frames (N,) the one that is explained best, error (N,)."""
+    edges = np.linspace(0, len(frames), min(count, len(frames)) + 1).round().astype(int)
+    return np.array([frames[a + int(np.argmin(error[a:b]))] for a, b in zip(edges[:-1], edges[1:], strict=True)])

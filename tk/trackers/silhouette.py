@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from tk.io.init_pose import InitPose
 from tk.model.camera import Rig
+from tk.model.cone_body import ConeBody
 from tk.trackers.base import Estimate, Observation, Stopwatch
-from tk.trackers.contours import RELOCATE_EVERY, ContourConfig, ContourTracker, restore_body
+from tk.trackers.contours import RELOCATE_EVERY, SilhouetteConfig, ContourTracker, restore_body
 
 Float = NDArray[np.float64]
 
@@ -30,18 +31,24 @@ class SilhouetteTracker(ContourTracker):
     method = "silhouette"
     timing_stages: tuple[str, ...] = ("masks_clean", "optimise", "check")
 
-    def __init__(self, rig: Rig, up: str, config: ContourConfig | None = None) -> None:
-        super().__init__(rig, up, config or ContourConfig())
+    def __init__(self, rig: Rig, up: str, config: SilhouetteConfig | None = None) -> None:
+        super().__init__(rig, up, config or SilhouetteConfig())
         self.stages = tuple(f"scale_{i}" for i in reversed(range(self.contours.solver.scales)))
         self._pose = self._previous = np.zeros(len(self.pose_names))
         self._lost_for = 0
         self._fresh = True
 
-    def start(self, frames: Sequence[Observation], height_m: float | None, init: InitPose | None) -> None:
+    def start(
+        self,
+        frames: Sequence[Observation],
+        height_m: float | None,
+        init: InitPose | None,
+        body: ConeBody | None = None,
+    ) -> None:
         """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourTracker.find`."""
         # colours are none of this tracker's cues
         blind = [Observation(f.index, f.images[:0], f.masks) for f in frames]
-        self._pose = self._previous = self.find(blind, height_m, init)
+        self._pose = self._previous = self.find(blind, height_m, init, body)
         self._lost_for = 0
         self._fresh = True
 

@@ -91,6 +91,7 @@ class VolumetricTracker:
         self.pose_names = tuple(skeleton.names[k] for k in told)
         self.pose_units = tuple(skeleton.units[k] for k in told)
         self.waist_names = tuple(name for name in skeleton.names if name in WAIST)
+        self.ankle_names: tuple[str, ...] = ()
         self._body: Body | None = None
         self._objective: BodyObjective
         self._appearance: Appearance
@@ -239,6 +240,13 @@ class VolumetricTracker:
             settled=lambda pose: problem.value(pose) <= self.config.tracking.settled_ratio * self._usual,
             alternatives=self._alternatives,
         )
+
+    any_pose = False
+
+    @property
+    def opening_frames(self) -> int:
+        """Frames that the body is fitted to."""
+        return self.config.tracking.init_frames
 
     @property
     def body(self) -> Body:
