@@ -298,7 +298,7 @@ def _search_stages(
     yield Stage("colour segmentation", median_ms(segmented), {})
 
     # the peer knows neither colours nor normals, so this comparison leaves them out of ours as well
-    objective = BodyObjective(body, config.objective, config.sampling)
+    objective = BodyObjective(body, config.objective.settings, config.sampling)
     rng = np.random.default_rng(0)
     samples = objective.draw(rng)
     points, normals = (values[samples].astype(np.float32) for values in body.place(pose))
@@ -325,11 +325,11 @@ def _search_stages(
     yield Stage("neighbours: build and query", build.ms + query.ms, both)
 
     index = built(segmented())
-    rows = len(CHAINS) * config.schedule.hypotheses
+    rows, settings = len(CHAINS), config.objective.settings
     for name, B, M, Q in (
         ("objective: one launch, whole body", 1, len(samples), config.sampling.voxels),
         (
-            f"objective: one launch, {rows} hypotheses of chains",
+            "objective: one launch, five chains",
             rows,
             config.sampling.chain,
             config.sampling.chain_voxels,
@@ -338,9 +338,11 @@ def _search_stages(
         chosen = np.resize(samples, (B, M)).astype(np.int32)
         voxels = rng.integers(len(surface), size=(B, Q)).astype(np.int32)
         poses = np.repeat(pose[None], B, axis=0)
-        call = partial(objective.kernel.evaluate, index, chosen, voxels, poses, np.ones_like(poses), config.objective)
+        call = partial(
+            objective.kernel.evaluate, index, chosen, voxels, poses, np.ones_like(poses), config.objective.settings
+        )
         yield Stage(name, median_ms(call), {})
-    yield from contour_stages(objective, capture, config, frame, masks, pose, index)
+    yield from contour_stages(objective, capture, config, frame, pose, index)
 
 
 # --- printing -----------------------------------------------------------------------------------------------------

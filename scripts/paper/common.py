@@ -120,12 +120,6 @@ def track(
     return Track(error, pose, units, iterations, optimise, lost)
 
 
-def plain(config: Config) -> Config:
-    """SMD with the paper's passes only, as Levenberg-Marquardt has them: one start of each chain, no search anew."""
-    schedule = replace(config.schedule, hypotheses=1, wide_hypotheses=1, candidates=0, retries=0, newton_iterations=0)
-    return replace(config, schedule=schedule)
-
-
 def contours(config: Config, **values: Any) -> Config:
     """The configuration with other settings of the contour cues."""
     return replace(config, contours=replace(config.contours, **values))

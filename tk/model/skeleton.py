@@ -284,15 +284,6 @@ def with_waist(skeleton: Skeleton, pose: Float, waist: Float) -> Float:
     return _turn_hips(skeleton, whole, _waist_rotation(skeleton, whole).T)
 
 
-def turn_trunk(skeleton: Skeleton, pose: Float, angle: float) -> Float:
-    """The pose (D,) with trunk, head and arms turned by an angle about the upright axis, and the legs as they stand."""
-    torso, waist = skeleton.segment_dof[SEGMENTS.index("torso")], _waist_rotation(skeleton, pose)
-    result = pose.copy()
-    result[skeleton.index("torso_yaw")] += angle
-    before, after = (skeleton.transforms(p)[torso, :3, :3] for p in (pose, result))
-    return _turn_hips(skeleton, result, waist.T @ after.T @ before @ waist)
-
-
 def _waist_rotation(skeleton: Skeleton, pose: Float) -> Float:
     R = np.eye(3)
     for k in np.flatnonzero(skeleton.is_waist):
