@@ -84,7 +84,9 @@ _preset = click.option("--preset", metavar="NAME", help="Settings to begin with:
 @click.option("--seed", type=int, help="Of the random generator.  [default: 0]")
 @_masks
 @click.option("--init-pose", type=click.Path(path_type=Path), metavar="FILE", help="Start from this rough pose (TOML).")
-@click.option("--body", type=click.Path(path_type=Path), metavar="FILE", help="The body of a result, or of a TOML file.")
+@click.option(
+    "--body", type=click.Path(path_type=Path), metavar="FILE", help="The body of a result, or of a TOML file."
+)
 @click.option("--causal", is_flag=True, help="Leave it at the first pass: no frame knows of those after it.")
 @click.option("--resume", is_flag=True, help="Go on where an earlier run of the same command stopped.")
 @click.option("--store-hull", is_flag=True, help="Keep the hull's coloured surface in the result.")

@@ -16,14 +16,12 @@ import tomli_w
 
 from tk.errors import ConfigError
 from tk.io.toml import LARGE, parse_toml, read_text, shown
-from tk.kernels.edges import EdgeConfig
-from tk.kernels.objective import ObjectiveSettings
 from tk.model.appearance import AppearanceConfig
 from tk.model.body import BodyConfig
 from tk.model.contour_term import ContourConfig
 from tk.model.fitting import FitConfig
 from tk.model.foreground import ForegroundConfig
-from tk.model.objective import SamplingConfig
+from tk.model.objective import ObjectiveConfig, SamplingConfig
 from tk.optim.levenberg_marquardt import LmConfig
 from tk.optim.schedule import ScheduleConfig
 from tk.optim.smd import SmdConfig
@@ -33,7 +31,7 @@ from tk.trackers.region import RegionConfig
 T = TypeVar("T")
 
 SEGMENTATIONS = ("collinearity", "mog2")
-PRESETS = ("kehl2006", "fast")
+PRESETS = ("kehl2006",)
 
 #: of whatever a configuration counts: frames, points, rounds
 MOST_COUNT = 100_000
@@ -47,30 +45,15 @@ class TrackingConfig:
         prediction: share of the last frame's motion that the next is expected to repeat. The paper does not say how it
             predicts; at 15 Hz an arm turns by up to 31° between frames (its section 7.4).
         init_frames: frames from which the body is fitted.
-        settled_ratio: limbs are looked for elsewhere only in a frame whose objective, after the first pass, exceeds
-            that of the usual frame by this factor; 0 looks in every frame.
-        retry_ratio: a frame whose objective exceeds that of the usual frame by this factor is searched anew.
-        retry_astray: the same for the share of the hull's surface farther than 10 cm from the body: this much more.
         lost_ratio: a frame is lost whose objective exceeds that of the usual frame by this factor.
         lost_astray: a frame is lost, too, when this much more of the hull's surface than usual is farther than 10 cm
             from the body: the body is somewhere, but the person is elsewhere.
-        lost_limb: and when more than this share of the samples of a limb, the head or the torso has no voxel near it.
-        least_voxels: fewer surface voxels than this are no person.
-        overrule: voxels about the expected body in which one camera that carves is overruled by all others; -1 never.
-        overrule_doubt: the same where that camera's pixel may be a shadow as well as the person.
     """
 
     prediction: float = 0.9
     init_frames: int = 4
-    settled_ratio: float = 1.25
-    retry_ratio: float = 1.25
-    retry_astray: float = 0.05
     lost_ratio: float = 3.0
     lost_astray: float = 0.25
-    lost_limb: float = 0.6
-    least_voxels: int = 60
-    overrule: int = 0
-    overrule_doubt: int = 2
 
     def __post_init__(self) -> None:
         if not 0 <= self.prediction <= 1.5 or self.init_frames < 1:
@@ -98,10 +81,9 @@ class Config:
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
     appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
     body: BodyConfig = field(default_factory=BodyConfig)
-    objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)
+    objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     contours: ContourConfig = field(default_factory=ContourConfig)
-    edges: EdgeConfig = field(default_factory=EdgeConfig)
     smd: SmdConfig = field(default_factory=SmdConfig)
     lm: LmConfig = field(default_factory=LmConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)

@@ -19,11 +19,17 @@ from tk.config import Config
 from tk.errors import CaptureError, ConfigError, ResultError, TkError
 from tk.io.capture import Capture
 from tk.io.init_pose import InitPose, read_init_pose
-from tk.io.result import FrameResult, HullPoints, ResultMeta, ResultWriter, Status, Value, blamed_on
+from tk.io.mask_store import MaskStore
+from tk.io.result import FrameResult, HullPoints, ResultMeta, ResultWriter, Status, Value, read_result, revise_result
+from tk.model.cone_body import ConeBody
 from tk.model.hull import HullSurface
+from tk.model.skeleton import join_pose, split_pose
 from tk.segmentation import make_segmenter as make_segmenter
-from tk.trackers.silhouette import SilhouetteTracker
 from tk.trackers.base import Estimate, Tracker
+from tk.trackers.bodies import read_body
+from tk.trackers.contours import ContourTracker
+from tk.trackers.region import RegionTracker
+from tk.trackers.silhouette import SilhouetteTracker
 from tk.trackers.volumetric import LevenbergMarquardtTracker, VolumetricTracker
 
 METHODS = ("region", "silhouette", "volumetric", "lm")
@@ -387,9 +393,7 @@ def refine(output: Path, plan: _Plan, masks: MaskStore, note: Callable[[str], No
         for observation, _ in plan.source.frames(min(missing), max(missing) + 1):
             masks.put(observation.index, observation.masks)
     skeleton = tracker.body.skeleton
-    poses = np.array(
-        [join_pose(skeleton, *row) for row in zip(result.pose, result.waist, result.ankles, strict=True)]
-    )
+    poses = np.array([join_pose(skeleton, *row) for row in zip(result.pose, result.waist, result.ankles, strict=True)])
     lost = result.status == Status.LOST
     note("second pass: the body is fitted to the whole recording")
     poses, error = tracker.second_pass(

@@ -86,7 +86,7 @@ class Track:
         return int((self.frame_cm > ASTRAY_CM).sum())
 
 
-class _Silent(sequence.Reporter):
+class _Silent(session.Reporter):
     def note(self, text: str) -> None:
         pass
 
@@ -118,12 +118,6 @@ def track(
     rows = np.searchsorted(truth.frames, result.frames)
     error = 100 * np.linalg.norm(result.positions - truth.positions[rows], axis=2)
     return Track(error, pose, units, iterations, optimise, lost)
-
-
-def plain(config: Config) -> Config:
-    """SMD with the paper's passes only, as Levenberg-Marquardt has them: one start of each chain, no search anew."""
-    schedule = replace(config.schedule, hypotheses=1, wide_hypotheses=1, candidates=0, retries=0, newton_iterations=0)
-    return replace(config, schedule=schedule)
 
 
 def contours(config: Config, **values: Any) -> Config:

@@ -1,7 +1,7 @@
 """A cone body seen through a grid of rays: what each ray meets first, and what that costs (silhouette paper, eq. 12).
 
-A ray's cost depends on what it meets: column 0 of ``cost`` where it meets nothing, column g + 1 where it meets a part of
-colour group g. With 0 and 1 in the right places their sum is the number of wrong pixels, E_S's numerator; with what
+A ray's cost depends on what it meets: column 0 of ``cost`` where it meets nothing, column g + 1 where it meets a part
+of colour group g. With 0 and 1 in the right places their sum is the number of wrong pixels, E_S's numerator; with what
 colours say it tells a forearm before the trunk from one behind it.
 
 Many poses that differ in one limb are compared by casting the rest once: a launch may start from labels and depths that

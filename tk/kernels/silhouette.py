@@ -258,7 +258,7 @@ def _equations_kernel(real):
         likelihood: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (G, COLOR_BINS)
         group: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
         # settings; scale: pixels of the full picture in one of this scale
-        numbers: ti.types.ndarray(dtype=real, ndim=1),  # scale, window, spacing, ambiguous, tangential, robust, lost, colours
+        numbers: ti.types.ndarray(dtype=real, ndim=1),  # (8,) in _launch's order
         spread: ti.i32,
         most_samples: ti.i32,
         interior: ti.i32,
@@ -525,7 +525,9 @@ def _launch(
 
 @functools.cache
 def _no_regions(parts: int) -> Regions:
-    return Regions(np.zeros((1, 1, 1, 3), np.uint8), np.zeros((1, COLOR_BINS), np.float32), np.zeros(parts, np.int32), 0.0)
+    return Regions(
+        np.zeros((1, 1, 1, 3), np.uint8), np.zeros((1, COLOR_BINS), np.float32), np.zeros(parts, np.int32), 0.0
+    )
 
 
 def normal_equations(

@@ -192,7 +192,8 @@ class ConeBody:
         """
         rows = dict(zip(self.shape_groups, change, strict=True))
         return replace(
-            self, parts=tuple(_reshape(part, rows[group_of(part.name)], part.name.endswith("_r")) for part in self.parts)
+            self,
+            parts=tuple(_reshape(part, rows[group_of(part.name)], part.name.endswith("_r")) for part in self.parts),
         )
 
     def place(

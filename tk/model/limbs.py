@@ -1,7 +1,7 @@
 """Where a limb may be: candidates for a search that looks at all of its places, not only at those near the last one.
 
-An arm's candidates are directions spread evenly over the sphere, each with the elbow stretched or bent to one of several
-sides; a leg's are hip and knee angles on a grid. Both are relative to the trunk and within the limits.
+An arm's candidates are directions spread evenly over the sphere, each with the elbow stretched or bent to one of
+several sides; a leg's are hip and knee angles on a grid. Both are relative to the trunk and within the limits.
 """
 
 from __future__ import annotations

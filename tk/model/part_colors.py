@@ -1,7 +1,7 @@
 """Colours of a body's parts, learned as the person moves: which part does a pixel show?
 
-Left and right share a model, as clothes do. A model is a histogram over 16 levels of blue, green and red; it holds what a
-shirt with stripes, or an arm half in a sleeve, has of colours, which no single Gaussian does.
+Left and right share a model, as clothes do. A model is a histogram over 16 levels of blue, green and red; it holds what
+a shirt with stripes, or an arm half in a sleeve, has of colours, which no single Gaussian does.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ class PartColors:
 
     def _update(self) -> None:
         cubes = [gaussian_filter(row.reshape(16, 16, 16), _SMOOTHING, mode="nearest").ravel() for row in self._counts]
-        share = np.array(cubes)
-        share /= np.maximum(share.sum(axis=1, keepdims=True), 1e-9)
+        share: Float = np.array(cubes)
+        share = share / np.maximum(share.sum(axis=1, keepdims=True), 1e-9)
         self.log_likelihood = np.log((1 - _ANYTHING) * share + _ANYTHING / COLOR_BINS).astype(np.float32)
 
     def mismatch(self) -> NDArray[np.float32]:
@@ -92,4 +92,3 @@ def color_bins(images: NDArray[np.uint8]) -> NDArray[np.int32]:
 
 def _group(component: str) -> str:
     return component[:-2] if component.endswith(("_l", "_r")) else component
-

@@ -116,7 +116,14 @@ class Views:
     ) -> NormalEquations:
         """Normal equations of poses (B, D) at a scale's index."""
         return kernels.normal_equations(
-            body.arrays, self._cameras32, pyramid.sizes[scale], pyramid.masks[scale], 2.0**scale, poses, settings, regions
+            body.arrays,
+            self._cameras32,
+            pyramid.sizes[scale],
+            pyramid.masks[scale],
+            2.0**scale,
+            poses,
+            settings,
+            regions,
         )
 
     def edgels(self, body: ConeBody, pyramid: Pyramid, pose: Float, scale: int, settings: SearchSettings) -> Edgels:

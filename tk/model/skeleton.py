@@ -202,7 +202,7 @@ class Skeleton:
         steps[:, :3, 3] = np.where(
             self.prismatic[:, None], self.axis * pose[:, None], self.point - np.einsum("kab,kb->ka", R, self.point)
         )
-        for k in np.flatnonzero(self.rise.any(axis=1)):
+        for k in map(int, np.flatnonzero(self.rise.any(axis=1))):
             steps[k, :3, 3] += self.rise[k] * arm_elevation(pose[k], pose[k + 1])
         steps[:, 3, 3] = 1.0
         result = np.empty_like(steps)
@@ -326,15 +326,6 @@ def with_waist(skeleton: Skeleton, pose: Float, waist: Float) -> Float:
     return join_pose(skeleton, pose, waist, np.zeros(0))
 
 
-def turn_trunk(skeleton: Skeleton, pose: Float, angle: float) -> Float:
-    """The pose (D,) with trunk, head and arms turned by an angle about the upright axis, and the legs as they stand."""
-    torso, waist = skeleton.segment_dof[SEGMENTS.index("torso")], _waist_rotation(skeleton, pose)
-    result = pose.copy()
-    result[skeleton.index("torso_yaw")] += angle
-    before, after = (skeleton.transforms(p)[torso, :3, :3] for p in (pose, result))
-    return _turn_hips(skeleton, result, waist.T @ after.T @ before @ waist)
-
-
 def _waist_rotation(skeleton: Skeleton, pose: Float) -> Float:
     R = np.eye(3)
     for k in np.flatnonzero(skeleton.is_waist):
@@ -375,9 +366,7 @@ def up_rotation(up: str) -> Float:
     return np.column_stack([x, np.cross(z, x), z])
 
 
-def build_skeleton(
-    dimensions: BodyDimensions, up: str = "z", waist: bool = False, ankles: bool = False
-) -> Skeleton:
+def build_skeleton(dimensions: BodyDimensions, up: str = "z", waist: bool = False, ankles: bool = False) -> Skeleton:
     """The skeleton with these dimensions, standing upright along ``up``: the paper's 24 degrees of freedom, three more
     with a waist, four more with ankles."""
     d = dimensions

@@ -1,6 +1,6 @@
 """What the trackers that follow contours share: finding the person, fitting the body, and a search for lost limbs.
 
-    masks → cleaned, scales → {contours → edgels along their normals → normal equations → step} × iterations × scales
+masks → cleaned, scales → {contours → edgels along their normals → normal equations → step} × iterations × scales
 """
 
 from __future__ import annotations
@@ -109,8 +109,8 @@ class ContourTracker:
         paper = np.flatnonzero(skeleton.is_paper)
         self.pose_names = tuple(skeleton.names[k] for k in paper)
         self.pose_units = tuple(skeleton.units[k] for k in paper)
-        self.waist_names = WAIST if full else ()
-        self.ankle_names = ANKLES if full else ()
+        self.waist_names: tuple[str, ...] = WAIST if full else ()
+        self.ankle_names: tuple[str, ...] = ANKLES if full else ()
         self._body: ConeBody | None = None
         self.colors: PartColors
         self.limbs: tuple[Limb, ...]
@@ -185,9 +185,7 @@ class ContourTracker:
             error += self.fit_error(pyramid, now)
         return np.asarray(firsts[int(np.argmin(error))])
 
-    def _adapt(
-        self, frames: Sequence[Observation], pyramids: Sequence[Pyramid], start: Float, stature: float
-    ) -> Float:
+    def _adapt(self, frames: Sequence[Observation], pyramids: Sequence[Pyramid], start: Float, stature: float) -> Float:
         """Track all frames with the average body, then fit body and poses together."""
         poses = [start]
         every = self.contours.search_every
@@ -211,9 +209,7 @@ class ContourTracker:
         """The body that suits the chosen ones of several frames, and their poses."""
         seen = [pyramids[i] for i in chosen]
         contours = self.contours
-        return fit_body(
-            contours.body, self.views, seen, poses[chosen], self.up, contours.search, stature, config
-        )
+        return fit_body(contours.body, self.views, seen, poses[chosen], self.up, contours.search, stature, config)
 
     def _centroid(self, pyramid: Pyramid, index: int) -> Float:
         """(3,) the point nearest to the rays through the silhouettes' centroids, metres."""
@@ -318,9 +314,7 @@ class ContourTracker:
             _, rest = coarse.cast(self.body, group, pose[None], limb.others, export=True)
             assert rest is not None
             tried = limb.candidates(pose, NEARBY, rng)
-            cost, _ = coarse.cast(
-                self.body, group, tried, limb.parts, Cast(rest.label[0].copy(), rest.depth[0].copy())
-            )
+            cost, _ = coarse.cast(self.body, group, tried, limb.parts, Cast(rest.label[0].copy(), rest.depth[0].copy()))
             proposals.append(list(limb.distinct(skeleton, tried, mean_of_views(cost), PLACES)))
         poses = [pose, *(p for places in proposals for p in places)]
         for first, second in ((0, 1), (2, 3)):  # both arms, both legs

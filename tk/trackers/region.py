@@ -8,8 +8,8 @@ A frame's way, top to bottom:
           → the few best live on for some frames; the one that explains them best is the pose
           → colours of the parts learned
 
-Contours and equations are the silhouette paper's (sections 4.1 to 4.3); borders between colours are those of region-based
-tracking (Stoiber et al., *SRT3D*, IJCV 2022). The search takes the place of the first paper's Stochastic Meta Descent
+Contours and equations are the silhouette paper's (sections 4.1 to 4.3); borders between colours are those of
+region-based tracking (Stoiber et al., *SRT3D*, IJCV 2022). The search takes the place of the first paper's Stochastic Meta Descent
 and of its visual hull: a place of a limb is inside the hull and covers it where it is inside all silhouettes and leaves
 no ray of theirs without a part, which casting rays tells directly, at the pictures' resolution and not the voxels'.
 """
@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,7 @@ from tk.model.silhouettes import Pyramid
 from tk.model.skeleton import JOINTS
 from tk.optim.gauss_newton import Prior
 from tk.trackers.base import Estimate, Observation, Stopwatch
-from tk.trackers.contours import GAIN, RELOCATE_EVERY, SilhouetteConfig, ContourTracker, restore_body
+from tk.trackers.contours import GAIN, RELOCATE_EVERY, ContourTracker, SilhouetteConfig, restore_body
 
 Float = NDArray[np.float64]
 
@@ -187,7 +188,7 @@ class RegionTracker(ContourTracker):
         return Prior(np.where(straight, 0.0, mean), deviation**-2 / INFORMATION)
 
     def _rank(self) -> None:
-        """The hypothesis that explains the last frames best comes first; those that hardly do, or agree, are dropped."""
+        """The hypothesis that explains the last frames best comes first; those far behind, or equal, are dropped."""
         skeleton = self.body.skeleton
         kept: list[Hypothesis] = []
         places: list[Float] = []
@@ -305,14 +306,14 @@ class RegionTracker(ContourTracker):
             return poses, error
         if not keep_body and self.contours.adapt:
             chosen = _spread(tracked, np.nanmean(error[tracked], axis=1), SECOND_FIT.frames)
-            seen = [self.views.pyramid(masks[i], scales, cleaning) for i in chosen]
+            seen = [self.views.pyramid(masks[int(i)], scales, cleaning) for i in chosen]
             stature = height_m or self.body.dimensions.stature
             fit = SECOND_FIT if height_m else replace(SECOND_FIT, stature_deviation=0.03)
             body, _ = self.fit(seen, poses[chosen], np.arange(len(chosen)), stature, fit)
             self.take_body(body)
         result, errors = poses.copy(), np.array(error)
         for i in tracked:
-            pyramid = self.views.pyramid(masks[i], scales, cleaning)
+            pyramid = self.views.pyramid(masks[int(i)], scales, cleaning)
             prior = self._prior(poses[i], SECOND_ANGLE_DEG)
             settled = self.settle(pyramid, poses[i][None], scales, prior=prior)
             evidence = Evidence.of(self.screen, pyramid.masks[0])
@@ -362,4 +363,4 @@ class RegionTracker(ContourTracker):
 def _spread(frames: NDArray[np.int64], error: Float, count: int) -> NDArray[np.int64]:
     """Of each of ``count`` stretches of the frames (N,) the one that is explained best, error (N,)."""
     edges = np.linspace(0, len(frames), min(count, len(frames)) + 1).round().astype(int)
-    return np.array([frames[a + int(np.argmin(error[a:b]))] for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    return np.array([frames[a + int(np.argmin(error[a:b]))] for a, b in pairwise(edges)])

@@ -4,8 +4,8 @@ No voxels and no colour: two or three cameras and their masks are enough. A fram
 
     masks → cleaned, scales → {contours → edgels along their normals → normal equations → step} × iterations × scales
 
-Beyond the paper: from time to time other places are tried for the limbs (:meth:`ContourTracker.search`), for a silhouette
-hides an arm before or behind the trunk, and where it comes out again no contour may be near.
+Beyond the paper: from time to time other places are tried for the limbs (:meth:`ContourTracker.search`), for a
+silhouette hides an arm before or behind the trunk, and where it comes out again no contour may be near.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from tk.io.init_pose import InitPose
 from tk.model.camera import Rig
 from tk.model.cone_body import ConeBody
 from tk.trackers.base import Estimate, Observation, Stopwatch
-from tk.trackers.contours import RELOCATE_EVERY, SilhouetteConfig, ContourTracker, restore_body
+from tk.trackers.contours import RELOCATE_EVERY, ContourTracker, SilhouetteConfig, restore_body
 
 Float = NDArray[np.float64]
 
