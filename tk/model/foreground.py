@@ -339,7 +339,9 @@ class CollinearityForeground:
 
         Noise, and what is left of the gain's error, are as measured all over the picture, most of which is the scene.
         """
-        brighter = ((_window_sums(self._small) - self._plate_sums * gains[:, None]) * np.float32(GREY)).sum(axis=2)
+        brighter = ((_window_sums(self._small) - self._plate_sums * gains[:, None]) * np.array(GREY, np.float32)).sum(
+            axis=2
+        )
         usual = median(brighter)
         noise = np.maximum(1.4826 * median(np.abs(brighter - usual[:, None])), 9 * sum(GREY) * _LEAST_NOISE)
         return np.stack([usual + _BRIGHT * noise, usual], axis=1).astype(np.float32)
@@ -387,9 +389,9 @@ class CollinearityForeground:
         blue, green, red = cv2.split(difference)
         contrast = np.asarray(cv2.max(cv2.max(blue, green), red), np.uint8)
         person = trim_rim(whole > 127, contrast, self.config.rim, _RIM_LAYERS)
-        person = clean_by_area(person, self._speck * _REDUCTION**2, self._hole * _REDUCTION**2)
+        clean = clean_by_area(person, self._speck * _REDUCTION**2, self._hole * _REDUCTION**2)
         for c in range(len(images)):
-            full.crop(masks[c], c)[...] = full.part(person, c)
+            full.crop(masks[c], c)[...] = full.part(clean, c)
 
 
 def _window_sums(images: Images) -> NDArray[np.uint16]:

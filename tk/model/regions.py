@@ -6,6 +6,8 @@ of pixels of the picture that is given.
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -72,7 +74,7 @@ def enclosed(unsure: Mask, certain: Mask, share: float, cut: Mask | None = None)
     chosen = touching_inside > share * (touching_inside + touching_outside)
     if cut is not None:
         chosen[region[cut[y, x]]] = False
-    cv2.drawContours(result, [contours[k] for k in np.flatnonzero(chosen[owner])], -1, 1, cv2.FILLED)
+    cv2.drawContours(result, [contours[k] for k in np.flatnonzero(chosen[owner]).tolist()], -1, 1, cv2.FILLED)
     return result.view(np.bool_) & unsure
 
 
@@ -149,16 +151,16 @@ def joined(
         ends = (ax + left, ay + top), (bx + left, by + top)
         line = cv2.line(np.zeros_like(result), *ends, 1, 1)
         if np.mean(seen_closed[line > 0]) >= _SEEN:
-            result |= cv2.line(line, *ends, 1, width) & seen_closed
+            result |= np.asarray(cv2.line(line, *ends, 1, width), np.uint8) & seen_closed
     return result.view(np.bool_)
 
 
-def _area(contour: NDArray[np.int32]) -> float:
+def _area(contour: NDArray[Any]) -> float:
     """Pixels in an outline, it and its holes included: Pick's theorem for the polygon through their centres."""
     return cv2.contourArea(contour) + len(contour) / 2 + 1
 
 
-def _filled(contour: NDArray[np.int32], box: NDArray[np.int32]) -> Mask:
+def _filled(contour: NDArray[Any], box: NDArray[np.int32]) -> Mask:
     """(h, w) of its bounding box: what lies in an outline."""
     part = np.zeros((box[3], box[2]), np.uint8)
     cv2.drawContours(part, [contour], 0, 1, cv2.FILLED, offset=(-int(box[0]), -int(box[1])))
