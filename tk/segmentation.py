@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from tk.config import Config
 from tk.io.capture import Capture
 from tk.io.frames import FrameSet
-from tk.model.foreground import CollinearityForeground, Mog2Foreground, median_plate
+from tk.model.foreground import CollinearityForeground
+from tk.model.mog2 import Mog2Foreground
+from tk.model.scene import median_plate
 
 Segmenter = Callable[[FrameSet], NDArray[np.uint8]]
 #: masks, and where they are 0 for what may be the person all the same; None where nobody says
