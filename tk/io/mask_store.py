@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +38,7 @@ class MaskStore:
         return Frames(self, [int(i) for i in indices])
 
 
-class Frames:
+class Frames(Sequence[Masks]):
     """A sequence of masks that holds one at a time."""
 
     def __init__(self, store: MaskStore, indices: list[int]) -> None:
@@ -46,8 +47,16 @@ class Frames:
     def __len__(self) -> int:
         return len(self._indices)
 
-    def __getitem__(self, i: int) -> Masks:
+    @overload
+    def __getitem__(self, i: int) -> Masks: ...
+
+    @overload
+    def __getitem__(self, i: slice) -> Frames: ...
+
+    def __getitem__(self, i: int | slice) -> Masks | Frames:
+        if isinstance(i, slice):
+            return Frames(self._store, self._indices[i])
         return self._store.get(self._indices[i])
 
     def __iter__(self) -> Iterator[Masks]:
-        return (self[i] for i in range(len(self)))
+        return (self._store.get(i) for i in self._indices)

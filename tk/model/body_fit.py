@@ -3,9 +3,9 @@
 One Gauss-Newton problem over the poses of F frames and the body's parameters: the logarithms of the dimensions, and for
 each group of parts what :meth:`~tk.model.cone_body.ConeBody.reshaped` changes. An edgel's row by a parameter is
 n·Jπ·∂x/∂δ at the material point x of the contour, as it is by a degree of freedom: along an occluding contour the
-surface slides in the image's tangent only. Dimensions and shapes are fitted together because shapes make up for dimensions and
-the other way round: thighs that taper otherwise than the average ones move the knee by centimetres if only the
-dimensions may give way. (The silhouette paper leaves the adaptation of the body to future work.)
+surface slides in the image's tangent only. Dimensions and shapes are fitted together because shapes make up for
+dimensions and the other way round: thighs that taper otherwise than the average ones move the knee by centimetres if
+only the dimensions may give way. (The silhouette paper leaves the adaptation of the body to future work.)
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ class PartColors:
 
     def __init__(self, body: ConeBody) -> None:
         self.group = np.array([GROUPS.index(_group(part.component)) for part in body.parts], np.int32)
-        self._counts = np.zeros((len(GROUPS), COLOR_BINS))
+        self._counts: Float = np.zeros((len(GROUPS), COLOR_BINS))
         self.log_likelihood: NDArray[np.float32] | None = None
 
     @property
@@ -55,8 +55,10 @@ class PartColors:
         self._update()
 
     def _update(self) -> None:
-        cubes = [gaussian_filter(row.reshape(16, 16, 16), _SMOOTHING, mode="nearest").ravel() for row in self._counts]
-        share: Float = np.array(cubes)
+        cubes: list[Float] = [
+            gaussian_filter(row.reshape(16, 16, 16), _SMOOTHING, mode="nearest").ravel() for row in self._counts
+        ]
+        share = np.stack(cubes).astype(np.float64)
         share = share / np.maximum(share.sum(axis=1, keepdims=True), 1e-9)
         self.log_likelihood = np.log((1 - _ANYTHING) * share + _ANYTHING / COLOR_BINS).astype(np.float32)
 

@@ -9,9 +9,9 @@ A frame's way, top to bottom:
           → colours of the parts learned
 
 Contours and equations are the silhouette paper's (sections 4.1 to 4.3); borders between colours are those of
-region-based tracking (Stoiber et al., *SRT3D*, IJCV 2022). The search takes the place of the first paper's Stochastic Meta Descent
-and of its visual hull: a place of a limb is inside the hull and covers it where it is inside all silhouettes and leaves
-no ray of theirs without a part, which casting rays tells directly, at the pictures' resolution and not the voxels'.
+region-based tracking (Stoiber et al., *SRT3D*, IJCV 2022). The search takes the place of the first paper's Stochastic
+Meta Descent and of its visual hull: a limb lies in the hull and fills it where it lies in all silhouettes and leaves no
+ray of theirs without a part. Casting rays tells that directly, at the pictures' resolution and not the voxels'.
 """
 
 from __future__ import annotations
