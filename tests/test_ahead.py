@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import FRAMES, QUICK, Silent
-from tests.test_sequence import assert_same, send
+from tests.test_session import assert_same, send
 from tk.ahead import Ahead, Serial, Source, open_source
 from tk.config import Config
 from tk.errors import ConfigError, VideoError, WorkerError
