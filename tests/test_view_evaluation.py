@@ -24,9 +24,6 @@ from tk.trackers.volumetric import restore_body as restore_superellipsoids
 
 SETTINGS = """
 [silhouette]
-headings = 4
-phases = 1
-finalists = 1
 init_frames = 2
 [silhouette.fit]
 frames = 2
