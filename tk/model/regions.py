@@ -54,8 +54,8 @@ def beyond_shadows(unsure: Mask, certain: Mask, dark: Mask, width: int, share: f
     return enclosed(thick, certain, share)
 
 
-def enclosed(unsure: Mask, certain: Mask, share: float, cut: Mask | None = None) -> Mask:
-    """The regions of ``unsure`` whose border touches ``certain`` more than the share allows, and not ``cut``.
+def enclosed(unsure: Mask, certain: Mask, share: float) -> Mask:
+    """The regions of ``unsure`` whose border touches ``certain`` more than the share allows.
 
     Works on outlines, which are short: that of a region and those of its holes are its border.
     """
@@ -72,8 +72,6 @@ def enclosed(unsure: Mask, certain: Mask, share: float, cut: Mask | None = None)
     touching_outside = np.bincount(region[outside[y, x]], minlength=len(contours))
     touching_inside = np.bincount(region[inside[y, x]], minlength=len(contours))
     chosen = touching_inside > share * (touching_inside + touching_outside)
-    if cut is not None:
-        chosen[region[cut[y, x]]] = False
     cv2.drawContours(result, [contours[k] for k in np.flatnonzero(chosen[owner]).tolist()], -1, 1, cv2.FILLED)
     return result.view(np.bool_) & unsure
 
