@@ -62,8 +62,11 @@ class Hdf5Reader:
 
     def fail(self, message: str) -> NoReturn:
         """Raise a ResultError about this file: one line, whatever the message quotes from it."""
+        raise self._error(message)
+
+    def _error(self, message: str) -> ResultError:
         line = "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))
-        raise ResultError(f"{self.path}: {line if len(line) <= 400 else f'{line[:400]}...'}")
+        return ResultError(f"{self.path}: {line if len(line) <= 400 else f'{line[:400]}...'}")
 
     def below(self, group: str) -> list[str]:
         """The names of the datasets below a group, relative to it, sorted."""
@@ -180,7 +183,7 @@ class Hdf5Reader:
             raise
         except Exception as error:
             what = f"/{name} cannot be read; the file is damaged" if name != "/" else "is damaged"
-            raise ResultError(f"{self.path}: {what}") from error
+            raise self._error(what) from error
 
     def _survey(self) -> None:
         waiting: list[tuple[str, int]] = [("", 0)]
