@@ -355,6 +355,49 @@ def test_a_folder_without_permission(tk: Tk, quick: Path, tiny: Path, tmp_path: 
     tk(command, tiny, "-o", locked / "r.h5", "--config", quick).complaint("r.h5")
 
 
+def spoil(path: Path, name: str, value: Any) -> None:
+    """Replace a dataset or group of a result; None leaves nothing in its place."""
+    with h5py.File(path, "r+") as file:
+        del file[name]
+        if value is not None:
+            file[name] = value
+
+
+def test_evaluate_takes_no_damaged_result(tk: Tk, tracked: Path, tiny: Path, tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe.h5"
+    os.mkfifo(pipe)
+    tk("evaluate", pipe, tiny / "truth.h5").complaint("pipe.h5", "not a file")
+    tk("evaluate", tracked, pipe).complaint("pipe.h5", "not a file")
+    for name, value in [
+        ("joints/position", np.zeros(3)),
+        ("frames", h5py.SoftLink("/nowhere")),
+        ("status", "good"),
+        ("pose", np.zeros((FRAMES, 3))),
+        ("model/dimensions/trunk", "tall"),
+        ("model/dimensions/trunk", np.zeros(7)),
+    ]:
+        path = Path(shutil.copy(tracked, tmp_path / "r.h5"))
+        spoil(path, name, value)
+        tk("evaluate", path, tiny / "truth.h5").complaint("r.h5")
+
+
+def test_a_damaged_state_is_not_taken_up(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    result = tmp_path / "r.h5"
+    command = ["track", tiny, "-o", result, "--config", quick]
+    assert tk(*command, "--frames", ":2").code == 0
+    good = result.read_bytes()
+    for name, value in [
+        ("resume/state/pose", None),
+        ("resume/state/usual", "text"),
+        ("resume/state/run/lost frames", np.zeros(3)),
+        ("model/patches", None),
+        ("pose", np.zeros((2, 3))),
+    ]:
+        result.write_bytes(good)
+        spoil(result, name, value)
+        tk(*command, "--frames", ":4", "--resume").complaint("r.h5")
+
+
 def test_evaluate_names_what_it_cannot_read(tk: Tk, tracked: Path, tiny: Path, tmp_path: Path) -> None:
     tk("evaluate", tmp_path / "r.h5", tiny / "truth.h5").complaint("r.h5", "no such file")
     tk("evaluate", tracked, tiny / "calibration.toml").complaint("calibration.toml", "not an HDF5 file")

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Any
 
@@ -254,6 +255,10 @@ def test_a_text_file_called_mp4(make_capture: MakeCapture) -> None:
         ({"volume": {"center": [0, float("nan"), 1], "size": [1, 1, 1]}}, VolumeError, "center holds nan"),
         ({"volume": {"center": [0, 0, 60], "size": [1, 1, 1]}}, VolumeError, "no two cameras see"),
         ({"volume": [1, 2]}, CaptureError, "must be a table"),
+        ({"fps": 1e300}, CaptureError, "fps = 1e+300 is too large"),
+        ({"fps": 1e6}, CaptureError, "fps = 1e+06 must be between 0.01 and 100000"),
+        ({"init": {"frame": 10**30}}, CaptureError, "is too large"),
+        ({"volume": {"center": [0, 0, 1], "size": [1, 1, 1e8]}}, VolumeError, "too large or too far away"),
         ({"fps": 0}, CaptureError, "fps = 0 must be positive"),
         ({"fps": "15"}, CaptureError, "fps = '15' must be a finite number"),
         ({"fps": float("nan")}, CaptureError, "fps = nan"),
@@ -335,3 +340,58 @@ def test_shared_captures(name: str, cameras: int, frames: int, masks: bool, back
         assert frame_sets[0].masks is not None
         share = (frame_sets[0].masks == 255).mean(axis=(1, 2))
         assert ((share > 0.005) & (share < 0.4)).all()
+
+
+def test_what_is_no_file_is_not_waited_for(make_capture: MakeCapture) -> None:
+    """A pipe in the place of a file would be read for ever."""
+    folder = make_capture()
+    for name in ("capture.toml", "calibration.toml", "videos/cam1.mp4"):
+        path = folder / name
+        content = path.read_bytes()
+        path.unlink()
+        os.mkfifo(path)
+        with pytest.raises(CaptureError, match=rf"{name}: .*not a file"):
+            open_capture(folder)
+        path.unlink()
+        path.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "fps = 1" + 400 * "0",
+        "fps = 1" + 5000 * "0",
+        "fps = " + 3000 * "[",
+        "fps = " + 3000 * "[" + 3000 * "]",
+        "name = 1" + 400 * "0",
+        "[init]\nframe = -1" + 400 * "0",
+        "[volume]\ncenter = [0, 0, 1" + 400 * "0" + "]\nsize = [1, 1, 1]",
+    ],
+)
+def test_absurd_numbers_and_nesting_are_one_short_line(make_capture: MakeCapture, text: str) -> None:
+    folder = make_capture()
+    (folder / "capture.toml").write_text(text)
+    with pytest.raises(CaptureError, match=r"capture\.toml: ") as caught:
+        open_capture(folder)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "complaint"),
+    [
+        ("translation", [0.0, 1e308, 0.0], r"translation holds 1e\+308, which is too large"),
+        ("rotation", [1e300, 0.0, 0.0], "rotation holds"),
+        ("distortions", [1e12, 0.0, 0.0, 0.0], "distortions holds"),
+        ("matrix", [[1e200, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], "matrix holds"),
+        ("size", [10**6, 48], "65536 pixels a side"),
+    ],
+)
+def test_every_number_of_a_camera_has_a_bound(
+    make_capture: MakeCapture, key: str, value: list[Any], complaint: str
+) -> None:
+    folder = make_capture()
+    tables = calibration_tables(3)
+    tables["cam2"][key] = value
+    write_toml(folder / "calibration.toml", tables)
+    with pytest.raises(CalibrationError, match=rf"calibration\.toml: camera 'cam2': .*{complaint}"):
+        open_capture(folder)
