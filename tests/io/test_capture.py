@@ -64,6 +64,13 @@ def test_opens_with_what_capture_toml_says(make_capture: MakeCapture) -> None:
         capture.fps = 1.0  # type: ignore[misc]
 
 
+def test_up_may_be_any_direction(make_capture: MakeCapture) -> None:
+    capture = open_capture(make_capture(settings={"up": [0.02, -0.99, 0.01]}))
+    expected = np.array([0.02, -0.99, 0.01])
+    np.testing.assert_allclose(capture.up_axis, expected / np.linalg.norm(expected), atol=1e-15)
+    assert open_capture(make_capture(settings={"up": [0.0, -2.0, 0.0]}, name="axis")).up == "-y"
+
+
 def test_everything_in_capture_toml_has_a_default(make_capture: MakeCapture) -> None:
     capture = open_capture(make_capture(settings={}, name="ring"))
     assert (capture.name, capture.fps, capture.up) == ("ring", 15.0, "z")
@@ -258,6 +265,8 @@ def test_a_text_file_called_mp4(make_capture: MakeCapture) -> None:
         ({"fps": "15"}, CaptureError, "fps = '15' must be a finite number"),
         ({"fps": float("nan")}, CaptureError, "fps = nan"),
         ({"up": "w"}, CaptureError, "up = 'w' must be one of x, y, z, -x, -y, -z"),
+        ({"up": [0.0, 1.0]}, CaptureError, "up must be 3 numbers, and is 2"),
+        ({"up": [0.0, 0.0, 0.0]}, CaptureError, "up = [0.0, 0.0, 0.0] has no direction"),
         ({"name": 3}, CaptureError, "name = 3 must be a text"),
         ({"subject": {"height": 178}}, CaptureError, "[subject]: height = 178 must be between 0.3 and 3 metres"),
         ({"init": {"frame": -1}}, CaptureError, "[init]: frame = -1"),
