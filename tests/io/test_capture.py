@@ -293,15 +293,21 @@ def test_settings_that_are_no_toml_or_misspelt(make_capture: MakeCapture) -> Non
     assert warning.endswith("unknown keys are ignored: fsp, subject.heigth")
 
 
-def test_millimetres_without_units_are_suspected(make_capture: MakeCapture) -> None:
+def test_millimetres_without_units_are_recognised(make_capture: MakeCapture) -> None:
     folder = make_capture(settings={})
+    expected = open_capture(folder).rig.centers
     tables = calibration_tables(3)
     for table in tables.values():
         table["translation"] = [1000 * x for x in table["translation"]]
     write_toml(folder / "calibration.toml", tables)
-    assert any('units = "mm" missing' in line for line in open_capture(folder).warnings)
+    capture = open_capture(folder)
+    np.testing.assert_allclose(capture.rig.centers, expected, atol=1e-12)
+    (line,) = [line for line in capture.warnings if "[metadata] units" in line]
+    assert "taken for mm" in line and "5.2 m apart" in line and str(folder / "calibration.toml") in line
     write_toml(folder / "calibration.toml", {**tables, "metadata": {"units": "mm"}})
     assert not any("[metadata]" in line for line in open_capture(folder).warnings)
+    write_toml(folder / "calibration.toml", {**tables, "metadata": {"units": "m"}})  # what is said is believed
+    assert any('units = "mm" missing' in line for line in open_capture(folder).warnings)
 
 
 def test_no_volume_and_none_to_infer(make_capture: MakeCapture) -> None:

@@ -64,5 +64,5 @@ def test_the_skeleton_turns_with_up(seed: int) -> None:
 
 @pytest.mark.parametrize("up", ["north", "[1, 2]", "[0, 0, 0]", '["a", 1, 2]', "[NaN, 0, 1]", "[[1, 0, 0]]", "{}", "3"])
 def test_no_direction(up: str) -> None:
-    with pytest.raises(ConfigError, match="^up = "):
+    with pytest.raises(ConfigError, match=r"^up = "):
         up_vector(up)

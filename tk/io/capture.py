@@ -136,7 +136,7 @@ def open_capture(path: str | Path, cameras: Sequence[str] | None = None, masks: 
     if walk and walk.masks is not None and masks == "auto":
         masks = str(walk.masks)
     mask_clips = _open_masks(calibration, path, masks)
-    warnings: list[str] = []
+    warnings: list[str] = list(calibration.notes)
     if settings.unknown:
         warnings.append(f"{path / 'capture.toml'}: unknown keys are ignored: {', '.join(settings.unknown)}")
     _warn_of_units(calibration, warnings.append)

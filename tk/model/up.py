@@ -65,7 +65,7 @@ def _unit(values: ArrayLike) -> Float:
     except (TypeError, ValueError):
         vector = np.zeros(0)
     if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise ConfigError(f"up = {values} must be {UP_FORMS}")
+        raise ConfigError(f"up = {values!r} must be {UP_FORMS}")
     length = float(np.linalg.norm(vector))
     if length < _SHORT:
         raise ConfigError(f"up = {vector.tolist()} has no direction: its length is {length:g}")
