@@ -62,8 +62,8 @@ def infer_unit(centers: ArrayLike, default: str = "m") -> FoundUnit:
     if not possible:
         return FoundUnit(
             default,
-            f"lengths are taken for {default}: the cameras are then up to {distance * UNITS[default]:.3g} m apart; no unit "
-            f"makes it {LEAST_APART_M:g} to {MOST_APART_M:g} m",
+            f"lengths are taken for {default}: the cameras are then up to {distance * UNITS[default]:.3g} m apart; no "
+            f"unit makes it {LEAST_APART_M:g} to {MOST_APART_M:g} m",
         )
     name = min(possible, key=lambda unit: abs(math.log(distance * UNITS[unit] / USUAL_APART_M)))
     others = [f"in {unit} it would be {distance * UNITS[unit]:.3g} m" for unit in possible if unit != name]

@@ -40,28 +40,34 @@ def closest_to_axes(rig: Rig) -> Float:
     return np.linalg.solve(normal, np.einsum("cij,cj->i", across, rig.centers))
 
 
-def infer_volume(rig: Rig) -> Volume:
+def infer_volume(rig: Rig, fewest: int | None = None) -> Volume:
     """A working volume for a rig: the box around what all cameras see in common.
+
+    Args:
+        rig: the cameras.
+        fewest: cameras that have to see a point; all of them by default.
 
     The rule: start at the point closest to all optical axes. Around it, out to 0.6 of the distance to the nearest
     camera, take the points that are in every camera's picture. The volume is their axis-aligned bounding box: rather
     too large than a head cut off. The paper (section 4.1) takes the volume as given.
 
     Raises:
-        VolumeError: the axes do not meet, or no region is seen by all cameras.
+        VolumeError: the axes do not meet, or no region is seen by all (or ``fewest``) cameras.
     """
+    fewest = len(rig) if fewest is None else fewest
+    nowhere = f"no region is seen by {'all' if fewest == len(rig) else fewest} cameras"
     middle = closest_to_axes(rig)
     reach_m = 0.6 * float(np.linalg.norm(rig.centers - middle, axis=1).min())
     if not reach_m > 0:
         raise VolumeError("a camera stands where the others look")
     ball = sample_box(Volume(_triple(middle), (2 * reach_m,) * 3), 2 * _SAMPLES)
     ball = ball[np.linalg.norm(ball - middle, axis=1) <= reach_m]
-    common = ball[views_of(rig, ball) == len(rig)]
+    common = ball[views_of(rig, ball) >= fewest]
     if len(common) == 0:
-        raise VolumeError("no region is seen by all cameras")
+        raise VolumeError(nowhere)
     lower, upper = common.min(axis=0), common.max(axis=0)
     if not (upper > lower).all():
-        raise VolumeError("no region is seen by all cameras")
+        raise VolumeError(nowhere)
     return Volume(_triple((lower + upper) / 2), _triple(upper - lower))
 
 

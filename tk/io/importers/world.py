@@ -1,0 +1,88 @@
+"""Which way is up in a calibration's world, and where in it the person is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tk.errors import VolumeError
+from tk.model.camera import Rig
+from tk.model.common_view import closest_to_axes, infer_volume
+from tk.model.up import UP_AXES, up_text, up_vector
+from tk.model.volume import Volume
+
+#: a direction this close to an axis is meant to be the axis
+SNAP_DEG = 10.0
+
+#: the mean of the cameras' upward directions is shorter than this when they are mounted every way
+_AGREE = 0.4
+
+#: the two greater eigenvalues of the rightward directions, as a ratio, below which these do not span the horizontal
+_SPAN = 0.05
+
+
+@dataclass(frozen=True)
+class FoundUp:
+    """The world's upward direction: ``up`` as :func:`tk.model.up.up_text` tells it, and ``how`` it was found."""
+
+    up: str
+    how: str
+
+
+def infer_up(rig: Rig) -> FoundUp:
+    """The upward direction, from cameras that are mounted upright.
+
+    A first guess is the mean of the directions that point up in the pictures. Cameras that look down tilt it, those on
+    one side of a room all alike; but a camera that is not rolled has a horizontal rightward direction however it is
+    tilted. So, where these directions span a plane, up is across it, to the side of the guess. Within 10° of an axis
+    it is that axis.
+    """
+    guess = -np.mean([camera.rotation[1] for camera in rig], axis=0)
+    agreement = float(np.linalg.norm(guess))
+    how = "mean of the directions that point up in the pictures"
+    if agreement < 1e-6:
+        return FoundUp("z", "the cameras say nothing: they are mounted every way; z is a guess")
+    up = guess / agreement
+    right = np.array([camera.rotation[0] for camera in rig])
+    values, vectors = np.linalg.eigh(right.T @ right)  # ascending
+    across = vectors[:, 0]
+    if values[1] > _SPAN * values[2] and abs(across @ up) > np.cos(np.pi / 4):
+        up = across * np.sign(across @ up)
+        how = "the direction across those that point right in the pictures"
+    text = up_text(up)
+    for name in UP_AXES:
+        degrees = float(np.degrees(np.arccos(np.clip(up_vector(name) @ up, -1.0, 1.0))))
+        if degrees <= SNAP_DEG:
+            text, how = name, f"{how}, {degrees:.1f}° from this axis"
+    if agreement < _AGREE:
+        how += "; the cameras are mounted every way, so make sure of it"
+    return FoundUp(text, how)
+
+
+def find_volume(rig: Rig) -> tuple[Volume | None, str]:
+    """A working volume where the views overlap, around the point nearest to all optical axes; and how it was found.
+
+    What all cameras see in common, where there is such a region; else what fewer and fewer of them do, down to two.
+    """
+    try:
+        middle = closest_to_axes(rig)
+    except VolumeError as reason:
+        return None, f"no [volume] could be inferred: {reason}; give one"
+    behind = [camera.name for camera in rig if camera.to_camera(middle)[0, 2] <= 0]
+    looks = f"; {', '.join(behind)} look away from it: is the calibration right?" if behind else ""
+    for fewest in range(len(rig), 1, -1):
+        try:
+            found = infer_volume(rig, fewest)
+        except VolumeError:
+            continue
+        who = "all cameras see" if fewest == len(rig) else f"{fewest} of the {len(rig)} cameras see"
+        return _rounded(found), f"the box around what {who} near the point that is nearest to their axes{looks}"
+    return None, f"no [volume] could be inferred: no two cameras see the point nearest to all axes{looks}; give one"
+
+
+def _rounded(volume: Volume) -> Volume:
+    """To centimetres, for people to read and edit."""
+    center = [round(x, 2) for x in volume.center]
+    size = [max(round(x, 2), 0.01) for x in volume.size]
+    return Volume((center[0], center[1], center[2]), (size[0], size[1], size[2]))
