@@ -25,7 +25,7 @@ class Attributes:
         return Attributes(found, f"{where}: <{found.tag}>")
 
     def numbers(self, key: str, count: int, default: list[float] | None = None, skip: int = 0) -> list[float]:
-        """The finite numbers of an attribute, ``count`` at least, after ``skip`` words; ``default`` where it is missing.
+        """The finite numbers of an attribute after ``skip`` words, ``count`` or more; ``default`` where it is missing.
 
         Raises:
             CalibrationError: it is missing without a default, or holds something else.
