@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tk.errors import VolumeError
-from tk.model.camera import Rig
+from tk.model.camera import Camera, Rig
 from tk.model.common_view import closest_to_axes, infer_volume
 from tk.model.up import UP_AXES, up_text, up_vector
 from tk.model.volume import Volume
@@ -33,31 +33,41 @@ class FoundUp:
 def infer_up(rig: Rig) -> FoundUp:
     """The upward direction, from cameras that are mounted upright.
 
-    A first guess is the mean of the directions that point up in the pictures. Cameras that look down tilt it, those on
-    one side of a room all alike; but a camera that is not rolled has a horizontal rightward direction however it is
-    tilted. So, where these directions span a plane, up is across it, to the side of the guess. Within 10° of an axis
-    it is that axis.
+    A first estimate is the mean of the directions that point up in the pictures. Cameras that look down tilt it, those
+    on one side of a room all alike. A camera that is not rolled has a horizontal rightward direction however it looks
+    down: so, where these directions span a plane, a second estimate is across it, to the side of the first. When
+    either is within 10° of an axis it is that axis, since people lay the world's axes along the floor; unless the world
+    is one of the cameras' own frame, which nobody has laid. Otherwise the second counts, where there is one.
     """
-    guess = -np.mean([camera.rotation[1] for camera in rig], axis=0)
-    agreement = float(np.linalg.norm(guess))
-    how = "mean of the directions that point up in the pictures"
+    mean = -np.mean([camera.rotation[1] for camera in rig], axis=0)
+    agreement = float(np.linalg.norm(mean))
     if agreement < 1e-6:
         return FoundUp("z", "the cameras say nothing: they are mounted every way; z is a guess")
-    up = guess / agreement
+    mean /= agreement
+    estimates = [(mean, "the mean of the directions that point up in the pictures")]
     right = np.array([camera.rotation[0] for camera in rig])
     values, vectors = np.linalg.eigh(right.T @ right)  # ascending
-    across = vectors[:, 0]
-    if values[1] > _SPAN * values[2] and abs(across @ up) > np.cos(np.pi / 4):
-        up = across * np.sign(across @ up)
-        how = "the direction across those that point right in the pictures"
-    text = up_text(up)
-    for name in UP_AXES:
-        degrees = float(np.degrees(np.arccos(np.clip(up_vector(name) @ up, -1.0, 1.0))))
-        if degrees <= SNAP_DEG:
-            text, how = name, f"{how}, {degrees:.1f}° from this axis"
-    if agreement < _AGREE:
-        how += "; the cameras are mounted every way, so make sure of it"
-    return FoundUp(text, how)
+    across = vectors[:, 0] * np.sign(vectors[:, 0] @ mean)
+    if values[1] > _SPAN * values[2] and across @ mean > np.cos(np.pi / 4):
+        estimates.insert(0, (across, "the direction across those that point right in the pictures"))
+    unsure = "; the cameras are mounted every way, so make sure of it" if agreement < _AGREE else ""
+
+    own = next((camera.name for camera in rig if _is_world(camera)), None)
+    if own is not None:
+        up, how = estimates[0]
+        return FoundUp(up_text(up), f"{how}; the world is the frame of camera {own}{unsure}")
+    for up, how in estimates:
+        for name in UP_AXES:
+            degrees = float(np.degrees(np.arccos(np.clip(up_vector(name) @ up, -1.0, 1.0))))
+            if degrees <= SNAP_DEG:
+                return FoundUp(name, f"the axis {degrees:.1f}° from {how}{unsure}")
+    up, how = estimates[0]
+    return FoundUp(up_text(up), f"{how}{unsure}")
+
+
+def _is_world(camera: Camera) -> bool:
+    """Whether the world is this camera's own frame."""
+    return bool(np.allclose(camera.rotation, np.eye(3), atol=1e-6) and np.allclose(camera.translation, 0.0, atol=1e-6))
 
 
 def find_volume(rig: Rig) -> tuple[Volume | None, str]:

@@ -77,8 +77,10 @@ def write_capture(project: Project, output: Path) -> Imported:
             capture_toml(output.resolve().name, project, found, volume, where), encoding="utf-8"
         )
         copied = _place(project.clips, rig.names, draft, "videos")
-        copied |= _place(project.masks, rig.names, draft, "masks")
-        copied |= _place(project.backgrounds, rig.names, draft, "background")
+        if project.masks:
+            copied |= _place(project.masks, rig.names, draft, "masks")
+        if project.backgrounds:
+            copied |= _place(project.backgrounds, rig.names, draft, "background")
         warnings = open_capture(draft).warnings if volume else ()  # without a volume it cannot be opened yet
         draft.chmod(0o755)
         if output.exists():
