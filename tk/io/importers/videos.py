@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from os.path import commonprefix
 from pathlib import Path
 
 from tk.errors import CaptureError, VideoError
@@ -143,12 +144,14 @@ def match_clips(cameras: Sequence[Wanted], stems: Sequence[str], in_order: bool)
 
     Tried in this order, the one that matches most cameras counts, and none may match two cameras with one clip: equal
     names; one name within the other ("cam01" in "int_cam01_img"); the number in which the names differ ("cam_0",
-    "port_0"); and, where ``in_order``, the order of the names.
+    "port_0"); what is left of the names without their common beginning and end ("A", "trial1-camA"); and, where
+    ``in_order``, the order of the names.
     """
     ways: list[tuple[str, Callable[[], list[str | None]]]] = [
         ("name", lambda: [_equal(camera, stems) for camera in cameras]),
         ("part", lambda: [_within(camera, stems) for camera in cameras]),
-        ("number", lambda: _by_number(cameras, stems)),
+        ("number", lambda: _by_difference(cameras, stems, _distinct_numbers)),
+        ("difference", lambda: _by_difference(cameras, stems, _differences)),
     ]
     best: _Order | None = None
     for by, way in ways:
@@ -202,30 +205,41 @@ def _contains(words: tuple[str, ...], part: tuple[str, ...]) -> bool:
     return n > 0 and any(words[start : start + n] == part for start in range(len(words) - n + 1))
 
 
-def _by_number(cameras: Sequence[Wanted], stems: Sequence[str]) -> list[str | None]:
-    """By the one number that differs between the names; all numbers of the cameras are those of stems, or vice versa.
+def _by_difference(
+    cameras: Sequence[Wanted], stems: Sequence[str], differences: Callable[[Sequence[str]], list[str]]
+) -> list[str | None]:
+    """By that in which the names differ; all there is of the cameras must be there of the stems, or vice versa.
 
     "cam1" to "cam4" and "0" to "3" are thus not matched: which is which would be a guess.
     """
-    numbers = _distinct_numbers(list(stems))
+    theirs = differences(stems)
     for names in ([camera.name for camera in cameras], [camera.key for camera in cameras]):
-        own = _distinct_numbers(names)
-        if own and numbers and (set(own) <= set(numbers) or set(numbers) <= set(own)):
-            return [stems[numbers.index(number)] if number in numbers else None for number in own]
+        own = differences(names)
+        if own and theirs and (set(own) <= set(theirs) or set(theirs) <= set(own)):
+            return [stems[theirs.index(value)] if value in theirs else None for value in own]
     return [None] * len(cameras)
 
 
-def _distinct_numbers(names: Sequence[str]) -> list[int]:
+def _distinct_numbers(names: Sequence[str]) -> list[str]:
     """A number of each name, at the same place in all, in which no two agree; [] if there is none or several."""
     rows = [_words(name) for name in names]
     if len({len(row) for row in rows}) != 1:
         return []
     columns = [
-        [int(word) for word in column]
+        list(column)
         for column in zip(*rows, strict=True)
         if all(word.isdigit() for word in column) and len(set(column)) == len(column)
     ]
     return columns[0] if len(columns) == 1 else []
+
+
+def _differences(names: Sequence[str]) -> list[str]:
+    """Each name without the beginning and the end that all have in common; [] if nothing is left of one."""
+    start = len(commonprefix(list(names)))
+    rest = [name[start:] for name in names]
+    end = len(commonprefix([name[::-1] for name in rest]))
+    left = [name[: len(name) - end].lower().lstrip("0") for name in rest]
+    return left if all(left) and len(set(left)) == len(left) else []
 
 
 def _one_set(root: Path, places: Places, trial: str | None) -> tuple[Path, Mapping[str, Path]]:
