@@ -71,7 +71,11 @@ def test_easymocap_with_pictures(folder: Path, check: Import) -> None:
         for k in range(FRAMES):
             write_picture(folder / "images" / camera.name / f"{k:06d}.png", picture(index, k, (WIDTH, HEIGHT)))
     checked = check(folder, rig)
-    assert sorted(path.name for path in checked.imported.path.iterdir()) == ["calibration.toml", "capture.toml", "images"]
+    assert sorted(path.name for path in checked.imported.path.iterdir()) == [
+        "calibration.toml",
+        "capture.toml",
+        "images",
+    ]
 
 
 def test_easymocap_camera_without_a_pose(folder: Path, check: Import) -> None:
@@ -149,7 +153,9 @@ def write_panoptic(folder: Path, rig: Rig, names: list[str]) -> Path:
         }
         for index, (name, camera) in enumerate(zip(names, rig, strict=True))
     ]
-    others = [{**cameras[0], "name": f"{panel:02d}_{node:02d}", "type": "vga"} for panel in (1, 2) for node in range(1, 25)]
+    others = [
+        {**cameras[0], "name": f"{panel:02d}_{node:02d}", "type": "vga"} for panel in (1, 2) for node in range(1, 25)
+    ]
     path = folder / "calibration_171204_pose1.json"
     path.write_text(json.dumps({"calibDataSource": "160922_calib_norm", "cameras": [*others, *cameras]}))
     return path

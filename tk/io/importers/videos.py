@@ -18,6 +18,9 @@ _OTHER_VIDEOS = (".m4v", ".mts", ".m2ts", ".webm", ".wmv", ".mpg", ".mpeg", ".fl
 #: words in the names of cameras and files that tell nothing about which camera it is
 _COMMON_WORDS = frozenset({"int", "ext", "img", "calib", "video", "synchronized", "sync", "camera", "cam", "port"})
 
+#: a name of numbers alone that is shorter than this ("1", "02") may be within another by chance
+_TELLING = 4
+
 #: files of a folder that are looked at before it is taken to hold no pictures
 _GLANCE = 200
 
@@ -191,13 +194,18 @@ def _words(text: str) -> tuple[str, ...]:
 def _within(camera: Wanted, stems: Sequence[str]) -> str | None:
     """The one stem that contains a name of the camera, or is contained in it, word by word."""
     for name in dict.fromkeys((camera.name, camera.key)):
-        words = _words(name)
-        inner = [stem for stem in stems if _contains(_words(stem), words)]
-        outer = [stem for stem in stems if _contains(words, _words(stem)) and not set(_words(stem)) <= _COMMON_WORDS]
+        inner = [stem for stem in stems if _tells(name) and _contains(_words(stem), _words(name))]
+        outer = [stem for stem in stems if _tells(stem) and _contains(_words(name), _words(stem))]
         for found in (inner, outer):
             if len(found) == 1:
                 return found[0]
     return None
+
+
+def _tells(name: str) -> bool:
+    """Whether a name, found within another, can be no chance."""
+    words = _words(name)
+    return not set(words) <= _COMMON_WORDS and (len(name) >= _TELLING or not all(word.isdigit() for word in words))
 
 
 def _contains(words: tuple[str, ...], part: tuple[str, ...]) -> bool:

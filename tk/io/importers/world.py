@@ -18,6 +18,9 @@ SNAP_DEG = 10.0
 #: the mean of the cameras' upward directions is shorter than this when they are mounted every way
 _AGREE = 0.4
 
+#: cameras whose rightward directions are off the horizontal by more than this, root mean square, are rolled
+_ROLLED_DEG = 4.0
+
 #: the two greater eigenvalues of the rightward directions, as a ratio, below which these do not span the horizontal
 _SPAN = 0.05
 
@@ -35,9 +38,11 @@ def infer_up(rig: Rig) -> FoundUp:
 
     A first estimate is the mean of the directions that point up in the pictures. Cameras that look down tilt it, those
     on one side of a room all alike. A camera that is not rolled has a horizontal rightward direction however it looks
-    down: so, where these directions span a plane, a second estimate is across it, to the side of the first. When
-    either is within 10° of an axis it is that axis, since people lay the world's axes along the floor; unless the world
-    is one of the cameras' own frame, which nobody has laid. Otherwise the second counts, where there is one.
+    down: so, where these directions span a plane, a second estimate is across it, to the side of the first. It counts
+    where the cameras agree with it to 4° (root mean square); otherwise they are rolled, and the first counts.
+
+    An estimate within 10° of an axis is that axis, since people lay the world's axes along the floor; where the cameras
+    are rolled either estimate may be. Not so where the world is one of the cameras' own frame, which nobody has laid.
     """
     mean = -np.mean([camera.rotation[1] for camera in rig], axis=0)
     agreement = float(np.linalg.norm(mean))
@@ -49,7 +54,9 @@ def infer_up(rig: Rig) -> FoundUp:
     values, vectors = np.linalg.eigh(right.T @ right)  # ascending
     across = vectors[:, 0] * np.sign(vectors[:, 0] @ mean)
     if values[1] > _SPAN * values[2] and across @ mean > np.cos(np.pi / 4):
-        estimates.insert(0, (across, "the direction across those that point right in the pictures"))
+        second = (across, "the direction across those that point right in the pictures")
+        roll_deg = float(np.degrees(np.sqrt(max(values[0], 0.0) / len(rig))))
+        estimates = [second] if roll_deg <= _ROLLED_DEG else [*estimates, second]
     unsure = "; the cameras are mounted every way, so make sure of it" if agreement < _AGREE else ""
 
     own = next((camera.name for camera in rig if _is_world(camera)), None)
