@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from os.path import commonprefix
 from pathlib import Path
 
 from tk.errors import CaptureError, VideoError
@@ -243,11 +242,20 @@ def _distinct_numbers(names: Sequence[str]) -> list[str]:
 
 def _differences(names: Sequence[str]) -> list[str]:
     """Each name without the beginning and the end that all have in common; [] if nothing is left of one."""
-    start = len(commonprefix(list(names)))
+    if not names:
+        return []
+    start = _shared(names)
     rest = [name[start:] for name in names]
-    end = len(commonprefix([name[::-1] for name in rest]))
+    end = _shared([name[::-1] for name in rest])
     left = [name[: len(name) - end].lower().lstrip("0") for name in rest]
     return left if all(left) and len(set(left)) == len(left) else []
+
+
+def _shared(names: Sequence[str]) -> int:
+    """How many characters all names begin with in common."""
+    first, last = min(names), max(names)
+    same = (index for index, (a, b) in enumerate(zip(first, last, strict=False)) if a != b)
+    return next(same, min(len(first), len(last)))
 
 
 def _one_set(root: Path, places: Places, trial: str | None) -> tuple[Path, Mapping[str, Path]]:

@@ -8,12 +8,15 @@ import numpy as np
 
 from tk.errors import VolumeError
 from tk.model.camera import Camera, Rig
-from tk.model.common_view import closest_to_axes, infer_volume
+from tk.model.common_view import closest_to_axes, common_boxes
 from tk.model.up import UP_AXES, up_text, up_vector
 from tk.model.volume import Volume
 
 #: a direction this close to an axis is meant to be the axis
 SNAP_DEG = 10.0
+
+#: a working volume that is narrower than this has no room for a person, metres
+ROOM_M = 1.5
 
 #: the mean of the cameras' upward directions is shorter than this when they are mounted every way
 _AGREE = 0.4
@@ -80,22 +83,21 @@ def _is_world(camera: Camera) -> bool:
 def find_volume(rig: Rig) -> tuple[Volume | None, str]:
     """A working volume where the views overlap, around the point nearest to all optical axes; and how it was found.
 
-    What all cameras see in common, where there is such a region; else what fewer and fewer of them do, down to two.
+    What all cameras see in common, if a person fits into it; else what all but one do, and so on, down to two.
     """
     try:
         middle = closest_to_axes(rig)
+        boxes = list(common_boxes(rig))
     except VolumeError as reason:
         return None, f"no [volume] could be inferred: {reason}; give one"
     behind = [camera.name for camera in rig if camera.to_camera(middle)[0, 2] <= 0]
     looks = f"; {', '.join(behind)} look away from it: is the calibration right?" if behind else ""
-    for fewest in range(len(rig), 1, -1):
-        try:
-            found = infer_volume(rig, fewest)
-        except VolumeError:
-            continue
-        who = "all cameras see" if fewest == len(rig) else f"{fewest} of the {len(rig)} cameras see"
-        return _rounded(found), f"the box around what {who} near the point that is nearest to their axes{looks}"
-    return None, f"no [volume] could be inferred: no two cameras see the point nearest to all axes{looks}; give one"
+    if not boxes:
+        return None, f"no [volume] could be inferred: no two cameras see the point nearest to all axes{looks}; give one"
+    roomy = [(views, box) for views, box in boxes if min(box.size) >= ROOM_M]
+    views, box = roomy[0] if roomy else boxes[0]
+    who = "all cameras see" if views == len(rig) else f"{views} of the {len(rig)} cameras see"
+    return _rounded(box), f"the box around what {who} near the point that is nearest to their axes{looks}"
 
 
 def _rounded(volume: Volume) -> Volume:
