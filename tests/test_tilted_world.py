@@ -49,7 +49,9 @@ def tilted(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(("method", "quick"), [("volumetric", QUICK), ("silhouette", QUICK_SILHOUETTE)])
+@pytest.mark.parametrize(
+    ("method", "quick"), [("volumetric", QUICK), ("silhouette", QUICK_SILHOUETTE)], ids=["volumetric", "silhouette"]
+)
 def test_the_person_is_tracked(tiny: Path, tilted: Path, tmp_path: Path, method: str, quick: str) -> None:
     path = tmp_path / "r.h5"
     track(open_capture(tilted), path, Config.from_toml(quick), Silent(), method, (0, 6))

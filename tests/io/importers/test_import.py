@@ -202,6 +202,13 @@ def test_videos_in_a_format_that_is_not_read(folder: Path, check: Import) -> Non
         import_project(folder, check.output)
 
 
+def test_two_videos_of_one_name(folder: Path, check: Import) -> None:
+    write_project(folder)
+    write_clips(folder / "videos-raw", ["cam1"], suffix=".avi")
+    with pytest.raises(VideoError, match=r"holds both cam1.avi and cam1.mp4; keep one of them"):
+        import_project(folder, check.output)
+
+
 def test_cameras_that_look_past_each_other_get_no_volume(folder: Path, check: Import) -> None:
     """Parallel cameras: the capture is written, its volume is for the user to give."""
     document = tables(make_rig())

@@ -202,6 +202,18 @@ def test_masks_and_background_come_along(folder: Path, check: Import) -> None:
     background = capture.background()
     assert background is not None and all((picture == 7).all() for picture in background)
 
+    (folder / "background" / "cam3.png").unlink()
+    for mask in (folder / "masks").iterdir():
+        mask.rename(mask.with_name(f"{mask.name} of someone"))
+    (folder / "masks" / "cam1 of someone").rename(folder / "masks" / "x")
+    (folder / "masks" / "cam2 of someone").rename(folder / "masks" / "y")
+    (folder / "masks" / "cam3 of someone").rename(folder / "masks" / "z")
+    check.output = check.output.with_name("again")
+    checked = check(folder, rig)
+    assert not checked.capture.has_masks and checked.capture.background() is None
+    checked.note("background: has nothing of cam3: all of it is left out")
+    checked.note("masks: cannot tell which video belongs to which camera", "masks/ is left out")
+
 
 @pytest.mark.parametrize(
     ("change", "complaint"),

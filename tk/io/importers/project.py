@@ -10,7 +10,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from tk.errors import CalibrationError
+from tk.errors import CalibrationError, VideoError
 from tk.io.calibration import scale_world
 from tk.io.importers.videos import Places, Wanted, find_clips
 from tk.io.units import LEAST_APART_M, MOST_APART_M, FoundUnit, apart, infer_unit
@@ -184,27 +184,37 @@ def assemble(
         notes.append(f"{found.folder}: no video of {', '.join(without)}: left out")
     elif without:
         notes.append(f"{cameras.source}: {len(without)} of its {len(names)} cameras have no video here: left out")
+    wanted = [names[index] for index in chosen]
+    masks = _beside(request.folder, found.folder, ("masks", "mask"), wanted, notes)
+    backgrounds = _beside(request.folder, found.folder, ("background", "backgrounds"), wanted, notes)
     return Project(
         tool=tool,
         source=cameras.source,
         rig=Rig(tuple(cameras.rig[index] for index in chosen)),
         clips=tuple(clip for clip in found.clips if clip is not None),
-        masks=_beside(request.folder, found.folder, ("masks", "mask"), names, chosen),
-        backgrounds=_beside(request.folder, found.folder, ("background", "backgrounds"), names, chosen),
+        masks=masks,
+        backgrounds=backgrounds,
         up=up,
         notes=tuple(notes),
     )
 
 
 def _beside(
-    root: Path, videos: Path, folders: Sequence[str], names: Sequence[Wanted], chosen: Sequence[int]
+    root: Path, videos: Path, folders: Sequence[str], wanted: Sequence[Wanted], notes: list[str]
 ) -> tuple[Path, ...]:
-    """Masks or backgrounds of the chosen cameras, from the first of these folders that has them all."""
+    """Masks or backgrounds of these cameras, from the first of these folders there is; () and a note if not of all."""
     for parent in dict.fromkeys((videos.parent, root)):
         for name in folders:
-            if (parent / name).is_dir():
-                wanted = [names[index] for index in chosen]
-                found = find_clips(parent, Places((name,), pictures=True), wanted, None, False, optional=True)
-                if all(clip is not None for clip in found.clips):
-                    return tuple(clip for clip in found.clips if clip is not None)
+            if not (parent / name).is_dir():
+                continue
+            try:
+                found = find_clips(parent, Places((name,), pictures=True), wanted, None, False)
+            except VideoError as reason:
+                notes.append(f"{reason}: {name}/ is left out")
+                return ()
+            missing = [camera.name for camera, clip in zip(wanted, found.clips, strict=True) if clip is None]
+            if missing:
+                notes.append(f"{found.folder}: has nothing of {', '.join(missing)}: all of it is left out")
+                return ()
+            return tuple(clip for clip in found.clips if clip is not None)
     return ()

@@ -66,7 +66,6 @@ def find_clips(
     cameras: Sequence[Wanted],
     trial: str | None,
     in_order: bool,
-    optional: bool = False,
 ) -> Found:
     """The video of each camera in the project's folder.
 
@@ -76,16 +75,10 @@ def find_clips(
         cameras: whose videos.
         trial: a part of the path of the videos that are meant.
         in_order: where names tell nothing, the first camera belongs to the first video, and so on.
-        optional: find nothing rather than complain.
 
     Raises:
         VideoError: there are no videos, several recordings, or names that cannot be matched; it says what there is.
     """
-    if optional:
-        try:
-            return find_clips(root, places, cameras, trial, in_order)
-        except VideoError:
-            return Found(root, (None,) * len(cameras))
     folder, clips = _one_set(root, places, trial)
     order = match_clips(cameras, list(clips), in_order)
     if order is None:
@@ -112,10 +105,18 @@ def clips_in(folder: Path, pictures: bool = False) -> dict[str, Path]:
     """The clips that a folder holds, by name: video files; else folders of pictures, or of one video each.
 
     Symbolic links are followed; pipes and devices are not clips.
+
+    Raises:
+        VideoError: two files have one name, but for the suffix.
     """
     files = _regular(folder)
     suffixes = VIDEO_SUFFIXES + (PICTURE_SUFFIXES if pictures else ())
-    clips = {path.stem: path for path in files if path.suffix.lower() in suffixes}
+    clips: dict[str, Path] = {}
+    for path in files:
+        if path.suffix.lower() in suffixes:
+            if path.stem in clips:
+                raise VideoError(f"{folder}: holds both {clips[path.stem].name} and {path.name}; keep one of them")
+            clips[path.stem] = path
     if clips:
         return clips
     for below in _folders(folder):
