@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import pickle
+import re
+import sys
 from pathlib import Path
 
 import cv2
@@ -19,13 +21,14 @@ from tests.io.importers.conftest import (
     Import,
     make_rig,
     renamed,
-    tables,
     write_clips,
 )
 from tk.errors import CalibrationError, CaptureError
 from tk.io.importers import import_project
 from tk.io.importers.projections import take_apart
 from tk.model.camera import Rig
+
+MANUAL = Path(__file__).resolve().parents[3] / "docs" / "import.md"
 
 
 def write_yml(path: Path, names: list[str], matrices: dict[str, np.ndarray], numbers: dict[str, int]) -> None:
@@ -237,13 +240,22 @@ def test_text_without_matrices_is_no_project(folder: Path, check: Import) -> Non
         import_project(folder, check.output)
 
 
-def test_a_converted_opencap_project(folder: Path, check: Import) -> None:
-    """Once the TOML file is there, the pickles are nobody's business."""
-    import tomli_w
-
-    rig = make_rig()
-    (folder / "Videos" / "Cam0").mkdir(parents=True)
-    (folder / "Videos" / "Cam0" / "cameraIntrinsicsExtrinsics.pickle").write_bytes(b"")
-    (folder / "calibration.toml").write_text(tomli_w.dumps(tables(rig)))
-    write_clips(folder / "videos-raw", ["cam1", "cam2", "cam3", "cam4"])
-    check(folder, rig)
+def test_the_conversion_in_the_manual(folder: Path, check: Import, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The program that docs/import.md gives makes a project that is read; the pickles are then nobody's business."""
+    rig = renamed(make_rig(), "Cam0", "Cam1", "Cam2", "Cam3")
+    for camera in rig:
+        kept = {
+            "imageSize": np.array([[HEIGHT], [WIDTH]]),
+            "intrinsicMat": camera.matrix,
+            "distortion": camera.distortions[None],
+            "rotation": camera.rotation,
+            "translation": 1000 * camera.translation[:, None],
+        }
+        path = folder / "Videos" / camera.name / "cameraIntrinsicsExtrinsics.pickle"
+        path.parent.mkdir(parents=True)
+        path.write_bytes(pickle.dumps(kept))
+    (program,) = re.findall(r"^```python\n(.*?)^```", MANUAL.read_text(encoding="utf-8"), re.M | re.S)
+    monkeypatch.setattr(sys, "argv", ["convert.py", str(folder)])
+    exec(compile(program, "convert.py", "exec"), {})
+    write_clips(folder / "videos-raw", [camera.name for camera in rig], suffix=".mov")
+    check(folder, rig).note("lengths are in mm, as the file says")
