@@ -192,3 +192,10 @@ def test_match_camera(name: str, key: str, stems: list[str], expected: str | Non
 def test_match_camera_refuses_to_guess() -> None:
     with pytest.raises(CaptureError, match="could be any of cam-01, cam01"):
         match_camera("cam_01", "cam_01", ["cam01", "cam-01"])
+
+
+def test_a_number_of_too_many_digits(tmp_path: Path) -> None:
+    path = write(tmp_path, calibration_tables(2))
+    path.write_text(path.read_text().replace("60.0", "9" * 400, 1))
+    with pytest.raises(CalibrationError, match="camera 'cam1': matrix holds a number that is too large"):
+        read_calibration(path)

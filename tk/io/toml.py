@@ -84,9 +84,15 @@ class Table:
         value = self.values.get(key, default)
         if value is None:
             self.fail(f"{key} is missing")
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
             self.fail(f"{key} = {value!r} must be a finite number")
-        return float(value)
+        try:
+            number = float(value)
+        except OverflowError:  # a whole number of more than 308 digits
+            self.fail(f"{key} has {len(str(value))} digits, too many for a number")
+        if not math.isfinite(number):
+            self.fail(f"{key} = {value!r} must be a finite number")
+        return number
 
     def array(self, key: str, *shapes: tuple[int, ...]) -> NDArray[np.float64]:
         """The finite numbers ``key`` as an array of one of these shapes."""
@@ -98,7 +104,10 @@ class Table:
         if shape is None or shape not in shapes:
             found = "something else" if shape is None else "×".join(map(str, shape)) or "one number"
             self.fail(f"{key} must be {wanted} numbers, and is {found}")
-        result = np.array(value, dtype=np.float64)
+        try:
+            result = np.array(value, dtype=np.float64)
+        except OverflowError:  # a whole number of more than 308 digits
+            self.fail(f"{key} holds a number that is too large")
         if not np.isfinite(result).all():
             bad = result[~np.isfinite(result)][0]
             self.fail(f"{key} holds {bad}; every number must be finite")

@@ -81,6 +81,29 @@ def test_easymocap_with_pictures(folder: Path, check: Import) -> None:
     ]
 
 
+def test_easymocap_as_opencv_itself_writes_it(folder: Path, check: Import) -> None:
+    """Numbers like `1.`, lines that are wrapped, names within brackets."""
+    rig = make_rig()
+    for file, keys in (("intri.yml", ("K", "dist")), ("extri.yml", ("Rot", "T"))):
+        storage = cv2.FileStorage(str(folder / file), cv2.FILE_STORAGE_WRITE)
+        storage.startWriteStruct("names", cv2.FileNode_SEQ | (cv2.FileNode_FLOW if file == "intri.yml" else 0))
+        for camera in rig:
+            storage.write("", camera.name)
+        storage.endWriteStruct()
+        for camera in rig:
+            for key in keys:
+                values = {
+                    "K": camera.matrix,
+                    "dist": camera.distortions,
+                    "Rot": camera.rotation,
+                    "T": camera.translation,
+                }
+                storage.write(f"{key}_{camera.name}", values[key])
+        storage.release()
+    write_clips(folder / "videos", [camera.name for camera in rig])
+    check(folder, rig)
+
+
 def test_easymocap_camera_without_a_pose(folder: Path, check: Import) -> None:
     rig = make_rig()
     write_easymocap(folder, rig)
@@ -95,9 +118,11 @@ def test_easymocap_camera_without_a_pose(folder: Path, check: Import) -> None:
     [
         ("intri.yml", "K_cam2:", "L_cam2:", "has no K_cam2"),
         ("intri.yml", "names:", "cams:", "has no list `names`"),
-        ("intri.yml", "data: [", "data: [ x{", "is no YAML as OpenCV writes it"),
-        ("extri.yml", "rows: 3", "rows: 2", "extri.yml"),
-        ("extri.yml", "%YAML:1.0", "\x00", "extri.yml"),
+        ("intri.yml", "data: [", "data: [ x{", "intri.yml: K_cam1 must be a matrix of 9 finite numbers"),
+        ("intri.yml", '"cam2"', '"cam1"', "names must be different"),
+        ("intri.yml", "W_cam3: 320", "W_cam3: wide", "W_cam3 = 'wide' must be a number of pixels"),
+        ("extri.yml", "data: [", "data: [ .Nan, ", "extri.yml: R_cam1 must be a matrix of 3 finite numbers"),
+        ("extri.yml", ":", ";", "is no YAML as OpenCV writes it"),
         ("intri.yml", None, "", "intri.yml: cannot be read (No such file or directory)"),
     ],
 )

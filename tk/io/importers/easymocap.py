@@ -10,6 +10,7 @@ The videos are in `videos/1.mp4`, or pictures in `images/1/000000.jpg`.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
@@ -66,8 +67,8 @@ def _read_cameras(folder: Path) -> Cameras:
         distortions = intrinsic.matrix(f"dist_{name}", 5, 4)
         camera = Camera(
             name=name,
-            width=intrinsic.integer(f"W_{name}"),
-            height=intrinsic.integer(f"H_{name}"),
+            width=intrinsic.pixels(f"W_{name}"),
+            height=intrinsic.pixels(f"H_{name}"),
             matrix=matrix.reshape(3, 3),
             distortions=np.zeros(5) if distortions is None else distortions,
             rotation=rotation.reshape(3, 3),
@@ -82,48 +83,53 @@ def _read_cameras(folder: Path) -> Cameras:
 
 
 class _Storage:
-    """A YAML file of OpenCV's, read from memory: the file itself has been made sure of."""
+    """The little of YAML that OpenCV writes: at the top level matrices, numbers and a list of names.
+
+    Read here and not by OpenCV, which a damaged file can bring down with the whole process.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        text = read_text(path)
-        if not text.lstrip().startswith("%YAML"):
-            text = "%YAML:1.0\n---\n" + text
-        try:
-            self._storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        except (cv2.error, SystemError) as reason:
-            raise self._damaged(reason) from None
-        if not self._storage.isOpened():
-            raise self._damaged("it cannot be parsed")
+        blocks = re.findall(r"^([^\s:#%-][^:\n]*):(.*?)(?=^[^\s-]|\Z)", f"{read_text(path)}\n", re.M | re.S)
+        self._blocks = {key.strip(): block.strip() for key, block in blocks}
+        if not self._blocks:
+            raise CalibrationError(f"{path}: is no YAML as OpenCV writes it: it has no keys")
 
     def names(self) -> list[str]:
-        node = self._storage.getNode("names")
-        if node.empty() or not node.isSeq():
+        """The list `names`: a line each, or within brackets."""
+        block = self._blocks.get("names")
+        if block is None:
             raise CalibrationError(f"{self.path}: has no list `names` of its cameras")
-        found = []
-        for index in range(node.size()):
-            item = node.at(index)
-            found.append(item.string() if item.isString() else f"{item.real():g}")
+        inside = re.fullmatch(r"\[(.*)\]", block, re.S)
+        items = inside.group(1).split(",") if inside else re.findall(r"^\s*-(.*)$", block, re.M)
+        found = [item.strip().strip("\"'").strip() for item in items]
+        if not all(found) or len(set(found)) < len(found):
+            raise CalibrationError(f"{self.path}: names must be different and not empty, and are {found}")
         return found
 
     def matrix(self, key: str, *counts: int) -> NDArray[np.float64] | None:
         """The numbers of a matrix, flat, as many as one of ``counts``; None when there is no such key."""
-        node = self._storage.getNode(key)
-        if node.empty():
+        block = self._blocks.get(key)
+        if block is None:
             return None
+        data = re.search(r"data:\s*\[(.*?)\]", block, re.S)
         try:
-            found = node.mat() if node.isMap() else None
-        except (cv2.error, SystemError) as reason:
-            raise self._damaged(f"{key}: {reason}") from None
-        if found is None or found.size not in counts:
-            size = "no matrix" if found is None else f"{found.size} numbers"
-            raise CalibrationError(f"{self.path}: {key} must be a matrix of {counts[0]} numbers, and is {size}")
-        return np.asarray(found, dtype=np.float64).ravel()
+            values = [float(word) for word in data.group(1).split(",")] if data else []
+        except ValueError:
+            values = []
+        if len(values) not in counts or not np.isfinite(values).all():
+            raise CalibrationError(f"{self.path}: {key} must be a matrix of {counts[0]} finite numbers")
+        return np.array(values)
 
-    def integer(self, key: str) -> int:
-        """A whole number, 0 when there is no such key."""
-        node = self._storage.getNode(key)
-        return 0 if node.empty() or not (node.isInt() or node.isReal()) else round(node.real())
-
-    def _damaged(self, reason: object) -> CalibrationError:
-        return CalibrationError(f"{self.path}: is no YAML as OpenCV writes it: {' '.join(str(reason).split())[:120]}")
+    def pixels(self, key: str) -> int:
+        """A whole number from 1 on, 0 when there is no such key."""
+        block = self._blocks.get(key)
+        if block is None:
+            return 0
+        try:
+            value = float(block)
+        except ValueError:
+            value = 0.0
+        if not 1 <= value < 1e6:
+            raise CalibrationError(f"{self.path}: {key} = {block[:40]!r} must be a number of pixels")
+        return round(value)
