@@ -236,6 +236,15 @@ def test_projection_matrices(folder: Path, check: Import, kind: str) -> None:
     check(folder, rig)
 
 
+def test_a_text_that_is_no_matrix_is_told(folder: Path, check: Import) -> None:
+    rig = make_rig(distorted=False)
+    for camera in rig:
+        np.savetxt(folder / f"{camera.name}.txt", camera.projection)
+    (folder / "notes.txt").write_text("recorded on Monday")
+    write_clips(folder / "videos", [camera.name for camera in rig])
+    check(folder, rig).note("notes.txt: holds no 3×4 matrix: left out")
+
+
 def test_take_apart_says_what_is_no_camera() -> None:
     with pytest.raises(CalibrationError, match="left 3×3 part is singular"):
         take_apart(np.ones((3, 4)), "P.txt")

@@ -78,10 +78,10 @@ def take_apart(P: NDArray[np.float64], where: str) -> tuple[NDArray[np.float64],
 
 
 def _files(root: Path) -> list[Path] | None:
-    """The files of the first folder that has two with a matrix in them."""
+    """The .txt and .npy files of the first folder in which two of them hold a matrix."""
     for folder in (root, root / "calibration", root / "calib", root / "cameras", root / "projections"):
-        files = [path for path in matching(folder, "*.txt", "*.npy") if _matrix(path) is not None]
-        if len(files) >= 2:
+        files = matching(folder, "*.txt", "*.npy")
+        if sum(_matrix(path) is not None for path in files) >= 2:
             return files
     return None
 
