@@ -10,11 +10,13 @@ import pytest
 
 from tests.conftest import Tk
 from tests.io.conftest import write_toml
-from tests.io.importers.conftest import HEIGHT, WIDTH, Import, make_rig, tables, write_clips
+from tests.io.importers.conftest import HEIGHT, WIDTH, Import, make_rig, points, renamed, tables, write_clips
 from tests.io.importers.test_xml_formats import write_qca
 from tk.errors import CalibrationError, CaptureError, VideoError
+from tk.io.capture import open_capture
 from tk.io.importers import FORMATS, import_project
 from tk.io.importers.files import LARGEST
+from tk.model.camera import Rig
 
 CAMS = ["cam1", "cam2", "cam3", "cam4"]
 
@@ -106,9 +108,6 @@ def test_videos_of_another_size(
     folder: Path, check: Import, size: tuple[int, int], expected: tuple[float, float], note: str
 ) -> None:
     """A pixel x of the calibration is the pixel scale · x + shift of the video, pixel centres being whole numbers."""
-    from tests.io.importers.conftest import points
-    from tk.io.capture import open_capture
-
     write_toml(folder / "calibration.toml", tables(make_rig()))
     write_clips(folder / "videos", CAMS, size)
     imported = import_project(folder, check.output)
@@ -178,14 +177,10 @@ def test_an_empty_folder_may_be_the_output(folder: Path, check: Import) -> None:
 def test_a_camera_without_a_video_is_left_out(folder: Path, check: Import) -> None:
     write_project(folder)
     (folder / "videos-raw" / "cam4.mp4").unlink()
-    from tk.model.camera import Rig
-
     check(folder, Rig(make_rig().cameras[:3])).note("no video of cam4: left out")
 
 
 def test_names_that_files_cannot_have(folder: Path, check: Import) -> None:
-    from tests.io.importers.conftest import renamed
-
     rig = renamed(make_rig(), "a/b", "a b", "metadata", "ok")
     write_toml(folder / "calibration.toml", {f"cam{k}": table for k, table in enumerate(tables(rig).values())})
     write_clips(folder / "videos-raw", ["cam0", "cam1", "cam2", "cam3"])

@@ -23,6 +23,7 @@ from tests.io.importers.conftest import (
 )
 from tests.io.importers.test_xml_formats import write_qca
 from tk.errors import CalibrationError, VideoError
+from tk.io.capture import open_capture
 from tk.io.importers import import_project
 from tk.model.camera import Rig
 from tk.model.up import up_vector
@@ -111,8 +112,6 @@ def test_freemocap_without_a_board_on_the_floor(folder: Path, check: Import) -> 
     p_camera = points() @ first.rotation.T + first.translation
     checked = import_project(folder, check.output)
     assert imported.notes[0] == checked.notes[0] and "lengths are in mm, as mm is usual there" in imported.notes[0]
-    from tk.io.capture import open_capture
-
     capture = open_capture(check.output)
     for camera, true in zip(capture.rig, own, strict=True):
         np.testing.assert_allclose(camera.project(p_camera)[0], true.project(p_camera)[0], atol=0.01)
