@@ -129,6 +129,28 @@ def track(
         sys.exit(1)
 
 
+@main.command("import")
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="CAPTURE")
+@click.option(
+    "--units", type=click.Choice(["m", "cm", "mm"]), help="Of the calibration's lengths.  [default: inferred]"
+)
+@click.option(
+    "--trial", metavar="NAME", help="Take the videos with NAME in their path, where there are several trials."
+)
+def import_(folder: Path, output: Path, units: str | None, trial: str | None) -> None:
+    """Make a capture of another tool's project: Pose2Sim, FreeMoCap, Caliscope, Anipose, EasyMocap and others.
+
+    For example: tk import my_session -o my_capture
+    """
+    from tk.io.importers import import_project
+
+    done = import_project(folder, output, units, trial)
+    for note in done.notes:
+        click.echo(f"note: {note}", err=True)
+    click.echo(f"{done.cameras} cameras in {output}; have a look at {output / 'capture.toml'}", err=True)
+
+
 @main.command()
 @_capture
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="HULL.h5")

@@ -65,6 +65,13 @@ def test_opens_with_what_capture_toml_says(make_capture: MakeCapture) -> None:
         capture.fps = 1.0  # type: ignore[misc]
 
 
+def test_up_may_be_any_direction(make_capture: MakeCapture) -> None:
+    capture = open_capture(make_capture(settings={"up": [0.02, -0.99, 0.01]}))
+    expected = np.array([0.02, -0.99, 0.01])
+    np.testing.assert_allclose(capture.up_axis, expected / np.linalg.norm(expected), atol=1e-15)
+    assert open_capture(make_capture(settings={"up": [0.0, -2.0, 0.0]}, name="axis")).up == "-y"
+
+
 def test_everything_in_capture_toml_has_a_default(make_capture: MakeCapture) -> None:
     capture = open_capture(make_capture(settings={}, name="ring"))
     assert (capture.name, capture.fps, capture.up) == ("ring", 15.0, "z")
@@ -263,6 +270,8 @@ def test_a_text_file_called_mp4(make_capture: MakeCapture) -> None:
         ({"fps": "15"}, CaptureError, "fps = '15' must be a finite number"),
         ({"fps": float("nan")}, CaptureError, "fps = nan"),
         ({"up": "w"}, CaptureError, "up = 'w' must be one of x, y, z, -x, -y, -z"),
+        ({"up": [0.0, 1.0]}, CaptureError, "up must be 3 numbers, and is 2"),
+        ({"up": [0.0, 0.0, 0.0]}, CaptureError, "up = [0.0, 0.0, 0.0] has no direction"),
         ({"name": 3}, CaptureError, "name = 3 must be a text"),
         ({"subject": {"height": 178}}, CaptureError, "[subject]: height = 178 must be between 0.3 and 3 metres"),
         ({"init": {"frame": -1}}, CaptureError, "[init]: frame = -1"),
@@ -289,15 +298,21 @@ def test_settings_that_are_no_toml_or_misspelt(make_capture: MakeCapture) -> Non
     assert warning.endswith("unknown keys are ignored: fsp, subject.heigth")
 
 
-def test_millimetres_without_units_are_suspected(make_capture: MakeCapture) -> None:
+def test_millimetres_without_units_are_recognised(make_capture: MakeCapture) -> None:
     folder = make_capture(settings={})
+    expected = open_capture(folder).rig.centers
     tables = calibration_tables(3)
     for table in tables.values():
         table["translation"] = [1000 * x for x in table["translation"]]
     write_toml(folder / "calibration.toml", tables)
-    assert any('units = "mm" missing' in line for line in open_capture(folder).warnings)
+    capture = open_capture(folder)
+    np.testing.assert_allclose(capture.rig.centers, expected, atol=1e-12)
+    (line,) = [line for line in capture.warnings if "[metadata] units" in line]
+    assert "taken for mm" in line and "5.2 m apart" in line and str(folder / "calibration.toml") in line
     write_toml(folder / "calibration.toml", {**tables, "metadata": {"units": "mm"}})
     assert not any("[metadata]" in line for line in open_capture(folder).warnings)
+    write_toml(folder / "calibration.toml", {**tables, "metadata": {"units": "m"}})  # what is said is believed
+    assert any('units = "mm" missing' in line for line in open_capture(folder).warnings)
 
 
 def test_no_volume_and_none_to_infer(make_capture: MakeCapture) -> None:
