@@ -69,8 +69,8 @@ class AngleSet:
 def _sets() -> tuple[AngleSet, ...]:
     spine = (("flexion", 0, -1.0), ("lateral_bending", 1, 1.0), ("rotation", 2, 1.0))
     trunk_words = (
-        "flexion forward, lateral bending to the right, rotation to the left are positive; turns Z-X-Y (Wu et al. 2002, "
-        "there with the opposite sign of flexion)"
+        "flexion forward, lateral bending to the right, rotation to the left are positive; turns Z-X-Y "
+        "(Wu et al. 2002, there with the opposite sign of flexion)"
     )
     found = [
         AngleSet(
@@ -111,7 +111,7 @@ def _sets() -> tuple[AngleSet, ...]:
                 f"thigh_{side}",
                 "zxy",
                 (("flexion", 0, 1.0), ("adduction", 1, 1.0), ("rotation", 2, 1.0)),
-                "thigh against pelvis, turns Z-X-Y (Wu et al. 2002): flexion, adduction, internal rotation are positive",
+                "thigh against pelvis, turns Z-X-Y (Wu et al. 2002): flexion, adduction, internal rotation positive",
             ),
             AngleSet(
                 f"knee_{side}",
