@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from tk.config import Config
 from tk.io.capture import Capture, open_capture
-from tk.io.result_data import read_joints
+from tk.io.result import read_joints
 from tk.model.objective import BARRED
 from tk.segmentation import make_labeller
 from tk.tracker import Observation

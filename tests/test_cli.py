@@ -79,7 +79,7 @@ def test_track_writes_what_the_contract_says(tk: Tk, quick: Path, tiny: Path, tm
         assert "hull" not in file
         attributes = dict(file.attrs)
     assert {key: attributes[key] for key in ("format", "format_version", "fps", "units", "up", "capture")} == {
-        "format": "tk-result", "format_version": 1, "fps": 15.0, "units": "m", "up": "z", "capture": "demo",
+        "format": "tk-result", "format_version": 2, "fps": 15.0, "units": "m", "up": "z", "capture": "demo",
     }  # fmt: skip
     assert (attributes["method"], attributes["seed"]) == ("volumetric", 5)
     assert __version__ in attributes["software"] and attributes["created"].startswith("20")

@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 
-from tk.io.result import FrameResult, HullPoints, ResultMeta, ResultWriter, Status
+from tk.io.result import FrameResult, HullPoints, JointAngles, ResultMeta, ResultWriter, Status
 
 META = ResultMeta(
     pose_names=tuple(f"p{i}" for i in range(24)),
@@ -23,6 +23,16 @@ META = ResultMeta(
     method="volumetric",
     seed=7,
     config_toml='method = "volumetric"\n[smd]\nmu = 0.1\n',
+    ankle_names=("ankle_pitch_l", "ankle_roll_l", "ankle_pitch_r", "ankle_roll_r"),
+    sigma=True,
+    fit_cameras=("cam1", "cam2", "cam3"),
+    segment_names=("torso", "head"),
+    feet=True,
+    angles=(
+        JointAngles("knee_l", ("flexion",), "0 is straight, flexion positive"),
+        JointAngles("hip_l", ("flexion", "abduction", "rotation"), "Grood and Suntay"),
+    ),
+    objective_kind="negative log-likelihood",
 )
 
 
@@ -41,6 +51,12 @@ def make_frame(index: int) -> FrameResult:
         iterations=np.array([index, index + 1]),
         timing={"hull": 0.01, "total": 0.05 + index},
         hull=hull,
+        ankles=np.arange(4) / 10 + index,
+        sigma=None if index % 4 == 3 else np.full(15, 0.01 * index),  # nothing known in some frames
+        fit_error=np.array([0.1, 0.2, index]),
+        segments_rotation=np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),
+        feet=np.arange(12.0).reshape(4, 3) - index,
+        angles={"knee_l": np.array([5.0 * index]), "hip_l": np.array([1.0, 2.0, index])},
     )
 
 

@@ -17,7 +17,18 @@ import pytest
 
 from tests.io.result_victim import META, make_frame, make_state
 from tk.errors import ResultError
-from tk.io.result import ResultMeta, ResultWriter, Value, read_joints, read_result
+from tk.io.result import (
+    FrameResult,
+    JointAngles,
+    ResultMeta,
+    ResultWriter,
+    UsedCameras,
+    Value,
+    read_joints,
+    read_result,
+    revise_result,
+)  # fmt: skip
+from tk.model.camera import Camera, Rig
 from tk.model.skeleton import JOINTS
 
 ROOT = Path(__file__).parents[2]
@@ -40,6 +51,12 @@ def assert_complete(path: Path, at_least: int) -> int:
             np.testing.assert_array_equal(dataset[()], [getattr(frame, name) for frame in expected])
         np.testing.assert_array_equal(file["joints/position"][()], [frame.joints for frame in expected])
         np.testing.assert_array_equal(file["timing/total"][()], [frame.timing["total"] for frame in expected])
+        for name, field in (("ankles", "ankles"), ("fit_error", "fit_error"), ("feet/position", "feet")):
+            np.testing.assert_array_equal(file[name][()], [getattr(frame, field) for frame in expected])
+        sigma = [np.full(15, np.nan) if frame.sigma is None else frame.sigma for frame in expected]
+        np.testing.assert_array_equal(file["joints/sigma"][()], np.reshape(sigma, (count, 15)))
+        np.testing.assert_array_equal(file["angles/hip_l"][()], [frame.angles["hip_l"] for frame in expected])
+        assert file["segments/rotation"].shape == (count, 2, 4)
         assert file["timing/hull"].shape == file["timing/optimise"].shape == (count,)
         if count > 1:
             offsets = file["hull/offsets"][()]
@@ -95,6 +112,13 @@ def test_layout_is_the_contract(tmp_path: Path) -> None:
             ("objective", (2,), "float64"),
             ("iterations", (2, 2), "int32"),
             ("timing/optimise", (2,), "float64"),
+            ("ankles", (2, 4), "float64"),
+            ("joints/sigma", (2, 15), "float64"),
+            ("fit_error", (2, 3), "float64"),
+            ("segments/rotation", (2, 2, 4), "float64"),
+            ("feet/position", (2, 4, 3), "float64"),
+            ("angles/knee_l", (2, 1), "float64"),
+            ("angles/hip_l", (2, 3), "float64"),
         ]:
             assert (file[name].shape, file[name].dtype) == (shape, dtype), name
         assert tuple(file["joints/position"].attrs["names"]) == JOINTS
@@ -102,12 +126,21 @@ def test_layout_is_the_contract(tmp_path: Path) -> None:
         assert tuple(file["pose"].attrs["units"]) == META.pose_units
         assert tuple(file["iterations"].attrs["stages"]) == META.stages
         assert file["status"].attrs["meaning"][3] == "3: lost"
+        assert tuple(file["ankles"].attrs["names"]) == META.ankle_names
+        assert tuple(file["ankles"].attrs["units"]) == ("rad",) * 4
+        assert tuple(file["joints/sigma"].attrs["names"]) == JOINTS
+        assert tuple(file["fit_error"].attrs["cameras"]) == META.fit_cameras
+        assert tuple(file["segments/rotation"].attrs["names"]) == META.segment_names
+        assert tuple(file["feet/position"].attrs["names"]) == ("heel_l", "toe_l", "heel_r", "toe_r")
+        assert tuple(file["angles/hip_l"].attrs["names"]) == ("flexion", "abduction", "rotation")
+        assert file["angles/hip_l"].attrs["convention"] == "Grood and Suntay"
+        assert file["objective"].attrs["kind"] == "negative log-likelihood"
         attributes = dict(file.attrs)
     assert attributes.pop("software").startswith("tk-mocap")
     assert attributes.pop("created").endswith("+00:00")
     assert attributes == {
         "format": "tk-result",
-        "format_version": 1,
+        "format_version": 2,
         "fps": 15.0,
         "units": "m",
         "up": "z",
@@ -179,7 +212,9 @@ def test_result_without_pose_or_joints(tmp_path: Path) -> None:
         for index in range(3):
             frame = make_frame(index)
             writer.append(
-                replace(frame, pose=np.zeros(0), joints=np.zeros((0, 3)), iterations=np.zeros(0, dtype=np.int32))
+                replace(
+                    frame, pose=np.zeros(0), joints=np.zeros((0, 3)), iterations=np.zeros(0, dtype=np.int32), sigma=None
+                )
             )
     result = read_result(path)
     assert result.meta == meta
@@ -197,6 +232,10 @@ def test_result_without_pose_or_joints(tmp_path: Path) -> None:
         {"iterations": np.zeros(3, dtype=np.int32)},
         {"status": 4},
         {"timing": {"nonsense": 1.0}},
+        {"sigma": np.zeros(14)},
+        {"fit_error": np.zeros(2)},
+        {"angles": {"elbow_l": np.zeros(1)}},
+        {"angles": {"knee_l": np.zeros(2)}},
     ],
 )
 def test_a_frame_of_the_wrong_shape_is_refused_and_the_rest_kept(tmp_path: Path, change: dict[str, object]) -> None:
@@ -311,6 +350,11 @@ def test_frames_after_the_last_state_are_done_again(tmp_path: Path) -> None:
         ({"fps": 30.0}, "fps is 15.0, not 30.0"),
         ({"pose_names": ("x",), "pose_units": ("m",)}, "the pose has 24 entries, not 1"),
         ({"stages": ("all",)}, "stages are all, chains; not all"),
+        ({"ankle_names": ()}, "ankle_names are ankle_pitch_l, .*; not none"),
+        ({"sigma": False}, "sigma is True, not none"),
+        ({"objective_kind": ""}, "objective_kind is negative log-likelihood, not none"),
+        ({"angles": ()}, "angles are knee_l, hip_l; not none"),
+        ({"angles": (replace(META.angles[0], convention="other"), META.angles[1])}, "differ in their convention"),
         ({"config_toml": META.config_toml.replace("0.1", "0.2")}, r"config smd\.mu is 0\.1, not 0\.2"),
         ({"config_toml": META.config_toml + "[hull]\nvoxels = 64\n"}, "config hull is not set"),
     ],
@@ -334,6 +378,233 @@ def test_config_that_only_looks_different_is_the_same(tmp_path: Path) -> None:
     assert done == 1
 
 
+# --- what a tracker may have or not -----------------------------------------------------------------------------------
+
+PLAIN = replace(
+    META, ankle_names=(), sigma=False, fit_cameras=(), segment_names=(), feet=False, angles=(), objective_kind=""
+)
+
+
+def plain_frame(index: int) -> FrameResult:
+    return replace(
+        make_frame(index), ankles=None, sigma=None, fit_error=None, segments_rotation=None, feet=None, angles={}
+    )
+
+
+def write_version_1(path: Path, count: int) -> None:
+    """As tk 0.1 wrote it: none of what is new, and the old number."""
+    with ResultWriter.create(path, PLAIN) as writer:
+        for index in range(count):
+            writer.append(plain_frame(index), make_state(index))
+    with h5py.File(path, "r+") as file:
+        file.attrs["format_version"] = 1
+
+
+def test_what_is_optional_is_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    write(path, 5)
+    result = read_result(path)
+    assert result.meta == META
+    assert result.ankles is not None and result.sigma is not None and result.fit_error is not None
+    assert result.segments_rotation is not None and result.feet is not None
+    assert result.sigma.shape == (5, 15) and np.isnan(result.sigma).all(axis=1).tolist() == [False] * 3 + [True, False]
+    np.testing.assert_array_equal(result.ankles[2], make_frame(2).ankles)
+    np.testing.assert_array_equal(result.fit_error[:, 2], range(5))
+    np.testing.assert_array_equal(result.segments_rotation[4], make_frame(4).segments_rotation)
+    np.testing.assert_array_equal(result.feet[1], make_frame(1).feet)
+    assert list(result.angles) == ["knee_l", "hip_l"]
+    np.testing.assert_array_equal(result.angles["knee_l"][:, 0], 5.0 * np.arange(5))
+    assert result.cameras is None and result.smoothed is None
+    track = read_joints(path)
+    np.testing.assert_array_equal(track.sigma, result.sigma)
+
+
+def test_version_1_is_read_and_resumed(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    write_version_1(path, 4)
+    result = read_result(path)
+    assert result.meta == PLAIN and len(result) == 4
+    assert result.ankles is None and result.sigma is None and result.feet is None and result.angles == {}
+    assert read_joints(path).sigma is None
+    writer, done = ResultWriter.resume(path, PLAIN)
+    with writer:
+        assert done == 4
+        writer.append(plain_frame(4), make_state(4))
+    with h5py.File(path) as file:
+        assert (file.attrs["format_version"], len(file["frames"])) == (2, 5)
+
+
+def test_the_same_angles_twice_are_refused() -> None:
+    with pytest.raises(ValueError, match="same name"):
+        replace(META, angles=META.angles * 2)
+    with pytest.raises(ValueError, match="slash"):
+        JointAngles("a/b", ("flexion",), "")
+
+
+def make_cameras(shift_m: float = 0.0) -> UsedCameras:
+    matrix = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
+    rotation, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
+    rotation *= np.linalg.det(rotation)
+    return UsedCameras(
+        Rig(
+            (
+                Camera("cam1", 640, 480, matrix, np.array([0.1, 0.0, 0.01, 0.0, 0.2]), rotation, np.full(3, shift_m)),
+                Camera("cam2", 320, 240, matrix, np.array([0.1, 0.2, 0.3, 0.4]), np.eye(3), np.arange(3.0), True),
+            )
+        ),
+        np.array([0.0, -0.04]),
+    )
+
+
+def assert_same_cameras(found: UsedCameras | None, expected: UsedCameras) -> None:
+    assert found is not None and found.rig.names == expected.rig.names
+    np.testing.assert_array_equal(found.time_offset_s, expected.time_offset_s)
+    for a, b in zip(found.rig, expected.rig, strict=True):
+        assert (a.width, a.height, a.fisheye) == (b.width, b.height, b.fisheye)
+        np.testing.assert_array_equal(a.matrix, b.matrix)
+        np.testing.assert_array_equal(a.distortions, b.distortions)
+        np.testing.assert_allclose(a.rotation, b.rotation, atol=1e-12)
+        np.testing.assert_array_equal(a.translation, b.translation)
+
+
+def test_cameras_as_used_are_kept_and_may_be_refined(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    with ResultWriter.create(path, META) as writer:
+        writer.write_cameras(make_cameras())
+        writer.append(make_frame(0), make_state(0))
+        assert_same_cameras(read_result(path).cameras, make_cameras())
+        writer.append(make_frame(1), make_state(1))
+        writer.write_cameras(make_cameras(shift_m=0.5))
+        writer.append(make_frame(2), make_state(2))
+    with ResultWriter.resume(path, META)[0] as writer:
+        writer.append(make_frame(3), make_state(3))
+    assert assert_complete(path, 4) == 4
+    assert_same_cameras(read_result(path).cameras, make_cameras(shift_m=0.5))
+    with h5py.File(path) as file:
+        assert list(file["cameras"].attrs["names"]) == ["cam1", "cam2"]
+        assert file["cameras/rotation"].shape == (2, 3) and file["cameras/distortions"].shape == (2, 5)
+
+
+def test_time_offsets_that_do_not_fit_the_cameras_are_refused() -> None:
+    with pytest.raises(ValueError, match="2 finite numbers"):
+        UsedCameras(make_cameras().rig, np.zeros(3))
+
+
+# --- a second pass ----------------------------------------------------------------------------------------------------
+
+
+def make_smoothed(count: int) -> dict[str, np.ndarray]:
+    return {
+        "pose": np.full((count, 24), 0.5),
+        "joints/position": np.full((count, 15, 3), 0.25),
+        "angles/knee_l": np.full((count, 1), 30.0),
+        "bridged": np.arange(count) % 2 == 0,
+    }
+
+
+def test_a_second_pass_replaces_what_it_names_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    write(path, 6)
+    before = read_result(path)
+    pose, sigma = np.random.default_rng(0).normal(size=(6, 24)), np.full((6, 15), 0.02)
+    meta = revise_result(path, {"pose": pose, "joints/sigma": sigma}, model={"height_m": 1.8}, cameras=make_cameras())
+    after = read_result(path)
+    assert meta == META == after.meta
+    np.testing.assert_array_equal(after.pose, pose)
+    np.testing.assert_array_equal(after.sigma, sigma)
+    np.testing.assert_array_equal(after.joints, before.joints)
+    np.testing.assert_array_equal(after.angles["hip_l"], before.angles["hip_l"])
+    assert after.model == {"height_m": 1.8}
+    assert_same_cameras(after.cameras, make_cameras())
+    assert_equal_values(after.state, before.state)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["result.h5"]
+    with ResultWriter.resume(path, META)[0] as writer:
+        writer.append(make_frame(6), make_state(6))
+    np.testing.assert_array_equal(read_result(path).pose[:6], pose)
+
+
+def test_what_is_smoothed_stands_beside_and_can_take_its_place(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    write(path, 6)
+    smoothed = make_smoothed(6)
+    revise_result(path, smoothed=smoothed)
+    result = read_result(path)
+    assert result.smoothed is not None and result.smoothed.keys() == smoothed.keys()
+    for name, values in smoothed.items():
+        np.testing.assert_array_equal(result.smoothed[name], values)
+    assert result.smoothed["bridged"].dtype == bool
+    np.testing.assert_array_equal(result.joints[0], make_frame(0).joints)
+    shown = result.with_smoothed()
+    np.testing.assert_array_equal(shown.joints, smoothed["joints/position"])
+    np.testing.assert_array_equal(shown.angles["knee_l"], smoothed["angles/knee_l"])
+    np.testing.assert_array_equal(shown.angles["hip_l"], result.angles["hip_l"])
+    assert shown.smoothed is None and shown.with_smoothed() is not result
+    with h5py.File(path) as file:
+        assert tuple(file["smoothed/joints/position"].attrs["names"]) == JOINTS
+    revise_result(path, smoothed={"bridged": np.zeros(6)})
+    again = read_result(path).smoothed
+    assert again is not None and again.keys() == {"bridged"}
+
+
+def test_what_was_smoothed_does_not_outlive_what_it_was_made_of(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    write(path, 4)
+    revise_result(path, smoothed=make_smoothed(4))
+    with ResultWriter.resume(path, META)[0]:
+        pass
+    assert read_result(path).smoothed is not None  # no frame was added
+    with ResultWriter.resume(path, META)[0] as writer:
+        writer.append(make_frame(4), make_state(4))
+    assert read_result(path).smoothed is None
+    revise_result(path, smoothed=make_smoothed(5))
+    revise_result(path, {"pose": np.zeros((5, 24))})
+    assert read_result(path).smoothed is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"columns": {"pose": np.zeros((3, 24))}},
+        {"columns": {"waist": np.zeros((4, 3))}},
+        {"smoothed": {"pose": np.zeros((4, 24))}},
+        {"smoothed": {"pose": np.zeros((5, 24)), "bridged": np.zeros(4)}},
+        {"smoothed": {"status": np.zeros(4), "bridged": np.zeros(4)}},
+    ],
+)
+def test_a_second_pass_of_the_wrong_shape_changes_nothing(tmp_path: Path, change: dict[str, object]) -> None:
+    path = tmp_path / "result.h5"
+    write(path, 4)
+    before = path.read_bytes()
+    with pytest.raises(ValueError):
+        revise_result(path, **change)  # type: ignore[arg-type]
+    assert path.read_bytes() == before
+
+
+def test_a_second_pass_that_fails_on_the_way_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "result.h5"
+    write(path, 4)
+    before = path.read_bytes()
+
+    def refuse(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(ResultError, match=r"result\.h5: cannot be written: No space left on device"):
+        revise_result(path, {"pose": np.zeros((4, 24))})
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["result.h5"]
+
+
+def test_a_second_pass_keeps_off_a_result_that_is_being_written(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    with ResultWriter.create(path, META) as writer:
+        writer.append(make_frame(0), make_state(0))
+        with pytest.raises(ResultError, match="another run"):
+            revise_result(path, {"pose": np.zeros((1, 24))})
+    with pytest.raises(ResultError, match="no such file"):
+        revise_result(tmp_path / "other.h5", {})
+
+
 # --- files that cannot be used ----------------------------------------------------------------------------------------
 
 
@@ -349,7 +620,7 @@ def not_hdf5(path: Path) -> None:
 def newer_version(path: Path) -> None:
     write(path, 1)
     with h5py.File(path, "r+") as file:
-        file.attrs["format_version"] = 2
+        file.attrs["format_version"] = 3
 
 
 def truncated(path: Path) -> None:
@@ -372,7 +643,7 @@ def missing(path: Path) -> None:
     [
         (other_software, "other software|neither"),
         (not_hdf5, "not an HDF5 file"),
-        (newer_version, "format_version is 2"),
+        (newer_version, "format_version is 3"),
         (truncated, "damaged"),
         (incomplete, "no /frames"),
         (missing, "no such file"),

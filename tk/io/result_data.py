@@ -1,20 +1,18 @@
-"""What a result file holds, as values, and how it is read. :mod:`tk.io.result` writes it."""
+"""What a result file holds, as values. :mod:`tk.io.result` writes it, :mod:`tk.io.result_read` reads it."""
 
 from __future__ import annotations
 
-import os
 import sys
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import ResultError
+from tk.model.camera import Rig
 from tk.model.skeleton import JOINTS
 
 if sys.version_info >= (3, 11):
@@ -23,7 +21,11 @@ else:
     import tomli as tomllib
 
 FORMAT = "tk-result"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+READABLE_VERSIONS = (1, 2)
+
+#: the points of the feet, in the order of `/feet/position`
+FOOT_POINTS = ("heel_l", "toe_l", "heel_r", "toe_r")
 
 Float = NDArray[np.float64]
 Value = NDArray[Any] | float | int | str
@@ -38,12 +40,40 @@ class Status(IntEnum):
     LOST = 3
 
 
+#: fields of ResultMeta that hold names
+_LISTS = (
+    "pose_names", "pose_units", "stages", "timing_stages", "joint_names",
+    "waist_names", "ankle_names", "fit_cameras", "segment_names",
+)  # fmt: skip
+
 STATUS_MEANING = ("tracked", "initialised", "recovered after loss", "lost")
+
+
+@dataclass(frozen=True)
+class JointAngles:
+    """What the columns of `/angles/<joint>` mean.
+
+    Attributes:
+        joint: the dataset's name, such as ``knee_l``.
+        names: of its angles, such as ``flexion``.
+        convention: where zero lies and which way is positive, in words.
+    """
+
+    joint: str
+    names: tuple[str, ...]
+    convention: str
+
+    def __post_init__(self) -> None:
+        if not self.joint or "/" in self.joint or not self.names:
+            raise ValueError(f"angles of {self.joint!r}: a name without a slash and one angle at least are expected")
 
 
 @dataclass(frozen=True)
 class ResultMeta:
     """What is fixed for a whole run. A run is resumed only with an equal one.
+
+    The fields from ``waist_names`` on declare what a tracker may have or not: what is declared here is in the file, and
+    each frame should bring it.
 
     Attributes:
         pose_names, pose_units: names and units of the D entries of the configuration vector.
@@ -55,6 +85,14 @@ class ResultMeta:
         seed: of the random generator.
         config_toml: the full configuration as TOML text.
         joint_names: J names, in the order of `/joints/position`.
+        waist_names: names of the angles between trunk and pelvis, radians.
+        ankle_names: names of the angles of the feet against the shins, radians.
+        sigma: whether there is a standard deviation of each joint's position.
+        fit_cameras: names of the C cameras whose fit is told, for `/fit_error`.
+        segment_names: names of the segments whose rotation is told.
+        feet: whether there are the positions of :data:`FOOT_POINTS`.
+        angles: the joints' angles as a clinician reads them.
+        objective_kind: what the numbers of `/objective` are; empty if nobody says.
     """
 
     pose_names: tuple[str, ...]
@@ -69,25 +107,55 @@ class ResultMeta:
     config_toml: str
     joint_names: tuple[str, ...] = JOINTS
     waist_names: tuple[str, ...] = ()
+    ankle_names: tuple[str, ...] = ()
+    sigma: bool = False
+    fit_cameras: tuple[str, ...] = ()
+    segment_names: tuple[str, ...] = ()
+    feet: bool = False
+    angles: tuple[JointAngles, ...] = ()
+    objective_kind: str = ""
 
     def __post_init__(self) -> None:
         if len(self.pose_names) != len(self.pose_units):
             raise ValueError(f"{len(self.pose_names)} pose names but {len(self.pose_units)} units")
         if not (np.isfinite(self.fps) and self.fps > 0):
             raise ValueError(f"fps = {self.fps} must be positive")
+        if len({angles.joint for angles in self.angles}) != len(self.angles):
+            raise ValueError("two sets of angles have the same name")
 
     def difference(self, other: ResultMeta) -> str | None:
         """In what the two differ, as ``seed is 1, not 2``; None if in nothing."""
         sizes = len(self.pose_names), len(other.pose_names)
         if sizes[0] != sizes[1]:
             return f"the pose has {sizes[0]} entries, not {sizes[1]}"
-        for name in ("capture", "method", "seed", "fps", "up"):
+        for name in ("capture", "method", "seed", "fps", "up", "sigma", "feet", "objective_kind"):
             if getattr(self, name) != getattr(other, name):
-                return f"{name} is {getattr(self, name)}, not {getattr(other, name)}"
-        for name in ("pose_names", "pose_units", "stages", "timing_stages", "joint_names", "waist_names"):
+                return f"{name} is {getattr(self, name) or 'none'}, not {getattr(other, name) or 'none'}"
+        for name in _LISTS:
             if getattr(self, name) != getattr(other, name):
-                return f"{name} are {', '.join(getattr(self, name))}; not {', '.join(getattr(other, name))}"
+                both = [", ".join(getattr(meta, name)) or "none" for meta in (self, other)]
+                return f"{name} are {both[0]}; not {both[1]}"
+        if self.angles != other.angles:
+            both = [", ".join(angles.joint for angles in meta.angles) or "none" for meta in (self, other)]
+            return f"angles are {both[0]}; not {both[1]}" if both[0] != both[1] else "angles differ in their convention"
         return _config_difference(tomllib.loads(self.config_toml), tomllib.loads(other.config_toml))
+
+
+#: fields of Result by the name of their dataset, for those that can be smoothed; `/angles` have a field for all
+_SMOOTHED_FIELDS = {
+    "pose": "pose",
+    "waist": "waist",
+    "ankles": "ankles",
+    "joints/position": "joints",
+    "joints/sigma": "sigma",
+    "segments/rotation": "segments_rotation",
+    "feet/position": "feet",
+}
+
+
+def can_be_smoothed(name: str) -> bool:
+    """Whether a dataset may stand below `/smoothed`."""
+    return name in _SMOOTHED_FIELDS or name.startswith("angles/")
 
 
 @dataclass(frozen=True)
@@ -113,6 +181,16 @@ class FrameResult:
         timing: seconds a stage; a stage that is not mentioned took none.
         hull: the surface voxels, if they are to be stored.
         waist: (W,) angles beyond the pose's, radians; none by default.
+
+    What follows may be None: nothing is known in this frame, which the file tells by NaN. It is refused where
+    :class:`ResultMeta` does not declare it.
+
+        ankles: (A,) angles of the feet against the shins, radians.
+        sigma: (J,) one standard deviation of each joint's position, metres; NaN where a joint has no evidence.
+        fit_error: (C,) the share of wrongly classified pixels of each camera (E_S).
+        segments_rotation: (S, 4) quaternions (w, x, y, z), segment to world.
+        feet: (4, 3) the :data:`FOOT_POINTS`, metres, world frame.
+        angles: degrees by joint; a joint that is not mentioned is NaN.
     """
 
     frame: int
@@ -125,6 +203,29 @@ class FrameResult:
     timing: Mapping[str, float]
     hull: HullPoints | None = None
     waist: Float = field(default_factory=lambda: np.zeros(0))
+    ankles: Float | None = None
+    sigma: Float | None = None
+    fit_error: Float | None = None
+    segments_rotation: Float | None = None
+    feet: Float | None = None
+    angles: Mapping[str, Float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class UsedCameras:
+    """The calibration as a run used it, after refinement where there was one.
+
+    Attributes:
+        rig: the C cameras.
+        time_offset_s: (C,) seconds by which a camera's frame k was taken later than k / fps.
+    """
+
+    rig: Rig
+    time_offset_s: Float
+
+    def __post_init__(self) -> None:
+        if np.shape(self.time_offset_s) != (len(self.rig),) or not np.isfinite(self.time_offset_s).all():
+            raise ValueError(f"time offsets {self.time_offset_s} are not {len(self.rig)} finite numbers")
 
 
 @dataclass(frozen=True)
@@ -145,7 +246,10 @@ class Hull:
 
 @dataclass(frozen=True)
 class Result:
-    """A whole result file: F frames, D degrees of freedom, J joints, S optimiser stages."""
+    """A whole result file: F frames, D degrees of freedom, J joints, S optimiser stages.
+
+    What the file does not have is None (no angles: an empty mapping).
+    """
 
     path: Path
     meta: ResultMeta
@@ -163,9 +267,24 @@ class Result:
     state: Mapping[str, Value]  # what the tracker needs to go on after the last frame
     software: str
     created: str
+    ankles: Float | None = None  # (F, A) radians
+    sigma: Float | None = None  # (F, J) metres, NaN where a joint has no evidence
+    fit_error: Float | None = None  # (F, C)
+    segments_rotation: Float | None = None  # (F, S, 4) w, x, y, z; segment to world
+    feet: Float | None = None  # (F, 4, 3) metres
+    angles: Mapping[str, Float] = field(default_factory=dict)  # by joint, each (F, k) degrees
+    cameras: UsedCameras | None = None
+    smoothed: Mapping[str, NDArray[Any]] | None = None  # by the datasets' names, and "bridged" (F,) bool
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    def with_smoothed(self) -> Result:
+        """The same result with what is below `/smoothed` in its place; as it is where nothing was smoothed."""
+        smoothed = self.smoothed or {}
+        fields: dict[str, Any] = {field: smoothed[name] for name, field in _SMOOTHED_FIELDS.items() if name in smoothed}
+        angles = {joint: smoothed.get(f"angles/{joint}", values) for joint, values in self.angles.items()}
+        return replace(self, **fields, angles=angles, smoothed=None)
 
 
 @dataclass(frozen=True)
@@ -178,6 +297,7 @@ class JointTrack:
         positions: (F, 15, 3) metres, world frame, in the order of :data:`tk.model.skeleton.JOINTS`.
         status: (F,) as in a result; None for a truth.
         seconds: (F,) wall time of each frame; None where the file does not tell.
+        sigma: (F, 15) one standard deviation of each position, metres, NaN where unknown; None where there is none.
     """
 
     path: Path
@@ -185,184 +305,7 @@ class JointTrack:
     positions: Float
     status: NDArray[np.uint8] | None = None
     seconds: Float | None = None
-
-
-def read_result(path: str | os.PathLike[str]) -> Result:
-    """Read a whole result.
-
-    Raises:
-        ResultError: no such file, not HDF5, of other software or another version, or incomplete.
-    """
-    path = Path(path)
-    with open_hdf5(path) as file:
-        check_format(file, path)
-        meta = read_meta(file, path)
-        result = Result(
-            path=path,
-            meta=meta,
-            frames=_read(file, "frames", path),
-            time=_read(file, "time", path),
-            pose=_read(file, "pose", path),
-            joints=_read(file, "joints/position", path),
-            waist=_read(file, "waist", path) if meta.waist_names else None,
-            status=_read(file, "status", path),
-            objective=_read(file, "objective", path),
-            iterations=_read(file, "iterations", path),
-            timing={stage: _read(file, f"timing/{stage}", path) for stage in meta.timing_stages},
-            model=read_values(file, "model"),
-            hull=Hull(*(_read(file, f"hull/{name}", path) for name in ("positions", "colors", "offsets")))
-            if "hull" in file
-            else None,
-            state=read_values(file, "resume/state"),
-            software=str(file.attrs.get("software", "")),
-            created=str(file.attrs.get("created", "")),
-        )
-    columns: dict[str, NDArray[Any]] = {
-        "time": result.time,
-        "pose": result.pose,
-        **({} if result.waist is None else {"waist": result.waist}),
-        "joints/position": result.joints,
-        "status": result.status,
-        "objective": result.objective,
-        "iterations": result.iterations,
-    }
-    for name, column in columns.items():
-        if len(column) != len(result):
-            raise ResultError(f"{path}: /{name} has {len(column)} rows for {len(result)} frames; the file is damaged")
-    return result
-
-
-def read_joints(path: str | os.PathLike[str]) -> JointTrack:
-    """Read `/frames` and `/joints/position` of a result or a truth, the joints in the contract's order.
-
-    Raises:
-        ResultError: as :func:`read_result`, or a joint is missing, a frame is there twice, or the unit is not metres.
-    """
-    path = Path(path)
-    with open_hdf5(path) as file:
-        if "format" in file.attrs:
-            check_format(file, path)
-        for name in ("frames", "joints/position"):
-            if not isinstance(file.get(name), h5py.Dataset):
-                raise ResultError(f"{path}: has no /{name}; it is neither a tk result nor a capture's truth")
-        if file.attrs.get("units", "m") != "m":
-            raise ResultError(f"{path}: units = {file.attrs['units']}; joint positions must be in metres (m)")
-        frames = np.asarray(_read(file, "frames", path), dtype=np.int64)
-        dataset = file["joints/position"]
-        names = [_text(name) for name in np.atleast_1d(dataset.attrs.get("names", []))]
-        missing = [joint for joint in JOINTS if joint not in names]
-        if missing:
-            raise ResultError(f"{path}: /joints/position has no joint {missing[0]} in its attribute names")
-        if dataset.shape != (len(frames), len(names), 3):
-            raise ResultError(
-                f"{path}: /joints/position has shape {dataset.shape}; {(len(frames), len(names), 3)} is expected"
-            )
-        positions = np.asarray(_read(file, "joints/position", path), dtype=np.float64)
-        status = _column(file, "status", len(frames), path) if "status" in file else None
-        stages = list(file.get("timing", ()))
-        timing = {stage: _column(file, f"timing/{stage}", len(frames), path) for stage in stages}
-    values, counts = np.unique(frames, return_counts=True)
-    if (counts > 1).any():
-        raise ResultError(f"{path}: frame {values[counts > 1][0]} is there twice; each frame must be listed once")
-    seconds: Float | None = None
-    if timing:
-        seconds = timing["total"] if "total" in timing else np.sum(list(timing.values()), axis=0)
-    order = [names.index(joint) for joint in JOINTS]
-    return JointTrack(path, frames, positions[:, order], status, seconds)
-
-
-# --- shared with the writer -------------------------------------------------------------------------------------------
-
-
-def open_hdf5(path: Path) -> h5py.File:
-    """Open for reading. Without locks: a published result is never written to."""
-    if not path.is_file():
-        raise ResultError(f"{path}: is a folder; name a file" if path.is_dir() else f"{path}: no such file")
-    try:
-        return h5py.File(path, "r", locking=False)
-    except PermissionError:
-        raise ResultError(f"{path}: no permission to read it") from None
-    except OSError:
-        raise ResultError(f"{path}: is not an HDF5 file, or is damaged") from None
-
-
-def check_format(file: h5py.File, path: Path) -> None:
-    """Raise ResultError unless the file says that it is a result of this format version."""
-    if _text(file.attrs.get("format", "")) != FORMAT:
-        raise ResultError(f"{path}: an HDF5 file of other software, not a {FORMAT}; name another file")
-    found = file.attrs.get("format_version")
-    if found != FORMAT_VERSION:
-        raise ResultError(
-            f"{path}: format_version is {found}, this version of tk knows {FORMAT_VERSION}; track the capture again"
-        )
-
-
-def read_meta(file: h5py.File, path: Path) -> ResultMeta:
-    """The metadata of an open result."""
-
-    def attribute(holder: str, name: str) -> Any:
-        if holder not in file or name not in file[holder].attrs:
-            raise ResultError(f"{path}: has no attribute {name} on {holder}; the file is damaged")
-        return _text(file[holder].attrs[name])
-
-    def names(holder: str, name: str) -> tuple[str, ...]:
-        values: Iterable[Any] = np.atleast_1d(attribute(holder, name))
-        return tuple(str(_text(value)) for value in values)
-
-    return ResultMeta(
-        pose_names=names("/pose", "names"),
-        pose_units=names("/pose", "units"),
-        stages=names("/iterations", "stages"),
-        timing_stages=names("/timing", "stages"),
-        fps=float(attribute("/", "fps")),
-        up=attribute("/", "up"),
-        capture=attribute("/", "capture"),
-        method=attribute("/", "method"),
-        seed=int(attribute("/", "seed")),
-        config_toml=attribute("/", "config"),
-        joint_names=names("/joints/position", "names"),
-        waist_names=names("/waist", "names") if "waist" in file else (),
-    )
-
-
-def encode(value: Value) -> NDArray[Any]:
-    """A value as an array that HDF5 can hold in place: text becomes its UTF-8 bytes."""
-    return np.frombuffer(value.encode(), dtype=np.uint8) if isinstance(value, str) else np.asarray(value)
-
-
-def read_values(file: h5py.File, group: str) -> dict[str, Value]:
-    """All datasets below a group as a flat mapping; {} if there is no such group."""
-    found: dict[str, Value] = {}
-
-    def visit(name: str, item: h5py.HLObject) -> None:
-        if isinstance(item, h5py.Dataset):
-            value = item[()]
-            is_text = item.attrs.get("encoding") == "utf-8"
-            found[name] = value.tobytes().decode() if is_text else _text(value)
-
-    if group in file:
-        file[group].visititems(visit)
-    return found
-
-
-def _text(value: Any) -> Any:
-    return value.decode() if isinstance(value, bytes) else value
-
-
-def _read(file: h5py.File, name: str, path: Path) -> NDArray[Any]:
-    if not isinstance(file.get(name), h5py.Dataset):
-        raise ResultError(f"{path}: has no /{name}; the file is damaged")
-    try:
-        return file[name][()]
-    except OSError:
-        raise ResultError(f"{path}: /{name} cannot be read; the file is damaged") from None
-
-
-def _column(file: h5py.File, name: str, rows: int, path: Path) -> NDArray[Any]:
-    values = _read(file, name, path)
-    if values.shape != (rows,):
-        raise ResultError(f"{path}: /{name} has shape {values.shape} for {rows} frames; the file is damaged")
-    return values
+    sigma: Float | None = None
 
 
 def _config_difference(mine: Mapping[str, Any], other: Mapping[str, Any], prefix: str = "") -> str | None:

@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import cv2
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.result_data import (
-    FORMAT,
-    FORMAT_VERSION,
-    STATUS_MEANING,
-    FrameResult,
-    HullPoints,
-    ResultMeta,
-    Value,
-    encode,
-    read_values,
-)
+from tk.io.result_columns import columns_of, put_attributes, row_of, strings
+from tk.io.result_data import FORMAT, FORMAT_VERSION, FrameResult, HullPoints, ResultMeta, UsedCameras, Value
+from tk.io.result_read import encode, read_values
 
 CHUNK_SECONDS = 1.5  # rows of a chunk: few enough to be rewritten each frame, enough to be read back fast
 HULL_CHUNK = 8192  # voxels: some seconds of frames at 64³, a few frames at 128³
@@ -47,26 +40,7 @@ class Row:
         Raises:
             ValueError: a shape, the status or a timing stage is not what ``meta`` says.
         """
-        values: dict[str, Any] = {
-            "frames": result.frame,
-            "time": result.time,
-            "pose": result.pose,
-            "waist": result.waist,
-            "joints/position": result.joints,
-            "status": int(result.status),
-            "objective": result.objective,
-            "iterations": result.iterations,
-            **{f"timing/{stage}": result.timing.get(stage, 0.0) for stage in meta.timing_stages},
-        }
-        columns = {name: np.array(values[name], dtype=dtype) for name, (_, dtype) in _columns(meta).items()}
-        for name, (shape, _) in _columns(meta).items():
-            if columns[name].shape != shape:
-                raise ValueError(f"{name} has shape {columns[name].shape}, {shape} is expected")
-        if int(result.status) not in range(len(STATUS_MEANING)):
-            raise ValueError(f"status {result.status} has no meaning")
-        unknown = set(result.timing) - set(meta.timing_stages)
-        if unknown:
-            raise ValueError(f"timing of unknown stages: {', '.join(sorted(unknown))}")
+        columns = row_of(result, meta)
         hull = result.hull
         if hull is not None:
             hull = HullPoints(np.array(hull.positions, dtype=np.float32), np.array(hull.colors, dtype=np.uint8))
@@ -85,12 +59,15 @@ class Twin:
         self.file = file
         self.rows = int(file["frames"].shape[0])
         self.model_version = 0
+        self.cameras_version = 0
+        self._has_smoothed = "smoothed" in file
         self._open: dict[str, h5py.h5d.DatasetID] = {}
         self._state_names = set(read_values(file, "resume/state"))
         self._put_last: dict[str, tuple[object, bytes]] = {}  # most of a state is the same in every frame
 
     def append(self, news: Sequence[Row]) -> None:
-        """Add frames, and the latest state among them. Nothing is flushed."""
+        """Add frames, and the latest state among them. Nothing is flushed. What was smoothed goes: it lacks them."""
+        self._drop_smoothed()
         for name in news[0].columns:
             self._extend(name, np.stack([row.columns[name] for row in news]))
         if "hull" in self.file or any(row.hull is not None for row in news):
@@ -101,36 +78,24 @@ class Twin:
                 self._put_state(row.state, row.index + 1)
                 break
 
-    def put_model(self, model: Mapping[str, Value]) -> None:
-        """Replace `/model`."""
-        if "model" in self.file:
-            del self.file["model"]
-        group = self.file.create_group("model")
-        for name, value in model.items():
-            group[name] = value
-
-    def drop_rows_without_state(self) -> None:
+    def drop_rows_without_state(self, meta: ResultMeta) -> None:
         """Cut a resumed file back to the frame that its state belongs to."""
         if "resume/rows" not in self.file or self.file["resume/rows"][()] >= self.rows:
             return
         self.rows = int(self.file["resume/rows"][()])
-        growing = [
-            "frames",
-            "time",
-            "pose",
-            *(["waist"] if "waist" in self.file else []),
-            "joints/position",
-            "status",
-            "objective",
-            "iterations",
-        ]
-        for name in [*growing, *(f"timing/{stage}" for stage in self.file["timing"])]:
+        for name in columns_of(meta):
             self.file[name].resize(self.rows, axis=0)
+        self._drop_smoothed()
         if "hull" in self.file:
             voxels = int(self.file["hull/offsets"][self.rows])
             self.file["hull/offsets"].resize(self.rows + 1, axis=0)
             self.file["hull/positions"].resize(voxels, axis=0)
             self.file["hull/colors"].resize(voxels, axis=0)
+
+    def _drop_smoothed(self) -> None:
+        if self._has_smoothed:
+            del self.file["smoothed"]
+            self._has_smoothed = False
 
     def _append_hulls(self, hulls: Sequence[HullPoints | None]) -> None:
         if "hull" not in self.file:
@@ -220,32 +185,35 @@ def write_layout(file: h5py.File, meta: ResultMeta) -> None:
         }
     )
     rows = max(1, round(CHUNK_SECONDS * meta.fps))
-    file.create_group("timing").attrs["stages"] = _strings(meta.timing_stages)
-    for name, (shape, dtype) in _columns(meta).items():
-        _create_growing(file, name, shape, dtype, rows)
-    file["pose"].attrs["names"] = _strings(meta.pose_names)
-    file["pose"].attrs["units"] = _strings(meta.pose_units)
-    if meta.waist_names:
-        file["waist"].attrs["names"] = _strings(meta.waist_names)
-        file["waist"].attrs["units"] = _strings(["rad"] * len(meta.waist_names))
-    file["joints/position"].attrs["names"] = _strings(meta.joint_names)
-    file["iterations"].attrs["stages"] = _strings(meta.stages)
-    file["status"].attrs["meaning"] = _strings(f"{value}: {text}" for value, text in enumerate(STATUS_MEANING))
+    file.create_group("timing").attrs["stages"] = strings(meta.timing_stages)
+    if meta.angles:
+        file.create_group("angles").attrs["joints"] = strings(angles.joint for angles in meta.angles)
+    for name, column in columns_of(meta).items():
+        put_attributes(_create_growing(file, name, column.shape, column.dtype, rows), column)
 
 
-def _columns(meta: ResultMeta) -> dict[str, tuple[tuple[int, ...], str]]:
-    """The datasets with one row a frame: shape of a row, and type."""
-    return {
-        "frames": ((), "i8"),
-        "time": ((), "f8"),
-        "pose": ((len(meta.pose_names),), "f8"),
-        **({"waist": ((len(meta.waist_names),), "f8")} if meta.waist_names else {}),
-        "joints/position": ((len(meta.joint_names), 3), "f8"),
-        "status": ((), "u1"),
-        "objective": ((), "f8"),
-        "iterations": ((len(meta.stages),), "i4"),
-        **{f"timing/{stage}": ((), "f8") for stage in meta.timing_stages},
-    }
+def put_model(file: h5py.File, model: Mapping[str, Value]) -> None:
+    """Write or replace `/model`. A name may hold slashes."""
+    if "model" in file:
+        del file["model"]
+    group = file.create_group("model")
+    for name, value in model.items():
+        group[name] = value
+
+
+def put_cameras(file: h5py.File, cameras: UsedCameras) -> None:
+    """Write or replace `/cameras`: an array a kind, a row a camera; the attribute `names`."""
+    if "cameras" in file:
+        del file["cameras"]
+    group = file.create_group("cameras")
+    group.attrs["names"] = strings(cameras.rig.names)
+    group["matrix"] = np.array([camera.matrix for camera in cameras.rig])
+    group["distortions"] = np.array([np.pad(c.distortions, (0, 5 - len(c.distortions))) for c in cameras.rig])
+    group["rotation"] = np.array([cv2.Rodrigues(camera.rotation)[0].ravel() for camera in cameras.rig])
+    group["translation"] = np.array([camera.translation for camera in cameras.rig])
+    group["size"] = np.array([(camera.width, camera.height) for camera in cameras.rig], dtype=np.int64)
+    group["fisheye"] = np.array([camera.fisheye for camera in cameras.rig], dtype=np.uint8)
+    group["time_offset"] = np.array(cameras.time_offset_s, dtype=np.float64)
 
 
 def _create_growing(file: h5py.File, name: str, shape: tuple[int, ...], dtype: str, rows: int) -> h5py.Dataset:
@@ -256,10 +224,6 @@ def _create_growing(file: h5py.File, name: str, shape: tuple[int, ...], dtype: s
         chunks=(rows, *(max(1, n) for n in shape)),
         dtype=dtype,
     )
-
-
-def _strings(values: Iterable[str]) -> NDArray[Any]:
-    return np.array(list(values), dtype=h5py.string_dtype())
 
 
 def _software_version() -> str:
