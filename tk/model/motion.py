@@ -49,12 +49,9 @@ def foot_points(skeleton: Skeleton, dimensions: BodyDimensions, transforms: Floa
     The foot rides on the calf where the skeleton has no segment of its own for it.
     """
     T = transforms[:, [foot_segment(name) for name in FOOT_POINTS]]
-    points = [
-        skeleton.joint_position[JOINTS.index("ankle" + name[-2:])]
-        + skeleton.T_world_body @ sole_offset(name, dimensions)
-        for name in FOOT_POINTS
-    ]
-    return np.einsum("fpab,pb->fpa", T[..., :3, :3], np.array(points)) + T[..., :3, 3]
+    ankles = skeleton.joint_position[[JOINTS.index("ankle" + name[-2:]) for name in FOOT_POINTS]]
+    soles = np.array([sole_offset(name, dimensions) for name in FOOT_POINTS]) @ skeleton.T_world_body.T
+    return np.einsum("fpab,pb->fpa", T[..., :3, :3], ankles + soles) + T[..., :3, 3]
 
 
 def sole_offset(name: str, dimensions: BodyDimensions) -> Float:

@@ -1,0 +1,169 @@
+"""Smoothing the poses of a whole recording: noise out, short gaps bridged, nothing delayed.
+
+Each degree of freedom is a value that moves at a velocity, which white noise accelerates; it is seen with white noise.
+A Kalman filter runs forward, a Rauch-Tung-Striebel smoother back over it (Rauch, Tung & Striebel, AIAA J. 3 (1965)
+1445-1450): each frame is estimated from all frames, those after it too, so that no lag is left. Chosen over a low-pass
+filter run forth and back, because a frame without measurement needs no special treatment (across a gap the model gives
+the smoothest motion between its sides), and because it needs no cut-off frequency: how strong either noise is, is
+found for each degree of freedom by maximum likelihood in the data. A tracker's errors that last for many frames are
+not white and stay: they cannot be told from motion.
+
+Angles are smoothed one by one. The limits of the skeleton's ball joints keep them away from their singular directions,
+where the angles would not follow the rotation smoothly. A foot that stands is not held: it may slide by what its
+tracking errors leave.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.model.skeleton import Skeleton
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+# Standard deviation of the acceleration's noise over that of the measurement's, both for steps of one frame: from
+# motion that is hardly seen to change within seconds to measurements that are taken as they are.
+_RATIOS = np.geomspace(1e-3, 10.0, 17)
+# A velocity that nothing is known of, against the measurement's noise a frame.
+_UNKNOWN = 1e3
+# Frames of a stretch below which there is too little to estimate noise from; it stays as it is.
+SHORTEST = 8
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """A smoothed copy of F poses.
+
+    Attributes:
+        poses: (F, D) radians and metres; as they were given where neither known nor bridged.
+        bridged: (F,) True where no pose was known and one has been filled in.
+        noise: (D,) the standard deviation of the measurements' noise as estimated, radians or metres; NaN where there
+            was too little to estimate it from.
+    """
+
+    poses: Float
+    bridged: Bool
+    noise: Float
+
+
+def smooth(skeleton: Skeleton, poses: Float, known: Bool, fps: float, longest_gap_s: float = 0.5) -> Smoothed:
+    """Smooth the poses of a recording.
+
+    Args:
+        skeleton: whose limits the result keeps.
+        poses: (F, D) tracked poses, frames at equal steps.
+        known: (F,) False where the person was lost; such a pose is not looked at.
+        fps: frames a second.
+        longest_gap_s: a loss up to this long between known frames is bridged; a longer one divides the recording.
+    """
+    poses = np.asarray(poses, dtype=np.float64)
+    result, bridged = poses.copy(), np.zeros(len(poses), dtype=bool)
+    stretches = [stretch for stretch in _stretches(known, longest_gap_s * fps) if known[stretch].sum() >= SHORTEST]
+    if not stretches:
+        return Smoothed(result, bridged, np.full(poses.shape[1], np.nan))
+    turning = np.array([unit == "rad" for unit in skeleton.units])
+    pieces = []
+    for stretch in stretches:
+        values, seen = poses[stretch].copy(), known[stretch]
+        values[np.ix_(seen, turning)] = np.unwrap(values[np.ix_(seen, turning)], axis=0)
+        pieces.append((values, seen))
+    ratio, noise = _noise(pieces)
+    for stretch, (values, seen) in zip(stretches, pieces, strict=True):
+        smoothed = _smooth(values, seen, ratio)
+        result[stretch] = skeleton.clip(_into_limits(skeleton, smoothed, turning))
+        bridged[stretch] = ~seen
+    return Smoothed(result, bridged, noise)
+
+
+def _stretches(known: Bool, longest_gap: float) -> list[slice]:
+    """Runs of frames that begin and end with a known one and hold no gap longer than ``longest_gap`` frames."""
+    frames = np.flatnonzero(known)
+    if not len(frames):
+        return []
+    ends = np.flatnonzero(np.diff(frames) - 1 > longest_gap)
+    starts = frames[np.concatenate([[0], ends + 1])]
+    return [slice(int(a), int(b) + 1) for a, b in zip(starts, frames[np.append(ends, -1)], strict=True)]
+
+
+def _into_limits(skeleton: Skeleton, poses: Float, turning: Bool) -> Float:
+    """Angles (F, D) that were unwrapped, back by whole turns to where the limits lie."""
+    bounded = np.isfinite(skeleton.lower)
+    middle = np.zeros(len(bounded))
+    middle[bounded] = (skeleton.lower[bounded] + skeleton.upper[bounded]) / 2
+    turns = np.round((poses - middle) / (2 * np.pi))
+    return np.where(turning, poses - 2 * np.pi * turns, poses)
+
+
+# --- the filter; values are taken in units of the measurement's noise, time in frames ---------------------------------
+
+
+def _noise(pieces: list[tuple[Float, Bool]]) -> tuple[Float, Float]:
+    """(D,) the ratio of :data:`_RATIOS` under which the measurements are most likely, and (D,) their noise."""
+    degrees = pieces[0][0].shape[1]
+    ratio = np.repeat(_RATIOS, degrees)
+    squares, logs, count = np.zeros(len(ratio)), np.zeros(len(ratio)), 0
+    for values, seen in pieces:
+        forward = _filter(np.tile(values, len(_RATIOS)), seen, ratio)
+        judged = np.flatnonzero(seen)[2:]  # the first two fix the line that it starts with
+        squares += (forward.surprise[judged] ** 2 / forward.variance[judged]).sum(axis=0)
+        logs += np.log(forward.variance[judged]).sum(axis=0)
+        count += len(judged)
+    variance = (squares / count).reshape(len(_RATIOS), degrees)
+    cost = count * np.log(np.maximum(variance, 1e-30)) + logs.reshape(variance.shape)
+    best = cost.argmin(axis=0)
+    return _RATIOS[best], np.sqrt(variance[best, np.arange(degrees)])
+
+
+@dataclass(frozen=True)
+class _Forward:
+    """What the filter leaves: states (F, N, 2) and covariances (F, N, 3) as xx, xv, vv, before and after a frame."""
+
+    predicted: Float
+    predicted_covariance: Float
+    state: Float
+    covariance: Float
+    surprise: Float  # (F, N) measurement less prediction
+    variance: Float  # (F, N) that was expected of it
+
+
+def _filter(values: Float, seen: Bool, ratio: Float) -> _Forward:
+    """Forward over values (F, N), for each of N series with the noise of its acceleration, ratio (N,)."""
+    frames, series = values.shape
+    q = ratio**2 * np.array([[1 / 3], [1 / 2], [1.0]])  # of white acceleration over one frame: xx, xv, vv
+    found = _Forward(*(np.zeros((frames, series, n)) for n in (2, 3, 2, 3)), *np.zeros((2, frames, series)))
+    x, v = values[0], np.zeros(series)
+    xx, xv, vv = np.ones(series), np.zeros(series), np.full(series, _UNKNOWN**2)
+    for f in range(frames):
+        if f:
+            x, (xx, xv, vv) = x + v, (xx + 2 * xv + vv + q[0], xv + vv + q[1], vv + q[2])
+        found.predicted[f] = np.column_stack([x, v])
+        found.predicted_covariance[f] = np.column_stack([xx, xv, vv])
+        if seen[f] and f:
+            surprise, variance = values[f] - x, xx + 1
+            x, v = x + xx / variance * surprise, v + xv / variance * surprise
+            xx, xv, vv = xx / variance, xv / variance, vv - xv**2 / variance
+            found.surprise[f], found.variance[f] = surprise, variance
+        found.state[f] = np.column_stack([x, v])
+        found.covariance[f] = np.column_stack([xx, xv, vv])
+    return found
+
+
+def _smooth(values: Float, seen: Bool, ratio: Float) -> Float:
+    """(F, N) the smoothed values: forward, and back by Rauch, Tung and Striebel's gain."""
+    forward = _filter(values, seen, ratio)
+    smoothed = forward.state.copy()
+    for f in range(len(values) - 2, -1, -1):
+        xx, xv, vv = forward.covariance[f].T
+        pxx, pxv, pvv = forward.predicted_covariance[f + 1].T
+        determinant = pxx * pvv - pxv**2
+        ahead = smoothed[f + 1] - forward.predicted[f + 1]
+        # the gain P Fᵀ P⁻¹ with F = [[1, 1], [0, 1]]: first P⁻¹ (…), then P Fᵀ
+        a = (pvv * ahead[:, 0] - pxv * ahead[:, 1]) / determinant
+        b = (pxx * ahead[:, 1] - pxv * ahead[:, 0]) / determinant
+        smoothed[f, :, 0] += (xx + xv) * a + xv * b
+        smoothed[f, :, 1] += (xv + vv) * a + vv * b
+    return smoothed[:, :, 0]
