@@ -72,3 +72,18 @@ def decompose(sequence: str, R: Float) -> Float:
     return np.stack(
         [np.where(singular, 0.0, np.arctan2(*first)), middle, np.where(singular, alone, np.arctan2(*third))], axis=-1
     )
+
+
+def follow(angles: Float) -> Float:
+    """Angles (F, 3), radians, of turns about three different axes, rewritten such that each frame is near to the last.
+
+    (a, b, c) is the same rotation as (a + π, π - b, c + π), and each angle may have whole turns added. Euler angles
+    that are to be looked at, or interpolated, must not jump between these.
+    """
+    result = np.array(angles, dtype=np.float64)
+    for f in range(1, len(result)):
+        a, b, c = result[f]
+        found = np.array([[a, b, c], [a + np.pi, np.pi - b, c + np.pi]])
+        found -= 2 * np.pi * np.round((found - result[f - 1]) / (2 * np.pi))
+        result[f] = found[np.abs(found - result[f - 1]).sum(axis=1).argmin()]
+    return result
