@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tk.io.export.motion import Motion
 from tk.io.export.tree import Tree, build_tree
@@ -31,7 +32,7 @@ def write_bvh(motion: Motion, path: Path) -> None:
         columns.append(np.degrees(follow(decompose("zxy", tree.rotations[:, node]))))
     lines = ["HIERARCHY", *_node(tree, 0, "")]
     lines += ["MOTION", f"Frames: {len(motion)}", f"Frame Time: {1 / motion.fps:.8f}"]
-    lines += [" ".join(f"{value:.6f}" for value in row) for row in np.concatenate(columns, axis=1)]
+    lines += [_numbers(row) for row in np.concatenate(columns, axis=1)]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -55,7 +56,7 @@ def _node(tree: Tree, node: int, indent: str) -> Iterator[str]:
     else:
         yield f"{indent}{'JOINT' if indent else 'ROOT'} {name}"
     yield f"{indent}{{"
-    yield f"{inner}OFFSET " + " ".join(f"{value:.6f}" for value in tree.offsets[node])
+    yield f"{inner}OFFSET " + _numbers(tree.offsets[node])
     if not _is_tip(tree, node):
         channels = (*(_PLACE if tree.moving[node] else ()), *_TURN)
         yield f"{inner}CHANNELS {len(channels)} " + " ".join(channels)
@@ -63,3 +64,7 @@ def _node(tree: Tree, node: int, indent: str) -> Iterator[str]:
             if not tree.names[child].startswith("heel"):
                 yield from _node(tree, child, inner)
     yield f"{indent}}}"
+
+
+def _numbers(values: NDArray[np.float64]) -> str:
+    return " ".join(f"{value:.6f}" for value in np.round(values, 6) + 0.0)  # + 0.0: no -0

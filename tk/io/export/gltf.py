@@ -28,7 +28,7 @@ Float = NDArray[np.float64]
 _FLOAT, _UINT16 = 5126, 5123  # componentType
 _VERTICES, _INDICES = 34962, 34963  # bufferView.target
 # Points along and around a piece.
-_ALONG, _AROUND = 9, 17
+_ALONG, _AROUND = 11, 21
 # Left limbs warm, right limbs cool, trunk and head green, as in the overlays.
 _COLORS = {"_l": (0.85, 0.35, 0.15), "_r": (0.2, 0.4, 0.85), "": (0.3, 0.6, 0.3)}
 
@@ -149,7 +149,10 @@ def _meshes(motion: Motion, tree: Tree, buffer: _Buffer, nodes: list[dict[str, A
 
 def _surface(piece: Superellipsoid) -> tuple[Float, Float, NDArray[np.int64]]:
     """Points (N, 3) and normals (N, 3) of a piece in the zero configuration, body frame, and triangles (M, 3)."""
-    eta, omega = np.meshgrid(np.linspace(*piece.eta_range, _ALONG), np.linspace(-np.pi, np.pi, _AROUND), indexing="ij")
+    along, around = np.linspace(*piece.eta_range, 256), np.linspace(-np.pi, np.pi, 512)
+    along = _evenly(along, piece.point(along, np.zeros_like(along)), _ALONG)
+    around = _evenly(around, piece.point(np.zeros_like(around), around), _AROUND)
+    eta, omega = np.meshgrid(along, around, indexing="ij")
     T = piece.T_body_piece
     points = piece.point(eta, omega).reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
     normals = piece.normal(eta, omega).reshape(-1, 3) @ T[:3, :3].T
@@ -157,6 +160,12 @@ def _surface(piece: Superellipsoid) -> tuple[Float, Float, NDArray[np.int64]]:
     right, up = corner + 1, corner + _AROUND
     faces = np.concatenate([np.column_stack([corner, right, up]), np.column_stack([right, up + 1, up])])
     return points, normals, faces
+
+
+def _evenly(parameter: Float, curve: Float, count: int) -> Float:
+    """(count,) values of the parameter (N,) at equal lengths along a curve (N, 3), which equal steps would not be."""
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+    return np.interp(np.linspace(0.0, length[-1], count), length, parameter)
 
 
 def _float32(values: Float) -> NDArray[np.float32]:
