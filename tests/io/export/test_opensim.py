@@ -36,6 +36,8 @@ def read_trc(path: Path) -> Trc:
     assert lines[4].split("\t") == ["", "", *(f"{axis}{m + 1}" for m in range(count) for axis in "XYZ")]
     assert lines[5].strip() == "" and lines[-1] == ""
     rows = [line.split("\t") for line in lines[6:-1]]
+    # OpenSim 4.6 takes a tab at a line's end for its end
+    rows = [row[:-1] if row[-1] == "" else row for row in rows]
     assert len(rows) == int(header["NumFrames"]) and {len(row) for row in rows} == {2 + 3 * count}
     values = np.array([[float(cell) if cell else np.nan for cell in row] for row in rows])
     return Trc(header, markers, values[:, 0], values[:, 1], values[:, 2:].reshape(len(rows), count, 3))

@@ -27,6 +27,7 @@ def write_trc(motion: Motion, path: Path) -> None:
         "",
     ]
     for f, frame in enumerate(motion.frames):
-        cells = [f"{value:.4f}" for value in points[f].ravel()] if motion.known[f] else [""] * points[f].size
+        # OpenSim takes a tab at a line's end for its end: without one more, the last blank would be missing
+        cells = [f"{value:.4f}" for value in points[f].ravel()] if motion.known[f] else [""] * (points[f].size + 1)
         lines.append("\t".join((str(frame), f"{motion.time[f]:.6f}", *cells)))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
