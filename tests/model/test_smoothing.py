@@ -13,11 +13,11 @@ from tk.model.smoothing import SHORTEST, smooth
 
 SKELETON = build_skeleton(BodyDimensions.from_stature(1.75), waist=True)
 D = len(SKELETON.names)
-FPS = 25.0
+FPS = 60.0
 NOISE = 0.03
 
 
-def motion(frames: int = 250, seed: int = 0) -> np.ndarray:
+def motion(frames: int = 400, seed: int = 0) -> np.ndarray:
     """Swings of 0.3 to 1.2 Hz within the limits, (F, D)."""
     rng = np.random.default_rng(seed)
     t = np.arange(frames)[:, None] / FPS
@@ -52,7 +52,7 @@ def test_what_is_exact_stays() -> None:
 def test_stillness_becomes_stiller() -> None:
     true = np.full((200, D), 0.1)
     found = smooth(SKELETON, noisy(true), np.ones(200, bool), FPS)
-    assert np.sqrt(((found.poses - true) ** 2).mean()) < 0.25 * NOISE
+    assert np.sqrt(((found.poses - true) ** 2).mean()) < 0.5 * NOISE
 
 
 def test_short_gaps_are_bridged_and_long_ones_left() -> None:
@@ -94,6 +94,19 @@ def test_a_turning_body_is_not_torn_where_the_angle_wraps() -> None:
     difference = found.poses[:, yaw] - true[:, yaw]
     assert np.abs((difference + np.pi) % (2 * np.pi) - np.pi).max() < 3 * NOISE
     assert np.abs(found.poses[:, yaw]).max() <= np.pi + 1e-12
+
+
+@pytest.mark.parametrize("fps", [15.0, 60.0])
+def test_motion_is_left_alone(fps: float) -> None:
+    """What moves at 2 Hz keeps its size; what is quicker than any motion does not, where the frame rate shows it."""
+    t = np.arange(200)[:, None] / fps
+    true = np.tile(0.05 * np.sin(2 * np.pi * 2.0 * t), (1, D))
+    poses = noisy(true)
+    found = smooth(SKELETON, poses, np.ones(200, bool), fps).poses
+    wave = np.exp(2j * np.pi * 2.0 * t)
+    kept = np.abs((wave * found).sum(axis=0)) / np.abs((wave * poses).sum(axis=0))
+    np.testing.assert_allclose(kept, 1.0, atol=0.05)
+    assert np.sqrt(((found - true) ** 2).mean()) < (1.0 if fps < 20 else 0.6) * NOISE
 
 
 def test_too_little_stays_as_it_is() -> None:

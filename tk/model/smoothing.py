@@ -4,9 +4,11 @@ Each degree of freedom is a value that moves at a velocity, which white noise ac
 A Kalman filter runs forward, a Rauch-Tung-Striebel smoother back over it (Rauch, Tung & Striebel, AIAA J. 3 (1965)
 1445-1450): each frame is estimated from all frames, those after it too, so that no lag is left. Chosen over a low-pass
 filter run forth and back, because a frame without measurement needs no special treatment (across a gap the model gives
-the smoothest motion between its sides), and because it needs no cut-off frequency: how strong either noise is, is
-found for each degree of freedom by maximum likelihood in the data. A tracker's errors that last for many frames are
-not white and stay: they cannot be told from motion.
+the smoothest motion between its sides), and because each degree of freedom is smoothed as much as its own noise asks
+for: how strong either noise is, is found in the data by maximum likelihood. A person does not move as the model
+does, though, and what the model cannot follow would be taken for noise; so nothing slower than :data:`MOTION_HZ` is
+smoothed away. At 15 frames/s this leaves little to smooth, at 30 and more much. A tracker's errors that last for many
+frames are not white and stay: they cannot be told from motion.
 
 Angles are smoothed one by one. The limits of the skeleton's ball joints keep them away from their singular directions,
 where the angles would not follow the rotation smoothly. A foot that stands is not held: it may slide by what its
@@ -28,6 +30,9 @@ Bool = NDArray[np.bool_]
 # Standard deviation of the acceleration's noise over that of the measurement's, both for steps of one frame: from
 # motion that is hardly seen to change within seconds to measurements that are taken as they are.
 _RATIOS = np.geomspace(1e-3, 10.0, 17)
+# Voluntary movement has next to no power above 6 Hz, the usual cut-off in gait analysis (Winter, Biomechanics and Motor
+# Control of Human Movement, 2009, chapter 3).
+MOTION_HZ = 6.0
 # A velocity that nothing is known of, against the measurement's noise a frame.
 _UNKNOWN = 1e3
 # Frames of a stretch below which there is too little to estimate noise from; it stays as it is.
@@ -72,11 +77,20 @@ def smooth(skeleton: Skeleton, poses: Float, known: Bool, fps: float, longest_ga
         values[np.ix_(seen, turning)] = np.unwrap(values[np.ix_(seen, turning)], axis=0)
         pieces.append((values, seen))
     ratio, noise = _noise(pieces)
+    ratio = np.maximum(ratio, _ratio_of(MOTION_HZ / fps))
     for stretch, (values, seen) in zip(stretches, pieces, strict=True):
         smoothed = _smooth(values, seen, ratio)
         result[stretch] = skeleton.clip(_into_limits(skeleton, smoothed, turning))
         bridged[stretch] = ~seen
     return Smoothed(result, bridged, noise)
+
+
+def _ratio_of(cutoff: float) -> float:
+    """The ratio (as :data:`_RATIOS`) under which a swing of this frequency, in cycles a frame, is halved.
+
+    The smoother is a filter of gain 1 / (1 + ω⁴ / ratio²): that of the cubic smoothing spline.
+    """
+    return float((2 * np.pi * cutoff) ** 2)
 
 
 def _stretches(known: Bool, longest_gap: float) -> list[slice]:
