@@ -17,6 +17,7 @@ tracking errors leave.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,10 +122,11 @@ def _noise(pieces: list[tuple[Float, Bool]]) -> tuple[Float, Float]:
     ratio = np.repeat(_RATIOS, degrees)
     squares, logs, count = np.zeros(len(ratio)), np.zeros(len(ratio)), 0
     for values, seen in pieces:
-        forward = _filter(np.tile(values, len(_RATIOS)), seen, ratio)
         judged = np.flatnonzero(seen)[2:]  # the first two fix the line that it starts with
-        squares += (forward.surprise[judged] ** 2 / forward.variance[judged]).sum(axis=0)
-        logs += np.log(forward.variance[judged]).sum(axis=0)
+        for f, step in enumerate(_filter(np.tile(values, len(_RATIOS)), seen, ratio)):
+            if seen[f] and f >= judged[0]:
+                squares += step.surprise**2 / step.variance
+                logs += np.log(step.variance)
         count += len(judged)
     variance = (squares / count).reshape(len(_RATIOS), degrees)
     cost = count * np.log(np.maximum(variance, 1e-30)) + logs.reshape(variance.shape)
@@ -133,51 +135,47 @@ def _noise(pieces: list[tuple[Float, Bool]]) -> tuple[Float, Float]:
 
 
 @dataclass(frozen=True)
-class _Forward:
-    """What the filter leaves: states (F, N, 2) and covariances (F, N, 3) as xx, xv, vv, before and after a frame."""
+class _Step:
+    """A frame of the filter for N series: position and velocity (2, N), covariances (3, N) as xx, xv, vv."""
 
     predicted: Float
     predicted_covariance: Float
     state: Float
     covariance: Float
-    surprise: Float  # (F, N) measurement less prediction
-    variance: Float  # (F, N) that was expected of it
+    surprise: Float  # (N,) measurement less prediction
+    variance: Float  # (N,) what was expected of its square
 
 
-def _filter(values: Float, seen: Bool, ratio: Float) -> _Forward:
+def _filter(values: Float, seen: Bool, ratio: Float) -> Iterator[_Step]:
     """Forward over values (F, N), for each of N series with the noise of its acceleration, ratio (N,)."""
-    frames, series = values.shape
+    series = values.shape[1]
     q = ratio**2 * np.array([[1 / 3], [1 / 2], [1.0]])  # of white acceleration over one frame: xx, xv, vv
-    found = _Forward(*(np.zeros((frames, series, n)) for n in (2, 3, 2, 3)), *np.zeros((2, frames, series)))
     x, v = values[0], np.zeros(series)
     xx, xv, vv = np.ones(series), np.zeros(series), np.full(series, _UNKNOWN**2)
-    for f in range(frames):
+    for f in range(len(values)):
         if f:
             x, (xx, xv, vv) = x + v, (xx + 2 * xv + vv + q[0], xv + vv + q[1], vv + q[2])
-        found.predicted[f] = np.column_stack([x, v])
-        found.predicted_covariance[f] = np.column_stack([xx, xv, vv])
+        predicted, predicted_covariance = np.array([x, v]), np.array([xx, xv, vv])
+        surprise, variance = values[f] - x, xx + 1
         if seen[f] and f:
-            surprise, variance = values[f] - x, xx + 1
             x, v = x + xx / variance * surprise, v + xv / variance * surprise
             xx, xv, vv = xx / variance, xv / variance, vv - xv**2 / variance
-            found.surprise[f], found.variance[f] = surprise, variance
-        found.state[f] = np.column_stack([x, v])
-        found.covariance[f] = np.column_stack([xx, xv, vv])
-    return found
+        yield _Step(predicted, predicted_covariance, np.array([x, v]), np.array([xx, xv, vv]), surprise, variance)
 
 
 def _smooth(values: Float, seen: Bool, ratio: Float) -> Float:
     """(F, N) the smoothed values: forward, and back by Rauch, Tung and Striebel's gain."""
-    forward = _filter(values, seen, ratio)
-    smoothed = forward.state.copy()
-    for f in range(len(values) - 2, -1, -1):
-        xx, xv, vv = forward.covariance[f].T
-        pxx, pxv, pvv = forward.predicted_covariance[f + 1].T
-        determinant = pxx * pvv - pxv**2
-        ahead = smoothed[f + 1] - forward.predicted[f + 1]
+    steps = list(_filter(values, seen, ratio))
+    x, v = steps[-1].state
+    smoothed = [x]
+    for step, after in zip(steps[-2::-1], steps[:0:-1], strict=True):
+        xx, xv, vv = step.covariance
+        pxx, pxv, pvv = after.predicted_covariance
+        dx, dv = x - after.predicted[0], v - after.predicted[1]
         # the gain P Fᵀ P⁻¹ with F = [[1, 1], [0, 1]]: first P⁻¹ (…), then P Fᵀ
-        a = (pvv * ahead[:, 0] - pxv * ahead[:, 1]) / determinant
-        b = (pxx * ahead[:, 1] - pxv * ahead[:, 0]) / determinant
-        smoothed[f, :, 0] += (xx + xv) * a + xv * b
-        smoothed[f, :, 1] += (xv + vv) * a + vv * b
-    return smoothed[:, :, 0]
+        determinant = pxx * pvv - pxv**2
+        a, b = (pvv * dx - pxv * dv) / determinant, (pxx * dv - pxv * dx) / determinant
+        x = step.state[0] + (xx + xv) * a + xv * b
+        v = step.state[1] + (xv + vv) * a + vv * b
+        smoothed.append(x)
+    return np.array(smoothed[::-1])
