@@ -139,8 +139,12 @@ ANGLES: tuple[AngleSet, ...] = _sets()
 
 def segment_rotations(skeleton: Skeleton, poses: Float) -> Float:
     """(F, S, 3, 3) rotations of the segments' axes (see the module's docstring) to the world, from poses (F, D)."""
-    zero = skeleton.T_world_body @ standing_axes()
-    return segment_transforms(skeleton, poses)[..., :3, :3] @ zero
+    return standing_rotations(skeleton, segment_transforms(skeleton, poses))
+
+
+def standing_rotations(skeleton: Skeleton, transforms: Float) -> Float:
+    """(F, S, 3, 3) the same from :func:`tk.model.motion.segment_transforms`."""
+    return transforms[..., :3, :3] @ skeleton.T_world_body @ standing_axes()
 
 
 def segment_quaternions(skeleton: Skeleton, poses: Float) -> Float:

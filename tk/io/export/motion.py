@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from tk.errors import ConfigError, ResultError
 from tk.io.result import Result, Status, read_result
-from tk.model.angles import segment_quaternions, segment_rotations
+from tk.model.angles import segment_rotations
 from tk.model.anthropometry import BodyDimensions
-from tk.model.motion import FOOT_POINTS, joint_positions, segment_transforms, sole_offset
+from tk.model.derived import derive
+from tk.model.motion import FOOT_POINTS, sole_offset
 from tk.model.rotations import to_matrices
 from tk.model.skeleton import JOINTS, SEGMENTS, Skeleton, build_skeleton, with_waist
 from tk.model.smoothing import smooth
@@ -199,8 +200,9 @@ def _smooth(result: Result, dimensions: BodyDimensions) -> tuple[Result, NDArray
     found = smooth(skeleton, poses, known, result.meta.fps)
     changed = known | found.bridged
     joints = result.joints.copy()
-    joints[changed] = joint_positions(skeleton, segment_transforms(skeleton, found.poses[changed]))
+    derived = derive(skeleton, dimensions, found.poses[changed])
+    joints[changed] = derived.joints
     rotation = np.full((len(result), len(SEGMENTS), 4), np.nan)
-    rotation[changed] = segment_quaternions(skeleton, found.poses[changed])
+    rotation[changed] = derived.rotations
     meta = replace(result.meta, segment_names=SEGMENTS)
     return replace(result, meta=meta, joints=joints, segments_rotation=rotation, feet=None), found.bridged
