@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -89,44 +88,39 @@ def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[M
         ResultError: as :func:`tk.io.result.read_result`, or no body or no known frame is in it.
     """
     result = read_result(path)
-    dimensions = _dimensions(result)
     bridged = np.zeros(len(result), dtype=bool)
-    notes: tuple[str, ...] = ()
+    is_made_here = smoothed and result.smoothed is None
     if smoothed and result.smoothed is not None:
         bridged = np.asarray(result.smoothed["bridged"], dtype=bool)
         result = result.with_smoothed()
-    elif smoothed:
+    result = _in_order(result)
+    dimensions = _dimensions(result)
+    notes: tuple[str, ...] = ()
+    if is_made_here:
         result, bridged = _smooth(result, dimensions)
         notes = (f"{path}: has no smoothed copy; the poses were smoothed for this export",)
     segments = result.meta.segment_names if result.segments_rotation is not None else SEGMENTS
     missing = [name for name in SEGMENTS if name not in segments and not name.startswith("foot")]
     if missing:
         raise ResultError(f"{path}: /segments/rotation has no segment {missing[0]}; track the capture again")
+    skeleton = _skeleton(result, dimensions)
+    # (F, …) what the segments' rotations are made of
+    source = _poses(result, skeleton) if result.segments_rotation is None else result.segments_rotation
     known = bridged | (result.status != Status.LOST)
-    known &= np.isfinite(result.joints).all(axis=(1, 2))
+    for numbers in (result.joints, source):
+        known &= np.isfinite(numbers).reshape(len(known), -1).all(axis=1)
     if result.segments_rotation is not None:
-        known &= np.isfinite(result.segments_rotation).all(axis=(1, 2))
+        known &= result.segments_rotation.any(axis=2).all(axis=1)  # a quaternion of zeros is none
     if not known.any():
         raise ResultError(f"{path}: the person is lost in every frame; there is nothing to export")
     if (np.diff(result.frames) != 1).any():
         raise ResultError(f"{path}: its frames are not consecutive, which no other format can tell; track all of them")
-    return _motion(result, dimensions, segments, known, bridged), notes
-
-
-def _motion(
-    result: Result,
-    dimensions: BodyDimensions,
-    segments: Sequence[str],
-    known: NDArray[np.bool_],
-    bridged: NDArray[np.bool_],
-) -> Motion:
     held = _held(known)
-    skeleton = _skeleton(result, dimensions)
-    if result.segments_rotation is not None:
-        rotations = to_matrices(result.segments_rotation[held])
-    else:
-        rotations = segment_rotations(skeleton, _poses(result, skeleton)[held])
-    joints = result.joints[held]
+    rotations = (
+        segment_rotations(skeleton, source[held])
+        if result.segments_rotation is None
+        else to_matrices(result.segments_rotation[held])
+    )
     sigma = np.full((len(result), len(JOINTS) + len(FOOT_POINTS)), np.nan)
     if result.sigma is not None:
         sigma[:, : len(JOINTS)] = result.sigma
@@ -139,7 +133,7 @@ def _motion(
         bridged=bridged,
         known=known,
         point_names=(*JOINTS, *FOOT_POINTS),
-        points=joints,
+        points=result.joints[held],
         sigma=sigma,
         segments=tuple(segments),
         rotations=rotations,
@@ -150,7 +144,20 @@ def _motion(
         feet = result.feet[held]
     else:
         feet = np.stack([_sole(motion, name) for name in FOOT_POINTS], axis=1)
-    return replace(motion, points=np.concatenate([joints, feet], axis=1))
+    return replace(motion, points=np.concatenate([motion.points, feet], axis=1)), notes
+
+
+def _in_order(result: Result) -> Result:
+    """The result with its joints in the order of :data:`JOINTS`."""
+    names = result.meta.joint_names
+    missing = [name for name in JOINTS if name not in names]
+    if missing:
+        raise ResultError(f"{result.path}: /joints/position has no joint {missing[0]}; the file is damaged")
+    if (result.status > Status.LOST).any():
+        raise ResultError(f"{result.path}: /status holds {result.status.max()}, which has no meaning")
+    order = [names.index(name) for name in JOINTS]
+    sigma = None if result.sigma is None else result.sigma[:, order]
+    return replace(result, joints=result.joints[:, order], sigma=sigma)
 
 
 def _sole(motion: Motion, name: str) -> Float:
