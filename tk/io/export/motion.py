@@ -110,7 +110,7 @@ def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[M
     for numbers in (result.joints, source):
         known &= np.isfinite(numbers).reshape(len(known), -1).all(axis=1)
     if result.segments_rotation is not None:
-        known &= result.segments_rotation.any(axis=2).all(axis=1)  # a quaternion of zeros is none
+        known &= np.linalg.norm(result.segments_rotation, axis=2).min(axis=1) > 0  # a quaternion of zeros is none
     if not known.any():
         raise ResultError(f"{path}: the person is lost in every frame; there is nothing to export")
     if (np.diff(result.frames) != 1).any():
