@@ -25,34 +25,24 @@ from tk.io.capture import Capture, open_capture
 from tk.io.result import read_joints
 from tk.model.objective import BARRED
 from tk.segmentation import make_labeller
-from tk.tracker import Observation
-from tk.volumetric import VolumetricTracker
+from tk.trackers.base import Observation
+from tk.trackers.volumetric import VolumetricTracker
 
 Changes = dict[str, dict[str, Any]]
 
 # label, settings that differ from the defaults
 ROWS: tuple[tuple[str, Changes], ...] = (
     ("defaults", {}),
-    ("no outline of the masks", {"contours": {"outline_weight": 0.0}}),
-    ("colour edges too, w_e 0.3, hidden 0.3", {"contours": {"edge_weight": 0.3, "hidden": 0.3}}),
-    ("colour edges too, as in the paper, w_e 1", {"contours": {"edge_weight": 1.0, "hidden": 1.0, "pairs": 5}}),
     ("no coverage (data to model)", {"objective": {"coverage_weight": 0.0}}),
-    ("normals ignored", {"objective": {"min_cosine": -1.0, "coverage_cosine": -1.0}}),
-    ("colours ignored", {"appearance": {"enabled": False}}),
-    ("no camera is overruled", {"tracking": {"overrule": -1, "overrule_doubt": -1}}),
-    ("a camera in doubt carves", {"tracking": {"overrule_doubt": -1}}),
-    ("no waist", {"body": {"waist": False}}),
-    ("no outline of hands and feet", {"contours": {"extremity_circles": 0}}),
-    ("limbs compared by the contour points of an iteration", {"": {"compared": 1}}),
-    ("no Gauss-Newton steps at the end", {"schedule": {"newton_iterations": 0}}),
-    ("no last pass and no Gauss-Newton steps", {"schedule": {"newton_iterations": 0, "polish_iterations": 0}}),
-    ("limbs searched in every frame", {"tracking": {"settled_ratio": 0.0}}),
-    ("limbs searched in unusual frames only", {"schedule": {"searched": 0}}),
-    ("2 limbs searched in usual frames, 4 hypotheses", {"schedule": {"searched": 2, "hypotheses": 4}}),
-    ("no hypotheses at all", {"schedule": {"hypotheses": 1, "wide_hypotheses": 1}}),
-    ("no search anew", {"schedule": {"retries": 0}}),
-    ("no prediction", {"tracking": {"prediction": 0.0}}),
+    ("ν soft, then hard", {"schedule": {"soft": 4.0, "chain_soft": 2.0}}),
+    ("σ is the limb's diameter", {"sampling": {"sigma_m": 0.0}, "contours": {"sigma_m": 0.0}}),
     ("SMD not whitened", {"schedule": {"whiten": False}}),
+    ("the paper's tolerance, 2° and 2 cm", {"schedule": {"tolerance_deg": 2.0, "tolerance_m": 0.02}}),
+    ("no prediction", {"tracking": {"prediction": 0.0}}),
+    ("no waist", {"body": {"waist": False}}),
+    ("no colour edges", {"contours": {"edge_weight": 0.0}}),
+    ("normals count", {"objective": {"min_cosine": 0.0}}),
+    ("colours ignored", {"appearance": {"enabled": False}}),
     ("shoulders do not rise with the arms", {"": {"rise": False}}),
     ("parts may enter each other", {"": {"exclusion": False}}),
 )
@@ -91,8 +81,6 @@ def changed(changes: Changes) -> Iterator[Config]:
             stack.enter_context(mock.patch("tk.model.skeleton.RAISED_SHOULDERS", 0.0))
         if "exclusion" in other:
             stack.enter_context(mock.patch("tk.model.objective.BARRED", np.zeros_like(BARRED)))
-        if "compared" in other:
-            stack.enter_context(mock.patch("tk.model.objective.COMPARED", other["compared"]))
         yield config
 
 

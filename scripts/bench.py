@@ -43,7 +43,7 @@ from scipy.spatial import cKDTree
 
 from scripts import bench_hull
 from scripts.bench_stages import Stage, contour_stages, median_ms, silhouette_stages
-from tk import __version__, sequence
+from tk import __version__, session
 from tk.config import Config
 from tk.errors import TkError
 from tk.io.capture import Capture, open_capture
@@ -57,9 +57,9 @@ from tk.model.hull import VisualHull
 from tk.model.objective import BodyObjective
 from tk.model.skeleton import CHAINS
 from tk.model.volume import VoxelGrid
-from tk.silhouette import SilhouetteTracker
-from tk.tracker import Estimate
-from tk.volumetric import CELL_VOXELS, restore_body
+from tk.trackers.base import Estimate
+from tk.trackers.silhouette import SilhouetteTracker
+from tk.trackers.volumetric import CELL_VOXELS, restore_body
 
 DEMO = Path(__file__).resolve().parents[1] / "tk" / "data" / "demo"
 WINDOW = 12  # frames that the stages alone are measured on
@@ -119,7 +119,7 @@ def counted_launches() -> Iterator[Counter[str]]:
         Launcher._launch = remembered  # type: ignore[method-assign]
 
 
-class _Clock(sequence.Reporter):
+class _Clock(session.Reporter):
     """Notes when frames are finished and how many launches there had been."""
 
     def __init__(self, counts: Counter[str]) -> None:
@@ -169,7 +169,7 @@ def run_once(options: Options, output: Path) -> Run:
     started = time.perf_counter()
     with counted_launches() as counts:
         clock = _Clock(counts)
-        summary = sequence.track(
+        summary = session.track(
             options.open(),
             output,
             options.config,
@@ -240,7 +240,7 @@ def stages_alone(options: Options, result: Result) -> tuple[list[Stage], bench_h
     first = max(stop - WINDOW, int(result.frames[0]))
     with capture.frames(first, stop) as reader:
         frames = list(reader)
-    segment = sequence.make_segmenter(capture, config, lambda _: None)
+    segment = session.make_segmenter(capture, config, lambda _: None)
     masks = [segment(frame) for frame in frames]
     decoding = Stage("decode", _decode_ms(capture, first, stop, options.repeat), {})
     masking = Stage("masks", statistics.median(median_ms(partial(segment, frame), 1) for frame in frames), {})
@@ -298,7 +298,7 @@ def _search_stages(
     yield Stage("colour segmentation", median_ms(segmented), {})
 
     # the peer knows neither colours nor normals, so this comparison leaves them out of ours as well
-    objective = BodyObjective(body, config.objective, config.sampling)
+    objective = BodyObjective(body, config.objective.settings, config.sampling)
     rng = np.random.default_rng(0)
     samples = objective.draw(rng)
     points, normals = (values[samples].astype(np.float32) for values in body.place(pose))
@@ -325,11 +325,11 @@ def _search_stages(
     yield Stage("neighbours: build and query", build.ms + query.ms, both)
 
     index = built(segmented())
-    rows = len(CHAINS) * config.schedule.hypotheses
+    rows = len(CHAINS)
     for name, B, M, Q in (
         ("objective: one launch, whole body", 1, len(samples), config.sampling.voxels),
         (
-            f"objective: one launch, {rows} hypotheses of chains",
+            "objective: one launch, five chains",
             rows,
             config.sampling.chain,
             config.sampling.chain_voxels,
@@ -338,9 +338,11 @@ def _search_stages(
         chosen = np.resize(samples, (B, M)).astype(np.int32)
         voxels = rng.integers(len(surface), size=(B, Q)).astype(np.int32)
         poses = np.repeat(pose[None], B, axis=0)
-        call = partial(objective.kernel.evaluate, index, chosen, voxels, poses, np.ones_like(poses), config.objective)
+        call = partial(
+            objective.kernel.evaluate, index, chosen, voxels, poses, np.ones_like(poses), config.objective.settings
+        )
         yield Stage(name, median_ms(call), {})
-    yield from contour_stages(objective, capture, config, frame, masks, pose, index)
+    yield from contour_stages(objective, capture, config, frame, pose, index)
 
 
 # --- printing -----------------------------------------------------------------------------------------------------

@@ -17,11 +17,11 @@ from tk.io.result import Result
 from tk.kernels.edge_search import search_edges
 from tk.kernels.nearest import SurfaceIndex
 from tk.model import gait
-from tk.model.contour_term import ContourTerm, Pictures
+from tk.model.contour_term import ContourTerm
 from tk.model.objective import BodyObjective
 from tk.model.silhouettes import Pyramid, Views
 from tk.optim import gauss_newton
-from tk.silhouette import restore_body
+from tk.trackers.silhouette import restore_body
 
 Float = np.ndarray
 
@@ -56,17 +56,13 @@ def contour_stages(
     capture: Capture,
     config: Config,
     frame: FrameSet,
-    masks: np.ndarray,
     pose: Float,
     index: SurfaceIndex,
 ) -> Iterator[Stage]:
-    """The volumetric tracker's contour cues at a pose (D,): contours, both searches, and what their entries cost."""
+    """The volumetric tracker's edge term at a pose (D,): contours, search, and what its entries cost."""
     poses = pose[None]
-    pictures = Pictures(frame.images, masks)
-    # both cues are measured, whichever of them counts
-    outlines = replace(config.contours, edge_weight=0.0, outline_weight=config.contours.outline_weight or 1.0)
-    colours = replace(config.contours, edge_weight=config.contours.edge_weight or 1.0, outline_weight=0.0)
-    term, edges = (ContourTerm(objective.body, capture.rig, c, config.edges) for c in (outlines, colours))
+    images = frame.images
+    term = ContourTerm(objective.body, capture.rig, config.contours)
     chosen = term.draw(None)[None]
     views = len(capture.rig)
     yield Stage(
@@ -74,32 +70,22 @@ def contour_stages(
         median_ms(lambda: term.kernel(poses, chosen)),
         {},
     )
-    points = edges.kernel(poses, chosen)
-    _, lines = edges._pairs(points)
-    search = partial(
-        search_edges, pictures.images, pictures.masks, edges.sizes, lines, colours.threshold, colours.mask_edge,
-        config.edges,
-    )  # fmt: skip
+    _, lines = term._pairs(term.kernel(poses, chosen))
+    search = partial(search_edges, images, term.sizes, lines, config.contours.threshold, term.gradient)
     yield Stage(f"colour edges: search on demand along {len(lines)} lines", median_ms(search), {})
     yield Stage(
-        "colour edges: contours, pairs, search and entries",
-        median_ms(lambda: edges.assign(pictures, poses, chosen)),
-        {},
+        "colour edges: contours, pairs, search and entries", median_ms(lambda: term.assign(images, poses, chosen)), {}
     )
-    yield Stage(
-        "outline cue: contours, tests, search and entries, one launch",
-        median_ms(lambda: term.assign(pictures, poses, chosen)),
-        {},
-    )
-    entries = term.assign(pictures, poses, chosen)
+    entries = term.assign(images, poses, chosen)
     rng = np.random.default_rng(0)
     samples, voxels = objective.draw(rng), rng.integers(len(index.positions), size=config.sampling.voxels)
     rows = samples[None].astype(np.int32), voxels[None].astype(np.int32)
+    settings = config.objective.settings
     for text, given in (("without entries", None), (f"and {entries.shape[1]} alignment entries", entries)):
-        *_, held = objective.kernel.evaluate(index, *rows, poses, poses, config.objective, entries=given)
-        evaluate = partial(objective.kernel.evaluate, index, *rows, poses, poses, config.objective, entries=given)
+        *_, held = objective.kernel.evaluate(index, *rows, poses, poses, settings, entries=given)
+        evaluate = partial(objective.kernel.evaluate, index, *rows, poses, poses, settings, entries=given)
         linearise = partial(
-            objective.kernel.linearise, index, rows[0][0], rows[1][0], pose, held, config.objective,
+            objective.kernel.linearise, index, rows[0][0], rows[1][0], pose, held, settings,
             with_jacobian=False, entries=given,
         )  # fmt: skip
         yield Stage(f"objective {text}: value, gradient, H·v", median_ms(evaluate), {})

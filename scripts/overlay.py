@@ -25,7 +25,7 @@ from tk.model.body import Body
 from tk.model.camera import Camera
 from tk.model.skeleton import JOINTS, SEGMENTS
 from tk.model.superellipsoid import Superellipsoid
-from tk.volumetric import restore_body
+from tk.trackers.volumetric import restore_body
 
 Float = NDArray[np.float64]
 Image = NDArray[np.uint8]

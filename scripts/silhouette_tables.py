@@ -26,8 +26,8 @@ from tk.model.camera import Rig
 from tk.model.silhouettes import pixel_rays, silhouette_error
 from tk.model.skeleton import JOINTS
 from tk.optim.gauss_newton import GaussNewtonConfig
-from tk.silhouette import SilhouetteConfig, SilhouetteTracker
-from tk.tracker import Observation
+from tk.trackers.base import Observation
+from tk.trackers.silhouette import SilhouetteConfig, SilhouetteTracker
 
 Float = NDArray[np.float64]
 

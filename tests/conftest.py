@@ -84,7 +84,7 @@ def tracked(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The result of an unbroken run over the tiny capture. Not to be changed."""
     from tk.config import Config
     from tk.io.capture import open_capture
-    from tk.sequence import track
+    from tk.session import track
 
     path = tmp_path_factory.mktemp("results") / "unbroken.h5"
     track(open_capture(tiny), path, Config.from_toml(QUICK), Silent(), store_hull=True)

@@ -15,7 +15,7 @@ from tk.config import Config
 from tk.evaluation import Evaluation, evaluate_files
 from tk.io.capture import open_capture
 from tk.io.result import read_result
-from tk.sequence import track
+from tk.session import track
 
 pytestmark = pytest.mark.slow
 

@@ -22,7 +22,7 @@ from tk.config import Config
 from tk.errors import ConfigError, VideoError, WorkerError
 from tk.io.capture import open_capture
 from tk.io.result import read_result
-from tk.sequence import track
+from tk.session import track
 
 AHEAD = Config.from_toml(QUICK.replace("ahead = 0", "ahead = 2"))
 ROOT = Path(__file__).parents[1]

@@ -87,7 +87,12 @@ def test_what_a_file_leaves_out_keeps_its_default() -> None:
         ("[tracking]\nprediction = 7.0", ["prediction = 7.0"]),
         ("[tracking]\ninit_frames = 0", ["init_frames = 0"]),
         ("[smd]\nmemory = 3.0", ["smd.memory"]),
-        ("voxels = ", ["not valid TOML"]),
+        ("voxels = ", ["invalid TOML"]),
+        ("tracking = " + 3000 * "[", ["invalid TOML"]),
+        ("[tracking]\ninit_frames = 1000000000\n", ["tracking.init_frames = 1000000000 is too large"]),
+        ("[smd]\nmeta_step = 1e300\n", ["smd.meta_step = 1e+300 is too large"]),
+        (f"[smd]\nmeta_step = 1{400 * '0'}\n", ["smd.meta_step = 1000", "is too large"]),
+        (f"voxels = 1{5000 * '0'}\n", ["invalid TOML"]),
         ("seed = 99999999999999999999", ["seed"]),
     ],
 )
@@ -129,7 +134,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         Config.read(tmp_path)
     (tmp_path / "latin.toml").write_bytes(b'segmentation = "\xe4"')
-    with pytest.raises(ConfigError, match=r"latin\.toml: cannot be read"):
+    with pytest.raises(ConfigError, match=r"latin\.toml: is not UTF-8"):
         Config.read(tmp_path / "latin.toml")
 
 
@@ -147,24 +152,23 @@ def test_presets_are_valid_and_unlike_the_defaults(name: str) -> None:
 
 def test_the_papers_preset_has_the_papers_numbers() -> None:
     c = Config.preset("kehl2006")
-    assert (c.objective.coverage_weight, c.contours.outline_weight) == (0, 0)
-    assert (c.objective.tangential, c.objective.min_cosine, c.sampling.sigma_m, c.contours.sigma_m) == (1, -1, 0, 0)
-    assert (c.contours.views, c.contours.pairs, c.sampling.torso, c.sampling.chain) == (3, 5, 60, 20)
-    assert (c.schedule.tolerance_deg, c.schedule.tolerance_m, c.schedule.refine) == (2, 0.02, 0.5)
-    assert (c.schedule.hypotheses, c.schedule.retries, c.schedule.polish_iterations) == (1, 0, 0)
+    assert (c.objective.tangential, c.objective.min_cosine) == (1, -1)
+    assert (c.contours.views, c.contours.pairs, c.contours.hidden) == (3, 5, 1)
+    assert (c.sampling.torso, c.sampling.chain, c.voxels, c.body.waist) == (60, 20, 64, False)
+    assert (c.schedule.refine, c.schedule.soft, c.schedule.chain_soft) == (0.5, 1, 1)
     assert (c.smd.memory, c.smd.max_iterations, c.smd.window, c.smd.shuffle) == (0.3, 40, 3, True)
 
 
-def test_the_fast_preset_searches_less() -> None:
-    fast, usual = Config.preset("fast").schedule, Config().schedule
-    assert fast.retries == 0 and fast.hypotheses < usual.hypotheses and fast.searched < usual.searched
+def test_the_papers_preset_is_the_default_but_for_the_waist() -> None:
+    c = Config.preset("kehl2006")
+    assert dataclasses.replace(c, body=Config().body) == Config()
 
 
 def test_a_file_wins_over_a_preset(tmp_path: Path) -> None:
     file = tmp_path / "own.toml"
     file.write_text("voxels = 128\n[contours]\nviews = 2\n")
     config = Config.read(file, Config.preset("kehl2006"))
-    assert (config.voxels, config.contours.views, config.contours.pairs) == (128, 2, 5)
+    assert (config.voxels, config.contours.views, config.body.waist) == (128, 2, False)
 
 
 def test_an_unknown_preset_is_named() -> None:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from tk.errors import ResultError
 from tk.evaluation import LIMB_JOINTS, evaluate, evaluate_files, trunk_axes
+from tk.evaluation_details import flexion_deg, normal_share
 from tk.io.result import JointTrack, Status
 from tk.model.skeleton import JOINTS
 
@@ -260,3 +261,143 @@ def test_table_and_json_hold_the_same(tmp_path: Path) -> None:
     row = next(line for line in lines if line.startswith("all 15")).split()
     assert row[2:7] == ["6.93", "6.93", "0.0", "100.0", "100.0"]
     assert max(map(len, lines)) <= 100
+
+
+# --- flexion ----------------------------------------------------------------------------------------------------------
+
+
+def bent(flexion: dict[str, float], count: int = 4) -> JointTrack:
+    """A standing person with these joints bent by so many degrees, the lower bone turned forward or back."""
+    p = STANDING.copy()
+    at = {name: index for index, name in enumerate(JOINTS)}
+    for side in "lr":
+        p[at[f"elbow_{side}"]] = p[at[f"shoulder_{side}"]] - [0, 0, 0.3]
+        p[at[f"wrist_{side}"]] = p[at[f"elbow_{side}"]] - [0, 0, 0.25]
+        p[at[f"knee_{side}"]] = p[at[f"hip_{side}"]] - [0, 0, 0.45]
+        p[at[f"ankle_{side}"]] = p[at[f"knee_{side}"]] - [0, 0, 0.4]
+    for name, degrees in flexion.items():
+        end = at[name.replace("knee", "ankle").replace("elbow", "wrist")]
+        angle = np.radians(degrees)
+        length = np.linalg.norm(p[end] - p[at[name]])
+        p[end] = p[at[name]] + length * np.array([np.sin(angle), 0, -np.cos(angle)])
+    return JointTrack(Path("truth.h5"), np.arange(count), np.repeat(p[None], count, axis=0))
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1e-4, 30.0, 90.0, 150.0, 180.0])
+def test_flexion_is_zero_when_straight(degrees: float) -> None:
+    found = flexion_deg(bent({"knee_l": degrees, "elbow_r": -degrees}).positions)
+    np.testing.assert_allclose(found["knee_l"], degrees, atol=1e-9)
+    np.testing.assert_allclose(found["elbow_r"], degrees, atol=1e-9)
+    np.testing.assert_allclose(found["knee_r"], 0, atol=1e-9)
+
+
+def test_flexion_errors_are_told_by_joint_and_kind() -> None:
+    truth = bent({"knee_l": 20, "elbow_l": 40, "elbow_r": 60})
+    result = as_result(bent({"knee_l": 35, "elbow_l": 30, "elbow_r": 60}))
+    found = evaluate(result, truth).flexion
+    assert found["knee_l"].mean_deg == pytest.approx(15) and found["knee_l"].bias_deg == pytest.approx(15)
+    assert found["elbow_l"].mean_deg == pytest.approx(10) and found["elbow_l"].bias_deg == pytest.approx(-10)
+    assert found["knees"].mean_deg == pytest.approx(7.5)
+    assert found["elbows"].mean_deg == pytest.approx(5) and found["elbows"].median_deg == pytest.approx(5)
+    assert set(found) == {"knee_l", "knee_r", "elbow_l", "elbow_r", "knees", "elbows"}
+    assert "knees 7.5° (left 15.0°, right 0.0°)" in evaluate(result, truth).format_table()
+
+
+def test_flexion_that_is_unknown_is_not_averaged_away() -> None:
+    truth = bent({})
+    positions = truth.positions.copy()
+    positions[1, JOINTS.index("ankle_l")] = np.nan
+    positions[2, JOINTS.index("wrist_l")] = positions[2, JOINTS.index("elbow_l")]  # a bone of no length
+    found = evaluate(as_result(truth, positions=positions), truth).flexion
+    assert found["knee_l"].mean_deg == found["knees"].mean_deg == found["elbow_l"].mean_deg == np.inf
+    assert found["knee_l"].median_deg == pytest.approx(0, abs=1e-9) == found["knee_l"].bias_deg
+    assert found["knee_r"].mean_deg == pytest.approx(0, abs=1e-9)
+    gaps = truth.positions.copy()
+    gaps[:, JOINTS.index("ankle_r")] = np.nan
+    unknown = evaluate(as_result(truth), replace(truth, positions=gaps)).flexion
+    assert np.isnan(unknown["knee_r"].mean_deg) and unknown["knees"].mean_deg == pytest.approx(0, abs=1e-9)
+
+
+# --- runs astray ------------------------------------------------------------------------------------------------------
+
+
+def test_the_longest_run_astray() -> None:
+    truth = make_truth()
+    positions = truth.positions.copy()
+    positions[[2, 3, 4], JOINTS.index("wrist_l")] += 0.2
+    positions[4:8, JOINTS.index("ankle_r")] += 0.2  # goes on where the wrist ends: one run from 2 to 7
+    positions[10:18, JOINTS.index("neck")] += 0.5  # not a limb
+    positions[12, JOINTS.index("knee_l")] += 0.2
+    result = as_result(truth, positions=positions)
+    found = evaluate(result, truth)
+    for run in (found.longest_astray, found.longest_astray_raw):
+        assert (run.frames, run.first, run.last) == (6, 2, 7)
+    assert "15 cm off, offset taken off: 6 frames, 2 to 7" in found.format_table()
+    order = np.random.default_rng(0).permutation(20)
+    shuffled = replace(truth, frames=truth.frames[order], positions=truth.positions[order])
+    assert evaluate(result, shuffled).longest_astray == found.longest_astray
+    perfect = evaluate(as_result(truth), truth)
+    assert (perfect.longest_astray.frames, perfect.longest_astray.first) == (0, None)
+    assert "0 frames\n" in perfect.format_table()
+
+
+def test_missing_frames_are_astray_and_unknown_ones_are_not() -> None:
+    truth = make_truth()
+    rows = [0, 1, 2, 7, 8, 9]
+    result = as_result(
+        truth, frames=truth.frames[rows], positions=truth.positions[rows], status=np.zeros(6, dtype=np.uint8)
+    )
+    run = evaluate(result, truth).longest_astray
+    assert (run.frames, run.first, run.last) == (4, 3, 6)
+    gaps = truth.positions.copy()
+    gaps[5] = np.nan
+    run = evaluate(result, replace(truth, positions=gaps)).longest_astray_raw
+    assert (run.frames, run.first, run.last) == (2, 3, 4)
+
+
+# --- sigma ------------------------------------------------------------------------------------------------------------
+
+
+def test_normal_shares_are_those_of_three_dimensions() -> None:
+    lengths = np.linalg.norm(np.random.default_rng(0).normal(size=(200_000, 3)), axis=1)
+    for count in (0.5, 1, 2, 3):
+        assert normal_share(count) == pytest.approx((lengths < count).mean(), abs=0.005)
+    assert (normal_share(1), normal_share(2)) == (pytest.approx(0.1987, abs=1e-4), pytest.approx(0.7385, abs=1e-4))
+
+
+def test_a_result_that_knows_how_sure_it_is() -> None:
+    truth = make_truth(count=400)
+    generator = np.random.default_rng(5)
+    sigma = generator.uniform(0.005, 0.05, size=(400, 15))
+    positions = truth.positions + sigma[..., None] * generator.normal(size=(400, 15, 3))
+    found = evaluate(as_result(truth, positions=positions, sigma=sigma), truth).sigma
+    assert found is not None
+    for shares in found.values():
+        assert shares.raw[1] == pytest.approx(shares.expected[1], abs=0.03)
+        assert shares.raw[2] == pytest.approx(shares.expected[2], abs=0.03)
+        assert shares.corrected[2] == pytest.approx(shares.expected[2], abs=0.03)
+    assert (found["all"].judged, found["limbs"].judged, found["all"].without) == (6000, 4800, 0)
+    boastful = evaluate(as_result(truth, positions=positions, sigma=sigma / 3), truth).sigma
+    assert boastful is not None and boastful["all"].raw[2] < 0.3
+
+
+def test_joints_without_sigma_are_left_out_and_failures_count() -> None:
+    truth = make_truth()
+    sigma = np.full((20, 15), 0.01)
+    sigma[3] = np.nan
+    positions = truth.positions.copy()
+    positions[5, JOINTS.index("wrist_l")] = np.nan
+    result = as_result(truth, positions=positions, sigma=sigma)
+    shares = evaluate(result, truth).sigma
+    assert shares is not None
+    assert (shares["all"].judged, shares["all"].without) == (285, 15)
+    assert shares["all"].raw[2] == pytest.approx(284 / 285) and shares["all"].median_cm == pytest.approx(1)
+    table = evaluate(result, truth).format_table()
+    assert "12 limb: 99.6 % within 1 σ" in table and max(map(len, table.splitlines())) <= 100
+    nothing = evaluate(as_result(truth, sigma=np.full((20, 15), np.nan)), truth).sigma
+    assert nothing is not None and np.isnan(nothing["all"].raw[1]) and nothing["all"].judged == 0
+    assert evaluate(as_result(truth), truth).sigma is None
+    plain = json.loads(evaluate(result, truth).to_json())
+    assert plain["sigma"]["limbs"]["expected"]["1"] == pytest.approx(0.1987, abs=1e-4)
+    assert plain["longest_astray"] == {"frames": 1, "first": 5, "last": 5}
+    assert plain["flexion"]["elbow_l"]["mean_deg"] is None

@@ -18,9 +18,8 @@ CONFIG = Config.from_toml(QUICK)
 
 
 def test_the_hull_is_the_trackers(tk: Tk, tiny: Path, tmp_path: Path) -> None:
-    """Where no camera is overruled: without a body there is nobody to expect."""
     settings, tracked = tmp_path / "settings.toml", tmp_path / "tracked.h5"
-    settings.write_text(QUICK.replace("[tracking]", "[tracking]\noverrule = -1"), encoding="utf-8")
+    settings.write_text(QUICK, encoding="utf-8")
     ran = tk("track", tiny, "-o", tracked, "--config", settings, "--store-hull")
     assert ran.code == 0, ran.err
     reporter = Silent()

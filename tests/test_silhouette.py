@@ -14,8 +14,8 @@ from tk.model.cone_fitting import ConeFitConfig
 from tk.model.gait import walking_pose
 from tk.model.silhouettes import draw_silhouettes
 from tk.model.skeleton import JOINTS
-from tk.silhouette import SilhouetteConfig, SilhouetteTracker
-from tk.tracker import Observation
+from tk.trackers.silhouette import SilhouetteConfig, SilhouetteTracker
+from tk.trackers.base import Observation
 
 STATURE = 1.75
 RIG = ring_of_cameras(3, width=240, height=300)

@@ -13,8 +13,8 @@ from tests.conftest import Silent
 from tk.config import Config
 from tk.io.capture import open_capture
 from tk.io.result import read_joints
-from tk.sequence import track as track_capture
-from tk.silhouette import SilhouetteConfig
+from tk.session import track as track_capture
+from tk.trackers.silhouette import SilhouetteConfig
 
 CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "captures"
 TREADMILL = CAPTURES / "treadmill-slow"

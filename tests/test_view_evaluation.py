@@ -17,10 +17,10 @@ from tk.io.result import read_joints, read_result
 from tk.model.silhouettes import draw_silhouettes
 from tk.model.skeleton import JOINTS
 from tk.model.superellipsoid_silhouettes import draw_body
-from tk.sequence import track
-from tk.silhouette import restore_body
+from tk.session import track
+from tk.trackers.silhouette import restore_body
 from tk.view_evaluation import capture_of, evaluate_views
-from tk.volumetric import restore_body as restore_superellipsoids
+from tk.trackers.volumetric import restore_body as restore_superellipsoids
 
 SETTINGS = """
 [silhouette]

@@ -38,7 +38,7 @@ from tk.config import Config
 from tk.errors import TkError, WorkerError
 from tk.io.capture import Capture
 from tk.segmentation import Labeller, make_labeller
-from tk.tracker import Observation, Stopwatch
+from tk.trackers.base import Observation, Stopwatch
 
 Note = Callable[[str], None]
 #: a frame, and what it took: seconds in "decode", "masks", and how long the tracker had to "wait" for it

@@ -73,9 +73,10 @@ _preset = click.option("--preset", metavar="NAME", help="Settings to begin with:
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="RESULT.h5")
 @click.option(
     "--method",
-    default="volumetric",
+    default="region",
     show_default=True,
-    help="The tracker: volumetric, lm (the same by Levenberg-Marquardt), or silhouette.",
+    type=click.Choice(["region", "silhouette", "volumetric", "lm"]),
+    help="The tracker: region; silhouette and volumetric, the two papers' own; lm, by Levenberg-Marquardt.",
 )
 @_voxels
 @_cameras
@@ -83,6 +84,10 @@ _preset = click.option("--preset", metavar="NAME", help="Settings to begin with:
 @click.option("--seed", type=int, help="Of the random generator.  [default: 0]")
 @_masks
 @click.option("--init-pose", type=click.Path(path_type=Path), metavar="FILE", help="Start from this rough pose (TOML).")
+@click.option(
+    "--body", type=click.Path(path_type=Path), metavar="FILE", help="The body of a result, or of a TOML file."
+)
+@click.option("--causal", is_flag=True, help="Leave it at the first pass: no frame knows of those after it.")
 @click.option("--resume", is_flag=True, help="Go on where an earlier run of the same command stopped.")
 @click.option("--store-hull", is_flag=True, help="Keep the hull's coloured surface in the result.")
 @_preset
@@ -97,20 +102,24 @@ def track(
     seed: int | None,
     masks: str,
     init_pose: Path | None,
+    body: Path | None,
+    causal: bool,
     resume: bool,
     store_hull: bool,
     preset: str | None,
     config_file: Path | None,
 ) -> None:
     """Track the person in CAPTURE and write the pose of every frame to RESULT.h5."""
-    from tk import sequence  # the heavy imports wait until a command needs them
+    from tk import session  # the heavy imports wait until a command needs them
     from tk.io.capture import open_capture
 
     span = _span(frames)
     config = _configuration(config_file, preset, voxels=voxels, seed=seed)
     opened = open_capture(capture, _names(cameras), masks)
     with _Report() as report:
-        summary = sequence.track(opened, output, config, report, method, span, init_pose, resume, store_hull)
+        summary = session.track(
+            opened, output, config, report, method, span, init_pose, resume, store_hull, body, causal
+        )
     rate = summary.tracked_now / summary.seconds if summary.seconds > 0 else 0.0
     if summary.frames:
         click.echo(f"{summary.frames} frames in {output}, {summary.lost} lost, {rate:.1f} frames/s", err=True)
@@ -212,14 +221,14 @@ def demo(output: Path, voxels: int | None) -> None:
     """Track the capture that ships with tk and compare the result with its truth."""
     from importlib.resources import as_file, files
 
-    from tk import sequence
+    from tk import session
     from tk.evaluation import evaluate_files
     from tk.io.capture import open_capture
 
     with as_file(files("tk") / "data" / "demo") as folder:
         click.echo(f"tracking the capture that ships with tk: {folder}", err=True)
         with _Report() as report:
-            summary = sequence.track(open_capture(folder), output, _configuration(None, voxels=voxels), report)
+            summary = session.track(open_capture(folder), output, _configuration(None, voxels=voxels), report)
         if summary.interrupted:
             sys.exit(1)
         click.echo(evaluate_files(output, folder / "truth.h5").format_table())

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import sys
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -16,28 +15,26 @@ from typing import Any, TypeVar
 import tomli_w
 
 from tk.errors import ConfigError
-from tk.kernels.edges import EdgeConfig
-from tk.kernels.objective import ObjectiveSettings
+from tk.io.toml import LARGE, parse_toml, read_text, shown
 from tk.model.appearance import AppearanceConfig
 from tk.model.body import BodyConfig
 from tk.model.contour_term import ContourConfig
 from tk.model.fitting import FitConfig
 from tk.model.foreground import ForegroundConfig
-from tk.model.objective import SamplingConfig
+from tk.model.objective import ObjectiveConfig, SamplingConfig
 from tk.optim.levenberg_marquardt import LmConfig
 from tk.optim.schedule import ScheduleConfig
 from tk.optim.smd import SmdConfig
-from tk.silhouette import SilhouetteConfig
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from tk.trackers.contours import SilhouetteConfig
+from tk.trackers.region import RegionConfig
 
 T = TypeVar("T")
 
 SEGMENTATIONS = ("collinearity", "mog2")
-PRESETS = ("kehl2006", "fast")
+PRESETS = ("kehl2006",)
+
+#: of whatever a configuration counts: frames, points, rounds
+MOST_COUNT = 100_000
 
 
 @dataclass(frozen=True)
@@ -48,30 +45,15 @@ class TrackingConfig:
         prediction: share of the last frame's motion that the next is expected to repeat. The paper does not say how it
             predicts; at 15 Hz an arm turns by up to 31° between frames (its section 7.4).
         init_frames: frames from which the body is fitted.
-        settled_ratio: limbs are looked for elsewhere only in a frame whose objective, after the first pass, exceeds
-            that of the usual frame by this factor; 0 looks in every frame.
-        retry_ratio: a frame whose objective exceeds that of the usual frame by this factor is searched anew.
-        retry_astray: the same for the share of the hull's surface farther than 10 cm from the body: this much more.
         lost_ratio: a frame is lost whose objective exceeds that of the usual frame by this factor.
         lost_astray: a frame is lost, too, when this much more of the hull's surface than usual is farther than 10 cm
             from the body: the body is somewhere, but the person is elsewhere.
-        lost_limb: and when more than this share of the samples of a limb, the head or the torso has no voxel near it.
-        least_voxels: fewer surface voxels than this are no person.
-        overrule: voxels about the expected body in which one camera that carves is overruled by all others; -1 never.
-        overrule_doubt: the same where that camera's pixel may be a shadow as well as the person.
     """
 
     prediction: float = 0.9
     init_frames: int = 4
-    settled_ratio: float = 1.25
-    retry_ratio: float = 1.25
-    retry_astray: float = 0.05
     lost_ratio: float = 3.0
     lost_astray: float = 0.25
-    lost_limb: float = 0.6
-    least_voxels: int = 60
-    overrule: int = 0
-    overrule_doubt: int = 2
 
     def __post_init__(self) -> None:
         if not 0 <= self.prediction <= 1.5 or self.init_frames < 1:
@@ -99,16 +81,16 @@ class Config:
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
     appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
     body: BodyConfig = field(default_factory=BodyConfig)
-    objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)
+    objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     contours: ContourConfig = field(default_factory=ContourConfig)
-    edges: EdgeConfig = field(default_factory=EdgeConfig)
     smd: SmdConfig = field(default_factory=SmdConfig)
     lm: LmConfig = field(default_factory=LmConfig)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     silhouette: SilhouetteConfig = field(default_factory=SilhouetteConfig)
+    region: RegionConfig = field(default_factory=RegionConfig)
 
     def __post_init__(self) -> None:
         if not 8 <= self.voxels <= 512:
@@ -131,11 +113,7 @@ class Config:
         Raises:
             ConfigError: unknown names, wrong types, values out of range; ``where`` names the source.
         """
-        try:
-            values = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
-            raise ConfigError(f"{where}: not valid TOML: {error}") from None
-        return _build(base or Config(), values, where)
+        return _build(base or Config(), parse_toml(text, where, ConfigError), where)
 
     @staticmethod
     def preset(name: str) -> Config:
@@ -152,10 +130,7 @@ class Config:
     @staticmethod
     def read(path: Path, base: Config | None = None) -> Config:
         """A configuration file; what it leaves out is as in ``base``, the defaults if None."""
-        try:
-            return Config.from_toml(path.read_text(encoding="utf-8"), str(path), base)
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path}: cannot be read: {error}") from None
+        return Config.from_toml(read_text(path, ConfigError), str(path), base)
 
 
 def _build(default: T, values: dict[str, Any], where: str, path: str = "") -> T:
@@ -167,6 +142,10 @@ def _build(default: T, values: dict[str, Any], where: str, path: str = "") -> T:
         if key not in known:
             raise ConfigError(f"{where}: unknown setting {name}; known here: {', '.join(known)}")
         old = known[key]
+        if isinstance(value, int) and name != "seed" and abs(value) > MOST_COUNT:
+            raise ConfigError(f"{where}: {name} = {shown(value)} is too large; give {MOST_COUNT} at most")
+        if isinstance(value, float) and math.isfinite(value) and abs(value) > LARGE:
+            raise ConfigError(f"{where}: {name} = {value:g} is too large; give {LARGE:g} at most")
         if dataclasses.is_dataclass(old):
             if not isinstance(value, dict):
                 raise ConfigError(f"{where}: {name} must be a table")
@@ -174,7 +153,7 @@ def _build(default: T, values: dict[str, Any], where: str, path: str = "") -> T:
         elif isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
             changes[key] = float(value)
         elif type(value) is not type(old):
-            raise ConfigError(f"{where}: {name} = {value!r} must be of type {type(old).__name__}, as {old!r} is")
+            raise ConfigError(f"{where}: {name} = {shown(value)} must be of type {type(old).__name__}, as {old!r} is")
         elif isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"{where}: {name} = {value} must be a finite number")
         else:

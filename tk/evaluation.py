@@ -15,6 +15,8 @@ tracking. The corrected figures take it off: the median, a joint and an axis, of
 frames that are not lost, where the columns of ``R_t`` are the axes of the truth's trunk. The truth's, and not the
 estimate's, because only then an offset that is constant vanishes exactly, for the trunk's own joints too, and a wrong
 hip in the estimate does not spoil all other joints. Kehl 2006 reports no errors in centimetres, so this is ours.
+
+What else is told - flexion, runs of bad frames, σ - is defined in :mod:`tk.evaluation_details`.
 """
 
 from __future__ import annotations
@@ -30,14 +32,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ResultError
+from tk.evaluation_details import (
+    ASTRAY_CM,
+    LIMB_JOINTS,
+    FlexionError,
+    Run,
+    SigmaShares,
+    flexion_errors,
+    longest_run,
+    sigma_shares,
+)
 from tk.io.result import JointTrack, Status, read_joints
 from tk.model.skeleton import JOINTS
 
 Float = NDArray[np.float64]
 
-LIMB_JOINTS = tuple(
-    f"{joint}_{side}" for side in "lr" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-)
 PCK_CM = (5, 10, 15)
 
 
@@ -81,6 +90,10 @@ class Evaluation:
         unknown_joints: joints of judged frames that the truth does not know.
         frames_per_second: frames of the whole result over the wall time spent on them; None if not recorded.
         median_frames_per_second: of the median frame: without start-up and compilation.
+        flexion: errors of the flexion by ``knee_l`` … ``elbow_r``, and of all ``knees`` and ``elbows``.
+        longest_astray, longest_astray_raw: the longest run of frames with a limb joint more than 15 cm off, with the
+            joints' offsets taken off and as it is.
+        sigma: how many errors are within 1 and 2 σ, of ``all`` joints and of the ``limbs``; None where there is no σ.
     """
 
     raw: Scores
@@ -95,6 +108,10 @@ class Evaluation:
     unknown_joints: int
     frames_per_second: float | None
     median_frames_per_second: float | None
+    flexion: Mapping[str, FlexionError]
+    longest_astray: Run
+    longest_astray_raw: Run
+    sigma: Mapping[str, SigmaShares] | None
 
     @property
     def lost_share(self) -> float:
@@ -123,7 +140,7 @@ class Evaluation:
         named += [(name, self.raw.joints[name], self.corrected.joints[name]) for name in JOINTS]
         for name, raw, corrected in named:
             lines.append(f"{name:12}{_format_score(raw)}  {_format_score(corrected)}")
-        lines.append("")
+        lines += ["", *self._details(), ""]
         lines.append(
             f"{self.judged} frames judged: {self.lost} lost ({100 * self.lost_share:.1f} %), "
             f"{self.nan_frames} with NaN or missing joints"
@@ -141,6 +158,28 @@ class Evaluation:
                 f"{self.frames_per_second:.1f} frames/s, {self.median_frames_per_second:.1f} by the median frame"
             )
         return "\n".join(lines)
+
+    def _details(self) -> list[str]:
+        """Flexion, the longest run astray, and shares within σ, a line each."""
+        parts = [
+            f"{kind}s {self.flexion[f'{kind}s'].mean_deg:.1f}° "
+            f"(left {self.flexion[f'{kind}_l'].mean_deg:.1f}°, right {self.flexion[f'{kind}_r'].mean_deg:.1f}°)"
+            for kind in ("knee", "elbow")
+        ]
+        run = self.longest_astray
+        where = f", {run.first} to {run.last}" if run.frames else ""
+        lines = [
+            f"flexion, mean error: {', '.join(parts)}",
+            f"longest run with a limb joint over {ASTRAY_CM:g} cm off, offset taken off: {run.frames} frames{where}",
+        ]
+        for name, shares in (self.sigma or {}).items():
+            within, expected = shares.corrected, shares.expected
+            label = {"all": "all 15", "limbs": "12 limb"}[name]
+            lines.append(
+                f"{label}: {100 * within[1]:.1f} % within 1 σ, {100 * within[2]:.1f} % within 2 σ, offset taken off"
+                f" (if normal: {100 * expected[1]:.1f} %, {100 * expected[2]:.1f} %)"
+            )
+        return lines
 
 
 def evaluate_files(result: str | os.PathLike[str], truth: str | os.PathLike[str]) -> Evaluation:
@@ -178,10 +217,19 @@ def evaluate(result: JointTrack, truth: JointTrack) -> Evaluation:
     in_trunk = np.einsum("fki,fjk->fji", axes, difference)
     offsets = _median_where_finite(in_trunk[~lost])  # (J, 3)
     known_trunk = known & np.isfinite(axes.sum(axis=(1, 2)))[:, None]
+    distances = {
+        "raw": _distances(difference, known),
+        "corrected": _distances(in_trunk - offsets, known_trunk),
+    }
+    limbs = [JOINTS.index(name) for name in LIMB_JOINTS]
+    sigma: Float | None = None
+    if result.sigma is not None:
+        sigma = np.full(known.shape, np.nan)
+        sigma[found] = result.sigma[rows[found]]
     mean_rate, median_rate = _frames_per_second(result.seconds)
     return Evaluation(
-        raw=_scores(_distances(difference, known), lost),
-        corrected=_scores(_distances(in_trunk - offsets, known_trunk), lost),
+        raw=_scores(distances["raw"], lost),
+        corrected=_scores(distances["corrected"], lost),
         offsets_cm={name: _triple(100 * offset) for name, offset in zip(JOINTS, offsets, strict=True)},
         judged=len(frames),
         missing_inside=int((~found).sum()),
@@ -192,6 +240,15 @@ def evaluate(result: JointTrack, truth: JointTrack) -> Evaluation:
         unknown_joints=int((~known).sum()),
         frames_per_second=mean_rate,
         median_frames_per_second=median_rate,
+        flexion=flexion_errors(p_result, p_truth),
+        longest_astray=longest_run(frames, distances["corrected"][:, limbs]),
+        longest_astray_raw=longest_run(frames, distances["raw"][:, limbs]),
+        sigma=None
+        if sigma is None
+        else {
+            name: sigma_shares(sigma[:, chosen], distances["raw"][:, chosen], distances["corrected"][:, chosen])
+            for name, chosen in (("all", list(range(len(JOINTS)))), ("limbs", limbs))
+        },
     )
 
 

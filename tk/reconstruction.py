@@ -14,7 +14,7 @@ from tk.io.result import HullPoints
 from tk.model.hull import VisualHull
 from tk.model.volume import VoxelGrid
 from tk.segmentation import make_segmenter
-from tk.sequence import Reporter, choose_frames, points_of
+from tk.session import Reporter, choose_frames, points_of
 
 
 def reconstruct(

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from tk.config import Config
 from tk.io.capture import Capture
 from tk.io.frames import FrameSet
-from tk.model.foreground import CollinearityForeground, Mog2Foreground, median_plate
+from tk.model.foreground import CollinearityForeground
+from tk.model.mog2 import Mog2Foreground
+from tk.model.scene import median_plate
 
 Segmenter = Callable[[FrameSet], NDArray[np.uint8]]
 #: masks, and where they are 0 for what may be the person all the same; None where nobody says
@@ -27,7 +29,7 @@ def make_segmenter(capture: Capture, config: Config, note: Callable[[str], None]
 
 
 def make_labeller(capture: Capture, config: Config, note: Callable[[str], None]) -> Labeller:
-    """The same, and what is doubtful in them (:attr:`tk.tracker.Observation.doubtful`)."""
+    """The same, and what is doubtful in them (:attr:`tk.trackers.base.Observation.doubtful`)."""
     if capture.has_masks:
         return _given_masks
     sizes = [(camera.width, camera.height) for camera in capture.rig]

@@ -20,16 +20,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import CaptureError, ConfigError
+from tk.errors import CaptureError, ConfigError, ResultError
 from tk.evaluation import plain_values
 from tk.io.capture import Capture, open_capture
-from tk.io.result import Result, read_joints, read_result
+from tk.io.result import Result, blamed_on, read_joints, read_result
 from tk.model.camera import Rig
 from tk.model.silhouettes import draw_silhouettes, share_wrong
-from tk.model.skeleton import JOINTS
+from tk.model.skeleton import JOINTS, Skeleton
 from tk.model.superellipsoid_silhouettes import draw_body
-from tk.silhouette import restore_body as restore_cones
-from tk.volumetric import restore_body as restore_superellipsoids
+from tk.trackers.silhouette import restore_body as restore_cones
+from tk.trackers.volumetric import restore_body as restore_superellipsoids
 
 Float = NDArray[np.float64]
 
@@ -143,7 +143,8 @@ def evaluate_views(
     estimate, position = found.joints[rows], true.positions[true_rows]
     used = found.state.get("run/cameras")
     names = None if used is None else [name.strip() for name in str(used).split(",")]
-    error, note = _silhouette_errors(found, opened)
+    with blamed_on(found.path, "the body or a pose"):
+        error, note = _silhouette_errors(found, opened)
     views = []
     for v, camera in enumerate(opened.rig):
         px, share = _pixel_error(Rig((camera,)), estimate, position, joints)
@@ -192,12 +193,22 @@ def _drawn(result: Result, rig: Rig) -> Callable[[int], NDArray[np.uint8]] | Non
     """What draws a row's body, (V, H, W) 0 or 255; None if the result has no body."""
     if "parts/shape" in result.model and "body" in result.model:
         cones = restore_cones(result.model, result.meta.up)
+        _check_poses(result, result.pose, cones.skeleton)
         return lambda row: draw_silhouettes(cones, rig, result.pose[row][None])[0]
     restored = restore_superellipsoids(result)
     if restored is None:
         return None
     body, poses = restored
+    _check_poses(result, poses, body.skeleton)
     return lambda row: draw_body(body, rig, poses[row])
+
+
+def _check_poses(result: Result, poses: Float, skeleton: Skeleton) -> None:
+    """Kernels do not look whether poses (F, D) have as many entries as the body has degrees of freedom."""
+    if poses.shape[1:] != (len(skeleton.names),):
+        raise ResultError(
+            f"{result.path}: a pose has {poses.shape[1]} entries, its body {len(skeleton.names)} degrees of freedom"
+        )
 
 
 def capture_of(truth: str | os.PathLike[str]) -> Path | None:

@@ -13,12 +13,12 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
-from tk import sequence
+from tk import session
 from tk.config import Config
 from tk.io.capture import open_capture
 from tk.io.result import read_joints
 from tk.model.skeleton import JOINTS
-from tk.tracker import Estimate
+from tk.trackers.base import Estimate
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -86,7 +86,7 @@ class Track:
         return int((self.frame_cm > ASTRAY_CM).sum())
 
 
-class _Silent(sequence.Reporter):
+class _Silent(session.Reporter):
     def note(self, text: str) -> None:
         pass
 
@@ -108,7 +108,7 @@ def track(
     truth = read_joints(capture / "truth.h5")
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "result.h5"
-        sequence.track(open_capture(capture, cameras), out, config, _Silent(), method, (0, frames))
+        session.track(open_capture(capture, cameras), out, config, _Silent(), method, (0, frames))
         result = read_joints(out)
         with h5py.File(out) as file:
             pose, units = file["pose"][:], tuple(file["pose"].attrs["units"])
@@ -118,12 +118,6 @@ def track(
     rows = np.searchsorted(truth.frames, result.frames)
     error = 100 * np.linalg.norm(result.positions - truth.positions[rows], axis=2)
     return Track(error, pose, units, iterations, optimise, lost)
-
-
-def plain(config: Config) -> Config:
-    """SMD with the paper's passes only, as Levenberg-Marquardt has them: one start of each chain, no search anew."""
-    schedule = replace(config.schedule, hypotheses=1, wide_hypotheses=1, candidates=0, retries=0, newton_iterations=0)
-    return replace(config, schedule=schedule)
 
 
 def contours(config: Config, **values: Any) -> Config:

@@ -11,16 +11,12 @@ from tk.config import Config
 def variants() -> dict[str, Config]:
     """The cues by name."""
     default = Config()
-    hull = contours(default, edge_weight=0.0, outline_weight=0.0)
-    paper = Config.preset("kehl2006")
+    without = replace(default, objective=replace(default.objective, coverage_weight=0.0))
     return {
-        "surface": replace(hull, objective=replace(hull.objective, coverage_weight=0.0)),
-        "surface, coverage": hull,
-        "surface, coverage, colour edges": contours(hull, edge_weight=1.0),
-        "surface, coverage, outline": contours(hull, outline_weight=1.0),
-        "surface, coverage, outline, colour edges": contours(hull, outline_weight=1.0, edge_weight=1.0),
-        "kehl2006, surface": contours(paper, edge_weight=0.0),
-        "kehl2006, surface, colour edges": paper,
+        "surface": contours(without, edge_weight=0.0),
+        "surface, colour edges": without,
+        "surface, coverage": contours(default, edge_weight=0.0),
+        "surface, coverage, colour edges": default,
     }
 
 

@@ -17,14 +17,14 @@ from scripts.paper.common import Float, Options, plt, save, table
 from tk.config import Config
 from tk.io.capture import open_capture
 from tk.kernels.nearest import SurfaceIndex
-from tk.model.contour_term import ContourTerm, Pictures
+from tk.model.contour_term import ContourTerm
 from tk.model.objective import CHAIN_NAMES, BodyObjective, FrameObjective
 from tk.model.skeleton import with_waist
 from tk.optim import smd
-from tk.optim.schedule import descent_basis
-from tk.sequence import make_segmenter
-from tk.tracker import Observation
-from tk.volumetric import CELL_VOXELS, VolumetricTracker
+from tk.optim.schedule import CHAIN_LEVER_M, descent_basis, max_step
+from tk.session import make_segmenter
+from tk.trackers.base import Observation
+from tk.trackers.volumetric import CELL_VOXELS, VolumetricTracker
 
 ANGLES = ("shoulder_r_pitch", "elbow_r_flexion")
 MOVED_DEG = np.array([18.3, 5.7])
@@ -51,7 +51,7 @@ class Scene:
     def fresh(self, seed: int) -> FrameObjective:
         """The same frame with draws of this seed."""
         f = self.frame
-        return FrameObjective(f.objective, f.index, np.random.default_rng(seed), f.outliers, pictures=f.pictures)
+        return FrameObjective(f.objective, f.index, np.random.default_rng(seed), f.outliers, images=f.images)
 
 
 def look(options: Options, paper: Config) -> Scene:
@@ -73,10 +73,10 @@ def look(options: Options, paper: Config) -> Scene:
     # colours do not confine the neighbours here: the arm's own are what it could not mistake
     every = np.full(len(surface), -1, np.int64)
     index = SurfaceIndex.build(surface.positions, surface.normals, every, CELL_VOXELS * tracker.hull.grid.voxel_m)
-    term = ContourTerm(body, capture.rig, paper.contours, paper.edges) if paper.contours.enabled else None
-    objective = BodyObjective(body, paper.objective, paper.sampling, term)
-    pictures = Pictures(observation.images, observation.masks)
-    frame = FrameObjective(objective, index, np.random.default_rng(0), pictures=pictures)
+    objective = BodyObjective(
+        body, paper.objective.settings, paper.sampling, ContourTerm(body, capture.rig, paper.contours)
+    )
+    frame = FrameObjective(objective, index, np.random.default_rng(0), images=observation.images)
     two = np.array([body.skeleton.index(name) for name in ANGLES])
     return Scene(frame, with_waist(body.skeleton, estimate.pose, estimate.waist), two)
 
@@ -100,9 +100,7 @@ def descend(scene: Scene, start: Float, seed: int, shuffle: bool, config: Config
     free = np.zeros(len(start), bool)
     free[scene.two] = True
     s = config.schedule
-    basis, inverse = descent_basis(
-        frame.curvature(start), free, frame.damping(s.chain_lever_m), replace(s, whiten=False)
-    )
+    basis, inverse = descent_basis(frame.curvature(start), free, frame.damping(CHAIN_LEVER_M), whiten=False)
     tolerance = s.refine * np.where(frame.angular, np.radians(s.tolerance_deg), s.tolerance_m)
     found = smd.minimise(
         frame.chains(np.array([CHAIN]), scene.pose),
@@ -113,7 +111,7 @@ def descend(scene: Scene, start: Float, seed: int, shuffle: bool, config: Config
         basis[None],
         replace(config.smd, shuffle=shuffle),
         keep_path=True,
-        max_step=np.where(frame.angular, np.radians(s.max_step_deg), s.max_step_m),
+        max_step=max_step(frame.angular),
         basis_inverse=inverse[None],
     )
     assert found.path is not None

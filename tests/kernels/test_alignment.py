@@ -7,7 +7,6 @@ import pytest
 
 from tests.kernels.test_contour import BODY, RIG, some_poses
 from tk.kernels import alignment as a
-from tk.kernels.edges import EdgeConfig
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective import ObjectiveSettings
 from tk.model.contour_term import ContourConfig, ContourTerm
@@ -24,7 +23,7 @@ EXACT = 1e-10
 
 
 def kernel_of(dtype=np.float64):
-    term = ContourTerm(BODY, RIG, ContourConfig(), EdgeConfig(), dtype)
+    term = ContourTerm(BODY, RIG, ContourConfig(), dtype=dtype)
     return BodyObjective(BODY, SILENT, SamplingConfig(), term, dtype).kernel
 
 

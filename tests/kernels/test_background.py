@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tk.kernels.background import PAD, STRIP, Planes, level_of
+from tk.kernels.background import BRIGHT, DARK, GREY, Statistic, level_of
 
 SETTINGS = {"darkness_offset": 40.0, "shadow_min": 0.7, "difference_min": 4.0}
+LABELS = {"shadow_max": 0.95, "threshold": 6.0, "octaves_per_neighbour": 0.5, "iterations": 3}
 ONE_LEVEL = 1  # float32 sums in another order may cross the border between two levels
 
 
@@ -38,15 +39,30 @@ def oracle(image, plate, weight, precision, darkness_offset, shadow_min, differe
     return difference, collinearity
 
 
-def measure(images, plates, weights=None, precision=None, **changes):
-    planes = Planes(*images.shape[:3])
+def measure(images, plates, weights=None, precision=None, boxes=None, brightness=None, **changes):
+    """The statistic, the boxes side by side with a column of zeros between them and a frame of zeros around."""
+    count, height, width = images.shape[:3]
     weights = np.ones(images.shape[:3], np.float32) if weights is None else weights
-    precision = np.full(len(images), 0.5, np.float32) if precision is None else precision
-    planes.measure(images, plates, weights, precision, **{**SETTINGS, **changes})
-    return planes
+    precision = np.full(count, 0.5, np.float32) if precision is None else precision
+    boxes = np.array([[0, 0, width, height]] * count if boxes is None else boxes, np.int32)
+    brightness = np.zeros((count, 2), np.float32) if brightness is None else brightness
+    statistic = Statistic(np.ascontiguousarray(images), np.ascontiguousarray(plates), weights)
+    corners, shape = layout(boxes)
+    statistic.measure(precision, brightness, boxes, corners, shape, **{**SETTINGS, **LABELS, **changes})
+    return statistic
 
 
-def scene(seed, shape=(2, STRIP + 5, 17, 3)):
+def layout(boxes):
+    corners = np.array([[1 + sum(boxes[:c, 2] + 1), 1] for c in range(len(boxes))], np.int32)
+    return corners, (int(boxes[:, 3].max()) + 2, int(sum(boxes[:, 2] + 1)) + 1)
+
+
+def pictures(mosaic, width):
+    """(C, H, W) out of the mosaic of whole pictures."""
+    return np.stack([mosaic[1:-1, x : x + width] for x in range(1, mosaic.shape[1] - 1, width + 1)])
+
+
+def scene(seed, shape=(2, 29, 17, 3)):
     """A plate, and a picture with noise, a shadow, something bright, something black and something coloured."""
     rng = np.random.default_rng(seed)
     plates = rng.integers(60, 200, shape)
@@ -54,7 +70,7 @@ def scene(seed, shape=(2, STRIP + 5, 17, 3)):
     images[:, 2:8, 2:8] *= 0.8
     images[:, 10:14, 0:5] += 40
     images[:, 15:20, 10:] = 8
-    images[:, STRIP - 2 : STRIP + 3, 4:9] *= [0.4, 0.7, 1.0]
+    images[:, 22:27, 4:9] *= [0.4, 0.7, 1.0]
     return np.clip(images.round(), 0, 255).astype(np.uint8), plates.astype(np.uint8)
 
 
@@ -64,26 +80,28 @@ def test_levels_match_the_oracle(seed):
     rng = np.random.default_rng(seed)
     weights = rng.uniform(0.3, 1.5, images.shape[:3]).astype(np.float32)
     precision = np.array([0.5, 0.2], np.float32)
-    planes = measure(images, plates, weights, precision)
+    statistic = measure(images, plates, weights, precision)
+    found = pictures(statistic.difference, 17), pictures(statistic.collinearity, 17)
     for c in range(2):
         difference, collinearity = oracle(images[c], plates[c], weights[c], precision[c], **SETTINGS)
         assert 0.1 < np.mean(difference > 0) < 0.9
-        near = np.abs(planes.difference[c].astype(int) - difference) <= ONE_LEVEL
-        near |= np.isin(np.maximum(planes.difference[c], difference), (level_of(4.0), level_of(4.0) + 1))
+        near = np.abs(found[0][c].astype(int) - difference) <= ONE_LEVEL
+        near |= np.isin(np.maximum(found[0][c], difference), (level_of(4.0), level_of(4.0) + 1))
         assert near.all()
-        both = (difference > 0) & (planes.difference[c] > 0)
-        assert np.abs(planes.collinearity[c].astype(int) - collinearity)[both].max() <= ONE_LEVEL
+        both = (difference > 0) & (found[0][c] > 0)
+        assert np.abs(found[1][c].astype(int) - collinearity)[both].max() <= ONE_LEVEL
 
 
 def test_unconfined_statistic_is_the_smaller_eigenvalue():
     images, plates = scene(3, (1, 12, 12, 3))
     images = np.minimum(images, plates)  # nothing brighter: the upper limit of s plays no part
-    planes = measure(images, plates, shadow_min=1e-6)
+    statistic = measure(images, plates, shadow_min=1e-6)
+    difference, collinearity = pictures(statistic.difference, 12)[0], pictures(statistic.collinearity, 12)[0]
     a, b = windows(images[0]), windows(plates[0])
-    for y, x in np.argwhere(planes.difference[0] > 0):
+    for y, x in np.argwhere(difference > 0):
         p, q = np.append(a[y, x], 40.0), np.append(b[y, x], 40.0)
         smaller = np.linalg.eigvalsh(np.array([[p @ p, p @ q], [p @ q, q @ q]]))[0]
-        assert abs(int(planes.collinearity[0, y, x]) - level_of(smaller / 27 * 0.5)) <= ONE_LEVEL
+        assert abs(int(collinearity[y, x]) - level_of(smaller / 27 * 0.5)) <= ONE_LEVEL
 
 
 @settings(deadline=None, max_examples=20)
@@ -91,11 +109,11 @@ def test_unconfined_statistic_is_the_smaller_eigenvalue():
 def test_a_shadow_stays_collinear_and_a_highlight_does_not(factor, seed):
     plates = np.random.default_rng(seed).integers(100, 180, (1, 10, 10, 3)).astype(np.uint8)
     shadow = (plates * factor).round().astype(np.uint8)
-    planes = measure(shadow, plates, darkness_offset=1.0)
-    assert planes.collinearity.max() <= level_of(0.5)
+    statistic = measure(shadow, plates, darkness_offset=1.0)
+    assert statistic.collinearity.max() <= level_of(0.5)
     highlight = np.minimum(plates / factor, 255).round().astype(np.uint8)
-    planes = measure(highlight, plates)
-    np.testing.assert_array_equal(planes.collinearity, planes.difference)
+    statistic = measure(highlight, plates)
+    np.testing.assert_array_equal(statistic.collinearity, statistic.difference)
 
 
 def test_the_offset_keeps_dark_noise_from_firing():
@@ -104,49 +122,73 @@ def test_the_offset_keeps_dark_noise_from_firing():
     small = measure(dark[0], dark[1], darkness_offset=0.5, shadow_min=0.05, difference_min=0.1)
     large = measure(dark[0], dark[1], darkness_offset=40.0, shadow_min=0.05, difference_min=0.1)
     # with the offset the dark windows are compared by their difference
-    assert np.abs(large.collinearity.astype(int) - large.difference).max() <= STRIP // 3
+    assert np.abs(large.collinearity.astype(int) - large.difference).max() <= 8
     assert small.collinearity.astype(int).mean() < large.collinearity.mean()
 
 
 def test_equal_pictures_have_no_difference():
     images, _ = scene(0)
-    planes = measure(images, images)
-    assert not planes.difference.any() and not planes.collinearity.any()
+    statistic = measure(images, images)
+    assert not statistic.difference.any() and not statistic.collinearity.any()
 
 
 def test_measuring_again_leaves_nothing_behind():
     images, plates = scene(0)
-    planes = measure(images, plates)
-    planes.relax(6.0, 0.5, 3)
-    weights, precision = np.ones(images.shape[:3], np.float32), np.full(2, 0.5, np.float32)
-    planes.measure(plates, plates, weights, precision, **SETTINGS)
-    planes.relax(6.0, 0.5, 3)
-    assert not planes.labels.any()
+    statistic = measure(images, plates)
+    assert statistic.labels.any()
+    images[...] = plates
+    boxes = np.array([[0, 0, 17, 29]] * 2, np.int32)
+    again = Statistic(images, plates, np.ones(images.shape[:3], np.float32))
+    for picture in (255 - plates, plates):
+        images[...] = picture
+        again.measure(np.ones(2, np.float32), np.zeros((2, 2), np.float32), boxes, *layout(boxes), **SETTINGS, **LABELS)
+    assert not again.labels.any() and not again.difference.any() and not again.shades.any()
 
 
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 1000), iterations=st.integers(0, 4))
 def test_relaxation_matches_the_oracle(seed, iterations):
-    rng = np.random.default_rng(seed)
-    planes = Planes(2, 9, 11)
-    planes.collinearity[:] = rng.choice([0, 120, 140, 150, 160, 200], (2, 9, 11))
-    levels = planes.collinearity.astype(int)
-    labels = levels >= level_of(6.0)
+    images, plates = scene(seed)
+    statistic = measure(images, plates, threshold=3.0, iterations=iterations)
+    levels = pictures(statistic.collinearity, 17).astype(int)
+    labels = levels >= level_of(3.0)
     for _ in range(iterations):
         padded = np.pad(labels, ((0, 0), (1, 1), (1, 1))).astype(int)
-        count = sum(padded[:, dy : dy + 9, dx : dx + 11] for dy in range(3) for dx in range(3)) - labels
-        labels = (levels > 0) & (levels + 4 * (count - 4) >= level_of(6.0))
-    planes.relax(6.0, 0.5, iterations)
-    np.testing.assert_array_equal(planes.labels, labels)
+        count = sum(padded[:, dy : dy + 29, dx : dx + 17] for dy in range(3) for dx in range(3)) - labels
+        labels = (levels > 0) & (levels + 4 * (count - 4) >= level_of(3.0))
+    np.testing.assert_array_equal(pictures(statistic.labels, 17), labels)
 
 
-def test_the_frame_of_the_planes_stays_empty():
-    images, plates = scene(5)
-    planes = measure(255 - images, plates)
-    planes.relax(6.0, 0.5, 4)
-    for picture, whole in ((planes.labels, planes._labels), (planes.collinearity, planes._collinearity)):
-        assert whole.sum() == picture.sum() > 0
-        assert whole.size >= 2 * (picture.shape[1] + 2 * PAD) * (picture.shape[2] + 2 * PAD)
+@settings(deadline=None, max_examples=20)
+@given(
+    seed=st.integers(0, 100),
+    box=st.tuples(st.integers(0, 10), st.integers(0, 20), st.integers(1, 7), st.integers(1, 9)),
+)
+def test_a_box_is_a_part_of_the_whole(seed, box):
+    """Windows at its edge see what lies beyond it, labels do not."""
+    images, plates = scene(seed)
+    whole = measure(images, plates)
+    left, top, w, h = box
+    part = measure(images, plates, boxes=[box, (0, 0, 0, 0)], iterations=0)
+    for name in ("difference", "collinearity", "shades"):
+        mosaic = getattr(part, name)
+        expected = pictures(getattr(whole, name), 17)[0, top : top + h, left : left + w]
+        np.testing.assert_array_equal(mosaic[1 : 1 + h, 1 : 1 + w], expected)
+        assert mosaic.sum() == expected.sum()  # the frame, and the place of the empty box, stay zero
+    np.testing.assert_array_equal(part.labels, part.collinearity >= level_of(6.0))
+
+
+def test_shades_tell_brighter_and_darker():
+    plates = np.full((1, 12, 30, 3), 120, np.uint8)
+    images = plates.copy()
+    images[:, 2:10, 1:9] = 150
+    images[:, 2:10, 11:19] = 90
+    images[:, 2:10, 21:29] = 118  # too faint for a shadow
+    unit = 9 * sum(GREY)
+    statistic = measure(images, plates, brightness=np.array([[5 * unit, 0]], np.float32), difference_min=0.5)
+    shades = pictures(statistic.shades, 30)[0]
+    assert (shades[3:9, 2:8] == BRIGHT).all() and (shades[3:9, 12:18] == DARK).all()
+    assert (pictures(statistic.difference, 30)[0, 3:9, 22:28] > 0).all() and not shades[3:9, 22:28].any()
 
 
 def test_levels_are_monotonic_and_eight_an_octave():

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.kernels.test_occlusion import AGREEMENT, GRAZING_M, MeshedBody, camera_at, random_pose
-from tk.kernels.contour import BEHIND_M, OUTER_MARGIN_M
+from tests.kernels.test_occlusion import camera_at, random_pose
 from tk.model.anthropometry import BodyDimensions
 from tk.model.body import build_body, neutral_pose
 from tk.model.camera import Camera, Rig
@@ -277,32 +276,3 @@ def test_no_strips_give_no_points_and_wrong_ones_are_named(kernel):
     assert kernel(pose, np.zeros((1, 0), int)).pixels.shape == (1, len(RIG), 0, 2, 2)
     with pytest.raises(IndexError, match="there are 0 to"):
         kernel(pose, np.array([[0, len(STRIPS.piece)]]))
-
-
-def test_outer_points_are_those_beyond_which_a_ray_meets_nothing(kernel):
-    """The ray just beyond the contour, followed behind the body, against ray casting of the meshed pieces."""
-    poses = some_poses(6, seed=11)
-    points = kernel(poses, np.tile(STRIPS.even(6), (len(poses), 1)))
-    assert ((points.outer == 0) | (points.visible == 1)).all() and ((points.visible == 0) | (points.found == 1)).all()
-    agree = total = outer = seen = 0
-    for b, pose in enumerate(poses):
-        meshed = MeshedBody(BODY, pose)
-        T = piece_transforms(BODY, pose)[STRIPS.piece[points.strip[b]]]
-        world = world_points(points, pose, b)
-        for c, center in enumerate(RIG.centers):
-            k, slot = np.nonzero(points.visible[b, c])
-            x, own = world[c, k, slot], STRIPS.piece[points.strip[b, k]]
-            local = np.einsum("nji,nj->ni", T[k, :3, :3], x - T[k, :3, 3])
-            n = np.array([piece_gradient(BODY.pieces[i], q[None])[0] for i, q in zip(own, local, strict=True)])
-            n = np.einsum("nij,nj->ni", T[k, :3, :3], n / np.linalg.norm(n, axis=1, keepdims=True))
-            answers = []
-            for margin in (OUTER_MARGIN_M - GRAZING_M, OUTER_MARGIN_M, OUTER_MARGIN_M + GRAZING_M):
-                beyond = x + margin * n
-                away = (beyond - center) / np.linalg.norm(beyond - center, axis=1, keepdims=True)
-                answers.append(~meshed.hidden(beyond + BEHIND_M * away, own, center))
-            steady = (answers[0] == answers[1]) & (answers[1] == answers[2])
-            same = (points.outer[b, c, k, slot] == 1) == answers[1]
-            agree, total = agree + (same & steady).sum(), total + steady.sum()
-            outer, seen = outer + points.outer[b, c].sum(), seen + len(k)
-    assert seen > 1000 and 0.2 < outer / seen < 0.9, (outer, seen)
-    assert total > 0.9 * seen and agree >= AGREEMENT * total, f"{agree} of {total}"

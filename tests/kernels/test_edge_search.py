@@ -1,15 +1,14 @@
-"""The search along lines against NumPy: pairs (eq. 12), single points (eq. 14), the mask's outline."""
+"""The search along lines against NumPy: pairs (eq. 12) and single points (eq. 14)."""
 
 import numpy as np
 import pytest
 
-from tk.kernels.edge_search import MOST_EDGES, OUTLINE, PAIR, SINGLE, search_edges
+from tk.kernels.edge_search import MOST_EDGES, PAIR, SINGLE, search_edges
 from tk.kernels.edges import EdgeConfig, rgb_gradient
 
 CONFIG = EdgeConfig()
 THRESHOLD = 0.12
 H, W = 48, 64
-EMPTY = np.zeros((1, H, W), np.uint8)
 # float32 of pixels below a hundred
 EXACT_PX = 1e-4
 
@@ -28,31 +27,16 @@ def line(kind, at, other=None, normal=(1.0, 0.0), other_normal=None, reach=8.0, 
     return np.array([[kind, camera, *at, *other, *normal, *other_normal, reach]], np.float32)
 
 
-def search(images, lines, masks=None, mask_edge=0.0, threshold=THRESHOLD, sizes=None):
-    masks = np.zeros(images.shape[:3], np.uint8) if masks is None else masks
+def search(images, lines, threshold=THRESHOLD, sizes=None):
     sizes = np.tile([images.shape[1:3]], (len(images), 1)) if sizes is None else sizes
-    return search_edges(images, masks, np.asarray(sizes, np.int32), lines, threshold, mask_edge, CONFIG)
+    return search_edges(images, np.asarray(sizes, np.int32), lines, threshold, CONFIG)
 
 
-def oracle(gradients, masks, sizes, row, mask_edge, threshold=THRESHOLD):
+def oracle(gradients, sizes, row, threshold=THRESHOLD):
     """(found, a's edge, b's edge) of one line, and whether a choice was too close to call in float32."""
     kind, c = int(row[0]), int(row[1])
     p, q, na, nb, reach = row[2:4], row[4:6], row[6:8], row[8:10], row[10]
     h, w = sizes[c]
-    if kind == OUTLINE:
-        x, y = np.rint(p).astype(int)
-        if not (0 <= x < w and 0 <= y < h):
-            return None, False
-        person = masks[c, y, x] > 127
-        sign = 1.0 if person else -1.0
-        for i in range(1, int(np.ceil(reach)) + 1):
-            u, v = np.rint(p + sign * i * na).astype(int)
-            if not (0 <= u < w and 0 <= v < h):
-                return None, False
-            if (masks[c, v, u] > 127) != person:
-                at = p + sign * (i - 0.5) * na
-                return (at, at), False
-        return None, False
     magnitude, direction = (x[c] for x in gradients)
     length = np.float32(np.linalg.norm(q - p)) if kind == PAIR else np.float32(0)
     u = (q - p) / max(length, 1e-6) if kind == PAIR else na
@@ -61,22 +45,17 @@ def oracle(gradients, masks, sizes, row, mask_edge, threshold=THRESHOLD):
     t = -reach + step * np.arange(steps)
     xy = np.rint(p + t[:, None] * u).astype(int)
     inside = (xy >= 0).all(axis=1) & (xy[:, 0] < w) & (xy[:, 1] < h)
-    strength, gradient, person = np.zeros(steps + 2), np.zeros((steps, 2)), np.full(steps, -1)
+    strength, gradient = np.zeros(steps + 2), np.zeros((steps, 2))
     for i in np.flatnonzero(inside):
         x, y = xy[i]
         gradient[i] = direction[y, x]
         strength[i + 1] = magnitude[y, x] * abs(gradient[i] @ u)
-        person[i] = masks[c, y, x] > 127
     edges = []
     for i in range(steps):
         before, here, after = strength[i : i + 3]
         if here >= threshold and here >= before and here > after:
             x, y = xy[i]
             edges.append((t[i], magnitude[y, x] * abs(gradient[i] @ na), magnitude[y, x] * abs(gradient[i] @ nb)))
-        if mask_edge and i and person[i] >= 0 and person[i - 1] >= 0 and person[i] != person[i - 1]:
-            leaves = person[i] == 0
-            for_a = leaves != (kind == PAIR)
-            edges.append((t[i] - step / 2, mask_edge * for_a, mask_edge * (not for_a)))
     assert len(edges) <= MOST_EDGES
     if kind == SINGLE:
         choices = [(-s, at, at) for at, s, _ in edges if s > 0]
@@ -94,16 +73,14 @@ def oracle(gradients, masks, sizes, row, mask_edge, threshold=THRESHOLD):
     return (p + choices[0][1] * u, p + choices[0][2] * u), close
 
 
-@pytest.mark.parametrize("mask_edge", [0.0, 0.3])
-@pytest.mark.parametrize("kind", [PAIR, SINGLE, OUTLINE])
-def test_search_is_the_slow_one(kind, mask_edge):
+@pytest.mark.parametrize("kind", [PAIR, SINGLE])
+def test_search_is_the_slow_one(kind):
     """Lines of all directions, some over the border, on blocks: two cameras, one smaller than its place."""
     rng = np.random.default_rng(kind)
     small = rng.integers(0, 256, (2, 6, 8, 3)).astype(np.float32)
     images = np.stack([np.kron(s, np.ones((8, 8, 1))) for s in small]).astype(np.uint8)
-    masks = np.stack([np.kron(rng.random((6, 8)) < 0.5, np.ones((8, 8))) for _ in small]).astype(np.uint8) * 255
     sizes = np.array([(H, W), (40, 50)])
-    images[1, 40:], images[1, :, 50:], masks[1, 40:], masks[1, :, 50:] = 0, 0, 0, 0
+    images[1, 40:], images[1, :, 50:] = 0, 0
     count, compared, hits = 150, 0, 0
     rows = np.zeros((count, 11), np.float32)
     rows[:, 0], rows[:, 1] = kind, rng.integers(0, 2, count)
@@ -113,11 +90,11 @@ def test_search_is_the_slow_one(kind, mask_edge):
     rows[:, 8], rows[:, 9] = (np.cos(turn[:, 1]), np.sin(turn[:, 1])) if kind == PAIR else rows[:, 6:8].T
     far = rng.uniform(3, 15, (count, 1)) if kind == PAIR else 0
     rows[:, 4:6] = rows[:, 2:4] + far * -rows[:, 6:8]
-    rows[:, 10] = rng.uniform(2, 25 if kind == OUTLINE else 9, count)
+    rows[:, 10] = rng.uniform(2, 9, count)
     gradient = rgb_gradient(images, CONFIG, sizes)
-    found = search(images, rows, masks, mask_edge, sizes=sizes)
+    found = search(images, rows, sizes=sizes)
     for row, got in zip(rows, found, strict=True):
-        expected, close = oracle(gradient, masks, sizes, row, mask_edge)
+        expected, close = oracle(gradient, sizes, row)
         if close:
             continue
         compared += 1
@@ -162,45 +139,20 @@ def test_an_edge_along_the_line_is_none():
 
 def test_no_edge_no_answer_and_no_lines_no_work():
     flat = picture()
-    for kind in (PAIR, SINGLE, OUTLINE):
+    for kind in (PAIR, SINGLE):
         assert not search(flat, line(kind, (20, 24), (30, 24), (-1, 0), (1, 0))).any()
     assert search(flat, np.zeros((0, 11), np.float32)).shape == (0, 5)
 
 
 @pytest.mark.parametrize("at", [(-30, 24), (W + 30, 24), (30, -30), (30, H + 30), (1, 1), (W - 1, H - 1)])
-@pytest.mark.parametrize("kind", [PAIR, SINGLE, OUTLINE])
+@pytest.mark.parametrize("kind", [PAIR, SINGLE])
 def test_lines_end_at_the_border(kind, at):
-    """The border itself is no edge, of the picture or of the mask."""
-    image, mask = picture((0, W, 0, H, 200)), np.full((1, H, W), 255, np.uint8)
-    assert not search(image, line(kind, at, (at[0] + 5, at[1]), (-1, 0), (1, 0), 12), mask, 0.5).any()
+    """The border itself is no edge."""
+    image = picture((0, W, 0, H, 200))
+    assert not search(image, line(kind, at, (at[0] + 5, at[1]), (-1, 0), (1, 0), 12)).any()
 
 
 def test_a_padded_picture_ends_where_it_ends():
-    image, mask = picture((0, 30, 0, H, 200)), EMPTY.copy()
-    mask[:, :, :30] = 255
-    for kind in (SINGLE, OUTLINE):
-        assert search(image, line(kind, (27, 24)), mask)[0, 0] == 1
-        assert not search(image, line(kind, (27, 24)), mask, sizes=[(H, 30)]).any()
-
-
-@pytest.mark.parametrize(("x", "expected"), [(25, 29.5), (29, 29.5), (30, 29.5), (35, 29.5), (39, None), (20, None)])
-def test_the_outline_is_the_nearest_change_of_the_mask(x, expected):
-    """From inside outwards, from outside inwards, at most ``reach`` away."""
-    mask = EMPTY.copy()
-    mask[:, :, :30] = 255
-    found = search(picture(), line(OUTLINE, (x, 24), reach=8), mask)[0]
-    assert found[0] == (expected is not None)
-    if expected is not None:
-        np.testing.assert_allclose(found[1:], [expected, 24, expected, 24], atol=EXACT_PX)
-
-
-def test_a_masks_edge_counts_only_for_the_side_it_bounds():
-    """Person on the left: it is the outline of what lies left of it."""
-    mask = EMPTY.copy()
-    mask[:, :, :30] = 255
-    assert search(picture(), line(SINGLE, (28, 24), normal=(1, 0)), mask, 0.3)[0, 0] == 1
-    assert not search(picture(), line(SINGLE, (28, 24), normal=(-1, 0)), mask, 0.3).any()
-    mask[:, :, :20] = 0
-    pair = line(PAIR, (22, 24), (32, 24), (-1, 0), (1, 0))
-    np.testing.assert_allclose(search(picture(), pair, mask, 0.3)[0], [1, 19.5, 24, 29.5, 24], atol=EXACT_PX)
-    assert not search(picture(), pair, 255 - mask, 0.3).any(), "a gap between two people is no limb"
+    image = picture((0, 30, 0, H, 200))
+    assert search(image, line(SINGLE, (27, 24)))[0, 0] == 1
+    assert not search(image, line(SINGLE, (27, 24)), sizes=[(H, 30)]).any()

@@ -8,20 +8,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tk.model.appearance import Appearance, AppearanceConfig, to_yuv
+from tk.model.appearance import FLOOR_YUV, LEASH, Appearance, AppearanceConfig, to_yuv
 
 CONFIG = AppearanceConfig()
-# no patch is too rare to constrain, so that colour alone decides
-STRICT = replace(CONFIG, least_share=0.0)
 RED, GREEN, BLUE = np.array([30.0, 30, 200]), np.array([30.0, 200, 30]), np.array([200.0, 30, 30])
 
 
-def learned(config=CONFIG, noise=3.0, seed=0):
+def learned(noise=3.0, seed=0):
     """Three patches, red, green and one that no voxel taught."""
     rng = np.random.default_rng(seed)
     patch = np.repeat([0, 1], 50)
     colors = np.array([RED, GREEN])[patch] + rng.normal(0, noise, (100, 3))
-    return Appearance.learn(3, patch, colors, config), patch, colors
+    return Appearance.learn(3, patch, colors), patch, colors
 
 
 def test_to_yuv_is_opencvs():
@@ -48,24 +46,23 @@ def test_learns_a_gaussian_a_channel():
 def test_a_few_voxels_of_another_colour_do_not_spoil_a_patch():
     clean, patch, colors = learned()
     colors[:10] = BLUE
-    spoilt = Appearance.learn(3, patch, colors, CONFIG)
+    spoilt = Appearance.learn(3, patch, colors)
     assert np.abs(spoilt.mean - clean.mean).max() < 3
     assert np.abs(spoilt.deviation - clean.deviation).max() < 3
 
 
 def test_deviations_have_a_floor_and_otherwise_follow_the_colours():
-    floor = [CONFIG.floor_y, CONFIG.floor_uv, CONFIG.floor_uv]
-    np.testing.assert_array_equal(learned(noise=0.0)[0].deviation[:2], [floor, floor])
+    np.testing.assert_array_equal(learned(noise=0.0)[0].deviation[:2], [FLOOR_YUV, FLOOR_YUV])
     patch = np.zeros(4000, int)
     wide = np.random.default_rng(1).normal(128, 40, (4000, 3))
-    model = Appearance.learn(1, patch, wide, CONFIG)
+    model = Appearance.learn(1, patch, wide)
     np.testing.assert_allclose(model.deviation[0], to_yuv(wide).std(axis=0), rtol=0.08)
 
 
 def test_voxels_fit_their_own_patch():
     model, _, _ = learned()
     colors = np.array([RED, GREEN, BLUE, BLUE])
-    fits = model.segment(colors, np.array([1, 1, 1, 0]), STRICT)
+    fits = model.segment(colors, np.array([1, 1, 1, 0]), CONFIG)
     # the untaught patch fits everything, and what no camera sees fits every patch
     np.testing.assert_array_equal(fits, [0b101, 0b110, 0b100, 0b111])
 
@@ -91,15 +88,17 @@ def test_a_patch_that_hardly_any_voxel_fits_constrains_nothing(red, fits_all):
 
 @given(st.floats(0, 1), st.integers(0, 2**32 - 1))
 @settings(max_examples=30, deadline=None)
-def test_update_is_equation_16(rate, seed):
-    config = replace(CONFIG, rate=rate, leash=1e9)
+def test_update_is_equation_16_within_the_leash(rate, seed):
+    config = replace(CONFIG, rate=rate)
     model, _, _ = learned()
     rng = np.random.default_rng(seed)
     patch, colors = rng.integers(0, 2, 60), rng.uniform(0, 255, (60, 3))
     updated = model.updated(patch, colors, config)
     for p in (0, 1):
         incoming = to_yuv(colors[patch == p]).mean(axis=0)
-        np.testing.assert_allclose(updated.mean[p], (1 - rate) * model.mean[p] + rate * incoming, atol=1e-9)
+        expected = (1 - rate) * model.mean[p] + rate * incoming
+        expected = np.clip(expected, model.mean[p] - LEASH, model.mean[p] + LEASH)
+        np.testing.assert_allclose(updated.mean[p], expected, atol=1e-9)
     np.testing.assert_array_equal(updated.initial, model.initial)
     np.testing.assert_array_equal(updated.deviation, model.deviation)
 
@@ -111,7 +110,7 @@ def test_the_leash_holds_against_a_steady_pull():
     for _ in range(50):
         model = model.updated(np.zeros(20, int), np.tile(BLUE, (20, 1)), CONFIG)
     distance = np.abs(model.mean - start)
-    assert distance[0].max() == pytest.approx(CONFIG.leash)
+    assert distance[0].max() == pytest.approx(LEASH)
     np.testing.assert_allclose(distance[1:], 0, atol=1e-9)
 
 

@@ -10,32 +10,29 @@ import pytest
 from tests.kernels.test_contour import BODY, RIG, piece_transforms, some_poses
 from tk.errors import ConfigError
 from tk.kernels import alignment as a
-from tk.kernels.edges import EdgeConfig
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective import ObjectiveSettings
 from tk.model.camera import Camera, Rig
-from tk.model.contour_term import ContourConfig, ContourTerm, Pictures
+from tk.model.contour_term import ContourConfig, ContourTerm
 from tk.model.objective import BodyObjective, FrameObjective, SamplingConfig
 from tk.model.skeleton import CHAINS, SEGMENTS
 from tk.model.strips import LIMBS
 
-EDGES = ContourConfig(edge_weight=1.0, outline_weight=0.0)
-OUTLINE = ContourConfig(edge_weight=0.0, outline_weight=1.0)
-BOTH = ContourConfig(edge_weight=0.7, outline_weight=1.3)
+EDGES = ContourConfig(edge_weight=1.0)
 TRUTH = some_poses(1, seed=21)[0]
 # rendered from 3 × 10⁴ triangles a piece, sampled at whole pixels, searched at half pixels
 NEAR_PX = 1.5
 
 
-def term_of(config=BOTH, rig=RIG):
-    return ContourTerm(BODY, rig, config, EdgeConfig())
+def term_of(config=EDGES, rig=RIG):
+    return ContourTerm(BODY, rig, config)
 
 
 @functools.cache
 def pictures():
     """The body's pieces as filled polygons on a dark ground: each limb a colour, nearest last."""
     H, W = RIG.frame_shape
-    images, masks = np.full((len(RIG), H, W, 3), 30, np.uint8), np.zeros((len(RIG), H, W), np.uint8)
+    images = np.full((len(RIG), H, W, 3), 30, np.uint8)
     colors = np.random.default_rng(0).integers(90, 256, (len(SEGMENTS), 3))
     T = piece_transforms(BODY, TRUTH)
     for c, camera in enumerate(RIG):
@@ -46,8 +43,7 @@ def pictures():
             hull = cv2.convexHull(camera.project(x @ T[i][:3, :3].T + T[i][:3, 3])[0].astype(np.float32))
             polygon = np.rint(hull * 16).astype(np.int32)
             cv2.fillPoly(images[c], [polygon], colors[SEGMENTS.index(piece.segment)].tolist(), shift=4)
-            cv2.fillPoly(masks[c], [polygon], 255, shift=4)
-    return Pictures(images, masks)
+    return images
 
 
 def residual_px(entries, pose, b=0):
@@ -92,12 +88,14 @@ def test_colour_edges_are_looked_for_in_the_views_with_the_fewest_hidden_points(
     assert fewer, "all views were alike: nothing was tested"
 
 
-def test_limbs_only_have_colour_edges_and_all_parts_an_outline():
+def test_limbs_only_have_edges():
     limbs = {int(BODY.skeleton.segment_dof[SEGMENTS.index(s)]) for s in LIMBS}
-    edges, outline = assigned(term_of(EDGES), TRUTH)[0], assigned(term_of(OUTLINE), TRUTH)[0]
-    assert {int(k) for k in edges[0, :, a.LAST_DOF]} == limbs
-    trunk = {int(BODY.skeleton.segment_dof[SEGMENTS.index(s)]) for s in ("torso", "head")}
-    assert trunk <= {int(k) for k in outline[0, :, a.LAST_DOF]}
+    term = term_of()
+    head = list(CHAINS).index("head")
+    for chosen in (term.draw(None)[None], term.draw_chains(None)[[head]]):
+        entries = term.assign(pictures(), TRUTH[None], chosen)[0]
+        found = {int(k) for k in entries[entries[:, a.STATE] != a.ABSENT, a.LAST_DOF]}
+        assert found == (limbs if len(chosen[0]) > 20 else set())
 
 
 @pytest.mark.parametrize("hidden", [1.0, 0.25])
@@ -119,41 +117,39 @@ def test_hidden_points_cost_and_pull_nowhere(hidden):
     assert lost > 0
 
 
-@pytest.mark.parametrize("config", [EDGES, OUTLINE, BOTH])
-def test_weights_sum_to_the_cues_weights(config):
+def test_weights_sum_to_the_terms_weight():
+    config = replace(EDGES, edge_weight=0.7)
     entries, _ = assigned(term_of(config), some_poses(3, seed=24))
     scale = np.where(entries[..., a.STATE] == a.ABSENT, 0, entries[..., a.SCALE])
-    np.testing.assert_allclose(scale.sum(axis=1), config.edge_weight + config.outline_weight, rtol=1e-5)
+    np.testing.assert_allclose(scale.sum(axis=1), 0.7, rtol=1e-5)
     assert (scale >= 0).all()
 
 
-def test_the_truth_explains_its_own_outline_and_edges():
-    for config, near, unfound in ((OUTLINE, 0.95, 0.02), (EDGES, 0.6, 0.2)):
-        entries, _ = assigned(term_of(replace(config, hidden=0.0)), TRUTH)
-        entries = entries[:, entries[0, :, a.SCALE] > 0]  # hidden points can have no edge
-        distance = residual_px(entries, TRUTH)
-        assert np.isnan(distance).mean() <= unfound
-        assert np.mean(distance[~np.isnan(distance)] < NEAR_PX) > near
+def test_the_truth_explains_its_own_edges():
+    entries, _ = assigned(term_of(replace(EDGES, hidden=0.0)), TRUTH)
+    entries = entries[:, entries[0, :, a.SCALE] > 0]  # hidden points can have no edge
+    distance = residual_px(entries, TRUTH)
+    assert np.isnan(distance).mean() <= 0.2
+    assert np.mean(distance[~np.isnan(distance)] < NEAR_PX) > 0.6
 
 
 def test_pictures_pull_a_displaced_body_back():
-    """Each cue's value grows, and its gradient points uphill, as an arm is turned away."""
+    """The value grows, and its gradient points uphill, as an arm is turned away."""
     index = SurfaceIndex.build(np.full((1, 3), 50.0), np.zeros((1, 3)), np.full(1, -1), 0.1)
     silent = ObjectiveSettings(coverage_weight=0.0, reach_m=1e-6)
-    for config in (OUTLINE, EDGES):
-        body = BodyObjective(BODY, silent, SamplingConfig(), term_of(config))
-        frame = FrameObjective(body, index, np.random.default_rng(0), pictures=pictures())
-        for axis in (0, 2):
-            for sign in (-1, 1):
-                pose = TRUTH.copy()
-                pose[axis] += sign * 0.04
-                assert frame.value(pose) > frame.value(TRUTH)
-                gradient = frame.full()(pose[None], np.zeros((1, len(pose))), 0).gradient[0]
-                assert sign * gradient[axis] > 0, (config, axis, sign)
+    body = BodyObjective(BODY, silent, SamplingConfig(), term_of())
+    frame = FrameObjective(body, index, np.random.default_rng(0), images=pictures())
+    for axis in (0, 2):
+        for sign in (-1, 1):
+            pose = TRUTH.copy()
+            pose[axis] += sign * 0.04
+            assert frame.value(pose) > frame.value(TRUTH)
+            gradient = frame.full()(pose[None], np.zeros((1, len(pose))), 0).gradient[0]
+            assert sign * gradient[axis] > 0, (axis, sign)
 
 
 def test_a_batch_is_its_poses_one_by_one():
-    term = term_of(BOTH)
+    term = term_of()
     poses = some_poses(3, seed=25)
     chosen = np.stack([term.draw(np.random.default_rng(i)) for i in range(3)])
     together = term.assign(pictures(), poses, chosen)
@@ -194,14 +190,13 @@ def test_a_body_that_nobody_sees_has_no_entries():
         np.diag([-1.0, 1, -1]) @ looks_away.rotation,
         np.diag([-1.0, 1, -1]) @ looks_away.translation,
     )
-    term = term_of(BOTH, Rig((turned,)))
-    nothing = Pictures(pictures().images[:1], pictures().masks[:1])
-    entries = term.assign(nothing, TRUTH[None], term.draw(None)[None])
+    term = term_of(EDGES, Rig((turned,)))
+    entries = term.assign(pictures()[:1], TRUTH[None], term.draw(None)[None])
     assert not (entries[..., a.STATE] != a.ABSENT).any()
 
 
 @pytest.mark.parametrize(
-    "bad", [{"edge_weight": -1.0}, {"views": 0}, {"pairs": 0}, {"reach_m": 0.0}, {"along": 1.5}, {"outline_nu": 0.0}]
+    "bad", [{"edge_weight": -1.0}, {"views": 0}, {"pairs": 0}, {"reach_m": 0.0}, {"hidden": -1.0}, {"nu": 0.0}]
 )
 def test_bad_settings_are_refused(bad):
     with pytest.raises(ConfigError, match=f"contours.{next(iter(bad))}"):

@@ -9,8 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tk.errors import CaptureError, ConfigError
-from tk.model.foreground import CollinearityForeground, ForegroundConfig, Mog2Foreground, median_plate
+from tk.model.foreground import CollinearityForeground, ForegroundConfig
+from tk.model.mog2 import Mog2Foreground
 from tk.model.regions import clean_by_area
+from tk.model.scene import median_plate
 
 CAPTURES = Path(__file__).parents[3] / "shared" / "captures"
 SHAPE = (120, 160)
@@ -99,7 +101,7 @@ def test_a_shadow_is_doubtful_and_the_scene_and_the_person_are_not(learner):
     assert not (doubtful & (masks > 0)).any()
     assert not doubtful[1, :, SIZES[1][0] :].any() and not doubtful[1, SIZES[1][1] :].any()
     shade, elsewhere = np.zeros(SHAPE, bool), np.ones(SHAPE, bool)
-    shade[82:91, 24:56] = True  # without its soft edge
+    shade[82:91, 52:56] = True  # next to the person, without its soft edge
     elsewhere[65:105, :95] = False
     assert doubtful[0][shade].mean() > 0.9
     assert doubtful[0][elsewhere & ~truth[0]].mean() < 0.02
@@ -236,7 +238,7 @@ def test_wrong_clips_are_refused(learned):
 
 @pytest.mark.parametrize(
     "change",
-    [{"threshold": -1.0}, {"threshold": float("nan")}, {"shadow_min": 1.5}, {"shadow_min": 0.0}, {"reduction": 1.5}],
+    [{"threshold": -1.0}, {"threshold": float("nan")}, {"shadow_min": 1.5}, {"shadow_min": 0.0}, {"rim": 1.5}],
 )
 def test_wrong_configuration_is_refused(change):
     with pytest.raises(ConfigError, match=next(iter(change))):

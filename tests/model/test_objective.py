@@ -17,6 +17,7 @@ from tk.model.objective import (
     CHAIN_OF_SEGMENT,
     BodyObjective,
     FrameObjective,
+    ObjectiveConfig,
     SamplingConfig,
     even,
     pick,
@@ -250,18 +251,6 @@ def test_pools_are_the_chains_own_voxels_and_nobodys(frame, truth):
         assert nobody <= set(pool) <= set(fit.voxels)
 
 
-def test_chain_values_are_least_at_the_truth(frame, truth):
-    frame.chains(ALL_CHAINS, truth)
-    poses = np.repeat(truth[None], 5, 0)
-    moved = poses.copy()
-    for c in ALL_CHAINS:
-        moved[c, frame.free[c]] += 0.25
-    moved = frame.constrain(moved)
-    best = frame.chain_values(ALL_CHAINS, poses)
-    assert (frame.chain_values(ALL_CHAINS, moved) > best).all()
-    np.testing.assert_array_equal(best, frame.chain_values(ALL_CHAINS, poses))
-
-
 def test_constrain_is_the_skeletons_clip(frame):
     poses = np.random.default_rng(0).uniform(-6, 6, (4, D))
     np.testing.assert_array_equal(frame.constrain(poses), SKELETON.clip(poses))
@@ -288,7 +277,6 @@ def test_without_coverage_no_voxel_counts(index, truth):
     assert len(fit.linear.residual) == len(fit.samples) and not fit.astray.any() and fit.value < 0.1
     result = frame.chains(ALL_CHAINS, truth)(np.repeat(truth[None], 5, 0), np.zeros((5, D)), 0)
     assert np.isfinite(result.value).all()
-    assert np.isfinite(frame.chain_values(ALL_CHAINS, np.repeat(truth[None], 5, 0))).all()
 
 
 def test_sigma_zero_takes_the_limbs_diameter(index, truth):
@@ -360,4 +348,18 @@ def test_a_stiff_waist_costs_its_square_with_the_derivatives_to_it(index, truth)
     a, b = (FrameObjective(o, index, np.random.default_rng(0)) for o in (soft, stiff))
     np.testing.assert_allclose(b.curvature(pose[0]) - a.curvature(pose[0]), np.diag(k), atol=1e-12)
     np.testing.assert_allclose(b.value(pose[0]) - a.value(pose[0]), cost, atol=1e-12)
-    np.testing.assert_allclose(b.gradient(pose[0]) - a.gradient(pose[0]), k * pose[0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "bad", [{"nu": 0.0}, {"tangential": 1.5}, {"min_cosine": -2.0}, {"coverage_weight": -1.0}, {"surface_weight": -1.0}]
+)
+def test_bad_objectives_are_refused(bad):
+    with pytest.raises(ConfigError, match=f"objective.{next(iter(bad))}"):
+        ObjectiveConfig(**bad)
+
+
+def test_the_kernel_takes_the_settings():
+    settings = ObjectiveConfig(nu=0.5, tangential=0.2, min_cosine=0.1, coverage_weight=0.4, surface_weight=0.9).settings
+    assert (settings.nu, settings.coverage_nu) == (0.5, 1.0)
+    assert (settings.tangential, settings.coverage_weight, settings.surface_weight) == (0.2, 0.4, 0.9)
+    assert settings.min_cosine == settings.coverage_cosine == 0.1

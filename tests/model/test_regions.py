@@ -20,20 +20,22 @@ def levels(mask, value):
     return np.where(mask, level_of(value), 0).astype(np.uint8)
 
 
+def join(mask, seen, statistic, reach=20.0, starts=(0,)):
+    return joined(mask, seen, statistic, np.array(starts), seed=64.0, least=20, reach=reach, width=4)
+
+
 def test_edges_of_shadows_are_unsure_and_sharp_outlines_certain():
     labels = boxes((slice(5, 7), slice(5, 50)))
     difference = boxes((slice(5, 20), slice(5, 50)))
     plain = levels(difference, 200.0)
-    certain, unsure = without_penumbrae(labels, plain, levels(labels, 20.0), 0.2, 8.0)
-    assert not certain.any() and np.array_equal(unsure, difference)
-    certain, unsure = without_penumbrae(labels, plain, levels(labels, 80.0), 0.2, 8.0)
-    assert np.array_equal(certain, labels) and np.array_equal(unsure, difference & ~labels)
+    assert not without_penumbrae(labels, plain, levels(labels, 20.0), 0.2, 8.0).any()
+    np.testing.assert_array_equal(without_penumbrae(labels, plain, levels(labels, 80.0), 0.2, 8.0), labels)
 
 
 @pytest.mark.parametrize("statistic, is_certain", [(4.0, False), (20.0, True)])
 def test_a_thick_region_is_certain_where_it_is_strong(statistic, is_certain):
     labels = boxes((slice(5, 20), slice(5, 50)))
-    certain, _ = without_penumbrae(labels, levels(labels, 500.0), levels(labels, statistic), 0.2, 8.0)
+    certain = without_penumbrae(labels, levels(labels, 500.0), levels(labels, statistic), 0.2, 8.0)
     assert certain.any() == is_certain
 
 
@@ -57,18 +59,36 @@ def test_a_hand_is_joined_through_what_differs_only():
     hand = boxes((slice(18, 24), slice(36, 44)))
     arm = boxes((slice(18, 24), slice(20, 36)))
     strong = levels(body | hand, 100.0)
-    bridged = joined(body | hand, arm, strong, 64.0, 20, 20.0, 4)
+    bridged = join(body | hand, arm, strong)
     assert bridged[21, 20:36].all() and not (bridged & ~(body | hand | arm)).any()
     for seen, reach in ((arm & False, 20.0), (arm, 10.0)):
-        np.testing.assert_array_equal(joined(body | hand, seen, strong, 64.0, 20, reach, 4), body | hand)
+        np.testing.assert_array_equal(join(body | hand, seen, strong, reach), body | hand)
+
+
+def test_pictures_side_by_side_are_not_joined():
+    """Each has a largest part of its own, which stays however weak it is."""
+    body, other = boxes((slice(10, 30), slice(5, 20))), boxes((slice(18, 28), slice(26, 36)))
+    seen = boxes((slice(0, 40), slice(0, 60)))
+    mask = body | other
+    np.testing.assert_array_equal(join(mask, seen, levels(body, 100.0), starts=(0, 22)), mask)
+    np.testing.assert_array_equal(join(mask, seen, levels(body, 100.0)), body)
+    assert join(mask, seen, levels(mask, 100.0)).sum() > mask.sum()
+    np.testing.assert_array_equal(join(mask, seen, levels(mask, 100.0), starts=(0, 22)), mask)
+
+
+def test_what_is_cut_is_not_enclosed():
+    patch = boxes((slice(10, 20), slice(10, 20)))
+    around = boxes((slice(7, 23), slice(7, 23))) & ~patch
+    np.testing.assert_array_equal(enclosed(patch, around, 0.6), patch)
+    assert not enclosed(patch, around, 0.6, boxes((slice(19, 20), slice(0, 60)))).any()
 
 
 def test_weak_parts_go_but_never_the_largest():
     body, edge = boxes((slice(10, 30), slice(5, 20))), boxes((slice(33, 36), slice(30, 50)))
     weak = levels(body | edge, 10.0)
-    np.testing.assert_array_equal(joined(body | edge, body, weak, 64.0, 20, 5.0, 4), body)
+    np.testing.assert_array_equal(join(body | edge, body, weak, 5.0), body)
     strong = levels(body | edge, 100.0)
-    np.testing.assert_array_equal(joined(body | edge, body, strong, 64.0, 20, 5.0, 4), body | edge)
+    np.testing.assert_array_equal(join(body | edge, body, strong, 5.0), body | edge)
 
 
 def test_the_rim_goes_where_it_shows_the_scene():

@@ -17,7 +17,6 @@ from tk.model.skeleton import (
     WAIST,
     build_skeleton,
     shoulder_angles,
-    turn_trunk,
     twist_exp,
     up_rotation,
     with_waist,
@@ -168,27 +167,6 @@ def test_without_a_waist_all_limbs_keep_their_directions(up):
         away = np.linalg.norm(plain.joints(told) - skeleton.joints(pose), axis=1).max()
         assert away < 0.25 * np.linalg.norm(waist) + 1e-9
         np.testing.assert_allclose(with_waist(skeleton, told, waist), pose, atol=1e-9)
-
-
-@pytest.mark.parametrize("angle", [-1.4, 0.3])
-def test_a_trunk_is_turned_above_legs_that_stay(angle):
-    """Trunk, head and arms turn about the upright axis; pelvis and legs keep their orientation."""
-    rng = np.random.default_rng(3)
-    for skeleton in (SKELETON, build_skeleton(DIMENSIONS, waist=True)):
-        for _ in range(5):
-            # small angles: the hips take up the turn, and are unique only within their ranges
-            pose = rng.uniform(-0.25, 0.25, len(skeleton.names))
-            before, after = (
-                skeleton.segment_transforms(p)[:, :3, :3] for p in (pose, turn_trunk(skeleton, pose, angle))
-            )
-            up = skeleton.T_world_body[:3, :3] @ [0, 0, 1]
-            turn = twist_exp(up, np.zeros(3), angle)[:3, :3]
-            for k, segment in enumerate(SEGMENTS):
-                stays = segment.startswith(("thigh", "calf"))
-                if segment != "pelvis":
-                    np.testing.assert_allclose(
-                        after[k], before[k] if stays else turn @ before[k], atol=1e-9, err_msg=segment
-                    )
 
 
 def test_chains_and_torso_share_out_the_degrees_of_freedom():

@@ -20,7 +20,7 @@ from scripts.figure4_edges import (
     rgb_edges,
     run,
 )
-from tk.kernels.edges import EdgeConfig
+from tk.kernels.edges import HIGH
 
 WALK = Path(__file__).resolve().parents[3] / "shared" / "captures" / "walk"
 
@@ -50,7 +50,7 @@ def test_a_picture_is_split_into_outline_shadow_and_clothes() -> None:
 
 def test_colour_edges_skip_shadow_and_find_the_outline() -> None:
     picture = describe(*scene())
-    threshold = np.array([EdgeConfig().high])
+    threshold = np.array([HIGH])
     colour = measure([picture], Detector("rgb", rgb_edges, threshold))
     grey = measure([picture], Detector("grey", grey_canny, np.array([100.0])))
     assert colour.recall[0] == grey.recall[0] == 1

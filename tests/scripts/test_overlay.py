@@ -17,7 +17,7 @@ from tk.model.anthropometry import BodyDimensions
 from tk.model.body import build_body, neutral_pose
 from tk.model.camera import Camera
 from tk.model.skeleton import JOINTS
-from tk.volumetric import restore_body
+from tk.trackers.volumetric import restore_body
 
 DEMO = Path(__file__).resolve().parents[2] / "tk" / "data" / "demo"
 BODY = build_body(BodyDimensions.from_stature(1.7))

@@ -20,6 +20,9 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 #: a reciprocal condition number below this is a singular intrinsic matrix: focal lengths of 10^-9 of the rest
 _SINGULAR = 1e-9
 
+#: pixels of a side of a picture
+_MOST_PIXELS = 2**16
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -99,6 +102,8 @@ def _camera(key: str, values: Mapping[str, object], path: Path, unit_m: float) -
     size = table.array("size", (2,))
     if (size <= 0).any() or (size != np.round(size)).any():
         table.fail(f"size = {values['size']} must be two positive whole numbers [width, height]")
+    if (size > _MOST_PIXELS).any():
+        table.fail(f"size = {values['size']} is too large; {_MOST_PIXELS} pixels a side are the most")
 
     matrix = table.array("matrix", (3, 3))
     if np.linalg.cond(matrix) > 1 / _SINGULAR:

@@ -1,21 +1,278 @@
-"""Opening HDF5 files that others may have made."""
+"""Opening and reading HDF5 files that anybody may have made, or that are damaged.
+
+Everything in the file is looked over before anything is read: only groups and datasets that lie in the file itself, no
+links to elsewhere, no storage outside, no more data declared than the file can hold. What is then read has the type and
+the shape that were asked for. HDF5 and h5py raise nearly any exception for a damaged file; here all of them become a
+:class:`~tk.errors.ResultError` of one line.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import math
+import mmap
+import os
+import struct
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, NoReturn
 
 import h5py
+import numpy as np
+from numpy.typing import NDArray
 
-from tk.errors import ResultError
+from tk.errors import ResultError, TkError
+
+#: groups and datasets in a file, groups within groups, bytes of an attribute: far more than a result has
+MOST_OBJECTS, DEEPEST, MOST_ATTRIBUTE_BYTES = 10_000, 12, 2**20
+
+#: filters that only compress or check: deflate, shuffle, Fletcher's checksum, and h5py's LZF
+FILTERS = (1, 2, 3, 32000)
+
+#: compressed data may unfold to so many times what is stored; so many bytes may be declared though nothing is stored
+#: (HDF5 stores no parts that nobody wrote)
+MOST_UNFOLDED, MOST_UNWRITTEN_BYTES = 100, 2**16
+
+_HEAP = b"GCOL\x01\x00\x00\x00"  # how a heap of texts begins: signature, version, reserved
+
+_NUMBERS = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.ENUM)  # h5py stores bool as an enumeration
+_KINDS = {"f": "fiu", "i": "iuf", "u": "iuf", "b": "biu"}  # what may be stored where a kind is asked for
 
 
-def open_hdf5(path: Path) -> h5py.File:
-    """Open for reading. Without locks: a published result is never written to."""
+class Hdf5Reader:
+    """An open file that has been looked over. Make one with :func:`open_hdf5`.
+
+    Attributes:
+        path: the file.
+        shapes: the shape of every dataset, by its name without a leading slash.
+        groups: the names of all groups.
+    """
+
+    def __init__(self, path: Path, file: h5py.File) -> None:
+        self.path = path
+        self.shapes: dict[str, tuple[int, ...]] = {}
+        self.groups: set[str] = {""}
+        self._file = file
+        self._bytes = path.stat().st_size
+        with self._guarded("/"):
+            _check_text_heaps(path, file)
+            self._survey()
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.shapes or name in self.groups
+
+    def fail(self, message: str) -> NoReturn:
+        """Raise a ResultError about this file."""
+        raise ResultError(f"{self.path}: {message}")
+
+    def below(self, group: str) -> list[str]:
+        """The names of the datasets below a group, relative to it, sorted."""
+        return sorted(name[len(group) + 1 :] for name in self.shapes if name.startswith(f"{group}/"))
+
+    def array(
+        self, name: str, dtype: str, shape: tuple[int | None, ...], most: float = math.inf, missing: str = ""
+    ) -> NDArray[Any]:
+        """A dataset of numbers.
+
+        Args:
+            name: of the dataset.
+            dtype: numpy's name of the type that is wanted.
+            shape: that is wanted; None stands for any length.
+            most: the largest magnitude that makes sense; NaN and infinity pass.
+            missing: what to say if there is no such dataset.
+
+        Raises:
+            ResultError: it is not there, of another shape, not of numbers that fit the type, or out of range.
+        """
+        if name not in self.shapes:
+            self.fail(missing or f"has no /{name}; the file is damaged")
+        found, wanted = self.shapes[name], np.dtype(dtype)
+        if len(found) != len(shape) or any(b is not None and a != b for a, b in zip(found, shape, strict=True)):
+            expected = "×".join("any" if length is None else str(length) for length in shape) or "one number"
+            self.fail(f"/{name} has shape {'×'.join(map(str, found)) or 'one number'}; {expected} is expected")
+        values = self._numbers(name)
+        if values.dtype.kind not in _KINDS[wanted.kind]:
+            self.fail(f"/{name} holds {values.dtype}; {wanted} is expected")
+        finite = values[np.isfinite(values)]
+        if wanted.kind in "iu":
+            limits = np.iinfo(wanted)
+            if len(finite) < values.size or (finite != np.round(finite)).any():
+                self.fail(f"/{name} holds numbers that are not whole")
+            low, high = max(float(limits.min), -most), min(float(limits.max), most)
+        else:
+            low, high = (0.0, 1.0) if wanted.kind == "b" else (-most, most)
+        outside = finite[(finite < low) | (finite > high)]
+        if len(outside):
+            self.fail(f"/{name} holds {outside[0]:g}, which is out of range; the file is damaged")
+        return values.astype(wanted)
+
+    def value(self, name: str) -> Any:
+        """A dataset of a few numbers or of texts, as h5py gives it."""
+        with self._guarded(name):
+            dataset = self._file[name]
+            is_text = dataset.id.get_type().get_class() == h5py.h5t.STRING
+            value = dataset[()] if is_text else self._numbers(name)[()]
+            if dataset.attrs.get("encoding") == "utf-8":
+                return np.asarray(value, dtype=np.uint8).tobytes().decode()
+            return value.decode() if isinstance(value, bytes) else value
+
+    def attribute(self, holder: str, name: str) -> Any:
+        """An attribute of a dataset or group: texts, numbers, or arrays of them; None if it is not there."""
+        with self._guarded(f"{holder}, attribute {name},"):
+            held = self._file[f"/{holder}"]
+            if name not in held.attrs:
+                return None
+            found = held.attrs.get_id(name)
+            size = math.prod(found.shape) * found.get_type().get_size()
+            if found.get_type().get_class() not in (*_NUMBERS, h5py.h5t.STRING) or size > MOST_ATTRIBUTE_BYTES:
+                self.fail(f"the attribute {name} of /{holder} is neither text nor numbers; the file is damaged")
+            value = held.attrs[name]
+            return value.decode() if isinstance(value, bytes) else value
+
+    def text(self, holder: str, name: str, default: str | None = None) -> str:
+        """An attribute that is one text."""
+        value = self.attribute(holder, name)
+        if value is None and default is not None:
+            return default
+        if not isinstance(value, str):
+            self._no_attribute(holder, name, "a text")
+        return value
+
+    def number(self, holder: str, name: str) -> float:
+        """An attribute that is one finite number."""
+        value = self.attribute(holder, name)
+        if np.ndim(value) or not isinstance(value, (int, float, np.integer, np.floating)) or not math.isfinite(value):
+            self._no_attribute(holder, name, "a number")
+        return float(value)
+
+    def names(self, holder: str, name: str) -> tuple[str, ...]:
+        """An attribute that is a list of texts."""
+        value = self.attribute(holder, name)
+        listed = [item.decode("utf-8", "replace") if isinstance(item, bytes) else item for item in np.atleast_1d(value)]
+        if value is None or np.ndim(value) > 1 or not all(isinstance(item, str) for item in listed):
+            self._no_attribute(holder, name, "a list of texts")
+        return tuple(str(item) for item in listed)
+
+    def _no_attribute(self, holder: str, name: str, expected: str) -> NoReturn:
+        self.fail(f"/{holder} has no attribute {name} that is {expected}; the file is damaged")
+
+    def _numbers(self, name: str) -> NDArray[Any]:
+        """A dataset whose type is one of numbers, each NaN the usual one: others make numpy warn later."""
+        with self._guarded(name):
+            dataset = self._file[name]
+            kind = dataset.dtype.kind if dataset.id.get_type().get_class() in _NUMBERS else "?"
+            if kind not in "fiub" or dataset.dtype.itemsize > 8:
+                self.fail(f"/{name} does not hold numbers; the file is damaged")
+            values = np.asarray(dataset[()])
+            return np.where(np.isnan(values), np.asarray(np.nan, values.dtype), values) if kind == "f" else values
+
+    @contextlib.contextmanager
+    def _guarded(self, name: str) -> Iterator[None]:
+        try:
+            with np.errstate(all="ignore"):
+                yield
+        except TkError:
+            raise
+        except Exception as error:
+            what = f"/{name} cannot be read; the file is damaged" if name != "/" else "is damaged"
+            raise ResultError(f"{self.path}: {what}") from error
+
+    def _survey(self) -> None:
+        waiting: list[tuple[str, int]] = [("", 0)]
+        while waiting:
+            name, depth = waiting.pop()
+            if depth > DEEPEST:
+                self.fail(f"/{name}: groups lie within each other more than {DEEPEST} deep; the file is damaged")
+            group = h5py.h5g.open(self._file.id, f"/{name}".encode())
+            for link in self._links(group, name):
+                path = f"{name}/{link}" if name else link
+                kind = h5py.h5o.get_info(group, link.encode()).type
+                if kind == h5py.h5o.TYPE_GROUP:
+                    self.groups.add(path)
+                    waiting.append((path, depth + 1))
+                elif kind == h5py.h5o.TYPE_DATASET:
+                    self.shapes[path] = self._check_storage(path, h5py.h5d.open(group, link.encode()))
+                if len(self.shapes) + len(self.groups) > MOST_OBJECTS:
+                    self.fail(f"holds more than {MOST_OBJECTS} groups and datasets; the file is damaged")
+
+    def _links(self, group: h5py.h5g.GroupID, name: str) -> list[str]:
+        """The names in a group, all of them of things in this file."""
+        found: list[str] = []
+
+        def take(link: bytes, info: h5py.h5l.LinkInfo) -> None:
+            text = link.decode()
+            if info.type != h5py.h5l.TYPE_HARD:
+                self.fail(f"/{name}{'/' if name else ''}{text} is a link to elsewhere; copy what it stands for")
+            if len(found) >= MOST_OBJECTS:
+                self.fail(f"holds more than {MOST_OBJECTS} groups and datasets; the file is damaged")
+            found.append(text)
+
+        group.links.iterate(take, info=True)
+        return found
+
+    def _check_storage(self, name: str, dataset: h5py.h5d.DatasetID) -> tuple[int, ...]:
+        """The shape of a dataset whose data lie in this file, and not more of them than it can hold."""
+        made = dataset.get_create_plist()
+        layout = made.get_layout()
+        if layout not in (h5py.h5d.COMPACT, h5py.h5d.CONTIGUOUS, h5py.h5d.CHUNKED) or made.get_external_count():
+            self.fail(f"/{name} lies in another file; copy it into this one")
+        shape = tuple(int(length) for length in dataset.shape)
+        item = int(dataset.get_type().get_size())
+        stored = int(dataset.get_storage_size())
+        filters = [made.get_filter(index)[0] for index in range(made.get_nfilters())]
+        if any(code not in FILTERS for code in filters):
+            self.fail(f"/{name} is compressed in a way that is not read here; write it with gzip or without")
+        most = max(stored * (MOST_UNFOLDED if filters else 1), MOST_UNWRITTEN_BYTES)
+        declared = item * math.prod(shape)
+        if layout == h5py.h5d.CHUNKED and declared:
+            declared = max(declared, item * math.prod(made.get_chunk()))
+        if stored > self._bytes or declared > most:
+            self.fail(f"/{name} declares {declared} bytes, and {stored} are stored; the file is damaged")
+        return shape
+
+
+def _check_text_heaps(path: Path, file: h5py.File) -> None:
+    """Walk through the heaps that hold texts of any length, as HDF5 will.
+
+    HDF5 (2.0.0 and before) goes round for ever in a heap with an object of no size. The layout: section III.E of the
+    HDF5 file format specification.
+
+    Raises:
+        ResultError: a heap is damaged.
+    """
+    if file.id.get_create_plist().get_sizes() != (8, 8):
+        raise ResultError(f"{path}: has addresses of another length than 8 bytes; write it anew with another HDF5")
+    with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        start = data.find(_HEAP)
+        while start >= 0:
+            if len(data) - start >= 16:
+                (size,) = struct.unpack_from("<Q", data, start + 8)
+                end = start + min(size, len(data) - start)
+                at = start + 16
+                while end - at >= 16:
+                    index, length = struct.unpack_from("<H6xQ", data, at)
+                    taken = 16 + (length + 7) // 8 * 8 if index else length  # object 0 is the free space
+                    if not 0 < taken <= end - at:
+                        raise ResultError(f"{path}: the heap of its texts is damaged")
+                    at += taken
+            start = data.find(_HEAP, start + 1)
+
+
+@contextlib.contextmanager
+def open_hdf5(path: Path) -> Iterator[Hdf5Reader]:
+    """Open for reading, and look it over. Without locks: a published result is never written to.
+
+    Raises:
+        ResultError: no such file, not HDF5, or it cannot be trusted.
+    """
     if not path.is_file():
-        raise ResultError(f"{path}: is a folder; name a file" if path.is_dir() else f"{path}: no such file")
+        reason = "is a folder; name a file" if path.is_dir() else "is not a file"
+        raise ResultError(f"{path}: {reason if os.path.lexists(path) else 'no such file'}")
     try:
-        return h5py.File(path, "r", locking=False)
+        file = h5py.File(path, "r", locking=False)
     except PermissionError:
         raise ResultError(f"{path}: no permission to read it") from None
-    except OSError:
-        raise ResultError(f"{path}: is not an HDF5 file, or is damaged") from None
+    except Exception as error:  # almost any, if it is damaged
+        raise ResultError(f"{path}: is not an HDF5 file, or is damaged") from error
+    with file:
+        yield Hdf5Reader(path, file)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tk import __version__
 from tk.errors import ResultError
 from tk.io.capture import Capture
+from tk.io.hdf5 import open_hdf5
 from tk.io.result import HullPoints
 from tk.model.volume import VoxelGrid
 
@@ -153,9 +154,9 @@ def check_hull_path(path: Path) -> None:
     if not path.exists():
         return
     try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("format") == HULL_FORMAT:
+        with open_hdf5(path) as file:
+            if file.attribute("", "format") == HULL_FORMAT:
                 return
-    except OSError:
+    except ResultError:
         pass
     raise ResultError(f"{path}: exists and is not a {HULL_FORMAT} file; it is not overwritten: choose another name")

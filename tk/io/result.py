@@ -36,9 +36,26 @@ from tk.io.result_data import (
     UsedCameras,
     Value,
 )
-from tk.io.result_files import Workshop, as_result_error, check_is_result, move_to_memory, open_for_writing, writable
+from tk.io.result_files import (
+    WRITE_ERRORS,
+    Workshop,
+    as_result_error,
+    check_is_result,
+    move_to_memory,
+    open_for_writing,
+    writable,
+)
 from tk.io.result_layout import Row, Twin, put_cameras, put_model, write_layout
-from tk.io.result_read import check_format, read_joints, read_meta, read_result, read_values
+from tk.io.result_read import (
+    blamed_on,
+    check_format,
+    check_hull,
+    count_rows,
+    read_joints,
+    read_meta,
+    read_result,
+    read_values,
+)
 from tk.io.result_revision import revise_result
 
 __all__ = [
@@ -56,6 +73,7 @@ __all__ = [
     "Status",
     "UsedCameras",
     "Value",
+    "blamed_on",
     "read_joints",
     "read_result",
     "revise_result",
@@ -120,10 +138,18 @@ class ResultWriter:
         if not target.exists():
             return cls.create(path, meta), 0
         with open_hdf5(target) as done:
-            check_format(done, target)
-            difference = read_meta(done, target).difference(meta)
+            check_format(done)
+            found = read_meta(done)
+            try:
+                difference = found.difference(meta)
+            except ResultError as reason:
+                done.fail(f"{reason}; run without --resume to start afresh")
             if difference:
-                raise ResultError(f"{target}: was made differently: {difference}; run without --resume to start afresh")
+                done.fail(f"was made differently: {difference}; run without --resume to start afresh")
+            rows = count_rows(done, found)
+            check_hull(done, rows)
+            if "resume/rows" in done:
+                done.array("resume/rows", "int64", (), most=rows)
             state, model = read_values(done, "resume/state"), read_values(done, "model")
         with as_result_error(target), contextlib.ExitStack() as undo:
             workshop = undo.enter_context(Workshop(target))
@@ -235,6 +261,6 @@ class ResultWriter:
             if news:
                 twin.append(news)
             twin.file.flush()
-        except (OSError, RuntimeError):
+        except WRITE_ERRORS:
             move_to_memory(twin.file)
             raise

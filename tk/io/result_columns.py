@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 
 from tk.io.result_data import FOOT_POINTS, STATUS_MEANING, FrameResult, ResultMeta
 
+#: no number in a result makes sense beyond these: metres from the world's origin, anything else, a frame's number
+FAR_M, LARGE, LAST_FRAME = 1e6, 1e12, 10**9
+LAST_STATUS = len(STATUS_MEANING) - 1
+
 
 @dataclass(frozen=True)
 class Column:
@@ -20,11 +24,13 @@ class Column:
     Attributes:
         shape, dtype: of a row.
         attributes: of the dataset: a text, or a list of texts.
+        most: the largest magnitude of a number that makes sense.
     """
 
     shape: tuple[int, ...]
     dtype: str
     attributes: Mapping[str, str | Sequence[str]] = field(default_factory=dict)
+    most: float = LARGE
 
     def checked(self, name: str, values: Any, rows: int | None = None) -> NDArray[Any]:
         """A copy of a row (or of so many rows) in this column's type.
@@ -43,12 +49,17 @@ def columns_of(meta: ResultMeta) -> dict[str, Column]:
     """The columns of a result, by the names of their datasets."""
     joints = meta.joint_names
     columns = {
-        "frames": Column((), "i8"),
+        "frames": Column((), "i8", most=LAST_FRAME),
         "time": Column((), "f8"),
         "pose": Column((len(meta.pose_names),), "f8", {"names": meta.pose_names, "units": meta.pose_units}),
-        "joints/position": Column((len(joints), 3), "f8", {"names": joints}),
-        "status": Column((), "u1", {"meaning": tuple(f"{value}: {text}" for value, text in enumerate(STATUS_MEANING))}),
-        "objective": Column((), "f8", {"kind": meta.objective_kind} if meta.objective_kind else {}),
+        "joints/position": Column((len(joints), 3), "f8", {"names": joints}, FAR_M),
+        "status": Column(
+            (),
+            "u1",
+            {"meaning": tuple(f"{value}: {text}" for value, text in enumerate(STATUS_MEANING))},
+            LAST_STATUS,
+        ),
+        "objective": Column((), "f8", {"kind": meta.objective_kind} if meta.objective_kind else {}, np.inf),
         "iterations": Column((len(meta.stages),), "i4", {"stages": meta.stages}),
         **{f"timing/{stage}": Column((), "f8") for stage in meta.timing_stages},
     }
@@ -56,13 +67,13 @@ def columns_of(meta: ResultMeta) -> dict[str, Column]:
         if names:
             columns[name] = Column((len(names),), "f8", {"names": names, "units": ("rad",) * len(names)})
     if meta.sigma:
-        columns["joints/sigma"] = Column((len(joints),), "f8", {"names": joints})
+        columns["joints/sigma"] = Column((len(joints),), "f8", {"names": joints}, FAR_M)
     if meta.fit_cameras:
         columns["fit_error"] = Column((len(meta.fit_cameras),), "f8", {"cameras": meta.fit_cameras})
     if meta.segment_names:
         columns["segments/rotation"] = Column((len(meta.segment_names), 4), "f8", {"names": meta.segment_names})
     if meta.feet:
-        columns["feet/position"] = Column((len(FOOT_POINTS), 3), "f8", {"names": FOOT_POINTS})
+        columns["feet/position"] = Column((len(FOOT_POINTS), 3), "f8", {"names": FOOT_POINTS}, FAR_M)
     for angles in meta.angles:
         columns[f"angles/{angles.joint}"] = Column(
             (len(angles.names),), "f8", {"names": angles.names, "convention": angles.convention}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
@@ -12,13 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.errors import ResultError
+from tk.io.toml import parse_toml
 from tk.model.camera import Rig
 from tk.model.skeleton import JOINTS
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 FORMAT = "tk-result"
 FORMAT_VERSION = 2
@@ -138,7 +134,8 @@ class ResultMeta:
         if self.angles != other.angles:
             both = [", ".join(angles.joint for angles in meta.angles) or "none" for meta in (self, other)]
             return f"angles are {both[0]}; not {both[1]}" if both[0] != both[1] else "angles differ in their convention"
-        return _config_difference(tomllib.loads(self.config_toml), tomllib.loads(other.config_toml))
+        mine, others = (parse_toml(meta.config_toml, "config", ResultError) for meta in (self, other))
+        return _config_difference(mine, others)
 
 
 #: fields of Result by the name of their dataset, for those that can be smoothed; `/angles` have a field for all

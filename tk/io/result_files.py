@@ -64,6 +64,10 @@ class Workshop:
 # --- files and their errors -------------------------------------------------------------------------------------------
 
 
+#: what h5py raises for a full disk, a lost folder, or a file that turns out to be damaged
+WRITE_ERRORS = (OSError, RuntimeError, KeyError, ValueError, TypeError)
+
+
 def open_for_writing(path: Path, mode: str) -> h5py.File:
     # "earliest": newer superblocks carry a flag "being written" that a killed process leaves set, and the file then
     # refuses to open. No locks: readers of the published twin must not be kept out.
@@ -74,7 +78,7 @@ def check_is_result(target: Path) -> None:
     """Refuse to replace what is not a result of any version."""
     try:
         with open_hdf5(target) as file:
-            if file.attrs.get("format") == FORMAT:
+            if file.attribute("", "format") == FORMAT:
                 return
     except ResultError:
         pass
@@ -102,7 +106,7 @@ def as_result_error(target: Path) -> Iterator[None]:
     """The system's and HDF5's refusals as one line; HDF5 reports a full disk as either of the two types."""
     try:
         yield
-    except (OSError, RuntimeError) as error:
+    except WRITE_ERRORS as error:
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         system = re.search(r"error message = '([^']+)'", reason)
         reason = system[1] if system else reason

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from tk.io.result_columns import columns_of, put_attributes, row_of, strings
 from tk.io.result_data import FORMAT, FORMAT_VERSION, FrameResult, HullPoints, ResultMeta, UsedCameras, Value
-from tk.io.result_read import encode, read_values
 
 CHUNK_SECONDS = 1.5  # rows of a chunk: few enough to be rewritten each frame, enough to be read back fast
 HULL_CHUNK = 8192  # voxels: some seconds of frames at 64³, a few frames at 128³
@@ -62,7 +61,7 @@ class Twin:
         self.cameras_version = 0
         self._has_smoothed = "smoothed" in file
         self._open: dict[str, h5py.h5d.DatasetID] = {}
-        self._state_names = set(read_values(file, "resume/state"))
+        self._state_names = _dataset_names(file, "resume/state")
         self._put_last: dict[str, tuple[object, bytes]] = {}  # most of a state is the same in every frame
 
     def append(self, news: Sequence[Row]) -> None:
@@ -80,9 +79,10 @@ class Twin:
 
     def drop_rows_without_state(self, meta: ResultMeta) -> None:
         """Cut a resumed file back to the frame that its state belongs to."""
-        if "resume/rows" not in self.file or self.file["resume/rows"][()] >= self.rows:
+        rows = int(self.file["resume/rows"][()]) if "resume/rows" in self.file else self.rows
+        if rows >= self.rows:
             return
-        self.rows = int(self.file["resume/rows"][()])
+        self.rows = rows
         for name in columns_of(meta):
             self.file[name].resize(self.rows, axis=0)
         self._drop_smoothed()
@@ -214,6 +214,18 @@ def put_cameras(file: h5py.File, cameras: UsedCameras) -> None:
     group["size"] = np.array([(camera.width, camera.height) for camera in cameras.rig], dtype=np.int64)
     group["fisheye"] = np.array([camera.fisheye for camera in cameras.rig], dtype=np.uint8)
     group["time_offset"] = np.array(cameras.time_offset_s, dtype=np.float64)
+
+
+def encode(value: Value) -> NDArray[Any]:
+    """A value as an array that HDF5 can hold in place: text becomes its UTF-8 bytes."""
+    return np.frombuffer(value.encode(), dtype=np.uint8) if isinstance(value, str) else np.asarray(value)
+
+
+def _dataset_names(file: h5py.File, group: str) -> set[str]:
+    names: set[str] = set()
+    if group in file:
+        file[group].visititems(lambda name, item: names.add(name) if isinstance(item, h5py.Dataset) else None)
+    return names
 
 
 def _create_growing(file: h5py.File, name: str, shape: tuple[int, ...], dtype: str, rows: int) -> h5py.Dataset:

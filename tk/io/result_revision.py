@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 from tk.io.hdf5 import open_hdf5
 from tk.io.result_columns import Column, columns_of, put_attributes
 from tk.io.result_data import FORMAT_VERSION, ResultMeta, UsedCameras, Value, can_be_smoothed
-from tk.io.result_files import Workshop, as_result_error, move_to_memory, open_for_writing, writable
+from tk.io.result_files import WRITE_ERRORS, Workshop, as_result_error, move_to_memory, open_for_writing, writable
 from tk.io.result_layout import put_cameras, put_model
-from tk.io.result_read import check_format, read_meta
+from tk.io.result_read import check_format, count_rows, read_meta
 
 
 def revise_result(
@@ -52,33 +52,33 @@ def revise_result(
     """
     target = writable(Path(path))
     with open_hdf5(target) as file:
-        check_format(file, target)
-        meta = read_meta(file, target)
-        rows = len(file["frames"])
+        check_format(file)
+        meta = read_meta(file)
+        rows = count_rows(file, meta)
     known = columns_of(meta)
     changed = {name: _column(known, name).checked(name, values, rows) for name, values in (columns or {}).items()}
     filtered = None if smoothed is None else _smoothed_values(known, smoothed, rows)
     with as_result_error(target), Workshop(target) as workshop:
         revised = workshop.twin_paths[0]
         shutil.copyfile(target, revised)
-        with open_for_writing(revised, "r+") as file:
+        with open_for_writing(revised, "r+") as copy:
             try:
-                file.attrs["format_version"] = FORMAT_VERSION
+                copy.attrs["format_version"] = FORMAT_VERSION
                 for name, values in changed.items():
-                    file[name][...] = values
-                if (changed or filtered is not None) and "smoothed" in file:
-                    del file["smoothed"]
+                    copy[name][...] = values
+                if (changed or filtered is not None) and "smoothed" in copy:
+                    del copy["smoothed"]
                 for name, values in (filtered or {}).items():
-                    dataset = file.create_dataset(f"smoothed/{name}", data=values)
+                    dataset = copy.create_dataset(f"smoothed/{name}", data=values)
                     if name in known:
                         put_attributes(dataset, known[name])
                 if model is not None:
-                    put_model(file, model)
+                    put_model(copy, model)
                 if cameras is not None:
-                    put_cameras(file, cameras)
-                file.flush()
-            except (OSError, RuntimeError):
-                move_to_memory(file)
+                    put_cameras(copy, cameras)
+                copy.flush()
+            except WRITE_ERRORS:
+                move_to_memory(copy)
                 raise
         with revised.open("rb") as stream:
             os.fsync(stream.fileno())

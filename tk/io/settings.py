@@ -18,6 +18,12 @@ UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 #: known initialisation poses; "any" promises none
 INIT_POSES = ("da-vinci", "any")
 
+#: frames a second, from one picture in 100 s to the fastest cameras
+FPS_RANGE = (0.01, 1e5)
+
+#: metres: the largest side of a working volume, and how far away its middle may be
+_MOST_VOLUME_M, _FARTHEST_M = 1000.0, 1e6
+
 _KEYS: dict[str, tuple[str, ...]] = {
     "volume": ("center", "size"),
     "subject": ("height",),
@@ -65,6 +71,8 @@ def read_settings(path: Path) -> CaptureSettings:
     fps = document.number("fps") if "fps" in document else None
     if fps is not None and fps <= 0:
         document.fail(f"fps = {fps:g} must be positive")
+    if fps is not None and not FPS_RANGE[0] <= fps <= FPS_RANGE[1]:
+        document.fail(f"fps = {fps:g} must be between {FPS_RANGE[0]:g} and {FPS_RANGE[1]:g}")
 
     up = document.text("up", "z").strip().lower().removeprefix("+")
     if up not in UP_AXES:
@@ -101,6 +109,8 @@ def _volume(table: Table) -> Volume:
     size = table.array("size", (3,))
     if (size <= 0).any():
         table.fail(f"size = {size.tolist()} is empty; give three positive lengths in metres")
+    if (size > _MOST_VOLUME_M).any() or (np.abs(center) > _FARTHEST_M).any():
+        table.fail(f"center = {center.tolist()}, size = {size.tolist()}: is too large or too far away; give metres")
     return Volume(_triple(center), _triple(size))
 
 

@@ -1,35 +1,69 @@
-"""Read TOML tables with errors that name the file and the key."""
+"""Read TOML tables with errors that name the file and the key. Every number has a bound."""
 
 from __future__ import annotations
 
 import importlib
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import CaptureError
+from tk.errors import CaptureError, TkError
 
 # the standard library has a reader from Python 3.11 on; tomli is the same code for 3.10
 _toml = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 
 
-def load_toml(path: Path, error: type[CaptureError] = CaptureError) -> dict[str, Any]:
+#: no number that a person writes down is larger, in whatever unit
+LARGE = 1e9
+
+#: bytes of a TOML file: a calibration has some hundred a camera
+_MOST_BYTES = 2**24
+
+
+def load_toml(path: Path, error: type[TkError] = CaptureError) -> dict[str, Any]:
     """The document in ``path``. Raises ``error`` when it cannot be read or is not TOML."""
+    return parse_toml(read_text(path, error), str(path), error)
+
+
+def read_text(path: Path, error: type[TkError] = CaptureError) -> str:
+    """The text of a small file. Raises ``error`` when it cannot be read, is no file (a pipe would never end) or large.
+
+    Reads a byte order mark as Windows editors leave it.
+    """
     try:
-        text = path.read_bytes().decode("utf-8-sig")  # Windows editors leave a byte order mark
+        if path.exists() and not path.is_file():
+            raise error(f"{path}: cannot be read (it is not a file)")
+        if path.stat().st_size > _MOST_BYTES:
+            raise error(f"{path}: has more than {_MOST_BYTES // 2**20} MiB; it is not a file that a person wrote")
+        return path.read_bytes().decode("utf-8-sig")
     except OSError as reason:
         raise error(f"{path}: cannot be read ({reason.strerror or reason})") from None
     except UnicodeDecodeError:
         raise error(f"{path}: is not UTF-8 text") from None
+
+
+def parse_toml(text: str, where: str, error: type[TkError] = CaptureError) -> dict[str, Any]:
+    """The document in ``text``; raises ``error``, which names it by ``where``, when it is not TOML."""
     try:
         return _toml.loads(text)
-    except _toml.TOMLDecodeError as reason:
-        raise error(f"{path}: invalid TOML: {' '.join(str(reason).split())}") from None
+    except ValueError as reason:  # TOMLDecodeError, or Python's own for a number of thousands of digits
+        raise error(f"{where}: invalid TOML: {' '.join(str(reason).split())}") from None
+    except RecursionError:
+        raise error(f"{where}: invalid TOML: lists or tables lie too deep within each other") from None
+
+
+def shown(value: object) -> str:
+    """A value for a message: short, whatever it is."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python writes no numbers of thousands of digits
+        return "a number of thousands of digits"
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 class Table:
@@ -41,7 +75,7 @@ class Table:
         error: the exception class to raise.
     """
 
-    def __init__(self, values: Mapping[str, Any], where: str, error: type[CaptureError] = CaptureError) -> None:
+    def __init__(self, values: Mapping[str, Any], where: str, error: type[TkError] = CaptureError) -> None:
         self.values = values
         self.where = where
         self.error = error
@@ -64,32 +98,36 @@ class Table:
         """The string ``key``, not empty."""
         value = self.values.get(key, default)
         if not isinstance(value, str) or not value.strip():
-            self.fail(f"{key} = {value!r} must be a text that is not empty")
+            self.fail(f"{key} = {shown(value)} must be a text that is not empty")
         return value
 
     def flag(self, key: str, default: bool) -> bool:
         value = self.values.get(key, default)
         if not isinstance(value, bool):
-            self.fail(f"{key} = {value!r} must be true or false")
+            self.fail(f"{key} = {shown(value)} must be true or false")
         return value
 
     def integer(self, key: str, default: int) -> int:
         value = self.values.get(key, default)
         if isinstance(value, bool) or not isinstance(value, int):
-            self.fail(f"{key} = {value!r} must be a whole number")
+            self.fail(f"{key} = {shown(value)} must be a whole number")
+        if abs(value) > LARGE:
+            self.fail(f"{key} = {shown(value)} is too large; give {LARGE:.0e} at most")
         return value
 
     def number(self, key: str, default: float | None = None) -> float:
-        """The finite number ``key``; it must be there when no ``default`` is given."""
+        """The number ``key``, at most :data:`LARGE`; it must be there when no ``default`` is given."""
         value = self.values.get(key, default)
         if value is None:
             self.fail(f"{key} is missing")
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            self.fail(f"{key} = {value!r} must be a finite number")
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or _is_endless(value):
+            self.fail(f"{key} = {shown(value)} must be a finite number")
+        if abs(value) > LARGE:
+            self.fail(f"{key} = {shown(value)} is too large; give {LARGE:.0e} at most")
         return float(value)
 
     def array(self, key: str, *shapes: tuple[int, ...]) -> NDArray[np.float64]:
-        """The finite numbers ``key`` as an array of one of these shapes."""
+        """The numbers ``key``, each at most :data:`LARGE`, as an array of one of these shapes."""
         if key not in self.values:
             self.fail(f"{key} is missing")
         value = self.values[key]
@@ -98,11 +136,26 @@ class Table:
         if shape is None or shape not in shapes:
             found = "something else" if shape is None else "×".join(map(str, shape)) or "one number"
             self.fail(f"{key} must be {wanted} numbers, and is {found}")
-        result = np.array(value, dtype=np.float64)
-        if not np.isfinite(result).all():
-            bad = result[~np.isfinite(result)][0]
-            self.fail(f"{key} holds {bad}; every number must be finite")
-        return result
+        for number in _flat(value):
+            if _is_endless(number):
+                self.fail(f"{key} holds {number}; every number must be finite")
+            if abs(number) > LARGE:
+                self.fail(f"{key} holds {shown(number)}, which is too large; give {LARGE:.0e} at most")
+        return np.array(value, dtype=np.float64)
+
+
+def _is_endless(value: float) -> bool:
+    """Infinite or NaN; a whole number never is, however large."""
+    return isinstance(value, float) and not math.isfinite(value)
+
+
+def _flat(value: Any) -> Iterator[float]:
+    """The numbers in nested lists."""
+    if isinstance(value, (int, float)):
+        yield value
+    else:
+        for item in value:
+            yield from _flat(item)
 
 
 def _shape(value: object) -> tuple[int, ...] | None:

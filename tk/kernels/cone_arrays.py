@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from tk.kernels.kinematics import load_rotation, load_translation
 from tk.kernels.runtime import ti
 
-# Degrees of freedom above a part: the trunk's six and at most four of a limb.
-LONGEST_CHAIN = 10
+# Degrees of freedom above a part: the trunk's six, the waist's three, a leg's four and the ankle's two.
+LONGEST_CHAIN = 15
 # Nearer than this to a camera nothing is projected, metres.
 NEAREST_M = 0.1
 

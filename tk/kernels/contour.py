@@ -44,11 +44,7 @@ from tk.kernels.superellipsoid import power
 # Strips that one parallel task handles, each task with its own forward kinematics (some microseconds).
 STRIPS_PER_TASK = 10
 
-FOUND, VISIBLE, OUTER = 1, 2, 4  # bits of a point's flags
-# How far beyond a contour point nothing of the body may be seen, before or behind, for it to lie on the outline.
-OUTER_MARGIN_M = 0.02
-# A ray is followed this far behind the point.
-BEHIND_M = 4.0
+FOUND, VISIBLE = 1, 2  # bits of a point's flags
 
 
 @ti.func
@@ -146,13 +142,6 @@ def image_normal(J, n):
     return m / ti.sqrt(ti.max(m.norm_sqr(), 1e-30))
 
 
-@ti.func
-def behind(x, n, center):
-    """Where the ray from the camera just beyond a point x of the rim, with normal n, has passed the whole body."""
-    beyond = x + OUTER_MARGIN_M * n
-    return beyond + BEHIND_M * (beyond - center).normalized()
-
-
 @functools.cache
 def _contour_kernel(real):
     @ti.kernel
@@ -189,7 +178,7 @@ def _contour_kernel(real):
                 s = chosen[b, m]
                 i = strip_piece(strips, s)
                 if i != near_to:
-                    near, near_to = pieces_beside(placed, c, pieces, i, OUTER_MARGIN_M), i
+                    near, near_to = pieces_beside(placed, c, pieces, i, 0.0), i
                 crossings = rim_crossings(strips, s, load_placed_vector(placed, c, i, PLACED_CAMERA))
                 row = (b * C + v) * K + m
                 for slot in range(2):
@@ -205,8 +194,6 @@ def _contour_kernel(real):
                             flag = FOUND
                             if is_occluded(placed, c, pieces, near, x, center) == 0:
                                 flag = FOUND | VISIBLE
-                                if is_occluded(placed, c, pieces, near, behind(x, n, center), center) == 0:
-                                    flag = FOUND | VISIBLE | OUTER
                             normal = image_normal(J, n)
                             x_zero = to_zero_configuration(pieces, i, q)
                             for a in ti.static(range(3)):
@@ -236,8 +223,6 @@ class ContourPoints:
         scale: (B, C, K, 2) pixels a metre there.
         found: (B, C, K, 2) uint8, 1 where the strip crosses the rim in front of the camera.
         visible: (B, C, K, 2) uint8, 1 where found and not hidden by another piece.
-        outer: (B, C, K, 2) uint8, 1 where visible and on the outline of the whole body: just beyond, no other piece is
-            seen.
     """
 
     strip: np.ndarray
@@ -249,7 +234,6 @@ class ContourPoints:
     scale: np.ndarray
     found: np.ndarray
     visible: np.ndarray
-    outer: np.ndarray
 
     @property
     def occluded(self) -> np.ndarray:
@@ -371,5 +355,4 @@ class ContourKernel:
             scale=geometry[..., 7],
             found=flags & FOUND,
             visible=flags >> 1 & 1,
-            outer=flags >> 2,
         )

@@ -1,19 +1,15 @@
 """Which picture edges belong to the model's contour points (Kehl 2006, section 6.1.2). One launch for all lines.
 
-Three kinds of search, all along a straight line of pixels (Bresenham's: a pixel a step along the longer axis):
+Two kinds of search, both along a straight line of pixels (Bresenham's: a pixel a step along the longer axis):
 
 pair
     through two contour points symmetric about the limb's axis, and ``reach`` beyond each. Of all pairs of edges on it
     the one with the least ``|length difference| / (s_a s_b)`` is taken (eq. 12), with the gradient score s of eq. 11.
 single
     through one point along the contour's normal, the edge with the greatest score (eq. 14).
-outline
-    the same line, for the nearest change of the foreground mask from person to background. Not in the paper, whose
-    masks end with the hull: the hull's voxels are some centimetres wide, the mask's edge is known to a pixel or two.
 
 An edge is a pixel whose colour gradient (section 4.2) is at least ``threshold`` and the greatest along the line. The
-gradient is evaluated here, on demand. A mask's change counts as an edge of strength ``mask_edge`` in the paper's two
-searches as well, 0 leaves it out: masks are noisy but know what is person.
+gradient is evaluated here, on demand.
 
 Where the paper is silent, or cannot be meant: equal lengths alone would win in eq. 12 with any gradient, as its
 numerator is 0 then; a length is known to about a pixel, so one pixel is added. Lines end at the picture's border.
@@ -24,55 +20,12 @@ import numpy as np
 from tk.kernels.edges import EdgeConfig, rgb_gradient_at
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
-PAIR, SINGLE, OUTLINE = 0, 1, 2
+PAIR, SINGLE = 0, 1
 # Columns of a line: kind, camera, the pixels a and b (b = a unless PAIR), a's outward unit normal, b's, and how far
 # beyond the points edges are looked for, pixels.
 LINE_NUMBERS = 11
 # Edges kept along one line. More are met on clutter only; the first are kept.
 MOST_EDGES = 24
-# A mask's value where person and scene cannot be told apart, and how far beyond an edge it makes the edge worthless.
-DOUBTFUL = 127
-BEYOND = 3
-
-
-@ti.func
-def _inside(masks: ti.template(), c: int, x: int, y: int):
-    return 1 if masks[c, y, x] > 127 else 0
-
-
-@ti.func
-def is_doubtful(masks: ti.template(), c: int, width: int, height: int, edge, normal):
-    """1 where just beyond an outline's edge, (2,) pixels, the mask cannot tell person and scene apart."""
-    result = 0
-    for i in ti.static(range(BEYOND)):
-        x = ti.cast(ti.round(edge[0] + (i + 0.5) * normal[0]), ti.i32)
-        y = ti.cast(ti.round(edge[1] + (i + 0.5) * normal[1]), ti.i32)
-        if 0 <= x < width and 0 <= y < height and masks[c, y, x] == DOUBTFUL:
-            result = 1
-    return result
-
-
-@ti.func
-def outline_at(masks: ti.template(), c: int, width: int, height: int, x, y, nx, ny, reach):
-    """(found, signed distance along the normal) of the nearest change from person to background."""
-    found = 0
-    at = x * 0.0
-    steps = ti.cast(ti.ceil(reach), ti.i32)
-    px, py = ti.cast(ti.round(x), ti.i32), ti.cast(ti.round(y), ti.i32)
-    if 0 <= px < width and 0 <= py < height:
-        person = _inside(masks, c, px, py)
-        sign = 1.0 if person == 1 else -1.0  # inside: outwards, outside: inwards
-        i = 1
-        while found == 0 and i <= steps:
-            qx = ti.cast(ti.round(x + sign * i * nx), ti.i32)
-            qy = ti.cast(ti.round(y + sign * i * ny), ti.i32)
-            if qx < 0 or qx >= width or qy < 0 or qy >= height:
-                i = steps
-            elif _inside(masks, c, qx, qy) != person:
-                found = 1
-                at = sign * (i - 0.5)
-            i += 1
-    return found, at
 
 
 @ti.kernel
@@ -82,11 +35,9 @@ def _search_kernel(
     angle_scale: ti.f32,
     angle_share: ti.f32,
     threshold: ti.f32,
-    mask_edge: ti.f32,
     spread: ti.i32,
     sizes: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (C, 2) height, width
     images: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (C, H, W, 3)
-    masks: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (C, H, W)
     lines: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (R, 11)
     edges: ti.types.ndarray(dtype=ti.f32, ndim=3),  # (R, MOST_EDGES, 3) scratch: position, score for a, for b
     found: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (R, 5) out: 1 or 0, the edges' pixels for a and for b
@@ -103,94 +54,73 @@ def _search_kernel(
         height, width = sizes[c, 0], sizes[c, 1]
         for k in range(5):
             found[r, k] = 0.0
-        if kind == OUTLINE:
-            hit, at = outline_at(masks, c, width, height, ax, ay, nax, nay, reach)
-            if hit == 1:
-                found[r, 0] = 1.0
-                found[r, 1], found[r, 2] = ax + at * nax, ay + at * nay
-                found[r, 3], found[r, 4] = found[r, 1], found[r, 2]
+        # the line from a to b; from inside to outside for a single point
+        ux, uy = nax, nay
+        length = ax * 0.0
+        if kind == PAIR:
+            length = ti.sqrt((bx - ax) ** 2 + (by - ay) ** 2)
+            ux, uy = (bx - ax) / ti.max(length, 1e-6), (by - ay) / ti.max(length, 1e-6)
+        step = 1.0 / ti.max(ti.max(ti.abs(ux), ti.abs(uy)), 1e-6)
+        steps = ti.cast((length + 2.0 * reach) / step, ti.i32) + 1
+        count = 0
+        # three values in a row: the middle one is an edge if it is the greatest
+        t1 = -reach
+        m0, m1, gx1, gy1 = t1 * 0.0, t1 * 0.0, t1 * 0.0, t1 * 0.0
+        for i in range(steps + 1):
+            t = -reach + i * step
+            x = ti.cast(ti.round(ax + t * ux), ti.i32)
+            y = ti.cast(ti.round(ay + t * uy), ti.i32)
+            m, gx, gy = t * 0.0, t * 0.0, t * 0.0
+            if i < steps and 0 <= x < width and 0 <= y < height:
+                m, gx, gy = rgb_gradient_at(
+                    images, c, y, x, height, width, intensity_offset, intensity_slope, angle_scale, angle_share
+                )
+                m *= ti.abs(gx * ux + gy * uy)
+            if m1 >= threshold and m1 >= m0 and m1 > m and count < MOST_EDGES:
+                # the gradient's part along the line is in m1; the score wants it along the normals
+                along = ti.max(ti.abs(gx1 * ux + gy1 * uy), 1e-6)
+                edges[r, count, 0] = t1
+                edges[r, count, 1] = m1 / along * ti.abs(gx1 * nax + gy1 * nay)
+                edges[r, count, 2] = m1 / along * ti.abs(gx1 * nbx + gy1 * nby)
+                count += 1
+            t1, m0, m1, gx1, gy1 = t, m1, m, gx, gy
+        if kind == SINGLE:
+            best = t1 * 0.0
+            for i in range(count):
+                if edges[r, i, 1] > best:
+                    best = edges[r, i, 1]
+                    found[r, 0] = 1.0
+                    found[r, 1], found[r, 2] = ax + edges[r, i, 0] * ux, ay + edges[r, i, 0] * uy
+                    found[r, 3], found[r, 4] = found[r, 1], found[r, 2]
         else:
-            # the line from a to b; from inside to outside for a single point
-            ux, uy = nax, nay
-            length = ax * 0.0
-            if kind == PAIR:
-                length = ti.sqrt((bx - ax) ** 2 + (by - ay) ** 2)
-                ux, uy = (bx - ax) / ti.max(length, 1e-6), (by - ay) / ti.max(length, 1e-6)
-            step = 1.0 / ti.max(ti.max(ti.abs(ux), ti.abs(uy)), 1e-6)
-            steps = ti.cast((length + 2.0 * reach) / step, ti.i32) + 1
-            count = 0
-            # three values in a row: the middle one is an edge if it is the greatest
-            t1 = -reach
-            m0, m1, gx1, gy1 = t1 * 0.0, t1 * 0.0, t1 * 0.0, t1 * 0.0
-            person1 = -1
-            for i in range(steps + 1):
-                t = -reach + i * step
-                x = ti.cast(ti.round(ax + t * ux), ti.i32)
-                y = ti.cast(ti.round(ay + t * uy), ti.i32)
-                m, gx, gy = t * 0.0, t * 0.0, t * 0.0
-                person = -1
-                if i < steps and 0 <= x < width and 0 <= y < height:
-                    person = _inside(masks, c, x, y)
-                    m, gx, gy = rgb_gradient_at(
-                        images, c, y, x, height, width, intensity_offset, intensity_slope, angle_scale, angle_share
-                    )
-                    m *= ti.abs(gx * ux + gy * uy)
-                if m1 >= threshold and m1 >= m0 and m1 > m and count < MOST_EDGES:
-                    # the gradient's part along the line is in m1; the score wants it along the normals
-                    along = ti.max(ti.abs(gx1 * ux + gy1 * uy), 1e-6)
-                    edges[r, count, 0] = t1
-                    edges[r, count, 1] = m1 / along * ti.abs(gx1 * nax + gy1 * nay)
-                    edges[r, count, 2] = m1 / along * ti.abs(gx1 * nbx + gy1 * nby)
-                    count += 1
-                if mask_edge > 0 and person >= 0 and person1 >= 0 and person != person1 and count < MOST_EDGES:
-                    # a lies on the side that the line comes from (PAIR), a single point's outside is ahead
-                    leaves = 1 if person == 0 else 0
-                    for_a = 1 if (kind == PAIR) != (leaves == 1) else 0
-                    edges[r, count, 0] = t - 0.5 * step
-                    edges[r, count, 1] = mask_edge * for_a
-                    edges[r, count, 2] = mask_edge * (1 - for_a)
-                    count += 1
-                t1, m0, m1, gx1, gy1, person1 = t, m1, m, gx, gy, person
-            if kind == SINGLE:
-                best = t1 * 0.0
-                for i in range(count):
-                    if edges[r, i, 1] > best:
-                        best = edges[r, i, 1]
-                        found[r, 0] = 1.0
-                        found[r, 1], found[r, 2] = ax + edges[r, i, 0] * ux, ay + edges[r, i, 0] * uy
-                        found[r, 3], found[r, 4] = found[r, 1], found[r, 2]
-            else:
-                best = t1 * 0.0 + 1e30
-                for i in range(count):
-                    for j in range(count):
-                        if edges[r, j, 0] > edges[r, i, 0] and edges[r, i, 1] > 0 and edges[r, j, 2] > 0:
-                            difference = ti.abs(edges[r, j, 0] - edges[r, i, 0] - length) + 1.0
-                            cost = difference / (edges[r, i, 1] * edges[r, j, 2])
-                            if cost < best:
-                                best = cost
-                                found[r, 0] = 1.0
-                                found[r, 1], found[r, 2] = ax + edges[r, i, 0] * ux, ay + edges[r, i, 0] * uy
-                                found[r, 3], found[r, 4] = ax + edges[r, j, 0] * ux, ay + edges[r, j, 0] * uy
+            best = t1 * 0.0 + 1e30
+            for i in range(count):
+                for j in range(count):
+                    if edges[r, j, 0] > edges[r, i, 0] and edges[r, i, 1] > 0 and edges[r, j, 2] > 0:
+                        difference = ti.abs(edges[r, j, 0] - edges[r, i, 0] - length) + 1.0
+                        cost = difference / (edges[r, i, 1] * edges[r, j, 2])
+                        if cost < best:
+                            best = cost
+                            found[r, 0] = 1.0
+                            found[r, 1], found[r, 2] = ax + edges[r, i, 0] * ux, ay + edges[r, i, 0] * uy
+                            found[r, 3], found[r, 4] = ax + edges[r, j, 0] * ux, ay + edges[r, j, 0] * uy
 
 
 def search_edges(
     images: np.ndarray,
-    masks: np.ndarray,
     sizes: np.ndarray,
     lines: np.ndarray,
     threshold: float,
-    mask_edge: float,
     config: EdgeConfig,
 ) -> np.ndarray:
     """The edges assigned to R lines.
 
     Args:
-        images: (C, H, W, 3) uint8 BGR; masks: (C, H, W) uint8, 0 or 255.
+        images: (C, H, W, 3) uint8 BGR.
         sizes: (C, 2) int32 height and width of each picture in its zero-padded place.
         lines: (R, 11) float32: kind, camera, pixel a (x, y), pixel b, outward unit normal at a, at b, reach
             in pixels.
         threshold: least colour gradient, 0…1, along the line.
-        mask_edge: strength of a mask's edge beside that of colour edges; 0 ignores masks in pair and single searches.
         config: of the colour gradient.
 
     Returns:
@@ -203,11 +133,9 @@ def search_edges(
         _search_kernel(
             *config.constants,
             threshold,
-            mask_edge,
             spread_of(R),
             sizes,
             images,
-            masks,
             np.ascontiguousarray(lines, np.float32),
             np.empty((R, MOST_EDGES, 3), np.float32),
             found,

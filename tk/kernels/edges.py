@@ -35,21 +35,23 @@ from numpy.typing import NDArray
 from tk.errors import ConfigError
 from tk.kernels.runtime import ensure_runtime, ti
 
+# Thresholds of :func:`edge_map` on the magnitude: edges count from the high one on, and are followed down to the low
+# one. The high one finds 80 to 90 % of a person's outline (``scripts/figure4_edges.py``).
+LOW, HIGH = 0.08, 0.20
+
 
 @dataclass(frozen=True)
 class EdgeConfig:
     """What makes a colour edge. The paper tuned its own by hand for each camera and prints none of them.
 
     The defaults were chosen with ``scripts/figure4_edges.py`` (two rendered captures): little clutter at equal recall
-    of the person's outline. ``high`` finds 80 to 90 % of it.
+    of the person's outline.
 
     Attributes:
         intensity_offset: mean of the channels, 0…255, at which a pixel's sigmoid is one half.
         intensity_slope: of the sigmoid, per level.
         full_angle_rad: angle between two colours that counts as much as the step from black to white.
         angle_share: weight of the angle between two bright pixels; 0 leaves the Euclidean distance alone.
-        low, high: hysteresis thresholds of :func:`edge_map` on the magnitude. Edges count from ``high`` on, and are
-            followed down to ``low``.
 
     Raises:
         ConfigError: a value is out of range.
@@ -59,8 +61,6 @@ class EdgeConfig:
     intensity_slope: float = 0.1
     full_angle_rad: float = 0.7
     angle_share: float = 0.75
-    low: float = 0.08
-    high: float = 0.20
 
     def __post_init__(self) -> None:
         for name, value, valid, expected in (
@@ -68,8 +68,6 @@ class EdgeConfig:
             ("intensity_slope", self.intensity_slope, 0 < self.intensity_slope <= 10, "(0, 10]"),
             ("full_angle_rad", self.full_angle_rad, 0 < self.full_angle_rad <= math.pi / 2, "(0, π/2]"),
             ("angle_share", self.angle_share, 0 <= self.angle_share <= 1, "[0, 1]"),
-            ("high", self.high, 0 < self.high <= 1, "(0, 1]"),
-            ("low", self.low, 0 < self.low <= self.high, f"(0, high = {self.high}]"),
         ):
             if not valid:
                 raise ConfigError(f"edges: {name} = {value} must lie in {expected}")
@@ -304,4 +302,4 @@ def edge_map(
     """
     config = config or EdgeConfig()
     magnitude, direction = rgb_gradient(images, config, sizes)
-    return follow_edges(thin_edges(magnitude, direction), config.low, config.high)
+    return follow_edges(thin_edges(magnitude, direction), LOW, HIGH)

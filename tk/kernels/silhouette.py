@@ -37,6 +37,12 @@ HIDING_SHRINK = 0.95
 _SUMS = 3 + LONGEST_CHAIN + LONGEST_CHAIN * (LONGEST_CHAIN + 1) // 2
 # Columns of an exported sample: see Edgels.
 _EXPORT = 12
+# Colours are told apart by 16 levels of each channel.
+COLOR_BINS = 4096
+# A pixel says no more than this about which of two parts it shows: models are never that sure.
+_MOST_LOG_RATIO = 3.0
+# Neighbouring pixels of a line are alike (texture, blur, coding): so many of them count as one.
+_ALIKE_PIXELS = 3.0
 
 
 @dataclass(frozen=True)
@@ -84,6 +90,23 @@ class SearchSettings:
         ):
             if not valid:
                 raise ConfigError(f"silhouette search: {name} = {value} must lie {expected}")
+
+
+class Regions(NamedTuple):
+    """What the colours on either side of a contour tell where it lies before another part (region-based tracking,
+    Stoiber et al. 2022, SRT3D).
+
+    Attributes:
+        image: (V, H, W, 3) uint8 BGR, the full picture.
+        log_likelihood: (G, :data:`COLOR_BINS`) float32 log p(colour | group), see :func:`color_bin`.
+        group: (P,) int32 the colour group of each part.
+        weight: of a contour whose place the colours tell exactly, beside that of a silhouette's edge.
+    """
+
+    image: NDArray[np.uint8]
+    log_likelihood: NDArray[np.float32]
+    group: NDArray[np.int32]
+    weight: float
 
 
 class NormalEquations(NamedTuple):
@@ -166,6 +189,43 @@ def _search(mask: ti.template(), v: int, width: int, height: int, x, n, window):
 
 
 @ti.func
+def color_bin(image: ti.template(), v: int, j: int, i: int):
+    """The bin of a pixel's colour: its blue, green and red in 16 levels each."""
+    b, g, r = ti.cast(image[v, j, i, 0], ti.i32), ti.cast(image[v, j, i, 1], ti.i32), ti.cast(image[v, j, i, 2], ti.i32)
+    return ((b >> 4) << 8) | ((g >> 4) << 4) | (r >> 4)
+
+
+@ti.func
+def _search_colors(
+    image: ti.template(), likelihood: ti.template(), v: int, width: int, height: int, x, n, window, scale, front, back
+):
+    """(certainty in [0, 1], mean place) of the border between two colour groups on the line x + s n.
+
+    The border lies behind step d with probability ∝ exp of the summed log ratios of the pixels before it (Stoiber et
+    al. 2022, eqs. 3-8 with a hard step); its mean is the Newton step, its variance beside a uniform one's the weight.
+    """
+    log_sum = 0.0 * window
+    total, first, second = 1.0 + 0.0 * window, -(window + 0.5), (window + 0.5) ** 2
+    reach = ti.cast(window, ti.i32)
+    for k in range(-reach, reach + 1):
+        place = x + (k * scale) * n
+        i, j = ti.cast(ti.round(place[0]), ti.i32), ti.cast(ti.round(place[1]), ti.i32)
+        if i >= 0 and j >= 0 and i < width and j < height:
+            bin = color_bin(image, v, j, i)
+            ratio = likelihood[front, bin] - likelihood[back, bin]
+            log_sum += ti.min(ti.max(ratio, -_MOST_LOG_RATIO), _MOST_LOG_RATIO) / _ALIKE_PIXELS
+        p = ti.exp(log_sum)
+        d = k + 0.5
+        total += p
+        first += p * d
+        second += p * d * d
+    mean = first / total
+    variance = second / total - mean * mean
+    certainty = ti.max(1.0 - 3.0 * variance / ((window + 1.0) * (window + 1.0)), 0.0)
+    return certainty * certainty, mean
+
+
+@ti.func
 def _to_segment(e, a, b):
     """Squared distance of e from the segment a b."""
     ab = b - a
@@ -194,8 +254,11 @@ def _equations_kernel(real):
         camera: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
         size: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (V, 2) width, height at this scale
         mask: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (V, H, W) at this scale
+        image: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (V, H, W, 3) of the full picture
+        likelihood: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (G, COLOR_BINS)
+        group: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
         # settings; scale: pixels of the full picture in one of this scale
-        numbers: ti.types.ndarray(dtype=real, ndim=1),  # scale, window, spacing, ambiguous, tangential, robust, lost
+        numbers: ti.types.ndarray(dtype=real, ndim=1),  # (8,) in _launch's order
         spread: ti.i32,
         most_samples: ti.i32,
         interior: ti.i32,
@@ -266,7 +329,7 @@ def _equations_kernel(real):
             b, v, q = c // (V * Q), (c // Q) % V, c % Q
             p, kind = curve_part[q], curve_kind[q]
             scale, window, spacing, ambiguous = numbers[0], numbers[1], numbers[2], numbers[3]
-            tangential, robust, lost = numbers[4], numbers[5], numbers[6]
+            tangential, robust, lost, colors = numbers[4], numbers[5], numbers[6], numbers[7]
             for i in range(sums.shape[1]):
                 sums[c, i] = 0.0
             if export == 1:
@@ -292,6 +355,7 @@ def _equations_kernel(real):
                     n = ti.Vector([along[1], -along[0]]) * (sign / ti.max(norm, 1e-9))
                     at = (pixel + 0.5) / scale - 0.5
                     use = norm > 1e-6 and _in_picture(width, height, at)
+                    behind, depth = -1, 1e9 + 0.0 * scale
                     if use:
                         ray = x - eye
                         for o in range(P):
@@ -301,13 +365,27 @@ def _equations_kernel(real):
                                 t_o = enter(
                                     part_kind[o], shape_of(part_shape, o), co, Ro.transpose() @ ray, HIDING_SHRINK
                                 )
-                                # behind another part it is not seen; before one it is no edge of the silhouette
-                                if t_o > 0.0 and (interior == 0 or t_o < 1.0):
+                                # behind another part it is not seen
+                                if t_o > 0.0 and t_o < 1.0:
                                     use = False
-                    if use:
+                                elif t_o > 0.0 and t_o < depth:
+                                    behind = o
+                                    depth = t_o
+                    # before another part it is no edge of the silhouette
+                    found, d, weight = 0, 0.0 * scale, share
+                    if use and behind >= 0 and interior == 0:
+                        use = False
+                        if colors > 0.0 and part_limb[behind] != part_limb[p] and group[behind] != group[p]:
+                            certainty, place = _search_colors(
+                                image, likelihood, v, image.shape[2], image.shape[1], pixel, n, window, scale,
+                                group[p], group[behind],
+                            )  # fmt: skip
+                            weight = share * colors * certainty
+                            d = place * scale
+                            found = 2
+                    elif use:
                         found, d = _search(mask, v, width, height, at, n, window)
                         d *= scale
-                        weight = share
                         if found == 0:
                             sums[c, 0] = sums[c, 0] + share * lost * lost
                             sums[c, 2] = sums[c, 2] + share
@@ -340,32 +418,33 @@ def _equations_kernel(real):
                             sums[c, 0] = sums[c, 0] + share * ti.min(d * d, lost * lost)
                             sums[c, 1] = sums[c, 1] + share
                             sums[c, 2] = sums[c, 2] + share
-                            g = J.transpose() @ n
-                            h = J.transpose() @ ti.Vector([-n[1], n[0]])
-                            L = 0
-                            while L < LONGEST_CHAIN and chain[p, L] >= 0:
-                                velocity = point_velocity(prismatic, twists, b, chain[p, L], x)
-                                row[c, 0, L] = g.dot(velocity)
-                                row[c, 1, L] = h.dot(velocity)
-                                L += 1
-                            at_sum = 3 + LONGEST_CHAIN
-                            for k in range(L):
-                                sums[c, 3 + k] = sums[c, 3 + k] + weight * d * row[c, 0, k]
-                                for m in range(k, L):
-                                    sums[c, at_sum] = sums[c, at_sum] + weight * row[c, 0, k] * row[c, 0, m]
-                                    if tangential > 0.0:
-                                        across = weight * tangential * row[c, 1, k] * row[c, 1, m]
-                                        sums[c, at_sum] = sums[c, at_sum] + across
-                                    at_sum += 1
-                            if export == 1:
-                                s = unscaled(kind, shape, x_part)
-                                samples[c, i, 0] = 1.0
-                                samples[c, i, 1] = d
-                                samples[c, i, 2] = weight
-                                for a in ti.static(range(3)):
-                                    samples[c, i, 3 + a] = s[a]
-                                    samples[c, i, 6 + a] = g[a]
-                                samples[c, i, 9], samples[c, i, 10] = pixel[0], pixel[1]
+                    if found > 0 and weight > 0.0:
+                        g = J.transpose() @ n
+                        h = J.transpose() @ ti.Vector([-n[1], n[0]])
+                        L = 0
+                        while L < LONGEST_CHAIN and chain[p, L] >= 0:
+                            velocity = point_velocity(prismatic, twists, b, chain[p, L], x)
+                            row[c, 0, L] = g.dot(velocity)
+                            row[c, 1, L] = h.dot(velocity)
+                            L += 1
+                        at_sum = 3 + LONGEST_CHAIN
+                        for k in range(L):
+                            sums[c, 3 + k] = sums[c, 3 + k] + weight * d * row[c, 0, k]
+                            for m in range(k, L):
+                                sums[c, at_sum] = sums[c, at_sum] + weight * row[c, 0, k] * row[c, 0, m]
+                                if tangential > 0.0:
+                                    across = weight * tangential * row[c, 1, k] * row[c, 1, m]
+                                    sums[c, at_sum] = sums[c, at_sum] + across
+                                at_sum += 1
+                        if export == 1:
+                            s = unscaled(kind, shape, x_part)
+                            samples[c, i, 0] = 1.0
+                            samples[c, i, 1] = d
+                            samples[c, i, 2] = weight
+                            for a in ti.static(range(3)):
+                                samples[c, i, 3 + a] = s[a]
+                                samples[c, i, 6 + a] = g[a]
+                            samples[c, i, 9], samples[c, i, 10] = pixel[0], pixel[1]
 
         # in a fixed order: the same sums every time
         for b in range(B):
@@ -373,7 +452,7 @@ def _equations_kernel(real):
                 total[b, i] = 0.0
             for j in range(V * Q):
                 c = b * V * Q + j
-                if sums[c, 2] > 0.0:
+                if facts[c, 0] > 0.0:
                     p = curve_part[j % Q]
                     for i in ti.static(range(3)):
                         total[b, i] = total[b, i] + sums[c, i]
@@ -402,6 +481,7 @@ def _launch(
     poses: NDArray[np.floating],
     settings: SearchSettings,
     export: bool,
+    regions: Regions | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.floating]]:
     ensure_runtime()
     dtype = body.axis.dtype
@@ -410,7 +490,10 @@ def _launch(
     V, Q, P = len(cameras), len(body.curve_part), len(body.part_kind)
     tasks = B * V * Q
     s = settings
-    numbers = (scale, s.window_px, s.spacing_px, s.ambiguous_px, s.tangential, s.robust_px, s.lost_px)
+    regions = regions or _no_regions(len(body.part_kind))
+    numbers = (
+        scale, s.window_px, s.spacing_px, s.ambiguous_px, s.tangential, s.robust_px, s.lost_px, regions.weight
+    )  # fmt: skip
     total = np.empty((B, 3 + D + D * D))
     samples = np.zeros((tasks, settings.most_samples, _EXPORT) if export else (1, 1, _EXPORT), dtype)
     _equations_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
@@ -418,6 +501,9 @@ def _launch(
         np.ascontiguousarray(cameras, dtype),
         np.ascontiguousarray(sizes, np.int32),
         np.ascontiguousarray(masks),
+        regions.image,
+        regions.log_likelihood,
+        regions.group,
         np.array(numbers, dtype),
         spread_of(tasks),
         settings.most_samples,
@@ -437,6 +523,13 @@ def _launch(
     return total, samples
 
 
+@functools.cache
+def _no_regions(parts: int) -> Regions:
+    return Regions(
+        np.zeros((1, 1, 1, 3), np.uint8), np.zeros((1, COLOR_BINS), np.float32), np.zeros(parts, np.int32), 0.0
+    )
+
+
 def normal_equations(
     body: ConeArrays,
     cameras: np.ndarray,
@@ -445,6 +538,7 @@ def normal_equations(
     scale: float,
     poses: np.ndarray,
     settings: SearchSettings,
+    regions: Regions | None = None,
 ) -> NormalEquations:
     """Search the silhouettes from B poses and add up the equations (eqs. 9-11 of the silhouette paper).
 
@@ -456,8 +550,9 @@ def normal_equations(
         scale: pixels of the full picture in one of this scale (1, 2, …).
         poses: (B, D).
         settings: see :class:`SearchSettings`.
+        regions: what colours tell inside the silhouette; None: nothing.
     """
-    total, _ = _launch(body, cameras, sizes, masks, scale, poses, settings, False)
+    total, _ = _launch(body, cameras, sizes, masks, scale, poses, settings, False, regions)
     B, D = poses.shape
     weight = total[:, 2]
     seen = weight > 0
@@ -480,7 +575,7 @@ def find_edgels(
     settings: SearchSettings,
 ) -> Edgels:
     """The edgels that one pose (D,) finds; arguments as for :func:`normal_equations`."""
-    _, samples = _launch(body, cameras, sizes, masks, scale, pose[None], settings, True)
+    _, samples = _launch(body, cameras, sizes, masks, scale, pose[None], settings, True, None)
     Q = len(body.curve_part)
     task, index = np.nonzero(samples[:, :, 0])
     chosen = samples[task, index].astype(np.float64)

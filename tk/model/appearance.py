@@ -22,6 +22,16 @@ Float = NDArray[np.float64]
 _YUV_FROM_BGR = np.array([[0.114, 0.587, 0.299], [0.436, -0.289, -0.147], [-0.100, -0.515, 0.615]])
 
 
+# Least standard deviations of Y, U, V, levels of 255: shading moves Y more than U and V.
+FLOOR_YUV = (16.0, 6.0, 6.0)
+# Greatest distance of a mean from its first value, levels.
+LEASH = 30.0
+# Greatest distance between a sample and the voxel that teaches it, metres.
+TEACHING_M = 0.05
+# A patch that fewer than this share of the voxels fit constrains nothing.
+LEAST_SHARE = 0.01
+
+
 @dataclass(frozen=True)
 class AppearanceConfig:
     """Settings of the colour models.
@@ -31,20 +41,11 @@ class AppearanceConfig:
         rate: α of eq. 16 (paper: 0.3).
         width: a voxel fits when every channel lies within this many standard deviations of the mean. The paper does
             not say what fits.
-        floor_y, floor_uv: least standard deviations, levels of 255. Shading moves Y more than U and V.
-        leash: greatest distance of a mean from its initial value, levels.
-        teaching_m: greatest distance between a sample and the voxel that teaches it, metres.
-        least_share: a patch that fewer than this share of the voxels fit constrains nothing.
     """
 
     enabled: bool = True
     rate: float = 0.3
     width: float = 2.5
-    floor_y: float = 16.0
-    floor_uv: float = 6.0
-    leash: float = 30.0
-    teaching_m: float = 0.05
-    least_share: float = 0.01
 
 
 @dataclass(frozen=True)
@@ -62,9 +63,7 @@ class Appearance:
     known: NDArray[np.bool_]
 
     @staticmethod
-    def learn(
-        patches: int, patch: NDArray[np.integer], colors_bgr: NDArray[np.floating], config: AppearanceConfig
-    ) -> Appearance:
+    def learn(patches: int, patch: NDArray[np.integer], colors_bgr: NDArray[np.floating]) -> Appearance:
         """Models from the voxels under the initialised body.
 
         Args:
@@ -81,8 +80,7 @@ class Appearance:
                 mean[p] = np.median(mine, axis=0)
                 deviation[p] = 1.4826 * np.median(np.abs(mine - mean[p]), axis=0)
                 known[p] = True
-        floor = np.array([config.floor_y, config.floor_uv, config.floor_uv])
-        return Appearance(mean, mean.copy(), np.maximum(deviation, floor), known)
+        return Appearance(mean, mean.copy(), np.maximum(deviation, FLOOR_YUV), known)
 
     def segment(
         self, colors_bgr: NDArray[np.floating], seen: NDArray[np.integer], config: AppearanceConfig
@@ -96,7 +94,7 @@ class Appearance:
         counts = np.bincount(
             np.concatenate([np.full(int(np.count_nonzero((fits >> b) & 1)), b) for b in bits]), minlength=len(bits)
         )
-        for b in bits[counts < config.least_share * len(fits)]:
+        for b in bits[counts < LEAST_SHARE * len(fits)]:
             fits |= np.int64(1) << np.int64(b)
         return fits
 
@@ -113,7 +111,7 @@ class Appearance:
         learns = self.known & (count >= 3)
         incoming = np.where(learns[:, None], incoming / np.maximum(count, 1)[:, None], self.mean)
         mean = (1 - config.rate) * self.mean + config.rate * incoming
-        return replace(self, mean=np.clip(mean, self.initial - config.leash, self.initial + config.leash))
+        return replace(self, mean=np.clip(mean, self.initial - LEASH, self.initial + LEASH))
 
 
 def to_yuv(colors_bgr: NDArray[np.floating]) -> Float:

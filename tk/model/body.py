@@ -319,6 +319,8 @@ def _patches(points: Float, normals: Float, segment: NDArray[np.int32]) -> tuple
     patch = np.zeros(len(points), dtype=np.int32)
     for s, name in enumerate(SEGMENTS):
         here = segment == s
+        if not here.any():  # feet are the calves'
+            continue
         axis = np.array([1.0, np.sign(points[here][0, 1]), 0.0]) if "arm" in name else np.array([0.0, 0.0, 1.0])
         along = points[here] @ axis
         low, high = along.min(), along.max()

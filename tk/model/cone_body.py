@@ -56,6 +56,9 @@ _LIMBS = {
     "calf_l": 4,
     "thigh_r": 5,
     "calf_r": 5,
+    "pelvis": 0,
+    "foot_l": 4,
+    "foot_r": 5,
 }
 
 # The seven degrees of freedom of the paper's experiments (section 6): translation, hips and knees.
@@ -176,7 +179,7 @@ class ConeBody:
     @property
     def shape_groups(self) -> tuple[str, ...]:
         """Parts that are shaped alike: a name for each, "thigh_" for the left and right thigh."""
-        return tuple(dict.fromkeys(_group(part.name) for part in self.parts))
+        return tuple(dict.fromkeys(group_of(part.name) for part in self.parts))
 
     def reshaped(self, change: Float) -> ConeBody:
         """A body whose parts have other sizes and lie elsewhere about their bones; the skeleton is the same.
@@ -189,7 +192,8 @@ class ConeBody:
         """
         rows = dict(zip(self.shape_groups, change, strict=True))
         return replace(
-            self, parts=tuple(_reshape(part, rows[_group(part.name)], part.name.endswith("_r")) for part in self.parts)
+            self,
+            parts=tuple(_reshape(part, rows[group_of(part.name)], part.name.endswith("_r")) for part in self.parts),
         )
 
     def place(
@@ -277,7 +281,8 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
         else:  # without a foot the calf reaches the ground
             reach = d.calf + d.ankle_height
             parts.append(_limb(f"calf_{side}", knee, -z, reach, d.knee_radius, d.ankle_radius, x, (False, True)))
-    return ConeBody(d, build_skeleton(d, up), tuple(parts), preset)
+    full = preset == "full"
+    return ConeBody(d, build_skeleton(d, up, waist=full, ankles=full), tuple(parts), preset)
 
 
 def _calf(side: str, knee: Float, ankle: Float, d: BodyDimensions) -> list[ConePart]:
@@ -306,7 +311,7 @@ def _foot(side: str, ankle: Float, d: BodyDimensions) -> list[ConePart]:
         length = float(np.linalg.norm(end - start))
         axis = (end - start) / length
         frame = _frame(start, axis, np.cross(axis, y))
-        return ConePart(f"{name}_{side}", f"calf_{side}", CONE, (*sizes, length, m), frame, ends=(far, far))
+        return ConePart(f"{name}_{side}", f"foot_{side}", CONE, (*sizes, length, m), frame, ends=(far, far))
 
     heel, toes = ground + thick * z - 0.2 * d.foot * x, ground + thin * z + 0.8 * d.foot * x
     ball = ground + thick * z + 0.45 * d.foot * x
@@ -341,7 +346,7 @@ def _trunk_and_head(d: BodyDimensions) -> list[ConePart]:
     chest = (d.chest_half_depth, d.chest_half_width)
 
     def slice_of(name: str, low: float, high: float, sizes: tuple[float, float], m: float) -> ConePart:
-        return ConePart(name, "torso", CONE, (*sizes, high - low, m), _frame(low * z, z, x))
+        return ConePart(name, "pelvis" if low < 0 else "torso", CONE, (*sizes, high - low, m), _frame(low * z, z, x))
 
     skull = 0.46 * d.head
     forward = 0.1 * d.head
@@ -383,7 +388,7 @@ def _head(d: BodyDimensions) -> ConePart:
     return ConePart("head", "head", ELLIPSOID, shape, _frame(center, z, x))
 
 
-def _group(name: str) -> str:
+def group_of(name: str) -> str:
     """A part's name without its side; it ends with an underscore if there are two."""
     return name[:-1] if name.endswith(("_l", "_r")) else name
 

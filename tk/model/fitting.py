@@ -54,22 +54,24 @@ GROUPS: tuple[tuple[tuple[str, ...], float], ...] = (
 )
 
 
+# Standard deviation of a voxel's distance from the body, metres: what the prior is weighed against.
+NOISE_M = 0.02
+# How many neighbouring pairs count as one observation; voxels err together.
+REDUNDANCY = 8.0
+# Weight of a pair's distance along the surface beside that across it. Nearest neighbours hold a limb where it is along
+# its axis; with little weight on that, the fit slides into place in a few rounds.
+SLIDING = 0.03
+
+
 @dataclass(frozen=True)
 class FitConfig:
     """Settings of the fit.
 
     Attributes:
         rounds: times that pairs are found anew and pose and dimensions move.
-        noise_m: standard deviation of a voxel's distance from the body, metres: what the prior is weighed against.
-        redundancy: how many neighbouring pairs count as one observation; voxels err together.
-        sliding: weight of a pair's distance along the surface beside that across it. Nearest neighbours hold a limb
-            where it is along its axis; with little weight on that, the fit slides into place in a few rounds.
     """
 
     rounds: int = 25
-    noise_m: float = 0.02
-    redundancy: float = 8.0
-    sliding: float = 0.03
 
 
 def apply_factors(dimensions: BodyDimensions, log_factors: Float) -> BodyDimensions:
@@ -121,7 +123,7 @@ def fit_body(
         H[:G, :G] += np.diag(prior)
         g[:G] += prior * log_factors
         for f, index in enumerate(frames):
-            A, r, w = _equations(objective, index, poses[f], dimensions, log_factors, up, config)
+            A, r, w = _equations(objective, index, poses[f], dimensions, log_factors, up)
             weighted = A * w[:, None, None]
             own = np.r_[0:G, G + f * D : G + (f + 1) * D]
             H[np.ix_(own, own)] += np.einsum("kai,kaj->ij", A, weighted)
@@ -144,7 +146,6 @@ def _equations(
     dimensions: BodyDimensions,
     log_factors: Float,
     up: str,
-    config: FitConfig,
 ) -> tuple[Float, Float, Float]:
     """Linear equations of one frame: A (K, 3, G + D), residuals (K, 3), weights (K,)."""
     body = objective.body
@@ -157,7 +158,7 @@ def _equations(
     piece, x0 = piece[keep], x0[keep]
     # both terms see the same surfaces; together they should count as much as the voxels alone
     share = np.concatenate([np.full(M, len(fit.voxels) / max(M, 1)), np.ones(Q)])[keep] / (2 if Q else 1)
-    weight = fit.linear.decay[keep] * share / config.noise_m**2 / config.redundancy
+    weight = fit.linear.decay[keep] * share / NOISE_M**2 / REDUNDANCY
 
     here = _surface(apply_factors(dimensions, log_factors), piece, None, x0, pose, up)
     columns = []
@@ -171,7 +172,7 @@ def _equations(
     # the square root of the metric n nᵀ + sliding · (I − n nᵀ)
     n = index.normals[fit.linear.partner[keep]].astype(np.float64)
     across = n[:, :, None] * n[:, None, :]
-    root = across + np.sqrt(config.sliding) * (np.eye(3) - across)
+    root = across + np.sqrt(SLIDING) * (np.eye(3) - across)
     root[~n.any(axis=1)] = np.eye(3)
     return root @ A, np.einsum("kab,kb->ka", root, fit.linear.residual[keep]), weight
 

@@ -1,11 +1,13 @@
 """Foreground segmentation: which pixels show the person.
 
 The main method is the collinearity test (Mester et al. 2001, extended by Griesser et al. 2005; Kehl & Van Gool 2006,
-section 4, use it). :mod:`tk.kernels.background` computes the statistic; here is what surrounds it: learning the empty
-scene and its noise, following gain and noise from frame to frame, and cleaning up the labels.
+section 4, use it). :mod:`tk.kernels.background` computes the statistic, :mod:`tk.model.scene` learns the empty scene
+and its noise; here is what surrounds them: following gain and noise from frame to frame, finding where to look, and
+cleaning up the labels.
 
 The test runs on pictures reduced by two: four pixels together have a quarter of the noise, and a grey sleeve on a grey
-floor shows. The full picture then draws the outline.
+floor shows. The full picture then draws the outline. A coarse look at the whole picture, reduced once more, says where
+anything differs from the scene; all else happens in the box around that.
 
 No state passes from one frame to the next, so a run that is resumed gives the same masks. The papers are silent on
 five things, which are settled here as follows.
@@ -26,18 +28,17 @@ five things, which are settled here as follows.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tk.errors import CaptureError, ConfigError
-from tk.kernels.background import Planes
+from tk.errors import ConfigError
+from tk.kernels.background import BRIGHT, DARK, GREY, Statistic
+from tk.model.mosaic import Mosaic
 from tk.model.regions import (
     beyond_shadows,
     clean_by_area,
@@ -47,89 +48,103 @@ from tk.model.regions import (
     trim_rim,
     without_penumbrae,
 )
+from tk.model.scene import (
+    Images,
+    check_clips,
+    gain_and_noise,
+    learn_scene,
+    median,
+    reduced,
+    relative_noise,
+    samples,
+)
 
-Images = NDArray[np.uint8]
+# "Measured" means: on rendered captures with exact masks and on one real one.
 
-_SQUARE3 = np.ones((3, 3), np.uint8)
-_LEAST_NOISE = 0.4  # of a mean over 3×3 pixels: grey levels, rounded twice, do not tell less
+# Pixels of the full picture that are one of the picture that is tested, each way: the sleeves of a grey man over a grey
+# floor show, and it takes a quarter of the time.
+_REDUCTION = 2
+
+# The coarse look. Its pixels are four of the full picture each way.
+_LOOK = 3.0  # noise deviations of a reduced pixel by which a coarse one differs
+_WHOLE = 128  # shares of the scene's light are counted in so many parts, to fit a byte
+_LOOK_CELLS = 4  # of a coarse pixel and its eight neighbours, how many differ: fewer are noise, or a speck
+# The margin about it, share of the picture's height. The boxes of 535 pictures of five rendered captures cut nothing
+# off with 20 of 240 pixels, a hand in five of them with 12.
+_LOOK_MARGIN = 0.085
+
+# A further foreground neighbour divides the threshold by 2 to this power. Griesser et al. derive such a term from a
+# Markov random field; the value is measured.
+_NEIGHBOUR_OCTAVES = 0.5
+_ITERATIONS = 3  # updates of the labels under the neighbours' influence
+
+# Plain difference, noise variances, below which a pixel is background whatever its neighbours are. Pure noise gives
+# 0.5, with a 99.9 % quantile of 1.03 (χ² with 27 degrees of freedom); the rest is for noise that coding made alike over
+# a window.
+_DIFFERENCE_MIN = 2.0
+
+# Grey levels. Griesser et al. choose it by hand; here a tenth of a bright window's length, so that windows darker than
+# about ten grey levels are compared by their difference.
+_DARKNESS_OFFSET = 40.0
+
+# A mean over 3×3 reduced pixels that is brighter than the scene by this many of its noise deviations is foreground, for
+# shadows only darken. Four: once in 30 000 pixels by chance, then dropped as a speck.
+_BRIGHT = 4.0
+_LEAST_NOISE = 0.4  # of such a mean: grey levels, rounded twice, do not tell less
+_BRIGHT_STEP = 16  # every so many rows and columns such a mean is taken, to measure its noise
+
+# Variance added to the measured noise, grey levels²: what video coding does to the picture. It rounds small noise away
+# in places and then lets it jump; its errors are alike over a window. Measured: more would make cleaner rims, but holes
+# in grey clothes before a grey wall. With a single picture for a plate, its coding errors and the light that has
+# changed since are alike over a window as well, and no mean takes them away: measured on one real recording.
+_NOISE_FLOOR = 0.7
+_STILL_NOISE = 15.0
+
+# A label is the edge of a shadow where the statistic is below this share of the plain difference nearby: 0.29 at a
+# sharp edge, 0.05 over four reduced pixels of blur (both follow from the statistic).
+_PENUMBRA = 0.2
+_CORE = 8.0  # thick labels of more than this statistic, noise variances, are no edge of a shadow; measured
+_PENUMBRA_REACH = 0.017  # how far from a shadow its edge may reach, share of the picture's height; measured
+
+# Shares of its border by which a region must touch certain foreground. One that no shadow explains; measured. One that
+# could be a shadow: a clear majority, for a shadow between two legs touches them on two sides; measured.
+_FAINT_ENCLOSURE = 0.2
+_ENCLOSURE = 0.6
+
+# A region that could be either is also foreground between parts of the person that are no farther apart than this share
+# of the picture's height (a gap of 10 of 480 pixels). Measured.
+_BRIDGE = 0.02
+
+# Parts of the person but the largest hold pixels of this statistic, noise variances; measured. Parts are joined over
+# gaps of half a forearm by a thin arm: shares of the picture's height, of which a person's is half.
+_SEED = 64.0
+_GAP = 0.08
+_LIMB = 0.025
+
+_RIM_LAYERS = 4  # how deep the rim is searched, pixels: two reduced ones for the window
 
 
 @dataclass(frozen=True)
 class ForegroundConfig:
-    """How the segmentation decides. "Measured" means: on rendered captures with exact masks and on one real one.
+    """What can be said about the segmentation.
 
     Attributes:
-        reduction: how many pixels of the full picture are one of the picture that is tested, each way. Two: the sleeves
-            of a grey man over a grey floor show, and it takes a quarter of the time.
-        threshold: statistic that makes a pixel foreground with four of its eight neighbours foreground, in noise
-            variances; pure noise gives 0.5. Measured.
-        neighbour_octaves: a further foreground neighbour divides the threshold by 2 to this power (Griesser et al.
-            derive such a term from a Markov random field; the value is measured).
-        iterations: updates of the labels under the neighbours' influence.
-        difference_min: plain difference, noise variances, below which a pixel is background whatever its neighbours
-            are. Pure noise gives 0.5, with a 99.9 % quantile of 1.03 (χ² with 27 degrees of freedom); the rest is for
-            noise that coding made alike over a window.
-        darkness_offset: grey levels. Griesser et al. choose it by hand; here a tenth of a bright window's length, so
-            that windows darker than about ten grey levels are compared by their difference.
-        shadow_min: the darkest shadow, as a share of the lit plate. Measured: 0.76 under two lamps; a shadow that is
-            darker is taken for the person, which the other cameras put right, while a hole in one mask cuts through the
-            visual hull.
-        shadow_max: the faintest shadow, as a share of the lit plate. What is fainter is the edge of a darker one.
-            Measured.
-        bright: a mean over 3×3 reduced pixels that is brighter than the scene by this many of its noise deviations is
-            foreground, for shadows only darken. Four: once in 30 000 pixels by chance, then dropped as a speck.
-        noise_floor: variance added to the measured noise, grey levels²: what video coding does to the picture. It
-            rounds small noise away in places and then lets it jump; its errors are alike over a window. Measured: more
-            would make cleaner rims, but holes in grey clothes before a grey wall.
-        still_noise: the same where the plate is a single picture: its coding errors and the light that has changed
-            since are alike over a window, and no mean takes them away. Measured on one real recording.
-        relative_noise_floor: least noise variance of a pixel, as a share of its picture's. As above.
-        jitter_px: unsteadiness of camera and coding, pixels: adds noise where the plate has contrast. Measured.
-        penumbra: a label is the edge of a shadow where the statistic is below this share of the plain difference
-            nearby. 0.29 at a sharp edge, 0.05 over four reduced pixels of blur (both follow from the statistic).
-        core: thick labels of more than this statistic, noise variances, are no edge of a shadow. Measured.
-        penumbra_reach: how far from a shadow its edge may reach, share of the picture's height. Measured.
-        faint_enclosure: share of its border by which a region that no shadow explains must touch certain foreground.
-            Measured.
-        enclosure: share of its border by which a region must touch certain foreground to become foreground: a clear
-            majority, for a shadow between two legs touches them on two sides. Measured.
-        bridge: a region that could be either is also foreground between parts of the person that are no farther apart
-            than this share of the picture's height (a gap of 10 of 480 pixels). Measured.
-        seed: parts of the person but the largest hold pixels of this statistic, noise variances. Measured.
-        gap: parts that are no farther apart than this share of the picture's height are joined. Half a forearm, where a
-            person's height is half of the picture's.
-        limb: how thick they are joined, share of the picture's height. As above: a thin arm.
-        rim: share of the largest contrast nearby from which a rim pixel stays; 0.5 would be unbiased at a sharp
-            outline, less is cautious: a pixel too many swells the hull a little, one too few cuts through it.
-        rim_layers: how deep the rim is searched, pixels: two reduced ones for the window.
-        speck_area: smaller foreground components go, share of the picture's area (61 pixels of 640×480). Measured.
-        hole_area: smaller holes are filled, share of the picture's area (123 pixels of 640×480). Measured.
+        threshold: how unlike the scene the person is, in noise variances; pure noise gives 0.5. Lower finds more, and
+            more that is nobody. Measured on rendered captures with exact masks, as all of these.
+        shadow_min: the darkest shadow, as a share of the lit scene; 1 if there are none. What is darker is taken for
+            the person, which the other cameras put right, while a hole in one mask cuts through the visual hull. 0.76
+            was measured under two lamps.
+        shadow_max: the faintest shadow, as a share of the lit scene. What is fainter is the edge of a darker one.
+        rim: a pixel of the outline stays if it has this share of the largest contrast nearby; 0.5 would be unbiased at
+            a sharp outline, less is cautious: a pixel too many swells the hull a little, one too few cuts through it.
+        speck_area: smaller pieces of foreground go, share of the picture's area (61 pixels of 640×480).
+        hole_area: smaller holes are filled, share of the picture's area (123 pixels of 640×480).
     """
 
-    reduction: int = 2
     threshold: float = 3.0
-    neighbour_octaves: float = 0.5
-    iterations: int = 3
-    difference_min: float = 2.0
-    darkness_offset: float = 40.0
     shadow_min: float = 0.7
     shadow_max: float = 0.95
-    bright: float = 4.0
-    noise_floor: float = 0.7
-    still_noise: float = 15.0
-    relative_noise_floor: float = 0.5
-    jitter_px: float = 0.04
-    penumbra: float = 0.2
-    core: float = 8.0
-    penumbra_reach: float = 0.017
-    faint_enclosure: float = 0.2
-    enclosure: float = 0.6
-    seed: float = 64.0
-    bridge: float = 0.02
     rim: float = 0.3
-    rim_layers: int = 4
-    gap: float = 0.08
-    limb: float = 0.025
     speck_area: float = 2e-4
     hole_area: float = 4e-4
 
@@ -138,31 +153,10 @@ class ForegroundConfig:
             value = getattr(self, field.name)
             if not (np.isfinite(value) and value >= 0):
                 raise ConfigError(f"foreground.{field.name} = {value}: must be a finite number, 0 or more")
-        for name in (
-            "reduction",
-            "threshold",
-            "difference_min",
-            "darkness_offset",
-            "noise_floor",
-            "penumbra",
-            "core",
-            "seed",
-        ):
-            if getattr(self, name) == 0:
-                raise ConfigError(f"foreground.{name} = 0: must be positive")
-        for name in (
-            "shadow_min",
-            "shadow_max",
-            "relative_noise_floor",
-            "penumbra",
-            "enclosure",
-            "faint_enclosure",
-            "rim",
-        ):
-            if getattr(self, name) > 1:
-                raise ConfigError(f"foreground.{name} = {getattr(self, name)}: a share, at most 1")
-        if self.reduction != int(self.reduction):
-            raise ConfigError(f"foreground.reduction = {self.reduction}: must be a whole number of pixels, 1 or more")
+            if field.name != "threshold" and value > 1:
+                raise ConfigError(f"foreground.{field.name} = {value}: a share, at most 1")
+        if self.threshold == 0:
+            raise ConfigError("foreground.threshold = 0: must be positive")
         if self.shadow_min == 0:
             raise ConfigError("foreground.shadow_min = 0: must be positive (1 switches the tolerance of shadows off)")
 
@@ -183,128 +177,13 @@ class Foreground(Protocol):
         ...
 
 
-def median_plate(frames: Sequence[Images], sizes: ArrayLike) -> tuple[Images, ...]:
-    """An empty scene from a recording without one: the median over frames that are spread over it.
-
-    It holds where the person covers a pixel in less than half of the frames.
-
-    Args:
-        frames: pictures (C, H, W, 3) uint8, a few dozen.
-        sizes: (C, 2) each camera's (width, height), pixels.
-
-    Returns:
-        one clip (1, h, w, 3) a camera, as ``learn`` takes them.
-    """
-    if not frames:
-        raise CaptureError("no frames to take a background from: the recording is empty")
-    plates = []
-    for c, (width, height) in enumerate(np.asarray(sizes, dtype=int)):
-        stack = np.stack([frame[c, :height, :width] for frame in frames])
-        plates.append(np.median(stack, axis=0).round().astype(np.uint8)[None])
-    return tuple(plates)
-
-
-def _check_clips(clips: Sequence[Images], frame_shape: tuple[int, int], sizes: NDArray[np.int_]) -> None:
-    if len(clips) != len(sizes):
-        raise CaptureError(f"background: {len(clips)} clips for {len(sizes)} cameras; one a camera is needed")
-    for c, (clip, (width, height)) in enumerate(zip(clips, sizes, strict=True)):
-        if clip.ndim != 4 or len(clip) == 0 or clip.shape[1:] != (height, width, 3):
-            raise CaptureError(
-                f"background: the clip of camera {c + 1} has shape {clip.shape}, "
-                f"its calibration wants (T, {height}, {width}, 3)"
-            )
-        if height > frame_shape[0] or width > frame_shape[1]:
-            raise CaptureError(f"background: camera {c + 1} is larger than the frame {frame_shape}")
-
-
-def _reduced(images: Images, factor: int) -> Images:
-    """(N, H // factor, W // factor, 3): means over squares of pixels."""
-    height, width = images.shape[1] // factor, images.shape[2] // factor
-    return np.stack([cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) for image in images])
-
-
-def _samples(images: NDArray[Any]) -> NDArray[Any]:
-    """(C, 3, N) pixels on a coarse grid: about thirty rows."""
-    step = max(min(images.shape[1:3]) // 30, 1)
-    grid = images[:, step // 2 :: step, step // 2 :: step]
-    return np.ascontiguousarray(np.moveaxis(grid, -1, 1)).reshape(len(images), 3, -1)
-
-
-def _gain_and_noise(
-    image: NDArray[np.uint8], plate: NDArray[np.float32], relative: NDArray[np.float32]
-) -> tuple[NDArray[np.float64], float]:
-    """A picture's gain against the plate and its noise, from samples of which most show the empty scene.
-
-    Args:
-        image, plate: (3, N) grey levels.
-        relative: (N,) relative noise variance.
-
-    Returns:
-        gain (3,) and noise variance, grey levels²; gain 1 and variance 0 where too little can be seen.
-    """
-    low, high = np.minimum(image, plate).min(axis=0), np.maximum(image, plate).max(axis=0)
-    usable = (low > 20) & (high < 245)  # neither drowned in noise nor saturated
-    if np.count_nonzero(usable) < 64:
-        return np.ones(3), 0.0
-    a, b = image[:, usable].astype(np.float32), plate[:, usable]
-    scale = 1.0 / np.sqrt(relative[usable])
-    residual = np.abs(a - np.median(a / b, axis=1, keepdims=True) * b).max(axis=0) * scale
-    # twice: the person and the shadow inflate the first median, and lie outside three times it
-    inlier = residual <= 3 * np.median(residual)
-    inlier = residual <= 3 * np.median(residual[inlier])
-    a, b = a[:, inlier], b[:, inlier]
-    gain = np.einsum("cn,cn->c", a, b) / np.einsum("cn,cn->c", b, b)
-    variance = np.mean(np.square((a - gain[:, None] * b) * scale[inlier]))
-    return gain.astype(np.float64), float(variance)
-
-
-def _learn_scene(clip: Images) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Mean and temporal variance (h, w, 3) of a clip of the empty scene, flicker taken off; no variance for T = 1."""
-    reference = clip[0].astype(np.float32)
-    if len(clip) == 1:
-        return reference, None
-    total = np.zeros_like(reference)
-    squares = np.zeros_like(reference)
-    sample = _samples(clip)
-    ones = np.ones(sample.shape[2], np.float32)
-    for frame, pixels in zip(clip, sample, strict=True):
-        gain, _ = _gain_and_noise(pixels, sample[0].astype(np.float32), ones)
-        # sums of differences from the first frame: no cancellation in float32
-        difference = frame / gain.astype(np.float32) - reference
-        total += difference
-        squares += difference * difference
-    mean = total / len(clip)
-    variance = (squares - total * mean) / (len(clip) - 1)
-    return reference + mean, np.maximum(variance, 0)
-
-
-def _box_mean(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    mean = cv2.boxFilter(values, cv2.CV_32F, (3, 3), borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(mean, dtype=np.float32)
-
-
-def _relative_noise(
-    plate: NDArray[np.float32], variance: NDArray[np.float32] | None, config: ForegroundConfig
-) -> NDArray[np.float32]:
-    """(h, w) noise variance of each window as a multiple of the picture's level."""
-    floor = config.noise_floor
-    level, window = floor, np.full(plate.shape[:2], floor, np.float32)
-    if variance is not None:
-        window = _box_mean(variance).mean(axis=2)
-        median = float(np.median(window))
-        window = np.maximum(window, config.relative_noise_floor * median) + floor
-        level = median + floor
-    contrast = np.maximum(_box_mean(plate * plate) - _box_mean(plate) ** 2, 0).mean(axis=2)
-    return ((window + config.jitter_px**2 * contrast) / level).astype(np.float32)
-
-
 class CollinearityForeground:
     """The collinearity test against a learned empty scene. Make it with :meth:`learn`."""
 
     def __init__(
         self,
         plates: Images,
-        relative_noise: NDArray[np.float32],
+        relative: NDArray[np.float32],
         sizes: NDArray[np.int_],
         config: ForegroundConfig,
         noise_floor: NDArray[np.floating],
@@ -315,16 +194,27 @@ class CollinearityForeground:
         """
         self.config = config
         self.plates = plates
-        self.sizes = sizes
-        self._small_plates = _reduced(plates, config.reduction)
+        self._small_plates = reduced(plates, _REDUCTION)
         self._small = np.empty_like(self._small_plates)
         self._small_scenes = np.empty_like(self._small_plates)
-        self._noise_floor = noise_floor
-        self._weights = (1.0 / relative_noise).astype(np.float32)
-        self._plate_samples = _samples(self._small_plates).astype(np.float32)
-        self._noise_samples = _samples(relative_noise[..., None].repeat(3, axis=3))[:, 0]
-        self._planes = Planes(*self._small.shape[:3])
-        self._pool = ThreadPoolExecutor(max_workers=min(len(plates), os.cpu_count() or 1))
+        self._coarse_plates = reduced(self._small_plates, 2)
+        self._coarse_scenes = np.empty_like(self._coarse_plates)
+        darkest = self._coarse_plates.min(axis=3)
+        self._darkest = darkest.reshape(-1, darkest.shape[2])
+        self._noise_floor = noise_floor.astype(np.float32)
+        self._plate_samples = samples(self._small_plates).astype(np.float32)
+        self._noise_samples = samples(relative[..., None])[:, 0]
+        self._plate_sums = _window_sums(self._small_plates).astype(np.float32)
+        self._statistic = Statistic(self._small, self._small_scenes, (1.0 / relative).astype(np.float32))
+        # of the reduced pictures
+        self._height = int(np.median(sizes[:, 1])) // _REDUCTION
+        self._speck, self._hole = (
+            share * float(np.median(np.prod(sizes, axis=1))) / _REDUCTION**2
+            for share in (config.speck_area, config.hole_area)
+        )
+        self._bridge = 2 * round(_BRIDGE * self._height / 2) + 1
+        self._penumbra = 2 * round(_PENUMBRA_REACH * self._height) + 1
+        self._gap = max(self._bridge, self._penumbra, 2 * _RIM_LAYERS) + 1  # no filter reaches from box to box
 
     @classmethod
     def learn(
@@ -337,8 +227,8 @@ class CollinearityForeground:
         """Learn the empty scene.
 
         A clip gives the plate and how the noise varies over the picture; of a single picture (T = 1) the noise is taken
-        to be even. The noise's level is measured in each frame that is segmented, so a plate need not tell it;
-        of a single picture, ``still_noise`` is added.
+        to be even. The noise's level is measured in each frame that is segmented, so a plate need not tell it; with a
+        single picture, more is added to it.
 
         Args:
             clips: one (T, h, w, 3) uint8 a camera.
@@ -351,15 +241,15 @@ class CollinearityForeground:
         """
         config = config or ForegroundConfig()
         sizes = np.asarray(sizes, dtype=int).reshape(-1, 2)
-        _check_clips(clips, frame_shape, sizes)
+        check_clips(clips, frame_shape, sizes)
         plates = np.zeros((len(clips), *frame_shape, 3), np.uint8)
-        relative = np.ones((len(clips), *(n // config.reduction for n in frame_shape)), np.float32)
-        floor = np.array([config.still_noise if len(clip) == 1 else config.noise_floor for clip in clips])
+        relative = np.ones((len(clips), *(n // _REDUCTION for n in frame_shape)), np.float32)
+        floor = np.array([_STILL_NOISE if len(clip) == 1 else _NOISE_FLOOR for clip in clips])
         for c, (clip, (width, height)) in enumerate(zip(clips, sizes, strict=True)):
-            plate, _ = _learn_scene(clip)
+            plate, _ = learn_scene(clip)
             plates[c, :height, :width] = np.clip(plate.round(), 0, 255)
-            small_plate, variance = _learn_scene(_reduced(clip, config.reduction))
-            noise = _relative_noise(small_plate, variance, config)
+            small_plate, variance = learn_scene(reduced(clip, _REDUCTION))
+            noise = relative_noise(small_plate, variance, _NOISE_FLOOR)
             relative[c, : noise.shape[0], : noise.shape[1]] = noise
         return cls(plates, relative, sizes, config, floor)
 
@@ -372,152 +262,143 @@ class CollinearityForeground:
 
         What differs is looked for about the person, as far as :meth:`segment` looks.
         """
-        config = self.config
-        cameras = range(len(images))
-        # OpenCV lets go of the interpreter: cameras run side by side, each with its own memory
-        levels = list(self._pool.map(lambda c: self._expose(c, images[c]), cameras))
-        self._planes.measure(
-            self._small,
-            self._small_scenes,
-            self._weights,
-            (1.0 / (np.array([variance for _, variance in levels]) + self._noise_floor)).astype(np.float32),
-            darkness_offset=config.darkness_offset,
-            shadow_min=config.shadow_min,
-            difference_min=config.difference_min,
-        )
-        self._planes.relax(config.threshold, config.neighbour_octaves, config.iterations)
         masks = np.zeros(images.shape[:3], np.uint8)
         doubtful = np.zeros(images.shape[:3], np.bool_)
-        list(self._pool.map(lambda c: self._draw(images[c], c, levels[c][0], masks[c], doubtful[c]), cameras))
+        self._small[...] = reduced(images, _REDUCTION)
+        gains, variances = gain_and_noise(samples(self._small), self._plate_samples, self._noise_samples)
+        noise = variances + self._noise_floor
+        boxes = self._look(gains, _LOOK * np.sqrt(noise))
+        if not boxes.any():
+            return masks, doubtful
+        mosaic = Mosaic.of(boxes, self._gap)
+        for c, gain in enumerate(gains):
+            x, y, w, h = boxes[c]
+            near = slice(max(y - 1, 0), y + h + 1), slice(max(x - 1, 0), x + w + 1)  # the windows' reach
+            if w > 0:
+                cv2.transform(self._small_plates[c][near], np.diag(gain), dst=self._small_scenes[c][near])
+        self._statistic.measure(
+            1.0 / noise,
+            self._brightness(gains),
+            mosaic.boxes,
+            mosaic.corners,
+            mosaic.shape,
+            darkness_offset=_DARKNESS_OFFSET,
+            shadow_min=self.config.shadow_min,
+            shadow_max=self.config.shadow_max,
+            difference_min=_DIFFERENCE_MIN,
+            threshold=self.config.threshold,
+            octaves_per_neighbour=_NEIGHBOUR_OCTAVES,
+            iterations=_ITERATIONS,
+        )
+        decision, doubt = self._decide(mosaic)
+        self._outline(images, gains, decision, mosaic, masks)
+        full = mosaic.enlarged(_REDUCTION)
+        whole = cv2.resize(doubt, full.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        for c in range(len(images)):
+            np.greater(full.part(whole, c), full.crop(masks[c], c), out=full.crop(doubtful[c], c))  # 1 where 0
         return masks, doubtful
 
-    def _draw(
-        self, image: Images, c: int, gain: NDArray[np.float64], mask: Images, doubtful: NDArray[np.bool_]
-    ) -> None:
-        """Decide on camera ``c``'s reduced picture; the results in full go to ``mask`` and ``doubtful`` (H, W)."""
-        decision, doubt = self._decide(c)
-        self._outline(image, c, gain, decision, mask)
-        height, width = mask.shape
-        whole = cv2.resize(doubt, (width, height), interpolation=cv2.INTER_NEAREST)
-        np.greater(whole, mask, out=doubtful)  # 1 where the mask is 0
+    def _look(self, gains: NDArray[np.float32], least: NDArray[np.float32]) -> NDArray[np.int32]:
+        """A coarse look at the whole of each picture: (C, 4) boxes of the reduced ones that hold the person.
 
-    def _expose(self, c: int, image: Images) -> tuple[NDArray[np.float64], float]:
-        """Reduce camera ``c``'s picture and bring its reduced plate to the same gain; the gain (3,) and the noise."""
-        small = self._small[c]
-        cv2.resize(image, small.shape[1::-1], dst=small, interpolation=cv2.INTER_AREA)
-        gain, variance = _gain_and_noise(_samples(small[None])[0], self._plate_samples[c], self._noise_samples[c])
-        cv2.transform(self._small_plates[c], np.diag(gain), dst=self._small_scenes[c])
-        return gain, variance
+        What is brighter than the scene, darker than a shadow makes it, or of another colour, and a margin about it that
+        is larger than what may look like a shadow. A box is empty, all 0, where there is nothing.
 
-    def _decide(self, c: int) -> tuple[Images, Images]:
-        """(h, w) uint8, 0 or 255: which pixels of camera ``c``'s reduced picture show the person; 0 or 1: may do so."""
-        config, planes = self.config, self._planes
-        mask = np.zeros(self._small.shape[1:3], np.uint8)
-        doubt = np.zeros_like(mask)
-        height = int(self.sizes[c, 1]) // config.reduction
-        area = int(np.prod(self.sizes[c])) / config.reduction**2
-        reach = 2 * round(config.bridge * height / 2) + 1
-        # the window widens whatever shows the person: what vanishes under erosion is noise
-        x, y, w, h = cv2.boundingRect(cv2.erode(planes.labels[c], _SQUARE3))
-        if w == 0:
-            return mask, doubt
-        margin = reach + height // 10  # shows enough of a shadow to tell it from a cloth
-        crop = (slice(max(y - margin, 0), y + h + margin), slice(max(x - margin, 0), x + w + margin))
-        difference = np.ascontiguousarray(planes.difference[c][crop])
-        collinearity = np.ascontiguousarray(planes.collinearity[c][crop])
-        labels = planes.labels[c][crop].view(np.bool_)
-        certain, unsure = without_penumbrae(labels, difference, collinearity, config.penumbra, config.core)
-        brightness, noise, scene = self._brightness(c)
-        bright = unsure & (brightness[crop] > config.bright * noise)
-        certain, unsure = certain | bright, unsure & ~bright
-        dark = brightness[crop] < (config.shadow_max - 1.0) * scene[crop]
-        width = 2 * round(config.penumbra_reach * height) + 1
-        faint = beyond_shadows(unsure, certain, dark, width, config.faint_enclosure)
-        certain, unsure = certain | faint, unsure & ~faint
-        foreground = certain | enclosed(unsure, certain, config.enclosure)
-        foreground |= unsure & closed(foreground, reach)
-        bar = max(round(config.limb * height), 1)
-        foreground = joined(
-            foreground, difference > 0, collinearity, config.seed, config.speck_area * area, config.gap * height, bar
-        )
-        doubt[crop] = (difference > 0) & ~foreground
-        mask[crop] = clean_by_area(foreground, config.speck_area * area, config.hole_area * area)
-        return mask, doubt
-
-    def _brightness(self, c: int) -> tuple[NDArray[np.float32], float, NDArray[Any]]:
-        """Of camera ``c``'s reduced picture: mean over 3×3 pixels less the scene's, its noise, and the scene (h, w)."""
-        image, scene = (cv2.cvtColor(p[c], cv2.COLOR_BGR2GRAY) for p in (self._small, self._small_scenes))
-        signed = cv2.subtract(image, scene, dtype=cv2.CV_16S)
-        brightness = cv2.boxFilter(signed, cv2.CV_32F, (3, 3))
-        sample = brightness[2::6, 2::6]  # most of it shows the scene
-        median = float(np.median(sample))
-        noise = 1.4826 * float(np.median(np.abs(sample - median)))
-        return np.subtract(brightness, np.float32(median), dtype=np.float32), max(noise, _LEAST_NOISE), scene
-
-    def _outline(self, image: Images, c: int, gain: NDArray[np.float64], decision: Images, mask: Images) -> None:
-        """Draw camera ``c``'s outline in the full picture, into ``mask``: the rim goes where it shows the scene."""
-        area = int(np.prod(self.sizes[c]))
-        height, width = mask.shape
-        whole = cv2.resize(decision, (width, height), interpolation=cv2.INTER_LINEAR)
-        x, y, w, h = cv2.boundingRect(whole)
-        if w == 0:
-            return
-        margin = self.config.rim_layers
-        crop = (slice(max(y - margin, 0), y + h + margin), slice(max(x - margin, 0), x + w + margin))
-        scene = cv2.transform(self.plates[c][crop], np.diag(gain))
-        # the plain mean: a grey level all but leaves out blue
-        contrast = np.asarray(cv2.transform(cv2.absdiff(image[crop], scene), np.full((1, 3), 1 / 3)), np.uint8)
-        person = trim_rim(whole[crop] > 127, contrast, self.config.rim, self.config.rim_layers)
-        mask[crop] = clean_by_area(person, self.config.speck_area * area, self.config.hole_area * area)
-
-
-class Mog2Foreground:
-    """OpenCV's mixture of Gaussians (MOG2) a pixel, learned from the clips and then frozen; its shadows are dropped."""
-
-    def __init__(
-        self, models: Sequence[cv2.BackgroundSubtractorMOG2], sizes: NDArray[np.int_], config: ForegroundConfig
-    ):
-        self.config = config
-        self.sizes = sizes
-        self._models = tuple(models)
-
-    @classmethod
-    def learn(
-        cls,
-        clips: Sequence[Images],
-        frame_shape: tuple[int, int],
-        sizes: ArrayLike,
-        config: ForegroundConfig | None = None,
-    ) -> Mog2Foreground:
-        """Learn the empty scene; arguments and errors as :meth:`CollinearityForeground.learn`.
-
-        Of ``config`` only the areas of specks and holes matter; OpenCV's defaults hold otherwise. A plate (T = 1)
-        leaves each pixel with OpenCV's initial variance.
+        Args:
+            gains: (C, 3).
+            least: (C,) grey levels that noise does not make.
         """
-        sizes = np.asarray(sizes, dtype=int).reshape(-1, 2)
-        _check_clips(clips, frame_shape, sizes)
-        models = []
-        for clip in clips:
-            model = cv2.createBackgroundSubtractorMOG2(history=max(len(clip), 1), detectShadows=True)
-            for frame in clip:
-                model.apply(np.ascontiguousarray(frame))
-            models.append(model)
-        return cls(models, sizes, config or ForegroundConfig())
+        coarse = reduced(self._small, 2)
+        count, height, width = coarse.shape[:3]
+        for plate, gain, scene in zip(self._coarse_plates, gains, self._coarse_scenes, strict=True):
+            cv2.transform(plate, np.diag(gain), dst=scene)
+        # one below the other they are one picture
+        tall, scenes = coarse.reshape(-1, width, 3), self._coarse_scenes.reshape(-1, width, 3)
+        shaded = cv2.convertScaleAbs(scenes, alpha=self.config.shadow_min)
+        # a shadow leaves the same share of every colour
+        blue, green, red = cv2.split(cv2.divide(tall, scenes, scale=_WHOLE))
+        uneven = cv2.subtract(cv2.max(cv2.max(blue, green), red), cv2.min(cv2.min(blue, green), red))
+        tinted = cv2.multiply(uneven, self._darkest, scale=1 / _WHOLE)
+        blue, green, red = cv2.split(cv2.max(cv2.subtract(tall, scenes), cv2.subtract(shaded, tall)))
+        beyond = np.asarray(cv2.max(cv2.max(blue, green), cv2.max(red, tinted)), np.uint8).reshape(count, -1)
+        differs = (beyond > least.astype(np.uint8)[:, None]).reshape(-1, width).view(np.uint8)
+        crowd = cv2.boxFilter(differs, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        differs &= crowd >= _LOOK_CELLS
+        margin = round(_LOOK_MARGIN * self._height)
+        boxes = np.zeros((count, 4), np.int32)
+        for c, picture in enumerate(differs.reshape(count, height, width)):
+            x, y, w, h = (2 * n for n in cv2.boundingRect(picture))
+            if w > 0:
+                left, top = max(x - margin, 0), max(y - margin, 0)
+                right, bottom = min(x + w + margin, 2 * width), min(y + h + margin, 2 * height)
+                boxes[c] = left, top, right - left, bottom - top
+        return boxes
 
-    def segment(self, images: Images) -> Images:
-        """Pictures (C, H, W, 3) uint8 BGR to masks (C, H, W) uint8, 0 or 255."""
-        return self.label(images)[0]
+    def _brightness(self, gains: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(C, 2) sums over a window of how much brighter a picture is than the scene: what is bright, what is usual.
 
-    def label(self, images: Images) -> tuple[Images, NDArray[np.bool_]]:
-        """Masks (C, H, W) uint8, and where OpenCV says shadow (C, H, W) bool."""
-        masks = np.zeros(images.shape[:3], np.uint8)
-        doubtful = np.zeros(images.shape[:3], np.bool_)
-        for c, (model, (width, height)) in enumerate(zip(self._models, self.sizes, strict=True)):
-            labels = model.apply(np.ascontiguousarray(images[c, :height, :width]), learningRate=0)
-            area = width * height
-            masks[c, :height, :width] = clean_by_area(
-                labels == 255, self.config.speck_area * area, self.config.hole_area * area
-            )
-            shadow = labels == model.getShadowValue()
-            doubtful[c, :height, :width] = shadow & (masks[c, :height, :width] == 0)
-        return masks, doubtful
+        Noise, and what is left of the gain's error, are as measured all over the picture, most of which is the scene.
+        """
+        brighter = ((_window_sums(self._small) - self._plate_sums * gains[:, None]) * np.array(GREY, np.float32)).sum(
+            axis=2
+        )
+        usual = median(brighter)
+        noise = np.maximum(1.4826 * median(np.abs(brighter - usual[:, None])), 9 * sum(GREY) * _LEAST_NOISE)
+        return np.stack([usual + _BRIGHT * noise, usual], axis=1).astype(np.float32)
+
+    def _decide(self, mosaic: Mosaic) -> tuple[Images, Images]:
+        """Mosaics of the reduced pictures: where the person is, 0 or 255, and where he may be as well, 0 or 1."""
+        statistic = self._statistic
+        difference, collinearity, shades = statistic.difference, statistic.collinearity, statistic.shades
+        seen = difference > 0
+        certain = without_penumbrae(statistic.labels.view(np.bool_), difference, collinearity, _PENUMBRA, _CORE)
+        certain |= shades == BRIGHT
+        unsure = seen & ~certain
+        certain |= beyond_shadows(unsure, certain, shades == DARK, self._penumbra, _FAINT_ENCLOSURE)
+        unsure &= ~certain
+        # a box holds the person: what runs out of it is a shadow
+        foreground = certain | enclosed(unsure, certain, _ENCLOSURE, mosaic.cut(self._small.shape[1:3]))
+        foreground |= unsure & closed(foreground, self._bridge)
+        foreground = joined(
+            foreground,
+            seen,
+            collinearity,
+            mosaic.corners[:, 0],
+            seed=_SEED,
+            least=self._speck,
+            reach=_GAP * self._height,
+            width=max(round(_LIMB * self._height), 1),
+        )
+        return clean_by_area(foreground, self._speck, self._hole), (seen & ~foreground).view(np.uint8)
+
+    def _outline(
+        self, images: Images, gains: NDArray[np.float32], decision: Images, mosaic: Mosaic, masks: Images
+    ) -> None:
+        """Draw the outlines in the full pictures, into ``masks``: the rim goes where it shows the scene."""
+        tight = mosaic.tightened(decision, _RIM_LAYERS // _REDUCTION + 1)
+        small = np.zeros(tight.shape, np.uint8)
+        for c in range(len(images)):
+            tight.part(small, c)[...] = mosaic.part_of(decision, c, tight.boxes[c])
+        full = tight.enlarged(_REDUCTION)
+        whole = cv2.resize(small, full.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        difference = np.zeros((*full.shape, 3), np.uint8)
+        for c, gain in enumerate(gains):
+            if full.boxes[c].any():
+                scene = cv2.transform(full.crop(self.plates[c], c), np.diag(gain))
+                cv2.absdiff(full.crop(images[c], c), scene, dst=full.part(difference, c))
+        blue, green, red = cv2.split(difference)
+        contrast = np.asarray(cv2.max(cv2.max(blue, green), red), np.uint8)
+        person = trim_rim(whole > 127, contrast, self.config.rim, _RIM_LAYERS)
+        clean = clean_by_area(person, self._speck * _REDUCTION**2, self._hole * _REDUCTION**2)
+        for c in range(len(images)):
+            full.crop(masks[c], c)[...] = full.part(clean, c)
+
+
+def _window_sums(images: Images) -> NDArray[np.uint16]:
+    """(C, N, 3) sums over 3×3 pixels of pictures (C, h, w, 3), here and there."""
+    last = images.shape[1] - 2, images.shape[2] - 2
+    parts = [images[:, y : last[0] + y : _BRIGHT_STEP, x : last[1] + x : _BRIGHT_STEP] for y, x in np.ndindex(3, 3)]
+    total = parts[0].astype(np.uint16)
+    for part in parts[1:]:
+        total += part
+    return total.reshape(len(images), -1, 3)

@@ -19,8 +19,7 @@ from tk.kernels.linearisation import Linearisation
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective import Held, ObjectiveKernel, ObjectiveSettings
 from tk.model.body import Body
-from tk.model.contour_term import ContourTerm, Pictures
-from tk.model.postures import limb_postures
+from tk.model.contour_term import RENEW, ContourTerm
 from tk.model.skeleton import CHAINS, SEGMENTS, WAIST_STIFFNESS
 
 Float = NDArray[np.float64]
@@ -47,6 +46,59 @@ def _barred() -> Ints:
 
 
 BARRED = _barred()
+
+
+# How far a sample looks for a voxel, and a voxel for the body, metres.
+REACH_M, COVERAGE_REACH_M = 0.3, 0.5
+# Leclerc's ν of the coverage term beside the surface term's: a voxel of a limb that has left the body is far from it.
+COVERAGE_SOFTNESS = 2.0
+# Least weight of a pair in the Hessian: a limb that has moved away from its data keeps some curvature.
+OUTLIERS = 0.1
+
+
+@dataclass(frozen=True)
+class ObjectiveConfig:
+    """Settings of the objective (section 6.1).
+
+    Attributes:
+        nu: Leclerc's ν of eq. 9, in units of ½ (d/σ)². The paper prints none.
+        tangential: weight of the distance along the data's surface; 1 is the paper's distance, 0 point-to-plane.
+        min_cosine: least cosine between a sample's normal and its voxel's; -1 ignores normals, as the paper does.
+        coverage_weight: w_c of the coverage term, from data to model; 0 leaves it out, as the paper does.
+        surface_weight: w_s of eq. 8; 0 leaves the surface term out.
+    """
+
+    nu: float = 0.35
+    tangential: float = 1.0
+    min_cosine: float = -1.0
+    coverage_weight: float = 0.7
+    surface_weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, valid in (
+            ("nu", self.nu > 0),
+            ("tangential", 0 <= self.tangential <= 1),
+            ("min_cosine", -1 <= self.min_cosine <= 1),
+            ("coverage_weight", self.coverage_weight >= 0),
+            ("surface_weight", self.surface_weight >= 0),
+        ):
+            if not valid:
+                raise ConfigError(f"objective.{name} = {getattr(self, name)} is out of range")
+
+    @property
+    def settings(self) -> ObjectiveSettings:
+        """What the kernel takes."""
+        return ObjectiveSettings(
+            nu=self.nu,
+            tangential=self.tangential,
+            min_cosine=self.min_cosine,
+            reach_m=REACH_M,
+            coverage_weight=self.coverage_weight,
+            coverage_nu=COVERAGE_SOFTNESS * self.nu,
+            coverage_cosine=self.min_cosine,
+            coverage_reach_m=COVERAGE_REACH_M,
+            surface_weight=self.surface_weight,
+        )
 
 
 @dataclass(frozen=True)
@@ -132,7 +184,6 @@ class BodyObjective:
         chain = CHAIN_OF_SEGMENT[body.segment]
         self.torso_samples = np.flatnonzero(chain < 0).astype(np.int32)
         self.chain_samples = [np.flatnonzero(chain == c).astype(np.int32) for c in range(len(CHAINS))]
-        self.postures = limb_postures(skeleton)
         self.chain_free = np.array([skeleton.chain_dofs(c) for c in CHAIN_NAMES])
 
     def draw(self, rng: np.random.Generator, scale: int = 1) -> Ints:
@@ -204,9 +255,6 @@ class Evaluation(NamedTuple):
 
 # A voxel farther from the body than this is not explained by it, metres.
 ASTRAY_M = 0.1
-# So many times the contour points of an iteration when hypotheses of a limb are compared: a limb has but a few on the
-# outline of the whole body, and one that met a wrong boundary would decide.
-COMPARED = 5
 # A voxel this far from the nearest piece may belong to another: voxels lie 2 to 3 cm off the piece they belong to.
 UNCLAIMED_M = 0.05
 
@@ -252,10 +300,9 @@ class Fit:
 
 
 class _Look(NamedTuple):
-    """A pose's value on the even samples, its gradient (D,), and the assignments that they rest on."""
+    """A pose's value on the even samples, and the assignments that it rests on."""
 
     value: float
-    gradient: Float
     held: Held
     entries: NDArray[np.floating] | None
 
@@ -269,7 +316,7 @@ class FrameObjective:
         rng: where samples are drawn from.
         outliers: least weight of a pair in the Hessian.
         with_jacobian: whether :meth:`fit` keeps the pairs' Jacobian.
-        pictures: what the contour cues look at; without it, or without those cues, the hull alone counts.
+        images: (C, H, W, 3) the pictures of the edge term; without them, or without that term, the hull alone counts.
     """
 
     def __init__(
@@ -277,20 +324,19 @@ class FrameObjective:
         objective: BodyObjective,
         index: SurfaceIndex,
         rng: np.random.Generator,
-        outliers: float = 0.1,
+        outliers: float = OUTLIERS,
         with_jacobian: bool = False,
-        pictures: Pictures | None = None,
+        images: NDArray[np.uint8] | None = None,
     ) -> None:
         self.objective = objective
         self.index = index
         self.rng = rng
         self.outliers = outliers
         self.with_jacobian = with_jacobian
-        self.contours = None if pictures is None else objective.contours
-        self.pictures = pictures
+        self.contours = None if images is None else objective.contours
+        self.images = images
         self.voxel_count = len(index.positions)
         self.free = objective.chain_free
-        self.postures = objective.postures
         self.angular = ~objective.body.skeleton.prismatic
         self._even_samples = objective.spread()
         self._even_voxels = np.arange(0, self.voxel_count, max(self.voxel_count // 600, 1), dtype=np.int32)
@@ -334,11 +380,6 @@ class FrameObjective:
 
         return evaluate
 
-    def screen(self, owner: NDArray[np.intp], pose: Float, poses: Float, softness: float = 1.0) -> Float:
-        """(B,) the chains' objectives at ``poses`` (B, D) by the hull alone, on few points: rough, and cheap."""
-        self._pools = self._chain_pools(self.fit(pose))
-        return self._evaluate(*self._draw_chains(owner), poses, None, self._softened(softness)).value
-
     def fixed(self, softness: float = 1.0) -> FixedObjective:
         """All degrees of freedom on one draw of points that stays: what Levenberg-Marquardt minimises (section 7.3)."""
         strips = None if self.contours is None else self._term.draw(self.rng)
@@ -350,16 +391,6 @@ class FrameObjective:
         strips = None if self.contours is None else self._term.draw_chains(self.rng)[chain]
         return FixedObjective(self, *self._draw_chain(chain), strips, softness)
 
-    def chain_values(self, owner: NDArray[np.intp], poses: Float) -> Float:
-        """(B,) the chains' objectives on even samples, and on the voxels it may have to cover (:meth:`chains`).
-
-        A limb that leaves the voxels it lay on uncovered is no better for it.
-        """
-        samples = np.stack([np.resize(even(s, 60), 60) for s in self.objective.chain_samples])
-        voxels = np.stack([np.resize(even(pool, 120), 120) for pool in self._pools])
-        entries = self._entries(poses, self._term.draw_chains(None, COMPARED)[owner]) if self.contours else None
-        return self._evaluate(samples[owner], voxels[owner], poses, None, self.objective.settings, entries).value
-
     def value(self, pose: Float) -> float:
         """The objective at ``pose`` (D,) on even samples and evenly spread voxels."""
         return float(self.values(pose[None])[0])
@@ -370,11 +401,6 @@ class FrameObjective:
         if unknown:
             self._look(np.array(unknown))
         return np.array([self._looks[pose.tobytes()].value for pose in poses])
-
-    def gradient(self, pose: Float) -> Float:
-        """(D,) gradient of :meth:`value`, with the assignments held."""
-        self.values(pose[None])
-        return self._looks[pose.tobytes()].gradient
 
     def curvature(self, pose: Float, softness: float = 1.0) -> Float:
         """(D, D) Gauss-Newton Hessian at ``pose`` (D,), outliers weighing at least :attr:`outliers`."""
@@ -395,7 +421,7 @@ class FrameObjective:
         entries = None
         if self.contours:
             entries = self._entries(poses, np.repeat(self._term.draw(None)[None], B, 0))
-        value, gradient, _, held = self.objective.kernel.evaluate(
+        value, gradient, product, held = self.objective.kernel.evaluate(
             self.index,
             np.repeat(self._even_samples[None], B, 0),
             np.repeat(self._even_voxels[None], B, 0),
@@ -404,12 +430,10 @@ class FrameObjective:
             self.objective.settings,
             entries=entries,
         )
-        value, gradient, _ = self.objective.with_stiffness(poses, None, value, gradient, gradient)
+        value = self.objective.with_stiffness(poses, None, value, gradient, product).value
         for b, pose in enumerate(poses):
             own = Held(held.assigned[b : b + 1], held.covering[b : b + 1])
-            self._looks[pose.tobytes()] = _Look(
-                float(value[b]), gradient[b], own, None if entries is None else entries[b : b + 1]
-            )
+            self._looks[pose.tobytes()] = _Look(float(value[b]), own, None if entries is None else entries[b : b + 1])
 
     def _linearise(self, pose: Float, softness: float, with_jacobian: bool) -> Linearisation:
         self.values(pose[None])
@@ -468,8 +492,8 @@ class FrameObjective:
         return self.contours
 
     def _entries(self, poses: Float, chosen: Ints, softness: float = 1.0) -> NDArray[np.floating]:
-        assert self.pictures is not None
-        return self._term.assign(self.pictures, poses, chosen, softness)
+        assert self.images is not None
+        return self._term.assign(self.images, poses, chosen, softness)
 
     def _renewing(
         self, draw: Callable[[int], Ints], softness: float
@@ -484,7 +508,7 @@ class FrameObjective:
             if self.contours is None:
                 return None
             # calls are counted, as the iteration's number stands still where points are not shuffled
-            if last is None or calls % self._term.config.renew == 0:
+            if last is None or calls % RENEW == 0:
                 if drawn is None or drawn[0] != iteration:
                     drawn = iteration, draw(len(poses))
                 last = self._entries(poses, drawn[1], softness)

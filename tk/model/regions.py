@@ -6,6 +6,8 @@ of pixels of the picture that is given.
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +22,8 @@ _SQUARE5 = np.ones((5, 5), np.uint8)
 _CROSS3 = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 
-def without_penumbrae(
-    labels: Mask, difference: Images, collinearity: Images, penumbra: float, core: float
-) -> tuple[Mask, Mask]:
-    """Split what differs from the scene into certain foreground and what may be a shadow (both (h, w) bool).
+def without_penumbrae(labels: Mask, difference: Images, collinearity: Images, penumbra: float, core: float) -> Mask:
+    """The labels (h, w) that are certain foreground: no edge of a shadow.
 
     The edge of a shadow is thin or its statistic is below ``core`` noise variances, and it is below a share
     ``penumbra`` of the plain difference nearby.
@@ -32,8 +32,7 @@ def without_penumbrae(
     thick = cv2.morphologyEx(strong.view(np.uint8), cv2.MORPH_OPEN, _SQUARE5).view(np.bool_)
     levels = round(-STEPS_PER_OCTAVE * np.log2(penumbra))
     blurred = cv2.add(collinearity, levels) < cv2.dilate(difference, _SQUARE5)
-    certain = labels & (thick | ~blurred)
-    return certain, (difference > 0) & ~certain
+    return np.asarray(labels & (thick | ~blurred))
 
 
 def beyond_shadows(unsure: Mask, certain: Mask, dark: Mask, width: int, share: float) -> Mask:
@@ -55,17 +54,34 @@ def beyond_shadows(unsure: Mask, certain: Mask, dark: Mask, width: int, share: f
     return enclosed(thick, certain, share)
 
 
-def enclosed(unsure: Mask, certain: Mask, share: float) -> Mask:
-    """The 4-connected regions of ``unsure`` whose border touches ``certain`` more than the share allows."""
-    count, regions = cv2.connectedComponents(unsure.view(np.uint8), connectivity=4, ltype=cv2.CV_32S)
-    background = (~(unsure | certain)).view(np.uint8)
-    outside = cv2.dilate(background, _CROSS3, borderType=cv2.BORDER_CONSTANT, borderValue=1).view(np.bool_)
-    inside = cv2.dilate(certain.view(np.uint8), _CROSS3).view(np.bool_)
-    touching_outside = np.bincount(regions[unsure & outside], minlength=count)
-    touching_inside = np.bincount(regions[unsure & inside], minlength=count)
+def enclosed(unsure: Mask, certain: Mask, share: float, cut: Mask | None = None) -> Mask:
+    """The regions of ``unsure`` whose border touches ``certain`` more than the share allows, and not ``cut``.
+
+    Works on outlines, which are short: that of a region and those of its holes are its border.
+    """
+    result = np.zeros(unsure.shape, np.uint8)
+    inside = _beside(certain) & unsure
+    if not inside.any():
+        return result.view(np.bool_)
+    outside = _beside(~(unsure | certain), beyond=1) & unsure
+    contours, hierarchy = cv2.findContours(unsure.view(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    parent = hierarchy[0, :, 3]
+    owner = np.where(parent < 0, np.arange(len(contours)), parent)
+    x, y = np.concatenate(contours)[:, 0].T
+    region = np.repeat(owner, [len(contour) for contour in contours])
+    touching_outside = np.bincount(region[outside[y, x]], minlength=len(contours))
+    touching_inside = np.bincount(region[inside[y, x]], minlength=len(contours))
     chosen = touching_inside > share * (touching_inside + touching_outside)
-    chosen[0] = False
-    return chosen[regions]
+    if cut is not None:
+        chosen[region[cut[y, x]]] = False
+    cv2.drawContours(result, [contours[k] for k in np.flatnonzero(chosen[owner]).tolist()], -1, 1, cv2.FILLED)
+    return result.view(np.bool_) & unsure
+
+
+def _beside(mask: Mask, beyond: int = 0) -> Mask:
+    """Where a pixel or one of its four neighbours is set; ``beyond``: what lies outside the picture."""
+    grown = cv2.dilate(mask.view(np.uint8), _CROSS3, borderType=cv2.BORDER_CONSTANT, borderValue=beyond)
+    return np.asarray(grown, np.uint8).view(np.bool_)
 
 
 def closed(mask: Mask, size: int) -> Mask:
@@ -75,34 +91,85 @@ def closed(mask: Mask, size: int) -> Mask:
     return np.ascontiguousarray(closed[size:-size, size:-size]).view(np.bool_)
 
 
-def joined(mask: Mask, seen: Mask, statistic: Images, seed: float, least: float, reach: float, width: int) -> Mask:
+def joined(
+    mask: Mask,
+    seen: Mask,
+    statistic: Images,
+    starts: NDArray[np.integer],
+    *,
+    seed: float,
+    least: float,
+    reach: float,
+    width: int,
+) -> Mask:
     """The parts that are the person, in one piece where that is possible.
 
-    Of the 8-connected parts the largest stays, and those that hold more than three pixels of ``seed`` noise variances:
-    the edges of shadows do not. Those of ``least`` pixels or more are then joined to the nearest other one by a bar,
-    where it is no farther than ``reach`` and everything between them was seen to differ from the scene.
+    Of each picture's 8-connected parts the largest stays, and those that hold more than three pixels of ``seed`` noise
+    variances: the edges of shadows do not. Those of ``least`` pixels or more are then joined to the nearest other one
+    by a bar, where it is no farther than ``reach`` and everything between them was seen to differ from the scene.
+
+    Args:
+        mask, seen, statistic: (h, w) of pictures side by side.
+        starts: (C,) their first columns.
     """
-    count, parts, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8, ltype=cv2.CV_32S)
-    if count <= 2:
+    contours, _ = cv2.findContours(mask.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if len(contours) <= 1:
         return mask
-    areas = stats[:, cv2.CC_STAT_AREA].copy()
-    areas[0] = 0
-    keep = np.bincount(parts[mask & (statistic >= level_of(seed))], minlength=count) > 3
-    keep[np.argmax(areas)] = True
-    keep[0] = False
-    result = keep[parts].view(np.uint8)
-    large = keep & (areas >= least)
-    order = np.flatnonzero(large)[np.argsort(areas[large], kind="stable")]
-    if len(order) > 1:
-        seen_closed = cv2.morphologyEx((seen | mask).view(np.uint8), cv2.MORPH_CLOSE, _SQUARE3)
-    for part in order[:-1]:
-        ends = _shortest(parts == part, large[parts] & (parts != part), reach)
+    areas = np.array([_area(contour) for contour in contours])
+    boxes = np.array([cv2.boundingRect(contour) for contour in contours])
+    picture = np.searchsorted(starts, boxes[:, 0], side="right")
+    by_area = np.argsort(areas, kind="stable")
+    largest = dict(zip(picture[by_area].tolist(), by_area.tolist(), strict=True)).values()
+    strong = mask & (statistic >= level_of(seed))
+    others = []  # than the largest
+    for k in by_area[areas[by_area] >= least]:
+        if k not in largest:
+            part = _filled(contours[k], boxes[k])
+            if np.count_nonzero(_crop(strong, boxes[k]) & part) > 3:
+                others.append((k, part))
+    result = np.zeros(mask.shape, np.uint8)
+    cv2.drawContours(result, [contours[k] for k in (*largest, *(k for k, _ in others))], -1, 1, cv2.FILLED)
+    kept = result.view(np.bool_) & mask
+    result &= mask
+    seen_closed: Images | None = None
+    bounds = [0, *starts[1:].tolist(), mask.shape[1]]
+    for k, part in others:
+        x, y, w, h = boxes[k].tolist()
+        margin = int(reach) + 1  # nothing farther matters
+        left, right = max(x - margin, bounds[picture[k] - 1]), min(x + w + margin, bounds[picture[k]])
+        top, bottom = max(y - margin, 0), y + h + margin
+        near = kept[top:bottom, left:right].copy()
+        here = np.zeros_like(near)
+        here[y - top : y - top + h, x - left : x - left + w] = part
+        ends = _shortest(here & near, near & ~here, reach)
         if ends is None:
             continue
+        if seen_closed is None:
+            closing = cv2.morphologyEx((seen | mask).view(np.uint8), cv2.MORPH_CLOSE, _SQUARE3)
+            seen_closed = np.asarray(closing, np.uint8)
+        (ax, ay), (bx, by) = ends
+        ends = (ax + left, ay + top), (bx + left, by + top)
         line = cv2.line(np.zeros_like(result), *ends, 1, 1)
         if np.mean(seen_closed[line > 0]) >= _SEEN:
-            result |= cv2.line(line, *ends, 1, width) & seen_closed
+            result |= np.asarray(cv2.line(line, *ends, 1, width), np.uint8) & seen_closed
     return result.view(np.bool_)
+
+
+def _area(contour: NDArray[Any]) -> float:
+    """Pixels in an outline, it and its holes included: Pick's theorem for the polygon through their centres."""
+    return cv2.contourArea(contour) + len(contour) / 2 + 1
+
+
+def _filled(contour: NDArray[Any], box: NDArray[np.int32]) -> Mask:
+    """(h, w) of its bounding box: what lies in an outline."""
+    part = np.zeros((box[3], box[2]), np.uint8)
+    cv2.drawContours(part, [contour], 0, 1, cv2.FILLED, offset=(-int(box[0]), -int(box[1])))
+    return part.view(np.bool_)
+
+
+def _crop(mask: Mask, box: NDArray[np.int32]) -> Mask:
+    x, y, w, h = box
+    return mask[y : y + h, x : x + w]
 
 
 _SEEN = 0.9
@@ -111,6 +178,8 @@ _SEEN = 0.9
 
 def _shortest(part: Mask, others: Mask, reach: float) -> tuple[tuple[int, int], tuple[int, int]] | None:
     """The two ends (x, y) of a shortest line from a part to the others; None where it is longer than ``reach``."""
+    if not others.any():
+        return None
     distance, nearest = cv2.distanceTransformWithLabels(
         (~others).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
@@ -127,9 +196,8 @@ def _shortest(part: Mask, others: Mask, reach: float) -> tuple[tuple[int, int], 
 def clean_by_area(mask: Mask, speck: float, hole: float) -> Images:
     """Drop foreground (8-connected) of less than ``speck`` pixels, fill holes (4-connected) of less than ``hole``.
 
-    Works on outlines, which are short, not on regions: Pick's theorem turns the polygon through the outline's pixel
-    centres into a count of pixels. The outline of a hole runs on the foreground around it. What lies inside an outline
-    goes with it.
+    Works on outlines, which are short, not on regions. The outline of a hole runs on the foreground around it. What
+    lies inside an outline goes with it.
 
     Returns:
         (h, w) uint8, 0 or 255.
@@ -138,10 +206,9 @@ def clean_by_area(mask: Mask, speck: float, hole: float) -> Images:
     contours, hierarchy = cv2.findContours(clean, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     specks = []
     for contour, (_, _, _, parent) in zip(contours, hierarchy[0] if len(contours) else (), strict=True):
-        area, half_length = cv2.contourArea(contour), len(contour) / 2
-        if parent < 0 and area + half_length + 1 < speck:
+        if parent < 0 and _area(contour) < speck:
             specks.append(contour)
-        elif parent >= 0 and area - half_length + 1 < hole:
+        elif parent >= 0 and _area(contour) - len(contour) < hole:
             cv2.drawContours(clean, [contour], -1, 255, cv2.FILLED)
     if specks:
         cv2.drawContours(clean, specks, -1, 0, cv2.FILLED)
@@ -151,7 +218,8 @@ def clean_by_area(mask: Mask, speck: float, hole: float) -> Images:
 def trim_rim(mask: Mask, contrast: Images, share: float, layers: int) -> Mask:
     """Take pixels off the outline, ``layers`` deep, that have less than a share of the largest contrast near them."""
     size = 2 * layers - 1
-    weak = contrast < share * cv2.dilate(contrast, np.ones((size, size), np.uint8))
+    largest = cv2.dilate(contrast, np.ones((size, size), np.uint8))
+    weak = contrast < cv2.convertScaleAbs(largest, alpha=share)
     for _ in range(layers):
         inside = cv2.erode(mask.view(np.uint8), _SQUARE3, borderValue=1).view(np.bool_)
         mask = mask & (inside | ~weak)

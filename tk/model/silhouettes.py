@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from tk.errors import ConfigError
 from tk.kernels import silhouette as kernels
-from tk.kernels.overlap import overlap
 from tk.kernels.projection import pack_camera
-from tk.kernels.silhouette import Edgels, NormalEquations, SearchSettings
+from tk.kernels.raycast import cast
+from tk.kernels.silhouette import Edgels, NormalEquations, Regions, SearchSettings
 from tk.model.camera import Rig
 from tk.model.cone_body import ConeBody
 
@@ -82,16 +82,13 @@ class Views:
 
     Args:
         rig: the cameras.
-        ray_step: pixels between the rays by which poses are compared.
     """
 
-    def __init__(self, rig: Rig, ray_step: int = 4) -> None:
+    def __init__(self, rig: Rig) -> None:
         self.rig = rig
         self.cameras = pack_rig(rig)
         self._cameras32 = self.cameras.astype(np.float32)
         self.sizes = np.array([(c.width, c.height) for c in rig], np.int32)
-        self.ray_step = ray_step
-        self.rays = pixel_rays(rig, ray_step)
 
     def pyramid(self, masks: Masks, scales: int, cleaning: CleaningConfig | None) -> Pyramid:
         """The scales of masks (V, H, W), cleaned unless ``cleaning`` is None."""
@@ -109,11 +106,24 @@ class Views:
         return Pyramid(tuple(levels), tuple(sizes))
 
     def equations(
-        self, body: ConeBody, pyramid: Pyramid, poses: Float, scale: int, settings: SearchSettings
+        self,
+        body: ConeBody,
+        pyramid: Pyramid,
+        poses: Float,
+        scale: int,
+        settings: SearchSettings,
+        regions: Regions | None = None,
     ) -> NormalEquations:
         """Normal equations of poses (B, D) at a scale's index."""
         return kernels.normal_equations(
-            body.arrays, self._cameras32, pyramid.sizes[scale], pyramid.masks[scale], 2.0**scale, poses, settings
+            body.arrays,
+            self._cameras32,
+            pyramid.sizes[scale],
+            pyramid.masks[scale],
+            2.0**scale,
+            poses,
+            settings,
+            regions,
         )
 
     def edgels(self, body: ConeBody, pyramid: Pyramid, pose: Float, scale: int, settings: SearchSettings) -> Edgels:
@@ -121,10 +131,6 @@ class Views:
         return kernels.find_edgels(
             body.arrays, self._cameras32, pyramid.sizes[scale], pyramid.masks[scale], 2.0**scale, pose, settings
         )
-
-    def fit_error(self, body: ConeBody, masks: Masks, poses: Float) -> Float:
-        """(B, V) E_S of poses (B, D) against masks (V, H, W), on every ``ray_step``-th pixel (eq. 12)."""
-        return silhouette_error(body, self.rig, masks, poses, self.ray_step, self.rays)
 
 
 def pack_rig(rig: Rig) -> Float:
@@ -145,37 +151,6 @@ def pixel_rays(rig: Rig, step: int = 1) -> NDArray[np.float32]:
     return rays.reshape(len(rig), len(ys), len(xs), 3)
 
 
-def silhouette_error(
-    body: ConeBody,
-    rig: Rig,
-    masks: Masks,
-    poses: Float,
-    step: int = 1,
-    rays: NDArray[np.float32] | None = None,
-) -> Float:
-    """(B, V) share of wrongly classified pixels E_S = |S_M △ S_T| / |S_T| (silhouette paper, eq. 12).
-
-    Args:
-        body: the body that is projected.
-        rig: the cameras.
-        masks: (V, H, W) uint8, S_T.
-        poses: (B, D).
-        step: every how many pixels.
-        rays: :func:`pixel_rays` of the rig and step, if at hand.
-
-    Returns:
-        One number a pose and view; inf where the mask is empty.
-    """
-    if rays is None:
-        rays = pixel_rays(rig, step)
-    offset = step // 2
-    seen = np.ascontiguousarray(masks[:, offset::step, offset::step])
-    counts, _ = overlap(body.arrays, pack_rig(rig), step, rays, seen, poses)
-    total = np.count_nonzero(seen >= 128, axis=(1, 2))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(total > 0, counts.sum(axis=2) / total, np.inf)
-
-
 def share_wrong(drawn: Masks, seen: Masks) -> Float:
     """(V,) E_S (eq. 12) of silhouettes (V, H, W) against masks (V, H, W), S_T; inf where the mask is empty."""
     wrong = np.count_nonzero((drawn >= 128) != (seen >= 128), axis=(1, 2))
@@ -187,6 +162,12 @@ def share_wrong(drawn: Masks, seen: Masks) -> Float:
 def draw_silhouettes(body: ConeBody, rig: Rig, poses: Float) -> NDArray[np.uint8]:
     """(B, V, H, W) silhouettes of the body at poses (B, D), 0 or 255."""
     rays = pixel_rays(rig)
-    empty = np.zeros(rays.shape[:3], np.uint8)
-    _, pictures = overlap(body.arrays, pack_rig(rig), 1, rays, empty, poses)
-    return pictures
+    group = np.zeros(len(body.parts), np.int32)
+    cost = np.zeros((*rays.shape[:3], 2), np.float32)
+    cameras = pack_rig(rig).astype(np.float32)
+    pictures = []
+    for pose in poses:  # one at a time: depths of all pixels of many poses are large
+        _, met = cast(body.arrays, group, cameras, 1, rays, cost, pose[None], export=True)
+        assert met is not None
+        pictures.append(np.where(met.label[0] > 0, np.uint8(255), np.uint8(0)))
+    return np.array(pictures)

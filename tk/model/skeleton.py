@@ -22,6 +22,7 @@ degrees of freedom.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +63,8 @@ SEGMENTS = (
     "thigh_r",
     "calf_r",
     "pelvis",
+    "foot_l",
+    "foot_r",
 )
 
 # The five chains that are refined one by one with the torso held (section 6.4): the segments of each.
@@ -69,8 +72,8 @@ CHAINS: dict[str, tuple[str, ...]] = {
     "head": ("head",),
     "arm_l": ("upper_arm_l", "forearm_l"),
     "arm_r": ("upper_arm_r", "forearm_r"),
-    "leg_l": ("thigh_l", "calf_l"),
-    "leg_r": ("thigh_r", "calf_r"),
+    "leg_l": ("thigh_l", "calf_l", "foot_l"),
+    "leg_r": ("thigh_r", "calf_r", "foot_r"),
 }
 
 # Zero configuration of the left arm (see the module's docstring).
@@ -87,7 +90,9 @@ _ELBOW = np.cross(_ARM, [0.5, -0.5, np.sqrt(0.5)])
 # about other axes than ours: the box below holds them, and every direction of the arm but a cone of 10° about the
 # singular diagonal (tests/model/test_skeleton.py samples them). Neck: Youdas et al., Phys. Ther. 72 (1992) 770-780:
 # flexion and extension 60-70 together with the upper spine, lateral bending 40-45. Waist: what textbooks give for the
-# lumbar spine (flexion 50, extension 15, bending 20-25, rotation 5-10), more for what the chest above it turns.
+# lumbar spine (flexion 50, extension 15, bending 20-25, rotation 5-10), more for what the chest above it turns. Ankle:
+# Boone & Azen, plantar flexion 56±6, dorsiflexion 13±4 (more when the knee is bent and loaded), inversion 37±5,
+# eversion 21±5.
 _LIMITS_DEG: dict[str, tuple[float, float]] = {
     "torso_yaw": (-np.inf, np.inf),
     "torso_roll": (-80.0, 80.0),
@@ -105,19 +110,25 @@ _LIMITS_DEG: dict[str, tuple[float, float]] = {
     "hip_yaw": (-45.0, 80.0),
     "hip_roll": (-70.0, 70.0),
     "knee_flexion": (-10.0, 160.0),
+    "ankle_flexion": (-60.0, 40.0),
+    "ankle_inversion": (-30.0, 40.0),
 }
 
 DEGREES_OF_FREEDOM = 24  # of the paper's body
 WAIST = ("waist_roll", "waist_pitch", "waist_yaw")
 # How stiff each is beside the first: nothing outlines the pelvis from the front, and a hip can turn as well as it.
 WAIST_STIFFNESS = (1.0, 3.0, 5.0)
+ANKLES = ("ankle_l_flexion", "ankle_l_inversion", "ankle_r_flexion", "ankle_r_inversion")
 # Where the waist bends, as a share of the trunk's length above the hip centres: about L4, in the middle of what bends.
 WAIST_HEIGHT = 0.25
 
 
 @dataclass(frozen=True)
 class Skeleton:
-    """The kinematic tree as plain arrays: D = 24 degrees of freedom (27 with a waist), S = 11 segments, J = 15 joints.
+    """The kinematic tree as plain arrays: D = 24 degrees of freedom, S = 13 segments, J = 15 joints.
+
+    A waist has three more degrees of freedom, ankles have two each; without them pelvis and feet are carried by torso
+    and calves.
 
     Attributes:
         names: (D,) names of the degrees of freedom; translations first.
@@ -154,6 +165,16 @@ class Skeleton:
         """(D,) True for the waist's degrees of freedom, where there are any."""
         return np.isin(self.names, WAIST)
 
+    @property
+    def is_ankle(self) -> NDArray[np.bool_]:
+        """(D,) True for the ankles' degrees of freedom, where there are any."""
+        return np.isin(self.names, ANKLES)
+
+    @property
+    def is_paper(self) -> NDArray[np.bool_]:
+        """(D,) True for the paper's 24."""
+        return ~(self.is_waist | self.is_ankle)
+
     def index(self, name: str) -> int:
         """The position of a degree of freedom in p."""
         return self.names.index(name)
@@ -162,19 +183,31 @@ class Skeleton:
         """Poses (..., D) mapped into the limits (eq. 22)."""
         return np.clip(poses, self.lower, self.upper)
 
+    @cached_property
+    def _generators(self) -> tuple[Float, Float]:
+        """(D, 3, 3) the skew matrices of the axes, zero for translations, and their squares."""
+        K = np.zeros((len(self.names), 3, 3))
+        for k, (x, y, z) in enumerate(self.axis):
+            if not self.prismatic[k]:
+                K[k] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+        return K, K @ K
+
     def transforms(self, pose: Float) -> Float:
         """(D, 4, 4) transforms T_k after each degree of freedom, float64. Kernels have their own."""
         pose = np.asarray(pose, dtype=np.float64)
-        result = np.empty((len(self.names), 4, 4))
-        for k, angle in enumerate(pose):
-            step = np.eye(4)
-            if self.prismatic[k]:
-                step[:3, 3] = self.axis[k] * angle
-            else:
-                step = twist_exp(self.axis[k], self.point[k], angle)
-                if self.rise[k].any():
-                    step[:3, 3] += self.rise[k] * arm_elevation(angle, pose[k + 1])
-            result[k] = step if self.parent[k] < 0 else result[self.parent[k]] @ step
+        K, squares = self._generators
+        steps = np.zeros((len(pose), 4, 4))
+        R = np.eye(3) + np.sin(pose)[:, None, None] * K + (1 - np.cos(pose))[:, None, None] * squares
+        steps[:, :3, :3] = R
+        steps[:, :3, 3] = np.where(
+            self.prismatic[:, None], self.axis * pose[:, None], self.point - np.einsum("kab,kb->ka", R, self.point)
+        )
+        for k in map(int, np.flatnonzero(self.rise.any(axis=1))):
+            steps[k, :3, 3] += self.rise[k] * arm_elevation(pose[k], pose[k + 1])
+        steps[:, 3, 3] = 1.0
+        result = np.empty_like(steps)
+        for k, parent in enumerate(self.parent):
+            result[k] = steps[k] if parent < 0 else result[parent] @ steps[k]
         return result
 
     @property
@@ -226,8 +259,8 @@ class Skeleton:
             "head": ("neck",),
             "arm_l": ("shoulder_l", "elbow_l"),
             "arm_r": ("shoulder_r", "elbow_r"),
-            "leg_l": ("hip_l", "knee_l"),
-            "leg_r": ("hip_r", "knee_r"),
+            "leg_l": ("hip_l", "knee_l", "ankle_l"),
+            "leg_r": ("hip_r", "knee_r", "ankle_r"),
         }[chain]
         return np.array([name.startswith(prefixes) for name in self.names])
 
@@ -266,31 +299,31 @@ def twist_exp(axis: Float, point: Float, angle: float) -> Float:
     return T
 
 
-def without_waist(skeleton: Skeleton, pose: Float) -> tuple[Float, Float]:
-    """A pose (27,) as (24,) of the paper's body, and the waist's angles (3,) in the order of :data:`WAIST`.
+def split_pose(skeleton: Skeleton, pose: Float) -> tuple[Float, Float, Float]:
+    """A pose (D,) as the paper's (24,), the waist's angles (3,) and the ankles' (4,); empty where there are none.
 
     The hips' angles become those between thigh and trunk: all limbs, trunk and head keep their orientation; the legs
     are moved by what the waist moves their sockets.
     """
-    waist = skeleton.is_waist
-    return _turn_hips(skeleton, pose, _waist_rotation(skeleton, pose))[~waist], pose[waist]
+    turned = _turn_hips(skeleton, pose, _waist_rotation(skeleton, pose))
+    return turned[skeleton.is_paper], pose[skeleton.is_waist], pose[skeleton.is_ankle]
 
 
-def with_waist(skeleton: Skeleton, pose: Float, waist: Float) -> Float:
-    """(27,) the inverse of :func:`without_waist`."""
+def join_pose(skeleton: Skeleton, pose: Float, waist: Float, ankles: Float) -> Float:
+    """(D,) the inverse of :func:`split_pose`."""
     whole = np.empty(len(skeleton.names))
-    whole[skeleton.is_waist] = waist
-    whole[~skeleton.is_waist] = pose
+    whole[skeleton.is_paper], whole[skeleton.is_waist], whole[skeleton.is_ankle] = pose, waist, ankles
     return _turn_hips(skeleton, whole, _waist_rotation(skeleton, whole).T)
 
 
-def turn_trunk(skeleton: Skeleton, pose: Float, angle: float) -> Float:
-    """The pose (D,) with trunk, head and arms turned by an angle about the upright axis, and the legs as they stand."""
-    torso, waist = skeleton.segment_dof[SEGMENTS.index("torso")], _waist_rotation(skeleton, pose)
-    result = pose.copy()
-    result[skeleton.index("torso_yaw")] += angle
-    before, after = (skeleton.transforms(p)[torso, :3, :3] for p in (pose, result))
-    return _turn_hips(skeleton, result, waist.T @ after.T @ before @ waist)
+def without_waist(skeleton: Skeleton, pose: Float) -> tuple[Float, Float]:
+    """:func:`split_pose` of a body without ankles."""
+    return split_pose(skeleton, pose)[:2]
+
+
+def with_waist(skeleton: Skeleton, pose: Float, waist: Float) -> Float:
+    """:func:`join_pose` of a body without ankles."""
+    return join_pose(skeleton, pose, waist, np.zeros(0))
 
 
 def _waist_rotation(skeleton: Skeleton, pose: Float) -> Float:
@@ -333,8 +366,9 @@ def up_rotation(up: str) -> Float:
     return np.column_stack([x, np.cross(z, x), z])
 
 
-def build_skeleton(dimensions: BodyDimensions, up: str = "z", waist: bool = False) -> Skeleton:
-    """The skeleton with these dimensions, standing upright along ``up``: 24 degrees of freedom, 27 with a waist."""
+def build_skeleton(dimensions: BodyDimensions, up: str = "z", waist: bool = False, ankles: bool = False) -> Skeleton:
+    """The skeleton with these dimensions, standing upright along ``up``: the paper's 24 degrees of freedom, three more
+    with a waist, four more with ankles."""
     d = dimensions
     B = up_rotation(up) if up != "z" else np.eye(3)
     x, y, z = np.eye(3)
@@ -392,9 +426,14 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z", waist: bool = Fals
         last = add(f"hip_{side}_yaw", spin * x, h, last)
         segment_dof[f"thigh_{side}"] = add(f"hip_{side}_roll", -spin * z, h, last)
         segment_dof[f"calf_{side}"] = add(f"knee_{side}_flexion", y, knee, segment_dof[f"thigh_{side}"])
+        ankle = knee - d.calf * z
+        last = segment_dof[f"calf_{side}"]
+        for name, axis in (("flexion", -y), ("inversion", -spin * x)) if ankles else ():
+            last = add(f"ankle_{side}_{name}", axis, ankle, last)
+        segment_dof[f"foot_{side}"] = last
         joints[f"hip_{side}"] = ("pelvis", h)
         joints[f"knee_{side}"] = (f"thigh_{side}", knee)
-        joints[f"ankle_{side}"] = (f"calf_{side}", knee - d.calf * z)
+        joints[f"ankle_{side}"] = (f"calf_{side}", ankle)
 
     names = tuple(row[0] for row in rows)
     lift = RAISED_SHOULDERS / TRUNK_LENGTH * d.trunk * z

@@ -68,6 +68,19 @@ class GaussNewtonConfig:
             )
 
 
+@dataclass(frozen=True)
+class Prior:
+    """A normal prior on the state, in the units of the equations.
+
+    Attributes:
+        mean: (D,) or (B, D).
+        precision: (D,) zero where there is none.
+    """
+
+    mean: Float
+    precision: Float
+
+
 def minimise(
     equations: Callable[[Float, int], Equations],
     start: Float,
@@ -75,6 +88,7 @@ def minimise(
     lower: Float,
     upper: Float,
     config: GaussNewtonConfig | None = None,
+    prior: Prior | None = None,
 ) -> Float:
     """Descend from B states at once.
 
@@ -84,6 +98,7 @@ def minimise(
         free: (D,) parameters that may change.
         lower, upper: (D,) limits; infinite where there is none.
         config: see :class:`GaussNewtonConfig`.
+        prior: what is known beside the equations.
 
     Returns:
         (B, D) the states after the last iteration.
@@ -93,7 +108,7 @@ def minimise(
     for scale in range(config.scales - 1, -1, -1):
         for _ in range(config.iterations):
             here = equations(state, scale)
-            state += step(here.hessian, here.gradient, state, free, lower, upper, config)
+            state += step(here.hessian, here.gradient, state, free, lower, upper, config, prior)
     return state
 
 
@@ -105,6 +120,7 @@ def step(
     lower: Float,
     upper: Float,
     config: GaussNewtonConfig,
+    prior: Prior | None = None,
 ) -> Float:
     """One damped step (B, D) of each state, limits included; zero for parameters that are not free."""
     index = np.flatnonzero(free)
@@ -120,6 +136,10 @@ def step(
     beyond = excess != 0
     added = config.damping * diagonal + config.stiffness * unit + config.limit_weight * unit * beyond + 1e-9 * unit
     g += config.limit_weight * unit * excess
+    if prior is not None:
+        precision = prior.precision[index]
+        added = added + precision
+        g += precision * (np.broadcast_to(prior.mean, state.shape)[:, index] - p)
     H = H + added[:, :, None] * np.eye(n)
     delta = np.linalg.solve(H, g[:, :, None])[:, :, 0]
     longest = np.abs(delta).max(axis=1, initial=0.0)

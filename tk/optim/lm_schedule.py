@@ -2,8 +2,7 @@
 
 All degrees of freedom, then each chain with the torso held, on the objective that :mod:`tk.optim.schedule` hands SMD:
 the same terms and the same numbers of points. As in the paper, the points are drawn once for each frame and pass and
-stay. What SMD has beyond the paper, several hypotheses of each chain and a search anew, Levenberg-Marquardt does not
-have: compare it with SMD that has ``hypotheses = 1`` and ``retries = 0``.
+stay.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.optim import levenberg_marquardt as lm
-from tk.optim.schedule import ScheduleConfig, ScheduleResult
+from tk.optim.schedule import CHAIN_LEVER_M, LEVER_M, ScheduleConfig, ScheduleResult
 
 Float = NDArray[np.float64]
 
@@ -62,24 +61,20 @@ class FixedProblem(Protocol):
 
 
 def optimise(problem: FixedProblem, starts: Float, config: ScheduleConfig, lm_config: lm.LmConfig) -> ScheduleResult:
-    """All passes, from the best of the starts (S, D); again over all parameters where SMD does so, too."""
+    """Both passes, from the best of the starts (S, D)."""
     starts = problem.constrain(starts)
     start = starts[0] if len(starts) == 1 else min(starts, key=problem.value)
     torso = np.logical_not(np.asarray(problem.free.any(axis=0)))
     first = torso if config.hierarchical else np.ones_like(torso)
-    pose, made = _descend(problem, problem.fixed(config.soft), start, first, config.lever_m, config.soft, lm_config)
+    pose, made = _descend(problem, problem.fixed(config.soft), start, first, LEVER_M, config.soft, lm_config)
     result, iterations = pose.copy(), [made]
     # ε₂ of section 6.4: the chains are held to a finer tolerance
     finer = replace(lm_config, tolerance=config.refine * lm_config.tolerance)
     for k, free in enumerate(problem.free):
         objective = problem.fixed_chain(k, pose, config.chain_soft)
-        moved, made = _descend(problem, objective, pose, free, config.chain_lever_m, config.chain_soft, finer)
+        moved, made = _descend(problem, objective, pose, free, CHAIN_LEVER_M, config.chain_soft, finer)
         result[free] = moved[free]
         iterations.append(made)
-    if config.polish_iterations and not config.hierarchical:
-        limit = replace(finer, max_iterations=config.polish_iterations)
-        result, made = _descend(problem, problem.fixed(1.0), result, first, config.lever_m, 1.0, limit)
-        iterations[0] += made
     return ScheduleResult(result, np.array(iterations, np.int32))
 
 

@@ -1,4 +1,4 @@
-"""What a tracker is: the protocol that :mod:`tk.volumetric` and :mod:`tk.silhouette` share."""
+"""What a tracker is: the protocol that :mod:`tk.trackers` share."""
 
 from __future__ import annotations
 
@@ -39,13 +39,18 @@ class Estimate:
     """A tracker's answer for one frame.
 
     Attributes:
-        pose: (D,) configuration vector; waist: (W,) angles beyond it, in the order of the tracker's names.
+        pose: (D,) configuration vector; waist: (W,), ankles: (A,) angles beyond it, in the order of the tracker's
+            names.
         joints: (15, 3) joint centres, metres.
         status: "tracked", "initialised", "recovered" or "lost".
         objective: the objective's final value.
         iterations: (S,) optimiser iterations a stage.
         timing: seconds a stage.
         surface: the hull's surface, if the tracker made one.
+        sigma: (15,) one standard deviation of each joint's position along an axis, metres; None where the tracker does
+            not say.
+        fit_error: (C,) E_S of each camera; None where the tracker does not say.
+        frame, time: the frame's number in the capture, and seconds; whoever steps the tracker knows them.
     """
 
     pose: Float
@@ -56,6 +61,11 @@ class Estimate:
     timing: Mapping[str, float]
     surface: HullSurface | None = None
     waist: Float = field(default_factory=lambda: np.zeros(0))
+    ankles: Float = field(default_factory=lambda: np.zeros(0))
+    sigma: Float | None = None
+    fit_error: Float | None = None
+    frame: int = -1
+    time: float = 0.0
 
 
 class Tracker(Protocol):
@@ -67,6 +77,14 @@ class Tracker(Protocol):
     pose_names: tuple[str, ...]
     pose_units: tuple[str, ...]
     waist_names: tuple[str, ...]
+    ankle_names: tuple[str, ...]
+    any_pose: bool
+    """Whether the person is found in any pose, not only in the Da Vinci pose."""
+
+    @property
+    def opening_frames(self) -> int:
+        """Frames that :meth:`start` wants to look at."""
+        ...
 
     def start(self, frames: Sequence[Observation], height_m: float | None, init: InitPose | None) -> None:
         """Find the subject in the first of the frames; nothing is returned, :meth:`step` begins with that frame."""

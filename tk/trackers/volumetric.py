@@ -1,15 +1,21 @@
 """The volumetric tracker: visual hull, colour, superellipsoid body, Stochastic Meta Descent (Kehl & Van Gool 2006).
 
-A frame's way, top to bottom (figure 8 of the paper, with what goes before it):
+A frame's way, top to bottom, as :meth:`VolumetricTracker.step` has it: figure 8 of the paper, with what goes before.
 
-    masks → hull → coloured surface → colour segmentation → all 24 degrees of freedom → five chains → colours updated
+    masks → visual hull, coloured surface      4.1
+    (1) colour segmentation                    6.1.3
+    (2) all degrees of freedom at ε₁           6.1, 6.2
+    (3) five chains at ε₂, the torso held      6.4
+    (4) colour models updated                  eq. 16
+
+Where it departs from the paper is told in docs/method.md.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,42 +26,29 @@ from tk.config import Config
 from tk.errors import CaptureError
 from tk.io.init_pose import InitPose
 from tk.io.result_data import Result
-from tk.kernels.edge_search import DOUBTFUL
 from tk.kernels.nearest import SurfaceIndex
 from tk.model import initialisation
 from tk.model.anthropometry import BodyDimensions
-from tk.model.appearance import Appearance
-from tk.model.body import Body, build_body, filling
+from tk.model.appearance import TEACHING_M, Appearance
+from tk.model.body import Body, build_body
 from tk.model.camera import Rig
-from tk.model.contour_term import ContourTerm, Pictures
+from tk.model.contour_term import ContourTerm
 from tk.model.fitting import fit_body
 from tk.model.hull import HullSurface, VisualHull
 from tk.model.objective import CHAIN_OF_SEGMENT, BodyObjective, Fit, FrameObjective
-from tk.model.skeleton import CHAINS, JOINTS, WAIST, build_skeleton, turn_trunk, with_waist, without_waist
+from tk.model.skeleton import CHAINS, JOINTS, WAIST, build_skeleton, with_waist, without_waist
 from tk.model.volume import Volume, VoxelGrid
 from tk.optim import lm_schedule, schedule
-from tk.tracker import Estimate, Observation, Stopwatch
+from tk.trackers.base import Estimate, Observation, Stopwatch
 
 Float = NDArray[np.float64]
 
 # Cells of the nearest-neighbour search, in voxels: some twenty surface voxels a cell.
 CELL_VOXELS = 4.0
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """What the tracker makes of one observation before it looks for the pose."""
-
-    surface: HullSurface
-    index: SurfaceIndex
-
-
-def _pictures(frame: Observation) -> Pictures:
-    """What the contour cues look at."""
-    masks = frame.masks
-    if frame.doubtful is not None:
-        masks = masks | frame.doubtful.view(np.uint8) * np.uint8(DOUBTFUL)
-    return Pictures(frame.images, masks)
+# Fewer surface voxels than this are no person.
+LEAST_VOXELS = 60
+# A frame is lost, too, when more than this share of the samples of a limb, the head or the torso has no voxel near it.
+LOST_LIMB = 0.6
 
 
 def _drift(usual: float, now: float) -> float:
@@ -91,6 +84,7 @@ class VolumetricTracker:
         self.pose_names = tuple(skeleton.names[k] for k in told)
         self.pose_units = tuple(skeleton.units[k] for k in told)
         self.waist_names = tuple(name for name in skeleton.names if name in WAIST)
+        self.ankle_names: tuple[str, ...] = ()
         self._body: Body | None = None
         self._objective: BodyObjective
         self._appearance: Appearance
@@ -119,7 +113,7 @@ class VolumetricTracker:
             surfaces.append(self.hull.surface(frame.images))
             if len(surfaces) == 1:
                 occupancy = self.hull.occupancy
-        if len(surfaces[0]) < self.config.tracking.least_voxels:
+        if len(surfaces[0]) < LEAST_VOXELS:
             raise CaptureError(
                 f"initialisation: only {len(surfaces[0])} surface voxels in frame {frames[0].index}: check the masks, "
                 "the calibration and the working volume ([volume] of capture.toml)"
@@ -131,14 +125,14 @@ class VolumetricTracker:
         else:
             dimensions, pose = initialisation.rough_pose(init.joints, init.angles, init.height_m or height_m, self.up)
             anchor = initialisation.rough_certainty(build_skeleton(dimensions, self.up))
-        surfaces = [s for s in surfaces if len(s) >= self.config.tracking.least_voxels]
+        surfaces = [s for s in surfaces if len(s) >= LEAST_VOXELS]
         indices = [self._index(surface, np.full(len(surface), -1, np.int64)) for surface in surfaces]
         dimensions, poses = fit_body(
             dimensions,
             np.repeat(pose[None], len(indices), axis=0),
             indices,
             self.up,
-            self.config.objective,
+            self.config.objective.settings,
             self.config.sampling,
             anchor,
             self.config.fit,
@@ -149,7 +143,7 @@ class VolumetricTracker:
         pose = np.zeros(len(waist))
         pose[~waist] = poses[0]
         self._pose = self._previous = pose
-        first = FrameObjective(self._objective, indices[0], np.random.default_rng(0), pictures=_pictures(frames[0]))
+        first = FrameObjective(self._objective, indices[0], np.random.default_rng(0), images=frames[0].images)
         fit = first.fit(pose)
         self._usual, self._usual_astray = fit.value, fit.astray_share
         self._learn_colours(surfaces[0], indices[0], pose)
@@ -157,13 +151,11 @@ class VolumetricTracker:
 
     def _take_body(self, dimensions: BodyDimensions) -> None:
         self._body = build_body(dimensions, self.up, waist=self.config.body.waist)
-        self._filling = filling(self._body)
-        cues = self.config.contours
-        cues = cues.scaled(self.config.sampling.scale)
-        contours = ContourTerm(self._body, self.rig, cues, self.config.edges) if cues.enabled else None
+        edges, scale = self.config.contours, self.config.sampling.scale
+        contours = ContourTerm(self._body, self.rig, edges, scale) if edges.edge_weight > 0 else None
         self._objective = BodyObjective(
             self._body,
-            self.config.objective,
+            self.config.objective.settings,
             self.config.sampling,
             contours,
             waist_stiffness=self.config.body.waist_stiffness,
@@ -174,7 +166,7 @@ class VolumetricTracker:
         assert self._body is not None
         fit = FrameObjective(self._objective, index, np.random.default_rng(0)).fit(pose)
         patch, colors = self._taught(surface, index, fit)
-        self._appearance = Appearance.learn(len(self._body.patch_names), patch, colors, self.config.appearance)
+        self._appearance = Appearance.learn(len(self._body.patch_names), patch, colors)
 
     # --- tracking (section 6.4) ---------------------------------------------------------------------------------
 
@@ -182,29 +174,27 @@ class VolumetricTracker:
         """The pose in the next frame."""
         watch = Stopwatch()
         config = self.config
+        # the visual hull and its coloured surface (section 4.1)
         self.hull.update(frame.masks)
-        if config.tracking.overrule >= 0 and not self._lost_for:
-            expected = self._pose + config.tracking.prediction * (self._pose - self._previous)
-            filled = self._filled(expected)
-            self.hull.overrule(filled, config.tracking.overrule)
-            if frame.doubtful is not None and config.tracking.overrule_doubt >= 0:
-                self.hull.overrule_doubt(filled, frame.doubtful, config.tracking.overrule_doubt)
         watch.lap("hull")
         surface = self.hull.surface(frame.images)
         watch.lap("surface")
-        if len(surface) < config.tracking.least_voxels:
+        if len(surface) < LEAST_VOXELS:
             return self._nothing_seen(frame, surface, watch)
+        # (1) colour segmentation (section 6.1.3)
         index = self._index(surface, self._appearance.segment(surface.colors, surface.seen, config.appearance))
         watch.lap("colour")
         # a generator of its own for every frame: a resumed run draws what an unbroken one would have drawn
         rng = np.random.default_rng([config.seed, frame.index])
-        problem = FrameObjective(self._objective, index, rng, config.schedule.outliers, pictures=_pictures(frame))
-        result = self._search(problem, self._starts(surface), rng)
+        problem = FrameObjective(self._objective, index, rng, images=frame.images)
+        # (2) all degrees of freedom at ε₁, (3) five chains at ε₂ (section 6.4)
+        result = self._search(problem, self._starts(surface))
         fit = problem.fit(result.pose)
         watch.lap("optimise")
         lost = self._is_lost(fit)
         status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
         if not lost:
+            # (4) the colour models follow (eq. 16)
             self._usual = _drift(self._usual, fit.value)
             self._usual_astray = _drift(self._usual_astray, fit.astray_share)
             patch, colors = self._taught(surface, index, fit)
@@ -226,19 +216,16 @@ class VolumetricTracker:
             surface=surface,
         )
 
-    def _search(self, problem: FrameObjective, starts: Float, rng: np.random.Generator) -> schedule.ScheduleResult:
+    def _search(self, problem: FrameObjective, starts: Float) -> schedule.ScheduleResult:
         """The pose that explains a frame best, from the starts (S, D)."""
-        return schedule.optimise(
-            problem,
-            starts,
-            self._pose,
-            rng,
-            self.config.schedule,
-            self.config.smd,
-            good_enough=lambda pose: self._is_usual(problem.fit(pose)),
-            settled=lambda pose: problem.value(pose) <= self.config.tracking.settled_ratio * self._usual,
-            alternatives=self._alternatives,
-        )
+        return schedule.optimise(problem, starts, self.config.schedule, self.config.smd)
+
+    any_pose = False
+
+    @property
+    def opening_frames(self) -> int:
+        """Frames that the body is fitted to."""
+        return self.config.tracking.init_frames
 
     @property
     def body(self) -> Body:
@@ -246,12 +233,6 @@ class VolumetricTracker:
         if self._body is None:
             raise RuntimeError("the tracker has no body yet: call start() or restore() first")
         return self._body
-
-    def _filled(self, pose: Float) -> Float:
-        """(N, 3) points on the body's surface and inside it."""
-        points, segment = self._filling
-        T = self.body.skeleton.segment_transforms(pose)[segment]
-        return np.einsum("nab,nb->na", T[:, :3, :3], points) + T[:, :3, 3]
 
     def _starts(self, surface: HullSurface) -> Float:
         """(S, D) where the search may begin."""
@@ -271,34 +252,6 @@ class VolumetricTracker:
             starts = starts[:1]
         return np.array(starts)
 
-    def _alternatives(self, pose: Float, rng: np.random.Generator, attempt: int) -> Float:
-        """(A, D) other places to look from when ``pose`` explains the frame badly: first other limbs, then the trunk
-        turned above the legs, which takes both arms elsewhere."""
-        skeleton = self.body.skeleton
-        if attempt % 2:
-            return np.array([turn_trunk(skeleton, pose, angle) for angle in np.radians([-80.0, -40.0, 40.0, 80.0])])
-        side = {
-            k: name.replace("_l_", "_r_") if "_l_" in name else name.replace("_r_", "_l_")
-            for k, name in enumerate(skeleton.names)
-        }
-        other = np.array([skeleton.index(side[k]) for k in range(len(side))])
-        legs = np.array([name.startswith(("hip", "knee")) for name in skeleton.names])
-        arms = np.array([name.startswith(("shoulder", "elbow")) for name in skeleton.names])
-        swapped = [np.where(chains, pose[other], pose) for chains in (legs, arms)]
-        limbs = np.where(legs | arms, self._pose, pose)  # the limbs as they were
-        straight = self._pose + (self._pose - self._previous)  # all of the last motion again
-        spread = np.radians(25.0) * (legs | arms)
-        shaken = [pose + spread * rng.normal(size=len(pose)) for _ in range(2)]
-        return np.array([pose, *swapped, limbs, straight, *shaken])
-
-    def _is_usual(self, fit: Fit) -> bool:
-        """Whether a frame is explained about as well as this person's frames usually are."""
-        limits = self.config.tracking
-        return (
-            fit.value <= limits.retry_ratio * self._usual
-            and fit.astray_share <= self._usual_astray + limits.retry_astray
-        )
-
     def _is_lost(self, fit: Fit) -> bool:
         """Whether the person, or one of the limbs, is elsewhere."""
         limits = self.config.tracking
@@ -308,7 +261,7 @@ class VolumetricTracker:
         return (
             fit.value > limits.lost_ratio * self._usual
             or fit.astray_share > self._usual_astray + limits.lost_astray
-            or bool((stranded > limits.lost_limb * everywhere).any())
+            or bool((stranded > LOST_LIMB * everywhere).any())
         )
 
     def _nothing_seen(self, frame: Observation, surface: HullSurface, watch: Stopwatch) -> Estimate:
@@ -337,7 +290,7 @@ class VolumetricTracker:
     ) -> tuple[NDArray[np.integer], NDArray[np.floating]]:
         """Patches (N,) and colours (N, 3) of the samples that sit on a voxel which a camera sees."""
         M = len(fit.samples)
-        near = np.linalg.norm(fit.linear.residual[:M], axis=1) < self.config.appearance.teaching_m
+        near = np.linalg.norm(fit.linear.residual[:M], axis=1) < TEACHING_M
         partner = index.order[fit.linear.partner[:M]]
         sure = (fit.linear.partner[:M] >= 0) & near & (surface.seen[partner] > 0)
         return self.body.patch[fit.samples[sure]], surface.colors[partner[sure]]
@@ -412,5 +365,5 @@ class LevenbergMarquardtTracker(VolumetricTracker):
 
     method = "lm"
 
-    def _search(self, problem: FrameObjective, starts: Float, rng: np.random.Generator) -> schedule.ScheduleResult:
+    def _search(self, problem: FrameObjective, starts: Float) -> schedule.ScheduleResult:
         return lm_schedule.optimise(problem, starts, self.config.schedule, self.config.lm)

@@ -1,0 +1,218 @@
+"""A cone body seen through a grid of rays: what each ray meets first, and what that costs (silhouette paper, eq. 12).
+
+A ray's cost depends on what it meets: column 0 of ``cost`` where it meets nothing, column g + 1 where it meets a part
+of colour group g. With 0 and 1 in the right places their sum is the number of wrong pixels, E_S's numerator; with what
+colours say it tells a forearm before the trunk from one behind it.
+
+Many poses that differ in one limb are compared by casting the rest once: a launch may start from labels and depths that
+an earlier one left, and draw some parts only.
+"""
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.kernels.cone_arrays import NEAREST_M, ConeArrays, keep, place_part, shape_of
+from tk.kernels.cones import enclosing_radius, enter, interior_point
+from tk.kernels.kinematics import forward, load_rotation, load_translation
+from tk.kernels.launch import Launcher
+from tk.kernels.projection import camera_center, project
+from tk.kernels.runtime import ensure_runtime, spread_of, ti
+
+# How much larger than its first-order size a part's disc is taken when rays are cast.
+DISC_MARGIN = 1.1
+# Depth of a ray that meets nothing.
+FAR = 1e9
+# Most parts that one row of rays can meet.
+MOST_PARTS = 64
+
+
+class Cast(NamedTuple):
+    """What rays meet.
+
+    Attributes:
+        label: (V, H, W) uint8: 0 nothing, else 1 + the part's index.
+        depth: (V, H, W) float32, in lengths of the ray's direction; :data:`FAR` where a ray meets nothing.
+    """
+
+    label: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+
+
+@functools.cache
+def _cast_kernel(real):
+    @ti.kernel
+    def cast_rows(
+        axis: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
+        point: ti.types.ndarray(dtype=real, ndim=2),  # (D, 6)
+        prismatic: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
+        parent: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
+        part_kind: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
+        part_shape: ti.types.ndarray(dtype=real, ndim=2),  # (P, 4)
+        part_frame: ti.types.ndarray(dtype=real, ndim=2),  # (P, 12)
+        part_dof: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
+        group: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,) colour group of each part
+        camera: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
+        drawn: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (K,) the parts to draw
+        spread: ti.i32,
+        step: ti.i32,  # pixels between rays; the first is at step // 2
+        rays: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (V, H, W, 3) world; zero outside the picture
+        cost: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (V, H, W, G + 1)
+        before_label: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (V, H, W)
+        before_depth: ti.types.ndarray(dtype=ti.f32, ndim=3),  # (V, H, W)
+        export: ti.i32,
+        pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
+        frames: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 12) scratch
+        twists: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 6) scratch
+        placed: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 12) scratch
+        disc: ti.types.ndarray(dtype=real, ndim=4),  # (B, V, P, 3) scratch, centre and square radius in pixels
+        change: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (B V, H) out: what drawing changes of a row's cost
+        label: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (B, V, H, W) out, if export; before_label when called
+        depth: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (B, V, H, W) out, if export; before_depth when called
+    ):
+        B, V, H, W = pose.shape[0], rays.shape[0], rays.shape[1], rays.shape[2]
+        P, K = part_dof.shape[0], drawn.shape[0]
+        for b in range(B):
+            forward(axis, point, prismatic, parent, pose, b, b, frames, twists)
+            for p in range(P):
+                R, t = place_part(frames, part_dof, part_frame, b, p)
+                keep(placed, b, p, R, t)
+                # a disc in each picture that holds the part: most pixels are far from most parts
+                shape = shape_of(part_shape, p)
+                middle = R @ interior_point(part_kind[p], shape) + t
+                reach = enclosing_radius(part_kind[p], shape)
+                for v in range(V):
+                    pixel, J, z = project(camera, v, middle)
+                    radius = 0.0 * z
+                    if z > 1.5 * reach + NEAREST_M:
+                        # the Frobenius norm of the derivative is at least its growth in any direction
+                        radius = DISC_MARGIN * J.norm() * reach * z / (z - reach)
+                    elif z > -reach:
+                        radius = 1e6 + 0.0 * z
+                    disc[b, v, p, 0], disc[b, v, p, 1], disc[b, v, p, 2] = pixel[0], pixel[1], radius * radius
+        for turn in range(spread * (B * V)):
+            if turn % spread != 0:
+                continue
+            c = turn // spread
+            b, v = c // V, c % V
+            eye = camera_center(camera, v)
+            for j in range(H):
+                row = j * step + step // 2
+                # the stretch of this row that the drawn parts' discs cover
+                low, high = W, -1
+                for k in range(K):
+                    across = disc[b, v, drawn[k], 2] - (row - disc[b, v, drawn[k], 1]) ** 2
+                    if across > 0.0:
+                        half = ti.sqrt(across)
+                        middle = disc[b, v, drawn[k], 0] - step // 2
+                        low = ti.min(low, ti.max(ti.cast(ti.ceil((middle - half) / step), ti.i32), 0))
+                        high = ti.max(high, ti.min(ti.cast(ti.floor((middle + half) / step), ti.i32), W - 1))
+                total = ti.cast(0.0, ti.f32)
+                for i in range(low, high + 1):
+                    ray = ti.Vector([ti.cast(rays[v, j, i, a], real) for a in ti.static(range(3))])
+                    nearest = ti.cast(before_depth[v, j, i], real)
+                    met = -1
+                    if ray.norm_sqr() > 0.0:
+                        column = i * step + step // 2
+                        for k in range(K):
+                            p = drawn[k]
+                            dx, dy = column - disc[b, v, p, 0], row - disc[b, v, p, 1]
+                            if dx * dx + dy * dy < disc[b, v, p, 2]:
+                                R = load_rotation(placed, b, p).transpose()
+                                local = R @ (eye - load_translation(placed, b, p))
+                                t = enter(part_kind[p], shape_of(part_shape, p), local, R @ ray, 1.0)
+                                if t > 0.0 and t < nearest:
+                                    nearest = t
+                                    met = p
+                    if met >= 0:
+                        old = ti.cast(before_label[v, j, i], ti.i32)
+                        was = 0
+                        if old > 0:
+                            was = group[old - 1] + 1
+                        total += cost[v, j, i, group[met] + 1] - cost[v, j, i, was]
+                        if export == 1:
+                            label[b, v, j, i] = ti.cast(met + 1, ti.u8)
+                            depth[b, v, j, i] = ti.cast(nearest, ti.f32)
+                change[c, j] = total
+
+    return Launcher(cast_rows)
+
+
+def nothing(shape: tuple[int, int, int]) -> Cast:
+    """Rays (V, H, W) that meet nothing."""
+    return Cast(np.zeros(shape, np.uint8), np.full(shape, FAR, np.float32))
+
+
+def cast(
+    body: ConeArrays,
+    group: NDArray[np.int32],
+    cameras: NDArray[np.floating],
+    step: int,
+    rays: NDArray[np.float32],
+    cost: NDArray[np.float32],
+    poses: NDArray[np.floating],
+    drawn: NDArray[np.int32] | None = None,
+    before: Cast | None = None,
+    export: bool = False,
+) -> tuple[NDArray[np.float64], Cast | None]:
+    """Cast the rays at B poses.
+
+    Args:
+        body: the cone body.
+        group: (P,) colour group of each part.
+        cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_camera`.
+        step: pixels between rays; the first goes through pixel ``step // 2``.
+        rays: (V, H, W, 3) float32 viewing directions, world frame; zero where a camera has no pixel.
+        cost: (V, H, W, G + 1) float32, see the module.
+        poses: (B, D).
+        drawn: (K,) indices of the parts to draw; all if None.
+        before: what the rays meet of the other parts; nothing if None.
+        export: whether to return what the rays meet.
+
+    Returns:
+        (B, V) sum of the rays' costs; and, with ``export``, the casts with B as the first axis, else None.
+    """
+    ensure_runtime()
+    dtype = body.axis.dtype
+    poses = np.ascontiguousarray(poses, dtype)
+    B, D = poses.shape
+    V, H, W = rays.shape[:3]
+    P = len(body.part_kind)
+    if drawn is None:
+        drawn = np.arange(P, dtype=np.int32)
+    before = before or nothing((V, H, W))
+    change = np.empty((B * V, H), np.float32)
+    shape = (B, V, H, W) if export else (1, 1, 1, 1)
+    label, depth = np.empty(shape, np.uint8), np.empty(shape, np.float32)
+    if export:
+        label[:], depth[:] = before.label, before.depth
+    _cast_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
+        *body[:8],
+        group,
+        np.ascontiguousarray(cameras, dtype),
+        drawn,
+        spread_of(B * V),
+        step,
+        rays,
+        cost,
+        before.label,
+        before.depth,
+        int(export),
+        poses,
+        np.empty((B, D, 12), dtype),
+        np.empty((B, D, 6), dtype),
+        np.empty((B, P, 12), dtype),
+        np.empty((B, V, P, 3), dtype),
+        change,
+        label,
+        depth,
+    )
+    if before.label.any():
+        columns = np.concatenate([[0], group + 1])[before.label]
+        base = np.take_along_axis(cost, columns[..., None], axis=-1)[..., 0].sum(axis=(1, 2), dtype=np.float64)
+    else:
+        base = cost[..., 0].sum(axis=(1, 2), dtype=np.float64)
+    total = base + change.reshape(B, V, H).sum(axis=2, dtype=np.float64)
+    return total, Cast(label, depth) if export else None

@@ -1,0 +1,300 @@
+"""Fits a cone body to silhouettes of several frames: its dimensions, its parts' shapes and the poses, all at once.
+
+One Gauss-Newton problem over the poses of F frames and the body's parameters: the logarithms of the dimensions, and for
+each group of parts what :meth:`~tk.model.cone_body.ConeBody.reshaped` changes. An edgel's row by a parameter is
+n·Jπ·∂x/∂δ at the material point x of the contour, as it is by a degree of freedom: along an occluding contour the
+surface slides in the image's tangent only. Dimensions and shapes are fitted together because shapes make up for
+dimensions and the other way round: thighs that taper otherwise than the average ones move the knee by centimetres if
+only the dimensions may give way. (The silhouette paper leaves the adaptation of the body to future work.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ConfigError
+from tk.kernels.cones import CONE
+from tk.kernels.kinematics import place
+from tk.kernels.silhouette import Edgels, SearchSettings
+from tk.model.anthropometry import BodyDimensions
+from tk.model.cone_body import SHAPE_NUMBERS, ConeBody, build_cone_body, group_of
+from tk.model.silhouettes import Pyramid, Views
+from tk.model.skeleton import SEGMENTS, Skeleton
+
+Float = NDArray[np.float64]
+
+# One standard deviation of a dimension's logarithm about the proportions of the stature. Lengths between joints vary by
+# 4 to 5 % at a given stature (Drillis & Contini 1966), radii by girth and by clothes.
+_LENGTHS = {
+    "trunk": 0.05,
+    "head": 0.05,
+    "upper_arm": 0.05,
+    "forearm": 0.05,
+    "thigh": 0.05,
+    "calf": 0.05,
+    "foot": 0.06,
+    "hand": 0.1,
+    "shoulder_drop": 0.25,
+    "shoulder_half_width": 0.06,
+    "hip_half_width": 0.06,
+    "ankle_height": 0.1,
+}
+_RADII = 0.2
+_UPRIGHT = ("head", "trunk", "thigh", "calf", "ankle_height")  # what adds up to the stature
+
+# One standard deviation of what changes a part, see ConeBody.reshaped: logarithms of a, b, m and h about what the
+# dimensions make them, and metres off the bone along x and y, where the axis begins and where it ends. Parts between
+# joints keep their lengths; what ends a limb has no joint behind it, so its length and direction are open. What lies in
+# the middle is symmetric.
+_FIXED = 1e-6
+_LIMB = (0.15, 0.15, 0.15, _FIXED, 0.005, 0.005, 0.005, 0.005)
+_TRUNK = (0.15, 0.15, 0.15, _FIXED, 0.01, _FIXED, 0.01, _FIXED)
+_SHAPES = {
+    "hand_": (0.15, 0.15, 0.15, 0.1, 0.005, 0.005, 0.02, 0.01),
+    "foot_": (0.15, 0.15, 0.15, 0.1, 0.005, 0.005, 0.02, 0.01),
+    "head": (0.15, 0.15, 0.15, 0.1, 0.005, _FIXED, 0.02, _FIXED),
+}
+_STEP = 1e-4  # of the differences by a dimension's logarithm
+# Standard deviation of an edgel, pixels. Besides ragged masks it stands for shapes that no cone has, which err alike in
+# all frames.
+_EDGE_NOISE_PX = 3.0
+# Along a contour this many pixels err together.
+_CORRELATION_PX = 10.0
+# Between samples of a contour, pixels: no more than these are independent.
+_SPACING_PX = 6.0
+# Of a degree of freedom about the pose that the fit was given, radians or metres.
+_POSE_DEVIATION = 0.3
+# Of the waist and the ankles about a straight one, radians: a bent waist and another trunk look alike.
+_STRAIGHT_DEVIATION = 0.3
+_DIMENSIONS = tuple(field.name for field in fields(BodyDimensions))
+
+
+@dataclass(frozen=True)
+class BodyFitConfig:
+    """Settings of the body's fit.
+
+    Attributes:
+        frames: most frames that are used, evenly spaced.
+        rounds: Gauss-Newton iterations.
+        stature_deviation: of the logarithm of the stature about the given one.
+    """
+
+    frames: int = 16
+    rounds: int = 4
+    stature_deviation: float = 0.01
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.frames <= 200 or not 0 <= self.rounds <= 50:
+            raise ConfigError(
+                f"body fit: frames = {self.frames} must lie in [1, 200], rounds = {self.rounds} in [0, 50]"
+            )
+        if not 0 < self.stature_deviation <= 1:
+            raise ConfigError(f"body fit: stature_deviation = {self.stature_deviation} must lie in (0, 1]")
+
+
+def fit_body(
+    preset: str,
+    views: Views,
+    pyramids: Sequence[Pyramid],
+    poses: Float,
+    up: str,
+    settings: SearchSettings,
+    stature_m: float,
+    config: BodyFitConfig | None = None,
+) -> tuple[ConeBody, Float]:
+    """The body that suits several frames, with their poses.
+
+    Args:
+        preset: of :data:`~tk.model.cone_body.PRESETS`.
+        views: the cameras.
+        pyramids: F frames' silhouettes.
+        poses: (F, D) their poses, close enough for the search to find the right edges.
+        up: the world axis that points up.
+        settings: of the search.
+        stature_m: the subject's height without shoes, given or measured.
+        config: see :class:`BodyFitConfig`.
+
+    Returns:
+        The body, and poses (F, D).
+    """
+    config = config or BodyFitConfig()
+    settings = replace(settings, spacing_px=_SPACING_PX)
+    problem = _Problem(preset, up, BodyDimensions.from_stature(stature_m), config.stature_deviation)
+    shared = problem.mean.copy()
+    poses, start = np.array(poses), np.array(poses)
+    F, D, K = len(poses), poses.shape[1], len(shared)
+    information = 1.0 / (_EDGE_NOISE_PX**2 * _CORRELATION_PX)  # of one pixel of contour
+    body_at = slice(F * D, F * D + K)
+    for _ in range(config.rounds):
+        here = problem.build(shared)
+        skeleton = here.skeleton
+        straight = skeleton.is_waist | skeleton.is_ankle
+        pose_precision = np.where(straight, _STRAIGHT_DEVIATION, _POSE_DEVIATION) ** -2.0
+        mean = np.where(straight, 0.0, start)
+        seen = [views.edgels(here, pyramid, pose, 0, settings) for pyramid, pose in zip(pyramids, poses, strict=True)]
+        by_dimension = problem.dimension_rows(shared, poses, seen)
+        H, g = np.zeros((F * D + K, F * D + K)), np.zeros(F * D + K)
+        transforms = segment_transforms(skeleton, poses)
+        for f, edgels in enumerate(seen):
+            rows = np.hstack(
+                [pose_rows(here, poses[f], edgels), by_dimension[f], shape_rows(here, transforms[f], edgels)]
+            )
+            weight = edgels.weight * information
+            A = (rows * weight[:, None]).T @ rows
+            y = rows.T @ (weight * edgels.distance)
+            at = slice(f * D, (f + 1) * D)
+            H[at, at] += A[:D, :D]
+            H[at, body_at] += A[:D, D:]
+            H[body_at, at] += A[D:, :D]
+            H[body_at, body_at] += A[D:, D:]
+            g[at] += y[:D]
+            g[body_at] += y[D:]
+            # joints beyond a limit are pulled back
+            excess = skeleton.clip(poses[f]) - poses[f]
+            limit = np.where(excess != 0, 1e3, 0.0)
+            H[at, at] += np.diag(pose_precision + limit)
+            g[at] += pose_precision * (mean[f] - poses[f]) + limit * excess
+        problem.add_prior(shared, H[body_at, body_at], g[body_at])
+        free = np.flatnonzero(here.free)
+        chosen = np.concatenate([*(f * D + free for f in range(F)), F * D + np.arange(K)])
+        delta = np.zeros(len(g))
+        delta[chosen] = np.linalg.solve(H[np.ix_(chosen, chosen)], g[chosen])
+        poses += np.clip(delta[: F * D].reshape(F, D), -0.3, 0.3)
+        shared += np.clip(delta[body_at], -0.1, 0.1)
+    return problem.build(shared), poses
+
+
+class _Problem:
+    """The family of bodies: 24 logarithms of dimensions, then 8 numbers for each group of parts."""
+
+    def __init__(self, preset: str, up: str, average: BodyDimensions, stature_deviation: float) -> None:
+        self.preset, self.up, self.average = preset, up, average
+        self.stature_deviation = stature_deviation
+        self.groups = build_cone_body(average, up, preset).shape_groups
+        shapes = [_SHAPES.get(name, _LIMB if name.endswith("_") else _TRUNK) for name in self.groups]
+        logs = np.log([getattr(average, name) for name in _DIMENSIONS])
+        self.mean = np.concatenate([logs, np.zeros(SHAPE_NUMBERS * len(self.groups))])
+        self.deviation = np.concatenate([[_LENGTHS.get(name, _RADII) for name in _DIMENSIONS], np.ravel(shapes)])
+
+    def build(self, shared: Float) -> ConeBody:
+        values = np.exp(shared[: len(_DIMENSIONS)])
+        dimensions = BodyDimensions(**dict(zip(_DIMENSIONS, values.tolist(), strict=True)))
+        change = shared[len(_DIMENSIONS) :].reshape(len(self.groups), SHAPE_NUMBERS)
+        return build_cone_body(dimensions, self.up, self.preset).reshaped(change)
+
+    def dimension_rows(self, shared: Float, poses: Float, seen: Sequence[Edgels]) -> list[Float]:
+        """For each frame (N, 24): rows by the dimensions, by central differences of the surface points."""
+        ends = np.cumsum([len(edgels.part) for edgels in seen])
+        frame = np.repeat(np.arange(len(seen)), [len(edgels.part) for edgels in seen])
+        part = np.concatenate([edgels.part for edgels in seen])
+        unscaled = np.concatenate([edgels.unscaled for edgels in seen])
+        row = np.concatenate([edgels.row for edgels in seen])
+        rows = np.zeros((len(part), len(_DIMENSIONS)))
+        for k in range(len(_DIMENSIONS)):
+            step = np.zeros(len(shared))
+            step[k] = _STEP
+            larger, smaller = (
+                _surface_points(body, part_transforms(body, T)[frame, part], part, unscaled)
+                for body, T in (
+                    (body, segment_transforms(body.skeleton, poses))
+                    for body in (self.build(shared + step), self.build(shared - step))
+                )
+            )
+            rows[:, k] = np.einsum("na,na->n", row, larger - smaller) / (2 * _STEP)
+        return np.split(rows, ends[:-1])
+
+    def add_prior(self, shared: Float, H: Float, g: Float) -> None:
+        """Add what is known of bodies to the equations (K, K), (K,) of the parameters."""
+        H += np.diag(self.deviation**-2)
+        g += (self.mean - shared) / self.deviation**2
+        lengths = dict(zip(_DIMENSIONS, np.exp(shared[: len(_DIMENSIONS)]), strict=True))
+        stature = sum(lengths[name] for name in _UPRIGHT)
+        row = np.zeros(len(shared))
+        for name in _UPRIGHT:
+            row[_DIMENSIONS.index(name)] = lengths[name] / stature / self.stature_deviation
+        H += np.outer(row, row)
+        g += row * np.log(self.average.stature / stature) / self.stature_deviation
+
+
+def segment_transforms(skeleton: Skeleton, poses: Float) -> Float:
+    """(F, S, 4, 4) transforms of the segments at poses (F, D), as :meth:`Skeleton.segment_transforms` has them."""
+    corners = np.concatenate([np.zeros((1, 3)), np.eye(3)])
+    local = np.tile(corners, (len(SEGMENTS), 1))
+    last = np.repeat(skeleton.segment_dof, 4)
+    world = place(
+        skeleton.axis, skeleton.anchor, skeleton.prismatic, skeleton.parent, local, last, np.asarray(poses, np.float64)
+    ).reshape(len(poses), len(SEGMENTS), 4, 3)
+    T = np.zeros((len(poses), len(SEGMENTS), 4, 4))
+    T[..., :3, :3] = np.swapaxes(world[:, :, 1:] - world[:, :, :1], -1, -2)
+    T[..., :3, 3] = world[:, :, 0]
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def part_transforms(body: ConeBody, T_world_segment: Float) -> Float:
+    """(..., P, 4, 4) from each part to the world, from the segments' (..., S, 4, 4)."""
+    B = np.eye(4)
+    B[:3, :3] = body.skeleton.T_world_body
+    segments = [SEGMENTS.index(part.segment) for part in body.parts]
+    inside = B @ np.array([part.T_body_part for part in body.parts])
+    return np.asarray(T_world_segment[..., segments, :, :] @ inside)
+
+
+def _local(body: ConeBody, part: NDArray[np.integer], unscaled: Float) -> tuple[Float, Float, Float]:
+    """Shape (N, 4) and radius factor (N,) of the parts, points (N, 3) in their frames."""
+    shape = np.array([p.shape for p in body.parts])[part]
+    cone = np.array([p.kind == CONE for p in body.parts])[part]
+    r = np.where(cone, 1 + (shape[:, 3] - 1) * unscaled[:, 2], 1.0)
+    return shape, r, unscaled * np.column_stack([shape[:, 0] * r, shape[:, 1] * r, shape[:, 2]])
+
+
+def _surface_points(body: ConeBody, T_world_part: Float, part: NDArray[np.integer], unscaled: Float) -> Float:
+    """(N, 3) world points of the surface, see :meth:`ConeBody.place`, from each one's part's transform (N, 4, 4)."""
+    local = _local(body, part, unscaled)[2]
+    return (T_world_part[:, :3, :3] @ local[:, :, None])[:, :, 0] + T_world_part[:, :3, 3]
+
+
+def pose_rows(body: ConeBody, pose: Float, edgels: Edgels) -> Float:
+    """(N, D) derivative of the contour's position along its normal by the pose, pixels."""
+    s = body.skeleton
+    w, v = s.twists(pose)
+    x = body.place(pose, edgels.part, edgels.unscaled)
+    moves = s.ancestors()[[SEGMENTS.index(part.segment) for part in body.parts]][edgels.part]
+    # n · (ω × x + v) = ω · (x × n) + v · n
+    return np.where(moves, np.cross(x, edgels.row) @ w.T + edgels.row @ v.T, 0.0)
+
+
+def shape_rows(body: ConeBody, T_world_segment: Float, edgels: Edgels) -> Float:
+    """(N, 8 G) the same by what :meth:`ConeBody.reshaped` changes, at no change, to first order.
+
+    An axis whose ends move apart tilts, and the cross-sections tilt with it.
+    """
+    groups = body.shape_groups
+    part = edgels.part
+    T = part_transforms(body, T_world_segment)[part]
+    n = np.einsum("nab,na->nb", T[:, :3, :3], edgels.row)  # the row in the part's frame
+    shape, _, local = _local(body, part, edgels.unscaled)
+    cone = np.array([p.kind == CONE for p in body.parts])[part]
+    mirror = np.array([-1.0 if p.name.endswith("_r") else 1.0 for p in body.parts])[part]
+    u = edgels.unscaled
+    along = np.where(cone, u[:, 2], 0.5 * (u[:, 2] + 1))  # 0 where the axis begins, 1 where it ends
+    length = np.where(cone, shape[:, 2], 2 * shape[:, 2])
+    grown = np.where(cone, shape[:, 3] * u[:, 2], 0.0)  # of the radius factor with log m
+    rows = np.zeros((len(part), SHAPE_NUMBERS))
+    rows[:, 0] = n[:, 0] * local[:, 0]
+    rows[:, 1] = n[:, 1] * local[:, 1]
+    rows[:, 2] = grown * (n[:, 0] * shape[:, 0] * u[:, 0] + n[:, 1] * shape[:, 1] * u[:, 1])
+    rows[:, 3] = n[:, 2] * local[:, 2]
+    for axis in range(2):
+        side = mirror if axis == 1 else 1.0
+        tilt = n[:, 2] * local[:, axis] / length
+        rows[:, 4 + axis] = side * ((1 - along) * n[:, axis] + tilt)
+        rows[:, 6 + axis] = side * (along * n[:, axis] - tilt)
+    result = np.zeros((len(part), len(groups), SHAPE_NUMBERS))
+    column = np.array([groups.index(group_of(p.name)) for p in body.parts])[part]
+    result[np.arange(len(part)), column] = rows
+    return result.reshape(len(part), -1)

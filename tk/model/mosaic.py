@@ -1,0 +1,76 @@
+"""Boxes out of several cameras' pictures side by side in one picture, so that a filter runs once for all of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Mosaic:
+    """Where each camera's box lies. Zeros between them keep them apart.
+
+    Attributes:
+        boxes: (C, 4) int32 left, top, width, height in the camera's picture; a box may be empty.
+        corners: (C, 2) int32 left, top in the mosaic.
+        shape: (height, width) of the mosaic.
+    """
+
+    boxes: NDArray[np.int32]
+    corners: NDArray[np.int32]
+    shape: tuple[int, int]
+
+    @staticmethod
+    def of(boxes: NDArray[np.int32], gap: int) -> Mosaic:
+        """Boxes (C, 4) from left to right, ``gap`` pixels between them and around them all."""
+        widths = boxes[:, 2] + gap
+        corners = np.empty((len(boxes), 2), np.int32)
+        corners[:, 0] = gap + np.cumsum(widths) - widths
+        corners[:, 1] = gap
+        return Mosaic(boxes, corners, (int(boxes[:, 3].max()) + 2 * gap, int(widths.sum()) + gap))
+
+    def enlarged(self, factor: int) -> Mosaic:
+        """The same on pictures that are larger by a whole factor."""
+        return Mosaic(factor * self.boxes, factor * self.corners, (factor * self.shape[0], factor * self.shape[1]))
+
+    def part(self, mosaic: NDArray[Any], c: int) -> NDArray[Any]:
+        """The view of camera ``c``'s box in a mosaic."""
+        x, y = self.corners[c]
+        _, _, w, h = self.boxes[c]
+        return mosaic[y : y + h, x : x + w]
+
+    def crop(self, picture: NDArray[Any], c: int) -> NDArray[Any]:
+        """The view of camera ``c``'s box in its picture."""
+        x, y, w, h = self.boxes[c]
+        return picture[y : y + h, x : x + w]
+
+    def part_of(self, mosaic: NDArray[Any], c: int, box: NDArray[np.int32]) -> NDArray[Any]:
+        """The view of a box within camera ``c``'s, in its picture's coordinates."""
+        x, y = self.corners[c] + box[:2] - self.boxes[c, :2]
+        return mosaic[y : y + box[3], x : x + box[2]]
+
+    def tightened(self, mosaic: NDArray[np.uint8], margin: int) -> Mosaic:
+        """The least boxes around what is not 0 in a mosaic, and ``margin`` more where the boxes have it."""
+        boxes = np.zeros_like(self.boxes)
+        for c, (left, top, width, height) in enumerate(self.boxes):
+            x, y, w, h = cv2.boundingRect(self.part(mosaic, c)) if width > 0 else (0, 0, 0, 0)
+            if w > 0:
+                right, bottom = min(x + w + margin, width), min(y + h + margin, height)
+                x, y = max(x - margin, 0), max(y - margin, 0)
+                boxes[c] = left + x, top + y, right - x, bottom - y
+        return Mosaic.of(boxes, int(self.corners[0, 1]))
+
+    def cut(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+        """Where in the mosaic a box ends while its picture of this (height, width) goes on."""
+        result = np.zeros(self.shape, np.bool_)
+        for c, (left, top, w, h) in enumerate(self.boxes.tolist()):
+            if w > 0:
+                part = self.part(result, c)
+                part[0], part[-1] = top > 0, top + h < shape[0]
+                part[:, 0] |= left > 0
+                part[:, -1] |= left + w < shape[1]
+        return result

@@ -1,0 +1,466 @@
+"""The loop: open a capture, step a tracker through it, write the result, tell how it goes, resume."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from tk.ahead import TIMING_STAGES, Observed, Source, open_source
+from tk.config import Config
+from tk.errors import CaptureError, ConfigError, ResultError, TkError
+from tk.io.capture import Capture
+from tk.io.init_pose import InitPose, read_init_pose
+from tk.io.mask_store import MaskStore
+from tk.io.result import FrameResult, HullPoints, ResultMeta, ResultWriter, Status, Value, read_result, revise_result
+from tk.model.cone_body import ConeBody
+from tk.model.hull import HullSurface
+from tk.model.skeleton import join_pose, split_pose
+from tk.segmentation import make_segmenter as make_segmenter
+from tk.trackers.base import Estimate, Tracker
+from tk.trackers.bodies import read_body
+from tk.trackers.contours import ContourTracker
+from tk.trackers.region import RegionTracker
+from tk.trackers.silhouette import SilhouetteTracker
+from tk.trackers.volumetric import LevenbergMarquardtTracker, VolumetricTracker
+
+METHODS = ("region", "silhouette", "volumetric", "lm")
+
+
+class Reporter(Protocol):
+    """Who wants to know how it goes."""
+
+    def note(self, text: str) -> None:
+        """A line worth reading."""
+        ...
+
+    def begin(self, total: int, done: int) -> None:
+        """``total`` frames are to be tracked, ``done`` of which an earlier run has finished."""
+        ...
+
+    def advance(self, frame: int, estimate: Estimate | None) -> None:
+        """A frame is finished; ``estimate`` is None where no pose is sought."""
+        ...
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a run did.
+
+    Attributes:
+        frames: in the result, those of earlier runs included.
+        lost: frames among them that are lost.
+        seconds: that this run took.
+        tracked_now: frames that this run added.
+        interrupted: somebody stopped it with Ctrl-C.
+    """
+
+    frames: int
+    lost: int
+    seconds: float
+    tracked_now: int
+    interrupted: bool = False
+
+
+def make_tracker(method: str, capture: Capture, config: Config) -> Tracker:
+    """The tracker of this name for a capture.
+
+    Raises:
+        ConfigError: there is none of this name.
+    """
+    rig, up = capture.rig, capture.up
+    if method == RegionTracker.method:
+        return RegionTracker(rig, up, config.silhouette, config.region)
+    if method == SilhouetteTracker.method:
+        return SilhouetteTracker(rig, up, config.silhouette)
+    for tracker in (VolumetricTracker, LevenbergMarquardtTracker):
+        if method == tracker.method:
+            return tracker(rig, capture.volume, up, config)
+    raise ConfigError(f"--method {method}: choose one of {', '.join(METHODS)}")
+
+
+def track(
+    capture: Capture,
+    output: Path,
+    config: Config,
+    reporter: Reporter,
+    method: str = "region",
+    frames: tuple[int, int | None] = (0, None),
+    init_pose: Path | None = None,
+    resume: bool = False,
+    store_hull: bool = False,
+    body: Path | None = None,
+    causal: bool = False,
+) -> Summary:
+    """Track a capture and write the result, frame by frame.
+
+    The subject is found in the capture's initial frame and followed from there; what lies before ``frames`` is tracked
+    but not written. Ctrl-C ends the run with all finished frames in the file, closed and ready for ``resume``.
+
+    Args:
+        capture: what to track.
+        output: the result file.
+        config: all settings.
+        reporter: who hears of the progress.
+        method: the tracker's name.
+        frames: first frame to write and the one to stop before (None: the last).
+        init_pose: a file with a rough initial pose, see :mod:`tk.io.init_pose`.
+        resume: go on where an earlier run of the same command stopped.
+        store_hull: keep the hull's surface in the result, too.
+        body: a result or a TOML file whose body is taken; None fits one to the opening frames.
+        causal: leave it at the first pass, in which a frame knows nothing of those after it.
+
+    Raises:
+        TkError: bad input; everything finished before it is in the file.
+    """
+    for warning in capture.warnings:
+        reporter.note(warning)
+    with _open(capture, config, reporter.note, method, frames, init_pose, body) as plan:
+        tracker, capture = plan.tracker, plan.capture
+        meta = _meta(tracker, capture, config)
+        origin = _origin(capture, plan, store_hull)
+        writer, done = ResultWriter.resume(output, meta) if resume else (ResultWriter.create(output, meta), 0)
+        run = _Run(plan, config, _Output(writer, done, origin, store_hull))
+        started = time.perf_counter()
+        interrupted = False
+        try:
+            with writer:
+                reporter.begin(plan.stop - plan.begin, min(done, plan.stop - plan.begin))
+                for estimate in run.estimates():
+                    reporter.advance(estimate.frame, estimate)
+            if not causal and run.tracked:
+                refine(output, plan, run.masks, reporter.note)
+        except KeyboardInterrupt:
+            # caught outside the writer, which then leaves an older result alone if nothing is done
+            interrupted = True
+        return Summary(done + run.tracked, run.lost, time.perf_counter() - started, run.tracked, interrupted)
+
+
+def estimates(
+    capture: Capture,
+    config: Config,
+    note: Callable[[str], None] = lambda _: None,
+    method: str = "region",
+    frames: tuple[int, int | None] = (0, None),
+    init_pose: Path | None = None,
+    body: Path | None = None,
+) -> Iterator[Estimate]:
+    """Track a capture and hand out the frames' estimates one by one, as the first pass finds them; no file is written.
+
+    Arguments and errors are those of :func:`track`.
+    """
+    for warning in capture.warnings:
+        note(warning)
+    with _open(capture, config, note, method, frames, init_pose, body) as plan:
+        yield from _Run(plan, config, None).estimates()
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What is to be tracked, and by whom.
+
+    Attributes:
+        first: the frame in which the subject is found; begin: the first that is told; stop: the one to stop before.
+        init: the rough pose, if one was given; body: the body, if one was given.
+    """
+
+    capture: Capture
+    source: Source
+    tracker: Tracker
+    first: int
+    begin: int
+    stop: int
+    init: InitPose | None
+    body: ConeBody | None
+
+
+@contextmanager
+def _open(
+    capture: Capture,
+    config: Config,
+    note: Callable[[str], None],
+    method: str,
+    frames: tuple[int, int | None],
+    init_pose: Path | None,
+    body_file: Path | None,
+) -> Iterator[_Plan]:
+    # its process starts while this one makes tables and compiles
+    with open_source(capture, config, note, keep_images=method != SilhouetteTracker.method) as source:
+        tracker = make_tracker(method, capture, config)
+        body = read_body(body_file, capture.up) if body_file else None
+        if body is not None and not isinstance(tracker, ContourTracker):
+            raise ConfigError(f"--body {body_file}: the {method} tracker fits a body of its own; use --method region")
+        init = read_init_pose(init_pose, tracker.pose_names) if init_pose else None
+        if init and not ((capture.volume.lower <= init.center) & (init.center <= capture.volume.upper)).all():
+            raise CaptureError(
+                f"{init_pose}: the body is at {init.center.round(2).tolist()}, outside the working volume "
+                f"{capture.volume.lower.round(2).tolist()} to {capture.volume.upper.round(2).tolist()}; give metres"
+            )
+        first = init.frame if init and init.frame is not None else frames[0] if init else capture.init_frame
+        if init is None and capture.init_pose == "any":
+            if not tracker.any_pose:
+                raise CaptureError(
+                    f'{capture.path / "capture.toml"}: init.pose = "any", so nobody stands in the Da Vinci pose; '
+                    f"give a rough pose with --init-pose FILE, or use --method {RegionTracker.method}"
+                )
+            first = max(first, frames[0])  # no frame is better than another
+        start, stop = choose_frames(capture, frames, note)
+        if not first < capture.frame_count:
+            raise CaptureError(f"{init_pose}: frame = {first} is past the capture's last, {capture.frame_count - 1}")
+        if first >= stop:
+            raise ConfigError(
+                f"--frames {start}:{stop}: the subject is found in frame {first} and followed forwards; "
+                f"end after frame {first}, or start elsewhere with --init-pose FILE"
+            )
+        if start < first:
+            note(f"frames before {first} are left out: the subject is found in frame {first} and followed forwards")
+        yield _Plan(capture, source, tracker, first, max(start, first), stop, init, body)
+
+
+def _meta(tracker: Tracker, capture: Capture, config: Config) -> ResultMeta:
+    contours = isinstance(tracker, ContourTracker)
+    return ResultMeta(
+        pose_names=tracker.pose_names,
+        pose_units=tracker.pose_units,
+        stages=tracker.stages,
+        timing_stages=(*TIMING_STAGES, *tracker.timing_stages, "total"),
+        fps=capture.fps,
+        up=capture.up,
+        capture=capture.name,
+        method=tracker.method,
+        seed=config.seed,
+        config_toml=config.to_toml(),
+        waist_names=tracker.waist_names,
+        ankle_names=tracker.ankle_names,
+        sigma=tracker.method == RegionTracker.method,
+        fit_cameras=capture.rig.names if tracker.method == RegionTracker.method else (),
+        objective_kind="E_S" if contours else "robust distance of surface points",
+    )
+
+
+def choose_frames(capture: Capture, frames: tuple[int, int | None], note: Callable[[str], None]) -> tuple[int, int]:
+    """The first frame of ``--frames`` and the one to stop before, within the capture.
+
+    Raises:
+        ConfigError: the capture ends before the first.
+    """
+    start, stop = frames
+    if start >= capture.frame_count:
+        asked = f"{start}:" if stop is None else f"{start}:{stop}"
+        raise ConfigError(f"--frames {asked}: {capture.path} has only frames 0 to {capture.frame_count - 1}")
+    if stop is not None and stop > capture.frame_count:
+        note(f"--frames {start}:{stop}: {capture.path} ends with frame {capture.frame_count - 1}")
+    return start, capture.frame_count if stop is None else min(stop, capture.frame_count)
+
+
+def _origin(capture: Capture, plan: _Plan, store_hull: bool) -> dict[str, str]:
+    """What else but :class:`ResultMeta` must agree when a run is taken up again, by the name that a user knows."""
+    masks, init = capture.mask_clips, plan.init
+    given = "none" if plan.body is None else hashlib.sha256(repr(plan.body).encode()).hexdigest()[:12]
+    return {
+        "first frame": str(plan.begin),
+        "frame of the initial pose": str(plan.first),
+        "given body (its hash)": given,
+        "cameras": ", ".join(capture.rig.names),
+        "masks": "none" if masks is None else os.path.relpath(masks[0].path.parent, capture.path),
+        "initial pose (its hash)": "none" if init is None else hashlib.sha256(repr(init).encode()).hexdigest()[:12],
+        "stored hull": "yes" if store_hull else "no",
+    }
+
+
+_ORIGIN, _LOST = "run/", "lost frames"
+#: in `/model` of a result that a second pass has gone over
+REFINED = "refined"
+
+
+@dataclass
+class _Output:
+    """Where a run writes, and what an earlier one has written.
+
+    Attributes:
+        done: frames that an earlier run has finished.
+        origin: what must agree with it.
+    """
+
+    writer: ResultWriter
+    done: int
+    origin: Mapping[str, str]
+    store_hull: bool
+
+    def check(self) -> None:
+        """Raise ResultError where the earlier run was another one."""
+        for name, value in self.origin.items():
+            found = self.writer.state.get(_ORIGIN + name)
+            if found != value:
+                raise ResultError(
+                    f"{self.writer.path}: was made differently: {name}: {found}, not {value}; "
+                    "run without --resume to start afresh"
+                )
+        if REFINED in self.writer.model:
+            raise ResultError(
+                f"{self.writer.path}: a second pass has gone over its frames, so no more can be added; run without "
+                "--resume to start afresh, or with --causal for a result that can be prolonged"
+            )
+
+
+class _Run:
+    """One run of a tracker through a capture; how far it got stands in ``tracked`` and ``lost`` whatever ends it."""
+
+    def __init__(self, plan: _Plan, config: Config, output: _Output | None) -> None:
+        self.plan, self.config, self.output = plan, config, output
+        self.tracked = 0
+        self.lost = 0
+        self.masks = MaskStore()
+
+    def estimates(self) -> Iterator[Estimate]:
+        """Start or restore the tracker, and step it to the end; what is handed out is in the file already."""
+        plan, output = self.plan, self.output
+        done = output.done if output else 0
+        if output and done:
+            self.lost = int(np.asarray(output.writer.state[_ORIGIN + _LOST]))
+        if plan.begin + done >= plan.stop:
+            return
+        if output and done:
+            output.check()
+            plan.tracker.restore(output.writer.model, output.writer.state)
+            yield from self._step_through(plan.source.frames(plan.begin + done, plan.stop))
+            return
+        # The body is fitted to the same frames however few are asked for, so that a run may be prolonged by --resume.
+        count = plan.tracker.opening_frames
+        observations = plan.source.frames(plan.first, max(plan.stop, plan.first + count))
+        opening, broken = _take(observations, count)
+        seen = [o for o, _ in opening]
+        try:
+            if plan.body is not None and isinstance(plan.tracker, ContourTracker):
+                plan.tracker.start(seen, plan.capture.subject_height_m, plan.init, plan.body)
+            else:
+                plan.tracker.start(seen, plan.capture.subject_height_m, plan.init)
+        except CaptureError as error:
+            raise CaptureError(f"{plan.capture.path}: {error}") from None
+        if output:
+            output.writer.write_model(plan.tracker.model())
+        yield from self._step_through(chain(_emptied(opening), broken or observations))
+
+    def _step_through(self, observations: Iterator[Observed]) -> Iterator[Estimate]:
+        plan, output = self.plan, self.output
+        writing = 0.0
+        for observation, laps in observations:
+            if observation.index >= plan.stop:
+                return
+            started = time.perf_counter()
+            estimate = plan.tracker.step(observation)
+            if observation.index < plan.begin:
+                continue
+            if output and isinstance(plan.tracker, RegionTracker):
+                self.masks.put(observation.index, observation.masks)
+            finished = time.perf_counter()
+            total = laps["wait"] + writing + finished - started
+            timing = {**laps, **estimate.timing, "total": total}
+            index = observation.index
+            estimate = replace(estimate, frame=index, time=index / plan.capture.fps, timing=timing)
+            self.lost += estimate.status == "lost"
+            if output:
+                output.writer.append(_row(estimate, output.store_hull), self._state(output))
+            self.tracked += 1
+            writing = time.perf_counter() - finished
+            yield estimate
+
+    def _state(self, output: _Output) -> Mapping[str, Value]:
+        origin = {_ORIGIN + name: value for name, value in output.origin.items()}
+        return {**self.plan.tracker.state(), **origin, _ORIGIN + _LOST: self.lost}
+
+
+def refine(output: Path, plan: _Plan, masks: MaskStore, note: Callable[[str], None]) -> None:
+    """The second pass: the body fitted to frames of the whole recording, and every frame settled anew with it.
+
+    The result is replaced in one step; if this does not end, the first pass's stays.
+    """
+    tracker = plan.tracker
+    if not isinstance(tracker, RegionTracker):
+        return
+    result = read_result(output)
+    assert result.waist is not None and result.ankles is not None and result.fit_error is not None
+    missing = [int(f) for f in result.frames if int(f) not in masks]
+    if missing:  # what an earlier run has tracked
+        for observation, _ in plan.source.frames(min(missing), max(missing) + 1):
+            masks.put(observation.index, observation.masks)
+    skeleton = tracker.body.skeleton
+    poses = np.array([join_pose(skeleton, *row) for row in zip(result.pose, result.waist, result.ankles, strict=True)])
+    lost = result.status == Status.LOST
+    note("second pass: the body is fitted to the whole recording")
+    poses, error = tracker.second_pass(
+        masks.sequence(result.frames),
+        poses,
+        lost,
+        result.fit_error,
+        plan.capture.subject_height_m,
+        keep_body=plan.body is not None,
+    )
+    skeleton = tracker.body.skeleton
+    parts = [split_pose(skeleton, pose) for pose in poses]
+    columns = {
+        "pose": np.array([p for p, _, _ in parts]),
+        "waist": np.array([w for _, w, _ in parts]),
+        "ankles": np.array([a for _, _, a in parts]),
+        "joints/position": np.array([skeleton.joints(pose) for pose in poses]),
+        "fit_error": error,
+    }
+    revise_result(output, columns, model={**tracker.model(), REFINED: 1})
+
+
+def _take(observations: Iterator[Observed], count: int) -> tuple[list[Observed], Iterator[Observed] | None]:
+    """The first ``count`` observations; if one after the first cannot be read, those before it and what raises then."""
+    taken: list[Observed] = []
+    try:
+        for observation in observations:
+            taken.append(observation)
+            if len(taken) == count:
+                break
+    except TkError as error:
+        if not taken:
+            raise
+        return taken, _raising(error)
+    return taken, None
+
+
+def _emptied(opening: list[Observed]) -> Iterator[Observed]:
+    """Hands the opening out and keeps none of it, for pictures are large."""
+    opening.reverse()
+    while opening:
+        yield opening.pop()
+
+
+def _raising(error: TkError) -> Iterator[Observed]:
+    raise error
+    yield
+
+
+def _row(estimate: Estimate, store_hull: bool) -> FrameResult:
+    return FrameResult(
+        frame=estimate.frame,
+        time=estimate.time,
+        pose=estimate.pose,
+        waist=estimate.waist,
+        ankles=estimate.ankles if len(estimate.ankles) else None,
+        joints=estimate.joints,
+        sigma=estimate.sigma,
+        fit_error=estimate.fit_error,
+        status=int(Status[estimate.status.upper()]),
+        objective=estimate.objective,
+        iterations=estimate.iterations,
+        timing=estimate.timing,
+        hull=points_of(estimate.surface) if store_hull and estimate.surface is not None else None,
+    )
+
+
+def points_of(surface: HullSurface) -> HullPoints:
+    """A hull's surface as the result file keeps it: colours RGB, uint8."""
+    return HullPoints(surface.positions, surface.colors[:, ::-1].round().clip(0, 255).astype(np.uint8))

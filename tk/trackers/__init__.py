@@ -1,0 +1,1 @@
+"""The trackers: what makes a pose out of what the cameras saw."""

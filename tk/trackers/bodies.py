@@ -1,0 +1,42 @@
+"""A person's body from an earlier recording: a result file, or a TOML file with its dimensions."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+from tk.errors import ConfigError
+from tk.io.result import read_result
+from tk.io.toml import parse_toml, read_text
+from tk.model.anthropometry import BodyDimensions
+from tk.model.cone_body import ConeBody, build_cone_body
+from tk.trackers.contours import restore_body
+
+
+def read_body(path: Path, up: str) -> ConeBody:
+    """The body that a result holds, or that a TOML file describes by ``[dimensions]`` in metres, or by ``stature``.
+
+    Dimensions that the TOML file leaves out are the average ones of its stature.
+
+    Raises:
+        ConfigError: there is no such file, or no body of contours in it.
+        ResultError: a damaged result.
+    """
+    if path.suffix.lower() != ".toml":
+        model = read_result(path).model
+        if "parts/shape" not in model or "body" not in model:
+            raise ConfigError(f"{path}: holds no body of contours; give a result of --method region or a TOML file")
+        return restore_body(model, up)
+    values = parse_toml(read_text(path, ConfigError), str(path), ConfigError)
+    given = values.get("dimensions", {})
+    known = {field.name for field in fields(BodyDimensions)}
+    stature = values.get("stature", 1.75)
+    numbers = {"stature": stature, **(given if isinstance(given, dict) else {"dimensions": given})}
+    for name, value in numbers.items():
+        if name != "stature" and name not in known:
+            raise ConfigError(f"{path}: unknown dimension {name}; known are {', '.join(sorted(known))}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 3:
+            raise ConfigError(f"{path}: {name} = {value} must be a number of metres between 0 and 3")
+    average = BodyDimensions.from_stature(float(stature))
+    lengths = {name: float(given.get(name, getattr(average, name))) for name in known}
+    return build_cone_body(BodyDimensions(**lengths), up)

@@ -1,0 +1,401 @@
+"""What the trackers that follow contours share: finding the person, fitting the body, and a search for lost limbs.
+
+masks → cleaned, scales → {contours → edgels along their normals → normal equations → step} × iterations × scales
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import CaptureError, ConfigError
+from tk.io.init_pose import InitPose
+from tk.kernels.raycast import Cast
+from tk.kernels.silhouette import SearchSettings
+from tk.model import gait
+from tk.model.anthropometry import BodyDimensions
+from tk.model.body_fit import BodyFitConfig, fit_body
+from tk.model.camera import Rig
+from tk.model.cone_body import PRESETS, ConeBody, ConePart, build_cone_body
+from tk.model.evidence import Evidence, RayGrid, mean_of_views
+from tk.model.initialisation import rough_pose
+from tk.model.limbs import Limb, limbs_of
+from tk.model.part_colors import PartColors
+from tk.model.silhouettes import CleaningConfig, Pyramid, Views
+from tk.model.skeleton import ANKLES, WAIST, build_skeleton, join_pose, split_pose, up_rotation
+from tk.optim import gauss_newton
+from tk.optim.gauss_newton import GaussNewtonConfig, Prior
+from tk.trackers.base import Observation
+
+Float = NDArray[np.float64]
+
+# Headings and walking phases that the initialisation tries, and how many of them are followed through the first frames
+# before one is chosen.
+HEADINGS, PHASES, FINALISTS = 8, 8, 6
+# A lost frame is searched for the person from the silhouettes' centroid; of several lost ones every so many.
+RELOCATE_EVERY = 3
+# The fall of the cost, as a share of the person's pixels, that makes another place of a limb the pose.
+GAIN = 0.004
+# Places of a limb that are descended from, and random ones about its own place that are looked at beside the grid.
+PLACES, NEARBY = 3, 100
+# Rays a picture's height: to screen many places of a limb, and to choose among few poses.
+SCREEN_ROWS, CHOICE_ROWS = 60, 120
+
+
+@dataclass(frozen=True)
+class SilhouetteConfig:
+    """How contours are followed; both trackers of contours have these.
+
+    Attributes:
+        body: "full" (14 parts, 31 degrees of freedom), "limbs" (10 parts, the paper's 24) or "walker" (the silhouette
+            paper's 6 parts and 7 degrees of freedom).
+        prediction: share of the last frame's motion that the next is expected to repeat (the silhouette paper: 0, for
+            it found none useful; half of it pays when arms and legs swing).
+        adapt: whether the body is fitted to the silhouettes.
+        init_frames: frames that the initialisation looks at; a stride is about one second.
+        search_every: every how many frames other places are tried for the limbs; 0: never.
+        lost_error: a frame whose E_S, averaged over the views, is above this is lost.
+    """
+
+    body: str = "full"
+    prediction: float = 0.5
+    adapt: bool = True
+    init_frames: int = 24
+    search_every: int = 6
+    lost_error: float = 0.6
+    search: SearchSettings = field(default_factory=SearchSettings)
+    solver: GaussNewtonConfig = field(default_factory=lambda: GaussNewtonConfig(scales=3))
+    cleaning: CleaningConfig = field(default_factory=CleaningConfig)
+    fit: BodyFitConfig = field(default_factory=lambda: BodyFitConfig(frames=8, rounds=3))
+
+    def __post_init__(self) -> None:
+        if self.body not in PRESETS:
+            raise ConfigError(f'silhouette: body = "{self.body}": choose one of {", ".join(PRESETS)}')
+        if not 1 <= self.init_frames <= 1000 or not 0 <= self.search_every <= 1_000_000:
+            raise ConfigError(
+                f"silhouette: init_frames = {self.init_frames} must lie in [1, 1000], search_every = "
+                f"{self.search_every} in [0, 1000000]"
+            )
+        if not 0 <= self.prediction <= 1.5 or not 0 < self.lost_error <= 10:
+            raise ConfigError(
+                f"silhouette: prediction = {self.prediction} must lie in [0, 1.5], lost_error = {self.lost_error} "
+                "in (0, 10]"
+            )
+
+
+class ContourTracker:
+    """The person, the body and the descent; what a frame's way is, a subclass says.
+
+    Args:
+        rig: the cameras.
+        up: the world axis that points up.
+        config: see :class:`SilhouetteConfig`.
+    """
+
+    any_pose = True
+
+    def __init__(self, rig: Rig, up: str, config: SilhouetteConfig) -> None:
+        self.contours = config
+        self.up = up
+        self.views = Views(rig)
+        self.screen, self.choice = RayGrid(rig, SCREEN_ROWS), RayGrid(rig, CHOICE_ROWS)
+        full = config.body == "full"
+        skeleton = build_skeleton(BodyDimensions.from_stature(1.7), up, waist=full, ankles=full)
+        paper = np.flatnonzero(skeleton.is_paper)
+        self.pose_names = tuple(skeleton.names[k] for k in paper)
+        self.pose_units = tuple(skeleton.units[k] for k in paper)
+        self.waist_names: tuple[str, ...] = WAIST if full else ()
+        self.ankle_names: tuple[str, ...] = ANKLES if full else ()
+        self._body: ConeBody | None = None
+        self.colors: PartColors
+        self.limbs: tuple[Limb, ...]
+
+    @property
+    def opening_frames(self) -> int:
+        """Frames that the person is found in."""
+        return self.contours.init_frames
+
+    @property
+    def body(self) -> ConeBody:
+        """The body; only after :meth:`start` or :meth:`restore`."""
+        if self._body is None:
+            raise RuntimeError("the tracker has no body yet: call start() or restore() first")
+        return self._body
+
+    def take_body(self, body: ConeBody) -> None:
+        """Track this body from now on; the colours of its parts are kept where there are any."""
+        known = self.colors.state() if self._body is not None else {}
+        self._body = body
+        self.colors = PartColors(body)
+        self.colors.restore(known)
+        self.limbs = limbs_of(body)
+
+    # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
+
+    def find(
+        self, frames: Sequence[Observation], height_m: float | None, init: InitPose | None, body: ConeBody | None = None
+    ) -> Float:
+        """(D,) the pose in the first of the frames; the body is fitted to all of them.
+
+        Args:
+            frames: consecutive observations from the initial one on, at least one; better a whole stride.
+            height_m: the subject's height, if known.
+            init: a rough pose given by a person; None tries walking phases, standing and the Da Vinci pose.
+            body: the body, if known; it is not fitted then.
+
+        Raises:
+            CaptureError: fewer than two cameras see anybody in the first frame.
+        """
+        pyramids = [self.pyramid(frame) for frame in frames]
+        preset = self.contours.body
+        if init is None:
+            p_centroid = self._centroid(pyramids[0], frames[0].index)
+            stature = height_m or self._stature(pyramids[0], p_centroid)
+            self.take_body(body or build_cone_body(BodyDimensions.from_stature(stature), self.up, preset))
+            start = self._choose(pyramids, p_centroid)
+        else:
+            stature = init.height_m or height_m or 0.0
+            dimensions, rough = rough_pose(init.joints, init.angles, stature or None, self.up)
+            stature = stature or dimensions.stature
+            self.take_body(body or build_cone_body(dimensions, self.up, preset))
+            skeleton = self.body.skeleton
+            start = join_pose(skeleton, rough, np.zeros(len(self.waist_names)), np.zeros(len(self.ankle_names)))
+            start = self.settle(pyramids[0], start[None])[0]
+        start = self.search(frames[0], pyramids[0], start)[0][0]
+        if self.contours.adapt and body is None:
+            start = self._adapt(frames, pyramids, start, stature)
+        return start
+
+    def _choose(self, pyramids: Sequence[Pyramid], p_centroid: Float) -> Float:
+        """Hypotheses settle on the first frame; the best are followed, and the one that keeps fitting is taken."""
+        poses = gait.hypotheses(self.body.skeleton, HEADINGS, PHASES, p_centroid)
+        poses = self.settle(pyramids[0], poses)
+        error = self.fit_error(pyramids[0], poses)
+        firsts = poses[_distinct(poses, error, FINALISTS)]
+        error = self.fit_error(pyramids[0], firsts)
+        now = firsts
+        # every other frame is enough to tell who walks backwards
+        for pyramid in pyramids[2::2]:
+            now = self.settle(pyramid, now)
+            error += self.fit_error(pyramid, now)
+        return np.asarray(firsts[int(np.argmin(error))])
+
+    def _adapt(self, frames: Sequence[Observation], pyramids: Sequence[Pyramid], start: Float, stature: float) -> Float:
+        """Track all frames with the average body, then fit body and poses together."""
+        poses = [start]
+        every = self.contours.search_every
+        for i, pyramid in enumerate(pyramids[1:], 1):
+            pose = self.settle(pyramid, poses[-1][None])[0]
+            poses.append(self.search(frames[i], pyramid, pose)[0][0] if every and i % every == 0 else pose)
+        count = min(self.contours.fit.frames, len(pyramids))
+        chosen = np.unique(np.linspace(0, len(pyramids) - 1, count).round().astype(int))
+        body, fitted = self.fit(pyramids, np.array(poses), chosen, stature, self.contours.fit)
+        self.take_body(body)
+        return np.asarray(fitted[0])
+
+    def fit(
+        self,
+        pyramids: Sequence[Pyramid],
+        poses: Float,
+        chosen: NDArray[np.int64],
+        stature: float,
+        config: BodyFitConfig,
+    ) -> tuple[ConeBody, Float]:
+        """The body that suits the chosen ones of several frames, and their poses."""
+        seen = [pyramids[i] for i in chosen]
+        contours = self.contours
+        return fit_body(contours.body, self.views, seen, poses[chosen], self.up, contours.search, stature, config)
+
+    def _centroid(self, pyramid: Pyramid, index: int) -> Float:
+        """(3,) the point nearest to the rays through the silhouettes' centroids, metres."""
+        A, y, count = np.zeros((3, 3)), np.zeros(3), 0
+        for mask, camera in zip(pyramid.masks[0], self.views.rig, strict=True):
+            ys, xs = np.nonzero(mask >= 128)
+            if len(xs) == 0:
+                continue
+            ray = camera.rays([[xs.mean(), ys.mean()]])[0]
+            across = np.eye(3) - np.outer(ray, ray)
+            A += across
+            y += across @ camera.center
+            count += 1
+        if count < 2:
+            raise CaptureError(
+                f"initialisation: {count} of {len(self.views.rig)} masks of frame {index} show anybody, two are "
+                "needed: check the masks, or choose another first frame"
+            )
+        return np.asarray(np.linalg.solve(A, y), np.float64)
+
+    def _stature(self, pyramid: Pyramid, p_centroid: Float) -> float:
+        """Median over the views of the silhouette's height at the depth of its centroid, metres."""
+        up = up_rotation(self.up)[:, 2]
+        heights = []
+        for mask, camera in zip(pyramid.masks[0], self.views.rig, strict=True):
+            rows, columns = np.nonzero(mask >= 128)
+            if len(rows) == 0:
+                continue
+            level = []
+            for i in (rows.argmin(), rows.argmax()):
+                ray = camera.rays([[columns[i], rows[i]]])[0]
+                flat = ray - (ray @ up) * up
+                away = (p_centroid - camera.center) - ((p_centroid - camera.center) @ up) * up
+                level.append((camera.center + ray * (away @ flat) / (flat @ flat)) @ up)
+            heights.append(abs(level[0] - level[1]))
+        return float(np.clip(np.median(heights), 0.8, 2.4))
+
+    def start(
+        self,
+        frames: Sequence[Observation],
+        height_m: float | None,
+        init: InitPose | None,
+        body: ConeBody | None = None,
+    ) -> None:
+        """Find the subject in the first frame; what is kept of it, a subclass says."""
+        self.find(frames, height_m, init, body)
+
+    # --- one frame ----------------------------------------------------------------------------------------------
+
+    def pyramid(self, frame: Observation) -> Pyramid:
+        """The frame's silhouettes, cleaned, at all scales."""
+        return self.views.pyramid(frame.masks, self.contours.solver.scales, self.contours.cleaning)
+
+    def settle(
+        self,
+        pyramid: Pyramid,
+        poses: Float,
+        scales: int | None = None,
+        images: NDArray[np.uint8] | None = None,
+        prior: Prior | None = None,
+    ) -> Float:
+        """Gauss-Newton from poses (B, D), from the scale ``scales - 1`` to the finest.
+
+        With ``images``, colours pull at contours inside the silhouette, too.
+        """
+        body, contours = self.body, self.contours
+        solver = replace(contours.solver, scales=scales) if scales else contours.solver
+        regions = None if images is None else self.colors.regions(images)
+        return gauss_newton.minimise(
+            lambda states, scale: self.views.equations(body, pyramid, states, scale, contours.search, regions),
+            poses,
+            body.free,
+            body.skeleton.lower,
+            body.skeleton.upper,
+            solver,
+            prior,
+        )
+
+    def evidence(self, grid: RayGrid, frame: Observation, pyramid: Pyramid) -> Evidence:
+        """What the frame shows on a grid."""
+        return Evidence.of(grid, pyramid.masks[0], frame.doubtful, frame.images, self.colors)
+
+    def fit_error(self, pyramid: Pyramid, poses: Float) -> Float:
+        """(B,) E_S averaged over the views that see anybody; inf where none does."""
+        evidence = Evidence.of(self.screen, pyramid.masks[0])
+        return mean_of_views(evidence.cast(self.body, self.colors.group, poses)[0])
+
+    def search(
+        self, frame: Observation, pyramid: Pyramid, pose: Float, images: NDArray[np.uint8] | None = None
+    ) -> tuple[Float, Float]:
+        """Other places of the limbs: proposals, screened in one batch a limb, the best descended from.
+
+        Returns:
+            Poses (B, D), the best first, and their costs (B,). The pose itself stays first unless another one costs
+            :data:`GAIN` less.
+        """
+        skeleton, group = self.body.skeleton, self.colors.group
+        rng = np.random.default_rng([7, frame.index])
+        coarse = self.evidence(self.screen, frame, pyramid)
+        proposals: list[list[Float]] = []
+        for limb in self.limbs:
+            _, rest = coarse.cast(self.body, group, pose[None], limb.others, export=True)
+            assert rest is not None
+            tried = limb.candidates(pose, NEARBY, rng)
+            cost, _ = coarse.cast(self.body, group, tried, limb.parts, Cast(rest.label[0].copy(), rest.depth[0].copy()))
+            proposals.append(list(limb.distinct(skeleton, tried, mean_of_views(cost), PLACES)))
+        poses = [pose, *(p for places in proposals for p in places)]
+        for first, second in ((0, 1), (2, 3)):  # both arms, both legs
+            if second < len(self.limbs):
+                for a in proposals[first][:2]:
+                    for b in proposals[second][:2]:
+                        both = a.copy()
+                        both[self.limbs[second].dofs] = b[self.limbs[second].dofs]
+                        poses.append(both)
+        settled = self.settle(pyramid, np.array(poses), min(2, self.contours.solver.scales), images)
+        settled = np.concatenate([pose[None], settled])
+        fine = self.evidence(self.choice, frame, pyramid)
+        cost = mean_of_views(fine.cast(self.body, group, settled)[0])
+        order = np.argsort(cost, kind="stable")
+        # the pose where it was, or where it settled now
+        own = 1 if cost[1] < cost[0] else 0
+        if cost[order[0]] > cost[own] - GAIN:
+            order = np.concatenate([[own], order[order != own]])
+        return settled[order], cost[order]
+
+    def relocate(self, pyramid: Pyramid, pose: Float, error: float) -> tuple[Float, float]:
+        """The pose or, if that explains the silhouettes better, one found as at the start; and its E_S."""
+        try:
+            p_centroid = self._centroid(pyramid, 0)
+        except CaptureError:
+            return pose, error
+        starts = gait.hypotheses(self.body.skeleton, HEADINGS, PHASES, p_centroid)
+        settled = self.settle(pyramid, starts)
+        errors = self.fit_error(pyramid, settled)
+        i = int(np.argmin(errors))
+        return (settled[i], float(errors[i])) if errors[i] < error else (pose, error)
+
+    def told(self, pose: Float) -> dict[str, Any]:
+        """A pose (D,) as an :class:`~tk.trackers.base.Estimate` tells it."""
+        skeleton = self.body.skeleton
+        paper, waist, ankles = split_pose(skeleton, pose)
+        return {"pose": paper, "waist": waist, "ankles": ankles, "joints": skeleton.joints(pose)}
+
+    # --- what a result file keeps -------------------------------------------------------------------------------
+
+    def model(self) -> Mapping[str, Any]:
+        """The body for `/model`."""
+        body = self.body
+        return {
+            **{f"dimensions/{name}": value for name, value in asdict(body.dimensions).items()},
+            "body": body.preset,
+            "parts/name": json.dumps([part.name for part in body.parts]),
+            "parts/segment": json.dumps([part.segment for part in body.parts]),
+            "parts/kind": np.array([part.kind for part in body.parts]),
+            "parts/shape": np.array([part.shape for part in body.parts]),
+            "parts/T_body_part": np.array([part.T_body_part for part in body.parts]),
+        }
+
+
+def restore_body(model: Mapping[str, Any], up: str) -> ConeBody:
+    """The body that :meth:`ContourTracker.model` wrote down."""
+    prefix = "dimensions/"
+    dimensions = BodyDimensions(**{k[len(prefix) :]: float(v) for k, v in model.items() if k.startswith(prefix)})
+    body = build_cone_body(dimensions, up, str(model["body"]))
+    # parts as they were written down: other versions of this program may lay the body out in other ones
+    ends = {part.name: part.ends for part in body.parts}
+    parts = []
+    for name, segment, kind, shape, T in zip(
+        json.loads(str(model["parts/name"])),
+        json.loads(str(model["parts/segment"])),
+        model["parts/kind"],
+        model["parts/shape"],
+        model["parts/T_body_part"],
+        strict=True,
+    ):
+        a, b, h, m = (float(value) for value in shape)
+        parts.append(ConePart(name, segment, int(kind), (a, b, h, m), np.asarray(T), ends.get(name, (False, False))))
+    return replace(body, parts=tuple(parts))
+
+
+def _distinct(poses: Float, error: Float, count: int) -> NDArray[np.int64]:
+    """Indices of the best poses, at most ``count``, that differ from each other by more than 0.2 somewhere."""
+    chosen: list[int] = []
+    for i in np.argsort(error, kind="stable"):
+        if all(np.abs(poses[i] - poses[j]).max() > 0.2 for j in chosen):
+            chosen.append(int(i))
+        if len(chosen) == count:
+            break
+    return np.array(chosen)

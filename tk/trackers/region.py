@@ -1,0 +1,366 @@
+"""The region tracker, the default: contours place the limbs, a search over all of their places finds them again.
+
+A frame's way, top to bottom:
+
+    masks → contours from the prediction: silhouette edges, and inside the silhouette borders between colours
+          → does the body explain every ray?  ── yes ─► pose, σ
+          → no: places of all limbs, screened in one batch each, the best descended from
+          → the few best live on for some frames; the one that explains them best is the pose
+          → colours of the parts learned
+
+Contours and equations are the silhouette paper's (sections 4.1 to 4.3); borders between colours are those of
+region-based tracking (Stoiber et al., *SRT3D*, IJCV 2022). The search takes the place of the first paper's Stochastic
+Meta Descent and of its visual hull: a limb lies in the hull and fills it where it lies in all silhouettes and leaves no
+ray of theirs without a part. Casting rays tells that directly, at the pictures' resolution and not the voxels'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ConfigError
+from tk.io.init_pose import InitPose
+from tk.model.body_fit import BodyFitConfig
+from tk.model.camera import Rig
+from tk.model.cone_body import ConeBody
+from tk.model.evidence import Evidence, mean_of_views
+from tk.model.silhouettes import Pyramid
+from tk.model.skeleton import JOINTS
+from tk.optim.gauss_newton import Prior
+from tk.trackers.base import Estimate, Observation, Stopwatch
+from tk.trackers.contours import GAIN, RELOCATE_EVERY, ContourTracker, SilhouetteConfig, restore_body
+
+Float = NDArray[np.float64]
+
+# Information of one pixel of contour, 1/px²: edgels err by 2 px, and together along 10 px.
+INFORMATION = 1.0 / (2.0**2 * 10.0)
+# Standard deviations of the priors: waist and ankles about straight ones, the others about their prediction.
+WAIST_DEG, ANKLE_DEG, ANGLE_DEG, TRANSLATION_M = 12.0, 20.0, 40.0, 0.3
+# How long a hypothesis may live beside the best one, in frames, and how much of its running cost a frame replaces.
+PATIENCE, RENEWAL = 6, 0.4
+# Hypotheses that cost this much more than the best one, as a share of the person's pixels, are dropped.
+MARGIN = 0.02
+# Of two hypotheses: joints that lie farther apart than this make them different, metres.
+APART_M = 0.05
+# Colours are learned only in frames that are explained about as well as is usual.
+LEARN_RATIO = 1.15
+# The second pass: what the body is fitted to, and how near a frame stays to its pose of the first pass.
+SECOND_FIT = BodyFitConfig(frames=24, rounds=4)
+SECOND_ANGLE_DEG = 15.0
+# What a joint's position errs by beside what the contours' noise tells: joints of people are not where a model's are.
+# Chosen on the development captures such that as many errors are within 1 and 2 σ as are of a normal's.
+JOINT_FLOOR_M = 0.008
+
+
+@dataclass(frozen=True)
+class RegionConfig:
+    """How the region tracker searches.
+
+    Attributes:
+        hypotheses: most poses that are followed at once.
+        search_ratio: a frame that is explained worse than is usual for this person, by this factor, is searched.
+        colors: whether the colours of the parts are learned and used.
+    """
+
+    hypotheses: int = 3
+    search_ratio: float = 1.1
+    colors: bool = True
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.hypotheses <= 20:
+            raise ConfigError(f"region: hypotheses = {self.hypotheses} must lie in [1, 20]")
+        if not 1 <= self.search_ratio <= 1000:
+            raise ConfigError(f"region: search_ratio = {self.search_ratio} must lie in [1, 1000]")
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A pose that is followed.
+
+    Attributes:
+        pose, previous: (D,) now and a frame before.
+        cost: running mean of what it leaves unexplained.
+        age: frames since it was proposed.
+    """
+
+    pose: Float
+    previous: Float
+    cost: float
+    age: int = 0
+
+
+class RegionTracker(ContourTracker):
+    """Tracks one person. :meth:`start` once, then :meth:`step` for every frame, the first included."""
+
+    method = "region"
+    stages: tuple[str, ...] = ("contours", "search")
+    timing_stages: tuple[str, ...] = ("masks_clean", "optimise", "check", "search")
+
+    def __init__(
+        self, rig: Rig, up: str, contours: SilhouetteConfig | None = None, config: RegionConfig | None = None
+    ) -> None:
+        super().__init__(rig, up, contours or SilhouetteConfig())
+        self.config = config or RegionConfig()
+        self._alive: list[Hypothesis] = []
+        self._usual = np.inf
+        self._lost_for = 0
+        self._fresh = True
+
+    def start(
+        self,
+        frames: Sequence[Observation],
+        height_m: float | None,
+        init: InitPose | None,
+        body: ConeBody | None = None,
+    ) -> None:
+        """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourTracker.find`."""
+        pose = self.find(frames, height_m, init, body)
+        self._alive = [Hypothesis(pose, pose, 0.0)]
+        self._usual = np.inf
+        self._lost_for = 0
+        self._fresh = True
+
+    def step(self, frame: Observation) -> Estimate:
+        """The pose in the next frame."""
+        watch = Stopwatch()
+        contours, config = self.contours, self.config
+        pyramid = self.pyramid(frame)
+        images = frame.images if config.colors else None
+        watch.lap("masks_clean")
+        starts = np.array([h.pose + contours.prediction * (h.pose - h.previous) for h in self._alive])
+        poses = self.settle(pyramid, starts, images=images, prior=self._prior(starts))
+        watch.lap("optimise")
+        evidence = self.evidence(self.screen, frame, pyramid)
+        cost = mean_of_views(evidence.cast(self.body, self.colors.group, poses)[0])
+        if not np.isfinite(cost).all():
+            return self._nobody(frame, watch)
+        self._alive = [
+            Hypothesis(pose, h.pose, h.cost + RENEWAL * (c - h.cost) if h.age or h.cost else float(c), h.age + 1)
+            for h, pose, c in zip(self._alive, poses, cost, strict=True)
+        ]
+        self._rank()
+        _, seen = evidence.cast(self.body, self.colors.group, self._best.pose[None], export=True)
+        assert seen is not None
+        error = evidence.fit_error(seen.label[0])
+        watch.lap("check")
+        searched = self._needs_search(frame, float(np.nanmean(error)))
+        if searched:
+            self._propose(frame, pyramid, images)
+            _, seen = evidence.cast(self.body, self.colors.group, self._best.pose[None], export=True)
+            assert seen is not None
+            error = evidence.fit_error(seen.label[0])
+        watch.lap("search")
+        lost = self._follow(pyramid, float(np.nanmean(error)))
+        self._learn(evidence, seen.label[0], float(np.nanmean(error)), lost)
+        status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
+        self._lost_for = self._lost_for + 1 if lost else 0
+        self._fresh = False
+        pose = self._best.pose
+        sigma = self._sigma(pyramid, pose, images)
+        watch.lap("check")
+        return Estimate(
+            **self.told(pose),
+            status=status,
+            objective=float(self._best.cost),
+            iterations=np.array([contours.solver.scales * contours.solver.iterations, int(searched)], np.int32),
+            timing=watch.laps,
+            sigma=sigma,
+            fit_error=error,
+        )
+
+    @property
+    def _best(self) -> Hypothesis:
+        return self._alive[0]
+
+    def _prior(self, mean: Float, angle_deg: float = ANGLE_DEG) -> Prior:
+        """Waist and ankles are about straight, all else is about where it was expected."""
+        skeleton = self.body.skeleton
+        deviation = np.where(skeleton.prismatic, TRANSLATION_M, np.radians(angle_deg))
+        deviation[skeleton.is_waist] = np.radians(WAIST_DEG)
+        deviation[skeleton.is_ankle] = np.radians(ANKLE_DEG)
+        straight = skeleton.is_waist | skeleton.is_ankle
+        return Prior(np.where(straight, 0.0, mean), deviation**-2 / INFORMATION)
+
+    def _rank(self) -> None:
+        """The hypothesis that explains the last frames best comes first; those far behind, or equal, are dropped."""
+        skeleton = self.body.skeleton
+        kept: list[Hypothesis] = []
+        places: list[Float] = []
+        for h in sorted(self._alive, key=lambda h: h.cost):
+            joints = skeleton.joints(h.pose)
+            if kept and (h.cost > kept[0].cost + MARGIN or h.age > PATIENCE):
+                continue
+            if all(np.linalg.norm(joints - other, axis=1).max() > APART_M for other in places):
+                kept.append(h)
+                places.append(joints)
+        self._alive = [replace(kept[0], age=1), *kept[1 : self.config.hypotheses]]
+
+    def _needs_search(self, frame: Observation, error: float) -> bool:
+        """Whether the body leaves more unexplained than is usual, or it is time to look around."""
+        every = self.contours.search_every
+        due = every > 0 and frame.index % every == 0
+        return self.contours.body != "walker" and (due or error > self.config.search_ratio * self._usual)
+
+    def _propose(self, frame: Observation, pyramid: Pyramid, images: NDArray[np.uint8] | None) -> None:
+        """Other places of the limbs join the hypotheses, with what they cost above the best one's running mean."""
+        best = self._best
+        poses, cost = self.search(frame, pyramid, best.pose, images)
+        motion = best.pose - best.previous
+        # where the pose itself stands among the others
+        joints = self.body.skeleton.joints(best.pose)
+        near = [np.linalg.norm(self.body.skeleton.joints(p) - joints, axis=1).max() < APART_M for p in poses]
+        own = float(cost[np.argmax(near)]) if any(near) else float(cost.max())
+        fresh = []
+        for pose, c in zip(poses, cost, strict=True):
+            if c < own + MARGIN / 2:
+                fresh.append(Hypothesis(pose, pose - 0 * motion, best.cost + float(c) - own))
+        # a jump must pay more than noise makes of two casts
+        if fresh and fresh[0].cost < best.cost - GAIN:
+            self._alive = [fresh[0], *(replace(h, age=max(h.age, 1)) for h in self._alive), *fresh[1:]]
+        else:
+            self._alive = [*self._alive, *fresh]
+        self._rank()
+
+    def _follow(self, pyramid: Pyramid, error: float) -> bool:
+        """Whether the person is lost; whoever is lost is looked for as at the start."""
+        limit = self.contours.lost_error
+        due = self._lost_for > 0 if error <= limit else self._lost_for % RELOCATE_EVERY == 0
+        if not due:
+            return error > limit
+        pose, found = self.relocate(pyramid, self._best.pose, error)
+        if found < error:
+            self._alive = [Hypothesis(pose, pose, self._best.cost)]
+        return found > limit
+
+    def _learn(self, evidence: Evidence, label: NDArray[np.uint8], error: float, lost: bool) -> None:
+        if lost:
+            return
+        usual = error if not np.isfinite(self._usual) else self._usual
+        if self.config.colors and evidence.bins is not None and error <= LEARN_RATIO * usual:
+            shown = evidence.person & (label > 0)
+            self.colors.learn(evidence.bins[shown], label[shown])
+        # quick to learn that it can be better, slow to put up with worse
+        self._usual = usual + (0.1 if error < usual else 0.05) * (error - usual)
+
+    def _sigma(self, pyramid: Pyramid, pose: Float, images: NDArray[np.uint8] | None) -> Float:
+        """(15,) one standard deviation of each joint's position along an axis, metres.
+
+        From the curvature at the optimum: the inverse of the information that contours and priors give about the pose,
+        carried to the joints.
+        """
+        regions = None if images is None else self.colors.regions(images)
+        here = self.views.equations(self.body, pyramid, pose[None], 0, self.contours.search, regions)
+        skeleton = self.body.skeleton
+        precision = INFORMATION * (here.hessian[0] + np.diag(self._prior(pose).precision))
+        free = np.flatnonzero(self.body.free)
+        covariance = np.zeros_like(precision)
+        covariance[np.ix_(free, free)] = np.linalg.inv(precision[np.ix_(free, free)])
+        w, v = skeleton.twists(pose)
+        x = skeleton.joints(pose)
+        moves = skeleton.ancestors()[skeleton.joint_segment]
+        J = np.where(moves[:, :, None], np.cross(w[None], x[:, None]) + v[None], 0.0)  # (15, D, 3)
+        variance = np.einsum("jka,kl,jla->j", J, covariance, J) / 3
+        # hypotheses that live say where else the joint may be
+        if len(self._alive) > 1:
+            weight = np.exp(-(np.array([h.cost for h in self._alive]) - self._best.cost) / GAIN)
+            places = np.array([skeleton.joints(h.pose) for h in self._alive])
+            mean = np.einsum("h,hja->ja", weight / weight.sum(), places)
+            variance += np.einsum("h,hja->j", weight / weight.sum(), (places - mean) ** 2) / 3
+        return np.asarray(np.sqrt(variance + JOINT_FLOOR_M**2))
+
+    def second_pass(
+        self,
+        masks: Sequence[NDArray[np.uint8]],
+        poses: Float,
+        lost: NDArray[np.bool_],
+        error: Float,
+        height_m: float | None,
+        keep_body: bool = False,
+    ) -> tuple[Float, Float]:
+        """Fit the body to frames of the whole recording, and settle every frame anew with it.
+
+        Frames of differing poses show what the opening ones do not: where a knee or an elbow is, only a bent one tells.
+        Each frame stays near the pose that the first pass found, so that what colours told of a limb inside the
+        silhouette is not lost.
+
+        Args:
+            masks: (C, H, W) of F frames.
+            poses: (F, D) of the first pass.
+            lost: (F,) bool; such frames neither teach nor change.
+            error: (F, C) E_S of the first pass.
+            height_m: the subject's height, if known.
+            keep_body: leave the body as it is.
+
+        Returns:
+            Poses (F, D) and E_S (F, C). The tracker has the new body.
+        """
+        cleaning, scales = self.contours.cleaning, 1
+        tracked = np.flatnonzero(~lost)
+        if not len(tracked):
+            return poses, error
+        if not keep_body and self.contours.adapt:
+            chosen = _spread(tracked, np.nanmean(error[tracked], axis=1), SECOND_FIT.frames)
+            seen = [self.views.pyramid(masks[int(i)], scales, cleaning) for i in chosen]
+            stature = height_m or self.body.dimensions.stature
+            fit = SECOND_FIT if height_m else replace(SECOND_FIT, stature_deviation=0.03)
+            body, _ = self.fit(seen, poses[chosen], np.arange(len(chosen)), stature, fit)
+            self.take_body(body)
+        result, errors = poses.copy(), np.array(error)
+        for i in tracked:
+            pyramid = self.views.pyramid(masks[int(i)], scales, cleaning)
+            prior = self._prior(poses[i], SECOND_ANGLE_DEG)
+            settled = self.settle(pyramid, poses[i][None], scales, prior=prior)
+            evidence = Evidence.of(self.screen, pyramid.masks[0])
+            result[i], errors[i] = settled[0], evidence.cast(self.body, self.colors.group, settled)[0][0]
+        return result, errors
+
+    def _nobody(self, frame: Observation, watch: Stopwatch) -> Estimate:
+        """Nobody is in sight: the last pose stands, as lost."""
+        self._lost_for += 1
+        pose = self._best.pose
+        self._alive = [Hypothesis(pose, pose, self._best.cost)]
+        for stage in self.timing_stages:
+            watch.lap(stage)
+        return Estimate(
+            **self.told(pose),
+            status="lost",
+            objective=np.inf,
+            iterations=np.zeros(len(self.stages), np.int32),
+            timing=watch.laps,
+            sigma=np.full(len(JOINTS), np.nan),
+            fit_error=np.full(len(frame.masks), np.nan),
+        )
+
+    def state(self) -> Mapping[str, Any]:
+        """What :meth:`restore` needs beside the model to go on from the last frame."""
+        return {
+            "poses": np.array([h.pose for h in self._alive]),
+            "previous": np.array([h.previous for h in self._alive]),
+            "costs": np.array([h.cost for h in self._alive]),
+            "ages": np.array([h.age for h in self._alive]),
+            "usual": self._usual,
+            "lost_for": self._lost_for,
+            **self.colors.state(),
+        }
+
+    def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
+        """Take up where a run with this model and state stopped."""
+        self.take_body(restore_body(model, self.up))
+        rows = zip(state["poses"], state["previous"], state["costs"], state["ages"], strict=True)
+        self._alive = [Hypothesis(np.asarray(p), np.asarray(q), float(c), int(a)) for p, q, c, a in rows]
+        self._usual = float(state["usual"])
+        self._lost_for = int(state["lost_for"])
+        self.colors.restore(state)
+        self._fresh = False
+
+
+def _spread(frames: NDArray[np.int64], error: Float, count: int) -> NDArray[np.int64]:
+    """Of each of ``count`` stretches of the frames (N,) the one that is explained best, error (N,)."""
+    edges = np.linspace(0, len(frames), min(count, len(frames)) + 1).round().astype(int)
+    return np.array([frames[a + int(np.argmin(error[a:b]))] for a, b in pairwise(edges)])

@@ -1,0 +1,98 @@
+"""The silhouette tracker: cone body, occluding contours, damped Gauss-Newton (the paper on silhouettes and twists).
+
+No voxels and no colour: two or three cameras and their masks are enough. A frame's way, top to bottom:
+
+    masks → cleaned, scales → {contours → edgels along their normals → normal equations → step} × iterations × scales
+
+Beyond the paper: from time to time other places are tried for the limbs (:meth:`ContourTracker.search`), for a
+silhouette hides an arm before or behind the trunk, and where it comes out again no contour may be near.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.io.init_pose import InitPose
+from tk.model.camera import Rig
+from tk.model.cone_body import ConeBody
+from tk.trackers.base import Estimate, Observation, Stopwatch
+from tk.trackers.contours import RELOCATE_EVERY, ContourTracker, SilhouetteConfig, restore_body
+
+Float = NDArray[np.float64]
+
+
+class SilhouetteTracker(ContourTracker):
+    """Tracks one person. :meth:`start` once, then :meth:`step` for every frame, the first included."""
+
+    method = "silhouette"
+    timing_stages: tuple[str, ...] = ("masks_clean", "optimise", "check")
+
+    def __init__(self, rig: Rig, up: str, config: SilhouetteConfig | None = None) -> None:
+        super().__init__(rig, up, config or SilhouetteConfig())
+        self.stages = tuple(f"scale_{i}" for i in reversed(range(self.contours.solver.scales)))
+        self._pose = self._previous = np.zeros(len(self.pose_names))
+        self._lost_for = 0
+        self._fresh = True
+
+    def start(
+        self,
+        frames: Sequence[Observation],
+        height_m: float | None,
+        init: InitPose | None,
+        body: ConeBody | None = None,
+    ) -> None:
+        """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourTracker.find`."""
+        # colours are none of this tracker's cues
+        blind = [Observation(f.index, f.images[:0], f.masks) for f in frames]
+        self._pose = self._previous = self.find(blind, height_m, init, body)
+        self._lost_for = 0
+        self._fresh = True
+
+    def step(self, frame: Observation) -> Estimate:
+        """The pose in the next frame."""
+        watch = Stopwatch()
+        config = self.contours
+        pyramid = self.pyramid(frame)
+        watch.lap("masks_clean")
+        start = self._pose + config.prediction * (self._pose - self._previous)
+        pose = self.settle(pyramid, start[None])[0]
+        watch.lap("optimise")
+        if config.search_every and frame.index % config.search_every == 0:
+            pose = self.search(Observation(frame.index, frame.images[:0], frame.masks), pyramid, pose)[0][0]
+        error = float(self.fit_error(pyramid, pose[None])[0])
+        # after a loss the last pose is no evidence, however well the pose near it fits
+        due = self._lost_for > 0 if error <= config.lost_error else self._lost_for % RELOCATE_EVERY == 0
+        if due and np.isfinite(error):
+            pose, error = self.relocate(pyramid, pose, error)
+        lost = not error <= config.lost_error
+        status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
+        # nobody is in sight: the last pose stands
+        pose = pose if np.isfinite(error) else self._pose
+        # whoever was lost has jumped, not moved
+        self._previous, self._pose = pose if self._lost_for else self._pose, pose
+        self._lost_for = self._lost_for + 1 if lost else 0
+        self._fresh = False
+        watch.lap("check")
+        return Estimate(
+            **self.told(pose),
+            status=status,
+            objective=error,
+            iterations=np.full(len(self.stages), config.solver.iterations, np.int32),
+            timing=watch.laps,
+        )
+
+    def state(self) -> Mapping[str, Any]:
+        """What :meth:`restore` needs beside the model to go on from the last frame."""
+        return {"pose": self._pose, "previous": self._previous, "lost_for": self._lost_for}
+
+    def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
+        """Take up where a run with this model and state stopped."""
+        self.take_body(restore_body(model, self.up))
+        self._pose = np.asarray(state["pose"])
+        self._previous = np.asarray(state["previous"])
+        self._lost_for = int(state["lost_for"])
+        self._fresh = False
