@@ -15,7 +15,7 @@ from tk.model.anthropometry import BodyDimensions
 from tk.model.derived import derive
 from tk.model.motion import FOOT_POINTS, sole_offset
 from tk.model.rotations import to_matrices
-from tk.model.skeleton import JOINTS, SEGMENTS, Skeleton, build_skeleton, with_waist
+from tk.model.skeleton import JOINTS, SEGMENTS, Skeleton, build_skeleton, join_pose
 from tk.model.smoothing import smooth
 
 Float = NDArray[np.float64]
@@ -184,23 +184,24 @@ def _dimensions(result: Result) -> BodyDimensions:
 
 
 def _skeleton(result: Result, dimensions: BodyDimensions) -> Skeleton:
-    return build_skeleton(dimensions, result.meta.up, waist=result.waist is not None)
+    return build_skeleton(dimensions, result.meta.up, waist=result.waist is not None, ankles=result.ankles is not None)
 
 
 def _poses(result: Result, skeleton: Skeleton) -> Float:
-    """(F, D) the waist's angles in their place. Frames without numbers stay so."""
-    size = len(skeleton.names) - (0 if result.waist is None else result.waist.shape[1])
+    """(F, D) the angles of waist and ankles in their place. Frames without numbers stay so."""
+    size = int(skeleton.is_paper.sum())
     if result.pose.shape[1] != size:
         raise ResultError(f"{result.path}: /pose has {result.pose.shape[1]} columns; {size} are expected")
-    if result.waist is None:
-        return result.pose
-    return np.array([with_waist(skeleton, *row) for row in zip(result.pose, result.waist, strict=True)])
+    none = np.zeros((len(result), 0))
+    waist = none if result.waist is None else result.waist
+    ankles = none if result.ankles is None else result.ankles
+    if waist.shape[1] != skeleton.is_waist.sum() or ankles.shape[1] != skeleton.is_ankle.sum():
+        raise ResultError(f"{result.path}: /waist or /ankles has not as many columns as the body has; track it again")
+    return np.array([join_pose(skeleton, *row) for row in zip(result.pose, waist, ankles, strict=True)])
 
 
 def _smooth(result: Result, dimensions: BodyDimensions) -> tuple[Result, NDArray[np.bool_]]:
     """The result with smoothed poses and what follows from them, and (F,) the frames that were bridged."""
-    if result.ankles is not None:
-        raise ResultError(f"{result.path}: has no /smoothed; export it without --smoothed, or track the capture again")
     skeleton = _skeleton(result, dimensions)
     poses = _poses(result, skeleton)
     known = (result.status != Status.LOST) & np.isfinite(poses).all(axis=1)
