@@ -216,6 +216,27 @@ def evaluate(result: Path, truth: Path, capture: Path | None, joints: str, masks
 
 
 @main.command()
+@click.argument("result", type=click.Path(path_type=Path), metavar="RESULT.h5")
+@click.option(
+    "--to", "formats", required=True, metavar="A,B,…", help="Formats: trc, mot (OpenSim), c3d, bvh, csv, gltf (.glb)."
+)
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder.  [default: beside RESULT.h5]"
+)
+@click.option("--smoothed", is_flag=True, help="The smoothed copy, with short losses bridged.")
+@click.option("--force", is_flag=True, help="Replace files that exist.")
+def export(result: Path, formats: str, output: Path | None, smoothed: bool, force: bool) -> None:
+    """Write RESULT.h5 in formats of other programs. Example: tk export walk.h5 --to trc,mot,bvh"""
+    from tk.io.export import export as write
+
+    written = write(result, _names(formats) or (), output, smoothed, force)
+    for note in written.notes:
+        click.echo(f"note: {note}", err=True)
+    for file in written.files:
+        click.echo(f"wrote {file}", err=True)
+
+
+@main.command()
 @click.option("-o", "--output", default="demo.h5", show_default=True, type=click.Path(path_type=Path))
 @_voxels
 def demo(output: Path, voxels: int | None) -> None:
