@@ -129,6 +129,28 @@ def track(
         sys.exit(1)
 
 
+@main.command("import")
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="CAPTURE")
+@click.option(
+    "--units", type=click.Choice(["m", "cm", "mm"]), help="Of the calibration's lengths.  [default: inferred]"
+)
+@click.option(
+    "--trial", metavar="NAME", help="Take the videos with NAME in their path, where there are several trials."
+)
+def import_(folder: Path, output: Path, units: str | None, trial: str | None) -> None:
+    """Make a capture of another tool's project: Pose2Sim, FreeMoCap, Caliscope, Anipose, EasyMocap and others.
+
+    For example: tk import my_session -o my_capture
+    """
+    from tk.io.importers import import_project
+
+    done = import_project(folder, output, units, trial)
+    for note in done.notes:
+        click.echo(f"note: {note}", err=True)
+    click.echo(f"{done.cameras} cameras in {output}; have a look at {output / 'capture.toml'}", err=True)
+
+
 @main.command()
 @_capture
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="HULL.h5")
@@ -191,6 +213,27 @@ def evaluate(result: Path, truth: Path, capture: Path | None, joints: str, masks
         click.echo(json.dumps(found.to_dict() | views, indent=2, allow_nan=False))
     else:
         click.echo(found.format_table() + (f"\n\n{seen.format_table()}" if seen else ""))
+
+
+@main.command()
+@click.argument("result", type=click.Path(path_type=Path), metavar="RESULT.h5")
+@click.option(
+    "--to", "formats", required=True, metavar="A,B,…", help="Formats: trc, mot (OpenSim), c3d, bvh, csv, gltf (.glb)."
+)
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder.  [default: beside RESULT.h5]"
+)
+@click.option("--smoothed", is_flag=True, help="The smoothed copy, with short losses bridged.")
+@click.option("--force", is_flag=True, help="Replace files that exist.")
+def export(result: Path, formats: str, output: Path | None, smoothed: bool, force: bool) -> None:
+    """Write RESULT.h5 in formats of other programs. Example: tk export walk.h5 --to trc,mot,bvh"""
+    from tk.io.export import export as write
+
+    written = write(result, _names(formats) or (), output, smoothed, force)
+    for note in written.notes:
+        click.echo(f"note: {note}", err=True)
+    for file in written.files:
+        click.echo(f"wrote {file}", err=True)
 
 
 @main.command()

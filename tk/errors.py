@@ -29,6 +29,10 @@ class ResultError(TkError):
     """A result file cannot be written, read or continued."""
 
 
+class ExportError(TkError):
+    """A result cannot be written in another format."""
+
+
 class ConfigError(TkError):
     """A configuration value or command-line option is out of range."""
 

@@ -59,6 +59,16 @@ def test_variants_of_the_neighbours(tmp_path: Path) -> None:
     assert read_calibration(write(tmp_path, {"cameras": caliscope})).rig.names == ("0", "1")
 
 
+def test_a_rotation_may_be_a_matrix(tmp_path: Path) -> None:
+    tables = calibration_tables(3)
+    expected = read_calibration(write(tmp_path, tables)).rig
+    for table, camera in zip(tables.values(), expected, strict=True):
+        table["rotation"] = camera.rotation.round(7).tolist()
+    for camera, other in zip(expected, read_calibration(write(tmp_path, tables)).rig, strict=True):
+        np.testing.assert_allclose(other.rotation, camera.rotation, atol=1e-6)
+        np.testing.assert_allclose(other.rotation @ other.rotation.T, np.eye(3), atol=1e-14)
+
+
 def test_byte_order_mark_is_no_obstacle(tmp_path: Path) -> None:
     path = write(tmp_path, calibration_tables(2))
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
@@ -93,7 +103,9 @@ MATRIX = [[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]]
         ("distortions", [0.0] * 8, "4 or 5 numbers, and is 8"),
         ("distortions", [], "4 or 5 numbers, and is 0"),
         ("distortions", [0.0, float("inf"), 0.0, 0.0], "distortions holds inf"),
-        ("rotation", np.eye(3).tolist(), "rotation must be 3 numbers, and is 3×3"),
+        ("rotation", np.eye(2).tolist(), "rotation must be 3 or 3×3 numbers, and is 2×2"),
+        ("rotation", (2 * np.eye(3)).tolist(), "rotation is no rotation matrix: R Rᵀ is off the identity by 3"),
+        ("rotation", np.diag([1.0, 1.0, -1.0]).tolist(), "rotation is no rotation matrix"),
         ("rotation", [0.0, float("nan"), 0.0], "rotation holds nan"),
         ("translation", 3.0, "translation must be 3 numbers, and is one number"),
         ("size", [0, 48], "two positive whole numbers"),
@@ -180,3 +192,10 @@ def test_match_camera(name: str, key: str, stems: list[str], expected: str | Non
 def test_match_camera_refuses_to_guess() -> None:
     with pytest.raises(CaptureError, match="could be any of cam-01, cam01"):
         match_camera("cam_01", "cam_01", ["cam01", "cam-01"])
+
+
+def test_a_number_of_too_many_digits(tmp_path: Path) -> None:
+    path = write(tmp_path, calibration_tables(2))
+    path.write_text(path.read_text().replace("60.0", "9" * 400, 1))
+    with pytest.raises(CalibrationError, match="camera 'cam1': matrix holds a number that is too large"):
+        read_calibration(path)

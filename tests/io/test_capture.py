@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,13 @@ def test_opens_with_what_capture_toml_says(make_capture: MakeCapture) -> None:
     assert capture.warnings == ()
     with pytest.raises(dataclasses.FrozenInstanceError):
         capture.fps = 1.0  # type: ignore[misc]
+
+
+def test_up_may_be_any_direction(make_capture: MakeCapture) -> None:
+    capture = open_capture(make_capture(settings={"up": [0.02, -0.99, 0.01]}))
+    expected = np.array([0.02, -0.99, 0.01])
+    np.testing.assert_allclose(capture.up_axis, expected / np.linalg.norm(expected), atol=1e-15)
+    assert open_capture(make_capture(settings={"up": [0.0, -2.0, 0.0]}, name="axis")).up == "-y"
 
 
 def test_everything_in_capture_toml_has_a_default(make_capture: MakeCapture) -> None:
@@ -254,10 +262,16 @@ def test_a_text_file_called_mp4(make_capture: MakeCapture) -> None:
         ({"volume": {"center": [0, float("nan"), 1], "size": [1, 1, 1]}}, VolumeError, "center holds nan"),
         ({"volume": {"center": [0, 0, 60], "size": [1, 1, 1]}}, VolumeError, "no two cameras see"),
         ({"volume": [1, 2]}, CaptureError, "must be a table"),
+        ({"fps": 1e300}, CaptureError, "fps = 1e+300 is too large"),
+        ({"fps": 1e6}, CaptureError, "fps = 1e+06 must be between 0.01 and 100000"),
+        ({"init": {"frame": 10**30}}, CaptureError, "is too large"),
+        ({"volume": {"center": [0, 0, 1], "size": [1, 1, 1e8]}}, VolumeError, "too large or too far away"),
         ({"fps": 0}, CaptureError, "fps = 0 must be positive"),
         ({"fps": "15"}, CaptureError, "fps = '15' must be a finite number"),
         ({"fps": float("nan")}, CaptureError, "fps = nan"),
         ({"up": "w"}, CaptureError, "up = 'w' must be one of x, y, z, -x, -y, -z"),
+        ({"up": [0.0, 1.0]}, CaptureError, "up must be 3 numbers, and is 2"),
+        ({"up": [0.0, 0.0, 0.0]}, CaptureError, "up = [0.0, 0.0, 0.0] has no direction"),
         ({"name": 3}, CaptureError, "name = 3 must be a text"),
         ({"subject": {"height": 178}}, CaptureError, "[subject]: height = 178 must be between 0.3 and 3 metres"),
         ({"init": {"frame": -1}}, CaptureError, "[init]: frame = -1"),
@@ -284,15 +298,21 @@ def test_settings_that_are_no_toml_or_misspelt(make_capture: MakeCapture) -> Non
     assert warning.endswith("unknown keys are ignored: fsp, subject.heigth")
 
 
-def test_millimetres_without_units_are_suspected(make_capture: MakeCapture) -> None:
+def test_millimetres_without_units_are_recognised(make_capture: MakeCapture) -> None:
     folder = make_capture(settings={})
+    expected = open_capture(folder).rig.centers
     tables = calibration_tables(3)
     for table in tables.values():
         table["translation"] = [1000 * x for x in table["translation"]]
     write_toml(folder / "calibration.toml", tables)
-    assert any('units = "mm" missing' in line for line in open_capture(folder).warnings)
+    capture = open_capture(folder)
+    np.testing.assert_allclose(capture.rig.centers, expected, atol=1e-12)
+    (line,) = [line for line in capture.warnings if "[metadata] units" in line]
+    assert "taken for mm" in line and "5.2 m apart" in line and str(folder / "calibration.toml") in line
     write_toml(folder / "calibration.toml", {**tables, "metadata": {"units": "mm"}})
     assert not any("[metadata]" in line for line in open_capture(folder).warnings)
+    write_toml(folder / "calibration.toml", {**tables, "metadata": {"units": "m"}})  # what is said is believed
+    assert any('units = "mm" missing' in line for line in open_capture(folder).warnings)
 
 
 def test_no_volume_and_none_to_infer(make_capture: MakeCapture) -> None:
@@ -335,3 +355,58 @@ def test_shared_captures(name: str, cameras: int, frames: int, masks: bool, back
         assert frame_sets[0].masks is not None
         share = (frame_sets[0].masks == 255).mean(axis=(1, 2))
         assert ((share > 0.005) & (share < 0.4)).all()
+
+
+def test_what_is_no_file_is_not_waited_for(make_capture: MakeCapture) -> None:
+    """A pipe in the place of a file would be read for ever."""
+    folder = make_capture()
+    for name in ("capture.toml", "calibration.toml", "videos/cam1.mp4"):
+        path = folder / name
+        content = path.read_bytes()
+        path.unlink()
+        os.mkfifo(path)
+        with pytest.raises(CaptureError, match=rf"{name}: .*not a file"):
+            open_capture(folder)
+        path.unlink()
+        path.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "fps = 1" + 400 * "0",
+        "fps = 1" + 5000 * "0",
+        "fps = " + 3000 * "[",
+        "fps = " + 3000 * "[" + 3000 * "]",
+        "name = 1" + 400 * "0",
+        "[init]\nframe = -1" + 400 * "0",
+        "[volume]\ncenter = [0, 0, 1" + 400 * "0" + "]\nsize = [1, 1, 1]",
+    ],
+)
+def test_absurd_numbers_and_nesting_are_one_short_line(make_capture: MakeCapture, text: str) -> None:
+    folder = make_capture()
+    (folder / "capture.toml").write_text(text)
+    with pytest.raises(CaptureError, match=r"capture\.toml: ") as caught:
+        open_capture(folder)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "complaint"),
+    [
+        ("translation", [0.0, 1e308, 0.0], r"translation holds 1e\+308, which is too large"),
+        ("rotation", [1e300, 0.0, 0.0], "rotation holds"),
+        ("distortions", [1e12, 0.0, 0.0, 0.0], "distortions holds"),
+        ("matrix", [[1e200, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], "matrix holds"),
+        ("size", [10**6, 48], "65536 pixels a side"),
+    ],
+)
+def test_every_number_of_a_camera_has_a_bound(
+    make_capture: MakeCapture, key: str, value: list[Any], complaint: str
+) -> None:
+    folder = make_capture()
+    tables = calibration_tables(3)
+    tables["cam2"][key] = value
+    write_toml(folder / "calibration.toml", tables)
+    with pytest.raises(CalibrationError, match=rf"calibration\.toml: camera 'cam2': .*{complaint}"):
+        open_capture(folder)

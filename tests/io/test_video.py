@@ -295,6 +295,20 @@ def test_reading_ahead_is_bounded() -> None:
         assert all(clip.position <= 5 + 8 for clip in clips)
 
 
+def test_memory_is_used_again_once_nobody_holds_it() -> None:
+    clips = [FakeClip(0), FakeClip(1)]
+    with reader_of(clips) as reader:
+        held = [next(reader).images[1:, ::2] for _ in range(3)]
+        copies = [view.copy() for view in held]
+        addresses = set()
+        for _ in range(60):
+            addresses.add(next(reader).images.ctypes.data)
+        # those that lie ready, that are being filled, and the one at hand
+        assert len(addresses) <= 8 + 2
+        for view, copy in zip(held, copies, strict=True):
+            np.testing.assert_array_equal(view, copy)
+
+
 def test_everything_before_an_error_is_handed_out() -> None:
     clips = [FakeClip(0), FakeClip(1, fails_at=20), FakeClip(2, fails_at=20)]
     seen = []

@@ -55,6 +55,33 @@ def test_leaves_the_callers_runtime_alone():
     assert printed[-2:] == ["True", "7"]
 
 
+CACHE = """
+    import os, sys
+    for name in ("HOME", "XDG_CACHE_HOME"):
+        os.environ.pop(name, None)
+    os.environ.update(item.split("=") for item in sys.argv[1:])
+    from tk.kernels.runtime import ensure_runtime, ti
+    ensure_runtime()
+    print(ti.lang.impl.default_cfg().offline_cache_file_path)
+"""
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc"), reason="needs a folder that nobody can write to")
+@pytest.mark.parametrize("home", [None, "/proc/nobody"])
+def test_compiled_kernels_are_kept_where_there_is_no_home(tmp_path, home):
+    """Without HOME Taichi would abort the process."""
+    code = CACHE.replace("sys.argv[1:]", repr([f"TMPDIR={tmp_path}"] + ([f"HOME={home}"] if home else [])))
+    (folder,) = run(code)
+    assert not folder.startswith("/proc") and os.access(os.path.dirname(os.path.dirname(folder)), os.W_OK)
+    if home:
+        assert folder.startswith(str(tmp_path))
+
+
+def test_a_cache_that_is_named_is_used(tmp_path):
+    (folder,) = run(CACHE.replace("sys.argv[1:]", repr([f"XDG_CACHE_HOME={tmp_path}"])))
+    assert folder.startswith(str(tmp_path))
+
+
 @pytest.mark.parametrize(("age_s", "stays"), [(3600, False), (1, True)])
 def test_a_killed_process_does_not_switch_the_cache_off_for_good(tmp_path, age_s, stays):
     lock = tmp_path / "ticache.lock"

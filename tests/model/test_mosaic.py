@@ -45,14 +45,3 @@ def test_tightened_boxes_hold_what_is_set_and_a_margin():
     np.testing.assert_array_equal(tight.boxes, [[7, 2, 9, 5], [0, 0, 0, 0], [0, 0, 0, 0]])
     part = mosaic.part_of(marks, 0, tight.boxes[0])
     assert part.shape == (5, 9) and part.sum() == 3 and part[1, 3:6].all()
-
-
-def test_a_box_is_cut_where_its_picture_goes_on():
-    mosaic = Mosaic.of(np.array([[0, 5, 10, 15], [0, 0, 0, 0], [3, 0, 27, 4]], np.int32), 1)
-    cut = mosaic.cut((HEIGHT, WIDTH))
-    expected = np.zeros((15, 10), bool)
-    expected[0] = expected[:, -1] = True
-    np.testing.assert_array_equal(mosaic.part(cut, 0), expected)
-    expected = np.zeros((4, 27), bool)
-    expected[-1] = expected[:, 0] = True
-    np.testing.assert_array_equal(mosaic.part(cut, 2), expected)

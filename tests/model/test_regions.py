@@ -76,13 +76,6 @@ def test_pictures_side_by_side_are_not_joined():
     np.testing.assert_array_equal(join(mask, seen, levels(mask, 100.0), starts=(0, 22)), mask)
 
 
-def test_what_is_cut_is_not_enclosed():
-    patch = boxes((slice(10, 20), slice(10, 20)))
-    around = boxes((slice(7, 23), slice(7, 23))) & ~patch
-    np.testing.assert_array_equal(enclosed(patch, around, 0.6), patch)
-    assert not enclosed(patch, around, 0.6, boxes((slice(19, 20), slice(0, 60)))).any()
-
-
 def test_weak_parts_go_but_never_the_largest():
     body, edge = boxes((slice(10, 30), slice(5, 20))), boxes((slice(33, 36), slice(30, 50)))
     weak = levels(body | edge, 10.0)

@@ -4,18 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tk.model.cone_fitting import ConeFitConfig
 
 from tests.model.ring import ring_of_cameras
 from tk.errors import CaptureError, ConfigError
 from tk.io.init_pose import InitPose
 from tk.model.anthropometry import BodyDimensions
 from tk.model.cone_body import build_cone_body
-from tk.model.cone_fitting import ConeFitConfig
 from tk.model.gait import walking_pose
 from tk.model.silhouettes import draw_silhouettes
 from tk.model.skeleton import JOINTS
-from tk.trackers.silhouette import SilhouetteConfig, SilhouetteTracker
 from tk.trackers.base import Observation
+from tk.trackers.silhouette import SilhouetteConfig, SilhouetteTracker
 
 STATURE = 1.75
 RIG = ring_of_cameras(3, width=240, height=300)

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from tk.errors import CalibrationError, CaptureError
 from tk.io.toml import Table, load_toml
+from tk.io.units import UNITS, FoundUnit, infer_unit
 from tk.model.camera import Camera, Rig
-
-#: metres in one unit of ``[metadata] units``
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 #: a reciprocal condition number below this is a singular intrinsic matrix: focal lengths of 10^-9 of the rest
 _SINGULAR = 1e-9
 
 #: pixels of a side of a picture
 _MOST_PIXELS = 2**16
+#: how far a 3×3 rotation may be from orthonormal: files are written with six digits and more
+_ORTHONORMAL = 1e-4
 
 
 @dataclass(frozen=True)
@@ -32,11 +33,13 @@ class Calibration:
         path: the file.
         rig: its cameras, in the file's order.
         keys: the table's key of each camera, which may differ from its name.
+        notes: what was inferred, a line each, for the user to read.
     """
 
     path: Path
     rig: Rig
     keys: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
     def select(self, names: Sequence[str] | None) -> Calibration:
         """The calibration of these cameras only, still in the file's order; all of them for None.
@@ -53,16 +56,17 @@ class Calibration:
         if len(chosen) < 2:
             source = self.path if names is None else f"--cameras {','.join(wanted)}"
             raise CaptureError(f"{source}: {len(chosen)} camera; a visual hull needs at least 2")
-        return Calibration(self.path, Rig(tuple(self.rig[i] for i in chosen)), tuple(self.keys[i] for i in chosen))
+        return replace(self, rig=Rig(tuple(self.rig[i] for i in chosen)), keys=tuple(self.keys[i] for i in chosen))
 
 
 def read_calibration(path: str | Path) -> Calibration:
     """Read and check a calibration file.
 
     One table a camera, `metadata` skipped; Caliscope's ``[cameras.1]`` is read too. Each has ``size = [width, height]``
-    (pixels), ``matrix`` (3×3), ``distortions`` (4 or 5 numbers in OpenCV's order), ``rotation`` (Rodrigues vector,
-    world to camera), ``translation`` (metres, or ``[metadata] units``) and, optionally, ``name`` (by default the
-    table's key) and ``fisheye``.
+    (pixels), ``matrix`` (3×3), ``distortions`` (4 or 5 numbers in OpenCV's order), ``rotation`` (Rodrigues vector or
+    3×3, world to camera), ``translation`` (in ``[metadata] units``; without these, metres unless the cameras' distances
+    say otherwise, see :func:`tk.io.units.infer_unit`) and, optionally, ``name`` (by default the table's key) and
+    ``fisheye``.
 
     Raises:
         CalibrationError: with the file, the camera and the key that is wrong.
@@ -71,31 +75,66 @@ def read_calibration(path: str | Path) -> Calibration:
     if not path.exists():
         raise CalibrationError(f"{path}: there is no such file; a capture needs its cameras' calibration")
     document = load_toml(path, CalibrationError)
-    metadata = Table(document, str(path), CalibrationError).table("metadata")
-    units = metadata.text("units", "m")
-    if units not in UNITS:
-        metadata.fail(f"units = {units!r} must be one of {', '.join(UNITS)}")
+    tables = camera_tables(document, path)
+    return calibration_of(path, tables, given_unit(document, path))
 
+
+def camera_tables(document: Mapping[str, object], path: Path) -> dict[str, Mapping[str, object]]:
+    """The tables of a calibration document that are cameras, by key.
+
+    Raises:
+        CalibrationError: there are none.
+    """
     tables: Mapping[str, object] = {key: value for key, value in document.items() if key != "metadata"}
     nested = tables.get("cameras")
     if isinstance(nested, Mapping) and all(isinstance(value, Mapping) for value in nested.values()):
         tables = nested
     # plain values beside the tables (a date, a tool's version) are nobody's camera
-    tables = {key: value for key, value in tables.items() if isinstance(value, Mapping)}
-    if not tables:
+    found = {key: value for key, value in tables.items() if isinstance(value, Mapping)}
+    if not found:
         raise CalibrationError(f"{path}: has no cameras; it needs one table a camera")
+    return found
 
+
+def given_unit(document: Mapping[str, object], path: Path) -> str | None:
+    """``[metadata] units`` of a calibration document, None where it has none.
+
+    Raises:
+        CalibrationError: it is no unit that is known.
+    """
+    metadata = Table(document, str(path), CalibrationError).table("metadata")
+    if "units" not in metadata:
+        return None
+    units = metadata.text("units", "m")
+    if units not in UNITS:
+        metadata.fail(f"units = {units!r} must be one of {', '.join(UNITS)}")
+    return units
+
+
+def calibration_of(path: Path, tables: Mapping[str, Mapping[str, object]], unit: str | None) -> Calibration:
+    """The calibration in these tables; ``unit`` is that of the translations, None to infer it.
+
+    Raises:
+        CalibrationError: with the file, the camera and the key that is wrong.
+    """
     cameras: list[Camera] = []
     for key, values in tables.items():
-        assert isinstance(values, Mapping)
-        camera = _camera(key, values, path, UNITS[units])
+        camera = _camera(key, values, path)
         if camera.name in [other.name for other in cameras]:
             raise CalibrationError(f"{path}: two cameras have the name {camera.name!r}; give each its own")
         cameras.append(camera)
-    return Calibration(path, Rig(tuple(cameras)), tuple(tables))
+    found = FoundUnit(unit) if unit else infer_unit(Rig(tuple(cameras)).centers)
+    notes = (f"{path}: {found.note}; [metadata] units says it for sure",) if found.note else ()
+    return Calibration(path, scale_world(Rig(tuple(cameras)), found.metres), tuple(tables), notes)
 
 
-def _camera(key: str, values: Mapping[str, object], path: Path, unit_m: float) -> Camera:
+def scale_world(rig: Rig, metres: float) -> Rig:
+    """The rig with its translations multiplied by ``metres``, the metres in a unit: its projections stay."""
+    return Rig(tuple(replace(camera, translation=camera.translation * metres) for camera in rig))
+
+
+def _camera(key: str, values: Mapping[str, object], path: Path) -> Camera:
+    """One table's camera, its translation in the file's unit."""
     name = Table(values, f"{path}: camera {key!r}", CalibrationError).text("name", key)
     table = Table(values, f"{path}: camera {name!r}", CalibrationError)
 
@@ -118,17 +157,27 @@ def _camera(key: str, values: Mapping[str, object], path: Path, unit_m: float) -
             table.fail("distortions has 5 numbers; a fisheye lens has 4 (k1 k2 k3 k4)")
         distortions = distortions[:4]
 
-    rotation, _ = cv2.Rodrigues(table.array("rotation", (3,)))
     return Camera(
         name=name,
         width=int(size[0]),
         height=int(size[1]),
         matrix=matrix,
         distortions=distortions,
-        rotation=np.asarray(rotation, dtype=np.float64),
-        translation=table.array("translation", (3,)) * unit_m,
+        rotation=_rotation(table),
+        translation=table.array("translation", (3,)),
         fisheye=fisheye,
     )
+
+
+def _rotation(table: Table) -> NDArray[np.float64]:
+    """(3, 3) world to camera, from a Rodrigues vector or a matrix."""
+    given = table.array("rotation", (3,), (3, 3))
+    if given.shape == (3, 3):
+        off = float(np.abs(given @ given.T - np.eye(3)).max())
+        if off > _ORTHONORMAL or np.linalg.det(given) < 0:
+            table.fail(f"rotation is no rotation matrix: R Rᵀ is off the identity by {off:.2g}, det R has to be 1")
+        given = np.asarray(cv2.Rodrigues(given)[0], dtype=np.float64)  # of the nearest orthonormal matrix
+    return np.asarray(cv2.Rodrigues(given)[0], dtype=np.float64)
 
 
 def match_camera(name: str, key: str, stems: Iterable[str]) -> str | None:

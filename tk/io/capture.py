@@ -19,6 +19,7 @@ from tk.io.settings import CaptureSettings, read_settings
 from tk.io.video import Clip, Image, list_clips, probe
 from tk.model.camera import Camera, Rig
 from tk.model.common_view import infer_volume, sample_box, views_of
+from tk.model.up import up_vector
 from tk.model.volume import Volume
 
 __all__ = ["Capture", "FrameReader", "FrameSet", "open_capture"]
@@ -42,7 +43,7 @@ class Capture:
         path: the folder.
         name: from `capture.toml`, else the folder's name.
         fps: frames a second, from `capture.toml`, else from the videos, else 30.
-        up: the world axis that points up: x, y, z, -x, -y or -z.
+        up: what points up in the world: x, y, z, -x, -y or -z, or a unit vector's text, "[0.02, -0.9998, 0.01]".
         rig: the cameras, in the calibration file's order.
         volume: the working volume, world frame, metres; inferred from the rig where `capture.toml` has none.
         frame_count: frames that all cameras (and masks) have.
@@ -76,9 +77,7 @@ class Capture:
     @property
     def up_axis(self) -> NDArray[np.float64]:
         """(3,) unit vector that points up, world frame."""
-        axis = np.zeros(3)
-        axis["xyz".index(self.up[-1])] = -1.0 if self.up.startswith("-") else 1.0
-        return axis
+        return up_vector(self.up)
 
     def frames(self, start: int = 0, stop: int | None = None) -> FrameReader:
         """The frames ``start`` … ``stop - 1``, decoded ahead; up to the capture's end by default.
@@ -137,7 +136,7 @@ def open_capture(path: str | Path, cameras: Sequence[str] | None = None, masks: 
     if walk and walk.masks is not None and masks == "auto":
         masks = str(walk.masks)
     mask_clips = _open_masks(calibration, path, masks)
-    warnings: list[str] = []
+    warnings: list[str] = list(calibration.notes)
     if settings.unknown:
         warnings.append(f"{path / 'capture.toml'}: unknown keys are ignored: {', '.join(settings.unknown)}")
     _warn_of_units(calibration, warnings.append)

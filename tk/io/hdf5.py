@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import math
 import mmap
-import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -62,8 +61,12 @@ class Hdf5Reader:
         return name in self.shapes or name in self.groups
 
     def fail(self, message: str) -> NoReturn:
-        """Raise a ResultError about this file."""
-        raise ResultError(f"{self.path}: {message}")
+        """Raise a ResultError about this file: one line, whatever the message quotes from it."""
+        raise self._error(message)
+
+    def _error(self, message: str) -> ResultError:
+        line = "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))
+        return ResultError(f"{self.path}: {line if len(line) <= 400 else f'{line[:400]}...'}")
 
     def below(self, group: str) -> list[str]:
         """The names of the datasets below a group, relative to it, sorted."""
@@ -129,6 +132,11 @@ class Hdf5Reader:
             value = held.attrs[name]
             return value.decode() if isinstance(value, bytes) else value
 
+    def is_format(self, name: str) -> bool:
+        """Whether the file says that it is of this format."""
+        found = self.attribute("", "format")
+        return isinstance(found, str) and found == name
+
     def text(self, holder: str, name: str, default: str | None = None) -> str:
         """An attribute that is one text."""
         value = self.attribute(holder, name)
@@ -175,7 +183,7 @@ class Hdf5Reader:
             raise
         except Exception as error:
             what = f"/{name} cannot be read; the file is damaged" if name != "/" else "is damaged"
-            raise ResultError(f"{self.path}: {what}") from error
+            raise self._error(what) from error
 
     def _survey(self) -> None:
         waiting: list[tuple[str, int]] = [("", 0)]
@@ -197,18 +205,20 @@ class Hdf5Reader:
 
     def _links(self, group: h5py.h5g.GroupID, name: str) -> list[str]:
         """The names in a group, all of them of things in this file."""
-        found: list[str] = []
+        found: list[tuple[bytes, int]] = []
 
-        def take(link: bytes, info: h5py.h5l.LinkInfo) -> None:
-            text = link.decode()
-            if info.type != h5py.h5l.TYPE_HARD:
-                self.fail(f"/{name}{'/' if name else ''}{text} is a link to elsewhere; copy what it stands for")
-            if len(found) >= MOST_OBJECTS:
-                self.fail(f"holds more than {MOST_OBJECTS} groups and datasets; the file is damaged")
-            found.append(text)
+        def take(link: bytes, info: h5py.h5l.LinkInfo) -> bool | None:  # what it raises would not arrive
+            found.append((link, info.type))
+            return True if len(found) > MOST_OBJECTS else None
 
         group.links.iterate(take, info=True)
-        return found
+        if len(found) > MOST_OBJECTS:
+            self.fail(f"holds more than {MOST_OBJECTS} groups and datasets; the file is damaged")
+        for link, kind in found:
+            if kind != h5py.h5l.TYPE_HARD:
+                path = f"/{name}/{link.decode()}".replace("//", "/")
+                self.fail(f"{path} is a link to elsewhere; copy what it stands for")
+        return [link.decode() for link, _ in found]
 
     def _check_storage(self, name: str, dataset: h5py.h5d.DatasetID) -> tuple[int, ...]:
         """The shape of a dataset whose data lie in this file, and not more of them than it can hold."""
@@ -266,8 +276,9 @@ def open_hdf5(path: Path) -> Iterator[Hdf5Reader]:
         ResultError: no such file, not HDF5, or it cannot be trusted.
     """
     if not path.is_file():
-        reason = "is a folder; name a file" if path.is_dir() else "is not a file"
-        raise ResultError(f"{path}: {reason if os.path.lexists(path) else 'no such file'}")
+        if path.exists():
+            raise ResultError(f"{path}: {'is a folder; name a file' if path.is_dir() else 'is not a file'}")
+        raise ResultError(f"{path}: {'is a link to nowhere' if path.is_symlink() else 'no such file'}")
     try:
         file = h5py.File(path, "r", locking=False)
     except PermissionError:

@@ -155,7 +155,7 @@ def check_hull_path(path: Path) -> None:
         return
     try:
         with open_hdf5(path) as file:
-            if file.attribute("", "format") == HULL_FORMAT:
+            if file.is_format(HULL_FORMAT):
                 return
     except ResultError:
         pass

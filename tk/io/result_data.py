@@ -126,7 +126,8 @@ class ResultMeta:
             return f"the pose has {sizes[0]} entries, not {sizes[1]}"
         for name in ("capture", "method", "seed", "fps", "up", "sigma", "feet", "objective_kind"):
             if getattr(self, name) != getattr(other, name):
-                return f"{name} is {getattr(self, name) or 'none'}, not {getattr(other, name) or 'none'}"
+                both = ["none" if value == "" else str(value) for value in (getattr(self, name), getattr(other, name))]
+                return f"{name} is {both[0]}, not {both[1]}"
         for name in _LISTS:
             if getattr(self, name) != getattr(other, name):
                 both = [", ".join(getattr(meta, name)) or "none" for meta in (self, other)]

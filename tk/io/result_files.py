@@ -78,7 +78,7 @@ def check_is_result(target: Path) -> None:
     """Refuse to replace what is not a result of any version."""
     try:
         with open_hdf5(target) as file:
-            if file.attribute("", "format") == FORMAT:
+            if file.is_format(FORMAT):
                 return
     except ResultError:
         pass

@@ -128,7 +128,7 @@ class Twin:
         if self._put_last.get(name) == content:
             return
         self._put_last[name] = content
-        if name in self._open or name in self.file:
+        if name in self._open or isinstance(self.file.get(name), h5py.Dataset):
             dataset = self._dataset(name)
             growing = dataset.get_create_plist().get_layout() == h5py.h5d.CHUNKED
             if dataset.dtype == array.dtype and growing == is_text and (is_text or dataset.shape == array.shape):
@@ -137,6 +137,8 @@ class Twin:
                 if array.size:
                     dataset.write(h5py.h5s.ALL, h5py.h5s.ALL, array)
                 return
+            self._drop(name)
+        elif name in self.file:  # a group, in a file that was tampered with
             self._drop(name)
         if is_text:  # HDF5's own strings of varying length leave their old bytes in the file at every write
             self.file.create_dataset(name, data=array, maxshape=(None,), chunks=(1024,)).attrs["encoding"] = "utf-8"

@@ -88,7 +88,7 @@ def read_joints(path: str | os.PathLike[str]) -> JointTrack:
             check_format(file)
         units = file.text("", "units", "m")
         if units != "m":
-            raise ResultError(f"{path}: units = {units}; joint positions must be in metres (m)")
+            file.fail(f"units = {units}; joint positions must be in metres (m)")
         for name in ("frames", "joints/position"):
             if name not in file.shapes:
                 file.fail(f"has no /{name}; it is neither a tk result nor a capture's truth")
@@ -134,7 +134,7 @@ def blamed_on(path: Path, what: str) -> Iterator[None]:
 
 def check_format(file: Hdf5Reader) -> None:
     """Raise ResultError unless the file says that it is a result of a format version that is known here."""
-    if file.attribute("", "format") != FORMAT:
+    if not file.is_format(FORMAT):
         file.fail(f"an HDF5 file of other software, not a {FORMAT}; name another file")
     found = file.attribute("", "format_version")
     if np.ndim(found) or found not in READABLE_VERSIONS:

@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from tk.errors import VolumeError
+from tk.errors import ConfigError, VolumeError
 from tk.io.toml import Table, load_toml
+from tk.model.up import up_text
 from tk.model.volume import Volume
-
-#: world axes that may point up
-UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 
 #: known initialisation poses; "any" promises none
 INIT_POSES = ("da-vinci", "any")
@@ -39,7 +37,7 @@ class CaptureSettings:
     Attributes:
         name: of the capture.
         fps: frames a second.
-        up: the world axis that points up, one of :data:`UP_AXES`.
+        up: what points up in the world, as :func:`tk.model.up.up_text` tells it: "z", or a unit vector's text.
         volume: the working volume, metres.
         subject_height_m: the subject's height without shoes, metres.
         init_frame: the frame in which the subject stands in the initialisation pose.
@@ -74,9 +72,7 @@ def read_settings(path: Path) -> CaptureSettings:
     if fps is not None and not FPS_RANGE[0] <= fps <= FPS_RANGE[1]:
         document.fail(f"fps = {fps:g} must be between {FPS_RANGE[0]:g} and {FPS_RANGE[1]:g}")
 
-    up = document.text("up", "z").strip().lower().removeprefix("+")
-    if up not in UP_AXES:
-        document.fail(f"up = {up!r} must be one of {', '.join(UP_AXES)}")
+    up = _up(document)
 
     subject = document.table("subject")
     height_m = subject.number("height") if "height" in subject else None
@@ -101,6 +97,15 @@ def read_settings(path: Path) -> CaptureSettings:
         init_pose=init_pose,
         unknown=_unknown_keys(document.values),
     )
+
+
+def _up(document: Table) -> str:
+    """The text of ``up``: the name of an axis, or an array that need not be of unit length."""
+    value = document.values.get("up", "z")
+    try:
+        return up_text(document.array("up", (3,)) if isinstance(value, list) else document.text("up", "z"))
+    except ConfigError as reason:
+        document.fail(str(reason))
 
 
 def _volume(table: Table) -> Volume:

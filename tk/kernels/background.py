@@ -70,6 +70,15 @@ def _column(images: ti.template(), plates: ti.template(), pixel: ti.i32, width: 
     return ti.Vector([db, bb, brighter])
 
 
+@ti.func
+def _relaxed(labels: ti.template(), i: ti.i32, stride: ti.i32, level: ti.i32, per_neighbour: ti.i32, threshold: ti.i32):
+    """The label of pixel ``i`` under those of its eight neighbours, 0 or 1."""
+    above = labels[i - stride - 1] + labels[i - stride] + labels[i - stride + 1]
+    below = labels[i + stride - 1] + labels[i + stride] + labels[i + stride + 1]
+    count = ti.cast(above + below + labels[i - 1] + labels[i + 1], ti.i32)
+    return ti.cast(level + per_neighbour * (count - 4) >= threshold, ti.u8)
+
+
 @ti.kernel
 def _label_kernel(
     images: ti.types.ndarray(dtype=ti.u8, ndim=1),  # [C * H * W * 3]
@@ -79,8 +88,8 @@ def _label_kernel(
     difference: ti.types.ndarray(dtype=ti.u8, ndim=1),  # [mosaic] out, and so are the others; zero before
     collinearity: ti.types.ndarray(dtype=ti.u8, ndim=1),
     shades: ti.types.ndarray(dtype=ti.u8, ndim=1),
-    labels: ti.types.ndarray(dtype=ti.u8, ndim=1),
-    spare: ti.types.ndarray(dtype=ti.u8, ndim=1),
+    labels: ti.types.ndarray(dtype=ti.u8, ndim=1),  # after an even number of iterations
+    spare: ti.types.ndarray(dtype=ti.u8, ndim=1),  # after an odd one
     precision: ti.types.ndarray(dtype=ti.f32, ndim=1),  # [C] 1 / noise variance
     brightness: ti.types.ndarray(dtype=ti.f32, ndim=2),  # [C, 2] least of what is bright, and of the scene
     boxes: ti.types.ndarray(dtype=ti.i32, ndim=2),  # [C, 4] left, top, width, height
@@ -164,7 +173,9 @@ def _label_kernel(
                         t = 1.0 - s
                         residual = (dd + 2.0 * t * db + t * t * bb) / (1.0 + s * s)
                         difference[to + x] = _level(plain * (precision[c] / 54.0))
-                        collinearity[to + x] = _level(residual * weights[pixel] * (precision[c] / 27.0))
+                        level = _level(residual * weights[pixel] * (precision[c] / 27.0))
+                        collinearity[to + x] = level
+                        labels[to + x] = ti.cast(level >= threshold, ti.u8)
                         scene = 0
                         for k in ti.static(range(3)):
                             scene += GREY[k] * ti.cast(plates[3 * pixel + k], ti.i32)
@@ -175,10 +186,6 @@ def _label_kernel(
                         elif brighter < brightness[c, 1] + (shadow_max - 1.0) * 9.0 * scene:
                             shade = DARK
                         shades[to + x] = ti.cast(shade, ti.u8)
-        for y in range(h):
-            for x in range(w):
-                i = corner + y * stride + x
-                labels[i] = ti.cast(collinearity[i] >= threshold, ti.u8)
         for turn_of_labels in range(iterations):
             for y in range(h):
                 for x in range(w):
@@ -189,19 +196,6 @@ def _label_kernel(
                             spare[i] = _relaxed(labels, i, stride, level, per_neighbour, threshold)
                         else:
                             labels[i] = _relaxed(spare, i, stride, level, per_neighbour, threshold)
-        if iterations % 2 == 1:
-            for y in range(h):
-                for x in range(w):
-                    i = corner + y * stride + x
-                    labels[i] = spare[i]
-
-
-@ti.func
-def _relaxed(labels: ti.template(), i: ti.i32, stride: ti.i32, level: ti.i32, per_neighbour: ti.i32, threshold: ti.i32):
-    above = labels[i - stride - 1] + labels[i - stride] + labels[i - stride + 1]
-    below = labels[i + stride - 1] + labels[i + stride] + labels[i + stride + 1]
-    count = ti.cast(above + below + labels[i - 1] + labels[i + 1], ti.i32)
-    return ti.cast(level + per_neighbour * (count - 4) >= threshold, ti.u8)
 
 
 class Statistic:
@@ -284,4 +278,6 @@ class Statistic:
             round(octaves_per_neighbour * STEPS_PER_OCTAVE),
             iterations,
         )
-        self.difference, self.collinearity, self.shades, self.labels = self._planes[:4, :size].reshape(4, *shape)
+        planes = self._planes[:, :size].reshape(5, *shape)
+        self.difference, self.collinearity, self.shades = planes[:3]
+        self.labels = planes[3 + iterations % 2]

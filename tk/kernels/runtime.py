@@ -11,6 +11,7 @@ import contextlib
 import functools
 import io
 import os
+import tempfile
 import time
 import warnings
 from pathlib import Path
@@ -18,6 +19,32 @@ from pathlib import Path
 # Taichi greets on import unless told otherwise; a library has no business on the user's stdout.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_LOG_LEVEL", "error")
+
+
+def _choose_cache() -> None:
+    """Name a folder for compiled kernels where Taichi would find none: without HOME it aborts the process, and where it
+    may not write it compiles everything anew at each start."""
+    usual = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))  # the password file knows homes
+    if _is_usable(usual):
+        if "HOME" not in os.environ:
+            os.environ["XDG_CACHE_HOME"] = str(usual)
+        return
+    temporary = Path(tempfile.gettempdir()) / f"tk-cache-{os.getuid()}"
+    # compiled kernels are code: what somebody else has put there is not ours to run
+    ours = _is_usable(temporary) and temporary.stat().st_uid == os.getuid()
+    os.environ["XDG_CACHE_HOME"] = str(temporary) if ours else tempfile.mkdtemp(prefix="tk-cache-")
+
+
+def _is_usable(folder: Path) -> bool:
+    """Whether the folder is there or can be made, and can be written to."""
+    if folder.is_absolute():
+        with contextlib.suppress(OSError):
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            return os.access(folder, os.W_OK | os.X_OK)
+    return False
+
+
+_choose_cache()
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # taichi's own deprecation notices are not ours to mend

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,19 +52,37 @@ def infer_volume(rig: Rig) -> Volume:
     Raises:
         VolumeError: the axes do not meet, or no region is seen by all cameras.
     """
+    for views, volume in common_boxes(rig):
+        if views == len(rig):
+            return volume
+    raise VolumeError("no region is seen by all cameras")
+
+
+def common_boxes(rig: Rig) -> Iterator[tuple[int, Volume]]:
+    """What all cameras see in common, then what all but one of them do, and so on down to two.
+
+    The rule is that of :func:`infer_volume`.
+
+    Yields:
+        the number of cameras and the box, the larger the fewer cameras; numbers without a region are left out.
+
+    Raises:
+        VolumeError: the axes do not meet, or a camera stands where they do.
+    """
     middle = closest_to_axes(rig)
     reach_m = 0.6 * float(np.linalg.norm(rig.centers - middle, axis=1).min())
     if not reach_m > 0:
         raise VolumeError("a camera stands where the others look")
     ball = sample_box(Volume(_triple(middle), (2 * reach_m,) * 3), 2 * _SAMPLES)
     ball = ball[np.linalg.norm(ball - middle, axis=1) <= reach_m]
-    common = ball[views_of(rig, ball) == len(rig)]
-    if len(common) == 0:
-        raise VolumeError("no region is seen by all cameras")
-    lower, upper = common.min(axis=0), common.max(axis=0)
-    if not (upper > lower).all():
-        raise VolumeError("no region is seen by all cameras")
-    return Volume(_triple((lower + upper) / 2), _triple(upper - lower))
+    seen_by = views_of(rig, ball)
+    for views in range(len(rig), 1, -1):
+        common = ball[seen_by >= views]
+        if len(common) == 0:
+            continue
+        lower, upper = common.min(axis=0), common.max(axis=0)
+        if (upper > lower).all():
+            yield views, Volume(_triple((lower + upper) / 2), _triple(upper - lower))
 
 
 def _triple(values: Float) -> tuple[float, float, float]:

@@ -356,8 +356,7 @@ class CollinearityForeground:
         unsure = seen & ~certain
         certain |= beyond_shadows(unsure, certain, shades == DARK, self._penumbra, _FAINT_ENCLOSURE)
         unsure &= ~certain
-        # a box holds the person: what runs out of it is a shadow
-        foreground = certain | enclosed(unsure, certain, _ENCLOSURE, mosaic.cut(self._small.shape[1:3]))
+        foreground = certain | enclosed(unsure, certain, _ENCLOSURE)
         foreground |= unsure & closed(foreground, self._bridge)
         foreground = joined(
             foreground,

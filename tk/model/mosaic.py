@@ -63,14 +63,3 @@ class Mosaic:
                 x, y = max(x - margin, 0), max(y - margin, 0)
                 boxes[c] = left + x, top + y, right - x, bottom - y
         return Mosaic.of(boxes, int(self.corners[0, 1]))
-
-    def cut(self, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-        """Where in the mosaic a box ends while its picture of this (height, width) goes on."""
-        result = np.zeros(self.shape, np.bool_)
-        for c, (left, top, w, h) in enumerate(self.boxes.tolist()):
-            if w > 0:
-                part = self.part(result, c)
-                part[0], part[-1] = top > 0, top + h < shape[0]
-                part[:, 0] |= left > 0
-                part[:, -1] |= left + w < shape[1]
-        return result

@@ -27,9 +27,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import ConfigError
 from tk.kernels.kinematics import ARM_UP
 from tk.model.anthropometry import RAISED_SHOULDERS, TRUNK_LENGTH, BodyDimensions
+from tk.model.up import up_vector
 
 Float = NDArray[np.float64]
 
@@ -353,16 +353,16 @@ def _turn_hips(skeleton: Skeleton, pose: Float, R: Float) -> Float:
 
 
 def up_rotation(up: str) -> Float:
-    """(3, 3) rotation of the body frame such that its z axis is the world axis ``up`` ("z", "-y", …)."""
-    name = up.strip().lower()
-    sign = -1.0 if name.startswith("-") else 1.0
-    axis = name.lstrip("+-")
-    if axis not in ("x", "y", "z"):
-        raise ConfigError(f'up = "{up}" must be one of x, y, z, -x, -y, -z')
-    z = np.zeros(3)
-    z["xyz".index(axis)] = sign
+    """(3, 3) rotation of the body frame such that its z axis points along ``up`` (see :func:`tk.model.up.up_vector`).
+
+    The body's x axis is the world axis that follows the one nearest to ``up``, made horizontal: y for x, z for y, x for
+    z.
+    """
+    z = up_vector(up)
     x = np.zeros(3)
-    x[("xyz".index(axis) + 1) % 3] = 1.0
+    x[(int(np.abs(z).argmax()) + 1) % 3] = 1.0
+    x -= (x @ z) * z
+    x /= np.linalg.norm(x)
     return np.column_stack([x, np.cross(z, x), z])
 
 

@@ -7,9 +7,9 @@ every view makes its equation singular.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +81,18 @@ class Prior:
     precision: Float
 
 
+class Descent(NamedTuple):
+    """Where B descents ended.
+
+    Attributes:
+        states: (B, D) after the last iteration.
+        hessian: (B, D, D) JᵀWJ where the last step was taken from.
+    """
+
+    states: Float
+    hessian: Float
+
+
 def minimise(
     equations: Callable[[Float, int], Equations],
     start: Float,
@@ -89,7 +101,8 @@ def minimise(
     upper: Float,
     config: GaussNewtonConfig | None = None,
     prior: Prior | None = None,
-) -> Float:
+    levels: Sequence[int] | None = None,
+) -> Descent:
     """Descend from B states at once.
 
     Args:
@@ -99,17 +112,17 @@ def minimise(
         lower, upper: (D,) limits; infinite where there is none.
         config: see :class:`GaussNewtonConfig`.
         prior: what is known beside the equations.
-
-    Returns:
-        (B, D) the states after the last iteration.
+        levels: the scales to go through; all from the coarsest to the finest if None.
     """
     config = config or GaussNewtonConfig()
     state = np.array(start, np.float64)
-    for scale in range(config.scales - 1, -1, -1):
+    hessian = np.zeros((*state.shape, state.shape[1]))
+    for scale in range(config.scales - 1, -1, -1) if levels is None else levels:
         for _ in range(config.iterations):
             here = equations(state, scale)
             state += step(here.hessian, here.gradient, state, free, lower, upper, config, prior)
-    return state
+            hessian = here.hessian
+    return Descent(state, hessian)
 
 
 def step(

@@ -29,7 +29,7 @@ from tk.model.part_colors import PartColors
 from tk.model.silhouettes import CleaningConfig, Pyramid, Views
 from tk.model.skeleton import ANKLES, WAIST, build_skeleton, join_pose, split_pose, up_rotation
 from tk.optim import gauss_newton
-from tk.optim.gauss_newton import GaussNewtonConfig, Prior
+from tk.optim.gauss_newton import Descent, GaussNewtonConfig, Prior
 from tk.trackers.base import Observation
 
 Float = NDArray[np.float64]
@@ -42,7 +42,9 @@ RELOCATE_EVERY = 3
 # The fall of the cost, as a share of the person's pixels, that makes another place of a limb the pose.
 GAIN = 0.004
 # Places of a limb that are descended from, and random ones about its own place that are looked at beside the grid.
-PLACES, NEARBY = 3, 100
+PLACES, NEARBY = 2, 100
+# Poses that a search descends from to the end, beside the present one.
+FINISHED = 4
 # Rays a picture's height: to screen many places of a limb, and to choose among few poses.
 SCREEN_ROWS, CHOICE_ROWS = 60, 120
 
@@ -165,7 +167,7 @@ class ContourTracker:
             self.take_body(body or build_cone_body(dimensions, self.up, preset))
             skeleton = self.body.skeleton
             start = join_pose(skeleton, rough, np.zeros(len(self.waist_names)), np.zeros(len(self.ankle_names)))
-            start = self.settle(pyramids[0], start[None])[0]
+            start = self.settle(pyramids[0], start[None]).states[0]
         start = self.search(frames[0], pyramids[0], start)[0][0]
         if self.contours.adapt and body is None:
             start = self._adapt(frames, pyramids, start, stature)
@@ -174,14 +176,14 @@ class ContourTracker:
     def _choose(self, pyramids: Sequence[Pyramid], p_centroid: Float) -> Float:
         """Hypotheses settle on the first frame; the best are followed, and the one that keeps fitting is taken."""
         poses = gait.hypotheses(self.body.skeleton, HEADINGS, PHASES, p_centroid)
-        poses = self.settle(pyramids[0], poses)
+        poses = self.settle(pyramids[0], poses).states
         error = self.fit_error(pyramids[0], poses)
         firsts = poses[_distinct(poses, error, FINALISTS)]
         error = self.fit_error(pyramids[0], firsts)
         now = firsts
         # every other frame is enough to tell who walks backwards
         for pyramid in pyramids[2::2]:
-            now = self.settle(pyramid, now)
+            now = self.settle(pyramid, now).states
             error += self.fit_error(pyramid, now)
         return np.asarray(firsts[int(np.argmin(error))])
 
@@ -190,7 +192,7 @@ class ContourTracker:
         poses = [start]
         every = self.contours.search_every
         for i, pyramid in enumerate(pyramids[1:], 1):
-            pose = self.settle(pyramid, poses[-1][None])[0]
+            pose = self.settle(pyramid, poses[-1][None]).states[0]
             poses.append(self.search(frames[i], pyramid, pose)[0][0] if every and i % every == 0 else pose)
         count = min(self.contours.fit.frames, len(pyramids))
         chosen = np.unique(np.linspace(0, len(pyramids) - 1, count).round().astype(int))
@@ -267,16 +269,15 @@ class ContourTracker:
         self,
         pyramid: Pyramid,
         poses: Float,
-        scales: int | None = None,
+        levels: Sequence[int] | None = None,
         images: NDArray[np.uint8] | None = None,
         prior: Prior | None = None,
-    ) -> Float:
-        """Gauss-Newton from poses (B, D), from the scale ``scales - 1`` to the finest.
+    ) -> Descent:
+        """Gauss-Newton from poses (B, D), through all scales or those of ``levels``, 0 the finest.
 
         With ``images``, colours pull at contours inside the silhouette, too.
         """
         body, contours = self.body, self.contours
-        solver = replace(contours.solver, scales=scales) if scales else contours.solver
         regions = None if images is None else self.colors.regions(images)
         return gauss_newton.minimise(
             lambda states, scale: self.views.equations(body, pyramid, states, scale, contours.search, regions),
@@ -284,8 +285,9 @@ class ContourTracker:
             body.free,
             body.skeleton.lower,
             body.skeleton.upper,
-            solver,
+            contours.solver,
             prior,
+            levels,
         )
 
     def evidence(self, grid: RayGrid, frame: Observation, pyramid: Pyramid) -> Evidence:
@@ -324,15 +326,17 @@ class ContourTracker:
                         both = a.copy()
                         both[self.limbs[second].dofs] = b[self.limbs[second].dofs]
                         poses.append(both)
-        settled = self.settle(pyramid, np.array(poses), min(2, self.contours.solver.scales), images)
-        settled = np.concatenate([pose[None], settled])
+        # all of them roughly, the best to the end; the pose itself is always among those
+        rough = self.settle(pyramid, np.array(poses), (min(1, self.contours.solver.scales - 1),), images).states
+        cost = mean_of_views(coarse.cast(self.body, group, rough)[0])
+        best = np.argsort(cost, kind="stable")[:FINISHED]
+        chosen = np.concatenate([pose[None], rough[best]])
+        settled = self.settle(pyramid, chosen, (0,), images).states
         fine = self.evidence(self.choice, frame, pyramid)
         cost = mean_of_views(fine.cast(self.body, group, settled)[0])
         order = np.argsort(cost, kind="stable")
-        # the pose where it was, or where it settled now
-        own = 1 if cost[1] < cost[0] else 0
-        if cost[order[0]] > cost[own] - GAIN:
-            order = np.concatenate([[own], order[order != own]])
+        if cost[order[0]] > cost[0] - GAIN:
+            order = np.concatenate([[0], order[order != 0]])
         return settled[order], cost[order]
 
     def relocate(self, pyramid: Pyramid, pose: Float, error: float) -> tuple[Float, float]:
@@ -342,7 +346,7 @@ class ContourTracker:
         except CaptureError:
             return pose, error
         starts = gait.hypotheses(self.body.skeleton, HEADINGS, PHASES, p_centroid)
-        settled = self.settle(pyramid, starts)
+        settled = self.settle(pyramid, starts).states
         errors = self.fit_error(pyramid, settled)
         i = int(np.argmin(errors))
         return (settled[i], float(errors[i])) if errors[i] < error else (pose, error)

@@ -134,35 +134,41 @@ class RegionTracker(ContourTracker):
         images = frame.images if config.colors else None
         watch.lap("masks_clean")
         starts = np.array([h.pose + contours.prediction * (h.pose - h.previous) for h in self._alive])
-        poses = self.settle(pyramid, starts, images=images, prior=self._prior(starts))
+        poses, hessian = self.settle(pyramid, starts, images=images, prior=self._prior(starts))
         watch.lap("optimise")
         evidence = self.evidence(self.screen, frame, pyramid)
-        cost = mean_of_views(evidence.cast(self.body, self.colors.group, poses)[0])
+        by_view, met = evidence.cast(self.body, self.colors.group, poses, export=True)
+        assert met is not None
+        cost = mean_of_views(by_view)
         if not np.isfinite(cost).all():
             return self._nobody(frame, watch)
         self._alive = [
-            Hypothesis(pose, h.pose, h.cost + RENEWAL * (c - h.cost) if h.age or h.cost else float(c), h.age + 1)
+            Hypothesis(pose, h.pose, h.cost + RENEWAL * (c - h.cost) if h.age else float(c), h.age + 1)
             for h, pose, c in zip(self._alive, poses, cost, strict=True)
         ]
         self._rank()
-        _, seen = evidence.cast(self.body, self.colors.group, self._best.pose[None], export=True)
-        assert seen is not None
-        error = evidence.fit_error(seen.label[0])
+        i = int(np.argmin([np.abs(pose - self._best.pose).max() for pose in poses]))
+        label, curvature = met.label[i], hessian[i]
+        error = evidence.fit_error(label)
         watch.lap("check")
         searched = self._needs_search(frame, float(np.nanmean(error)))
         if searched:
+            before = self._best.pose
             self._propose(frame, pyramid, images)
-            _, seen = evidence.cast(self.body, self.colors.group, self._best.pose[None], export=True)
-            assert seen is not None
-            error = evidence.fit_error(seen.label[0])
+            if self._best.pose is not before:
+                best = self._best.pose[None]
+                _, again = evidence.cast(self.body, self.colors.group, best, export=True)
+                assert again is not None
+                label, curvature = again.label[0], self._curvature(pyramid, best, images)
+                error = evidence.fit_error(label)
         watch.lap("search")
         lost = self._follow(pyramid, float(np.nanmean(error)))
-        self._learn(evidence, seen.label[0], float(np.nanmean(error)), lost)
+        self._learn(evidence, label, float(np.nanmean(error)), lost)
         status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
         self._lost_for = self._lost_for + 1 if lost else 0
         self._fresh = False
         pose = self._best.pose
-        sigma = self._sigma(pyramid, pose, images)
+        sigma = self._sigma(pose, curvature)
         watch.lap("check")
         return Estimate(
             **self.told(pose),
@@ -248,16 +254,19 @@ class RegionTracker(ContourTracker):
         # quick to learn that it can be better, slow to put up with worse
         self._usual = usual + (0.1 if error < usual else 0.05) * (error - usual)
 
-    def _sigma(self, pyramid: Pyramid, pose: Float, images: NDArray[np.uint8] | None) -> Float:
+    def _curvature(self, pyramid: Pyramid, poses: Float, images: NDArray[np.uint8] | None) -> Float:
+        """(D, D) JᵀWJ at the first of the poses."""
+        regions = None if images is None else self.colors.regions(images)
+        return self.views.equations(self.body, pyramid, poses, 0, self.contours.search, regions).hessian[0]
+
+    def _sigma(self, pose: Float, curvature: Float) -> Float:
         """(15,) one standard deviation of each joint's position along an axis, metres.
 
         From the curvature at the optimum: the inverse of the information that contours and priors give about the pose,
         carried to the joints.
         """
-        regions = None if images is None else self.colors.regions(images)
-        here = self.views.equations(self.body, pyramid, pose[None], 0, self.contours.search, regions)
         skeleton = self.body.skeleton
-        precision = INFORMATION * (here.hessian[0] + np.diag(self._prior(pose).precision))
+        precision = INFORMATION * (curvature + np.diag(self._prior(pose).precision))
         free = np.flatnonzero(self.body.free)
         covariance = np.zeros_like(precision)
         covariance[np.ix_(free, free)] = np.linalg.inv(precision[np.ix_(free, free)])
@@ -315,7 +324,7 @@ class RegionTracker(ContourTracker):
         for i in tracked:
             pyramid = self.views.pyramid(masks[int(i)], scales, cleaning)
             prior = self._prior(poses[i], SECOND_ANGLE_DEG)
-            settled = self.settle(pyramid, poses[i][None], scales, prior=prior)
+            settled = self.settle(pyramid, poses[i][None], (0,), prior=prior).states
             evidence = Evidence.of(self.screen, pyramid.masks[0])
             result[i], errors[i] = settled[0], evidence.cast(self.body, self.colors.group, settled)[0][0]
         return result, errors

@@ -59,7 +59,7 @@ class SilhouetteTracker(ContourTracker):
         pyramid = self.pyramid(frame)
         watch.lap("masks_clean")
         start = self._pose + config.prediction * (self._pose - self._previous)
-        pose = self.settle(pyramid, start[None])[0]
+        pose = self.settle(pyramid, start[None]).states[0]
         watch.lap("optimise")
         if config.search_every and frame.index % config.search_every == 0:
             pose = self.search(Observation(frame.index, frame.images[:0], frame.masks), pyramid, pose)[0][0]

@@ -1,0 +1,91 @@
+"""BVH, read by the package bvh; its channels applied as BVH's readers do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from bvh import Bvh
+
+from tests.io.export.conftest import FPS, FRAMES, LOST, SKELETON, Write
+from tk.io.export import export, read_motion
+from tk.model.rotations import turn
+from tk.model.skeleton import JOINTS, build_skeleton
+
+
+def places(path: Path, at: int | None) -> dict[str, np.ndarray]:
+    """(3,) of every joint in a frame, and of tips as ``tip of <joint>``; None: the rest pose."""
+    file = Bvh(path.read_text())
+    found: dict[str, np.ndarray] = {}
+    turned: dict[str, np.ndarray] = {}
+    for name in file.get_joints_names():
+        parent = file.joint_parent(name)
+        offset = np.array(file.joint_offset(name))
+        R = np.eye(3)
+        for channel in file.joint_channels(name) if at is not None else ():
+            value = file.frame_joint_channel(at, name, channel)
+            if channel.endswith("position"):
+                offset["XYZ".index(channel[0])] = value  # stands for the OFFSET
+            else:
+                R = R @ turn(channel[0].lower(), np.radians(value))
+        if parent is None:
+            found[name], turned[name] = offset, R
+        else:
+            found[name] = found[parent.name] + turned[parent.name] @ offset
+            turned[name] = turned[parent.name] @ R
+        for end in file.get_joint(name).filter("End"):
+            found[f"tip of {name}"] = found[name] + turned[name] @ np.array([float(x) for x in end["OFFSET"]])
+    return found
+
+
+def test_joints_come_back_within_a_millimetre(write: Write) -> None:
+    path = write()
+    motion, _ = read_motion(path)
+    (target,) = export(path, ["bvh"]).files
+    file = Bvh(target.read_text())
+    assert file.nframes == FRAMES and abs(file.frame_time - 1 / FPS) < 1e-7
+    for f in np.flatnonzero(motion.known):
+        found = places(target, f)
+        found["head_top"] = found["tip of neck"]
+        for name in JOINTS:
+            x, y, z = motion.point(name)[f]  # forward, left, up
+            np.testing.assert_allclose(found[name], [y, z, x], atol=1e-4, err_msg=name)
+        toe = motion.point("toe_r")[f]
+        np.testing.assert_allclose(found["tip of ankle_r"], toe[[1, 2, 0]], atol=1e-4)
+
+
+def test_lost_frames_hold_the_pose_before(write: Write) -> None:
+    written = export(write(), ["bvh"])
+    assert any("2 lost frames" in note for note in written.notes)
+    before = places(written.files[0], LOST[0] - 1)
+    for f in LOST:
+        for name, place in places(written.files[0], f).items():
+            np.testing.assert_array_equal(place, before[name])
+
+
+def test_rest_pose_is_a_t(write: Write) -> None:
+    (target,) = export(write(), ["bvh"]).files
+    rest = places(target, None)
+    body = read_motion(write())[0].dimensions
+    np.testing.assert_allclose(rest["wrist_l"] - rest["shoulder_l"], [body.upper_arm + body.forearm, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(rest["wrist_r"] - rest["shoulder_r"], [-body.upper_arm - body.forearm, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(rest["ankle_l"] - rest["hip_l"], [0, -body.thigh - body.calf, 0], atol=1e-5)
+    assert rest["tip of ankle_l"][2] > rest["ankle_l"][2] + 0.1  # the toes point forward
+    assert rest["hip_l"][0] > 0 > rest["hip_r"][0]
+
+
+def test_only_what_moves_has_channels_for_its_place(write: Write) -> None:
+    (target,) = export(write(), ["bvh"]).files
+    file = Bvh(target.read_text())
+    names = file.get_joints_names()
+    moving = {name for name in names if len(file.joint_channels(name)) == 6}
+    assert moving == {"pelvis", "shoulder_l", "shoulder_r"}
+
+
+def test_another_axis_up(write: Write) -> None:
+    skeleton = build_skeleton(read_motion(write())[0].dimensions, "-y", waist=True)
+    (target,) = export(write("y.h5", skeleton, up="-y"), ["bvh"]).files
+    (other,) = export(write("z.h5", SKELETON), ["bvh"]).files
+    a, b = places(target, 3), places(other, 3)
+    for name, place in a.items():
+        np.testing.assert_allclose(place - a["pelvis"], b[name] - b["pelvis"], atol=1e-4)

@@ -1,0 +1,57 @@
+"""C3D, read by ezc3d."""
+
+from __future__ import annotations
+
+import sys
+
+import ezc3d
+import numpy as np
+import pytest
+
+from tests.io.export.conftest import FPS, FRAMES, LOST, Write
+from tk.errors import ExportError
+from tk.io.export import export, read_motion
+from tk.io.result import ResultError
+from tk.model.skeleton import JOINTS, SEGMENTS
+
+
+def test_points_and_segments(write: Write) -> None:
+    path = write()
+    motion, _ = read_motion(path)
+    (target,) = export(path, ["c3d"]).files
+    file = ezc3d.c3d(str(target))
+    parameters = file["parameters"]["POINT"]
+    assert parameters["LABELS"]["value"] == list(motion.point_names) and parameters["UNITS"]["value"] == ["mm"]
+    assert parameters["RATE"]["value"][0] == FPS and parameters["FRAMES"]["value"][0] == FRAMES
+    points = file["data"]["points"][:3].transpose(2, 1, 0) / 1000
+    np.testing.assert_allclose(points[motion.known], motion.points[motion.known], atol=1e-6)
+    residuals = file["data"]["meta_points"]["residuals"][0]
+    assert (residuals[:, list(LOST)] == -1).all() and (residuals[:, motion.known] == 0).all()
+    assert np.isnan(points[list(LOST)]).all()
+
+    assert file["parameters"]["ROTATION"]["LABELS"]["value"] == list(SEGMENTS)
+    T = file["data"]["rotations"]
+    assert T.shape == (4, 4, len(SEGMENTS), FRAMES)
+    np.testing.assert_allclose(T[:3, :3].transpose(3, 2, 0, 1)[motion.known], motion.rotations[motion.known], atol=1e-6)
+    knee = motion.points[motion.known, JOINTS.index("knee_r")]
+    np.testing.assert_allclose(T[:3, 3, SEGMENTS.index("calf_r")].T[motion.known] / 1000, knee, atol=1e-6)
+    assert np.isnan(T[:3, :3, :, list(LOST)]).all()
+
+
+def test_residual_is_the_standard_deviation(write: Write) -> None:
+    sigma = np.full(15, 0.012)
+    sigma[3] = np.nan
+    path = write(meta={"sigma": True}, rows=lambda f: {"sigma": sigma}, version=None)
+    file = ezc3d.c3d(str(export(path, ["c3d"]).files[0]))
+    residuals = file["data"]["meta_points"]["residuals"][0]
+    assert residuals[0, 0] == 12 and residuals[3, 0] == 0 and residuals[0, LOST[0]] == -1
+
+
+def test_missing_package_is_one_line(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write()
+    monkeypatch.setitem(sys.modules, "ezc3d", None)
+    with pytest.raises(ExportError, match=r"pip install 'tk-mocap\[export\]'"):
+        export(path, ["c3d"])
+    assert not list(path.parent.glob("*c3d*"))
+    assert export(path, ["trc"]).files[0].exists()  # the others do without
+    assert not issubclass(ExportError, ResultError)

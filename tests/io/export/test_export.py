@@ -1,0 +1,182 @@
+"""What export takes and refuses; CSV; versions of the result; the smoothed copy."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.conftest import Tk
+from tests.io.export.conftest import FIRST, FPS, FRAMES, LOST, SKELETON, Write, poses, status
+from tk.errors import ExportError, ResultError
+from tk.io.export import FORMATS, export, read_motion
+from tk.io.result import Status
+from tk.model.angles import segment_quaternions
+from tk.model.anthropometry import BodyDimensions
+from tk.model.motion import FOOT_POINTS
+from tk.model.skeleton import JOINTS, SEGMENTS, build_skeleton
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_csv_of_points(write: Write) -> None:
+    sigma = np.full(15, 0.02)
+    points, _ = export(write(meta={"sigma": True}, rows=lambda f: {"sigma": sigma}, version=None), ["csv"]).files
+    rows = rows_of(points)
+    assert list(rows[0]) == ["frame", "time", "status", "point", "x", "y", "z", "sigma"]
+    assert len(rows) == FRAMES * (len(JOINTS) + 4)
+    for row in rows:
+        f = int(row["frame"]) - FIRST
+        assert float(row["time"]) == pytest.approx(int(row["frame"]) / FPS, abs=1e-6)
+        assert row["status"] == {0: "initialised"}.get(f, "lost" if f in LOST else "tracked")
+        if f in LOST:
+            assert row["x"] == row["sigma"] == ""
+        elif row["point"] in JOINTS:
+            place = SKELETON.joints(poses()[f])[JOINTS.index(row["point"])]
+            np.testing.assert_allclose([float(row[axis]) for axis in "xyz"], place, atol=1e-6)
+            assert float(row["sigma"]) == 0.02
+        else:
+            assert row["point"] in FOOT_POINTS and row["sigma"] == ""
+
+
+def test_csv_of_angles(write: Write) -> None:
+    _, angles = export(write(), ["csv"]).files
+    assert angles.name == "walk_angles.csv"
+    rows = rows_of(angles)
+    knee = [row for row in rows if row["joint"] == "knee_l"]
+    assert len(knee) == FRAMES and knee[LOST[0]]["degrees"] == ""
+    expected = np.degrees(poses()[3, SKELETON.index("knee_l_flexion")])
+    assert float(knee[3]["degrees"]) == pytest.approx(expected, abs=1e-4)
+
+
+def test_without_a_waist(write: Write) -> None:
+    skeleton = build_skeleton(BodyDimensions.from_stature(1.75))
+    motion, _ = read_motion(write(skeleton=skeleton))
+    np.testing.assert_allclose(motion.rotation("pelvis"), motion.rotation("torso"), atol=1e-12)
+
+
+def test_what_the_result_holds_goes_before_what_is_computed(write: Write) -> None:
+    """Version 2: rotations and feet are the file's, in the order of its names."""
+    q = segment_quaternions(SKELETON, poses())[:, ::-1]
+    feet = np.arange(12.0).reshape(4, 3)
+    meta = {"segment_names": SEGMENTS[::-1], "feet": True}
+
+    q[4, 2] = 0  # no rotation
+
+    def rows(f: int) -> dict[str, np.ndarray]:
+        return {} if f in LOST else {"segments_rotation": q[f], "feet": feet}
+
+    motion, _ = read_motion(write("new.h5", meta=meta, rows=rows, version=None))
+    old, _ = read_motion(write("old.h5"))
+    assert motion.segments == SEGMENTS[::-1]
+    both = motion.known & old.known
+    np.testing.assert_allclose(motion.rotation("calf_r")[both], old.rotation("calf_r")[both], atol=1e-9)
+    np.testing.assert_array_equal(motion.point("heel_l")[0], feet[0])
+    assert old.point("heel_l")[0, 2] < old.point("knee_l")[0, 2]
+    assert set(np.flatnonzero(~motion.known)) == {4, *LOST}
+
+
+def test_smoothed_copy_of_the_result(write: Write) -> None:
+    """`/smoothed` where there is one; what it bridged counts as known."""
+    path = write(version=None)
+    joints = np.array([SKELETON.joints(pose) for pose in poses()]) + 0.01
+    with h5py.File(path, "r+") as file:
+        file["smoothed/joints/position"] = joints
+        file["smoothed/bridged"] = status() == Status.LOST
+    motion, notes = read_motion(path, smoothed=True)
+    assert notes == () and motion.known.all()
+    np.testing.assert_allclose(motion.points[:, : len(JOINTS)], joints)
+    assert [motion.status_word(f) for f in (0, LOST[0])] == ["initialised", "bridged"]
+
+
+def test_smoothed_here_where_the_result_has_no_copy(write: Write) -> None:
+    path = write()
+    written = export(path, ["csv", "bvh"], smoothed=True)
+    assert written.files[0].name == "walk_smoothed.csv"
+    assert "smoothed for this export" in written.notes[0] and len(written.notes) == 1  # nothing is held
+    motion, _ = read_motion(path, smoothed=True)
+    assert motion.known.all() and motion.bridged.sum() == len(LOST)
+    true = np.array([SKELETON.joints(pose) for pose in poses()])
+    assert np.linalg.norm(motion.points[:, :15] - true, axis=2).max() < 0.06
+
+
+def test_refusals(write: Write, tmp_path: Path) -> None:
+    path = write()
+    with pytest.raises(ExportError, match=r"fbx.*trc, mot, c3d, bvh, csv, gltf"):
+        export(path, ["trc", "fbx"])
+    with pytest.raises(ExportError, match="--to"):
+        export(path, [])
+    first = export(path, ["trc"]).files[0]
+    text = first.read_text()
+    with pytest.raises(ExportError, match="--force"):
+        export(path, ["csv", "trc"])
+    assert not (tmp_path / "walk.csv").exists()  # all or nothing
+    first.write_text("old")
+    export(path, ["trc"], force=True)
+    assert first.read_text() == text
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ExportError, match="cannot be written"):
+        export(path, ["trc"], tmp_path / "file")
+    with pytest.raises(ResultError, match="lost in every frame"):
+        export(write("lost.h5", lost=np.full(FRAMES, Status.LOST)), ["bvh"])
+    with pytest.raises(ResultError, match="not consecutive"):
+        export(write("gaps.h5", frames=np.arange(FRAMES) * 2), ["bvh"])
+    with h5py.File(path, "r+") as file:
+        del file["model/dimensions/thigh"]
+    with pytest.raises(ResultError, match="/model/dimensions/thigh"):
+        export(path, ["csv"])
+
+
+def test_frames_without_numbers_are_not_known(write: Write) -> None:
+    path = write()
+    with h5py.File(path, "r+") as file:
+        file["pose"][3] = np.nan
+        file["joints/position"][7, 2] = np.nan
+    motion, _ = read_motion(path)
+    assert set(np.flatnonzero(~motion.known)) == {3, 7, *LOST} and np.isfinite(motion.points).all()
+    with h5py.File(path, "r+") as file:
+        file["status"][5] = 9
+    with pytest.raises(ResultError, match="/status"):
+        read_motion(path)
+
+
+def test_joints_in_another_order(write: Write) -> None:
+    path, other = write("a.h5"), write("b.h5")
+    with h5py.File(other, "r+") as file:
+        file["joints/position"][...] = file["joints/position"][()][:, ::-1]
+        file["joints/position"].attrs["names"] = list(JOINTS[::-1])
+    np.testing.assert_array_equal(read_motion(path)[0].points, read_motion(other)[0].points)
+
+
+def test_lost_from_the_beginning_is_held_backwards(write: Write) -> None:
+    states = np.zeros(FRAMES, dtype=np.uint8)
+    states[:3] = Status.LOST
+    motion, _ = read_motion(write(lost=states))
+    np.testing.assert_array_equal(motion.points[0], motion.points[3])
+    assert not motion.known[:3].any() and motion.known[3:].all()
+
+
+def test_command(tk: Tk, write: Write, tmp_path: Path) -> None:
+    path = write()
+    ran = tk("export", path, "--to", ",".join(FORMATS), "-o", tmp_path / "out" / "deep")
+    assert ran.code == 0 and ran.out == "", ran.err
+    names = {"walk.trc", "walk.mot", "walk.c3d", "walk.bvh", "walk.csv", "walk_angles.csv", "walk.glb"}
+    assert {file.name for file in (tmp_path / "out" / "deep").iterdir()} == names
+    assert "note: bvh, gltf: in 2 lost frames the pose before is held" in ran.err
+    tk("export", path, "--to", "trc", "-o", tmp_path / "out" / "deep").complaint("walk.trc", "--force")
+    tk("export", path, "--to", "fbx").complaint("--to fbx", "gltf")
+    tk("export", tmp_path / "none.h5", "--to", "trc").complaint("none.h5", "no such file")
+    assert tk("export", path, "--to", "trc", "--smoothed").code == 0
+    assert (tmp_path / "walk_smoothed.trc").exists()
+
+
+def test_a_tracked_result(tracked: Path, tmp_path: Path) -> None:
+    """What the tracker writes goes through every format."""
+    written = export(tracked, list(FORMATS), tmp_path)
+    assert all(file.stat().st_size > 1000 for file in written.files)

@@ -1,0 +1,126 @@
+"""glTF, read by pygltflib; nodes and animation applied as the format's specification says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pygltflib
+from scipy.spatial.transform import Rotation
+
+from tests.io.export.conftest import FPS, FRAMES, LOST, Write, poses
+from tk.io.export import export, read_motion
+from tk.model.body import build_body
+from tk.model.skeleton import JOINTS, SEGMENTS
+
+TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+DTYPES = {5126: np.float32, 5123: np.uint16}
+
+
+def array(file: pygltflib.GLTF2, index: int) -> np.ndarray:
+    accessor = file.accessors[index]
+    view = file.bufferViews[accessor.bufferView]
+    width = TYPES[accessor.type]
+    values = np.frombuffer(
+        file.binary_blob(), DTYPES[accessor.componentType], accessor.count * width, view.byteOffset
+    ).reshape(accessor.count, width)
+    assert values.nbytes == view.byteLength
+    if accessor.min:  # pygltflib gives [] where there is none
+        np.testing.assert_array_equal(values.min(axis=0), np.array(accessor.min, np.float32))
+        np.testing.assert_array_equal(values.max(axis=0), np.array(accessor.max, np.float32))
+    return values
+
+
+def frame_transforms(file: pygltflib.GLTF2, f: int) -> dict[str, np.ndarray]:
+    """(4, 4) of every node to the world in a frame."""
+    (animation,) = file.animations
+    local = []
+    for node in file.nodes:
+        assert node.rotation is None or node.rotation == [0, 0, 0, 1]
+        T = np.eye(4)
+        T[:3, 3] = node.translation
+        local.append(T)
+    for channel in animation.channels:
+        sampler = animation.samplers[channel.sampler]
+        times, values = array(file, sampler.input), array(file, sampler.output)
+        assert len(times) == len(values) == FRAMES
+        if channel.target.path == "rotation":
+            local[channel.target.node][:3, :3] = Rotation.from_quat(values[f]).as_matrix()
+        else:
+            local[channel.target.node][:3, 3] = values[f]
+    found: dict[str, np.ndarray] = {}
+
+    def descend(index: int, above: np.ndarray) -> None:
+        node = file.nodes[index]
+        found[node.name] = above @ local[index]
+        for child in node.children or []:
+            descend(child, found[node.name])
+
+    for root in file.scenes[file.scene].nodes:
+        descend(root, np.eye(4))
+    assert len(found) == len(file.nodes)
+    return found
+
+
+def load(path: Path) -> pygltflib.GLTF2:
+    file = pygltflib.GLTF2().load_binary(str(path))
+    assert file is not None and file.asset.version == "2.0"
+    return file
+
+
+def test_joints_come_back(write: Write) -> None:
+    path = write()
+    motion, _ = read_motion(path)
+    (target,) = export(path, ["gltf"]).files
+    assert target.suffix == ".glb"
+    file = load(target)
+    times = array(file, file.animations[0].samplers[0].input)[:, 0]
+    np.testing.assert_allclose(times, np.arange(FRAMES) / FPS, atol=1e-6)
+    for f in np.flatnonzero(motion.known):
+        found = frame_transforms(file, f)
+        for name in (*JOINTS, "toe_l", "heel_r"):
+            x, y, z = motion.point(name)[f]
+            np.testing.assert_allclose(found[name][:3, 3], [y, z, x], atol=1e-4, err_msg=name)
+
+
+def test_lost_frames_are_held_and_listed(write: Write) -> None:
+    path = write()
+    file = load(export(path, ["gltf"]).files[0])
+    before = frame_transforms(file, LOST[0] - 1)
+    for name, T in frame_transforms(file, LOST[1]).items():
+        np.testing.assert_array_equal(T, before[name])
+    frames = read_motion(path)[0].frames
+    assert file.asset.extras["lost_frames"] == [int(frames[f]) for f in LOST]
+
+
+def test_the_body_rides_on_the_nodes(write: Write) -> None:
+    """The meshes in a frame lie where the body's surface samples lie."""
+    path = write()
+    motion, _ = read_motion(path)
+    f = 7
+    body = build_body(motion.dimensions, waist=True)
+    points, _ = body.place(poses()[f])
+    file = load(export(path, ["gltf"]).files[0])
+    T = frame_transforms(file, f)
+    assert {mesh.name for mesh in file.meshes} == {SEGMENTS[s] for s in np.unique(body.segment)}
+    for node in file.nodes:
+        if node.mesh is None:
+            continue
+        mesh = file.meshes[node.mesh]
+        (primitive,) = mesh.primitives
+        at = array(file, primitive.attributes.POSITION) @ T[node.name][:3, :3].T + T[node.name][:3, 3]
+        facing = array(file, primitive.attributes.NORMAL) @ T[node.name][:3, :3].T
+        triangles = array(file, primitive.indices).reshape(-1, 3)
+        assert triangles.max() == len(at) - 1
+        np.testing.assert_allclose(np.linalg.norm(facing, axis=1), 1, atol=1e-4)
+        # front faces look out: the sides of a triangle turn about its normal
+        a, b, c = (at[triangles[:, k]] for k in range(3))
+        across = np.cross(b - a, c - a)
+        big = np.linalg.norm(across, axis=1) > 1e-7
+        along = (across * facing[triangles].mean(axis=1))[big].sum(axis=1)
+        assert (along > 0).mean() > 0.98
+        own = body.segment == SEGMENTS.index(mesh.name)
+        mine = points[own][:, [1, 2, 0]]
+        surface = np.concatenate([at, (a + b) / 2, (b + c) / 2, (c + a) / 2, (a + b + c) / 3])
+        distance = np.linalg.norm(mine[:, None] - surface[None], axis=2).min(axis=1)
+        assert distance.mean() < 0.015 and distance.max() < 0.04, mesh.name

@@ -1,0 +1,216 @@
+"""What all formats have in common: finding, refusing, writing; and the command."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.conftest import Tk
+from tests.io.conftest import write_toml
+from tests.io.importers.conftest import HEIGHT, WIDTH, Import, make_rig, points, renamed, tables, write_clips
+from tests.io.importers.test_xml_formats import write_qca
+from tk.errors import CalibrationError, CaptureError, VideoError
+from tk.io.capture import open_capture
+from tk.io.importers import FORMATS, import_project
+from tk.io.importers.files import LARGEST
+from tk.model.camera import Rig
+
+CAMS = ["cam1", "cam2", "cam3", "cam4"]
+
+
+def write_project(folder: Path) -> Path:
+    write_toml(folder / "calibration.toml", tables(make_rig(), unit_m=0.001))
+    write_clips(folder / "videos-raw", CAMS)
+    return folder
+
+
+def test_the_command(folder: Path, tmp_path: Path, tk: Tk) -> None:
+    write_project(folder)
+    ran = tk("import", folder, "-o", tmp_path / "capture")
+    assert ran.code == 0 and ran.out == ""
+    notes = [line for line in ran.err.splitlines() if line.startswith("note: ")]
+    assert len([note for note in notes if "lengths are taken for mm" in note]) == 1
+    assert (
+        ran.err.splitlines()[-1]
+        == f"4 cameras in {tmp_path / 'capture'}; have a look at {tmp_path}/capture/capture.toml"
+    )
+    tk("import", folder, "-o", tmp_path / "capture").complaint(str(tmp_path / "capture"), "exists already")
+    tk("import", folder, "-o", tmp_path / "c", "--units", "inch").complaint("inch")
+    tk("import", folder, "-o", tmp_path / "c", "--trial", "x").complaint("holds no videos of the trial 'x'")
+    tk("import", tmp_path / "nowhere", "-o", tmp_path / "c").complaint("nowhere: is not a folder")
+
+
+def test_a_capture_needs_no_import(folder: Path, tmp_path: Path, tk: Tk) -> None:
+    tk("import", write_project(folder), "-o", tmp_path / "capture")
+    tk("import", tmp_path / "capture", "-o", tmp_path / "c").complaint("is a capture already", "tk track")
+
+
+def test_nothing_matches(folder: Path, check: Import) -> None:
+    (folder / "readme.md").write_text("# Nothing")
+    with pytest.raises(CaptureError) as caught:
+        import_project(folder, check.output)
+    for importer in FORMATS:
+        assert f"{importer.TOOL}: {importer.LOOKS_FOR}" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "calibration.toml",
+        "camera_array.toml",
+        "x_camera_calibration.toml",
+        "intri.yml",
+        "x.qca.txt",
+        "x.xcp",
+        "calibration_x.json",
+        "calibration/Calib.toml",
+    ],
+)
+def test_a_pipe_does_not_hang(folder: Path, check: Import, name: str) -> None:
+    write_clips(folder / "videos", CAMS[:2])
+    path = folder / name
+    path.parent.mkdir(exist_ok=True)
+    os.mkfifo(path)
+    os.mkfifo(folder / "videos" / "cam9.mp4")
+    with pytest.raises(CalibrationError, match="is no regular file") as caught:
+        import_project(folder, check.output)
+    assert str(path) in str(caught.value)
+
+
+def test_a_pipe_is_no_video(folder: Path, check: Import) -> None:
+    write_project(folder)
+    os.mkfifo(folder / "videos-raw" / "cam5.mp4")
+    check(folder, make_rig())
+
+
+def test_a_huge_file_is_not_read(folder: Path, check: Import) -> None:
+    path = folder / "session.qca.txt"
+    with path.open("wb") as file:
+        file.truncate(LARGEST + 1)
+    with pytest.raises(CalibrationError, match="too large for a calibration file"):
+        import_project(folder, check.output)
+
+
+@pytest.mark.parametrize(
+    ("size", "expected", "note"),
+    [
+        ((WIDTH, HEIGHT - 8), (1.0, 0.0), "padding at the right and the bottom; the matrix stays"),
+        ((WIDTH + 8, HEIGHT), (1.0, 0.0), "padding"),
+        ((WIDTH // 2, HEIGHT // 2), (0.5, -0.25), "scaled by 0.5, and so is the matrix"),
+        ((WIDTH * 2, HEIGHT * 2), (2.0, 0.5), "scaled by 2, and so is the matrix"),
+    ],
+)
+def test_videos_of_another_size(
+    folder: Path, check: Import, size: tuple[int, int], expected: tuple[float, float], note: str
+) -> None:
+    """A pixel x of the calibration is the pixel scale · x + shift of the video, pixel centres being whole numbers."""
+    write_toml(folder / "calibration.toml", tables(make_rig()))
+    write_clips(folder / "videos", CAMS, size)
+    imported = import_project(folder, check.output)
+    scale, shift = expected
+    for camera, true in zip(open_capture(check.output).rig, make_rig(), strict=True):
+        assert (camera.width, camera.height) == size
+        np.testing.assert_allclose(camera.project(points())[0], scale * true.project(points())[0] + shift, atol=0.01)
+    told = [line for line in imported.notes if note in line]
+    assert len(told) == 4 and f"calibrated at {WIDTH}×{HEIGHT}, video {size[0]}×{size[1]}" in told[0]
+
+
+@pytest.mark.parametrize(
+    ("size", "complaint"),
+    [((HEIGHT, WIDTH), "is the video turned by 90°?"), ((WIDTH, HEIGHT // 2), "(1 and 0.5)")],
+)
+def test_videos_of_a_size_that_nothing_explains(
+    folder: Path, check: Import, size: tuple[int, int], complaint: str
+) -> None:
+    write_toml(folder / "calibration.toml", tables(make_rig()))
+    write_clips(folder / "videos", CAMS, size)
+    with pytest.raises(CalibrationError) as caught:
+        import_project(folder, check.output)
+    text = str(caught.value)
+    assert complaint in text and f"calibrated at 320×240, video {size[0]}×{size[1]}" in text
+    assert str(folder / "videos" / "cam1.mp4") in text and "\n" not in text
+
+
+def test_links_take_no_room_and_other_file_systems_get_copies(
+    folder: Path, check: Import, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_project(folder)
+    check(folder, make_rig()).note("hard links")
+    original = folder / "videos-raw" / "cam2.mp4"
+    assert original.stat().st_ino == (check.output / "videos" / "cam2.mp4").stat().st_ino
+
+    def refuse(*_: object) -> None:
+        raise OSError("another device")
+
+    monkeypatch.setattr(os, "link", refuse)
+    check.output = check.output.with_name("copied")
+    check(folder, make_rig()).note("the videos were copied")
+    copied = check.output / "videos" / "cam2.mp4"
+    assert original.stat().st_ino != copied.stat().st_ino and original.read_bytes() == copied.read_bytes()
+
+
+def test_a_failed_import_leaves_nothing(folder: Path, check: Import) -> None:
+    write_project(folder)
+    (folder / "videos-raw" / "cam3.mp4").write_bytes(b"no video")
+    with pytest.raises(VideoError) as caught:
+        import_project(folder, check.output)
+    assert str(folder / "videos-raw" / "cam3.mp4") in str(caught.value)
+    assert sorted(path.name for path in folder.parent.iterdir()) == ["project"]
+
+
+def test_an_output_that_cannot_be_written(folder: Path, check: Import) -> None:
+    write_project(folder)
+    (folder.parent / "file").write_text("")
+    with pytest.raises(CaptureError, match="cannot be written"):
+        import_project(folder, folder.parent / "file" / "capture")
+
+
+def test_an_empty_folder_may_be_the_output(folder: Path, check: Import) -> None:
+    check.output.mkdir()
+    check(write_project(folder), make_rig())
+
+
+def test_a_camera_without_a_video_is_left_out(folder: Path, check: Import) -> None:
+    write_project(folder)
+    (folder / "videos-raw" / "cam4.mp4").unlink()
+    check(folder, Rig(make_rig().cameras[:3])).note("no video of cam4: left out")
+
+
+def test_names_that_files_cannot_have(folder: Path, check: Import) -> None:
+    rig = renamed(make_rig(), "a/b", "a b", "metadata", "ok")
+    write_toml(folder / "calibration.toml", {f"cam{k}": table for k, table in enumerate(tables(rig).values())})
+    write_clips(folder / "videos-raw", ["cam0", "cam1", "cam2", "cam3"])
+    checked = check(folder, rig)
+    assert checked.capture.rig.names == ("a_b", "a_b_", "metadata_", "ok")
+    checked.note("camera 'a/b' is called a_b in the capture")
+
+
+def test_videos_in_a_format_that_is_not_read(folder: Path, check: Import) -> None:
+    write_qca(folder / "session.qca.txt", make_rig())
+    for name in CAMS:
+        (folder / f"{name}.mts").write_bytes(b"\x47")
+    with pytest.raises(VideoError, match=r"cam1.mts, cam2.mts, .* tk reads .mp4, .avi, .mov, .mkv; convert them"):
+        import_project(folder, check.output)
+
+
+def test_two_videos_of_one_name(folder: Path, check: Import) -> None:
+    write_project(folder)
+    write_clips(folder / "videos-raw", ["cam1"], suffix=".avi")
+    with pytest.raises(VideoError, match=r"holds both cam1.avi and cam1.mp4; keep one of them"):
+        import_project(folder, check.output)
+
+
+def test_cameras_that_look_past_each_other_get_no_volume(folder: Path, check: Import) -> None:
+    """Parallel cameras: the capture is written, its volume is for the user to give."""
+    document = tables(make_rig())
+    for index, table in enumerate(document.values()):
+        table |= {"rotation": [-np.pi / 2, 0.0, 0.0], "translation": [float(index), 0.0, 0.0]}
+    write_toml(folder / "calibration.toml", document)
+    write_clips(folder / "videos", CAMS)
+    imported = import_project(folder, check.output)
+    assert any("no [volume] could be inferred: the cameras' axes are parallel; give one" in n for n in imported.notes)
+    assert "\n# [volume]\n" in (check.output / "capture.toml").read_text()

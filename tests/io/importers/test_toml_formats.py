@@ -1,0 +1,252 @@
+"""Pose2Sim, FreeMoCap, Caliscope and Anipose: the same tables, told apart by their folders."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.io.conftest import write_picture, write_toml
+from tests.io.importers.conftest import (
+    FRAMES,
+    HEIGHT,
+    WIDTH,
+    Import,
+    make_rig,
+    points,
+    renamed,
+    rodrigues,
+    tables,
+    write_clips,
+)
+from tests.io.importers.test_xml_formats import write_qca
+from tk.errors import CalibrationError, VideoError
+from tk.io.capture import open_capture
+from tk.io.importers import import_project
+from tk.model.camera import Rig
+from tk.model.up import up_vector
+
+CAMS = ["cam1", "cam2", "cam3", "cam4"]
+
+
+def write_pose2sim(session: Path) -> Rig:
+    """As Pose2Sim writes it: sizes as floats, four distortions, names of the intrinsic calibration's folders."""
+    rig = make_rig()
+    named = renamed(rig, *(f"int_cam{k:02d}_img" for k in range(1, 5)))
+    document = tables(named)
+    for table in document.values():
+        table["size"] = [float(WIDTH), float(HEIGHT)]
+        table["distortions"] = table["distortions"][:4]  # type: ignore[index]
+        table["fisheye"] = False
+    (session / "calibration").mkdir()
+    write_toml(
+        session / "calibration" / "Calib_scene.toml", {**document, "metadata": {"adjusted": False, "error": 0.0}}
+    )
+    return rig
+
+
+def test_pose2sim(folder: Path, check: Import) -> None:
+    rig = write_pose2sim(folder)
+    (folder / "calibration" / "intrinsics" / "int_cam01_img").mkdir(parents=True)
+    write_picture(folder / "calibration/intrinsics/int_cam01_img/board_01.png", np.zeros((9, 9, 3), np.uint8))
+    write_clips(folder / "videos", ["cam01", "cam02", "cam03", "cam04"])
+    checked = check(folder, rig)
+    assert checked.capture.rig.names[0] == "int_cam01_img"
+    assert checked.capture.up == "z"
+    checked.note("Calib_scene.toml", "lengths are in m")
+    checked.note('up = "z"', "the axis")
+    checked.note("hard links")
+    text = (checked.imported.path / "capture.toml").read_text()
+    assert "# imported from Pose2Sim, Calib_scene.toml" in text
+    assert "\n# up: the axis" in text and "[volume]" in text
+
+
+def test_pose2sim_matches_in_order_where_names_do_not_tell(folder: Path, check: Import) -> None:
+    rig = write_pose2sim(folder)
+    write_clips(folder / "raw-2d", ["back", "front", "left", "right"])
+    note = check(folder, rig).note("matched in their order")
+    assert "int_cam01_img ↔ back.mp4" in note and "int_cam04_img ↔ right.mp4" in note
+
+
+def test_a_trial_finds_the_calibration_of_its_session(folder: Path, check: Import) -> None:
+    rig = write_pose2sim(folder)
+    for trial in ("walk", "run"):
+        write_clips(folder / trial / "videos", ["cam01", "cam02", "cam03", "cam04"])
+    with pytest.raises(VideoError, match=r"several recordings, in run/videos, walk/videos; choose one with --trial"):
+        import_project(folder, check.output)
+    check(folder, rig, trial="walk")
+    check.output = check.output.with_name("from_the_trial")
+    check(folder / "run", rig)
+
+
+def test_pose2sim_with_the_file_of_qualisys(folder: Path, check: Import) -> None:
+    (folder / "calibration").mkdir()
+    rig = make_rig()
+    write_qca(folder / "calibration" / "Calib.qca.txt", rig)
+    write_clips(folder / "videos", CAMS)
+    assert "# imported from Pose2Sim" in (check(folder, rig).imported.path / "capture.toml").read_text()
+
+
+def test_freemocap_without_a_board_on_the_floor(folder: Path, check: Import) -> None:
+    """The world is camera 0's frame, lengths are millimetres, nobody says so."""
+    rig = make_rig()
+    first = rig[0]
+    turned = [
+        replace(
+            camera,
+            rotation=camera.rotation @ first.rotation.T,
+            translation=camera.translation - camera.rotation @ first.rotation.T @ first.translation,
+        )
+        for camera in rig
+    ]
+    own = Rig(tuple(turned))
+    document = tables(renamed(own, *(f"cam_{k}" for k in range(4))), unit_m=0.001)
+    metadata = {"adjusted": False, "charuco_square_size": 54.0, "path_to_recorded_videos": "x"}
+    write_toml(folder / "project_camera_calibration.toml", {**document, "metadata": metadata})
+    write_clips(folder / "synchronized_videos", [f"Camera_{k:03d}_synchronized" for k in range(4)])
+
+    imported = import_project(folder, check.output)
+    check.output = check.output.with_name("again")
+    p_camera = points() @ first.rotation.T + first.translation
+    checked = import_project(folder, check.output)
+    assert imported.notes[0] == checked.notes[0] and "lengths are in mm, as mm is usual there" in imported.notes[0]
+    capture = open_capture(check.output)
+    for camera, true in zip(capture.rig, own, strict=True):
+        np.testing.assert_allclose(camera.project(p_camera)[0], true.project(p_camera)[0], atol=0.01)
+    # up is the true one, tilted in the camera's frame: not snapped to an axis
+    expected = first.rotation @ [0.0, 0.0, 1.0]
+    np.testing.assert_allclose(up_vector(capture.up), expected, atol=1e-4)
+    assert any("the frame of camera cam_0" in note for note in imported.notes)
+
+
+def test_caliscope_old_layout(folder: Path, check: Import) -> None:
+    """config.toml with [cam_N], 3×3 rotations, and cameras that are switched off or not placed yet."""
+    rig = make_rig()
+    document: dict[str, object] = {"CreationDate": "2023-05-06", "fps_recording": 24}
+    for index, camera in enumerate(rig):
+        document[f"cam_{index}"] = {
+            "port": index,
+            "size": [WIDTH, HEIGHT],
+            "rotation_count": 0,
+            "matrix": camera.matrix.tolist(),
+            "distortions": camera.distortions.tolist(),
+            "translation": camera.translation.tolist(),
+            "rotation": camera.rotation.tolist(),
+            "ignore": False,
+        }
+    assert isinstance(document["cam_0"], dict)
+    unplaced = {key: value for key, value in document["cam_0"].items() if key not in ("rotation", "translation")}
+    document["cam_4"] = {**unplaced, "rotation": "null", "translation": "null"}
+    document["cam_5"] = {**document["cam_0"], "ignore": True}
+    document["charuco"] = {"columns": 4, "rows": 5}
+    document["capture_volume"] = {"stage": 2}
+    write_toml(folder / "config.toml", document)
+    write_clips(folder / "recordings" / "walk", [f"port_{k}" for k in range(6)])
+    write_clips(folder / "calibration" / "extrinsic", [f"port_{k}" for k in range(6)])
+    checked = check(folder, rig)
+    checked.note("'cam_4' has no rotation and no translation: left out")
+    checked.note("'cam_5' is switched off there: left out")
+    checked.note("belongs to no camera: port_4, port_5")
+
+
+def test_caliscope_new_layout(folder: Path, check: Import) -> None:
+    rig = make_rig()
+    cameras = {
+        str(index): {
+            "cam_id": index,
+            "size": [WIDTH, HEIGHT],
+            "matrix": camera.matrix.tolist(),
+            "distortions": camera.distortions.tolist(),
+            "translation": camera.translation.tolist(),
+            "rotation": rodrigues(camera),
+        }
+        for index, camera in enumerate(rig)
+    }
+    write_toml(folder / "camera_array.toml", {"cameras": cameras})
+    for take in ("first", "second"):
+        write_clips(folder / "recordings" / take, [f"cam_{k}" for k in range(4)])
+    assert check(folder, rig, trial="second").capture.rig.names == ("0", "1", "2", "3")
+
+
+@pytest.mark.parametrize("metadata", [{}, {"units": "mm"}])
+def test_anipose_in_millimetres(folder: Path, check: Import, metadata: dict[str, str]) -> None:
+    rig = renamed(make_rig(), "A", "B", "C", "D")
+    (folder / "calibration").mkdir()
+    document = {f"cam_{k}": table for k, table in enumerate(tables(rig, unit_m=0.001).values())}
+    write_toml(folder / "calibration" / "calibration.toml", {**document, "metadata": metadata})
+    write_clips(folder / "videos-raw", [f"trial1-cam{letter}" for letter in "ABCD"], suffix=".avi")
+    checked = check(folder, rig)
+    checked.note("lengths are in mm, as the file says" if metadata else "lengths are taken for mm")
+
+
+def test_units_of_the_command_line_come_first(folder: Path, check: Import) -> None:
+    rig = make_rig()
+    write_toml(folder / "calibration.toml", {**tables(rig, unit_m=0.01), "metadata": {"units": "m"}})
+    write_clips(folder, CAMS)
+    check(folder, rig, unit="cm").note("lengths are in cm, as --units says")
+
+
+def test_masks_and_background_come_along(folder: Path, check: Import) -> None:
+    rig = make_rig()
+    write_toml(folder / "calibration.toml", tables(rig))
+    write_clips(folder / "videos-raw", CAMS)
+    for name in CAMS:
+        write_picture(folder / "background" / f"{name}.png", np.full((HEIGHT, WIDTH, 3), 7, np.uint8))
+        for k in range(FRAMES):
+            write_picture(folder / "masks" / name / f"{k:06d}.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    capture = check(folder, rig).capture
+    assert capture.has_masks
+    background = capture.background()
+    assert background is not None and all((picture == 7).all() for picture in background)
+
+    (folder / "background" / "cam3.png").unlink()
+    for mask in (folder / "masks").iterdir():
+        mask.rename(mask.with_name(f"{mask.name} of someone"))
+    (folder / "masks" / "cam1 of someone").rename(folder / "masks" / "x")
+    (folder / "masks" / "cam2 of someone").rename(folder / "masks" / "y")
+    (folder / "masks" / "cam3 of someone").rename(folder / "masks" / "z")
+    check.output = check.output.with_name("again")
+    checked = check(folder, rig)
+    assert not checked.capture.has_masks and checked.capture.background() is None
+    checked.note("background: has nothing of cam3: all of it is left out")
+    checked.note("masks: cannot tell which video belongs to which camera", "masks/ is left out")
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"matrix": [[1.0, 0.0], [0.0, 1.0]]}, "camera 'cam2': matrix must be 3×3 numbers"),
+        ({"rotation": [0.1, float("nan"), 0.0]}, "camera 'cam2': rotation holds nan"),
+        ({"distortions": [0.0] * 8}, "camera 'cam2': distortions must be 4 or 5 numbers, and is 8"),
+        ({"size": [0, 1]}, "camera 'cam2': size = [0, 1]"),
+    ],
+)
+def test_damaged_tables(folder: Path, check: Import, change: dict[str, object], complaint: str) -> None:
+    document = tables(make_rig())
+    document["cam2"] |= change
+    write_toml(folder / "camera_array.toml", {"cameras": document})
+    write_clips(folder / "recordings" / "a", CAMS)
+    with pytest.raises(CalibrationError) as caught:
+        import_project(folder, check.output)
+    text = str(caught.value)
+    assert complaint in text and str(folder / "camera_array.toml") in text and "\n" not in text
+    assert not check.output.exists()
+
+
+def test_too_few_cameras_have_a_pose(folder: Path, check: Import) -> None:
+    document = tables(make_rig())
+    for name in CAMS[1:]:
+        document[name] |= {"rotation": "null"}
+    write_toml(folder / "calibration.toml", document)
+    write_clips(folder, CAMS)
+    with pytest.raises(CalibrationError, match=r"1 camera with a pose, .*'cam2' has no rotation: left out"):
+        import_project(folder, check.output)
+
+
+def test_two_calibrations(folder: Path, check: Import) -> None:
+    write_pose2sim(folder)
+    (folder / "calibration" / "Calib_old.toml").write_text("")
+    with pytest.raises(CalibrationError, match=r"several calibrations: Calib_old.toml, Calib_scene.toml"):
+        import_project(folder, check.output)

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from tests.io.importers.conftest import make_rig, points
+from tk.io.importers.world import find_volume, infer_up
+from tk.model.camera import Rig
+from tk.model.up import UP_AXES, up_vector
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def rolled(rig: Rig, degrees: float, seed: int = 1) -> Rig:
+    """Each camera turned about its optical axis by up to so much."""
+    rng = np.random.default_rng(seed)
+    cameras = []
+    for camera in rig:
+        roll = Rotation.from_euler("z", rng.uniform(-degrees, degrees), degrees=True).as_matrix()
+        cameras.append(replace(camera, rotation=roll @ camera.rotation, translation=roll @ camera.translation))
+    return Rig(tuple(cameras))
+
+
+@pytest.mark.parametrize("name", UP_AXES)
+def test_worlds_along_an_axis(name: str) -> None:
+    turn = Rotation.align_vectors([up_vector(name)], [[0.0, 0.0, 1.0]])[0].as_matrix()
+    assert infer_up(make_rig(world=turn)).up == name
+    found = infer_up(rolled(make_rig(world=turn), 10.0))
+    assert found.up == name and "the axis" in found.how
+
+
+@given(seed=seeds)
+@settings(max_examples=30, deadline=None)
+def test_any_other_world(seed: int) -> None:
+    turn = Rotation.random(random_state=seed).as_matrix()
+    found = infer_up(make_rig(world=turn))
+    off = np.degrees(np.arccos(np.clip(up_vector(found.up) @ turn[:, 2], -1, 1)))
+    # exact, unless the true direction is close to an axis and taken for it
+    assert off < 1e-3 or (found.up in UP_AXES and off <= 10.0)
+
+
+def test_a_camera_overhead_does_not_tilt_it() -> None:
+    """Its upward direction is horizontal; its rightward one is, too."""
+    turn = Rotation.from_euler("xyz", [0.5, -0.4, 0.2]).as_matrix()
+    rig = make_rig(world=turn)
+    down = np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, -1.0]]) @ turn.T
+    overhead = replace(rig[0], name="top", rotation=down, translation=-down @ turn @ np.array([0.1, 0.0, 4.0]))
+    found = infer_up(Rig((*rig.cameras, overhead)))
+    np.testing.assert_allclose(up_vector(found.up), turn[:, 2], atol=1e-6)
+
+
+def test_cameras_side_by_side_fall_back_on_the_mean() -> None:
+    rig = make_rig()
+    twins = Rig(tuple(replace(rig[0], name=str(k)) for k in range(3)))
+    found = infer_up(twins)
+    np.testing.assert_allclose(up_vector(found.up), -rig[0].rotation[1], atol=1e-12)
+    assert "the mean" in found.how
+
+
+def test_cameras_that_are_mounted_every_way() -> None:
+    rig = make_rig()
+    half = Rotation.from_euler("z", 180, degrees=True).as_matrix()
+    two = [replace(c, rotation=half @ c.rotation, translation=half @ c.translation) for c in rig.cameras[:2]]
+    assert "make sure of it" in infer_up(Rig((*two, *rig.cameras[2:]))).how
+    assert "z is a guess" in infer_up(Rig((rig[0], replace(two[0], name="upside down")))).how
+
+
+def test_the_volume_holds_the_person() -> None:
+    volume, how = find_volume(make_rig())
+    assert volume is not None and "all cameras see" in how
+    assert (points() > volume.lower).all() and (points() < volume.upper).all()
+
+
+def test_one_camera_that_looks_elsewhere_does_not_matter() -> None:
+    rig = make_rig()
+    aside = Rotation.from_euler("y", 75, degrees=True).as_matrix()
+    astray = replace(rig[3], name="astray", rotation=aside @ rig[3].rotation, translation=aside @ rig[3].translation)
+    volume, how = find_volume(Rig((*rig.cameras, astray)))
+    assert volume is not None and "4 of the 5 cameras see" in how
+    assert (points().mean(axis=0) > volume.lower).all() and (points().mean(axis=0) < volume.upper).all()
+
+
+def test_cameras_that_look_outwards() -> None:
+    outwards = [
+        replace(c, rotation=c.rotation * [[-1], [1], [-1]], translation=c.translation * [-1, 1, -1]) for c in make_rig()
+    ]
+    volume, how = find_volume(Rig(tuple(outwards)))
+    assert volume is None and "cam1, cam2, cam3, cam4 look away" in how

@@ -1,0 +1,176 @@
+"""Qualisys and Vicon."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.io.importers.conftest import HEIGHT, WIDTH, Import, make_rig, points, renamed, write_clips
+from tk.errors import CalibrationError, VideoError
+from tk.io.capture import open_capture
+from tk.io.importers import import_project
+from tk.model.camera import Camera, Rig
+
+SERIALS = ["26578", "26579", "26580", "26581"]
+
+#: what the part of the sensor that a video shows leaves out, pixels
+LEFT, TOP = 40, 24
+
+
+def write_qca(path: Path, rig: Rig, models: tuple[str, ...] = ("Miqus Video",) * 4) -> None:
+    """As QTM writes it: 64ths of a pixel of the whole sensor, millimetres, a frame with y up and z backwards."""
+    cameras = []
+    for camera, model in zip(rig, models, strict=True):
+        R = np.diag([1.0, -1.0, -1.0]) @ camera.rotation
+        x, y, z = 1000 * camera.center
+        r = " ".join(f'r{i + 1}{j + 1}="{R[i, j]:.9f}"' for i in range(3) for j in range(3))
+        K, d = camera.matrix, camera.distortions
+        cameras.append(
+            f'<camera active="1" serial="{camera.name}" model="{model}" viewrotation="0">\n'
+            f'<fov_video left="{LEFT}" top="{TOP}" right="{LEFT + WIDTH - 1}" bottom="{TOP + HEIGHT - 1}"/>\n'
+            f'<transform x="{x:.6f}" y="{y:.6f}" z="{z:.6f}" {r}/>\n'
+            f'<intrinsic focalLengthU="{64 * K[0, 0]}" focalLengthV="{64 * K[1, 1]}" skew="0.000000" '
+            f'centerPointU="{64 * (K[0, 2] + LEFT)}" centerPointV="{64 * (K[1, 2] + TOP)}" '
+            f'radialDistortion1="{d[0]}" radialDistortion2="{d[1]}" radialDistortion3="{d[4]}" '
+            f'tangentalDistortion1="{d[2]}" tangentalDistortion2="{d[3]}"/></camera>'
+        )
+    text = "<?xml version='1.0' encoding='ASCII'?>\n<calibration type=\"regular\"><cameras>\n"
+    path.write_text(text + "\n".join(cameras) + "\n</cameras></calibration>\n")
+
+
+def write_xcp(path: Path, rig: Rig, radial: tuple[float, float] = (0.0, 0.0), markers: int = 1) -> None:
+    """As Nexus writes it: millimetres, quaternions with the real part last, a distortion in pixels that undistorts."""
+    cameras = []
+    for camera in rig:
+        quaternion = " ".join(map(repr, Rotation.from_matrix(camera.rotation).as_quat().tolist()))
+        position = " ".join(map(repr, (1000 * camera.center).tolist()))
+        K = camera.matrix
+        cameras.append(
+            f'<Camera DEVICEID="{camera.name}" TYPE="Vicon.VideoCamera" DISPLAY_TYPE="Vue" NAME="" '
+            f'SENSOR_SIZE="{camera.width} {camera.height}" PIXEL_ASPECT_RATIO="{float(K[0, 0] / K[1, 1])!r}">'
+            f'<KeyFrames><KeyFrame FRAME="0" FOCAL_LENGTH="{K[0, 0]}" PRINCIPAL_POINT="{K[0, 2]} {K[1, 2]}" '
+            f'POSITION="{position}" ORIENTATION="{quaternion}" '
+            f'VICON_RADIAL2="ViconRadial2 {K[0, 2]} {K[1, 2]} {radial[0]!r} {radial[1]!r} 0"/></KeyFrames></Camera>'
+        )
+    for index in range(markers):
+        cameras.append(f'<Camera DEVICEID="{index}" TYPE="DxCore160" DISPLAY_TYPE="T160"><KeyFrames/></Camera>')
+    path.write_text('<?xml version="1.0" encoding="UTF-8"?>\n<Cameras>\n' + "\n".join(cameras) + "\n</Cameras>\n")
+
+
+def test_qualisys(folder: Path, check: Import) -> None:
+    rig = renamed(make_rig(), *SERIALS)
+    write_qca(folder / "session.qca.txt", rig)
+    write_clips(folder, [f"walk_Miqus_{k}_{serial}" for k, serial in enumerate(SERIALS, 3)], suffix=".avi")
+    checked = check(folder, rig)
+    checked.note("lengths are in mm, as always in this format")
+    assert checked.capture.up == "z"
+
+
+def test_qualisys_marker_cameras_make_no_videos(folder: Path, check: Import) -> None:
+    rig = renamed(make_rig(), *SERIALS)
+    write_qca(folder / "session.qca.txt", rig, ("Miqus Video", "Oqus 300+", "Miqus Video", "Miqus Video"))
+    write_clips(folder, [SERIALS[0], SERIALS[2], SERIALS[3]])
+    checked = check(folder, Rig((rig[0], rig[2], rig[3])))
+    checked.note("1 of its 4 cameras make no videos: left out")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("<cameras>", "<cameras", "invalid XML"),
+        ("<calibration", "<!DOCTYPE x [<!ENTITY a 'b'>]><calibration", "declares a document type"),
+        ("<transform ", "<transformed ", "camera '26578': has no <transform>"),
+        ('skew="0.000000"', 'centerPointU="1"', "invalid XML: duplicate attribute"),
+        ("focalLengthU=", "focalLengthW=", "camera '26578': <intrinsic>: focalLengthU is missing"),
+        ('r11="', 'r11="nan', "camera '26578': <transform>: r11 = 'nan"),
+        ('r12="', 'r12="7', "camera '26578': the rotation is no rotation matrix"),
+        ("<camera ", "<kamera ", "invalid XML"),
+        ('active="1"', 'active="0"', "0 active video camera; a capture needs at least 2"),
+    ],
+)
+def test_damaged_qualisys(folder: Path, check: Import, old: str, new: str, complaint: str) -> None:
+    path = folder / "session.qca.txt"
+    write_qca(path, renamed(make_rig(), *SERIALS))
+    path.write_text(path.read_text().replace(old, new))
+    write_clips(folder, SERIALS)
+    with pytest.raises(CalibrationError) as caught:
+        import_project(folder, check.output)
+    assert complaint in str(caught.value) and str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_vicon(folder: Path, check: Import) -> None:
+    rig = renamed(make_rig(distorted=False), *SERIALS)
+    write_xcp(folder / "session.xcp", rig)
+    write_clips(folder, [f"Walk01.{serial}.20190301120000" for serial in SERIALS], suffix=".avi")
+    checked = check(folder, rig)
+    checked.note("1 of its 5 cameras make no videos: left out")
+    checked.note("lengths are in mm, as always in this format")
+
+
+def test_vicon_distortion_undoes_opencvs(folder: Path, check: Import) -> None:
+    """A pixel that Vicon's model corrects to the ideal projection is the pixel that our camera projects to."""
+    rig = renamed(make_rig(distorted=False), *SERIALS)
+    k1, k2 = 6e-7, 4e-13
+    write_xcp(folder / "session.xcp", rig, (k1, k2))
+    write_clips(folder, SERIALS)
+    import_project(folder, check.output)
+    moved = []
+    for camera, ideal in zip(open_capture(check.output).rig, rig, strict=True):
+        pixels, expected = camera.project(points())[0], ideal.project(points())[0]
+        principal, aspect = ideal.matrix[:2, 2], np.array([1.0, ideal.matrix[0, 0] / ideal.matrix[1, 1]])
+        offset = (pixels - principal) * aspect
+        r2 = (offset**2).sum(axis=1, keepdims=True)
+        corrected = principal + (1 + k1 * r2 + k2 * r2**2) * offset / aspect
+        np.testing.assert_allclose(corrected, expected, atol=0.01)
+        moved.append(np.abs(pixels - expected).max())
+    assert max(moved) > 0.2  # there was something to undo
+
+
+def test_vicon_with_several_trials_in_one_folder(folder: Path, check: Import) -> None:
+    rig = renamed(make_rig(distorted=False), *SERIALS)
+    write_xcp(folder / "session.xcp", rig)
+    for trial in ("Walk01", "Walk02"):
+        write_clips(folder, [f"{trial}.{serial}" for serial in SERIALS], suffix=".avi")
+    with pytest.raises(VideoError, match=r"cannot tell which video belongs .* choose a recording with --trial NAME"):
+        import_project(folder, check.output)
+    check(folder, rig, trial="Walk02")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("ORIENTATION=", "ORIENTED=", "camera '26578': <KeyFrame>: ORIENTATION is missing"),
+        ('POSITION="', 'POSITION="x ', "camera '26578': <KeyFrame>: POSITION = 'x "),
+        ('SENSOR_SIZE="320 240"', 'SENSOR_SIZE="320"', "camera '26578': SENSOR_SIZE = '320' must be 2 finite numbers"),
+        ('FOCAL_LENGTH="', 'FOCAL_LENGTH="-', "must be positive"),
+        ("KeyFrames>", "Frames>", "0 calibrated video camera; a capture needs at least 2"),
+        ("ViconRadial2 ", "ViconRadial2 0 0 -1 0 0 ", "the distortion folds back within the picture"),
+    ],
+)
+def test_damaged_vicon(folder: Path, check: Import, old: str, new: str, complaint: str) -> None:
+    path = folder / "session.xcp"
+    write_xcp(path, renamed(make_rig(distorted=False), *SERIALS))
+    path.write_text(path.read_text().replace(old, new))
+    write_clips(folder, SERIALS)
+    with pytest.raises(CalibrationError) as caught:
+        import_project(folder, check.output)
+    assert complaint in str(caught.value) and str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_camera_turned_by_half(folder: Path, check: Import) -> None:
+    """QTM's viewrotation is told: whether the exported video is turned, the file does not say."""
+    rig = renamed(make_rig(), *SERIALS)
+    path = folder / "session.qca.txt"
+    write_qca(path, rig)
+    path.write_text(path.read_text().replace('viewrotation="0"', 'viewrotation="180"', 1))
+    write_clips(folder, SERIALS)
+    check(folder, rig).note("QTM shows 26578 turned (viewrotation)")
+
+
+def test_the_first_test_rig_is_seen_by_all() -> None:
+    """What the other tests rest on: the points are in all pictures."""
+    cameras: tuple[Camera, ...] = make_rig().cameras
+    assert all(camera.sees(points()).all() for camera in cameras)

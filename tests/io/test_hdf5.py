@@ -1,0 +1,307 @@
+"""Files that are damaged, or made to do harm: read, or one line that names them. No traceback, no hang."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.io.result_victim import META, make_frame, make_state
+from tests.io.test_result import make_cameras, make_smoothed, write_truth
+from tk.errors import ResultError, TkError
+from tk.evaluation import evaluate_files
+from tk.io.hdf5 import DEEPEST, open_hdf5
+from tk.io.result import ResultWriter, read_joints, read_result, revise_result
+from tk.model.skeleton import JOINTS
+
+COUNT = 6
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`result.h5` with everything that a result can have, `truth.h5` beside it."""
+    folder = tmp_path_factory.mktemp("hdf5")
+    with ResultWriter.create(folder / "result.h5", META) as writer:
+        writer.write_model({"torso/radii_m": np.arange(4.0), "height_m": 1.78, "sex": "any", "count": 3})
+        writer.write_cameras(make_cameras())
+        for index in range(COUNT):
+            writer.append(make_frame(index), make_state(index))
+    revise_result(folder / "result.h5", smoothed=make_smoothed(COUNT))
+    write_truth(folder / "truth.h5", list(range(3, 3 + COUNT)))
+    return folder
+
+
+@pytest.fixture
+def result(folder: Path, tmp_path: Path) -> Path:
+    """A result, to be spoilt."""
+    return Path(shutil.copy(folder / "result.h5", tmp_path))
+
+
+@pytest.fixture
+def truth(folder: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(folder / "truth.h5", tmp_path))
+
+
+def read_in_every_way(path: Path, folder: Path) -> list[str]:
+    """Read a file as everything that tk reads; returns the complaints, each of one line that names the file."""
+    complaints = []
+
+    def resume() -> None:
+        writer, done = ResultWriter.resume(path, META)
+        with writer:
+            writer.append(make_frame(done), make_state(done))
+
+    ways: list[Callable[[], object]] = [
+        lambda: read_result(path),
+        lambda: evaluate_files(path, folder / "truth.h5"),
+        lambda: evaluate_files(folder / "result.h5", path),
+        resume,
+    ]
+    for way in ways:
+        try:
+            way()
+        except TkError as error:
+            complaints.append(str(error))
+            assert path.name in str(error) and "\n" not in str(error)
+    return complaints
+
+
+# --- any damage -------------------------------------------------------------------------------------------------------
+
+# where in the file, as a share, and what is put there
+patches = st.lists(
+    st.tuples(
+        st.floats(0, 1, exclude_max=True),
+        st.one_of(
+            st.binary(min_size=1, max_size=8),
+            st.sampled_from([b"\x00" * 8, b"\xff" * 8, b"\xff" * 64, b"\x00" * 512, (2**40).to_bytes(8, "little")]),
+        ),
+    ),
+    min_size=0,
+    max_size=4,
+)
+flips = st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 7)), max_size=8)
+
+
+def near_structure(data: bytes, share: float) -> int:
+    """A place in the file; every second one of them where HDF5 keeps its own: what follows a signature."""
+    at = int(share * len(data))
+    if int(share * 1e6) % 2:
+        return at
+    found = [data.find(mark, at) for mark in (b"TREE", b"SNOD", b"HEAP", b"GCOL")]
+    return min([place + int(share * 1e9) % 96 for place in found if place >= 0] or [at]) % len(data)
+
+
+# the same examples each time: a new one may find a new way to hang HDF5 itself, which is a task, not a broken build
+@settings(
+    max_examples=120, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    name=st.sampled_from(["result.h5", "truth.h5"]),
+    patched=patches,
+    flipped=flips,
+    kept=st.one_of(st.just(1.0), st.just(1.0), st.floats(0, 1)),
+)
+def test_whatever_the_damage(
+    folder: Path,
+    tmp_path: Path,
+    name: str,
+    patched: list[tuple[float, bytes]],
+    flipped: list[tuple[float, int]],
+    kept: float,
+) -> None:
+    whole = (folder / name).read_bytes()
+    data = bytearray(whole)
+    for share, patch in patched:
+        at = near_structure(whole, share)
+        data[at : at + len(patch)] = patch[: len(data) - at]
+    for share, bit in flipped:
+        data[near_structure(whole, share)] ^= 1 << bit
+    path = tmp_path / "damaged.h5"
+    path.write_bytes(data[: int(kept * len(data))])
+    read_in_every_way(path, folder)
+
+
+DATASETS = [
+    "frames", "pose", "joints/position", "joints/sigma", "status", "timing/total", "angles/hip_l", "cameras/size",
+    "smoothed/bridged", "hull/offsets", "hull/positions", "model/height_m", "resume/rows", "resume/state/mean",
+]  # fmt: skip
+VALUES = [
+    np.float64(1e300), np.full((COUNT, 24), np.inf), np.full(COUNT, -1), np.full((COUNT, 15, 3), 1e300), "text",
+    np.arange(COUNT, dtype=np.uint64) + 2**63, np.full(COUNT, 2.5), np.zeros(COUNT, dtype=[("a", "f8"), ("b", "i4")]),
+    np.zeros((0, 3)), np.array([True] * COUNT), np.full((COUNT, 15), -1.0), np.zeros(COUNT, complex),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DATASETS)
+def test_whatever_the_type(result: Path, folder: Path, name: str) -> None:
+    good = result.read_bytes()
+    for value in VALUES:
+        result.write_bytes(good)
+        with h5py.File(result, "r+") as file:
+            del file[name]
+            file[name] = value
+        read_in_every_way(result, folder)
+    result.write_bytes(good)
+    with h5py.File(result, "r+") as file:
+        del file[name]
+        file.create_group(name)
+    read_in_every_way(result, folder)
+
+
+@pytest.mark.parametrize("holder", ["/", "pose", "joints/position", "timing", "angles", "cameras", "iterations"])
+def test_whatever_the_attributes(result: Path, folder: Path, holder: str) -> None:
+    good = result.read_bytes()
+    with h5py.File(result) as file:
+        names = list(file[holder].attrs)
+    values = [
+        np.nan, "two\nlines\x1b", np.bytes_(b"caf\xe9"), ["a", "b"], np.zeros((2, 2)), h5py.Empty("f8"),
+    ]  # fmt: skip
+    for name in names:
+        for value in values:
+            result.write_bytes(good)
+            with h5py.File(result, "r+") as file:
+                file[holder].attrs[name] = value
+            read_in_every_way(result, folder)
+        result.write_bytes(good)
+        with h5py.File(result, "r+") as file:
+            del file[holder].attrs[name]
+        read_in_every_way(result, folder)
+
+
+# --- what is made to do harm ------------------------------------------------------------------------------------------
+
+
+def soft_link(file: h5py.File, folder: Path) -> None:
+    file["joints/position"] = h5py.SoftLink("/nowhere")
+
+
+def ring_of_links(file: h5py.File, folder: Path) -> None:
+    file["joints/position"] = h5py.SoftLink("/joints/position")
+
+
+def external_link(file: h5py.File, folder: Path) -> None:
+    file["joints/position"] = h5py.ExternalLink(str(folder / "truth.h5"), "joints/position")
+
+
+def external_storage(file: h5py.File, folder: Path) -> None:
+    file.create_dataset("joints/position", (COUNT, 15, 3), "f8", external=[("/etc/passwd", 0, h5py.h5f.UNLIMITED)])
+
+
+def virtual(file: h5py.File, folder: Path) -> None:
+    layout = h5py.VirtualLayout((COUNT, 15, 3), "f8")
+    layout[:] = h5py.VirtualSource(str(folder / "truth.h5"), "joints/position", (COUNT, 15, 3))
+    file.create_virtual_dataset("joints/position", layout)
+
+
+def huge(file: h5py.File, folder: Path) -> None:
+    file.create_dataset("joints/position", (10**12, 15, 3), "f8", chunks=(64, 15, 3))
+
+
+def huge_chunks(file: h5py.File, folder: Path) -> None:
+    file.create_dataset("joints/position", (COUNT, 15, 3), "f8", chunks=(10**7, 15, 3), maxshape=(None, 15, 3))
+
+
+def bomb(file: h5py.File, folder: Path) -> None:
+    file.create_dataset("joints/position", data=np.zeros((20_000, 15, 3)), chunks=(20_000, 15, 3), compression=9)
+
+
+def strange_filter(file: h5py.File, folder: Path) -> None:
+    file.create_dataset("joints/position", data=np.zeros((COUNT, 15, 3), "i4"), chunks=(COUNT, 15, 3), scaleoffset=0)
+
+
+def ring_of_groups(file: h5py.File, folder: Path) -> None:
+    file["joints/again"] = file["/"]
+
+
+def deep(file: h5py.File, folder: Path) -> None:
+    file.create_group("/".join(["deeper"] * (DEEPEST + 2)))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (soft_link, "link to elsewhere"),
+        (ring_of_links, "link to elsewhere"),
+        (external_link, "link to elsewhere"),
+        (external_storage, "lies in another file"),
+        (virtual, "lies in another file"),
+        (huge, "declares 360000000000000 bytes"),
+        (huge_chunks, "bytes, and 0 are stored"),
+        (bomb, "bytes, and .* are stored"),
+        (strange_filter, "compressed in a way"),
+        (ring_of_groups, "deep"),
+        (deep, "deep"),
+    ],
+)
+def test_nothing_is_followed_and_nothing_unfolds(
+    truth: Path, folder: Path, make: Callable[[h5py.File, Path], None], message: str
+) -> None:
+    with h5py.File(truth, "r+") as file:
+        if make not in (ring_of_groups, deep):
+            del file["joints/position"]
+        make(file, folder)
+    for read in (read_joints, read_result):
+        with pytest.raises(ResultError, match=rf"truth\.h5: .*{message}"):
+            read(truth)
+
+
+def test_what_is_compressed_honestly_is_read(truth: Path) -> None:
+    values = np.random.default_rng(0).normal(size=(COUNT, 15, 3))
+    with h5py.File(truth, "r+") as file:
+        del file["joints/position"]
+        file.create_dataset("joints/position", data=values, compression="gzip", shuffle=True, fletcher32=True)
+        file["joints/position"].attrs["names"] = list(JOINTS)
+    np.testing.assert_array_equal(read_joints(truth).positions, values)
+
+
+def test_whole_numbers_and_single_precision_will_do(truth: Path) -> None:
+    values = np.random.default_rng(0).integers(-2, 3, (COUNT, 15, 3))
+    for frames, dtype in ((np.arange(COUNT, dtype=np.float64), np.int32), (np.arange(COUNT, dtype="u1"), np.float32)):
+        with h5py.File(truth, "r+") as file:
+            for name in ("frames", "joints/position"):
+                del file[name]
+            file["frames"], file["joints/position"] = frames, values.astype(dtype)
+            file["joints/position"].attrs["names"] = list(JOINTS)
+        track = read_joints(truth)
+        assert (track.frames.dtype, track.positions.dtype) == (np.int64, np.float64)
+        np.testing.assert_array_equal(track.positions, values)
+
+
+def test_a_heap_of_texts_over_which_hdf5_would_hang(truth: Path) -> None:
+    data = bytearray(truth.read_bytes())
+    heap = data.index(b"GCOL")
+    data[heap + 16 : heap + 32] = bytes(16)  # free space of no size: HDF5 2.0.0 goes round in it for ever
+    truth.write_bytes(data)
+    with pytest.raises(ResultError, match="heap"):
+        read_joints(truth)
+
+
+def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe.h5"
+    os.mkfifo(pipe)
+    for path in (pipe, Path("/dev/zero")):
+        with pytest.raises(ResultError, match="is not a file"):
+            read_joints(path)
+    dangling = tmp_path / "link.h5"
+    dangling.symlink_to(tmp_path / "nowhere.h5")
+    with pytest.raises(ResultError, match="link to nowhere"):
+        read_joints(dangling)
+
+
+def test_the_look_over_tells_what_there_is(result: Path) -> None:
+    with open_hdf5(result) as file:
+        assert file.shapes["joints/position"] == (COUNT, 15, 3)
+        assert "model" in file and "model/height_m" in file and "nothing" not in file
+        assert file.below("model") == ["count", "height_m", "sex", "torso/radii_m"]
+        with pytest.raises(ResultError, match=r"/pose has shape 6×24; any×3 is expected"):
+            file.array("pose", "float64", (None, 3))
+        with pytest.raises(ResultError, match="out of range"):
+            file.array("pose", "float64", (COUNT, 24), most=1.0)

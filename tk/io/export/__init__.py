@@ -1,0 +1,95 @@
+"""Results in the formats of other programs. A format is a module that writes it and a line in :data:`FORMATS`."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tk.errors import ExportError
+from tk.io.export.bvh import write_bvh
+from tk.io.export.c3d import write_c3d
+from tk.io.export.csv import write_angles_csv, write_points_csv
+from tk.io.export.gltf import write_glb
+from tk.io.export.mot import write_mot
+from tk.io.export.motion import Motion, read_motion
+from tk.io.export.trc import write_trc
+
+__all__ = ["FORMATS", "Exported", "Motion", "export", "read_motion"]
+
+Writer = Callable[[Motion, Path], None]
+
+# A format's files: what is added to the result's name, and who writes it.
+FORMATS: dict[str, tuple[tuple[str, Writer], ...]] = {
+    "trc": ((".trc", write_trc),),
+    "mot": ((".mot", write_mot),),
+    "c3d": ((".c3d", write_c3d),),
+    "bvh": ((".bvh", write_bvh),),
+    "csv": ((".csv", write_points_csv), ("_angles.csv", write_angles_csv)),
+    "gltf": ((".glb", write_glb),),
+}
+# Formats that cannot say that a pose is not known.
+_HOLDING = ("bvh", "gltf")
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What :func:`export` has written, and what its user should know of it."""
+
+    files: tuple[Path, ...]
+    notes: tuple[str, ...]
+
+
+def export(
+    result: str | os.PathLike[str],
+    formats: Sequence[str],
+    folder: Path | None = None,
+    smoothed: bool = False,
+    force: bool = False,
+) -> Exported:
+    """Write a result in other formats; the files take its name.
+
+    Args:
+        formats: of :data:`FORMATS`.
+        folder: where to; beside the result by default. It is made if it does not exist.
+        smoothed: the smoothed copy; `_smoothed` is added to the files' names.
+        force: replace files that exist.
+
+    Raises:
+        ResultError: the result cannot be read, or holds nothing to export.
+        ExportError: an unknown format, a file that exists, a package that is missing, or a file that cannot be written.
+    """
+    unknown = [name for name in formats if name not in FORMATS]
+    if unknown or not formats:
+        raise ExportError(f"--to {','.join(formats)}: give some of {', '.join(FORMATS)}")
+    path = Path(result)
+    folder = path.parent if folder is None else folder
+    stem = path.stem + ("_smoothed" if smoothed else "")
+    jobs = [(folder / (stem + ending), write) for name in dict.fromkeys(formats) for ending, write in FORMATS[name]]
+    taken = [target for target, _ in jobs if target.exists()]
+    if taken and not force:
+        raise ExportError(f"{taken[0]}: exists; choose another folder with -o, or replace it with --force")
+    motion, notes = read_motion(path, smoothed)
+    lost = int((~motion.known).sum())
+    holding = [name for name in formats if name in _HOLDING]
+    if lost and holding:
+        notes = (*notes, f"{', '.join(holding)}: in {lost} lost frames the pose before is held")
+    for target, write in jobs:
+        _write(motion, target, write)
+    return Exported(tuple(target for target, _ in jobs), notes)
+
+
+def _write(motion: Motion, target: Path, write: Writer) -> None:
+    """Write beside the target and rename: a file that has its name is whole."""
+    part = target.with_name(f".{target.stem}.part{target.suffix}")  # ezc3d adds an ending that it misses
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write(motion, part)
+        os.replace(part, target)
+    except OSError as error:
+        raise ExportError(f"{target}: cannot be written: {error.strerror or error}") from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink()

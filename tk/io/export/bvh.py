@@ -1,0 +1,70 @@
+"""BVH, for Blender and other programs of animation.
+
+Axes, units and rest pose as in :mod:`tk.io.export.tree`: Y up, facing +Z, metres, a T pose with the fitted body's
+lengths. Rotations are Z, then X, then Y about moving axes, degrees. The root has channels for its place, and so have
+the shoulders, which rise with the arms; such a channel stands for the place in the parent and replaces the OFFSET.
+A frame that is not known holds the pose before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.io.export.motion import Motion
+from tk.io.export.tree import Tree, build_tree
+from tk.model.rotations import decompose, follow
+
+_PLACE = ("Xposition", "Yposition", "Zposition")
+_TURN = ("Zrotation", "Xrotation", "Yrotation")
+
+
+def write_bvh(motion: Motion, path: Path) -> None:
+    """Write the tree; a node's tip (head, hand, toe) is an End Site. Heels, a second tip of the foot, are left out."""
+    tree = build_tree(motion)
+    columns = []
+    for node in _in_order(tree, 0):
+        if tree.moving[node]:
+            columns.append(tree.translations[:, node])
+        columns.append(np.degrees(follow(decompose("zxy", tree.rotations[:, node]))))
+    lines = ["HIERARCHY", *_node(tree, 0, "")]
+    lines += ["MOTION", f"Frames: {len(motion)}", f"Frame Time: {1 / motion.fps:.8f}"]
+    lines += [_numbers(row) for row in np.concatenate(columns, axis=1)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _is_tip(tree: Tree, node: int) -> bool:
+    return not tree.segments[node]
+
+
+def _in_order(tree: Tree, node: int) -> Iterator[int]:
+    """The nodes with channels, as the hierarchy lists them."""
+    yield node
+    for child in tree.children(node):
+        if not _is_tip(tree, child):
+            yield from _in_order(tree, child)
+
+
+def _node(tree: Tree, node: int, indent: str) -> Iterator[str]:
+    """The hierarchy's lines from a node down."""
+    name, inner = tree.names[node], indent + "  "
+    if _is_tip(tree, node):
+        yield f"{indent}End Site"
+    else:
+        yield f"{indent}{'JOINT' if indent else 'ROOT'} {name}"
+    yield f"{indent}{{"
+    yield f"{inner}OFFSET " + _numbers(tree.offsets[node])
+    if not _is_tip(tree, node):
+        channels = (*(_PLACE if tree.moving[node] else ()), *_TURN)
+        yield f"{inner}CHANNELS {len(channels)} " + " ".join(channels)
+        for child in tree.children(node):
+            if not tree.names[child].startswith("heel"):
+                yield from _node(tree, child, inner)
+    yield f"{indent}}}"
+
+
+def _numbers(values: NDArray[np.float64]) -> str:
+    return " ".join(f"{value:.6f}" for value in np.round(values, 6) + 0.0)  # + 0.0: no -0

@@ -1,0 +1,172 @@
+"""glTF 2.0 in one file (.glb): the tree of nodes, its animation, and the body's pieces riding on the nodes.
+
+Axes, units and rest pose as in :mod:`tk.io.export.tree`, which are glTF's own. A frame that is not known holds the pose
+before; `asset.extras.lost_frames` of the file lists such frames.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk import __version__
+from tk.io.export.motion import Motion
+from tk.io.export.tree import Tree, build_tree, rest_axes
+from tk.model.angles import standing_axes
+from tk.model.body import build_pieces
+from tk.model.rotations import continuous, to_quaternions
+from tk.model.skeleton import JOINTS, SEGMENTS, WAIST_HEIGHT, build_skeleton
+from tk.model.superellipsoid import Superellipsoid
+
+Float = NDArray[np.float64]
+
+_FLOAT, _UINT16 = 5126, 5123  # componentType
+_VERTICES, _INDICES = 34962, 34963  # bufferView.target
+# Points along and around a piece.
+_ALONG, _AROUND = 11, 21
+# Left limbs warm, right limbs cool, trunk and head green, as in the overlays.
+_COLORS = {"_l": (0.85, 0.35, 0.15), "_r": (0.2, 0.4, 0.85), "": (0.3, 0.6, 0.3)}
+
+
+class _Buffer:
+    """The binary chunk, and the JSON that tells what lies in it."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+
+    def add(self, values: NDArray[Any], target: int | None = None, bounds: bool = False) -> int:
+        """Append an array (N,) or (N, k), float32 or uint16; the index of its accessor."""
+        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": values.nbytes}
+        self.views.append(view if target is None else view | {"target": target})
+        self.data += values.tobytes()
+        self.data += bytes(-len(self.data) % 4)
+        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1] if values.ndim > 1 else 1]
+        component = _UINT16 if values.dtype == np.uint16 else _FLOAT
+        accessor: dict[str, Any] = {
+            "bufferView": len(self.views) - 1, "componentType": component, "count": len(values), "type": kind,
+        }  # fmt: skip
+        if bounds:
+            columns = values.reshape(len(values), -1)
+            accessor |= {"min": columns.min(axis=0).tolist(), "max": columns.max(axis=0).tolist()}
+        self.accessors.append(accessor)
+        return len(self.accessors) - 1
+
+
+def write_glb(motion: Motion, path: Path) -> None:
+    """Write nodes, animation and meshes."""
+    tree, buffer = build_tree(motion), _Buffer()
+    nodes: list[dict[str, Any]] = []
+    for n, name in enumerate(tree.names):
+        node: dict[str, Any] = {"name": name, "translation": tree.offsets[n].tolist()}
+        children = tree.children(n)
+        nodes.append(node | {"children": children} if children else node)
+    nodes[0]["translation"] = tree.translations[0, 0].tolist()
+    meshes = _meshes(motion, tree, buffer, nodes)
+    document = {
+        "asset": {
+            "version": "2.0",
+            "generator": f"tk {__version__}",
+            "extras": {"lost_frames": motion.frames[~motion.known].tolist()},
+        },
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": nodes,
+        "meshes": meshes,
+        "materials": [
+            {"name": f"body{side}", "pbrMetallicRoughness": {"baseColorFactor": [*color, 1.0], "metallicFactor": 0.0}}
+            for side, color in _COLORS.items()
+        ],
+        "animations": [_animation(motion, tree, buffer)],
+        "accessors": buffer.accessors,
+        "bufferViews": buffer.views,
+        "buffers": [{"byteLength": len(buffer.data)}],
+    }
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(buffer.data), b"BIN\0")
+    whole = chunks + bytes(buffer.data)
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(whole)) + whole)
+
+
+def _animation(motion: Motion, tree: Tree, buffer: _Buffer) -> dict[str, Any]:
+    """Turns of all nodes but the tips, places of those that move; linear between frames, the first at time 0."""
+    times = buffer.add((motion.time - motion.time[0]).astype(np.float32), bounds=True)
+    quaternions = continuous(to_quaternions(tree.rotations))[..., [1, 2, 3, 0]].astype(np.float32)
+    samplers: list[dict[str, Any]] = []
+    channels: list[dict[str, Any]] = []
+    for n, segment in enumerate(tree.segments):
+        curves = {"rotation": quaternions[:, n]} if segment else {}
+        if tree.moving[n]:
+            curves["translation"] = tree.translations[:, n].astype(np.float32)
+        for name, values in curves.items():
+            output = buffer.add(np.ascontiguousarray(values))
+            channels.append({"sampler": len(samplers), "target": {"node": n, "path": name}})
+            samplers.append({"input": times, "output": output, "interpolation": "LINEAR"})
+    return {"name": motion.name, "channels": channels, "samplers": samplers}
+
+
+def _meshes(motion: Motion, tree: Tree, buffer: _Buffer, nodes: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A mesh for each segment with pieces; it is put onto its node."""
+    skeleton = build_skeleton(motion.dimensions)
+    pieces = build_pieces(motion.dimensions)
+    meshes: list[dict[str, Any]] = []
+    for s, segment in enumerate(SEGMENTS):
+        own = [piece for piece in pieces if piece.segment == segment]
+        if not own:
+            continue
+        node = tree.segments.index(segment)
+        name = tree.names[node]
+        origin = (
+            np.array([0.0, 0.0, WAIST_HEIGHT * motion.dimensions.trunk])
+            if name == "lumbar"
+            else skeleton.joint_position[JOINTS.index(name)]
+        )
+        to_rest = rest_axes(segment) @ standing_axes()[s].T  # from the zero configuration to the rest pose
+        points, normals, faces = zip(*(_surface(piece) for piece in own), strict=True)
+        starts = np.cumsum([0, *(len(p) for p in points[:-1])])
+        attributes = {
+            "POSITION": buffer.add(_float32((np.concatenate(points) - origin) @ to_rest.T), _VERTICES, bounds=True),
+            "NORMAL": buffer.add(_float32(np.concatenate(normals) @ to_rest.T), _VERTICES),
+        }
+        indices = np.concatenate([start + face.ravel() for start, face in zip(starts, faces, strict=True)])
+        side = segment[-2:] if segment[-2:] in _COLORS else ""
+        primitive = {
+            "attributes": attributes,
+            "indices": buffer.add(indices.astype(np.uint16), _INDICES),
+            "material": list(_COLORS).index(side),
+        }
+        nodes[node]["mesh"] = len(meshes)
+        meshes.append({"name": segment, "primitives": [primitive]})
+    return meshes
+
+
+def _surface(piece: Superellipsoid) -> tuple[Float, Float, NDArray[np.int64]]:
+    """Points (N, 3) and normals (N, 3) of a piece in the zero configuration, body frame, and triangles (M, 3)."""
+    along, around = np.linspace(*piece.eta_range, 256), np.linspace(-np.pi, np.pi, 512)
+    along = _evenly(along, piece.point(along, np.zeros_like(along)), _ALONG)
+    around = _evenly(around, piece.point(np.zeros_like(around), around), _AROUND)
+    eta, omega = np.meshgrid(along, around, indexing="ij")
+    T = piece.T_body_piece
+    points = piece.point(eta, omega).reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
+    normals = piece.normal(eta, omega).reshape(-1, 3) @ T[:3, :3].T
+    corner = (np.arange(_ALONG - 1)[:, None] * _AROUND + np.arange(_AROUND - 1)).ravel()
+    right, up = corner + 1, corner + _AROUND
+    faces = np.concatenate([np.column_stack([corner, right, up]), np.column_stack([right, up + 1, up])])
+    return points, normals, faces
+
+
+def _evenly(parameter: Float, curve: Float, count: int) -> Float:
+    """(count,) values of the parameter (N,) at equal lengths along a curve (N, 3), which equal steps would not be."""
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+    return np.interp(np.linspace(0.0, length[-1], count), length, parameter)
+
+
+def _float32(values: Float) -> NDArray[np.float32]:
+    return np.ascontiguousarray(values, dtype=np.float32)

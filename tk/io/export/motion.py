@@ -1,0 +1,216 @@
+"""A result as the exporters want it: points and rotations over time, for files of any version."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ConfigError, ResultError
+from tk.io.result import Result, Status, read_result
+from tk.model.angles import segment_rotations
+from tk.model.anthropometry import BodyDimensions
+from tk.model.derived import derive
+from tk.model.motion import FOOT_POINTS, sole_offset
+from tk.model.rotations import to_matrices
+from tk.model.skeleton import JOINTS, SEGMENTS, Skeleton, build_skeleton, join_pose
+from tk.model.smoothing import smooth
+
+Float = NDArray[np.float64]
+
+STATUS_WORDS = ("tracked", "initialised", "recovered", "lost")
+
+# Axes of other programs as rows, in the body's (forward, left, up) when it stands as the skeleton does in its zero
+# configuration: that is (x, y, z) of a world whose z axis is up.
+FORWARD_UP_RIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # OpenSim, ISB
+LEFT_UP_FORWARD = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # glTF, and usual in BVH
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A person's motion over F frames. Where a frame is not known, its numbers are those of the last known one before.
+
+    Attributes:
+        name: the result's name without its ending.
+        fps: frames a second.
+        frames, time: (F,) source frames, seconds.
+        status: (F,) as in the result; bridged: (F,) True where the smoothed copy fills a gap.
+        known: (F,) False where the person was lost and the gap was not bridged.
+        point_names: P joints and points of the feet; points: (F, P, 3) metres, world frame.
+        sigma: (F, P) one standard deviation of a point, metres; NaN where nobody says.
+        segments: S names; rotations: (F, S, 3, 3) segment to world, axes as in :mod:`tk.model.angles`.
+        dimensions: of the fitted body.
+        T_world_body: (3, 3) the world's forward, left and up as columns.
+    """
+
+    name: str
+    fps: float
+    frames: NDArray[np.int64]
+    time: Float
+    status: NDArray[np.uint8]
+    bridged: NDArray[np.bool_]
+    known: NDArray[np.bool_]
+    point_names: tuple[str, ...]
+    points: Float
+    sigma: Float
+    segments: tuple[str, ...]
+    rotations: Float
+    dimensions: BodyDimensions
+    T_world_body: Float
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def point(self, name: str) -> Float:
+        """(F, 3) a point, metres, world frame."""
+        return self.points[:, self.point_names.index(name)]
+
+    def rotation(self, segment: str) -> Float:
+        """(F, 3, 3) a segment's rotation to the world; a foot without a segment of its own has that of its calf."""
+        if segment not in self.segments:
+            segment = segment.replace("foot", "calf")
+        return self.rotations[:, self.segments.index(segment)]
+
+    def status_word(self, frame: int) -> str:
+        """One of :data:`STATUS_WORDS`, or "bridged"."""
+        return "bridged" if self.bridged[frame] else STATUS_WORDS[self.status[frame]]
+
+
+def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[Motion, tuple[str, ...]]:
+    """Read a result for export, and what there is to say about it.
+
+    Args:
+        smoothed: take the smoothed copy; it is made here where the result has none.
+
+    Raises:
+        ResultError: as :func:`tk.io.result.read_result`, or no body or no known frame is in it.
+    """
+    result = read_result(path)
+    bridged = np.zeros(len(result), dtype=bool)
+    is_made_here = smoothed and result.smoothed is None
+    if smoothed and result.smoothed is not None:
+        bridged = np.asarray(result.smoothed["bridged"], dtype=bool)
+        result = result.with_smoothed()
+    result = _in_order(result)
+    dimensions = _dimensions(result)
+    notes: tuple[str, ...] = ()
+    if is_made_here:
+        result, bridged = _smooth(result, dimensions)
+        notes = (f"{path}: has no smoothed copy; the poses were smoothed for this export",)
+    segments = result.meta.segment_names if result.segments_rotation is not None else SEGMENTS
+    missing = [name for name in SEGMENTS if name not in segments and not name.startswith("foot")]
+    if missing:
+        raise ResultError(f"{path}: /segments/rotation has no segment {missing[0]}; track the capture again")
+    skeleton = _skeleton(result, dimensions)
+    # (F, …) what the segments' rotations are made of
+    source = _poses(result, skeleton) if result.segments_rotation is None else result.segments_rotation
+    known = bridged | (result.status != Status.LOST)
+    for numbers in (result.joints, source):
+        known &= np.isfinite(numbers).reshape(len(known), -1).all(axis=1)
+    if result.segments_rotation is not None:
+        known &= np.linalg.norm(result.segments_rotation, axis=2).min(axis=1) > 0  # a quaternion of zeros is none
+    if not known.any():
+        raise ResultError(f"{path}: the person is lost in every frame; there is nothing to export")
+    if (np.diff(result.frames) != 1).any():
+        raise ResultError(f"{path}: its frames are not consecutive, which no other format can tell; track all of them")
+    held = _held(known)
+    rotations = (
+        segment_rotations(skeleton, source[held])
+        if result.segments_rotation is None
+        else to_matrices(result.segments_rotation[held])
+    )
+    sigma = np.full((len(result), len(JOINTS) + len(FOOT_POINTS)), np.nan)
+    if result.sigma is not None:
+        sigma[:, : len(JOINTS)] = result.sigma
+    motion = Motion(
+        name=result.path.stem,
+        fps=result.meta.fps,
+        frames=result.frames,
+        time=result.time,
+        status=result.status,
+        bridged=bridged,
+        known=known,
+        point_names=(*JOINTS, *FOOT_POINTS),
+        points=result.joints[held],
+        sigma=sigma,
+        segments=tuple(segments),
+        rotations=rotations,
+        dimensions=dimensions,
+        T_world_body=skeleton.T_world_body,
+    )
+    if result.feet is not None and np.isfinite(result.feet[known]).all():
+        feet = result.feet[held]
+    else:
+        feet = np.stack([_sole(motion, name) for name in FOOT_POINTS], axis=1)
+    return replace(motion, points=np.concatenate([motion.points, feet], axis=1)), notes
+
+
+def _in_order(result: Result) -> Result:
+    """The result with its joints in the order of :data:`JOINTS`."""
+    names = result.meta.joint_names
+    missing = [name for name in JOINTS if name not in names]
+    if missing:
+        raise ResultError(f"{result.path}: /joints/position has no joint {missing[0]}; the file is damaged")
+    if (result.status > Status.LOST).any():
+        raise ResultError(f"{result.path}: /status holds {result.status.max()}, which has no meaning")
+    order = [names.index(name) for name in JOINTS]
+    sigma = None if result.sigma is None else result.sigma[:, order]
+    return replace(result, joints=result.joints[:, order], sigma=sigma)
+
+
+def _sole(motion: Motion, name: str) -> Float:
+    """(F, 3) heel or toe of a foot, from its ankle and its segment's rotation."""
+    ankle, foot = motion.point("ankle" + name[-2:]), motion.rotation("foot" + name[-2:])
+    return ankle + foot @ sole_offset(name, motion.dimensions)
+
+
+def _held(known: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(F,) for each frame the last known one up to it; the first known one where there is none before."""
+    latest = np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))
+    return np.where(latest < 0, int(np.argmax(known)), latest)
+
+
+def _dimensions(result: Result) -> BodyDimensions:
+    values = {field.name: result.model.get(f"dimensions/{field.name}") for field in fields(BodyDimensions)}
+    missing = [name for name, value in values.items() if value is None]
+    if missing:
+        raise ResultError(f"{result.path}: has no /model/dimensions/{missing[0]}; track the capture again")
+    try:
+        return BodyDimensions(**{name: float(np.asarray(value)) for name, value in values.items()})
+    except (ConfigError, TypeError, ValueError) as error:
+        raise ResultError(f"{result.path}: /model/dimensions: {error}; the file is damaged") from None
+
+
+def _skeleton(result: Result, dimensions: BodyDimensions) -> Skeleton:
+    return build_skeleton(dimensions, result.meta.up, waist=result.waist is not None, ankles=result.ankles is not None)
+
+
+def _poses(result: Result, skeleton: Skeleton) -> Float:
+    """(F, D) the angles of waist and ankles in their place. Frames without numbers stay so."""
+    size = int(skeleton.is_paper.sum())
+    if result.pose.shape[1] != size:
+        raise ResultError(f"{result.path}: /pose has {result.pose.shape[1]} columns; {size} are expected")
+    none = np.zeros((len(result), 0))
+    waist = none if result.waist is None else result.waist
+    ankles = none if result.ankles is None else result.ankles
+    if waist.shape[1] != skeleton.is_waist.sum() or ankles.shape[1] != skeleton.is_ankle.sum():
+        raise ResultError(f"{result.path}: /waist or /ankles has not as many columns as the body has; track it again")
+    return np.array([join_pose(skeleton, *row) for row in zip(result.pose, waist, ankles, strict=True)])
+
+
+def _smooth(result: Result, dimensions: BodyDimensions) -> tuple[Result, NDArray[np.bool_]]:
+    """The result with smoothed poses and what follows from them, and (F,) the frames that were bridged."""
+    skeleton = _skeleton(result, dimensions)
+    poses = _poses(result, skeleton)
+    known = (result.status != Status.LOST) & np.isfinite(poses).all(axis=1)
+    found = smooth(skeleton, poses, known, result.meta.fps)
+    changed = known | found.bridged
+    joints = result.joints.copy()
+    derived = derive(skeleton, dimensions, found.poses[changed])
+    joints[changed] = derived.joints
+    rotation = np.full((len(result), len(SEGMENTS), 4), np.nan)
+    rotation[changed] = derived.rotations
+    meta = replace(result.meta, segment_names=SEGMENTS)
+    return replace(result, meta=meta, joints=joints, segments_rotation=rotation, feet=None), found.bridged

@@ -1,0 +1,33 @@
+"""TRC: points over time as OpenSim reads them (Motion Analysis' "track row column").
+
+Axes are OpenSim's: X forward, Y up, Z to the right, where the world's x axis is forward. For a world with z up this is
+the rotation by -90° about x: (x, y, z) becomes (x, z, -y). Millimetres.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tk.io.export.motion import FORWARD_UP_RIGHT, Motion
+
+
+def write_trc(motion: Motion, path: Path) -> None:
+    """Write the joints and the points of the feet; a frame that is not known has blank coordinates."""
+    points = 1000.0 * motion.points @ (FORWARD_UP_RIGHT @ motion.T_world_body.T).T
+    count, rate = len(motion), f"{motion.fps:.6f}"
+    names = motion.point_names
+    head = ("DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units")
+    original = ("OrigDataRate", "OrigDataStartFrame", "OrigNumFrames")
+    lines = [
+        f"PathFileType\t4\t(X/Y/Z)\t{motion.name}.trc",
+        "\t".join((*head, *original)),
+        "\t".join((rate, rate, str(count), str(len(names)), "mm", rate, str(motion.frames[0]), str(count))),
+        "Frame#\tTime\t" + "\t\t\t".join(names) + "\t\t",
+        "\t\t" + "\t".join(f"{axis}{k + 1}" for k in range(len(names)) for axis in "XYZ"),
+        "",
+    ]
+    for f, frame in enumerate(motion.frames):
+        # OpenSim takes a tab at a line's end for its end: without one more, the last blank would be missing
+        cells = [f"{value:.4f}" for value in points[f].ravel()] if motion.known[f] else [""] * (points[f].size + 1)
+        lines.append("\t".join((str(frame), f"{motion.time[f]:.6f}", *cells)))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

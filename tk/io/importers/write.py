@@ -1,0 +1,204 @@
+"""Write an imported project as a capture folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import tomli_w
+
+from tk.errors import CaptureError
+from tk.io.capture import open_capture
+from tk.io.importers.project import Project
+from tk.io.importers.sizes import fit_size
+from tk.io.importers.world import FoundUp, find_volume, infer_up
+from tk.io.video import PICTURE_SUFFIXES, probe
+from tk.model.camera import Camera, Rig
+from tk.model.up import up_text
+from tk.model.volume import Volume
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What has been written.
+
+    Attributes:
+        path: the capture.
+        cameras: how many it has.
+        notes: what was inferred, changed or left out, a line each.
+    """
+
+    path: Path
+    cameras: int
+    notes: tuple[str, ...]
+
+
+def write_capture(project: Project, output: Path) -> Imported:
+    """Write the capture: whole or not at all.
+
+    Videos and pictures become hard links to the originals, which take no room and stay when the original is deleted;
+    on another file system they are copied.
+
+    Raises:
+        CaptureError: the output exists already or cannot be written, a video cannot be read or does not fit.
+    """
+    if len(project.rig) < 2:
+        raise CaptureError(f"{project.source}: {len(project.rig)} camera with a video; a capture needs at least 2")
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise CaptureError(f"{output}: exists already; remove it, or give another name")
+    notes = list(project.notes)
+    rig = _fitted(_renamed(project.rig, notes), project.clips, notes)
+    found = FoundUp(project.up, f"as always with {project.tool}") if project.up else infer_up(rig)
+    volume, where = find_volume(rig)
+    notes.append(f"up = {_up_toml(found.up)}: {found.how}")
+    if volume is None:
+        notes.append(where)
+    else:
+        center, size = list(volume.center), list(volume.size)
+        notes.append(f"[volume] center = {center}, size = {size} (metres): {where}")
+
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        draft = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
+    except OSError as reason:
+        raise CaptureError(f"{output}: cannot be written ({reason.strerror or reason})") from None
+    try:
+        document = calibration_toml(rig, project)
+        (draft / "calibration.toml").write_text(document, encoding="utf-8")
+        (draft / "capture.toml").write_text(
+            capture_toml(output.resolve().name, project, found, volume, where), encoding="utf-8"
+        )
+        copied = _place(project.clips, rig.names, draft, "videos")
+        if project.masks:
+            copied |= _place(project.masks, rig.names, draft, "masks")
+        if project.backgrounds:
+            copied |= _place(project.backgrounds, rig.names, draft, "background")
+        warnings = open_capture(draft).warnings if volume else ()  # without a volume it cannot be opened yet
+        draft.chmod(0o755)
+        if output.exists():
+            output.rmdir()
+        draft.rename(output)
+    except OSError as reason:
+        raise CaptureError(f"{output}: cannot be written ({reason.strerror or reason})") from None
+    except CaptureError as reason:  # of the draft, which nobody knows
+        raise type(reason)(str(reason).replace(str(draft), str(output))) from None
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+    notes.append("the videos were copied" if copied else "the videos are hard links to the originals: no copies")
+    notes += [line.replace(str(draft), str(output)) for line in warnings]
+    return Imported(output, len(rig), tuple(notes))
+
+
+def calibration_toml(rig: Rig, project: Project) -> str:
+    """`calibration.toml` of the rig, metres."""
+    document: dict[str, object] = {
+        camera.name: {
+            "name": camera.name,
+            "size": [camera.width, camera.height],
+            "matrix": camera.matrix.tolist(),
+            "distortions": camera.distortions.tolist(),
+            "rotation": np.asarray(cv2.Rodrigues(camera.rotation)[0], dtype=np.float64).ravel().tolist(),
+            "translation": camera.translation.tolist(),
+            "fisheye": camera.fisheye,
+        }
+        for camera in rig
+    }
+    document["metadata"] = {"units": "m", "imported_from": f"{project.tool}, {project.source.name}"}
+    return tomli_w.dumps(document)
+
+
+def capture_toml(name: str, project: Project, up: FoundUp, volume: Volume | None, where: str) -> str:
+    """`capture.toml`: what was inferred, each with a comment that says how."""
+    lines = [
+        f"# imported from {project.tool}, {project.source.name}",
+        tomli_w.dumps({"name": name}).strip(),
+        f"# up: {up.how}",
+        f"up = {_up_toml(up.up)}",
+        "",
+    ]
+    if volume is None:
+        lines += [f"# {where}", "# [volume]", "# center = [0.0, 0.0, 1.0]", "# size = [2.0, 2.0, 2.2]"]
+    else:
+        lines += [
+            f"# {where}; metres",
+            "# make it as small as the motion allows: voxels then are smaller",
+            "[volume]",
+            f"center = {list(volume.center)}",
+            f"size = {list(volume.size)}",
+        ]
+    lines += [
+        "",
+        "# [subject]",
+        "# height = 1.75    # metres, without shoes",
+        "",
+        "# [init]",
+        '# pose = "any"     # where nobody stands with arms and legs spread to begin with',
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _up_toml(up: str) -> str:
+    """An axis as a TOML string, a vector as an array of five decimals."""
+    if not up.startswith("["):
+        return f'"{up}"'
+    return json.dumps([round(value, 5) for value in json.loads(up_text(up))])
+
+
+def _renamed(rig: Rig, notes: list[str]) -> Rig:
+    """The cameras with names that files can have."""
+    cameras: list[Camera] = []
+    for camera in rig:
+        name = re.sub(r"[^\w.+-]+", "_", camera.name).strip(".") or "camera"
+        while name == "metadata" or name in [other.name for other in cameras]:
+            name += "_"
+        if name != camera.name:
+            notes.append(f"camera {camera.name!r} is called {name} in the capture")
+        cameras.append(replace(camera, name=name))
+    return Rig(tuple(cameras))
+
+
+def _fitted(rig: Rig, clips: Sequence[Path], notes: list[str]) -> Rig:
+    cameras = []
+    for camera, clip in zip(rig, clips, strict=True):
+        found = probe(clip)
+        fitted, note = fit_size(camera, found.width, found.height, clip)
+        if note:
+            notes.append(note)
+        cameras.append(fitted)
+    return Rig(tuple(cameras))
+
+
+def _place(clips: Sequence[Path], names: Sequence[str], draft: Path, folder: str) -> bool:
+    """Put the clips into a folder of the capture, named by their cameras; True when something had to be copied."""
+    pictures = folder == "videos" and any(clip.is_dir() for clip in clips)
+    copied = False
+    for clip, name in zip(clips, names, strict=True):
+        target = draft / ("images" if pictures else folder)
+        target.mkdir(exist_ok=True)
+        if not clip.is_dir():
+            copied |= _link(clip, target / f"{name}{clip.suffix.lower()}")
+            continue
+        (target / name).mkdir()
+        for file in sorted(clip.iterdir()):
+            if file.is_file() and file.suffix.lower() in PICTURE_SUFFIXES and not file.name.startswith("."):
+                copied |= _link(file, target / name / file.name)
+    return copied
+
+
+def _link(original: Path, target: Path) -> bool:
+    """A hard link where the file system allows it, else a copy and True."""
+    original = original.resolve()
+    try:
+        os.link(original, target)
+        return False
+    except OSError:
+        shutil.copy2(original, target)
+        return True

@@ -1,0 +1,78 @@
+"""The unit of a calibration's lengths, found from how far the cameras stand from one another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Float = NDArray[np.float64]
+
+#: metres in one unit
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+
+#: the cameras of a motion capture that are farthest apart are this far apart, metres: the least and the most
+LEAST_APART_M, MOST_APART_M = 0.5, 30.0
+
+#: what is usual; of two units that are possible the one that comes nearer to it, as a ratio, is taken
+USUAL_APART_M = 5.0
+
+
+@dataclass(frozen=True)
+class FoundUnit:
+    """The unit of a calibration.
+
+    Attributes:
+        name: "m", "cm" or "mm".
+        note: how it was found, for the user to read; None where there is nothing to say.
+    """
+
+    name: str
+    note: str | None = None
+
+    @property
+    def metres(self) -> float:
+        return UNITS[self.name]
+
+
+def apart(centers: ArrayLike) -> float:
+    """The distance of the two cameras that are farthest apart, in the unit of ``centers`` (C, 3)."""
+    c = np.asarray(centers, dtype=np.float64).reshape(-1, 3)
+    return float(np.linalg.norm(c[:, None] - c[None], axis=-1).max(initial=0.0))
+
+
+def infer_unit(centers: ArrayLike, default: str = "m") -> FoundUnit:
+    """The unit in which the cameras stand 0.5 to 30 m apart.
+
+    Args:
+        centers: (C, 3) centres of projection, in the unknown unit.
+        default: the unit where none makes sense, and where there are no two cameras; nothing is said about this one
+            where it is a possible one.
+
+    Centimetres and millimetres can both be possible: 1200 is 12 m or 1.2 m. The one nearer to 5 m is taken, and the
+    note says what else it could be.
+    """
+    distance = apart(centers)
+    possible = [name for name in UNITS if LEAST_APART_M <= distance * UNITS[name] <= MOST_APART_M]
+    if distance == 0.0 or default in possible:
+        return FoundUnit(default)
+    if not possible:
+        return FoundUnit(
+            default,
+            f"lengths are taken for {default}: the cameras are then up to {distance * UNITS[default]:.3g} m apart; no "
+            f"unit makes it {LEAST_APART_M:g} to {MOST_APART_M:g} m",
+        )
+    name = min(possible, key=lambda unit: abs(math.log(distance * UNITS[unit] / USUAL_APART_M)))
+    others = [f"in {unit} it would be {distance * UNITS[unit]:.3g} m" for unit in possible if unit != name]
+    return FoundUnit(
+        name,
+        f"lengths are taken for {name}: the cameras are then up to {distance * UNITS[name]:.3g} m apart"
+        + _in_brackets([f"in {default} it would be {distance * UNITS[default]:.3g} m", *others]),
+    )
+
+
+def _in_brackets(texts: Sequence[str]) -> str:
+    return f" ({'; '.join(texts)})" if texts else ""

@@ -1,0 +1,89 @@
+"""Rotations as matrices, quaternions (w, x, y, z) and successive turns about axes; all vectorised over leading axes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Float = NDArray[np.float64]
+
+# Below this sine of the middle angle the first and the last turn cannot be told apart: all is given to the last.
+_SINGULAR = 1e-7
+
+
+def to_quaternions(R: Float) -> Float:
+    """(..., 4) unit quaternions (w, x, y, z) of rotations (..., 3, 3); w is not negative."""
+    q = Rotation.from_matrix(np.reshape(R, (-1, 3, 3))).as_quat()[:, [3, 0, 1, 2]]
+    return np.where(q[:, :1] < 0, -q, q).reshape(*np.shape(R)[:-2], 4)
+
+
+def to_matrices(quaternions: Float) -> Float:
+    """(..., 3, 3) rotations of quaternions (..., 4), w first; they need not have length 1, but must not be zero."""
+    q = np.reshape(quaternions, (-1, 4))[:, [1, 2, 3, 0]]
+    return Rotation.from_quat(q).as_matrix().reshape(*np.shape(quaternions)[:-1], 3, 3)
+
+
+def continuous(quaternions: Float) -> Float:
+    """Quaternions (F, ..., 4) over time with the signs such that each is near to the one before."""
+    turns_back = (quaternions[1:] * quaternions[:-1]).sum(axis=-1) < 0
+    signs = np.cumprod(np.where(turns_back, -1.0, 1.0), axis=0)
+    return np.concatenate([quaternions[:1], quaternions[1:] * signs[..., None]])
+
+
+def turn(axis: str, angle: Float) -> Float:
+    """(..., 3, 3) the rotation by ``angle`` (...), radians, about the axis "x", "y" or "z"."""
+    k = "xyz".index(axis)
+    i, j = (k + 1) % 3, (k + 2) % 3
+    R = np.zeros((*np.shape(angle), 3, 3))
+    R[..., k, k] = 1.0
+    R[..., i, i] = R[..., j, j] = np.cos(angle)
+    R[..., j, i] = np.sin(angle)
+    R[..., i, j] = -np.sin(angle)
+    return R
+
+
+def compose(sequence: str, angles: Float) -> Float:
+    """(..., 3, 3) turns about moving axes, the first first: "zxy" is Rz(angles[..., 0]) Rx(angles[..., 1]) Ry(...)."""
+    first, second, third = (turn(axis, angles[..., k]) for k, axis in enumerate(sequence))
+    return first @ second @ third
+
+
+def decompose(sequence: str, R: Float) -> Float:
+    """(..., 3) radians, the inverse of :func:`compose` for the sequences "zxy", "yxz" and "yxy".
+
+    The middle angle lies within ±90°, or for "yxy" within -180° and 0. Where it is at an end of that range only the sum
+    or difference of the others is determined; the first is then 0.
+    """
+    if sequence == "zxy":
+        sine, first, third = R[..., 2, 1], (-R[..., 0, 1], R[..., 1, 1]), (-R[..., 2, 0], R[..., 2, 2])
+        alone = np.arctan2(R[..., 0, 2], R[..., 0, 0])
+    elif sequence == "yxz":
+        sine, first, third = -R[..., 1, 2], (R[..., 0, 2], R[..., 2, 2]), (R[..., 1, 0], R[..., 1, 1])
+        alone = np.arctan2(-R[..., 0, 1], R[..., 0, 0])
+    elif sequence == "yxy":
+        sine, first, third = R[..., 1, 1], (-R[..., 0, 1], -R[..., 2, 1]), (-R[..., 1, 0], R[..., 1, 2])
+        alone = np.arctan2(R[..., 0, 2], R[..., 0, 0])
+    else:
+        raise ValueError(f"sequence {sequence} is none of zxy, yxz, yxy")
+    cosine = np.hypot(*first)
+    middle = -np.arctan2(cosine, sine) if sequence == "yxy" else np.arctan2(sine, cosine)
+    singular = cosine < _SINGULAR
+    return np.stack(
+        [np.where(singular, 0.0, np.arctan2(*first)), middle, np.where(singular, alone, np.arctan2(*third))], axis=-1
+    )
+
+
+def follow(angles: Float) -> Float:
+    """Angles (F, 3), radians, of turns about three different axes, rewritten such that each frame is near to the last.
+
+    (a, b, c) is the same rotation as (a + π, π - b, c + π), and each angle may have whole turns added. Euler angles
+    that are to be looked at, or interpolated, must not jump between these.
+    """
+    result = np.array(angles, dtype=np.float64)
+    for f in range(1, len(result)):
+        a, b, c = result[f]
+        found = np.array([[a, b, c], [a + np.pi, np.pi - b, c + np.pi]])
+        found -= 2 * np.pi * np.round((found - result[f - 1]) / (2 * np.pi))
+        result[f] = found[np.abs(found - result[f - 1]).sum(axis=1).argmin()]
+    return result
