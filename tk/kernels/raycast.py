@@ -73,10 +73,11 @@ def _cast_kernel(real):
         depth: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (B, V, H, W) out, if export; before_depth when called
     ):
         B, V, H, W = pose.shape[0], rays.shape[0], rays.shape[1], rays.shape[2]
-        P, K = part_dof.shape[0], drawn.shape[0]
+        K = drawn.shape[0]
         for b in range(B):
             forward(axis, point, prismatic, parent, pose, b, b, frames, twists)
-            for p in range(P):
+            for k in range(drawn.shape[0]):
+                p = drawn[k]
                 R, t = place_part(frames, part_dof, part_frame, b, p)
                 keep(placed, b, p, R, t)
                 # a disc in each picture that holds the part: most pixels are far from most parts

@@ -19,6 +19,7 @@ from tk.kernels.cone_arrays import LONGEST_CHAIN, NEAREST_M, ConeArrays, keep, p
 from tk.kernels.cones import (
     SIDE_B,
     curve_of,
+    enclosing_radius,
     enter,
     interior_point,
     point_on,
@@ -268,6 +269,7 @@ def _equations_kernel(real):
         frames: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 12) scratch
         twists: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 6) scratch
         placed: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 12) scratch, parts to world
+        ball: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 4) scratch, a sphere about each part, world
         lines: ti.types.ndarray(dtype=real, ndim=3),  # (B V Q, CHORDS + 1, 2) scratch, pixels of the full picture
         facts: ti.types.ndarray(dtype=real, ndim=2),  # (B V Q, 5) scratch: visible, q0, q1, length, outward sign
         row: ti.types.ndarray(dtype=real, ndim=3),  # (B V Q, 2, L) scratch
@@ -283,6 +285,10 @@ def _equations_kernel(real):
             for p in range(P):
                 R, t = place_part(frames, part_dof, part_frame, b, p)
                 keep(placed, b, p, R, t)
+                middle = R @ interior_point(part_kind[p], shape_of(part_shape, p)) + t
+                for a in ti.static(range(3)):
+                    ball[b, p, a] = middle[a]
+                ball[b, p, 3] = enclosing_radius(part_kind[p], shape_of(part_shape, p)) ** 2
 
         for turn in range(spread * (B * V * Q)):
             if turn % spread != 0:
@@ -358,8 +364,13 @@ def _equations_kernel(real):
                     behind, depth = -1, 1e9 + 0.0 * scale
                     if use:
                         ray = x - eye
+                        long = ray.norm_sqr()
                         for o in range(P):
-                            if use and o != p:
+                            to = ti.Vector([ball[b, o, a] for a in ti.static(range(3))]) - eye
+                            ahead = to.dot(ray)
+                            # most parts are far from most rays
+                            close = ahead > 0.0 and to.norm_sqr() * long - ahead * ahead < ball[b, o, 3] * long
+                            if use and o != p and close:
                                 Ro = load_rotation(placed, b, o)
                                 co = Ro.transpose() @ (eye - load_translation(placed, b, o))
                                 t_o = enter(
@@ -513,6 +524,7 @@ def _launch(
         np.empty((B, D, 12), dtype),
         np.empty((B, D, 6), dtype),
         np.empty((B, P, 12), dtype),
+        np.empty((B, P, 4), dtype),
         np.empty((tasks, CHORDS + 1, 2), dtype),
         np.empty((tasks, 5), dtype),
         np.empty((tasks, 2, LONGEST_CHAIN), dtype),

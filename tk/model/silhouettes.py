@@ -15,6 +15,7 @@ from tk.kernels.raycast import cast
 from tk.kernels.silhouette import Edgels, NormalEquations, Regions, SearchSettings
 from tk.model.camera import Rig
 from tk.model.cone_body import ConeBody
+from tk.model.regions import clean_by_area
 
 Float = NDArray[np.float64]
 Masks = NDArray[np.uint8]
@@ -41,26 +42,20 @@ class CleaningConfig:
 
 
 def clean(mask: Masks, config: CleaningConfig) -> Masks:
-    """A mask (H, W) without specks and small holes."""
-    ys = np.flatnonzero(mask.any(axis=1))
-    if len(ys) == 0:
+    """A mask (H, W) without specks and small holes, 0 or 255."""
+    box = cv2.boundingRect(mask)
+    if box[2] == 0:
         return mask
-    xs = np.flatnonzero(mask.any(axis=0))
-    # a margin of background makes everything around the person one region
-    rows, columns = slice(ys[0], ys[-1] + 1), slice(xs[0], xs[-1] + 1)
-    part = cv2.copyMakeBorder(mask[rows, columns], 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=8, ltype=cv2.CV_16U)
-    area = stats[:, cv2.CC_STAT_AREA].copy()
-    area[0] = 0
-    keep = area >= config.speck_share * area.max()
-    keep[0] = False
-    body = (keep.astype(np.uint8) * 255)[labels]
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(255 - body, connectivity=4, ltype=cv2.CV_16U)
-    hole = stats[:, cv2.CC_STAT_AREA] < config.hole_share * area.max()
-    hole[0] = False
-    body |= (hole.astype(np.uint8) * 255)[labels]
+    x, y, width, height = box
+    part = mask[y : y + height, x : x + width] >= 128
+    contours, _ = cv2.findContours(part.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not contours:
+        return np.zeros_like(mask)
+    largest = max(cv2.contourArea(contour) + len(contour) / 2 + 1 for contour in contours)
     result = np.zeros_like(mask)
-    result[rows, columns] = body[1:-1, 1:-1]
+    result[y : y + height, x : x + width] = clean_by_area(
+        part, config.speck_share * largest, config.hole_share * largest
+    )
     return result
 
 
@@ -98,10 +93,14 @@ class Views:
         for _ in range(scales - 1):
             last = levels[-1]
             height, width = (last.shape[1] + 1) // 2, (last.shape[2] + 1) // 2
-            even = [cv2.copyMakeBorder(m, 0, m.shape[0] % 2, 0, m.shape[1] % 2, cv2.BORDER_CONSTANT) for m in last]
-            levels.append(
-                np.stack([cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA) for m in even]).astype(np.uint8)
-            )
+            even = list(last)
+            if last.shape[1] % 2 or last.shape[2] % 2:
+                rest = last.shape[1] % 2, last.shape[2] % 2
+                even = [cv2.copyMakeBorder(m, 0, rest[0], 0, rest[1], cv2.BORDER_CONSTANT) for m in last]
+            half = np.empty((len(last), height, width), np.uint8)
+            for m, out in zip(even, half, strict=True):
+                cv2.resize(m, (width, height), dst=out, interpolation=cv2.INTER_AREA)
+            levels.append(half)
             sizes.append((sizes[-1] + 1) // 2)
         return Pyramid(tuple(levels), tuple(sizes))
 

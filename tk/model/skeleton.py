@@ -246,6 +246,10 @@ class Skeleton:
 
     def ancestors(self) -> NDArray[np.bool_]:
         """(S, D): True where a degree of freedom moves a segment."""
+        return self._ancestors
+
+    @cached_property
+    def _ancestors(self) -> NDArray[np.bool_]:
         result = np.zeros((len(SEGMENTS), len(self.names)), dtype=bool)
         for s, k in enumerate(self.segment_dof):
             while k >= 0:

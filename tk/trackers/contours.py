@@ -42,11 +42,11 @@ RELOCATE_EVERY = 3
 # The fall of the cost, as a share of the person's pixels, that makes another place of a limb the pose.
 GAIN = 0.004
 # Places of a limb that are descended from, and random ones about its own place that are looked at beside the grid.
-PLACES, NEARBY = 2, 100
+PLACES, NEARBY = 2, 80
 # Poses that a search descends from to the end, beside the present one.
 FINISHED = 4
 # Rays a picture's height: to screen many places of a limb, and to choose among few poses.
-SCREEN_ROWS, CHOICE_ROWS = 60, 120
+SCREEN_ROWS, CHOICE_ROWS = 54, 96
 
 
 @dataclass(frozen=True)
