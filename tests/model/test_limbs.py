@@ -55,20 +55,20 @@ def directions(name, ends):
 
 @pytest.mark.parametrize("name", ["arm_l", "arm_r"])
 def test_arms_are_looked_for_in_all_directions(name):
-    """But through the back and far across; 56 directions of the sphere lie some 30° apart."""
+    """But through the back and far across; no direction is farther than 35° from one that is tried."""
     found = directions(name, ("shoulder", "elbow"))
     wanted = np.random.default_rng(1).normal(size=(500, 3))
     wanted /= np.linalg.norm(wanted, axis=1, keepdims=True)
     outward = wanted[:, 1] * (1 if name == "arm_l" else -1)
     wanted = wanted[(wanted[:, 0] > -0.6) & (outward > -0.65)]
-    assert np.degrees(np.arccos((wanted @ found.T).max(axis=1))).max() < 30
+    assert np.degrees(np.arccos((wanted @ found.T).max(axis=1))).max() < 35
 
 
 @pytest.mark.parametrize("name", ["arm_l", "arm_r"])
 def test_elbows_are_stretched_and_bent_to_all_sides(name):
     elbow = list(LIMB[name].dofs).index(SKELETON.index(f"elbow_{name[-1]}_flexion"))
     bends = np.degrees(LIMB[name].places[:, elbow])
-    assert bends.min() < 20 and bends.max() > 120 and len(np.unique(bends.round())) >= 4
+    assert bends.min() < 20 and bends.max() > 110 and len(np.unique(bends.round())) >= 3
 
 
 @pytest.mark.parametrize("name", ["leg_l", "leg_r"])
