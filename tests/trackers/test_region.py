@@ -219,8 +219,8 @@ def crossing(count: int) -> np.ndarray:
     pose[NAMES.index("torso_yaw")] = np.arctan2(toward[1], toward[0])
     poses = []
     for share in np.linspace(0, 1, count):
-        here = with_arm(pose, "l", (0.35, 0.15, -0.93), 70.0 + 40.0 * share)
-        here[NAMES.index("shoulder_l_roll")] = np.radians(-35.0)
+        here = with_arm(pose, "l", (0.35, 0.1, -0.93), 85.0 + 30.0 * share)
+        here[NAMES.index("shoulder_l_roll")] = np.radians(60.0)
         poses.append(here)
     return np.array(poses)
 
