@@ -112,7 +112,7 @@ def test_an_estimate_says_all_that_the_contract_has() -> None:
     np.testing.assert_allclose(SKELETON.joints(joined), estimate.joints, atol=1e-9)
     assert set(estimate.timing) == set(tracker.timing_stages) and len(estimate.iterations) == len(tracker.stages)
     assert estimate.fit_error is not None and estimate.fit_error.shape == (3,)
-    assert (0 <= estimate.fit_error).all() and (estimate.fit_error < 0.15).all()
+    assert (estimate.fit_error >= 0).all() and (estimate.fit_error < 0.15).all()
 
 
 def test_sigma_is_finite_and_larger_where_less_is_seen() -> None:
@@ -212,31 +212,32 @@ def clothed(poses: np.ndarray) -> np.ndarray:
 
 
 def crossing(count: int) -> np.ndarray:
-    """(count, D) a forearm that moves up and down before the chest."""
+    """(count, D) a forearm that swings from the side to before the chest."""
     pose = walking_pose(SKELETON, None)
     pose[:3] = [0.0, 0.0, 0.93]
     toward = FRONT[0].center + FRONT[1].center
     pose[NAMES.index("torso_yaw")] = np.arctan2(toward[1], toward[0])
     poses = []
     for share in np.linspace(0, 1, count):
-        here = with_arm(pose, "l", (0.35, 0.1, -0.93), 85.0 + 30.0 * share)
-        here[NAMES.index("shoulder_l_roll")] = np.radians(60.0)
+        here = with_arm(pose, "l", (0.35, 0.1, -0.93), 90.0)
+        here[NAMES.index("shoulder_l_roll")] = np.radians(-30.0 + 100.0 * share)
         poses.append(here)
     return np.array(poses)
 
 
-def test_colors_hold_a_forearm_that_silhouettes_do_not_show() -> None:
-    poses = crossing(9)
+def test_colors_show_a_forearm_that_silhouettes_do_not() -> None:
+    """Learned while the forearm sticks out, they tell where it is before the chest."""
+    poses = crossing(10)
     images, masks = clothed(poses), draw_silhouettes(BODY, FRONT, poses)
     wrist = JOINTS.index("wrist_l")
     off = {}
     for colored in (True, False):
-        tracker = RegionTracker(FRONT, "z", SETTINGS, RegionConfig(colors=colored, search_ratio=1000.0))
+        tracker = RegionTracker(FRONT, "z", replace(SETTINGS, search_every=6), RegionConfig(colors=colored))
         tracker.start([observe(masks[0], 0, images[0])], None, init_of(poses[0]), BODY)
         found = [tracker.step(observe(m, i, p)) for i, (m, p) in enumerate(zip(masks, images, strict=True))]
-        off[colored] = errors(found[-1], poses[-1])[wrist]
+        off[colored] = np.mean([errors(e, p)[wrist] for e, p in zip(found[-3:], poses[-3:], strict=True)])
         assert tracker.colors.known == colored and ("colors" in tracker.state()) == colored
-    assert off[True] < 0.06 and off[True] < 0.6 * off[False], off
+    assert off[True] < 0.08 and off[True] < 0.6 * off[False], off
 
 
 # --- the second pass --------------------------------------------------------------------------------------------------
