@@ -16,12 +16,16 @@ from tk.io.frames import FrameSet
 from tk.io.result import Result
 from tk.kernels.edge_search import search_edges
 from tk.kernels.nearest import SurfaceIndex
-from tk.model import gait
+from tk.kernels.raycast import Cast
 from tk.model.contour_term import ContourTerm
+from tk.model.evidence import Evidence, RayGrid
+from tk.model.limbs import limbs_of
 from tk.model.objective import BodyObjective
+from tk.model.part_colors import PartColors
 from tk.model.silhouettes import Pyramid, Views
 from tk.optim import gauss_newton
-from tk.trackers.silhouette import restore_body
+from tk.trackers.bodies import body_and_poses
+from tk.trackers.contours import NEARBY, SCREEN_ROWS
 
 Float = np.ndarray
 
@@ -100,14 +104,22 @@ def silhouette_stages(
     Every frame but the first starts where the tracker would: at the pose before it.
     """
     settings = config.silhouette
-    body = restore_body(result.model, result.meta.up)
-    views = Views(capture.rig, settings.ray_step or max(1, round(capture.rig.frame_shape[0] / 54)))
+    found_body = body_and_poses(result)
+    assert found_body is not None
+    body, tracked = found_body
+    views = Views(capture.rig)
     scales = settings.solver.scales
     pyramids = [views.pyramid(frame, scales, settings.cleaning) for frame in masks[1:]]
     row_of = {int(index): row for row, index in enumerate(result.frames)}
-    poses = result.pose[[row_of[frame.index] for frame in frames[:-1]]]
+    poses = tracked[[row_of[frame.index] for frame in frames[:-1]]]
     last, pose = pyramids[-1], poses[-1][None]
-    variants = gait.arm_variants(body.skeleton, pose[0])
+    limb = limbs_of(body)[0]
+    variants = limb.candidates(pose[0], NEARBY, np.random.default_rng(0))
+    group = PartColors(body).group
+    evidence = Evidence.of(RayGrid(capture.rig, SCREEN_ROWS), last.masks[0])
+    _, rest = evidence.cast(body, group, pose, limb.others, export=True)
+    assert rest is not None
+    others = Cast(rest.label[0], rest.depth[0])
     here = views.equations(body, last, pose, 0, settings.search)
     limits = body.free, body.skeleton.lower, body.skeleton.upper
 
@@ -139,10 +151,10 @@ def silhouette_stages(
             statistics.median(median_ms(partial(fit, *frame), 3) for frame in zip(poses, pyramids, strict=True)),
             {},
         ),
-        Stage("E_S of a pose", median_ms(lambda: views.fit_error(body, last.masks[0], pose)), {}),
+        Stage("E_S of a pose", median_ms(lambda: evidence.cast(body, group, pose)), {}),
         Stage(
             f"E_S of {len(variants)} places of an arm",
-            median_ms(lambda: views.fit_error(body, last.masks[0], variants)),
+            median_ms(lambda: evidence.cast(body, group, variants, limb.parts, others)),
             {},
         ),
     ]

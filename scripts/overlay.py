@@ -21,10 +21,13 @@ from numpy.typing import NDArray
 from tk.errors import TkError
 from tk.io.capture import Capture, open_capture
 from tk.io.result import Result, Status, read_joints, read_result
+from tk.kernels.cones import ELLIPSOID
 from tk.model.body import Body
 from tk.model.camera import Camera
+from tk.model.cone_body import ConeBody, ConePart
 from tk.model.skeleton import JOINTS, SEGMENTS
 from tk.model.superellipsoid import Superellipsoid
+from tk.trackers.bodies import body_and_poses
 from tk.trackers.volumetric import restore_body
 
 Float = NDArray[np.float64]
@@ -52,6 +55,8 @@ _COLORS: dict[str, Color] = {
     "calf_l": (130, 140, 250),
     "thigh_r": (190, 50, 140),
     "calf_r": (240, 140, 210),
+    "foot_l": (90, 100, 235),
+    "foot_r": (215, 95, 175),
 }
 _OPACITY = 0.35
 _SUBPIXEL = 4  # bits of a fraction of a pixel that OpenCV draws with
@@ -102,11 +107,28 @@ def piece_points(piece: Superellipsoid) -> Float:
     return piece.point(eta.ravel(), omega.ravel())
 
 
-def outlines(body: Body, pose: Float, camera: Camera) -> list[tuple[str, float, list[Float]]]:
+def part_points(part: ConePart) -> Float:
+    """(N, 3) points over the whole surface of a frustum or an ellipsoid, its own frame, metres."""
+    angle, z = np.meshgrid(np.linspace(-np.pi, np.pi, 32, endpoint=False), np.linspace(0, 1, 13))
+    radius = np.ones_like(z)
+    if part.kind == ELLIPSOID:
+        radius, z = np.sin(np.pi * z), np.cos(np.pi * z)
+    unscaled = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)
+    return part.surface(unscaled.reshape(-1, 3))
+
+
+def solids(body: Body | ConeBody) -> list[tuple[str, Float, Float]]:
+    """Of each of the body's solids: its segment, (4, 4) its frame in the segment's, and points (N, 3) in its frame."""
+    if isinstance(body, ConeBody):
+        return [(part.segment, part.T_body_part, part_points(part)) for part in body.parts]
+    return [(piece.segment, piece.T_body_piece, piece_points(piece)) for piece in body.pieces]
+
+
+def outlines(body: Body | ConeBody, pose: Float, camera: Camera) -> list[tuple[str, float, list[Float]]]:
     """What a camera sees of the body, farthest segment first.
 
     Returns:
-        segment, depth in metres, and the outlines (N, 2) of its pieces, pixels. Pieces are convex, so each outline is
+        segment, depth in metres, and the outlines (N, 2) of its solids, pixels. Solids are convex, so each outline is
         the convex hull of the projected surface (lens distortion bends it by less than a pixel over a limb).
     """
     skeleton = body.skeleton
@@ -114,12 +136,12 @@ def outlines(body: Body, pose: Float, camera: Camera) -> list[tuple[str, float, 
     T_body[:3, :3] = skeleton.T_world_body
     T_world = skeleton.segment_transforms(pose)
     seen: dict[str, tuple[list[float], list[Float]]] = {}
-    for piece in body.pieces:
-        T = T_world[SEGMENTS.index(piece.segment)] @ T_body @ piece.T_body_piece
-        xy, depth = camera.project(piece_points(piece) @ T[:3, :3].T + T[:3, 3])
+    for segment, T_body_solid, points in solids(body):
+        T = T_world[SEGMENTS.index(segment)] @ T_body @ T_body_solid
+        xy, depth = camera.project(points @ T[:3, :3].T + T[:3, 3])
         if not np.isfinite(xy).all():
             continue  # behind the camera, in part
-        depths, polygons = seen.setdefault(piece.segment, ([], []))
+        depths, polygons = seen.setdefault(segment, ([], []))
         depths.append(float(depth.mean()))
         polygons.append(cv2.convexHull(xy.astype(np.float32))[:, 0].astype(np.float64))
     found = [(segment, float(np.mean(depths)), polygons) for segment, (depths, polygons) in seen.items()]
@@ -182,7 +204,7 @@ def overlay_rows(
         tile_height: pixels.
         full: whole pictures, not the person cut out.
     """
-    restored = restore_body(result)
+    restored = body_and_poses(result) or restore_body(result)
     truth_file = capture.path / "truth.h5"
     truth = read_joints(truth_file) if truth_file.is_file() else None
     row_of = {int(frame): row for row, frame in enumerate(result.frames)}

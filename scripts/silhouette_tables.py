@@ -2,8 +2,8 @@
 
 Table 1: E_S and the ankles' error with 2, 3 and 4 views, 2, 3 and 5 iterations, without ambiguity weighting, with a
 single scale. E_S is averaged over all views, tracked or not; the ankles' error over the tracked ones, pixels. "paper"
-rows search contours inside the outline, too, by plain least squares, and use no prediction and no second thoughts about
-the arms; "tk" rows are the defaults. Table 2: milliseconds a frame. Figure 6: the ankles' x in one view against truth.
+rows search contours inside the outline, too, by plain least squares, and use no prediction and no search for lost
+limbs; "tk" rows are the defaults. Table 2: milliseconds a frame. Figure 6: the ankles' x in one view against truth.
 
     python -m scripts.silhouette_tables CAPTURE [--cameras a,b,c,d] [--frames 340] [--every 1] [--figure FILE.png]
 """
@@ -23,11 +23,12 @@ from tk.io.capture import open_capture
 from tk.io.result import read_joints
 from tk.kernels.silhouette import SearchSettings
 from tk.model.camera import Rig
-from tk.model.silhouettes import pixel_rays, silhouette_error
-from tk.model.skeleton import JOINTS
+from tk.model.evidence import Evidence, RayGrid
+from tk.model.skeleton import JOINTS, join_pose
 from tk.optim.gauss_newton import GaussNewtonConfig
 from tk.trackers.base import Observation
-from tk.trackers.silhouette import SilhouetteConfig, SilhouetteTracker
+from tk.trackers.contours import SilhouetteConfig
+from tk.trackers.silhouette import SilhouetteTracker
 
 Float = NDArray[np.float64]
 
@@ -37,7 +38,7 @@ ANKLES = [JOINTS.index("ankle_l"), JOINTS.index("ankle_r")]
 
 PAPER = SilhouetteConfig(
     prediction=0.0,
-    second_thoughts=0,
+    search_every=0,
     search=SearchSettings(interior=True, ambiguous_px=8.0, tangential=1.0, spacing_px=1.0, robust_px=0.0),
     solver=GaussNewtonConfig(scales=2),
 )
@@ -116,11 +117,12 @@ def track(data: Sequence3D, name: str, views: int, config: SilhouetteConfig) -> 
     estimates = [tracker.step(frame) for frame in frames]
     joints = np.array([e.joints for e in estimates])
     every = max(1, len(frames) // 68)
-    rays = pixel_rays(data.rig, 2)
-    error = [
-        silhouette_error(tracker.body, data.rig, data.masks[i], estimates[i].pose[None], 2, rays).mean()
-        for i in range(0, len(frames), every)
-    ]
+    grid = RayGrid(data.rig, data.rig.frame_shape[0] // 2)
+    error = []
+    for i in range(0, len(frames), every):
+        pose = join_pose(tracker.body.skeleton, estimates[i].pose, estimates[i].waist, estimates[i].ankles)
+        shares, _ = Evidence.of(grid, data.masks[i]).cast(tracker.body, tracker.colors.group, pose[None])
+        error.append(np.nanmean(shares))
     found, true = joints[:, ANKLES], data.truth[:, ANKLES]
     off, height = [], []
     for camera in rig:

@@ -14,12 +14,17 @@ from scripts.synthetic.capture import Options, plan_capture, write_capture
 
 FRAMES = 14
 
-# coarse, a short fit of the body, and no second process to be started: a whole run takes about a second
+# coarse, short fits of the body, and no second process to be started: a whole run takes a second or two
 QUICK = """
 voxels = 32
 ahead = 0
 [fit]
 rounds = 6
+[silhouette]
+init_frames = 3
+[silhouette.fit]
+frames = 2
+rounds = 2
 [tracking]
 init_frames = 3
 """
@@ -81,13 +86,13 @@ def copy(tiny: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def tracked(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The result of an unbroken run over the tiny capture. Not to be changed."""
+    """The result of an unbroken run of the volumetric tracker over the tiny capture. Not to be changed."""
     from tk.config import Config
     from tk.io.capture import open_capture
     from tk.session import track
 
     path = tmp_path_factory.mktemp("results") / "unbroken.h5"
-    track(open_capture(tiny), path, Config.from_toml(QUICK), Silent(), store_hull=True)
+    track(open_capture(tiny), path, Config.from_toml(QUICK), Silent(), method="volumetric", store_hull=True)
     return path
 
 

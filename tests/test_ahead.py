@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -16,16 +17,17 @@ import numpy as np
 import pytest
 
 from tests.conftest import FRAMES, QUICK, Silent
-from tests.test_sequence import assert_same, send
+from tests.test_session import assert_same, send
 from tk.ahead import Ahead, Serial, Source, open_source
 from tk.config import Config
 from tk.errors import ConfigError, VideoError, WorkerError
 from tk.io.capture import open_capture
 from tk.io.result import read_result
-from tk.session import track
+from tk import session
 
 AHEAD = Config.from_toml(QUICK.replace("ahead = 0", "ahead = 2"))
 ROOT = Path(__file__).parents[1]
+track = partial(session.track, method="volumetric")
 
 
 def arrays(source: Source, start: int, stop: int) -> list[tuple[int, np.ndarray, np.ndarray]]:

@@ -52,7 +52,11 @@ def test_track_writes_what_the_contract_says(tk: Tk, quick: Path, tiny: Path, tm
         "frames": ((6,), "int64"),
         "time": ((6,), "float64"),
         "pose": ((6, 24), "float64"),
+        "waist": ((6, 3), "float64"),
+        "ankles": ((6, 4), "float64"),
         "joints/position": ((6, 15, 3), "float64"),
+        "joints/sigma": ((6, 15), "float64"),
+        "fit_error": ((6, 4), "float64"),
         "status": ((6,), "uint8"),
         "objective": ((6,), "float64"),
     }
@@ -75,13 +79,13 @@ def test_track_writes_what_the_contract_says(tk: Tk, quick: Path, tiny: Path, tm
         assert (file["timing/total"][()] >= parts - 1e-9).all()  # writing is in it, too
         dimensions = {name: float(value[()]) for name, value in file["model/dimensions"].items()}
         assert dimensions and all(0 < abs(value) < 2.5 for value in dimensions.values() if value)
-        assert file["model/patches/mean_yuv"].shape[1] == 3
+        assert file["model/parts/shape"].shape[1] == 4
         assert "hull" not in file
         attributes = dict(file.attrs)
     assert {key: attributes[key] for key in ("format", "format_version", "fps", "units", "up", "capture")} == {
         "format": "tk-result", "format_version": 2, "fps": 15.0, "units": "m", "up": "z", "capture": "demo",
     }  # fmt: skip
-    assert (attributes["method"], attributes["seed"]) == ("volumetric", 5)
+    assert (attributes["method"], attributes["seed"]) == ("region", 5)
     assert __version__ in attributes["software"] and attributes["created"].startswith("20")
     config = Config.from_toml(attributes["config"])
     assert (config.voxels, config.seed) == (32, 5)
@@ -265,12 +269,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], list[str]]] = {
         lambda folder: (folder / "masks/cam2/000000.png").write_text("white"), ["masks/cam2/000000.png"],
     ),
     "a camera without masks": (lambda folder: shutil.rmtree(folder / "masks/cam3"), ["masks", "cam3"]),
-    "nobody there": (_empty_masks, ["capture", "masks", "surface voxels"]),
-    "no Da Vinci pose": (_squeezed, ["capture", "no Da Vinci pose", "--init-pose"]),
-    "any pose": (
-        lambda folder: edit_toml(folder / "capture.toml", lambda d: d["init"].update(pose="any")),
-        ["capture.toml", "--init-pose"],
-    ),
+    "nobody there": (_empty_masks, ["capture", "0 of 4 masks of frame 0 show anybody"]),
     "an initial frame past the end": (
         lambda folder: edit_toml(folder / "capture.toml", lambda d: d["init"].update(frame=99)),
         ["capture.toml", "99", "13"],
@@ -278,13 +277,27 @@ SPOILT: dict[str, tuple[Callable[[Path], object], list[str]]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("spoil", SPOILT)
+# what only the volumetric tracker cannot track
+SPOILT_FOR_VOXELS: dict[str, tuple[Callable[[Path], object], list[str]]] = {
+    "nobody there": (_empty_masks, ["capture", "masks", "surface voxels"]),
+    "no Da Vinci pose": (_squeezed, ["capture", "no Da Vinci pose", "--init-pose"]),
+    "any pose": (
+        lambda folder: edit_toml(folder / "capture.toml", lambda d: d["init"].update(pose="any")),
+        ["capture.toml", "--init-pose"],
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ("method", "spoil"), [*(("region", name) for name in SPOILT), *(("volumetric", name) for name in SPOILT_FOR_VOXELS)]
+)
 def test_a_bad_capture_is_one_line_that_names_the_file(
-    tk: Tk, quick: Path, copy: Path, tmp_path: Path, spoil: str
+    tk: Tk, quick: Path, copy: Path, tmp_path: Path, method: str, spoil: str
 ) -> None:
-    change, parts = SPOILT[spoil]
+    change, parts = (SPOILT if method == "region" else SPOILT_FOR_VOXELS)[spoil]
     change(copy)
-    tk("track", copy, "-o", tmp_path / "r.h5", "--config", quick).complaint(str(copy), *parts)
+    ran = tk("track", copy, "-o", tmp_path / "r.h5", "--method", method, "--config", quick)
+    ran.complaint(str(copy), *parts)
     assert list(tmp_path.iterdir()) == [copy]
 
 

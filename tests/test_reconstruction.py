@@ -20,7 +20,7 @@ CONFIG = Config.from_toml(QUICK)
 def test_the_hull_is_the_trackers(tk: Tk, tiny: Path, tmp_path: Path) -> None:
     settings, tracked = tmp_path / "settings.toml", tmp_path / "tracked.h5"
     settings.write_text(QUICK, encoding="utf-8")
-    ran = tk("track", tiny, "-o", tracked, "--config", settings, "--store-hull")
+    ran = tk("track", tiny, "--method", "volumetric", "-o", tracked, "--config", settings, "--store-hull")
     assert ran.code == 0, ran.err
     reporter = Silent()
     assert reconstruct(open_capture(tiny), tmp_path / "h.h5", CONFIG, reporter) == FRAMES

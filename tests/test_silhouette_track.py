@@ -17,12 +17,9 @@ from tk.io.result import Status, read_joints, read_result
 from tk.model.skeleton import JOINTS
 from tk.session import METHODS, Summary, track
 
-# few hypotheses, few frames to fit the body to
+# few frames to fit the body to
 QUICK = """
 [silhouette]
-headings = 4
-phases = 1
-finalists = 2
 init_frames = 3
 [silhouette.fit]
 frames = 2
@@ -89,7 +86,7 @@ def test_it_starts_from_a_pose_file(tiny: Path, tmp_path: Path) -> None:
 
 
 def test_the_walker_is_a_choice(tiny: Path, tmp_path: Path) -> None:
-    run(tiny, tmp_path / "r.h5", QUICK.replace("headings", 'body = "walker"\nheadings'), frames=(0, 2))
+    run(tiny, tmp_path / "r.h5", QUICK.replace("init_frames", 'body = "walker"\ninit_frames'), frames=(0, 2))
     with h5py.File(tmp_path / "r.h5") as file:
         assert file["model/parts/shape"].shape == (6, 4)
         assert file["model/body"][()].decode() == "walker"

@@ -18,15 +18,12 @@ from tk.model.silhouettes import draw_silhouettes
 from tk.model.skeleton import JOINTS
 from tk.model.superellipsoid_silhouettes import draw_body
 from tk.session import track
-from tk.trackers.silhouette import restore_body
-from tk.trackers.volumetric import restore_body as restore_superellipsoids
+from tk.trackers.bodies import body_and_poses
 from tk.view_evaluation import capture_of, evaluate_views
+from tk.trackers.volumetric import restore_body as restore_superellipsoids
 
 SETTINGS = """
 [silhouette]
-headings = 4
-phases = 1
-finalists = 1
 init_frames = 2
 [silhouette.fit]
 frames = 2
@@ -46,10 +43,14 @@ def test_every_view_is_judged_as_by_hand(tiny: Path, three_views: Path) -> None:
     found = evaluate_views(three_views, tiny / "truth.h5", tiny, ("wrist_l",))
     result, truth = read_result(three_views), read_joints(tiny / "truth.h5")
     capture = open_capture(tiny)
-    body = restore_body(result.model, "z")
+    restored = body_and_poses(result)
+    assert restored is not None
+    body, poses = restored
+    # the poses are whole: their joints are those of the file
+    np.testing.assert_allclose([body.skeleton.joints(pose) for pose in poses], result.joints, atol=1e-9)
     with capture.frames(0, 3) as frames:
         masks = np.array([frame.masks for frame in frames])
-    drawn = draw_silhouettes(body, capture.rig, result.pose)
+    drawn = draw_silhouettes(body, capture.rig, poses)
     wrist = JOINTS.index("wrist_l")
     assert [view.tracked for view in found.views] == [True, True, True, False]
     for v, (camera, view) in enumerate(zip(capture.rig, found.views, strict=True)):
@@ -108,3 +109,33 @@ def test_what_cannot_be_judged_is_told(tk: Tk, tiny: Path, three_views: Path, co
     assert ran.code == 0 and "not judged in the pictures" in ran.err and "PCK5" in ran.out
     with h5py.File(three_views) as file:
         assert "state" in file["resume"]
+
+
+def test_waist_and_ankles_are_drawn(tiny: Path, three_views: Path, tmp_path: Path) -> None:
+    """A body whose ankles or waist are bent otherwise covers other pixels; without them it is drawn straight."""
+    straight = evaluate_views(three_views, tiny / "truth.h5", tiny)
+    for name in ("ankles", "waist"):
+        bent = Path(shutil.copy(three_views, tmp_path / f"{name}.h5"))
+        with h5py.File(bent, "a") as file:
+            file[name][...] = file[name][()] + 0.4
+        found = evaluate_views(bent, tiny / "truth.h5", tiny)
+        assert found.silhouette_error is not None and straight.silhouette_error is not None
+        assert found.silhouette_error > straight.silhouette_error + 0.005, name
+    old = Path(shutil.copy(three_views, tmp_path / "old.h5"))
+    with h5py.File(old, "a") as file:
+        del file["ankles"]
+    restored = body_and_poses(read_result(old))
+    assert restored is not None
+    body, poses = restored
+    assert not poses[:, body.skeleton.is_ankle].any() and poses[:, body.skeleton.is_waist].any()
+
+
+def test_poses_of_another_body_are_told(tk: Tk, tiny: Path, three_views: Path, tmp_path: Path) -> None:
+    spoilt = Path(shutil.copy(three_views, tmp_path / "r.h5"))
+    with h5py.File(spoilt, "a") as file:
+        values, attributes = file["waist"][:, :2], dict(file["waist"].attrs)
+        del file["waist"]
+        file["waist"] = values
+        for key, value in attributes.items():
+            file["waist"].attrs[key] = value[:2]
+    tk("evaluate", spoilt, tiny / "truth.h5", "--capture", tiny).complaint("r.h5", "waist")

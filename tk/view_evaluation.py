@@ -28,7 +28,7 @@ from tk.model.camera import Rig
 from tk.model.silhouettes import draw_silhouettes, share_wrong
 from tk.model.skeleton import JOINTS, Skeleton
 from tk.model.superellipsoid_silhouettes import draw_body
-from tk.trackers.silhouette import restore_body as restore_cones
+from tk.trackers.bodies import body_and_poses
 from tk.trackers.volumetric import restore_body as restore_superellipsoids
 
 Float = NDArray[np.float64]
@@ -191,10 +191,10 @@ def _silhouette_errors(result: Result, capture: Capture) -> tuple[list[float] | 
 
 def _drawn(result: Result, rig: Rig) -> Callable[[int], NDArray[np.uint8]] | None:
     """What draws a row's body, (V, H, W) 0 or 255; None if the result has no body."""
-    if "parts/shape" in result.model and "body" in result.model:
-        cones = restore_cones(result.model, result.meta.up)
-        _check_poses(result, result.pose, cones.skeleton)
-        return lambda row: draw_silhouettes(cones, rig, result.pose[row][None])[0]
+    found = body_and_poses(result)
+    if found is not None:
+        cones, whole = found
+        return lambda row: draw_silhouettes(cones, rig, whole[row][None])[0]
     restored = restore_superellipsoids(result)
     if restored is None:
         return None

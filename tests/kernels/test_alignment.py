@@ -11,7 +11,6 @@ from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective import ObjectiveSettings
 from tk.model.contour_term import ContourConfig, ContourTerm
 from tk.model.objective import BodyObjective, SamplingConfig
-from tk.model.skeleton import SEGMENTS
 
 SKELETON = BODY.skeleton
 D = len(SKELETON.names)
@@ -76,7 +75,7 @@ class Scene:
         rng = np.random.default_rng(seed)
         self.poses = some_poses(poses, seed)
         self.direction = rng.normal(size=(poses, D))
-        self.segment = rng.integers(0, len(SEGMENTS), (poses, count))
+        self.segment = rng.choice(np.unique(BODY.segment), (poses, count))
         entries = np.zeros((poses, count, a.ENTRY_NUMBERS))
         for b in range(poses):
             for e in range(count):

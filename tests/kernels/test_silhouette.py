@@ -13,14 +13,13 @@ from tests.model.ring import ring_of_cameras
 from tk.errors import ConfigError
 from tk.kernels import silhouette
 from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A, SIDE_B, curve_of, enter, point_on
-from tk.kernels.overlap import overlap
 from tk.kernels.runtime import ensure_runtime, ti
-from tk.kernels.silhouette import SearchSettings
+from tk.kernels.silhouette import COLOR_BINS, SearchSettings, _search_colors
 from tk.model import gait
 from tk.model.anthropometry import BodyDimensions
+from tk.model.body_fit import pose_rows
 from tk.model.camera import Rig
 from tk.model.cone_body import build_cone_body
-from tk.model.cone_fitting import pose_rows
 from tk.model.silhouettes import Views, draw_silhouettes
 
 BODY = build_cone_body(BodyDimensions.from_stature(1.75))
@@ -304,16 +303,6 @@ def test_a_body_that_no_camera_sees_has_no_equations():
     assert np.isinf(total.cost[0]) and total.found[0] == 0 and not total.hessian.any()
 
 
-def test_overlap_counts_what_it_draws():
-    poses = np.stack([POSE, POSE + 0.1])
-    seen = MASKS[:, 2::4, 2::4]
-    counts, pictures = overlap(BODY.arrays, VIEWS.cameras, 4, VIEWS.rays, seen, poses)
-    drawn, masks = pictures > 0, MASKS[None, :, 2::4, 2::4] > 0
-    np.testing.assert_array_equal(counts[..., 0], (drawn & ~masks).sum(axis=(2, 3)))
-    np.testing.assert_array_equal(counts[..., 1], (masks & ~drawn).sum(axis=(2, 3)))
-    assert not counts[0].any() and counts[1].all()
-
-
 def test_drawn_silhouettes_are_the_hulls_of_the_parts():
     """Each part is convex: its silhouette is the convex hull of its projected cloud, lens distortion included."""
     rig = ring_of_cameras(2, width=160, height=200)
@@ -335,6 +324,87 @@ def test_drawn_silhouettes_are_the_hulls_of_the_parts():
         assert not ((picture > 0) & (around == 0)).any()
         assert not ((core > 0) & (picture == 0)).any()
         assert (core > 0).sum() > 0.6 * (picture > 0).sum()
+
+
+@ti.kernel
+def _border(
+    image: ti.types.ndarray(dtype=ti.u8, ndim=4),
+    likelihood: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    start: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    normal: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    window: ti.f64,
+    scale: ti.f64,
+    found: ti.types.ndarray(dtype=ti.f64, ndim=1),
+):
+    x, n = ti.Vector([start[0], start[1]]), ti.Vector([normal[0], normal[1]])
+    for _ in range(1):
+        certainty, place = _search_colors(
+            image, likelihood, 0, image.shape[2], image.shape[1], x, n, window, scale, 0, 1
+        )
+        found[0], found[1] = certainty, place
+
+
+def border(image, likelihood, start, normal, window=8.0, scale=1.0):
+    """(certainty, place in pixels of the scale) of the border between group 0 and group 1."""
+    ensure_runtime()
+    found = np.empty(2)
+    _border(image[None], likelihood.astype(np.float32), np.array(start, float), np.array(normal), window, scale, found)
+    return found
+
+
+RED, BLUE = (20, 20, 200), (200, 20, 20)
+
+
+def two_colors():
+    """(2, COLOR_BINS) group 0 is red, group 1 is blue, and either may be anything now and then."""
+    share = np.full((2, COLOR_BINS), 0.02 / COLOR_BINS)
+    for row, (b, g, r) in zip(share, (RED, BLUE), strict=True):
+        row[(b >> 4) << 8 | (g >> 4) << 4 | r >> 4] += 0.98
+    return np.log(share)
+
+
+@given(
+    turn=st.floats(0, 2 * np.pi),
+    place=st.floats(-4, 4),
+    scale=st.sampled_from([1.0, 2.0]),
+)
+@few
+def test_the_border_between_two_colors_is_found(turn, place, scale):
+    """A half-plane of either colour: the border lies where it lies, to half a pixel, and is certain."""
+    n, start = np.array([np.cos(turn), np.sin(turn)]), np.array([41.3, 38.7])
+    y, x = np.mgrid[:80, :80]
+    inside = (x - start[0]) * n[0] + (y - start[1]) * n[1] < place * scale
+    image = np.where(inside[..., None], RED, BLUE).astype(np.uint8)
+    certainty, found = border(image, two_colors(), start, n, scale=scale)
+    # pixels along a slanting line are met up to half a diagonal off
+    assert abs(found - place) < 0.5 + 0.71 / scale
+    assert certainty > 0.8
+    if np.abs(n).max() > 1 - 1e-9:
+        assert abs(found - place) <= 0.5 + 0.05
+
+
+@pytest.mark.parametrize("normal", [(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
+@pytest.mark.parametrize("offset", [-3, 0, 2])
+def test_along_rows_and_columns_the_border_is_found_to_half_a_pixel(normal, offset):
+    """The border halfway between two pixels; from the start, a pixel's centre, it is offset + 1/2 away."""
+    y, x = np.mgrid[:60, :60]
+    along = (x - 30) * normal[0] + (y - 30) * normal[1]
+    image = np.where((along <= offset)[..., None], RED, BLUE).astype(np.uint8)
+    certainty, found = border(image, two_colors(), (30, 30), normal)
+    assert abs(found - (offset + 0.5)) < 0.25 and certainty > 0.8
+
+
+def test_equal_colors_tell_nothing():
+    y, x = np.mgrid[:60, :60]
+    split = np.where((x < 30)[..., None], RED, BLUE).astype(np.uint8)
+    plain = np.full((60, 60, 3), RED, np.uint8)
+    alike = np.repeat(two_colors()[:1], 2, axis=0)
+    for image, likelihood in ((split, alike), (plain, alike)):
+        certainty, _ = border(image, likelihood, (30, 30), (1.0, 0.0))
+        assert certainty == pytest.approx(0.0, abs=1e-4)
+    # one colour that suits one group only: the border is not on the line
+    assert border(plain, two_colors(), (30, 30), (1.0, 0.0))[1] > 6
+    assert border(np.full((60, 60, 3), BLUE, np.uint8), two_colors(), (30, 30), (1.0, 0.0))[1] < -6
 
 
 def test_settings_out_of_range_are_told():

@@ -27,7 +27,8 @@ def in_piece(body, index, points, pose):
 
 def test_every_segment_has_samples_of_its_own_pieces():
     np.testing.assert_array_equal(PIECE_SEGMENT[BODY.piece], BODY.segment)
-    assert set(BODY.segment) == set(range(len(SEGMENTS)))
+    feet = {SEGMENTS.index("foot_l"), SEGMENTS.index("foot_r")}  # pieces of the calves: this body has no ankles
+    assert set(BODY.segment) == set(range(len(SEGMENTS))) - feet
     np.testing.assert_array_equal(BODY.diameter, np.array([p.diameter_m for p in BODY.pieces])[BODY.piece])
 
 

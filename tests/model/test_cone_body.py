@@ -28,8 +28,9 @@ def points_of(body, pose):
     return owner, body.place(pose, owner, np.concatenate(pieces))
 
 
-@pytest.mark.parametrize(("preset", "components"), [("full", 14), ("limbs", 10), ("walker", 6)])
+@pytest.mark.parametrize(("preset", "components"), [("full", 15), ("limbs", 10), ("walker", 6)])
 def test_presets_have_the_papers_components(preset, components):
+    """The full body has one more: a pelvis apart from the trunk."""
     body = build_cone_body(DIMENSIONS, preset=preset)
     assert len({part.component for part in body.parts}) == components
     assert [part.component for part in body.parts if part.kind == ELLIPSOID] == ["head"]

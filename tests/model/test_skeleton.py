@@ -10,13 +10,17 @@ from tk.errors import ConfigError
 from tk.model.anthropometry import RAISED_SHOULDERS, TRUNK_LENGTH, BodyDimensions
 from tk.model.body import neutral_pose
 from tk.model.skeleton import (
+    ANKLES,
     CHAINS,
     DEGREES_OF_FREEDOM,
     JOINTS,
     SEGMENTS,
     WAIST,
+    arm_elevation,
     build_skeleton,
+    join_pose,
     shoulder_angles,
+    split_pose,
     twist_exp,
     up_rotation,
     with_waist,
@@ -120,6 +124,8 @@ def test_layout():
         "hip_r_roll",
         "knee_r_flexion",
         "torso_pitch",  # the pelvis, part of the trunk
+        "knee_l_flexion",  # the feet, parts of the calves
+        "knee_r_flexion",
     ]
 
 
@@ -141,7 +147,8 @@ def test_a_waist_is_three_more_degrees_of_freedom_between_trunk_and_pelvis():
     moved = WAISTED.ancestors()[:, WAISTED.is_waist]
     below = {SEGMENTS[s] for s in np.flatnonzero(moved.all(axis=1))}
     assert (
-        below == {"pelvis", "thigh_l", "calf_l", "thigh_r", "calf_r"} and (moved.any(axis=1) == moved.all(axis=1)).all()
+        below == {"pelvis", "thigh_l", "calf_l", "foot_l", "thigh_r", "calf_r", "foot_r"}
+        and (moved.any(axis=1) == moved.all(axis=1)).all()
     )
     assert not np.array([WAISTED.chain_dofs(c) for c in CHAINS])[:, WAISTED.is_waist].any()
 
@@ -169,6 +176,96 @@ def test_without_a_waist_all_limbs_keep_their_directions(up):
         np.testing.assert_allclose(with_waist(skeleton, told, waist), pose, atol=1e-9)
 
 
+# The whole skeleton, with waist and ankles
+
+
+def whole(up="z"):
+    return build_skeleton(DIMENSIONS, up, waist=True, ankles=True)
+
+
+def test_ankles_are_two_more_degrees_of_freedom_a_side_that_move_the_foot_only():
+    skeleton = whole()
+    assert len(skeleton.names) == 31 and tuple(np.array(skeleton.names)[skeleton.is_ankle]) == ANKLES
+    assert tuple(np.array(skeleton.names)[skeleton.is_paper]) == SKELETON.names
+    assert (skeleton.is_paper ^ skeleton.is_waist ^ skeleton.is_ankle).all()
+    for side in "lr":
+        moved = skeleton.ancestors()[:, [skeleton.index(f"ankle_{side}_{n}") for n in ("flexion", "inversion")]]
+        assert [s for s, m in zip(SEGMENTS, moved.any(axis=1), strict=True) if m] == [f"foot_{side}"]
+        assert moved[SEGMENTS.index(f"foot_{side}")].all()
+    pose = np.random.default_rng(0).uniform(-0.5, 0.5, 31)
+    bent = pose.copy()
+    bent[skeleton.is_ankle] = 0.3
+    np.testing.assert_array_equal(skeleton.joints(bent), skeleton.joints(pose), err_msg="no joint is below an ankle")
+
+
+@pytest.mark.parametrize("side", ["l", "r"])
+def test_signs_of_the_ankles_are_anatomical(side):
+    """Flexion lifts the toes, inversion turns the sole inwards; the limits are those of a foot."""
+    skeleton = whole()
+    foot = SEGMENTS.index(f"foot_{side}")
+
+    def turned(name):
+        pose = np.zeros(31)
+        pose[skeleton.index(f"ankle_{side}_{name}")] = 0.2
+        return skeleton.segment_transforms(pose)[foot][:3, :3]
+
+    assert (turned("flexion") @ FORWARD)[2] == pytest.approx(np.sin(0.2))
+    inward = -1 if side == "l" else 1
+    assert (turned("inversion") @ -UP)[1] * inward == pytest.approx(np.sin(0.2))
+    for name, low, high in (("flexion", -60, 40), ("inversion", -30, 40)):
+        k = skeleton.index(f"ankle_{side}_{name}")
+        np.testing.assert_allclose(np.degrees([skeleton.lower[k], skeleton.upper[k]]), [low, high])
+    assert (skeleton.clip(np.full(31, -9.0))[skeleton.is_ankle] < 0).all()
+
+
+@pytest.mark.parametrize("up", ["z", "-y"])
+@given(seed=seeds)
+@settings(max_examples=20, deadline=None)
+def test_poses_are_split_and_joined(up, seed):
+    """A round trip; in between, what is told has the same limbs, and the legs hang elsewhere by the waist only."""
+    skeleton = whole(up)
+    pose = skeleton.clip(np.random.default_rng(seed).normal(0, 0.5, 31))
+    paper, waist, ankles = split_pose(skeleton, pose)
+    assert (len(paper), len(waist), len(ankles)) == (24, 3, 4)
+    np.testing.assert_array_equal(waist, pose[skeleton.is_waist])
+    np.testing.assert_array_equal(ankles, pose[skeleton.is_ankle])
+    joined = join_pose(skeleton, paper, waist, ankles)
+    np.testing.assert_allclose(joined, pose, atol=1e-9)
+    np.testing.assert_allclose(skeleton.joints(joined), skeleton.joints(pose), atol=1e-9)
+    plain = build_skeleton(DIMENSIONS, up)
+    R, R_told = (s.segment_transforms(p)[:, :3, :3] for s, p in ((skeleton, pose), (plain, paper)))
+    limbs = [SEGMENTS.index(s) for s in SEGMENTS if s != "pelvis" and not s.startswith("foot")]
+    np.testing.assert_allclose(R_told[limbs], R[limbs], atol=1e-9)
+
+
+def test_bodies_without_waist_or_ankles_are_split_into_nothing_more():
+    pose = random_pose(3)
+    paper, waist, ankles = split_pose(SKELETON, SKELETON.clip(pose))
+    np.testing.assert_allclose(paper, SKELETON.clip(pose), atol=1e-12)
+    assert waist.shape == ankles.shape == (0,)
+    np.testing.assert_allclose(join_pose(SKELETON, paper, waist, ankles), SKELETON.clip(pose), atol=1e-12)
+
+
+@pytest.mark.parametrize("up", ["z", "-y"])
+@given(seed=seeds)
+@settings(max_examples=20, deadline=None)
+def test_transforms_are_the_products_of_exponentials(up, seed):
+    """T_k = T_parent(k) exp(ξ_k p_k), one after the other; a raised arm lifts its shoulder."""
+    skeleton = whole(up)
+    pose = np.random.default_rng(seed).uniform(-np.pi, np.pi, 31)
+    expected = []
+    for k, parent in enumerate(skeleton.parent):
+        step = np.eye(4)
+        if skeleton.prismatic[k]:
+            step[:3, 3] = skeleton.axis[k] * pose[k]
+        else:
+            step = twist_exp(skeleton.axis[k], skeleton.point[k], pose[k])
+        if skeleton.rise[k].any():
+            step[:3, 3] += skeleton.rise[k] * arm_elevation(pose[k], pose[k + 1])
+        expected.append(step if parent < 0 else expected[parent] @ step)
+    np.testing.assert_allclose(skeleton.transforms(pose), expected, atol=1e-12)
+
+
 def test_chains_and_torso_share_out_the_degrees_of_freedom():
     free = np.array([SKELETON.chain_dofs(c) for c in CHAINS])
     assert free.sum(axis=0).max() == 1
@@ -184,7 +281,7 @@ def test_chains_and_torso_share_out_the_degrees_of_freedom():
     for chain, moved in zip(CHAINS, free, strict=True):
         # a chain's degrees of freedom move its own segments and no others
         affected = SKELETON.ancestors()[:, moved].any(axis=1)
-        assert [s for s, a in zip(SEGMENTS, affected, strict=True) if a] == list(CHAINS[chain])
+        assert {s for s, a in zip(SEGMENTS, affected, strict=True) if a} == set(CHAINS[chain])
 
 
 def test_ancestors_are_what_moves_a_segment():

@@ -105,10 +105,11 @@ class ContourTerm:
 
     def draw_chains(self, rng: np.random.Generator | None) -> Ints:
         """(chains, K) strips of each chain. The head's find no edges (6.4); rows are of one length."""
+        chains = [[s for s in chain if s in self._circles] for chain in CHAINS.values()]
         return np.stack(
             [
                 np.concatenate([_some(self._circles[s], 2 * self._pairs_a_limb // len(chain), rng) for s in chain])
-                for chain in CHAINS.values()
+                for chain in chains
             ]
         )
 

@@ -17,14 +17,6 @@ from tk.model.skeleton import Skeleton, shoulder_angles
 Float = NDArray[np.float64]
 
 
-# Where an arm may be, degrees: forward, to the side, elbow. Walking, then raised.
-_ARMS = [(forward, 7.0, elbow) for forward in (-30.0, -10.0, 15.0, 40.0) for elbow in (15.0, 45.0, 75.0)]
-_ARMS += [
-    (forward, aside, elbow) for forward, aside in ((80.0, 10.0), (130.0, 10.0), (0.0, 45.0)) for elbow in (20.0, 80.0)
-]
-_ARMS += [(0.0, 90.0, 10.0), (0.0, 90.0, 70.0), (180.0, 40.0, 20.0)]
-
-
 def hip_and_knee(phase: float) -> tuple[float, float]:
     """Hip flexion and knee flexion, radians, at a phase in [0, 1) of the leg's cycle; 0 is heel strike."""
     phase %= 1.0
@@ -55,24 +47,6 @@ def walking_pose(skeleton: Skeleton, phase: float | None) -> Float:
         pose[skeleton.index(f"shoulder_{side}_pitch")] = pitch
         pose[skeleton.index(f"elbow_{side}_flexion")] = np.radians(20.0 if phase is not None else 10.0)
     return pose
-
-
-def arm_variants(skeleton: Skeleton, pose: Float) -> Float:
-    """(B, D) copies of a pose with one arm elsewhere: hanging and swung, or raised, the elbow little or much bent."""
-    variants = []
-    for side in ("l", "r"):
-        for forward, aside, elbow in _ARMS:
-            changed = pose.copy()
-            f, a = np.radians([forward, aside])
-            # from hanging: swung forward about the shoulders' axis, then raised to the side
-            arm = np.array([np.sin(f) * np.cos(a), np.sin(a), -np.cos(f) * np.cos(a)])
-            yaw, pitch = shoulder_angles(arm)
-            changed[skeleton.index(f"shoulder_{side}_yaw")] = yaw
-            changed[skeleton.index(f"shoulder_{side}_pitch")] = pitch
-            changed[skeleton.index(f"shoulder_{side}_roll")] = 0.0
-            changed[skeleton.index(f"elbow_{side}_flexion")] = np.radians(elbow)
-            variants.append(changed)
-    return np.array(variants)
 
 
 def hypotheses(skeleton: Skeleton, headings: int, phases: int, p_pelvis: Float) -> Float:

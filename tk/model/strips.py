@@ -25,7 +25,8 @@ from tk.model.superellipsoid import Superellipsoid, signed_power
 Float = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
-LIMBS = tuple(s for s in SEGMENTS if s not in ("torso", "pelvis", "head"))
+# feet are pieces of the calves
+LIMBS = tuple(s for s in SEGMENTS if s not in ("torso", "pelvis", "head", "foot_l", "foot_r"))
 
 
 @dataclass(frozen=True)

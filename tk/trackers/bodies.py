@@ -5,11 +5,15 @@ from __future__ import annotations
 from dataclasses import fields
 from pathlib import Path
 
-from tk.errors import ConfigError
-from tk.io.result import read_result
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ConfigError, ResultError
+from tk.io.result import Result, read_result
 from tk.io.toml import parse_toml, read_text
 from tk.model.anthropometry import BodyDimensions
 from tk.model.cone_body import ConeBody, build_cone_body
+from tk.model.skeleton import DEGREES_OF_FREEDOM, join_pose
 from tk.trackers.contours import restore_body
 
 
@@ -40,3 +44,33 @@ def read_body(path: Path, up: str) -> ConeBody:
     average = BodyDimensions.from_stature(float(stature))
     lengths = {name: float(given.get(name, getattr(average, name))) for name in known}
     return build_cone_body(BodyDimensions(**lengths), up)
+
+
+def body_and_poses(result: Result) -> tuple[ConeBody, NDArray[np.float64]] | None:
+    """The body of contours that a result was tracked with, and its poses (F, D); None where it holds no such body.
+
+    Angles that the result does not tell, as results of version 1 do not tell the ankles', are 0.
+
+    Raises:
+        ResultError: the poses are not of this body.
+    """
+    if "parts/shape" not in result.model or "body" not in result.model:
+        return None
+    body = restore_body(result.model, result.meta.up)
+    skeleton = body.skeleton
+    F = len(result.frames)
+    columns = []
+    for name, values, count in (
+        ("pose", result.pose, DEGREES_OF_FREEDOM),
+        ("waist", result.waist, int(skeleton.is_waist.sum())),
+        ("ankles", result.ankles, int(skeleton.is_ankle.sum())),
+    ):
+        column = np.zeros((F, count)) if values is None else values
+        if column.shape[1:] != (count,):
+            raise ResultError(
+                f"{result.path}: /{name} has {column.shape[1]} entries a frame, its body {count} such degrees of "
+                "freedom; track anew"
+            )
+        columns.append(column)
+    poses = [join_pose(skeleton, pose, waist, ankles) for pose, waist, ankles in zip(*columns, strict=True)]
+    return body, np.array(poses).reshape(F, len(skeleton.names))

@@ -1,4 +1,7 @@
-"""The loop: same seed, same file; runs that are stopped, killed, prolonged or taken up again; where a run starts."""
+"""The loop: same seed, same file; runs that are stopped, killed, prolonged or taken up again; where a run starts.
+
+By the volumetric tracker; tests/test_region_track.py has what is the default's own.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +25,12 @@ from tk.errors import ConfigError
 from tk.io.capture import open_capture
 from tk.io.result import Status, read_joints, read_result
 from tk.model.skeleton import JOINTS
-from tk.session import Summary, choose_frames, make_tracker, track
+from tk import session
+from tk.session import Summary, choose_frames, make_tracker
 
 ROOT = Path(__file__).parents[1]
 CONFIG = Config.from_toml(QUICK)
+track = partial(session.track, method="volumetric")
 
 # `tk` that sends itself a signal once a frame is finished
 VICTIM = """
@@ -101,7 +107,7 @@ def test_another_seed_gives_another_result(tiny: Path, tracked: Path, tmp_path: 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs POSIX signals")
 def test_a_killed_run_is_taken_up_again(tk: Tk, quick: Path, tiny: Path, tracked: Path, tmp_path: Path) -> None:
     result = tmp_path / "r.h5"
-    command = ["track", tiny, "-o", result, "--config", quick, "--store-hull"]
+    command = ["track", tiny, "--method", "volumetric", "-o", result, "--config", quick, "--store-hull"]
     killed = send(signal.SIGKILL, 5, *command)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert killed.stdout == ""
@@ -120,7 +126,7 @@ def test_a_killed_run_is_taken_up_again(tk: Tk, quick: Path, tiny: Path, tracked
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 def test_ctrl_c_ends_cleanly_and_the_run_is_taken_up_again(tiny: Path, quick: Path, tmp_path: Path) -> None:
     result = tmp_path / "r.h5"
-    stopped = send(signal.SIGINT, 3, "track", tiny, "-o", result, "--config", quick)
+    stopped = send(signal.SIGINT, 3, "track", tiny, "--method", "volumetric", "-o", result, "--config", quick)
     assert stopped.returncode == 1, stopped.stderr
     assert stopped.stdout == "" and "Traceback" not in stopped.stderr
     assert stopped.stderr.splitlines()[-1] == "tk: interrupted; go on with the same command and --resume"
@@ -178,7 +184,7 @@ def test_only_the_same_command_is_taken_up_again(
     tk: Tk, quick: Path, tiny: Path, begun: Path, options: list[str], difference: str
 ) -> None:
     before = begun.read_bytes()
-    ran = tk("track", tiny, "-o", begun, "--config", quick, "--resume", *options)
+    ran = tk("track", tiny, "--method", "volumetric", "-o", begun, "--config", quick, "--resume", *options)
     ran.complaint(str(begun), difference, "run without --resume")
     assert begun.read_bytes() == before
 
@@ -194,7 +200,7 @@ def test_results_of_other_software_are_not_taken_up(tk: Tk, quick: Path, tiny: P
     other = tmp_path / "other.h5"
     with h5py.File(other, "w") as file:
         file["frames"] = np.arange(3)
-    command = ["track", tiny, "-o", other, "--config", quick, "--resume"]
+    command = ["track", tiny, "--method", "volumetric", "-o", other, "--config", quick, "--resume"]
     tk(*command).complaint("other.h5", "other software")
     other.write_text("not HDF5")
     tk(*command).complaint("other.h5", "not an HDF5 file")
@@ -267,7 +273,7 @@ def test_starts_from_angles(tiny: Path, tracked: Path, tmp_path: Path) -> None:
 def test_an_initial_pose_past_the_end(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
     joints = {name: [0.1 * (k % 2), 0.05 * k, 1.0] for k, name in enumerate(JOINTS)}
     file = pose_file(tmp_path / "pose.toml", {"frame": 99, "joints": joints})
-    tk("track", tiny, "-o", tmp_path / "r.h5", "--config", quick, "--init-pose", file).complaint(
+    tk("track", tiny, "--method", "volumetric", "-o", tmp_path / "r.h5", "--config", quick, "--init-pose", file).complaint(
         "pose.toml", "99", "13"
     )
 
@@ -275,7 +281,7 @@ def test_an_initial_pose_past_the_end(tk: Tk, quick: Path, tiny: Path, tmp_path:
 def test_an_initial_pose_in_millimetres(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
     joints = {name: [100.0 * (k % 2), 50.0 * k, 1000.0] for k, name in enumerate(JOINTS)}
     file = pose_file(tmp_path / "pose.toml", {"joints": joints})
-    ran = tk("track", tiny, "-o", tmp_path / "r.h5", "--config", quick, "--init-pose", file)
+    ran = tk("track", tiny, "--method", "volumetric", "-o", tmp_path / "r.h5", "--config", quick, "--init-pose", file)
     ran.complaint("pose.toml", "outside the working volume", "metres")
 
 
