@@ -325,7 +325,7 @@ def _search_stages(
     yield Stage("neighbours: build and query", build.ms + query.ms, both)
 
     index = built(segmented())
-    rows, settings = len(CHAINS), config.objective.settings
+    rows = len(CHAINS)
     for name, B, M, Q in (
         ("objective: one launch, whole body", 1, len(samples), config.sampling.voxels),
         (
