@@ -14,12 +14,14 @@ from scripts.synthetic.capture import Options, plan_capture, write_capture
 
 FRAMES = 14
 
-# coarse, a short fit of the body, and no second process to be started: a whole run takes about a second
+# coarse, a short fit of the body, few iterations, and no second process to be started: a whole run takes about a second
 QUICK = """
 voxels = 32
 ahead = 0
 [fit]
 rounds = 6
+[smd]
+max_iterations = 6
 [tracking]
 init_frames = 3
 """
@@ -38,7 +40,8 @@ class Ran:
         lines = self.err.splitlines()
         assert self.code == 2, (self.code, self.out, self.err)
         assert self.out == ""
-        assert len([line for line in lines if not line.startswith("note: ")]) == 1, self.err
+        # a slow machine has told its progress before
+        assert len([line for line in lines if not line.startswith(("note: ", "frame "))]) == 1, self.err
         assert lines[-1].startswith("tk: "), self.err
         for part in parts:
             assert part in lines[-1], self.err
