@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -41,8 +42,11 @@ class Ran:
     err: str
 
     def complaint(self, *parts: str) -> str:
-        """The one line that a command left that could not use its input; it holds these parts."""
-        lines = self.err.splitlines()
+        """The one line that a command left that could not use its input; it holds these parts.
+
+        Notes, and lines of progress that a busy machine makes it tell, may stand before it.
+        """
+        lines = [line for line in self.err.splitlines() if not re.match(r"frame \d+: \d+/\d+, ", line)]
         assert self.code == 2, (self.code, self.out, self.err)
         assert self.out == ""
         # a slow machine has told its progress before

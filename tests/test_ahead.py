@@ -18,12 +18,12 @@ import pytest
 
 from tests.conftest import FRAMES, QUICK, Silent
 from tests.test_session import assert_same, send
+from tk import session
 from tk.ahead import Ahead, Serial, Source, open_source
 from tk.config import Config
 from tk.errors import ConfigError, VideoError, WorkerError
 from tk.io.capture import open_capture
 from tk.io.result import read_result
-from tk import session
 
 AHEAD = Config.from_toml(QUICK.replace("ahead = 0", "ahead = 2"))
 ROOT = Path(__file__).parents[1]

@@ -47,7 +47,8 @@ def test_track_writes_what_the_contract_says(tk: Tk, quick: Path, tiny: Path, tm
     assert ran.out == ""  # progress is no result
     lines = ran.err.splitlines()
     assert all(line.isprintable() for line in lines)  # plain lines, no bar: this is no terminal
-    assert lines[-2].startswith("frame 7: 6/6, ") and lines[-1].startswith(f"6 frames in {result}, 0 lost, ")
+    assert lines[-2] == "note: second pass: the body is fitted to the whole recording"
+    assert lines[-3].startswith("frame 7: 6/6, ") and lines[-1].startswith(f"6 frames in {result}, 0 lost, ")
     shapes = {
         "frames": ((6,), "int64"),
         "time": ((6,), "float64"),
@@ -197,7 +198,7 @@ def test_bad_usage_is_one_line(tk: Tk, arguments: list[str], parts: list[str]) -
         (["--cameras", "cam1"], ["--cameras cam1", "at least 2"]),
         (["--cameras", ","], ["--cameras", "at least 2"]),
         (["--masks", "nowhere"], ["--masks nowhere"]),
-        (["--method", "magic"], ["--method magic", "volumetric"]),
+        (["--method", "magic"], ["--method", "magic", "volumetric"]),
         (["--config", "none.toml"], ["none.toml"]),
         (["--init-pose", "none.toml"], ["none.toml"]),
     ],
@@ -394,16 +395,24 @@ def test_evaluate_takes_no_damaged_result(tk: Tk, tracked: Path, tiny: Path, tmp
         tk("evaluate", path, tiny / "truth.h5").complaint("r.h5")
 
 
-def test_a_damaged_state_is_not_taken_up(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("options", "own"),
+    [
+        (["--method", "volumetric"], [("resume/state/pose", None), ("model/patches", None)]),
+        (["--causal"], [("resume/state/poses", None), ("resume/state/costs", "text"), ("model/parts", None)]),
+    ],
+)
+def test_a_damaged_state_is_not_taken_up(
+    tk: Tk, quick: Path, tiny: Path, tmp_path: Path, options: list[str], own: list[tuple[str, Any]]
+) -> None:
     result = tmp_path / "r.h5"
-    command = ["track", tiny, "-o", result, "--config", quick]
+    command = ["track", tiny, "-o", result, "--config", quick, *options]
     assert tk(*command, "--frames", ":2").code == 0
     good = result.read_bytes()
     for name, value in [
-        ("resume/state/pose", None),
+        *own,
         ("resume/state/usual", "text"),
         ("resume/state/run/lost frames", np.zeros(3)),
-        ("model/patches", None),
         ("pose", np.zeros((2, 3))),
     ]:
         result.write_bytes(good)

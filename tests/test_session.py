@@ -20,12 +20,12 @@ import tomli_w
 
 from tests.conftest import FRAMES, QUICK, Silent, Tk
 from tests.io.conftest import write_picture
+from tk import session
 from tk.config import Config
 from tk.errors import ConfigError
 from tk.io.capture import open_capture
 from tk.io.result import Status, read_joints, read_result
 from tk.model.skeleton import JOINTS
-from tk import session
 from tk.session import Summary, choose_frames, make_tracker
 
 ROOT = Path(__file__).parents[1]
@@ -273,9 +273,9 @@ def test_starts_from_angles(tiny: Path, tracked: Path, tmp_path: Path) -> None:
 def test_an_initial_pose_past_the_end(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
     joints = {name: [0.1 * (k % 2), 0.05 * k, 1.0] for k, name in enumerate(JOINTS)}
     file = pose_file(tmp_path / "pose.toml", {"frame": 99, "joints": joints})
-    tk("track", tiny, "--method", "volumetric", "-o", tmp_path / "r.h5", "--config", quick, "--init-pose", file).complaint(
-        "pose.toml", "99", "13"
-    )
+    tk(
+        "track", tiny, "--method", "volumetric", "-o", tmp_path / "r.h5", "--config", quick, "--init-pose", file
+    ).complaint("pose.toml", "99", "13")
 
 
 def test_an_initial_pose_in_millimetres(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from tests.test_silhouette_track import QUICK as QUICK_SILHOUETTE
 from tk.config import Config
 from tk.io.capture import open_capture
 from tk.io.result import read_joints, read_result
-from tk.sequence import track
+from tk.session import track
 
 TURN = Rotation.from_euler("xyz", [-1.2, 0.3, 0.5]).as_matrix()
 

@@ -395,7 +395,7 @@ def test_along_rows_and_columns_the_border_is_found_to_half_a_pixel(normal, offs
 
 
 def test_equal_colors_tell_nothing():
-    y, x = np.mgrid[:60, :60]
+    x = np.mgrid[:60, :60][1]
     split = np.where((x < 30)[..., None], RED, BLUE).astype(np.uint8)
     plain = np.full((60, 60, 3), RED, np.uint8)
     alike = np.repeat(two_colors()[:1], 2, axis=0)

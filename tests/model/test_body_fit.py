@@ -167,10 +167,7 @@ def test_shapes_are_found_and_left_and_right_are_mirror_images():
 
     def error(body, poses):
         return np.mean(
-            [
-                Evidence.of(grid, p.masks[0]).cast(body, group, q[None])[0]
-                for p, q in zip(seen, poses, strict=True)
-            ]
+            [Evidence.of(grid, p.masks[0]).cast(body, group, q[None])[0] for p, q in zip(seen, poses, strict=True)]
         )
 
     assert error(found, fitted) < 0.6 * error(AVERAGE, poses)

@@ -8,11 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tk.errors import ConfigError
-from tk.optim.gauss_newton import GaussNewtonConfig, minimise, step
+from tk.optim import gauss_newton
+from tk.optim.gauss_newton import GaussNewtonConfig, Prior, step
 
 UNDAMPED = GaussNewtonConfig(scales=1, iterations=1, damping=0.0, stiffness=0.0, longest_step=100.0)
 NONE = (np.full(4, -np.inf), np.full(4, np.inf))
 ALL = np.ones(4, bool)
+
+
+def minimise(*arguments, **options):
+    """(B, 4) the states at the end."""
+    return gauss_newton.minimise(*arguments, **options).states
 
 
 class Sums(NamedTuple):
@@ -110,8 +116,13 @@ def test_scales_run_from_coarse_to_fine():
         seen.append(scale)
         return linear(A, y)(states, scale)
 
-    minimise(watched, start, ALL, *NONE, GaussNewtonConfig(scales=3, iterations=2))
+    config = GaussNewtonConfig(scales=3, iterations=2)
+    minimise(watched, start, ALL, *NONE, config)
     assert seen == [2, 2, 1, 1, 0, 0]
+    seen.clear()
+    found = gauss_newton.minimise(watched, start, ALL, *NONE, config, levels=(1,))
+    assert seen == [1, 1]
+    np.testing.assert_allclose(found.hessian, np.repeat((A.T @ A)[None], len(start), 0))
 
 
 def test_a_batch_is_as_good_as_one_at_a_time():
@@ -122,6 +133,39 @@ def test_a_batch_is_as_good_as_one_at_a_time():
         np.testing.assert_allclose(
             minimise(linear(A, y), start[i : i + 1], ALL, *NONE, config)[0], together[i], rtol=1e-12
         )
+
+
+@given(seed=st.integers(0, 10**6), each=st.booleans())
+@settings(max_examples=30, deadline=None)
+def test_a_prior_is_a_further_measurement(seed, each):
+    """The minimum of ‖A p − y‖² + Σ w (p − m)², the mean shared or each state's own."""
+    A, y, start = problem(seed)
+    rng = np.random.default_rng(seed + 1)
+    mean, precision = rng.normal(size=(3, 4) if each else 4), rng.uniform(0, 5, 4)
+    found = minimise(linear(A, y), start, ALL, *NONE, UNDAMPED, Prior(mean, precision))
+    for state, m in zip(found, np.broadcast_to(mean, (3, 4)), strict=True):
+        expected = np.linalg.solve(A.T @ A + np.diag(precision), A.T @ y + precision * m)
+        np.testing.assert_allclose(state, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_precise_prior_holds_the_state_and_none_leaves_it_alone():
+    A, y, start = problem(6)
+    config = GaussNewtonConfig(scales=1, iterations=5)
+    held = Prior(start, np.array([1e9, 0.0, 1e9, 0.0]))
+    found = minimise(linear(A, y), start, ALL, *NONE, config, held)
+    np.testing.assert_allclose(found[:, [0, 2]], start[:, [0, 2]], atol=1e-6)
+    assert np.abs(found[:, [1, 3]] - start[:, [1, 3]]).min() > 1e-3
+    without = minimise(linear(A, y), start, ALL, *NONE, config)
+    weak = minimise(linear(A, y), start, ALL, *NONE, config, Prior(start + 9.0, np.zeros(4)))
+    np.testing.assert_array_equal(weak, without)
+
+
+def test_a_prior_places_what_the_data_does_not_see():
+    A, y, start = problem(7)
+    A[:, 2] = 0.0
+    prior = Prior(np.array([0, 0, 0.3, 0]), np.array([0, 0, 1e3, 0.0]))
+    found = minimise(linear(A, y), start, ALL, *NONE, GaussNewtonConfig(scales=1, iterations=8, longest_step=9), prior)
+    np.testing.assert_allclose(found[:, 2], 0.3, atol=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -6,17 +6,23 @@ from dataclasses import asdict
 from pathlib import Path
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 
 from scripts import overlay
-from scripts.overlay import BONES, View, draw_body, main, outlines
+from scripts.overlay import BONES, View, draw_body, main, outlines, write_sheets
+from tests.conftest import QUICK, Silent
 from tk.config import Config
+from tk.io.capture import open_capture
 from tk.io.result import FrameResult, ResultMeta, ResultWriter, Status, read_joints, read_result
 from tk.model.anthropometry import BodyDimensions
 from tk.model.body import build_body, neutral_pose
-from tk.model.camera import Camera
+from tk.model.camera import Camera, Rig
+from tk.model.cone_body import build_cone_body
+from tk.model.silhouettes import draw_silhouettes
 from tk.model.skeleton import JOINTS
+from tk.session import track
 from tk.trackers.volumetric import restore_body
 
 DEMO = Path(__file__).resolve().parents[2] / "tk" / "data" / "demo"
@@ -75,6 +81,34 @@ def test_outlines_hold_the_surface_samples() -> None:
     grown = cv2.dilate(mask, np.ones((3, 3), np.uint8))  # the outline has corners: a sample may lie just outside
     assert (grown[xy[:, 1], xy[:, 0]] > 0).all()
     assert (mask > 0).sum() < 1.3 * cv2.contourArea(cv2.convexHull(xy.astype(np.int32)))
+
+
+def test_outlines_of_cones_are_their_silhouette() -> None:
+    """With waist and ankles bent: filled, they are what rays through the pixels meet."""
+    body = build_cone_body(BodyDimensions.from_stature(1.7))
+    pose = np.random.default_rng(0).normal(0, 0.2, len(body.skeleton.names))
+    pose[:3] = 0.0
+    cam = camera()
+    mask = np.zeros((240, 320), np.uint8)
+    for _, _, polygons in outlines(body, pose, cam):
+        for polygon in polygons:
+            cv2.fillConvexPoly(mask, np.rint(polygon * 16).astype(np.int32), 255, cv2.LINE_8, 4)
+    drawn = draw_silhouettes(body, Rig((cam,)), pose[None])[0, 0]
+    assert not ((drawn > 0) & (mask == 0)).sum() > 0.01 * (drawn > 0).sum()
+    assert not ((cv2.erode(mask, np.ones((3, 3), np.uint8)) > 0) & (drawn == 0)).any()
+
+
+def test_results_of_the_region_tracker_are_drawn(tiny: Path, tmp_path: Path) -> None:
+    path = tmp_path / "region.h5"
+    track(open_capture(tiny), path, Config.from_toml(QUICK), Silent(), frames=(0, 2))
+    (sheet,) = write_sheets(open_capture(tiny, masks="none"), read_result(path), tmp_path, [1], full=True)
+    picture = cv2.imread(str(sheet))
+    with h5py.File(path, "a") as file:
+        del file["model"]
+        file.create_group("model")
+    (bare,) = write_sheets(open_capture(tiny, masks="none"), read_result(path), tmp_path / "bare", [1], full=True)
+    differ = (picture != cv2.imread(str(bare))).any(axis=2)
+    assert 0.01 < differ.mean() < 0.5, "the body is drawn, and not everywhere"
 
 
 def test_what_is_behind_the_camera_is_not_drawn() -> None:

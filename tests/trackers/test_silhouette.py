@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tk.model.cone_fitting import ConeFitConfig
 
 from tests.model.ring import ring_of_cameras
 from tk.errors import CaptureError, ConfigError
 from tk.io.init_pose import InitPose
 from tk.model.anthropometry import BodyDimensions
+from tk.model.body_fit import BodyFitConfig
 from tk.model.cone_body import build_cone_body
 from tk.model.gait import walking_pose
 from tk.model.silhouettes import draw_silhouettes
@@ -46,10 +46,15 @@ def errors(estimate, pose):
     return np.linalg.norm(estimate.joints - BODY.skeleton.joints(pose), axis=1)
 
 
+def init_of(pose) -> InitPose:
+    paper = BODY.skeleton.is_paper
+    return InitPose({}, {n: v for n, v, known in zip(NAMES, pose, paper, strict=True) if known}, None, STATURE)
+
+
 def tracker_at(pose, **settings) -> SilhouetteTracker:
     """A tracker of the true body that starts near a pose."""
     tracker = SilhouetteTracker(RIG, "z", SilhouetteConfig(adapt=False, **settings))
-    init = InitPose({}, dict(zip(NAMES, pose, strict=True)), None, STATURE)
+    init = init_of(pose)
     tracker.start([observe(MASKS[0])], None, init)
     return tracker
 
@@ -76,14 +81,14 @@ def test_a_walk_is_followed_and_can_be_taken_up_again():
             model, state = dict(tracker.model()), {k: np.copy(v) for k, v in tracker.state().items()}
     assert [e.status for e in estimates] == ["initialised"] + ["tracked"] * 5
     assert max(errors(e, p).mean() for e, p in zip(estimates, POSES, strict=True)) < CLOSE_M
-    second = SilhouetteTracker(RIG, "z", tracker.config)
+    second = SilhouetteTracker(RIG, "z", tracker.contours)
     second.restore(model, state)
     for i in range(3, 6):
         np.testing.assert_array_equal(second.step(observe(MASKS[i], i)).pose, estimates[i].pose)
 
 
 def test_the_subject_is_found_without_any_hint():
-    config = SilhouetteConfig(headings=8, phases=4, finalists=3, adapt=False)
+    config = SilhouetteConfig(adapt=False)
     tracker = SilhouetteTracker(RIG, "z", config)
     tracker.start([observe(m, i) for i, m in enumerate(MASKS)], STATURE, None)
     estimate = tracker.step(observe(MASKS[0]))
@@ -95,7 +100,7 @@ def test_the_subject_is_found_without_any_hint():
 
 
 def test_the_stature_is_read_off_the_silhouettes():
-    tracker = SilhouetteTracker(RIG, "z", SilhouetteConfig(headings=8, phases=1, finalists=1, adapt=False))
+    tracker = SilhouetteTracker(RIG, "z", SilhouetteConfig(adapt=False))
     tracker.start([observe(MASKS[0])], None, None)
     assert tracker.body.dimensions.stature == pytest.approx(STATURE, rel=0.06)
 
@@ -103,13 +108,15 @@ def test_the_stature_is_read_off_the_silhouettes():
 def test_dimensions_are_adapted_in_start():
     thick = BODY.dimensions.scaled(thigh_radius=1.25, head_radius=1.15)
     masks = draw_silhouettes(build_cone_body(thick), RIG, POSES[:3])
-    config = SilhouetteConfig(fit=ConeFitConfig(frames=2, rounds=5, edge_noise_px=1.0))
+    config = SilhouetteConfig(fit=BodyFitConfig(frames=2, rounds=5))
     tracker = SilhouetteTracker(RIG, "z", config)
-    init = InitPose({}, dict(zip(NAMES, POSES[0], strict=True)), None, STATURE)
+    init = init_of(POSES[0])
     tracker.start([observe(m, i) for i, m in enumerate(masks)], None, init)
     found = tracker.body.dimensions
-    assert found.thigh_radius == pytest.approx(thick.thigh_radius, rel=0.06)
-    assert found.head_radius == pytest.approx(thick.head_radius, rel=0.06)
+    # what is known of bodies holds radii back a little: two frames, edgels that are taken to err by 3 px
+    for name in ("thigh_radius", "head_radius"):
+        true, average = getattr(thick, name), getattr(BODY.dimensions, name)
+        assert 0.5 < (getattr(found, name) - average) / (true - average) < 1.2, name
     assert found.stature == pytest.approx(STATURE, rel=0.02)
 
 
@@ -159,5 +166,7 @@ def test_nobody_in_the_first_frame_is_told():
 def test_settings_out_of_range_are_told():
     with pytest.raises(ConfigError, match="prediction = 2"):
         replace(SilhouetteConfig(), prediction=2.0)
-    with pytest.raises(ConfigError, match="finalists"):
-        SilhouetteConfig(finalists=0)
+    with pytest.raises(ConfigError, match="init_frames = 0"):
+        SilhouetteConfig(init_frames=0)
+    with pytest.raises(ConfigError, match='body = "robot"'):
+        SilhouetteConfig(body="robot")

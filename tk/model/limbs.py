@@ -86,10 +86,13 @@ def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
         parts = np.array([p.segment in CHAINS[name] for p in body.parts])
         if not parts.any():
             continue
-        dofs = np.flatnonzero(skeleton.chain_dofs(name) & body.free)
+        chain = np.flatnonzero(skeleton.chain_dofs(name))
+        dofs = chain[body.free[chain]]
         lower, upper = skeleton.lower[dofs], skeleton.upper[dofs]
         arm = name.startswith("arm")
-        places = _arm_places() if arm else _leg_places(len(dofs))
+        places = _arm_places() if arm else _leg_places(len(chain))
+        if len(dofs) < len(chain):  # the walker's hips turn about one axis only
+            places = np.unique(places[:, body.free[chain]], axis=0)
         ends = ("elbow", "wrist") if arm else ("knee", "ankle")
         result.append(
             Limb(

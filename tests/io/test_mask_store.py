@@ -1,0 +1,58 @@
+"""Masks are kept bit for bit, in little memory, and unpacked one at a time."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+
+from tk.io.mask_store import MaskStore
+
+
+@given(masks=array_shapes(min_dims=3, max_dims=3, max_side=13).flatmap(lambda s: arrays(np.uint8, s)))
+@settings(max_examples=60, deadline=None)
+def test_masks_come_back_as_person_and_background(masks):
+    store = MaskStore()
+    store.put(7, masks)
+    found = store.get(7)
+    assert found.dtype == np.uint8
+    np.testing.assert_array_equal(found, np.where(masks >= 128, 255, 0))
+    store.put(7, found)
+    np.testing.assert_array_equal(store.get(7), found)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_frames_are_a_sequence_in_the_order_that_was_asked_for(seed):
+    rng = np.random.default_rng(seed)
+    store, masks = MaskStore(), {}
+    for index in rng.permutation(20)[:6].tolist():
+        masks[index] = (rng.random((2, 5, 9)) < 0.5).astype(np.uint8) * 255
+        store.put(index, masks[index])
+    wanted = rng.permutation(list(masks))
+    frames = store.sequence(wanted)
+    assert len(frames) == 6 and all(i in store for i in masks) and 99 not in store
+    for i, index in enumerate(wanted):
+        np.testing.assert_array_equal(frames[i], masks[int(index)])
+    for index, found in zip(wanted, frames, strict=True):
+        np.testing.assert_array_equal(found, masks[int(index)])
+    part = frames[1:5:2]
+    assert len(part) == 2
+    np.testing.assert_array_equal(part[1], masks[int(wanted[3])])
+    np.testing.assert_array_equal(frames[-1], masks[int(wanted[-1])])
+    with pytest.raises(IndexError):
+        frames[6]
+
+
+def test_silhouettes_take_little_memory():
+    masks = np.zeros((5, 480, 640), np.uint8)
+    masks[:, 100:400, 250:350] = 255
+    store = MaskStore()
+    for index in range(10):
+        store.put(index, masks)
+    assert sum(map(len, store._packed.values())) < 10 * 10_000
+
+
+def test_a_frame_that_was_not_put_is_told():
+    with pytest.raises(KeyError):
+        MaskStore().get(0)

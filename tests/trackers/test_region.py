@@ -1,0 +1,291 @@
+"""The region tracker on silhouettes and pictures of its own body, drawn by ray casting."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.model.ring import ring_of_cameras
+from tk.errors import CaptureError, ConfigError
+from tk.io.init_pose import InitPose
+from tk.model.anthropometry import BodyDimensions
+from tk.model.camera import Rig
+from tk.model.cone_body import ConeBody, build_cone_body
+from tk.model.evidence import Evidence, RayGrid
+from tk.model.gait import walking_pose
+from tk.model.part_colors import GROUPS, PartColors
+from tk.model.silhouettes import draw_silhouettes
+from tk.model.skeleton import JOINTS, join_pose, shoulder_angles, split_pose
+from tk.optim.gauss_newton import GaussNewtonConfig
+from tk.trackers.base import Estimate, Observation
+from tk.trackers.contours import SilhouetteConfig
+from tk.trackers.region import JOINT_FLOOR_M, RegionConfig, RegionTracker
+
+STATURE = 1.75
+RIG = ring_of_cameras(3, width=160, height=200)
+BODY = build_cone_body(BodyDimensions.from_stature(STATURE))
+SKELETON = BODY.skeleton
+NAMES = SKELETON.names
+EMPTY = np.zeros((0,), np.uint8)
+# A pixel is 1.4 cm wide at the subject; a joint rests on dozens of edgels in three views.
+CLOSE_M = 0.025
+SETTINGS = SilhouetteConfig(adapt=False, search_every=0)
+
+
+def walk(count: int, first: float = 0.0) -> np.ndarray:
+    """(count, D) a stride at 30 Hz, on the spot."""
+    poses = np.array([walking_pose(SKELETON, first + i / 34) for i in range(count)])
+    poses[:, :3] = [0.05, -0.04, 0.93]
+    poses[:, NAMES.index("torso_yaw")] = 0.7
+    return poses
+
+
+def with_arm(pose: np.ndarray, side: str, direction: tuple[float, float, float], elbow_deg: float) -> np.ndarray:
+    """The pose with an arm pointing along (forward, outward, up)."""
+    result = pose.copy()
+    d = np.array(direction) / np.linalg.norm(direction)
+    yaw, pitch = shoulder_angles(d)
+    for name, value in (("yaw", yaw), ("pitch", pitch), ("roll", 0.0)):
+        result[NAMES.index(f"shoulder_{side}_{name}")] = value
+    result[NAMES.index(f"elbow_{side}_flexion")] = np.radians(elbow_deg)
+    return result
+
+
+POSES = walk(6)
+MASKS = draw_silhouettes(BODY, RIG, POSES)
+
+
+def observe(masks: np.ndarray, index: int = 0, images: np.ndarray = EMPTY) -> Observation:
+    return Observation(index, images, masks)
+
+
+def errors(estimate: Estimate, pose: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(estimate.joints - SKELETON.joints(pose), axis=1)
+
+
+def init_of(pose: np.ndarray) -> InitPose:
+    paper, _, _ = split_pose(SKELETON, pose)
+    return InitPose({}, dict(zip(np.array(NAMES)[SKELETON.is_paper].tolist(), paper, strict=True)), None, STATURE)
+
+
+def tracker_at(
+    pose: np.ndarray,
+    masks: np.ndarray = MASKS[0],
+    body: ConeBody = BODY,
+    contours: SilhouetteConfig = SETTINGS,
+    config: RegionConfig | None = None,
+    images: np.ndarray = EMPTY,
+) -> RegionTracker:
+    """A tracker of this body that starts near a pose."""
+    tracker = RegionTracker(RIG, "z", contours, config)
+    tracker.start([observe(masks, 0, images)], None, init_of(pose), body)
+    return tracker
+
+
+def test_a_walk_is_followed_and_can_be_taken_up_again() -> None:
+    tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=3))
+    estimates = []
+    for i, masks in enumerate(MASKS):
+        estimates.append(tracker.step(observe(masks, i)))
+        if i == 2:
+            model = {name: np.copy(v) if isinstance(v, np.ndarray) else v for name, v in tracker.model().items()}
+            state = {name: np.copy(value) for name, value in tracker.state().items()}
+    assert [e.status for e in estimates] == ["initialised"] + ["tracked"] * 5
+    assert max(errors(e, p).mean() for e, p in zip(estimates, POSES, strict=True)) < CLOSE_M
+    second = RegionTracker(RIG, "z", tracker.contours, tracker.config)
+    second.restore(model, state)
+    for i in range(3, 6):
+        again = second.step(observe(MASKS[i], i))
+        for name in ("pose", "waist", "ankles", "joints", "sigma", "fit_error", "objective", "status"):
+            np.testing.assert_array_equal(getattr(again, name), getattr(estimates[i], name), err_msg=name)
+
+
+def test_an_estimate_says_all_that_the_contract_has() -> None:
+    tracker = tracker_at(POSES[0])
+    tracker.step(observe(MASKS[0]))
+    estimate = tracker.step(observe(MASKS[1], 1))
+    assert (len(estimate.pose), len(estimate.waist), len(estimate.ankles)) == (24, 3, 4)
+    assert len(tracker.pose_names) == len(tracker.pose_units) == 24
+    joined = join_pose(SKELETON, estimate.pose, estimate.waist, estimate.ankles)
+    np.testing.assert_allclose(SKELETON.joints(joined), estimate.joints, atol=1e-9)
+    assert set(estimate.timing) == set(tracker.timing_stages) and len(estimate.iterations) == len(tracker.stages)
+    assert estimate.fit_error is not None and estimate.fit_error.shape == (3,)
+    assert (estimate.fit_error >= 0).all() and (estimate.fit_error < 0.15).all()
+
+
+def test_sigma_is_finite_and_larger_where_less_is_seen() -> None:
+    first = tracker_at(POSES[0]).step(observe(MASKS[0]))
+    assert first.sigma is not None and first.sigma.shape == (15,)
+    assert (first.sigma >= JOINT_FLOOR_M).all() and (first.sigma < 0.2).all()
+    masks = MASKS[0].copy()
+    masks[1:] = 0
+    tracker = tracker_at(POSES[0])
+    tracker.step(observe(MASKS[0]))
+    one_view = tracker.step(observe(masks, 1))
+    assert one_view.sigma is not None and np.isfinite(one_view.sigma).all()
+    assert one_view.sigma.mean() > 1.2 * first.sigma.mean()
+    assert one_view.fit_error is not None and np.isnan(one_view.fit_error).tolist() == [False, True, True]
+
+
+def test_an_arm_elsewhere_is_found_again_by_the_search() -> None:
+    """From one frame to the next an arm is raised to the side: no contour is near."""
+    raised = np.array([with_arm(pose, "l", (0.1, 1.0, 0.3), 15.0) for pose in POSES])
+    masks = draw_silhouettes(BODY, RIG, raised)
+    found = {}
+    for every in (0, 1):
+        # without a search where a frame is explained badly, the arm stays where it was
+        config = RegionConfig(search_ratio=1.1 if every else 1000.0)
+        tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=every), config=config)
+        tracker.step(observe(MASKS[0]))
+        for i in range(1, 4):
+            found[every] = tracker.step(observe(masks[i], i))
+    wrist = JOINTS.index("wrist_l")
+    assert errors(found[0], raised[3])[wrist] > 0.25
+    assert errors(found[1], raised[3])[wrist] < 0.06
+    assert errors(found[1], raised[3]).mean() < 1.5 * CLOSE_M
+
+
+def test_a_frame_that_is_explained_badly_is_searched_unasked() -> None:
+    raised = with_arm(POSES[1], "r", (0.1, 1.0, 0.5), 15.0)
+    tracker = tracker_at(POSES[0])
+    assert tracker.step(observe(MASKS[0])).iterations[1] == 0
+    estimate = tracker.step(observe(draw_silhouettes(BODY, RIG, raised[None])[0], 1))
+    assert estimate.iterations[1] == 1
+    assert errors(estimate, raised)[JOINTS.index("wrist_r")] < 0.08
+
+
+def test_nobody_in_sight_is_a_lost_frame_and_then_the_person_is_recovered() -> None:
+    tracker = tracker_at(POSES[0])
+    first = tracker.step(observe(MASKS[0]))
+    for index in (1, 2):
+        lost = tracker.step(observe(np.zeros_like(MASKS[0]), index))
+        assert lost.status == "lost" and np.isinf(lost.objective)
+        np.testing.assert_array_equal(lost.joints, first.joints)
+        assert lost.sigma is not None and np.isnan(lost.sigma).all()
+        assert lost.fit_error is not None and np.isnan(lost.fit_error).all()
+        assert set(lost.timing) == set(tracker.timing_stages)
+    back = tracker.step(observe(MASKS[1], 3))
+    assert back.status == "recovered" and errors(back, POSES[1]).mean() < CLOSE_M
+    assert tracker.step(observe(MASKS[2], 4)).status == "tracked"
+
+
+def test_somebody_who_comes_back_elsewhere_is_found() -> None:
+    tracker = tracker_at(POSES[0])
+    tracker.step(observe(MASKS[0]))
+    tracker.step(observe(np.zeros_like(MASKS[0]), 1))
+    away = POSES[:4].copy()
+    away[:, 0] += 0.45
+    away[:, NAMES.index("torso_yaw")] += 2.0
+    estimates = [tracker.step(observe(m, i)) for i, m in enumerate(draw_silhouettes(BODY, RIG, away), 2)]
+    assert "recovered" in [e.status for e in estimates]
+    assert estimates[-1].status in ("recovered", "tracked")
+    assert errors(estimates[-1], away[-1]).mean() < 2 * CLOSE_M
+
+
+def test_the_person_is_found_without_any_hint() -> None:
+    tracker = RegionTracker(RIG, "z", SETTINGS)
+    tracker.start([observe(m, i) for i, m in enumerate(MASKS[:3])], STATURE, None)
+    estimate = tracker.step(observe(MASKS[0]))
+    assert estimate.status == "initialised" and errors(estimate, POSES[0]).mean() < CLOSE_M
+    with pytest.raises(CaptureError, match="0 of 3 masks of frame 7 show anybody"):
+        tracker.start([observe(np.zeros_like(MASKS[0]), 7)], STATURE, None)
+
+
+# --- colours ----------------------------------------------------------------------------------------------------------
+
+SHADES = {"torso": (200, 40, 30), "forearm": (110, 150, 225), "hand": (110, 150, 225), "head": (110, 150, 225)}
+# two cameras 14° apart: both see the chest, and what is before it lies within the silhouette of both
+FRONT = Rig(ring_of_cameras(24, width=160, height=200).cameras[:2])
+
+
+def clothed(poses: np.ndarray) -> np.ndarray:
+    """(F, V, H, W, 3) the body in clothes before grey: a blue shirt, bare forearms, dark trousers."""
+    colors = PartColors(BODY)
+    worn = np.array([(90, 90, 90), *(SHADES.get(GROUPS[g], (45, 60, 40)) for g in colors.group)], np.uint8)
+    grid = RayGrid(FRONT, FRONT.frame_shape[0])
+    nobody = np.zeros(grid.rays.shape[:3], np.uint8)
+    _, met = Evidence.of(grid, nobody).cast(BODY, colors.group, poses, export=True)
+    assert met is not None
+    return worn[met.label]
+
+
+def crossing(count: int) -> np.ndarray:
+    """(count, D) a forearm that swings from the side to before the chest."""
+    pose = walking_pose(SKELETON, None)
+    pose[:3] = [0.0, 0.0, 0.93]
+    toward = FRONT[0].center + FRONT[1].center
+    pose[NAMES.index("torso_yaw")] = np.arctan2(toward[1], toward[0])
+    poses = []
+    for share in np.linspace(0, 1, count):
+        here = with_arm(pose, "l", (0.35, 0.1, -0.93), 90.0)
+        here[NAMES.index("shoulder_l_roll")] = np.radians(-30.0 + 100.0 * share)
+        poses.append(here)
+    return np.array(poses)
+
+
+def test_colors_show_a_forearm_that_silhouettes_do_not() -> None:
+    """Learned while the forearm sticks out, they tell where it is before the chest."""
+    poses = crossing(10)
+    images, masks = clothed(poses), draw_silhouettes(BODY, FRONT, poses)
+    wrist = JOINTS.index("wrist_l")
+    off = {}
+    for colored in (True, False):
+        tracker = RegionTracker(FRONT, "z", replace(SETTINGS, search_every=6), RegionConfig(colors=colored))
+        tracker.start([observe(masks[0], 0, images[0])], None, init_of(poses[0]), BODY)
+        found = [tracker.step(observe(m, i, p)) for i, (m, p) in enumerate(zip(masks, images, strict=True))]
+        off[colored] = np.mean([errors(e, p)[wrist] for e, p in zip(found[-3:], poses[-3:], strict=True)])
+        assert tracker.colors.known == colored and ("colors" in tracker.state()) == colored
+    assert off[True] < 0.08 and off[True] < 0.6 * off[False], off
+
+
+# --- the second pass --------------------------------------------------------------------------------------------------
+
+
+def error_of(body: ConeBody, poses: np.ndarray, masks: np.ndarray) -> float:
+    drawn = draw_silhouettes(body, RIG, poses)
+    return float(np.mean([(d != m).sum() / (m > 0).sum() for d, m in zip(drawn, masks, strict=True)]))
+
+
+def test_the_second_pass_mends_a_wrong_body() -> None:
+    """A first pass with a body that is too thin; the second fits it to all frames."""
+    thin = build_cone_body(BODY.dimensions.scaled(thigh_radius=0.75, chest_half_width=0.85, upper_arm_radius=0.75))
+    tracker = RegionTracker(RIG, "z", replace(SETTINGS, adapt=True))
+    tracker.start([observe(MASKS[0])], STATURE, init_of(POSES[0]), thin)
+    first = [tracker.step(observe(m, i)) for i, m in enumerate(MASKS)]
+    poses = np.array([join_pose(SKELETON, e.pose, e.waist, e.ankles) for e in first])
+    error = np.array([e.fit_error for e in first])
+    before = error_of(thin, poses, MASKS)
+    lost = np.array([False] * 5 + [True])
+    result, found = tracker.second_pass(MASKS, poses, lost, error, STATURE)
+    assert error_of(tracker.body, result[:5], MASKS[:5]) < 0.8 * before
+    assert found[:5].mean() < 0.8 * error[:5].mean()
+    # a lost frame stays as it was
+    np.testing.assert_array_equal(result[5], poses[5])
+    np.testing.assert_array_equal(found[5], error[5])
+    assert tracker.body.dimensions.thigh_radius > thin.dimensions.thigh_radius
+    off = [
+        np.linalg.norm(tracker.body.skeleton.joints(p) - SKELETON.joints(q), axis=1).mean()
+        for p, q in zip(result[:5], POSES[:5], strict=True)
+    ]
+    assert np.mean(off) < CLOSE_M
+
+
+def test_a_body_that_was_given_is_kept_in_the_second_pass() -> None:
+    tracker = tracker_at(POSES[0])
+    poses, error = POSES[:3], np.full((3, 3), 0.1)
+    result, found = tracker.second_pass(MASKS[:3], poses, np.zeros(3, bool), error, STATURE, keep_body=True)
+    assert tracker.body is BODY
+    assert result.shape == poses.shape and found.shape == (3, 3) and (found < 0.1).all()
+    same, unchanged = tracker.second_pass(MASKS[:3], poses, np.ones(3, bool), error, STATURE)
+    np.testing.assert_array_equal(same, poses)
+    np.testing.assert_array_equal(unchanged, error)
+
+
+def test_settings_out_of_range_are_told() -> None:
+    for values, message in (({"hypotheses": 0}, "hypotheses = 0"), ({"search_ratio": 0.5}, "search_ratio = 0.5")):
+        with pytest.raises(ConfigError, match=message):
+            RegionConfig(**values)
+    with pytest.raises(ConfigError, match="scales = 0"):
+        replace(SETTINGS, solver=GaussNewtonConfig(scales=0))
