@@ -19,11 +19,8 @@ from tk.model.skeleton import JOINTS
 from tk.model.superellipsoid_silhouettes import draw_body
 from tk.session import track
 from tk.trackers.bodies import body_and_poses
-<<<<<<< HEAD
-from tk.view_evaluation import capture_of, evaluate_views
-=======
->>>>>>> tests
 from tk.trackers.volumetric import restore_body as restore_superellipsoids
+from tk.view_evaluation import capture_of, evaluate_views
 
 SETTINGS = """
 [silhouette]
