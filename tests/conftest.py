@@ -21,6 +21,8 @@ voxels = 32
 ahead = 0
 [fit]
 rounds = 6
+[smd]
+max_iterations = 6
 [silhouette]
 init_frames = 3
 [silhouette.fit]
@@ -47,7 +49,8 @@ class Ran:
         lines = [line for line in self.err.splitlines() if not re.match(r"frame \d+: \d+/\d+, ", line)]
         assert self.code == 2, (self.code, self.out, self.err)
         assert self.out == ""
-        assert len([line for line in lines if not line.startswith("note: ")]) == 1, self.err
+        # a slow machine has told its progress before
+        assert len([line for line in lines if not line.startswith(("note: ", "frame "))]) == 1, self.err
         assert lines[-1].startswith("tk: "), self.err
         for part in parts:
             assert part in lines[-1], self.err

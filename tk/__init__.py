@@ -1,9 +1,63 @@
-"""Markerless motion capture from a few calibrated cameras: no markers, no trained weights, no GPU."""
+"""Markerless motion capture from a few calibrated cameras: no markers, no trained weights, no GPU.
 
-import os
+    import tk
 
-# The matrices here are 24×24 at most. A pool of BLAS threads beside Taichi's costs milliseconds for what takes
-# microseconds; it has an effect only where NumPy is not loaded yet, and the caller's own setting stands.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    capture = tk.open_capture("CAPTURE")
+    for estimate in tk.track(capture):  # frame by frame
+        print(estimate.frame, estimate.joints)
+    result = tk.track(capture, "result.h5")  # or into a file, with a second pass
+
+Importing this changes nothing in the process; the heavy imports wait until a name is used.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tk.api import open_capture, track
+    from tk.config import Config
+    from tk.io.result import Result, read_result
+    from tk.model.cone_body import ConeBody as Body
+    from tk.model.hull import VisualHull
+    from tk.trackers.base import Estimate
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "Body",
+    "Config",
+    "Estimate",
+    "Result",
+    "VisualHull",
+    "__version__",
+    "open_capture",
+    "read_result",
+    "track",
+]
+
+_HOMES = {
+    "Body": ("tk.model.cone_body", "ConeBody"),
+    "Config": ("tk.config", "Config"),
+    "Estimate": ("tk.trackers.base", "Estimate"),
+    "Result": ("tk.io.result", "Result"),
+    "VisualHull": ("tk.model.hull", "VisualHull"),
+    "open_capture": ("tk.api", "open_capture"),
+    "read_result": ("tk.io.result", "read_result"),
+    "track": ("tk.api", "track"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'tk' has no attribute '{name}'")
+    from importlib import import_module
+
+    module, attribute = _HOMES[name]
+    value = getattr(import_module(module), attribute)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Iterator
@@ -18,6 +19,10 @@ from tk.errors import CaptureError, ConfigError, TkError
 
 if TYPE_CHECKING:
     from tk.config import Config
+
+# The matrices here are small. A pool of BLAS threads beside Taichi's costs milliseconds for what takes microseconds; it
+# has an effect only before NumPy is loaded, and the caller's own setting stands.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 _CONSOLE = Console(stderr=True, highlight=False, soft_wrap=True)
 

@@ -87,23 +87,6 @@ class Body:
         return points, np.einsum("nab,nb->na", T[:, :3, :3], self.normals)
 
 
-def filling(body: Body, depths: tuple[float, ...] = (0.0, 0.35, 0.7)) -> tuple[Float, NDArray[np.int32]]:
-    """Points (N, 3) on and below the body's surface, zero configuration, world frame, and their segments (N,).
-
-    ``depths`` are the distances from each piece's axis at which points lie, as shares of the surface's.
-    """
-    B = body.skeleton.T_world_body
-    points = []
-    for index, piece in enumerate(body.pieces):
-        T = piece.T_body_piece
-        q = (body.points[body.piece == index] @ B - T[:3, 3]) @ T[:3, :3]
-        for depth in depths:
-            points.append((q * [depth, depth, 1.0]) @ T[:3, :3].T + T[:3, 3])
-    counts = [len(depths) * int((body.piece == index).sum()) for index in range(len(body.pieces))]
-    segments = np.array([SEGMENTS.index(piece.segment) for piece in body.pieces], np.int32)
-    return np.concatenate(points) @ B.T, np.repeat(segments, counts)
-
-
 def build_body(
     dimensions: BodyDimensions, up: str = "z", spacing_m: float = 0.03, extremities: bool = True, waist: bool = False
 ) -> Body:

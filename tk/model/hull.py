@@ -105,51 +105,6 @@ class VisualHull:
             self._occupied,
         )
 
-    def overrule(self, p_world: NDArray[np.floating], margin: int = 1) -> None:
-        """Activate voxels near the given points that all cameras but one leave standing.
-
-        Not in the paper. A sleeve of the floor's colour is missing in the picture of the one camera that looks down on
-        it, and the hull then misses the arm. Where a body is expected, the others outvote that camera. Needs four
-        cameras. What :meth:`update` makes of the next masks does not depend on it.
-
-        Args:
-            p_world: (N, 3) points at most a voxel apart, in and on the body as it is expected; metres.
-            margin: voxels about them that count as near.
-        """
-        if len(self.rig) >= 4 and len(p_world):
-            self._occupied |= self._denied_once(p_world, margin)
-
-    def overrule_doubt(self, p_world: NDArray[np.floating], doubtful: NDArray[np.bool_], margin: int = 2) -> None:
-        """Activate voxels near the given points that one camera denies without being sure; all others see the person.
-
-        As :meth:`overrule`, but farther from where the body is expected: what the camera sees there is not the empty
-        scene, it may be a shadow as well as a cloth of the floor's colour.
-
-        Args:
-            p_world, margin: as for :meth:`overrule`.
-            doubtful: (C, H, W) bool, pixels that are background in the masks and may be the person.
-        """
-        if len(self.rig) < 4 or not len(p_world):
-            return
-        denied = self._denied_once(p_world, margin) & ~self._occupied
-        voxels = np.flatnonzero(kernels.unpack(denied, self.grid.shape))
-        pixels = self._tables.pixels[voxels]
-        # the other cameras have the voxel on foreground, where nothing is doubtful
-        doubts = doubtful.reshape(len(self.rig), -1)[np.arange(len(self.rig)), pixels] & (pixels >= 0)
-        chosen = np.zeros(self.grid.count, dtype=np.bool_)
-        chosen[voxels[doubts.any(axis=1)]] = True
-        self._occupied |= kernels.pack(chosen.reshape(self.grid.shape))
-
-    def _denied_once(self, p_world: NDArray[np.floating], margin: int) -> NDArray[np.uint32]:
-        """(W,) packed voxels within ``margin`` of points (N, 3) that at most one camera carves."""
-        cell = np.rint((p_world - np.asarray(self.grid.origin)) / self.grid.voxel_m).astype(np.int64)
-        cell = cell[((cell >= 0) & (cell < self.grid.shape)).all(axis=1)]
-        near = np.zeros(self.grid.shape, dtype=np.bool_)
-        near[tuple(cell.T)] = True
-        for axis in range(3):
-            near = _dilated(near, axis, margin)
-        return kernels.missing_at_most_one(self._planes) & self._tables.enough & kernels.pack(near)
-
     @property
     def occupancy(self) -> NDArray[np.bool_]:
         """(nx, ny, nz) bool, the active voxels; a copy."""
@@ -205,16 +160,6 @@ class VisualHull:
         words = np.zeros_like(self._previous)
         words.view(np.uint8)[:, : self._pixel_count] = flat
         return words
-
-
-def _dilated(flags: NDArray[np.bool_], axis: int, margin: int) -> NDArray[np.bool_]:
-    """Flags (nx, ny, nz) spread by ``margin`` along an axis."""
-    result = flags.copy()
-    source, target = flags.swapaxes(0, axis), result.swapaxes(0, axis)
-    for step in range(1, margin + 1):
-        target[step:] |= source[:-step]
-        target[:-step] |= source[step:]
-    return result
 
 
 def _sample_spacing(rig: Rig, grid: VoxelGrid) -> NDArray[np.int32]:

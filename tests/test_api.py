@@ -1,0 +1,47 @@
+"""The Python interface: what `import tk` offers, and that it leaves the process alone."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import tk
+from tk.errors import CaptureError
+
+
+def test_importing_changes_nothing_in_the_process():
+    code = (
+        "import os, sys, signal; before = dict(os.environ), set(sys.modules), signal.getsignal(signal.SIGINT);"
+        "import tk; heavy = {'numpy', 'taichi', 'cv2', 'open3d', 'h5py', 'scipy'} & set(sys.modules);"
+        "assert dict(os.environ) == before[0] and not heavy, heavy;"
+        "assert signal.getsignal(signal.SIGINT) is before[2]; print(sorted(set(dir(tk)) & {'track', 'Body'}))"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == "['Body', 'track']"
+
+
+def test_every_public_name_is_there():
+    for name in tk.__all__:
+        assert getattr(tk, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        tk.nonsense  # noqa: B018
+
+
+def test_a_missing_capture_is_one_line(tmp_path):
+    with pytest.raises(CaptureError, match="nowhere"):
+        tk.open_capture(tmp_path / "nowhere")
+
+
+def test_estimates_one_by_one_are_those_of_the_file(tiny, tmp_path):
+    """The iterator's first pass is the file's, bit for bit."""
+    config = tk.Config.from_toml("ahead = 0\n[silhouette]\ninit_frames = 3\n")
+    opened = tk.open_capture(tiny)
+    told = list(tk.track(opened, config=config, frames=(0, 4)))
+    assert [e.frame for e in told] == [0, 1, 2, 3]
+    assert told[0].joints.shape == (15, 3) and told[0].status == "initialised"
+    result = tk.track(opened, tmp_path / "r.h5", config=config, frames=(0, 4), causal=True)
+    np.testing.assert_array_equal(result.joints, [e.joints for e in told])
+    assert result.sigma is not None and np.isfinite(result.sigma).all()

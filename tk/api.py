@@ -1,0 +1,140 @@
+"""What a script calls: :func:`tk.open_capture`, :func:`tk.track`, :func:`tk.read_result`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import overload
+
+from tk import session
+from tk.config import Config
+from tk.io.capture import Capture
+from tk.io.capture import open_capture as _open_capture
+from tk.io.result import Result, read_result
+from tk.trackers.base import Estimate
+
+PathLike = str | os.PathLike[str]
+
+
+class _Quiet:
+    """A reporter for scripts: notes go to ``note``, progress nowhere."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+    def begin(self, total: int, done: int) -> None:
+        pass
+
+    def advance(self, frame: int, estimate: Estimate | None) -> None:
+        pass
+
+
+def open_capture(path: PathLike, cameras: Sequence[str] | None = None, masks: str = "auto") -> Capture:
+    """A capture folder.
+
+    Args:
+        path: the folder, see the README.
+        cameras: names of the cameras to use; all if None.
+        masks: "auto" (the capture's own where it has some), "none" (segment the videos), or a folder of masks.
+
+    Raises:
+        tk.errors.CaptureError: what is wrong with the folder, in one line that names the file.
+    """
+    return _open_capture(Path(path), tuple(cameras) if cameras else None, masks)
+
+
+@overload
+def track(
+    capture: Capture,
+    output: None = None,
+    *,
+    method: str = ...,
+    frames: tuple[int, int | None] = ...,
+    config: Config | None = ...,
+    seed: int | None = ...,
+    init_pose: PathLike | None = ...,
+    body: PathLike | None = ...,
+    causal: bool = ...,
+    resume: bool = ...,
+) -> Iterator[Estimate]: ...
+
+
+@overload
+def track(
+    capture: Capture,
+    output: PathLike,
+    *,
+    method: str = ...,
+    frames: tuple[int, int | None] = ...,
+    config: Config | None = ...,
+    seed: int | None = ...,
+    init_pose: PathLike | None = ...,
+    body: PathLike | None = ...,
+    causal: bool = ...,
+    resume: bool = ...,
+) -> Result: ...
+
+
+def track(
+    capture: Capture,
+    output: PathLike | None = None,
+    *,
+    method: str = "region",
+    frames: tuple[int, int | None] = (0, None),
+    config: Config | None = None,
+    seed: int | None = None,
+    init_pose: PathLike | None = None,
+    body: PathLike | None = None,
+    causal: bool = False,
+    resume: bool = False,
+) -> Iterator[Estimate] | Result:
+    """Track the person in a capture.
+
+    Args:
+        capture: of :func:`open_capture`.
+        output: a result file to write; without one the estimates are handed out frame by frame.
+        method: "region", "silhouette", "volumetric" or "lm".
+        frames: the first frame to tell and the one to stop before (None: the last).
+        config: all settings; the defaults if None.
+        seed: of the random generator, in the place of the configuration's.
+        init_pose: a file with a rough initial pose.
+        body: a result or a TOML file whose body is taken.
+        causal: leave it at the first pass. Without ``output`` there is no other.
+        resume: go on where an earlier run with the same ``output`` stopped.
+
+    Returns:
+        Without ``output`` an iterator of :class:`~tk.trackers.base.Estimate`: ``frame``, ``time`` (seconds), ``pose``
+        (24,), ``joints`` (15, 3) metres, ``sigma`` (15,) metres, ``status`` … With it the finished
+        :class:`~tk.io.result.Result`.
+
+    Raises:
+        tk.errors.TkError: bad input, in one line; what was finished before it is in the file.
+        KeyboardInterrupt: somebody stopped it; with ``output`` the finished frames are in the file.
+    """
+    chosen = config or Config()
+    if seed is not None:
+        chosen = replace(chosen, seed=seed)
+    pose_file = Path(init_pose) if init_pose is not None else None
+    body_file = Path(body) if body is not None else None
+    if output is None:
+        return session.estimates(capture, chosen, method=method, frames=frames, init_pose=pose_file, body=body_file)
+    summary = session.track(
+        capture,
+        Path(output),
+        chosen,
+        _Quiet(),
+        method,
+        frames,
+        pose_file,
+        resume,
+        body=body_file,
+        causal=causal,
+    )
+    if summary.interrupted:
+        raise KeyboardInterrupt
+    return read_result(Path(output))
