@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tk.ahead import TIMING_STAGES, Observed, Source, open_source
 from tk.config import Config
@@ -20,10 +21,24 @@ from tk.errors import CaptureError, ConfigError, ResultError, TkError
 from tk.io.capture import Capture
 from tk.io.init_pose import InitPose, read_init_pose
 from tk.io.mask_store import MaskStore
-from tk.io.result import FrameResult, HullPoints, ResultMeta, ResultWriter, Status, Value, read_result, revise_result
+from tk.io.result import (
+    FrameResult,
+    HullPoints,
+    JointAngles,
+    ResultMeta,
+    ResultWriter,
+    Status,
+    UsedCameras,
+    Value,
+    read_result,
+    revise_result,
+)
+from tk.model.angles import ANGLES
 from tk.model.cone_body import ConeBody
+from tk.model.derived import derive
 from tk.model.hull import HullSurface
-from tk.model.skeleton import join_pose, split_pose
+from tk.model.skeleton import SEGMENTS, join_pose, split_pose
+from tk.model.smoothing import smooth
 from tk.segmentation import make_segmenter as make_segmenter
 from tk.trackers.base import Estimate, Tracker
 from tk.trackers.bodies import read_body
@@ -136,8 +151,8 @@ def track(
                 reporter.begin(plan.stop - plan.begin, min(done, plan.stop - plan.begin))
                 for estimate in run.estimates():
                     reporter.advance(estimate.frame, estimate)
-            if not causal and run.tracked:
-                refine(output, plan, run.masks, reporter.note)
+            if run.tracked:
+                finish(output, plan, run.masks, reporter.note, causal)
         except KeyboardInterrupt:
             # caught outside the writer, which then leaves an older result alone if nothing is done
             interrupted = True
@@ -242,6 +257,9 @@ def _meta(tracker: Tracker, capture: Capture, config: Config) -> ResultMeta:
         ankle_names=tracker.ankle_names,
         sigma=tracker.method == RegionTracker.method,
         fit_cameras=capture.rig.names if tracker.method == RegionTracker.method else (),
+        segment_names=SEGMENTS if contours else (),
+        feet=contours,
+        angles=tuple(JointAngles(a.joint, a.names, a.convention) for a in ANGLES) if contours else (),
         objective_kind="E_S" if contours else "robust distance of surface points",
     )
 
@@ -378,42 +396,60 @@ class _Run:
         return {**self.plan.tracker.state(), **origin, _ORIGIN + _LOST: self.lost}
 
 
-def refine(output: Path, plan: _Plan, masks: MaskStore, note: Callable[[str], None]) -> None:
-    """The second pass: the body fitted to frames of the whole recording, and every frame settled anew with it.
+def finish(output: Path, plan: _Plan, masks: MaskStore, note: Callable[[str], None], causal: bool) -> None:
+    """What needs all frames: the second pass unless ``causal``; segments, feet and angles; the smoothed copy; cameras.
 
-    The result is replaced in one step; if this does not end, the first pass's stays.
+    The second pass fits the body to frames of the whole recording and settles every frame anew with it. The result is
+    replaced in one step; if this does not end, the first pass's stays.
     """
     tracker = plan.tracker
-    if not isinstance(tracker, RegionTracker):
+    if not isinstance(tracker, ContourTracker):
         return
     result = read_result(output)
-    assert result.waist is not None and result.ankles is not None and result.fit_error is not None
-    missing = [int(f) for f in result.frames if int(f) not in masks]
-    if missing:  # what an earlier run has tracked
-        for observation, _ in plan.source.frames(min(missing), max(missing) + 1):
-            masks.put(observation.index, observation.masks)
+    none = np.zeros((len(result.frames), 0))
+    waist = none if result.waist is None else result.waist
+    ankles = none if result.ankles is None else result.ankles
     skeleton = tracker.body.skeleton
-    poses = np.array([join_pose(skeleton, *row) for row in zip(result.pose, result.waist, result.ankles, strict=True)])
+    poses = np.array([join_pose(skeleton, *row) for row in zip(result.pose, waist, ankles, strict=True)])
     lost = result.status == Status.LOST
-    note("second pass: the body is fitted to the whole recording")
-    poses, error = tracker.second_pass(
-        masks.sequence(result.frames),
-        poses,
-        lost,
-        result.fit_error,
-        plan.capture.subject_height_m,
-        keep_body=plan.body is not None,
-    )
+    columns: dict[str, NDArray[np.floating]] = {}
+    model: Mapping[str, Value] | None = None
+    if isinstance(tracker, RegionTracker) and not causal:
+        note("second pass: the body is fitted to the whole recording")
+        missing = [int(f) for f in result.frames if int(f) not in masks]
+        if missing:  # what an earlier run has tracked
+            for observation, _ in plan.source.frames(min(missing), max(missing) + 1):
+                masks.put(observation.index, observation.masks)
+        assert result.fit_error is not None
+        poses, columns["fit_error"] = tracker.second_pass(
+            masks.sequence(result.frames),
+            poses,
+            lost,
+            result.fit_error,
+            plan.capture.subject_height_m,
+            keep_body=plan.body is not None,
+        )
+        model = {**tracker.model(), REFINED: 1}
+    columns |= _columns(tracker, poses)
+    filtered = smooth(tracker.body.skeleton, poses, ~lost, plan.capture.fps)
+    smoothed = {**_columns(tracker, filtered.poses), "bridged": filtered.bridged}
+    cameras = UsedCameras(plan.capture.rig, np.zeros(len(plan.capture.rig)))
+    revise_result(output, columns, smoothed=smoothed, model=model, cameras=cameras)
+
+
+def _columns(tracker: ContourTracker, poses: NDArray[np.float64]) -> dict[str, NDArray[np.floating]]:
+    """The datasets that tell poses (F, D) and what follows from them."""
     skeleton = tracker.body.skeleton
-    parts = [split_pose(skeleton, pose) for pose in poses]
-    columns = {
-        "pose": np.array([p for p, _, _ in parts]),
-        "waist": np.array([w for _, w, _ in parts]),
-        "ankles": np.array([a for _, _, a in parts]),
-        "joints/position": np.array([skeleton.joints(pose) for pose in poses]),
-        "fit_error": error,
-    }
-    revise_result(output, columns, model={**tracker.model(), REFINED: 1})
+    paper, waist, ankles = (np.array(part) for part in zip(*(split_pose(skeleton, p) for p in poses), strict=True))
+    derived = derive(skeleton, tracker.body.dimensions, poses)
+    columns = {"pose": paper, "joints/position": derived.joints, "segments/rotation": derived.rotations}
+    columns["feet/position"] = derived.feet
+    columns |= {f"angles/{joint}": values for joint, values in derived.angles.items()}
+    if tracker.waist_names:
+        columns["waist"] = waist
+    if tracker.ankle_names:
+        columns["ankles"] = ankles
+    return columns
 
 
 def _take(observations: Iterator[Observed], count: int) -> tuple[list[Observed], Iterator[Observed] | None]:
