@@ -20,7 +20,17 @@ from tk.errors import CaptureError, ConfigError, ResultError, TkError
 from tk.io.capture import Capture
 from tk.io.init_pose import InitPose, read_init_pose
 from tk.io.mask_store import MaskStore
-from tk.io.result import FrameResult, HullPoints, ResultMeta, ResultWriter, Status, Value, read_result, revise_result
+from tk.io.result import (
+    FrameResult,
+    HullPoints,
+    ResultMeta,
+    ResultWriter,
+    Status,
+    Value,
+    blamed_on,
+    read_result,
+    revise_result,
+)
 from tk.model.cone_body import ConeBody
 from tk.model.hull import HullSurface
 from tk.model.skeleton import join_pose, split_pose
@@ -325,12 +335,14 @@ class _Run:
         plan, output = self.plan, self.output
         done = output.done if output else 0
         if output and done:
-            self.lost = int(np.asarray(output.writer.state[_ORIGIN + _LOST]))
+            with blamed_on(output.writer.path, "the state of the run"):
+                self.lost = int(np.asarray(output.writer.state[_ORIGIN + _LOST]))
         if plan.begin + done >= plan.stop:
             return
         if output and done:
             output.check()
-            plan.tracker.restore(output.writer.model, output.writer.state)
+            with blamed_on(output.writer.path, "the state of the run"):
+                plan.tracker.restore(output.writer.model, output.writer.state)
             yield from self._step_through(plan.source.frames(plan.begin + done, plan.stop))
             return
         # The body is fitted to the same frames however few are asked for, so that a run may be prolonged by --resume.
