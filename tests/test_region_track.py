@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import tomli_w
@@ -218,6 +220,11 @@ def test_results_without_a_body_of_contours_are_told(
     tk(*command, "--body", tracked).complaint(tracked.name, "no body of contours", "--method region")
     tk(*command, "--body", tmp_path / "none.h5").complaint("none.h5")
     tk(*command, "--body", tmp_path / "none.toml").complaint("none.toml")
+    damaged = Path(shutil.copy(causal, tmp_path / "damaged.h5"))
+    with h5py.File(damaged, "r+") as file:
+        del file["model/parts/name"]
+    tk(*command, "--body", damaged).complaint("damaged.h5", "the body cannot be used")
+    damaged.unlink()
     tk(*command, "--body", causal, "--method", "volumetric").complaint("--body", "volumetric", "--method region")
     assert list(tmp_path.iterdir()) == []
 

@@ -30,6 +30,7 @@ from tk.io.result import (
     Status,
     UsedCameras,
     Value,
+    blamed_on,
     read_result,
     revise_result,
 )
@@ -343,12 +344,14 @@ class _Run:
         plan, output = self.plan, self.output
         done = output.done if output else 0
         if output and done:
-            self.lost = int(np.asarray(output.writer.state[_ORIGIN + _LOST]))
+            with blamed_on(output.writer.path, "the state of the run"):
+                self.lost = int(np.asarray(output.writer.state[_ORIGIN + _LOST]))
         if plan.begin + done >= plan.stop:
             return
         if output and done:
             output.check()
-            plan.tracker.restore(output.writer.model, output.writer.state)
+            with blamed_on(output.writer.path, "the state of the run"):
+                plan.tracker.restore(output.writer.model, output.writer.state)
             yield from self._step_through(plan.source.frames(plan.begin + done, plan.stop))
             return
         # The body is fitted to the same frames however few are asked for, so that a run may be prolonged by --resume.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError, ResultError
-from tk.io.result import Result, read_result
+from tk.io.result import Result, blamed_on, read_result
 from tk.io.toml import parse_toml, read_text
 from tk.model.anthropometry import BodyDimensions
 from tk.model.cone_body import ConeBody, build_cone_body
@@ -30,7 +30,8 @@ def read_body(path: Path, up: str) -> ConeBody:
         model = read_result(path).model
         if "parts/shape" not in model or "body" not in model:
             raise ConfigError(f"{path}: holds no body of contours; give a result of --method region or a TOML file")
-        return restore_body(model, up)
+        with blamed_on(path, "the body"):
+            return restore_body(model, up)
     values = parse_toml(read_text(path, ConfigError), str(path), ConfigError)
     given = values.get("dimensions", {})
     known = {field.name for field in fields(BodyDimensions)}
