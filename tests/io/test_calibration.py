@@ -197,5 +197,5 @@ def test_match_camera_refuses_to_guess() -> None:
 def test_a_number_of_too_many_digits(tmp_path: Path) -> None:
     path = write(tmp_path, calibration_tables(2))
     path.write_text(path.read_text().replace("60.0", "9" * 400, 1))
-    with pytest.raises(CalibrationError, match="camera 'cam1': matrix holds 9+.*, which is too large"):
+    with pytest.raises(CalibrationError, match=r"camera 'cam1': matrix holds 9+.*, which is too large"):
         read_calibration(path)
