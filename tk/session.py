@@ -433,7 +433,9 @@ def finish(output: Path, plan: _Plan, masks: MaskStore, note: Callable[[str], No
             keep_body=plan.body is not None,
         )
         model = {**tracker.model(), REFINED: 1}
-    columns |= _columns(tracker, poses)
+    # the first pass's poses stand as they are
+    told = ("pose", "waist", "ankles", "joints/position") if model is None else ()
+    columns |= {name: values for name, values in _columns(tracker, poses).items() if name not in told}
     filtered = smooth(tracker.body.skeleton, poses, ~lost, plan.capture.fps)
     smoothed = {**_columns(tracker, filtered.poses), "bridged": filtered.bridged}
     cameras = UsedCameras(plan.capture.rig, np.zeros(len(plan.capture.rig)))

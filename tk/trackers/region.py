@@ -109,7 +109,6 @@ class RegionTracker(ContourTracker):
         self.config = config or RegionConfig()
         self._alive: list[Hypothesis] = []
         self._usual = np.inf
-        self._searched = 0.0
         self._lost_for = 0
         self._fresh = True
 
@@ -124,7 +123,6 @@ class RegionTracker(ContourTracker):
         pose = self.find(frames, height_m, init, body)
         self._alive = [Hypothesis(pose, pose, 0.0)]
         self._usual = np.inf
-        self._searched = 0.0
         self._lost_for = 0
         self._fresh = True
 
@@ -163,7 +161,6 @@ class RegionTracker(ContourTracker):
                 assert again is not None
                 label, curvature = again.label[0], self._curvature(pyramid, best, images)
                 error = evidence.fit_error(label)
-            self._searched = float(np.nanmean(error))
         watch.lap("search")
         lost = self._follow(pyramid, float(np.nanmean(error)))
         self._learn(evidence, label, float(np.nanmean(error)), lost)
@@ -211,14 +208,10 @@ class RegionTracker(ContourTracker):
         self._alive = [replace(kept[0], age=1), *kept[1 : self.config.hypotheses]]
 
     def _needs_search(self, frame: Observation, error: float) -> bool:
-        """Whether the body leaves more unexplained than is usual, or it is time to look around.
-
-        What a search has just left is not searched again until it grows, or it is time.
-        """
+        """Whether the body leaves more unexplained than is usual, or it is time to look around."""
         every = self.contours.search_every
         due = every > 0 and frame.index % every == 0
-        explained = error <= self.config.search_ratio * max(self._usual, self._searched)
-        return self.contours.body != "walker" and (due or not explained)
+        return self.contours.body != "walker" and (due or error > self.config.search_ratio * self._usual)
 
     def _propose(self, frame: Observation, pyramid: Pyramid, images: NDArray[np.uint8] | None) -> None:
         """Other places of the limbs join the hypotheses, with what they cost above the best one's running mean."""
@@ -361,7 +354,6 @@ class RegionTracker(ContourTracker):
             "costs": np.array([h.cost for h in self._alive]),
             "ages": np.array([h.age for h in self._alive]),
             "usual": self._usual,
-            "searched": self._searched,
             "lost_for": self._lost_for,
             **self.colors.state(),
         }
@@ -372,7 +364,6 @@ class RegionTracker(ContourTracker):
         rows = zip(state["poses"], state["previous"], state["costs"], state["ages"], strict=True)
         self._alive = [Hypothesis(np.asarray(p), np.asarray(q), float(c), int(a)) for p, q, c, a in rows]
         self._usual = float(state["usual"])
-        self._searched = float(state["searched"])
         self._lost_for = int(state["lost_for"])
         self.colors.restore(state)
         self._fresh = False
