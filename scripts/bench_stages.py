@@ -120,18 +120,18 @@ def silhouette_stages(
     _, rest = evidence.cast(body, group, pose, limb.others, export=True)
     assert rest is not None
     others = Cast(rest.label[0], rest.depth[0])
-    here = views.equations(body, last, pose, 0, settings.search)
+    here = views.equations(body.arrays, last, pose, 0, settings.search)
     limits = body.free, body.skeleton.lower, body.skeleton.upper
 
     def fit(start: Float, pyramid: Pyramid) -> Float:
         return gauss_newton.minimise(
-            lambda states, scale: views.equations(body, pyramid, states, scale, settings.search),
+            lambda states, scale: views.equations(body.arrays, pyramid, states, scale, settings.search),
             start[None], *limits, settings.solver,
         )  # fmt: skip
 
     def equations(scale: int, window_px: float) -> float:
         search = replace(settings.search, window_px=window_px)
-        return median_ms(lambda: views.equations(body, last, pose, scale, search))
+        return median_ms(lambda: views.equations(body.arrays, last, pose, scale, search))
 
     window = settings.search.window_px
     found = [Stage("masks cleaned, scales", median_ms(lambda: views.pyramid(masks[-1], scales, settings.cleaning)), {})]

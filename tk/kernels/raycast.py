@@ -57,25 +57,32 @@ def _cast_kernel(real):
         camera: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
         drawn: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (K,) the parts to draw
         spread: ti.i32,
+        spread_poses: ti.i32,
         step: ti.i32,  # pixels between rays; the first is at step // 2
         rays: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (V, H, W, 3) world; zero outside the picture
         cost: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (V, H, W, G + 1)
         before_label: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (V, H, W)
         before_depth: ti.types.ndarray(dtype=ti.f32, ndim=3),  # (V, H, W)
         export: ti.i32,
+        most_outside: real,
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
         frames: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 12) scratch
         twists: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 6) scratch
         placed: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 12) scratch
         disc: ti.types.ndarray(dtype=real, ndim=4),  # (B, V, P, 3) scratch, centre and square radius in pixels
+        outside: ti.types.ndarray(dtype=real, ndim=1),  # (B,) out: mean cost at the drawn parts' middles
         change: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (B V, H) out: what drawing changes of a row's cost
         label: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (B, V, H, W) out, if export; before_label when called
         depth: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (B, V, H, W) out, if export; before_depth when called
     ):
         B, V, H, W = pose.shape[0], rays.shape[0], rays.shape[1], rays.shape[2]
         K = drawn.shape[0]
-        for b in range(B):
+        for turn in range(spread_poses * B):
+            if turn % spread_poses != 0:
+                continue
+            b = turn // spread_poses
             forward(axis, point, prismatic, parent, pose, b, b, frames, twists)
+            out, seen = ti.cast(0.0, real), ti.cast(1e-6, real)
             for k in range(drawn.shape[0]):
                 p = drawn[k]
                 R, t = place_part(frames, part_dof, part_frame, b, p)
@@ -93,11 +100,20 @@ def _cast_kernel(real):
                     elif z > -reach:
                         radius = 1e6 + 0.0 * z
                     disc[b, v, p, 0], disc[b, v, p, 1], disc[b, v, p, 2] = pixel[0], pixel[1], radius * radius
+                    if radius > 0.0 and radius < 1e6:
+                        i = ti.cast(ti.round((pixel[0] - step // 2) / step), ti.i32)
+                        j = ti.cast(ti.round((pixel[1] - step // 2) / step), ti.i32)
+                        if i >= 0 and j >= 0 and i < W and j < H:
+                            out += ti.cast(ti.max(cost[v, j, i, group[p] + 1] - cost[v, j, i, 0], 0.0), real)
+                            seen += 1.0
+            outside[b] = out / seen
         for turn in range(spread * (B * V)):
             if turn % spread != 0:
                 continue
             c = turn // spread
             b, v = c // V, c % V
+            if outside[b] > most_outside:
+                continue
             eye = camera_center(camera, v)
             for j in range(H):
                 row = j * step + step // 2
@@ -157,6 +173,7 @@ def cast(
     drawn: NDArray[np.int32] | None = None,
     before: Cast | None = None,
     export: bool = False,
+    most_outside: float = np.inf,
 ) -> tuple[NDArray[np.float64], Cast | None]:
     """Cast the rays at B poses.
 
@@ -171,6 +188,8 @@ def cast(
         drawn: (K,) indices of the parts to draw; all if None.
         before: what the rays meet of the other parts; nothing if None.
         export: whether to return what the rays meet.
+        most_outside: a pose is not cast, and costs inf, whose drawn parts' middles cost more than this, on an average
+            over parts and views: most of a limb's places are outside the visual hull, and are told by these few rays.
 
     Returns:
         (B, V) sum of the rays' costs; and, with ``export``, the casts with B as the first axis, else None.
@@ -184,7 +203,7 @@ def cast(
     if drawn is None:
         drawn = np.arange(P, dtype=np.int32)
     before = before or nothing((V, H, W))
-    change = np.empty((B * V, H), np.float32)
+    change, outside = np.empty((B * V, H), np.float32), np.empty(B, dtype)
     shape = (B, V, H, W) if export else (1, 1, 1, 1)
     label, depth = np.empty(shape, np.uint8), np.empty(shape, np.float32)
     if export:
@@ -195,21 +214,25 @@ def cast(
         np.ascontiguousarray(cameras, dtype),
         drawn,
         spread_of(B * V),
+        spread_of(B),
         step,
         rays,
         cost,
         before.label,
         before.depth,
         int(export),
+        most_outside,
         poses,
         np.empty((B, D, 12), dtype),
         np.empty((B, D, 6), dtype),
         np.empty((B, P, 12), dtype),
         np.empty((B, V, P, 3), dtype),
+        outside,
         change,
         label,
         depth,
     )
+    change.reshape(B, V, H)[outside > most_outside] = np.inf
     if before.label.any():
         columns = np.concatenate([[0], group + 1])[before.label]
         base = np.take_along_axis(cost, columns[..., None], axis=-1)[..., 0].sum(axis=(1, 2), dtype=np.float64)

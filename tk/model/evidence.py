@@ -91,14 +91,25 @@ class Evidence:
         drawn: NDArray[np.int32] | None = None,
         before: Cast | None = None,
         export: bool = False,
+        most_outside: float = np.inf,
     ) -> tuple[Float, Cast | None]:
         """(B, V) cost of poses (B, D) by view, NaN where a view sees nobody; and with ``export`` what the rays meet.
 
-        ``drawn`` and ``before`` as :func:`tk.kernels.raycast.cast` has them.
+        ``drawn``, ``before`` and ``most_outside`` as :func:`tk.kernels.raycast.cast` has them.
         """
         grid = self.grid
         total, met = cast(
-            body.arrays, group, grid.cameras, grid.step, grid.rays, self.cost, poses, drawn, before, export
+            body.arrays,
+            group,
+            grid.cameras,
+            grid.step,
+            grid.rays,
+            self.cost,
+            poses,
+            drawn,
+            before,
+            export,
+            most_outside,
         )
         seen = np.count_nonzero(self.person, axis=(1, 2))
         return np.where(seen > 0, total / np.maximum(seen, 1), np.nan), met

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.cone_arrays import ConeArrays
 from tk.model.cone_body import ConeBody
 from tk.model.skeleton import CHAINS, JOINTS, Skeleton, shoulder_angles
 
@@ -39,7 +40,9 @@ class Limb:
     Attributes:
         name: of :data:`LIMBS`.
         dofs: (L,) its degrees of freedom.
+        free: (D,) bool, where those are.
         parts: (K,) int32 its parts; others: (P - K,) all others.
+        arrays: the body for the kernels, with the contours of these parts only.
         joints: elbow and wrist, or knee and ankle, as indices into the skeleton's joints.
         places: (N, L) candidates.
         lower, upper: (L,) limits.
@@ -47,8 +50,10 @@ class Limb:
 
     name: str
     dofs: NDArray[np.int64]
+    free: NDArray[np.bool_]
     parts: NDArray[np.int32]
     others: NDArray[np.int32]
+    arrays: ConeArrays
     joints: tuple[int, int]
     places: Float
     lower: Float
@@ -68,13 +73,15 @@ class Limb:
         ends: list[Float] = []
         # beyond these only neighbours of the first follow
         for i in np.argsort(cost, kind="stable")[: 20 * count]:
+            if not np.isfinite(cost[i]):
+                break
             end = skeleton.joints(poses[i])[list(self.joints)]
             if all(np.linalg.norm(end - other, axis=1).max() > DISTINCT_M for other in ends):
                 chosen.append(poses[i])
                 ends.append(end)
             if len(chosen) == count:
                 break
-        return np.array(chosen)
+        return np.array(chosen).reshape(len(chosen), poses.shape[1])
 
 
 def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
@@ -93,13 +100,20 @@ def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
         places = _arm_places() if arm else _leg_places(len(chain))
         if len(dofs) < len(chain):  # the walker's hips turn about one axis only
             places = np.unique(places[:, body.free[chain]], axis=0)
+        own = parts[body.arrays.curve_part]
+        free = np.zeros(len(skeleton.names), bool)
+        free[dofs] = True
         ends = ("elbow", "wrist") if arm else ("knee", "ankle")
         result.append(
             Limb(
                 name=name,
                 dofs=dofs,
+                free=free,
                 parts=np.flatnonzero(parts).astype(np.int32),
                 others=np.flatnonzero(~parts).astype(np.int32),
+                arrays=body.arrays._replace(
+                    curve_part=body.arrays.curve_part[own], curve_kind=body.arrays.curve_kind[own]
+                ),
                 joints=(JOINTS.index(f"{ends[0]}_{side}"), JOINTS.index(f"{ends[1]}_{side}")),
                 places=np.clip(places, lower, upper),
                 lower=lower,

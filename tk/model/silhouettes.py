@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tk.errors import ConfigError
 from tk.kernels import silhouette as kernels
+from tk.kernels.cone_arrays import ConeArrays
 from tk.kernels.projection import pack_camera
 from tk.kernels.raycast import cast
 from tk.kernels.silhouette import Edgels, NormalEquations, Regions, SearchSettings
@@ -106,7 +107,7 @@ class Views:
 
     def equations(
         self,
-        body: ConeBody,
+        body: ConeArrays,
         pyramid: Pyramid,
         poses: Float,
         scale: int,
@@ -115,7 +116,7 @@ class Views:
     ) -> NormalEquations:
         """Normal equations of poses (B, D) at a scale's index."""
         return kernels.normal_equations(
-            body.arrays,
+            body,
             self._cameras32,
             pyramid.sizes[scale],
             pyramid.masks[scale],

@@ -244,6 +244,10 @@ class Skeleton:
         T = self.segment_transforms(pose)[self.joint_segment]
         return np.einsum("jab,jb->ja", T[:, :3, :3], self.joint_position) + T[:, :3, 3]
 
+    def apart(self, pose: Float, joints: Float) -> float:
+        """How far the joints of a pose lie at most from others (J, 3), metres."""
+        return float(np.linalg.norm(self.joints(pose) - joints, axis=1).max())
+
     def ancestors(self) -> NDArray[np.bool_]:
         """(S, D): True where a degree of freedom moves a segment."""
         return self._ancestors

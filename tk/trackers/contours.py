@@ -42,9 +42,15 @@ RELOCATE_EVERY = 3
 # The fall of the cost, as a share of the person's pixels, that makes another place of a limb the pose.
 GAIN = 0.004
 # Places of a limb that are descended from, and random ones about its own place that are looked at beside the grid.
-PLACES, NEARBY = 2, 80
-# Poses that a search descends from to the end, beside the present one.
-FINISHED = 4
+PLACES, NEARBY = 3, 80
+# Places of a limb are not looked at where that much of it is outside the silhouettes.
+OUTSIDE = 0.4
+# A limb's place that costs this much more than its present one, once the limb alone has settled there, is given up.
+PROMISING = 0.01
+# Poses that a search descends from with all limbs, beside the present one.
+FINISHED = 2
+# Poses whose joints lie farther apart than this are different ones, metres.
+APART_M = 0.05
 # Rays a picture's height: to screen many places of a limb, and to choose among few poses.
 SCREEN_ROWS, CHOICE_ROWS = 54, 96
 
@@ -168,7 +174,7 @@ class ContourTracker:
             skeleton = self.body.skeleton
             start = join_pose(skeleton, rough, np.zeros(len(self.waist_names)), np.zeros(len(self.ankle_names)))
             start = self.settle(pyramids[0], start[None]).states[0]
-        start = self.search(frames[0], pyramids[0], start)[0][0]
+        start = self.improved(frames[0], pyramids[0], start)
         if self.contours.adapt and body is None:
             start = self._adapt(frames, pyramids, start, stature)
         return start
@@ -193,7 +199,7 @@ class ContourTracker:
         every = self.contours.search_every
         for i, pyramid in enumerate(pyramids[1:], 1):
             pose = self.settle(pyramid, poses[-1][None]).states[0]
-            poses.append(self.search(frames[i], pyramid, pose)[0][0] if every and i % every == 0 else pose)
+            poses.append(self.improved(frames[i], pyramid, pose) if every and i % every == 0 else pose)
         count = min(self.contours.fit.frames, len(pyramids))
         chosen = np.unique(np.linspace(0, len(pyramids) - 1, count).round().astype(int))
         body, fitted = self.fit(pyramids, np.array(poses), chosen, stature, self.contours.fit)
@@ -272,17 +278,19 @@ class ContourTracker:
         levels: Sequence[int] | None = None,
         images: NDArray[np.uint8] | None = None,
         prior: Prior | None = None,
+        limb: Limb | None = None,
     ) -> Descent:
         """Gauss-Newton from poses (B, D), through all scales or those of ``levels``, 0 the finest.
 
-        With ``images``, colours pull at contours inside the silhouette, too.
+        With ``images``, colours pull at contours inside the silhouette, too. With ``limb`` all else stays where it is.
         """
         body, contours = self.body, self.contours
+        arrays, free = (limb.arrays, limb.free) if limb else (body.arrays, body.free)
         regions = None if images is None else self.colors.regions(images)
         return gauss_newton.minimise(
-            lambda states, scale: self.views.equations(body, pyramid, states, scale, contours.search, regions),
+            lambda states, scale: self.views.equations(arrays, pyramid, states, scale, contours.search, regions),
             poses,
-            body.free,
+            free,
             body.skeleton.lower,
             body.skeleton.upper,
             contours.solver,
@@ -302,42 +310,59 @@ class ContourTracker:
     def search(
         self, frame: Observation, pyramid: Pyramid, pose: Float, images: NDArray[np.uint8] | None = None
     ) -> tuple[Float, Float]:
-        """Other places of the limbs: proposals, screened in one batch a limb, the best descended from.
+        """Other places of the limbs: all of a limb's are screened in one launch, the best ones descended from, first by
+        the limb alone, then, where that promises something, by the whole body.
 
         Returns:
-            Poses (B, D), the best first, and their costs (B,). The pose itself stays first unless another one costs
-            :data:`GAIN` less.
+            Poses (B, D), that which was given first, and their costs (B,).
         """
         skeleton, group = self.body.skeleton, self.colors.group
         rng = np.random.default_rng([7, frame.index])
         coarse = self.evidence(self.screen, frame, pyramid)
-        proposals: list[list[Float]] = []
+        own = mean_of_views(coarse.cast(self.body, group, pose[None])[0])[0]
+        joints = skeleton.joints(pose)
+        level = (min(1, self.contours.solver.scales - 1),)
+        found: list[tuple[Limb, list[Float]]] = []
         for limb in self.limbs:
             _, rest = coarse.cast(self.body, group, pose[None], limb.others, export=True)
             assert rest is not None
+            before = Cast(rest.label[0].copy(), rest.depth[0].copy())
             tried = limb.candidates(pose, NEARBY, rng)
-            cost, _ = coarse.cast(self.body, group, tried, limb.parts, Cast(rest.label[0].copy(), rest.depth[0].copy()))
-            proposals.append(list(limb.distinct(skeleton, tried, mean_of_views(cost), PLACES)))
-        poses = [pose, *(p for places in proposals for p in places)]
-        for first, second in ((0, 1), (2, 3)):  # both arms, both legs
-            if second < len(self.limbs):
-                for a in proposals[first][:2]:
-                    for b in proposals[second][:2]:
-                        both = a.copy()
-                        both[self.limbs[second].dofs] = b[self.limbs[second].dofs]
-                        poses.append(both)
-        # all of them roughly, the best to the end; the pose itself is always among those
-        rough = self.settle(pyramid, np.array(poses), (min(1, self.contours.solver.scales - 1),), images).states
-        cost = mean_of_views(coarse.cast(self.body, group, rough)[0])
+            cost, _ = coarse.cast(self.body, group, tried, limb.parts, before, most_outside=OUTSIDE)
+            places = limb.distinct(skeleton, tried, mean_of_views(cost), PLACES)
+            if not len(places):
+                continue
+            settled = self.settle(pyramid, places, level, images, limb=limb).states
+            cost, _ = coarse.cast(self.body, group, settled, limb.parts, before)
+            told = mean_of_views(cost)
+            others = [
+                settled[i]
+                for i in np.argsort(told, kind="stable")
+                if told[i] < own + PROMISING and skeleton.apart(settled[i], joints) > APART_M
+            ]
+            if others:
+                found.append((limb, others[:2]))
+        if not found:
+            return pose[None], np.array([own])
+        # a limb elsewhere, and pairs of limbs
+        poses = [place for _, places in found for place in places]
+        for i, (_, places) in enumerate(found):
+            for limb, others in found[i + 1 :]:
+                both = places[0].copy()
+                both[limb.dofs] = others[0][limb.dofs]
+                poses.append(both)
+        cost = mean_of_views(coarse.cast(self.body, group, np.array(poses))[0])
         best = np.argsort(cost, kind="stable")[:FINISHED]
-        chosen = np.concatenate([pose[None], rough[best]])
+        chosen = np.concatenate([pose[None], np.array(poses)[best]])
         settled = self.settle(pyramid, chosen, (0,), images).states
         fine = self.evidence(self.choice, frame, pyramid)
-        cost = mean_of_views(fine.cast(self.body, group, settled)[0])
-        order = np.argsort(cost, kind="stable")
-        if cost[order[0]] > cost[0] - GAIN:
-            order = np.concatenate([[0], order[order != 0]])
-        return settled[order], cost[order]
+        return settled, mean_of_views(fine.cast(self.body, group, settled)[0])
+
+    def improved(self, frame: Observation, pyramid: Pyramid, pose: Float) -> Float:
+        """(D,) the pose, or what a search finds that costs :data:`GAIN` less."""
+        poses, cost = self.search(frame, pyramid, pose)
+        best = int(np.argmin(cost))
+        return np.asarray(poses[best if cost[best] < cost[0] - GAIN else 0])
 
     def relocate(self, pyramid: Pyramid, pose: Float, error: float) -> tuple[Float, float]:
         """The pose or, if that explains the silhouettes better, one found as at the start; and its E_S."""

@@ -34,7 +34,7 @@ from tk.model.silhouettes import Pyramid
 from tk.model.skeleton import JOINTS
 from tk.optim.gauss_newton import Prior
 from tk.trackers.base import Estimate, Observation, Stopwatch
-from tk.trackers.contours import GAIN, RELOCATE_EVERY, ContourTracker, SilhouetteConfig, restore_body
+from tk.trackers.contours import APART_M, GAIN, RELOCATE_EVERY, ContourTracker, SilhouetteConfig, restore_body
 
 Float = NDArray[np.float64]
 
@@ -46,8 +46,6 @@ WAIST_DEG, ANKLE_DEG, ANGLE_DEG, TRANSLATION_M = 12.0, 20.0, 40.0, 0.3
 PATIENCE, RENEWAL = 6, 0.4
 # Hypotheses that cost this much more than the best one, as a share of the person's pixels, are dropped.
 MARGIN = 0.02
-# Of two hypotheses: joints that lie farther apart than this make them different, metres.
-APART_M = 0.05
 # Colours are learned only in frames that are explained about as well as is usual.
 LEARN_RATIO = 1.15
 # The second pass: what the body is fitted to, and how near a frame stays to its pose of the first pass.
@@ -199,12 +197,11 @@ class RegionTracker(ContourTracker):
         kept: list[Hypothesis] = []
         places: list[Float] = []
         for h in sorted(self._alive, key=lambda h: h.cost):
-            joints = skeleton.joints(h.pose)
             if kept and (h.cost > kept[0].cost + MARGIN or h.age > PATIENCE):
                 continue
-            if all(np.linalg.norm(joints - other, axis=1).max() > APART_M for other in places):
+            if all(skeleton.apart(h.pose, other) > APART_M for other in places):
                 kept.append(h)
-                places.append(joints)
+                places.append(skeleton.joints(h.pose))
         self._alive = [replace(kept[0], age=1), *kept[1 : self.config.hypotheses]]
 
     def _needs_search(self, frame: Observation, error: float) -> bool:
@@ -217,20 +214,13 @@ class RegionTracker(ContourTracker):
         """Other places of the limbs join the hypotheses, with what they cost above the best one's running mean."""
         best = self._best
         poses, cost = self.search(frame, pyramid, best.pose, images)
-        motion = best.pose - best.previous
-        # where the pose itself stands among the others
-        joints = self.body.skeleton.joints(best.pose)
-        near = [np.linalg.norm(self.body.skeleton.joints(p) - joints, axis=1).max() < APART_M for p in poses]
-        own = float(cost[np.argmax(near)]) if any(near) else float(cost.max())
-        fresh = []
-        for pose, c in zip(poses, cost, strict=True):
-            if c < own + MARGIN / 2:
-                fresh.append(Hypothesis(pose, pose - 0 * motion, best.cost + float(c) - own))
-        # a jump must pay more than noise makes of two casts
-        if fresh and fresh[0].cost < best.cost - GAIN:
-            self._alive = [fresh[0], *(replace(h, age=max(h.age, 1)) for h in self._alive), *fresh[1:]]
-        else:
-            self._alive = [*self._alive, *fresh]
+        # a jump must pay more than noise makes of two casts; less must show in the frames that follow
+        gain = np.where(cost < cost[0] - GAIN, cost[0] - cost, np.minimum(cost[0] - cost, 0.0))
+        self._alive += [
+            Hypothesis(pose, pose, best.cost - float(g))
+            for pose, g in zip(poses[1:], gain[1:], strict=True)
+            if g > -MARGIN / 2
+        ]
         self._rank()
 
     def _follow(self, pyramid: Pyramid, error: float) -> bool:
@@ -257,7 +247,7 @@ class RegionTracker(ContourTracker):
     def _curvature(self, pyramid: Pyramid, poses: Float, images: NDArray[np.uint8] | None) -> Float:
         """(D, D) JᵀWJ at the first of the poses."""
         regions = None if images is None else self.colors.regions(images)
-        return self.views.equations(self.body, pyramid, poses, 0, self.contours.search, regions).hessian[0]
+        return self.views.equations(self.body.arrays, pyramid, poses, 0, self.contours.search, regions).hessian[0]
 
     def _sigma(self, pose: Float, curvature: Float) -> Float:
         """(15,) one standard deviation of each joint's position along an axis, metres.
