@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from tk.kernels.kinematics import load_rotation, load_translation
 from tk.kernels.runtime import ti
 
-# Degrees of freedom above a part: the trunk's six, the waist's three, a leg's four and the ankle's two.
-LONGEST_CHAIN = 15
 # Nearer than this to a camera nothing is projected, metres.
 NEAREST_M = 0.1
 
@@ -25,7 +23,6 @@ class ConeArrays(NamedTuple):
         part_frame: (P, 12) 3×4 transform from the part to the zero configuration.
         part_dof: (P,) int32 the last degree of freedom above each part.
         part_limb: (P,) int32 parts of one limb never make each other's edges ambiguous.
-        chain: (P, LONGEST_CHAIN) int32 the degrees of freedom above each part, -1 behind the last.
         curve_part, curve_kind: (Q,) int32.
     """
 
@@ -38,7 +35,6 @@ class ConeArrays(NamedTuple):
     part_frame: NDArray
     part_dof: NDArray[np.int32]
     part_limb: NDArray[np.int32]
-    chain: NDArray[np.int32]
     curve_part: NDArray[np.int32]
     curve_kind: NDArray[np.int32]
 

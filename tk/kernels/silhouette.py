@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
-from tk.kernels.cone_arrays import LONGEST_CHAIN, NEAREST_M, ConeArrays, keep, place_part, shape_of
+from tk.kernels.cone_arrays import NEAREST_M, ConeArrays, keep, place_part, shape_of
 from tk.kernels.cones import (
     SIDE_B,
     curve_of,
@@ -25,17 +25,19 @@ from tk.kernels.cones import (
     point_on,
     unscaled,
 )
-from tk.kernels.kinematics import forward, load_rotation, load_translation, point_velocity
+from tk.kernels.kinematics import forward, load_rotation, load_translation
 from tk.kernels.launch import Launcher
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
+from tk.kernels.wrench import INERTIA_NUMBERS
 
 # Chords that stand for a curve when its length is measured and when edgels are compared with it.
 CHORDS = 12
 # A sample is hidden by another part if it lies this far inside its cross-section: neighbours at a joint touch.
 HIDING_SHRINK = 0.95
-# Columns of a task's sums: cost, weight of the edgels found, weight of all samples, gradient, upper triangle of JᵀWJ.
-_SUMS = 3 + LONGEST_CHAIN + LONGEST_CHAIN * (LONGEST_CHAIN + 1) // 2
+# Columns of a task's sums: cost, weight of the edgels found, weight of all samples; the wrench of the pulls and the
+# inertia of the edgels, lower triangle, both about an origin in the body (tk.kernels.wrench).
+_SUMS = 3 + 6 + INERTIA_NUMBERS
 # Columns of an exported sample: see Edgels.
 _EXPORT = 12
 # Colours are told apart by 16 levels of each channel.
@@ -234,6 +236,14 @@ def _to_segment(e, a, b):
     return (e - a - t * ab).norm_sqr()
 
 
+@ti.func
+def _twist_about(twists: ti.template(), b: int, k: int, origin):
+    """The twist of a degree of freedom with the velocity of the origin."""
+    w = ti.Vector([twists[b, k, i] for i in ti.static(range(3))])
+    v = ti.Vector([twists[b, k, 3 + i] for i in ti.static(range(3))]) + w.cross(origin)
+    return ti.Vector([w[0], w[1], w[2], v[0], v[1], v[2]])
+
+
 @functools.cache
 def _equations_kernel(real):
     @ti.kernel
@@ -248,7 +258,6 @@ def _equations_kernel(real):
         part_frame: ti.types.ndarray(dtype=real, ndim=2),  # (P, 12)
         part_dof: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
         part_limb: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
-        chain: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (P, L)
         curve_part: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (Q,)
         curve_kind: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (Q,)
         # the frame
@@ -261,6 +270,7 @@ def _equations_kernel(real):
         # settings; scale: pixels of the full picture in one of this scale
         numbers: ti.types.ndarray(dtype=real, ndim=1),  # (8,) in _launch's order
         spread: ti.i32,
+        spread_poses: ti.i32,
         most_samples: ti.i32,
         interior: ti.i32,
         export: ti.i32,
@@ -272,7 +282,7 @@ def _equations_kernel(real):
         ball: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 4) scratch, a sphere about each part, world
         lines: ti.types.ndarray(dtype=real, ndim=3),  # (B V Q, CHORDS + 1, 2) scratch, pixels of the full picture
         facts: ti.types.ndarray(dtype=real, ndim=2),  # (B V Q, 5) scratch: visible, q0, q1, length, outward sign
-        row: ti.types.ndarray(dtype=real, ndim=3),  # (B V Q, 2, L) scratch
+        collected: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 6 + 21) scratch
         sums: ti.types.ndarray(dtype=real, ndim=2),  # (B V Q, _SUMS) scratch
         samples: ti.types.ndarray(dtype=real, ndim=3),  # (V Q, most_samples, _EXPORT) out, if export
         total: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (B, 3 + D + D D) out
@@ -280,7 +290,10 @@ def _equations_kernel(real):
         B, V, Q = pose.shape[0], camera.shape[0], curve_part.shape[0]
         P, D = part_dof.shape[0], axis.shape[0]
 
-        for b in range(B):
+        for turn in range(spread_poses * B):
+            if turn % spread_poses != 0:
+                continue
+            b = turn // spread_poses
             forward(axis, point, prismatic, parent, pose, b, b, frames, twists)
             for p in range(P):
                 R, t = place_part(frames, part_dof, part_frame, b, p)
@@ -336,8 +349,10 @@ def _equations_kernel(real):
             p, kind = curve_part[q], curve_kind[q]
             scale, window, spacing, ambiguous = numbers[0], numbers[1], numbers[2], numbers[3]
             tangential, robust, lost, colors = numbers[4], numbers[5], numbers[6], numbers[7]
-            for i in range(sums.shape[1]):
-                sums[c, i] = 0.0
+            cost, met, all_samples = 0.0 * scale, 0.0 * scale, 0.0 * scale
+            pull = ti.Vector([0.0 * scale for _ in range(6)])
+            inertia = ti.Vector([0.0 * scale for _ in range(INERTIA_NUMBERS)])
+            origin = load_translation(placed, b, 0)
             if export == 1:
                 for i in range(most_samples):
                     samples[c, i, 0] = 0.0
@@ -398,8 +413,8 @@ def _equations_kernel(real):
                         found, d = _search(mask, v, width, height, at, n, window)
                         d *= scale
                         if found == 0:
-                            sums[c, 0] = sums[c, 0] + share * lost * lost
-                            sums[c, 2] = sums[c, 2] + share
+                            cost += share * lost * lost
+                            all_samples += share
                         else:
                             if ambiguous > 0.0:
                                 edgel = pixel + d * n
@@ -426,27 +441,23 @@ def _equations_kernel(real):
                                     weight *= 0.5 * other / ti.max(other + ti.abs(d), 1e-6)
                             if robust > 0.0:
                                 weight *= 1.0 / (1.0 + (d / (robust * scale)) ** 2) ** 2
-                            sums[c, 0] = sums[c, 0] + share * ti.min(d * d, lost * lost)
-                            sums[c, 1] = sums[c, 1] + share
-                            sums[c, 2] = sums[c, 2] + share
+                            cost += share * ti.min(d * d, lost * lost)
+                            met += share
+                            all_samples += share
                     if found > 0 and weight > 0.0:
                         g = J.transpose() @ n
                         h = J.transpose() @ ti.Vector([-n[1], n[0]])
-                        L = 0
-                        while L < LONGEST_CHAIN and chain[p, L] >= 0:
-                            velocity = point_velocity(prismatic, twists, b, chain[p, L], x)
-                            row[c, 0, L] = g.dot(velocity)
-                            row[c, 1, L] = h.dot(velocity)
-                            L += 1
-                        at_sum = 3 + LONGEST_CHAIN
-                        for k in range(L):
-                            sums[c, 3 + k] = sums[c, 3 + k] + weight * d * row[c, 0, k]
-                            for m in range(k, L):
-                                sums[c, at_sum] = sums[c, at_sum] + weight * row[c, 0, k] * row[c, 0, m]
-                                if tangential > 0.0:
-                                    across = weight * tangential * row[c, 1, k] * row[c, 1, m]
-                                    sums[c, at_sum] = sums[c, at_sum] + across
-                                at_sum += 1
+                        # what a twist does to the distance, and to the place along the contour
+                        arm = x - origin
+                        gm, hm = arm.cross(g), arm.cross(h)
+                        across = ti.Vector([gm[0], gm[1], gm[2], g[0], g[1], g[2]])
+                        beside = ti.Vector([hm[0], hm[1], hm[2], h[0], h[1], h[2]])
+                        pull += weight * d * across
+                        for j in ti.static(range(6)):
+                            for k in ti.static(range(j + 1)):
+                                inertia[j * (j + 1) // 2 + k] += weight * (
+                                    across[j] * across[k] + tangential * beside[j] * beside[k]
+                                )
                         if export == 1:
                             s = unscaled(kind, shape, x_part)
                             samples[c, i, 0] = 1.0
@@ -457,28 +468,52 @@ def _equations_kernel(real):
                                 samples[c, i, 6 + a] = g[a]
                             samples[c, i, 9], samples[c, i, 10] = pixel[0], pixel[1]
 
+            sums[c, 0], sums[c, 1], sums[c, 2] = cost, met, all_samples
+            for i in ti.static(range(6)):
+                sums[c, 3 + i] = pull[i]
+            for i in ti.static(range(INERTIA_NUMBERS)):
+                sums[c, 9 + i] = inertia[i]
+
         # in a fixed order: the same sums every time
-        for b in range(B):
+        for turn in range(spread_poses * B):
+            if turn % spread_poses != 0:
+                continue
+            b = turn // spread_poses
             for i in range(total.shape[1]):
                 total[b, i] = 0.0
+            for k in range(D):
+                for i in range(6 + INERTIA_NUMBERS):
+                    collected[b, k, i] = 0.0
             for j in range(V * Q):
                 c = b * V * Q + j
                 if facts[c, 0] > 0.0:
-                    p = curve_part[j % Q]
+                    k = part_dof[curve_part[j % Q]]
                     for i in ti.static(range(3)):
                         total[b, i] = total[b, i] + sums[c, i]
-                    L = 0
-                    while L < LONGEST_CHAIN and chain[p, L] >= 0:
-                        L += 1
-                    at_sum = 3 + LONGEST_CHAIN
-                    for k in range(L):
-                        total[b, 3 + chain[p, k]] = total[b, 3 + chain[p, k]] + sums[c, 3 + k]
-                        for m in range(k, L):
-                            r, s = chain[p, k], chain[p, m]
-                            total[b, 3 + D + r * D + s] = total[b, 3 + D + r * D + s] + sums[c, at_sum]
-                            if r != s:
-                                total[b, 3 + D + s * D + r] = total[b, 3 + D + s * D + r] + sums[c, at_sum]
-                            at_sum += 1
+                    for i in range(6 + INERTIA_NUMBERS):
+                        collected[b, k, i] = collected[b, k, i] + sums[c, 3 + i]
+            # handed down the tree, from the leaves to the root
+            origin = load_translation(placed, b, 0)
+            for back in range(D):
+                k = D - 1 - back
+                own = _twist_about(twists, b, k, origin)
+                force = own * 0.0
+                gradient = 0.0 * own[0]
+                for i in ti.static(range(6)):
+                    gradient += own[i] * collected[b, k, i]
+                    for j in ti.static(range(6)):
+                        low, high = min(i, j), max(i, j)
+                        force[i] += collected[b, k, 6 + high * (high + 1) // 2 + low] * own[j]
+                total[b, 3 + k] = gradient
+                j = k
+                while j >= 0:
+                    shared = ti.cast(force.dot(_twist_about(twists, b, j, origin)), ti.f64)
+                    total[b, 3 + D + k * D + j] = shared
+                    total[b, 3 + D + j * D + k] = shared
+                    j = parent[j]
+                if parent[k] >= 0:
+                    for i in range(6 + INERTIA_NUMBERS):
+                        collected[b, parent[k], i] = collected[b, parent[k], i] + collected[b, k, i]
 
     return Launcher(silhouette_equations)
 
@@ -517,6 +552,7 @@ def _launch(
         regions.group,
         np.array(numbers, dtype),
         spread_of(tasks),
+        spread_of(B),
         settings.most_samples,
         int(settings.interior),
         int(export),
@@ -527,7 +563,7 @@ def _launch(
         np.empty((B, P, 4), dtype),
         np.empty((tasks, CHORDS + 1, 2), dtype),
         np.empty((tasks, 5), dtype),
-        np.empty((tasks, 2, LONGEST_CHAIN), dtype),
+        np.empty((B, D, 6 + INERTIA_NUMBERS), dtype),
         np.empty((tasks, _SUMS), dtype),
         samples,
         total,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
-from tk.kernels.cone_arrays import LONGEST_CHAIN, ConeArrays
+from tk.kernels.cone_arrays import ConeArrays
 from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A, SIDE_B
 from tk.model.anthropometry import (
     ANKLE_OUTWARD,
@@ -149,11 +149,6 @@ class ConeBody:
         B = np.eye(4)
         B[:3, :3] = s.T_world_body
         segments = [SEGMENTS.index(part.segment) for part in self.parts]
-        moves = s.ancestors()
-        chain = np.full((len(self.parts), LONGEST_CHAIN), -1, np.int32)
-        for p, segment in enumerate(segments):
-            dofs = np.flatnonzero(moves[segment])
-            chain[p, : len(dofs)] = dofs
         curves: list[tuple[int, int]] = []
         for p, part in enumerate(self.parts):
             if part.kind == ELLIPSOID:
@@ -171,7 +166,6 @@ class ConeBody:
             part_frame=np.array([(B @ part.T_body_part)[:3].ravel() for part in self.parts], dtype),
             part_dof=s.segment_dof[segments].astype(np.int32),
             part_limb=np.array([_LIMBS[part.segment] for part in self.parts], np.int32),
-            chain=chain,
             curve_part=np.array([p for p, _ in curves], np.int32),
             curve_kind=np.array([kind for _, kind in curves], np.int32),
         )

@@ -69,19 +69,17 @@ class Limb:
 
     def distinct(self, skeleton: Skeleton, poses: Float, cost: Float, count: int) -> Float:
         """(C, D) the cheapest of the poses whose limbs lie apart by more than :data:`DISTINCT_M`, at most ``count``."""
-        chosen: list[Float] = []
-        ends: list[Float] = []
         # beyond these only neighbours of the first follow
-        for i in np.argsort(cost, kind="stable")[: 20 * count]:
-            if not np.isfinite(cost[i]):
-                break
-            end = skeleton.joints(poses[i])[list(self.joints)]
-            if all(np.linalg.norm(end - other, axis=1).max() > DISTINCT_M for other in ends):
-                chosen.append(poses[i])
-                ends.append(end)
+        best = np.argsort(cost, kind="stable")[: 20 * count]
+        best = best[np.isfinite(cost[best])]
+        ends = skeleton.joints(poses[best])[:, list(self.joints)]
+        chosen: list[int] = []
+        for i, end in enumerate(ends):
+            if all(np.linalg.norm(end - ends[j], axis=1).max() > DISTINCT_M for j in chosen):
+                chosen.append(i)
             if len(chosen) == count:
                 break
-        return np.array(chosen).reshape(len(chosen), poses.shape[1])
+        return np.asarray(poses[best[chosen]])
 
 
 def limbs_of(body: ConeBody) -> tuple[Limb, ...]:

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tk.kernels.kinematics import ARM_UP
 from tk.model.anthropometry import RAISED_SHOULDERS, TRUNK_LENGTH, BodyDimensions
@@ -160,17 +160,17 @@ class Skeleton:
     joint_position: Float
     T_world_body: Float
 
-    @property
+    @cached_property
     def is_waist(self) -> NDArray[np.bool_]:
         """(D,) True for the waist's degrees of freedom, where there are any."""
         return np.isin(self.names, WAIST)
 
-    @property
+    @cached_property
     def is_ankle(self) -> NDArray[np.bool_]:
         """(D,) True for the ankles' degrees of freedom, where there are any."""
         return np.isin(self.names, ANKLES)
 
-    @property
+    @cached_property
     def is_paper(self) -> NDArray[np.bool_]:
         """(D,) True for the paper's 24."""
         return ~(self.is_waist | self.is_ankle)
@@ -192,22 +192,49 @@ class Skeleton:
                 K[k] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
         return K, K @ K
 
+    @cached_property
+    def _levels(self) -> tuple[NDArray[np.int64], ...]:
+        """Degrees of freedom by their depth in the tree, the root's first."""
+        depth = np.zeros(len(self.names), int)
+        for k, parent in enumerate(self.parent):
+            depth[k] = depth[parent] + 1 if parent >= 0 else 0
+        return tuple(np.flatnonzero(depth == d) for d in range(depth.max() + 1))
+
+    @cached_property
+    def _raised(self) -> NDArray[np.int64]:
+        """The degrees of freedom that lift a shoulder: with the one behind it each turns the arm up."""
+        return np.flatnonzero(self.rise.any(axis=1))
+
+    @cached_property
+    def _levels(self) -> tuple[NDArray[np.int64], ...]:
+        """Degrees of freedom by their depth in the tree, the root's first."""
+        depth = np.zeros(len(self.names), int)
+        for k, parent in enumerate(self.parent):
+            depth[k] = depth[parent] + 1 if parent >= 0 else 0
+        return tuple(np.flatnonzero(depth == d) for d in range(depth.max() + 1))
+
+    @cached_property
+    def _raised(self) -> NDArray[np.int64]:
+        """The degrees of freedom that lift a shoulder: with the one behind it each turns the arm up."""
+        return np.flatnonzero(self.rise.any(axis=1))
+
     def transforms(self, pose: Float) -> Float:
-        """(D, 4, 4) transforms T_k after each degree of freedom, float64. Kernels have their own."""
+        """(..., D, 4, 4) transforms T_k after each degree of freedom of poses (..., D), float64. Kernels have their
+        own."""
         pose = np.asarray(pose, dtype=np.float64)
         K, squares = self._generators
-        steps = np.zeros((len(pose), 4, 4))
-        R = np.eye(3) + np.sin(pose)[:, None, None] * K + (1 - np.cos(pose))[:, None, None] * squares
-        steps[:, :3, :3] = R
-        steps[:, :3, 3] = np.where(
-            self.prismatic[:, None], self.axis * pose[:, None], self.point - np.einsum("kab,kb->ka", R, self.point)
+        steps = np.zeros((*pose.shape, 4, 4))
+        R = np.eye(3) + np.sin(pose)[..., None, None] * K + (1 - np.cos(pose))[..., None, None] * squares
+        steps[..., :3, :3] = R
+        steps[..., :3, 3] = np.where(
+            self.prismatic[:, None], self.axis * pose[..., None], self.point - (R @ self.point[:, :, None])[..., 0]
         )
-        for k in map(int, np.flatnonzero(self.rise.any(axis=1))):
-            steps[k, :3, 3] += self.rise[k] * arm_elevation(pose[k], pose[k + 1])
-        steps[:, 3, 3] = 1.0
-        result = np.empty_like(steps)
-        for k, parent in enumerate(self.parent):
-            result[k] = steps[k] if parent < 0 else result[parent] @ steps[k]
+        for k in self._raised:
+            steps[..., k, :3, 3] += self.rise[k] * arm_elevation(pose[..., k], pose[..., k + 1])[..., None]
+        steps[..., 3, 3] = 1.0
+        result = steps
+        for level in self._levels[1:]:
+            result[..., level, :, :] = result[..., self.parent[level], :, :] @ steps[..., level, :, :]
         return result
 
     @property
@@ -218,35 +245,29 @@ class Skeleton:
     def twists(self, pose: Float) -> tuple[Float, Float]:
         """World twists (ω, v), each (D, 3): a point x below degree of freedom k moves at ω_k × x + v_k (eqs. 6-8)."""
         T = self.transforms(pose)
-        w, v = np.zeros((2, len(self.names), 3))
-        for k, parent in enumerate(self.parent):
-            above = T[parent] if parent >= 0 else np.eye(4)
-            axis = above[:3, :3] @ self.axis[k]
-            if self.prismatic[k]:
-                v[k] = axis
-                continue
-            w[k] = axis
-            # the joint's place, its rise included, does not move when it turns
-            q = T[k, :3, :3] @ self.point[k] + T[k, :3, 3]
-            v[k] = np.cross(q, axis)
-            first = parent if parent >= 0 and self.rise[parent].any() else k
-            if self.rise[first].any():
-                root = T[self.parent[first], :3, :3] if self.parent[first] >= 0 else np.eye(3)
-                v[k] += root @ self.rise[first] * arm_elevation(pose[first], pose[first + 1], by=k - first)
-        return w, v
+        above = np.where((self.parent >= 0)[:, None, None], T[self.parent], np.eye(4))
+        axis = (above[:, :3, :3] @ self.axis[:, :, None])[..., 0]
+        # the joint's place, its rise included, does not move when it turns
+        q = (T[:, :3, :3] @ self.point[:, :, None])[..., 0] + T[:, :3, 3]
+        v = np.where(self.prismatic[:, None], axis, np.cross(q, axis))
+        for k in self._raised:
+            lift = above[k, :3, :3] @ self.rise[k]
+            for by in (0, 1):
+                v[k + by] += lift * arm_elevation(pose[k], pose[k + 1], by=by)
+        return np.where(self.prismatic[:, None], 0.0, axis), v
 
     def segment_transforms(self, pose: Float) -> Float:
-        """(S, 4, 4) transforms of the segments."""
-        return self.transforms(pose)[self.segment_dof]
+        """(..., S, 4, 4) transforms of the segments."""
+        return self.transforms(pose)[..., self.segment_dof, :, :]
 
     def joints(self, pose: Float) -> Float:
-        """(J, 3) joint centres in the world frame, metres, in the order of :data:`JOINTS`."""
-        T = self.segment_transforms(pose)[self.joint_segment]
-        return np.einsum("jab,jb->ja", T[:, :3, :3], self.joint_position) + T[:, :3, 3]
+        """(..., J, 3) joint centres in the world frame at poses (..., D), metres, in the order of :data:`JOINTS`."""
+        T = self.segment_transforms(pose)[..., self.joint_segment, :, :]
+        return np.asarray((T[..., :3, :3] @ self.joint_position[:, :, None])[..., 0] + T[..., :3, 3])
 
-    def apart(self, pose: Float, joints: Float) -> float:
-        """How far the joints of a pose lie at most from others (J, 3), metres."""
-        return float(np.linalg.norm(self.joints(pose) - joints, axis=1).max())
+    def apart(self, poses: Float, joints: Float) -> Float:
+        """(...) how far the joints of poses (..., D) lie at most from others (J, 3), metres."""
+        return np.asarray(np.linalg.norm(self.joints(poses) - joints, axis=-1).max(axis=-1))
 
     def ancestors(self) -> NDArray[np.bool_]:
         """(S, D): True where a degree of freedom moves a segment."""
@@ -282,7 +303,7 @@ def shoulder_angles(direction: Float) -> tuple[float, float]:
     return float(np.arctan2(direction @ third, direction @ arm)), pitch
 
 
-def arm_elevation(first: float, second: float, by: int | None = None) -> float:
+def arm_elevation(first: ArrayLike, second: ArrayLike, by: int | None = None) -> Float:
     """Sine of the arm's elevation over the horizontal in the trunk's frame, from a shoulder's first two angles.
 
     Args:
@@ -290,10 +311,10 @@ def arm_elevation(first: float, second: float, by: int | None = None) -> float:
     """
     a, b = ARM_UP
     if by == 0:
-        return float(a * np.cos(second) * np.cos(first))
+        return np.asarray(a * np.cos(second) * np.cos(first))
     if by == 1:
-        return float(b * np.cos(second) - a * np.sin(second) * np.sin(first))
-    return float(a * np.cos(second) * np.sin(first) + b * np.sin(second))
+        return np.asarray(b * np.cos(second) - a * np.sin(second) * np.sin(first))
+    return np.asarray(a * np.cos(second) * np.sin(first) + b * np.sin(second))
 
 
 def twist_exp(axis: Float, point: Float, angle: float) -> Float:

@@ -322,7 +322,7 @@ class ContourTracker:
         own = mean_of_views(coarse.cast(self.body, group, pose[None])[0])[0]
         joints = skeleton.joints(pose)
         level = (min(1, self.contours.solver.scales - 1),)
-        found: list[tuple[Limb, list[Float]]] = []
+        found: list[tuple[Limb, Float]] = []
         for limb in self.limbs:
             _, rest = coarse.cast(self.body, group, pose[None], limb.others, export=True)
             assert rest is not None
@@ -335,12 +335,9 @@ class ContourTracker:
             settled = self.settle(pyramid, places, level, images, limb=limb).states
             cost, _ = coarse.cast(self.body, group, settled, limb.parts, before)
             told = mean_of_views(cost)
-            others = [
-                settled[i]
-                for i in np.argsort(told, kind="stable")
-                if told[i] < own + PROMISING and skeleton.apart(settled[i], joints) > APART_M
-            ]
-            if others:
+            order = np.argsort(told, kind="stable")
+            others = settled[order][(told[order] < own + PROMISING) & (skeleton.apart(settled[order], joints) > APART_M)]
+            if len(others):
                 found.append((limb, others[:2]))
         if not found:
             return pose[None], np.array([own])

@@ -214,10 +214,10 @@ class RegionTracker(ContourTracker):
         """Other places of the limbs join the hypotheses, with what they cost above the best one's running mean."""
         best = self._best
         poses, cost = self.search(frame, pyramid, best.pose, images)
+        gain = cost[0] - cost
         # a jump must pay more than noise makes of two casts; less must show in the frames that follow
-        gain = np.where(cost < cost[0] - GAIN, cost[0] - cost, np.minimum(cost[0] - cost, 0.0))
         self._alive += [
-            Hypothesis(pose, pose, best.cost - float(g))
+            Hypothesis(pose, pose, best.cost - RENEWAL * float(g if g > GAIN else min(g, 0.0)))
             for pose, g in zip(poses[1:], gain[1:], strict=True)
             if g > -MARGIN / 2
         ]
