@@ -120,6 +120,12 @@ class Evidence:
         seen = np.count_nonzero(self.person, axis=(1, 2))
         return np.where(seen > 0, wrong / np.maximum(seen, 1), np.nan)
 
+    def unmet(self, label: NDArray[np.uint8]) -> float:
+        """The share of the person's rays that meet no part, averaged over the views; labels (V, h, w)."""
+        missed = np.count_nonzero(self.person & (label == 0), axis=(1, 2))
+        seen = np.count_nonzero(self.person, axis=(1, 2))
+        return float(mean_of_views(np.where(seen > 0, missed / np.maximum(seen, 1), np.nan)[None])[0])
+
 
 def mean_of_views(cost: Float) -> Float:
     """(B,) the mean over the views (B, V) that see somebody; inf where none does."""

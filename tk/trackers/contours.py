@@ -319,13 +319,17 @@ class ContourTracker:
         skeleton, group = self.body.skeleton, self.colors.group
         rng = np.random.default_rng([7, frame.index])
         coarse = self.evidence(self.screen, frame, pyramid)
-        own = mean_of_views(coarse.cast(self.body, group, pose[None])[0])[0]
+        by_view, met = coarse.cast(self.body, group, pose[None], export=True)
+        assert met is not None
+        own, unmet = mean_of_views(by_view)[0], coarse.unmet(met.label[0])
         joints = skeleton.joints(pose)
         level = (min(1, self.contours.solver.scales - 1),)
         found: list[tuple[Limb, Float]] = []
         for limb in self.limbs:
-            _, rest = coarse.cast(self.body, group, pose[None], limb.others, export=True)
+            without, rest = coarse.cast(self.body, group, pose[None], limb.others, export=True)
             assert rest is not None
+            if mean_of_views(without)[0] - own > unmet:
+                continue  # it explains more where it is than there is to explain elsewhere
             before = Cast(rest.label[0].copy(), rest.depth[0].copy())
             tried = limb.candidates(pose, NEARBY, rng)
             cost, _ = coarse.cast(self.body, group, tried, limb.parts, before, most_outside=OUTSIDE)
