@@ -380,8 +380,8 @@ class _Run:
             estimate = plan.tracker.step(observation)
             if observation.index < plan.begin:
                 continue
-            if output and isinstance(plan.tracker, RegionTracker):
-                self.masks.put(observation.index, observation.masks)
+            if output and estimate.masks is not None:
+                self.masks.put(observation.index, estimate.masks)
             finished = time.perf_counter()
             total = laps["wait"] + writing + finished - started
             timing = {**laps, **estimate.timing, "total": total}
@@ -422,7 +422,7 @@ def finish(output: Path, plan: _Plan, masks: MaskStore, note: Callable[[str], No
         missing = [int(f) for f in result.frames if int(f) not in masks]
         if missing:  # what an earlier run has tracked
             for observation, _ in plan.source.frames(min(missing), max(missing) + 1):
-                masks.put(observation.index, observation.masks)
+                masks.put(observation.index, tracker.without_foreign(observation).masks)
         assert result.fit_error is not None
         poses, columns["fit_error"] = tracker.second_pass(
             masks.sequence(result.frames),

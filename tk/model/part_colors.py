@@ -2,6 +2,9 @@
 
 Left and right share a model, as clothes do. A model is a histogram over 16 levels of blue, green and red; it holds what
 a shirt with stripes, or an arm half in a sleeve, has of colours, which no single Gaussian does.
+
+What the person carries is in the mask, too. Its colours are seen beside the body more than on it, or were never seen on
+it before: such a colour is foreign.
 """
 
 from __future__ import annotations
@@ -40,6 +43,8 @@ class PartColors:
     def __init__(self, body: ConeBody) -> None:
         self.group = np.array([GROUPS.index(_group(part.component)) for part in body.parts], np.int32)
         self._counts: Float = np.zeros((len(GROUPS), COLOR_BINS))
+        self._beside: Float = np.zeros(COLOR_BINS)
+        self.foreign = np.zeros(COLOR_BINS, np.bool_)
         self.log_likelihood: NDArray[np.float32] | None = None
 
     @property
@@ -48,19 +53,22 @@ class PartColors:
         return self.log_likelihood is not None
 
     def learn(self, bins: NDArray[np.int32], label: NDArray[np.uint8]) -> None:
-        """Take up the colours (N,) of pixels that show the parts ``label - 1`` (N,)."""
-        flat = self.group[label.astype(np.int64) - 1] * COLOR_BINS + bins
+        """Take up the colours (N,) of the person's pixels, which show the parts ``label - 1`` (N,), or none: 0."""
+        shown = label > 0
+        flat = self.group[label[shown].astype(np.int64) - 1] * COLOR_BINS + bins[shown]
         seen = np.bincount(flat, minlength=self._counts.size).reshape(self._counts.shape)
-        self._counts = seen.astype(np.float64) if not self.known else (1 - _RATE) * self._counts + _RATE * seen
+        beside = np.bincount(bins[~shown], minlength=COLOR_BINS)
+        rate = _RATE if self.known else 1.0
+        self._counts = (1 - rate) * self._counts + rate * seen
+        self._beside = (1 - rate) * self._beside + rate * beside
         self._update()
 
     def _update(self) -> None:
-        cubes: list[Float] = [
-            gaussian_filter(row.reshape(16, 16, 16), _SMOOTHING, mode="nearest").ravel() for row in self._counts
-        ]
-        share = np.stack(cubes).astype(np.float64)
-        share = share / np.maximum(share.sum(axis=1, keepdims=True), 1e-9)
+        rows = np.stack([_smooth(row) for row in self._counts])
+        total = rows.sum(axis=1, keepdims=True)
+        share = rows / np.maximum(total, 1e-9)
         self.log_likelihood = np.log((1 - _ANYTHING) * share + _ANYTHING / COLOR_BINS).astype(np.float32)
+        self.foreign = _smooth(self._beside) + _ANYTHING * total.sum() / COLOR_BINS > rows.sum(axis=0)
 
     def mismatch(self) -> NDArray[np.float32]:
         """(COLOR_BINS, G) in [0, 1]: how much less likely a colour is on a part than on the part that it suits best."""
@@ -77,12 +85,13 @@ class PartColors:
 
     def state(self) -> dict[str, Any]:
         """What :meth:`restore` needs."""
-        return {"colors": self._counts} if self.known else {}
+        return {"colors": self._counts, "colors_beside": self._beside} if self.known else {}
 
     def restore(self, state: Any) -> None:
         """Take up what :meth:`state` gave."""
         if "colors" in state:
             self._counts = np.asarray(state["colors"], np.float64)
+            self._beside = np.asarray(state["colors_beside"], np.float64)
             self._update()
 
 
@@ -90,6 +99,11 @@ def color_bins(images: NDArray[np.uint8]) -> NDArray[np.int32]:
     """(...) the bin of each pixel (..., 3) BGR, as the kernels number them."""
     levels = images.astype(np.int32) >> 4
     return np.asarray((levels[..., 0] << 8) | (levels[..., 1] << 4) | levels[..., 2])
+
+
+def _smooth(counts: Float) -> Float:
+    cube: Float = gaussian_filter(counts.reshape(16, 16, 16), _SMOOTHING, mode="nearest")
+    return np.asarray(cube.ravel(), np.float64)
 
 
 def _group(component: str) -> str:

@@ -50,6 +50,7 @@ class Estimate:
         sigma: (15,) one standard deviation of each joint's position along an axis, metres; None where the tracker does
             not say.
         fit_error: (C,) E_S of each camera; None where the tracker does not say.
+        masks: (C, H, W) uint8, what the tracker took for the person; None where that is the observation's.
         frame, time: the frame's number in the capture, and seconds; whoever steps the tracker knows them.
     """
 
@@ -64,6 +65,7 @@ class Estimate:
     ankles: Float = field(default_factory=lambda: np.zeros(0))
     sigma: Float | None = None
     fit_error: Float | None = None
+    masks: NDArray[np.uint8] | None = None
     frame: int = -1
     time: float = 0.0
 

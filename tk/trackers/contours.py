@@ -74,7 +74,7 @@ class SilhouetteConfig:
     prediction: float = 0.5
     adapt: bool = True
     init_frames: int = 24
-    search_every: int = 6
+    search_every: int = 10
     lost_error: float = 0.6
     search: SearchSettings = field(default_factory=SearchSettings)
     solver: GaussNewtonConfig = field(default_factory=lambda: GaussNewtonConfig(scales=3))

@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,6 +31,7 @@ from tk.model.body_fit import BodyFitConfig
 from tk.model.camera import Rig
 from tk.model.cone_body import ConeBody
 from tk.model.evidence import Evidence, mean_of_views
+from tk.model.part_colors import color_bins
 from tk.model.silhouettes import Pyramid
 from tk.model.skeleton import JOINTS
 from tk.optim.gauss_newton import Prior
@@ -48,6 +50,10 @@ PATIENCE, RENEWAL = 6, 0.4
 MARGIN = 0.02
 # Colours are learned only in frames that are explained about as well as is usual.
 LEARN_RATIO = 1.15
+# Masks are searched for what is carried where this share of their pixels has colours that are not the person's; smaller
+# things than this many pixels across stay.
+FOREIGN_SHARE = 0.01
+_THING = np.ones((5, 5), np.uint8)
 # The second pass: what the body is fitted to, and how near a frame stays to its pose of the first pass.
 SECOND_FIT = BodyFitConfig(frames=24, rounds=4)
 SECOND_ANGLE_DEG = 15.0
@@ -67,7 +73,7 @@ class RegionConfig:
     """
 
     hypotheses: int = 3
-    search_ratio: float = 1.1
+    search_ratio: float = 1.2
     colors: bool = True
 
     def __post_init__(self) -> None:
@@ -128,6 +134,7 @@ class RegionTracker(ContourTracker):
         """The pose in the next frame."""
         watch = Stopwatch()
         contours, config = self.contours, self.config
+        frame = self.without_foreign(frame)
         pyramid = self.pyramid(frame)
         images = frame.images if config.colors else None
         watch.lap("masks_clean")
@@ -176,7 +183,30 @@ class RegionTracker(ContourTracker):
             timing=watch.laps,
             sigma=sigma,
             fit_error=error,
+            masks=frame.masks,
         )
+
+    def without_foreign(self, frame: Observation) -> Observation:
+        """The frame, where it shows things of colours that are not the person's without those in its masks: what is
+        carried. They stay in doubt, for parts may be before or behind them."""
+        foreign, grid = self.colors.foreign, self.screen
+        if not (self.config.colors and self.colors.known and frame.images.size):
+            return frame
+        person = grid.sample(frame.masks) >= 128
+        if np.count_nonzero(foreign[color_bins(grid.sample(frame.images)[person])]) < FOREIGN_SHARE * person.sum():
+            return frame
+        masks = frame.masks.copy()
+        doubtful = np.zeros(masks.shape, np.bool_) if frame.doubtful is None else frame.doubtful.copy()
+        for mask, image, doubt in zip(masks, frame.images, doubtful, strict=True):
+            x, y, w, h = cv2.boundingRect(mask)
+            if w == 0:
+                continue
+            box = slice(y, y + h), slice(x, x + w)
+            strange = (foreign[color_bins(image[box])] & (mask[box] >= 128)).view(np.uint8)
+            thing = cv2.morphologyEx(strange, cv2.MORPH_OPEN, _THING).view(np.bool_)
+            mask[box][thing] = 0
+            doubt[box][thing] = True
+        return replace(frame, masks=masks, doubtful=doubtful)
 
     @property
     def _best(self) -> Hypothesis:
@@ -239,8 +269,7 @@ class RegionTracker(ContourTracker):
             return
         usual = error if not np.isfinite(self._usual) else self._usual
         if self.config.colors and evidence.bins is not None and error <= LEARN_RATIO * usual:
-            shown = evidence.person & (label > 0)
-            self.colors.learn(evidence.bins[shown], label[shown])
+            self.colors.learn(evidence.bins[evidence.person], label[evidence.person])
         # quick to learn that it can be better, slow to put up with worse
         self._usual = usual + (0.1 if error < usual else 0.05) * (error - usual)
 
