@@ -18,11 +18,12 @@ from tk.kernels.cone_arrays import ConeArrays
 from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A, SIDE_B
 from tk.model.anthropometry import (
     ANKLE_OUTWARD,
-    CALF_LENGTH,
     CROTCH_DROP,
     HAIR,
     HEAD_LENGTH,
     HIP_HALF_WIDTH,
+    KNEE_BACK,
+    PELVIS_FORWARD,
     BodyDimensions,
 )
 from tk.model.skeleton import SEGMENTS, Skeleton, build_skeleton
@@ -245,7 +246,7 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
     if preset not in PRESETS:
         raise ConfigError(f'cone body "{preset}": choose one of {", ".join(PRESETS)}')
     d = dimensions
-    x, _, z = np.eye(3)
+    x, y, z = np.eye(3)
     parts = _trunk_and_head(d) if preset == "full" else [_torso(d), _head(d)]
     for side, sign in (("l", 1.0), ("r", -1.0)):
         M = np.diag([1.0, sign, 1.0])
@@ -267,12 +268,15 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
         hip = M @ np.array([0.0, d.hip_half_width, 0.0])
         knee = hip - d.thigh * z
         ankle = knee - d.calf * z
-        parts.append(_limb(f"thigh_{side}", hip, -z, d.thigh, d.thigh_radius, d.knee_radius, x))
         if preset == "full":
-            # the flesh lies outside the line from knee to ankle
-            outside = ankle + M @ np.array([0.0, ANKLE_OUTWARD / CALF_LENGTH * d.calf, 0.0])
-            parts += _calf(side, knee, outside, d) + _foot(side, ankle, d)
+            # the flesh lies before the hip, behind the knee and outside of the ankle
+            top = hip + PELVIS_FORWARD * d.stature * x
+            hollow = knee - KNEE_BACK * d.stature * x
+            low = ankle + ANKLE_OUTWARD * d.stature * (M @ y)
+            parts.append(_between(f"thigh_{side}", f"thigh_{side}", top, hollow, d.thigh_radius, d.knee_radius))
+            parts += _calf(side, hollow, low, d) + _foot(side, ankle, d)
         else:  # without a foot the calf reaches the ground
+            parts.append(_limb(f"thigh_{side}", hip, -z, d.thigh, d.thigh_radius, d.knee_radius, x))
             reach = d.calf + d.ankle_height
             parts.append(_limb(f"calf_{side}", knee, -z, reach, d.knee_radius, d.ankle_radius, x, (False, True)))
     full = preset == "full"
@@ -281,18 +285,25 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
 
 def _calf(side: str, knee: Float, ankle: Float, d: BodyDimensions) -> list[ConePart]:
     """Two frusta that meet where the muscle is thickest."""
-    x = np.array([1.0, 0.0, 0.0])
-    length = float(np.linalg.norm(ankle - knee))
-    axis = (ankle - knee) / length
-    front = x - (x @ axis) * axis
-    front /= np.linalg.norm(front)
     share = 0.35
+    belly = knee + share * (ankle - knee)
     radius = CALF_BELLY * (d.knee_radius + share * (d.ankle_radius - d.knee_radius))
-    upper = _limb(f"calf_{side}", knee, axis, share * length, d.knee_radius, radius, front)
-    lower = _limb(
-        f"calf_{side}", knee + share * length * axis, axis, (1 - share) * length, radius, d.ankle_radius, front
+    segment = f"calf_{side}"
+    return [
+        _between(segment, segment, knee, belly, d.knee_radius, radius),
+        _between(f"shin_{side}", segment, belly, ankle, radius, d.ankle_radius),
+    ]
+
+
+def _between(name: str, segment: str, begin: Float, end: Float, r0: float, r1: float) -> ConePart:
+    """A frustum of a leg."""
+    length = float(np.linalg.norm(end - begin))
+    axis = (end - begin) / length
+    front = np.array([1.0, 0.0, 0.0])
+    front -= (front @ axis) * axis
+    return ConePart(
+        name, segment, CONE, (r0, r0, length, r1 / r0), _frame(begin, axis, front / np.linalg.norm(front))
     )
-    return [upper, replace(lower, name=f"shin_{side}")]
 
 
 def _foot(side: str, ankle: Float, d: BodyDimensions) -> list[ConePart]:
@@ -329,7 +340,7 @@ def _torso(d: BodyDimensions) -> ConePart:
 def _trunk_and_head(d: BodyDimensions) -> list[ConePart]:
     """Torso and head in more detail: abdomen, belly, chest, shoulders; skull, neck.
 
-    The trunk lies about the line of the joints; hair stands on the crown.
+    At the hips the trunk lies before the line of the joints, at the shoulders about it; hair stands on the crown.
     """
     x, _, z = np.eye(3)
     bottom = -0.9 * CROTCH_DROP / HIP_HALF_WIDTH * d.hip_half_width
@@ -340,7 +351,9 @@ def _trunk_and_head(d: BodyDimensions) -> list[ConePart]:
     chest = (d.chest_half_depth, d.chest_half_width)
 
     def slice_of(name: str, low: float, high: float, sizes: tuple[float, float], m: float) -> ConePart:
-        return ConePart(name, "pelvis" if low < 0 else "torso", CONE, (*sizes, high - low, m), _frame(low * z, z, x))
+        begin, end = (h * z + PELVIS_FORWARD * d.stature * np.clip((shoulders - h) / (shoulders - waist), 0, 1) * x for h in (low, high))
+        part = _between(name, "pelvis" if low < 0 else "torso", begin, end, 1.0, m)
+        return replace(part, shape=(*sizes, part.shape[2], m))
 
     skull = 0.46 * d.head
     forward = 0.1 * d.head
