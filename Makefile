@@ -23,7 +23,7 @@ $(VENV)/.installed: pyproject.toml scripts/setup.sh
 	@touch "$@"
 
 demo: install
-	@"$(VENV)/bin/tk" demo
+	@"$(VENV)/bin/tk" demo --force
 
 test: install
 	@$(RUN) pytest

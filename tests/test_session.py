@@ -35,16 +35,16 @@ track = partial(session.track, method="volumetric")
 # `tk` that sends itself a signal once a frame is finished
 VICTIM = """
 import os, signal, sys
-from tk import cli
+from tk import cli, console
 
-tell = cli._Report.advance
+tell = console.Report.advance
 
 def advance(self, frame, estimate):
     tell(self, frame, estimate)
     if frame == int(os.environ["TEST_FRAME"]):
         os.kill(os.getpid(), int(os.environ["TEST_SIGNAL"]))
 
-cli._Report.advance = advance
+console.Report.advance = advance
 cli.main(prog_name="tk")
 """
 
@@ -164,7 +164,7 @@ def test_ctrl_c_before_the_first_frame_leaves_an_older_result(tiny: Path, tmp_pa
     result = tmp_path / "r.h5"
     run(tiny, result, frames=(0, 2))
     before = result.read_bytes()
-    summary = track(open_capture(tiny), result, CONFIG, Impatient())
+    summary = track(open_capture(tiny), result, CONFIG, Impatient(), force=True)
     assert summary.interrupted and summary.frames == 0
     assert result.read_bytes() == before
 
@@ -185,7 +185,7 @@ def test_only_the_same_command_is_taken_up_again(
 ) -> None:
     before = begun.read_bytes()
     ran = tk("track", tiny, "--method", "volumetric", "-o", begun, "--config", quick, "--resume", *options)
-    ran.complaint(str(begun), difference, "run without --resume")
+    ran.complaint(str(begun), difference, "--force in the place of --resume")
     assert begun.read_bytes() == before
 
 

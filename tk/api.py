@@ -61,6 +61,7 @@ def track(
     body: PathLike | None = ...,
     causal: bool = ...,
     resume: bool = ...,
+    force: bool = ...,
 ) -> Iterator[Estimate]: ...
 
 
@@ -77,6 +78,7 @@ def track(
     body: PathLike | None = ...,
     causal: bool = ...,
     resume: bool = ...,
+    force: bool = ...,
 ) -> Result: ...
 
 
@@ -92,6 +94,7 @@ def track(
     body: PathLike | None = None,
     causal: bool = False,
     resume: bool = False,
+    force: bool = False,
 ) -> Iterator[Estimate] | Result:
     """Track the person in a capture.
 
@@ -106,6 +109,7 @@ def track(
         body: a result or a TOML file whose body is taken.
         causal: leave it at the first pass. Without ``output`` there is no other.
         resume: go on where an earlier run with the same ``output`` stopped.
+        force: replace a result that exists under ``output``; without it that is an error.
 
     Returns:
         Without ``output`` an iterator of :class:`~tk.trackers.base.Estimate`: ``frame``, ``time`` (seconds), ``pose``
@@ -134,6 +138,7 @@ def track(
         resume,
         body=body_file,
         causal=causal,
+        force=force,
     )
     if summary.interrupted:
         raise KeyboardInterrupt
