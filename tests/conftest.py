@@ -19,10 +19,7 @@ FRAMES = 14
 QUICK = """
 voxels = 32
 ahead = 0
-[fit]
-rounds = 6
-[smd]
-max_iterations = 6
+effort = 0.15
 [silhouette]
 init_frames = 3
 [silhouette.fit]

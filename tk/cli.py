@@ -330,6 +330,16 @@ def demo(output: Path, voxels: int | None, force: bool, quiet: bool) -> None:
         _tell(output, summary, quiet, as_json=False)
 
 
+@main.command(epilog=_example("tk config > settings.toml", "tk config --preset kehl2006"))
+@_preset
+@_config
+def config(preset: str | None, config_file: Path | None) -> None:
+    """Print all settings with what they mean, as TOML that --config takes."""
+    from tk.config_text import annotated_toml
+
+    click.echo(annotated_toml(_configuration(config_file, preset)), nl=False)
+
+
 def _names(cameras: str | None) -> tuple[str, ...] | None:
     return tuple(name.strip() for name in cameras.split(",") if name.strip()) if cameras else None
 
