@@ -48,10 +48,14 @@ def test_a_terminal_shows_what_is_being_done_before_the_first_frame() -> None:
         report.stage("finding the person")
         assert report._live is not None and report._live.tasks[0].description == "finding the person"
         report.begin(2, 0)
-        assert report._live.tasks[0].total == 2
+        logging.getLogger("tk.session").info("fitting the body")
+        assert report._live.tasks[0].description == "fitting the body"
+        report.advance(0, None)
+        assert (report._live.tasks[0].completed, report._live.tasks[0].total) == (1, 2)
+        report.advance(1, None)
         logging.getLogger("tk.session").info("second pass")
         assert report._live.tasks[0].description == "second pass"
-    assert "finding the person" in shown(console)
+    assert "finding the person" in shown(console) and "2/2" in shown(console)
     assert report._live is None
 
 

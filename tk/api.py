@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import overload
+from typing import TYPE_CHECKING, TypedDict, overload
 
 from tk import session
 from tk.config import Config
@@ -14,6 +14,9 @@ from tk.io.capture import Capture
 from tk.io.capture import open_capture as _open_capture
 from tk.io.result import Result, read_result
 from tk.trackers.base import Estimate
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack  # in typing from Python 3.11 on
 
 PathLike = str | os.PathLike[str]
 
@@ -38,7 +41,7 @@ def open_capture(path: PathLike, cameras: Sequence[str] | None = None, masks: st
     """A capture folder.
 
     Args:
-        path: the folder, see the README.
+        path: the folder: `calibration.toml`, `videos/` and what else there is.
         cameras: names of the cameras to use; all if None.
         masks: "auto" (the capture's own where it has some), "none" (segment the videos), or a folder of masks.
 
@@ -48,38 +51,26 @@ def open_capture(path: PathLike, cameras: Sequence[str] | None = None, masks: st
     return _open_capture(Path(path), tuple(cameras) if cameras else None, masks)
 
 
-@overload
-def track(
-    capture: Capture,
-    output: None = None,
-    *,
-    method: str = ...,
-    frames: tuple[int, int | None] = ...,
-    config: Config | None = ...,
-    seed: int | None = ...,
-    init_pose: PathLike | None = ...,
-    body: PathLike | None = ...,
-    causal: bool = ...,
-    resume: bool = ...,
-    force: bool = ...,
-) -> Iterator[Estimate]: ...
+class _Options(TypedDict, total=False):
+    """What :func:`track` takes beside capture and output."""
+
+    method: str
+    frames: tuple[int, int | None]
+    config: Config | None
+    seed: int | None
+    init_pose: PathLike | None
+    body: PathLike | None
+    causal: bool
+    resume: bool
+    force: bool
 
 
 @overload
-def track(
-    capture: Capture,
-    output: PathLike,
-    *,
-    method: str = ...,
-    frames: tuple[int, int | None] = ...,
-    config: Config | None = ...,
-    seed: int | None = ...,
-    init_pose: PathLike | None = ...,
-    body: PathLike | None = ...,
-    causal: bool = ...,
-    resume: bool = ...,
-    force: bool = ...,
-) -> Result: ...
+def track(capture: Capture, output: None = None, **options: Unpack[_Options]) -> Iterator[Estimate]: ...
+
+
+@overload
+def track(capture: Capture, output: PathLike, **options: Unpack[_Options]) -> Result: ...
 
 
 def track(

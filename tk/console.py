@@ -88,36 +88,44 @@ class Report(logging.Handler):
         self._total, self._done = total, done
         if done:
             self.note(f"{done} of {total} frames are there already")
-        self._stop()
-        if self._console.is_terminal and not self._quiet:
-            # narrow enough for 80 columns with all that may stand in it
-            columns = (
-                TextColumn("frames"), BarColumn(20), MofNCompleteColumn(),
-                TextColumn("{task.fields[rate]}"), TimeRemainingColumn(), TextColumn("{task.fields[lost]}"),
-            )  # fmt: skip
-            self._live = Progress(*columns, console=self._console)
-            self._live.add_task("", total=total, completed=done, rate="", lost="")
-            self._live.start()
         self._started = self._last = time.perf_counter()
 
     def advance(self, frame: int, estimate: object) -> None:
-        """A frame is finished."""
+        """A frame is finished. The first one is waited for: kernels are compiled, the person is found."""
         self._count += 1
         self._lost += getattr(estimate, "status", "") == "lost"
         if self._quiet:
             return
         now = time.perf_counter()
-        speed = self._count / max(now - self._started, 1e-9)
-        rate = f"{speed:.1f} frames/s"
-        lost = f"{self._lost} lost" if self._lost else ""
         made = self._done + self._count
-        if self._live is not None:
-            self._live.update(self._live.task_ids[0], advance=1, rate=rate, lost=lost)
-        elif now - self._last > self.every_s or made == self._total:
-            self._last = now
+        if self._count == 1:
+            rate, left = f"first after {now - self._begun:.1f} s", ""
+            self._started = self._last = now
+        else:
+            speed = (self._count - 1) / max(now - self._started, 1e-9)
+            rate = f"{speed:.1f} frames/s"
             left = f"{(self._total - made) / speed:.0f} s left" if made < self._total else ""
+        lost = f"{self._lost} lost" if self._lost else ""
+        if self._console.is_terminal:
+            if self._count == 1:
+                self._start_bar()
+            assert self._live is not None
+            self._live.update(self._live.task_ids[0], completed=made, rate=rate, lost=lost)
+        elif self._count == 1 or now - self._last > self.every_s or made == self._total:
+            self._last = now
             told = ", ".join(part for part in (rate, left, lost) if part)
             click.echo(f"frame {frame}: {made}/{self._total}, {told}", err=True)
+
+    def _start_bar(self) -> None:
+        self._stop()
+        # narrow enough for 80 columns with all that may stand in it
+        columns = (
+            TextColumn("frames"), BarColumn(20), MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]}"), TimeRemainingColumn(), TextColumn("{task.fields[lost]}"),
+        )  # fmt: skip
+        self._live = Progress(*columns, console=self._console)
+        self._live.add_task("", total=self._total, completed=self._done, rate="", lost="")
+        self._live.start()
 
     def _stop(self) -> None:
         if self._live is not None:
