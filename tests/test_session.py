@@ -114,7 +114,7 @@ def test_a_killed_run_is_taken_up_again(tk: Tk, quick: Path, tiny: Path, tracked
     assert_same(result, tracked, slice(0, 6))  # read by plain h5py
     ran = tk(*command, "--resume")
     assert ran.code == 0, ran.err
-    assert ran.err.splitlines()[0] == f"note: 6 of {FRAMES} frames are there already"
+    assert ran.told[0] == f"note: 6 of {FRAMES} frames are there already"
     assert ran.err.splitlines()[-1].startswith(f"{FRAMES} frames in {result}, 0 lost")
     assert_same(result, tracked)
     assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]  # the killed run's scraps are gone
@@ -293,7 +293,7 @@ def test_frames_before_the_initial_one_are_left_out(copy: Path, tmp_path: Path) 
     assert reporter.frames == [3, 4, 5]
     assert any("frames before 3 are left out" in note for note in reporter.notes)
     with pytest.raises(ConfigError, match=r"--frames 0:2: the subject is found in frame 3"):
-        run(copy, tmp_path / "r.h5", frames=(0, 2))
+        run(copy, tmp_path / "other.h5", frames=(0, 2))
 
 
 def test_frames_that_are_asked_for(tiny: Path) -> None:

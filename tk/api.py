@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -18,17 +19,16 @@ from tk.trackers.base import Estimate
 if TYPE_CHECKING:
     from typing_extensions import Unpack  # in typing from Python 3.11 on
 
+_LOG = logging.getLogger(__name__)
+
 PathLike = str | os.PathLike[str]
 
 
-class _Quiet:
-    """A reporter for scripts: notes go to ``note``, progress nowhere."""
-
-    def __init__(self) -> None:
-        self.notes: list[str] = []
+class _Logged:
+    """The reporter of scripts: notes are warnings of the logger "tk", progress goes nowhere."""
 
     def note(self, text: str) -> None:
-        self.notes.append(text)
+        _LOG.warning("%s", text)
 
     def begin(self, total: int, done: int) -> None:
         pass
@@ -116,13 +116,14 @@ def track(
         chosen = replace(chosen, seed=seed)
     pose_file = Path(init_pose) if init_pose is not None else None
     body_file = Path(body) if body is not None else None
+    reporter = _Logged()
     if output is None:
-        return session.estimates(capture, chosen, method=method, frames=frames, init_pose=pose_file, body=body_file)
+        return session.estimates(capture, chosen, reporter.note, method, frames, pose_file, body_file)
     summary = session.track(
         capture,
         Path(output),
         chosen,
-        _Quiet(),
+        reporter,
         method,
         frames,
         pose_file,
