@@ -1,6 +1,6 @@
 """Track a person and plot how the knees bend and how high the wrists are.
 
-    python examples/01_track_and_plot.py [CAPTURE] [--frames 45] [--out tracked]
+    python examples/01_track_and_plot.py [CAPTURE] [--frames 45] [--out tracked] [--config FILE]
 
 Without CAPTURE it takes the one that ships with tk. Needs matplotlib; the table needs pandas, and is left out without.
 """
@@ -20,11 +20,13 @@ parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
 parser.add_argument("capture", nargs="?", type=Path, default=DEMO)
 parser.add_argument("--frames", type=int, help="how many; all by default")
 parser.add_argument("--out", type=Path, default=Path("tracked"), help="folder")
+parser.add_argument("--config", type=Path, help="settings, TOML")
 options = parser.parse_args()
 options.out.mkdir(parents=True, exist_ok=True)
 
 capture = tk.open_capture(options.capture)
-result = tk.track(capture, options.out / "result.h5", frames=(0, options.frames), force=True)
+config = tk.Config.read(options.config) if options.config else tk.Config()
+result = tk.track(capture, options.out / "result.h5", frames=(0, options.frames), config=config, force=True)
 lost = result.status == 3
 print(f"{len(result)} frames, {lost.sum()} lost")
 

@@ -1,6 +1,6 @@
 """Track the same frames in several ways, and print how far the joints are from the truth.
 
-    python examples/02_compare_methods_and_cameras.py [CAPTURE] [--frames 45]
+    python examples/02_compare_methods_and_cameras.py [CAPTURE] [--frames 45] [--config FILE]
 
 Without CAPTURE it takes the one that ships with tk. CAPTURE must have a truth.h5.
 """
@@ -20,7 +20,9 @@ LIMBS = slice(3, 15)  # shoulders, elbows, wrists, hips, knees, ankles
 parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
 parser.add_argument("capture", nargs="?", type=Path, default=DEMO)
 parser.add_argument("--frames", type=int, default=45, help="how many, at most")
+parser.add_argument("--config", type=Path, help="settings, TOML")
 options = parser.parse_args()
+config = tk.Config.read(options.config) if options.config else tk.Config()
 
 truth = read_joints(options.capture / "truth.h5")  # positions (F, 15, 3) metres
 cameras = tk.open_capture(options.capture).rig.names
@@ -35,7 +37,7 @@ print(f"{'':28}  mean [cm]  limbs [cm]  lost  E_S of the cameras")
 for label, (method, chosen) in runs.items():
     capture = tk.open_capture(options.capture, chosen)
     # an iterator: nothing is written, and one may stop when one has seen enough
-    estimates = list(islice(tk.track(capture, method=method), options.frames))
+    estimates = list(islice(tk.track(capture, method=method, config=config), options.frames))
     rows = np.searchsorted(truth.frames, [estimate.frame for estimate in estimates])
     found = np.array([estimate.joints for estimate in estimates])
     distance = 100 * np.linalg.norm(found - truth.positions[rows], axis=2)  # (F, 15)

@@ -8,6 +8,7 @@ Without CAPTURE it takes the one that ships with tk. --show opens a window, wher
 import argparse
 from pathlib import Path
 
+import numpy as np
 import open3d as o3d
 
 import tk
@@ -42,7 +43,9 @@ with capture.frames(0, options.frames) as frames:
         height = cloud.get_axis_aligned_bounding_box().get_extent()[2]
         print(f"frame {frame.index}: {len(cloud.points)} voxels, {litres:.0f} litres, {height:.2f} m high")
 
-# the last frame as a closed surface
+# the last frame as a closed surface; a voxel that stands alone has no normal
+has_normal = np.flatnonzero(np.linalg.norm(surface.normals, axis=1) > 0.5)
+cloud = cloud.select_by_index(has_normal)
 mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=6, n_threads=1)
 mesh.compute_vertex_normals()
 o3d.io.write_triangle_mesh(options.out / "last.ply", mesh)

@@ -1,4 +1,4 @@
-"""Each of the examples runs on the capture that ships with tk, and makes what it says."""
+"""Each example runs on the capture that ships with tk, with settings that make it short, and does what it says."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ OPTIONS = {
 @pytest.mark.filterwarnings("default")  # of the packages that the examples show
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_runs(
-    example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    example: Path, quick: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", [example.name, *OPTIONS[example.stem]])
+    settings = ["--config", str(quick)] if "--config" in example.read_text(encoding="utf-8") else []
+    monkeypatch.setattr(sys, "argv", [example.name, *OPTIONS[example.stem], *settings])
     runpy.run_path(str(example), run_name="__main__")
     said = capfd.readouterr().out
     if example.stem.startswith("01"):

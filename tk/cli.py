@@ -44,6 +44,14 @@ def _one_line() -> Iterator[None]:
         raise click.exceptions.Exit(2) from None
 
 
+@contextmanager
+def _working(on: str) -> Iterator[None]:
+    """On a terminal, that something is done which has no frames to count."""
+    with Report(quiet=not sys.stderr.isatty()) as report:
+        report.stage(on)
+        yield
+
+
 class _Commands(click.Group):
     """Reports mistakes as :func:`_one_line` does."""
 
@@ -203,9 +211,10 @@ def _print_json(**values: object) -> None:
 )
 def import_(folder: Path, output: Path, units: str | None, trial: str | None) -> None:
     """Make a capture of another tool's project: Pose2Sim, FreeMoCap, Caliscope, Anipose, EasyMocap and others."""
-    from tk.io.importers import import_project
+    with _working(f"importing {folder}"):
+        from tk.io.importers import import_project
 
-    done = import_project(folder, output, units, trial)
+        done = import_project(folder, output, units, trial)
     for note in done.notes:
         click.echo(f"note: {note}", err=True)
     click.echo(f"{done.cameras} cameras in {output}; have a look at {output / 'capture.toml'}", err=True)
@@ -266,18 +275,21 @@ def reconstruct(
 @_json
 def evaluate(result: Path, truth: Path, capture: Path | None, joints: str, masks: str, as_json: bool) -> None:
     """Compare RESULT.h5 with TRUTH.h5: joint distances, PCK, lost frames, frames/s; pixels and silhouettes by view."""
-    from tk.evaluation import evaluate_files
-    from tk.view_evaluation import capture_of, evaluate_views
+    seen, note = None, ""
+    with _working(f"comparing {result} with {truth}"):
+        from tk.evaluation import evaluate_files
+        from tk.view_evaluation import capture_of, evaluate_views
 
-    found = evaluate_files(result, truth)
-    folder = capture or capture_of(truth)
-    try:
-        seen = evaluate_views(result, truth, folder, _names(joints) or (), masks) if folder else None
-    except CaptureError as error:
-        if capture is not None:
-            raise
-        click.echo(f"note: not judged in the pictures: {error}", err=True)
-        seen = None
+        found = evaluate_files(result, truth)
+        folder = capture or capture_of(truth)
+        try:
+            seen = evaluate_views(result, truth, folder, _names(joints) or (), masks) if folder else None
+        except CaptureError as error:
+            if capture is not None:
+                raise
+            note = f"note: not judged in the pictures: {error}"
+    if note:
+        click.echo(note, err=True)
     if as_json:
         _print_json(**found.to_dict(), **({"views": seen.to_dict()} if seen else {}))
     else:
@@ -296,9 +308,10 @@ def evaluate(result: Path, truth: Path, capture: Path | None, joints: str, masks
 @_force
 def export(result: Path, formats: str, output: Path | None, smoothed: bool, force: bool) -> None:
     """Write RESULT.h5 in formats of other programs: OpenSim, Blender, spreadsheets."""
-    from tk.io.export import export as write
+    with _working(f"exporting {result}"):
+        from tk.io.export import export as write
 
-    written = write(result, _names(formats) or (), output, smoothed, force)
+        written = write(result, _names(formats) or (), output, smoothed, force)
     for note in written.notes:
         click.echo(f"note: {note}", err=True)
     for file in written.files:
