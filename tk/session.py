@@ -165,7 +165,7 @@ def track(
                 for estimate in run.estimates():
                     reporter.advance(estimate.frame, estimate)
             if run.tracked:
-                finish(output, plan, run.masks, causal)
+                finish(output, plan, run.masks, reporter.note, causal)
         except KeyboardInterrupt:
             # caught outside the writer, which then leaves an older result alone if nothing is done
             interrupted = True
@@ -414,7 +414,7 @@ class _Run:
         return {**self.plan.tracker.state(), **origin, _ORIGIN + _LOST: self.lost}
 
 
-def finish(output: Path, plan: _Plan, masks: MaskStore, causal: bool) -> None:
+def finish(output: Path, plan: _Plan, masks: MaskStore, note: Callable[[str], None], causal: bool) -> None:
     """What needs all frames: the second pass unless ``causal``; segments, feet and angles; the smoothed copy; cameras.
 
     The second pass fits the body to frames of the whole recording and settles every frame anew with it. The result is
