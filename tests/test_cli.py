@@ -163,6 +163,7 @@ def test_demo_tracks_and_says_how_well(tk: Tk, tiny: Path, tmp_path: Path, monke
     assert ran.code == 0, ran.err
     assert f"{FRAMES} frames judged: 0 lost" in ran.out
     assert ran.out.splitlines()[-1].startswith(f"The result is in {tmp_path / 'demo.h5'}")
+    tk("demo", "-o", tmp_path / "demo.h5").complaint("demo.h5", "exists", "--force")
 
 
 # --- bad usage --------------------------------------------------------------------------------------------------------

@@ -91,6 +91,7 @@ _masks = click.option(
 _voxels = click.option("--voxels", type=int, help="Voxels along the working volume's longest side.  [default: 64]")
 _config = click.option("--config", "config_file", type=click.Path(path_type=Path), help="Settings, TOML.")
 _preset = click.option("--preset", metavar="NAME", help="Settings to begin with: kehl2006, the paper's own.")
+_resume = click.option("--resume", is_flag=True, help="Go on where an earlier run of the same command stopped.")
 _force = click.option("--force", is_flag=True, help="Replace what exists under the output's name.")
 _quiet = click.option("-q", "--quiet", is_flag=True, help="No progress: only notes and errors.")
 _json = click.option("--json", "as_json", is_flag=True, help="Print a summary for scripts on stdout.")
@@ -121,7 +122,7 @@ _json = click.option("--json", "as_json", is_flag=True, help="Print a summary fo
     "--body", type=click.Path(path_type=Path), metavar="FILE", help="The body of a result, or of a TOML file."
 )
 @click.option("--causal", is_flag=True, help="Leave it at the first pass: no frame knows of those after it.")
-@click.option("--resume", is_flag=True, help="Go on where an earlier run of the same command stopped.")
+@_resume
 @_force
 @click.option("--store-hull", is_flag=True, help="Keep the hull's coloured surface in the result.")
 @_preset
@@ -321,9 +322,10 @@ def export(result: Path, formats: str, output: Path | None, smoothed: bool, forc
 @main.command(epilog=_example("tk demo"))
 @click.option("-o", "--output", default="demo.h5", show_default=True, type=click.Path(path_type=Path))
 @_voxels
+@_resume
 @_force
 @_quiet
-def demo(output: Path, voxels: int | None, force: bool, quiet: bool) -> None:
+def demo(output: Path, voxels: int | None, resume: bool, force: bool, quiet: bool) -> None:
     """Track the capture that ships with tk and compare the result with its truth."""
     from importlib.resources import as_file, files
 
@@ -333,10 +335,12 @@ def demo(output: Path, voxels: int | None, force: bool, quiet: bool) -> None:
             from tk import session
             from tk.evaluation import evaluate_files
             from tk.io.capture import open_capture
+            from tk.io.result_files import check_output
 
+            check_output(output, force, resume)
             report.stage(f"opening the capture that ships with tk, {folder}")
             config = _configuration(None, voxels=voxels)
-            summary = session.track(open_capture(folder), output, config, report, force=force)
+            summary = session.track(open_capture(folder), output, config, report, resume=resume, force=force)
         if not summary.interrupted:
             click.echo(evaluate_files(output, folder / "truth.h5").format_table())
             click.echo(f"The result is in {output}. Try it on your own recording: tk track CAPTURE -o RESULT.h5")
