@@ -21,8 +21,8 @@ LIMBS = ("arm_l", "arm_r", "leg_l", "leg_r")
 # Of the two places of a limb: joints that lie farther apart than this make them different, metres.
 DISTINCT_M = 0.12
 
-# Directions of the upper arm on the sphere, some 30° apart; those through the back or far across are left out.
-_DIRECTIONS = 42
+# Directions of the upper arm on the sphere, some 20° apart; those through the back or far across are left out.
+_DIRECTIONS = 84
 _ELBOWS_DEG = (60.0, 115.0)
 _ARM_ROLLS_DEG = (-80.0, -30.0, 20.0, 70.0)
 _HIPS_DEG = (-20.0, 10.0, 40.0, 70.0, 100.0)

@@ -45,7 +45,7 @@ GAIN = 0.004
 # place that are looked at beside the grid.
 PLACES, MORE_PLACES, NEARBY = 3, 8, 80
 # Places of a limb are not looked at where that much of it is outside the silhouettes.
-OUTSIDE = 0.4
+OUTSIDE = 0.5
 # A limb's place that costs this much more than its present one, once the limb alone has settled there, is given up.
 PROMISING = 0.01
 # Poses that a search descends from with all limbs, beside the present one.
