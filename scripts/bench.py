@@ -9,10 +9,12 @@ Three kinds of figures, all medians:
   the hull, SciPy's cKDTree for the nearest neighbours. All in one process, so that they share the machine's mood.
 * *growth* (with `--growth`): the hull from 4, 5 and 9 cameras, as table 1 of Kehl & Van Gool 2006.
 
-With ``--method silhouette`` the same of the other tracker, which has no voxels.
+With ``--method silhouette`` the same of the other tracker, which has no voxels. ``--pictures`` only tells what the
+overlay video and the report cost beside a default run.
 
     python -m scripts.bench [CAPTURE] [--voxels 64 128] [--repeat 3] [--growth CAPTURE] [--json FILE]
     python -m scripts.bench CAPTURE --method silhouette --masks auto --cameras a,b,c
+    python -m scripts.bench [CAPTURE] --pictures
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial import cKDTree
 
-from scripts import bench_hull
+from scripts import bench_hull, bench_pictures
 from scripts.bench_stages import Stage, contour_stages, median_ms, silhouette_stages
 from tk import __version__, session
 from tk.config import Config
@@ -464,6 +466,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--cameras", type=_names, metavar="A,B,C", help="only these")
     parser.add_argument("--init-pose", type=Path, metavar="FILE", help="as of tk track")
     parser.add_argument("--growth", type=Path, metavar="CAPTURE", help="with masks of up to nine cameras: table 1")
+    parser.add_argument("--pictures", action="store_true", help="only what the overlay video and the report cost")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here too")
     given = parser.parse_args(arguments)
     if given.repeat < 1 or (given.frames is not None and given.frames < 3):
@@ -472,6 +475,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = Options(
         given.capture, 0, given.frames, given.repeat, given.masks, given.init_pose, given.method, given.cameras
     )
+    if given.pictures:
+        console.print(bench_pictures.measure(given.capture, given.masks, given.frames, given.repeat))
+        return
     resolutions = given.voxels if given.method != SilhouetteTracker.method else [0]  # it has no voxels
     report: dict[str, Any] = {"machine": machine(), "runs": [], "growth": []}
     console.print(

@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
 # Make a virtual environment with tk and all that its development needs: setup.sh VENV
+# Only the browser that the tests of the report need: setup.sh --browser
 # On Debian and Ubuntu, missing system packages are installed if we are root and named if we are not.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-venv=${1:?usage: scripts/setup.sh VENV}
+venv=${1:?usage: scripts/setup.sh VENV | --browser}
 
 say() { echo "setup: $*" >&2; }
 die() { say "$*"; exit 1; }
@@ -18,6 +19,17 @@ install_packages() { # packages...
     die "system packages are missing; install them and run again: sudo apt-get install $*"
   fi
 }
+
+if [ "$venv" = --browser ]; then
+  if ! command -v chromium chromium-browser google-chrome >/dev/null; then
+    if [ "$(id -u)" = 0 ]; then
+      install_packages chromium
+    else
+      say "no Chromium: the tests that need one will be skipped; sudo apt-get install chromium"
+    fi
+  fi
+  exit
+fi
 
 suitable() { # python: is it one that Taichi has wheels for?
   "$1" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' >/dev/null 2>&1

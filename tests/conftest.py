@@ -64,10 +64,15 @@ Tk = Callable[..., Ran]
 
 @pytest.fixture
 def tk(capfd: pytest.CaptureFixture[str]) -> Tk:
-    """``tk("track", capture, "-o", result)`` in this process; what libraries print below Python is heard, too."""
+    """``tk("track", capture, "-o", result)`` in this process; what libraries print below Python is heard, too.
+
+    A run of `tk track` leaves no video and no report, which take their time, unless ``pictures`` is set.
+    """
     from tk.cli import main
 
-    def run(*arguments: Any) -> Ran:
+    def run(*arguments: Any, pictures: bool = False) -> Ran:
+        if arguments[:1] == ("track",) and not pictures:
+            arguments = (*arguments, "--no-report")
         capfd.readouterr()
         with pytest.raises(SystemExit) as ended:
             main([str(argument) for argument in arguments], prog_name="tk")

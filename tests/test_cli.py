@@ -50,6 +50,7 @@ def test_track_writes_what_the_contract_says(tk: Tk, quick: Path, tiny: Path, tm
     done = next(i for i, line in enumerate(lines) if line.startswith("frame 7: 6/6, "))
     assert "second pass" in lines[done + 1] and ran.told == lines[-1:]
     assert lines[-1].startswith(f"6 frames in {result}, 0 lost, ")
+    assert {path.name for path in tmp_path.iterdir()} == {"result.h5"}  # --no-report
     shapes = {
         "frames": ((6,), "int64"),
         "time": ((6,), "float64"),

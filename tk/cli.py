@@ -18,6 +18,7 @@ from tk.errors import CaptureError, ConfigError, TkError
 
 if TYPE_CHECKING:
     from tk.config import Config
+    from tk.io.capture import Capture
     from tk.session import Summary
 
 # The matrices here are small. A pool of BLAS threads beside Taichi's costs milliseconds for what takes microseconds; it
@@ -89,6 +90,7 @@ _masks = click.option(
     help="The capture's masks where it has some, none (segment the videos), or a folder of masks.",
 )  # fmt: skip
 _voxels = click.option("--voxels", type=int, help="Voxels along the working volume's longest side.  [default: 64]")
+_no_report = click.option("--no-report", is_flag=True, help="Leave out the overlay video and the report.")
 _config = click.option("--config", "config_file", type=click.Path(path_type=Path), help="Settings, TOML.")
 _preset = click.option("--preset", metavar="NAME", help="Settings to begin with: kehl2006, the paper's own.")
 _resume = click.option("--resume", is_flag=True, help="Go on where an earlier run of the same command stopped.")
@@ -125,6 +127,7 @@ _json = click.option("--json", "as_json", is_flag=True, help="Print a summary fo
 @_resume
 @_force
 @click.option("--store-hull", is_flag=True, help="Keep the hull's coloured surface in the result.")
+@_no_report
 @_preset
 @_config
 @_quiet
@@ -144,12 +147,16 @@ def track(
     resume: bool,
     force: bool,
     store_hull: bool,
+    no_report: bool,
     preset: str | None,
     config_file: Path | None,
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Track the person in CAPTURE and write the pose of every frame to RESULT.h5."""
+    """Track the person in CAPTURE and write the pose of every frame to RESULT.h5.
+
+    An overlay video, RESULT.mp4, and a report, RESULT.html, are left beside it.
+    """
     span = _span(frames)
     with Report(quiet) as report:
         report.stage("loading")
@@ -164,6 +171,8 @@ def track(
         summary = session.track(
             opened, output, config, report, method, span, init_pose, resume, store_hull, body, causal, force
         )
+        if not no_report:
+            _leave_pictures(opened, output, summary, report, quiet)
     _tell(output, summary, quiet, as_json)
 
 
@@ -193,6 +202,18 @@ def _tell(output: Path, summary: Summary, quiet: bool, as_json: bool) -> None:
             err=True,
         )
         sys.exit(EXIT_LOST)
+
+
+def _leave_pictures(capture: Capture, result: Path, summary: Summary, report: Report, quiet: bool) -> None:
+    """The overlay video and the report of a run that has ended."""
+    if summary.interrupted or not summary.frames:
+        return
+    from tk.report.after import leave_pictures
+
+    report.stage("drawing the overlay video and the report")
+    files = leave_pictures(capture, result, lambda text: click.echo(f"warning: {text}", err=True))
+    if files and not quiet:
+        click.echo(f"to look at: {', '.join(str(file) for file in files)}", err=True)
 
 
 def _print_json(**values: object) -> None:
@@ -319,13 +340,70 @@ def export(result: Path, formats: str, output: Path | None, smoothed: bool, forc
         click.echo(f"wrote {file}", err=True)
 
 
+@main.command(epilog=_example("tk render result.h5 CAPTURE", "tk render result.h5 --view 3d -o turning.mp4"))
+@click.argument("result", type=click.Path(path_type=Path), metavar="RESULT.h5")
+@click.argument("capture", type=click.Path(path_type=Path), required=False)
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), metavar="OUT.mp4", help="Video.  [default: beside RESULT.h5]"
+)
+@click.option(
+    "--view", type=click.Choice(["overlay", "3d", "hull"]),
+    help="Over the pictures; a turning view; the same with the stored hull.  [default: overlay, if CAPTURE is given]",
+)  # fmt: skip
+@_cameras
+@click.option("--frames", metavar="A:B|A,B,…", help="Frames A to B-1, or single ones.")
+@click.option("--png", type=click.Path(path_type=Path), metavar="DIR", help="Contact sheets in the place of a video.")
+@click.option("--full", is_flag=True, help="Whole pictures, not the part that holds the person.")
+@_force
+def render(
+    result: Path,
+    capture: Path | None,
+    output: Path | None,
+    view: str | None,
+    cameras: str | None,
+    frames: str | None,
+    png: Path | None,
+    full: bool,
+    force: bool,
+) -> None:
+    """Draw RESULT.h5 as a video: over the pictures of CAPTURE, or in 3D."""
+    from tk.render.command import Request
+    from tk.render.command import render as draw
+
+    request = Request(view, output, png, frames, _names(cameras), full, force)
+    with _working("drawing"):
+        files = draw(result, capture, request)
+    for file in files:
+        click.echo(f"wrote {file}", err=True)
+
+
+@main.command(epilog=_example("tk report result.h5 CAPTURE"))
+@click.argument("result", type=click.Path(path_type=Path), metavar="RESULT.h5")
+@click.argument("capture", type=click.Path(path_type=Path), required=False)
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), metavar="PAGE.html", help="Page.  [default: beside RESULT.h5]"
+)
+@_force
+def report(result: Path, capture: Path | None, output: Path | None, force: bool) -> None:
+    """Describe RESULT.h5 in one HTML page that needs no network.
+
+    With CAPTURE it shows pictures, too.
+    """
+    from tk.report.page import report as write
+
+    with _working("writing the report"):
+        file = write(result, capture, output, force)
+    click.echo(f"wrote {file}", err=True)
+
+
 @main.command(epilog=_example("tk demo"))
 @click.option("-o", "--output", default="demo.h5", show_default=True, type=click.Path(path_type=Path))
 @_voxels
 @_resume
 @_force
+@_no_report
 @_quiet
-def demo(output: Path, voxels: int | None, resume: bool, force: bool, quiet: bool) -> None:
+def demo(output: Path, voxels: int | None, resume: bool, force: bool, no_report: bool, quiet: bool) -> None:
     """Track the capture that ships with tk and compare the result with its truth."""
     from importlib.resources import as_file, files
 
@@ -340,7 +418,10 @@ def demo(output: Path, voxels: int | None, resume: bool, force: bool, quiet: boo
             check_output(output, force, resume)
             report.stage(f"opening the capture that ships with tk, {folder}")
             config = _configuration(None, voxels=voxels)
-            summary = session.track(open_capture(folder), output, config, report, resume=resume, force=force)
+            capture = open_capture(folder)
+            summary = session.track(capture, output, config, report, resume=resume, force=force)
+            if not no_report:
+                _leave_pictures(capture, output, summary, report, quiet)
         if not summary.interrupted:
             click.echo(evaluate_files(output, folder / "truth.h5").format_table())
             click.echo(f"The result is in {output}. Try it on your own recording: tk track CAPTURE -o RESULT.h5")

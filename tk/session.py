@@ -149,9 +149,15 @@ def track(
         TkError: bad input; everything finished before it is in the file.
     """
     check_output(output, force, resume)
+    said: list[str] = []
+
+    def note(text: str) -> None:
+        said.append(text)
+        reporter.note(text)
+
     for warning in capture.warnings:
-        reporter.note(warning)
-    with _open(capture, config, reporter.note, method, frames, init_pose, body) as plan:
+        note(warning)
+    with _open(capture, config, note, method, frames, init_pose, body) as plan:
         tracker, capture = plan.tracker, plan.capture
         meta = _meta(tracker, capture, config)
         origin = _origin(capture, plan, store_hull)
@@ -165,7 +171,9 @@ def track(
                 for estimate in run.estimates():
                     reporter.advance(estimate.frame, estimate)
             if run.tracked:
-                finish(output, plan, run.masks, reporter.note, causal)
+                finish(output, plan, run.masks, note, causal)
+                if said:
+                    revise_result(output, notes=said)
         except KeyboardInterrupt:
             # caught outside the writer, which then leaves an older result alone if nothing is done
             interrupted = True

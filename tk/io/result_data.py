@@ -277,6 +277,7 @@ class Result:
     angles: Mapping[str, Float] = field(default_factory=dict)  # by joint, each (F, k) degrees
     cameras: UsedCameras | None = None
     smoothed: Mapping[str, NDArray[Any]] | None = None  # by the datasets' names, and "bridged" (F,) bool
+    notes: tuple[str, ...] = ()  # what the run said
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -73,6 +73,7 @@ def read_result(path: str | os.PathLike[str]) -> Result:
             state=read_values(file, "resume/state"),
             software=file.text("", "software", ""),
             created=file.text("", "created", ""),
+            notes=file.names("", "notes") if file.attribute("", "notes") is not None else (),
         )
 
 

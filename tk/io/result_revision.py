@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import ArrayLike
 
 from tk.io.hdf5 import open_hdf5
-from tk.io.result_columns import Column, columns_of, put_attributes
+from tk.io.result_columns import Column, columns_of, put_attributes, strings
 from tk.io.result_data import FORMAT_VERSION, ResultMeta, UsedCameras, Value, can_be_smoothed
 from tk.io.result_files import WRITE_ERRORS, Workshop, as_result_error, move_to_memory, open_for_writing, writable
 from tk.io.result_layout import put_cameras, put_model
@@ -29,6 +29,7 @@ def revise_result(
     smoothed: Mapping[str, ArrayLike] | None = None,
     model: Mapping[str, Value] | None = None,
     cameras: UsedCameras | None = None,
+    notes: Sequence[str] | None = None,
 ) -> ResultMeta:
     """Replace parts of a finished result in one step; what is not given stays.
 
@@ -42,6 +43,7 @@ def revise_result(
             there.
         model: the whole of `/model`.
         cameras: the whole of `/cameras`.
+        notes: what the run said, a line each.
 
     Returns:
         the result's metadata.
@@ -76,6 +78,8 @@ def revise_result(
                     put_model(copy, model)
                 if cameras is not None:
                     put_cameras(copy, cameras)
+                if notes is not None:
+                    copy.attrs["notes"] = strings(notes)
                 copy.flush()
             except WRITE_ERRORS:
                 move_to_memory(copy)

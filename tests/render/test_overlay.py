@@ -1,0 +1,246 @@
+"""The overlay at a small size: a body drawn where it is, in pictures made for it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from tests.conftest import QUICK, Silent, Tk
+from tk.config import Config
+from tk.errors import ResultError
+from tk.io.capture import open_capture
+from tk.io.result import FrameResult, ResultMeta, ResultWriter, Status, read_joints, read_result
+from tk.model.anthropometry import BodyDimensions
+from tk.model.body import Body, build_body, neutral_pose
+from tk.model.camera import Camera, Rig
+from tk.model.cone_body import ConeBody, build_cone_body
+from tk.model.motion import segment_transforms
+from tk.model.silhouettes import draw_silhouettes
+from tk.model.skeleton import JOINTS
+from tk.render.canvas import View, draw_body, draw_joints
+from tk.render.figure import BONES, Figure, Outline, solids_of
+from tk.render.overlay import Grid, Overlay, write_sheets
+from tk.render.palette import LOST, SEGMENT_COLORS, sigma_colors
+from tk.session import track
+from tk.trackers.volumetric import restore_body
+
+DEMO = Path(__file__).resolve().parents[2] / "tk" / "data" / "demo"
+BODY = build_body(BodyDimensions.from_stature(1.7))
+
+
+def camera(distance_m: float = 4.0) -> Camera:
+    """Looks along +y at the origin's height 0."""
+    rotation = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    matrix = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+    return Camera("cam1", 320, 240, matrix, np.zeros(5), rotation, np.array([0, 0, distance_m]))
+
+
+def figure(body: Body | ConeBody, pose: np.ndarray) -> Figure:
+    """One frame."""
+    joints, transforms = body.skeleton.joints(pose), segment_transforms(body.skeleton, pose[None])
+    return Figure(np.zeros(1, int), joints[None], None, np.zeros(1, np.uint8), solids_of(body), transforms)
+
+
+@pytest.fixture()
+def result(tmp_path: Path) -> Path:
+    """A result of three frames of the demo: the neutral pose at the true pelvis; the last frame is lost."""
+    path = tmp_path / "result.h5"
+    skeleton, truth = BODY.skeleton, read_joints(DEMO / "truth.h5")
+    pose = neutral_pose(skeleton)
+    meta = ResultMeta(
+        skeleton.names, skeleton.units, ("all",), ("total",), 15.0, "z", "demo", "made", 0, Config().to_toml()
+    )
+    with ResultWriter.create(path, meta) as writer:
+        writer.write_model({f"dimensions/{name}": value for name, value in asdict(BODY.dimensions).items()})
+        for frame in range(3):
+            pose[:3] = truth.positions[frame, 0]
+            status = Status.LOST if frame == 2 else Status.TRACKED
+            joints = skeleton.joints(pose)
+            writer.append(FrameResult(frame, frame / 15, pose, joints, status, 0.1, np.array([1]), {"total": 0.1}))
+    return path
+
+
+def test_bones_join_all_joints_into_one_tree() -> None:
+    assert len(BONES) == len(JOINTS) - 1
+    assert {name for bone in BONES for name in bone} == set(JOINTS)
+
+
+def test_body_is_built_anew_from_the_model(result: Path) -> None:
+    restored = restore_body(read_result(result))
+    assert restored is not None
+    body, poses = restored
+    assert poses.shape == (3, 24) and body.dimensions == BODY.dimensions
+    np.testing.assert_array_equal(body.points, BODY.points)
+
+
+def test_outlines_hold_the_surface_samples() -> None:
+    pose = neutral_pose(BODY.skeleton)
+    cam = camera()
+    mask = np.zeros((240, 320), np.uint8)
+    found = figure(BODY, pose).seen(0, cam)[0]
+    assert [outline.depth for outline in found] == sorted((outline.depth for outline in found), reverse=True)
+    for outline in found:
+        for polygon in outline.polygons:
+            cv2.fillConvexPoly(mask, np.rint(polygon).astype(np.int32), 255)
+    xy = np.rint(cam.project(BODY.place(pose)[0])[0]).astype(int)
+    grown = cv2.dilate(mask, np.ones((3, 3), np.uint8))  # the outline has corners: a sample may lie just outside
+    assert (grown[xy[:, 1], xy[:, 0]] > 0).all()
+    assert (mask > 0).sum() < 1.3 * cv2.contourArea(cv2.convexHull(xy.astype(np.int32)))
+
+
+def test_outlines_of_cones_are_their_silhouette() -> None:
+    """With waist and ankles bent: filled, they are what rays through the pixels meet."""
+    body = build_cone_body(BodyDimensions.from_stature(1.7))
+    pose = np.random.default_rng(0).normal(0, 0.2, len(body.skeleton.names))
+    pose[:3] = 0.0
+    cam = camera()
+    mask = np.zeros((240, 320), np.uint8)
+    for outline in figure(body, pose).seen(0, cam)[0]:
+        for polygon in outline.polygons:
+            cv2.fillConvexPoly(mask, np.rint(polygon * 16).astype(np.int32), 255, cv2.LINE_8, 4)
+    drawn = draw_silhouettes(body, Rig((cam,)), pose[None])[0, 0]
+    assert ((drawn > 0) & (mask == 0)).sum() < 0.01 * (drawn > 0).sum()
+    outside = (cv2.erode(mask, np.ones((3, 3), np.uint8)) > 0) & (drawn == 0)  # in a narrow gap between two solids
+    assert outside.sum() < 0.01 * (drawn > 0).sum()
+
+
+def test_results_of_the_region_tracker_are_drawn(tiny: Path, tmp_path: Path) -> None:
+    path = tmp_path / "region.h5"
+    track(open_capture(tiny), path, Config.from_toml(QUICK), Silent(), frames=(0, 2))
+    capture = open_capture(tiny, masks="none")
+    (sheet,) = write_sheets(Overlay(capture, read_result(path)), tmp_path, [1], full=True)
+    picture = cv2.imread(str(sheet))
+    with h5py.File(path, "a") as file:
+        del file["model"]
+        file.create_group("model")
+    (bare,) = write_sheets(Overlay(capture, read_result(path)), tmp_path / "bare", [1], full=True)
+    differ = (picture != cv2.imread(str(bare))).any(axis=2)
+    assert 0.01 < differ.mean() < 0.5, "the body is drawn, and not everywhere"
+
+
+def test_what_is_behind_the_camera_is_not_drawn() -> None:
+    assert figure(BODY, neutral_pose(BODY.skeleton)).seen(0, camera(-5.0))[0] == []
+
+
+def test_a_tile_shows_what_it_is_cut_around() -> None:
+    cam = camera()
+    points = np.array([[100.0, 60.0], [130.0, 180.0]])
+    view = View.around(points, cam, 150, 200)
+    placed = view.place(points)
+    assert (placed >= 0).all() and (placed < (150, 200)).all()
+    picture = np.zeros((240, 320, 3), np.uint8)
+    picture[58:63, 98:103] = 255  # around the first point
+    y, x = np.nonzero(view.cut(picture)[..., 0] > 127)
+    np.testing.assert_allclose((x.mean(), y.mean()), placed[0], atol=0.6)
+    near_edge = View.around(np.array([[2.0, 2.0], [30.0, 60.0]]), cam, 150, 200)
+    assert (near_edge.origin == 0).all()
+
+
+def test_the_near_segment_hides_the_far_one() -> None:
+    tile = np.full((40, 40, 3), 200, np.uint8)
+    square = (np.array([[5.0, 5.0], [35.0, 5.0], [35.0, 35.0], [5.0, 35.0]]),)
+    view = View(np.zeros(2), 1.0, 40, 40)
+    near = np.array(SEGMENT_COLORS["calf_l"])
+    draw_body(tile, view, [Outline("thigh_r", 5.0, square), Outline("calf_l", 2.0, square)])
+    assert (tile[0, 0] == 200).all()
+    share = (tile[20, 20].astype(float) - 200) / (near - 200.0)
+    assert share.min() > 0.2 and share.max() < 0.6, "the near one's colour, and the picture shines through"
+    np.testing.assert_allclose(share, share.mean(), atol=0.02)
+    np.testing.assert_array_equal(tile[4, 20], near, err_msg="the contour is opaque")
+    grey = np.full((40, 40, 3), 200, np.uint8)
+    draw_body(grey, view, [Outline("calf_l", 2.0, square)], lost=True)
+    assert len(set(grey[20, 20].tolist())) == 1, "a lost body has no colour"
+
+
+def test_what_reaches_beyond_the_tile_is_cut_off() -> None:
+    whole, part = (np.full((60, 60, 3), 90, np.uint8) for _ in range(2))
+    polygon = np.array([[-20.0, 10.0], [80.0, 10.0], [80.0, 200.0], [-20.0, 200.0]])
+    draw_body(whole, View(np.zeros(2), 1.0, 60, 60), [Outline("torso", 1.0, (polygon,))])
+    assert (whole[5] == 90).all() and (whole[15:, 1:-1] != 90).any(axis=2).all()
+    draw_body(part, View(np.zeros(2), 1.0, 60, 60), [Outline("torso", 1.0, (polygon + 500,))])
+    assert (part == 90).all()
+
+
+def test_a_joint_tells_its_standard_deviation() -> None:
+    xy = np.full((len(JOINTS), 2), np.nan)
+    xy[:4] = [[10.0, 10.0], [30.0, 10.0], [10.0, 30.0], [30.0, 30.0]]
+    sigma = np.full(len(JOINTS), 0.01)
+    sigma[1], sigma[3] = 0.04, np.nan
+    tile = np.full((40, 40, 3), 100, np.uint8)
+    draw_joints(tile, xy, sigma)
+    certain, uncertain = sigma_colors([0.01, 0.04])
+    np.testing.assert_array_equal(tile[10, 10], certain)
+    np.testing.assert_array_equal(tile[10, 30], uncertain)
+    assert certain.sum() > uncertain.sum(), "what is uncertain is darker"
+    assert tile[30, 30].max() < 60 and tile[30, 33].min() > 180, "without evidence: a ring"
+
+
+def test_cameras_fill_a_grid_of_even_size() -> None:
+    from dataclasses import replace
+
+    for count, size in ((1, (641, 481)), (2, (160, 120)), (5, (640, 480)), (6, (288, 320)), (9, (1920, 1080))):
+        cameras = [replace(camera(), name=f"c{k}", width=size[0], height=size[1]) for k in range(count)]
+        grid = Grid.of(Rig(tuple(cameras)))
+        assert grid.width % 2 == grid.height % 2 == 0
+        assert grid.width <= 1281 and grid.height <= 721
+        tile = (int(size[1] * grid.scale), int(size[0] * grid.scale), 3)
+        corners = [grid.corner(k, tile) for k in range(count)]
+        assert len(set(corners)) == count
+        assert (
+            max(y for y, _ in corners) + tile[0] <= grid.height and max(x for _, x in corners) + tile[1] <= grid.width
+        )
+
+
+def test_sheets_are_written(result: Path, tmp_path: Path, tk: Tk) -> None:
+    said = tk("render", result, DEMO, "--png", tmp_path / "out", "--cameras", "cam1,cam5")
+    (sheet,) = (Path(line.removeprefix("wrote ")) for line in said.err.splitlines())
+    assert said.code == 0 and sheet.name == "overlay-000000-000002.png"
+    picture = cv2.imread(str(sheet))
+    assert picture.shape == (3 * 360 + 2 * 6, 2 * 270 + 6, 3)
+    names = picture[2 * 366 : 2 * 366 + 20].astype(int)
+    assert (names[..., 2] - names[..., 0] > 60).any(), "a lost frame says so in red"
+    assert tk("render", result, DEMO, "--png", tmp_path / "out", "--full", "--frames", "1").code == 0
+    whole = cv2.imread(str(tmp_path / "out" / "overlay-000001-000001.png"))
+    assert whole.shape == (360, 5 * 480 + 4 * 6, 3)
+
+
+def test_lost_frames_cannot_be_missed(result: Path) -> None:
+    overlay = Overlay(open_capture(DEMO, masks="none"), read_result(result))
+    pictures = {frame: overlay.mosaic(frame, images) for frame, images in overlay.pictures([0, 2])}
+    height = overlay.grid.height
+    assert (pictures[2][height + 2, 2] == LOST).all() and (pictures[2][2, 300] == LOST).all()
+    assert not (pictures[0][height + 2, 2] == LOST).all() and not (pictures[0][2, 300] == LOST).all()
+    bar = pictures[0][-1]
+    assert (bar[-100] == LOST).all() and not (bar[300] == LOST).all(), "the bar of time has the lost third in red"
+
+
+def test_videos_show_where_the_person_moves(result: Path) -> None:
+    capture = open_capture(DEMO, masks="none")
+    near, whole = (Overlay(capture, read_result(result), full=full) for full in (False, True))
+    for camera, view, all_of_it in zip(near.rig, near._views, whole._views, strict=True):
+        assert (view.width, view.height) == (all_of_it.width, all_of_it.height)
+        assert view.scale >= all_of_it.scale == near.grid.scale
+        xy = view.place(camera.project(near.figure.joints[:2].reshape(-1, 3))[0])
+        assert (xy > 0).all() and (xy < (view.width, view.height)).all()
+    assert max(view.scale for view in near._views) > 1.1 * near.grid.scale
+
+
+def test_a_frame_that_is_not_there_is_named(result: Path, tmp_path: Path, tk: Tk) -> None:
+    said = tk("render", result, DEMO, "--png", tmp_path, "--frames", "1,7")
+    said.complaint("frame 7 is not there; it has frames 0 to 2")
+    tk("render", tmp_path / "nothing.h5", DEMO).complaint("nothing.h5: no such file")
+    tk("render", result, DEMO, "--png", tmp_path, "--frames", "one").complaint("--frames one: give A:B")
+    tk("render", result, "--view", "overlay").complaint("needs the pictures, too")
+    tk("render", result, "--view", "hull").complaint("holds no hull")
+
+
+def test_a_result_of_another_capture_is_refused(result: Path, tiny: Path) -> None:
+    with h5py.File(result, "a") as file:
+        file["frames"][...] = [100, 101, 102]
+    with pytest.raises(ResultError, match="name the capture that was tracked"):
+        Overlay(open_capture(tiny, masks="none"), read_result(result))

@@ -1,0 +1,104 @@
+"""Videos: whole or not there, playable, and nobody else's file is replaced."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.conftest import Tk
+from tk.errors import ExportError
+from tk.io.result import read_result
+from tk.render.files import replacing
+from tk.render.scene import Scene
+from tk.render.video import made_here, video_writer
+
+
+def moving(count: int) -> list[np.ndarray]:
+    """A bright square that moves to the right over grey."""
+    pictures = np.full((count, 64, 96, 3), 60, np.uint8)
+    for k, picture in enumerate(pictures):
+        picture[20:40, 4 * k : 4 * k + 20] = (40, 200, 240)
+    return list(pictures)
+
+
+def decoded(path: Path) -> list[np.ndarray]:
+    import av
+
+    with av.open(str(path)) as container:
+        (stream,) = container.streams
+        assert stream.codec_context.name == "h264" and stream.codec_context.pix_fmt == "yuv420p"
+        return [frame.to_ndarray(format="bgr24") for frame in container.decode(stream)]
+
+
+def test_a_video_holds_its_pictures(tmp_path: Path) -> None:
+    path = tmp_path / "square.mp4"
+    pictures = moving(12)
+    with video_writer(path, 29.97) as add:
+        for picture in pictures:
+            add(picture)
+    found = decoded(path)
+    assert len(found) == 12
+    for picture, seen in zip(pictures, found, strict=True):
+        assert np.abs(picture.astype(int) - seen).mean() < 4
+    data = path.read_bytes()
+    assert data.index(b"moov") < data.index(b"mdat"), "a browser can begin before all is loaded"
+    assert made_here(path)
+    assert list(tmp_path.iterdir()) == [path], "nothing is left beside it"
+
+
+def test_an_error_leaves_the_earlier_video(tmp_path: Path) -> None:
+    path = tmp_path / "video.mp4"
+    path.write_bytes(b"precious")
+    with pytest.raises(RuntimeError, match="while drawing"), video_writer(path, 15) as add:
+        add(moving(1)[0])
+        raise RuntimeError("while drawing")
+    with pytest.raises(Exception, match=r".+"), video_writer(path, 15) as add:  # the encoder's own complaint
+        for _ in range(20):
+            add(np.zeros((63, 95, 3), np.uint8))
+    assert path.read_bytes() == b"precious" and list(tmp_path.iterdir()) == [path]
+    assert not made_here(path)
+
+
+def test_files_take_their_name_when_they_are_whole(tmp_path: Path) -> None:
+    path = tmp_path / "page.html"
+    with replacing(path) as part:
+        part.write_text("half")
+        assert not path.exists()
+    assert path.read_text() == "half"
+    with pytest.raises(ExportError, match="cannot be written"), replacing(tmp_path / "no" / "page.html") as part:
+        part.write_text("")
+
+
+def test_the_view_in_three_dimensions(tracked: Path) -> None:
+    result = read_result(tracked)
+    body, hull = Scene(result), Scene(result, hull=True)
+    first, last = body.picture(0), body.picture(len(result) - 1)
+    assert first.shape == (756, 960, 3)
+    assert (first[:720] != last[:720]).any(axis=2).mean() > 0.02, "it turns, and the person moves"
+    voxels = hull.picture(0)
+    differ = (voxels[:720] != first[:720]).any(axis=2)
+    assert 0.01 < differ.mean() < 0.5, "the hull in the place of the body"
+    # where the person is in one picture, there is the person in the other
+    y, x = np.nonzero(differ)
+    pelvis = body._camera(0.0).project(result.joints[0, 0])[0][0]
+    assert abs(x.mean() - pelvis[0]) < 60 and abs(y.mean() - pelvis[1]) < 120
+
+
+def test_render_writes_what_is_asked_for(tracked: Path, tiny: Path, tmp_path: Path, tk: Tk) -> None:
+    for name, arguments, frames in (
+        ("overlay.mp4", [tiny, "--frames", "2:6"], 4),
+        ("3d.mp4", ["--view", "3d", "--frames", "1,3"], 2),
+        ("hull.mp4", ["--view", "hull", "--frames", ":3"], 3),
+    ):
+        said = tk("render", tracked, *arguments, "-o", tmp_path / name)
+        assert said.code == 0 and f"wrote {tmp_path / name}" in said.err
+        found = decoded(tmp_path / name)
+        assert len(found) == frames and found[0].std() > 10
+    before = (tmp_path / "3d.mp4").read_bytes()
+    tk("render", tracked, "-o", tmp_path / "3d.mp4").complaint("3d.mp4: exists", "--force")
+    assert (tmp_path / "3d.mp4").read_bytes() == before
+    assert tk("render", tracked, "-o", tmp_path / "3d.mp4", "--frames", "1", "--force").code == 0
+    assert (tmp_path / "3d.mp4").read_bytes() != before
+    tk("render", tracked, "-o", tmp_path / "3d.avi").complaint("a video is an .mp4")

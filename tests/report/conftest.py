@@ -1,0 +1,72 @@
+"""A result with everything in it: a person who marches through the tiny capture, two frames lost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from tests.conftest import FRAMES
+from tk.config import Config
+from tk.io.capture import open_capture
+from tk.io.result import FrameResult, JointAngles, ResultMeta, ResultWriter, Status, read_joints, revise_result
+from tk.model.angles import ANGLES
+from tk.model.anthropometry import BodyDimensions
+from tk.model.cone_body import build_cone_body
+from tk.model.derived import derive
+from tk.model.skeleton import ANKLES, SEGMENTS, WAIST, split_pose
+from tk.trackers.contours import ContourTracker
+
+LOST = (6, 7)
+NOTE = 'said </script><b>"loudly"</b> & more'
+
+
+def complete_result(path: Path, capture_path: Path, count: int = FRAMES) -> Path:
+    """Write it; the poses are made up, but stand where the capture's actor stands."""
+    capture = open_capture(capture_path)
+    body = build_cone_body(BodyDimensions.from_stature(1.7), capture.up)
+    skeleton = body.skeleton
+    truth = read_joints(capture_path / "truth.h5").positions
+    paper = [name for name, own in zip(skeleton.names, skeleton.is_paper, strict=True) if own]
+    units = [unit for unit, own in zip(skeleton.units, skeleton.is_paper, strict=True) if own]
+    meta = ResultMeta(
+        pose_names=tuple(paper), pose_units=tuple(units), stages=("all",),
+        timing_stages=("decode", "optimise", "total"),
+        fps=capture.fps, up=capture.up, capture="made <up>", method="region", seed=0, config_toml=Config().to_toml(),
+        waist_names=WAIST, ankle_names=ANKLES, sigma=True, fit_cameras=capture.rig.names, segment_names=SEGMENTS,
+        feet=True, angles=tuple(JointAngles(a.joint, a.names, a.convention) for a in ANGLES), objective_kind="E_S",
+    )  # fmt: skip
+    rng = np.random.default_rng(1)
+    poses = np.zeros((count, len(skeleton.names)))
+    poses[:, :3] = truth[:count, 0]
+    for side, sign in (("l", 1), ("r", -1)):
+        poses[:, skeleton.index(f"hip_{side}_pitch")] = -0.5 * np.clip(sign * np.sin(np.arange(count)), 0, 1)
+        poses[:, skeleton.index(f"knee_{side}_flexion")] = np.clip(sign * np.sin(np.arange(count)), 0, 1)
+    derived = derive(skeleton, body.dimensions, poses)
+    with ResultWriter.create(path, meta) as writer:
+        writer.write_model(ContourTracker.model(cast(Any, SimpleNamespace(body=body))))
+        for f in range(count):
+            main, waist, ankles = split_pose(skeleton, poses[f])
+            sigma = rng.uniform(0.005, 0.03, 15)
+            sigma[8] = np.nan if f == 3 else sigma[8]
+            status = Status.LOST if f in LOST else Status.INITIALISED if f == 0 else Status.TRACKED
+            writer.append(
+                FrameResult(
+                    f, f / capture.fps, main, derived.joints[f], status, 0.1 + 0.01 * f, np.array([9]),
+                    {"decode": 0.01, "optimise": 0.12, "total": 0.15}, waist=waist, ankles=ankles, sigma=sigma,
+                    fit_error=np.full(len(capture.rig), 0.1 + (0.2 if f == 11 else 0.001 * f)),
+                    segments_rotation=derived.rotations[f], feet=derived.feet[f],
+                    angles={joint: values[f] for joint, values in derived.angles.items()},
+                )
+            )  # fmt: skip
+    revise_result(path, notes=["first", NOTE])
+    return path
+
+
+@pytest.fixture(scope="session")
+def complete(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The result of :func:`complete_result`. Not to be changed."""
+    return complete_result(tmp_path_factory.mktemp("complete") / "walk.h5", tiny)

@@ -1,0 +1,282 @@
+"""What stands in a report, and what becomes of it in a real browser."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scripts.browser import Page, browser_page, find_browser
+from tests.conftest import FRAMES, Tk
+from tests.report.conftest import LOST, NOTE
+from tk.io.result import Result, Status, read_result
+from tk.model.skeleton import JOINTS
+from tk.render.figure import figure_of
+from tk.report.data import hinge_sigma_deg
+from tk.report.page import build_page, made_here
+from tk.report.pictures import choose_rows
+
+
+def data_of(page: str) -> dict[str, Any]:
+    """The data in a page."""
+    (text,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)
+    found: dict[str, Any] = json.loads(text)
+    return found
+
+
+def unpacked(packed: dict[str, Any]) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(packed["data"]), "<f4").reshape(packed["shape"])
+
+
+def test_the_page_holds_the_result(complete: Path) -> None:
+    result = read_result(complete)
+    page = build_page(result, [])
+    data = data_of(page)
+    assert data["frames"] == list(range(FRAMES)) and data["capture"] == "made <up>" and data["notes"] == ["first", NOTE]
+    joints = unpacked(data["scene"]["joints"])
+    # the scene is the world moved: distances stay, and up is z
+    flat = joints.reshape(-1, 3).astype(float)
+    world = result.joints.reshape(-1, 3)
+    rng = np.random.default_rng(0)
+    i, j = rng.integers(0, len(flat), (2, 200))
+    np.testing.assert_allclose(
+        np.linalg.norm(flat[i] - flat[j], axis=1), np.linalg.norm(world[i] - world[j], axis=1), atol=1e-5
+    )
+    np.testing.assert_allclose(flat[i, 2] - flat[j, 2], world[i, 2] - world[j, 2], atol=1e-5)
+    np.testing.assert_allclose(unpacked(data["sigma"]), result.sigma, rtol=1e-6)
+    assert np.isnan(unpacked(data["sigma"])[3, 8])
+    (knee,) = (panel for panel in data["angles"] if panel["title"] == "Knee flexion")
+    assert [line["side"] for line in knee["lines"]] == ["left", "right"]
+    np.testing.assert_allclose(unpacked(knee["lines"][0]["values"]), result.angles["knee_l"][:, 0], atol=1e-4)
+    assert "sigma" in knee["lines"][0]
+    assert {camera["name"] for camera in data["scene"]["cameras"]} == set()
+
+
+def test_the_bodys_points_are_where_the_overlay_draws_them(complete: Path) -> None:
+    result = read_result(complete)
+    scene = data_of(build_page(result, []))["scene"]
+    figure = figure_of(result)
+    row = 5
+    transforms = unpacked(scene["transforms"])[row]
+    ours, theirs = [], []
+    for solid, handed in zip(figure.solids, scene["solids"], strict=True):
+        T = transforms[handed["segment"]]
+        ours.append(unpacked(handed["rings"])[0] @ T[:, :3].T + T[:, 3])
+        there = figure.transforms[row, solid.segment]
+        theirs.append(solid.rings[0] @ there[:3, :3].T + there[:3, 3])
+    a, b = np.concatenate(ours), np.concatenate(theirs)
+    joints = unpacked(scene["joints"])[row]
+    for k in range(15):
+        np.testing.assert_allclose(
+            np.linalg.norm(a - joints[k], axis=1), np.linalg.norm(b - figure.joints[row, k], axis=1), atol=1e-4
+        )
+
+
+def test_nothing_is_loaded_from_elsewhere_and_no_text_becomes_code(complete: Path) -> None:
+    page = build_page(read_result(complete), [])
+    assert "default-src 'none'" in page
+    assert set(re.findall(r"https?://[^\"'\s]+", page)) == {"http://www.w3.org/2000/svg"}, "a name, not an address"
+    assert not re.search(r"<(?:link|script|img|iframe)[^>]*(?:src|href)=(?!\"data:)", page)
+    assert "<title>made &lt;up&gt;: walk.h5</title>" in page
+    assert NOTE not in page and "{{" not in re.sub(r"<script.*?</script>", "", page, flags=re.S)
+
+
+def longer(result: Result, count: int) -> Result:
+    """The same frames over and over."""
+    rows = np.arange(count) % len(result)
+    columns = {
+        name: getattr(result, name)[rows]
+        for name in ("pose", "waist", "ankles", "joints", "sigma", "fit_error", "feet", "segments_rotation", "status",
+                     "objective", "iterations")
+    }  # fmt: skip
+    angles = {joint: values[rows] for joint, values in result.angles.items()}
+    timing = {stage: values[rows] for stage, values in result.timing.items()}
+    frames = np.arange(count)
+    return replace(result, **columns, angles=angles, timing=timing, frames=frames, time=frames / 15, smoothed=None)
+
+
+def test_a_thousand_frames_take_a_few_megabytes(complete: Path) -> None:
+    page = build_page(longer(read_result(complete), 1000), [])
+    assert len(page) < 4e6  # and five pictures of some 100 kB
+
+
+def test_flexions_standard_deviation_is_that_of_drawn_positions(complete: Path) -> None:
+    figure = figure_of(read_result(complete))
+    rng = np.random.default_rng(2)
+    names = ("hip_l", "knee_l", "ankle_l")
+    index = [JOINTS.index(name) for name in names]
+    told = hinge_sigma_deg(figure, names)
+    assert figure.sigma is not None
+    for row in (1, 2, 5):
+        scale = 0.1  # small errors: the formula is of first order
+        drawn = figure.joints[row, index] + scale * figure.sigma[row, index, None] * rng.normal(size=(20000, 3, 3))
+        u, v = drawn[:, 0] - drawn[:, 1], drawn[:, 2] - drawn[:, 1]
+        cosine = (u * v).sum(axis=1) / np.linalg.norm(u, axis=1) / np.linalg.norm(v, axis=1)
+        angle = np.degrees(np.arccos(cosine))
+        if angle.mean() < 170:  # a straight leg's angle cannot grow
+            assert told[row] == pytest.approx(angle.std() / scale, rel=0.05)
+
+
+def test_pictures_are_of_lost_worst_and_typical_frames(complete: Path, tracked: Path) -> None:
+    result = read_result(complete)
+    choices = {choice.row: choice.why for choice in choose_rows(result)}
+    assert choices[LOST[0]] == "first lost frame" and choices[11] == "among the worst: mean E_S 30 %"
+    assert sum(why.startswith("typical") for why in choices.values()) >= 1
+    unknown = choose_rows(read_result(tracked))
+    assert len(unknown) == 5 and {choice.why for choice in unknown} == {"spread over the recording"}
+
+
+def test_report_writes_a_page(tk: Tk, complete: Path, tiny: Path, tmp_path: Path) -> None:
+    target = tmp_path / "page.html"
+    said = tk("report", complete, tiny, "-o", target)
+    assert (said.code, said.err) == (0, f"wrote {target}\n") and made_here(target)
+    data = data_of(target.read_text(encoding="utf-8"))
+    assert {picture["row"] for picture in data["pictures"]} >= {LOST[0], 11}
+    assert len(data["scene"]["cameras"]) == 4
+    tk("report", complete, "-o", target).complaint("page.html: exists", "--force")
+    assert tk("report", complete, "-o", target, "--force").code == 0
+    assert data_of(target.read_text(encoding="utf-8"))["pictures"] == []
+    tk("report", complete, "-o", tmp_path / "no" / "page.html").complaint("does not exist")
+    tk("report", tmp_path / "none.h5").complaint("none.h5: no such file")
+
+
+# --- in a browser -----------------------------------------------------------------------------------------------------
+
+chromium = pytest.mark.skipif(find_browser() is None, reason="no Chromium is installed (Debian's package: chromium)")
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Page]:
+    """A page of one browser for all tests."""
+    with browser_page() as opened:
+        yield opened
+
+
+def wait_for(page: Page, condition: str, seconds: float = 20.0) -> None:
+    """Until an expression is true."""
+    deadline = time.monotonic() + seconds
+    while not page.run(condition):
+        assert time.monotonic() < deadline, condition
+        time.sleep(0.05)
+
+
+@pytest.fixture
+def opened(complete: Path, tiny: Path, page: Page, tmp_path: Path, tk: Tk) -> Page:
+    """The complete result's report in the browser, at its first frame."""
+    tk("report", complete, tiny, "-o", tmp_path / "walk.html")
+    page.said.clear()
+    page.open(tmp_path / "walk.html")
+    return page
+
+
+@chromium
+def test_it_plays_and_stops_at_the_end(opened: Page) -> None:
+    assert opened.run("report.row") == 0 and opened.run("report.playing") is False
+    before = opened.run("document.getElementById('view').toDataURL()")
+    opened.press(" ")
+    assert opened.run("report.playing") is True
+    wait_for(opened, "report.row > 2")
+    wait_for(opened, f"report.row === {FRAMES - 1} && !report.playing")
+    assert opened.run("document.getElementById('view').toDataURL()") != before
+    opened.run("document.getElementById('play').click()")  # begins again
+    wait_for(opened, "report.playing && report.row < 9")
+    opened.press(" ")
+    assert opened.run("report.playing") is False
+    assert opened.said == []
+
+
+@chromium
+def test_it_goes_where_it_is_sent(opened: Page) -> None:
+    opened.press("ArrowRight")
+    opened.press("ArrowRight")
+    opened.press("ArrowLeft")
+    assert opened.run("report.row") == 1
+    opened.run(
+        "(() => { const s = document.getElementById('scrubber'); s.value = 9; s.dispatchEvent(new Event('input')); })()"
+    )
+    assert opened.run("report.row") == 9
+    assert opened.run("document.getElementById('clock').textContent") == "frame 9 · 0.60 s"
+    opened.press("End")
+    assert opened.run("report.row") == FRAMES - 1
+    opened.press("Home")
+    opened.run("document.querySelector('#shots button').click()")
+    assert opened.run("report.row") == LOST[0], "a picture leads to its frame"
+    turned = opened.run("document.getElementById('view').toDataURL()")
+    box = opened.run("JSON.stringify(document.getElementById('view').getBoundingClientRect())")
+    top = json.loads(box)["top"]
+    opened.run("scrollTo(0, 0)")
+    opened.drag((300, max(top, 0) + 150), (420, max(top, 0) + 170))
+    wait_for(opened, f"document.getElementById('view').toDataURL() !== {json.dumps(turned)}")
+    assert opened.said == []
+
+
+@chromium
+def test_lost_frames_are_seen(opened: Page) -> None:
+    opened.run(f"report.show({LOST[0] - 1})")
+    assert opened.run("document.getElementById('badge').hidden") is True
+    opened.run(f"report.show({LOST[0]})")
+    assert opened.run("document.getElementById('badge').hidden") is False
+    assert opened.run("document.getElementById('status').textContent") == "lost"
+    assert opened.run("document.querySelectorAll('.chart')[0].querySelectorAll('rect.lost').length") == len(LOST)
+    assert opened.run("document.querySelector('#figures .bad dd').textContent").startswith("2")
+
+
+@chromium
+def test_all_of_it_is_there(opened: Page) -> None:
+    assert opened.run("document.querySelectorAll('#notes li')[1].textContent") == NOTE
+    assert opened.run("document.getElementById('title').textContent") == "made <up>"
+    assert opened.run("document.querySelectorAll('#angle-charts .chart').length") > 15
+    assert opened.run("document.querySelectorAll('#sigma-table tr').length") == 16
+    assert opened.run("[...document.images].every((image) => image.complete && image.naturalWidth > 100)") is True
+    assert opened.run("document.images.length") >= 3
+    assert opened.run("document.documentElement.scrollWidth <= window.innerWidth") is True, "nothing sticks out"
+    assert opened.run("document.querySelector('.chart path.line').getAttribute('d').includes('NaN')") is False
+    assert opened.said == []
+
+
+@chromium
+@pytest.mark.parametrize("kind", ["volumetric", "version 1"])
+def test_older_and_poorer_results(kind: str, tracked: Path, page: Page, tk: Tk, tmp_path: Path) -> None:
+    result = tracked
+    if kind == "version 1":
+        result = tmp_path / "old.h5"
+        write_version_1(tracked, result)
+    target = tmp_path / "page.html"
+    assert tk("report", result, "-o", target).code == 0
+    page.said.clear()
+    page.open(target, dark=True)
+    page.press(" ")
+    wait_for(page, "report.row > 2")
+    text = page.run("document.body.innerText")
+    for missing in ("does not tell E_S", "No pictures", "does not tell the joints' angles", "does not tell σ"):
+        assert missing in text
+    assert page.said == []
+
+
+def write_version_1(source: Path, target: Path) -> None:
+    """The same result as version 1 told it."""
+    import shutil
+
+    import h5py
+
+    shutil.copyfile(source, target)
+    with h5py.File(target, "a") as file:
+        file.attrs["format_version"] = 1
+        for name in ("cameras", "smoothed", "waist"):
+            if name in file:
+                del file[name]
+        del file["objective"].attrs["kind"]
+    assert read_result(target).meta.waist_names == ()
+
+
+def test_statuses_have_their_meaning() -> None:
+    """The page's colours go by the numbers."""
+    assert [int(Status.TRACKED), int(Status.INITIALISED), int(Status.RECOVERED), int(Status.LOST)] == [0, 1, 2, 3]

@@ -1,0 +1,36 @@
+"""The scripts about pictures at a small size: the documentation's pictures, and what pictures cost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import pytest
+
+from scripts import bench_pictures, screenshots
+from scripts.browser import find_browser
+from tests.report.conftest import complete_result
+
+
+@pytest.mark.skipif(find_browser() is None, reason="no Chromium is installed (Debian's package: chromium)")
+def test_the_documentations_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    result = complete_result(tmp_path / "demo.h5", screenshots.DEMO, max(screenshots.FRAMES) + 1)
+    screenshots.main([str(result), "-o", str(tmp_path)])
+    assert capsys.readouterr().out.split() == [str(tmp_path / "demo.png"), str(tmp_path / "report.png")]
+    assert cv2.imread(str(tmp_path / "report.png")).shape == (800, 1280, 3)
+    demo = cv2.imread(str(tmp_path / "demo.png"))
+    assert demo.shape == (2 * 330 + 6, 4 * 248 + 3 * 6, 3)
+    assert demo.std() > 30
+
+
+def test_the_cost_of_pictures(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def track(capture: object, output: Path, *_: object, **__: object) -> SimpleNamespace:
+        complete_result(output, tiny)
+        return SimpleNamespace(frames=14)
+
+    monkeypatch.setattr("tk.session.track", track)
+    cost = bench_pictures.run_once(tiny, "auto", None, tmp_path / "r.h5")
+    assert cost.frames == 14 and min(*cost.run, *cost.pictures) > 0
+    assert cost.shares == pytest.approx([p / (p + r) for p, r in zip(cost.pictures, cost.run, strict=True)])
+    assert {path.name for path in tmp_path.iterdir()} == {"r.h5", "r.mp4", "r.html"}

@@ -1,0 +1,147 @@
+"""Drawing on a tile, a part of a camera's picture at some scale: body, joints, truth, text."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.model.camera import Camera
+from tk.model.skeleton import JOINTS
+from tk.render.figure import BONES, Outline
+from tk.render.palette import BONE, INK, LOST_BODY, SEGMENT_COLORS, TEXT, Color, sigma_colors
+
+Float = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+_FILL, _LINE = 90, 255  # opacity of 255
+_BEYOND: Color = (24, 24, 24)  # where there is no picture
+_SUBPIXEL = 4  # bits of a fraction of a pixel that OpenCV draws with
+_BONES = [(JOINTS.index(a), JOINTS.index(b)) for a, b in BONES]
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+
+@dataclass(frozen=True)
+class View:
+    """A tile: what part of a picture it shows, ``origin`` (2,) being its upper left corner, pixels, and its scale."""
+
+    origin: Float
+    scale: float
+    width: int
+    height: int
+
+    @staticmethod
+    def around(xy: Float, camera: Camera, width: int, height: int) -> View:
+        """A tile of this size that holds the points (N, 2), within the picture, or around all of it."""
+        xy = xy[np.isfinite(xy).all(axis=1)]
+        if not len(xy):
+            return View.whole(camera, height)
+        low, high = xy.min(axis=0), xy.max(axis=0)
+        span = np.maximum(high - low, 1.0) * 1.2  # room for what the body misses
+        scale = float(min(width / span[0], height / span[1], 4.0))
+        size = np.array([width, height]) / scale
+        most = np.array([camera.width, camera.height]) - size
+        inside = np.clip((low + high) / 2 - size / 2, 0, np.maximum(most, 0)).round()
+        return View(np.where(most > 0, inside, most / 2), scale, width, height)
+
+    @staticmethod
+    def whole(camera: Camera, height: int) -> View:
+        """The whole picture at this height."""
+        return View(np.zeros(2), height / camera.height, round(camera.width * height / camera.height), height)
+
+    def cut(self, picture: Image) -> Image:
+        """(height, width, 3) the tile's part of a picture."""
+        reach = self.origin + np.array([self.width, self.height]) / self.scale
+        if self.scale <= 1 and (self.origin > -0.5).all() and (reach < np.array(picture.shape[1::-1]) + 0.5).all():
+            (left, top), (right, bottom) = self.origin.round().astype(int), reach.round().astype(int)
+            # down to half the size linear interpolation skips no pixel, and takes a tenth of the time
+            method = cv2.INTER_LINEAR if self.scale >= 0.5 else cv2.INTER_AREA
+            part = picture[top:bottom, left:right]
+            return np.asarray(cv2.resize(part, (self.width, self.height), interpolation=method), np.uint8)
+        shift = 0.5 * self.scale - 0.5 - self.scale * self.origin
+        M = np.column_stack([self.scale * np.eye(2), shift])
+        size = (self.width, self.height)
+        return np.asarray(cv2.warpAffine(picture, M, size, flags=cv2.INTER_LINEAR, borderValue=_BEYOND), np.uint8)
+
+    def place(self, xy: Float) -> Float:
+        """(N, 2) pixels of the picture as pixels of the tile."""
+        return np.asarray((xy + 0.5 - self.origin) * self.scale - 0.5)
+
+
+def draw_body(tile: Image, view: View, outlines: Sequence[Outline], lost: bool = False) -> None:
+    """Fill the segments, translucent, and draw their contours, near ones over far ones; grey if ``lost``."""
+    counts = [len(polygon) for outline in outlines for polygon in outline.polygons]
+    if not counts:
+        return
+    points = fixed(view.place(np.concatenate([polygon for outline in outlines for polygon in outline.polygons])))
+    x, y, width, height = _box(points, tile)
+    if width <= 0 or height <= 0:
+        return
+    layer = np.zeros((height, width, 4), np.uint8)  # the last is the opacity
+    placed = iter(np.split(points - (np.array([x, y], np.int32) << _SUBPIXEL), np.cumsum(counts)[:-1]))
+    for outline in outlines:
+        color = LOST_BODY if lost else SEGMENT_COLORS[outline.segment]
+        moved = [next(placed) for _ in outline.polygons]
+        # lines first: what of them is inside another solid of the segment is filled again
+        cv2.polylines(layer, moved, True, (*color, _LINE), 2, cv2.LINE_8, _SUBPIXEL)
+        for polygon in moved:
+            cv2.fillConvexPoly(layer, polygon, (*color, _FILL), cv2.LINE_8, _SUBPIXEL)
+    under = tile[y : y + height, x : x + width]
+    share = layer[..., 3] * np.float32(1 / 255)
+    under[...] = cv2.blendLinear(cv2.cvtColor(layer, cv2.COLOR_BGRA2BGR), under, share, 1 - share)
+
+
+def draw_joints(tile: Image, xy: Float, sigma_m: Float | None = None, lost: bool = False) -> None:
+    """Bones as lines, joints as dots; ``xy`` (15, 2) tile pixels.
+
+    The dots' colours tell the standard deviations ``sigma_m`` (15,); a joint without evidence (NaN) is a ring.
+    """
+    points = fixed(np.nan_to_num(xy))
+    seen = np.asarray(np.isfinite(xy).all(axis=1))
+    known = seen if sigma_m is None else seen & np.isfinite(sigma_m)
+    plain = LOST_BODY if lost else BONE
+    colors = [plain] * len(points) if lost or sigma_m is None else sigma_colors(np.nan_to_num(sigma_m)).tolist()
+    for a, b in _BONES:
+        if seen[a] and seen[b]:
+            cv2.line(tile, points[a], points[b], INK, 3, cv2.LINE_AA, _SUBPIXEL)
+            cv2.line(tile, points[a], points[b], plain, 1, cv2.LINE_AA, _SUBPIXEL)
+    for k in np.flatnonzero(seen):
+        cv2.circle(tile, points[k], 4 << _SUBPIXEL, INK, cv2.FILLED, cv2.LINE_AA, _SUBPIXEL)
+        color, width = (colors[k], cv2.FILLED) if known[k] else (plain, 1)
+        cv2.circle(tile, points[k], 3 << _SUBPIXEL, color, width, cv2.LINE_AA, _SUBPIXEL)
+
+
+def draw_truth(tile: Image, xy: Float) -> None:
+    """Small crosses at the true joints, ``xy`` (15, 2) tile pixels."""
+    for x, y in xy[np.isfinite(xy).all(axis=1)]:
+        for color, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+            for dx, dy in ((3.5, 3.5), (3.5, -3.5)):
+                a, b = fixed(np.array([[x - dx, y - dy], [x + dx, y + dy]]))
+                cv2.line(tile, a, b, color, width, cv2.LINE_AA, _SUBPIXEL)
+
+
+def fixed(xy: Float) -> NDArray[np.int32]:
+    """Pixels as OpenCV takes them with a fraction."""
+    return np.rint(np.clip(xy, -30000, 30000) * (1 << _SUBPIXEL)).astype(np.int32)
+
+
+def write(tile: Image, text: str, left: int, baseline: int, color: Color = TEXT, size: float = 0.42) -> int:
+    """A line of text (ASCII); returns where it ends, pixels."""
+    cv2.putText(tile, text, (left, baseline), _FONT, size, color, 1, cv2.LINE_AA)
+    return left + text_width(text, size)
+
+
+def text_width(text: str, size: float = 0.42) -> int:
+    """Pixels that a line of text takes."""
+    return int(cv2.getTextSize(text, _FONT, size, 1)[0][0])
+
+
+def _box(points: NDArray[np.int32], picture: Image) -> tuple[int, int, int, int]:
+    """x, y, width, height of the part of a picture that holds points (N, 2) of :func:`fixed` and a margin."""
+    x, y, width, height = cv2.boundingRect(points >> _SUBPIXEL)
+    left, top = max(x - 2, 0), max(y - 2, 0)
+    right, bottom = min(x + width + 3, picture.shape[1]), min(y + height + 3, picture.shape[0])
+    return left, top, right - left, bottom - top

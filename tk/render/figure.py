@@ -1,0 +1,204 @@
+"""What there is to draw of a person in every frame: skeleton, and the body's solids as meshes in their segments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ResultError
+from tk.io.result import Result, Status
+from tk.kernels.cones import ELLIPSOID
+from tk.model.body import Body
+from tk.model.camera import Camera
+from tk.model.cone_body import ConeBody, ConePart
+from tk.model.motion import segment_transforms
+from tk.model.skeleton import JOINTS, SEGMENTS
+from tk.model.superellipsoid import Superellipsoid
+from tk.trackers.bodies import body_and_poses
+from tk.trackers.volumetric import restore_body
+
+Float = NDArray[np.float64]
+
+BONES = (
+    ("pelvis", "neck"), ("neck", "head_top"),
+    ("neck", "shoulder_l"), ("shoulder_l", "elbow_l"), ("elbow_l", "wrist_l"),
+    ("neck", "shoulder_r"), ("shoulder_r", "elbow_r"), ("elbow_r", "wrist_r"),
+    ("pelvis", "hip_l"), ("hip_l", "knee_l"), ("knee_l", "ankle_l"),
+    ("pelvis", "hip_r"), ("hip_r", "knee_r"), ("knee_r", "ankle_r"),
+)  # fmt: skip
+
+#: points around a solid
+AROUND = 24
+# circles along an ellipsoid and a superellipsoid; a frustum is the convex hull of two
+_ALONG = 9
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A convex solid that rides on a segment.
+
+    Attributes:
+        segment: its index in :data:`~tk.model.skeleton.SEGMENTS`.
+        rings: (R, AROUND, 3) circles from one end to the other in the segment's frame, zero configuration; metres.
+    """
+
+    segment: int
+    rings: Float
+
+    @cached_property
+    def divided(self) -> Solid:
+        """The same with five circles at least: faces that are short enough to be sorted by their depth."""
+        if len(self.rings) > 2:
+            return self
+        share = np.linspace(0, 1, 5)[:, None, None]
+        return Solid(self.segment, (1 - share) * self.rings[0] + share * self.rings[1])
+
+    @cached_property
+    def faces(self) -> NDArray[np.int64]:
+        """(N, 4) corners of the faces as indices of the points of all circles; both ends are closed.
+
+        Seen from outside they run the same way round everywhere: a face's normal, the product of its diagonals, points
+        outwards.
+        """
+        R = len(self.rings)
+        index = np.arange(R * AROUND).reshape(R, AROUND)
+        following = np.roll(index, -1, axis=1)
+        side = np.stack([index[:-1], following[:-1], following[1:], index[1:]], axis=-1).reshape(-1, 4)
+        fan = np.array([[0, k, k + 1, k + 2] for k in range(1, AROUND - 2, 2)])
+        return np.concatenate([side, index[0][fan[:, ::-1]], index[-1][fan]])
+
+
+@dataclass(frozen=True)
+class Outline:
+    """What a camera sees of a segment: its depth, metres, and the outlines (N, 2) of its solids, pixels."""
+
+    segment: str
+    depth: float
+    polygons: tuple[Float, ...]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """The person in F frames.
+
+    Attributes:
+        frames: (F,) source frames.
+        joints: (F, 15, 3) metres, world frame.
+        sigma: (F, 15) standard deviations of the joints, metres, or None.
+        status: (F,) as in the result.
+        solids: the body; none where the result has no body.
+        transforms: (F, S, 4, 4) the segments, zero configuration to world.
+    """
+
+    frames: NDArray[np.int64]
+    joints: Float
+    sigma: Float | None
+    status: NDArray[np.uint8]
+    solids: tuple[Solid, ...]
+    transforms: Float
+    _placed: dict[int, Float] = field(default_factory=dict, repr=False, compare=False)
+
+    def lost(self, row: int) -> bool:
+        """Whether the frame is lost."""
+        return bool(self.status[row] == Status.LOST)
+
+    def placed(self, row: int) -> Float:
+        """(N, 3) the points of all solids' circles in a frame, solid by solid; metres, world frame."""
+        if row not in self._placed:  # every camera asks for the same
+            self._placed.clear()
+            T = self.transforms[row][self._segments]
+            points = np.concatenate([solid.rings.reshape(-1, 3) for solid in self.solids])
+            self._placed[row] = np.einsum("nab,nb->na", T[:, :3, :3], points) + T[:, :3, 3]
+        return self._placed[row]
+
+    @cached_property
+    def starts(self) -> NDArray[np.int64]:
+        """(S + 1,) where each solid's points begin among those of all, and their number."""
+        return np.cumsum([0, *(solid.rings.size // 3 for solid in self.solids)])
+
+    @cached_property
+    def _segments(self) -> NDArray[np.int64]:
+        """(N,) the segment of each point."""
+        return np.repeat([solid.segment for solid in self.solids], np.diff(self.starts))
+
+    def seen(self, row: int, camera: Camera) -> tuple[list[Outline], Float]:
+        """What a camera sees of the body, farthest segment first, and of the joints, pixels (15, 2).
+
+        Solids are convex, so each outline is the convex hull of the projected circles (lens distortion bends it by
+        less than a pixel over a limb). What is behind the camera, even in part, is left out; such a joint is NaN.
+        """
+        joints = self.joints[row]
+        if not self.solids:
+            return [], camera.project(joints)[0]
+        xy, depth = camera.project(np.concatenate([self.placed(row), joints]))
+        xy, depth, joints_xy = xy[: -len(joints)], depth[: -len(joints)], xy[-len(joints) :]
+        starts, counts = self.starts[:-1], np.diff(self.starts)
+        middle = np.add.reduceat(depth, starts) / counts
+        whole = np.logical_and.reduceat(np.isfinite(xy).all(axis=1), starts)
+        seen: dict[int, tuple[list[float], list[Float]]] = {}
+        for k in np.flatnonzero(whole):
+            depths, polygons = seen.setdefault(self.solids[k].segment, ([], []))
+            depths.append(float(middle[k]))
+            points = xy[starts[k] : starts[k] + counts[k]].astype(np.float32)
+            polygons.append(cv2.convexHull(points)[:, 0].astype(np.float64))
+        found = [
+            Outline(SEGMENTS[segment], float(np.mean(depths)), tuple(polygons))
+            for segment, (depths, polygons) in seen.items()
+        ]
+        return sorted(found, key=lambda outline: -outline.depth), joints_xy
+
+
+def figure_of(result: Result) -> Figure:
+    """The person of a result; its joints in the order of :data:`~tk.model.skeleton.JOINTS`.
+
+    Raises:
+        ResultError: the body and the poses do not belong together, or a joint is missing.
+    """
+    names = result.meta.joint_names
+    missing = [name for name in JOINTS if name not in names]
+    if missing:
+        raise ResultError(f"{result.path}: /joints/position has no joint {missing[0]}; track anew")
+    order = [names.index(name) for name in JOINTS]
+    sigma = None if result.sigma is None else result.sigma[:, order]
+    restored = body_and_poses(result) or restore_body(result)
+    solids: tuple[Solid, ...] = ()
+    transforms = np.zeros((len(result), 0, 4, 4))
+    if restored is not None:
+        body, poses = restored
+        solids, transforms = solids_of(body), segment_transforms(body.skeleton, poses)
+    return Figure(result.frames, result.joints[:, order], sigma, result.status, solids, transforms)
+
+
+def solids_of(body: Body | ConeBody) -> tuple[Solid, ...]:
+    """The body's solids in their segments' frames."""
+    T_body = np.eye(4)
+    T_body[:3, :3] = body.skeleton.T_world_body
+    if isinstance(body, ConeBody):
+        found = [(part.segment, T_body @ part.T_body_part, _part_rings(part)) for part in body.parts]
+    else:
+        found = [(piece.segment, T_body @ piece.T_body_piece, _piece_rings(piece)) for piece in body.pieces]
+    return tuple(Solid(SEGMENTS.index(name), rings @ T[:3, :3].T + T[:3, 3]) for name, T, rings in found)
+
+
+def _part_rings(part: ConePart) -> Float:
+    """(R, AROUND, 3) circles of a frustum or an ellipsoid, its own frame."""
+    angle, z = np.meshgrid(_angles(), np.linspace(0, 1, _ALONG if part.kind == ELLIPSOID else 2))
+    radius = np.ones_like(z)
+    if part.kind == ELLIPSOID:
+        radius, z = np.sin(np.pi * z), -np.cos(np.pi * z)
+    unscaled = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)
+    return part.surface(unscaled.reshape(-1, 3)).reshape(unscaled.shape)
+
+
+def _piece_rings(piece: Superellipsoid) -> Float:
+    """(R, AROUND, 3) circles of a piece, its own frame."""
+    omega, eta = np.meshgrid(_angles(), np.linspace(*piece.eta_range, _ALONG))
+    return piece.point(eta, omega)
+
+
+def _angles() -> Float:
+    return np.linspace(-np.pi, np.pi, AROUND, endpoint=False)

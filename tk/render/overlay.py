@@ -1,0 +1,309 @@
+"""The tracked body over the pictures of all cameras: the way to see whether a result is right.
+
+Filled outlines are the fitted body (left limbs warm, right limbs cool, trunk and head green), lines and dots its
+joints, a dot's colour the joint's standard deviation. A result without a body shows joints only. Lost frames are grey
+with a red frame. On contact sheets white crosses are the capture's truth, where it has one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ExportError, ResultError
+from tk.io.capture import Capture
+from tk.io.result import Result, Status, read_joints
+from tk.io.result_data import STATUS_MEANING
+from tk.model.camera import Camera, Rig
+from tk.render.canvas import Image, View, draw_body, draw_joints, draw_truth, text_width, write
+from tk.render.figure import Figure, figure_of
+from tk.render.palette import INK, LOST, SEGMENT_COLORS, SIGMA_MOST_M, TEXT, Color, sigma_colors
+
+Float = NDArray[np.float64]
+
+_GAP = 6  # pixels between the tiles of a sheet
+_STRIP, _BAR = 30, 6  # heights of a video's legend and of its bar of time
+#: pixels that a video is wide at most, and at least if that means to enlarge
+WIDEST, _NARROWEST = 1280, 640
+_ASPECT = 9 / 16  # of the tiles together, at most
+_STATUS_COLORS: dict[int, Color] = {
+    Status.TRACKED: (120, 150, 90),
+    Status.INITIALISED: (190, 170, 110),
+    Status.RECOVERED: (60, 190, 240),
+    Status.LOST: LOST,
+}
+
+
+class Overlay:
+    """A result over the pictures of its capture.
+
+    Args:
+        capture: the pictures, of the cameras that are to be shown.
+        result: what was tracked. The cameras are as the run used them, where it says so.
+        widest: pixels that a video is wide at most.
+        full: whole pictures in a video, not the part of each in which the person moves.
+
+    Raises:
+        ResultError: the result has no frames, frames that the capture does not have, or a body that cannot be used.
+    """
+
+    def __init__(self, capture: Capture, result: Result, widest: int = WIDEST, full: bool = False) -> None:
+        if not len(result):
+            raise ResultError(f"{result.path}: has no frames")
+        last = int(result.frames.max())
+        if last >= capture.frame_count:
+            raise ResultError(
+                f"{result.path}: has frame {last}, but {capture.path} ends with frame {capture.frame_count - 1}; "
+                "name the capture that was tracked"
+            )
+        self.capture, self.result = capture, result
+        self.figure: Figure = figure_of(result)
+        self.rig = used_rig(capture.rig, result)
+        self.grid = Grid.of(self.rig, widest)
+        self._views = [self._steady_view(camera, full) for camera in self.rig]
+        self.row_of = {int(frame): row for row, frame in enumerate(result.frames)}
+        truth_file = capture.path / "truth.h5"
+        truth = read_joints(truth_file) if truth_file.is_file() else None
+        self._truth = {} if truth is None else dict(zip(truth.frames.tolist(), truth.positions, strict=True))
+
+    def pictures(self, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """The chosen frames, ascending, and their pictures (C, H, W, 3)."""
+        wanted = set(frames)
+        with self.capture.frames(min(wanted), max(wanted) + 1) as reader:
+            for frame in reader:
+                if frame.index in wanted:
+                    yield frame.index, frame.images
+
+    def chosen(self, frames: Sequence[int] = (), count: int = 8) -> list[int]:
+        """These frames, ascending; without any, ``count`` spread over the result.
+
+        Raises:
+            ResultError: one is not in the result.
+        """
+        return choose_frames(self.result, frames, count)
+
+    def sheet_row(
+        self,
+        frame: int,
+        images: NDArray[np.uint8],
+        tile_height: int = 360,
+        full: bool = False,
+        truth: bool = True,
+    ) -> Image:
+        """A row of tiles, one a camera, of a frame; the person cut out, or the ``full`` pictures."""
+        row, tiles = self.row_of[frame], []
+        for camera, image in zip(self.rig, images, strict=True):
+            view = View.whole(camera, tile_height)
+            if not full:
+                outlines, joints = self.figure.seen(row, camera)
+                polygons = [polygon for outline in outlines for polygon in outline.polygons]
+                points = np.concatenate([joints, *polygons, *self._true(frame, camera)])
+                view = View.around(points, camera, round(0.75 * tile_height), tile_height)
+            tile = self._tile(row, camera, image, view)
+            for xy in self._true(frame, camera) if truth else ():
+                draw_truth(tile, view.place(xy))
+            state = STATUS_MEANING[self.figure.status[row]]
+            tile[:20] = tile[:20] // 3
+            write(tile, f"{camera.name}  {frame}  {state}", 6, 14, (120, 120, 255) if self.figure.lost(row) else TEXT)
+            tiles.append(tile)
+        return joined(tiles, axis=1)
+
+    def _tile(self, row: int, camera: Camera, image: Image, view: View) -> Image:
+        """A camera's picture with body and joints drawn over it."""
+        lost = self.figure.lost(row)
+        tile = view.cut(image[: camera.height, : camera.width])
+        outlines, joints = self.figure.seen(row, camera)
+        draw_body(tile, view, outlines, lost)
+        draw_joints(tile, view.place(joints), None if self.figure.sigma is None else self.figure.sigma[row], lost)
+        if lost:
+            cv2.rectangle(tile, (0, 0), (view.width - 1, view.height - 1), LOST, 5)
+        return tile
+
+    def _true(self, frame: int, camera: Camera) -> list[Float]:
+        return [camera.project(self._truth[frame])[0]] if frame in self._truth else []
+
+    # --- a picture of a video ---------------------------------------------------------------------------------------
+
+    def mosaic(self, frame: int, images: NDArray[np.uint8]) -> Image:
+        """All cameras' pictures in a grid, below them what is to be known: (H, W, 3), H and W even."""
+        grid, row = self.grid, self.row_of[frame]
+        canvas = np.full((grid.height + _STRIP + _BAR, grid.width, 3), 24, np.uint8)
+        for c, (camera, image) in enumerate(zip(self.rig, images, strict=True)):
+            tile = self._tile(row, camera, image, self._views[c])
+            self._name(tile, row, camera)
+            y, x = grid.corner(c, tile.shape)
+            canvas[y : y + tile.shape[0], x : x + tile.shape[1]] = tile
+        self._legend(canvas[grid.height : grid.height + _STRIP], row)
+        draw_timeline(canvas[grid.height + _STRIP :], self.figure.status, row)
+        return canvas
+
+    def _steady_view(self, camera: Camera, full: bool) -> View:
+        """A tile of the grid that holds the person in all frames, those aside that are lost."""
+        width, height = (max(int(size * self.grid.scale), 1) for size in (camera.width, camera.height))
+        whole = View(np.zeros(2), self.grid.scale, width, height)
+        good = self.figure.status != Status.LOST
+        points, _ = camera.project(self.figure.joints[good].reshape(-1, 3))
+        if full or not camera.sees(self.figure.joints[good].reshape(-1, 3)).any():
+            return whole
+        near = View.around(points, camera, width, height)
+        return near if near.scale > self.grid.scale else whole
+
+    def _name(self, tile: Image, row: int, camera: Camera) -> None:
+        """The camera's name and E_S in a corner."""
+        text = camera.name
+        names, errors = self.result.meta.fit_cameras, self.result.fit_error
+        if errors is not None and camera.name in names:
+            error = float(errors[row, names.index(camera.name)])
+            text += f"  E_S {100 * error:.0f} %" if np.isfinite(error) else ""
+        label = tile[:18, : text_width(text) + 12]
+        label[...] = label // 3
+        write(tile, text, 6, 13)
+
+    def _legend(self, strip: Image, row: int) -> None:
+        """Frame, time and status on the left; what the colours mean on the right, as far as there is room."""
+        lost = self.figure.lost(row)
+        if lost:
+            strip[...] = LOST
+        state = "LOST: do not use this pose" if lost else STATUS_MEANING[self.figure.status[row]]
+        text = f"frame {self.figure.frames[row]}   {self.result.time[row]:.2f} s   {state}"
+        end = write(strip, text, 10, 20, TEXT, 0.5)
+        if strip.shape[1] - end > 330:
+            draw_key(strip, strip.shape[1] - 310, self.figure.sigma is not None)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """How the pictures of several cameras are laid out; even numbers of pixels, as H.264 wants them."""
+
+    columns: int
+    scale: float
+    cell: tuple[int, int]  # height, width
+    width: int
+    height: int
+
+    @staticmethod
+    def of(rig: Rig, widest: int = WIDEST) -> Grid:
+        """The grid that shows the cameras' pictures largest."""
+        rows, across = rig.frame_shape
+        count = len(rig)
+
+        def scale(columns: int) -> float:
+            wanted = max(1.0, _NARROWEST / (columns * across))
+            return min(widest / (columns * across), _ASPECT * widest / (-(-count // columns) * rows), wanted)
+
+        columns = max(range(1, count + 1), key=lambda n: (scale(n), -n))
+        cell = max(int(rows * scale(columns)), 1), max(int(across * scale(columns)), 1)
+        width, height = columns * cell[1], -(-count // columns) * cell[0]
+        return Grid(columns, scale(columns), cell, width + width % 2, height + height % 2)
+
+    def corner(self, index: int, shape: tuple[int, ...]) -> tuple[int, int]:
+        """Where a tile of this shape begins (y, x): in the middle of its cell."""
+        row, column = divmod(index, self.columns)
+        return (
+            row * self.cell[0] + max(self.cell[0] - shape[0], 0) // 2,
+            column * self.cell[1] + max(self.cell[1] - shape[1], 0) // 2,
+        )
+
+
+def draw_key(strip: Image, left: int, sigma: bool) -> None:
+    """What the colours mean, from ``left`` on: 300 pixels."""
+    for name, segment in (("left", "forearm_l"), ("right", "upper_arm_r")):
+        cv2.rectangle(strip, (left, 10), (left + 10, 20), SEGMENT_COLORS[segment], cv2.FILLED)
+        left = write(strip, name, left + 15, 20) + 14
+    if not sigma:
+        return
+    left = write(strip, "joint sigma  0", left + 6, 20) + 6
+    ramp = sigma_colors(np.linspace(0, SIGMA_MOST_M, 60))
+    strip[10:21, left : left + 60] = ramp[None]
+    cv2.rectangle(strip, (left - 1, 9), (left + 60, 21), INK, 1)
+    write(strip, f"{100 * SIGMA_MOST_M:.0f} cm", left + 68, 20)
+
+
+def draw_timeline(bar: Image, status: NDArray[np.uint8], row: int) -> None:
+    """The status of all frames along a bar, lost ones red, and where this frame is."""
+    width = bar.shape[1]
+    colors = np.array([_STATUS_COLORS[int(value)] for value in status], np.uint8)
+    place = np.arange(width) * len(status) // width
+    line = colors[place]
+    # a single lost frame of a long recording takes less than a pixel, and must not vanish
+    line[np.flatnonzero(status == Status.LOST) * width // len(status)] = LOST
+    bar[...] = line[None]
+    at = round((row + 0.5) / len(status) * width)
+    bar[:, max(at - 2, 0) : at + 2] = (255, 255, 255)
+
+
+def choose_frames(result: Result, frames: Sequence[int], count: int) -> list[int]:
+    """These frames of a result, ascending; without any, ``count`` spread over it.
+
+    Raises:
+        ResultError: one is not in the result.
+    """
+    known = result.frames.tolist()
+    missing = sorted(set(frames) - set(known))
+    if missing:
+        raise ResultError(f"{result.path}: frame {missing[0]} is not there; it has frames {min(known)} to {max(known)}")
+    spread = [known[i] for i in np.unique(np.linspace(0, len(known) - 1, count).astype(int))]
+    return sorted(set(frames)) or sorted(spread)
+
+
+def used_rig(rig: Rig, result: Result) -> Rig:
+    """The cameras of a capture as the run used them: refined, where the result tells of it."""
+    if result.cameras is None:
+        return rig
+    used = {camera.name: camera for camera in result.cameras.rig}
+    return Rig(
+        tuple(
+            used[c.name] if c.name in used and (used[c.name].width, used[c.name].height) == (c.width, c.height) else c
+            for c in rig
+        )
+    )
+
+
+def joined(tiles: Sequence[Image], axis: int) -> Image:
+    """Tiles beside (axis 1) or below (axis 0) each other, on white."""
+    across = max(tile.shape[1 - axis] for tile in tiles)
+    parts: list[Image] = []
+    for tile in tiles:
+        pad = [(0, 0), (0, 0), (0, 0)]
+        pad[1 - axis] = (0, across - tile.shape[1 - axis])
+        if parts:
+            pad[axis] = (_GAP, 0)
+        parts.append(np.pad(tile, pad, constant_values=255))
+    return np.concatenate(parts, axis=axis)
+
+
+def write_sheets(
+    overlay: Overlay,
+    folder: Path,
+    frames: Sequence[int] = (),
+    rows: int = 4,
+    tile_height: int = 360,
+    full: bool = False,
+) -> list[Path]:
+    """Write contact sheets of ``rows`` frames each as PNG, a column a camera; eight frames by default.
+
+    Raises:
+        ResultError: a frame is not in the result.
+        ExportError: a sheet cannot be written.
+    """
+    chosen = overlay.chosen(frames)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ExportError(f"{folder}: cannot be made: {error.strerror or error}") from None
+    written: list[Path] = []
+    sheet: list[tuple[int, Image]] = []
+    for frame, images in overlay.pictures(chosen):
+        sheet.append((frame, overlay.sheet_row(frame, images, tile_height, full)))
+        if len(sheet) == rows or frame == chosen[-1]:
+            path = folder / f"overlay-{sheet[0][0]:06d}-{sheet[-1][0]:06d}.png"
+            if not cv2.imwrite(str(path), joined([image for _, image in sheet], axis=0)):
+                raise ExportError(f"{path}: cannot be written")
+            written.append(path)
+            sheet = []
+    return written

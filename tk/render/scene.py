@@ -1,0 +1,235 @@
+"""A view from a camera of its own that turns about the person: body or hull, skeleton, cameras, floor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ResultError
+from tk.io.result import Result
+from tk.io.result_data import STATUS_MEANING
+from tk.model.camera import Camera, Rig
+from tk.model.skeleton import SEGMENTS
+from tk.model.up import up_vector
+from tk.render.canvas import Image, draw_joints, fixed, write
+from tk.render.figure import Figure, figure_of
+from tk.render.overlay import choose_frames, draw_key, draw_timeline
+from tk.render.palette import LOST, LOST_BODY, SEGMENT_COLORS, TEXT
+
+Float = NDArray[np.float64]
+
+WIDTH, HEIGHT = 960, 720
+_STRIP, _BAR = 30, 6
+_FIELD_OF_VIEW_DEG = 38.0
+_ELEVATION_DEG = 14.0
+_TURN_S = 16.0  # seconds of a whole turn
+_SQUARE_M, _SQUARES = 0.5, 6  # of the floor, and how many lie on each side of its middle
+_PYRAMID_M = 0.25  # how long a camera is drawn
+_BACKGROUND, _FLOOR, _WIRE = (34, 30, 28), (78, 70, 66), (190, 170, 150)
+_SUBPIXEL = 4
+_NEAREST_M = 0.05
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Where the person moves.
+
+    Attributes:
+        axes: (3, 3) two directions along the floor and up, as columns; right-handed.
+        middle: (3,) of the motion, metres.
+        radius: of a ball around it that holds the motion, metres.
+        floor: height of the floor along up, metres.
+    """
+
+    axes: Float
+    middle: Float
+    radius: float
+    floor: float
+
+    @staticmethod
+    def of(result: Result, figure: Figure) -> Stage:
+        """From the frames that are not lost (all, if all are). The floor is where the lowest feet stand."""
+        up = up_vector(result.meta.up)
+        good = [row for row in range(len(result)) if not figure.lost(row)] or list(range(len(result)))
+        points = figure.joints[good].reshape(-1, 3)
+        points = points[np.isfinite(points).all(axis=1)]
+        if not len(points):
+            raise ResultError(f"{result.path}: has no joints to draw")
+        side = np.eye(3)[np.argmin(np.abs(up))]
+        east = np.cross(side, up)
+        east /= np.linalg.norm(east)
+        low, high = points.min(axis=0), points.max(axis=0)
+        middle = (low + high) / 2
+        feet = figure.joints[good] if result.feet is None else result.feet[good]
+        heights = (feet @ up).min(axis=1)
+        heights = heights[np.isfinite(heights)]
+        # single frames may step through it
+        floor = float(np.percentile(heights, 10)) if len(heights) else float((points @ up).min())
+        radius = float(np.linalg.norm(points - middle, axis=1).max()) + 0.15
+        return Stage(np.column_stack([east, np.cross(up, east), up]), middle, radius, floor)
+
+
+class Scene:
+    """A result in three dimensions.
+
+    Args:
+        result: what was tracked.
+        rig: the cameras; those of the result by default, none where it tells of none.
+        hull: draw the stored hull, and not the body.
+
+    Raises:
+        ResultError: no frames, no hull although it is asked for, or a body that cannot be used.
+    """
+
+    def __init__(self, result: Result, rig: Rig | None = None, hull: bool = False) -> None:
+        if not len(result):
+            raise ResultError(f"{result.path}: has no frames")
+        if hull and result.hull is None:
+            raise ResultError(f"{result.path}: holds no hull; track with --method volumetric --store-hull")
+        self.result, self.hull = result, result.hull if hull else None
+        figure = figure_of(result)
+        self.figure = replace(figure, solids=tuple(solid.divided for solid in figure.solids), _placed={})
+        self.stage = Stage.of(result, self.figure)
+        self.rig = rig or (result.cameras.rig if result.cameras else None)
+        away = [] if self.rig is None else np.linalg.norm(self.rig.centers - self.stage.middle, axis=1)
+        fitting = self.stage.radius / np.sin(np.radians(_FIELD_OF_VIEW_DEG / 2))
+        # beyond the recording's own cameras, so that they are seen, too; not so far that the person gets small
+        self._distance = float(np.clip(1.15 * np.median(away), fitting, 2.2 * fitting)) if len(away) else fitting
+
+    def rows(self, frames: Sequence[int] = ()) -> list[int]:
+        """The rows of these frames, of all by default.
+
+        Raises:
+            ResultError: one is not in the result.
+        """
+        wanted = choose_frames(self.result, frames, len(self.result))
+        return np.flatnonzero(np.isin(self.result.frames, wanted)).tolist()
+
+    def picture(self, row: int) -> Image:
+        """A frame: (HEIGHT + strips, WIDTH, 3). The camera goes round once in 16 seconds of the recording."""
+        canvas = np.full((HEIGHT + _STRIP + _BAR, WIDTH, 3), _BACKGROUND, np.uint8)
+        tile = canvas[:HEIGHT]
+        turn = 2 * np.pi * (self.result.time[row] - self.result.time[0]) / _TURN_S
+        eye = self._camera(float(turn))
+        self._draw_floor(tile, eye)
+        self._draw_cameras(tile, eye)
+        lost = self.figure.lost(row)
+        if self.hull is not None:
+            positions, colors = self.hull[row].positions, self.hull[row].colors
+            _splat(tile, eye, positions.astype(np.float64), colors[:, ::-1])
+        else:
+            self._draw_body(tile, eye, row, lost)
+        sigma = None if self.figure.sigma is None else self.figure.sigma[row]
+        draw_joints(tile, eye.project(self.figure.joints[row])[0], sigma, lost)
+        if lost:
+            cv2.rectangle(tile, (0, 0), (WIDTH - 1, HEIGHT - 1), LOST, 5)
+        self._draw_legend(canvas[HEIGHT : HEIGHT + _STRIP], row, lost)
+        draw_timeline(canvas[HEIGHT + _STRIP :], self.figure.status, row)
+        return canvas
+
+    def _camera(self, turn: float) -> Camera:
+        """Looks at the middle from this angle about the vertical, radians."""
+        up = self.stage.axes[:, 2]
+        elevation = np.radians(_ELEVATION_DEG)
+        level = self.stage.axes @ np.array([np.cos(turn), np.sin(turn), 0.0])
+        forward = -(np.cos(elevation) * level + np.sin(elevation) * up)
+        right = np.cross(forward, up)
+        right /= np.linalg.norm(right)
+        R = np.stack([right, np.cross(forward, right), forward])
+        center = self.stage.middle - self._distance * forward
+        focal = 0.5 * HEIGHT / np.tan(np.radians(_FIELD_OF_VIEW_DEG / 2))
+        matrix = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
+        return Camera("view", WIDTH, HEIGHT, matrix, np.zeros(5), R, -R @ center)
+
+    def _draw_floor(self, tile: Image, eye: Camera) -> None:
+        east, north, up = self.stage.axes.T
+        middle = self.stage.middle + (self.stage.floor - self.stage.middle @ up) * up
+        reach = _SQUARE_M * _SQUARES
+        for k in np.linspace(-reach, reach, 2 * _SQUARES + 1):
+            for along, across in ((east, north), (north, east)):
+                _line(tile, eye, middle + k * across - reach * along, middle + k * across + reach * along, _FLOOR)
+
+    def _draw_cameras(self, tile: Image, eye: Camera) -> None:
+        for camera in self.rig or ():
+            corners = np.array([[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], float)
+            rays = (np.column_stack([camera.undistort(corners), np.ones(4)])) @ camera.rotation
+            ends = camera.center + _PYRAMID_M * rays
+            for k in range(4):
+                _line(tile, eye, camera.center, ends[k], _WIRE)
+                _line(tile, eye, ends[k], ends[(k + 1) % 4], _WIRE)
+            xy, depth = eye.project(camera.center)
+            if depth[0] > _NEAREST_M and np.isfinite(xy).all() and (np.abs(xy[0]) < 4 * WIDTH).all():
+                write(tile, camera.name, int(xy[0, 0]) + 8, int(xy[0, 1]) - 8, _WIRE)
+
+    def _draw_body(self, tile: Image, eye: Camera, row: int, lost: bool) -> None:
+        """The solids' faces, far ones first, each lit from where the viewer is."""
+        if not self.figure.solids or not np.isfinite(self.figure.transforms[row]).all():
+            return
+        polygons, depths, colors = [], [], []
+        seen = np.split(eye.to_camera(self.figure.placed(row)), self.figure.starts[1:-1])
+        for solid, points in zip(self.figure.solids, seen, strict=True):
+            corners = points[solid.faces]  # (N, 4, 3)
+            if (corners[..., 2] < _NEAREST_M).any():
+                continue
+            normal = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+            center = corners.mean(axis=1)
+            length = np.linalg.norm(normal, axis=1) * np.linalg.norm(center, axis=1)
+            facing = -(normal * center).sum(axis=1) / np.maximum(length, 1e-12)
+            shown = facing > 0
+            base = np.array(LOST_BODY if lost else SEGMENT_COLORS[SEGMENTS[solid.segment]])
+            polygons.append(corners[shown] @ eye.matrix.T)
+            depths.append(center[shown, 2])
+            colors.append(base * (0.35 + 0.65 * facing[shown, None]))
+        if not polygons:
+            return
+        homogeneous, shades = np.concatenate(polygons), np.concatenate(colors).round().astype(int)
+        corners2 = fixed(homogeneous[..., :2] / homogeneous[..., 2:])
+        for k in np.argsort(-np.concatenate(depths)):
+            cv2.fillConvexPoly(tile, corners2[k], shades[k].tolist(), cv2.LINE_8, _SUBPIXEL)
+
+    def _draw_legend(self, strip: Image, row: int, lost: bool) -> None:
+        strip[...] = LOST if lost else 24
+        state = "LOST: do not use this pose" if lost else STATUS_MEANING[self.figure.status[row]]
+        write(strip, f"frame {self.figure.frames[row]}   {self.result.time[row]:.2f} s   {state}", 10, 20, TEXT, 0.5)
+        draw_key(strip, WIDTH - 310, self.figure.sigma is not None)
+
+
+def _line(tile: Image, eye: Camera, a: Float, b: Float, color: tuple[int, int, int]) -> None:
+    """A line between two points of the world, cut off before the eye."""
+    ends = eye.to_camera(np.stack([a, b]))
+    behind = ends[:, 2] < _NEAREST_M
+    if behind.all():
+        return
+    if behind.any():
+        share = (_NEAREST_M - ends[0, 2]) / (ends[1, 2] - ends[0, 2])
+        ends[int(np.flatnonzero(behind)[0])] = ends[0] + share * (ends[1] - ends[0])
+    pixels = ends @ eye.matrix.T
+    start, stop = fixed(pixels[:, :2] / pixels[:, 2:])
+    cv2.line(tile, start, stop, color, 1, cv2.LINE_AA, _SUBPIXEL)
+
+
+def _splat(tile: Image, eye: Camera, points: Float, colors: NDArray[np.uint8]) -> None:
+    """Points as squares of the size of a voxel, near ones over far ones."""
+    if not len(points):
+        return
+    xy, depth = eye.project(points)
+    shown = np.flatnonzero(np.isfinite(xy).all(axis=1) & (depth > _NEAREST_M))
+    order = shown[np.argsort(-depth[shown])]
+    spacing = _spacing(points)
+    size = int(np.clip(np.ceil(spacing * eye.matrix[0, 0] / np.median(depth)), 1, 15))
+    x, y = np.rint(xy[order]).astype(int).T
+    for dy in range(-(size // 2), size - size // 2):
+        for dx in range(-(size // 2), size - size // 2):
+            inside = (x + dx >= 0) & (x + dx < tile.shape[1]) & (y + dy >= 0) & (y + dy < tile.shape[0])
+            tile[y[inside] + dy, x[inside] + dx] = colors[order[inside]]
+
+
+def _spacing(points: Float) -> float:
+    """How far apart the voxels of a grid are, metres."""
+    steps = np.concatenate([np.diff(np.unique(points[:, axis].round(5))) for axis in range(3)])
+    steps = steps[steps > 1e-4]
+    return float(np.median(steps)) if len(steps) else 0.02

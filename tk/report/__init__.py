@@ -1,0 +1,1 @@
+"""A result as one self-contained HTML page: nothing is loaded from anywhere else."""

@@ -1,0 +1,157 @@
+"""What a report tells of a result, as plain values for JSON. Arrays go as base64 of little-endian float32."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tk.io.result import Result, Status
+from tk.io.result_data import STATUS_MEANING
+from tk.model.camera import Rig
+from tk.model.skeleton import JOINTS, SEGMENTS
+from tk.render.figure import AROUND, BONES, Figure, figure_of
+from tk.render.palette import BONE, LOST, LOST_BODY, SEGMENT_COLORS, SIGMA_MOST_M, hexadecimal, sigma_colors
+from tk.render.scene import Stage
+
+Float = NDArray[np.float64]
+
+#: how many stops of the scale of σ's colours are handed over
+_SIGMA_STOPS = 9
+_PYRAMID_M = 0.25  # how long a camera is drawn
+#: flexion at the middle joint of three
+_HINGES = {"elbow": ("shoulder", "elbow", "wrist"), "knee": ("hip", "knee", "ankle")}
+
+
+def describe(result: Result, rig: Rig | None = None) -> dict[str, Any]:
+    """Everything but the pictures.
+
+    Args:
+        result: with one frame at least.
+        rig: the cameras, where the result does not tell them.
+
+    Raises:
+        ResultError: the body cannot be used, or there is nothing to draw.
+    """
+    meta = result.meta
+    figure = figure_of(result)
+    return {
+        "capture": meta.capture,
+        "method": meta.method,
+        "fps": meta.fps,
+        "software": result.software,
+        "created": result.created,
+        "seed": meta.seed,
+        "settings": meta.config_toml,
+        "notes": list(result.notes),
+        "frames": result.frames.tolist(),
+        "time": result.time.round(4).tolist(),
+        "status": result.status.tolist(),
+        "statusWords": list(STATUS_MEANING),
+        "lostStatus": int(Status.LOST),
+        "scene": _scene(result, figure, rig),
+        "joints": list(JOINTS),
+        "sigma": None if figure.sigma is None else packed(figure.sigma),
+        "cameras": list(meta.fit_cameras),
+        "fitError": None if result.fit_error is None else packed(result.fit_error),
+        "objective": packed(result.objective),
+        "objectiveKind": meta.objective_kind,
+        "angles": _angles(result, figure),
+        "timing": _timing(result),
+        "colors": {
+            "segments": {name: hexadecimal(color) for name, color in SEGMENT_COLORS.items()},
+            "lost": hexadecimal(LOST),
+            "lostBody": hexadecimal(LOST_BODY),
+            "bone": hexadecimal(BONE),
+            "sigma": sigma_colors(np.linspace(0, SIGMA_MOST_M, _SIGMA_STOPS))[:, ::-1].tolist(),
+            "sigmaMost": SIGMA_MOST_M,
+        },
+    }
+
+
+def packed(values: ArrayLike) -> dict[str, Any]:
+    """An array as its shape and base64 of float32; what is not finite is NaN."""
+    array = np.asarray(values, dtype="<f4")
+    array = np.where(np.isfinite(array), array, np.float32(np.nan))
+    return {"shape": list(array.shape), "data": base64.b64encode(array.tobytes()).decode("ascii")}
+
+
+def _scene(result: Result, figure: Figure, rig: Rig | None) -> dict[str, Any]:
+    """Joints, body and cameras in the frame of the floor: x, y along it, z up, the motion's middle above the origin."""
+    stage = Stage.of(result, figure)
+    up = stage.axes[:, 2]
+    origin = stage.middle + (stage.floor - stage.middle @ up) * up
+    T = np.eye(4)
+    T[:3, :3] = stage.axes.T
+    T[:3, 3] = -stage.axes.T @ origin
+    cameras = result.cameras.rig if result.cameras else rig
+    carrying = sorted({solid.segment for solid in figure.solids})
+    return {
+        "joints": packed(figure.joints @ T[:3, :3].T + T[:3, 3]),
+        "bones": [[JOINTS.index(a), JOINTS.index(b)] for a, b in BONES],
+        "around": AROUND,
+        "segments": [SEGMENTS[k] for k in carrying],
+        "transforms": packed((T @ figure.transforms[:, carrying])[:, :, :3]),
+        "solids": [
+            {"segment": carrying.index(solid.segment), "rings": packed(solid.divided.rings)} for solid in figure.solids
+        ],
+        "cameras": [
+            {"name": camera.name, "points": packed(_pyramid(camera) @ T[:3, :3].T + T[:3, 3])}
+            for camera in cameras or ()
+        ],
+        "radius": stage.radius,
+        "height": float((stage.middle - origin) @ up),
+    }
+
+
+def _pyramid(camera: Any) -> Float:
+    """(5, 3) a camera's centre and the corners of its picture held before it, metres, world frame."""
+    w, h = camera.width, camera.height
+    rays = np.column_stack([camera.undistort([[0, 0], [w, 0], [w, h], [0, h]]), np.ones(4)]) @ camera.rotation
+    return np.vstack([camera.center, camera.center + _PYRAMID_M * rays])
+
+
+def _angles(result: Result, figure: Figure) -> list[dict[str, Any]]:
+    """A panel an angle; both sides of a pair share one. Flexion of elbows and knees has a standard deviation."""
+    panels: dict[str, dict[str, Any]] = {}
+    for joint in result.meta.angles:
+        side = joint.joint[-2:] if joint.joint.endswith(("_l", "_r")) else ""
+        base = joint.joint.removesuffix(side)
+        for column, name in enumerate(joint.names):
+            title = f"{base} {name}".replace("_", " ")
+            panel = panels.setdefault(
+                title, {"title": title[0].upper() + title[1:], "convention": joint.convention, "lines": []}
+            )
+            line: dict[str, Any] = {"side": {"_l": "left", "_r": "right", "": "middle"}[side]}
+            line |= {"values": packed(result.angles[joint.joint][:, column])}
+            if name == "flexion" and base in _HINGES and figure.sigma is not None:
+                line |= {"sigma": packed(hinge_sigma_deg(figure, [part + side for part in _HINGES[base]]))}
+            panel["lines"].append(line)
+    return list(panels.values())
+
+
+def hinge_sigma_deg(figure: Figure, joints: Sequence[str]) -> Float:
+    """(F,) standard deviation of the angle at the middle one of three joints, degrees.
+
+    To first order, the three positions' errors taken as independent and alike along all axes.
+    """
+    index = [JOINTS.index(name) for name in joints]
+    A, B, C = np.moveaxis(figure.joints[:, index], 1, 0)
+    assert figure.sigma is not None
+    a, b, c = np.moveaxis(figure.sigma[:, index], 1, 0)
+    u, v = A - B, C - B
+    p, q = np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cosine = (u * v).sum(axis=1) / (p * q)
+        # moved alike, the ends turn the limb and the middle stays; moved against each other they bend it
+        middle = 1 / p**2 + 1 / q**2 - 2 * cosine / (p * q)
+        return np.asarray(np.degrees(np.sqrt((a / p) ** 2 + (c / q) ** 2 + b**2 * middle)))
+
+
+def _timing(result: Result) -> list[dict[str, Any]]:
+    """Milliseconds a frame of every stage, means."""
+    means = {stage: 1e3 * float(np.nanmean(values)) if len(values) else 0.0 for stage, values in result.timing.items()}
+    return [{"stage": stage, "ms": ms} for stage, ms in means.items() if np.isfinite(ms)]

@@ -1,0 +1,251 @@
+"use strict";
+// Fills the page from the data, and keeps everything at the same frame.
+
+(function () {
+  const data = JSON.parse(document.getElementById("data").textContent);
+  const get = (id) => document.getElementById(id);
+  const count = data.frames.length;
+  const lost = data.status.map((status) => status === data.lostStatus);
+  const lostCount = lost.filter(Boolean).length;
+  const fitError = data.fitError && unpack(data.fitError);
+  const sigma = data.sigma && unpack(data.sigma);
+  const objective = unpack(data.objective);
+  const C = data.cameras.length, J = data.joints.length;
+  const segments = data.colors.segments;
+  const root = document.documentElement.style;
+  root.setProperty("--left-deep", segments.upper_arm_l);
+  root.setProperty("--left-pale", segments.forearm_l);
+  root.setProperty("--right-deep", segments.upper_arm_r);
+  root.setProperty("--right-pale", segments.forearm_r);
+
+  const make = (name, text = "", className = "") => {
+    const made = document.createElement(name);
+    made.textContent = text;
+    if (className) made.className = className;
+    return made;
+  };
+  const quantile = (values, share) => {
+    const sorted = Array.from(values).filter((value) => isFinite(value)).sort((a, b) => a - b);
+    return sorted.length ? sorted[Math.min(sorted.length - 1, Math.floor(share * sorted.length))] : NaN;
+  };
+  const column = (values, width, k) => Array.from({ length: values.length / width }, (_, row) => values[row * width + k]);
+  const good = (values) => values.filter((_, row) => !lost[row]);
+  const joint = (name) => name.replace(/^(.*)_([lr])$/, (_, part, side) => `${side === "l" ? "left" : "right"} ${part}`).replace("_", " ");
+
+  // --- head
+  get("title").textContent = data.capture;
+  const when = data.created.slice(0, 16).replace("T", " ");
+  get("subtitle").textContent = `${data.file} · ${count} frames at ${short(data.fps)} Hz · method ${data.method} · ${data.software}${when ? ` · ${when} UTC` : ""}`;
+  const tell = (name, value, unit = "", bad = false) => {
+    const box = make("div", "", bad ? "bad" : "");
+    const number = make("dd", value);
+    if (unit) number.append(" ", make("small", unit));
+    box.append(make("dt", name), number);
+    get("figures").append(box);
+  };
+  tell("lost frames", String(lostCount), `of ${count}`, lostCount > 0);
+  const meanError = fitError && Array.from({ length: count }, (_, row) => {
+    const told = Array.from(fitError.subarray(row * C, row * C + C)).filter(isFinite);
+    return told.length ? told.reduce((a, b) => a + b) / told.length : NaN;
+  });
+  if (meanError) tell("E_S, median frame", short(100 * quantile(good(meanError), 0.5)), "%");
+  if (sigma) tell("σ of a joint, median", short(1000 * quantile(sigma, 0.5)), "mm");
+  const total = data.timing.find(({ stage }) => stage === "total");
+  if (total) tell("time a frame, mean", short(total.ms), "ms");
+
+  // --- the frame that is shown
+  const viewer = new Viewer(get("view"), data);
+  const charts = [];
+  let row = -1, playing = false, clock = 0, startedAt = 0, startedTime = 0;
+  const bars = (holder, title, names, unit) => {
+    const box = make("div", "", "bars");
+    box.append(make("b", title));
+    const made = names.map((name) => {
+      const fill = make("i"), track = make("span", "", "track"), number = make("span", "", "number");
+      track.append(fill);
+      box.append(make("span", name), track, number);
+      return (value, most, color) => {
+        fill.style.width = `${isFinite(value) ? Math.min(100, 100 * value / most) : 0}%`;
+        if (color) fill.style.background = color;
+        number.textContent = isFinite(value) ? `${short(value)} ${unit}` : "–";
+      };
+    });
+    get(holder).append(box);
+    return made;
+  };
+  const errorBars = fitError ? bars("now-cameras", "E_S of each camera", data.cameras, "%") : [];
+  const sigmaBars = sigma ? bars("now-joints", "σ of each joint", data.joints.map(joint), "mm") : [];
+  if (!fitError && !sigma) get("now-joints").append(make("p", "This result tells neither E_S nor σ.", "muted"));
+  const mostError = fitError ? Math.max(quantile(fitError, 0.99) * 100, 1) : 1;
+
+  function show(wanted) {
+    const next = Math.min(Math.max(wanted, 0), count - 1);
+    if (next === row) return;
+    row = next;
+    viewer.show(row);
+    get("scrubber").value = row;
+    get("scrubber").setAttribute("aria-valuetext", `frame ${data.frames[row]}, ${data.statusWords[data.status[row]]}`);
+    get("clock").textContent = `frame ${data.frames[row]} · ${data.time[row].toFixed(2)} s`;
+    get("status").textContent = data.statusWords[data.status[row]];
+    get("status").dataset.status = data.status[row];
+    get("badge").hidden = !lost[row];
+    document.querySelector(".stage").classList.toggle("lost", lost[row]);
+    errorBars.forEach((set, k) => set(100 * fitError[row * C + k], mostError));
+    sigmaBars.forEach((set, k) => {
+      const value = sigma[row * J + k];
+      set(1000 * value, 1000 * data.colors.sigmaMost, isFinite(value) ? sigmaColor(data.colors, value) : "");
+    });
+    for (const chart of charts) chart.show(row);
+    drawStrip();
+  }
+
+  // --- time
+  const speed = () => Number(get("speed").value);
+  function play(on) {
+    playing = on;
+    if (on && row === count - 1) show(0);
+    startedAt = performance.now();
+    startedTime = data.time[row];
+    get("play").textContent = on ? "❚❚" : "▶";
+    get("play").setAttribute("aria-label", on ? "Stop" : "Play");
+    cancelAnimationFrame(clock);
+    if (on) clock = requestAnimationFrame(tick);
+  }
+  function tick(now) {
+    const time = startedTime + Math.max(now - startedAt, 0) / 1000 * speed();
+    let next = row;
+    while (next + 1 < count && data.time[next + 1] <= time) next++;
+    show(next);
+    if (row === count - 1) play(false);
+    else if (playing) clock = requestAnimationFrame(tick);
+  }
+  const seek = (wanted) => { play(false); show(wanted); };
+  get("scrubber").max = count - 1;
+  get("scrubber").addEventListener("input", (event) => seek(Number(event.target.value)));
+  get("play").addEventListener("click", () => play(!playing));
+  get("speed").addEventListener("change", () => play(playing));
+  document.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.altKey || event.metaKey || event.target.matches("select, summary")) return;
+    const step = event.shiftKey ? 10 : 1;
+    const jumps = { ArrowLeft: row - step, ArrowRight: row + step, Home: 0, End: count - 1 };
+    if (event.key === " " && !event.target.matches("input[type=checkbox], #shots button")) play(!playing);
+    else if (event.key in jumps) seek(jumps[event.key]);
+    else return;
+    event.preventDefault();
+  });
+  // a button takes the space bar for itself when it is let go
+  document.addEventListener("keyup", (event) => {
+    if (event.key === " " && event.target === get("play")) event.preventDefault();
+  });
+  for (const [id, part] of [["show-body", "body"], ["show-bones", "bones"], ["show-cameras", "cameras"]]) {
+    get(id).addEventListener("change", (event) => { viewer.shown[part] = event.target.checked; viewer.draw(); });
+  }
+  if (!viewer.solids.length) get("show-body").parentElement.remove();
+  if (!viewer.cameras.length) get("show-cameras").parentElement.remove();
+
+  function drawStrip() {
+    const strip = get("strip"), width = strip.width = strip.clientWidth, pen = strip.getContext("2d");
+    const style = getComputedStyle(document.documentElement);
+    const colors = ["--ok", "--initialised", "--recovered", "--lost"].map((name) => style.getPropertyValue(name).trim());
+    // lost frames last and a pixel wide at least: one of ten thousand must not vanish
+    for (const wanted of [false, true]) {
+      data.status.forEach((status, k) => {
+        if (lost[k] !== wanted) return;
+        pen.fillStyle = colors[status];
+        pen.fillRect(Math.floor(k / count * width), 0, Math.max(Math.ceil(width / count), 1), 8);
+      });
+    }
+  }
+  new ResizeObserver(drawStrip).observe(get("strip"));
+
+  // --- curves
+  const common = { time: data.time, lost, seek };
+  const hues = Array.from({ length: 9 }, (_, k) => `var(--hue-${k})`);
+  if (meanError) {
+    get("quality-text").textContent = "E_S is the share of pixels that the body explains wrongly. Red: lost frames. A click on a curve goes to its frame.";
+    charts.push(new Chart(get("quality-charts"), {
+      ...common, title: "E_S of each camera", unit: " %", width: 1240, height: 190, zero: true, digits: 1,
+      lines: data.cameras.map((name, k) => ({ name, color: hues[k % hues.length], values: column(fitError, C, k).map((v) => 100 * v) })),
+    }));
+  } else {
+    get("quality-text").textContent = "This result does not tell E_S. Red: lost frames. A click on a curve goes to its frame.";
+  }
+  const kind = data.objectiveKind ? ` (${data.objectiveKind})` : "";
+  charts.push(new Chart(get("quality-charts"), {
+    ...common, title: `Objective${kind}`, unit: "", width: 1240, height: 110, zero: true,
+    lines: [{ name: "", color: "var(--accent)", values: Array.from(objective) }],
+  }));
+  const tints = { left: "var(--left)", right: "var(--right)", middle: "var(--middle)" };
+  if (data.angles.length) {
+    const banded = data.angles.some(({ lines }) => lines.some((line) => line.sigma));
+    get("angles-text").textContent = "Degrees. Left warm, right cool; conventions on the titles, after the ISB where it has them. "
+      + (banded ? "Bands: ± one σ, from the positions of the three joints taken as independent; the other angles' σ is not known." : "No σ is known.");
+    for (const panel of data.angles) {
+      charts.push(new Chart(get("angle-charts"), {
+        ...common, title: panel.title, unit: "°", hint: panel.convention, wraps: true, least: 20, digits: 1,
+        lines: panel.lines.map((line) => ({
+          name: line.side === "middle" ? "" : line.side, color: tints[line.side],
+          values: Array.from(unpack(line.values)), sigma: line.sigma && Array.from(unpack(line.sigma)),
+        })),
+      }));
+    }
+  } else {
+    get("angles-text").textContent = "This result does not tell the joints' angles.";
+  }
+
+  // --- pictures
+  get("pictures-text").textContent = data.pictures.length
+    ? "The tracked body over the pictures: left limbs warm, right limbs cool. Dots are joints, from pale yellow (sure) to dark violet (σ of 5 cm and more). A click goes to the frame."
+    : "No pictures: the report was made without the capture. tk report RESULT.h5 CAPTURE adds them.";
+  for (const picture of data.pictures) {
+    const figure = make("figure"), caption = make("figcaption"), button = make("button"), image = make("img");
+    const at = `frame ${data.frames[picture.row]}, ${data.time[picture.row].toFixed(2)} s`;
+    caption.append(make("b", at), ` · ${picture.why}`);
+    image.alt = `Overlay of ${at}, all cameras`;
+    image.src = `data:image/jpeg;base64,${picture.jpeg}`;
+    button.type = "button";
+    button.setAttribute("aria-label", `Go to ${at}`);
+    button.append(image);
+    button.addEventListener("click", () => { seek(picture.row); scrollTo({ top: 0, behavior: "smooth" }); });
+    figure.append(caption, button);
+    get("shots").append(figure);
+  }
+
+  // --- tables
+  const line = (cells, kind = "td") => {
+    const made = make("tr");
+    cells.forEach((cell, k) => {
+      const box = make(kind, typeof cell === "string" ? cell : "", k && typeof cell === "string" ? "number" : "");
+      if (typeof cell !== "string") box.append(cell);
+      made.append(box);
+    });
+    return made;
+  };
+  if (sigma) {
+    get("sigma-text").textContent = "One standard deviation of a position along an axis, millimetres, frames that are not lost.";
+    get("sigma-table").append(line(["joint", "median", "90 %", "largest"], "th"));
+    data.joints.forEach((name, k) => {
+      const values = good(column(sigma, J, k));
+      get("sigma-table").append(line([joint(name), ...[0.5, 0.9, 1].map((share) => short(1000 * quantile(values, share)))]));
+    });
+  } else {
+    get("sigma-text").textContent = "This result does not tell σ.";
+  }
+  get("times-text").textContent = "Milliseconds, means. Decoding and masks run ahead in a process of their own and are no part of the total.";
+  get("times-table").append(line(["stage", "", "ms"], "th"));
+  const longest = Math.max(...data.timing.map(({ ms }) => ms), 1e-9);
+  for (const { stage, ms } of data.timing) {
+    const track = make("div", "", "track"), fill = make("i");
+    fill.style.width = `${100 * ms / longest}%`;
+    track.append(fill);
+    get("times-table").append(line([stage.replace("_", " "), track, short(ms)]));
+  }
+
+  // --- words
+  for (const note of data.notes.length ? data.notes : ["Nothing that is kept in the result."]) get("notes").append(make("li", note));
+  get("settings").textContent = data.settings;
+  get("foot").textContent = `Made by ${data.software} from ${data.file}; seed ${data.seed}. The page is complete by itself.`;
+
+  show(0);
+  window.report = { show, play, get row() { return row; }, get playing() { return playing; }, count };
+})();

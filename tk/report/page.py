@@ -1,0 +1,92 @@
+"""The page: template, style, scripts and data in one text."""
+
+from __future__ import annotations
+
+import html
+import json
+from pathlib import Path
+from typing import Any
+
+from tk.errors import ResultError
+from tk.io.capture import open_capture
+from tk.io.result import Result, read_result
+from tk.model.camera import Rig
+from tk.render.files import check_target, replacing
+from tk.render.overlay import Overlay
+from tk.report.data import describe
+from tk.report.pictures import choose_rows, embedded, shot
+
+_SCRIPTS = ("viewer.js", "charts.js", "page.js")
+_GENERATOR = '<meta name="generator" content="tk">'
+
+
+def build_page(result: Result, pictures: list[dict[str, Any]], rig: Rig | None = None) -> str:
+    """The page of a result.
+
+    Args:
+        result: with one frame at least.
+        pictures: of :func:`tk.report.pictures.embedded`.
+        rig: the cameras, where the result does not tell them.
+
+    Raises:
+        ResultError: the result cannot be drawn.
+    """
+    if not len(result):
+        raise ResultError(f"{result.path}: has no frames")
+    data = describe(result, rig) | {"file": result.path.name, "pictures": pictures}
+    # "<" could end the script element
+    text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    page = _read("page.html")
+    for mark, content in (
+        ("TITLE", html.escape(f"{result.meta.capture}: {result.path.name}")),
+        ("STYLE", _read("style.css")),
+        ("DATA", text),
+        ("SCRIPT", "\n".join(_read(name) for name in _SCRIPTS)),
+    ):
+        page = page.replace(f"{{{{{mark}}}}}", content, 1)
+    return page
+
+
+def write_page(path: Path, page: str) -> None:
+    """Write it under a temporary name first.
+
+    Raises:
+        ExportError: it cannot be written.
+    """
+    with replacing(path) as part:
+        part.write_text(page, encoding="utf-8")
+
+
+def made_here(path: Path) -> bool:
+    """Whether a file is a report of tk."""
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            return _GENERATOR in file.read(4096)
+    except OSError:
+        return False
+
+
+def report(result_path: Path, capture_path: Path | None, output: Path | None, force: bool = False) -> Path:
+    """What `tk report` does; the file that was written.
+
+    Raises:
+        TkError: result or capture cannot be used, or the page cannot be written.
+    """
+    result = read_result(result_path)
+    if not len(result):
+        raise ResultError(f"{result_path}: has no frames")
+    target = check_target(output or result_path.with_suffix(".html"), force)
+    shown: list[dict[str, Any]] = []
+    rig = None
+    if capture_path is not None:
+        overlay = Overlay(open_capture(capture_path, masks="none"), result)
+        choices, rig = choose_rows(result), overlay.rig
+        frames = [int(result.frames[choice.row]) for choice in choices]
+        shots = {overlay.row_of[frame]: shot(overlay, frame, images) for frame, images in overlay.pictures(frames)}
+        shown = embedded(choices, shots)
+    write_page(target, build_page(result, shown, rig))
+    return target
+
+
+def _read(name: str) -> str:
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")

@@ -1,0 +1,77 @@
+"""The frames that a report shows pictures of, and why these."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.io.result import Result, Status
+from tk.render.overlay import Overlay
+
+_WORST, _TYPICAL = 3, 2
+_WIDTH = 1400  # of a picture with all cameras side by side, pixels
+_QUALITY = 80  # of JPEG
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A row of the result and why it is shown."""
+
+    row: int
+    why: str
+
+
+def choose_rows(result: Result) -> list[Choice]:
+    """The first lost frame, the worst, and typical ones; frames spread over the result where no E_S is told."""
+    count = len(result)
+    lost = result.status == Status.LOST
+    error = np.full(count, np.nan)
+    if result.fit_error is not None and result.fit_error.size:
+        told = np.isfinite(result.fit_error).any(axis=1)
+        error[told] = np.nanmean(result.fit_error[told], axis=1)
+    chosen: dict[int, str] = {}
+    apart = max(2, count // 20)
+
+    def take(order: NDArray[np.int64], why: str, most: int) -> None:
+        for row in order.tolist():
+            if most == 0:
+                return
+            if np.isfinite(error[row]) and all(abs(row - other) >= apart for other in chosen):
+                chosen[row] = f"{why}: mean E_S {100 * error[row]:.0f} %"
+                most -= 1
+
+    if lost.any():
+        chosen[int(np.argmax(lost))] = "first lost frame"
+    good = np.flatnonzero(~lost)
+    if np.isfinite(error[good]).any():
+        take(good[np.argsort(-np.nan_to_num(error[good], nan=-1.0), kind="stable")], "among the worst", _WORST)
+        middle = float(np.nanmedian(error[good]))
+        take(good[np.argsort(np.abs(error[good] - middle), kind="stable")], "typical", _TYPICAL)
+    else:
+        for row in np.unique(np.linspace(0, count - 1, _WORST + _TYPICAL).astype(int)).tolist():
+            chosen.setdefault(row, "spread over the recording")
+    return [Choice(row, why) for row, why in chosen.items()]
+
+
+def shot(overlay: Overlay, frame: int, images: NDArray[np.uint8]) -> bytes:
+    """A JPEG of a frame: the person in all cameras."""
+    height = int(np.clip(_WIDTH / (0.75 * len(overlay.rig)), 160, 300))
+    _, data = cv2.imencode(
+        ".jpg", overlay.sheet_row(frame, images, height, truth=False), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    )
+    return data.tobytes()
+
+
+def embedded(choices: list[Choice], shots: Mapping[int, bytes]) -> list[dict[str, Any]]:
+    """The pictures for the page, in the order of the choices; ``shots`` by row."""
+    return [
+        {"row": choice.row, "why": choice.why, "jpeg": base64.b64encode(shots[choice.row]).decode("ascii")}
+        for choice in choices
+        if choice.row in shots
+    ]
