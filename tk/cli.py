@@ -65,8 +65,9 @@ _capture = click.argument("capture", type=click.Path(path_type=Path))
 _cameras = click.option("--cameras", metavar="A,B,…", help="Use these cameras only.")
 _frames = click.option("--frames", metavar="A:B", help="Frames A to B-1; either may be left out.")
 _masks = click.option(
-    "--masks", default="auto", show_default=True, metavar="auto|none|DIR",
-    help="The capture's masks where it has some, none (segment the videos), or a folder of masks.",
+    "--masks", default="auto", show_default=True, metavar="auto|none|median|DIR",
+    help="auto: the capture's masks, else its empty scene, else an installed segmenter; none: not its masks; "
+    "median: over the recording, for the empty scene; DIR: a folder of masks.",
 )  # fmt: skip
 _voxels = click.option("--voxels", type=int, help="Voxels along the working volume's longest side.  [default: 64]")
 _config = click.option("--config", "config_file", type=click.Path(path_type=Path), help="Settings, TOML.")
@@ -185,6 +186,27 @@ def reconstruct(
     with _Report() as report:
         count = reconstruction.reconstruct(opened, output, config, report, span, ply)
     click.echo(f"{count} frames in {output}", err=True)
+
+
+@main.command()
+@_capture
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="DIR")
+@click.option("--segmenter", metavar="NAME", help="Which one, where several are installed.")
+@_cameras
+@_frames
+def masks(capture: Path, output: Path, segmenter: str | None, cameras: str | None, frames: str | None) -> None:
+    """Let a segmenter make masks of CAPTURE's videos: DIR/CAMERA/000000.png, the person white.
+
+    The same command goes on where it was stopped. Example: tk masks CAPTURE -o masks; tk track CAPTURE --masks masks
+    """
+    from tk import mask_folder
+    from tk.io.capture import open_capture
+
+    span = _span(frames)
+    opened = open_capture(capture, _names(cameras), "none")
+    with _Report() as report:
+        written = mask_folder.write_masks(opened, output, report, segmenter, span)
+    click.echo(f"masks of {written.frames} frames in {output}, {written.now} of them new", err=True)
 
 
 @main.command()

@@ -246,6 +246,10 @@ class CoarseHull:
         sizes[0] = 0
         return np.asarray(parts.reshape(-1) == sizes.argmax(), np.bool_)
 
+    def litres(self, voxels: Mask) -> float:
+        """Of voxels (N,)."""
+        return float(1000 * self._grid.voxel_m**3 * np.count_nonzero(voxels))
+
     def points(self, voxels: Mask, c: int) -> Float:
         """(M, 2) where a picture shows voxels (N,), pixels; those that it does not show are left out."""
         return self._xy[c, voxels & self._in_view[c]].astype(np.float64)

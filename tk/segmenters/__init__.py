@@ -1,4 +1,4 @@
-"""Segmenters: networks that tell which pixels of a picture show a person, where there is no empty scene to compare with.
+"""Segmenters: networks that tell which pixels of a picture show a person, with no empty scene to compare with.
 
 :class:`~tk.segmenters.blazepose.BlazePose` is built in. A package adds another one with an entry point of the group
 ``tk.segmenters``: its name, and what makes an object with the protocol :class:`Segmenter`, called without arguments.
@@ -19,7 +19,8 @@ from tk.model.subject import Sighting
 GROUP = "tk.segmenters"
 
 _BUILT_IN = "mediapipe"
-_INSTALL = "pip install tk-mocap[segmenter]"
+#: how to get the built-in one
+INSTALL = "pip install tk-mocap[segmenter]"
 
 
 class Segmenter(Protocol):
@@ -61,7 +62,7 @@ def load(name: str) -> Segmenter:
                 raise ConfigError(f"segmenter {name}: {entry.value} cannot be loaded: {error!r}") from error
             return made
     if name != _BUILT_IN or name not in names():
-        known = ", ".join(names()) or f"none; {_INSTALL} adds {_BUILT_IN}"
+        known = ", ".join(names()) or f"none; {INSTALL} adds {_BUILT_IN}"
         raise ConfigError(f"segmenter {name}: is not installed; installed: {known}")
     from tk.segmenters.blazepose import BlazePose
 

@@ -2,8 +2,8 @@
 
 The detector tells each person's mid-hip point and the radius of the circle about it that holds the whole body. The pose
 network looks at one upright square with one person in it; beside the landmarks, which are not used here, it gives a
-mask of 256×256. The same figures as MediaPipe's own graph, but that nothing is carried over from frame to frame, and that
-the square is chosen by the caller, who has several cameras.
+mask of 256×256. The same figures as MediaPipe's own graph, but that nothing is carried over from frame to frame, and
+that the square is chosen by the caller, who has several cameras.
 """
 
 from __future__ import annotations
@@ -44,14 +44,13 @@ class BlazePose:
     def find(self, picture: NDArray[np.uint8]) -> list[Sighting]:
         """The people in a picture (h, w, 3) BGR, the surest first."""
         square, scale = _in_square(picture, _DETECTOR_SIDE)
-        found = self._detector(square.astype(np.float32) / 127.5 - 1)
+        found = self._detector(square / np.float32(127.5) - 1)
         rows, logits = (found[i][0] for i in np.argsort([-array.shape[-1] for array in found]))
         scores = 1 / (1 + np.exp(-np.clip(logits[:, 0].astype(np.float64), -100, 100)))
         sure = np.flatnonzero(scores >= _LEAST_SCORE)
         sure = sure[np.argsort(-scores[sure], kind="stable")]
         hips, circle = (
-            (rows[sure, part] + self._anchors[sure] * _DETECTOR_SIDE) / scale - 0.5
-            for part in (_HIPS, _CIRCLE)
+            (rows[sure, part] + self._anchors[sure] * _DETECTOR_SIDE) / scale - 0.5 for part in (_HIPS, _CIRCLE)
         )
         weight, people = scores[sure], []
         while len(hips):
@@ -69,7 +68,7 @@ class BlazePose:
         """(h, w) the probability of each pixel to show the person about the picture's (h, w, 3) middle."""
         height, width = picture.shape[:2]
         square, _ = _in_square(picture, _POSE_SIDE)
-        (logits,) = (a for a in self._pose(square.astype(np.float32) / 255) if a.shape[1:3] == (_POSE_SIDE,) * 2)
+        (logits,) = (a for a in self._pose(square / np.float32(255)) if a.shape[1:3] == (_POSE_SIDE,) * 2)
         side = max(height, width)
         # enlarged before the threshold, so that the outline is finer than the network's pixels
         whole = cv2.resize(logits[0, :, :, 0], (side, side), interpolation=cv2.INTER_LINEAR)
@@ -87,9 +86,9 @@ class _Network:
         self._input = self._interpreter.get_input_details()[0]["index"]
         self._outputs = [detail["index"] for detail in self._interpreter.get_output_details()]
 
-    def __call__(self, picture: NDArray[np.float32]) -> list[NDArray[Any]]:
+    def __call__(self, picture: NDArray[np.floating]) -> list[NDArray[Any]]:
         """The outputs (1, …) for a picture (n, n, 3)."""
-        self._interpreter.set_tensor(self._input, picture[None])
+        self._interpreter.set_tensor(self._input, picture[None].astype(np.float32))
         self._interpreter.invoke()
         return [self._interpreter.get_tensor(index) for index in self._outputs]
 
