@@ -6,8 +6,8 @@ cameras are calibrated, so they tell it: the subject is who stands in the workin
 1. Where the segmenter finds people, those of all pictures are brought together, and the one whom most cameras see in
    the volume is the subject. Each camera looks at a square about him or her, also one whose own detector has found
    nobody: from above, say. A segmenter that finds nobody is shown what a picture holds of the volume.
-2. A camera's square is held against the visual hull of the others' masks. Where it does not hold the hull, or is much
-   too large, the camera looks again.
+2. A camera's square and mask are held against the visual hull of the others' masks. Where the square does not hold the
+   hull or is much too large, or the mask shows somebody else, the camera looks again, at the hull.
 3. What is far from the hull of all masks is somebody else.
 
 Nothing passes from frame to frame: a run that is resumed sees the same masks.
@@ -27,6 +27,9 @@ Images = NDArray[np.uint8]
 
 #: sides of the square about the ball that holds the body, and about the hull: MediaPipe's 1.25 and a little
 _BALL_MARGIN, _HULL_MARGIN = 1.25, 1.35
+#: a mask with less than this share of the others' hull is of somebody else; such a hull is up to twice as large as the
+#: person is (measured: a right mask has 0.4 of it and more)
+_LEAST_SHARE = 0.3
 #: a square that is larger than the hull's by this factor wastes the network's pixels
 _MUCH = 1.6
 
@@ -51,11 +54,13 @@ class SubjectMasks:
         for c, patch in enumerate(patches):
             self._look(images, c, patch, masks)
         for c, patch in enumerate(patches):
-            expected = self._hull.points(self._hull.subject(masks, but=c), c)
+            others = self._hull.subject(masks, but=c)
+            expected = self._hull.points(others, c)
             if len(expected) == 0:
                 continue
             better = Patch.about(expected, _HULL_MARGIN, patch.angle)
-            if not patch.holds(expected) or patch.side > _MUCH * better.side:
+            missed = self._hull.share(others, c, masks[c]) < _LEAST_SHARE
+            if missed or patch.side > _MUCH * better.side or not patch.holds(expected):
                 self._look(images, c, better, masks)
         subject = self._hull.subject(masks)
         for c in range(len(self._rig)):

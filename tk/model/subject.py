@@ -33,10 +33,12 @@ _FORESHORTENED = 0.3
 
 #: voxels along the volume's longest side: 5 cm of 2.4 m, which a thigh fills
 _VOXELS = 48
+#: of a hull that may be a person's
+_LEAST_LITRES = 10.0
 #: a part of a mask belongs to the subject within so many voxels of the hull, for thin limbs hold no voxel's centre
 _NEAR_VOXELS = 2.5
-#: cameras that see a voxel, from which on one of them may be wrong
-_ENOUGH = 4
+#: cameras that see a voxel, from which on one of them may be wrong, and how much smaller the hull then is
+_ENOUGH, _MUCH_SMALLER = 4, 0.4
 
 
 @dataclass(frozen=True)
@@ -207,6 +209,7 @@ class CoarseHull:
 
     def __init__(self, rig: Rig, volume: Volume) -> None:
         self._grid = VoxelGrid.cover(volume, _VOXELS)
+        self._litre = 1000 * self._grid.voxel_m**3
         height, width = rig.frame_shape
         count = len(rig)
         self._pixels = np.zeros((count, self._grid.count), np.int64)  # flat, of the packed pictures
@@ -225,43 +228,55 @@ class CoarseHull:
                 self._reach[c] = _NEAR_VOXELS * self._grid.voxel_m * _focal(camera) / np.median(depth[inside])
 
     def subject(self, masks: NDArray[np.uint8], but: int | None = None) -> Mask:
-        """(N,) the voxels of the largest thing that the masks (C, H, W) agree about.
+        """(N,) the voxels of the thing that most masks (C, H, W) agree about, the largest of several.
 
-        Where four cameras and more see a voxel one of them may be wrong.
+        One of four cameras and more may be wrong, if the hull would be much smaller otherwise.
 
         Args:
             masks: 0 or more.
             but: a camera that is not asked.
         """
+        strict, lenient = (self._agreed(masks, but, wrong) for wrong in (0, 1))
+        return strict if np.count_nonzero(strict) >= _MUCH_SMALLER * np.count_nonzero(lenient) else lenient
+
+    def _agreed(self, masks: NDArray[np.uint8], but: int | None, wrong: int) -> Mask:
         asked = self._in_view.copy()
         if but is not None:
             asked[but] = False
         seeing = asked.sum(axis=0)
         agreeing = ((masks.reshape(-1)[self._pixels] > 0) & asked).sum(axis=0)
-        held = (seeing >= 2) & (agreeing >= np.where(seeing >= _ENOUGH, seeing - 1, seeing))
+        held = (seeing >= 2) & (agreeing >= np.where(seeing >= _ENOUGH, seeing - wrong, seeing))
         parts, count = ndimage.label(held.reshape(self._grid.shape), np.ones((3, 3, 3)))
         if count == 0:
             return held
-        sizes = np.bincount(parts.reshape(-1))
-        sizes[0] = 0
-        return np.asarray(parts.reshape(-1) == sizes.argmax(), np.bool_)
+        part = parts.reshape(-1)
+        # a corner that two cameras see may be larger than the person, whom more of them see
+        sizes = np.array(
+            [np.bincount(part[held & (agreeing >= n)], minlength=count + 1) for n in range(2, len(masks) + 1)]
+        )
+        large = sizes * self._litre >= _LEAST_LITRES
+        level = int(np.flatnonzero(large.any(axis=1))[-1]) if large.any() else 0
+        return np.asarray(part == sizes[level].argmax(), np.bool_) & held
 
     def litres(self, voxels: Mask) -> float:
         """Of voxels (N,)."""
-        return float(1000 * self._grid.voxel_m**3 * np.count_nonzero(voxels))
+        return self._litre * np.count_nonzero(voxels)
 
     def points(self, voxels: Mask, c: int) -> Float:
         """(M, 2) where a picture shows voxels (N,), pixels; those that it does not show are left out."""
         return self._xy[c, voxels & self._in_view[c]].astype(np.float64)
+
+    def share(self, voxels: Mask, c: int, mask: NDArray[np.uint8]) -> float:
+        """How much of what a picture shows of voxels (N,) is in its mask (h, w); 1 where it shows none."""
+        seen = voxels & self._in_view[c]
+        return float(np.mean(mask[self._xy[c, seen, 1], self._xy[c, seen, 0]] > 0)) if seen.any() else 1.0
 
     def only(self, voxels: Mask, c: int, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The parts of a mask (h, w) that lie at or near voxels (N,); all of it where the picture shows none."""
         xy = self._xy[c, voxels & self._in_view[c]]
         if len(xy) == 0:
             return mask
-        count, parts = cv2.connectedComponents(mask, connectivity=8)
-        if count <= 2:
-            return mask
+        parts = cv2.connectedComponents(mask, connectivity=8)[1]
         near = np.ones(mask.shape, np.uint8)
         inside = (xy[:, 0] < mask.shape[1]) & (xy[:, 1] < mask.shape[0])
         near[xy[inside, 1], xy[inside, 0]] = 0
