@@ -58,7 +58,7 @@ class _Commands(click.Group):
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="tk")
 def main() -> None:
-    """A person's motion out of a few ordinary, calibrated cameras: no markers, no trained weights, no GPU."""
+    """A person's motion out of a few ordinary, calibrated cameras: no markers, no GPU."""
 
 
 _capture = click.argument("capture", type=click.Path(path_type=Path))

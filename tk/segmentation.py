@@ -80,7 +80,7 @@ def make_labeller(capture: Capture, config: Config, note: Callable[[str], None])
         name = source.removeprefix(_SEGMENTER)
         note(f"{capture.path}: no masks and no background/; the segmenter {name} makes the masks")
         made = SubjectMasks(load(name), name, capture.rig, capture.volume)
-        return lambda frame: (made.segment(frame.images), None)
+        return lambda frame: made.label(frame.images)
     foreground = _learn_median(capture, config, note) if source == _MEDIAN else _learn_scene(capture, config)
     return lambda frame: foreground.label(frame.images)
 
