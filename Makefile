@@ -2,7 +2,7 @@
 VENV ?= .venv
 RUN = "$(VENV)/bin/python" -m
 
-.PHONY: help install demo test test-slow lint format bench clean
+.PHONY: help install demo test test-slow lint format docs bench clean
 .DEFAULT_GOAL := help
 
 help:
@@ -10,6 +10,7 @@ help:
 	@echo "make test       the tests"
 	@echo "make test-slow  the accuracy tests on whole captures (minutes)"
 	@echo "make lint       ruff and mypy"
+	@echo "make docs       the pages of docs/ as a site, in docs/_build/html"
 	@echo "make bench      the benchmarks of scripts/bench.py"
 	@echo "make install    only set up $(VENV)"
 	@echo "make clean      remove $(VENV) and caches"
@@ -23,7 +24,7 @@ $(VENV)/.installed: pyproject.toml scripts/setup.sh
 	@touch "$@"
 
 demo: install
-	@"$(VENV)/bin/tk" demo
+	@"$(VENV)/bin/tk" demo --force
 
 test: install
 	@$(RUN) pytest
@@ -40,9 +41,12 @@ format: install
 	@$(RUN) ruff check --fix .
 	@$(RUN) ruff format .
 
+docs: install
+	@$(RUN) sphinx -W --keep-going -q -b html docs docs/_build/html
+
 bench: install
 	@$(RUN) scripts.bench
 
 clean:
-	rm -rf "$(VENV)" .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist *.egg-info
+	rm -rf "$(VENV)" docs/_build .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist *.egg-info
 	find tk tests scripts -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -26,25 +26,33 @@ from tk.io.result import read_joints
 from tk.model.objective import BARRED
 from tk.segmentation import make_labeller
 from tk.trackers.base import Observation
-from tk.trackers.volumetric import VolumetricTracker
+from tk.trackers.volumetric import SAMPLING, SCHEDULE, VolumetricTracker
 
 Changes = dict[str, dict[str, Any]]
 
-# label, settings that differ from the defaults
+VOLUMETRIC = "tk.trackers.volumetric"
+
+# label; what differs from the defaults: settings by their table, constants under the module that holds them
 ROWS: tuple[tuple[str, Changes], ...] = (
     ("defaults", {}),
     ("no coverage (data to model)", {"objective": {"coverage_weight": 0.0}}),
-    ("ν soft, then hard", {"schedule": {"soft": 4.0, "chain_soft": 2.0}}),
-    ("σ is the limb's diameter", {"sampling": {"sigma_m": 0.0}, "contours": {"sigma_m": 0.0}}),
-    ("SMD not whitened", {"schedule": {"whiten": False}}),
-    ("the paper's tolerance, 2° and 2 cm", {"schedule": {"tolerance_deg": 2.0, "tolerance_m": 0.02}}),
+    ("ν soft, then hard", {VOLUMETRIC: {"SCHEDULE": replace(SCHEDULE, soft=4.0, chain_soft=2.0)}}),
+    (
+        "σ is the limb's diameter",
+        {VOLUMETRIC: {"SAMPLING": replace(SAMPLING, sigma_m=0.0)}, "tk.model.contour_term": {"SIGMA_M": 0.0}},
+    ),
+    ("SMD not whitened", {VOLUMETRIC: {"SCHEDULE": replace(SCHEDULE, whiten=False)}}),
+    (
+        "the paper's tolerance, 2° and 2 cm",
+        {VOLUMETRIC: {"SCHEDULE": replace(SCHEDULE, tolerance_deg=2.0, tolerance_m=0.02)}},
+    ),
     ("no prediction", {"tracking": {"prediction": 0.0}}),
     ("no waist", {"body": {"waist": False}}),
     ("no colour edges", {"contours": {"edge_weight": 0.0}}),
-    ("normals count", {"objective": {"min_cosine": 0.0}}),
+    ("normals count", {"tk.model.objective": {"MIN_COSINE": 0.0}}),
     ("colours ignored", {"appearance": {"enabled": False}}),
-    ("shoulders do not rise with the arms", {"": {"rise": False}}),
-    ("parts may enter each other", {"": {"exclusion": False}}),
+    ("shoulders do not rise with the arms", {"tk.model.skeleton": {"RAISED_SHOULDERS": 0.0}}),
+    ("parts may enter each other", {"tk.model.objective": {"BARRED": np.zeros_like(BARRED)}}),
 )
 
 
@@ -72,15 +80,15 @@ class Recorded:
 
 @contextmanager
 def changed(changes: Changes) -> Iterator[Config]:
-    """The configuration with changes; and, for the row, what no setting switches off."""
-    other = changes.get("", {})
+    """The configuration with changes; and, for the row, other constants."""
     config = Config()
-    config = replace(config, **{k: replace(getattr(config, k), **v) for k, v in changes.items() if k})
     with ExitStack() as stack:
-        if "rise" in other:
-            stack.enter_context(mock.patch("tk.model.skeleton.RAISED_SHOULDERS", 0.0))
-        if "exclusion" in other:
-            stack.enter_context(mock.patch("tk.model.objective.BARRED", np.zeros_like(BARRED)))
+        for place, values in changes.items():
+            if "." in place:
+                for name, value in values.items():
+                    stack.enter_context(mock.patch(f"{place}.{name}", value))
+            else:
+                config = replace(config, **{place: replace(getattr(config, place), **values)})
         yield config
 
 

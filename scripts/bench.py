@@ -59,7 +59,7 @@ from tk.model.skeleton import CHAINS
 from tk.model.volume import VoxelGrid
 from tk.trackers.base import Estimate
 from tk.trackers.silhouette import SilhouetteTracker
-from tk.trackers.volumetric import CELL_VOXELS, restore_body
+from tk.trackers.volumetric import CELL_VOXELS, SAMPLING, restore_body
 
 DEMO = Path(__file__).resolve().parents[1] / "tk" / "data" / "demo"
 WINDOW = 12  # frames that the stages alone are measured on
@@ -177,6 +177,7 @@ def run_once(options: Options, output: Path) -> Run:
             frames=(0, options.frames),
             init_pose=options.init_pose,
             method=options.method,
+            force=True,
         )
     seconds = time.perf_counter() - started
     loop = np.diff(clock.times)
@@ -298,7 +299,7 @@ def _search_stages(
     yield Stage("colour segmentation", median_ms(segmented), {})
 
     # the peer knows neither colours nor normals, so this comparison leaves them out of ours as well
-    objective = BodyObjective(body, config.objective.settings, config.sampling)
+    objective = BodyObjective(body, config.objective.settings, SAMPLING)
     rng = np.random.default_rng(0)
     samples = objective.draw(rng)
     points, normals = (values[samples].astype(np.float32) for values in body.place(pose))
@@ -327,12 +328,12 @@ def _search_stages(
     index = built(segmented())
     rows = len(CHAINS)
     for name, B, M, Q in (
-        ("objective: one launch, whole body", 1, len(samples), config.sampling.voxels),
+        ("objective: one launch, whole body", 1, len(samples), SAMPLING.voxels),
         (
             "objective: one launch, five chains",
             rows,
-            config.sampling.chain,
-            config.sampling.chain_voxels,
+            SAMPLING.chain,
+            SAMPLING.chain_voxels,
         ),
     ):
         chosen = np.resize(samples, (B, M)).astype(np.int32)

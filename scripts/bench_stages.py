@@ -26,6 +26,7 @@ from tk.model.silhouettes import Pyramid, Views
 from tk.optim import gauss_newton
 from tk.trackers.bodies import body_and_poses
 from tk.trackers.contours import NEARBY, SCREEN_ROWS
+from tk.trackers.volumetric import SAMPLING
 
 Float = np.ndarray
 
@@ -82,7 +83,7 @@ def contour_stages(
     )
     entries = term.assign(images, poses, chosen)
     rng = np.random.default_rng(0)
-    samples, voxels = objective.draw(rng), rng.integers(len(index.positions), size=config.sampling.voxels)
+    samples, voxels = objective.draw(rng), rng.integers(len(index.positions), size=SAMPLING.voxels)
     rows = samples[None].astype(np.int32), voxels[None].astype(np.int32)
     settings = config.objective.settings
     for text, given in (("without entries", None), (f"and {entries.shape[1]} alignment entries", entries)):

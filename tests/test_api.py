@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import tk
+from tests.conftest import QUICK
+from tests.io.conftest import picture, write_video
 from tk.errors import CaptureError
 
 
@@ -33,6 +35,14 @@ def test_every_public_name_is_there():
 def test_a_missing_capture_is_one_line(tmp_path):
     with pytest.raises(CaptureError, match="nowhere"):
         tk.open_capture(tmp_path / "nowhere")
+
+
+def test_what_is_worth_knowing_is_logged(copy, tmp_path, caplog):
+    write_video(copy / "videos" / "cam2.mp4", [picture(1, k, (160, 120)) for k in range(3)])
+    config = tk.Config.from_toml(QUICK)
+    list(tk.track(tk.open_capture(copy), config=config))
+    (said,) = [r.getMessage() for r in caplog.records if r.name.startswith("tk") and r.levelname == "WARNING"]
+    assert "only the first 3 are used" in said
 
 
 def test_estimates_one_by_one_are_those_of_the_file(tiny, tmp_path):

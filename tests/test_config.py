@@ -11,7 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tk.config import PRESETS, Config
+from tk.config_text import annotated_toml, meanings
 from tk.errors import ConfigError
+from tk.trackers.volumetric import SAMPLING, SCHEDULE, SMD, Effort
 
 
 def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -43,18 +45,17 @@ def test_defaults_round_trip() -> None:
     voxels=st.integers(8, 512),
     seed=st.integers(0, 2**62),
     prediction=st.floats(0, 1.5, allow_subnormal=False),
-    meta_step=st.floats(1e-6, 1.0),
+    effort=st.one_of(st.sampled_from(["fast", "normal", "thorough"]), st.floats(0.05, 20)),
     enabled=st.booleans(),
     segmentation=st.sampled_from(["collinearity", "mog2"]),
 )
 def test_values_round_trip(
-    voxels: int, seed: int, segmentation: str, prediction: float, meta_step: float, enabled: bool
+    voxels: int, seed: int, segmentation: str, prediction: float, effort: str | float, enabled: bool
 ) -> None:
-    config = Config(voxels=voxels, seed=seed, segmentation=segmentation)
+    config = Config(voxels=voxels, seed=seed, segmentation=segmentation, effort=effort)
     config = dataclasses.replace(
         config,
         tracking=dataclasses.replace(config.tracking, prediction=prediction),
-        smd=dataclasses.replace(config.smd, meta_step=meta_step),
         appearance=dataclasses.replace(config.appearance, enabled=enabled),
     )
     assert Config.from_toml(config.to_toml()) == config
@@ -86,12 +87,17 @@ def test_what_a_file_leaves_out_keeps_its_default() -> None:
         ("seed = -1", ["--seed -1"]),
         ("[tracking]\nprediction = 7.0", ["prediction = 7.0"]),
         ("[tracking]\ninit_frames = 0", ["init_frames = 0"]),
-        ("[smd]\nmemory = 3.0", ["smd.memory"]),
+        ("[smd]\nmemory = 0.3", ["unknown setting smd"]),
+        ('effort = "utmost"', ["utmost", "fast, normal, thorough"]),
+        ("effort = true", ["effort", "must be of type"]),
+        ("effort = 0.0", ["effort = 0", "from 0.05 to 20"]),
+        ("[appearance]\nrate = 2.0", ["rate = 2.0"]),
+        ("[tracking]\nlost_ratio = 0.5", ["lost_ratio = 0.5"]),
         ("voxels = ", ["invalid TOML"]),
         ("tracking = " + 3000 * "[", ["invalid TOML"]),
         ("[tracking]\ninit_frames = 1000000000\n", ["tracking.init_frames = 1000000000 is too large"]),
-        ("[smd]\nmeta_step = 1e300\n", ["smd.meta_step = 1e+300 is too large"]),
-        (f"[smd]\nmeta_step = 1{400 * '0'}\n", ["smd.meta_step = 1000", "is too large"]),
+        ("[contours]\nthreshold = 1e300\n", ["contours.threshold = 1e+300 is too large"]),
+        (f"[contours]\nthreshold = 1{400 * '0'}\n", ["contours.threshold = 1000", "is too large"]),
         (f"voxels = 1{5000 * '0'}\n", ["invalid TOML"]),
         ("seed = 99999999999999999999", ["seed"]),
     ],
@@ -114,7 +120,7 @@ def test_no_setting_takes_what_is_not_finite(name: str, value: str) -> None:
         Config.from_toml(toml(name, value))
 
 
-@pytest.mark.parametrize("name", [name for name in DEFAULTS if name not in ("segmentation",)])
+@pytest.mark.parametrize("name", [name for name in DEFAULTS if not isinstance(DEFAULTS[name], str)])
 @pytest.mark.parametrize("value", [-1, 0, 10**6])
 def test_extreme_values_are_taken_or_refused_as_the_users_mistake(name: str, value: int) -> None:
     default = DEFAULTS[name]
@@ -139,7 +145,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
 
 
 def test_every_default_is_finite() -> None:
-    assert len(NUMBERS) > 30
+    assert len(NUMBERS) > 20
     assert all(math.isfinite(DEFAULTS[name]) for name in NUMBERS)
 
 
@@ -152,11 +158,53 @@ def test_presets_are_valid_and_unlike_the_defaults(name: str) -> None:
 
 def test_the_papers_preset_has_the_papers_numbers() -> None:
     c = Config.preset("kehl2006")
-    assert (c.objective.tangential, c.objective.min_cosine) == (1, -1)
+    o, effort = c.objective.settings, Effort.of(c.effort_factor)
+    assert (o.tangential, o.min_cosine) == (1, -1)
     assert (c.contours.views, c.contours.pairs, c.contours.hidden) == (3, 5, 1)
-    assert (c.sampling.torso, c.sampling.chain, c.voxels, c.body.waist) == (60, 20, 64, False)
-    assert (c.schedule.refine, c.schedule.soft, c.schedule.chain_soft) == (0.5, 1, 1)
-    assert (c.smd.memory, c.smd.max_iterations, c.smd.window, c.smd.shuffle) == (0.3, 40, 3, True)
+    assert (c.voxels, c.body.waist, c.appearance.rate) == (64, False, 0.3)
+    assert (effort.sampling.torso, effort.sampling.chain, effort.sampling.scale) == (60, 20, 1)
+    assert (SCHEDULE.refine, SCHEDULE.soft, SCHEDULE.chain_soft) == (0.5, 1, 1)
+    assert (effort.smd.memory, effort.smd.max_iterations, effort.smd.window) == (0.3, 40, 3)
+    assert effort.smd.shuffle
+
+
+def test_effort_is_iterations_below_one_and_points_above() -> None:
+    fast, normal, thorough = (Effort.of(Config(effort=e).effort_factor) for e in ("fast", "normal", "thorough"))
+    assert (normal.sampling, normal.smd) == (SAMPLING, SMD)
+    assert fast.sampling == SAMPLING and fast.smd.max_iterations == SMD.max_iterations // 2
+    assert thorough.smd == SMD and thorough.sampling.scale == 5
+    assert Effort.of(0.05).fit.rounds >= 1
+
+
+def test_there_are_no_more_settings_than_one_can_look_through() -> None:
+    assert len(DEFAULTS) <= 60
+
+
+@pytest.mark.parametrize("config", [Config(), Config.preset("kehl2006")], ids=["defaults", "kehl2006"])
+def test_the_annotated_settings_are_the_settings(config: Config) -> None:
+    text = annotated_toml(config)
+    assert Config.from_toml(text) == config
+    lines = text.splitlines()
+    for number, line in enumerate(lines):
+        name, equals, _ = line.partition(" = ")
+        if equals and not line.startswith("#"):
+            assert lines[number - 1].startswith("# "), name  # each is explained
+    assert all(len(line) <= 120 for line in lines)
+    for default in ("Default: 64", 'Default: "normal"', "Default: true"):
+        assert default in text
+
+
+def test_each_setting_is_explained() -> None:
+    def check(config: Any) -> None:
+        said = meanings(type(config))
+        for field in dataclasses.fields(config):
+            value = getattr(config, field.name)
+            if dataclasses.is_dataclass(value):
+                check(value)
+            else:
+                assert len(said[field.name]) > 15, field.name
+
+    check(Config())
 
 
 def test_the_papers_preset_is_the_default_but_for_the_waist() -> None:

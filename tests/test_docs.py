@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+import shlex
 import sys
 from pathlib import Path
 
 import click
 import pytest
 
+from tests.conftest import Tk
 from tk.cli import main
 from tk.config import Config
 from tk.io.calibration import read_calibration
@@ -23,7 +25,7 @@ else:
     import tomli as tomllib
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 HOW_TO = ROOT / "docs" / "how-to.md"
 POSE_NAMES = build_skeleton(BodyDimensions.from_stature(1.7)).names
 
@@ -33,23 +35,33 @@ def blocks(page: Path, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S)
 
 
+def headings(page: Path) -> set[str]:
+    """The anchors of a page's headings."""
+    found = re.findall(r"^#+ (.*)", page.read_text(encoding="utf-8"), re.M)
+    return {re.sub(r"[^\w -]", "", line).strip().lower().replace(" ", "-") for line in found}
+
+
 def toml_block(mark: str) -> str:
-    """The how-to's one TOML block that holds ``mark``."""
-    (found,) = (text for text in blocks(HOW_TO, "toml") if mark in text)
+    """The documentation's one TOML block that holds ``mark``."""
+    (found,) = (text for page in PAGES for text in blocks(page, "toml") if mark in text)
     return found
+
+
+def shell_commands(page: Path) -> list[str]:
+    """The `tk …` lines of a page's shell blocks."""
+    lines = "".join(blocks(page, "sh")).replace("\\\n", " ").splitlines()
+    return [line for line in lines if line.startswith("tk ")]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_lead_somewhere(page: Path) -> None:
-    text = page.read_text(encoding="utf-8")
-    headings = {
-        re.sub(r"[^\w -]", "", line).strip().lower().replace(" ", "-") for line in re.findall(r"^#+ (.*)", text, re.M)
-    }
-    for target in re.findall(r"\]\(([^)]+)\)", text):
-        if target.startswith("#"):
-            assert target[1:] in headings, target
-        elif "://" not in target:
-            assert (page.parent / target).exists(), target
+    for target in re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8")):
+        if "://" in target:
+            continue
+        name, _, heading = target.partition("#")
+        other = page.parent / name if name else page
+        assert other.exists(), target
+        assert not heading or heading in headings(other), target
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -68,6 +80,39 @@ def test_commands_and_options_exist(page: Path) -> None:
         assert command in main.commands, command
         known = {name for parameter in main.commands[command].params for name in parameter.opts}
         assert set(re.findall(r"(?<!\w)(--?[a-z][\w-]*)", rest)) <= known | {"--help"}, command + rest
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_are_accepted(page: Path) -> None:
+    """Each parses as the real command line does it."""
+    assert isinstance(main, click.Group)
+    for line in shell_commands(page):
+        words = shlex.split(re.sub(r"\s[|>]\s.*", "", line), comments=True)[1:]
+        if words[0].startswith("-"):
+            assert {words[0]} <= {"--help", "--version"}, line
+            continue
+        try:
+            main.commands[words[0]].make_context(words[0], words[1:])
+        except click.exceptions.Exit:  # --help
+            assert "--help" in words, line
+
+
+@pytest.mark.filterwarnings("default")
+def test_commands_that_need_no_recording_run(
+    tk: Tk, tiny: Path, quick: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All that work on nothing, or on the demo's result; `tk demo` itself has a test of its own."""
+    lines = {line: page for page in PAGES for line in shell_commands(page)}
+    own = [line for line in lines if re.match(r"tk (--help|\w+ --help|config)|tk \w+ demo\.h5", line)]
+    assert len(own) >= 5 and any("export demo.h5" in line for line in own)
+    monkeypatch.chdir(tmp_path)
+    assert tk("track", tiny, "-o", "demo.h5", "--config", quick, "--frames", ":2", "--causal").code == 0
+    (tmp_path / "settings.toml").write_text("voxels = 64\n")
+    for line in own:
+        words = shlex.split(line, comments=True)
+        words = words[: words.index(">")] if ">" in words else words
+        ran = tk(*words[1:])
+        assert ran.code == 0, (lines[line].name, line, ran.err)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

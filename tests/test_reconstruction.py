@@ -74,7 +74,8 @@ def test_what_is_finished_is_kept_when_a_mask_breaks(tk: Tk, quick: Path, copy: 
 
 def test_an_older_hull_is_replaced(tiny: Path, tmp_path: Path) -> None:
     for stop in (3, 2):
-        assert reconstruct(open_capture(tiny), tmp_path / "h.h5", CONFIG, Silent(), (0, stop)) == stop
+        done = reconstruct(open_capture(tiny), tmp_path / "h.h5", CONFIG, Silent(), (0, stop), force=True)
+        assert done == stop
     with h5py.File(tmp_path / "h.h5", "r") as file:
         assert len(file["frames"]) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["h.h5"]

@@ -59,7 +59,7 @@ def refined(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("region") / "refined.h5"
     reporter = Silent()
     assert run(tiny, path, reporter).lost == 0
-    assert reporter.notes == ["second pass: the body is fitted to the whole recording"]
+    assert reporter.notes == []
     return path
 
 
@@ -139,7 +139,7 @@ def test_a_refined_result_is_not_prolonged(tk: Tk, tiny: Path, quick: Path, tmp_
     result = tmp_path / "r.h5"
     run(tiny, result, frames=(0, 4))
     before = result.read_bytes()
-    with pytest.raises(ResultError, match=r"a second pass has gone over .* run without --resume .* or with --causal"):
+    with pytest.raises(ResultError, match=r"a second pass has gone over .* --force .* with --causal"):
         run(tiny, result, frames=(0, 6), resume=True)
     assert result.read_bytes() == before
     # nothing to be done is no mistake, and changes nothing

@@ -35,16 +35,16 @@ track = partial(session.track, method="volumetric")
 # `tk` that sends itself a signal once a frame is finished
 VICTIM = """
 import os, signal, sys
-from tk import cli
+from tk import cli, console
 
-tell = cli._Report.advance
+tell = console.Report.advance
 
 def advance(self, frame, estimate):
     tell(self, frame, estimate)
     if frame == int(os.environ["TEST_FRAME"]):
         os.kill(os.getpid(), int(os.environ["TEST_SIGNAL"]))
 
-cli._Report.advance = advance
+console.Report.advance = advance
 cli.main(prog_name="tk")
 """
 
@@ -114,7 +114,7 @@ def test_a_killed_run_is_taken_up_again(tk: Tk, quick: Path, tiny: Path, tracked
     assert_same(result, tracked, slice(0, 6))  # read by plain h5py
     ran = tk(*command, "--resume")
     assert ran.code == 0, ran.err
-    assert ran.err.splitlines()[0] == f"note: 6 of {FRAMES} frames are there already"
+    assert ran.told[0] == f"note: 6 of {FRAMES} frames are there already"
     assert ran.err.splitlines()[-1].startswith(f"{FRAMES} frames in {result}, 0 lost")
     assert_same(result, tracked)
     assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]  # the killed run's scraps are gone
@@ -164,7 +164,7 @@ def test_ctrl_c_before_the_first_frame_leaves_an_older_result(tiny: Path, tmp_pa
     result = tmp_path / "r.h5"
     run(tiny, result, frames=(0, 2))
     before = result.read_bytes()
-    summary = track(open_capture(tiny), result, CONFIG, Impatient())
+    summary = track(open_capture(tiny), result, CONFIG, Impatient(), force=True)
     assert summary.interrupted and summary.frames == 0
     assert result.read_bytes() == before
 
@@ -185,7 +185,7 @@ def test_only_the_same_command_is_taken_up_again(
 ) -> None:
     before = begun.read_bytes()
     ran = tk("track", tiny, "--method", "volumetric", "-o", begun, "--config", quick, "--resume", *options)
-    ran.complaint(str(begun), difference, "run without --resume")
+    ran.complaint(str(begun), difference, "--force in the place of --resume")
     assert begun.read_bytes() == before
 
 
@@ -293,7 +293,7 @@ def test_frames_before_the_initial_one_are_left_out(copy: Path, tmp_path: Path) 
     assert reporter.frames == [3, 4, 5]
     assert any("frames before 3 are left out" in note for note in reporter.notes)
     with pytest.raises(ConfigError, match=r"--frames 0:2: the subject is found in frame 3"):
-        run(copy, tmp_path / "r.h5", frames=(0, 2))
+        run(copy, tmp_path / "other.h5", frames=(0, 2))
 
 
 def test_frames_that_are_asked_for(tiny: Path) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import overload
+from typing import TYPE_CHECKING, TypedDict, overload
 
 from tk import session
 from tk.config import Config
@@ -15,17 +16,19 @@ from tk.io.capture import open_capture as _open_capture
 from tk.io.result import Result, read_result
 from tk.trackers.base import Estimate
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack  # in typing from Python 3.11 on
+
+_LOG = logging.getLogger(__name__)
+
 PathLike = str | os.PathLike[str]
 
 
-class _Quiet:
-    """A reporter for scripts: notes go to ``note``, progress nowhere."""
-
-    def __init__(self) -> None:
-        self.notes: list[str] = []
+class _Logged:
+    """The reporter of scripts: notes are warnings of the logger "tk", progress goes nowhere."""
 
     def note(self, text: str) -> None:
-        self.notes.append(text)
+        _LOG.warning("%s", text)
 
     def begin(self, total: int, done: int) -> None:
         pass
@@ -38,7 +41,7 @@ def open_capture(path: PathLike, cameras: Sequence[str] | None = None, masks: st
     """A capture folder.
 
     Args:
-        path: the folder, see the README.
+        path: the folder: `calibration.toml`, `videos/` and what else there is.
         cameras: names of the cameras to use; all if None.
         masks: "auto" (the capture's own where it has some), "none" (segment the videos), "median" (against the
             recording's median), or a folder of masks.
@@ -49,36 +52,26 @@ def open_capture(path: PathLike, cameras: Sequence[str] | None = None, masks: st
     return _open_capture(Path(path), tuple(cameras) if cameras else None, masks)
 
 
-@overload
-def track(
-    capture: Capture,
-    output: None = None,
-    *,
-    method: str = ...,
-    frames: tuple[int, int | None] = ...,
-    config: Config | None = ...,
-    seed: int | None = ...,
-    init_pose: PathLike | None = ...,
-    body: PathLike | None = ...,
-    causal: bool = ...,
-    resume: bool = ...,
-) -> Iterator[Estimate]: ...
+class _Options(TypedDict, total=False):
+    """What :func:`track` takes beside capture and output."""
+
+    method: str
+    frames: tuple[int, int | None]
+    config: Config | None
+    seed: int | None
+    init_pose: PathLike | None
+    body: PathLike | None
+    causal: bool
+    resume: bool
+    force: bool
 
 
 @overload
-def track(
-    capture: Capture,
-    output: PathLike,
-    *,
-    method: str = ...,
-    frames: tuple[int, int | None] = ...,
-    config: Config | None = ...,
-    seed: int | None = ...,
-    init_pose: PathLike | None = ...,
-    body: PathLike | None = ...,
-    causal: bool = ...,
-    resume: bool = ...,
-) -> Result: ...
+def track(capture: Capture, output: None = None, **options: Unpack[_Options]) -> Iterator[Estimate]: ...
+
+
+@overload
+def track(capture: Capture, output: PathLike, **options: Unpack[_Options]) -> Result: ...
 
 
 def track(
@@ -93,6 +86,7 @@ def track(
     body: PathLike | None = None,
     causal: bool = False,
     resume: bool = False,
+    force: bool = False,
 ) -> Iterator[Estimate] | Result:
     """Track the person in a capture.
 
@@ -107,6 +101,7 @@ def track(
         body: a result or a TOML file whose body is taken.
         causal: leave it at the first pass. Without ``output`` there is no other.
         resume: go on where an earlier run with the same ``output`` stopped.
+        force: replace a result that exists under ``output``; without it that is an error.
 
     Returns:
         Without ``output`` an iterator of :class:`~tk.trackers.base.Estimate`: ``frame``, ``time`` (seconds), ``pose``
@@ -122,19 +117,21 @@ def track(
         chosen = replace(chosen, seed=seed)
     pose_file = Path(init_pose) if init_pose is not None else None
     body_file = Path(body) if body is not None else None
+    reporter = _Logged()
     if output is None:
-        return session.estimates(capture, chosen, method=method, frames=frames, init_pose=pose_file, body=body_file)
+        return session.estimates(capture, chosen, reporter.note, method, frames, pose_file, body_file)
     summary = session.track(
         capture,
         Path(output),
         chosen,
-        _Quiet(),
+        reporter,
         method,
         frames,
         pose_file,
         resume,
         body=body_file,
         causal=causal,
+        force=force,
     )
     if summary.interrupted:
         raise KeyboardInterrupt

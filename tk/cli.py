@@ -11,20 +11,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from tk import __version__
+from tk.console import Report
 from tk.errors import CaptureError, ConfigError, TkError
 
 if TYPE_CHECKING:
     from tk.config import Config
+    from tk.session import Summary
 
 # The matrices here are small. A pool of BLAS threads beside Taichi's costs milliseconds for what takes microseconds; it
 # has an effect only before NumPy is loaded, and the caller's own setting stands.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-_CONSOLE = Console(stderr=True, highlight=False, soft_wrap=True)
+#: more than half of the frames are lost
+EXIT_LOST = 3
 
 
 @contextmanager
@@ -43,6 +44,14 @@ def _one_line() -> Iterator[None]:
         raise click.exceptions.Exit(2) from None
 
 
+@contextmanager
+def _working(on: str) -> Iterator[None]:
+    """On a terminal, that something is done which has no frames to count."""
+    with Report(quiet=not sys.stderr.isatty()) as report:
+        report.stage(on)
+        yield
+
+
 class _Commands(click.Group):
     """Reports mistakes as :func:`_one_line` does."""
 
@@ -53,6 +62,17 @@ class _Commands(click.Group):
     def invoke(self, ctx: click.Context) -> object:
         with _one_line():
             return super().invoke(ctx)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Each command with the whole first sentence of its help; click's own cuts it off."""
+        rows = [(name, command.get_short_help_str(limit=1000)) for name, command in sorted(self.commands.items())]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
+
+
+def _example(*lines: str) -> str:
+    """What a command's help ends with."""
+    return "\b\n" + "\n".join(["Example:" if len(lines) == 1 else "Examples:", *(f"  {line}" for line in lines)])
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
@@ -71,10 +91,19 @@ _masks = click.option(
 )  # fmt: skip
 _voxels = click.option("--voxels", type=int, help="Voxels along the working volume's longest side.  [default: 64]")
 _config = click.option("--config", "config_file", type=click.Path(path_type=Path), help="Settings, TOML.")
-_preset = click.option("--preset", metavar="NAME", help="Settings to begin with: kehl2006, the paper's own; fast.")
+_preset = click.option("--preset", metavar="NAME", help="Settings to begin with: kehl2006, the paper's own.")
+_resume = click.option("--resume", is_flag=True, help="Go on where an earlier run of the same command stopped.")
+_force = click.option("--force", is_flag=True, help="Replace what exists under the output's name.")
+_quiet = click.option("-q", "--quiet", is_flag=True, help="No progress: only notes and errors.")
+_json = click.option("--json", "as_json", is_flag=True, help="Print a summary for scripts on stdout.")
 
 
-@main.command()
+@main.command(
+    epilog=_example(
+        "tk track CAPTURE -o result.h5",
+        "tk track CAPTURE -o part.h5 --frames 0:100 --cameras cam1,cam2,cam4",
+    )
+)
 @_capture
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="RESULT.h5")
 @click.option(
@@ -94,10 +123,13 @@ _preset = click.option("--preset", metavar="NAME", help="Settings to begin with:
     "--body", type=click.Path(path_type=Path), metavar="FILE", help="The body of a result, or of a TOML file."
 )
 @click.option("--causal", is_flag=True, help="Leave it at the first pass: no frame knows of those after it.")
-@click.option("--resume", is_flag=True, help="Go on where an earlier run of the same command stopped.")
+@_resume
+@_force
 @click.option("--store-hull", is_flag=True, help="Keep the hull's coloured surface in the result.")
 @_preset
 @_config
+@_quiet
+@_json
 def track(
     capture: Path,
     output: Path,
@@ -111,31 +143,66 @@ def track(
     body: Path | None,
     causal: bool,
     resume: bool,
+    force: bool,
     store_hull: bool,
     preset: str | None,
     config_file: Path | None,
+    quiet: bool,
+    as_json: bool,
 ) -> None:
     """Track the person in CAPTURE and write the pose of every frame to RESULT.h5."""
-    from tk import session  # the heavy imports wait until a command needs them
-    from tk.io.capture import open_capture
-
     span = _span(frames)
-    config = _configuration(config_file, preset, voxels=voxels, seed=seed)
-    opened = open_capture(capture, _names(cameras), masks)
-    with _Report() as report:
+    with Report(quiet) as report:
+        report.stage("loading")
+        from tk import session  # the heavy imports wait until a command needs them
+        from tk.io.capture import open_capture
+        from tk.io.result_files import check_output
+
+        config = _configuration(config_file, preset, voxels=voxels, seed=seed)
+        check_output(output, force, resume)
+        report.stage(f"opening {capture}")
+        opened = open_capture(capture, _names(cameras), masks)
         summary = session.track(
-            opened, output, config, report, method, span, init_pose, resume, store_hull, body, causal
+            opened, output, config, report, method, span, init_pose, resume, store_hull, body, causal, force
         )
+    _tell(output, summary, quiet, as_json)
+
+
+def _tell(output: Path, summary: Summary, quiet: bool, as_json: bool) -> None:
+    """How a run ended, and the exit code: 1 where somebody stopped it, 3 where most of its frames are lost."""
     rate = summary.tracked_now / summary.seconds if summary.seconds > 0 else 0.0
-    if summary.frames:
+    if as_json:
+        _print_json(
+            result=str(output),
+            frames=summary.frames,
+            lost=summary.lost,
+            tracked_now=summary.tracked_now,
+            seconds=round(summary.seconds, 3),
+            frames_per_second=round(rate, 3),
+            interrupted=summary.interrupted,
+        )
+    if summary.frames and not quiet:
         click.echo(f"{summary.frames} frames in {output}, {summary.lost} lost, {rate:.1f} frames/s", err=True)
     if summary.interrupted:
         further = "go on with the same command and --resume" if summary.frames else "no frame was finished"
         click.echo(f"tk: interrupted; {further}", err=True)
         sys.exit(1)
+    if summary.mostly_lost:
+        click.echo(
+            f"tk: {output}: {summary.lost} of {summary.frames} frames are lost; do not use it: check masks, "
+            "calibration and working volume",
+            err=True,
+        )
+        sys.exit(EXIT_LOST)
 
 
-@main.command("import")
+def _print_json(**values: object) -> None:
+    import json
+
+    click.echo(json.dumps(values, indent=2, allow_nan=False))
+
+
+@main.command("import", epilog=_example("tk import my_session -o my_capture"))
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="CAPTURE")
 @click.option(
@@ -145,19 +212,17 @@ def track(
     "--trial", metavar="NAME", help="Take the videos with NAME in their path, where there are several trials."
 )
 def import_(folder: Path, output: Path, units: str | None, trial: str | None) -> None:
-    """Make a capture of another tool's project: Pose2Sim, FreeMoCap, Caliscope, Anipose, EasyMocap and others.
+    """Make a capture of another tool's project: Pose2Sim, FreeMoCap, Caliscope, Anipose, EasyMocap and others."""
+    with _working(f"importing {folder}"):
+        from tk.io.importers import import_project
 
-    For example: tk import my_session -o my_capture
-    """
-    from tk.io.importers import import_project
-
-    done = import_project(folder, output, units, trial)
+        done = import_project(folder, output, units, trial)
     for note in done.notes:
         click.echo(f"note: {note}", err=True)
     click.echo(f"{done.cameras} cameras in {output}; have a look at {output / 'capture.toml'}", err=True)
 
 
-@main.command()
+@main.command(epilog=_example("tk reconstruct CAPTURE -o hull.h5 --ply hulls --frames 0:3"))
 @_capture
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="HULL.h5")
 @click.option("--ply", type=click.Path(path_type=Path), metavar="DIR", help="Also write a PLY file a frame.")
@@ -165,7 +230,10 @@ def import_(folder: Path, output: Path, units: str | None, trial: str | None) ->
 @_cameras
 @_frames
 @_masks
+@_force
 @_config
+@_quiet
+@_json
 def reconstruct(
     capture: Path,
     output: Path,
@@ -174,42 +242,56 @@ def reconstruct(
     cameras: str | None,
     frames: str | None,
     masks: str,
+    force: bool,
     config_file: Path | None,
+    quiet: bool,
+    as_json: bool,
 ) -> None:
     """Reconstruct the coloured surface of the visual hull in every frame of CAPTURE."""
-    from tk import reconstruction
-    from tk.io.capture import open_capture
-
     span = _span(frames)
-    config = _configuration(config_file, voxels=voxels)
-    opened = open_capture(capture, _names(cameras), masks)
-    with _Report() as report:
-        count = reconstruction.reconstruct(opened, output, config, report, span, ply)
-    click.echo(f"{count} frames in {output}", err=True)
+    started = time.perf_counter()
+    with Report(quiet) as report:
+        report.stage("loading")
+        from tk import reconstruction
+        from tk.io.capture import open_capture
+
+        config = _configuration(config_file, voxels=voxels)
+        report.stage(f"opening {capture}")
+        opened = open_capture(capture, _names(cameras), masks)
+        count = reconstruction.reconstruct(opened, output, config, report, span, ply, force)
+    if as_json:
+        _print_json(result=str(output), frames=count, seconds=round(time.perf_counter() - started, 3))
+    if not quiet:
+        click.echo(f"{count} frames in {output}", err=True)
 
 
-@main.command()
+@main.command(epilog=_example("tk masks CAPTURE -o masks; tk track CAPTURE -o result.h5 --masks masks"))
 @_capture
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="DIR")
 @click.option("--segmenter", metavar="NAME", help="Which one, where several are installed.")
 @_cameras
 @_frames
-def masks(capture: Path, output: Path, segmenter: str | None, cameras: str | None, frames: str | None) -> None:
-    """Let a segmenter make masks of CAPTURE's videos: DIR/CAMERA/000000.png, the person white.
+@_quiet
+def masks(
+    capture: Path, output: Path, segmenter: str | None, cameras: str | None, frames: str | None, quiet: bool
+) -> None:
+    """Let a segmenter make masks of CAPTURE's videos: DIR/CAMERA/000000.png.
 
-    The same command goes on where it was stopped. Example: tk masks CAPTURE -o masks; tk track CAPTURE --masks masks
+    The person is white. The same command goes on where it was stopped.
     """
-    from tk import mask_folder
-    from tk.io.capture import open_capture
-
     span = _span(frames)
-    opened = open_capture(capture, _names(cameras), "none")
-    with _Report() as report:
+    with Report(quiet) as report:
+        report.stage("loading")
+        from tk import mask_folder
+        from tk.io.capture import open_capture
+
+        opened = open_capture(capture, _names(cameras), "none")
         written = mask_folder.write_masks(opened, output, report, segmenter, span)
-    click.echo(f"masks of {written.frames} frames in {output}, {written.now} of them new", err=True)
+    if not quiet:
+        click.echo(f"masks of {written.frames} frames in {output}, {written.now} of them new", err=True)
 
 
-@main.command()
+@main.command(epilog=_example("tk evaluate result.h5 CAPTURE/truth.h5"))
 @click.argument("result", type=click.Path(path_type=Path))
 @click.argument("truth", type=click.Path(path_type=Path))
 @click.option(
@@ -218,31 +300,31 @@ def masks(capture: Path, output: Path, segmenter: str | None, cameras: str | Non
 )  # fmt: skip
 @click.option("--joints", default="ankle_l,ankle_r", show_default=True, help="Whose distance is told in pixels.")
 @_masks
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@_json
 def evaluate(result: Path, truth: Path, capture: Path | None, joints: str, masks: str, as_json: bool) -> None:
     """Compare RESULT.h5 with TRUTH.h5: joint distances, PCK, lost frames, frames/s; pixels and silhouettes by view."""
-    import json
+    seen, note = None, ""
+    with _working(f"comparing {result} with {truth}"):
+        from tk.evaluation import evaluate_files
+        from tk.view_evaluation import capture_of, evaluate_views
 
-    from tk.evaluation import evaluate_files
-    from tk.view_evaluation import capture_of, evaluate_views
-
-    found = evaluate_files(result, truth)
-    folder = capture or capture_of(truth)
-    try:
-        seen = evaluate_views(result, truth, folder, _names(joints) or (), masks) if folder else None
-    except CaptureError as error:
-        if capture is not None:
-            raise
-        click.echo(f"note: not judged in the pictures: {error}", err=True)
-        seen = None
+        found = evaluate_files(result, truth)
+        folder = capture or capture_of(truth)
+        try:
+            seen = evaluate_views(result, truth, folder, _names(joints) or (), masks) if folder else None
+        except CaptureError as error:
+            if capture is not None:
+                raise
+            note = f"note: not judged in the pictures: {error}"
+    if note:
+        click.echo(note, err=True)
     if as_json:
-        views = {"views": seen.to_dict()} if seen else {}
-        click.echo(json.dumps(found.to_dict() | views, indent=2, allow_nan=False))
+        _print_json(**found.to_dict(), **({"views": seen.to_dict()} if seen else {}))
     else:
         click.echo(found.format_table() + (f"\n\n{seen.format_table()}" if seen else ""))
 
 
-@main.command()
+@main.command(epilog=_example("tk export walk.h5 --to trc,mot,bvh"))
 @click.argument("result", type=click.Path(path_type=Path), metavar="RESULT.h5")
 @click.option(
     "--to", "formats", required=True, metavar="A,B,…", help="Formats: trc, mot (OpenSim), c3d, bvh, csv, gltf (.glb)."
@@ -251,37 +333,55 @@ def evaluate(result: Path, truth: Path, capture: Path | None, joints: str, masks
     "-o", "--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder.  [default: beside RESULT.h5]"
 )
 @click.option("--smoothed", is_flag=True, help="The smoothed copy, with short losses bridged.")
-@click.option("--force", is_flag=True, help="Replace files that exist.")
+@_force
 def export(result: Path, formats: str, output: Path | None, smoothed: bool, force: bool) -> None:
-    """Write RESULT.h5 in formats of other programs. Example: tk export walk.h5 --to trc,mot,bvh"""
-    from tk.io.export import export as write
+    """Write RESULT.h5 in formats of other programs: OpenSim, Blender, spreadsheets."""
+    with _working(f"exporting {result}"):
+        from tk.io.export import export as write
 
-    written = write(result, _names(formats) or (), output, smoothed, force)
+        written = write(result, _names(formats) or (), output, smoothed, force)
     for note in written.notes:
         click.echo(f"note: {note}", err=True)
     for file in written.files:
         click.echo(f"wrote {file}", err=True)
 
 
-@main.command()
+@main.command(epilog=_example("tk demo"))
 @click.option("-o", "--output", default="demo.h5", show_default=True, type=click.Path(path_type=Path))
 @_voxels
-def demo(output: Path, voxels: int | None) -> None:
+@_resume
+@_force
+@_quiet
+def demo(output: Path, voxels: int | None, resume: bool, force: bool, quiet: bool) -> None:
     """Track the capture that ships with tk and compare the result with its truth."""
     from importlib.resources import as_file, files
 
-    from tk import session
-    from tk.evaluation import evaluate_files
-    from tk.io.capture import open_capture
-
     with as_file(files("tk") / "data" / "demo") as folder:
-        click.echo(f"tracking the capture that ships with tk: {folder}", err=True)
-        with _Report() as report:
-            summary = session.track(open_capture(folder), output, _configuration(None, voxels=voxels), report)
-        if summary.interrupted:
-            sys.exit(1)
-        click.echo(evaluate_files(output, folder / "truth.h5").format_table())
-    click.echo(f"The result is in {output}. Try it on your own recording: tk track CAPTURE -o RESULT.h5")
+        with Report(quiet) as report:
+            report.stage("loading")
+            from tk import session
+            from tk.evaluation import evaluate_files
+            from tk.io.capture import open_capture
+            from tk.io.result_files import check_output
+
+            check_output(output, force, resume)
+            report.stage(f"opening the capture that ships with tk, {folder}")
+            config = _configuration(None, voxels=voxels)
+            summary = session.track(open_capture(folder), output, config, report, resume=resume, force=force)
+        if not summary.interrupted:
+            click.echo(evaluate_files(output, folder / "truth.h5").format_table())
+            click.echo(f"The result is in {output}. Try it on your own recording: tk track CAPTURE -o RESULT.h5")
+        _tell(output, summary, quiet, as_json=False)
+
+
+@main.command(epilog=_example("tk config > settings.toml", "tk config --preset kehl2006"))
+@_preset
+@_config
+def config(preset: str | None, config_file: Path | None) -> None:
+    """Print all settings with what they mean, as TOML that --config takes."""
+    from tk.config_text import annotated_toml
+
+    click.echo(annotated_toml(_configuration(config_file, preset)), nl=False)
 
 
 def _names(cameras: str | None) -> tuple[str, ...] | None:
@@ -310,51 +410,3 @@ def _configuration(file: Path | None, preset: str | None = None, **overrides: An
     base = Config.preset(preset) if preset else Config()
     config = Config.read(file, base) if file else base
     return replace(config, **{name: value for name, value in overrides.items() if value is not None})
-
-
-class _Report:
-    """Progress on stderr: a bar on a terminal, a plain line every few seconds elsewhere."""
-
-    every_s = 2.0
-
-    def __init__(self) -> None:
-        self._bar: Progress | None = None
-        self._lost = 0
-        self._count = self._done = self._total = 0
-        self._started = self._last = time.perf_counter()
-
-    def __enter__(self) -> _Report:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-
-    def note(self, text: str) -> None:
-        _CONSOLE.print(f"note: {text}", style="yellow", markup=False)
-
-    def begin(self, total: int, done: int) -> None:
-        self._total, self._done = total, done
-        if done:
-            self.note(f"{done} of {total} frames are there already")
-        if _CONSOLE.is_terminal:
-            columns = (
-                TextColumn("tracking"), BarColumn(), MofNCompleteColumn(),
-                TextColumn("{task.fields[rate]}"), TimeRemainingColumn(), TextColumn("{task.fields[lost]}"),
-            )  # fmt: skip
-            self._bar = Progress(*columns, console=_CONSOLE)
-            self._task = self._bar.add_task("", total=total, completed=done, rate="", lost="")
-            self._bar.start()
-        self._started = self._last = time.perf_counter()
-
-    def advance(self, frame: int, estimate: object) -> None:
-        self._count += 1
-        self._lost += getattr(estimate, "status", "") == "lost"
-        now = time.perf_counter()
-        rate = f"{self._count / max(now - self._started, 1e-9):.1f} frames/s"
-        lost = f"{self._lost} lost" if self._lost else ""
-        if self._bar is not None:
-            self._bar.update(self._task, advance=1, rate=rate, lost=lost)
-        elif now - self._last > self.every_s or self._done + self._count == self._total:
-            self._last = now
-            click.echo(f"frame {frame}: {self._done + self._count}/{self._total}, {rate} {lost}".rstrip(), err=True)

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import tomli_w
 
@@ -19,12 +19,8 @@ from tk.io.toml import LARGE, parse_toml, read_text, shown
 from tk.model.appearance import AppearanceConfig
 from tk.model.body import BodyConfig
 from tk.model.contour_term import ContourConfig
-from tk.model.fitting import FitConfig
 from tk.model.foreground import ForegroundConfig
-from tk.model.objective import ObjectiveConfig, SamplingConfig
-from tk.optim.levenberg_marquardt import LmConfig
-from tk.optim.schedule import ScheduleConfig
-from tk.optim.smd import SmdConfig
+from tk.model.objective import ObjectiveConfig
 from tk.trackers.contours import SilhouetteConfig
 from tk.trackers.region import RegionConfig
 
@@ -32,6 +28,7 @@ T = TypeVar("T")
 
 SEGMENTATIONS = ("collinearity", "mog2")
 PRESETS = ("kehl2006",)
+EFFORTS = {"fast": 0.5, "normal": 1.0, "thorough": 5.0}
 
 #: of whatever a configuration counts: frames, points, rounds
 MOST_COUNT = 100_000
@@ -46,25 +43,24 @@ class TrackingConfig:
             predicts; at 15 Hz an arm turns by up to 31° between frames (its section 7.4).
         init_frames: frames from which the body is fitted.
         lost_ratio: a frame is lost whose objective exceeds that of the usual frame by this factor.
-        lost_astray: a frame is lost, too, when this much more of the hull's surface than usual is farther than 10 cm
-            from the body: the body is somewhere, but the person is elsewhere.
     """
 
     prediction: float = 0.9
     init_frames: int = 4
     lost_ratio: float = 3.0
-    lost_astray: float = 0.25
 
     def __post_init__(self) -> None:
         if not 0 <= self.prediction <= 1.5 or self.init_frames < 1:
             raise ConfigError(
                 f"tracking: prediction = {self.prediction} must lie in [0, 1.5], init_frames = {self.init_frames} ≥ 1"
             )
+        if not self.lost_ratio >= 1:
+            raise ConfigError(f"tracking.lost_ratio = {self.lost_ratio} must be at least 1")
 
 
 @dataclass(frozen=True)
 class Config:
-    """All settings of a run.
+    """All settings of a run. Those within tables are told in the tables' classes.
 
     Attributes:
         voxels: voxels along the working volume's longest side (the paper: 64 and 128).
@@ -72,22 +68,29 @@ class Config:
         segmentation: "collinearity" (the paper's) or "mog2".
         ahead: frames that a process of its own decodes and segments ahead of the tracker; 0: no such process, each
             frame when the tracker asks for it. The result is the same.
+        effort: how much the volumetric tracker computes: "fast", "normal", "thorough", or a number. "normal", which is
+            1, takes the paper's numbers of iterations and points (6.4). Less than 1 is a share of the iterations; more
+            is so many times as many points: "thorough", which is 5, is what its section 7.3 compares.
+        foreground: masks made against the empty scene, with segmentation = "collinearity".
+        appearance: colour models, of --method volumetric and lm, as all up to [tracking].
+        body: the body.
+        objective: the objective (section 6.1).
+        contours: the edge term of the objective (section 6.1.2).
+        tracking: following a person from frame to frame.
+        silhouette: how contours are followed, by --method region and silhouette.
+        region: how --method region searches.
     """
 
     voxels: int = 64
     seed: int = 0
     segmentation: str = "collinearity"
     ahead: int = 4
+    effort: str | float = "normal"
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
     appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
     body: BodyConfig = field(default_factory=BodyConfig)
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
-    sampling: SamplingConfig = field(default_factory=SamplingConfig)
     contours: ContourConfig = field(default_factory=ContourConfig)
-    smd: SmdConfig = field(default_factory=SmdConfig)
-    lm: LmConfig = field(default_factory=LmConfig)
-    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
-    fit: FitConfig = field(default_factory=FitConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     silhouette: SilhouetteConfig = field(default_factory=SilhouetteConfig)
     region: RegionConfig = field(default_factory=RegionConfig)
@@ -101,6 +104,15 @@ class Config:
             raise ConfigError(f'segmentation = "{self.segmentation}": choose one of {", ".join(SEGMENTATIONS)}')
         if not 0 <= self.ahead <= 64:
             raise ConfigError(f"ahead = {self.ahead}: choose from 0 to 64 frames")
+        if isinstance(self.effort, str) and self.effort not in EFFORTS:
+            raise ConfigError(f'effort = "{self.effort}": choose one of {", ".join(EFFORTS)}, or a number')
+        if not 0.05 <= self.effort_factor <= 20:
+            raise ConfigError(f"effort = {self.effort}: choose from 0.05 to 20; 1 is normal")
+
+    @property
+    def effort_factor(self) -> float:
+        """``effort`` as a number."""
+        return EFFORTS[self.effort] if isinstance(self.effort, str) else self.effort
 
     def to_toml(self) -> str:
         """The whole configuration as TOML text."""
@@ -136,6 +148,7 @@ class Config:
 def _build(default: T, values: dict[str, Any], where: str, path: str = "") -> T:
     """``default`` with the values of a table put in, recursively."""
     known = {f.name: getattr(default, f.name) for f in dataclasses.fields(default)}  # type: ignore[arg-type]
+    hints = get_type_hints(type(default))
     changes: dict[str, Any] = {}
     for key, value in values.items():
         name = f"{path}{key}"
@@ -150,9 +163,11 @@ def _build(default: T, values: dict[str, Any], where: str, path: str = "") -> T:
             if not isinstance(value, dict):
                 raise ConfigError(f"{where}: {name} must be a table")
             changes[key] = _build(old, value, where, f"{name}.")
-        elif isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
+            continue
+        kinds = get_args(hints[key]) or (hints[key],)
+        if float in kinds and type(value) is int:
             changes[key] = float(value)
-        elif type(value) is not type(old):
+        elif type(value) not in kinds:
             raise ConfigError(f"{where}: {name} = {shown(value)} must be of type {type(old).__name__}, as {old!r} is")
         elif isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"{where}: {name} = {value} must be a finite number")

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from tk.config import Config
+from tk.errors import ResultError
 from tk.io.capture import Capture
-from tk.io.point_cloud import check_hull_path, write_hulls, write_ply
+from tk.io.point_cloud import check_hull_path, ply_path, write_hulls, write_ply
 from tk.io.result import HullPoints
 from tk.model.hull import VisualHull
 from tk.model.volume import VoxelGrid
@@ -24,6 +25,7 @@ def reconstruct(
     reporter: Reporter,
     frames: tuple[int, int | None] = (0, None),
     ply: Path | None = None,
+    force: bool = False,
 ) -> int:
     """Write the coloured surface voxels of every frame.
 
@@ -34,6 +36,7 @@ def reconstruct(
         reporter: who hears of the progress.
         frames: first frame and the one to stop before (None: the last).
         ply: folder for a PLY file a frame; needs Open3D.
+        force: replace files that exist.
 
     Returns:
         Frames written.
@@ -41,10 +44,14 @@ def reconstruct(
     Raises:
         TkError: bad input; every frame finished before it is in the file.
     """
-    check_hull_path(output)
+    check_hull_path(output, force)
     for warning in capture.warnings:
         reporter.note(warning)
     start, stop = choose_frames(capture, frames, reporter.note)
+    if ply is not None and not force:
+        for frame in range(start, stop):
+            if ply_path(ply, frame).exists():
+                raise ResultError(f"{ply_path(ply, frame)}: exists; replace it by --force, or choose another folder")
     segment = make_segmenter(capture, config, reporter.note)
     hull = VisualHull(capture.rig, VoxelGrid.cover(capture.volume, config.voxels))
     reporter.begin(stop - start, 0)
@@ -55,7 +62,7 @@ def reconstruct(
                 hull.update(segment(frame))
                 points: HullPoints = points_of(hull.surface(frame.images))
                 if ply is not None:
-                    write_ply(ply / f"{frame.index:06d}.ply", np.asarray(points.positions), points.colors)
+                    write_ply(ply_path(ply, frame.index), np.asarray(points.positions), points.colors)
                 yield frame.index, points
                 reporter.advance(frame.index, None)
 

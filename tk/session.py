@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -34,6 +35,7 @@ from tk.io.result import (
     read_result,
     revise_result,
 )
+from tk.io.result_files import check_output
 from tk.model.angles import ANGLES
 from tk.model.cone_body import ConeBody
 from tk.model.derived import derive
@@ -48,6 +50,8 @@ from tk.trackers.contours import ContourTracker
 from tk.trackers.region import RegionTracker
 from tk.trackers.silhouette import SilhouetteTracker
 from tk.trackers.volumetric import LevenbergMarquardtTracker, VolumetricTracker
+
+_LOG = logging.getLogger(__name__)
 
 METHODS = ("region", "silhouette", "volumetric", "lm")
 
@@ -86,6 +90,11 @@ class Summary:
     tracked_now: int
     interrupted: bool = False
 
+    @property
+    def mostly_lost(self) -> bool:
+        """Whether more than half of the result's frames are lost."""
+        return 2 * self.lost > self.frames
+
 
 def make_tracker(method: str, capture: Capture, config: Config) -> Tracker:
     """The tracker of this name for a capture.
@@ -116,6 +125,7 @@ def track(
     store_hull: bool = False,
     body: Path | None = None,
     causal: bool = False,
+    force: bool = False,
 ) -> Summary:
     """Track a capture and write the result, frame by frame.
 
@@ -134,10 +144,12 @@ def track(
         store_hull: keep the hull's surface in the result, too.
         body: a result or a TOML file whose body is taken; None fits one to the opening frames.
         causal: leave it at the first pass, in which a frame knows nothing of those after it.
+        force: replace a result that exists.
 
     Raises:
         TkError: bad input; everything finished before it is in the file.
     """
+    check_output(output, force, resume)
     for warning in capture.warnings:
         reporter.note(warning)
     with _open(capture, config, reporter.note, method, frames, init_pose, body) as plan:
@@ -211,6 +223,7 @@ def _open(
 ) -> Iterator[_Plan]:
     # its process starts while this one makes tables and compiles
     with open_source(capture, config, note, keep_images=method != SilhouetteTracker.method) as source:
+        _LOG.info("preparing the %s tracker", method)
         tracker = make_tracker(method, capture, config)
         body = read_body(body_file, capture.up) if body_file else None
         if body is not None and not isinstance(tracker, ContourTracker):
@@ -322,12 +335,12 @@ class _Output:
             if found != value:
                 raise ResultError(
                     f"{self.writer.path}: was made differently: {name}: {found}, not {value}; "
-                    "run without --resume to start afresh"
+                    "start afresh with --force in the place of --resume"
                 )
         if REFINED in self.writer.model:
             raise ResultError(
-                f"{self.writer.path}: a second pass has gone over its frames, so no more can be added; run without "
-                "--resume to start afresh, or with --causal for a result that can be prolonged"
+                f"{self.writer.path}: a second pass has gone over its frames, so no more can be added; start afresh "
+                "with --force in the place of --resume; with --causal the result can be prolonged"
             )
 
 
@@ -358,7 +371,9 @@ class _Run:
         # The body is fitted to the same frames however few are asked for, so that a run may be prolonged by --resume.
         count = plan.tracker.opening_frames
         observations = plan.source.frames(plan.first, max(plan.stop, plan.first + count))
+        _LOG.info("reading the first frames and learning what the scene looks like")
         opening, broken = _take(observations, count)
+        _LOG.info("finding the person in frame %d and fitting the body to %d frames", plan.first, len(opening))
         seen = [o for o, _ in opening]
         try:
             if plan.body is not None and isinstance(plan.tracker, ContourTracker):
@@ -419,7 +434,7 @@ def finish(output: Path, plan: _Plan, masks: MaskStore, note: Callable[[str], No
     columns: dict[str, NDArray[np.floating]] = {}
     model: Mapping[str, Value] | None = None
     if isinstance(tracker, RegionTracker) and not causal:
-        note("second pass: the body is fitted to the whole recording")
+        _LOG.info("second pass: the body is fitted to the whole recording")
         missing = [int(f) for f in result.frames if int(f) not in masks]
         if missing:  # what an earlier run has tracked
             for observation, _ in plan.source.frames(min(missing), max(missing) + 1):
@@ -434,6 +449,7 @@ def finish(output: Path, plan: _Plan, masks: MaskStore, note: Callable[[str], No
             keep_body=plan.body is not None,
         )
         model = {**tracker.model(), REFINED: 1}
+    _LOG.info("angles, feet, and the smoothed copy")
     # the first pass's poses stand as they are
     told = ("pose", "waist", "ankles", "joints/position") if model is None else ()
     columns |= {name: values for name, values in _columns(tracker, poses).items() if name not in told}

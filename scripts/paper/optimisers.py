@@ -23,7 +23,7 @@ def run(options: Options) -> str:
     rows = []
     base = Config()
     for name, method, scale in VARIANTS:
-        config = replace(base, sampling=replace(base.sampling, scale=scale))
+        config = replace(base, effort=float(scale))
         tracks = over_seeds(options, config, method)
         rows.append(
             {

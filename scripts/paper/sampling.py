@@ -24,7 +24,7 @@ from tk.optim import smd
 from tk.optim.schedule import CHAIN_LEVER_M, descent_basis, max_step
 from tk.session import make_segmenter
 from tk.trackers.base import Observation
-from tk.trackers.volumetric import CELL_VOXELS, VolumetricTracker
+from tk.trackers.volumetric import CELL_VOXELS, SAMPLING, SCHEDULE, SMD, VolumetricTracker
 
 ANGLES = ("shoulder_r_pitch", "elbow_r_flexion")
 MOVED_DEG = np.array([18.3, 5.7])
@@ -32,6 +32,7 @@ SIDES = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 BACK_DEG = 5.0
 CHAIN = CHAIN_NAMES.index("arm_r")
 AVERAGED = 40  # draws
+ARM_POINTS = 10  # on its surface; as many on each projected contour
 WIDTH_DEG, STEP_DEG = 36.0, 2.0
 
 
@@ -73,9 +74,8 @@ def look(options: Options, paper: Config) -> Scene:
     # colours do not confine the neighbours here: the arm's own are what it could not mistake
     every = np.full(len(surface), -1, np.int64)
     index = SurfaceIndex.build(surface.positions, surface.normals, every, CELL_VOXELS * tracker.hull.grid.voxel_m)
-    objective = BodyObjective(
-        body, paper.objective.settings, paper.sampling, ContourTerm(body, capture.rig, paper.contours)
-    )
+    term = ContourTerm(body, capture.rig, paper.contours)
+    objective = BodyObjective(body, paper.objective.settings, replace(SAMPLING, chain=ARM_POINTS), term)
     frame = FrameObjective(objective, index, np.random.default_rng(0), images=observation.images)
     two = np.array([body.skeleton.index(name) for name in ANGLES])
     return Scene(frame, with_waist(body.skeleton, estimate.pose, estimate.waist), two)
@@ -94,12 +94,12 @@ def moved(scene: Scene, offsets_deg: Float) -> Float:
     return scene.frame.constrain(poses)
 
 
-def descend(scene: Scene, start: Float, seed: int, shuffle: bool, config: Config) -> tuple[Float, int]:
+def descend(scene: Scene, start: Float, seed: int, shuffle: bool) -> tuple[Float, int]:
     """Path (I + 1, 2) of the two angles in degrees, and the iterations."""
     frame = scene.fresh(seed)
     free = np.zeros(len(start), bool)
     free[scene.two] = True
-    s = config.schedule
+    s = SCHEDULE
     basis, inverse = descent_basis(frame.curvature(start), free, frame.damping(CHAIN_LEVER_M), whiten=False)
     tolerance = s.refine * np.where(frame.angular, np.radians(s.tolerance_deg), s.tolerance_m)
     found = smd.minimise(
@@ -109,7 +109,7 @@ def descend(scene: Scene, start: Float, seed: int, shuffle: bool, config: Config
         tolerance,
         frame.constrain,
         basis[None],
-        replace(config.smd, shuffle=shuffle),
+        replace(SMD, shuffle=shuffle),
         keep_path=True,
         max_step=max_step(frame.angular),
         basis_inverse=inverse[None],
@@ -122,8 +122,6 @@ def descend(scene: Scene, start: Float, seed: int, shuffle: bool, config: Config
 def run(options: Options) -> str:
     """Write the figure and give the table."""
     paper = Config.preset("kehl2006")
-    # 7.1: 10 points on the arm's surface and 10 on each projected contour
-    paper = replace(paper, sampling=replace(paper.sampling, chain=10))
     scene = look(options, paper)
     axis = np.arange(-WIDTH_DEG, WIDTH_DEG + 0.1, STEP_DEG)
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
@@ -139,7 +137,7 @@ def run(options: Options) -> str:
             start[scene.two] += np.radians(MOVED_DEG * side)
             start = scene.frame.constrain(start[None])[0]
             for seed in range(options.seeds):
-                path, iterations = descend(scene, start, seed, shuffle, paper)
+                path, iterations = descend(scene, start, seed, shuffle)
                 paths.setdefault(name, path)
                 left = np.abs(path[-1] - goal)
                 back += bool(left.max() <= BACK_DEG)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tk.model.appearance import FLOOR_YUV, LEASH, Appearance, AppearanceConfig, to_yuv
+from tk.model.appearance import FLOOR_YUV, MOST_DRIFT, Appearance, AppearanceConfig, to_yuv
 
 CONFIG = AppearanceConfig()
 RED, GREEN, BLUE = np.array([30.0, 30, 200]), np.array([30.0, 200, 30]), np.array([200.0, 30, 30])
@@ -88,7 +88,7 @@ def test_a_patch_that_hardly_any_voxel_fits_constrains_nothing(red, fits_all):
 
 @given(st.floats(0, 1), st.integers(0, 2**32 - 1))
 @settings(max_examples=30, deadline=None)
-def test_update_is_equation_16_within_the_leash(rate, seed):
+def test_update_is_equation_16_within_its_bound(rate, seed):
     config = replace(CONFIG, rate=rate)
     model, _, _ = learned()
     rng = np.random.default_rng(seed)
@@ -97,20 +97,20 @@ def test_update_is_equation_16_within_the_leash(rate, seed):
     for p in (0, 1):
         incoming = to_yuv(colors[patch == p]).mean(axis=0)
         expected = (1 - rate) * model.mean[p] + rate * incoming
-        expected = np.clip(expected, model.mean[p] - LEASH, model.mean[p] + LEASH)
+        expected = np.clip(expected, model.mean[p] - MOST_DRIFT, model.mean[p] + MOST_DRIFT)
         np.testing.assert_allclose(updated.mean[p], expected, atol=1e-9)
     np.testing.assert_array_equal(updated.initial, model.initial)
     np.testing.assert_array_equal(updated.deviation, model.deviation)
 
 
-def test_the_leash_holds_against_a_steady_pull():
+def test_the_bound_holds_against_a_steady_pull():
     """Section 7.2's failure: a patch taught the wrong colour frame after frame."""
     model, _, _ = learned()
     start = model.mean.copy()
     for _ in range(50):
         model = model.updated(np.zeros(20, int), np.tile(BLUE, (20, 1)), CONFIG)
     distance = np.abs(model.mean - start)
-    assert distance[0].max() == pytest.approx(LEASH)
+    assert distance[0].max() == pytest.approx(MOST_DRIFT)
     np.testing.assert_allclose(distance[1:], 0, atol=1e-9)
 
 

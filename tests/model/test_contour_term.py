@@ -195,9 +195,7 @@ def test_a_body_that_nobody_sees_has_no_entries():
     assert not (entries[..., a.STATE] != a.ABSENT).any()
 
 
-@pytest.mark.parametrize(
-    "bad", [{"edge_weight": -1.0}, {"views": 0}, {"pairs": 0}, {"reach_m": 0.0}, {"hidden": -1.0}, {"nu": 0.0}]
-)
+@pytest.mark.parametrize("bad", [{"edge_weight": -1.0}, {"views": 0}, {"pairs": 0}, {"reach_m": 0.0}, {"hidden": -1.0}])
 def test_bad_settings_are_refused(bad):
     with pytest.raises(ConfigError, match=f"contours.{next(iter(bad))}"):
         ContourConfig(**bad)

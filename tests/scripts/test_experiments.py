@@ -62,10 +62,10 @@ def test_every_experiment_writes_a_figure_and_a_table(
 
 def test_optimisers_differ_in_method_and_points_alone(asked: list[tuple[Any, ...]], tmp_path: Path) -> None:
     main(["optimisers", str(DEMO), "--seeds", "1", "--out", str(tmp_path)])
-    assert [(method, config.sampling.scale) for config, _, method, _ in asked] == [
+    assert [(method, config.effort) for config, _, method, _ in asked] == [
         ("volumetric", 1), ("volumetric", 5), ("lm", 1), ("lm", 5),
     ]  # fmt: skip
-    same = {replace(config, sampling=Config().sampling) for config, *_ in asked}
+    same = {replace(config, effort="normal") for config, *_ in asked}
     assert same == {Config()}
 
 
@@ -117,7 +117,7 @@ def test_deterministic_points_stay_and_stochastic_ones_do_not() -> None:
     start = sampling.moved(scene, np.array([[10.0, 5.0]]))
     values = [sampling.landscape(scene, 3, start)[0] for _ in range(2)]
     assert values[0] == values[1] != sampling.landscape(scene, 4, start)[0]
-    ends = [sampling.descend(scene, start[0], 3, False, Config.preset("kehl2006"))[0][-1] for _ in range(2)]
+    ends = [sampling.descend(scene, start[0], 3, False)[0][-1] for _ in range(2)]
     np.testing.assert_array_equal(ends[0], ends[1])
     held = np.setdiff1d(np.arange(len(scene.pose)), scene.two)
     np.testing.assert_array_equal(start[0, held], scene.pose[held])

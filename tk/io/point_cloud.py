@@ -139,8 +139,8 @@ def _publish(temporary: Path, path: Path, count: int) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def check_hull_path(path: Path) -> None:
-    """Refuse a path that cannot be written, or that is somebody else's file.
+def check_hull_path(path: Path, force: bool = True) -> None:
+    """Refuse a path that cannot be written, or that is somebody else's file; without ``force`` any that exists.
 
     Raises:
         ResultError: with what to do about it.
@@ -155,8 +155,15 @@ def check_hull_path(path: Path) -> None:
         return
     try:
         with open_hdf5(path) as file:
-            if file.is_format(HULL_FORMAT):
-                return
+            known = file.is_format(HULL_FORMAT)
     except ResultError:
-        pass
-    raise ResultError(f"{path}: exists and is not a {HULL_FORMAT} file; it is not overwritten: choose another name")
+        known = False
+    if not known:
+        raise ResultError(f"{path}: exists and is not a {HULL_FORMAT} file; it is not overwritten: choose another name")
+    if not force:
+        raise ResultError(f"{path}: exists; replace it by --force, or choose another name")
+
+
+def ply_path(folder: Path, frame: int) -> Path:
+    """Where a frame's point cloud is written."""
+    return folder / f"{frame:06d}.ply"

@@ -143,9 +143,9 @@ class ResultWriter:
             try:
                 difference = found.difference(meta)
             except ResultError as reason:
-                done.fail(f"{reason}; run without --resume to start afresh")
+                done.fail(f"{reason}; start afresh with --force in the place of --resume")
             if difference:
-                done.fail(f"was made differently: {difference}; run without --resume to start afresh")
+                done.fail(f"was made differently: {difference}; start afresh with --force in the place of --resume")
             rows = count_rows(done, found)
             check_hull(done, rows)
             if "resume/rows" in done:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,10 @@ from tk.errors import ResultError
 from tk.io.toml import parse_toml
 from tk.model.camera import Rig
 from tk.model.skeleton import JOINTS
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
 
 FORMAT = "tk-result"
 FORMAT_VERSION = 2
@@ -276,6 +280,18 @@ class Result:
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """A table, one row a frame; see :func:`tk.io.result_tables.to_pandas`."""
+        from tk.io.result_tables import to_pandas
+
+        return to_pandas(self)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Arrays with named dimensions; see :func:`tk.io.result_tables.to_xarray`."""
+        from tk.io.result_tables import to_xarray
+
+        return to_xarray(self)
 
     def with_smoothed(self) -> Result:
         """The same result with what is below `/smoothed` in its place; as it is where nothing was smoothed."""

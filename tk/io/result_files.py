@@ -12,7 +12,7 @@ from pathlib import Path
 
 import h5py
 
-from tk.errors import ResultError
+from tk.errors import ConfigError, ResultError
 from tk.io.hdf5 import open_hdf5
 from tk.io.result_data import FORMAT
 
@@ -83,6 +83,28 @@ def check_is_result(target: Path) -> None:
     except ResultError:
         pass
     raise ResultError(f"{target}: exists and is not a {FORMAT}; it is not overwritten: choose another name")
+
+
+def check_output(path: Path, force: bool, resume: bool = False) -> None:
+    """Refuse a path where a result cannot be written, or must not be: nothing that exists is replaced unasked.
+
+    Args:
+        path: where the result is to be.
+        force: replace a result that is there; other files are left alone all the same.
+        resume: go on with a result that is there.
+
+    Raises:
+        ResultError: what is there, and what to do about it.
+        ConfigError: both ``force`` and ``resume``.
+    """
+    if force and resume:
+        raise ConfigError("--force replaces a result and --resume goes on with it: give one of them")
+    target = writable(path)
+    if resume or not target.exists():
+        return
+    check_is_result(target)
+    if not force:
+        raise ResultError(f"{path}: exists; go on with it by --resume, replace it by --force, or choose another name")
 
 
 def move_to_memory(file: h5py.File) -> None:

@@ -10,11 +10,14 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
+import logging
 import os
 import tempfile
 import time
 import warnings
 from pathlib import Path
+
+_LOG = logging.getLogger(__name__)
 
 # Taichi greets on import unless told otherwise; a library has no business on the user's stdout.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
@@ -79,6 +82,7 @@ def ensure_runtime() -> None:
     if threads:
         options["cpu_max_num_threads"] = int(threads)
     _break_stale_lock()
+    _LOG.info("starting the kernels; what this machine has not compiled yet takes some seconds")
     with contextlib.redirect_stdout(io.StringIO()):  # it prints that it starts, whatever the log level
         ti.init(**options)
 

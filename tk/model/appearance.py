@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.errors import ConfigError
 from tk.kernels.appearance import segment
 
 Float = NDArray[np.float64]
@@ -25,9 +26,9 @@ _YUV_FROM_BGR = np.array([[0.114, 0.587, 0.299], [0.436, -0.289, -0.147], [-0.10
 # Least standard deviations of Y, U, V, levels of 255: shading moves Y more than U and V.
 FLOOR_YUV = (16.0, 6.0, 6.0)
 # Greatest distance of a mean from its first value, levels.
-LEASH = 30.0
-# Greatest distance between a sample and the voxel that teaches it, metres.
-TEACHING_M = 0.05
+MOST_DRIFT = 30.0
+# Greatest distance between a sample and the voxel whose colour it learns, metres.
+LEARNING_M = 0.05
 # A patch that fewer than this share of the voxels fit constrains nothing.
 LEAST_SHARE = 0.01
 
@@ -46,6 +47,10 @@ class AppearanceConfig:
     enabled: bool = True
     rate: float = 0.3
     width: float = 2.5
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.rate <= 1 or not self.width > 0:
+            raise ConfigError(f"appearance: rate = {self.rate} must lie in [0, 1], width = {self.width} be positive")
 
 
 @dataclass(frozen=True)
@@ -111,7 +116,7 @@ class Appearance:
         learns = self.known & (count >= 3)
         incoming = np.where(learns[:, None], incoming / np.maximum(count, 1)[:, None], self.mean)
         mean = (1 - config.rate) * self.mean + config.rate * incoming
-        return replace(self, mean=np.clip(mean, self.initial - LEASH, self.initial + LEASH))
+        return replace(self, mean=np.clip(mean, self.initial - MOST_DRIFT, self.initial + MOST_DRIFT))
 
 
 def to_yuv(colors_bgr: NDArray[np.floating]) -> Float:

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import ConfigError
 from tk.model.anthropometry import (
     ANKLE_BACK,
     ANKLE_OUTWARD,
@@ -39,17 +38,9 @@ class BodyConfig:
     Attributes:
         waist: whether the pelvis turns against the trunk, by three angles beyond the paper's 24 degrees of freedom. A
             dancer's hips stay level while the trunk leans; a rigid trunk takes them along.
-        waist_stiffness: what a waist bent to the side by θ radians costs: half of this times θ², in units of the
-            objective; bending forward costs three times as much, twisting five times. The lumbar spine bends where the
-            picture asks for it, and not where nothing does.
     """
 
     waist: bool = True
-    waist_stiffness: float = 0.1
-
-    def __post_init__(self) -> None:
-        if not self.waist_stiffness >= 0:
-            raise ConfigError(f"body.waist_stiffness = {self.waist_stiffness} must not be negative")
 
 
 @dataclass(frozen=True)

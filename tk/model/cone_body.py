@@ -301,9 +301,7 @@ def _between(name: str, segment: str, begin: Float, end: Float, r0: float, r1: f
     axis = (end - begin) / length
     front = np.array([1.0, 0.0, 0.0])
     front -= (front @ axis) * axis
-    return ConePart(
-        name, segment, CONE, (r0, r0, length, r1 / r0), _frame(begin, axis, front / np.linalg.norm(front))
-    )
+    return ConePart(name, segment, CONE, (r0, r0, length, r1 / r0), _frame(begin, axis, front / np.linalg.norm(front)))
 
 
 def _foot(side: str, ankle: Float, d: BodyDimensions) -> list[ConePart]:
@@ -351,7 +349,11 @@ def _trunk_and_head(d: BodyDimensions) -> list[ConePart]:
     chest = (d.chest_half_depth, d.chest_half_width)
 
     def slice_of(name: str, low: float, high: float, sizes: tuple[float, float], m: float) -> ConePart:
-        begin, end = (h * z + PELVIS_FORWARD * d.stature * np.clip((shoulders - h) / (shoulders - waist), 0, 1) * x for h in (low, high))
+        # as far forward as the pelvis up to the waist, on the line at the shoulders
+        begin, end = (
+            h * z + PELVIS_FORWARD * d.stature * np.clip((shoulders - h) / (shoulders - waist), 0, 1) * x
+            for h in (low, high)
+        )
         part = _between(name, "pelvis" if low < 0 else "torso", begin, end, 1.0, m)
         return replace(part, shape=(*sizes, part.shape[2], m))
 

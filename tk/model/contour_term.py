@@ -36,6 +36,12 @@ RENEW = 5
 ALONG = 0.0
 
 
+# σ of eqs. 13 and 15, metres at the limb; 0 would take the limb's diameter, as the paper does.
+SIGMA_M = 0.1
+# Leclerc's ν of eq. 9, in units of ½ (d/σ)²; the paper prints none.
+EDGE_NU = 0.1
+
+
 @dataclass(frozen=True)
 class ContourConfig:
     """Settings of the edge term.
@@ -46,8 +52,6 @@ class ContourConfig:
         pairs: circles of latitude on each limb; the paper takes 10 contour points a limb and view, which are 5 pairs.
         reach_m: how far from the contour edges are looked for, metres at the limb.
         threshold: least colour gradient of an edge, 0…1; the paper tuned its own by hand for each camera.
-        sigma_m: σ of eqs. 13 and 15, metres at the limb; 0 takes the limb's diameter, as the paper does.
-        nu: Leclerc's ν of eq. 9, in units of ½ (d/σ)².
         hidden: ρ of a hidden contour point (paper: 1).
     """
 
@@ -56,15 +60,13 @@ class ContourConfig:
     pairs: int = 5
     reach_m: float = 0.08
     threshold: float = 0.12
-    sigma_m: float = 0.1
-    nu: float = 0.1
     hidden: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("edge_weight", "threshold", "sigma_m", "hidden"):
+        for name in ("edge_weight", "threshold", "hidden"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"contours.{name} = {getattr(self, name)} must not be negative")
-        for name in ("views", "pairs", "reach_m", "nu"):
+        for name in ("views", "pairs", "reach_m"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"contours.{name} = {getattr(self, name)} must be positive")
 
@@ -144,11 +146,11 @@ class ContourTerm:
         diameter = np.where(
             both, np.hypot(*(lines[:, 2:4] - lines[:, 4:6]).T), self._diameter[points.strip[b, k]] * pixels_a_metre
         )
-        sigma = c.sigma_m * pixels_a_metre if c.sigma_m else np.maximum(diameter, 1.0)
+        sigma = SIGMA_M * pixels_a_metre if SIGMA_M else np.maximum(diameter, 1.0)
         entries[:, alignment.INV_SIGMA2] = 1 / sigma**2
         entries[:, alignment.STATE] = np.where(any_seen, alignment.ASSIGNED, alignment.UNASSIGNABLE)
         entries[:, alignment.SHARE] = ALONG
-        entries[:, alignment.NU] = c.nu
+        entries[:, alignment.NU] = EDGE_NU
         # every contour point counts the same, whether it stands for itself or in a pair;
         # the hidden half of a half-hidden pair has an entry of its own
         found = points.found[b, v, k].sum(axis=1)

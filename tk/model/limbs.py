@@ -33,7 +33,7 @@ _KNEES_DEG = (5.0, 45.0, 85.0, 130.0)
 _NEAR_DEG = 25.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Limb:
     """A limb of a body.
 

@@ -54,6 +54,11 @@ REACH_M, COVERAGE_REACH_M = 0.3, 0.5
 COVERAGE_SOFTNESS = 2.0
 # Least weight of a pair in the Hessian: a limb that has moved away from its data keeps some curvature.
 OUTLIERS = 0.1
+# Leclerc's ν of eq. 9, in units of ½ (d/σ)²; the paper prints none.
+SURFACE_NU = 0.35
+# Weight of the distance along the data's surface, and the least cosine between a sample's normal and its voxel's: as in
+# the paper's eq. 10, which is the plain distance and ignores normals. Point-to-plane would be 0.
+TANGENTIAL, MIN_COSINE = 1.0, -1.0
 
 
 @dataclass(frozen=True)
@@ -61,41 +66,29 @@ class ObjectiveConfig:
     """Settings of the objective (section 6.1).
 
     Attributes:
-        nu: Leclerc's ν of eq. 9, in units of ½ (d/σ)². The paper prints none.
-        tangential: weight of the distance along the data's surface; 1 is the paper's distance, 0 point-to-plane.
-        min_cosine: least cosine between a sample's normal and its voxel's; -1 ignores normals, as the paper does.
         coverage_weight: w_c of the coverage term, from data to model; 0 leaves it out, as the paper does.
         surface_weight: w_s of eq. 8; 0 leaves the surface term out.
     """
 
-    nu: float = 0.35
-    tangential: float = 1.0
-    min_cosine: float = -1.0
     coverage_weight: float = 0.7
     surface_weight: float = 1.0
 
     def __post_init__(self) -> None:
-        for name, valid in (
-            ("nu", self.nu > 0),
-            ("tangential", 0 <= self.tangential <= 1),
-            ("min_cosine", -1 <= self.min_cosine <= 1),
-            ("coverage_weight", self.coverage_weight >= 0),
-            ("surface_weight", self.surface_weight >= 0),
-        ):
-            if not valid:
-                raise ConfigError(f"objective.{name} = {getattr(self, name)} is out of range")
+        for name in ("coverage_weight", "surface_weight"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"objective.{name} = {getattr(self, name)} must not be negative")
 
     @property
     def settings(self) -> ObjectiveSettings:
         """What the kernel takes."""
         return ObjectiveSettings(
-            nu=self.nu,
-            tangential=self.tangential,
-            min_cosine=self.min_cosine,
+            nu=SURFACE_NU,
+            tangential=TANGENTIAL,
+            min_cosine=MIN_COSINE,
             reach_m=REACH_M,
             coverage_weight=self.coverage_weight,
-            coverage_nu=COVERAGE_SOFTNESS * self.nu,
-            coverage_cosine=self.min_cosine,
+            coverage_nu=COVERAGE_SOFTNESS * SURFACE_NU,
+            coverage_cosine=MIN_COSINE,
             coverage_reach_m=COVERAGE_REACH_M,
             surface_weight=self.surface_weight,
         )
@@ -136,7 +129,7 @@ class BodyObjective:
         sampling: numbers of points.
         contours: the contour cues, if any.
         dtype: precision of the kernel.
-        waist_stiffness: see :class:`~tk.model.body.BodyConfig`.
+        waist_stiffness: see :data:`tk.trackers.volumetric.WAIST_STIFFNESS`.
     """
 
     def __init__(
@@ -254,7 +247,7 @@ class Evaluation(NamedTuple):
 
 
 # A voxel farther from the body than this is not explained by it, metres.
-ASTRAY_M = 0.1
+UNEXPLAINED_M = 0.1
 # A voxel this far from the nearest piece may belong to another: voxels lie 2 to 3 cm off the piece they belong to.
 UNCLAIMED_M = 0.05
 
@@ -278,25 +271,25 @@ class Fit:
     entries: NDArray[np.floating] | None = None
 
     @property
-    def stranded(self) -> NDArray[np.bool_]:
+    def unmatched(self) -> NDArray[np.bool_]:
         """(M,) True for samples with no voxel within σ."""
         M = len(self.samples)
         distance2 = np.sum(self.linear.residual[:M] ** 2, axis=1)
         return (self.linear.partner[:M] < 0) | (distance2 * self.linear.inv_sigma2[:M] > 1)
 
     @property
-    def astray(self) -> NDArray[np.bool_]:
+    def unexplained(self) -> NDArray[np.bool_]:
         """(Q,) True for voxels that the body does not explain."""
         M = len(self.samples)
         if len(self.linear.residual) == M:
             return np.zeros(len(self.voxels), bool)
-        return (self.linear.partner[M:] < 0) | (np.linalg.norm(self.linear.residual[M:], axis=1) > ASTRAY_M)
+        return (self.linear.partner[M:] < 0) | (np.linalg.norm(self.linear.residual[M:], axis=1) > UNEXPLAINED_M)
 
     @property
-    def astray_share(self) -> float:
+    def unexplained_share(self) -> float:
         """Share of the voxels that the body does not explain."""
-        astray = self.astray
-        return float(astray.mean()) if len(astray) else 0.0
+        unexplained = self.unexplained
+        return float(unexplained.mean()) if len(unexplained) else 0.0
 
 
 class _Look(NamedTuple):
@@ -462,7 +455,7 @@ class FrameObjective:
         nearest = np.where(piece >= 0, CHAIN_OF_SEGMENT[self.objective.piece_segment[piece]], -1)
         M = len(fit.samples)
         unclaimed = np.linalg.norm(fit.linear.residual[M:], axis=1) > UNCLAIMED_M
-        pools = [fit.voxels[(nearest == c) | fit.astray | unclaimed] for c in range(len(CHAINS))]
+        pools = [fit.voxels[(nearest == c) | fit.unexplained | unclaimed] for c in range(len(CHAINS))]
         return [pool if len(pool) else fit.voxels for pool in pools]
 
     def _draw_full(self) -> tuple[Ints, Ints]:

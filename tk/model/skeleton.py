@@ -205,19 +205,6 @@ class Skeleton:
         """The degrees of freedom that lift a shoulder: with the one behind it each turns the arm up."""
         return np.flatnonzero(self.rise.any(axis=1))
 
-    @cached_property
-    def _levels(self) -> tuple[NDArray[np.int64], ...]:
-        """Degrees of freedom by their depth in the tree, the root's first."""
-        depth = np.zeros(len(self.names), int)
-        for k, parent in enumerate(self.parent):
-            depth[k] = depth[parent] + 1 if parent >= 0 else 0
-        return tuple(np.flatnonzero(depth == d) for d in range(depth.max() + 1))
-
-    @cached_property
-    def _raised(self) -> NDArray[np.int64]:
-        """The degrees of freedom that lift a shoulder: with the one behind it each turns the arm up."""
-        return np.flatnonzero(self.rise.any(axis=1))
-
     def transforms(self, pose: Float) -> Float:
         """(..., D, 4, 4) transforms T_k after each degree of freedom of poses (..., D), float64. Kernels have their
         own."""

@@ -41,8 +41,9 @@ HEADINGS, PHASES, FINALISTS = 8, 8, 6
 RELOCATE_EVERY = 3
 # The fall of the cost, as a share of the person's pixels, that makes another place of a limb the pose.
 GAIN = 0.004
-# Places of a limb that are descended from, and random ones about its own place that are looked at beside the grid.
-PLACES, NEARBY = 3, 80
+# Places of a limb that are descended from, more of one that is known to be misplaced, and random ones about its own
+# place that are looked at beside the grid.
+PLACES, MORE_PLACES, NEARBY = 3, 8, 80
 # Places of a limb are not looked at where that much of it is outside the silhouettes.
 OUTSIDE = 0.4
 # A limb's place that costs this much more than its present one, once the limb alone has settled there, is given up.
@@ -308,7 +309,12 @@ class ContourTracker:
         return mean_of_views(evidence.cast(self.body, self.colors.group, poses)[0])
 
     def search(
-        self, frame: Observation, pyramid: Pyramid, pose: Float, images: NDArray[np.uint8] | None = None
+        self,
+        frame: Observation,
+        pyramid: Pyramid,
+        pose: Float,
+        images: NDArray[np.uint8] | None = None,
+        misplaced: Sequence[Limb] = (),
     ) -> tuple[Float, Float]:
         """Other places of the limbs: all of a limb's are screened in one launch, the best ones descended from, first by
         the limb alone, then, where that promises something, by the whole body.
@@ -328,19 +334,20 @@ class ContourTracker:
         for limb in self.limbs:
             without, rest = coarse.cast(self.body, group, pose[None], limb.others, export=True)
             assert rest is not None
-            if mean_of_views(without)[0] - own > unmet:
+            if limb not in misplaced and mean_of_views(without)[0] - own > unmet:
                 continue  # it explains more where it is than there is to explain elsewhere
             before = Cast(rest.label[0].copy(), rest.depth[0].copy())
             tried = limb.candidates(pose, NEARBY, rng)
             cost, _ = coarse.cast(self.body, group, tried, limb.parts, before, most_outside=OUTSIDE)
-            places = limb.distinct(skeleton, tried, mean_of_views(cost), PLACES)
+            places = limb.distinct(skeleton, tried, mean_of_views(cost), MORE_PLACES if limb in misplaced else PLACES)
             if not len(places):
                 continue
             settled = self.settle(pyramid, places, level, images, limb=limb).states
             cost, _ = coarse.cast(self.body, group, settled, limb.parts, before)
             told = mean_of_views(cost)
             order = np.argsort(told, kind="stable")
-            others = settled[order][(told[order] < own + PROMISING) & (skeleton.apart(settled[order], joints) > APART_M)]
+            settled, told = settled[order], told[order]
+            others = settled[(told < own + PROMISING) & (skeleton.apart(settled, joints) > APART_M)]
             if len(others):
                 found.append((limb, others[:2]))
         if not found:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,16 +29,18 @@ from tk.io.result_data import Result
 from tk.kernels.nearest import SurfaceIndex
 from tk.model import initialisation
 from tk.model.anthropometry import BodyDimensions
-from tk.model.appearance import TEACHING_M, Appearance
+from tk.model.appearance import LEARNING_M, Appearance
 from tk.model.body import Body, build_body
 from tk.model.camera import Rig
 from tk.model.contour_term import ContourTerm
-from tk.model.fitting import fit_body
+from tk.model.fitting import FitConfig, fit_body
 from tk.model.hull import HullSurface, VisualHull
-from tk.model.objective import CHAIN_OF_SEGMENT, BodyObjective, Fit, FrameObjective
+from tk.model.objective import CHAIN_OF_SEGMENT, BodyObjective, Fit, FrameObjective, SamplingConfig
 from tk.model.skeleton import CHAINS, JOINTS, WAIST, build_skeleton, with_waist, without_waist
 from tk.model.volume import Volume, VoxelGrid
 from tk.optim import lm_schedule, schedule
+from tk.optim.levenberg_marquardt import LmConfig
+from tk.optim.smd import SmdConfig
 from tk.trackers.base import Estimate, Observation, Stopwatch
 
 Float = NDArray[np.float64]
@@ -47,13 +49,51 @@ Float = NDArray[np.float64]
 CELL_VOXELS = 4.0
 # Fewer surface voxels than this are no person.
 LEAST_VOXELS = 60
-# A frame is lost, too, when more than this share of the samples of a limb, the head or the torso has no voxel near it.
+# A frame is lost, too, when more than this share of the samples of a limb, the head or the torso has no voxel near it,
 LOST_LIMB = 0.6
+# or when this much more of the hull's surface than usual is farther than 10 cm from the body: the body is somewhere,
+# but the person is elsewhere.
+LOST_UNEXPLAINED = 0.25
+# What a waist bent to the side by θ radians costs: half of this times θ², in units of the objective; bending forward
+# costs three times as much, twisting five times. The lumbar spine bends where the picture asks for it, and not where
+# nothing does.
+WAIST_STIFFNESS = 0.1
+
+# The paper's schedule (6.2, 6.4), and what stands in for numbers that it does not print: see docs/method.md.
+SCHEDULE = schedule.ScheduleConfig()
+SAMPLING = SamplingConfig()
+SMD = SmdConfig()
+LM = LmConfig()
+FIT = FitConfig()
 
 
 def _drift(usual: float, now: float) -> float:
     """What is usual after one more frame: quick to learn that it can be better, slow to put up with worse."""
     return usual + (0.1 if now < usual else 0.05) * (now - usual)
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What ``effort`` makes of the paper's numbers of iterations and points."""
+
+    sampling: SamplingConfig
+    smd: SmdConfig
+    lm: LmConfig
+    fit: FitConfig
+
+    @staticmethod
+    def of(factor: float) -> Effort:
+        """See :class:`tk.config.Config`."""
+
+        def share(count: int) -> int:
+            return max(round(min(factor, 1.0) * count), 1)
+
+        return Effort(
+            replace(SAMPLING, scale=max(round(factor), 1) * SAMPLING.scale),
+            replace(SMD, max_iterations=share(SMD.max_iterations)),
+            replace(LM, max_iterations=share(LM.max_iterations)),
+            replace(FIT, rounds=share(FIT.rounds)),
+        )
 
 
 class VolumetricTracker:
@@ -76,6 +116,7 @@ class VolumetricTracker:
 
     def __init__(self, rig: Rig, volume: Volume, up: str, config: Config, cache_dir: Path | None = None) -> None:
         self.config = config
+        self.effort = Effort.of(config.effort_factor)
         self.up = up
         self.rig = rig
         self.hull = VisualHull(rig, VoxelGrid.cover(volume, config.voxels), cache_dir)
@@ -90,7 +131,7 @@ class VolumetricTracker:
         self._appearance: Appearance
         self._pose = np.zeros(len(skeleton.names))
         self._previous = self._pose
-        self._usual, self._usual_astray = np.inf, 1.0
+        self._usual, self._usual_unexplained = np.inf, 1.0
         self._lost_for = 0
         self._fresh = True
 
@@ -133,9 +174,9 @@ class VolumetricTracker:
             indices,
             self.up,
             self.config.objective.settings,
-            self.config.sampling,
+            self.effort.sampling,
             anchor,
-            self.config.fit,
+            self.effort.fit,
         )
         self._take_body(dimensions)
         # people stand upright for the fit: their waist is straight
@@ -145,27 +186,27 @@ class VolumetricTracker:
         self._pose = self._previous = pose
         first = FrameObjective(self._objective, indices[0], np.random.default_rng(0), images=frames[0].images)
         fit = first.fit(pose)
-        self._usual, self._usual_astray = fit.value, fit.astray_share
+        self._usual, self._usual_unexplained = fit.value, fit.unexplained_share
         self._learn_colours(surfaces[0], indices[0], pose)
         self.hull.reset()
 
     def _take_body(self, dimensions: BodyDimensions) -> None:
         self._body = build_body(dimensions, self.up, waist=self.config.body.waist)
-        edges, scale = self.config.contours, self.config.sampling.scale
+        edges, scale = self.config.contours, self.effort.sampling.scale
         contours = ContourTerm(self._body, self.rig, edges, scale) if edges.edge_weight > 0 else None
         self._objective = BodyObjective(
             self._body,
             self.config.objective.settings,
-            self.config.sampling,
+            self.effort.sampling,
             contours,
-            waist_stiffness=self.config.body.waist_stiffness,
+            waist_stiffness=WAIST_STIFFNESS,
         )
 
     def _learn_colours(self, surface: HullSurface, index: SurfaceIndex, pose: Float) -> None:
         """Each patch takes the colours of the voxels under its samples."""
         assert self._body is not None
         fit = FrameObjective(self._objective, index, np.random.default_rng(0)).fit(pose)
-        patch, colors = self._taught(surface, index, fit)
+        patch, colors = self._correspondences(surface, index, fit)
         self._appearance = Appearance.learn(len(self._body.patch_names), patch, colors)
 
     # --- tracking (section 6.4) ---------------------------------------------------------------------------------
@@ -196,8 +237,8 @@ class VolumetricTracker:
         if not lost:
             # (4) the colour models follow (eq. 16)
             self._usual = _drift(self._usual, fit.value)
-            self._usual_astray = _drift(self._usual_astray, fit.astray_share)
-            patch, colors = self._taught(surface, index, fit)
+            self._usual_unexplained = _drift(self._usual_unexplained, fit.unexplained_share)
+            patch, colors = self._correspondences(surface, index, fit)
             self._appearance = self._appearance.updated(patch, colors, config.appearance)
         self._previous = result.pose if lost or self._lost_for else self._pose
         self._pose = result.pose
@@ -218,7 +259,7 @@ class VolumetricTracker:
 
     def _search(self, problem: FrameObjective, starts: Float) -> schedule.ScheduleResult:
         """The pose that explains a frame best, from the starts (S, D)."""
-        return schedule.optimise(problem, starts, self.config.schedule, self.config.smd)
+        return schedule.optimise(problem, starts, SCHEDULE, self.effort.smd)
 
     any_pose = False
 
@@ -254,14 +295,13 @@ class VolumetricTracker:
 
     def _is_lost(self, fit: Fit) -> bool:
         """Whether the person, or one of the limbs, is elsewhere."""
-        limits = self.config.tracking
         chain = CHAIN_OF_SEGMENT[self.body.segment[fit.samples]]
-        stranded = np.bincount(chain[fit.stranded] + 1, minlength=len(CHAINS) + 1)
+        unmatched = np.bincount(chain[fit.unmatched] + 1, minlength=len(CHAINS) + 1)
         everywhere = np.bincount(chain + 1, minlength=len(CHAINS) + 1)
         return (
-            fit.value > limits.lost_ratio * self._usual
-            or fit.astray_share > self._usual_astray + limits.lost_astray
-            or bool((stranded > LOST_LIMB * everywhere).any())
+            fit.value > self.config.tracking.lost_ratio * self._usual
+            or fit.unexplained_share > self._usual_unexplained + LOST_UNEXPLAINED
+            or bool((unmatched > LOST_LIMB * everywhere).any())
         )
 
     def _nothing_seen(self, frame: Observation, surface: HullSurface, watch: Stopwatch) -> Estimate:
@@ -285,12 +325,12 @@ class VolumetricTracker:
     def _index(self, surface: HullSurface, fits: NDArray[np.int64]) -> SurfaceIndex:
         return SurfaceIndex.build(surface.positions, surface.normals, fits, CELL_VOXELS * self.hull.grid.voxel_m)
 
-    def _taught(
+    def _correspondences(
         self, surface: HullSurface, index: SurfaceIndex, fit: Fit
     ) -> tuple[NDArray[np.integer], NDArray[np.floating]]:
         """Patches (N,) and colours (N, 3) of the samples that sit on a voxel which a camera sees."""
         M = len(fit.samples)
-        near = np.linalg.norm(fit.linear.residual[:M], axis=1) < TEACHING_M
+        near = np.linalg.norm(fit.linear.residual[:M], axis=1) < LEARNING_M
         partner = index.order[fit.linear.partner[:M]]
         sure = (fit.linear.partner[:M] >= 0) & near & (surface.seen[partner] > 0)
         return self.body.patch[fit.samples[sure]], surface.colors[partner[sure]]
@@ -318,7 +358,7 @@ class VolumetricTracker:
         return {
             "pose": self._pose,
             "previous": self._previous,
-            "usual": np.array([self._usual, self._usual_astray]),
+            "usual": np.array([self._usual, self._usual_unexplained]),
             "lost_for": self._lost_for,
             "mean_yuv": self._appearance.mean,
         }
@@ -339,7 +379,7 @@ class VolumetricTracker:
         self._appearance = replace(learned, mean=np.asarray(state["mean_yuv"]))
         self._pose = np.asarray(state["pose"])
         self._previous = np.asarray(state["previous"])
-        self._usual, self._usual_astray = (float(v) for v in state["usual"])
+        self._usual, self._usual_unexplained = (float(v) for v in state["usual"])
         self._lost_for = int(state["lost_for"])
         self._fresh = False
 
@@ -366,4 +406,4 @@ class LevenbergMarquardtTracker(VolumetricTracker):
     method = "lm"
 
     def _search(self, problem: FrameObjective, starts: Float) -> schedule.ScheduleResult:
-        return lm_schedule.optimise(problem, starts, self.config.schedule, self.config.lm)
+        return lm_schedule.optimise(problem, starts, SCHEDULE, self.effort.lm)

@@ -1,0 +1,128 @@
+"""What exists is not replaced unasked, how a run ends, and what scripts read."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import click
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+import tk as package
+from tests.conftest import FRAMES, QUICK, Tk
+from tk.cli import main
+from tk.errors import ConfigError, ResultError
+from tk.io.capture import open_capture
+
+
+def test_a_result_is_not_replaced_unasked(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    result = tmp_path / "r.h5"
+    command = ["track", tiny, "-o", result, "--config", quick, "--frames", ":2"]
+    assert tk(*command).code == 0
+    before = result.read_bytes()
+    tk(*command).complaint(str(result), "exists", "--resume", "--force")
+    tk(*command, "--resume", "--force").complaint("--resume", "--force", "one of them")
+    assert result.read_bytes() == before
+    assert tk(*command, "--seed", "4", "--force").code == 0
+    with h5py.File(result, "r") as file:
+        assert file.attrs["seed"] == 4
+
+
+def test_force_leaves_alone_what_is_no_result(tk: Tk, tiny: Path, tmp_path: Path) -> None:
+    other = tmp_path / "thesis.h5"
+    other.write_text("mine")
+    for command in ("track", "reconstruct"):
+        tk(command, tiny, "-o", other, "--force").complaint("thesis.h5", "not overwritten")
+    assert other.read_text() == "mine"
+
+
+def test_a_hull_and_its_point_clouds_are_not_replaced_unasked(tk: Tk, tiny: Path, tmp_path: Path) -> None:
+    settings = tmp_path / "s.toml"
+    settings.write_text("voxels = 16\nahead = 0\n")
+    command = ["reconstruct", tiny, "--config", settings, "--frames", ":2"]
+    first = tk(*command, "-o", tmp_path / "h.h5", "--ply", tmp_path / "ply")
+    assert first.code == 0, first.err
+    tk(*command, "-o", tmp_path / "h.h5").complaint("h.h5", "--force")
+    tk(*command, "-o", tmp_path / "i.h5", "--ply", tmp_path / "ply").complaint("000000.ply", "--force")
+    assert not (tmp_path / "i.h5").exists()
+    assert tk(*command, "-o", tmp_path / "h.h5", "--ply", tmp_path / "ply", "--force").code == 0
+
+
+def test_python_follows_the_same_rule(tiny: Path, tmp_path: Path) -> None:
+    path = tmp_path / "r.h5"
+    config = package.Config.from_toml(QUICK)
+    capture = open_capture(tiny)
+    first = package.track(capture, path, config=config, frames=(0, 1), causal=True)
+    with pytest.raises(ResultError, match="exists"):
+        package.track(capture, path, config=config)
+    with pytest.raises(ConfigError, match="one of them"):
+        package.track(capture, path, config=config, resume=True, force=True)
+    again = package.track(capture, path, config=config, frames=(0, 1), causal=True, force=True)
+    np.testing.assert_array_equal(first.pose, again.pose)
+
+
+def test_most_frames_lost_is_an_exit_code_of_its_own(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
+    for mask in (copy / "masks").glob("*/*.png"):
+        if int(mask.stem) >= 4:  # the person has left
+            cv2.imwrite(str(mask), np.zeros_like(cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE)))
+    ran = tk("track", copy, "-o", tmp_path / "r.h5", "--config", quick, "--quiet", "--json")
+    assert ran.code == 3, ran.err
+    assert f"{FRAMES - 4} of {FRAMES} frames are lost" in ran.told[-1] and ran.told[-1].startswith("tk: ")
+    found = json.loads(ran.out)
+    assert (found["frames"], found["lost"], found["interrupted"]) == (FRAMES, FRAMES - 4, False)
+
+
+def test_scripts_get_json_and_nothing_else(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    command = ["--config", quick, "--frames", ":2", "--quiet", "--json"]
+    ran = tk("track", tiny, "-o", tmp_path / "r.h5", *command)
+    assert (ran.code, ran.err) == (0, "")
+    found = json.loads(ran.out)
+    assert found["result"] == str(tmp_path / "r.h5") and found["frames"] == found["tracked_now"] == 2
+    assert found["seconds"] > 0 and found["frames_per_second"] > 0
+    hull = tk("reconstruct", tiny, "-o", tmp_path / "h.h5", *command)
+    assert (hull.code, hull.err) == (0, "")
+    assert json.loads(hull.out)["frames"] == 2
+
+
+def test_a_run_says_what_it_does_before_the_first_frame(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    ran = tk("track", tiny, "-o", tmp_path / "r.h5", "--config", quick, "--frames", ":1")
+    before = ran.err.partition("frame 0: ")[0]
+    said = [re.sub(r"^\[ *[\d.]+ s\] ", "", line) for line in before.splitlines()]
+    assert said[0] == "loading" and said[1] == f"opening {tiny}"
+    assert any("finding the person in frame 0" in line for line in said)
+
+
+def commands() -> list[str]:
+    assert isinstance(main, click.Group)
+    return sorted(main.commands)
+
+
+def test_no_summary_is_cut_off(tk: Tk) -> None:
+    listed = tk("--help").out.partition("Commands:")[2]
+    assert "..." not in listed and "…" not in listed
+    for name in commands():
+        assert name in listed
+
+
+@pytest.mark.parametrize("name", commands())
+def test_each_commands_help_has_an_example_that_it_accepts(tk: Tk, name: str) -> None:
+    ran = tk(name, "--help")
+    assert ran.code == 0 and f"tk {name}" in ran.out and ran.err == ""
+    assert isinstance(main, click.Group)
+    command = main.commands[name]
+    told = f"{command.help}\n{command.epilog}"  # as it was written, for the help wraps its lines
+    examples = re.findall(r"(?:^|xample:|;) *tk (.+?)(?=;|$)", told, re.M)
+    assert any(example.split()[0] == name for example in examples)
+    for example in examples:
+        first, *rest = shlex.split(example.partition(" > ")[0])
+        main.commands[first].make_context(first, rest)
+
+
+def test_the_shells_completion_can_be_had(tk: Tk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("_TK_COMPLETE", "zsh_source")
+    assert "compdef" in tk().out
