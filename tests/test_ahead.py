@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import FRAMES, QUICK, Silent
+from tests.people import write_people
 from tests.test_session import assert_same, send
 from tk import session
 from tk.ahead import Ahead, Serial, Source, open_source
@@ -89,13 +90,11 @@ def test_a_result_is_the_same(tiny: Path, tracked: Path, tmp_path: Path) -> None
     assert (timing["total"] >= work - 1e-6).all() and (timing["masks"] > 0).all()
 
 
-def test_notes_are_handed_on(copy: Path) -> None:
-    for clip in (copy / "background").iterdir():
-        clip.unlink()
-    (copy / "background").rmdir()
+def test_notes_are_handed_on(tmp_path: Path) -> None:
+    folder = write_people(tmp_path / "walk", [lambda k: (0.85 * np.cos(k / 2), 0.85 * np.sin(k / 2))], 12)
     notes: list[str] = []
-    assert len(arrays(Ahead(open_capture(copy, masks="none"), AHEAD, notes.append), 0, 1)) == 1
-    assert len(notes) == 1 and "the median of up to 25 frames" in notes[0]
+    assert len(arrays(Ahead(open_capture(folder, masks="median"), AHEAD, notes.append), 0, 1)) == 1
+    assert "the median of 12 frames is taken for the empty scene" in notes[0]
 
 
 def test_an_error_comes_at_its_frame(copy: Path, tmp_path: Path) -> None:

@@ -128,14 +128,6 @@ def test_masks_and_cameras_of_ones_own_choice(tk: Tk, quick: Path, copy: Path, t
         assert (b["status"][()] < 3).all()
 
 
-def test_a_median_stands_for_the_missing_empty_scene(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
-    shutil.rmtree(copy / "masks")
-    shutil.rmtree(copy / "background")
-    ran = tk("reconstruct", copy, "-o", tmp_path / "h.h5", "--config", quick, "--frames", ":2")
-    assert ran.code == 0
-    assert "no masks and no background/" in ran.told[0]
-
-
 def test_settings_from_a_file_and_options_over_them(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
     settings = tmp_path / "settings.toml"
     settings.write_text(f"seed = 3\n{QUICK}prediction = 0\n".replace("32", "40"), encoding="utf-8")

@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from tk.config import Config
 from tk.errors import TkError, WorkerError
 from tk.io.capture import Capture
-from tk.segmentation import Labeller, make_labeller
+from tk.segmentation import Labeller, make_labeller, mask_source
 from tk.trackers.base import Observation, Stopwatch
 
 Note = Callable[[str], None]
@@ -82,7 +82,11 @@ def open_source(capture: Capture, config: Config, note: Note, keep_images: bool 
         config: how they are segmented, and how many frames ahead.
         note: who hears what is worth knowing.
         keep_images: False leaves the images empty, (C, 0, 0, 3), for a tracker that looks at masks alone.
+
+    Raises:
+        CaptureError: nothing to make masks from.
     """
+    mask_source(capture)  # before anything is started
     if config.ahead == 0 or _cores() < 2 or not sys.executable:
         return Serial(capture, config, note, keep_images)
     return Ahead(capture, config, note, keep_images)

@@ -43,7 +43,8 @@ def open_capture(path: PathLike, cameras: Sequence[str] | None = None, masks: st
     Args:
         path: the folder: `calibration.toml`, `videos/` and what else there is.
         cameras: names of the cameras to use; all if None.
-        masks: "auto" (the capture's own where it has some), "none" (segment the videos), or a folder of masks.
+        masks: "auto" (the capture's own where it has some), "none" (segment the videos), "median" (against the
+            recording's median), or a folder of masks.
 
     Raises:
         tk.errors.CaptureError: what is wrong with the folder, in one line that names the file.

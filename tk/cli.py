@@ -79,15 +79,16 @@ def _example(*lines: str) -> str:
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="tk")
 def main() -> None:
-    """A person's motion out of a few ordinary, calibrated cameras: no markers, no trained weights, no GPU."""
+    """A person's motion out of a few ordinary, calibrated cameras: no markers, no GPU."""
 
 
 _capture = click.argument("capture", type=click.Path(path_type=Path))
 _cameras = click.option("--cameras", metavar="A,B,…", help="Use these cameras only.")
 _frames = click.option("--frames", metavar="A:B", help="Frames A to B-1; either may be left out.")
 _masks = click.option(
-    "--masks", default="auto", show_default=True, metavar="auto|none|DIR",
-    help="The capture's masks where it has some, none (segment the videos), or a folder of masks.",
+    "--masks", default="auto", show_default=True, metavar="auto|none|median|DIR",
+    help="auto: the capture's masks, else its empty scene, else an installed segmenter; none: not its masks; "
+    "median: over the recording, for the empty scene; DIR: a folder of masks.",
 )  # fmt: skip
 _voxels = click.option("--voxels", type=int, help="Voxels along the working volume's longest side.  [default: 64]")
 _no_report = click.option("--no-report", is_flag=True, help="Leave out the overlay video and the report.")
@@ -283,6 +284,32 @@ def reconstruct(
         _print_json(result=str(output), frames=count, seconds=round(time.perf_counter() - started, 3))
     if not quiet:
         click.echo(f"{count} frames in {output}", err=True)
+
+
+@main.command(epilog=_example("tk masks CAPTURE -o masks; tk track CAPTURE -o result.h5 --masks masks"))
+@_capture
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="DIR")
+@click.option("--segmenter", metavar="NAME", help="Which one, where several are installed.")
+@_cameras
+@_frames
+@_quiet
+def masks(
+    capture: Path, output: Path, segmenter: str | None, cameras: str | None, frames: str | None, quiet: bool
+) -> None:
+    """Let a segmenter make masks of CAPTURE's videos: DIR/CAMERA/000000.png.
+
+    The person is white. The same command goes on where it was stopped.
+    """
+    span = _span(frames)
+    with Report(quiet) as report:
+        report.stage("loading")
+        from tk import mask_folder
+        from tk.io.capture import open_capture
+
+        opened = open_capture(capture, _names(cameras), "none")
+        written = mask_folder.write_masks(opened, output, report, segmenter, span)
+    if not quiet:
+        click.echo(f"masks of {written.frames} frames in {output}, {written.now} of them new", err=True)
 
 
 @main.command(epilog=_example("tk evaluate result.h5 CAPTURE/truth.h5"))

@@ -43,6 +43,7 @@ from tk.model.hull import HullSurface
 from tk.model.skeleton import SEGMENTS, join_pose, split_pose
 from tk.model.smoothing import smooth
 from tk.segmentation import make_segmenter as make_segmenter
+from tk.segmentation import mask_source
 from tk.trackers.base import Estimate, Tracker
 from tk.trackers.bodies import read_body
 from tk.trackers.contours import ContourTracker
@@ -310,7 +311,7 @@ def _origin(capture: Capture, plan: _Plan, store_hull: bool) -> dict[str, str]:
         "frame of the initial pose": str(plan.first),
         "given body (its hash)": given,
         "cameras": ", ".join(capture.rig.names),
-        "masks": "none" if masks is None else os.path.relpath(masks[0].path.parent, capture.path),
+        "masks": mask_source(capture) if masks is None else os.path.relpath(masks[0].path.parent, capture.path),
         "initial pose (its hash)": "none" if init is None else hashlib.sha256(repr(init).encode()).hexdigest()[:12],
         "stored hull": "yes" if store_hull else "no",
     }

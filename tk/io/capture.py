@@ -53,6 +53,7 @@ class Capture:
         warnings: what was put up with, a line each, for the user to read.
         clips: a clip a camera.
         mask_clips: a mask clip a camera, None without ready masks.
+        masks: what :func:`open_capture` was asked for, which says where masks come from if there are none.
     """
 
     path: Path
@@ -68,6 +69,7 @@ class Capture:
     warnings: tuple[str, ...]
     clips: tuple[Clip, ...]
     mask_clips: tuple[Clip, ...] | None
+    masks: str
     _calibration: Calibration
 
     @property
@@ -116,13 +118,13 @@ def open_capture(path: str | Path, cameras: Sequence[str] | None = None, masks: 
     Args:
         path: the folder.
         cameras: names of the cameras to use; all of them by default.
-        masks: "auto" takes the capture's `masks/` where there is one, "none" takes no masks, anything else is a folder
-            in the layout of `masks/`.
+        masks: "auto" takes the capture's `masks/` where there is one; "none" and "median" take no masks, and leave it
+            to :mod:`tk.segmentation` to make some; anything else is a folder in the layout of `masks/`.
 
     Raises:
         CaptureError: or one of its subclasses, with one line that names the file and what is wrong with it.
     """
-    path = Path(path)
+    path, masks_asked = Path(path), masks
     if not path.is_dir():
         raise CaptureError(f"{path}: is not a folder; a capture is a folder with calibration.toml and videos/")
     walk = find_walk(path)
@@ -159,6 +161,7 @@ def open_capture(path: str | Path, cameras: Sequence[str] | None = None, masks: 
         warnings=tuple(warnings),
         clips=clips,
         mask_clips=mask_clips,
+        masks=masks_asked,
         _calibration=calibration,
     )
 
@@ -171,13 +174,13 @@ def _open_clips(calibration: Calibration, path: Path) -> tuple[Clip, ...]:
 
 
 def _open_masks(calibration: Calibration, path: Path, masks: str) -> tuple[Clip, ...] | None:
-    if masks == "none":
+    if masks in ("none", "median"):
         return None
     folder = path / "masks" if masks == "auto" else Path(masks)
     if not folder.is_dir():
         if masks == "auto":
             return None
-        raise CaptureError(f"--masks {masks}: is not a folder; give auto, none or a folder of masks")
+        raise CaptureError(f"--masks {masks}: is not a folder; give auto, none, median or a folder of masks")
     return _clips_of(calibration, folder, "masks", "mp4", is_mask=True)
 
 

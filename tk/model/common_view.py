@@ -34,12 +34,24 @@ def closest_to_axes(rig: Rig) -> Float:
     Raises:
         VolumeError: the axes are parallel, so that there is no such point.
     """
-    directions = np.array([camera.rotation[2] for camera in rig])
-    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]  # projects onto the plane across each axis
-    normal = across.sum(axis=0)
-    if np.linalg.cond(normal) > 1e6:  # axes within about a milliradian of one another
+    point = closest_to_lines(rig.centers, np.array([camera.rotation[2] for camera in rig]))
+    if point is None:
         raise VolumeError("the cameras' axes are parallel")
-    return np.linalg.solve(normal, np.einsum("cij,cj->i", across, rig.centers))
+    return point
+
+
+def closest_to_lines(origins: Float, directions: Float) -> Float | None:
+    """(3,) the point with the least sum of squared distances to lines; None where they are parallel.
+
+    Args:
+        origins: (N, 3) a point of each.
+        directions: (N, 3) unit vectors.
+    """
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]  # projects onto the plane across each line
+    normal = across.sum(axis=0)
+    if np.linalg.cond(normal) > 1e6:  # within about a milliradian of one another
+        return None
+    return np.linalg.solve(normal, np.einsum("cij,cj->i", across, origins))
 
 
 def infer_volume(rig: Rig) -> Volume:

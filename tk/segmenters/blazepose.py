@@ -1,0 +1,126 @@
+"""MediaPipe's pose networks (BlazePose; Bazarevsky et al. 2020), run with LiteRT: where people are, and one's mask.
+
+The detector tells each person's mid-hip point and the radius of the circle about it that holds the whole body. The pose
+network looks at one upright square with one person in it; beside the landmarks, which are not used here, it gives a
+mask of 256×256. The same figures as MediaPipe's own graph, but that nothing is carried over from frame to frame, and
+that the square is chosen by the caller, who has several cameras.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.model.subject import Sighting
+from tk.segmenters.weights import weights
+
+_DETECTOR_SIDE, _POSE_SIDE = 224, 256
+
+# Of the detector: cells of the grids that its anchors lie on, and how many lie in each (MediaPipe's
+# pose_detection_cpu.pbtxt: strides 8, 16, 32, 32, 32, two anchors each).
+_GRIDS = ((28, 2), (14, 2), (7, 6))
+_HIPS, _CIRCLE = slice(4, 6), slice(6, 8)  # columns: the mid-hip point, a point of the body's circle
+_LEAST_SCORE = 0.5  # MediaPipe's own
+_SAME = 0.5  # detections with mid-hip points within this share of the radius are one person
+
+
+class BlazePose:
+    """A :class:`~tk.segmenters.Segmenter` and :class:`~tk.segmenters.Finder`.
+
+    Raises:
+        ConfigError: the weights are not there and cannot be fetched.
+    """
+
+    def __init__(self) -> None:
+        files = weights()
+        self._detector = _Network(files["pose_detection.tflite"])
+        self._pose = _Network(files["pose_landmark_full.tflite"])
+        self._anchors = np.concatenate([_grid(cells, count) for cells, count in _GRIDS])
+
+    def find(self, picture: NDArray[np.uint8]) -> list[Sighting]:
+        """The people in a picture (h, w, 3) BGR, the surest first."""
+        square, scale = _in_square(picture, _DETECTOR_SIDE)
+        found = self._detector(square / np.float32(127.5) - 1)
+        rows, logits = (found[i][0] for i in np.argsort([-array.shape[-1] for array in found]))
+        scores = 1 / (1 + np.exp(-np.clip(logits[:, 0].astype(np.float64), -100, 100)))
+        sure = np.flatnonzero(scores >= _LEAST_SCORE)
+        sure = sure[np.argsort(-scores[sure], kind="stable")]
+        hips, circle = (
+            (rows[sure, part] + self._anchors[sure] * _DETECTOR_SIDE) / scale - 0.5 for part in (_HIPS, _CIRCLE)
+        )
+        weight, people = scores[sure], []
+        while len(hips):
+            # MediaPipe's weighted non-maximum suppression, by the mid-hip points
+            radius = float(np.linalg.norm(circle[0] - hips[0]))
+            same = np.linalg.norm(hips - hips[0], axis=1) <= _SAME * radius
+            share = weight[same, None] / weight[same].sum()
+            x, y = (share * hips[same]).sum(axis=0)
+            u, v = (share * circle[same]).sum(axis=0)
+            people.append(Sighting((float(x), float(y)), (float(u), float(v)), float(weight[0])))
+            hips, circle, weight = hips[~same], circle[~same], weight[~same]
+        return people
+
+    def segment(self, picture: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """(h, w) the probability of each pixel to show the person about the picture's (h, w, 3) middle."""
+        height, width = picture.shape[:2]
+        square, _ = _in_square(picture, _POSE_SIDE)
+        (logits,) = (a for a in self._pose(square / np.float32(255)) if a.shape[1:3] == (_POSE_SIDE,) * 2)
+        side = max(height, width)
+        # enlarged before the threshold, so that the outline is finer than the network's pixels
+        whole = cv2.resize(logits[0, :, :, 0], (side, side), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(1 / (1 + np.exp(-np.clip(whole[:height, :width], -50, 50))), np.float32)
+
+
+class _Network:
+    """A TensorFlow Lite network with one input (1, n, n, 3)."""
+
+    def __init__(self, path: Path) -> None:
+        from ai_edge_litert.interpreter import Interpreter
+
+        with _silenced():
+            self._interpreter = Interpreter(str(path), num_threads=1)
+            self._interpreter.allocate_tensors()
+        self._input = self._interpreter.get_input_details()[0]["index"]
+        self._outputs = [detail["index"] for detail in self._interpreter.get_output_details()]
+
+    def __call__(self, picture: NDArray[np.floating]) -> list[NDArray[Any]]:
+        """The outputs (1, …) for a picture (n, n, 3)."""
+        self._interpreter.set_tensor(self._input, picture[None].astype(np.float32))
+        self._interpreter.invoke()
+        return [self._interpreter.get_tensor(index) for index in self._outputs]
+
+
+@contextmanager
+def _silenced() -> Iterator[None]:
+    """Keep LiteRT from telling on stderr, below Python, which delegate it has chosen: it knows no other way."""
+    kept = os.dup(2)
+    try:
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+def _grid(cells: int, count: int) -> NDArray[np.float64]:
+    """(cells² count, 2) the anchors' centres x, y, shares of the picture."""
+    y, x = np.mgrid[:cells, :cells] + 0.5
+    return np.repeat(np.stack([x.ravel(), y.ravel()], axis=1) / cells, count, axis=0)
+
+
+def _in_square(picture: NDArray[np.uint8], side: int) -> tuple[NDArray[np.uint8], float]:
+    """The picture in RGB, scaled into the upper left of a black square (side, side, 3), and the scale."""
+    height, width = picture.shape[:2]
+    largest = max(height, width)
+    padded = cv2.copyMakeBorder(picture, 0, largest - height, 0, largest - width, cv2.BORDER_CONSTANT)
+    shrunk = cv2.INTER_AREA if largest > side else cv2.INTER_LINEAR
+    small = cv2.resize(padded, (side, side), interpolation=shrunk)
+    return np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2RGB), np.uint8), side / largest
