@@ -312,6 +312,46 @@ def masks(
         click.echo(f"masks of {written.frames} frames in {output}, {written.now} of them new", err=True)
 
 
+@main.command(epilog=_example("tk inspect CAPTURE -o looks"))
+@_capture
+@click.option("-o", "--output", type=click.Path(path_type=Path), metavar="DIR", help="Write a sheet of pictures here.")
+@_cameras
+@_masks
+@_config
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def inspect(
+    capture: Path, output: Path | None, cameras: str | None, masks: str, config_file: Path | None, as_json: bool
+) -> None:
+    """Look at CAPTURE before tracking: masks, cameras that disagree or are late, volume, floor, up."""
+    import json
+
+    from tk.inspection import inspect as look
+    from tk.inspection_sheet import write_sheet
+    from tk.io.capture import open_capture
+
+    opened = open_capture(capture, _names(cameras), masks)
+    found, seen = look(opened, _configuration(config_file))
+    if output is not None:
+        write_sheet(output / "inspect.png", opened, found, seen)
+        click.echo(f"pictures in {output / 'inspect.png'}", err=True)
+    click.echo(json.dumps(found.to_dict(), indent=2, allow_nan=False) if as_json else found.format_table())
+
+
+@main.command(epilog=_example("tk level CAPTURE"))
+@_capture
+@_masks
+@_config
+def level(capture: Path, masks: str, config_file: Path | None) -> None:
+    """Find what points up from cameras and person, and write it into CAPTURE/capture.toml."""
+    from tk.inspection import inspect as look
+    from tk.io.capture import open_capture
+    from tk.leveling import write_up
+
+    found, _ = look(open_capture(capture, None, masks), _configuration(config_file), pictures=0)
+    write_up(capture, found.leveling)
+    click.echo(f"up = {found.leveling.up} in {capture / 'capture.toml'}: {found.leveling.how}")
+
+
 @main.command(epilog=_example("tk evaluate result.h5 CAPTURE/truth.h5"))
 @click.argument("result", type=click.Path(path_type=Path))
 @click.argument("truth", type=click.Path(path_type=Path))

@@ -50,6 +50,7 @@ from tk.trackers.contours import ContourTracker
 from tk.trackers.region import RegionTracker
 from tk.trackers.silhouette import SilhouetteTracker
 from tk.trackers.volumetric import LevenbergMarquardtTracker, VolumetricTracker
+from tk.trackers.watch import Watch
 
 _LOG = logging.getLogger(__name__)
 
@@ -171,6 +172,8 @@ def track(
                 reporter.begin(plan.stop - plan.begin, min(done, plan.stop - plan.begin))
                 for estimate in run.estimates():
                     reporter.advance(estimate.frame, estimate)
+            for line in run.watch.report() if run.tracked else ():
+                reporter.note(line)
             if run.tracked:
                 finish(output, plan, run.masks, note, causal)
                 if said:
@@ -197,7 +200,10 @@ def estimates(
     for warning in capture.warnings:
         note(warning)
     with _open(capture, config, note, method, frames, init_pose, body) as plan:
-        yield from _Run(plan, config, None).estimates()
+        run = _Run(plan, config, None)
+        yield from run.estimates()
+        for line in run.watch.report():
+            note(line)
 
 
 @dataclass(frozen=True)
@@ -317,7 +323,7 @@ def _origin(capture: Capture, plan: _Plan, store_hull: bool) -> dict[str, str]:
     }
 
 
-_ORIGIN, _LOST = "run/", "lost frames"
+_ORIGIN, _LOST, _WATCH = "run/", "lost frames", "watch/"
 #: in `/model` of a result that a second pass has gone over
 REFINED = "refined"
 
@@ -360,6 +366,7 @@ class _Run:
         self.tracked = 0
         self.lost = 0
         self.masks = MaskStore()
+        self.watch = Watch(plan.tracker, plan.capture)
 
     def estimates(self) -> Iterator[Estimate]:
         """Start or restore the tracker, and step it to the end; what is handed out is in the file already."""
@@ -374,6 +381,7 @@ class _Run:
             output.check()
             with blamed_on(output.writer.path, "the state of the run"):
                 plan.tracker.restore(output.writer.model, output.writer.state)
+                self.watch.restore(_below(_WATCH, output.writer.state))
             yield from self._step_through(plan.source.frames(plan.begin + done, plan.stop))
             return
         # The body is fitted to the same frames however few are asked for, so that a run may be prolonged by --resume.
@@ -382,14 +390,16 @@ class _Run:
         _LOG.info("reading the first frames and learning what the scene looks like")
         opening, broken = _take(observations, count)
         _LOG.info("finding the person in frame %d and fitting the body to %d frames", plan.first, len(opening))
-        seen = [o for o, _ in opening]
         try:
+            seen = self.watch.start([o for o, _ in opening])
             if plan.body is not None and isinstance(plan.tracker, ContourTracker):
                 plan.tracker.start(seen, plan.capture.subject_height_m, plan.init, plan.body)
             else:
                 plan.tracker.start(seen, plan.capture.subject_height_m, plan.init)
+            self.watch.check_body()
         except CaptureError as error:
             raise CaptureError(f"{plan.capture.path}: {error}") from None
+        del seen
         if output:
             output.writer.write_model(plan.tracker.model())
         yield from self._step_through(chain(_emptied(opening), broken or observations))
@@ -401,7 +411,7 @@ class _Run:
             if observation.index >= plan.stop:
                 return
             started = time.perf_counter()
-            estimate = plan.tracker.step(observation)
+            estimate, _ = self.watch.step(observation)
             if observation.index < plan.begin:
                 continue
             if output and estimate.masks is not None:
@@ -420,7 +430,8 @@ class _Run:
 
     def _state(self, output: _Output) -> Mapping[str, Value]:
         origin = {_ORIGIN + name: value for name, value in output.origin.items()}
-        return {**self.plan.tracker.state(), **origin, _ORIGIN + _LOST: self.lost}
+        watched = {_WATCH + name: value for name, value in self.watch.state().items()}
+        return {**self.plan.tracker.state(), **watched, **origin, _ORIGIN + _LOST: self.lost}
 
 
 def finish(output: Path, plan: _Plan, masks: MaskStore, note: Callable[[str], None], causal: bool) -> None:
@@ -443,11 +454,14 @@ def finish(output: Path, plan: _Plan, masks: MaskStore, note: Callable[[str], No
     model: Mapping[str, Value] | None = None
     if isinstance(tracker, RegionTracker) and not causal:
         _LOG.info("second pass: the body is fitted to the whole recording")
+        assert result.fit_error is not None
         missing = [int(f) for f in result.frames if int(f) not in masks]
         if missing:  # what an earlier run has tracked
+            rows = {int(f): row for row, f in enumerate(result.frames)}
             for observation, _ in plan.source.frames(min(missing), max(missing) + 1):
-                masks.put(observation.index, tracker.without_foreign(observation).masks)
-        assert result.fit_error is not None
+                told = result.fit_error[rows[observation.index]]  # NaN where a camera was left out
+                own = tracker.without_foreign(observation).masks
+                masks.put(observation.index, np.where(np.isfinite(told)[:, None, None], own, np.uint8(0)))
         poses, columns["fit_error"] = tracker.second_pass(
             masks.sequence(result.frames),
             poses,
@@ -480,6 +494,10 @@ def _columns(tracker: ContourTracker, poses: NDArray[np.float64]) -> dict[str, N
     if tracker.ankle_names:
         columns["ankles"] = ankles
     return columns
+
+
+def _below(prefix: str, state: Mapping[str, Value]) -> dict[str, Value]:
+    return {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
 
 
 def _take(observations: Iterator[Observed], count: int) -> tuple[list[Observed], Iterator[Observed] | None]:

@@ -19,6 +19,7 @@ from tk.io.settings import CaptureSettings, read_settings
 from tk.io.video import Clip, Image, list_clips, probe
 from tk.model.camera import Camera, Rig
 from tk.model.common_view import infer_volume, sample_box, views_of
+from tk.model.mounting import infer_up
 from tk.model.up import up_vector
 from tk.model.volume import Volume
 
@@ -30,6 +31,9 @@ DEFAULT_FPS = 30.0
 #: pictures of the empty scene that are kept a camera, and the bytes that all of them may take
 _BACKGROUND_FRAMES = 50
 _BACKGROUND_BYTES = 384 * 2**20
+
+#: what points up when `capture.toml` does not say, unless the cameras' mounting is farther from it, degrees
+DEFAULT_UP, _UP_DEG = "z", 25.0
 
 #: cameras farther apart than this, in metres, are taken for millimetres in disguise
 _FAR_APART_M = 100.0
@@ -151,7 +155,7 @@ def open_capture(path: str | Path, cameras: Sequence[str] | None = None, masks: 
         path=path,
         name=settings.name or path.resolve().name,
         fps=_frame_rate(settings, clips, path, warnings.append),
-        up=settings.up,
+        up=_up(settings, rig, path, warnings.append),
         rig=rig,
         volume=_working_volume(settings, rig, path, warnings.append),
         frame_count=frame_count,
@@ -237,6 +241,17 @@ def _frame_rate(settings: CaptureSettings, clips: Sequence[Clip], path: Path, wa
             f"{path / 'videos'}: frame rates differ ({listed}); {rates[0]:g} is used, fps in capture.toml overrides it"
         )
     return rates[0]
+
+
+def _up(settings: CaptureSettings, rig: Rig, path: Path, warn: Callable[[str], None]) -> str:
+    """What points up: z unless `capture.toml` says otherwise, or says nothing and the cameras are mounted otherwise."""
+    if settings.up is not None:
+        return settings.up
+    found = infer_up(rig)
+    if up_vector(found.up) @ up_vector(DEFAULT_UP) > np.cos(np.radians(_UP_DEG)):
+        return DEFAULT_UP
+    warn(f"{path / 'capture.toml'}: gives no up; {found.up} is taken, {found.how}; tk level looks closer")
+    return found.up
 
 
 def _working_volume(settings: CaptureSettings, rig: Rig, path: Path, warn: Callable[[str], None]) -> Volume:

@@ -29,7 +29,7 @@ from tk.io.settings import CaptureSettings
 from tk.model.camera import Camera, Rig
 
 #: frames a second; nobody stands in the Da Vinci pose
-SETTINGS = CaptureSettings(fps=30.0, init_pose="any")
+SETTINGS = CaptureSettings(fps=30.0, up="z", init_pose="any")
 
 _PICTURES, _MASKS = "moboJpg", "moboBgSub"
 _NUMBERS = (

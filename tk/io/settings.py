@@ -37,7 +37,8 @@ class CaptureSettings:
     Attributes:
         name: of the capture.
         fps: frames a second.
-        up: what points up in the world, as :func:`tk.model.up.up_text` tells it: "z", or a unit vector's text.
+        up: what points up in the world, as :func:`tk.model.up.up_text` tells it: "z", or a unit vector's text; None
+            where the cameras have to tell.
         volume: the working volume, metres.
         subject_height_m: the subject's height without shoes, metres.
         init_frame: the frame in which the subject stands in the initialisation pose.
@@ -47,7 +48,7 @@ class CaptureSettings:
 
     name: str | None = None
     fps: float | None = None
-    up: str = "z"
+    up: str | None = None
     volume: Volume | None = None
     subject_height_m: float | None = None
     init_frame: int = 0
@@ -72,7 +73,7 @@ def read_settings(path: Path) -> CaptureSettings:
     if fps is not None and not FPS_RANGE[0] <= fps <= FPS_RANGE[1]:
         document.fail(f"fps = {fps:g} must be between {FPS_RANGE[0]:g} and {FPS_RANGE[1]:g}")
 
-    up = _up(document)
+    up = _up(document) if "up" in document else None
 
     subject = document.table("subject")
     height_m = subject.number("height") if "height" in subject else None

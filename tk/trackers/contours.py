@@ -121,6 +121,7 @@ class ContourTracker:
         self.waist_names: tuple[str, ...] = WAIST if full else ()
         self.ankle_names: tuple[str, ...] = ANKLES if full else ()
         self._body: ConeBody | None = None
+        self._lost_for = 0
         self.colors: PartColors
         self.limbs: tuple[Limb, ...]
 
@@ -265,6 +266,10 @@ class ContourTracker:
     ) -> None:
         """Find the subject in the first frame; what is kept of it, a subclass says."""
         self.find(frames, height_m, init, body)
+
+    def lose(self) -> None:
+        """The last frame's pose is not believed: the person is looked for in the next one."""
+        self._lost_for = max(self._lost_for, 1)
 
     # --- one frame ----------------------------------------------------------------------------------------------
 

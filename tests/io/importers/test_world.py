@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tests.io.importers.conftest import make_rig, points
-from tk.io.importers.world import find_volume, infer_up
+from tk.io.importers.world import find_volume
 from tk.model.camera import Rig
+from tk.model.mounting import infer_up
 from tk.model.up import UP_AXES, up_vector
 
 seeds = st.integers(0, 2**32 - 1)

@@ -19,9 +19,10 @@ from tk.errors import CaptureError
 from tk.io.capture import open_capture
 from tk.io.importers.project import Project
 from tk.io.importers.sizes import fit_size
-from tk.io.importers.world import FoundUp, find_volume, infer_up
+from tk.io.importers.world import find_volume
 from tk.io.video import PICTURE_SUFFIXES, probe
 from tk.model.camera import Camera, Rig
+from tk.model.mounting import FoundUp, infer_up
 from tk.model.up import up_text
 from tk.model.volume import Volume
 

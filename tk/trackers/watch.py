@@ -1,0 +1,288 @@
+"""A tracker under watch: a camera that cannot be believed is left out of a frame, and what cannot be true is lost.
+
+A camera is left out whose picture shows nothing or stands still (:mod:`tk.model.picture_health`), whose masks the hull
+of the others contradicts in the opening frames (:mod:`tk.model.mask_agreement`), and, from frame to frame, one that the
+body explains badly: the frame is then tracked a second time without it, and if the body still does not explain it,
+but does the others, the camera was what was wrong and not the pose. It comes back when the body that the others see
+explains it again. This is the iteratively reweighted fit of robust statistics with weights of 0 and 1 and the camera as
+the unit: what is wrong with one picture is wrong everywhere in it.
+
+Only for trackers of contours: a visual hull without one of its masks is empty, so those of hulls take all cameras.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.io.capture import Capture
+from tk.model.evidence import Evidence
+from tk.model.mask_agreement import MaskAgreement
+from tk.model.picture_health import PictureHealth, described
+from tk.model.plausibility import Plausibility, check_extent, check_stature
+from tk.model.skeleton import JOINTS, join_pose
+from tk.trackers.base import Estimate, Observation, Tracker
+from tk.trackers.contours import ContourTracker
+
+Float = NDArray[np.float64]
+
+# Frames of the opening whose masks are compared.
+_OPENING = 5
+# A camera is looked into whose E_S is above this, and above its usual by this factor.
+_SUSPECT, _SUSPECT_RATIO = 0.25, 1.8
+# It is left out if the body, fitted without it, leaves its usual E_S times this unexplained, and the others' mean falls
+# by this share; or if so much of the body lies outside its mask.
+_CULPRIT_RATIO, _RELIEF, _HOPELESS = 3.0, 0.15, 0.2
+# In any case the others must then be explained about as well as is usual, by this factor in the mean.
+_OTHERS_FIT = 1.3
+# It comes back when the others' body leaves no more than its usual times this unexplained.
+_BACK_RATIO = 1.6
+# A camera that was looked into in vain is not looked into again for so many frames unless it gets worse by this factor.
+_PAUSE, _WORSE = 6, 1.2
+# The usual E_S that is assumed at first, and how fast a better and a worse one is learned.
+_FIRST_USUAL, _BETTER, _SLOWLY = 0.12, 0.1, 0.02
+# Reasons, as messages tell them.
+_DISAGREES, _TOO_FEW = "disagrees with the others", "fewer than two cameras see anybody"
+_IMPLAUSIBLE = "the pose found cannot be true"
+
+Span = tuple[int, int, int]
+"""Of frames: the first, the last, how many."""
+
+
+class Watch:
+    """Steps a tracker.
+
+    Args:
+        tracker: started by :meth:`start`, or restored by whoever resumes.
+        capture: what it tracks.
+    """
+
+    def __init__(self, tracker: Tracker, capture: Capture) -> None:
+        self.tracker, self._capture = tracker, capture
+        self._names = capture.rig.names
+        self._health = PictureHealth()
+        self._plausibility = Plausibility(capture.up, capture.fps)
+        C = len(self._names)
+        self._usual = np.full(C, _FIRST_USUAL)
+        self._distrusted = np.zeros(C, bool)
+        self._since_trial = np.full(C, _PAUSE)
+        self._at_trial = np.zeros(C)
+        self._left_out: dict[str, Span] = {}  # by "camera/reason"
+        self._lost: dict[str, Span] = {}  # by reason
+        self._why_apart: dict[int, str] = {}
+
+    def start(self, frames: Sequence[Observation]) -> list[Observation]:
+        """The opening frames without the cameras that cannot be believed, for the tracker's start.
+
+        Raises:
+            CaptureError: the person has not the size that `capture.toml` tells.
+        """
+        health = PictureHealth()
+        bad = np.array([self._bad(health.look(f.images, f.masks)) for f in frames])
+        shown = [_without(f, b) for f, b in zip(frames, bad, strict=True)]
+        chosen = np.unique(np.linspace(0, len(shown) - 1, _OPENING).round().astype(int))
+        agreement = MaskAgreement(self._capture.rig, self._capture.volume).compare([shown[i].masks for i in chosen])
+        for camera in agreement.apart if isinstance(self.tracker, ContourTracker) else ():
+            if len(self._names) - self._distrusted.sum() > 2:
+                self._distrusted[camera] = True
+                self._why_apart[camera] = agreement.why(camera)
+        if self._capture.subject_height_m is not None:
+            check_extent(agreement.extent_m, self._capture.subject_height_m)
+        return [_without(f, self._distrusted) for f in shown]
+
+    def check_body(self) -> None:
+        """Refuse a body that nobody has, as the tracker's start found it.
+
+        Raises:
+            CaptureError: of the person's size.
+        """
+        if self._capture.subject_height_m is None and isinstance(self.tracker, ContourTracker):
+            check_stature(self.tracker.body.dimensions.stature)
+
+    def step(self, frame: Observation) -> tuple[Estimate, Observation]:
+        """The pose in the next frame, and what of the frame it was made from."""
+        sick = self._health.look(frame.images, frame.masks)
+        bad = self._bad(sick)
+        out = bad | self._distrusted
+        used = _without(frame, out)
+        if np.count_nonzero(used.masks.any(axis=(1, 2))) < 2:
+            used = _without(frame, np.ones(len(out), bool))  # depth is free with one view
+        watched = isinstance(self.tracker, ContourTracker) and len(out) - bad.sum() >= 3
+        before = self.tracker.state() if watched else {}
+        estimate = self.tracker.step(used)
+        beyond = None
+        if watched and used.masks.any() and estimate.fit_error is not None:
+            estimate, used, beyond = self._weigh(frame, used, bad, before, estimate)
+        for camera, reason in enumerate(sick):
+            if reason is not None and bad[camera]:
+                _count(self._left_out, f"{camera}/{reason}", frame.index)
+        for camera in np.flatnonzero((out | self._distrusted) & ~bad).tolist():
+            _count(self._left_out, f"{camera}/{_DISAGREES}", frame.index)
+        return self._judged(frame.index, estimate, used, beyond), used
+
+    def _bad(self, sick: Sequence[str | None]) -> NDArray[np.bool_]:
+        """(C,) the cameras to go without. A visual hull is empty where a mask is, so its trackers take them all."""
+        leaves_out = isinstance(self.tracker, ContourTracker)
+        return np.array([leaves_out and reason is not None for reason in sick])
+
+    def _weigh(
+        self, frame: Observation, used: Observation, bad: NDArray[np.bool_], before: Mapping[str, Any], first: Estimate
+    ) -> tuple[Estimate, Observation, Float]:
+        """Leave out a camera that the body does not explain, and take back one that it does.
+
+        Returns:
+            the estimate, what it was made from, and (C,) the share of the body outside each used camera's mask.
+        """
+        assert first.fit_error is not None
+        error = beyond = first.fit_error  # no more of the body can lie outside a mask
+        if self._distrusted.any() or np.nanmax(error, initial=0.0) > _SUSPECT:
+            error, beyond = self._errors(frame, first)
+        ratio = error / self._usual
+        usable = ~bad & np.isfinite(error)
+        back = self._distrusted & usable & ((ratio < _BACK_RATIO) | (error < 0.8 * _SUSPECT))
+        kept = usable & ~self._distrusted
+        self._since_trial += 1
+        suspects = np.flatnonzero(kept & (error > _SUSPECT) & (ratio > _SUSPECT_RATIO))
+        suspects = suspects[
+            (self._since_trial[suspects] > _PAUSE) | (error[suspects] > _WORSE * self._at_trial[suspects])
+        ]
+        estimate = first
+        if len(suspects) and kept.sum() >= 3:
+            worst = int(suspects[np.argmax(ratio[suspects])])
+            others = kept.copy()
+            others[worst] = False
+            after = self.tracker.state()
+            fewer = _without(used, ~others)
+            self._restore(before)
+            second = self.tracker.step(fewer)
+            again, beyond_again = self._errors(frame, second)
+            relief = 1.0 - float(np.mean(again[others]) / np.mean(error[others]))
+            # Where the body does not explain the others either, it is the pose that is wrong. A mask with somebody else
+            # beside the person misleads contours little. A body that two cameras see may be anywhere in a third.
+            others_fit = float(np.mean(again[others] / self._usual[others])) < _OTHERS_FIT
+            hopeless = beyond_again[worst] > (_HOPELESS if others.sum() >= 3 else 2 * _HOPELESS)
+            much = again[worst] > _CULPRIT_RATIO * self._usual[worst]
+            relieved = others.sum() >= 3 and much and relief > _RELIEF
+            culprit = others_fit and relief > -_RELIEF / 2 and (hopeless or relieved)
+            if culprit:
+                self._distrusted[worst] = True
+                estimate, used, kept = replace(second, status=first.status), fewer, others
+                beyond = beyond_again
+            else:
+                self._restore(after)
+                self._since_trial[worst], self._at_trial[worst] = 0, error[worst]
+        if estimate.status != "lost":
+            rate = np.where(error < self._usual, _BETTER, _SLOWLY)
+            self._usual = np.where(kept, np.maximum(self._usual + rate * (error - self._usual), 0.05), self._usual)
+        self._distrusted &= ~back
+        return estimate, used, np.where(kept, beyond, np.nan)
+
+    def _restore(self, state: Mapping[str, Any]) -> None:
+        self.tracker.restore(self.tracker.model(), state)
+
+    def _errors(self, frame: Observation, estimate: Estimate) -> Float:
+        """(2, C) E_S at the estimate's pose, of cameras left out, too; and what of it is body outside the mask.
+
+        NaN where a camera sees nobody.
+        """
+        tracker = self.tracker
+        assert isinstance(tracker, ContourTracker)
+        pose = join_pose(tracker.body.skeleton, estimate.pose, estimate.waist, estimate.ankles)
+        masks = frame.masks
+        if estimate.masks is not None:  # what it took for the person, where it had the camera
+            had = np.asarray(estimate.masks.any(axis=(1, 2)))
+            masks = np.where(had[:, None, None], estimate.masks, masks)
+        evidence = Evidence.of(tracker.screen, tracker.views.pyramid(masks, 1, tracker.contours.cleaning).masks[0])
+        _, met = evidence.cast(tracker.body, tracker.colors.group, pose[None], export=True)
+        assert met is not None
+        drawn = met.label[0] > 0
+        seen = np.count_nonzero(evidence.person, axis=(1, 2)).astype(np.float64)
+        seen[seen == 0] = np.nan
+        return np.stack([np.count_nonzero(wrong, axis=(1, 2)) / seen for wrong in _wrong(drawn, evidence.person)])
+
+    def _judged(self, index: int, estimate: Estimate, used: Observation, beyond: Float | None) -> Estimate:
+        """The estimate, lost where it cannot be true."""
+        if estimate.status == "lost":
+            self._plausibility.forget()
+            if not used.masks.any():
+                _count(self._lost, _TOO_FEW, index)
+            return estimate
+        reason = self._plausibility.judge(index, estimate.joints, beyond)
+        if reason is None:
+            return estimate
+        _count(self._lost, f"{_IMPLAUSIBLE}: {reason}", index)
+        self._plausibility.forget()
+        if isinstance(self.tracker, ContourTracker):
+            self.tracker.lose()
+        return replace(estimate, status="lost", sigma=None if estimate.sigma is None else np.full(len(JOINTS), np.nan))
+
+    def report(self) -> list[str]:
+        """What was left out or lost, a line a camera and reason."""
+        lines = []
+        for key, span in sorted(self._left_out.items()):
+            camera, _, reason = key.partition("/")
+            because = self._why_apart.get(int(camera)) if reason == _DISAGREES else None
+            more = f" ({because})" if because else ""
+            lines.append(f"camera {self._names[int(camera)]} {reason}{more}: left out of {described(*span)}")
+        return lines + [f"{reason}: lost, {described(*span)}" for reason, span in self._lost.items()]
+
+    def state(self) -> Mapping[str, Any]:
+        """What :meth:`restore` needs beside the tracker's own state."""
+        return {
+            "usual": self._usual,
+            "distrusted": self._distrusted,
+            "since_trial": self._since_trial,
+            "at_trial": self._at_trial,
+            **{f"health/{name}": value for name, value in self._health.state().items()},
+            **{f"plausibility/{name}": value for name, value in self._plausibility.state().items()},
+            "spans": json.dumps([self._left_out, self._lost, self._why_apart]),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take up what :meth:`state` gave; the tracker is restored by whoever has its model."""
+        part: dict[str, dict[str, Any]] = {"health": {}, "plausibility": {}}
+        for name, value in state.items():
+            group, slash, rest = name.partition("/")
+            if slash and group in part:
+                part[group][rest] = value
+        self._usual = np.array(state["usual"], np.float64)
+        self._distrusted = np.array(state["distrusted"], bool)
+        self._since_trial = np.array(state["since_trial"], np.int64)
+        self._at_trial = np.array(state["at_trial"], np.float64)
+        self._health.restore(part["health"])
+        self._plausibility.restore(part["plausibility"])
+        left_out, lost, apart = json.loads(str(state["spans"]))
+        self._left_out = {key: (span[0], span[1], span[2]) for key, span in left_out.items()}
+        self._lost = {key: (span[0], span[1], span[2]) for key, span in lost.items()}
+        self._why_apart = {int(camera): reason for camera, reason in apart.items()}
+
+
+def _wrong(drawn: NDArray[np.bool_], person: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    return drawn != person, drawn & ~person
+
+
+def _count(spans: dict[str, Span], key: str, index: int) -> None:
+    first, _, count = spans.get(key, (index, index, 0))
+    spans[key] = (first, index, count + 1)
+
+
+def _without(frame: Observation, out: NDArray[np.bool_]) -> Observation:
+    """The frame as if some cameras (C,) saw nobody."""
+    if not out.any():
+        return frame
+    masks = frame.masks.copy()
+    masks[out] = 0
+    doubtful = frame.doubtful
+    if doubtful is not None:
+        doubtful = doubtful.copy()
+        doubtful[out] = False
+    images = frame.images
+    if images.size:  # one colour has no borders
+        images = images.copy()
+        images[out] = 0
+    return replace(frame, images=images, masks=masks, doubtful=doubtful)
