@@ -411,11 +411,11 @@ class _Run:
             if observation.index >= plan.stop:
                 return
             started = time.perf_counter()
-            estimate, _ = self.watch.step(observation)
+            estimate, used = self.watch.step(observation)
             if observation.index < plan.begin:
                 continue
-            if output and estimate.masks is not None:
-                self.masks.put(observation.index, estimate.masks)
+            if output and isinstance(plan.tracker, RegionTracker):  # those of frames without anybody, too
+                self.masks.put(observation.index, used.masks if estimate.masks is None else estimate.masks)
             finished = time.perf_counter()
             total = laps["wait"] + writing + finished - started
             timing = {**laps, **estimate.timing, "total": total}
