@@ -42,6 +42,8 @@ _CULPRIT_RATIO, _RELIEF, _HOPELESS = 3.0, 0.15, 0.2
 _OTHERS_FIT = 1.3
 # It comes back when the others' body leaves no more than its usual times this unexplained.
 _BACK_RATIO = 1.6
+# Whoever was lost is found when the masks are explained as well as is usual, by this factor in the mean.
+_FOUND = 2.0
 # A camera that was looked into in vain is not looked into again for so many frames unless it gets worse by this factor.
 _PAUSE, _WORSE = 6, 1.2
 # The usual E_S that is assumed at first, and how fast a better and a worse one is learned.
@@ -75,6 +77,7 @@ class Watch:
         self._left_out: dict[str, Span] = {}  # by "camera/reason"
         self._lost: dict[str, Span] = {}  # by reason
         self._why_apart: dict[int, str] = {}
+        self._beside_usual = 1.0  # E_S of the last frame beside the usual
 
     def start(self, frames: Sequence[Observation]) -> list[Observation]:
         """The opening frames without the cameras that cannot be believed, for the tracker's start.
@@ -176,7 +179,9 @@ class Watch:
             else:
                 self._restore(after)
                 self._since_trial[worst], self._at_trial[worst] = 0, error[worst]
-        if estimate.status != "lost":
+        told = error if estimate is first else again
+        self._beside_usual = float(np.mean((told / self._usual)[kept])) if kept.any() else np.inf
+        if estimate.status != "lost" and self._beside_usual < _FOUND:
             rate = np.where(error < self._usual, _BETTER, _SLOWLY)
             self._usual = np.where(kept, np.maximum(self._usual + rate * (error - self._usual), 0.05), self._usual)
         self._distrusted &= ~back
@@ -213,6 +218,8 @@ class Watch:
                 _count(self._lost, _TOO_FEW, index)
             return estimate
         reason = self._plausibility.judge(index, estimate.joints, beyond)
+        if beyond is not None and estimate.status == "recovered" and self._beside_usual > _FOUND:
+            reason = reason or "after a loss it does not explain the masks yet"
         if reason is None:
             return estimate
         _count(self._lost, f"{_IMPLAUSIBLE}: {reason}", index)
