@@ -35,11 +35,13 @@ Float = NDArray[np.float64]
 _OPENING = 5
 # A camera is looked into whose E_S is above this, and above its usual by this factor.
 _SUSPECT, _SUSPECT_RATIO = 0.25, 1.8
-# It is left out if the body, fitted without it, leaves its usual E_S times this unexplained, and the others' mean falls
-# by this share; or if so much of the body lies outside its mask.
+# It is left out if so much of the body, fitted without it, lies outside its mask; or if the body leaves its usual E_S
+# times this unexplained, and the others' mean falls by this share.
 _CULPRIT_RATIO, _RELIEF, _HOPELESS = 3.0, 0.15, 0.2
-# In any case the others must then be explained about as well as is usual, by this factor in the mean.
-_OTHERS_FIT = 1.3
+# The others must then be explained about as well as is usual, by these factors in the mean in the two cases.
+_OTHERS_FIT = 1.5, 1.3
+# A mask of which the person explains less than a quarter shows anything.
+_BLOB = 0.75
 # It comes back when the others' body leaves no more than its usual times this unexplained.
 _BACK_RATIO = 1.6
 # Whoever was lost is found when the masks are explained as well as is usual, by this factor in the mean.
@@ -167,11 +169,12 @@ class Watch:
             relief = 1.0 - float(np.mean(again[others]) / np.mean(error[others]))
             # Where the body does not explain the others either, it is the pose that is wrong. A mask with somebody else
             # beside the person misleads contours little. A body that two cameras see may be anywhere in a third.
-            others_fit = float(np.mean(again[others] / self._usual[others])) < _OTHERS_FIT
-            hopeless = beyond_again[worst] > (_HOPELESS if others.sum() >= 3 else 2 * _HOPELESS)
-            much = again[worst] > _CULPRIT_RATIO * self._usual[worst]
-            relieved = others.sum() >= 3 and much and relief > _RELIEF
-            culprit = others_fit and relief > -_RELIEF / 2 and (hopeless or relieved)
+            others_fit = float(np.mean(again[others] / self._usual[others]))
+            outside = beyond_again[worst] > (_HOPELESS if others.sum() >= 3 else 2 * _HOPELESS)
+            hopeless = others_fit < _OTHERS_FIT[0] and (outside or again[worst] > _BLOB)
+            much = others.sum() >= 3 and again[worst] > _CULPRIT_RATIO * self._usual[worst]
+            relieved = others_fit < _OTHERS_FIT[1] and much and relief > _RELIEF
+            culprit = relief > -_RELIEF / 2 and (hopeless or relieved)
             if culprit:
                 self._distrusted[worst] = True
                 estimate, used, kept = replace(second, status=first.status), fewer, others
