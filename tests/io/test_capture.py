@@ -251,6 +251,7 @@ def test_time_offsets_choose_which_pictures_belong_together(make_capture: MakeCa
     assert capture.late_frames == (0, late, 0)
     assert (capture.first_frame, capture.frame_count) == (max(late, 0), 12 + min(late, 0))
     assert any(f"cam2 {late:+d}" in warning for warning in capture.warnings)
+    assert capture.as_recorded().late_frames == (0, 0, 0) and capture.as_recorded().frame_count == 12
     for start in (0, 1, 4):
         with capture.frames(start) as frames:
             for seen in frames:
