@@ -352,6 +352,57 @@ def level(capture: Path, masks: str, config_file: Path | None) -> None:
     click.echo(f"up = {found.leveling.up} in {capture / 'capture.toml'}: {found.leveling.how}")
 
 
+@main.command(epilog=_example("tk refine CAPTURE result.h5 -o refined.toml"))
+@_capture
+@click.argument("result", type=click.Path(path_type=Path), metavar="RESULT.h5")
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="CALIBRATION.toml")
+@click.option("--focal", is_flag=True, help="Refine the focal lengths, too.")
+@click.option("--offsets/--no-offsets", default=True, show_default=True, help="Seek the videos' time offsets.")
+@click.option(
+    "--trust", type=float, default=1.0, show_default=True,
+    help="How far off the cameras may be: 1 means some 0.3° and 12 mm in all.",
+)  # fmt: skip
+@_cameras
+@_masks
+@_config
+@_force
+@_quiet
+def refine(
+    capture: Path,
+    result: Path,
+    output: Path,
+    focal: bool,
+    offsets: bool,
+    trust: float,
+    cameras: str | None,
+    masks: str,
+    config_file: Path | None,
+    force: bool,
+    quiet: bool,
+) -> None:
+    """Refine the cameras of CAPTURE, and the time offsets of its videos, by RESULT.h5, which was tracked with them."""
+    with Report(quiet) as report:
+        report.stage("loading")
+        from tk.io.capture import open_capture
+        from tk.model.camera_refinement import RefinementConfig
+        from tk.refinement import refine_capture
+
+        if output.exists() and not force:
+            raise ConfigError(f"{output}: exists already; give another name, or --force")
+        how = RefinementConfig(focal=focal, offsets=offsets, trust=trust)
+        config = _configuration(config_file)
+        report.stage(f"opening {capture}")
+        opened = open_capture(capture, _names(cameras), masks)
+        for warning in opened.warnings:
+            report.note(warning)
+        report.stage("refining the cameras")
+        done = refine_capture(opened, result, output, config, report.note, how)
+        for warning in done.warnings:
+            report.note(warning)
+    click.echo(done.format_table())
+    click.echo(f"{done.frames} frames; the new calibration is in {output}", err=True)
+
+
 @main.command(epilog=_example("tk evaluate result.h5 CAPTURE/truth.h5"))
 @click.argument("result", type=click.Path(path_type=Path))
 @click.argument("truth", type=click.Path(path_type=Path))

@@ -79,6 +79,7 @@ class Config:
         tracking: following a person from frame to frame.
         silhouette: how contours are followed, by --method region and silhouette.
         region: how --method region searches.
+        refine: whether cameras that disagree about the person are refined before the second pass.
     """
 
     voxels: int = 64
@@ -86,6 +87,7 @@ class Config:
     segmentation: str = "collinearity"
     ahead: int = 4
     effort: str | float = "normal"
+    refine: bool = True
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
     appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
     body: BodyConfig = field(default_factory=BodyConfig)

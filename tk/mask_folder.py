@@ -61,6 +61,7 @@ def write_masks(
     """
     for warning in capture.warnings:
         reporter.note(warning)
+    capture = capture.as_recorded()  # masks are numbered as the pictures are: both shift by a time offset later
     start, stop = choose_frames(capture, frames, reporter.note)
     if segmenter is None:
         installed = names()

@@ -6,12 +6,12 @@ import hashlib
 import logging
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from tk.io.result import (
     FrameResult,
     HullPoints,
     JointAngles,
+    Result,
     ResultMeta,
     ResultWriter,
     Status,
@@ -42,9 +43,10 @@ from tk.model.derived import derive
 from tk.model.hull import HullSurface
 from tk.model.skeleton import SEGMENTS, join_pose, split_pose
 from tk.model.smoothing import smooth
+from tk.refinement import refine_if_astray
 from tk.segmentation import make_segmenter as make_segmenter
 from tk.segmentation import mask_source
-from tk.trackers.base import Estimate, Tracker
+from tk.trackers.base import Estimate, Observation, Tracker
 from tk.trackers.bodies import read_body
 from tk.trackers.contours import ContourTracker
 from tk.trackers.region import RegionTracker
@@ -53,6 +55,7 @@ from tk.trackers.volumetric import LevenbergMarquardtTracker, VolumetricTracker
 from tk.trackers.watch import Watch
 
 _LOG = logging.getLogger(__name__)
+Float = NDArray[np.float64]
 
 METHODS = ("region", "silhouette", "volumetric", "lm")
 
@@ -175,7 +178,7 @@ def track(
             for line in run.watch.report() if run.tracked else ():
                 reporter.note(line)
             if run.tracked:
-                finish(output, plan, run.masks, note, causal)
+                finish(output, plan, config, run.masks, note, causal)
                 if said:
                     revise_result(output, notes=said)
         except KeyboardInterrupt:
@@ -305,7 +308,7 @@ def choose_frames(capture: Capture, frames: tuple[int, int | None], note: Callab
         raise ConfigError(f"--frames {asked}: {capture.path} has only frames 0 to {capture.frame_count - 1}")
     if stop is not None and stop > capture.frame_count:
         note(f"--frames {start}:{stop}: {capture.path} ends with frame {capture.frame_count - 1}")
-    return start, capture.frame_count if stop is None else min(stop, capture.frame_count)
+    return max(start, capture.first_frame), capture.frame_count if stop is None else min(stop, capture.frame_count)
 
 
 def _origin(capture: Capture, plan: _Plan, store_hull: bool) -> dict[str, str]:
@@ -414,8 +417,8 @@ class _Run:
             estimate, used = self.watch.step(observation)
             if observation.index < plan.begin:
                 continue
-            if output and isinstance(plan.tracker, RegionTracker):  # those of frames without anybody, too
-                self.masks.put(observation.index, used.masks if estimate.masks is None else estimate.masks)
+            if output and isinstance(plan.tracker, RegionTracker):
+                self.masks.put(observation.index, _kept(observation, used, estimate))
             finished = time.perf_counter()
             total = laps["wait"] + writing + finished - started
             timing = {**laps, **estimate.timing, "total": total}
@@ -434,11 +437,14 @@ class _Run:
         return {**self.plan.tracker.state(), **watched, **origin, _ORIGIN + _LOST: self.lost}
 
 
-def finish(output: Path, plan: _Plan, masks: MaskStore, note: Callable[[str], None], causal: bool) -> None:
+def finish(
+    output: Path, plan: _Plan, config: Config, masks: MaskStore, note: Callable[[str], None], causal: bool
+) -> None:
     """What needs all frames: the second pass unless ``causal``; segments, feet and angles; the smoothed copy; cameras.
 
-    The second pass fits the body to frames of the whole recording and settles every frame anew with it. The result is
-    replaced in one step; if this does not end, the first pass's stays.
+    The second pass fits the body to frames of the whole recording and settles every frame anew with it; by refined
+    cameras where they disagree, unless ``config.refine`` is False. The result is replaced in one step; if this does not
+    end, the first pass's stays.
     """
     tracker = plan.tracker
     if not isinstance(tracker, ContourTracker):
@@ -450,23 +456,34 @@ def finish(output: Path, plan: _Plan, masks: MaskStore, note: Callable[[str], No
     skeleton = tracker.body.skeleton
     poses = np.array([join_pose(skeleton, *row) for row in zip(result.pose, waist, ankles, strict=True)])
     lost = result.status == Status.LOST
-    columns: dict[str, NDArray[np.floating]] = {}
+    columns: dict[str, NDArray[Any]] = {}
     model: Mapping[str, Value] | None = None
+    cameras = UsedCameras(plan.capture.rig, np.array(plan.capture.time_offset_s))
     if isinstance(tracker, RegionTracker) and not causal:
         _LOG.info("second pass: the body is fitted to the whole recording")
         assert result.fit_error is not None
         missing = [int(f) for f in result.frames if int(f) not in masks]
         if missing:  # what an earlier run has tracked
-            rows = {int(f): row for row, f in enumerate(result.frames)}
             for observation, _ in plan.source.frames(min(missing), max(missing) + 1):
-                told = result.fit_error[rows[observation.index]]  # NaN where a camera was left out
-                own = tracker.without_foreign(observation).masks
-                masks.put(observation.index, np.where(np.isfinite(told)[:, None, None], own, np.uint8(0)))
+                masks.put(observation.index, tracker.without_foreign(observation).masks)
+        if config.refine:
+            refined = refine_if_astray(tracker, masks, result.frames, poses, ~lost, note)
+            if refined is not None:
+                tracker, masks, offsets = refined
+                cameras = UsedCameras(tracker.views.rig, cameras.time_offset_s + offsets / plan.capture.fps)
+                if np.round(offsets).any():
+                    note("tracking again: the first pass had the pictures out of step")
+                    again = _track_again(plan, config, tracker, cameras, result.frames, poses)
+                    rows = np.flatnonzero(np.isin(result.frames, list(again)))
+                    told_again = [again[int(frame)] for frame in result.frames[rows]]
+                    poses[rows] = [join_pose(skeleton, e.pose, e.waist, e.ankles) for e in told_again]
+                    lost[rows] = [e.status == "lost" for e in told_again]
+                    columns |= _replaced(result, rows, told_again)
         poses, columns["fit_error"] = tracker.second_pass(
             masks.sequence(result.frames),
             poses,
             lost,
-            result.fit_error,
+            columns.get("fit_error", result.fit_error),
             plan.capture.subject_height_m,
             keep_body=plan.body is not None,
         )
@@ -477,8 +494,44 @@ def finish(output: Path, plan: _Plan, masks: MaskStore, note: Callable[[str], No
     columns |= {name: values for name, values in _columns(tracker, poses).items() if name not in told}
     filtered = smooth(tracker.body.skeleton, poses, ~lost, plan.capture.fps)
     smoothed = {**_columns(tracker, filtered.poses), "bridged": filtered.bridged}
-    cameras = UsedCameras(plan.capture.rig, np.zeros(len(plan.capture.rig)))
     revise_result(output, columns, smoothed=smoothed, model=model, cameras=cameras)
+
+
+def _track_again(
+    plan: _Plan, config: Config, tracker: RegionTracker, cameras: UsedCameras, frames: NDArray[np.int64], poses: Float
+) -> dict[int, Estimate]:
+    """The estimates of those of the frames (F,) of which all cameras have a picture once they are in step, by frame.
+
+    It begins at the pose that the first pass found there.
+    """
+    capture = replace(plan.capture, rig=cameras.rig, time_offset_s=tuple(cameras.time_offset_s.tolist()))
+    begin = max(capture.first_frame, int(frames[0]))
+    ends = [clip.frame_count + late for clip, late in zip(capture.clips, capture.late_frames, strict=True)]
+    stop = min(*ends, int(frames[-1]) + 1)
+    if begin >= stop:
+        return {}
+    start = poses[np.searchsorted(frames, begin)][None]
+    once = {"poses": start, "previous": start, "costs": np.zeros(1), "ages": np.ones(1, int)}
+    tracker.restore(tracker.model(), {**tracker.state(), **once, "usual": np.inf, "lost_for": 0})
+    with open_source(capture, config, lambda _: None) as source:
+        return {observation.index: tracker.step(observation) for observation, _ in source.frames(begin, stop)}
+
+
+def _replaced(result: Result, rows: NDArray[np.int64], estimates: Sequence[Estimate]) -> dict[str, NDArray[Any]]:
+    """What a result's first pass told of these rows, told by other estimates."""
+    assert result.sigma is not None and result.fit_error is not None
+    columns = {
+        "joints/sigma": result.sigma.copy(),
+        "fit_error": result.fit_error.copy(),
+        "objective": result.objective.copy(),
+        "status": result.status.copy(),
+    }
+    for row, e in zip(rows, estimates, strict=True):
+        columns["joints/sigma"][row], columns["fit_error"][row] = e.sigma, e.fit_error
+        columns["objective"][row] = e.objective
+        if result.status[row] != Status.INITIALISED:
+            columns["status"][row] = Status[e.status.upper()]
+    return columns
 
 
 def _columns(tracker: ContourTracker, poses: NDArray[np.float64]) -> dict[str, NDArray[np.floating]]:
@@ -494,6 +547,14 @@ def _columns(tracker: ContourTracker, poses: NDArray[np.float64]) -> dict[str, N
     if tracker.ankle_names:
         columns["ankles"] = ankles
     return columns
+
+
+def _kept(observation: Observation, used: Observation, estimate: Estimate) -> NDArray[np.uint8]:
+    """The masks (C, H, W) of a frame as the tracker took them; of cameras that were left out as they were, for those may
+    be refined."""
+    taken = used.masks if estimate.masks is None else estimate.masks
+    out = np.asarray(observation.masks.any(axis=(1, 2)) & ~used.masks.any(axis=(1, 2)))
+    return np.where(out[:, None, None], observation.masks, taken) if out.any() else taken
 
 
 def _below(prefix: str, state: Mapping[str, Value]) -> dict[str, Value]:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,9 @@ import pytest
 
 from tests.io.conftest import calibration_tables, write_toml
 from tk.errors import CalibrationError, CaptureError
-from tk.io.calibration import match_camera, read_calibration
+from tk.io.calibration import match_camera, read_calibration, write_calibration
+from tk.io.toml import load_toml
+from tk.model.camera import Rig
 
 
 def write(tmp_path: Path, document: dict[str, Any]) -> Path:
@@ -199,3 +202,21 @@ def test_a_number_of_too_many_digits(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace("60.0", "9" * 400, 1))
     with pytest.raises(CalibrationError, match=r"camera 'cam1': matrix holds 9+.*, which is too large"):
         read_calibration(path)
+
+
+def test_a_written_calibration_is_the_old_one_but_for_its_cameras(tmp_path: Path) -> None:
+    tables = calibration_tables(3)
+    tables["cam2"]["owner"] = "somebody"
+    path = write(tmp_path, {"cameras": tables, "metadata": {"units": "mm"}})
+    calibration = read_calibration(path).select(["cam1", "cam2"])
+    moved = Rig(tuple(replace(c, translation=c.translation + 0.001, matrix=c.matrix * 1.0) for c in calibration.rig))
+    write_calibration(tmp_path / "new.toml", calibration, moved, [0.0, -0.04])
+    again = read_calibration(tmp_path / "new.toml")
+    assert again.time_offset_s == (0.0, -0.04, 0.0)
+    for one, other in zip(again.rig, (*moved, read_calibration(path).rig[2]), strict=True):
+        np.testing.assert_allclose(one.translation, other.translation, atol=1e-12)
+        np.testing.assert_allclose(one.rotation, other.rotation, atol=1e-12)
+    document = load_toml(tmp_path / "new.toml")
+    assert document["metadata"] == {"units": "mm"} and document["cameras"]["cam2"]["owner"] == "somebody"
+    with pytest.raises(CalibrationError, match="cannot be written"):
+        write_calibration(tmp_path / "none" / "new.toml", calibration, moved, [0.0, 0.0])

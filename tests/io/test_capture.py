@@ -241,6 +241,34 @@ def test_videos_of_different_lengths(make_capture: MakeCapture) -> None:
         assert len(list(frames)) == 9
 
 
+@pytest.mark.parametrize("late", [2, -3])
+def test_time_offsets_choose_which_pictures_belong_together(make_capture: MakeCapture, late: int) -> None:
+    folder = make_capture(settings={"fps": 10.0})
+    tables = calibration_tables(3)
+    tables["cam2"]["time_offset"] = late / 10 + 0.03  # less than half a frame of it stays
+    write_toml(folder / "calibration.toml", tables)
+    capture = open_capture(folder)
+    assert capture.late_frames == (0, late, 0)
+    assert (capture.first_frame, capture.frame_count) == (max(late, 0), 12 + min(late, 0))
+    assert any(f"cam2 {late:+d}" in warning for warning in capture.warnings)
+    assert capture.as_recorded().late_frames == (0, 0, 0) and capture.as_recorded().frame_count == 12
+    for start in (0, 1, 4):
+        with capture.frames(start) as frames:
+            for seen in frames:
+                own = max(seen.index - late, 0)
+                assert [read_tag(image) for image in seen.images] == [(0, seen.index), (1, own), (2, seen.index)]
+
+
+def test_time_offsets_that_cannot_be(make_capture: MakeCapture) -> None:
+    folder = make_capture(settings={"fps": 10.0})
+    for value, complaint in ((1.3, "cam1.mp4: ends before all"), (1e5, "time_offset = 100000"), ("1", "finite number")):
+        tables = calibration_tables(3)
+        tables["cam2"]["time_offset"] = value
+        write_toml(folder / "calibration.toml", tables)
+        with pytest.raises(CaptureError, match=complaint):
+            open_capture(folder)
+
+
 def test_a_text_file_called_mp4(make_capture: MakeCapture) -> None:
     folder = make_capture()
     (folder / "videos" / "cam1.mp4").write_text("a shopping list\n" * 30)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import tomli_w
 from numpy.typing import NDArray
 
 from tk.errors import CalibrationError, CaptureError
@@ -21,6 +22,8 @@ _SINGULAR = 1e-9
 
 #: pixels of a side of a picture
 _MOST_PIXELS = 2**16
+#: seconds by which a video may be late
+_MOST_OFFSET_S = 3600.0
 #: how far a 3×3 rotation may be from orthonormal: files are written with six digits and more
 _ORTHONORMAL = 1e-4
 
@@ -34,12 +37,16 @@ class Calibration:
         rig: its cameras, in the file's order.
         keys: the table's key of each camera, which may differ from its name.
         notes: what was inferred, a line each, for the user to read.
+        time_offset_s: seconds by which each camera's pictures are taken later than their number says; empty: by none.
+        metres: in a unit of the file's translations.
     """
 
     path: Path
     rig: Rig
     keys: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    time_offset_s: tuple[float, ...] = ()
+    metres: float = 1.0
 
     def select(self, names: Sequence[str] | None) -> Calibration:
         """The calibration of these cameras only, still in the file's order; all of them for None.
@@ -56,7 +63,12 @@ class Calibration:
         if len(chosen) < 2:
             source = self.path if names is None else f"--cameras {','.join(wanted)}"
             raise CaptureError(f"{source}: {len(chosen)} camera; a visual hull needs at least 2")
-        return replace(self, rig=Rig(tuple(self.rig[i] for i in chosen)), keys=tuple(self.keys[i] for i in chosen))
+        return replace(
+            self,
+            rig=Rig(tuple(self.rig[i] for i in chosen)),
+            keys=tuple(self.keys[i] for i in chosen),
+            time_offset_s=tuple(self.time_offset_s[i] for i in chosen if self.time_offset_s),
+        )
 
 
 def read_calibration(path: str | Path) -> Calibration:
@@ -65,8 +77,8 @@ def read_calibration(path: str | Path) -> Calibration:
     One table a camera, `metadata` skipped; Caliscope's ``[cameras.1]`` is read too. Each has ``size = [width, height]``
     (pixels), ``matrix`` (3×3), ``distortions`` (4 or 5 numbers in OpenCV's order), ``rotation`` (Rodrigues vector or
     3×3, world to camera), ``translation`` (in ``[metadata] units``; without these, metres unless the cameras' distances
-    say otherwise, see :func:`tk.io.units.infer_unit`) and, optionally, ``name`` (by default the table's key) and
-    ``fisheye``.
+    say otherwise, see :func:`tk.io.units.infer_unit`) and, optionally, ``name`` (by default the table's key),
+    ``fisheye`` and ``time_offset`` (seconds by which picture k was taken later than k / fps; 0 by default).
 
     Raises:
         CalibrationError: with the file, the camera and the key that is wrong.
@@ -118,14 +130,52 @@ def calibration_of(path: Path, tables: Mapping[str, Mapping[str, object]], unit:
         CalibrationError: with the file, the camera and the key that is wrong.
     """
     cameras: list[Camera] = []
+    late: list[float] = []
     for key, values in tables.items():
         camera = _camera(key, values, path)
+        late.append(_time_offset(camera.name, values, path))
         if camera.name in [other.name for other in cameras]:
             raise CalibrationError(f"{path}: two cameras have the name {camera.name!r}; give each its own")
         cameras.append(camera)
     found = FoundUnit(unit) if unit else infer_unit(Rig(tuple(cameras)).centers)
     notes = (f"{path}: {found.note}; [metadata] units says it for sure",) if found.note else ()
-    return Calibration(path, scale_world(Rig(tuple(cameras)), found.metres), tuple(tables), notes)
+    rig = scale_world(Rig(tuple(cameras)), found.metres)
+    return Calibration(path, rig, tuple(tables), notes, tuple(late), found.metres)
+
+
+def write_calibration(path: Path, source: Calibration, rig: Rig, time_offset_s: Sequence[float]) -> None:
+    """Write the file that ``source`` was read from with other cameras: all that is not said here stays as it is.
+
+    Args:
+        path: the new file.
+        source: the calibration as it was read.
+        rig: its cameras, in its order, metres.
+        time_offset_s: of each camera, seconds.
+
+    Raises:
+        CalibrationError: the source is no TOML file, or the new one cannot be written.
+    """
+    document = load_toml(source.path, CalibrationError)
+    tables = camera_tables(document, source.path)
+    for key, camera, late in zip(source.keys, rig, time_offset_s, strict=True):
+        table = dict(tables[key])
+        table["matrix"] = camera.matrix.tolist()
+        table["rotation"] = np.asarray(cv2.Rodrigues(camera.rotation)[0]).ravel().tolist()
+        table["translation"] = (camera.translation / source.metres).tolist()
+        table["time_offset"] = float(late)
+        (document if key in document else document["cameras"])[key] = table
+    try:
+        path.write_text(tomli_w.dumps(document), encoding="utf-8")
+    except OSError as reason:
+        raise CalibrationError(f"{path}: cannot be written ({reason.strerror or reason})") from None
+
+
+def _time_offset(name: str, values: Mapping[str, object], path: Path) -> float:
+    table = Table(values, f"{path}: camera {name!r}", CalibrationError)
+    late = table.number("time_offset", 0.0)
+    if abs(late) > _MOST_OFFSET_S:
+        table.fail(f"time_offset = {late:g} must be seconds, {_MOST_OFFSET_S:g} at most")
+    return late
 
 
 def scale_world(rig: Rig, metres: float) -> Rig:

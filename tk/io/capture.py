@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +58,8 @@ class Capture:
         clips: a clip a camera.
         mask_clips: a mask clip a camera, None without ready masks.
         masks: what :func:`open_capture` was asked for, which says where masks come from if there are none.
+        time_offset_s: seconds by which each camera's pictures are later than their number says, from the calibration;
+            whole frames of it are put right by :meth:`frames`.
     """
 
     path: Path
@@ -75,6 +77,27 @@ class Capture:
     mask_clips: tuple[Clip, ...] | None
     masks: str
     _calibration: Calibration
+    time_offset_s: tuple[float, ...]
+
+    @property
+    def late_frames(self) -> tuple[int, ...]:
+        """The time offsets in whole frames: frame k of the capture holds picture k - late of each camera."""
+        return tuple(round(late * self.fps) for late in self.time_offset_s)
+
+    @property
+    def first_frame(self) -> int:
+        """The first frame of which every camera has a picture."""
+        return max(0, *self.late_frames)
+
+    def as_recorded(self) -> Capture:
+        """The capture without its time offsets: frame k holds picture k of every camera."""
+        clips = (*self.clips, *(self.mask_clips or ()))
+        return replace(self, time_offset_s=(0.0,) * len(self.rig), frame_count=min(clip.frame_count for clip in clips))
+
+    @property
+    def calibration(self) -> Calibration:
+        """The calibration file's cameras that are used."""
+        return self._calibration
 
     @property
     def has_masks(self) -> bool:
@@ -88,6 +111,8 @@ class Capture:
     def frames(self, start: int = 0, stop: int | None = None) -> FrameReader:
         """The frames ``start`` … ``stop - 1``, decoded ahead; up to the capture's end by default.
 
+        Before :attr:`first_frame` a camera whose video begins later shows its first picture.
+
         Raises:
             CaptureError: there are no such frames.
         """
@@ -96,7 +121,7 @@ class Capture:
             raise CaptureError(
                 f"{self.path}: no frames from {start} to {stop}; it has frames 0 to {self.frame_count - 1}"
             )
-        return FrameReader(self.clips, self.mask_clips, self.rig.frame_shape, start, stop)
+        return FrameReader(self.clips, self.mask_clips, self.rig.frame_shape, start, stop, self.late_frames)
 
     def background(self) -> tuple[NDArray[np.uint8], ...] | None:
         """The empty scene: an array (T, h, w, 3) uint8 BGR a camera, None without a `background/` folder.
@@ -146,7 +171,11 @@ def open_capture(path: str | Path, cameras: Sequence[str] | None = None, masks: 
     if settings.unknown:
         warnings.append(f"{path / 'capture.toml'}: unknown keys are ignored: {', '.join(settings.unknown)}")
     _warn_of_units(calibration, warnings.append)
-    frame_count = _common_length([*clips, *(mask_clips or ())], warnings.append)
+    fps = _frame_rate(settings, clips, path, warnings.append)
+    offsets = calibration.time_offset_s or (0.0,) * len(rig)
+    frame_count = _common_length(
+        [*clips, *(mask_clips or ())], [round(late * fps) for late in offsets], warnings.append
+    )
     if settings.init_frame >= frame_count:
         raise CaptureError(
             f"{path / 'capture.toml'}: [init]: frame = {settings.init_frame} is past the last frame, {frame_count - 1}"
@@ -154,7 +183,7 @@ def open_capture(path: str | Path, cameras: Sequence[str] | None = None, masks: 
     return Capture(
         path=path,
         name=settings.name or path.resolve().name,
-        fps=_frame_rate(settings, clips, path, warnings.append),
+        fps=fps,
         up=_up(settings, rig, path, warnings.append),
         rig=rig,
         volume=_working_volume(settings, rig, path, warnings.append),
@@ -167,6 +196,7 @@ def open_capture(path: str | Path, cameras: Sequence[str] | None = None, masks: 
         mask_clips=mask_clips,
         masks=masks_asked,
         _calibration=calibration,
+        time_offset_s=offsets,
     )
 
 
@@ -219,9 +249,20 @@ def _clips_of(
     return tuple(clips)
 
 
-def _common_length(clips: Sequence[Clip], warn: Callable[[str], None]) -> int:
-    counts = [clip.frame_count for clip in clips]
+def _common_length(clips: Sequence[Clip], late: Sequence[int], warn: Callable[[str], None]) -> int:
+    """Frames until the first clip ends; each clip (those of masks behind those of videos) is so many frames late."""
+    counts = [clip.frame_count + late[i % len(late)] for i, clip in enumerate(clips)]
     common = min(counts)
+    if common <= max(0, *late):
+        raise CaptureError(
+            f"{clips[counts.index(common)].path}: ends before all cameras have begun; check time_offset in the "
+            "calibration"
+        )
+    if any(late):
+        first, last = max(0, *late), common - 1
+        told = ", ".join(f"{clip.path.stem} {n:+d}" for clip, n in zip(clips, late, strict=False) if n)
+        warn(f"time offsets: {told} frames; all cameras have pictures of frames {first} to {last}")
+        return common
     if common < max(counts):
         short = ", ".join(str(clip.path) for clip in clips if clip.frame_count == common)
         warn(f"{short}: has {common} frames, others up to {max(counts)}; only the first {common} are used")

@@ -52,7 +52,12 @@ class FrameReader(Iterator[FrameSet]):
         frame_shape: tuple[int, int],
         start: int,
         stop: int,
+        late: Sequence[int] = (),
     ) -> None:
+        """``late``: for each clip, by how many frames its pictures are later than their number says; picture
+        k - late is handed out in frame k. Before a clip's first picture that one stands in.
+        """
+        late = tuple(late) or (0,) * len(clips)
         self.start = start
         self.stop = stop
         self._index = start
@@ -73,7 +78,7 @@ class FrameReader(Iterator[FrameSet]):
         self._threads = [
             threading.Thread(
                 target=_decode,
-                args=(window, camera, clip, mask_clips[camera] if mask_clips else None, start, stop),
+                args=(window, camera, clip, mask_clips[camera] if mask_clips else None, start, stop, late[camera]),
                 name=f"tk-decode-{camera}",
                 daemon=True,
             )
@@ -202,15 +207,16 @@ class _Window:
             self._changed.notify_all()
 
 
-def _decode(window: _Window, camera: int, clip: Clip, mask_clip: Clip | None, start: int, stop: int) -> None:
+def _decode(window: _Window, camera: int, clip: Clip, mask_clip: Clip | None, start: int, stop: int, late: int) -> None:
     """A camera's thread."""
     index = start
     slot: _Slot | None = None
+    first_picture = first_mask = np.empty(0, np.uint8)
     try:
         with ExitStack() as stack:
             pictures = stack.enter_context(closing(clip.open()))
             masks = stack.enter_context(closing(mask_clip.open())) if mask_clip else None
-            for _ in range(start):
+            for _ in range(max(start - late, 0)):
                 if window.closed:
                     return
                 pictures.skip()
@@ -221,9 +227,21 @@ def _decode(window: _Window, camera: int, clip: Clip, mask_clip: Clip | None, st
                 if slot is None:
                     return
                 layer = slot.frame_set.images[camera, : clip.height, : clip.width]
-                pictures.read(layer)
+                waits = start < index <= late  # for its first picture, which was read for the frame before
+                if waits:
+                    layer[...] = first_picture
+                else:
+                    pictures.read(layer)
                 if masks is not None and slot.frame_set.masks is not None:
-                    masks.read(slot.frame_set.masks[camera, : clip.height, : clip.width])
+                    mask_layer = slot.frame_set.masks[camera, : clip.height, : clip.width]
+                    if waits:
+                        mask_layer[...] = first_mask
+                    else:
+                        masks.read(mask_layer)
+                    if index < late:
+                        first_mask = mask_layer.copy()
+                if index < late:
+                    first_picture = layer.copy()
                 window.finish(slot, camera)
                 slot = None
     except BaseException as failure:

@@ -337,7 +337,7 @@ class RegionTracker(ContourTracker):
             masks: (C, H, W) of F frames.
             poses: (F, D) of the first pass.
             lost: (F,) bool; such frames neither teach nor change.
-            error: (F, C) E_S of the first pass.
+            error: (F, C) E_S of the first pass; NaN where a camera was left out, and is again.
             height_m: the subject's height, if known.
             keep_body: leave the body as it is.
 
@@ -348,16 +348,20 @@ class RegionTracker(ContourTracker):
         tracked = np.flatnonzero(~lost)
         if not len(tracked):
             return poses, error
+
+        def believed(i: int) -> NDArray[np.uint8]:
+            return np.where(np.isfinite(error[i])[:, None, None], masks[i], np.uint8(0))
+
         if not keep_body and self.contours.adapt:
             chosen = _spread(tracked, np.nanmean(error[tracked], axis=1), SECOND_FIT.frames)
-            seen = [self.views.pyramid(masks[int(i)], scales, cleaning) for i in chosen]
+            seen = [self.views.pyramid(believed(int(i)), scales, cleaning) for i in chosen]
             stature = height_m or self.body.dimensions.stature
             fit = SECOND_FIT if height_m else replace(SECOND_FIT, stature_deviation=0.03)
             body, _ = self.fit(seen, poses[chosen], np.arange(len(chosen)), stature, fit)
             self.take_body(body)
         result, errors = poses.copy(), np.array(error)
         for i in tracked:
-            pyramid = self.views.pyramid(masks[int(i)], scales, cleaning)
+            pyramid = self.views.pyramid(believed(int(i)), scales, cleaning)
             prior = self._prior(poses[i], SECOND_ANGLE_DEG)
             settled = self.settle(pyramid, poses[i][None], (0,), prior=prior).states
             evidence = Evidence.of(self.screen, pyramid.masks[0])
