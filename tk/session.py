@@ -442,7 +442,8 @@ def finish(
 ) -> None:
     """What needs all frames: the second pass unless ``causal``; segments, feet and angles; the smoothed copy; cameras.
 
-    The second pass fits the body to frames of the whole recording and settles every frame anew with it; by refined
+    The second pass settles every frame anew, with the body fitted to frames of the whole recording where that did not begin
+    with the initialisation pose; by refined
     cameras where they disagree, unless ``config.refine`` is False. The result is replaced in one step; if this does not
     end, the first pass's stays.
     """
@@ -460,7 +461,9 @@ def finish(
     model: Mapping[str, Value] | None = None
     cameras = UsedCameras(plan.capture.rig, np.array(plan.capture.time_offset_s))
     if isinstance(tracker, RegionTracker) and not causal:
-        _LOG.info("second pass: the body is fitted to the whole recording")
+        _LOG.info("second pass")
+        # the initialisation pose shows all of the body; what else a recording may begin with does not
+        shown = plan.init is None and plan.capture.init_pose != "any"
         assert result.fit_error is not None
         missing = [int(f) for f in result.frames if int(f) not in masks]
         if missing:  # what an earlier run has tracked
@@ -485,7 +488,7 @@ def finish(
             lost,
             columns.get("fit_error", result.fit_error),
             plan.capture.subject_height_m,
-            keep_body=plan.body is not None,
+            keep_body=plan.body is not None or shown,
         )
         model = {**tracker.model(), REFINED: 1}
     _LOG.info("angles, feet, and the smoothed copy")
@@ -550,8 +553,8 @@ def _columns(tracker: ContourTracker, poses: NDArray[np.float64]) -> dict[str, N
 
 
 def _kept(observation: Observation, used: Observation, estimate: Estimate) -> NDArray[np.uint8]:
-    """The masks (C, H, W) of a frame as the tracker took them; of cameras that were left out as they were, for those may
-    be refined."""
+    """The masks (C, H, W) of a frame as the tracker took them; those of cameras that were left out as they were, for
+    these may be refined."""
     taken = used.masks if estimate.masks is None else estimate.masks
     out = np.asarray(observation.masks.any(axis=(1, 2)) & ~used.masks.any(axis=(1, 2)))
     return np.where(out[:, None, None], observation.masks, taken) if out.any() else taken

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.cones import CONE
-from tk.model.body_fit import _Problem as Problem
+from tk.model.body_fit import BodyProblem as Problem
 from tk.model.body_fit import segment_transforms, shape_rows
 from tk.model.bundle import Seen
 from tk.model.cone_body import SHAPE_NUMBERS, ConeBody, ConePart, build_cone_body, group_of

@@ -62,6 +62,8 @@ _STEP = 1e-4  # of the differences by a dimension's logarithm
 # Standard deviation of an edgel, pixels. Besides ragged masks it stands for shapes that no cone has, which err alike in
 # all frames.
 _EDGE_NOISE_PX = 3.0
+# So more frames than this tell more of the poses, but no more of the body.
+_TELLING_FRAMES = 8
 # Along a contour this many pixels err together.
 _CORRELATION_PX = 10.0
 # Between samples of a contour, pixels: no more than these are independent.
@@ -123,11 +125,12 @@ def fit_body(
     """
     config = config or BodyFitConfig()
     settings = replace(settings, spacing_px=_SPACING_PX)
-    problem = _Problem(preset, up, BodyDimensions.from_stature(stature_m), config.stature_deviation)
+    problem = BodyProblem(preset, up, BodyDimensions.from_stature(stature_m), config.stature_deviation)
     shared = problem.mean.copy()
     poses, start = np.array(poses), np.array(poses)
     F, D, K = len(poses), poses.shape[1], len(shared)
-    information = 1.0 / (_EDGE_NOISE_PX**2 * _CORRELATION_PX)  # of one pixel of contour
+    # of one pixel of contour
+    information = 1.0 / (_EDGE_NOISE_PX**2 * _CORRELATION_PX * max(len(poses) / _TELLING_FRAMES, 1.0))
     body_at = slice(F * D, F * D + K)
     for _ in range(config.rounds):
         here = problem.build(shared)
@@ -168,7 +171,7 @@ def fit_body(
     return problem.build(shared), poses
 
 
-class _Problem:
+class BodyProblem:
     """The family of bodies: 24 logarithms of dimensions, then 8 numbers for each group of parts."""
 
     def __init__(self, preset: str, up: str, average: BodyDimensions, stature_deviation: float) -> None:

@@ -329,8 +329,8 @@ class RegionTracker(ContourTracker):
     ) -> tuple[Float, Float]:
         """Fit the body to frames of the whole recording, and settle every frame anew with it.
 
-        Frames of differing poses show what the opening ones do not: where a knee or an elbow is, only a bent one tells.
-        Each frame stays near the pose that the first pass found, so that what colours told of a limb inside the
+        Frames of differing poses show what an opening without the initialisation pose may not: where a knee or an elbow
+        is, only a bent one tells. Each frame stays near the pose that the first pass found, so that what colours told of a limb inside the
         silhouette is not lost.
 
         Args:
@@ -353,7 +353,9 @@ class RegionTracker(ContourTracker):
             return np.where(np.isfinite(error[i])[:, None, None], masks[i], np.uint8(0))
 
         if not keep_body and self.contours.adapt:
-            chosen = _spread(tracked, np.nanmean(error[tracked], axis=1), SECOND_FIT.frames)
+            opening = tracked[: self.contours.init_frames : 3]
+            spread = _spread(tracked, np.nanmean(error[tracked], axis=1), SECOND_FIT.frames - len(opening))
+            chosen = np.union1d(opening, spread)
             seen = [self.views.pyramid(believed(int(i)), scales, cleaning) for i in chosen]
             stature = height_m or self.body.dimensions.stature
             fit = SECOND_FIT if height_m else replace(SECOND_FIT, stature_deviation=0.03)
