@@ -442,10 +442,9 @@ def finish(
 ) -> None:
     """What needs all frames: the second pass unless ``causal``; segments, feet and angles; the smoothed copy; cameras.
 
-    The second pass settles every frame anew, with the body fitted to frames of the whole recording where that did not begin
-    with the initialisation pose; by refined
-    cameras where they disagree, unless ``config.refine`` is False. The result is replaced in one step; if this does not
-    end, the first pass's stays.
+    The second pass settles every frame anew, with the body fitted to frames of the whole recording where that did not
+    begin with the initialisation pose; by refined cameras where they disagree, unless ``config.refine`` is False. The
+    result is replaced in one step; if this does not end, the first pass's stays.
     """
     tracker = plan.tracker
     if not isinstance(tracker, ContourTracker):

@@ -95,7 +95,7 @@ def test_rows_by_shapes_are_differences():
 
 @pytest.mark.parametrize("up", ["z", "-y"])
 def test_rows_by_dimensions_are_differences(up):
-    problem = body_fit._Problem("full", up, AVERAGE.dimensions, 0.01)
+    problem = body_fit.BodyProblem("full", up, AVERAGE.dimensions, 0.01)
     shared = problem.mean + np.random.default_rng(2).normal(0, 0.02, len(problem.mean)) * (problem.deviation > 1e-5)
     (rows,) = problem.dimension_rows(shared, POSE[None], [EDGELS])
     assert rows.shape == (len(EDGELS.part), len(DIMENSIONS))
@@ -110,7 +110,7 @@ def test_rows_by_dimensions_are_differences(up):
 
 
 def test_frames_are_told_apart_in_rows_by_dimensions():
-    problem = body_fit._Problem("full", "z", AVERAGE.dimensions, 0.01)
+    problem = body_fit.BodyProblem("full", "z", AVERAGE.dimensions, 0.01)
     poses = walk(AVERAGE, 2)
     both = problem.dimension_rows(problem.mean, poses, [EDGELS, EDGELS])
     for pose, rows in zip(poses, both, strict=True):

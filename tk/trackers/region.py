@@ -330,8 +330,8 @@ class RegionTracker(ContourTracker):
         """Fit the body to frames of the whole recording, and settle every frame anew with it.
 
         Frames of differing poses show what an opening without the initialisation pose may not: where a knee or an elbow
-        is, only a bent one tells. Each frame stays near the pose that the first pass found, so that what colours told of a limb inside the
-        silhouette is not lost.
+        is, only a bent one tells. Each frame stays near the pose that the first pass found, so that what colours told
+        of a limb inside the silhouette is not lost.
 
         Args:
             masks: (C, H, W) of F frames.
