@@ -15,6 +15,7 @@ overlay video and the report cost beside a default run.
     python -m scripts.bench [CAPTURE] [--voxels 64 128] [--repeat 3] [--growth CAPTURE] [--json FILE]
     python -m scripts.bench CAPTURE --method silhouette --masks auto --cameras a,b,c
     python -m scripts.bench [CAPTURE] --pictures
+    python -m scripts.bench [CAPTURE] --speed
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial import cKDTree
 
-from scripts import bench_hull, bench_pictures
+from scripts import bench_hull, bench_pictures, bench_speed
 from scripts.bench_stages import Stage, contour_stages, median_ms, silhouette_stages
 from tk import __version__, session
 from tk.config import Config
@@ -466,6 +467,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--cameras", type=_names, metavar="A,B,C", help="only these")
     parser.add_argument("--init-pose", type=Path, metavar="FILE", help="as of tk track")
     parser.add_argument("--growth", type=Path, metavar="CAPTURE", help="with masks of up to nine cameras: table 1")
+    parser.add_argument("--speed", action="store_true", help="only a whole run of the default beside decoding alone")
     parser.add_argument("--pictures", action="store_true", help="only what the overlay video and the report cost")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here too")
     given = parser.parse_args(arguments)
@@ -475,6 +477,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = Options(
         given.capture, 0, given.frames, given.repeat, given.masks, given.init_pose, given.method, given.cameras
     )
+    if given.speed:
+        console.print(bench_speed.measure(given.capture, given.masks, given.repeat))
+        return
     if given.pictures:
         console.print(bench_pictures.measure(given.capture, given.masks, given.frames, given.repeat))
         return

@@ -17,7 +17,7 @@ from tk.report.after import leave_pictures
 from tk.trackers.base import Estimate
 
 
-class _Silent(session.Reporter):
+class Silent(session.Reporter):
     """Wants to know nothing."""
 
     def note(self, text: str) -> None:
@@ -54,7 +54,7 @@ def run_once(capture_path: Path, masks: str, frames: int | None, output: Path) -
     """A default run and its pictures; meant for a process of its own."""
     started = _clocks()
     capture = open_capture(capture_path, masks=masks)
-    summary = session.track(capture, output, Config(), _Silent(), frames=(0, frames))
+    summary = session.track(capture, output, Config(), Silent(), frames=(0, frames))
     tracked = _clocks()
     warnings: list[str] = []
     leave_pictures(capture, output, warnings.append)

@@ -63,7 +63,7 @@ SECOND_FIT = BodyFitConfig(frames=24, rounds=4)
 SECOND_ANGLE_DEG = 15.0
 # What a joint's position errs by beside what the contours' noise tells: joints of people are not where a model's are.
 # Chosen on the development captures such that as many errors are within 1 and 2 σ as are of a normal's.
-JOINT_FLOOR_M = 0.008
+JOINT_FLOOR_M = 0.006
 
 
 @dataclass(frozen=True)
