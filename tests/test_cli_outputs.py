@@ -50,6 +50,9 @@ def test_a_hull_and_its_point_clouds_are_not_replaced_unasked(tk: Tk, tiny: Path
     tk(*command, "-o", tmp_path / "h.h5").complaint("h.h5", "--force")
     tk(*command, "-o", tmp_path / "i.h5", "--ply", tmp_path / "ply").complaint("000000.ply", "--force")
     assert not (tmp_path / "i.h5").exists()
+    tk(*command, "-o", tmp_path / "i.h5", "--mesh", tmp_path / "ply").complaint("000000.ply", "--force")
+    both = ["--ply", tmp_path / "new", "--mesh", tmp_path / "new"]
+    tk(*command, "-o", tmp_path / "i.h5", *both).complaint("new", "a folder of its own")
     assert tk(*command, "-o", tmp_path / "h.h5", "--ply", tmp_path / "ply", "--force").code == 0
 
 

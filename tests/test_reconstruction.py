@@ -92,3 +92,22 @@ def test_ply_files_that_cannot_be_written(tk: Tk, quick: Path, tiny: Path, tmp_p
     command = ["reconstruct", tiny, "-o", tmp_path / "h.h5", "--config", quick, "--frames", ":1", "--ply"]
     tk(*command, tmp_path / "file").complaint(str(tmp_path / "file"))
     assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_meshes_are_closed_and_lie_where_the_voxels_do(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    hull, folder = tmp_path / "h.h5", tmp_path / "mesh"
+    ran = tk("reconstruct", tiny, "-o", hull, "--mesh", folder, "--config", quick, "--frames", "5:7")
+    assert ran.code == 0, ran.err
+    assert sorted(path.name for path in folder.iterdir()) == ["000005.ply", "000006.ply"]
+    with h5py.File(hull, "r") as file:
+        voxel = float(file.attrs["voxel_m"])
+        positions = file["hull/positions"][: file["hull/offsets"][1]]
+    mesh = open3d.io.read_triangle_mesh(folder / "000005.ply")
+    assert mesh.is_watertight() and mesh.has_vertex_colors()
+    scene = open3d.t.geometry.RaycastingScene()
+    scene.add_triangles(open3d.t.geometry.TriangleMesh.from_legacy(mesh))
+    distance = scene.compute_distance(open3d.core.Tensor(positions.astype(np.float32))).numpy()
+    assert np.median(distance) < 0.6 * voxel and distance.max() < 2 * voxel
+    low, high = np.asarray(mesh.vertices).min(axis=0), np.asarray(mesh.vertices).max(axis=0)
+    np.testing.assert_allclose(low, positions.min(axis=0), atol=1.1 * voxel)
+    np.testing.assert_allclose(high, positions.max(axis=0), atol=1.1 * voxel)

@@ -14,7 +14,7 @@ import click
 
 from tk import __version__
 from tk.console import Report
-from tk.errors import CaptureError, ConfigError, TkError
+from tk.errors import CaptureError, ConfigError, TkError, WorkerError
 
 if TYPE_CHECKING:
     from tk.config import Config
@@ -98,6 +98,19 @@ _resume = click.option("--resume", is_flag=True, help="Go on where an earlier ru
 _force = click.option("--force", is_flag=True, help="Replace what exists under the output's name.")
 _quiet = click.option("-q", "--quiet", is_flag=True, help="No progress: only notes and errors.")
 _json = click.option("--json", "as_json", is_flag=True, help="Print a summary for scripts on stdout.")
+_method = click.option(
+    "--method",
+    default="region",
+    show_default=True,
+    type=click.Choice(["region", "silhouette", "volumetric", "lm"]),
+    help="The tracker: region; silhouette and volumetric, the two papers' own; lm, by Levenberg-Marquardt.",
+)
+_seed = click.option("--seed", type=int, help="Of the random generator.  [default: 0]")
+_body = click.option(
+    "--body", type=click.Path(path_type=Path), metavar="FILE", help="The body of a result, or of a TOML file."
+)
+_causal = click.option("--causal", is_flag=True, help="Leave it at the first pass: no frame knows of those after it.")
+_store_hull = click.option("--store-hull", is_flag=True, help="Keep the hull's coloured surface in the result.")
 
 
 @main.command(
@@ -108,26 +121,18 @@ _json = click.option("--json", "as_json", is_flag=True, help="Print a summary fo
 )
 @_capture
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="RESULT.h5")
-@click.option(
-    "--method",
-    default="region",
-    show_default=True,
-    type=click.Choice(["region", "silhouette", "volumetric", "lm"]),
-    help="The tracker: region; silhouette and volumetric, the two papers' own; lm, by Levenberg-Marquardt.",
-)
+@_method
 @_voxels
 @_cameras
 @_frames
-@click.option("--seed", type=int, help="Of the random generator.  [default: 0]")
+@_seed
 @_masks
 @click.option("--init-pose", type=click.Path(path_type=Path), metavar="FILE", help="Start from this rough pose (TOML).")
-@click.option(
-    "--body", type=click.Path(path_type=Path), metavar="FILE", help="The body of a result, or of a TOML file."
-)
-@click.option("--causal", is_flag=True, help="Leave it at the first pass: no frame knows of those after it.")
+@_body
+@_causal
 @_resume
 @_force
-@click.option("--store-hull", is_flag=True, help="Keep the hull's coloured surface in the result.")
+@_store_hull
 @_no_report
 @_preset
 @_config
@@ -246,7 +251,8 @@ def import_(folder: Path, output: Path, units: str | None, trial: str | None) ->
 @main.command(epilog=_example("tk reconstruct CAPTURE -o hull.h5 --ply hulls --frames 0:3"))
 @_capture
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="HULL.h5")
-@click.option("--ply", type=click.Path(path_type=Path), metavar="DIR", help="Also write a PLY file a frame.")
+@click.option("--ply", type=click.Path(path_type=Path), metavar="DIR", help="Also write point clouds, a PLY a frame.")
+@click.option("--mesh", type=click.Path(path_type=Path), metavar="DIR", help="Also write closed meshes, a PLY a frame.")
 @_voxels
 @_cameras
 @_frames
@@ -259,6 +265,7 @@ def reconstruct(
     capture: Path,
     output: Path,
     ply: Path | None,
+    mesh: Path | None,
     voxels: int | None,
     cameras: str | None,
     frames: str | None,
@@ -279,7 +286,7 @@ def reconstruct(
         config = _configuration(config_file, voxels=voxels)
         report.stage(f"opening {capture}")
         opened = open_capture(capture, _names(cameras), masks)
-        count = reconstruction.reconstruct(opened, output, config, report, span, ply, force)
+        count = reconstruction.reconstruct(opened, output, config, report, span, ply, mesh, force)
     if as_json:
         _print_json(result=str(output), frames=count, seconds=round(time.perf_counter() - started, 3))
     if not quiet:
@@ -439,8 +446,9 @@ def evaluate(result: Path, truth: Path, capture: Path | None, joints: str, masks
 @main.command(epilog=_example("tk export walk.h5 --to trc,mot,bvh"))
 @click.argument("result", type=click.Path(path_type=Path), metavar="RESULT.h5")
 @click.option(
-    "--to", "formats", required=True, metavar="A,B,…", help="Formats: trc, mot (OpenSim), c3d, bvh, csv, gltf (.glb)."
-)
+    "--to", "formats", required=True, metavar="A,B,…",
+    help="Formats: trc, mot (OpenSim), c3d, bvh, csv, gltf (.glb), ply (a folder).",
+)  # fmt: skip
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder.  [default: beside RESULT.h5]"
 )
@@ -512,6 +520,80 @@ def report(result: Path, capture: Path | None, output: Path | None, force: bool)
     with _working("writing the report"):
         file = write(result, capture, output, force)
     click.echo(f"wrote {file}", err=True)
+
+
+@main.command(epilog=_example("tk batch recordings/* -o results --workers 4"))
+@click.argument("captures", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CAPTURE...")
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="FOLDER")
+@click.option("--workers", type=int, metavar="N", help="Captures at once on this machine.  [default: half the cores]")
+@click.option("--scheduler", metavar="ADDRESS", help="Use the workers of this Dask scheduler: tcp://host:8786.")
+@_method
+@_voxels
+@_cameras
+@_frames
+@_seed
+@_masks
+@_body
+@_causal
+@_store_hull
+@_no_report
+@_preset
+@_config
+@_quiet
+def batch(
+    captures: tuple[Path, ...],
+    output: Path,
+    workers: int | None,
+    scheduler: str | None,
+    method: str,
+    voxels: int | None,
+    cameras: str | None,
+    frames: str | None,
+    seed: int | None,
+    masks: str,
+    body: Path | None,
+    causal: bool,
+    store_hull: bool,
+    no_report: bool,
+    preset: str | None,
+    config_file: Path | None,
+    quiet: bool,
+) -> None:
+    """Track many captures into FOLDER, with a summary; the same command again goes on where it stopped."""
+    from tk.batch import TrackOptions, exit_code, run_batch
+    from tk.batch.report import BatchReport
+
+    config = _configuration(config_file, preset, voxels=voxels, seed=seed)
+    options = TrackOptions(
+        method, _span(frames), _names(cameras), masks, body and body.resolve(), causal, store_hull, config
+    )
+    with BatchReport(quiet) as report:
+        try:
+            outcomes = run_batch(captures, output, options, report, workers, scheduler, not no_report)
+        except KeyboardInterrupt:
+            click.echo("tk: interrupted; the same command goes on where it stopped", err=True)
+            sys.exit(1)
+        except WorkerError as error:
+            click.echo(f"tk: {error}", err=True)
+            sys.exit(1)
+    if not quiet:
+        click.echo(f"the summary is in {output / 'summary.html'}", err=True)
+    sys.exit(exit_code(outcomes))
+
+
+@main.command(epilog=_example("tk view walk.h5 --frame 40"))
+@click.argument("result", type=click.Path(path_type=Path), metavar="RESULT.h5")
+@click.argument("capture", type=click.Path(path_type=Path), required=False)
+@click.option("--frame", type=int, metavar="N", help="Frame to begin with.  [default: the first]")
+@click.option("--screenshot", type=click.Path(path_type=Path), metavar="FILE.png", help="Draw it there, and close.")
+def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path | None) -> None:
+    """Show RESULT.h5 in a window: body, joints, hull, cameras.
+
+    CAPTURE adds its cameras, where the result has none, and its truth, where it has one.
+    """
+    from tk.view.window import view as show
+
+    show(result, capture, frame, screenshot)
 
 
 @main.command(epilog=_example("tk demo"))

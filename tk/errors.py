@@ -29,8 +29,16 @@ class ResultError(TkError):
     """A result file cannot be written, read or continued."""
 
 
+class ResultBusyError(ResultError):
+    """Another run is writing the result."""
+
+
 class ExportError(TkError):
     """A result cannot be written in another format."""
+
+
+class DisplayError(TkError):
+    """There is no display to show something on, or nothing that can draw on it."""
 
 
 class ConfigError(TkError):

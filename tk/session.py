@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.ahead import TIMING_STAGES, Observed, Source, open_source
+from tk.blas import one_blas_thread
 from tk.config import Config
 from tk.errors import CaptureError, ConfigError, ResultError, TkError
 from tk.io.capture import Capture
@@ -175,10 +176,11 @@ def track(
                 reporter.begin(plan.stop - plan.begin, min(done, plan.stop - plan.begin))
                 for estimate in run.estimates():
                     reporter.advance(estimate.frame, estimate)
-            for line in run.watch.report() if run.tracked else ():
-                reporter.note(line)
-            if run.tracked:
-                finish(output, plan, config, run.masks, note, causal)
+            if run.tracked or run.restore_unfinished(output, causal):
+                for line in run.watch.report():
+                    reporter.note(line)
+                with one_blas_thread():
+                    finish(output, plan, config, run.masks, note, causal)
                 if said:
                     revise_result(output, notes=said)
         except KeyboardInterrupt:
@@ -394,18 +396,36 @@ class _Run:
         opening, broken = _take(observations, count)
         _LOG.info("finding the person in frame %d and fitting the body to %d frames", plan.first, len(opening))
         try:
-            seen = self.watch.start([o for o, _ in opening])
-            if plan.body is not None and isinstance(plan.tracker, ContourTracker):
-                plan.tracker.start(seen, plan.capture.subject_height_m, plan.init, plan.body)
-            else:
-                plan.tracker.start(seen, plan.capture.subject_height_m, plan.init)
-            self.watch.check_body()
+            with one_blas_thread():
+                seen = self.watch.start([o for o, _ in opening])
+                if plan.body is not None and isinstance(plan.tracker, ContourTracker):
+                    plan.tracker.start(seen, plan.capture.subject_height_m, plan.init, plan.body)
+                else:
+                    plan.tracker.start(seen, plan.capture.subject_height_m, plan.init)
+                self.watch.check_body()
         except CaptureError as error:
             raise CaptureError(f"{plan.capture.path}: {error}") from None
         del seen
         if output:
             output.writer.write_model(plan.tracker.model())
         yield from self._step_through(chain(_emptied(opening), broken or observations))
+
+    def restore_unfinished(self, path: Path, causal: bool) -> bool:
+        """Restore the tracker if an earlier run got to the last frame and no further; whether it is so."""
+        output, tracker = self.output, self.plan.tracker
+        if output is None or not output.done or not isinstance(tracker, ContourTracker):
+            return False
+        refined = causal or not isinstance(tracker, RegionTracker) or REFINED in output.writer.model
+        if refined and read_result(path).smoothed is not None:
+            return False
+        output.check()
+        self._restore(output)
+        return True
+
+    def _restore(self, output: _Output) -> None:
+        with blamed_on(output.writer.path, "the state of the run"):
+            self.plan.tracker.restore(output.writer.model, output.writer.state)
+            self.watch.restore(_below(_WATCH, output.writer.state))
 
     def _step_through(self, observations: Iterator[Observed]) -> Iterator[Estimate]:
         plan, output = self.plan, self.output
@@ -414,7 +434,8 @@ class _Run:
             if observation.index >= plan.stop:
                 return
             started = time.perf_counter()
-            estimate, used = self.watch.step(observation)
+            with one_blas_thread():
+                estimate, used = self.watch.step(observation)
             if observation.index < plan.begin:
                 continue
             if output and isinstance(plan.tracker, RegionTracker):
@@ -466,8 +487,9 @@ def finish(
         assert result.fit_error is not None
         missing = [int(f) for f in result.frames if int(f) not in masks]
         if missing:  # what an earlier run has tracked
-            for observation, _ in plan.source.frames(min(missing), max(missing) + 1):
-                masks.put(observation.index, tracker.without_foreign(observation).masks)
+            with open_source(plan.capture, config, lambda _: None) as source:
+                for observation, _ in source.frames(min(missing), max(missing) + 1):
+                    masks.put(observation.index, tracker.without_foreign(observation).masks)
         if config.refine:
             refined = refine_if_astray(tracker, masks, result.frames, poses, ~lost, note)
             if refined is not None:

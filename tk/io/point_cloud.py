@@ -6,6 +6,7 @@ import datetime
 import os
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -43,18 +44,8 @@ def write_ply(path: Path, positions: NDArray[np.floating], colors_rgb: NDArray[n
     Raises:
         ResultError: Open3D cannot be loaded, or the file cannot be written.
     """
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise ResultError(f"{path}: PLY files need Open3D, which does not load here: {error}") from None
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ResultError(f"{path.parent}: cannot be made: {error.strerror}") from None
-    try:  # Open3D does not tell why it cannot write, and writes no cloud without points
-        path.write_bytes(_EMPTY_PLY)
-    except OSError as error:
-        raise ResultError(f"{path}: cannot be written: {error.strerror}") from None
+    open3d = load_open3d(path)
+    claim(path, _EMPTY_PLY)
     if len(positions) == 0:
         return
     cloud = open3d.geometry.PointCloud()
@@ -63,7 +54,41 @@ def write_ply(path: Path, positions: NDArray[np.floating], colors_rgb: NDArray[n
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         written = open3d.io.write_point_cloud(path, cloud)
     if not written:
-        raise ResultError(f"{path}: cannot be written: check the space on the disk")
+        raise full(path)
+
+
+def load_open3d(path: Path) -> Any:
+    """Open3D, for writing ``path``.
+
+    Raises:
+        ResultError: it cannot be loaded.
+    """
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise ResultError(f"{path}: PLY files need Open3D, which does not load here: {error}") from None
+    return open3d
+
+
+def claim(path: Path, content: bytes) -> None:
+    """Write a file without points, for Open3D does not tell why it cannot write, and writes no such file itself.
+
+    Raises:
+        ResultError: with the reason.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ResultError(f"{path.parent}: cannot be made: {error.strerror}") from None
+    try:
+        path.write_bytes(content)
+    except OSError as error:
+        raise ResultError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def full(path: Path) -> ResultError:
+    """What to say where Open3D has failed in the middle of a file."""
+    return ResultError(f"{path}: cannot be written: check the space on the disk")
 
 
 def write_hulls(path: Path, capture: Capture, grid: VoxelGrid, frames: Iterable[tuple[int, HullPoints]]) -> int:
@@ -165,5 +190,5 @@ def check_hull_path(path: Path, force: bool = True) -> None:
 
 
 def ply_path(folder: Path, frame: int) -> Path:
-    """Where a frame's point cloud is written."""
+    """Where a frame's point cloud or mesh is written."""
     return folder / f"{frame:06d}.ply"

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import h5py
 
-from tk.errors import ConfigError, ResultError
+from tk.errors import ConfigError, ResultBusyError, ResultError
 from tk.io.hdf5 import open_hdf5
 from tk.io.result_data import FORMAT
 
@@ -29,7 +29,7 @@ class Workshop:
             fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             os.close(self._handle)
-            raise ResultError(
+            raise ResultBusyError(
                 f"{target}: another run is writing this result; wait for it, or choose another name"
             ) from None
         except OSError:

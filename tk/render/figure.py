@@ -71,6 +71,11 @@ class Solid:
         fan = np.array([[0, k, k + 1, k + 2] for k in range(1, AROUND - 2, 2)])
         return np.concatenate([side, index[0][fan[:, ::-1]], index[-1][fan]])
 
+    @cached_property
+    def triangles(self) -> NDArray[np.int64]:
+        """(M, 3) the faces halved, turned outwards as they are."""
+        return np.concatenate([self.faces[:, [0, 1, 2]], self.faces[:, [0, 2, 3]]])
+
 
 @dataclass(frozen=True)
 class Outline:

@@ -166,9 +166,9 @@ def test_command(tk: Tk, write: Write, tmp_path: Path) -> None:
     path = write()
     ran = tk("export", path, "--to", ",".join(FORMATS), "-o", tmp_path / "out" / "deep")
     assert ran.code == 0 and ran.out == "", ran.err
-    names = {"walk.trc", "walk.mot", "walk.c3d", "walk.bvh", "walk.csv", "walk_angles.csv", "walk.glb"}
+    names = {"walk.trc", "walk.mot", "walk.c3d", "walk.bvh", "walk.csv", "walk_angles.csv", "walk.glb", "walk_ply"}
     assert {file.name for file in (tmp_path / "out" / "deep").iterdir()} == names
-    assert "note: bvh, gltf: in 2 lost frames the pose before is held" in ran.err
+    assert "note: bvh, gltf, ply: in 2 lost frames the pose before is held" in ran.err
     tk("export", path, "--to", "trc", "-o", tmp_path / "out" / "deep").complaint("walk.trc", "--force")
     tk("export", path, "--to", "fbx").complaint("--to fbx", "gltf")
     tk("export", tmp_path / "none.h5", "--to", "trc").complaint("none.h5", "no such file")

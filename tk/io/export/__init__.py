@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,13 +17,14 @@ from tk.io.export.csv import write_angles_csv, write_points_csv
 from tk.io.export.gltf import write_glb
 from tk.io.export.mot import write_mot
 from tk.io.export.motion import Motion, read_motion
+from tk.io.export.ply import write_body_meshes
 from tk.io.export.trc import write_trc
 
 __all__ = ["FORMATS", "Exported", "Motion", "export", "read_motion"]
 
 Writer = Callable[[Motion, Path], None]
 
-# A format's files: what is added to the result's name, and who writes it.
+# A format's files, or folder of files: what is added to the result's name, and who writes it.
 FORMATS: dict[str, tuple[tuple[str, Writer], ...]] = {
     "trc": ((".trc", write_trc),),
     "mot": ((".mot", write_mot),),
@@ -29,9 +32,10 @@ FORMATS: dict[str, tuple[tuple[str, Writer], ...]] = {
     "bvh": ((".bvh", write_bvh),),
     "csv": ((".csv", write_points_csv), ("_angles.csv", write_angles_csv)),
     "gltf": ((".glb", write_glb),),
+    "ply": (("_ply", write_body_meshes),),
 }
 # Formats that cannot say that a pose is not known.
-_HOLDING = ("bvh", "gltf")
+_HOLDING = ("bvh", "gltf", "ply")
 
 
 @dataclass(frozen=True)
@@ -87,9 +91,19 @@ def _write(motion: Motion, target: Path, write: Writer) -> None:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         write(motion, part)
+        if target.is_dir():  # which no rename replaces
+            _remove(target)
         os.replace(part, target)
     except OSError as error:
         raise ExportError(f"{target}: cannot be written: {error.strerror or error}") from error
     finally:
         with contextlib.suppress(OSError):
-            part.unlink()
+            shutil.rmtree(part) if part.is_dir() else part.unlink()
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder that an earlier export has made."""
+    other = next((file for file in folder.iterdir() if not re.fullmatch(r"\d{6,}\.ply", file.name)), None)
+    if other is not None:
+        raise ExportError(f"{other}: tk export did not make it, so its folder is not replaced; choose another with -o")
+    shutil.rmtree(folder)

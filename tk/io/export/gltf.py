@@ -18,17 +18,16 @@ from tk import __version__
 from tk.io.export.motion import Motion
 from tk.io.export.tree import Tree, build_tree, rest_axes
 from tk.model.angles import standing_axes
-from tk.model.body import build_pieces
 from tk.model.rotations import continuous, to_quaternions
 from tk.model.skeleton import JOINTS, SEGMENTS, WAIST_HEIGHT, build_skeleton
-from tk.model.superellipsoid import Superellipsoid
+from tk.render.figure import AROUND, Solid, figure_of
 
 Float = NDArray[np.float64]
 
 _FLOAT, _UINT16 = 5126, 5123  # componentType
 _VERTICES, _INDICES = 34962, 34963  # bufferView.target
-# Points along and around a piece.
-_ALONG, _AROUND = 11, 21
+# twice the area below which a triangle is none: those at the poles of an ellipsoid
+_NO_AREA_M2 = 1e-10
 # Left limbs warm, right limbs cool, trunk and head green, as in the overlays.
 _COLORS = {"_l": (0.85, 0.35, 0.15), "_r": (0.2, 0.4, 0.85), "": (0.3, 0.6, 0.3)}
 
@@ -113,12 +112,12 @@ def _animation(motion: Motion, tree: Tree, buffer: _Buffer) -> dict[str, Any]:
 
 
 def _meshes(motion: Motion, tree: Tree, buffer: _Buffer, nodes: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A mesh for each segment with pieces; it is put onto its node."""
+    """A mesh for each segment of the tracked body with solids; it is put onto its node."""
     skeleton = build_skeleton(motion.dimensions)
-    pieces = build_pieces(motion.dimensions)
+    solids = figure_of(motion.result).solids
     meshes: list[dict[str, Any]] = []
     for s, segment in enumerate(SEGMENTS):
-        own = [piece for piece in pieces if piece.segment == segment]
+        own = [solid for solid in solids if solid.segment == s]
         if not own:
             continue
         node = tree.segments.index(segment)
@@ -129,11 +128,13 @@ def _meshes(motion: Motion, tree: Tree, buffer: _Buffer, nodes: list[dict[str, A
             else skeleton.joint_position[JOINTS.index(name)]
         )
         to_rest = rest_axes(segment) @ standing_axes()[s].T  # from the zero configuration to the rest pose
-        points, normals, faces = zip(*(_surface(piece) for piece in own), strict=True)
+        points, normals, faces = zip(*(_surface(solid) for solid in own), strict=True)
         starts = np.cumsum([0, *(len(p) for p in points[:-1])])
+        in_body = np.concatenate(points) @ motion.T_world_body - origin
+        turned = np.concatenate(normals) @ motion.T_world_body
         attributes = {
-            "POSITION": buffer.add(_float32((np.concatenate(points) - origin) @ to_rest.T), _VERTICES, bounds=True),
-            "NORMAL": buffer.add(_float32(np.concatenate(normals) @ to_rest.T), _VERTICES),
+            "POSITION": buffer.add(_float32(in_body @ to_rest.T), _VERTICES, bounds=True),
+            "NORMAL": buffer.add(_float32(turned @ to_rest.T), _VERTICES),
         }
         indices = np.concatenate([start + face.ravel() for start, face in zip(starts, faces, strict=True)])
         side = segment[-2:] if segment[-2:] in _COLORS else ""
@@ -147,25 +148,29 @@ def _meshes(motion: Motion, tree: Tree, buffer: _Buffer, nodes: list[dict[str, A
     return meshes
 
 
-def _surface(piece: Superellipsoid) -> tuple[Float, Float, NDArray[np.int64]]:
-    """Points (N, 3) and normals (N, 3) of a piece in the zero configuration, body frame, and triangles (M, 3)."""
-    along, around = np.linspace(*piece.eta_range, 256), np.linspace(-np.pi, np.pi, 512)
-    along = _evenly(along, piece.point(along, np.zeros_like(along)), _ALONG)
-    around = _evenly(around, piece.point(np.zeros_like(around), around), _AROUND)
-    eta, omega = np.meshgrid(along, around, indexing="ij")
-    T = piece.T_body_piece
-    points = piece.point(eta, omega).reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
-    normals = piece.normal(eta, omega).reshape(-1, 3) @ T[:3, :3].T
-    corner = (np.arange(_ALONG - 1)[:, None] * _AROUND + np.arange(_AROUND - 1)).ravel()
-    right, up = corner + 1, corner + _AROUND
-    faces = np.concatenate([np.column_stack([corner, right, up]), np.column_stack([right, up + 1, up])])
-    return points, normals, faces
+def _surface(solid: Solid) -> tuple[Float, Float, NDArray[np.int64]]:
+    """Points (N, 3), normals (N, 3) and triangles (M, 3) of a solid, its segment's frame.
 
-
-def _evenly(parameter: Float, curve: Float, count: int) -> Float:
-    """(count,) values of the parameter (N,) at equal lengths along a curve (N, 3), which equal steps would not be."""
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
-    return np.interp(np.linspace(0.0, length[-1], count), length, parameter)
+    The ends of a frustum are flat with an edge around, so they have points of their own; what has no area is left out.
+    """
+    rings = solid.rings
+    count = rings.shape[0] * AROUND
+    points = np.concatenate([rings.reshape(-1, 3), rings[0], rings[-1]])
+    faces = solid.triangles.copy()
+    is_end = [(faces < AROUND).all(axis=1), (faces >= count - AROUND).all(axis=1)]
+    faces[is_end[0]] += count
+    faces[is_end[1]] += 2 * AROUND  # the last circle's copy follows the first one's
+    corners = points[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    kept = np.linalg.norm(across, axis=1) > _NO_AREA_M2
+    normals = np.zeros_like(points)
+    for corner in range(3):
+        np.add.at(normals, faces[kept, corner], across[kept])
+    used = np.unique(faces[kept])
+    length = np.linalg.norm(normals[used], axis=1, keepdims=True)
+    order = np.zeros(len(points), np.int64)
+    order[used] = np.arange(len(used))
+    return points[used], normals[used] / length, order[faces[kept]]
 
 
 def _float32(values: Float) -> NDArray[np.float32]:

@@ -15,7 +15,7 @@ from tk.model.anthropometry import BodyDimensions
 from tk.model.derived import derive
 from tk.model.motion import FOOT_POINTS, sole_offset
 from tk.model.rotations import to_matrices
-from tk.model.skeleton import JOINTS, SEGMENTS, Skeleton, build_skeleton, join_pose
+from tk.model.skeleton import JOINTS, SEGMENTS, Skeleton, build_skeleton, join_pose, split_pose
 from tk.model.smoothing import smooth
 
 Float = NDArray[np.float64]
@@ -43,6 +43,8 @@ class Motion:
         segments: S names; rotations: (F, S, 3, 3) segment to world, axes as in :mod:`tk.model.angles`.
         dimensions: of the fitted body.
         T_world_body: (3, 3) the world's forward, left and up as columns.
+        result: what all this was read from; its smoothed copy where that was asked for.
+        held: (F,) the result's row that each frame shows: its own, or the last known one's.
     """
 
     name: str
@@ -59,6 +61,8 @@ class Motion:
     rotations: Float
     dimensions: BodyDimensions
     T_world_body: Float
+    result: Result
+    held: NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -139,6 +143,8 @@ def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[M
         rotations=rotations,
         dimensions=dimensions,
         T_world_body=skeleton.T_world_body,
+        result=result,
+        held=held,
     )
     if result.feet is not None and np.isfinite(result.feet[known]).all():
         feet = result.feet[held]
@@ -212,5 +218,17 @@ def _smooth(result: Result, dimensions: BodyDimensions) -> tuple[Result, NDArray
     joints[changed] = derived.joints
     rotation = np.full((len(result), len(SEGMENTS), 4), np.nan)
     rotation[changed] = derived.rotations
-    meta = replace(result.meta, segment_names=SEGMENTS)
-    return replace(result, meta=meta, joints=joints, segments_rotation=rotation, feet=None), found.bridged
+    paper, waist, ankles = (
+        np.array(part) for part in zip(*(split_pose(skeleton, p) for p in found.poses), strict=True)
+    )
+    result = replace(
+        result,
+        meta=replace(result.meta, segment_names=SEGMENTS),
+        pose=paper,
+        waist=None if result.waist is None else waist,
+        ankles=None if result.ankles is None else ankles,
+        joints=joints,
+        segments_rotation=rotation,
+        feet=None,
+    )
+    return result, found.bridged

@@ -1,0 +1,87 @@
+"""Meshes of voxels: closed, turned outwards, where the voxels are; read back by Open3D."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import open3d
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tk.errors import ResultError
+from tk.io.mesh import Mesh, hull_mesh, write_mesh
+from tk.io.result import HullPoints
+from tk.model.volume import VoxelGrid
+
+GRID = VoxelGrid((1.0, -2.0, 0.5), 0.04, (24, 20, 30))
+
+
+def surface_of(occupancy: np.ndarray) -> HullPoints:
+    """All voxels stand for the surface's: the lower half red, the upper half blue."""
+    flat = np.flatnonzero(occupancy)
+    upper = np.argwhere(occupancy)[:, 2] >= 15
+    colors = np.where(upper[:, None], [0, 0, 255], [255, 0, 0]).astype(np.uint8)
+    return HullPoints(GRID.centers(flat), colors)
+
+
+def legacy(mesh: Mesh) -> open3d.geometry.TriangleMesh:
+    return open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(mesh.vertices), open3d.utility.Vector3iVector(mesh.triangles)
+    )
+
+
+def test_a_ball_has_its_place_volume_and_colours() -> None:
+    x, y, z = np.meshgrid(*(np.arange(n) for n in GRID.shape), indexing="ij")
+    occupancy = (x - 12) ** 2 + (y - 10) ** 2 + (z - 15) ** 2 <= 8**2
+    mesh = hull_mesh(occupancy, GRID, surface_of(occupancy))
+    center = np.array([1.0, -2.0, 0.5]) + 0.04 * np.array([12, 10, 15])
+    np.testing.assert_allclose(mesh.vertices.mean(axis=0), center, atol=0.004)
+    radius = np.linalg.norm(mesh.vertices - center, axis=1)
+    assert radius.min() > 0.04 * 7.2 and radius.max() < 0.04 * 8.8
+    found = legacy(mesh)
+    assert found.is_watertight() and found.is_orientable()
+    assert found.get_volume() == pytest.approx(occupancy.sum() * 0.04**3, rel=0.04)
+    corners = mesh.vertices[mesh.triangles]
+    outwards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert ((outwards * (corners.mean(axis=1) - center)).sum(axis=1) > 0).all()
+    high = mesh.vertices[:, 2] > center[2] + 0.05
+    assert (mesh.colors[high] == [0, 0, 255]).all()
+
+
+@settings(deadline=None, max_examples=15)
+@given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.05, 0.95))
+def test_any_voxels_have_a_closed_surface(seed: int, share: float) -> None:
+    """Whether they touch the border of the volume, or each other by a corner only."""
+    occupancy = np.random.default_rng(seed).random(GRID.shape) < share
+    mesh = hull_mesh(occupancy, GRID, surface_of(occupancy))
+    edges = np.sort(np.concatenate([mesh.triangles[:, [0, 1]], mesh.triangles[:, [1, 2]], mesh.triangles[:, [2, 0]]]))
+    _, counts = np.unique(edges, axis=0, return_counts=True)
+    assert (counts % 2 == 0).all(), "an edge with a triangle on one side only is a hole"
+
+
+def test_no_voxels_no_triangles(tmp_path: Path) -> None:
+    empty = np.zeros(GRID.shape, bool)
+    mesh = hull_mesh(empty, GRID, surface_of(empty))
+    write_mesh(tmp_path / "a" / "none.ply", mesh)
+    assert len(open3d.io.read_triangle_mesh(tmp_path / "a" / "none.ply").triangles) == 0
+
+
+def test_ply_round_trip(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    mesh = Mesh(
+        rng.normal(size=(40, 3)),
+        rng.permutation(39).reshape(13, 3).astype(np.int32),
+        rng.integers(0, 256, (40, 3), dtype=np.uint8),
+    )
+    write_mesh(tmp_path / "m.ply", mesh)
+    back = open3d.io.read_triangle_mesh(tmp_path / "m.ply")
+    np.testing.assert_array_equal(np.asarray(back.vertices), mesh.vertices)
+    np.testing.assert_array_equal(np.asarray(back.triangles), mesh.triangles)
+    np.testing.assert_allclose(np.asarray(back.vertex_colors) * 255, mesh.colors, atol=0.51)
+
+
+def test_a_mesh_that_cannot_be_written(tmp_path: Path) -> None:
+    with pytest.raises(ResultError, match="cannot be written"):
+        write_mesh(tmp_path, Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32), np.zeros((3, 3), np.uint8)))

@@ -1,0 +1,287 @@
+"""``tk batch``: names, records, the summary; and a real scheduler with worker processes, some of which are killed."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.conftest import FRAMES, QUICK, Silent, Tk
+from tk.batch import Job, Outcome, TrackOptions, exit_code
+from tk.batch.jobs import DONE, FAILED, make_jobs
+from tk.batch.summary import write_summary
+from tk.config import Config
+from tk.errors import ConfigError, ResultBusyError, ResultError
+from tk.io.capture import open_capture
+from tk.io.result_files import Workshop
+from tk.session import track
+
+ROOT = Path(__file__).parents[1]
+CONFIG = Config.from_toml(QUICK)
+
+
+def folders(*paths: Path) -> list[Path]:
+    for path in paths:
+        path.mkdir(parents=True)
+    return list(paths)
+
+
+# --- names and records ------------------------------------------------------------------------------------------------
+
+
+def test_every_capture_gets_a_name_of_its_own_and_keeps_it(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (out / "jobs").mkdir(parents=True)
+    ann, bob, low = folders(tmp_path / "ann" / "walk", tmp_path / "bob" / "walk", tmp_path / "bob" / "WALK")
+    jobs = make_jobs([ann, bob, low], out, TrackOptions())
+    assert [job.name for job in jobs[:2]] == ["walk", "bob_walk"]
+    assert len({job.name.lower() for job in jobs}) == 3
+    for job in jobs:
+        job.write(Outcome(DONE, frames=3))
+    # another order, and a part of them: the names stay
+    assert [job.name for job in make_jobs([bob, ann], out, TrackOptions())] == [jobs[1].name, jobs[0].name]
+
+
+def test_a_capture_given_twice_and_a_result_of_somebody_else_are_refused(tmp_path: Path) -> None:
+    walk, out = folders(tmp_path / "walk", tmp_path / "out")
+    with pytest.raises(ConfigError, match="walk: is given twice"):
+        make_jobs([walk, tmp_path / "out" / ".." / "walk"], out, TrackOptions())
+    (out / "walk.h5").write_text("mine")
+    with pytest.raises(ResultError, match=r"walk\.h5: exists, and tk batch did not make it"):
+        make_jobs([walk], out, TrackOptions())
+
+
+def test_records_come_back_and_other_options_are_refused(tmp_path: Path) -> None:
+    walk, out = folders(tmp_path / "walk", tmp_path / "out" / "jobs")
+    (job,) = make_jobs([walk], out.parent, TrackOptions())
+    assert job.read() == Outcome()
+    told = Outcome(DONE, 14, 2, 10, 1.5, 2.0, None, 0.05, 1.2, ("said",))
+    job.write(told)
+    assert job.read() == told
+    (other,) = make_jobs([walk], out.parent, TrackOptions(method="silhouette"))
+    with pytest.raises(ResultError, match=r"made with another method: region, not silhouette; choose another folder"):
+        other.read()
+    (tuned,) = make_jobs([walk], out.parent, TrackOptions(config=CONFIG))
+    with pytest.raises(ResultError, match="made with another settings"):
+        tuned.read()
+
+
+@pytest.mark.parametrize("text", ["", "[1]", "{", "[" * 100_000, '{"capture": 3}', '{"capture": 3, "options": 4}'])
+def test_damaged_records_are_refused(tmp_path: Path, text: str) -> None:
+    walk, records = folders(tmp_path / "walk", tmp_path / "out" / "jobs")
+    (records / "walk.json").write_text(text)
+    with pytest.raises(ResultError):
+        make_jobs([walk], tmp_path / "out", TrackOptions())[0].read()
+        Job("walk", walk, tmp_path / "out", TrackOptions()).read()
+
+
+# --- the summary ------------------------------------------------------------------------------------------------------
+
+
+def test_the_summary_tells_all_of_it(tmp_path: Path) -> None:
+    nasty = tmp_path / "a <b> & c"
+    captures = folders(nasty, tmp_path / "two", tmp_path / "three", tmp_path / "out" / "jobs")[:3]
+    jobs = make_jobs(captures, tmp_path / "out", TrackOptions())
+    outcomes = dict(
+        zip(
+            [job.name for job in jobs],
+            [
+                Outcome(DONE, 10, 6, 10, 5.0, 2.345, 1.5, 0.031, 1.8, ("a note, with a comma",)),
+                Outcome(FAILED, failure="x.mp4: is cut off"),
+                Outcome(),
+            ],
+            strict=True,
+        )
+    )
+    write_summary(tmp_path / "out", jobs, outcomes)
+    with (tmp_path / "out" / "summary.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["state"] for row in rows] == ["mostly lost", "failed", "waiting"]
+    assert rows[0]["lost_percent"] == "60" and rows[0]["error_cm"] == "2.345" and rows[0]["frames_per_second"] == "2"
+    assert rows[0]["said"] == "a note, with a comma" and rows[1]["said"] == "x.mp4: is cut off"
+    assert {rows[2][name] for name in ("frames", "error_cm", "seconds")} == {""}
+    page = (tmp_path / "out" / "summary.html").read_text(encoding="utf-8")
+    assert "a &lt;b&gt; &amp; c" in page and "<b>" not in page
+    assert "1 done, 1 failed, 1 to come" in page and 'http-equiv="refresh"' in page
+    ended = {name: Outcome(DONE, 1) for name in outcomes}
+    write_summary(tmp_path / "out", jobs, ended)
+    assert 'http-equiv="refresh"' not in (tmp_path / "out" / "summary.html").read_text(encoding="utf-8")
+
+
+def test_exit_codes() -> None:
+    good, lost = Outcome(DONE, 10, 5), Outcome(DONE, 10, 6)
+    bad, defect = Outcome(FAILED, failure="no such file"), Outcome(FAILED, failure="a defect", trace="Traceback …")
+    assert exit_code({"a": good}) == 0
+    assert exit_code({"a": good, "b": lost}) == 3
+    assert exit_code({"a": good, "b": lost, "c": bad}) == 2
+    assert exit_code({"a": good, "b": bad, "c": defect}) == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--workers", "0"], "--workers 0"),
+        (["--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], "leave out --workers or --scheduler"),
+        (["--body", "nobody.h5"], "nobody.h5: cannot be read"),
+        (["--frames", "5"], "--frames 5"),
+    ],
+)
+def test_bad_options(tk: Tk, tiny: Path, tmp_path: Path, options: list[str], said: str) -> None:
+    tk("batch", tiny, "-o", tmp_path / "out", *options).complaint(said)
+
+
+def test_two_batches_in_one_folder_are_refused(tk: Tk, tiny: Path, tmp_path: Path) -> None:
+    import fcntl
+
+    (tmp_path / "out" / "jobs").mkdir(parents=True)
+    handle = os.open(tmp_path / "out" / "jobs", os.O_RDONLY)
+    fcntl.flock(handle, fcntl.LOCK_EX)
+    tk("batch", tiny, "-o", tmp_path / "out").complaint("another tk batch is at work here")
+    os.close(handle)
+
+
+def test_a_result_that_another_run_writes_is_told_apart(tmp_path: Path) -> None:
+    with Workshop(tmp_path / "r.h5"), pytest.raises(ResultBusyError):
+        Workshop(tmp_path / "r.h5")
+
+
+# --- a real cluster ---------------------------------------------------------------------------------------------------
+
+
+class Program:
+    """Python in a process of its own, and what it says on stderr."""
+
+    def __init__(self, said: Path, *arguments: object) -> None:
+        self._said = said
+        with said.open("w") as file:
+            self.process = subprocess.Popen(
+                [sys.executable, *map(str, arguments)],
+                cwd=ROOT,
+                stdout=subprocess.DEVNULL,
+                stderr=file,
+                env={**os.environ, "PYTHONPATH": str(ROOT)},
+            )
+
+    @property
+    def said(self) -> str:
+        return self._said.read_text()
+
+    def until(self, happened: Callable[[], bool], seconds: float = 240) -> None:
+        """Wait for something that does not happen any more once this has ended."""
+        deadline = time.monotonic() + seconds
+        while not happened():
+            assert self.process.poll() is None, self.said
+            assert time.monotonic() < deadline, self.said
+            time.sleep(0.02)
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[..., Program]]:
+    """Starts Python with some arguments; whatever still runs at the end is killed."""
+    running: list[Program] = []
+
+    def begin(*arguments: object) -> Program:
+        running.append(Program(tmp_path / f"{len(running)}.err", *arguments))
+        return running[-1]
+
+    yield begin
+    for program in running:
+        program.process.kill()
+        program.process.wait()
+
+
+def rows(path: Path) -> int:
+    if not path.exists():
+        return 0
+    with h5py.File(path, "r", locking=False) as file:
+        return int(file["frames"].shape[0])
+
+
+def assert_same(path: Path, expected: Path) -> None:
+    """Every dataset, bit for bit; only times differ."""
+    with h5py.File(path, "r") as a, h5py.File(expected, "r") as b:
+        found: list[set[str]] = [set(), set()]
+        for file, names in ((a, found[0]), (b, found[1])):
+            file.visititems(lambda name, item, to=names: to.add(name) if isinstance(item, h5py.Dataset) else None)
+        assert found[0] == found[1]
+        for name in found[0]:
+            if not name.startswith("timing/"):
+                assert np.asarray(a[name][()]).tobytes() == np.asarray(b[name][()]).tobytes(), name
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs POSIX signals")
+def test_whoever_is_killed_nothing_is_lost_or_done_twice(
+    tiny: Path, quick: Path, tmp_path: Path, start: Callable[..., Program]
+) -> None:
+    """A scheduler and two workers. A worker is killed in the middle of a capture, then the scheduler; the same command,
+    on workers of its own, finishes. A capture that cannot be read is in the way all the time."""
+    captures = [tmp_path / name for name in ("one", "two", "three")]
+    for capture in captures:  # a link to the tiny capture itself would be the same capture again
+        capture.mkdir()
+        for item in tiny.iterdir():
+            (capture / item.name).symlink_to(item)
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    out = tmp_path / "out"
+    tk = "import sys; from tk.cli import main; main(prog_name='tk')"
+    batch = ["-c", tk, "batch", broken, *captures, "-o", out, "--config", quick, "--no-report"]
+
+    def records() -> dict[str, dict[str, Any]]:
+        return {path.stem: json.loads(path.read_text()) for path in (out / "jobs").glob("[!.]*.json")}
+
+    def ended() -> set[str]:
+        return {name for name, record in records().items() if record["state"] in (DONE, FAILED)}
+
+    def under_way() -> list[str]:
+        return [name for name in set(records()) - ended() if 2 <= rows(out / f"{name}.h5") < FRAMES]
+
+    contact = tmp_path / "scheduler.json"
+    place = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", contact]
+    scheduler = start("-m", "distributed.cli.dask_scheduler", "--port", 0, *place)
+    scheduler.until(contact.exists)
+    worker = ("-m", "distributed.cli.dask_worker", "--nthreads", 1, "--no-nanny", *place)
+    workers = [start(*worker) for _ in range(2)]
+    first = start(*batch, "--scheduler", json.loads(contact.read_text())["address"])
+    first.until(lambda: bool(under_way()))
+    victim = under_way()[0]
+    os.kill(records()[victim]["by"]["pid"], signal.SIGKILL)
+    done_then = rows(out / f"{victim}.h5")
+    assert 2 <= done_then < FRAMES
+    first.until(lambda: len(ended()) >= 2)  # the broken one, and one of the worker that lives
+    scheduler.process.kill()
+    assert first.process.wait(120) == 1, first.said
+    assert first.said.splitlines()[-1].endswith("scheduler has gone; the same command goes on where it stopped")
+    for program in workers:  # without a scheduler, the one that lives would end what it has begun
+        program.process.kill()
+        program.process.wait()
+    before = {name: ((out / f"{name}.h5").read_bytes(), records()[name]) for name in ended() - {"broken"}}
+    assert before
+
+    second = start(*batch, "--workers", 2)
+    assert second.process.wait(300) == 2, second.said  # for the broken one
+    assert f"note: {len(before)} of 4 captures are done already" in second.said
+    for name, (content, record) in before.items():
+        assert ((out / f"{name}.h5").read_bytes(), records()[name]) == (content, record)
+    assert "calibration.toml: there is no such file" in records()["broken"]["failure"]
+    unbroken = tmp_path / "unbroken.h5"
+    track(open_capture(captures[0]), unbroken, CONFIG, Silent())
+    for capture in captures:
+        record = records()[capture.name]
+        assert (record["state"], record["frames"], record["lost"], record["trace"]) == (DONE, FRAMES, 0, "")
+        assert_same(out / f"{capture.name}.h5", unbroken)
+    assert records()[victim]["tracked_now"] <= FRAMES - done_then
+    with (out / "summary.csv").open(newline="", encoding="utf-8") as file:
+        assert [row["state"] for row in csv.DictReader(file)] == ["failed", "done", "done", "done"]
+    results = [f"{capture.name}.h5" for capture in captures]
+    assert sorted(p.name for p in out.iterdir()) == sorted([*results, "jobs", "summary.csv", "summary.html"])

@@ -1,0 +1,110 @@
+"""``tk view``: on a display that exists in memory only, and without one."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from tests.conftest import Tk
+from tk.io.result import read_result
+from tk.render.figure import figure_of
+from tk.view import shapes
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def display(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """An X server that draws into memory."""
+    if shutil.which("Xvfb") is None:
+        pytest.skip("needs Xvfb (Debian: xvfb, libvulkan1, mesa-vulkan-drivers)")
+    read, write = os.pipe()
+    server = subprocess.Popen(
+        ["Xvfb", "-displayfd", str(write), "-screen", "0", "1400x1000x24", "-nolisten", "tcp"],
+        pass_fds=(write,),
+        stderr=subprocess.DEVNULL,
+    )
+    os.close(write)
+    with os.fdopen(read) as told:
+        number = told.readline().strip()
+    yield f":{number}"
+    server.terminate()
+    server.wait()
+
+
+def run(display: str | None, *arguments: object) -> subprocess.CompletedProcess[str]:
+    env = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    return subprocess.run(
+        [sys.executable, "-c", "from tk.cli import main; main(prog_name='tk')", "view", *map(str, arguments)],
+        cwd=ROOT,
+        env=env | ({"DISPLAY": display} if display else {}),
+        capture_output=True,
+        text=True,
+        timeout=240,
+    )
+
+
+def test_a_frame_is_drawn(display: str, tracked: Path, tiny: Path, tmp_path: Path) -> None:
+    picture = tmp_path / "shot.png"
+    began = time.monotonic()
+    ran = run(display, tracked, tiny, "--frame", 5, "--screenshot", picture)
+    if ran.returncode == 2 and "ulkan" in ran.stderr:
+        pytest.skip("needs a Vulkan driver (Debian: libvulkan1, mesa-vulkan-drivers)")
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout == "", "the engine's chatter belongs on stderr"
+    image = cv2.imread(str(picture))
+    assert image is not None and image.shape[0] > 600 and image.shape[1] > 1000, time.monotonic() - began
+    middle = image[image.shape[0] // 6 : -image.shape[0] // 6, image.shape[1] // 3 : -image.shape[1] // 3].astype(int)
+    colorful = middle.max(axis=2) - middle.min(axis=2) > 40
+    assert 0.005 < colorful.mean() < 0.6, "left limbs warm, right limbs cool, trunk green"
+    assert (np.ptp(image[-1, :, :].astype(int), axis=0) > 0).any(), "the floor reaches to the lower edge"
+
+
+def test_without_a_display_one_line_says_so(tracked: Path) -> None:
+    for display, said in ((None, "DISPLAY is not set"), (":4711", "the display :4711 cannot be opened")):
+        ran = run(display, tracked)
+        assert (ran.returncode, ran.stdout) == (2, "")
+        assert len(ran.stderr.splitlines()) == 1 and said in ran.stderr and "tk render" in ran.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--frame", "99"], "--frame 99: the result has frames 0 to 13"),
+        (["--screenshot", "a.jpg"], "a picture is a .png"),
+        (["--screenshot", "nowhere/a.png"], "the folder nowhere does not exist"),
+    ],
+)
+def test_bad_options(tk: Tk, tracked: Path, options: list[str], said: str) -> None:
+    tk("view", tracked, *options).complaint(said)
+
+
+def test_shapes_are_those_of_the_result(tracked: Path) -> None:
+    result = read_result(tracked)
+    figure = figure_of(result)
+    body = shapes.body_mesh(figure, 3)
+    np.testing.assert_allclose(np.asarray(body.vertices), figure.placed(3))
+    _, counts, _ = body.cluster_connected_triangles()
+    assert len(counts) == len(figure.solids), "each part is in one piece, and none is joined to another"
+    assert body.is_orientable() and body.has_vertex_colors()
+    assert len(shapes.skeleton_lines(figure.joints[3]).lines) == 14
+    joints = figure.joints[3].copy()
+    joints[2] = np.nan  # the crown
+    assert len(shapes.skeleton_lines(joints).lines) == 13
+    one = len(shapes.joint_spheres(joints[:1], None).vertices)
+    assert len(shapes.joint_spheres(joints, None).vertices) == 14 * one
+    assert result.hull is not None
+    cloud = shapes.hull_cloud(result.hull[3])
+    with h5py.File(tracked, "r") as file:
+        first, last = file["hull/offsets"][3:5]
+        np.testing.assert_allclose(np.asarray(cloud.points), file["hull/positions"][first:last])

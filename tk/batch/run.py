@@ -1,0 +1,225 @@
+"""Runs a batch on Dask: a cluster of its own on this machine, or one that exists."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import logging
+import os
+import queue
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from tk.batch.jobs import DONE, FAILED, RECORDS, Job, Outcome, TrackOptions, make_jobs
+from tk.batch.summary import write_summary
+from tk.batch.work import TOPIC, work
+from tk.errors import ConfigError, ResultError, TkError, WorkerError
+
+#: seconds that a scheduler, and a cluster of our own, have to answer
+_PATIENCE_S = 20.0
+#: workers that a capture may outlive: whoever kills more of them is not to be tried again
+_KILLED_AT_MOST = 3
+
+
+class BatchReporter(Protocol):
+    """Who wants to know how a batch goes."""
+
+    def note(self, text: str) -> None:
+        """A line worth reading."""
+        ...
+
+    def progress(self, name: str, done: int, total: int) -> None:
+        """A capture has ``done`` of its ``total`` frames."""
+        ...
+
+    def finished(self, name: str, outcome: Outcome, done: int, total: int) -> None:
+        """A capture has ended; ``done`` of the ``total`` captures have by now."""
+        ...
+
+
+def run_batch(
+    captures: Sequence[Path],
+    folder: Path,
+    options: TrackOptions,
+    reporter: BatchReporter,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    pictures: bool = False,
+) -> Mapping[str, Outcome]:
+    """Track captures, each in a worker process, into ``folder``: `NAME.h5`, `summary.csv`, `summary.html`.
+
+    The same call again goes on where the last one stopped: what is done stays, what was interrupted is taken up at its
+    last frame, what failed is tried again. A capture that fails does not stop the others.
+
+    Args:
+        captures: their folders. Workers on other machines must find them, and ``folder``, under the same paths.
+        folder: where to; it is made if it does not exist.
+        options: of `tk track`, for all captures.
+        reporter: who hears of the progress.
+        workers: processes of a cluster of our own, which share the machine's cores; half as many as cores by default.
+        scheduler: address of a Dask scheduler to use in the place of a cluster of our own.
+        pictures: leave an overlay video and a report of each capture beside its result.
+
+    Returns:
+        The outcome of each capture, by its name.
+
+    Raises:
+        ConfigError: Dask is not installed, a capture is given twice, or the body's file cannot be read.
+        ResultError: the folder cannot be written, or holds what was made with other options.
+        WorkerError: the scheduler does not answer, or has gone.
+    """
+    if workers is not None and scheduler is not None:
+        raise ConfigError("--workers: the scheduler's own workers are used; leave out --workers or --scheduler")
+    if workers is not None and not 1 <= workers <= 1000:
+        raise ConfigError(f"--workers {workers}: choose from 1 to 1000")
+    options.told()  # a body that cannot be read is everybody's failure
+    _require_dask()
+    with _held(folder):
+        jobs = make_jobs(captures, folder, options, pictures)
+        outcomes = {job.name: job.read() for job in jobs}
+        waiting = [job for job in jobs if outcomes[job.name].state != DONE or not job.output.exists()]
+        if len(waiting) < len(jobs):
+            reporter.note(f"{len(jobs) - len(waiting)} of {len(jobs)} captures are done already")
+        for job in waiting:
+            outcomes[job.name] = Outcome()
+        write_summary(folder, jobs, outcomes)
+        if waiting:
+            with _cluster(workers, scheduler, len(waiting)) as client:
+                _tell_of_workers(client, reporter, len(waiting))
+                for name, outcome in _finished(client, waiting, reporter, scheduler):
+                    outcomes[name] = outcome
+                    ended = sum(o.state in (DONE, FAILED) for o in outcomes.values())
+                    reporter.finished(name, outcome, ended, len(jobs))
+                    write_summary(folder, jobs, outcomes)
+        return outcomes
+
+
+def exit_code(outcomes: Mapping[str, Outcome]) -> int:
+    """0: all captures are tracked; 3: of some more than half the frames are lost; 2: some failed, which their input
+    explains; 1: some failed by a defect, or with their worker."""
+    failed = [outcome for outcome in outcomes.values() if outcome.state != DONE]
+    if failed:
+        return 1 if any(outcome.trace or outcome.state != FAILED for outcome in failed) else 2
+    return 3 if any(outcome.mostly_lost for outcome in outcomes.values()) else 0
+
+
+def _require_dask() -> None:
+    try:
+        import distributed  # noqa: F401
+    except ImportError:
+        raise ConfigError("tk batch needs Dask: pip install 'tk-mocap[cluster]'") from None
+
+
+@contextlib.contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """Make the batch's folder, and keep other batches out of it."""
+    try:
+        (folder / RECORDS).mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder / RECORDS, os.O_RDONLY)
+    except OSError as error:
+        raise ResultError(f"{folder}: cannot be made: {error.strerror or error}") from None
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ResultError(f"{folder}: another tk batch is at work here; wait for it, or choose another") from None
+        except OSError:
+            pass  # no locks on this file system
+        yield
+    finally:
+        os.close(handle)
+
+
+@contextlib.contextmanager
+def _cluster(workers: int | None, scheduler: str | None, captures: int) -> Iterator[Any]:
+    """A client of the scheduler, or of a cluster on this machine that ends with the block."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is told by the outcomes
+    if scheduler is not None:
+        try:
+            client = Client(scheduler, timeout=_PATIENCE_S, set_as_default=False)
+        except (OSError, TimeoutError, ValueError, TypeError) as error:
+            reason = " ".join(str(error).split())[:200]
+            raise WorkerError(f"--scheduler {scheduler}: no Dask scheduler answers there: {reason}") from None
+        with contextlib.closing(client):
+            yield client
+        return
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = min(workers or max(cores // 2, 1), captures)
+    asked = os.environ.get("TK_THREADS")
+    threads = asked if asked else str(max(cores // count, 1))
+    settings = {
+        "distributed.scheduler.allowed-failures": _KILLED_AT_MOST,
+        "distributed.scheduler.worker-saturation": 1.0,  # whoever dies takes no waiting capture along
+        "distributed.worker.profile.enabled": False,
+    }
+    with dask.config.set(settings):
+        cluster = LocalCluster(
+            n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
+            memory_limit=None, silence_logs=logging.CRITICAL, env={"TK_THREADS": threads},
+        )  # fmt: skip
+        with cluster, Client(cluster, set_as_default=False) as client:
+            yield client
+
+
+def _tell_of_workers(client: Any, reporter: BatchReporter, captures: int) -> None:
+    found = client.scheduler_info(n_workers=-1)["workers"].values()
+    threads = sum(worker["nthreads"] for worker in found)
+    reporter.note(f"{captures} captures to track on {len(found)} workers")
+    if not found:
+        reporter.note("the scheduler has no workers yet; waiting for them")
+    elif threads > len(found):
+        reporter.note(
+            f"{len(found)} workers have {threads} threads; a worker tracks one capture at a time: start it with "
+            "--nthreads 1, and as many as there are captures to be tracked at once"
+        )
+
+
+def _finished(
+    client: Any, jobs: Sequence[Job], reporter: BatchReporter, scheduler: str | None
+) -> Iterator[tuple[str, Outcome]]:
+    """The jobs' names and outcomes as they end."""
+    news: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    client.subscribe_topic(TOPIC, lambda event: news.put(event[1]))
+    waiting: dict[str, Job] = {}
+    for priority, job in enumerate(jobs):
+        # impure: what an earlier run of the same name made is not to be taken from the scheduler's memory
+        future = client.submit(work, job, key=f"tk-{job.name}-{os.urandom(6).hex()}", priority=-priority, pure=False)
+        waiting[future.key] = job
+        future.add_done_callback(news.put)
+    while waiting:
+        item = news.get()
+        if isinstance(item, dict):
+            reporter.progress(str(item["name"]), int(item["done"]), int(item["total"]))
+            continue
+        job = waiting.pop(item.key)
+        if item.cancelled():
+            raise WorkerError(
+                f"{scheduler or 'the batch'}: the scheduler has gone; the same command goes on where it stopped"
+            )
+        yield job.name, _outcome(item, job)
+
+
+def _outcome(future: Any, job: Job) -> Outcome:
+    """What a worker returned; what became of it where it did not."""
+    from distributed.scheduler import KilledWorker
+
+    error = future.exception()
+    if error is None:
+        outcome = future.result()
+        assert isinstance(outcome, Outcome)
+        return outcome
+    if isinstance(error, KilledWorker):
+        failure = f"its worker was killed {_KILLED_AT_MOST + 1} times (out of memory?); use fewer workers"
+    else:
+        failure = f"the worker failed: {type(error).__name__}: {' '.join(str(error).split())[:200]}"
+    outcome = Outcome(FAILED, failure=failure, trace=f"{type(error).__name__}: {error}")
+    try:
+        job.write(outcome)
+    except TkError as unwritten:
+        outcome = replace(outcome, failure=f"{failure}; {unwritten}")
+    return outcome

@@ -1,0 +1,161 @@
+"""The table of a batch: `summary.csv` for programs, `summary.html` to look at."""
+
+from __future__ import annotations
+
+import csv
+import html
+import io
+import os
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from urllib.parse import quote
+
+from tk.batch.jobs import BEGUN, DONE, FAILED, WAITING, Job, Outcome
+from tk.errors import ResultError
+
+COLUMNS = (
+    "name", "capture", "state", "frames", "lost", "lost_percent", "error_cm", "limbs_cm", "fit_error",
+    "sigma_median_cm", "frames_per_second", "seconds", "said",
+)  # fmt: skip
+
+# seconds after which a browser looks again while the batch runs
+_REFRESH_S = 10
+
+_STYLE = """
+:root { color-scheme: light dark; --line: #8884; --soft: #8881; }
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 76rem; padding: 0 1.5rem; }
+h1 { font-size: 1.35rem; margin: 0; overflow-wrap: anywhere; }
+p.told { margin: .3rem 0 1.2rem; opacity: .75; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
+th, td { padding: .38rem .7rem; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
+th { font-weight: 600; vertical-align: bottom; border-bottom-width: 2px; }
+th small { display: block; font-weight: 400; opacity: .7; }
+td.text, th.text { text-align: left; }
+td.said { white-space: normal; min-width: 16rem; max-width: 30rem; font-size: .86rem; overflow-wrap: anywhere; }
+tr:hover td { background: var(--soft); }
+.state { display: inline-block; border-radius: .6rem; padding: 0 .55rem; font-size: .86rem; color: #fff; }
+.done { background: #2a7d4f; } .lost { background: #a8650b; } .failed { background: #b3332e; }
+.waiting, .begun { background: #6b7280; }
+td.bad { color: #c2571a; font-weight: 600; }
+"""
+
+
+def write_summary(folder: Path, jobs: Sequence[Job], outcomes: Mapping[str, Outcome]) -> None:
+    """Write `summary.csv` and `summary.html`, each replaced in one step.
+
+    Raises:
+        ResultError: one cannot be written.
+    """
+    rows = [_row(job, outcomes[job.name]) for job in jobs]
+    table = io.StringIO()
+    writer = csv.DictWriter(table, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    _replace(folder / "summary.csv", table.getvalue())
+    _replace(folder / "summary.html", _page(folder, jobs, outcomes))
+
+
+def _replace(path: Path, text: str) -> None:
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        os.replace(part, path)
+    except OSError as error:
+        raise ResultError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+def _row(job: Job, outcome: Outcome) -> dict[str, object]:
+    """The CSV's row; nothing where nothing is known."""
+    known = outcome.frames > 0
+    values = {
+        "frames": outcome.frames if known else None,
+        "lost": outcome.lost if known else None,
+        "lost_percent": _lost_percent(outcome),
+        "error_cm": outcome.error_cm,
+        "limbs_cm": outcome.limbs_cm,
+        "fit_error": outcome.fit_error,
+        "sigma_median_cm": outcome.sigma_cm,
+        "frames_per_second": outcome.frames_per_second,
+        "seconds": outcome.seconds if outcome.state in (DONE, FAILED) else None,
+    }
+    told = {name: f"{v:.4g}" if isinstance(v, float) else "" if v is None else v for name, v in values.items()}
+    return {"name": job.name, "capture": job.capture, "state": _state(outcome), **told, "said": _said(outcome)}
+
+
+def _lost_percent(outcome: Outcome) -> float | None:
+    return 100 * outcome.lost / outcome.frames if outcome.frames else None
+
+
+def _state(outcome: Outcome) -> str:
+    return "mostly lost" if outcome.mostly_lost else outcome.state
+
+
+def _said(outcome: Outcome) -> str:
+    return "; ".join(part for part in (outcome.failure, *outcome.said) if part)
+
+
+def _page(folder: Path, jobs: Sequence[Job], outcomes: Mapping[str, Outcome]) -> str:
+    states = [outcomes[job.name].state for job in jobs]
+    running = any(state in (WAITING, BEGUN) for state in states)
+    refresh = f'<meta http-equiv="refresh" content="{_REFRESH_S}">' if running else ""
+    name = html.escape(folder.resolve().name)
+    has_truth = any(outcome.error_cm is not None for outcome in outcomes.values())
+    errors = "<th>error<small>cm</small></th><th>limbs<small>cm</small></th>" if has_truth else ""
+    body = "\n".join(_line(job, outcomes[job.name], has_truth) for job in jobs)
+    return f"""<!doctype html>
+<html lang="en">
+<head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">{refresh}
+<title>{name}: tk batch</title>
+<style>{_STYLE}</style></head>
+<body>
+<h1>{name}</h1>
+<p class="told">{html.escape(_told(states, outcomes))}</p>
+<div class="scroll"><table>
+<thead><tr><th class="text">capture</th><th class="text">state</th><th>frames</th><th>lost<small>%</small></th>{errors}
+<th>E<sub>S</sub><small>%</small></th><th>σ<small>median, cm</small></th><th>speed<small>frames/s</small></th>
+<th class="text">what was said</th></tr></thead>
+<tbody>
+{body}
+</tbody></table></div>
+<p class="told">Error: mean distance of all joints from the capture's truth as they are; limbs: of the limb joints with
+their constant offsets taken off. E<sub>S</sub>: pixels that the body explains wrongly. σ: what the tracker says of its
+joints. Speed: with start-up and both passes, of the last attempt.</p>
+</body></html>
+"""
+
+
+def _told(states: Sequence[str], outcomes: Mapping[str, Outcome]) -> str:
+    counts = [(states.count(state), word) for state, word in ((DONE, "done"), (FAILED, "failed"))]
+    counts.append((len(states) - sum(count for count, _ in counts), "to come"))
+    frames = sum(outcome.frames for outcome in outcomes.values())
+    lost = sum(outcome.lost for outcome in outcomes.values())
+    parts = [f"{count} {word}" for count, word in counts if count]
+    when = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M")
+    return f"{len(states)} captures: {', '.join(parts)}. {frames} frames, {lost} of them lost. {when}"
+
+
+def _line(job: Job, outcome: Outcome, has_truth: bool) -> str:
+    def number(value: float | None, pattern: str, bad: bool = False) -> str:
+        return f"<td{' class=bad' if bad else ''}>{'' if value is None else format(value, pattern)}</td>"
+
+    title = html.escape(job.name)
+    shown = next((path for path in (job.page, job.output) if path.exists()), None)
+    if shown is not None:
+        title = f'<a href="{quote(shown.name)}">{title}</a>'
+    look = "lost" if outcome.mostly_lost else outcome.state
+    percent = _lost_percent(outcome)
+    fit = None if outcome.fit_error is None else 100 * outcome.fit_error
+    cells = [
+        f'<td class="text" title="{html.escape(str(job.capture))}">{title}</td>',
+        f'<td class="text"><span class="state {look}">{_state(outcome)}</span></td>',
+        number(outcome.frames or None, "d"),
+        number(percent, ".1f", bad=bool(outcome.lost)),
+        *([number(outcome.error_cm, ".2f"), number(outcome.limbs_cm, ".2f")] if has_truth else []),
+        number(fit, ".2f"),
+        number(outcome.sigma_cm, ".2f"),
+        number(outcome.frames_per_second, ".1f"),
+        f'<td class="text said">{html.escape(_said(outcome))}</td>',
+    ]
+    return f"<tr>{''.join(cells)}</tr>"

@@ -1,0 +1,1 @@
+"""A result in a window of Open3D: `tk view`."""
