@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # Make a virtual environment with tk and all that its development needs: setup.sh VENV
-# Only the browser that the tests of the report need: setup.sh --browser
+# Only what some tests need: setup.sh --browser (those of the report), setup.sh --display (those of tk view)
 # On Debian and Ubuntu, missing system packages are installed if we are root and named if we are not.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-venv=${1:?usage: scripts/setup.sh VENV | --browser}
+venv=${1:?usage: scripts/setup.sh VENV | --browser | --display}
 
 say() { echo "setup: $*" >&2; }
 die() { say "$*"; exit 1; }
@@ -20,16 +20,28 @@ install_packages() { # packages...
   fi
 }
 
-if [ "$venv" = --browser ]; then
-  if ! command -v chromium chromium-browser google-chrome >/dev/null; then
-    if [ "$(id -u)" = 0 ]; then
-      install_packages chromium
-    else
-      say "no Chromium: the tests that need one will be skipped; sudo apt-get install chromium"
-    fi
+for_tests() { # what is missing, packages...
+  local what=$1
+  shift
+  if [ "$(id -u)" = 0 ]; then
+    install_packages "$@"
+  else
+    say "no $what: the tests that need it will be skipped; sudo apt-get install $*"
   fi
-  exit
-fi
+}
+
+case $venv in
+  --browser)
+    command -v chromium chromium-browser google-chrome >/dev/null || for_tests Chromium chromium
+    exit
+    ;;
+  --display) # an X server that draws into memory, and Vulkan without a graphics card
+    if ! command -v Xvfb >/dev/null || ! compgen -G '/usr/share/vulkan/icd.d/*.json' >/dev/null; then
+      for_tests "Xvfb or Vulkan driver" xvfb libvulkan1 mesa-vulkan-drivers
+    fi
+    exit
+    ;;
+esac
 
 suitable() { # python: is it one that Taichi has wheels for?
   "$1" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' >/dev/null 2>&1
