@@ -384,9 +384,7 @@ class _Run:
             return
         if output and done:
             output.check()
-            with blamed_on(output.writer.path, "the state of the run"):
-                plan.tracker.restore(output.writer.model, output.writer.state)
-                self.watch.restore(_below(_WATCH, output.writer.state))
+            self._restore(output)
             yield from self._step_through(plan.source.frames(plan.begin + done, plan.stop))
             return
         # The body is fitted to the same frames however few are asked for, so that a run may be prolonged by --resume.
