@@ -54,6 +54,8 @@ def run(display: str | None, *arguments: object) -> subprocess.CompletedProcess[
     )
 
 
+# Mesa's software driver sometimes never finishes Open3D's drawing of a body
+@pytest.mark.slow
 def test_a_frame_is_drawn(display: str, tracked: Path, tiny: Path, tmp_path: Path) -> None:
     picture = tmp_path / "shot.png"
     began = time.monotonic()
