@@ -179,6 +179,8 @@ class RegionTracker(ContourTracker):
         self._fresh = False
         pose = self._best.pose
         sigma = self._sigma(pose, curvature)
+        for limb in self.misplaced(evidence, label):  # no search has found it
+            sigma[list(limb.joints)] = np.nan
         watch.lap("check")
         return Estimate(
             **self.told(pose),
