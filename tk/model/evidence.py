@@ -121,13 +121,16 @@ class Evidence:
         return np.where(seen > 0, wrong / np.maximum(seen, 1), np.nan)
 
     def cost_of_parts(self, group: NDArray[np.int32], label: NDArray[np.uint8]) -> tuple[Float, NDArray[np.int64]]:
-        """What the rays that meet each part cost in all, (P,), and how many they are, (P,); labels (V, h, w)."""
-        columns = np.concatenate([[0], group + 1])[label]
-        cost = np.take_along_axis(self.cost, columns[..., None], axis=-1)[..., 0]
-        flat, count = label.ravel(), len(group) + 1
-        return np.bincount(flat, cost.ravel(), count)[1:].astype(np.float64), np.bincount(flat, minlength=count)[
-            1:
-        ].astype(np.int64)
+        """What the rays that meet each part cost in all, (P,), and how many they are, (P,); labels (V, h, w).
+
+        Views that see nobody do not count.
+        """
+        views = self.person.any(axis=(1, 2))
+        flat, count = label[views], len(group) + 1
+        columns = np.concatenate([[0], group + 1])[flat]
+        cost = np.take_along_axis(self.cost[views], columns[..., None], axis=-1)[..., 0]
+        total = np.bincount(flat.ravel(), cost.ravel(), count)
+        return total[1:].astype(np.float64), np.bincount(flat.ravel(), minlength=count)[1:].astype(np.int64)
 
     def unmet(self, label: NDArray[np.uint8]) -> float:
         """The share of the person's rays that meet no part, averaged over the views; labels (V, h, w)."""
