@@ -221,6 +221,7 @@ def assert_same(path: Path, expected: Path) -> None:
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs POSIX signals")
+@pytest.mark.slow
 def test_whoever_is_killed_nothing_is_lost_or_done_twice(
     tiny: Path, quick: Path, tmp_path: Path, start: Callable[..., Program]
 ) -> None:
