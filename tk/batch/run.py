@@ -183,6 +183,8 @@ def _finished(
     client: Any, jobs: Sequence[Job], reporter: BatchReporter, scheduler: str | None
 ) -> Iterator[tuple[str, Outcome]]:
     """The jobs' names and outcomes as they end."""
+    from distributed.comm import CommClosedError
+
     news: queue.SimpleQueue[Any] = queue.SimpleQueue()
     client.subscribe_topic(TOPIC, lambda event: news.put(event[1]))
     waiting: dict[str, Job] = {}
@@ -197,11 +199,15 @@ def _finished(
             reporter.progress(str(item["name"]), int(item["done"]), int(item["total"]))
             continue
         job = waiting.pop(item.key)
-        if item.cancelled():
+        try:
+            outcome = None if item.cancelled() else _outcome(item, job)
+        except CommClosedError:
+            outcome = None
+        if outcome is None:
             raise WorkerError(
                 f"{scheduler or 'the batch'}: the scheduler has gone; the same command goes on where it stopped"
             )
-        yield job.name, _outcome(item, job)
+        yield job.name, outcome
 
 
 def _outcome(future: Any, job: Job) -> Outcome:
