@@ -2,13 +2,14 @@
 VENV ?= .venv
 RUN = "$(VENV)/bin/python" -m
 
-.PHONY: help install demo test test-slow lint format docs bench clean
+.PHONY: help install demo test test-slow test-random lint format docs bench clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo       track the capture that ships with tk, compare with its truth"
 	@echo "make test       the tests"
 	@echo "make test-slow  the accuracy tests on whole captures (minutes)"
+	@echo "make test-random  the tests, with new random examples"
 	@echo "make lint       ruff and mypy"
 	@echo "make docs       the pages of docs/ as a site, in docs/_build/html"
 	@echo "make bench      the benchmarks of scripts/bench.py"
@@ -31,6 +32,9 @@ test: install
 
 test-slow: install
 	@$(RUN) pytest -m slow
+
+test-random: install
+	@$(RUN) pytest --hypothesis-profile default
 
 lint: install
 	@$(RUN) ruff check .

@@ -20,7 +20,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.export import read_motion
+from tk.export import read_motion
 from tk.io.result import Status, read_joints
 from tk.model.skeleton import JOINTS
 

@@ -9,9 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import pytest
 
 from scripts.synthetic.capture import Options, plan_capture, write_capture
+
+# every run draws the same examples; `pytest --hypothesis-profile default` draws new ones
+hypothesis.settings.register_profile("same", derandomize=True)
+hypothesis.settings.load_profile("same")
 
 FRAMES = 14
 

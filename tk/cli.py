@@ -5,19 +5,42 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from tk import __version__
+from tk.cli_base import (
+    Commands,
+    body_option,
+    cameras_option,
+    capture_argument,
+    causal_option,
+    config_option,
+    configuration,
+    example,
+    force_option,
+    frame_span,
+    frames_option,
+    json_option,
+    listed,
+    masks_option,
+    method_option,
+    no_report_option,
+    preset_option,
+    print_json,
+    quiet_option,
+    resume_option,
+    seed_option,
+    store_hull_option,
+    voxels_option,
+    working,
+)
 from tk.console import Report
-from tk.errors import CaptureError, ConfigError, TkError, WorkerError
+from tk.errors import CaptureError, ConfigError, WorkerError
 
 if TYPE_CHECKING:
-    from tk.config import Config
     from tk.io.capture import Capture
     from tk.session import Summary
 
@@ -29,115 +52,37 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 EXIT_LOST = 3
 
 
-@contextmanager
-def _one_line() -> Iterator[None]:
-    """A user's mistake, in the input or in the command, becomes one line and exit code 2."""
-    try:
-        yield
-    except TkError as error:
-        click.echo(f"tk: {' '.join(str(error).split())}", err=True)
-        raise click.exceptions.Exit(2) from None
-    except click.UsageError as error:
-        if type(error).__name__ == "NoArgsIsHelpError":  # `tk` alone: the help
-            raise
-        command = error.ctx.command_path if error.ctx else "tk"
-        click.echo(f"tk: {' '.join(error.format_message().split())} See {command} --help", err=True)
-        raise click.exceptions.Exit(2) from None
-
-
-@contextmanager
-def _working(on: str) -> Iterator[None]:
-    """On a terminal, that something is done which has no frames to count."""
-    with Report(quiet=not sys.stderr.isatty()) as report:
-        report.stage(on)
-        yield
-
-
-class _Commands(click.Group):
-    """Reports mistakes as :func:`_one_line` does."""
-
-    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
-        with _one_line():
-            return super().make_context(*args, **kwargs)
-
-    def invoke(self, ctx: click.Context) -> object:
-        with _one_line():
-            return super().invoke(ctx)
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Each command with the whole first sentence of its help; click's own cuts it off."""
-        rows = [(name, command.get_short_help_str(limit=1000)) for name, command in sorted(self.commands.items())]
-        with formatter.section("Commands"):
-            formatter.write_dl(rows)
-
-
-def _example(*lines: str) -> str:
-    """What a command's help ends with."""
-    return "\b\n" + "\n".join(["Example:" if len(lines) == 1 else "Examples:", *(f"  {line}" for line in lines)])
-
-
-@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="tk")
 def main() -> None:
     """A person's motion out of a few ordinary, calibrated cameras: no markers, no GPU."""
 
 
-_capture = click.argument("capture", type=click.Path(path_type=Path))
-_cameras = click.option("--cameras", metavar="A,B,…", help="Use these cameras only.")
-_frames = click.option("--frames", metavar="A:B", help="Frames A to B-1; either may be left out.")
-_masks = click.option(
-    "--masks", default="auto", show_default=True, metavar="auto|none|median|DIR",
-    help="auto: the capture's masks, else its empty scene, else an installed segmenter; none: not its masks; "
-    "median: over the recording, for the empty scene; DIR: a folder of masks.",
-)  # fmt: skip
-_voxels = click.option("--voxels", type=int, help="Voxels along the working volume's longest side.  [default: 64]")
-_no_report = click.option("--no-report", is_flag=True, help="Leave out the overlay video and the report.")
-_config = click.option("--config", "config_file", type=click.Path(path_type=Path), help="Settings, TOML.")
-_preset = click.option("--preset", metavar="NAME", help="Settings to begin with: kehl2006, the paper's own.")
-_resume = click.option("--resume", is_flag=True, help="Go on where an earlier run of the same command stopped.")
-_force = click.option("--force", is_flag=True, help="Replace what exists under the output's name.")
-_quiet = click.option("-q", "--quiet", is_flag=True, help="No progress: only notes and errors.")
-_json = click.option("--json", "as_json", is_flag=True, help="Print a summary for scripts on stdout.")
-_method = click.option(
-    "--method",
-    default="region",
-    show_default=True,
-    type=click.Choice(["region", "silhouette", "volumetric", "lm"]),
-    help="The tracker: region; silhouette and volumetric, the two papers' own; lm, by Levenberg-Marquardt.",
-)
-_seed = click.option("--seed", type=int, help="Of the random generator.  [default: 0]")
-_body = click.option(
-    "--body", type=click.Path(path_type=Path), metavar="FILE", help="The body of a result, or of a TOML file."
-)
-_causal = click.option("--causal", is_flag=True, help="Leave it at the first pass: no frame knows of those after it.")
-_store_hull = click.option("--store-hull", is_flag=True, help="Keep the hull's coloured surface in the result.")
-
-
 @main.command(
-    epilog=_example(
+    epilog=example(
         "tk track CAPTURE -o result.h5",
         "tk track CAPTURE -o part.h5 --frames 0:100 --cameras cam1,cam2,cam4",
     )
 )
-@_capture
+@capture_argument
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="RESULT.h5")
-@_method
-@_voxels
-@_cameras
-@_frames
-@_seed
-@_masks
+@method_option
+@voxels_option
+@cameras_option
+@frames_option
+@seed_option
+@masks_option
 @click.option("--init-pose", type=click.Path(path_type=Path), metavar="FILE", help="Start from this rough pose (TOML).")
-@_body
-@_causal
-@_resume
-@_force
-@_store_hull
-@_no_report
-@_preset
-@_config
-@_quiet
-@_json
+@body_option
+@causal_option
+@resume_option
+@force_option
+@store_hull_option
+@no_report_option
+@preset_option
+@config_option
+@quiet_option
+@json_option
 def track(
     capture: Path,
     output: Path,
@@ -163,17 +108,17 @@ def track(
 
     An overlay video, RESULT.mp4, and a report, RESULT.html, are left beside it.
     """
-    span = _span(frames)
+    span = frame_span(frames)
     with Report(quiet) as report:
         report.stage("loading")
         from tk import session  # the heavy imports wait until a command needs them
         from tk.io.capture import open_capture
         from tk.io.result_files import check_output
 
-        config = _configuration(config_file, preset, voxels=voxels, seed=seed)
+        config = configuration(config_file, preset, voxels=voxels, seed=seed)
         check_output(output, force, resume)
         report.stage(f"opening {capture}")
-        opened = open_capture(capture, _names(cameras), masks)
+        opened = open_capture(capture, listed(cameras), masks)
         summary = session.track(
             opened, output, config, report, method, span, init_pose, resume, store_hull, body, causal, force
         )
@@ -186,7 +131,7 @@ def _tell(output: Path, summary: Summary, quiet: bool, as_json: bool) -> None:
     """How a run ended, and the exit code: 1 where somebody stopped it, 3 where most of its frames are lost."""
     rate = summary.tracked_now / summary.seconds if summary.seconds > 0 else 0.0
     if as_json:
-        _print_json(
+        print_json(
             result=str(output),
             frames=summary.frames,
             lost=summary.lost,
@@ -222,13 +167,7 @@ def _leave_pictures(capture: Capture, result: Path, summary: Summary, report: Re
         click.echo(f"to look at: {', '.join(str(file) for file in files)}", err=True)
 
 
-def _print_json(**values: object) -> None:
-    import json
-
-    click.echo(json.dumps(values, indent=2, allow_nan=False))
-
-
-@main.command("import", epilog=_example("tk import my_session -o my_capture"))
+@main.command("import", epilog=example("tk import my_session -o my_capture"))
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="CAPTURE")
 @click.option(
@@ -239,7 +178,7 @@ def _print_json(**values: object) -> None:
 )
 def import_(folder: Path, output: Path, units: str | None, trial: str | None) -> None:
     """Make a capture of another tool's project: Pose2Sim, FreeMoCap, Caliscope, Anipose, EasyMocap and others."""
-    with _working(f"importing {folder}"):
+    with working(f"importing {folder}"):
         from tk.io.importers import import_project
 
         done = import_project(folder, output, units, trial)
@@ -248,19 +187,19 @@ def import_(folder: Path, output: Path, units: str | None, trial: str | None) ->
     click.echo(f"{done.cameras} cameras in {output}; have a look at {output / 'capture.toml'}", err=True)
 
 
-@main.command(epilog=_example("tk reconstruct CAPTURE -o hull.h5 --ply hulls --frames 0:3"))
-@_capture
+@main.command(epilog=example("tk reconstruct CAPTURE -o hull.h5 --ply hulls --frames 0:3"))
+@capture_argument
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="HULL.h5")
 @click.option("--ply", type=click.Path(path_type=Path), metavar="DIR", help="Also write point clouds, a PLY a frame.")
 @click.option("--mesh", type=click.Path(path_type=Path), metavar="DIR", help="Also write closed meshes, a PLY a frame.")
-@_voxels
-@_cameras
-@_frames
-@_masks
-@_force
-@_config
-@_quiet
-@_json
+@voxels_option
+@cameras_option
+@frames_option
+@masks_option
+@force_option
+@config_option
+@quiet_option
+@json_option
 def reconstruct(
     capture: Path,
     output: Path,
@@ -276,30 +215,30 @@ def reconstruct(
     as_json: bool,
 ) -> None:
     """Reconstruct the coloured surface of the visual hull in every frame of CAPTURE."""
-    span = _span(frames)
+    span = frame_span(frames)
     started = time.perf_counter()
     with Report(quiet) as report:
         report.stage("loading")
         from tk import reconstruction
         from tk.io.capture import open_capture
 
-        config = _configuration(config_file, voxels=voxels)
+        config = configuration(config_file, voxels=voxels)
         report.stage(f"opening {capture}")
-        opened = open_capture(capture, _names(cameras), masks)
+        opened = open_capture(capture, listed(cameras), masks)
         count = reconstruction.reconstruct(opened, output, config, report, span, ply, mesh, force)
     if as_json:
-        _print_json(result=str(output), frames=count, seconds=round(time.perf_counter() - started, 3))
+        print_json(result=str(output), frames=count, seconds=round(time.perf_counter() - started, 3))
     if not quiet:
         click.echo(f"{count} frames in {output}", err=True)
 
 
-@main.command(epilog=_example("tk masks CAPTURE -o masks; tk track CAPTURE -o result.h5 --masks masks"))
-@_capture
+@main.command(epilog=example("tk masks CAPTURE -o masks; tk track CAPTURE -o result.h5 --masks masks"))
+@capture_argument
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="DIR")
 @click.option("--segmenter", metavar="NAME", help="Which one, where several are installed.")
-@_cameras
-@_frames
-@_quiet
+@cameras_option
+@frames_option
+@quiet_option
 def masks(
     capture: Path, output: Path, segmenter: str | None, cameras: str | None, frames: str | None, quiet: bool
 ) -> None:
@@ -307,24 +246,24 @@ def masks(
 
     The person is white. The same command goes on where it was stopped.
     """
-    span = _span(frames)
+    span = frame_span(frames)
     with Report(quiet) as report:
         report.stage("loading")
         from tk import mask_folder
         from tk.io.capture import open_capture
 
-        opened = open_capture(capture, _names(cameras), "none")
+        opened = open_capture(capture, listed(cameras), "none")
         written = mask_folder.write_masks(opened, output, report, segmenter, span)
     if not quiet:
         click.echo(f"masks of {written.frames} frames in {output}, {written.now} of them new", err=True)
 
 
-@main.command(epilog=_example("tk inspect CAPTURE -o looks"))
-@_capture
+@main.command(epilog=example("tk inspect CAPTURE -o looks"))
+@capture_argument
 @click.option("-o", "--output", type=click.Path(path_type=Path), metavar="DIR", help="Write a sheet of pictures here.")
-@_cameras
-@_masks
-@_config
+@cameras_option
+@masks_option
+@config_option
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def inspect(
     capture: Path, output: Path | None, cameras: str | None, masks: str, config_file: Path | None, as_json: bool
@@ -336,31 +275,31 @@ def inspect(
     from tk.inspection_sheet import write_sheet
     from tk.io.capture import open_capture
 
-    opened = open_capture(capture, _names(cameras), masks)
-    found, seen = look(opened, _configuration(config_file))
+    opened = open_capture(capture, listed(cameras), masks)
+    found, seen = look(opened, configuration(config_file))
     if output is not None:
         write_sheet(output / "inspect.png", opened, found, seen)
         click.echo(f"pictures in {output / 'inspect.png'}", err=True)
     click.echo(json.dumps(found.to_dict(), indent=2, allow_nan=False) if as_json else found.format_table())
 
 
-@main.command(epilog=_example("tk level CAPTURE"))
-@_capture
-@_masks
-@_config
+@main.command(epilog=example("tk level CAPTURE"))
+@capture_argument
+@masks_option
+@config_option
 def level(capture: Path, masks: str, config_file: Path | None) -> None:
     """Find what points up from cameras and person, and write it into CAPTURE/capture.toml."""
     from tk.inspection import inspect as look
     from tk.io.capture import open_capture
     from tk.leveling import write_up
 
-    found, _ = look(open_capture(capture, None, masks), _configuration(config_file), pictures=0)
+    found, _ = look(open_capture(capture, None, masks), configuration(config_file), pictures=0)
     write_up(capture, found.leveling)
     click.echo(f"up = {found.leveling.up} in {capture / 'capture.toml'}: {found.leveling.how}")
 
 
-@main.command(epilog=_example("tk refine CAPTURE result.h5 -o refined.toml"))
-@_capture
+@main.command(epilog=example("tk refine CAPTURE result.h5 -o refined.toml"))
+@capture_argument
 @click.argument("result", type=click.Path(path_type=Path), metavar="RESULT.h5")
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="CALIBRATION.toml")
 @click.option("--focal", is_flag=True, help="Refine the focal lengths, too.")
@@ -369,11 +308,11 @@ def level(capture: Path, masks: str, config_file: Path | None) -> None:
     "--trust", type=float, default=1.0, show_default=True,
     help="How far off the cameras may be: 1 means some 0.3° and 12 mm in all.",
 )  # fmt: skip
-@_cameras
-@_masks
-@_config
-@_force
-@_quiet
+@cameras_option
+@masks_option
+@config_option
+@force_option
+@quiet_option
 def refine(
     capture: Path,
     result: Path,
@@ -397,9 +336,9 @@ def refine(
         if output.exists() and not force:
             raise ConfigError(f"{output}: exists already; give another name, or --force")
         how = RefinementConfig(focal=focal, offsets=offsets, trust=trust)
-        config = _configuration(config_file)
+        config = configuration(config_file)
         report.stage(f"opening {capture}")
-        opened = open_capture(capture, _names(cameras), masks)
+        opened = open_capture(capture, listed(cameras), masks)
         for warning in opened.warnings:
             report.note(warning)
         report.stage("refining the cameras")
@@ -410,7 +349,7 @@ def refine(
     click.echo(f"{done.frames} frames; the new calibration is in {output}", err=True)
 
 
-@main.command(epilog=_example("tk evaluate result.h5 CAPTURE/truth.h5"))
+@main.command(epilog=example("tk evaluate result.h5 CAPTURE/truth.h5"))
 @click.argument("result", type=click.Path(path_type=Path))
 @click.argument("truth", type=click.Path(path_type=Path))
 @click.option(
@@ -418,19 +357,19 @@ def refine(
     help="Judge in the pictures, too: pixels and silhouettes.  [default: the folder of TRUTH.h5, if a capture]",
 )  # fmt: skip
 @click.option("--joints", default="ankle_l,ankle_r", show_default=True, help="Whose distance is told in pixels.")
-@_masks
-@_json
+@masks_option
+@json_option
 def evaluate(result: Path, truth: Path, capture: Path | None, joints: str, masks: str, as_json: bool) -> None:
     """Compare RESULT.h5 with TRUTH.h5: joint distances, PCK, lost frames, frames/s; pixels and silhouettes by view."""
     seen, note = None, ""
-    with _working(f"comparing {result} with {truth}"):
+    with working(f"comparing {result} with {truth}"):
         from tk.evaluation import evaluate_files
         from tk.view_evaluation import capture_of, evaluate_views
 
         found = evaluate_files(result, truth)
         folder = capture or capture_of(truth)
         try:
-            seen = evaluate_views(result, truth, folder, _names(joints) or (), masks) if folder else None
+            seen = evaluate_views(result, truth, folder, listed(joints) or (), masks) if folder else None
         except CaptureError as error:
             if capture is not None:
                 raise
@@ -438,12 +377,12 @@ def evaluate(result: Path, truth: Path, capture: Path | None, joints: str, masks
     if note:
         click.echo(note, err=True)
     if as_json:
-        _print_json(**found.to_dict(), **({"views": seen.to_dict()} if seen else {}))
+        print_json(**found.to_dict(), **({"views": seen.to_dict()} if seen else {}))
     else:
         click.echo(found.format_table() + (f"\n\n{seen.format_table()}" if seen else ""))
 
 
-@main.command(epilog=_example("tk export walk.h5 --to trc,mot,bvh"))
+@main.command(epilog=example("tk export walk.h5 --to trc,mot,bvh"))
 @click.argument("result", type=click.Path(path_type=Path), metavar="RESULT.h5")
 @click.option(
     "--to", "formats", required=True, metavar="A,B,…",
@@ -453,20 +392,20 @@ def evaluate(result: Path, truth: Path, capture: Path | None, joints: str, masks
     "-o", "--output", type=click.Path(path_type=Path), metavar="DIR", help="Folder.  [default: beside RESULT.h5]"
 )
 @click.option("--smoothed", is_flag=True, help="The smoothed copy, with short losses bridged.")
-@_force
+@force_option
 def export(result: Path, formats: str, output: Path | None, smoothed: bool, force: bool) -> None:
     """Write RESULT.h5 in formats of other programs: OpenSim, Blender, spreadsheets."""
-    with _working(f"exporting {result}"):
-        from tk.io.export import export as write
+    with working(f"exporting {result}"):
+        from tk.export import export as write
 
-        written = write(result, _names(formats) or (), output, smoothed, force)
+        written = write(result, listed(formats) or (), output, smoothed, force)
     for note in written.notes:
         click.echo(f"note: {note}", err=True)
     for file in written.files:
         click.echo(f"wrote {file}", err=True)
 
 
-@main.command(epilog=_example("tk render result.h5 CAPTURE", "tk render result.h5 --view 3d -o turning.mp4"))
+@main.command(epilog=example("tk render result.h5 CAPTURE", "tk render result.h5 --view 3d -o turning.mp4"))
 @click.argument("result", type=click.Path(path_type=Path), metavar="RESULT.h5")
 @click.argument("capture", type=click.Path(path_type=Path), required=False)
 @click.option(
@@ -476,11 +415,11 @@ def export(result: Path, formats: str, output: Path | None, smoothed: bool, forc
     "--view", type=click.Choice(["overlay", "3d", "hull"]),
     help="Over the pictures; a turning view; the same with the stored hull.  [default: overlay, if CAPTURE is given]",
 )  # fmt: skip
-@_cameras
+@cameras_option
 @click.option("--frames", metavar="A:B|A,B,…", help="Frames A to B-1, or single ones.")
 @click.option("--png", type=click.Path(path_type=Path), metavar="DIR", help="Contact sheets in the place of a video.")
 @click.option("--full", is_flag=True, help="Whole pictures, not the part that holds the person.")
-@_force
+@force_option
 def render(
     result: Path,
     capture: Path | None,
@@ -496,20 +435,20 @@ def render(
     from tk.render.command import Request
     from tk.render.command import render as draw
 
-    request = Request(view, output, png, frames, _names(cameras), full, force)
-    with _working("drawing"):
+    request = Request(view, output, png, frames, listed(cameras), full, force)
+    with working("drawing"):
         files = draw(result, capture, request)
     for file in files:
         click.echo(f"wrote {file}", err=True)
 
 
-@main.command(epilog=_example("tk report result.h5 CAPTURE"))
+@main.command(epilog=example("tk report result.h5 CAPTURE"))
 @click.argument("result", type=click.Path(path_type=Path), metavar="RESULT.h5")
 @click.argument("capture", type=click.Path(path_type=Path), required=False)
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), metavar="PAGE.html", help="Page.  [default: beside RESULT.h5]"
 )
-@_force
+@force_option
 def report(result: Path, capture: Path | None, output: Path | None, force: bool) -> None:
     """Describe RESULT.h5 in one HTML page that needs no network.
 
@@ -517,29 +456,29 @@ def report(result: Path, capture: Path | None, output: Path | None, force: bool)
     """
     from tk.report.page import report as write
 
-    with _working("writing the report"):
+    with working("writing the report"):
         file = write(result, capture, output, force)
     click.echo(f"wrote {file}", err=True)
 
 
-@main.command(epilog=_example("tk batch recordings/* -o results --workers 4"))
+@main.command(epilog=example("tk batch recordings/* -o results --workers 4"))
 @click.argument("captures", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CAPTURE...")
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="FOLDER")
 @click.option("--workers", type=int, metavar="N", help="Captures at once on this machine.  [default: half the cores]")
 @click.option("--scheduler", metavar="ADDRESS", help="Use the workers of this Dask scheduler: tcp://host:8786.")
-@_method
-@_voxels
-@_cameras
-@_frames
-@_seed
-@_masks
-@_body
-@_causal
-@_store_hull
-@_no_report
-@_preset
-@_config
-@_quiet
+@method_option
+@voxels_option
+@cameras_option
+@frames_option
+@seed_option
+@masks_option
+@body_option
+@causal_option
+@store_hull_option
+@no_report_option
+@preset_option
+@config_option
+@quiet_option
 def batch(
     captures: tuple[Path, ...],
     output: Path,
@@ -563,9 +502,9 @@ def batch(
     from tk.batch import TrackOptions, exit_code, run_batch
     from tk.batch.report import BatchReport
 
-    config = _configuration(config_file, preset, voxels=voxels, seed=seed)
+    config = configuration(config_file, preset, voxels=voxels, seed=seed)
     options = TrackOptions(
-        method, _span(frames), _names(cameras), masks, body and body.resolve(), causal, store_hull, config
+        method, frame_span(frames), listed(cameras), masks, body and body.resolve(), causal, store_hull, config
     )
     with BatchReport(quiet) as report:
         try:
@@ -581,7 +520,7 @@ def batch(
     sys.exit(exit_code(outcomes))
 
 
-@main.command(epilog=_example("tk view walk.h5 --frame 40"))
+@main.command(epilog=example("tk view walk.h5 --frame 40"))
 @click.argument("result", type=click.Path(path_type=Path), metavar="RESULT.h5")
 @click.argument("capture", type=click.Path(path_type=Path), required=False)
 @click.option("--frame", type=int, metavar="N", help="Frame to begin with.  [default: the first]")
@@ -596,13 +535,13 @@ def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path
     show(result, capture, frame, screenshot)
 
 
-@main.command(epilog=_example("tk demo"))
+@main.command(epilog=example("tk demo"))
 @click.option("-o", "--output", default="demo.h5", show_default=True, type=click.Path(path_type=Path))
-@_voxels
-@_resume
-@_force
-@_no_report
-@_quiet
+@voxels_option
+@resume_option
+@force_option
+@no_report_option
+@quiet_option
 def demo(output: Path, voxels: int | None, resume: bool, force: bool, no_report: bool, quiet: bool) -> None:
     """Track the capture that ships with tk and compare the result with its truth."""
     from importlib.resources import as_file, files
@@ -617,7 +556,7 @@ def demo(output: Path, voxels: int | None, resume: bool, force: bool, no_report:
 
             check_output(output, force, resume)
             report.stage(f"opening the capture that ships with tk, {folder}")
-            config = _configuration(None, voxels=voxels)
+            config = configuration(None, voxels=voxels)
             capture = open_capture(folder)
             summary = session.track(capture, output, config, report, resume=resume, force=force)
             if not no_report:
@@ -628,39 +567,11 @@ def demo(output: Path, voxels: int | None, resume: bool, force: bool, no_report:
         _tell(output, summary, quiet, as_json=False)
 
 
-@main.command(epilog=_example("tk config > settings.toml", "tk config --preset kehl2006"))
-@_preset
-@_config
+@main.command(epilog=example("tk config > settings.toml", "tk config --preset kehl2006"))
+@preset_option
+@config_option
 def config(preset: str | None, config_file: Path | None) -> None:
     """Print all settings with what they mean, as TOML that --config takes."""
     from tk.config_text import annotated_toml
 
-    click.echo(annotated_toml(_configuration(config_file, preset)), nl=False)
-
-
-def _names(cameras: str | None) -> tuple[str, ...] | None:
-    return tuple(name.strip() for name in cameras.split(",") if name.strip()) if cameras else None
-
-
-def _span(frames: str | None) -> tuple[int, int | None]:
-    """``A:B`` as (A, B)."""
-    if frames is None:
-        return 0, None
-    first, colon, last = frames.partition(":")
-    try:
-        start, stop = int(first) if first else 0, int(last) if last else None
-        if not colon or start < 0 or (stop is not None and stop <= start):
-            raise ValueError
-    except ValueError:
-        raise ConfigError(f"--frames {frames}: give A:B with 0 ≤ A < B, for example 0:100") from None
-    return start, stop
-
-
-def _configuration(file: Path | None, preset: str | None = None, **overrides: Any) -> Config:
-    from dataclasses import replace
-
-    from tk.config import Config
-
-    base = Config.preset(preset) if preset else Config()
-    config = Config.read(file, base) if file else base
-    return replace(config, **{name: value for name, value in overrides.items() if value is not None})
+    click.echo(annotated_toml(configuration(config_file, preset)), nl=False)

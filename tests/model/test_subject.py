@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tests.model.ring import ring_of_cameras
@@ -29,6 +29,7 @@ def sighted(camera, at, score=0.9, z=0.95):
     others=st.lists(st.tuples(inside, st.sampled_from(range(4))), max_size=4),
     blind=st.sampled_from([*range(4), None]),
 )
+@example(at=(0.0, 0.5), others=[((0.76, 0.0), 1)], blind=1)
 def test_the_one_whom_most_cameras_see(at, others, blind) -> None:
     """Whoever else single cameras take for a person, and though one camera does not see the subject."""
     sightings = [[sighted(camera, at)] if c != blind else [] for c, camera in enumerate(RIG)]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scripts.smoothing import bridging_cm, errors, main
-from tests.io.export.conftest import FRAMES, Write, write
+from tests.export.conftest import FRAMES, Write, write
 
 __all__ = ["write"]  # the fixture
 

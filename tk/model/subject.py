@@ -140,6 +140,9 @@ class Subject:
 def locate(rig: Rig, volume: Volume, sightings: Sequence[Sequence[Sighting]]) -> Subject | None:
     """The person whom most cameras see at one place in the volume; None where no two do.
 
+    Pairs of sightings propose places; a place's support is the truncated quadratic of MSAC (Torr and Zisserman 2000),
+    so that three cameras which agree exactly outweigh three which nearly do.
+
     Args:
         rig: C cameras.
         volume: the working volume.
@@ -148,7 +151,7 @@ def locate(rig: Rig, volume: Volume, sightings: Sequence[Sequence[Sighting]]) ->
     seen = [(c, sighting) for c, each in enumerate(sightings) for sighting in each]
     hips = [(rig[c].center, rig[c].rays([s.center])[0]) for c, s in seen]
     tops = [(rig[c].center, rig[c].rays([s.top])[0]) for c, s in seen]
-    best: tuple[int, float] = (1, 0.0)
+    best = 0.0
     found: Subject | None = None
     for a, b in combinations(range(len(seen)), 2):
         if seen[a][0] == seen[b][0]:
@@ -156,13 +159,14 @@ def locate(rig: Rig, volume: Volume, sightings: Sequence[Sequence[Sighting]]) ->
         point = _meeting([hips[a], hips[b]])
         if point is None or not _inside(point, volume):
             continue
-        chosen = _agreeing(rig, point, seen)
-        rank = (len(chosen), sum(seen[k][1].score for k in chosen))
-        if rank > best:
+        agreeing = _agreeing(rig, point, seen)
+        support = sum(seen[k][1].score * (1 - (distance / _AGREE) ** 2) for k, distance in agreeing.items())
+        if len(agreeing) > 1 and support > best:
+            chosen = list(agreeing)
             center, top = (_meeting([lines[k] for k in chosen]) for lines in (hips, tops))
             if center is not None and top is not None:
-                best = rank
-                found = Subject(center, top, _radius_m(rig, center, [seen[k] for k in chosen]), rank[0])
+                best = support
+                found = Subject(center, top, _radius_m(rig, center, [seen[k] for k in chosen]), len(chosen))
     return found
 
 
@@ -174,8 +178,8 @@ def _inside(point: Float, volume: Volume) -> bool:
     return bool(((volume.lower - _MARGIN_M <= point) & (point <= volume.upper + _MARGIN_M)).all())
 
 
-def _agreeing(rig: Rig, point: Float, seen: Sequence[tuple[int, Sighting]]) -> list[int]:
-    """The sightings of a person at a point, at most one a camera."""
+def _agreeing(rig: Rig, point: Float, seen: Sequence[tuple[int, Sighting]]) -> dict[int, float]:
+    """The sightings of a person at a point, at most one a camera: how far off it, in their radii."""
     nearest: dict[int, tuple[float, int]] = {}
     for c, camera in enumerate(rig):
         pixels, _ = camera.project(point)
@@ -183,7 +187,7 @@ def _agreeing(rig: Rig, point: Float, seen: Sequence[tuple[int, Sighting]]) -> l
             distance = float(np.linalg.norm(pixels[0] - sighting.center)) / max(sighting.radius, 1e-9)
             if view == c and distance <= min(_AGREE, nearest.get(c, (np.inf, 0))[0]):  # NaN is no agreement
                 nearest[c] = distance, k
-    return [k for _, k in nearest.values()]
+    return {k: distance for distance, k in nearest.values()}
 
 
 def _radius_m(rig: Rig, point: Float, seen: Sequence[tuple[int, Sighting]]) -> float:

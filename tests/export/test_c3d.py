@@ -8,9 +8,9 @@ import ezc3d
 import numpy as np
 import pytest
 
-from tests.io.export.conftest import FPS, FRAMES, LOST, Write
+from tests.export.conftest import FPS, FRAMES, LOST, Write
 from tk.errors import ExportError
-from tk.io.export import export, read_motion
+from tk.export import export, read_motion
 from tk.io.result import ResultError
 from tk.model.skeleton import JOINTS, SEGMENTS
 

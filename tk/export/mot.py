@@ -3,7 +3,7 @@
 Coordinates have the names, the axes and the signs of the full-body model of Rajagopal et al., IEEE Trans. Biomed. Eng.
 63 (2016) 2068-2079 (`Rajagopal2016.osim`): turns Z-X-Y at pelvis, lumbar joint, hip and shoulder, hinges at knee and
 elbow. The pelvis is placed at the midpoint of the hip centres; that model's own origin lies elsewhere in the pelvis, so
-that translations agree up to a constant in the pelvis. Axes as in :mod:`tk.io.export.trc`; degrees and metres.
+that translations agree up to a constant in the pelvis. Axes as in :mod:`tk.export.trc`; degrees and metres.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.export.motion import FORWARD_UP_RIGHT, Motion
+from tk.export.motion import FORWARD_UP_RIGHT, Motion
 from tk.model.rotations import decompose, follow
 
 Float = NDArray[np.float64]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tk.io.export.motion import FORWARD_UP_RIGHT, Motion
+from tk.export.motion import FORWARD_UP_RIGHT, Motion
 
 
 def write_trc(motion: Motion, path: Path) -> None:

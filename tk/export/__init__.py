@@ -11,14 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tk.errors import ExportError
-from tk.io.export.bvh import write_bvh
-from tk.io.export.c3d import write_c3d
-from tk.io.export.csv import write_angles_csv, write_points_csv
-from tk.io.export.gltf import write_glb
-from tk.io.export.mot import write_mot
-from tk.io.export.motion import Motion, read_motion
-from tk.io.export.ply import write_body_meshes
-from tk.io.export.trc import write_trc
+from tk.export.bvh import write_bvh
+from tk.export.c3d import write_c3d
+from tk.export.csv import write_angles_csv, write_points_csv
+from tk.export.gltf import write_glb
+from tk.export.mot import write_mot
+from tk.export.motion import Motion, read_motion
+from tk.export.ply import write_body_meshes
+from tk.export.trc import write_trc
 
 __all__ = ["FORMATS", "Exported", "Motion", "export", "read_motion"]
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from tests.conftest import Tk
-from tests.io.export.conftest import FIRST, FPS, FRAMES, LOST, SKELETON, Write, poses, status
+from tests.export.conftest import FIRST, FPS, FRAMES, LOST, SKELETON, Write, poses, status
 from tk.errors import ExportError, ResultError
-from tk.io.export import FORMATS, export, read_motion
+from tk.export import FORMATS, export, read_motion
 from tk.io.result import Status
 from tk.model.angles import segment_quaternions
 from tk.model.anthropometry import BodyDimensions

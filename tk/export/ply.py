@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from tk.errors import ExportError
-from tk.io.export.motion import Motion
+from tk.export.motion import Motion
 from tk.io.mesh import Mesh, write_mesh
 from tk.model.skeleton import SEGMENTS
 from tk.render.figure import figure_of

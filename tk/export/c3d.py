@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from tk.errors import ExportError
-from tk.io.export.motion import Motion
+from tk.export.motion import Motion
 
 # Where a segment begins.
 _ORIGINS = {

@@ -1,6 +1,6 @@
 """BVH, for Blender and other programs of animation.
 
-Axes, units and rest pose as in :mod:`tk.io.export.tree`: Y up, facing +Z, metres, a T pose with the fitted body's
+Axes, units and rest pose as in :mod:`tk.export.tree`: Y up, facing +Z, metres, a T pose with the fitted body's
 lengths. Rotations are Z, then X, then Y about moving axes, degrees. The root has channels for its place, and so have
 the shoulders, which rise with the arms; such a channel stands for the place in the parent and replaces the OFFSET.
 A frame that is not known holds the pose before.
@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.export.motion import Motion
-from tk.io.export.tree import Tree, build_tree
+from tk.export.motion import Motion
+from tk.export.tree import Tree, build_tree
 from tk.model.rotations import decompose, follow
 
 _PLACE = ("Xposition", "Yposition", "Zposition")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.export.motion import LEFT_UP_FORWARD, Motion
+from tk.export.motion import LEFT_UP_FORWARD, Motion
 from tk.model.rotations import turn
 from tk.model.skeleton import WAIST_HEIGHT
 

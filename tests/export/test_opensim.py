@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.io.export.conftest import FIRST, FPS, FRAMES, LOST, SKELETON, Write, poses
-from tk.io.export import export, read_motion
-from tk.io.export.mot import coordinates
+from tests.export.conftest import FIRST, FPS, FRAMES, LOST, SKELETON, Write, poses
+from tk.export import export, read_motion
+from tk.export.mot import coordinates
 from tk.model.rotations import turn
 from tk.model.skeleton import JOINTS, build_skeleton
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from bvh import Bvh
 
-from tests.io.export.conftest import FPS, FRAMES, LOST, SKELETON, Write
-from tk.io.export import export, read_motion
+from tests.export.conftest import FPS, FRAMES, LOST, SKELETON, Write
+from tk.export import export, read_motion
 from tk.model.rotations import turn
 from tk.model.skeleton import JOINTS, build_skeleton
 

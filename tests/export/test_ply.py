@@ -9,9 +9,9 @@ import open3d
 import pytest
 
 from tests.conftest import Tk
-from tests.io.export.conftest import BODY, FIRST, FRAMES, LOST, Write, poses
+from tests.export.conftest import BODY, FIRST, FRAMES, LOST, Write, poses
 from tk.errors import ExportError
-from tk.io.export import export
+from tk.export import export
 from tk.model.body import build_body
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tk.io.export.motion import Motion
+from tk.export.motion import Motion
 from tk.model.angles import ANGLES, joint_angles
 
 

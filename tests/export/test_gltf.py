@@ -8,8 +8,8 @@ import numpy as np
 import pygltflib
 from scipy.spatial.transform import Rotation
 
-from tests.io.export.conftest import FPS, FRAMES, LOST, Write, poses
-from tk.io.export import export, read_motion
+from tests.export.conftest import FPS, FRAMES, LOST, Write, poses
+from tk.export import export, read_motion
 from tk.model.body import build_body
 from tk.model.skeleton import JOINTS, SEGMENTS
 

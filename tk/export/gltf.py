@@ -1,6 +1,6 @@
 """glTF 2.0 in one file (.glb): the tree of nodes, its animation, and the body's pieces riding on the nodes.
 
-Axes, units and rest pose as in :mod:`tk.io.export.tree`, which are glTF's own. A frame that is not known holds the pose
+Axes, units and rest pose as in :mod:`tk.export.tree`, which are glTF's own. A frame that is not known holds the pose
 before; `asset.extras.lost_frames` of the file lists such frames.
 """
 
@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk import __version__
-from tk.io.export.motion import Motion
-from tk.io.export.tree import Tree, build_tree, rest_axes
+from tk.export.motion import Motion
+from tk.export.tree import Tree, build_tree, rest_axes
 from tk.model.angles import standing_axes
 from tk.model.rotations import continuous, to_quaternions
 from tk.model.skeleton import JOINTS, SEGMENTS, WAIST_HEIGHT, build_skeleton
