@@ -234,7 +234,10 @@ class Ahead:
 
     def frames(self, start: int, stop: int) -> Iterator[Observed]:
         self._begun = True
-        self._send((start, stop))
+        self._send((start, stop))  # now, not when the first is asked for
+        return self._arriving()
+
+    def _arriving(self) -> Iterator[Observed]:
         while True:
             asked = time.perf_counter()
             self._give_back()

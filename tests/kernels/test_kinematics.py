@@ -1,5 +1,7 @@
 """Forward kinematics in Taichi against the skeleton's own float64 NumPy."""
 
+import functools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tk.kernels import kinematics
+from tk.kernels.kinematics import forward_tree, load_rotation, load_translation, load_vector3
 from tk.kernels.runtime import ensure_runtime, ti
 from tk.model.anthropometry import BodyDimensions
 from tk.model.skeleton import SEGMENTS, build_skeleton
@@ -30,9 +33,42 @@ def points_of(rng, count):
     return rng.normal(0, 0.7, (count, 3)), rng.integers(0, len(SEGMENTS), count)
 
 
+@functools.cache
+def _place_kernel(real):
+    @ti.kernel
+    def place(
+        tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
+        local: ti.types.ndarray(dtype=real, ndim=2),  # (N, 3)
+        last_dof: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,)
+        pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
+        joints: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 18) scratch
+        world: ti.types.ndarray(dtype=real, ndim=3),  # (B, N, 3) out
+    ):
+        for b in range(pose.shape[0]):
+            forward_tree(tree, pose, b, b, joints)
+            for n in range(local.shape[0]):
+                k = last_dof[n]
+                x = load_rotation(joints, b, k) @ load_vector3(local, n) + load_translation(joints, b, k)
+                for i in ti.static(range(3)):
+                    world[b, n, i] = x[i]
+
+    return place
+
+
 def place(local, segment, poses):
-    s = SKELETON
-    return kinematics.place(s.axis, s.anchor, s.prismatic, s.parent, local, s.segment_dof[segment], poses)
+    """Points of the zero configuration carried to poses (B, D), in their precision."""
+    ensure_runtime()
+    s, dtype = SKELETON, poses.dtype
+    world = np.empty((len(poses), len(local), 3), dtype)
+    _place_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
+        kinematics.pack_tree(s.axis, s.anchor, s.prismatic, s.parent).astype(dtype),
+        np.ascontiguousarray(local, dtype),
+        s.segment_dof[segment].astype(np.int32),
+        np.ascontiguousarray(poses),
+        np.empty((len(poses), D, kinematics.JOINT_NUMBERS), dtype),
+        world,
+    )
+    return world
 
 
 def place_oracle(local, segment, poses):

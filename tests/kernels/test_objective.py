@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.kernels import oracles
-from tk.kernels import kinematics
 from tk.kernels.nearest import SurfaceIndex, nearest
 from tk.kernels.objective import Held, ObjectiveKernel, ObjectiveSettings
 from tk.model.anthropometry import BodyDimensions
@@ -79,7 +78,8 @@ class Scene:
 
 def placed(local, last_dof, pose):
     s = SKELETON
-    return kinematics.place(s.axis, s.anchor, s.prismatic, s.parent, local, last_dof, pose[None])[0]
+    T = s.transforms(pose)[last_dof]
+    return (T[:, :3, :3] @ local[:, :, None])[..., 0] + T[:, :3, 3]
 
 
 def pairs_oracle(scene, b, held, settings):

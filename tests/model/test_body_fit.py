@@ -16,7 +16,6 @@ from tk.model.body_fit import (
     fit_body,
     part_transforms,
     pose_rows,
-    segment_transforms,
     shape_rows,
 )
 from tk.model.cone_body import PRESETS, SHAPE_NUMBERS, build_cone_body
@@ -122,7 +121,7 @@ def test_frames_are_told_apart_in_rows_by_dimensions():
 def test_transforms_of_many_poses_are_the_skeletons(up):
     body = build_cone_body(AVERAGE.dimensions, up)
     poses = np.random.default_rng(0).uniform(-1, 1, (4, len(body.skeleton.names)))
-    T = segment_transforms(body.skeleton, poses)
+    T = body.skeleton.segment_transforms(poses)
     for pose, found in zip(poses, T, strict=True):
         np.testing.assert_allclose(found, body.skeleton.segment_transforms(pose), atol=1e-12)
     B = np.eye(4)

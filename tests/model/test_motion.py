@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tk.model.anthropometry import BodyDimensions
-from tk.model.motion import FOOT_POINTS, foot_points, joint_positions, segment_transforms
+from tk.model.motion import FOOT_POINTS, foot_points, joint_positions
 from tk.model.skeleton import JOINTS, build_skeleton
 
 BODY = BodyDimensions.from_stature(1.75)
@@ -17,7 +17,7 @@ BODY = BodyDimensions.from_stature(1.75)
 def test_agrees_with_the_skeleton(up: str, waist: bool) -> None:
     skeleton = build_skeleton(BODY, up, waist)
     poses = np.random.default_rng(1).uniform(-1, 1, (7, len(skeleton.names)))
-    T = segment_transforms(skeleton, poses)
+    T = skeleton.segment_transforms(poses)
     joints = joint_positions(skeleton, T)
     for f, pose in enumerate(poses):
         np.testing.assert_allclose(T[f], skeleton.segment_transforms(pose), atol=1e-12)
@@ -26,7 +26,7 @@ def test_agrees_with_the_skeleton(up: str, waist: bool) -> None:
 
 def test_feet_stand_on_the_floor() -> None:
     skeleton = build_skeleton(BODY)
-    T = segment_transforms(skeleton, np.zeros((1, 24)))
+    T = skeleton.segment_transforms(np.zeros((1, 24)))
     feet = foot_points(skeleton, BODY, T)[0]
     ankle = joint_positions(skeleton, T)[0, JOINTS.index("ankle_l")]
     np.testing.assert_allclose(feet[:, 2], ankle[2] - BODY.ankle_height)

@@ -53,13 +53,13 @@ def test_nothing_is_known_before_anything_is_learned():
     colors = PartColors(BODY)
     assert not colors.known and colors.state() == {}
     assert colors.regions(np.zeros((2, 4, 4, 3), np.uint8)) is None
-    assert colors.mismatch().shape == (COLOR_BINS, len(GROUPS)) and not colors.mismatch().any()
+    assert colors.mismatch.shape == (COLOR_BINS, len(GROUPS)) and not colors.mismatch.any()
 
 
 def test_colors_tell_parts_apart():
     colors = PartColors(BODY)
     clothed(colors)
-    mismatch = colors.mismatch()
+    mismatch = colors.mismatch
     assert colors.known and mismatch.dtype == np.float32 and mismatch.min() >= 0 and mismatch.max() <= 1
     torso, forearm, thigh = (GROUPS.index(name) for name in ("torso", "forearm", "thigh"))
     for color, suits in ((SHIRT, torso), (SKIN, forearm), (TROUSERS, thigh)):
@@ -89,7 +89,7 @@ def test_new_colors_are_learned_slowly():
     red, green = bin_of((0, 0, 250)), bin_of((0, 250, 0))
     group = GROUPS.index("torso")
     colors.learn(np.full(500, red), np.full(500, torso, np.uint8))
-    suits = [colors.mismatch()[green, group]]
+    suits = [colors.mismatch[green, group]]
     for _ in range(60):
         colors.learn(np.full(500, green), np.full(500, torso, np.uint8))
         suits.append(float(np.exp(colors.log_likelihood[group, green] - colors.log_likelihood[group, red])))
@@ -105,7 +105,7 @@ def test_state_round_trip():
     np.testing.assert_array_equal(second.log_likelihood, first.log_likelihood)
     for colors in (first, second):
         clothed(colors, seed=1)
-    np.testing.assert_array_equal(second.mismatch(), first.mismatch())
+    np.testing.assert_array_equal(second.mismatch, first.mismatch)
     untouched = PartColors(BODY)
     untouched.restore(PartColors(BODY).state())
     assert not untouched.known

@@ -19,7 +19,6 @@ from tk.model.anthropometry import BodyDimensions
 from tk.model.body import Body, build_body, neutral_pose
 from tk.model.camera import Camera, Rig
 from tk.model.cone_body import ConeBody, build_cone_body
-from tk.model.motion import segment_transforms
 from tk.model.silhouettes import draw_silhouettes
 from tk.model.skeleton import JOINTS
 from tk.render.canvas import View, draw_body, draw_joints
@@ -42,7 +41,7 @@ def camera(distance_m: float = 4.0) -> Camera:
 
 def figure(body: Body | ConeBody, pose: np.ndarray) -> Figure:
     """One frame."""
-    joints, transforms = body.skeleton.joints(pose), segment_transforms(body.skeleton, pose[None])
+    joints, transforms = body.skeleton.joints(pose), body.skeleton.segment_transforms(pose[None])
     return Figure(np.zeros(1, int), joints[None], None, np.zeros(1, np.uint8), solids_of(body), transforms)
 
 

@@ -9,11 +9,9 @@ freedom of a shoulder may carry a translation ``rise · u`` before its rotation,
 over the horizontal in the trunk's frame, which its own angle and the next one make (:data:`ARM_UP`).
 """
 
-import functools
-
 import numpy as np
 
-from tk.kernels.runtime import ensure_runtime, ti
+from tk.kernels.runtime import ti
 
 # The arm's elevation u from a shoulder's first two angles, the arm being level in the zero configuration:
 # u = ARM_UP[0] cos(second) sin(first) + ARM_UP[1] sin(second).
@@ -205,59 +203,3 @@ def point_velocity(prismatic: ti.template(), twists: ti.template(), c: int, k: i
     """∂x/∂p_k of a point x below degree of freedom k (silhouette paper, eq. 6)."""
     w = ti.Vector([twists[c, k, 0], twists[c, k, 1], twists[c, k, 2]])
     return w.cross(x) + ti.Vector([twists[c, k, 3], twists[c, k, 4], twists[c, k, 5]])
-
-
-@functools.cache
-def _place_kernel(real):
-    @ti.kernel
-    def place(
-        tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
-        local: ti.types.ndarray(dtype=real, ndim=2),  # (N, 3)
-        last_dof: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,)
-        pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
-        joints: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 18) scratch
-        world: ti.types.ndarray(dtype=real, ndim=3),  # (B, N, 3) out
-    ):
-        for b in range(pose.shape[0]):
-            forward_tree(tree, pose, b, b, joints)
-            for n in range(local.shape[0]):
-                k = last_dof[n]
-                x = load_rotation(joints, b, k) @ load_vector3(local, n) + load_translation(joints, b, k)
-                for i in ti.static(range(3)):
-                    world[b, n, i] = x[i]
-
-    return place
-
-
-def place(
-    axis: np.ndarray,
-    point: np.ndarray,
-    prismatic: np.ndarray,
-    parent: np.ndarray,
-    local: np.ndarray,
-    last_dof: np.ndarray,
-    pose: np.ndarray,
-) -> np.ndarray:
-    """Points of the zero configuration carried to B poses.
-
-    Args:
-        axis: (D, 3), point: (D, 3) or (D, 6), twists in the zero configuration; prismatic, parent: (D,).
-        local: (N, 3) points, metres; last_dof: (N,) the last degree of freedom above each.
-        pose: (B, D), float32 or float64: the precision of the computation.
-
-    Returns:
-        (B, N, 3) world points, metres.
-    """
-    ensure_runtime()
-    dtype = pose.dtype
-    B, D = pose.shape
-    world = np.empty((B, len(local), 3), dtype)
-    _place_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
-        pack_tree(axis, point, prismatic, parent).astype(dtype),
-        np.ascontiguousarray(local, dtype),
-        np.ascontiguousarray(last_dof, np.int32),
-        np.ascontiguousarray(pose),
-        np.empty((B, D, JOINT_NUMBERS), dtype),
-        world,
-    )
-    return world

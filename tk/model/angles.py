@@ -18,7 +18,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.motion import segment_transforms
 from tk.model.rotations import compose, decompose, to_quaternions
 from tk.model.skeleton import SEGMENTS, Skeleton
 
@@ -139,11 +138,11 @@ ANGLES: tuple[AngleSet, ...] = _sets()
 
 def segment_rotations(skeleton: Skeleton, poses: Float) -> Float:
     """(F, S, 3, 3) rotations of the segments' axes (see the module's docstring) to the world, from poses (F, D)."""
-    return standing_rotations(skeleton, segment_transforms(skeleton, poses))
+    return standing_rotations(skeleton, skeleton.segment_transforms(poses))
 
 
 def standing_rotations(skeleton: Skeleton, transforms: Float) -> Float:
-    """(F, S, 3, 3) the same from :func:`tk.model.motion.segment_transforms`."""
+    """(F, S, 3, 3) the same from :meth:`Skeleton.segment_transforms`."""
     return transforms[..., :3, :3] @ skeleton.T_world_body @ standing_axes()
 
 

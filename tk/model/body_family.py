@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tk.kernels.cones import CONE
 from tk.model.body_fit import BodyProblem as Problem
-from tk.model.body_fit import segment_transforms, shape_rows
+from tk.model.body_fit import shape_rows
 from tk.model.bundle import Seen
 from tk.model.cone_body import SHAPE_NUMBERS, ConeBody, ConePart, build_cone_body, group_of
 
@@ -38,7 +38,7 @@ class Family:
         body = self.build(shared)
         poses = np.array([view.pose for view in seen])
         by_dimension = self._problem.dimension_rows(shared, poses, [view.edgels for view in seen])
-        transforms = segment_transforms(body.skeleton, poses)
+        transforms = body.skeleton.segment_transforms(poses)
         return [
             np.hstack([rows, shape_rows(body, T, view.edgels)])
             for rows, T, view in zip(by_dimension, transforms, seen, strict=True)

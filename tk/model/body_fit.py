@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 
 from tk.errors import ConfigError
 from tk.kernels.cones import CONE
-from tk.kernels.kinematics import place
 from tk.kernels.silhouette import Edgels, SearchSettings
 from tk.model.anthropometry import BodyDimensions
 from tk.model.cone_body import SHAPE_NUMBERS, ConeBody, build_cone_body, group_of
 from tk.model.silhouettes import Pyramid, Views
-from tk.model.skeleton import SEGMENTS, Skeleton
+from tk.model.skeleton import SEGMENTS
 
 Float = NDArray[np.float64]
 
@@ -58,7 +57,7 @@ _SHAPES = {
     "foot_": (0.15, 0.15, 0.15, 0.1, 0.005, 0.005, 0.02, 0.01),
     "head": (0.15, 0.15, 0.15, 0.1, 0.005, _FIXED, 0.02, _FIXED),
 }
-_STEP = 1e-4  # of the differences by a dimension's logarithm
+_STEP = 1e-6  # of the differences by a dimension's logarithm
 # Standard deviation of an edgel, pixels. Besides ragged masks it stands for shapes that no cone has, which err alike in
 # all frames.
 _EDGE_NOISE_PX = 3.0
@@ -141,7 +140,7 @@ def fit_body(
         seen = [views.edgels(here, pyramid, pose, 0, settings) for pyramid, pose in zip(pyramids, poses, strict=True)]
         by_dimension = problem.dimension_rows(shared, poses, seen)
         H, g = np.zeros((F * D + K, F * D + K)), np.zeros(F * D + K)
-        transforms = segment_transforms(skeleton, poses)
+        transforms = skeleton.segment_transforms(poses)
         for f, edgels in enumerate(seen):
             rows = np.hstack(
                 [pose_rows(here, poses[f], edgels), by_dimension[f], shape_rows(here, transforms[f], edgels)]
@@ -190,24 +189,24 @@ class BodyProblem:
         return build_cone_body(dimensions, self.up, self.preset).reshaped(change)
 
     def dimension_rows(self, shared: Float, poses: Float, seen: Sequence[Edgels]) -> list[Float]:
-        """For each frame (N, 24): rows by the dimensions, by central differences of the surface points."""
+        """For each frame (N, 24): rows by the dimensions, by differences of the surface points."""
         ends = np.cumsum([len(edgels.part) for edgels in seen])
         frame = np.repeat(np.arange(len(seen)), [len(edgels.part) for edgels in seen])
         part = np.concatenate([edgels.part for edgels in seen])
         unscaled = np.concatenate([edgels.unscaled for edgels in seen])
         row = np.concatenate([edgels.row for edgels in seen])
         rows = np.zeros((len(part), len(_DIMENSIONS)))
+
+        def points(values: Float) -> Float:
+            body = self.build(values)
+            placed = part_transforms(body, body.skeleton.segment_transforms(poses))
+            return _surface_points(body, placed[frame, part], part, unscaled)
+
+        here = points(shared)
         for k in range(len(_DIMENSIONS)):
             step = np.zeros(len(shared))
             step[k] = _STEP
-            larger, smaller = (
-                _surface_points(body, part_transforms(body, T)[frame, part], part, unscaled)
-                for body, T in (
-                    (body, segment_transforms(body.skeleton, poses))
-                    for body in (self.build(shared + step), self.build(shared - step))
-                )
-            )
-            rows[:, k] = np.einsum("na,na->n", row, larger - smaller) / (2 * _STEP)
+            rows[:, k] = np.einsum("na,na->n", row, points(shared + step) - here) / _STEP
         return np.split(rows, ends[:-1])
 
     def add_prior(self, shared: Float, H: Float, g: Float) -> None:
@@ -221,21 +220,6 @@ class BodyProblem:
             row[_DIMENSIONS.index(name)] = lengths[name] / stature / self.stature_deviation
         H += np.outer(row, row)
         g += row * np.log(self.average.stature / stature) / self.stature_deviation
-
-
-def segment_transforms(skeleton: Skeleton, poses: Float) -> Float:
-    """(F, S, 4, 4) transforms of the segments at poses (F, D), as :meth:`Skeleton.segment_transforms` has them."""
-    corners = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-    local = np.tile(corners, (len(SEGMENTS), 1))
-    last = np.repeat(skeleton.segment_dof, 4)
-    world = place(
-        skeleton.axis, skeleton.anchor, skeleton.prismatic, skeleton.parent, local, last, np.asarray(poses, np.float64)
-    ).reshape(len(poses), len(SEGMENTS), 4, 3)
-    T = np.zeros((len(poses), len(SEGMENTS), 4, 4))
-    T[..., :3, :3] = np.swapaxes(world[:, :, 1:] - world[:, :, :1], -1, -2)
-    T[..., :3, 3] = world[:, :, 0]
-    T[..., 3, 3] = 1.0
-    return T
 
 
 def part_transforms(body: ConeBody, T_world_segment: Float) -> Float:

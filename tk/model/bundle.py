@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tk.kernels.projection import project_points
 from tk.kernels.silhouette import Edgels, SearchSettings
-from tk.model.body_fit import pose_rows, segment_transforms
+from tk.model.body_fit import pose_rows
 from tk.model.camera import Camera, Rig
 from tk.model.cone_body import ConeBody
 from tk.model.silhouettes import CleaningConfig, Pyramid, Views, pack_rig
@@ -167,7 +167,7 @@ def equations(
     straight = s.is_waist | s.is_ankle
     precision = np.concatenate([np.full(P, POSE_DEVIATION**-2.0), np.full(D - P, SEGMENT_M**-2.0)])
     blocks = [(np.zeros((D + S, D + S)), np.zeros(D + S)) for _ in moments]
-    transforms = segment_transforms(s, np.array([view.pose for view in seen]))
+    transforms = s.segment_transforms(np.array([view.pose for view in seen]))
     for view, rows_behind, T in zip(seen, further, transforms, strict=True):
         edgels = view.edgels
         x = body.place(view.pose, edgels.part, edgels.unscaled, T)

@@ -417,7 +417,8 @@ def _limb(
 
 def _frame(origin: Float, axis: Float, front: Float) -> Float:
     """(4, 4) frame at ``origin`` with z along ``axis`` and x along ``front`` (perpendicular to it)."""
+    (a, b, c), (x, y, z) = axis, front
     T = np.eye(4)
-    T[:3, :3] = np.column_stack([front, np.cross(axis, front), axis])
-    T[:3, 3] = origin
+    T[:3, 0], T[:3, 2], T[:3, 3] = front, axis, origin
+    T[:3, 1] = b * z - c * y, c * x - a * z, a * y - b * x  # np.cross takes ten times as long
     return T

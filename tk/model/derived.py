@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tk.model.angles import joint_angles, standing_rotations
 from tk.model.anthropometry import BodyDimensions
-from tk.model.motion import foot_points, joint_positions, segment_transforms
+from tk.model.motion import foot_points, joint_positions
 from tk.model.rotations import to_quaternions
 from tk.model.skeleton import Skeleton
 
@@ -37,7 +37,7 @@ class Derived:
 
 def derive(skeleton: Skeleton, dimensions: BodyDimensions, poses: Float) -> Derived:
     """What the poses (F, D) mean; they must be finite."""
-    T = segment_transforms(skeleton, poses)
+    T = skeleton.segment_transforms(poses)
     R = standing_rotations(skeleton, T)
     return Derived(
         joints=joint_positions(skeleton, T),

@@ -80,7 +80,7 @@ class Evidence:
         cost[..., 1:] = np.where(person, 0.0, outside)[..., None]
         bins = None if images is None or images.size == 0 else color_bins(grid.sample(images))
         if bins is not None and colors is not None and colors.known:
-            cost[person, 1:] = COLOR_COST * colors.mismatch()[bins[person]]
+            cost[person, 1:] = COLOR_COST * colors.mismatch[bins[person]]
         return Evidence(grid, person, cost, bins)
 
     def cast(
@@ -125,12 +125,11 @@ class Evidence:
 
         Views that see nobody do not count.
         """
-        views = self.person.any(axis=(1, 2))
-        flat, count = label[views], len(group) + 1
-        columns = np.concatenate([[0], group + 1])[flat]
-        cost = np.take_along_axis(self.cost[views], columns[..., None], axis=-1)[..., 0]
-        total = np.bincount(flat.ravel(), cost.ravel(), count)
-        return total[1:].astype(np.float64), np.bincount(flat.ravel(), minlength=count)[1:].astype(np.int64)
+        met = (label > 0) & np.asarray(self.person.any(axis=(1, 2)))[:, None, None]
+        part = label[met].astype(np.int64) - 1
+        cost = self.cost[met, group[part] + 1]
+        total, count = np.bincount(part, cost, len(group)), np.bincount(part, minlength=len(group))
+        return total.astype(np.float64), count.astype(np.int64)
 
     def unmet(self, label: NDArray[np.uint8]) -> float:
         """The share of the person's rays that meet no part, averaged over the views; labels (V, h, w)."""

@@ -38,6 +38,13 @@ class PartColors:
 
     Args:
         body: whose parts they are.
+
+    Attributes:
+        group: (P,) the group of each part.
+        log_likelihood: (G, COLOR_BINS) log p(colour | group); None before any colours are known.
+        foreign: (COLOR_BINS,) bool, colours that are not the person's.
+        mismatch: (COLOR_BINS, G) in [0, 1]: how much less likely a colour is on a part than on the part that it suits
+            best.
     """
 
     def __init__(self, body: ConeBody) -> None:
@@ -46,6 +53,7 @@ class PartColors:
         self._beside: Float = np.zeros(COLOR_BINS)
         self.foreign = np.zeros(COLOR_BINS, np.bool_)
         self.log_likelihood: NDArray[np.float32] | None = None
+        self.mismatch = np.zeros((COLOR_BINS, len(GROUPS)), np.float32)
 
     @property
     def known(self) -> bool:
@@ -64,18 +72,13 @@ class PartColors:
         self._update()
 
     def _update(self) -> None:
-        rows = np.stack([_smooth(row) for row in self._counts])
-        total = rows.sum(axis=1, keepdims=True)
+        *rows, beside = _smooth(np.concatenate([self._counts, self._beside[None]]))
+        total = np.sum(rows, axis=1, keepdims=True)
         share = rows / np.maximum(total, 1e-9)
-        self.log_likelihood = np.log((1 - _ANYTHING) * share + _ANYTHING / COLOR_BINS).astype(np.float32)
-        self.foreign = _smooth(self._beside) + _ANYTHING * total.sum() / COLOR_BINS > rows.sum(axis=0)
-
-    def mismatch(self) -> NDArray[np.float32]:
-        """(COLOR_BINS, G) in [0, 1]: how much less likely a colour is on a part than on the part that it suits best."""
-        if self.log_likelihood is None:
-            return np.zeros((COLOR_BINS, len(GROUPS)), np.float32)
-        worse = (self.log_likelihood.max(axis=0) - self.log_likelihood) / _MOST_LOG_RATIO
-        return np.ascontiguousarray(np.clip(worse, 0.0, 1.0).T)
+        told = np.log(((1 - _ANYTHING) * share + _ANYTHING / COLOR_BINS).astype(np.float32))
+        self.log_likelihood = told
+        self.mismatch = np.ascontiguousarray(np.minimum((told.max(axis=0) - told) / _MOST_LOG_RATIO, 1.0).T)
+        self.foreign = beside + _ANYTHING * total.sum() / COLOR_BINS > np.sum(rows, axis=0)
 
     def regions(self, images: NDArray[np.uint8]) -> Regions | None:
         """What the contours' search needs to use the colours of images (V, H, W, 3); None before any are known."""
@@ -97,13 +100,14 @@ class PartColors:
 
 def color_bins(images: NDArray[np.uint8]) -> NDArray[np.int32]:
     """(...) the bin of each pixel (..., 3) BGR, as the kernels number them."""
-    levels = images.astype(np.int32) >> 4
-    return np.asarray((levels[..., 0] << 8) | (levels[..., 1] << 4) | levels[..., 2])
+    blue, green, red = (images[..., i] >> 4 for i in range(3))
+    return np.asarray((blue.astype(np.int32) << 8) | (green << 4 | red))
 
 
-def _smooth(counts: Float) -> Float:
-    cube: Float = gaussian_filter(counts.reshape(16, 16, 16), _SMOOTHING, mode="nearest")
-    return np.asarray(cube.ravel(), np.float64)
+def _smooth(counts: Float) -> NDArray[np.float32]:
+    """Histograms (N, COLOR_BINS), each smoothed over its neighbouring bins."""
+    cubes = counts.reshape(-1, 16, 16, 16).astype(np.float32)
+    return np.asarray(gaussian_filter(cubes, (0, *[_SMOOTHING] * 3), mode="nearest").reshape(counts.shape))
 
 
 def _group(component: str) -> str:

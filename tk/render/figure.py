@@ -15,7 +15,6 @@ from tk.kernels.cones import ELLIPSOID
 from tk.model.body import Body
 from tk.model.camera import Camera
 from tk.model.cone_body import ConeBody, ConePart
-from tk.model.motion import segment_transforms
 from tk.model.skeleton import JOINTS, SEGMENTS
 from tk.model.superellipsoid import Superellipsoid
 from tk.trackers.bodies import body_and_poses
@@ -174,7 +173,7 @@ def figure_of(result: Result) -> Figure:
     transforms = np.zeros((len(result), 0, 4, 4))
     if restored is not None:
         body, poses = restored
-        solids, transforms = solids_of(body), segment_transforms(body.skeleton, poses)
+        solids, transforms = solids_of(body), body.skeleton.segment_transforms(poses)
     return Figure(result.frames, result.joints[:, order], sigma, result.status, solids, transforms)
 
 

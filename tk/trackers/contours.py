@@ -145,6 +145,14 @@ class ContourTracker:
         self.colors.restore(known)
         self.limbs = limbs_of(body)
 
+    def prepare(self) -> None:
+        """Have the kernels compiled while there is nothing else to do. Without it that is done where one is needed."""
+        body = build_cone_body(BodyDimensions.from_stature(1.7), self.up, self.contours.body)
+        empty = np.zeros((len(self.views.rig), *self.views.rig.frame_shape), np.uint8)
+        pose = np.zeros((1, len(body.skeleton.names)))
+        self.views.equations(body.arrays, self.views.pyramid(empty, 1, None), pose, 0, self.contours.search)
+        Evidence.of(self.screen, empty).cast(body, np.zeros(len(body.parts), np.int32), pose)
+
     # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
 
     def find(

@@ -199,8 +199,9 @@ class RegionTracker(ContourTracker):
         foreign, grid = self.colors.foreign, self.screen
         if not (self.config.colors and self.colors.known and frame.images.size):
             return frame
-        person = grid.sample(frame.masks) >= 128
-        if np.count_nonzero(foreign[color_bins(grid.sample(frame.images)[person])]) < FOREIGN_SHARE * person.sum():
+        person = np.flatnonzero(grid.sample(frame.masks) >= 128)
+        colors = grid.sample(frame.images).reshape(-1, 3).take(person, axis=0)
+        if np.count_nonzero(foreign[color_bins(colors)]) < FOREIGN_SHARE * len(person):
             return frame
         masks = frame.masks.copy()
         doubtful = np.zeros(masks.shape, np.bool_) if frame.doubtful is None else frame.doubtful.copy()
@@ -209,7 +210,9 @@ class RegionTracker(ContourTracker):
             if w == 0:
                 continue
             box = slice(y, y + h), slice(x, x + w)
-            strange = (foreign[color_bins(image[box])] & (mask[box] >= 128)).view(np.uint8)
+            shown = np.flatnonzero(mask[box] >= 128)
+            strange = np.zeros((h, w), np.uint8)
+            strange.ravel()[shown] = foreign[color_bins(image[box].reshape(-1, 3).take(shown, axis=0))]
             thing = cv2.morphologyEx(strange, cv2.MORPH_OPEN, _THING).view(np.bool_)
             mask[box][thing] = 0
             doubt[box][thing] = True
@@ -230,6 +233,9 @@ class RegionTracker(ContourTracker):
 
     def _rank(self) -> None:
         """The hypothesis that explains the last frames best comes first; those far behind, or equal, are dropped."""
+        if len(self._alive) == 1:
+            self._alive = [replace(self._alive[0], age=1)]
+            return
         skeleton = self.body.skeleton
         kept: list[Hypothesis] = []
         places: list[Float] = []
@@ -305,13 +311,13 @@ class RegionTracker(ContourTracker):
         skeleton = self.body.skeleton
         precision = INFORMATION * (curvature + np.diag(self._prior(pose).precision))
         free = np.flatnonzero(self.body.free)
-        covariance = np.zeros_like(precision)
-        covariance[np.ix_(free, free)] = np.linalg.inv(precision[np.ix_(free, free)])
+        covariance = np.linalg.inv(precision[np.ix_(free, free)])
         w, v = skeleton.twists(pose)
         x = skeleton.joints(pose)
-        moves = skeleton.ancestors()[skeleton.joint_segment]
-        J = np.where(moves[:, :, None], np.cross(w[None], x[:, None]) + v[None], 0.0)  # (15, D, 3)
-        variance = np.einsum("jka,kl,jla->j", J, covariance, J) / 3
+        moves = skeleton.ancestors()[skeleton.joint_segment][:, free]
+        J = np.where(moves[:, :, None], np.cross(w[free][None], x[:, None]) + v[free][None], 0.0)
+        rows = J.transpose(0, 2, 1)  # (15, 3, D)
+        variance = (rows * (rows @ covariance)).sum(axis=(1, 2)) / 3
         # hypotheses that live say where else the joint may be
         if len(self._alive) > 1:
             weight = np.exp(-(np.array([h.cost for h in self._alive]) - self._best.cost) / GAIN)
