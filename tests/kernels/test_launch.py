@@ -1,5 +1,7 @@
 """Launches from remembered kernels: the same as Taichi's own, and as careful about what they are handed."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -103,3 +105,25 @@ def test_positions_are_drawn_again_behind_it(monkeypatch):
     monkeypatch.delattr(ASTTransformerContext, "get_pos_info")  # another Taichi
     with short_positions():
         assert not hasattr(ASTTransformerContext, "get_pos_info")
+
+
+def test_threads_do_not_mix_their_arrays():
+    launch = launcher()
+
+    def work(value):
+        for _ in range(200):
+            x, y = np.full((2, 3), value, np.float32), np.zeros((2, 3), np.float32)
+            launch(0.0, 1, x, y)
+            assert (y == 2 * value).all()
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(work, range(1, 5)))
+
+
+def test_arrays_that_come_again_are_read_again():
+    launch = launcher()
+    x, y = np.zeros((1, 2), np.float32), np.zeros((1, 2), np.float32)
+    for value in range(5):
+        x[:] = value
+        launch(0.0, 1, x, y)
+        assert (y == 2 * value).all()

@@ -1,14 +1,15 @@
 """Launches that cost a third: for kernels that run dozens of times a frame on small arrays.
 
 Taichi spends 6 µs on each array of a launch, most of it to find out again what it is: type, place in the compiled
-kernel, context. A :class:`Launcher` lets Taichi do so at the first call, remembers the compiled kernel, and hands over
-pointers from then on, which is 2 µs an array and 1 µs for one that never changes. That reaches below Taichi's public
-interface; where a Taichi has no such thing, and in debug mode, every call is an ordinary one.
+kernel, context. A :class:`Launcher` lets Taichi do so at the first call, remembers the compiled kernel and its context,
+and from then on hands over pointers to those arrays that are not the ones of the call before: 2 µs each. That reaches
+below Taichi's public interface; where a Taichi has no such thing, and in debug mode, every call is an ordinary one.
 """
 
 from __future__ import annotations
 
 import contextlib
+import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -62,10 +63,11 @@ class Launcher:
         self._kernel = kernel
         self._constants = constants
         self._program: Any = None
-        self._source: Any = None
         self._compiled: Any = None
-        self._fixed: list[tuple[tuple[int], int, int, tuple[int, ...]]] = []
+        self._context: Any = None
         self._expected: list[tuple[tuple[int], Any, int]] = []
+        self._lock = threading.Lock()
+        self._last: list[Any] = []  # held, so that no other array comes to lie where one was
 
     def __call__(self, *arguments: Any) -> None:
         program = ti.lang.impl.get_runtime().prog
@@ -74,10 +76,15 @@ class Launcher:
                 self._kernel(*self._constants, *arguments)
             self._remember(arguments)
             return
-        context = self._source.make_launch_context()
-        for slot, address, size, shape in self._fixed:
-            context.set_arg_external_array_with_shape(slot, address, size, shape, 0)
-        for (slot, kind, ndim), value in zip(self._expected, arguments, strict=True):
+        with self._lock:
+            self._update(arguments)
+            self._launch(program, self._context)
+
+    def _update(self, arguments: tuple[Any, ...]) -> None:
+        context, last = self._context, self._last
+        for i, ((slot, kind, ndim), value) in enumerate(zip(self._expected, arguments, strict=True)):
+            if value is last[i]:
+                continue
             if kind is float:
                 context.set_arg_float(slot, float(value))
             elif kind is int:
@@ -89,7 +96,7 @@ class Launcher:
                     f"argument {slot[0]} is {value.dtype} of {value.ndim} dimensions, "
                     f"contiguous: {value.flags.c_contiguous}; the first call had {kind} of {ndim}"
                 )
-        self._launch(program, context)
+            last[i] = value
 
     def _launch(self, program: Any, context: Any) -> None:
         program.launch_kernel(self._compiled, context)
@@ -108,14 +115,16 @@ class Launcher:
         except (AttributeError, KeyError, TypeError):
             return
         first = len(self._constants)
-        self._fixed = [
-            ((i,), a.ctypes.data, a.nbytes, a.shape) for i, a in enumerate(self._constants) if a.flags.c_contiguous
-        ]
+        if not all(a.flags.c_contiguous for a in self._constants):
+            return
+        context = source.make_launch_context()
+        for i, a in enumerate(self._constants):
+            context.set_arg_external_array_with_shape((i,), a.ctypes.data, a.nbytes, a.shape, 0)
         self._expected = [
             ((i,), value.dtype, value.ndim)
             if isinstance(value, np.ndarray)
             else ((i,), int if annotations[i] in _WHOLE else float, 0)
             for i, value in enumerate(arguments, first)
         ]
-        if len(self._fixed) == first:
-            self._program, self._source, self._compiled = program, source, compiled
+        self._last = [None] * len(arguments)
+        self._program, self._context, self._compiled = program, context, compiled

@@ -535,11 +535,7 @@ def _launch(
     B, D = poses.shape
     V, Q, P = len(cameras), len(body.curve_part), len(body.part_kind)
     tasks = B * V * Q
-    s = settings
     regions = regions or _no_regions(len(body.part_kind))
-    numbers = (
-        scale, s.window_px, s.spacing_px, s.ambiguous_px, s.tangential, s.robust_px, s.lost_px, regions.weight
-    )  # fmt: skip
     total = np.empty((B, 3 + D + D * D))
     samples = np.zeros((tasks, settings.most_samples, _EXPORT) if export else (1, 1, _EXPORT), dtype)
     _equations_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
@@ -550,25 +546,35 @@ def _launch(
         regions.image,
         regions.log_likelihood,
         regions.group,
-        np.array(numbers, dtype),
+        _numbers(settings, scale, regions.weight, dtype),
         spread_of(tasks),
         spread_of(B),
         settings.most_samples,
         int(settings.interior),
         int(export),
         poses,
-        np.empty((B, D, 12), dtype),
-        np.empty((B, D, 6), dtype),
-        np.empty((B, P, 12), dtype),
-        np.empty((B, P, 4), dtype),
-        np.empty((tasks, CHORDS + 1, 2), dtype),
-        np.empty((tasks, 5), dtype),
-        np.empty((B, D, 6 + INERTIA_NUMBERS), dtype),
-        np.empty((tasks, _SUMS), dtype),
+        *_scratch(B, V, Q, D, P, dtype),
         samples,
         total,
     )
     return total, samples
+
+
+@functools.lru_cache(64)
+def _numbers(s: SearchSettings, scale: float, weight: float, dtype: np.dtype) -> NDArray[np.floating]:
+    return np.array(
+        (scale, s.window_px, s.spacing_px, s.ambiguous_px, s.tangential, s.robust_px, s.lost_px, weight), dtype
+    )
+
+
+@functools.lru_cache(8)
+def _scratch(B: int, V: int, Q: int, D: int, P: int, dtype: np.dtype) -> tuple[NDArray[np.floating], ...]:
+    tasks = B * V * Q
+    shapes: tuple[tuple[int, ...], ...] = (
+        (B, D, 12), (B, D, 6), (B, P, 12), (B, P, 4), (tasks, CHORDS + 1, 2), (tasks, 5), (B, D, 6 + INERTIA_NUMBERS),
+        (tasks, _SUMS),
+    )  # fmt: skip
+    return tuple(np.empty(shape, dtype) for shape in shapes)
 
 
 @functools.cache

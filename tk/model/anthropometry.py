@@ -38,9 +38,11 @@ CROTCH_DROP = 0.070  # lowest point of the trunk below the hip centres, in trous
 CHEST_FORWARD = 0.014
 PELVIS_FORWARD = 0.016
 # The same for other parts, and with the same reservation: the spine meets the skull behind its middle; the knee's
-# hollow, the calf's muscle and the heel's tendon lie behind the line from knee to ankle; hair stands on the crown.
+# hollow, the calf's muscle and the heel's tendon lie behind the line from knee to ankle; the arm's flexors lie before
+# the elbow's axis; hair stands on the crown.
 SKULL_FORWARD = 0.007
 KNEE_BACK = 0.007
+ELBOW_FRONT = 0.003
 ANKLE_BACK = 0.013
 ANKLE_OUTWARD = 0.006
 HAIR = 0.008

@@ -19,6 +19,7 @@ from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A
 from tk.model.anthropometry import (
     ANKLE_OUTWARD,
     CROTCH_DROP,
+    ELBOW_FRONT,
     HAIR,
     HEAD_LENGTH,
     HIP_HALF_WIDTH,
@@ -40,7 +41,10 @@ CALF_BELLY = 1.1
 SKULL_TILT_DEG = 15.0
 
 # Of the left arm in the zero configuration.
-ELBOW_AXIS = np.cross(np.array([1.0, 1.0, 0.0]) / np.sqrt(2), [0.5, -0.5, np.sqrt(0.5)])
+_BENT = np.array([0.5, -0.5, np.sqrt(0.5)])  # where the elbow's crook faces
+ELBOW_AXIS = np.cross(np.array([1.0, 1.0, 0.0]) / np.sqrt(2), _BENT)
+
+_FORWARD = np.array([1.0, 0.0, 0.0])
 
 # What :meth:`ConeBody.reshaped` changes of a part: logarithms of a, b, m and h; offsets of either end along x and y.
 SHAPE_NUMBERS = 8
@@ -255,8 +259,13 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
             shoulder = M @ np.array([0.0, d.shoulder_half_width, d.trunk - d.shoulder_drop])
             elbow = shoulder + d.upper_arm * u
             wrist = elbow + d.forearm * u
-            parts.append(_limb(f"upper_arm_{side}", shoulder, u, d.upper_arm, d.upper_arm_radius, d.elbow_radius, z))
-            parts.append(_limb(f"forearm_{side}", elbow, u, d.forearm, d.elbow_radius, d.wrist_radius, z))
+            # the flesh lies on the side that the elbow bends to
+            crook = elbow + ELBOW_FRONT * d.stature * (M @ _BENT) if preset == "full" else elbow
+            for segment, begin, end, r0, r1 in (
+                ("upper_arm", shoulder, crook, d.upper_arm_radius, d.elbow_radius),
+                ("forearm", crook, wrist, d.elbow_radius, d.wrist_radius),
+            ):
+                parts.append(_between(f"{segment}_{side}", f"{segment}_{side}", begin, end, r0, r1, z))
         if preset == "full":
             # half open: a little shorter than the stretched hand, wider than the wrist across the palm; the thumb's
             # side is that to which the elbow bends
@@ -295,12 +304,13 @@ def _calf(side: str, knee: Float, ankle: Float, d: BodyDimensions) -> list[ConeP
     ]
 
 
-def _between(name: str, segment: str, begin: Float, end: Float, r0: float, r1: float) -> ConePart:
-    """A frustum of a leg."""
+def _between(
+    name: str, segment: str, begin: Float, end: Float, r0: float, r1: float, toward: Float = _FORWARD
+) -> ConePart:
+    """A frustum whose x axis faces ``toward`` a direction, as near as may be."""
     length = float(np.linalg.norm(end - begin))
     axis = (end - begin) / length
-    front = np.array([1.0, 0.0, 0.0])
-    front -= (front @ axis) * axis
+    front = toward - (toward @ axis) * axis
     return ConePart(name, segment, CONE, (r0, r0, length, r1 / r0), _frame(begin, axis, front / np.linalg.norm(front)))
 
 

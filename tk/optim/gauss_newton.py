@@ -153,7 +153,7 @@ def step(
         precision = prior.precision[index]
         added = added + precision
         g += precision * (np.broadcast_to(prior.mean, state.shape)[:, index] - p)
-    H = H + added[:, :, None] * np.eye(n)
+    H[:, range(n), range(n)] += added
     delta = np.linalg.solve(H, g[:, :, None])[:, :, 0]
     longest = np.abs(delta).max(axis=1, initial=0.0)
     delta *= np.minimum(1.0, config.longest_step / np.maximum(longest, 1e-12))[:, None]
