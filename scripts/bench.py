@@ -60,6 +60,7 @@ from tk.model.hull import VisualHull
 from tk.model.objective import BodyObjective
 from tk.model.skeleton import CHAINS
 from tk.model.volume import VoxelGrid
+from tk.segmentation import make_segmenter
 from tk.trackers.base import Estimate
 from tk.trackers.silhouette import SilhouetteTracker
 from tk.trackers.volumetric import CELL_VOXELS, SAMPLING, restore_body
@@ -244,7 +245,7 @@ def stages_alone(options: Options, result: Result) -> tuple[list[Stage], bench_h
     first = max(stop - WINDOW, int(result.frames[0]))
     with capture.frames(first, stop) as reader:
         frames = list(reader)
-    segment = session.make_segmenter(capture, config, lambda _: None)
+    segment = make_segmenter(capture, config, lambda _: None)
     masks = [segment(frame) for frame in frames]
     decoding = Stage("decode", _decode_ms(capture, first, stop, options.repeat), {})
     masking = Stage("masks", statistics.median(median_ms(partial(segment, frame), 1) for frame in frames), {})

@@ -11,7 +11,7 @@ import pytest
 import tomli_w
 
 from tests.conftest import FRAMES, QUICK, Silent, Tk
-from tk import session
+from tk import finish, plan
 from tk.ahead import open_source
 from tk.config import Config
 from tk.io.calibration import read_calibration
@@ -90,8 +90,9 @@ def test_pictures_out_of_step_are_tracked_again(tiny: Path, tmp_path: Path, monk
         asked.append(np.array(capture.late_frames))
         return open_source(capture, config, note, keep_images)
 
-    monkeypatch.setattr(session, "refine_if_astray", made_up)
-    monkeypatch.setattr(session, "open_source", remember)
+    monkeypatch.setattr(finish, "refine_if_astray", made_up)
+    for module in (plan, finish):
+        monkeypatch.setattr(module, "open_source", remember)
     path, reporter = tmp_path / "again.h5", Silent()
     assert track(open_capture(tiny), path, Config.from_toml(QUICK), reporter, frames=(2, None)).lost == 0
     assert [late.tolist() for late in asked] == [[0, 0, 0, 0], [0, 0, 1, -1]]

@@ -20,10 +20,11 @@ from tests.io.conftest import write_picture
 from tests.test_session import send
 from tk.config import Config
 from tk.errors import ConfigError, ResultError
+from tk.finish import REFINED
 from tk.io.capture import open_capture
 from tk.io.result import Result, Status, read_joints, read_result
 from tk.model.anthropometry import BodyDimensions
-from tk.session import REFINED, Summary, estimates, track
+from tk.session import Summary, estimates, track
 from tk.trackers.bodies import body_and_poses, read_body
 
 CONFIG = Config.from_toml(QUICK)

@@ -26,7 +26,8 @@ from tk.errors import ConfigError
 from tk.io.capture import open_capture
 from tk.io.result import Status, read_joints, read_result
 from tk.model.skeleton import JOINTS
-from tk.session import Summary, choose_frames, make_tracker
+from tk.plan import choose_frames, make_tracker
+from tk.session import Summary
 
 ROOT = Path(__file__).parents[1]
 CONFIG = Config.from_toml(QUICK)

@@ -15,7 +15,8 @@ from tk.errors import ConfigError
 from tk.io.capture import open_capture
 from tk.io.result import Status, read_joints, read_result
 from tk.model.skeleton import JOINTS
-from tk.session import METHODS, Summary, track
+from tk.plan import METHODS
+from tk.session import Summary, track
 
 # few frames to fit the body to
 QUICK = """

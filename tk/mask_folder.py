@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError, ConfigError
 from tk.io.capture import Capture
 from tk.io.toml import load_toml
+from tk.plan import choose_frames
 from tk.segmentation import NO_SEGMENTER
 from tk.segmenters import load, names
-from tk.session import Reporter, choose_frames
+from tk.session import Reporter
 from tk.subject_masks import SubjectMasks
 
 _RECORD = "masks.toml"

@@ -15,8 +15,9 @@ from tk.io.point_cloud import check_hull_path, ply_path, write_hulls, write_ply
 from tk.io.result import HullPoints
 from tk.model.hull import VisualHull
 from tk.model.volume import VoxelGrid
+from tk.plan import choose_frames
 from tk.segmentation import make_segmenter
-from tk.session import Reporter, choose_frames, points_of
+from tk.session import Reporter, points_of
 
 
 def reconstruct(

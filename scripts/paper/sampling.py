@@ -22,7 +22,7 @@ from tk.model.objective import CHAIN_NAMES, BodyObjective, FrameObjective
 from tk.model.skeleton import with_waist
 from tk.optim import smd
 from tk.optim.schedule import CHAIN_LEVER_M, descent_basis, max_step
-from tk.session import make_segmenter
+from tk.segmentation import make_segmenter
 from tk.trackers.base import Observation
 from tk.trackers.volumetric import CELL_VOXELS, SAMPLING, SCHEDULE, SMD, VolumetricTracker
 

@@ -1,0 +1,143 @@
+"""What needs all frames of a result: the second pass, cameras that disagree refined for it; angles; a smoothed copy."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.ahead import open_source
+from tk.io.mask_store import MaskStore
+from tk.io.result import Result, Status, UsedCameras, Value, read_result, revise_result
+from tk.model.derived import derive
+from tk.model.skeleton import join_pose, split_pose
+from tk.model.smoothing import smooth
+from tk.plan import Plan
+from tk.refinement import refine_if_astray
+from tk.trackers.base import Estimate
+from tk.trackers.contours import ContourTracker
+from tk.trackers.region import RegionTracker
+
+_LOG = logging.getLogger(__name__)
+Float = NDArray[np.float64]
+
+#: in `/model` of a result that a second pass has gone over
+REFINED = "refined"
+
+
+def finish(output: Path, plan: Plan, masks: MaskStore, note: Callable[[str], None], causal: bool) -> None:
+    """What needs all frames: the second pass unless ``causal``; segments, feet and angles; the smoothed copy; cameras.
+
+    The second pass settles every frame anew, with the body fitted to frames of the whole recording where that did not
+    begin with the initialisation pose; by refined cameras where they disagree, unless ``config.refine`` is False. The
+    result is replaced in one step; if this does not end, the first pass's stays.
+    """
+    tracker = plan.tracker
+    if not isinstance(tracker, ContourTracker):
+        return
+    result = read_result(output)
+    none = np.zeros((len(result.frames), 0))
+    waist = none if result.waist is None else result.waist
+    ankles = none if result.ankles is None else result.ankles
+    skeleton = tracker.body.skeleton
+    poses = np.array([join_pose(skeleton, *row) for row in zip(result.pose, waist, ankles, strict=True)])
+    lost = result.status == Status.LOST
+    columns: dict[str, NDArray[Any]] = {}
+    model: Mapping[str, Value] | None = None
+    cameras = UsedCameras(plan.capture.rig, np.array(plan.capture.time_offset_s))
+    if isinstance(tracker, RegionTracker) and not causal:
+        _LOG.info("second pass")
+        # the initialisation pose shows all of the body; what else a recording may begin with does not
+        shown = plan.init is None and plan.capture.init_pose != "any"
+        assert result.fit_error is not None
+        missing = [int(f) for f in result.frames if int(f) not in masks]
+        if missing:  # what an earlier run has tracked
+            with open_source(plan.capture, plan.config, lambda _: None) as source:
+                for observation, _ in source.frames(min(missing), max(missing) + 1):
+                    masks.put(observation.index, tracker.without_foreign(observation).masks)
+        if plan.config.refine:
+            refined = refine_if_astray(tracker, masks, result.frames, poses, ~lost, note)
+            if refined is not None:
+                tracker, masks, offsets = refined
+                cameras = UsedCameras(tracker.views.rig, cameras.time_offset_s + offsets / plan.capture.fps)
+                if np.round(offsets).any():
+                    note("tracking again: the first pass had the pictures out of step")
+                    again = _track_again(plan, tracker, cameras, result.frames, poses)
+                    rows = np.flatnonzero(np.isin(result.frames, list(again)))
+                    told_again = [again[int(frame)] for frame in result.frames[rows]]
+                    poses[rows] = [join_pose(skeleton, e.pose, e.waist, e.ankles) for e in told_again]
+                    lost[rows] = [e.status == "lost" for e in told_again]
+                    columns |= _replaced(result, rows, told_again)
+        poses, columns["fit_error"] = tracker.second_pass(
+            masks.sequence(result.frames),
+            poses,
+            lost,
+            columns.get("fit_error", result.fit_error),
+            plan.capture.subject_height_m,
+            keep_body=plan.body is not None or shown,
+        )
+        model = {**tracker.model(), REFINED: 1}
+    _LOG.info("angles, feet, and the smoothed copy")
+    # the first pass's poses stand as they are
+    told = ("pose", "waist", "ankles", "joints/position") if model is None else ()
+    columns |= {name: values for name, values in _columns(tracker, poses).items() if name not in told}
+    filtered = smooth(tracker.body.skeleton, poses, ~lost, plan.capture.fps)
+    smoothed = {**_columns(tracker, filtered.poses), "bridged": filtered.bridged}
+    revise_result(output, columns, smoothed=smoothed, model=model, cameras=cameras)
+
+
+def _track_again(
+    plan: Plan, tracker: RegionTracker, cameras: UsedCameras, frames: NDArray[np.int64], poses: Float
+) -> dict[int, Estimate]:
+    """The estimates of those of the frames (F,) of which all cameras have a picture once they are in step, by frame.
+
+    It begins at the pose that the first pass found there.
+    """
+    capture = replace(plan.capture, rig=cameras.rig, time_offset_s=tuple(cameras.time_offset_s.tolist()))
+    begin = max(capture.first_frame, int(frames[0]))
+    ends = [clip.frame_count + late for clip, late in zip(capture.clips, capture.late_frames, strict=True)]
+    stop = min(*ends, int(frames[-1]) + 1)
+    if begin >= stop:
+        return {}
+    start = poses[np.searchsorted(frames, begin)][None]
+    once = {"poses": start, "previous": start, "costs": np.zeros(1), "ages": np.ones(1, int)}
+    tracker.restore(tracker.model(), {**tracker.state(), **once, "usual": np.inf, "lost_for": 0})
+    with open_source(capture, plan.config, lambda _: None) as source:
+        return {observation.index: tracker.step(observation) for observation, _ in source.frames(begin, stop)}
+
+
+def _replaced(result: Result, rows: NDArray[np.int64], estimates: Sequence[Estimate]) -> dict[str, NDArray[Any]]:
+    """What a result's first pass told of these rows, told by other estimates."""
+    assert result.sigma is not None and result.fit_error is not None
+    columns = {
+        "joints/sigma": result.sigma.copy(),
+        "fit_error": result.fit_error.copy(),
+        "objective": result.objective.copy(),
+        "status": result.status.copy(),
+    }
+    for row, e in zip(rows, estimates, strict=True):
+        columns["joints/sigma"][row], columns["fit_error"][row] = e.sigma, e.fit_error
+        columns["objective"][row] = e.objective
+        if result.status[row] != Status.INITIALISED:
+            columns["status"][row] = Status[e.status.upper()]
+    return columns
+
+
+def _columns(tracker: ContourTracker, poses: NDArray[np.float64]) -> dict[str, NDArray[np.floating]]:
+    """The datasets that tell poses (F, D) and what follows from them."""
+    skeleton = tracker.body.skeleton
+    paper, waist, ankles = (np.array(part) for part in zip(*(split_pose(skeleton, p) for p in poses), strict=True))
+    derived = derive(skeleton, tracker.body.dimensions, poses)
+    columns = {"pose": paper, "joints/position": derived.joints, "segments/rotation": derived.rotations}
+    columns["feet/position"] = derived.feet
+    columns |= {f"angles/{joint}": values for joint, values in derived.angles.items()}
+    if tracker.waist_names:
+        columns["waist"] = waist
+    if tracker.ankle_names:
+        columns["ankles"] = ankles
+    return columns
