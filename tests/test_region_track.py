@@ -115,6 +115,23 @@ def test_estimates_are_those_of_the_first_pass(tiny: Path, causal: Path) -> None
     np.testing.assert_array_equal([e.sigma for e in found], np.asarray(expected.sigma)[:4])
 
 
+@pytest.mark.parametrize("ahead", [0, 2])
+def test_estimates_keep_no_pictures_alive(tiny: Path, ahead: int) -> None:
+    """Whoever collects them holds some kilobytes a frame."""
+    found = list(estimates(open_capture(tiny), replace(CONFIG, ahead=ahead), frames=(0, 4)))
+    assert len(found) == 4
+    for estimate in found:
+        arrays = [value for value in vars(estimate).values() if isinstance(value, np.ndarray)]
+        assert len(arrays) > 5 and sum(map(memory_behind, arrays)) < 10_000
+
+
+def memory_behind(array: np.ndarray) -> int:
+    """Bytes of what an array is a view of, or its own."""
+    while isinstance(array.base, np.ndarray):
+        array = array.base
+    return array.nbytes if array.base is None else len(memoryview(array.base))
+
+
 # --- stopped and taken up again ---------------------------------------------------------------------------------------
 
 
@@ -205,6 +222,7 @@ def test_lost_frames_stay_as_they_are_in_the_second_pass(copy: Path, tmp_path: P
     np.testing.assert_array_equal(np.isnan(result.sigma).all(axis=1), result.status == Status.LOST)
     np.testing.assert_array_equal(np.isnan(result.fit_error).all(axis=1), result.status == Status.LOST)
     assert np.isfinite(result.joints).all()
+    assert "fewer than two cameras see anybody: lost, frames 3 to 4" in result.notes
 
 
 # --- bodies from files ------------------------------------------------------------------------------------------------

@@ -139,7 +139,7 @@ def track(
                     reporter.advance(estimate.frame, estimate)
             if run.tracked or run.restore_unfinished(output, causal):
                 for line in run.watch.report():
-                    reporter.note(line)
+                    note(line)
                 with one_blas_thread():
                     finish(output, plan, run.masks, note, causal)
                 if said:
@@ -286,7 +286,8 @@ class _Run:
             total = laps["wait"] + writing + finished - started
             timing = {**laps, **estimate.timing, "total": total}
             index = observation.index
-            estimate = replace(estimate, frame=index, time=index / plan.capture.fps, timing=timing)
+            # masks are large, and a view of the ring of frames at that: nobody who keeps the estimate keeps them
+            estimate = replace(estimate, frame=index, time=index / plan.capture.fps, timing=timing, masks=None)
             self.lost += estimate.status == "lost"
             if output:
                 output.writer.append(_row(estimate, output.store_hull), self._state(output))
