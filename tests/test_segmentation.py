@@ -197,6 +197,8 @@ def test_masks_that_another_command_has_made(
     command = ("masks", walk, "-o", tmp_path / "made", "--frames", "1:2", "--segmenter")
     ran = tk(*command, "red")
     assert ran.code == 0 and "frames before 1 are missing" in ran.err
+    with pytest.raises(CaptureError, match=r"starts with 000001.png, so frame 0 has no mask; .* tk masks"):
+        open_capture(walk, masks=str(tmp_path / "made"))
     tk(*command, "plain").complaint("masks.toml", "segmenter: red, not plain")
     tk(*command, "red", "--cameras", "c0,c1").complaint("cameras")
     tk("masks", walk, "-o", walk).complaint(str(walk), "choose another folder")

@@ -12,15 +12,13 @@ import tomli_w
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ConfigError
-from tk.io.capture import Capture
+from tk.io.capture import MASKS_RECORD, Capture
 from tk.io.toml import load_toml
 from tk.plan import choose_frames
 from tk.segmentation import NO_SEGMENTER
 from tk.segmenters import load, names
 from tk.session import Reporter
 from tk.subject_masks import SubjectMasks
-
-_RECORD = "masks.toml"
 
 
 @dataclass(frozen=True)
@@ -98,7 +96,7 @@ def _file(folder: Path, camera: str, index: int) -> Path:
 
 def _claim(folder: Path, origin: dict[str, str | list[str]]) -> None:
     """Note in the folder where its masks come from, so that another command does not go on with them."""
-    record = folder / _RECORD
+    record = folder / MASKS_RECORD
     if record.is_file():
         found = load_toml(record, ConfigError)
         for name, value in origin.items():

@@ -16,7 +16,7 @@ from tk.io.frames import FrameReader, FrameSet
 from tk.io.mobo import SETTINGS as MOBO_SETTINGS
 from tk.io.mobo import find_walk, read_cameras
 from tk.io.settings import CaptureSettings, read_settings
-from tk.io.video import Clip, Image, list_clips, probe
+from tk.io.video import Clip, Image, PictureClip, list_clips, picture_number, probe
 from tk.model.camera import Camera, Rig
 from tk.model.common_view import infer_volume, sample_box, views_of
 from tk.model.mounting import infer_up
@@ -24,6 +24,9 @@ from tk.model.up import up_vector
 from tk.model.volume import Volume
 
 __all__ = ["Capture", "FrameReader", "FrameSet", "open_capture"]
+
+#: in a folder of masks that `tk masks` has made: where they come from
+MASKS_RECORD = "masks.toml"
 
 #: frames a second when neither `capture.toml` nor the videos say
 DEFAULT_FPS = 30.0
@@ -215,7 +218,15 @@ def _open_masks(calibration: Calibration, path: Path, masks: str) -> tuple[Clip,
         if masks == "auto":
             return None
         raise CaptureError(f"--masks {masks}: is not a folder; give auto, none, median or a folder of masks")
-    return _clips_of(calibration, folder, "masks", "mp4", is_mask=True)
+    clips = _clips_of(calibration, folder, "masks", "mp4", is_mask=True)
+    if (folder / MASKS_RECORD).is_file():
+        for clip in clips:
+            if isinstance(clip, PictureClip) and picture_number(clip.files[0]) != 0:
+                raise CaptureError(
+                    f"{clip.path}: starts with {clip.files[0].name}, so frame 0 has no mask; "
+                    f"make the missing ones: tk masks {path} -o {folder}"
+                )
+    return clips
 
 
 def _clips_of(

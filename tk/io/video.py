@@ -164,6 +164,12 @@ def list_clips(folder: Path, pictures: bool = False) -> dict[str, Path]:
     return clips
 
 
+def picture_number(path: Path) -> int | None:
+    """The number that a picture's name ends with."""
+    digits = re.search(r"[0-9]+$", path.stem)
+    return int(digits.group()) if digits else None
+
+
 class _VideoReader:
     def __init__(self, clip: VideoClip) -> None:
         self._clip = clip
@@ -269,10 +275,9 @@ def _numbered_pictures(folder: Path) -> tuple[Path, ...]:
     for path in sorted(folder.iterdir()):
         if path.name.startswith(".") or path.suffix.lower() not in PICTURE_SUFFIXES:
             continue
-        digits = re.search(r"[0-9]+$", path.stem)
-        if digits is None:
+        number = picture_number(path)
+        if number is None:
             raise VideoError(f"{path}: its name has no number at the end; pictures are called 000000.png, 000001.png …")
-        number = int(digits.group())
         if number in files:
             raise VideoError(f"{folder}: both {files[number].name} and {path.name} are picture {number}; keep one")
         files[number] = path
