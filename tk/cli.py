@@ -271,14 +271,16 @@ def inspect(
     """Look at CAPTURE before tracking: masks, cameras that disagree or are late, volume, floor, up."""
     import json
 
-    from tk.inspection import inspect as look
-    from tk.inspection_sheet import write_sheet
-    from tk.io.capture import open_capture
+    with working(f"looking at {capture}"):
+        from tk.inspection import inspect as look
+        from tk.inspection_sheet import write_sheet
+        from tk.io.capture import open_capture
 
-    opened = open_capture(capture, listed(cameras), masks)
-    found, seen = look(opened, configuration(config_file))
+        opened = open_capture(capture, listed(cameras), masks)
+        found, seen = look(opened, configuration(config_file))
+        if output is not None:
+            write_sheet(output / "inspect.png", opened, found, seen)
     if output is not None:
-        write_sheet(output / "inspect.png", opened, found, seen)
         click.echo(f"pictures in {output / 'inspect.png'}", err=True)
     click.echo(json.dumps(found.to_dict(), indent=2, allow_nan=False) if as_json else found.format_table())
 
@@ -289,12 +291,13 @@ def inspect(
 @config_option
 def level(capture: Path, masks: str, config_file: Path | None) -> None:
     """Find what points up from cameras and person, and write it into CAPTURE/capture.toml."""
-    from tk.inspection import inspect as look
-    from tk.io.capture import open_capture
-    from tk.leveling import write_up
+    with working(f"looking at {capture}"):
+        from tk.inspection import inspect as look
+        from tk.io.capture import open_capture
+        from tk.leveling import write_up
 
-    found, _ = look(open_capture(capture, None, masks), configuration(config_file), pictures=0)
-    write_up(capture, found.leveling)
+        found, _ = look(open_capture(capture, None, masks), configuration(config_file), pictures=0)
+        write_up(capture, found.leveling)
     click.echo(f"up = {found.leveling.up} in {capture / 'capture.toml'}: {found.leveling.how}")
 
 

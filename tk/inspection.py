@@ -21,6 +21,7 @@ from tk.leveling import Leveling, find_up
 from tk.model.common_view import sample_box, views_of
 from tk.model.mask_agreement import DISAGREE, Agreement, MaskAgreement, Place
 from tk.model.picture_health import PictureHealth
+from tk.model.plausibility import fits_height
 from tk.model.regions import clean_by_area
 from tk.model.silhouettes import CleaningConfig
 from tk.model.up import up_vector
@@ -329,7 +330,7 @@ def _findings(found: Inspection, capture: Capture, agreement: Agreement) -> list
     if found.at_the_side > _AT_THE_SIDE:
         lines.append(f"{found.at_the_side:.0%} of the person lies at the sides of the working volume: make it larger")
     height = capture.subject_height_m
-    if height and np.isfinite(found.extent_m) and not 0.55 * height <= found.extent_m <= 1.5 * height:
+    if height and not fits_height(found.extent_m, height):
         lines.append(f"the person measures {found.extent_m:.2f} m, but [subject] height is {height:.2f} m")
     tilt = np.degrees(np.arccos(np.clip(capture.up_axis @ up_vector(found.leveling.up), -1.0, 1.0)))
     if tilt > _TILTED_DEG:

@@ -38,6 +38,11 @@ _SHOULDERS = JOINTS.index("shoulder_l"), JOINTS.index("shoulder_r")
 _ANKLES = JOINTS.index("ankle_l"), JOINTS.index("ankle_r")
 
 
+def fits_height(extent_m: float, height_m: float) -> bool:
+    """Whether a person of this height may be this long in some direction; an unknown extent, NaN, may be anything."""
+    return not (extent_m < EXTENT[0] * height_m or extent_m > EXTENT[1] * height_m)
+
+
 def check_extent(extent_m: float, height_m: float) -> None:
     """Refuse a hull in which a person of this height has no room, or far too much.
 
@@ -48,7 +53,7 @@ def check_extent(extent_m: float, height_m: float) -> None:
     Raises:
         CaptureError: with the likely causes.
     """
-    if extent_m < EXTENT[0] * height_m or extent_m > EXTENT[1] * height_m:
+    if not fits_height(extent_m, height_m):
         raise CaptureError(
             f"the person measures {extent_m:.2f} m in the pictures, but [subject] height in capture.toml says "
             f"{height_m:.2f} m: {_CAUSES}"
