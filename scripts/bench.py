@@ -123,7 +123,7 @@ def counted_launches() -> Iterator[Counter[str]]:
         Launcher._launch = remembered  # type: ignore[method-assign]
 
 
-class _Clock(session.Reporter):
+class _Clock(session.Silent):
     """Notes when frames are finished and how many launches there had been."""
 
     def __init__(self, counts: Counter[str]) -> None:
@@ -131,13 +131,7 @@ class _Clock(session.Reporter):
         self.times: list[float] = []
         self.launches: list[Counter[str]] = []
 
-    def note(self, text: str) -> None:
-        pass
-
-    def begin(self, total: int, done: int) -> None:
-        pass
-
-    def advance(self, frame: int, estimate: Estimate) -> None:
+    def advance(self, frame: int, estimate: Estimate | None) -> None:
         self.times.append(time.perf_counter())
         self.launches.append(Counter(self._counts))
 

@@ -14,20 +14,6 @@ from tk import session
 from tk.config import Config
 from tk.io.capture import open_capture
 from tk.report.after import leave_pictures
-from tk.trackers.base import Estimate
-
-
-class Silent(session.Reporter):
-    """Wants to know nothing."""
-
-    def note(self, text: str) -> None:
-        pass
-
-    def begin(self, total: int, done: int) -> None:
-        pass
-
-    def advance(self, frame: int, estimate: Estimate | None) -> None:
-        pass
 
 
 @dataclass(frozen=True)
@@ -54,7 +40,7 @@ def run_once(capture_path: Path, masks: str, frames: int | None, output: Path) -
     """A default run and its pictures; meant for a process of its own."""
     started = _clocks()
     capture = open_capture(capture_path, masks=masks)
-    summary = session.track(capture, output, Config(), Silent(), frames=(0, frames))
+    summary = session.track(capture, output, Config(), session.Silent(), frames=(0, frames))
     tracked = _clocks()
     warnings: list[str] = []
     leave_pictures(capture, output, warnings.append)

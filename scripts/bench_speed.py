@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from scripts.bench_pictures import Silent
 from tk import session
 from tk.config import Config
 from tk.io.capture import open_capture
@@ -19,7 +18,7 @@ from tk.io.result import read_result
 from tk.trackers.base import Estimate
 
 
-class _Clock(Silent):
+class _Clock(session.Silent):
     """Remembers when each frame was finished."""
 
     def __init__(self) -> None:

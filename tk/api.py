@@ -24,17 +24,11 @@ _LOG = logging.getLogger(__name__)
 PathLike = str | os.PathLike[str]
 
 
-class _Logged:
+class _Logged(session.Silent):
     """The reporter of scripts: notes are warnings of the logger "tk", progress goes nowhere."""
 
     def note(self, text: str) -> None:
         _LOG.warning("%s", text)
-
-    def begin(self, total: int, done: int) -> None:
-        pass
-
-    def advance(self, frame: int, estimate: Estimate | None) -> None:
-        pass
 
 
 def open_capture(path: PathLike, cameras: Sequence[str] | None = None, masks: str = "auto") -> Capture:

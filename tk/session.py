@@ -57,6 +57,19 @@ class Reporter(Protocol):
         ...
 
 
+class Silent:
+    """A reporter that wants to know nothing; whoever wants some of it derives from it."""
+
+    def note(self, text: str) -> None:
+        pass
+
+    def begin(self, total: int, done: int) -> None:
+        pass
+
+    def advance(self, frame: int, estimate: Estimate | None) -> None:
+        pass
+
+
 @dataclass(frozen=True)
 class Summary:
     """What a run did.

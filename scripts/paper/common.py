@@ -18,7 +18,6 @@ from tk.config import Config
 from tk.io.capture import open_capture
 from tk.io.result import read_joints
 from tk.model.skeleton import JOINTS
-from tk.trackers.base import Estimate
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -86,17 +85,6 @@ class Track:
         return int((self.frame_cm > ASTRAY_CM).sum())
 
 
-class _Silent(session.Reporter):
-    def note(self, text: str) -> None:
-        pass
-
-    def begin(self, total: int, done: int) -> None:
-        pass
-
-    def advance(self, frame: int, estimate: Estimate | None) -> None:
-        pass
-
-
 def track(
     capture: Path, config: Config, frames: int | None, method: str = "volumetric", cameras: Sequence[str] | None = None
 ) -> Track:
@@ -108,7 +96,7 @@ def track(
     truth = read_joints(capture / "truth.h5")
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "result.h5"
-        session.track(open_capture(capture, cameras), out, config, _Silent(), method, (0, frames))
+        session.track(open_capture(capture, cameras), out, config, session.Silent(), method, (0, frames))
         result = read_joints(out)
         with h5py.File(out) as file:
             pose, units = file["pose"][:], tuple(file["pose"].attrs["units"])

@@ -15,20 +15,6 @@ from tk.model.volume import VoxelGrid
 
 Float = NDArray[np.float64]
 
-_EMPTY_PLY = b"""ply
-format binary_little_endian 1.0
-element vertex 0
-property double x
-property double y
-property double z
-property uchar red
-property uchar green
-property uchar blue
-element face 0
-property list uchar uint vertex_indices
-end_header
-"""
-
 # Taubin's filter takes the voxels' steps away and keeps the volume (Taubin 1995, "A signal processing approach to fair
 # surface design"); twice as many rounds change little.
 _SMOOTHING_ROUNDS = 10
@@ -79,7 +65,7 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
         ResultError: Open3D cannot be loaded, or the file cannot be written.
     """
     open3d = load_open3d(path)
-    claim(path, _EMPTY_PLY)
+    claim(path, faces=True)
     if len(mesh.triangles) == 0:
         return
     written = open3d.geometry.TriangleMesh(

@@ -21,7 +21,7 @@ from tk.model.volume import VoxelGrid
 
 HULL_FORMAT = "tk-hull"
 
-_EMPTY_PLY = b"""ply
+_PLY_VERTICES = """ply
 format binary_little_endian 1.0
 element vertex 0
 property double x
@@ -30,7 +30,9 @@ property double z
 property uchar red
 property uchar green
 property uchar blue
-end_header
+"""
+_PLY_FACES = """element face 0
+property list uchar uint vertex_indices
 """
 
 
@@ -45,7 +47,7 @@ def write_ply(path: Path, positions: NDArray[np.floating], colors_rgb: NDArray[n
         ResultError: Open3D cannot be loaded, or the file cannot be written.
     """
     open3d = load_open3d(path)
-    claim(path, _EMPTY_PLY)
+    claim(path)
     if len(positions) == 0:
         return
     cloud = open3d.geometry.PointCloud()
@@ -70,8 +72,10 @@ def load_open3d(path: Path) -> Any:
     return open3d
 
 
-def claim(path: Path, content: bytes) -> None:
-    """Write a file without points, for Open3D does not tell why it cannot write, and writes no such file itself.
+def claim(path: Path, faces: bool = False) -> None:
+    """Write a PLY without points, and faces where there would be some.
+
+    Open3D does not tell why it cannot write, and writes no such file itself.
 
     Raises:
         ResultError: with the reason.
@@ -81,7 +85,7 @@ def claim(path: Path, content: bytes) -> None:
     except OSError as error:
         raise ResultError(f"{path.parent}: cannot be made: {error.strerror}") from None
     try:
-        path.write_bytes(content)
+        path.write_text(f"{_PLY_VERTICES}{_PLY_FACES if faces else ''}end_header\n", encoding="ascii", newline="\n")
     except OSError as error:
         raise ResultError(f"{path}: cannot be written: {error.strerror}") from None
 
