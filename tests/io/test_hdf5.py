@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.io.result_victim import META, make_frame, make_state
-from tests.io.test_result import make_cameras, make_smoothed, write_truth
+from tests.io.results import make_cameras, make_smoothed, write_truth
 from tk.errors import ResultError, TkError
 from tk.evaluation import evaluate_files
 from tk.io.hdf5 import DEEPEST, open_hdf5
