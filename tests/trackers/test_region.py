@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.model.ring import ring_of_cameras
+from tests.trackers.walker import BODY, EMPTY, NAMES, STATURE, errors, find_again_elsewhere, observe, walk
 from tk.errors import CaptureError, ConfigError
 from tk.io.init_pose import InitPose
-from tk.model.anthropometry import BodyDimensions
 from tk.model.camera import Rig
 from tk.model.cone_body import ConeBody, build_cone_body
 from tk.model.evidence import Evidence, RayGrid
@@ -19,27 +19,14 @@ from tk.model.part_colors import GROUPS, PartColors
 from tk.model.silhouettes import draw_silhouettes
 from tk.model.skeleton import JOINTS, join_pose, shoulder_angles, split_pose
 from tk.optim.gauss_newton import GaussNewtonConfig
-from tk.trackers.base import Estimate, Observation
 from tk.trackers.contours import SilhouetteConfig
 from tk.trackers.region import JOINT_FLOOR_M, RegionConfig, RegionTracker
 
-STATURE = 1.75
 RIG = ring_of_cameras(3, width=160, height=200)
-BODY = build_cone_body(BodyDimensions.from_stature(STATURE))
 SKELETON = BODY.skeleton
-NAMES = SKELETON.names
-EMPTY = np.zeros((0,), np.uint8)
 # A pixel is 1.4 cm wide at the subject; a joint rests on dozens of edgels in three views.
 CLOSE_M = 0.025
 SETTINGS = SilhouetteConfig(adapt=False, search_every=0)
-
-
-def walk(count: int, first: float = 0.0) -> np.ndarray:
-    """(count, D) a stride at 30 Hz, on the spot."""
-    poses = np.array([walking_pose(SKELETON, first + i / 34) for i in range(count)])
-    poses[:, :3] = [0.05, -0.04, 0.93]
-    poses[:, NAMES.index("torso_yaw")] = 0.7
-    return poses
 
 
 def with_arm(pose: np.ndarray, side: str, direction: tuple[float, float, float], elbow_deg: float) -> np.ndarray:
@@ -55,14 +42,6 @@ def with_arm(pose: np.ndarray, side: str, direction: tuple[float, float, float],
 
 POSES = walk(6)
 MASKS = draw_silhouettes(BODY, RIG, POSES)
-
-
-def observe(masks: np.ndarray, index: int = 0, images: np.ndarray = EMPTY) -> Observation:
-    return Observation(index, images, masks)
-
-
-def errors(estimate: Estimate, pose: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(estimate.joints - SKELETON.joints(pose), axis=1)
 
 
 def init_of(pose: np.ndarray) -> InitPose:
@@ -172,16 +151,7 @@ def test_nobody_in_sight_is_a_lost_frame_and_then_the_person_is_recovered() -> N
 
 
 def test_somebody_who_comes_back_elsewhere_is_found() -> None:
-    tracker = tracker_at(POSES[0])
-    tracker.step(observe(MASKS[0]))
-    tracker.step(observe(np.zeros_like(MASKS[0]), 1))
-    away = POSES[:4].copy()
-    away[:, 0] += 0.45
-    away[:, NAMES.index("torso_yaw")] += 2.0
-    estimates = [tracker.step(observe(m, i)) for i, m in enumerate(draw_silhouettes(BODY, RIG, away), 2)]
-    assert "recovered" in [e.status for e in estimates]
-    assert estimates[-1].status in ("recovered", "tracked")
-    assert errors(estimates[-1], away[-1]).mean() < 2 * CLOSE_M
+    find_again_elsewhere(tracker_at(POSES[0]), RIG, POSES[:4], 2 * CLOSE_M)
 
 
 def test_the_person_is_found_without_any_hint() -> None:

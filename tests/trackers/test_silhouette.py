@@ -6,44 +6,22 @@ import numpy as np
 import pytest
 
 from tests.model.ring import ring_of_cameras
+from tests.trackers.walker import BODY, NAMES, STATURE, errors, find_again_elsewhere, observe, walk
 from tk.errors import CaptureError, ConfigError
 from tk.io.init_pose import InitPose
-from tk.model.anthropometry import BodyDimensions
 from tk.model.body_fit import BodyFitConfig
 from tk.model.cone_body import build_cone_body
-from tk.model.gait import walking_pose
 from tk.model.silhouettes import draw_silhouettes
 from tk.model.skeleton import JOINTS
-from tk.trackers.base import Observation
 from tk.trackers.silhouette import SilhouetteConfig, SilhouetteTracker
 
-STATURE = 1.75
 RIG = ring_of_cameras(3, width=240, height=300)
-BODY = build_cone_body(BodyDimensions.from_stature(STATURE))
-NAMES = BODY.skeleton.names
 # A pixel is 1 cm wide at the subject; a joint rests on dozens of edgels in three views.
 CLOSE_M = 0.015
 
 
-def walk(count: int, first: float = 0.0) -> np.ndarray:
-    """(count, D) a stride at 30 Hz, on the spot."""
-    poses = np.array([walking_pose(BODY.skeleton, first + i / 34) for i in range(count)])
-    poses[:, :3] = [0.05, -0.04, 0.93]
-    poses[:, NAMES.index("torso_yaw")] = 0.7
-    return poses
-
-
 POSES = walk(6)
 MASKS = draw_silhouettes(BODY, RIG, POSES)
-EMPTY = np.zeros((0,), np.uint8)
-
-
-def observe(masks, index=0):
-    return Observation(index, EMPTY, masks)
-
-
-def errors(estimate, pose):
-    return np.linalg.norm(estimate.joints - BODY.skeleton.joints(pose), axis=1)
 
 
 def init_of(pose) -> InitPose:
@@ -131,16 +109,7 @@ def test_an_empty_picture_is_a_lost_frame_and_the_next_one_is_recovered():
 
 
 def test_somebody_who_comes_back_elsewhere_is_found():
-    tracker = tracker_at(POSES[0])
-    tracker.step(observe(MASKS[0]))
-    tracker.step(observe(np.zeros_like(MASKS[0]), 1))
-    away = POSES[:3].copy()
-    away[:, 0] += 0.45
-    away[:, NAMES.index("torso_yaw")] += 2.0
-    estimates = [tracker.step(observe(m, i)) for i, m in enumerate(draw_silhouettes(BODY, RIG, away), 2)]
-    assert "recovered" in [e.status for e in estimates]
-    assert estimates[-1].status in ("recovered", "tracked")
-    assert errors(estimates[-1], away[-1]).mean() < 2 * CLOSE_M
+    find_again_elsewhere(tracker_at(POSES[0]), RIG, POSES[:3], 2 * CLOSE_M)
 
 
 def test_the_walker_moves_only_its_seven_degrees_of_freedom():
