@@ -1,7 +1,7 @@
-"""One BLAS thread while a tracker works, so that a run's bits do not hang on who started it.
+"""One BLAS thread while masks are made, poses and cameras found, so that a run's bits do not hang on who started it.
 
 A pool of threads divides a matrix product otherwise than one thread does, and the last digits differ. The matrices here
-are small: a pool costs more than it gains.
+are small, and a pool costs more than it gains: `tk refine` takes 2.3 times the processor time with one.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from threadpoolctl import ThreadpoolController
 def one_blas_thread() -> Iterator[None]:
     """Inside, NumPy's and SciPy's BLAS run on one thread, whenever they were loaded; afterwards on as many as before.
 
-    20 µs; meant for the whole process, as the pools are.
+    20 µs; a decorator, too. Meant for the whole process, as the pools are.
     """
     with _pools().limit(limits=1, user_api="blas"):
         yield

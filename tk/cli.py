@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from pathlib import Path
@@ -43,10 +42,6 @@ from tk.errors import CaptureError, ConfigError, WorkerError
 if TYPE_CHECKING:
     from tk.io.capture import Capture
     from tk.session import Summary
-
-# The matrices here are small. A pool of BLAS threads beside Taichi's costs milliseconds for what takes microseconds; it
-# has an effect only before NumPy is loaded, and the caller's own setting stands.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 #: more than half of the frames are lost
 EXIT_LOST = 3

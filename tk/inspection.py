@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.blas import one_blas_thread
 from tk.config import Config
 from tk.io.capture import Capture
 from tk.leveling import Leveling, find_up
@@ -146,6 +147,7 @@ class Seen:
     step: int
 
 
+@one_blas_thread()
 def inspect(capture: Capture, config: Config, pictures: int = 3) -> tuple[Inspection, list[Seen]]:
     """Look at a capture.
 

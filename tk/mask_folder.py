@@ -11,6 +11,7 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
+from tk.blas import one_blas_thread
 from tk.errors import CaptureError, ConfigError
 from tk.io.capture import MASKS_RECORD, Capture
 from tk.io.toml import load_toml
@@ -36,6 +37,7 @@ class Written:
     empty: dict[str, int]
 
 
+@one_blas_thread()
 def write_masks(
     capture: Capture,
     folder: Path,

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.ahead import open_source
+from tk.blas import one_blas_thread
 from tk.config import Config
 from tk.errors import CaptureError, ConfigError, ResultError
 from tk.io.calibration import write_calibration
@@ -88,6 +89,7 @@ class Refinement:
         return "\n".join(lines)
 
 
+@one_blas_thread()
 def refine_capture(
     capture: Capture,
     result: Path,

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.blas import one_blas_thread
 from tk.config import Config
 from tk.errors import CaptureError
 from tk.io.capture import Capture
@@ -73,6 +74,11 @@ def make_labeller(capture: Capture, config: Config, note: Callable[[str], None])
         CaptureError: there is nothing to make masks from, or the median is not the empty scene.
         ConfigError: the segmenter cannot be loaded.
     """
+    with one_blas_thread():
+        return one_blas_thread()(_labeller(capture, config, note))
+
+
+def _labeller(capture: Capture, config: Config, note: Callable[[str], None]) -> Labeller:
     source = mask_source(capture)
     if source == _GIVEN:
         return _given_masks
