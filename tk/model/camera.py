@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -75,38 +76,44 @@ class Camera:
         """
         p_camera = self.to_camera(p_world)
         depth = p_camera[:, 2]
-        pixels = np.full((len(p_camera), 2), np.nan)
         front = depth > 1e-6
-        if front.any():
-            points = np.ascontiguousarray(p_camera[front])
-            zero = np.zeros(3)
-            if self.fisheye:
-                projected, _ = cv2.fisheye.projectPoints(
-                    points[:, None, :], zero, zero, self.matrix, self.distortions[:4]
-                )
-            else:
-                projected, _ = cv2.projectPoints(points, zero, zero, self.matrix, self.distortions)
-            pixels[front] = np.asarray(projected).reshape(-1, 2)
-            # A distortion polynomial folds back far outside the picture: such a point is not seen at all.
-            pixels[front] = np.where(self._unfolded(points)[:, None], pixels[front], np.nan)
+        if front.all():
+            return self._pixels(p_camera), depth
+        pixels = np.full((len(p_camera), 2), np.nan)
+        pixels[front] = self._pixels(p_camera[front])
         return pixels, depth
 
-    def _unfolded(self, p_camera: Float) -> NDArray[np.bool_]:
-        """True where the radial distortion still grows with the radius (it is one-to-one there)."""
-        radius = np.linalg.norm(p_camera[:, :2] / p_camera[:, 2:], axis=1)
+    def _pixels(self, p_camera: Float) -> Float:
+        """(N, 2) pixels of points (N, 3) before the camera, NaN past the fold of the distortion."""
+        xy = p_camera[:, :2] / p_camera[:, 2:]
+        squared = np.einsum("na,na->n", xy, xy)
         if self.fisheye:
-            # theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
-            coefficients = self.distortions[:4]
-            radius = np.arctan(radius)
+            bent = np.arctan(np.sqrt(squared)) ** 2
+            if len(p_camera):  # OpenCV refuses none
+                distorted = cv2.fisheye.distortPoints(xy[:, None], np.eye(3), self.distortions[:4])
+                xy = np.asarray(distorted, np.float64)[:, 0]
         else:
-            # r (1 + k1 r^2 + k2 r^4 + k3 r^6)
-            coefficients = np.delete(self.distortions, [2, 3])
-        # the derivative must be positive from the axis to the point; test it at a few radii on the way
-        squares = np.linspace(0.1, 1.0, 8)[:, None] ** 2 * radius[None, :] ** 2
-        slope = np.ones_like(squares)
-        for order, coefficient in enumerate(coefficients, 1):
-            slope += (2 * order + 1) * coefficient * squares**order
-        return np.all(slope > 0, axis=0)
+            # written out, for OpenCV's takes several times as long
+            k1, k2, p1, p2, k3 = (*self.distortions, 0.0)[:5]
+            bent = squared
+            radial = 1 + squared * (k1 + squared * (k2 + squared * k3))
+            tangential = 2 * (xy @ np.array([p2, p1]))  # along the point's own direction, as the radial part is
+            xy = xy * (radial + tangential)[:, None] + squared[:, None] * np.array([p2, p1])
+        pixels = xy * self.matrix.diagonal()[:2] + self.matrix[:2, 2]
+        pixels[bent > self._fold] = np.nan
+        return np.asarray(pixels, np.float64)
+
+    @cached_property
+    def _fold(self) -> float:
+        """Up to which squared radius (fisheye: angle from the axis) the distortion grows with it; infinite if always.
+
+        Far outside the picture its polynomial folds back: such a point is not seen at all.
+        """
+        k = self.distortions[:4] if self.fisheye else np.delete(self.distortions, [2, 3])
+        # where 1 + 3 k1 s + 5 k2 s² + … first gets zero; solved for 1 / s, whose highest coefficient is 1
+        roots = np.roots([1.0, *(np.arange(3, 2 * len(k) + 2, 2) * k)])
+        found = roots.real[np.isreal(roots) & (roots.real > 0)]
+        return float(1 / found.max()) if len(found) else np.inf
 
     def undistort(self, pixels: ArrayLike) -> Float:
         """Pixels (N, 2) to normalised image coordinates (N, 2): x/z and y/z in the camera frame."""

@@ -17,10 +17,11 @@ from tk.render.palette import BONE, INK, LOST_BODY, SEGMENT_COLORS, TEXT, Color,
 Float = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-_FILL, _LINE = 90, 255  # opacity of 255
+_FILL = 0.35  # opacity
+_SQUARE = np.ones((3, 3), np.uint8)  # makes contours two pixels wide
 _BEYOND: Color = (24, 24, 24)  # where there is no picture
 _SUBPIXEL = 4  # bits of a fraction of a pixel that OpenCV draws with
-_BONES = [(JOINTS.index(a), JOINTS.index(b)) for a, b in BONES]
+_BONES = np.array([(JOINTS.index(a), JOINTS.index(b)) for a, b in BONES])
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
@@ -52,19 +53,18 @@ class View:
         """The whole picture at this height."""
         return View(np.zeros(2), height / camera.height, round(camera.width * height / camera.height), height)
 
-    def cut(self, picture: Image) -> Image:
-        """(height, width, 3) the tile's part of a picture."""
+    def cut(self, picture: Image, tile: Image) -> None:
+        """Fill ``tile`` (height, width, 3) with its part of a picture."""
         reach = self.origin + np.array([self.width, self.height]) / self.scale
         if self.scale <= 1 and (self.origin > -0.5).all() and (reach < np.array(picture.shape[1::-1]) + 0.5).all():
             (left, top), (right, bottom) = self.origin.round().astype(int), reach.round().astype(int)
             # down to half the size linear interpolation skips no pixel, and takes a tenth of the time
             method = cv2.INTER_LINEAR if self.scale >= 0.5 else cv2.INTER_AREA
-            part = picture[top:bottom, left:right]
-            return np.asarray(cv2.resize(part, (self.width, self.height), interpolation=method), np.uint8)
+            cv2.resize(picture[top:bottom, left:right], (self.width, self.height), tile, interpolation=method)
+            return
         shift = 0.5 * self.scale - 0.5 - self.scale * self.origin
         M = np.column_stack([self.scale * np.eye(2), shift])
-        size = (self.width, self.height)
-        return np.asarray(cv2.warpAffine(picture, M, size, flags=cv2.INTER_LINEAR, borderValue=_BEYOND), np.uint8)
+        cv2.warpAffine(picture, M, (self.width, self.height), tile, cv2.INTER_LINEAR, borderValue=_BEYOND)
 
     def place(self, xy: Float) -> Float:
         """(N, 2) pixels of the picture as pixels of the tile."""
@@ -73,25 +73,27 @@ class View:
 
 def draw_body(tile: Image, view: View, outlines: Sequence[Outline], lost: bool = False) -> None:
     """Fill the segments, translucent, and draw their contours, near ones over far ones; grey if ``lost``."""
-    counts = [len(polygon) for outline in outlines for polygon in outline.polygons]
-    if not counts:
+    solids = [points for outline in outlines for points in outline.points]
+    if not solids:
         return
-    points = fixed(view.place(np.concatenate([polygon for outline in outlines for polygon in outline.polygons])))
-    x, y, width, height = _box(points, tile)
+    placed = fixed(view.place(np.concatenate(solids)))
+    x, y, width, height = _box(placed, tile)
     if width <= 0 or height <= 0:
         return
-    layer = np.zeros((height, width, 4), np.uint8)  # the last is the opacity
-    placed = iter(np.split(points - (np.array([x, y], np.int32) << _SUBPIXEL), np.cumsum(counts)[:-1]))
-    for outline in outlines:
-        color = LOST_BODY if lost else SEGMENT_COLORS[outline.segment]
-        moved = [next(placed) for _ in outline.polygons]
-        # lines first: what of them is inside another solid of the segment is filled again
-        cv2.polylines(layer, moved, True, (*color, _LINE), 2, cv2.LINE_8, _SUBPIXEL)
-        for polygon in moved:
-            cv2.fillConvexPoly(layer, polygon, (*color, _FILL), cv2.LINE_8, _SUBPIXEL)
-    under = tile[y : y + height, x : x + width]
-    share = layer[..., 3] * np.float32(1 / 255)
-    under[...] = cv2.blendLinear(cv2.cvtColor(layer, cv2.COLOR_BGRA2BGR), under, share, 1 - share)
+    placed -= np.array([x, y], np.int32) << _SUBPIXEL
+    # which segment is seen: its rank, near ones higher
+    layer, end = np.zeros((height, width), np.uint8), 0
+    colors = np.zeros((256, 1, 3), np.uint8)
+    for rank, outline in enumerate(outlines, 1):
+        colors[rank] = LOST_BODY if lost else SEGMENT_COLORS[outline.segment]
+        for points in outline.points:
+            begin, end = end, end + len(points)
+            cv2.fillConvexPoly(layer, cv2.convexHull(placed[begin:end]), (rank,), cv2.LINE_8, _SUBPIXEL)
+    near = cv2.dilate(layer, _SQUARE)
+    contour = near != cv2.erode(layer, _SQUARE)
+    over, under = cv2.applyColorMap(near, colors), tile[y : y + height, x : x + width]
+    cv2.copyTo(cv2.addWeighted(over, _FILL, under, 1 - _FILL, 0), near, under)
+    cv2.copyTo(over, contour.view(np.uint8), under)
 
 
 def draw_joints(tile: Image, xy: Float, sigma_m: Float | None = None, lost: bool = False) -> None:
@@ -104,10 +106,9 @@ def draw_joints(tile: Image, xy: Float, sigma_m: Float | None = None, lost: bool
     known = seen if sigma_m is None else seen & np.isfinite(sigma_m)
     plain = LOST_BODY if lost else BONE
     colors = [plain] * len(points) if lost or sigma_m is None else sigma_colors(np.nan_to_num(sigma_m)).tolist()
-    for a, b in _BONES:
-        if seen[a] and seen[b]:
-            cv2.line(tile, points[a], points[b], INK, 3, cv2.LINE_AA, _SUBPIXEL)
-            cv2.line(tile, points[a], points[b], plain, 1, cv2.LINE_AA, _SUBPIXEL)
+    bones = list(points[_BONES[seen[_BONES].all(axis=1)]])
+    for color, width in ((INK, 3), (plain, 1)):
+        cv2.polylines(tile, bones, False, color, width, cv2.LINE_AA, _SUBPIXEL)
     for k in np.flatnonzero(seen):
         cv2.circle(tile, points[k], 4 << _SUBPIXEL, INK, cv2.FILLED, cv2.LINE_AA, _SUBPIXEL)
         color, width = (colors[k], cv2.FILLED) if known[k] else (plain, 1)

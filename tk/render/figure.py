@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -78,11 +77,16 @@ class Solid:
 
 @dataclass(frozen=True)
 class Outline:
-    """What a camera sees of a segment: its depth, metres, and the outlines (N, 2) of its solids, pixels."""
+    """What a camera sees of a segment.
+
+    Attributes:
+        segment: its name; depth: metres.
+        points: (N, 2) pixels of each of its solids, whose convex hull is the solid's outline.
+    """
 
     segment: str
     depth: float
-    polygons: tuple[Float, ...]
+    points: tuple[Float, ...]
 
 
 @dataclass(frozen=True)
@@ -140,18 +144,20 @@ class Figure:
             return [], camera.project(joints)[0]
         xy, depth = camera.project(np.concatenate([self.placed(row), joints]))
         xy, depth, joints_xy = xy[: -len(joints)], depth[: -len(joints)], xy[-len(joints) :]
-        starts, counts = self.starts[:-1], np.diff(self.starts)
-        middle = np.add.reduceat(depth, starts) / counts
-        whole = np.logical_and.reduceat(np.isfinite(xy).all(axis=1), starts)
+        starts = self.starts[:-1]
+        middle = np.add.reduceat(depth, starts) / np.diff(self.starts)
+        whole = np.isfinite(np.add.reduceat(xy[:, 0], starts))
         seen: dict[int, tuple[list[float], list[Float]]] = {}
-        for k in np.flatnonzero(whole):
-            depths, polygons = seen.setdefault(self.solids[k].segment, ([], []))
-            depths.append(float(middle[k]))
-            points = xy[starts[k] : starts[k] + counts[k]].astype(np.float32)
-            polygons.append(cv2.convexHull(points)[:, 0].astype(np.float64))
+        for solid, points, distance, is_whole in zip(
+            self.solids, np.split(xy, starts[1:]), middle.tolist(), whole.tolist(), strict=True
+        ):
+            if is_whole:
+                depths, outlines = seen.setdefault(solid.segment, ([], []))
+                depths.append(distance)
+                outlines.append(points)
         found = [
-            Outline(SEGMENTS[segment], float(np.mean(depths)), tuple(polygons))
-            for segment, (depths, polygons) in seen.items()
+            Outline(SEGMENTS[segment], sum(depths) / len(depths), tuple(outlines))
+            for segment, (depths, outlines) in seen.items()
         ]
         return sorted(found, key=lambda outline: -outline.depth), joints_xy
 

@@ -65,6 +65,7 @@ class Overlay:
         self.figure: Figure = figure_of(result)
         self.rig = used_rig(capture.rig, result)
         self.grid = Grid.of(self.rig, widest)
+        self._canvas = np.full((self.grid.height + _STRIP + _BAR, self.grid.width, 3), 24, np.uint8)
         self._views = [self._steady_view(camera, full) for camera in self.rig]
         self.row_of = {int(frame): row for row, frame in enumerate(result.frames)}
         truth_file = capture.path / "truth.h5"
@@ -101,10 +102,11 @@ class Overlay:
             view = View.whole(camera, tile_height)
             if not full:
                 outlines, joints = self.figure.seen(row, camera)
-                polygons = [polygon for outline in outlines for polygon in outline.polygons]
-                points = np.concatenate([joints, *polygons, *self._true(frame, camera)])
-                view = View.around(points, camera, round(0.75 * tile_height), tile_height)
-            tile = self._tile(row, camera, image, view)
+                body = [points for outline in outlines for points in outline.points]
+                shown = np.concatenate([joints, *body, *self._true(frame, camera)])
+                view = View.around(shown, camera, round(0.75 * tile_height), tile_height)
+            tile = np.empty((view.height, view.width, 3), np.uint8)
+            self._draw(tile, row, camera, image, view)
             for xy in self._true(frame, camera) if truth else ():
                 draw_truth(tile, view.place(xy))
             state = STATUS_MEANING[self.figure.status[row]]
@@ -113,16 +115,15 @@ class Overlay:
             tiles.append(tile)
         return joined(tiles, axis=1)
 
-    def _tile(self, row: int, camera: Camera, image: Image, view: View) -> Image:
-        """A camera's picture with body and joints drawn over it."""
+    def _draw(self, tile: Image, row: int, camera: Camera, image: Image, view: View) -> None:
+        """Fill a tile with a camera's picture, body and joints drawn over it."""
         lost = self.figure.lost(row)
-        tile = view.cut(image[: camera.height, : camera.width])
+        view.cut(image[: camera.height, : camera.width], tile)
         outlines, joints = self.figure.seen(row, camera)
         draw_body(tile, view, outlines, lost)
         draw_joints(tile, view.place(joints), None if self.figure.sigma is None else self.figure.sigma[row], lost)
         if lost:
             cv2.rectangle(tile, (0, 0), (view.width - 1, view.height - 1), LOST, 5)
-        return tile
 
     def _true(self, frame: int, camera: Camera) -> list[Float]:
         return [camera.project(self._truth[frame])[0]] if frame in self._truth else []
@@ -130,14 +131,18 @@ class Overlay:
     # --- a picture of a video ---------------------------------------------------------------------------------------
 
     def mosaic(self, frame: int, images: NDArray[np.uint8]) -> Image:
-        """All cameras' pictures in a grid, below them what is to be known: (H, W, 3), H and W even."""
-        grid, row = self.grid, self.row_of[frame]
-        canvas = np.full((grid.height + _STRIP + _BAR, grid.width, 3), 24, np.uint8)
+        """All cameras' pictures in a grid, below them what is to be known: (H, W, 3), H and W even.
+
+        The next call draws over it.
+        """
+        grid, row, canvas = self.grid, self.row_of[frame], self._canvas
         for c, (camera, image) in enumerate(zip(self.rig, images, strict=True)):
-            tile = self._tile(row, camera, image, self._views[c])
+            view = self._views[c]
+            y, x = grid.corner(c, (view.height, view.width))
+            tile = canvas[y : y + view.height, x : x + view.width]
+            self._draw(tile, row, camera, image, view)
             self._name(tile, row, camera)
-            y, x = grid.corner(c, tile.shape)
-            canvas[y : y + tile.shape[0], x : x + tile.shape[1]] = tile
+        canvas[grid.height :] = 24
         self._legend(canvas[grid.height : grid.height + _STRIP], row)
         draw_timeline(canvas[grid.height + _STRIP :], self.figure.status, row)
         return canvas
@@ -201,8 +206,8 @@ class Grid:
         width, height = columns * cell[1], -(-count // columns) * cell[0]
         return Grid(columns, scale(columns), cell, width + width % 2, height + height % 2)
 
-    def corner(self, index: int, shape: tuple[int, ...]) -> tuple[int, int]:
-        """Where a tile of this shape begins (y, x): in the middle of its cell."""
+    def corner(self, index: int, shape: tuple[int, int]) -> tuple[int, int]:
+        """Where a tile of this shape (height, width) begins (y, x): in the middle of its cell."""
         row, column = divmod(index, self.columns)
         return (
             row * self.cell[0] + max(self.cell[0] - shape[0], 0) // 2,
