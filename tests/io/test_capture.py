@@ -21,7 +21,7 @@ from tests.io.conftest import (
     write_video,
 )
 from tk.errors import CalibrationError, CaptureError, VideoError, VolumeError
-from tk.io.capture import open_capture
+from tk.io.capture import FrameReader, open_capture
 
 SHARED = Path(__file__).parents[3] / "shared" / "captures"
 
@@ -257,6 +257,15 @@ def test_time_offsets_choose_which_pictures_belong_together(make_capture: MakeCa
             for seen in frames:
                 own = max(seen.index - late, 0)
                 assert [read_tag(image) for image in seen.images] == [(0, seen.index), (1, own), (2, seen.index)]
+
+
+@pytest.mark.parametrize("start", [0, 8, 11])
+def test_beyond_its_end_a_video_shows_its_last_picture(make_capture: MakeCapture, start: int) -> None:
+    clips = open_capture(make_capture()).clips
+    with FrameReader(clips, None, (clips[0].height, clips[0].width), start, 14, (2, -3, 2)) as frames:
+        for seen in frames:
+            early, late = min(seen.index + 3, 11), max(seen.index - 2, 0)
+            assert [read_tag(image) for image in seen.images] == [(0, late), (1, early), (2, late)]
 
 
 def test_time_offsets_that_cannot_be(make_capture: MakeCapture) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import cv2
@@ -14,7 +14,16 @@ from tests.conftest import QUICK, Silent, Tk
 from tk.config import Config
 from tk.errors import ResultError
 from tk.io.capture import open_capture
-from tk.io.result import FrameResult, ResultMeta, ResultWriter, Status, read_joints, read_result
+from tk.io.result import (
+    FrameResult,
+    ResultMeta,
+    ResultWriter,
+    Status,
+    UsedCameras,
+    read_joints,
+    read_result,
+    revise_result,
+)
 from tk.model.anthropometry import BodyDimensions
 from tk.model.body import Body, build_body, neutral_pose
 from tk.model.camera import Camera, Rig
@@ -24,7 +33,7 @@ from tk.model.skeleton import JOINTS
 from tk.render.canvas import View, draw_body, draw_joints
 from tk.render.figure import BONES, Figure, Outline, solids_of
 from tk.render.overlay import Grid, Overlay, write_sheets
-from tk.render.palette import LOST, SEGMENT_COLORS, sigma_colors
+from tk.render.palette import BONE, LOST, SEGMENT_COLORS, sigma_colors
 from tk.session import track
 from tk.trackers.volumetric import restore_body
 
@@ -182,8 +191,6 @@ def test_a_joint_tells_its_standard_deviation() -> None:
 
 
 def test_cameras_fill_a_grid_of_even_size() -> None:
-    from dataclasses import replace
-
     for count, size in ((1, (641, 481)), (2, (160, 120)), (5, (640, 480)), (6, (288, 320)), (9, (1920, 1080))):
         cameras = [replace(camera(), name=f"c{k}", width=size[0], height=size[1]) for k in range(count)]
         grid = Grid.of(Rig(tuple(cameras)))
@@ -229,6 +236,30 @@ def test_videos_show_where_the_person_moves(result: Path) -> None:
         xy = view.place(camera.project(near.figure.joints[:2].reshape(-1, 3))[0])
         assert (xy > 0).all() and (xy < (view.width, view.height)).all()
     assert max(view.scale for view in near._views) > 1.1 * near.grid.scale
+
+
+def test_cameras_and_time_offsets_are_those_of_the_run(result: Path) -> None:
+    """A camera that the run has refined, by a turn and by a frame: drawn where and on what it saw the person."""
+    capture = open_capture(DEMO, ("cam1", "cam2"), masks="none")
+    turn = cv2.Rodrigues(np.array([0.0, 0.05, 0.0]))[0]
+    turned = replace(capture.rig[0], rotation=turn @ capture.rig[0].rotation)
+    revise_result(result, cameras=UsedCameras(Rig((turned,)), np.array([-1 / capture.fps])))
+    overlay = Overlay(capture, read_result(result), full=True)
+    assert overlay.rig[0].rotation == pytest.approx(turned.rotation) and overlay.rig[1] is capture.rig[1]
+    with capture.frames(0, 3) as recorded:
+        pictures = [frame.images.copy() for frame in recorded]
+    shown = dict(overlay.pictures([0, 1]))
+    for k in (0, 1):
+        np.testing.assert_array_equal(
+            shown[k][0], pictures[k + 1][0], err_msg="the picture that was taken a frame later"
+        )
+        np.testing.assert_array_equal(shown[k][1], pictures[k][1])
+    drawn, view = overlay.mosaic(0, shown[0]), overlay._views[0]
+    old, new = (
+        np.rint(view.place(c.project(overlay.figure.joints[0])[0])).astype(int) for c in (capture.rig[0], turned)
+    )
+    assert (drawn[new[:, 1], new[:, 0]] == BONE).all()
+    assert (drawn[old[:, 1], old[:, 0]] == BONE).all(axis=1).mean() < 0.5
 
 
 def test_a_frame_that_is_not_there_is_named(result: Path, tmp_path: Path, tk: Tk) -> None:

@@ -55,7 +55,7 @@ class FrameReader(Iterator[FrameSet]):
         late: Sequence[int] = (),
     ) -> None:
         """``late``: for each clip, by how many frames its pictures are later than their number says; picture
-        k - late is handed out in frame k. Before a clip's first picture that one stands in.
+        k - late is handed out in frame k. Before a clip's first picture and after its last these stand in.
         """
         late = tuple(late) or (0,) * len(clips)
         self.start = start
@@ -211,12 +211,17 @@ def _decode(window: _Window, camera: int, clip: Clip, mask_clip: Clip | None, st
     """A camera's thread."""
     index = start
     slot: _Slot | None = None
-    first_picture = first_mask = np.empty(0, np.uint8)
+    last = clip.frame_count - 1 if mask_clip is None else min(clip.frame_count, mask_clip.frame_count) - 1
+    kept, kept_mask = np.empty((2, 0), np.uint8)  # what is handed out again
+
+    def picture_of(index: int) -> int:
+        return min(max(index - late, 0), last)
+
     try:
         with ExitStack() as stack:
             pictures = stack.enter_context(closing(clip.open()))
             masks = stack.enter_context(closing(mask_clip.open())) if mask_clip else None
-            for _ in range(max(start - late, 0)):
+            for _ in range(picture_of(start)):
                 if window.closed:
                     return
                 pictures.skip()
@@ -227,21 +232,23 @@ def _decode(window: _Window, camera: int, clip: Clip, mask_clip: Clip | None, st
                 if slot is None:
                     return
                 layer = slot.frame_set.images[camera, : clip.height, : clip.width]
-                waits = start < index <= late  # for its first picture, which was read for the frame before
-                if waits:
-                    layer[...] = first_picture
+                # a first or last picture that was read for the frame before, or that the next frame shows, too
+                stands_in = index > start and picture_of(index) == picture_of(index - 1)
+                again = picture_of(index) == picture_of(index + 1)
+                if stands_in:
+                    layer[...] = kept
                 else:
                     pictures.read(layer)
                 if masks is not None and slot.frame_set.masks is not None:
                     mask_layer = slot.frame_set.masks[camera, : clip.height, : clip.width]
-                    if waits:
-                        mask_layer[...] = first_mask
+                    if stands_in:
+                        mask_layer[...] = kept_mask
                     else:
                         masks.read(mask_layer)
-                    if index < late:
-                        first_mask = mask_layer.copy()
-                if index < late:
-                    first_picture = layer.copy()
+                    if again:
+                        kept_mask = mask_layer.copy()
+                if again:
+                    kept = layer.copy()
                 window.finish(slot, camera)
                 slot = None
     except BaseException as failure:

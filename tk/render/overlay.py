@@ -8,7 +8,7 @@ with a red frame. On contact sheets white crosses are the capture's truth, where
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -44,7 +44,8 @@ class Overlay:
 
     Args:
         capture: the pictures, of the cameras that are to be shown.
-        result: what was tracked. The cameras are as the run used them, where it says so.
+        result: what was tracked. The cameras and which picture belongs to a frame are as the run used them, where it
+            says so.
         widest: pixels that a video is wide at most.
         full: whole pictures in a video, not the part of each in which the person moves.
 
@@ -61,9 +62,9 @@ class Overlay:
                 f"{result.path}: has frame {last}, but {capture.path} ends with frame {capture.frame_count - 1}; "
                 "name the capture that was tracked"
             )
-        self.capture, self.result = capture, result
+        self.capture, self.result = as_tracked(capture, result), result
         self.figure: Figure = figure_of(result)
-        self.rig = used_rig(capture.rig, result)
+        self.rig = self.capture.rig
         self.grid = Grid.of(self.rig, widest)
         self._canvas = np.full((self.grid.height + _STRIP + _BAR, self.grid.width, 3), 24, np.uint8)
         self._views = [self._steady_view(camera, full) for camera in self.rig]
@@ -256,17 +257,19 @@ def choose_frames(result: Result, frames: Sequence[int], count: int) -> list[int
     return sorted(set(frames)) or sorted(spread)
 
 
-def used_rig(rig: Rig, result: Result) -> Rig:
-    """The cameras of a capture as the run used them: refined, where the result tells of it."""
+def as_tracked(capture: Capture, result: Result) -> Capture:
+    """The capture with the cameras and time offsets that the run used, where the result tells of them."""
     if result.cameras is None:
-        return rig
-    used = {camera.name: camera for camera in result.cameras.rig}
-    return Rig(
-        tuple(
-            used[c.name] if c.name in used and (used[c.name].width, used[c.name].height) == (c.width, c.height) else c
-            for c in rig
-        )
-    )
+        return capture
+    told = {
+        (camera.name, camera.width, camera.height): (camera, float(late))
+        for camera, late in zip(result.cameras.rig, result.cameras.time_offset_s, strict=True)
+    }
+    used = [
+        told.get((camera.name, camera.width, camera.height), (camera, late))
+        for camera, late in zip(capture.rig, capture.time_offset_s, strict=True)
+    ]
+    return replace(capture, rig=Rig(tuple(camera for camera, _ in used)), time_offset_s=tuple(late for _, late in used))
 
 
 def joined(tiles: Sequence[Image], axis: int) -> Image:
