@@ -6,7 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -27,7 +26,7 @@ ROOT = Path(__file__).parents[1]
 def display(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """An X server that draws into memory."""
     if shutil.which("Xvfb") is None:
-        pytest.skip("needs Xvfb (Debian: xvfb, libvulkan1, mesa-vulkan-drivers)")
+        pytest.skip("needs Xvfb (Debian: xvfb)")
     read, write = os.pipe()
     server = subprocess.Popen(
         ["Xvfb", "-displayfd", str(write), "-screen", "0", "1400x1000x24", "-nolisten", "tcp"],
@@ -44,6 +43,7 @@ def display(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 def run(display: str | None, *arguments: object) -> subprocess.CompletedProcess[str]:
     env = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    env |= {"VK_ICD_FILENAMES": os.devnull, "VK_DRIVER_FILES": os.devnull}  # no card: every machine draws alike
     return subprocess.run(
         [sys.executable, "-c", "from tk.cli import main; main(prog_name='tk')", "view", *map(str, arguments)],
         cwd=ROOT,
@@ -54,18 +54,14 @@ def run(display: str | None, *arguments: object) -> subprocess.CompletedProcess[
     )
 
 
-# Mesa's software driver sometimes never finishes Open3D's drawing of a body
-@pytest.mark.slow
 def test_a_frame_is_drawn(display: str, tracked: Path, tiny: Path, tmp_path: Path) -> None:
     picture = tmp_path / "shot.png"
-    began = time.monotonic()
     ran = run(display, tracked, tiny, "--frame", 5, "--screenshot", picture)
-    if ran.returncode == 2 and "ulkan" in ran.stderr:
-        pytest.skip("needs a Vulkan driver (Debian: libvulkan1, mesa-vulkan-drivers)")
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout == "", "the engine's chatter belongs on stderr"
+    assert "frame 5" in ran.stderr
     image = cv2.imread(str(picture))
-    assert image is not None and image.shape[0] > 600 and image.shape[1] > 1000, time.monotonic() - began
+    assert image is not None and image.shape[0] > 600 and image.shape[1] > 1000
     middle = image[image.shape[0] // 6 : -image.shape[0] // 6, image.shape[1] // 3 : -image.shape[1] // 3].astype(int)
     colorful = middle.max(axis=2) - middle.min(axis=2) > 40
     assert 0.005 < colorful.mean() < 0.6, "left limbs warm, right limbs cool, trunk green"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import sys
 import time
@@ -12,27 +11,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tk.errors import ConfigError, DisplayError, ExportError, ResultError
 from tk.io.capture import open_capture
-from tk.io.result import Result, read_joints, read_result
-from tk.io.result_data import STATUS_MEANING
-from tk.model.camera import Rig
-from tk.render.figure import figure_of
-from tk.render.scene import Stage
-from tk.view import shapes
+from tk.io.result import read_result
+from tk.view.contents import BACKGROUND, FIELD_OF_VIEW_DEG, SIZE, WIRE, Contents, truth_of
+from tk.view.display import has_graphics_card, require_display
+from tk.view.plain import PlainWindow
 
-Float = NDArray[np.float64]
-
-SIZE = (1280, 860)
-_BACKGROUND = (0.11, 0.12, 0.135, 1.0)
-_FLOOR, _WIRE, _BONE = (0.32, 0.34, 0.37, 1.0), (0.62, 0.68, 0.78, 1.0), (0.95, 0.95, 0.95, 1.0)
 _FLESH = (1.0, 1.0, 1.0, 0.45)  # joints and bones are to be seen within
-_FIELD_OF_VIEW_DEG = 40.0
-_ELEVATION_DEG = 14.0
 _HULL_POINT = 4
 _HINT = "drag: turn   shift+drag: move   wheel: nearer   space: play   arrows: a frame"
+# what goes by a name, where that is not one geometry of this name
+_PARTS = {"joints": ("bones", "joints")}
 # pictures drawn before one is kept: the first ones lack what is still on its way to the graphics card
 _SETTLED = 8
 
@@ -43,7 +34,7 @@ def view(
     frame: int | None = None,
     screenshot: Path | None = None,
 ) -> None:
-    """Show a result in a window until it is closed.
+    """Show a result in a window until it is closed: a plain one where no graphics card is behind Vulkan.
 
     Args:
         result_path: the result.
@@ -65,45 +56,20 @@ def view(
     truth = None
     if capture_path is not None:
         rig = rig or open_capture(capture_path, masks="none").rig
-        truth = _truth(result, capture_path / "truth.h5")
+        truth = truth_of(result, capture_path / "truth.h5")
     if screenshot is not None and screenshot.suffix.lower() != ".png":
         raise ConfigError(f"--screenshot {screenshot}: a picture is a .png")
     if screenshot is not None and not screenshot.parent.is_dir():
         raise ExportError(f"{screenshot}: the folder {screenshot.parent} does not exist; make it first")
     require_display()
+    contents, row = Contents(result, rig, truth), 0 if frame is None else known.index(frame)
     with _stdout_to_stderr():
-        _Window(result, rig, truth, screenshot).run(0 if frame is None else known.index(frame))
-
-
-def require_display() -> None:
-    """Raise DisplayError where there is no display: without one Open3D waits for ever, or ends the process."""
-    if sys.platform != "linux":
-        return
-    other = "without one, tk render draws a video"
-    if not os.environ.get("DISPLAY"):
-        wayland = " (Wayland alone does not do: Open3D needs XWayland)" if os.environ.get("WAYLAND_DISPLAY") else ""
-        raise DisplayError(f"tk view: there is no display, for DISPLAY is not set{wayland}; {other}")
-    try:
-        x11 = ctypes.CDLL("libX11.so.6")
-    except OSError as error:
-        raise DisplayError(f"tk view: {error}; install libx11-6; {other}") from None
-    x11.XOpenDisplay.restype, x11.XOpenDisplay.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
-    x11.XCloseDisplay.argtypes = [ctypes.c_void_p]
-    handle = x11.XOpenDisplay(None)
-    if not handle:
-        raise DisplayError(f"tk view: the display {os.environ['DISPLAY']} cannot be opened; {other}")
-    x11.XCloseDisplay(handle)
-
-
-def _truth(result: Result, path: Path) -> Float | None:
-    """(F, 15, 3) the true joints in the result's frames; NaN where the truth has none."""
-    if not path.exists():
-        return None
-    truth = read_joints(path)
-    places = np.full((len(result), *truth.positions.shape[1:]), np.nan)
-    _, mine, theirs = np.intersect1d(result.frames, truth.frames, return_indices=True)
-    places[mine] = truth.positions[theirs]
-    return places
+        if has_graphics_card():
+            _Window(contents, screenshot).run(row)
+        elif screenshot is not None:
+            PlainWindow(contents).keep(row, screenshot)
+        else:
+            PlainWindow(contents).run(row)
 
 
 @contextlib.contextmanager
@@ -120,41 +86,49 @@ def _stdout_to_stderr() -> Iterator[None]:
 
 
 class _Window:
-    def __init__(self, result: Result, rig: Rig | None, truth: Float | None, screenshot: Path | None) -> None:
+    def __init__(self, contents: Contents, screenshot: Path | None) -> None:
         try:
             from open3d.visualization import gui, rendering
         except (ImportError, OSError) as error:
             raise DisplayError(f"tk view: needs Open3D, which does not load here: {error}") from None
         self._gui, self._rendering = gui, rendering
-        self._result, self._rig, self._truth, self._screenshot = result, rig, truth, screenshot
-        self._figure = figure_of(result)
-        self._stage = Stage.of(result, self._figure)
+        self._contents, self._result, self._screenshot = contents, contents.result, screenshot
         self._row = -1
         self._playing, self._due = False, 0.0
         self._ticks, self._failure = 0, ""
         self._app = gui.Application.instance
         try:
             self._app.initialize()
-            self._window = self._app.create_window(f"{result.path.name} - tk view", *SIZE)
+            self._window = self._app.create_window(f"{contents.result.path.name} - tk view", *SIZE)
         except RuntimeError as error:
             reason = " ".join(str(error).split())
             mend = "; on Debian: apt install libvulkan1 mesa-vulkan-drivers" if "ulkan" in reason else ""
             raise DisplayError(f"tk view: Open3D cannot open a window: {reason}{mend}") from None
         self._scene = gui.SceneWidget()
         self._scene.scene = rendering.Open3DScene(self._window.renderer)
-        self._scene.scene.set_background(_BACKGROUND)
+        self._scene.scene.set_background((*BACKGROUND, 1.0))
         self._build_panel()
         self._window.add_child(self._scene)
         self._window.add_child(self._panel)
         self._window.set_on_layout(self._lay_out)
         self._window.set_on_tick_event(self._tick)
         self._window.set_on_key(self._key)
-        self._add_what_stays()
-        self._look()
+        self._materials = {
+            "body": self._material("defaultLitTransparency", _FLESH),
+            "bones": self._material("unlitLine", width=2.5),
+            "joints": self._material("defaultLit"),
+            "hull": self._material("defaultUnlit"),
+            "truth": self._material("defaultLit"),
+            "cameras": self._material("unlitLine"),
+            "floor": self._material("unlitLine", width=1.0),
+        }
+        for camera in contents.rig or ():
+            self._scene.add_3d_label(camera.center, camera.name).color = gui.Color(*WIRE)
 
     def run(self, row: int) -> None:
         """Show the window until it is closed."""
         self._show(row)
+        self._look()
         self._app.run()
         if self._failure:
             raise ExportError(self._failure)
@@ -178,15 +152,7 @@ class _Window:
         line.add_child(self._told)
         line.add_stretch()
         self._boxes: dict[str, Any] = {}
-        there = {
-            "body": bool(self._figure.solids),
-            "joints": True,
-            "hull": self._result.hull is not None,
-            "truth": self._truth is not None,
-            "cameras": self._rig is not None,
-            "floor": True,
-        }
-        for name in (name for name, is_there in there.items() if is_there):
+        for name in self._contents.names:
             box = self._boxes[name] = gui.Checkbox(name)
             box.checked = True
             box.set_on_checked(lambda _: self._show(self._row, anew=True))
@@ -208,27 +174,13 @@ class _Window:
         material.base_roughness = 0.6
         return material
 
-    def _add_what_stays(self) -> None:
-        scene = self._scene.scene
-        scene.add_geometry("floor", shapes.floor_lines(self._stage), self._material("unlitLine", _FLOOR, 1.0))
-        if self._rig is not None:
-            wires = self._material("unlitLine", _WIRE)
-            scene.add_geometry("cameras", shapes.camera_lines(self._rig), wires)
-            for camera in self._rig:
-                self._scene.add_3d_label(camera.center, camera.name).color = self._gui.Color(*_WIRE[:3])
-
     def _look(self) -> None:
-        """From aside and a little above, all that moves and some of the room in sight."""
-        stage = self._stage
-        up = stage.axes[:, 2]
-        level = stage.axes @ np.array([np.cos(0.6), np.sin(0.6), 0.0])
-        elevation = np.radians(_ELEVATION_DEG)
-        distance = 1.25 * stage.radius / np.sin(np.radians(_FIELD_OF_VIEW_DEG / 2))
-        eye = stage.middle + distance * (np.cos(elevation) * level + np.sin(elevation) * up)
-        self._scene.setup_camera(_FIELD_OF_VIEW_DEG, self._scene.scene.bounding_box, stage.middle)
-        self._scene.look_at(stage.middle, eye, up)
-        sun = -(0.6 * level + 0.35 * stage.axes[:, 1] + up)
-        self._scene.scene.set_lighting(
+        contents, scene = self._contents, self._scene.scene
+        up = contents.stage.axes[:, 2]
+        self._scene.setup_camera(FIELD_OF_VIEW_DEG, scene.bounding_box, contents.stage.middle)
+        self._scene.look_at(contents.stage.middle, contents.eye, up)
+        sun = -(0.6 * contents.level + 0.35 * contents.stage.axes[:, 1] + up)
+        scene.set_lighting(
             self._rendering.Open3DScene.LightingProfile.NO_SHADOWS, (sun / np.linalg.norm(sun)).astype(np.float32)
         )
 
@@ -238,42 +190,16 @@ class _Window:
         if row == self._row and not anew:
             return
         self._row = row
-        figure, scene = self._figure, self._scene.scene
-        joints = figure.joints[row]
-        sigma = None if figure.sigma is None else figure.sigma[row]
-        self._replace("body", "body", lambda: shapes.body_mesh(figure, row), "defaultLitTransparency", _FLESH)
-        self._replace("bones", "joints", lambda: shapes.skeleton_lines(joints), "unlitLine", _BONE, 2.5)
-        self._replace("joints", "joints", lambda: shapes.joint_spheres(joints, sigma), "defaultLit")
-        if (hull := self._result.hull) is not None:
-            self._replace("hull", "hull", lambda: shapes.hull_cloud(hull[row]), "defaultUnlit")
-        if (truth := self._truth) is not None:
-            self._replace("truth", "truth", lambda: shapes.truth_spheres(truth[row]), "defaultLit")
-        for name in ("cameras", "floor"):
-            scene.show_geometry(name, self._is_on(name))
-        self._slider.int_value = row
-        self._told.text = self._line()
-        self._window.post_redraw()
-
-    def _replace(
-        self, name: str, box: str, make: Any, shader: str, color: Any = (1.0,) * 4, width: float = 1.5
-    ) -> None:
         scene = self._scene.scene
-        scene.remove_geometry(name)
-        if self._is_on(box) and not (geometry := make()).is_empty():
-            scene.add_geometry(name, geometry, self._material(shader, color, width))
-
-    def _is_on(self, name: str) -> bool:
-        return name in self._boxes and bool(self._boxes[name].checked)
-
-    def _line(self) -> str:
-        """What there is to say of the frame."""
-        result, row = self._result, self._row
-        parts = [f"frame {result.frames[row]}", f"{result.time[row]:.2f} s", STATUS_MEANING[result.status[row]]]
-        if result.fit_error is not None and np.isfinite(result.fit_error[row]).any():
-            parts.append(f"E_S {100 * np.nanmean(result.fit_error[row]):.1f} %")
-        if result.sigma is not None and np.isfinite(result.sigma[row]).any():
-            parts.append(f"median sigma {100 * np.nanmedian(result.sigma[row]):.1f} cm")
-        return "    ".join(parts)
+        for name, box in self._boxes.items():
+            for part in _PARTS.get(name, (name,)):
+                scene.remove_geometry(part)
+            if box.checked:
+                for part, geometry in self._contents.geometry(name, row).items():
+                    scene.add_geometry(part, geometry, self._materials[part])
+        self._slider.int_value = row
+        self._told.text = self._contents.line(row)
+        self._window.post_redraw()
 
     # --- what happens
 

@@ -1,0 +1,116 @@
+"""Whether memory stays flat over a long recording.
+
+    python -m scripts.bench_memory [--frames 10000] [--every 1000] [--causal]
+
+The demo's videos, made small, run forwards and backwards until there are as many frames. They are tracked, and what
+the tracker and the process ahead of it hold is told every so many frames, and after the second pass. Linux only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scripts.bench_pictures import Silent
+from scripts.synthetic.capture import write_calibration
+from tk import session
+from tk.config import Config
+from tk.io.capture import Capture, open_capture
+from tk.model.camera import Camera, Rig
+from tk.render.video import video_writer
+from tk.trackers.base import Estimate
+
+DEMO = Path(__file__).resolve().parents[1] / "tk" / "data" / "demo"
+#: of the demo's pictures, along each side
+SCALE = 0.375
+
+
+def _smaller(camera: Camera) -> Camera:
+    width, height = round(SCALE * camera.width), round(SCALE * camera.height)
+    half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # pixel centres lie at integers
+    matrix = np.linalg.inv(half) @ np.diag([SCALE, SCALE, 1.0]) @ half @ camera.matrix
+    return replace(camera, width=width, height=height, matrix=matrix)
+
+
+def _shrink(pictures: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
+    """(N, h, w, 3) pictures at the size of a camera of the smaller rig."""
+    size = (camera.width, camera.height)
+    return np.array([cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in pictures])
+
+
+def make_loop(folder: Path, count: int) -> Capture:
+    """A capture of ``count`` frames."""
+    demo = open_capture(DEMO, masks="none")
+    rig = Rig(tuple(_smaller(camera) for camera in demo.rig))
+    write_calibration(rig, folder / "calibration.toml")
+    (folder / "capture.toml").write_bytes((DEMO / "capture.toml").read_bytes())
+    with demo.frames() as frames:
+        sets = np.array([[_shrink(image[None], c)[0] for image, c in zip(f.images, rig, strict=True)] for f in frames])
+    there = np.arange(len(sets))
+    order = np.resize(np.concatenate([there, there[-2:0:-1]]), count)
+    background = demo.background()
+    assert background is not None
+    for name in ("videos", "background"):
+        (folder / name).mkdir()
+    for c, camera in enumerate(rig):
+        with ExitStack() as stack:
+            add, add_empty = (
+                stack.enter_context(video_writer(folder / name / f"{camera.name}.mp4", demo.fps))
+                for name in ("videos", "background")
+            )
+            for k in order:
+                add(sets[k, c])
+            for picture in _shrink(background[c], camera):
+                add_empty(picture)
+    return open_capture(folder)
+
+
+def held_mib(process: int | str = "self") -> float:
+    """What a process holds, MiB: in memory, and of it what the system has put aside."""
+    fields = dict(line.split(":", 1) for line in Path(f"/proc/{process}/status").read_text().splitlines())
+    return sum(int(fields[name].split()[0]) for name in ("VmRSS", "VmSwap")) / 1024
+
+
+def _children() -> list[int]:
+    tasks = Path("/proc/self/task").iterdir()
+    return sorted(int(pid) for task in tasks for pid in (task / "children").read_text().split())
+
+
+class Telling(Silent):
+    """Tells what is held."""
+
+    def __init__(self, every: int) -> None:
+        self._every, self._count = every, 0
+
+    def advance(self, frame: int, estimate: Estimate | None) -> None:
+        self._count += 1
+        if self._count % self._every == 0 or self._count == 100:
+            ahead = ", ".join(f"{held_mib(child):.1f}" for child in _children())
+            print(f"{self._count} frames: tracker {held_mib():.1f} MiB, ahead {ahead} MiB", flush=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=int, default=10000)
+    parser.add_argument("--every", type=int, default=1000)
+    parser.add_argument("--causal", action="store_true", help="without the second pass")
+    chosen = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory() as scratch:
+        os.mkdir(folder := Path(scratch) / "loop")
+        capture = make_loop(folder, chosen.frames)
+        print(f"{len(capture.rig)} cameras of {capture.rig[0].width}×{capture.rig[0].height}", flush=True)
+        done = session.track(capture, Path(scratch) / "loop.h5", Config(), Telling(chosen.every), causal=chosen.causal)
+        print(f"{done.frames} frames in {done.seconds:.0f} s, {done.lost} lost; at the end {held_mib():.1f} MiB")
+
+
+if __name__ == "__main__":
+    main()
