@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import sys
 
 import ezc3d
@@ -38,13 +39,28 @@ def test_points_and_segments(write: Write) -> None:
     assert np.isnan(T[:3, :3, :, list(LOST)]).all()
 
 
+def test_missing_points_as_the_format_says_it(write: Write) -> None:
+    """The words of a point, read without ezc3d: x, y, z and residual with cameras, as 32-bit floats."""
+    path = write()
+    data = export(path, ["c3d"]).files[0].read_bytes()
+    count, (first, last) = struct.unpack_from("<H", data, 2)[0], struct.unpack_from("<HH", data, 6)
+    scale, block = struct.unpack_from("<fH", data, 12)
+    assert scale < 0, "floats"
+    frames = last - first + 1
+    words = np.frombuffer(data, "<f4", frames * count * 4, 512 * (block - 1)).reshape(frames, count, 4)
+    missing = np.isin(np.arange(FRAMES), LOST)
+    assert (words[missing] == [0, 0, 0, -1]).all()
+    assert (words[~missing, :, 3] >= 0).all() and (words[~missing, :, :3] != 0).any(axis=2).all()
+
+
 def test_residual_is_the_standard_deviation(write: Write) -> None:
     sigma = np.full(15, 0.012)
-    sigma[3] = np.nan
+    sigma[3], sigma[4] = np.nan, 0.3
     path = write(meta={"sigma": True}, rows=lambda f: {"sigma": sigma}, version=None)
     file = ezc3d.c3d(str(export(path, ["c3d"]).files[0]))
     residuals = file["data"]["meta_points"]["residuals"][0]
     assert residuals[0, 0] == 12 and residuals[3, 0] == 0 and residuals[0, LOST[0]] == -1
+    assert residuals[4, 0] == 127, "as much as the format holds, and not what is left over from 256"
 
 
 def test_missing_package_is_one_line(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,8 @@
 """C3D: points and rotations, the file of motion laboratories, written through ezc3d.
 
-World frame as in the result, millimetres. A point's residual is its standard deviation in whole millimetres where the
-result tells one, else 0, and -1 in frames that are not known. ROTATION holds each segment's 4×4 transform to the world.
+World frame as in the result, millimetres. A point's residual is its standard deviation in whole millimetres (127 at
+most) where the result tells one, else 0. In frames that are not known it is -1, and the coordinates are 0, which is how
+the format says that a point is missing; ROTATION, each segment's 4×4 transform to the world, has the reliability -1.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ _ORIGINS = {
     "torso": "neck", "head": "neck", "pelvis": "pelvis", "upper_arm": "shoulder", "forearm": "elbow", "thigh": "hip",
     "calf": "knee", "foot": "ankle",
 }  # fmt: skip
+# A byte of a signed word: ezc3d would wrap 256 to 0, which is a point without an error.
+_MOST_RESIDUAL = 127
 
 
 def write_c3d(motion: Motion, path: Path) -> None:
@@ -33,8 +36,8 @@ def write_c3d(motion: Motion, path: Path) -> None:
     file = ezc3d.c3d()
     points = np.ones((4, len(motion.point_names), len(motion)))
     points[:3] = 1000.0 * motion.points.transpose(2, 1, 0)
-    points[:3, :, ~motion.known] = np.nan
-    residuals = np.round(1000.0 * np.nan_to_num(motion.sigma.T))
+    points[:3, :, ~motion.known] = np.nan  # ezc3d writes zeros
+    residuals = np.round(1000.0 * np.nan_to_num(motion.sigma.T)).clip(max=_MOST_RESIDUAL)
     residuals[:, ~motion.known] = -1.0
     file["data"]["points"] = points
     file["data"]["meta_points"]["residuals"] = residuals[None]
