@@ -243,6 +243,14 @@ def test_all_of_it_is_there(opened: Page) -> None:
 
 
 @chromium
+def test_on_a_small_screen(opened: Page, tmp_path: Path) -> None:
+    opened.open(tmp_path / "walk.html", 390, 800)
+    assert opened.run("document.documentElement.scrollWidth <= window.innerWidth") is True, "nothing sticks out"
+    assert opened.run("document.getElementById('scrubber').getBoundingClientRect().width") > 250
+    assert opened.said == []
+
+
+@chromium
 @pytest.mark.parametrize("kind", ["volumetric", "version 1"])
 def test_older_and_poorer_results(kind: str, tracked: Path, page: Page, tk: Tk, tmp_path: Path) -> None:
     result = tracked

@@ -27,6 +27,11 @@ function short(value) {
   return String(+text).replace("-", "−");
 }
 
+/** A number of a table, where all have the same digits after the point. */
+function listed(value) {
+  return isFinite(value) ? value.toFixed(1).replace("-", "−") : "–";
+}
+
 class Chart {
   /**
    * options: title, unit, lines [{name, color, values, sigma}], time, lost (flags), height, width, wraps (at ±180),

@@ -67,7 +67,7 @@
       return (value, most, color) => {
         fill.style.width = `${isFinite(value) ? Math.min(100, 100 * value / most) : 0}%`;
         if (color) fill.style.background = color;
-        number.textContent = isFinite(value) ? `${short(value)} ${unit}` : "–";
+        number.textContent = isFinite(value) ? `${listed(value)} ${unit}` : "–";
       };
     });
     get(holder).append(box);
@@ -160,11 +160,12 @@
 
   // --- curves
   const common = { time: data.time, lost, seek };
+  const wide = innerWidth > 560 ? 1240 : 400; // of what goes over the whole page: its text keeps its size
   const hues = Array.from({ length: 9 }, (_, k) => `var(--hue-${k})`);
   if (meanError) {
     get("quality-text").textContent = "E_S is the share of pixels that the body explains wrongly. Red: lost frames. A click on a curve goes to its frame.";
     charts.push(new Chart(get("quality-charts"), {
-      ...common, title: "E_S of each camera", unit: " %", width: 1240, height: 190, zero: true, digits: 1,
+      ...common, title: "E_S of each camera", unit: " %", width: wide, height: 190, zero: true, digits: 1,
       lines: data.cameras.map((name, k) => ({ name, color: hues[k % hues.length], values: column(fitError, C, k).map((v) => 100 * v) })),
     }));
   } else {
@@ -172,7 +173,7 @@
   }
   const kind = data.objectiveKind ? ` (${data.objectiveKind})` : "";
   charts.push(new Chart(get("quality-charts"), {
-    ...common, title: `Objective${kind}`, unit: "", width: 1240, height: 110, zero: true,
+    ...common, title: `Objective${kind}`, unit: "", width: wide, height: 110, zero: true,
     lines: [{ name: "", color: "var(--accent)", values: Array.from(objective) }],
   }));
   const tints = { left: "var(--left)", right: "var(--right)", middle: "var(--middle)" };
@@ -226,7 +227,7 @@
     get("sigma-table").append(line(["joint", "median", "90 %", "largest"], "th"));
     data.joints.forEach((name, k) => {
       const values = good(column(sigma, J, k));
-      get("sigma-table").append(line([joint(name), ...[0.5, 0.9, 1].map((share) => short(1000 * quantile(values, share)))]));
+      get("sigma-table").append(line([joint(name), ...[0.5, 0.9, 1].map((share) => listed(1000 * quantile(values, share)))]));
     });
   } else {
     get("sigma-text").textContent = "This result does not tell σ.";
@@ -238,11 +239,11 @@
     const track = make("div", "", "track"), fill = make("i");
     fill.style.width = `${100 * ms / longest}%`;
     track.append(fill);
-    get("times-table").append(line([stage.replace("_", " "), track, short(ms)]));
+    get("times-table").append(line([stage.replace("_", " "), track, listed(ms)]));
   }
 
   // --- words
-  for (const note of data.notes.length ? data.notes : ["Nothing that is kept in the result."]) get("notes").append(make("li", note));
+  for (const note of data.notes.length ? data.notes : ["Nothing."]) get("notes").append(make("li", note));
   get("settings").textContent = data.settings;
   get("foot").textContent = `Made by ${data.software} from ${data.file}; seed ${data.seed}. The page is complete by itself.`;
 
