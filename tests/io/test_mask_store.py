@@ -1,11 +1,15 @@
 """Masks are kept bit for bit, in little memory, and unpacked one at a time."""
 
+import tempfile
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
+from tk.errors import TkError
+from tk.io import mask_store
 from tk.io.mask_store import MaskStore
 
 
@@ -50,9 +54,34 @@ def test_silhouettes_take_little_memory():
     store = MaskStore()
     for index in range(10):
         store.put(index, masks)
-    assert sum(map(len, store._packed.values())) < 10 * 10_000
+    assert sum(size for _, size in store._places.values()) < 10 * 10_000
 
 
 def test_a_frame_that_was_not_put_is_told():
     with pytest.raises(KeyError):
         MaskStore().get(0)
+
+
+def test_those_of_a_long_recording_are_on_disk(monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(mask_store, "IN_MEMORY", 2000)
+    rng = np.random.default_rng(0)
+    masks = (rng.random((12, 2, 30, 40)) < 0.5).astype(np.uint8) * 255
+    store = MaskStore()
+    for index, frame in enumerate(masks):
+        store.put(index, frame)
+    assert store._file._rolled, "a file by now"
+    for index in (11, 0, 5):
+        np.testing.assert_array_equal(store.get(index), masks[index])
+    assert list(tmp_path.iterdir()) == [], "without a name"
+
+
+def test_a_full_disk_is_one_line(monkeypatch):
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    store = MaskStore()
+    monkeypatch.setattr(store._file, "write", full)
+    with pytest.raises(TkError, match="masks cannot be kept there: No space left"):
+        store.put(0, np.zeros((1, 2, 2), np.uint8))
+    assert 0 not in store

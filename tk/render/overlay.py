@@ -112,7 +112,13 @@ class Overlay:
                 draw_truth(tile, view.place(xy))
             state = STATUS_MEANING[self.figure.status[row]]
             tile[:20] = tile[:20] // 3
-            write(tile, f"{camera.name}  frame {frame}  {state}", 6, 14, (120, 120, 255) if self.figure.lost(row) else TEXT)
+            write(
+                tile,
+                f"{camera.name}  frame {frame}  {state}",
+                6,
+                14,
+                (120, 120, 255) if self.figure.lost(row) else TEXT,
+            )
             tiles.append(tile)
         return joined(tiles, axis=1)
 
