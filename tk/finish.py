@@ -28,6 +28,8 @@ Float = NDArray[np.float64]
 
 #: in `/model` of a result that a second pass has gone over
 REFINED = "refined"
+# A joint whose σ is larger than the second pass's by this factor keeps that of the first.
+_LESS_SURE = 2.0
 
 
 def finish(output: Path, plan: Plan, masks: MaskStore, note: Callable[[str], None], causal: bool) -> None:
@@ -73,7 +75,7 @@ def finish(output: Path, plan: Plan, masks: MaskStore, note: Callable[[str], Non
                     poses[rows] = [join_pose(skeleton, e.pose, e.waist, e.ankles) for e in told_again]
                     lost[rows] = [e.status == "lost" for e in told_again]
                     columns |= _replaced(result, rows, told_again)
-        poses, columns["fit_error"] = tracker.second_pass(
+        poses, columns["fit_error"], sigma = tracker.second_pass(
             masks.sequence(result.frames),
             poses,
             lost,
@@ -81,6 +83,10 @@ def finish(output: Path, plan: Plan, masks: MaskStore, note: Callable[[str], Non
             plan.capture.subject_height_m,
             keep_body=plan.body is not None or shown,
         )
+        # where the first pass was much less sure, or NaN, it followed several poses, or none was found for a limb
+        assert result.sigma is not None
+        before = columns.get("joints/sigma", result.sigma)
+        columns["joints/sigma"] = np.where(before <= _LESS_SURE * sigma, sigma, before)
         model = {**tracker.model(), REFINED: 1}
     _LOG.info("angles, feet, and the smoothed copy")
     # the first pass's poses stand as they are

@@ -20,7 +20,7 @@ from tk.model.silhouettes import draw_silhouettes
 from tk.model.skeleton import JOINTS, join_pose, shoulder_angles, split_pose
 from tk.optim.gauss_newton import GaussNewtonConfig
 from tk.trackers.contours import SilhouetteConfig
-from tk.trackers.region import JOINT_FLOOR_M, RegionConfig, RegionTracker
+from tk.trackers.region import RegionConfig, RegionTracker
 
 RIG = ring_of_cameras(3, width=160, height=200)
 SKELETON = BODY.skeleton
@@ -97,7 +97,7 @@ def test_an_estimate_says_all_that_the_contract_has() -> None:
 def test_sigma_is_finite_and_larger_where_less_is_seen() -> None:
     first = tracker_at(POSES[0]).step(observe(MASKS[0]))
     assert first.sigma is not None and first.sigma.shape == (15,)
-    assert (first.sigma >= JOINT_FLOOR_M).all() and (first.sigma < 0.2).all()
+    assert (first.sigma > 0).all() and (first.sigma < 0.2).all()
     masks = MASKS[0].copy()
     masks[1:] = 0
     tracker = tracker_at(POSES[0])
@@ -228,12 +228,13 @@ def test_the_second_pass_mends_a_wrong_body() -> None:
     error = np.array([e.fit_error for e in first])
     before = error_of(thin, poses, MASKS)
     lost = np.array([False] * 5 + [True])
-    result, found = tracker.second_pass(MASKS, poses, lost, error, STATURE)
+    result, found, sigma = tracker.second_pass(MASKS, poses, lost, error, STATURE)
     assert error_of(tracker.body, result[:5], MASKS[:5]) < 0.8 * before
     assert found[:5].mean() < 0.8 * error[:5].mean()
     # a lost frame stays as it was
     np.testing.assert_array_equal(result[5], poses[5])
     np.testing.assert_array_equal(found[5], error[5])
+    assert (sigma[:5] > 0).all() and (sigma[:5] < 0.1).all() and not sigma[5].any()
     assert tracker.body.dimensions.thigh_radius > thin.dimensions.thigh_radius
     off = [
         np.linalg.norm(tracker.body.skeleton.joints(p) - SKELETON.joints(q), axis=1).mean()
@@ -245,10 +246,10 @@ def test_the_second_pass_mends_a_wrong_body() -> None:
 def test_a_body_that_was_given_is_kept_in_the_second_pass() -> None:
     tracker = tracker_at(POSES[0])
     poses, error = POSES[:3], np.full((3, 3), 0.1)
-    result, found = tracker.second_pass(MASKS[:3], poses, np.zeros(3, bool), error, STATURE, keep_body=True)
+    result, found, _ = tracker.second_pass(MASKS[:3], poses, np.zeros(3, bool), error, STATURE, keep_body=True)
     assert tracker.body is BODY
     assert result.shape == poses.shape and found.shape == (3, 3) and (found < 0.1).all()
-    same, unchanged = tracker.second_pass(MASKS[:3], poses, np.ones(3, bool), error, STATURE)
+    same, unchanged, _ = tracker.second_pass(MASKS[:3], poses, np.ones(3, bool), error, STATURE)
     np.testing.assert_array_equal(same, poses)
     np.testing.assert_array_equal(unchanged, error)
 

@@ -85,6 +85,22 @@ def blind(cameras: list[int], frames: range) -> Spoil:
     return spoil
 
 
+def torn(camera: int, frames: range, part: tuple[float, float]) -> Spoil:
+    """A part of the person, as shares of the height in the picture, is not in the camera's masks of these frames."""
+
+    def spoil(frame: Observation) -> Observation:
+        if frame.index not in frames:
+            return frame
+        masks = frame.masks.copy()
+        rows = np.flatnonzero(masks[camera].any(axis=1))
+        first, last = rows[0], rows[-1] + 1
+        low, high = (round(first + share * (last - first)) for share in part)
+        masks[camera, low:high] = 0
+        return replace(frame, masks=masks)
+
+    return spoil
+
+
 def test_nothing_is_left_out_of_a_good_recording(scene: Scene) -> None:
     watch, estimates, used = scene.follow(lambda frame: frame)
     assert watch.report() == [] and np.all(used)
@@ -131,6 +147,21 @@ def test_nobody_to_be_seen_is_lost_and_found_again_at_once(scene: Scene, cameras
     found = range(status.index("recovered"), FRAMES)
     assert scene.error(estimates, found) < 0.10
     assert "fewer than two cameras see anybody: lost, frames 5 to 7" in watch.report()
+
+
+def test_a_mask_with_a_piece_missing_is_no_camera_that_disagrees(scene: Scene) -> None:
+    watch, estimates, used = scene.follow(torn(1, range(5, 10), (0.45, 1.0)))
+    assert watch.report() == [] and all(u.all() for u in used)
+    assert not any(e.status == "lost" for e in estimates)
+    assert scene.error(estimates, range(FRAMES)) < 0.08
+
+
+def test_a_mask_that_misleads_by_a_missing_piece_is_left_out_and_named(scene: Scene) -> None:
+    watch, estimates, used = scene.follow(torn(1, range(5, 10), (0.0, 0.3)))
+    assert [bool(u[1]) for u in used] == [True] * 5 + [False] * 6 + [True] * (FRAMES - 11)
+    assert watch.report() == ["camera cam2 misses a part of the person: left out of frames 5 to 10"]
+    assert not any(e.status == "lost" for e in estimates)
+    assert scene.error(estimates, range(FRAMES)) < 0.05
 
 
 def test_the_opening_goes_without_a_camera_that_disagrees(scene: Scene) -> None:

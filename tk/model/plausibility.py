@@ -24,11 +24,11 @@ STATURE_M = (1.0, 2.3)
 EXTENT = (0.55, 1.5)
 #: a sprinter makes 12 m/s; and so much may the estimate of a trunk jump by itself, metres
 FASTEST_M_S, JUMP_M = 12.0, 0.2
-#: a pirouette makes three turns a second; a turn in a frame beyond this and 90° is left taken for right
+#: a pirouette makes three turns a second; a turn in a frame aside this and 90° is left taken for right
 FASTEST_TURN_DEG_S = 1500.0
 #: how far the lower ankle may be above where it stood lowest, metres: the best jump less than a metre
 HIGHEST_M = 1.2
-#: share of the body outside the mask of a view that shows something else
+#: by so much of the person a view's mask lies beside the body if it shows something else
 UNEXPLAINED = 0.5
 
 _CAUSES = "the unit or the scale of calibration.toml is wrong, or the masks show more or less than the person"
@@ -88,25 +88,25 @@ class Plausibility:
         self._index = -1
         self._lowest = np.inf
 
-    def judge(self, index: int, joints: Float, beyond: Float | None) -> str | None:
+    def judge(self, index: int, joints: Float, aside: Float | None) -> str | None:
         """Why the joints (15, 3) of a frame cannot be right; None where they can.
 
         Args:
             index: the frame's number.
             joints: (15, 3) metres.
-            beyond: (C,) share of the body outside the masks of the cameras that were used, NaN for others; None where
-                nobody tells.
+            aside: (C,) by how much the masks of the cameras that were used lie beside the body: body outside the mask
+                and as much mask outside the body, as a share of it. NaN for other cameras; None where nobody tells.
         """
-        reason = self._reason(index, joints, beyond)
+        reason = self._reason(index, joints, aside)
         if reason is None:
             self._joints, self._index = joints, index
             self._lowest = min(self._lowest, self._height(joints))
         return reason
 
-    def _reason(self, index: int, joints: Float, beyond: Float | None) -> str | None:
+    def _reason(self, index: int, joints: Float, aside: Float | None) -> str | None:
         if not np.isfinite(joints).all():
             return "it has joints that are no numbers"
-        if beyond is not None and np.nanmax(beyond, initial=0.0) > UNEXPLAINED:
+        if aside is not None and np.nanmax(aside, initial=0.0) > UNEXPLAINED:
             return "one view shows something else than the body"
         if self._height(joints) - self._lowest > HIGHEST_M:
             return "it hovers above where it stood"

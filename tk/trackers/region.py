@@ -31,6 +31,7 @@ from tk.model.body_fit import BodyFitConfig
 from tk.model.camera import Rig
 from tk.model.cone_body import ConeBody
 from tk.model.evidence import Evidence, mean_of_views
+from tk.model.joint_sigma import contour_variance, directions, posture_variance
 from tk.model.limbs import Limb
 from tk.model.part_colors import color_bins
 from tk.model.silhouettes import Pyramid
@@ -61,9 +62,8 @@ MISPLACED = 0.25
 # The second pass: what the body is fitted to, and how near a frame stays to its pose of the first pass.
 SECOND_FIT = BodyFitConfig(frames=24, rounds=4)
 SECOND_ANGLE_DEG = 15.0
-# What a joint's position errs by beside what the contours' noise tells: joints of people are not where a model's are.
-# Chosen on the development captures such that as many errors are within 1 and 2 σ as are of a normal's.
-JOINT_FLOOR_M = 0.006
+# Over so many frames the usual posture of the first pass is a plain mean, then one that forgets.
+USUAL_FRAMES = 200
 
 
 @dataclass(frozen=True)
@@ -117,6 +117,8 @@ class RegionTracker(ContourTracker):
         self.config = config or RegionConfig()
         self._alive: list[Hypothesis] = []
         self._usual = np.inf
+        self._usual_posture: Float = np.zeros((len(JOINTS), 3))
+        self._postures = 0
         self._lost_for = 0
         self._fresh = True
 
@@ -131,6 +133,7 @@ class RegionTracker(ContourTracker):
         pose = self.find(frames, height_m, init, body)
         self._alive = [Hypothesis(pose, pose, 0.0)]
         self._usual = np.inf
+        self._usual_posture, self._postures = np.zeros((len(JOINTS), 3)), 0
         self._lost_for = 0
         self._fresh = True
 
@@ -303,28 +306,20 @@ class RegionTracker(ContourTracker):
         return self.views.equations(self.body.arrays, pyramid, poses, 0, self.contours.search, regions).hessian[0]
 
     def _sigma(self, pose: Float, curvature: Float) -> Float:
-        """(15,) one standard deviation of each joint's position along an axis, metres.
-
-        From the curvature at the optimum: the inverse of the information that contours and priors give about the pose,
-        carried to the joints.
-        """
+        """(15,) one standard deviation of each joint's position along an axis, metres: of the contours' noise, the
+        posture beside the usual one until now, and the spread of the hypotheses that live."""
         skeleton = self.body.skeleton
         precision = INFORMATION * (curvature + np.diag(self._prior(pose).precision))
-        free = np.flatnonzero(self.body.free)
-        covariance = np.linalg.inv(precision[np.ix_(free, free)])
-        w, v = skeleton.twists(pose)
-        x = skeleton.joints(pose)
-        moves = skeleton.ancestors()[skeleton.joint_segment][:, free]
-        J = np.where(moves[:, :, None], np.cross(w[free][None], x[:, None]) + v[free][None], 0.0)
-        rows = J.transpose(0, 2, 1)  # (15, 3, D)
-        variance = (rows * (rows @ covariance)).sum(axis=(1, 2)) / 3
-        # hypotheses that live say where else the joint may be
+        variance = contour_variance(skeleton, pose, precision, self.body.free)
+        self._postures = min(self._postures + 1, USUAL_FRAMES)
+        self._usual_posture += (directions(skeleton, pose) - self._usual_posture) / self._postures
+        variance += posture_variance(skeleton, pose, self._usual_posture)
         if len(self._alive) > 1:
             weight = np.exp(-(np.array([h.cost for h in self._alive]) - self._best.cost) / GAIN)
             places = np.array([skeleton.joints(h.pose) for h in self._alive])
             mean = np.einsum("h,hja->ja", weight / weight.sum(), places)
             variance += np.einsum("h,hja->j", weight / weight.sum(), (places - mean) ** 2) / 3
-        return np.asarray(np.sqrt(variance + JOINT_FLOOR_M**2))
+        return np.asarray(np.sqrt(variance))
 
     def second_pass(
         self,
@@ -334,7 +329,7 @@ class RegionTracker(ContourTracker):
         error: Float,
         height_m: float | None,
         keep_body: bool = False,
-    ) -> tuple[Float, Float]:
+    ) -> tuple[Float, Float, Float]:
         """Fit the body to frames of the whole recording, and settle every frame anew with it.
 
         Frames of differing poses show what an opening without the initialisation pose may not: where a knee or an elbow
@@ -350,12 +345,14 @@ class RegionTracker(ContourTracker):
             keep_body: leave the body as it is.
 
         Returns:
-            Poses (F, D) and E_S (F, C). The tracker has the new body.
+            Poses (F, D), E_S (F, C), and one standard deviation (F, 15) of the joints' positions along an axis, metres,
+            0 in lost frames. The tracker has the new body.
         """
         cleaning, scales = self.contours.cleaning, 1
         tracked = np.flatnonzero(~lost)
+        variance = np.zeros((len(poses), len(JOINTS)))
         if not len(tracked):
-            return poses, error
+            return poses, error, variance
 
         def believed(i: int) -> NDArray[np.uint8]:
             return np.where(np.isfinite(error[i])[:, None, None], masks[i], np.uint8(0))
@@ -373,10 +370,14 @@ class RegionTracker(ContourTracker):
         for i in tracked:
             pyramid = self.views.pyramid(believed(int(i)), scales, cleaning)
             prior = self._prior(poses[i], SECOND_ANGLE_DEG)
-            settled = self.settle(pyramid, poses[i][None], (0,), prior=prior).states
+            settled = self.settle(pyramid, poses[i][None], (0,), prior=prior)
             evidence = Evidence.of(self.screen, pyramid.masks[0])
-            result[i], errors[i] = settled[0], evidence.cast(self.body, self.colors.group, settled)[0][0]
-        return result, errors
+            result[i], errors[i] = settled.states[0], evidence.cast(self.body, self.colors.group, settled.states)[0][0]
+            precision = INFORMATION * (settled.hessian[0] + np.diag(prior.precision))
+            variance[i] = contour_variance(self.body.skeleton, result[i], precision, self.body.free)
+        usual = np.median(directions(self.body.skeleton, result[tracked]), axis=0)
+        variance[tracked] += posture_variance(self.body.skeleton, result[tracked], usual)
+        return result, errors, np.sqrt(variance)
 
     def _nobody(self, frame: Observation, watch: Stopwatch) -> Estimate:
         """Nobody is in sight: the last pose stands, as lost."""
@@ -403,6 +404,8 @@ class RegionTracker(ContourTracker):
             "costs": np.array([h.cost for h in self._alive]),
             "ages": np.array([h.age for h in self._alive]),
             "usual": self._usual,
+            "usual_posture": self._usual_posture.copy(),
+            "postures": self._postures,
             "lost_for": self._lost_for,
             **self.colors.state(),
         }
@@ -413,6 +416,8 @@ class RegionTracker(ContourTracker):
         rows = zip(state["poses"], state["previous"], state["costs"], state["ages"], strict=True)
         self._alive = [Hypothesis(np.asarray(p), np.asarray(q), float(c), int(a)) for p, q, c, a in rows]
         self._usual = float(state["usual"])
+        self._usual_posture = np.array(state["usual_posture"], np.float64)
+        self._postures = int(state["postures"])
         self._lost_for = int(state["lost_for"])
         self.colors.restore(state)
         self._fresh = False

@@ -7,6 +7,10 @@ but does the others, the camera was what was wrong and not the pose. It comes ba
 explains it again. This is the iteratively reweighted fit of robust statistics with weights of 0 and 1 and the camera as
 the unit: what is wrong with one picture is wrong everywhere in it.
 
+A poor mask is no wrong camera. What a camera that is turned, moved or late lacks of the body on one side it shows
+beside the body on the other; a mask with pieces missing shows nothing there. Such a camera stays unless its mask
+misleads the pose, which is another without it.
+
 Only for trackers of contours: a visual hull without one of its masks is empty, so those of hulls take all cameras.
 """
 
@@ -35,13 +39,16 @@ Float = NDArray[np.float64]
 _OPENING = 5
 # A camera is looked into whose E_S is above this, and above its usual by this factor.
 _SUSPECT, _SUSPECT_RATIO = 0.25, 1.8
-# It is left out if so much of the body, fitted without it, lies outside its mask; or if the body leaves its usual E_S
-# times this unexplained, and the others' mean falls by this share.
+# It is left out if so much of its mask lies beside the body that was fitted without it; or if the body leaves its usual
+# E_S times this unexplained, and the others' mean falls by this share.
 _CULPRIT_RATIO, _RELIEF, _HOPELESS = 3.0, 0.15, 0.2
 # The others must then be explained about as well as is usual, by these factors in the mean in the two cases.
 _OTHERS_FIT = 1.5, 1.3
 # A mask of which the person explains less than a quarter shows anything.
 _BLOB = 0.75
+# A mask that lacks so much of the body misleads if the joints are so far from where they are without it, in the mean,
+# metres.
+_MISLED_M = 0.03
 # It comes back when the others' body leaves no more than its usual times this unexplained.
 _BACK_RATIO = 1.6
 # Whoever was lost is found when the masks are explained as well as is usual, by this factor in the mean.
@@ -52,6 +59,7 @@ _PAUSE, _WORSE = 6, 1.2
 _FIRST_USUAL, _BETTER, _SLOWLY = 0.12, 0.1, 0.02
 # Reasons, as messages tell them.
 _DISAGREES, _TOO_FEW = "disagrees with the others", "fewer than two cameras see anybody"
+_LACKS = "misses a part of the person"
 _IMPLAUSIBLE = "the pose found cannot be true"
 
 Span = tuple[int, int, int]
@@ -74,6 +82,7 @@ class Watch:
         C = len(self._names)
         self._usual = np.full(C, _FIRST_USUAL)
         self._distrusted = np.zeros(C, bool)
+        self._lacks = np.zeros(C, bool)  # those of them whose masks miss a part of the person
         self._since_trial = np.full(C, _PAUSE)
         self._at_trial = np.zeros(C)
         self._left_out: dict[str, Span] = {}  # by "camera/reason"
@@ -120,15 +129,16 @@ class Watch:
         watched = isinstance(self.tracker, ContourTracker) and len(out) - bad.sum() >= 3
         before = self.tracker.state() if watched else {}
         estimate = self.tracker.step(used)
-        beyond = None
+        aside = None
         if watched and used.masks.any() and estimate.fit_error is not None:
-            estimate, used, beyond = self._weigh(frame, used, bad, before, estimate)
+            estimate, used, aside = self._weigh(frame, used, bad, before, estimate)
         for camera, reason in enumerate(sick):
             if reason is not None and bad[camera]:
                 _count(self._left_out, f"{camera}/{reason}", frame.index)
         for camera in np.flatnonzero((out | self._distrusted) & ~bad).tolist():
-            _count(self._left_out, f"{camera}/{_DISAGREES}", frame.index)
-        return self._judged(frame.index, estimate, used, beyond), used
+            reason = _LACKS if self._lacks[camera] else _DISAGREES
+            _count(self._left_out, f"{camera}/{reason}", frame.index)
+        return self._judged(frame.index, estimate, used, aside), used
 
     def _bad(self, sick: Sequence[str | None]) -> NDArray[np.bool_]:
         """(C,) the cameras to go without. A visual hull is empty where a mask is, so its trackers take them all."""
@@ -141,12 +151,13 @@ class Watch:
         """Leave out a camera that the body does not explain, and take back one that it does.
 
         Returns:
-            the estimate, what it was made from, and (C,) the share of the body outside each used camera's mask.
+            the estimate, what it was made from, and (C,) by how much each used camera's mask lies beside the body.
         """
         assert first.fit_error is not None
-        error = beyond = first.fit_error  # no more of the body can lie outside a mask
+        error = aside = first.fit_error  # no mask can lie farther beside the body
         if self._distrusted.any() or np.nanmax(error, initial=0.0) > _SUSPECT:
-            error, beyond = self._errors(frame, first)
+            error, lacking, surplus = self._errors(frame, first)
+            aside = np.minimum(lacking, surplus)
         ratio = error / self._usual
         usable = ~bad & np.isfinite(error)
         back = self._distrusted & usable & ((ratio < _BACK_RATIO) | (error < 0.8 * _SUSPECT))
@@ -165,20 +176,25 @@ class Watch:
             fewer = _without(used, ~others)
             self._restore(before)
             second = self.tracker.step(fewer)
-            again, beyond_again = self._errors(frame, second)
+            again, lacking, surplus = self._errors(frame, second)
+            aside_again = np.minimum(lacking, surplus)
             relief = 1.0 - float(np.mean(again[others]) / np.mean(error[others]))
             # Where the body does not explain the others either, it is the pose that is wrong. A mask with somebody else
             # beside the person misleads contours little. A body that two cameras see may be anywhere in a third.
             others_fit = float(np.mean(again[others] / self._usual[others]))
-            outside = beyond_again[worst] > (_HOPELESS if others.sum() >= 3 else 2 * _HOPELESS)
-            hopeless = others_fit < _OTHERS_FIT[0] and (outside or again[worst] > _BLOB)
-            much = others.sum() >= 3 and again[worst] > _CULPRIT_RATIO * self._usual[worst]
+            least = _HOPELESS if others.sum() >= 3 else 2 * _HOPELESS
+            moved = float(np.linalg.norm(second.joints - first.joints, axis=1).mean())
+            misleads = lacking[worst] > least and moved > _MISLED_M
+            elsewhere = aside_again[worst] > least or surplus[worst] > _BLOB
+            hopeless = others_fit < _OTHERS_FIT[0] and (elsewhere or misleads)
+            much = others.sum() >= 3 and surplus[worst] + aside_again[worst] > _CULPRIT_RATIO * self._usual[worst]
             relieved = others_fit < _OTHERS_FIT[1] and much and relief > _RELIEF
             culprit = relief > -_RELIEF / 2 and (hopeless or relieved)
             if culprit:
                 self._distrusted[worst] = True
+                self._lacks[worst] = misleads and not (elsewhere or relieved)
                 estimate, used, kept = replace(second, status=first.status), fewer, others
-                beyond = beyond_again
+                aside = aside_again
             else:
                 self._restore(after)
                 self._since_trial[worst], self._at_trial[worst] = 0, error[worst]
@@ -188,15 +204,16 @@ class Watch:
             rate = np.where(error < self._usual, _BETTER, _SLOWLY)
             self._usual = np.where(kept, np.maximum(self._usual + rate * (error - self._usual), 0.05), self._usual)
         self._distrusted &= ~back
-        return estimate, used, np.where(kept, beyond, np.nan)
+        return estimate, used, np.where(kept, aside, np.nan)
 
     def _restore(self, state: Mapping[str, Any]) -> None:
         self.tracker.restore(self.tracker.model(), state)
 
     def _errors(self, frame: Observation, estimate: Estimate) -> Float:
-        """(2, C) E_S at the estimate's pose, of cameras left out, too; and what of it is body outside the mask.
+        """(3, C) of the estimate's pose, of cameras left out, too: E_S; body outside the mask; mask outside the body.
 
-        NaN where a camera sees nobody.
+        The last two are shares of the mask or of the body, whichever is larger: a mask of which little is left says
+        little. NaN where a camera sees nobody.
         """
         tracker = self.tracker
         assert isinstance(tracker, ContourTracker)
@@ -211,17 +228,21 @@ class Watch:
         drawn = met.label[0] > 0
         seen = np.count_nonzero(evidence.person, axis=(1, 2)).astype(np.float64)
         seen[seen == 0] = np.nan
-        return np.stack([np.count_nonzero(wrong, axis=(1, 2)) / seen for wrong in _wrong(drawn, evidence.person)])
+        lacking, surplus = (
+            np.count_nonzero(part, axis=(1, 2)) for part in (drawn & ~evidence.person, evidence.person & ~drawn)
+        )
+        larger = seen + np.maximum(lacking - surplus, 0)
+        return np.stack([(lacking + surplus) / seen, lacking / larger, surplus / larger])
 
-    def _judged(self, index: int, estimate: Estimate, used: Observation, beyond: Float | None) -> Estimate:
+    def _judged(self, index: int, estimate: Estimate, used: Observation, aside: Float | None) -> Estimate:
         """The estimate, lost where it cannot be true."""
         if estimate.status == "lost":
             self._plausibility.forget()
             if not used.masks.any():
                 _count(self._lost, _TOO_FEW, index)
             return estimate
-        reason = self._plausibility.judge(index, estimate.joints, beyond)
-        if beyond is not None and estimate.status == "recovered" and self._beside_usual > _FOUND:
+        reason = self._plausibility.judge(index, estimate.joints, aside)
+        if aside is not None and estimate.status == "recovered" and self._beside_usual > _FOUND:
             reason = reason or "after a loss it does not explain the masks yet"
         if reason is None:
             return estimate
@@ -246,6 +267,7 @@ class Watch:
         return {
             "usual": self._usual,
             "distrusted": self._distrusted,
+            "lacks": self._lacks,
             "since_trial": self._since_trial,
             "at_trial": self._at_trial,
             **{f"health/{name}": value for name, value in self._health.state().items()},
@@ -262,6 +284,7 @@ class Watch:
                 part[group][rest] = value
         self._usual = np.array(state["usual"], np.float64)
         self._distrusted = np.array(state["distrusted"], bool)
+        self._lacks = np.array(state["lacks"], bool)
         self._since_trial = np.array(state["since_trial"], np.int64)
         self._at_trial = np.array(state["at_trial"], np.float64)
         self._health.restore(part["health"])
@@ -270,10 +293,6 @@ class Watch:
         self._left_out = {key: (span[0], span[1], span[2]) for key, span in left_out.items()}
         self._lost = {key: (span[0], span[1], span[2]) for key, span in lost.items()}
         self._why_apart = {int(camera): reason for camera, reason in apart.items()}
-
-
-def _wrong(drawn: NDArray[np.bool_], person: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    return drawn != person, drawn & ~person
 
 
 def _count(spans: dict[str, Span], key: str, index: int) -> None:
