@@ -8,8 +8,9 @@ explains it again. This is the iteratively reweighted fit of robust statistics w
 the unit: what is wrong with one picture is wrong everywhere in it.
 
 A poor mask is no wrong camera. What a camera that is turned, moved or late lacks of the body on one side it shows
-beside the body on the other; a mask with pieces missing shows nothing there. Such a camera stays unless its mask
-misleads the pose, which is another without it.
+beside the body on the other; a mask with pieces missing shows nothing there. It would still pull limbs out of what is
+missing, so the camera is left out, too, but the pose that the others found is not doubted for it, and it comes back
+when its masks have been whole for some frames.
 
 Only for trackers of contours: a visual hull without one of its masks is empty, so those of hulls take all cameras.
 """
@@ -39,18 +40,18 @@ Float = NDArray[np.float64]
 _OPENING = 5
 # A camera is looked into whose E_S is above this, and above its usual by this factor.
 _SUSPECT, _SUSPECT_RATIO = 0.25, 1.8
-# It is left out if so much of its mask lies beside the body that was fitted without it; or if the body leaves its usual
-# E_S times this unexplained, and the others' mean falls by this share.
+# It is left out if so much of the body, fitted without it, lies outside its mask; or if the body leaves its usual E_S
+# times this unexplained, and the others' mean falls by this share.
 _CULPRIT_RATIO, _RELIEF, _HOPELESS = 3.0, 0.15, 0.2
 # The others must then be explained about as well as is usual, by these factors in the mean in the two cases.
 _OTHERS_FIT = 1.5, 1.3
 # A mask of which the person explains less than a quarter shows anything.
 _BLOB = 0.75
-# A mask that lacks so much of the body misleads if the joints are so far from where they are without it, in the mean,
-# metres.
-_MISLED_M = 0.03
-# It comes back when the others' body leaves no more than its usual times this unexplained.
-_BACK_RATIO = 1.6
+# Its mask has pieces missing if it shows beside the body no more than this share of what it lacks.
+_TORN = 0.5
+# It comes back when the others' body leaves no more than its usual times this unexplained; with a torn mask, when it
+# has done so for some frames, for such masks come and go.
+_BACK_RATIO, _WHOLE = 1.6, 6
 # Whoever was lost is found when the masks are explained as well as is usual, by this factor in the mean.
 _FOUND = 2.0
 # A camera that was looked into in vain is not looked into again for so many frames unless it gets worse by this factor.
@@ -83,6 +84,7 @@ class Watch:
         self._usual = np.full(C, _FIRST_USUAL)
         self._distrusted = np.zeros(C, bool)
         self._lacks = np.zeros(C, bool)  # those of them whose masks miss a part of the person
+        self._whole_for = np.zeros(C, np.int64)
         self._since_trial = np.full(C, _PAUSE)
         self._at_trial = np.zeros(C)
         self._left_out: dict[str, Span] = {}  # by "camera/reason"
@@ -136,8 +138,8 @@ class Watch:
             if reason is not None and bad[camera]:
                 _count(self._left_out, f"{camera}/{reason}", frame.index)
         for camera in np.flatnonzero((out | self._distrusted) & ~bad).tolist():
-            reason = _LACKS if self._lacks[camera] else _DISAGREES
-            _count(self._left_out, f"{camera}/{reason}", frame.index)
+            said = _LACKS if self._lacks[camera] else _DISAGREES
+            _count(self._left_out, f"{camera}/{said}", frame.index)
         return self._judged(frame.index, estimate, used, aside), used
 
     def _bad(self, sick: Sequence[str | None]) -> NDArray[np.bool_]:
@@ -156,11 +158,13 @@ class Watch:
         assert first.fit_error is not None
         error = aside = first.fit_error  # no mask can lie farther beside the body
         if self._distrusted.any() or np.nanmax(error, initial=0.0) > _SUSPECT:
-            error, lacking, surplus = self._errors(frame, first)
-            aside = np.minimum(lacking, surplus)
+            lacking, surplus = self._errors(frame, first)
+            error, aside = lacking + surplus, _aside(lacking, surplus)
         ratio = error / self._usual
         usable = ~bad & np.isfinite(error)
-        back = self._distrusted & usable & ((ratio < _BACK_RATIO) | (error < 0.8 * _SUSPECT))
+        whole = usable & ((ratio < _BACK_RATIO) | (error < 0.8 * _SUSPECT))
+        self._whole_for = np.where(whole, self._whole_for + 1, 0)
+        back = self._distrusted & (self._whole_for >= np.where(self._lacks, _WHOLE, 1))
         kept = usable & ~self._distrusted
         self._since_trial += 1
         suspects = np.flatnonzero(kept & (error > _SUSPECT) & (ratio > _SUSPECT_RATIO))
@@ -176,25 +180,22 @@ class Watch:
             fewer = _without(used, ~others)
             self._restore(before)
             second = self.tracker.step(fewer)
-            again, lacking, surplus = self._errors(frame, second)
-            aside_again = np.minimum(lacking, surplus)
+            lacking, surplus = self._errors(frame, second)
+            again = lacking + surplus
             relief = 1.0 - float(np.mean(again[others]) / np.mean(error[others]))
             # Where the body does not explain the others either, it is the pose that is wrong. A mask with somebody else
             # beside the person misleads contours little. A body that two cameras see may be anywhere in a third.
             others_fit = float(np.mean(again[others] / self._usual[others]))
-            least = _HOPELESS if others.sum() >= 3 else 2 * _HOPELESS
-            moved = float(np.linalg.norm(second.joints - first.joints, axis=1).mean())
-            misleads = lacking[worst] > least and moved > _MISLED_M
-            elsewhere = aside_again[worst] > least or surplus[worst] > _BLOB
-            hopeless = others_fit < _OTHERS_FIT[0] and (elsewhere or misleads)
-            much = others.sum() >= 3 and surplus[worst] + aside_again[worst] > _CULPRIT_RATIO * self._usual[worst]
+            outside = lacking[worst] > (_HOPELESS if others.sum() >= 3 else 2 * _HOPELESS)
+            hopeless = others_fit < _OTHERS_FIT[0] and (outside or again[worst] > _BLOB)
+            much = others.sum() >= 3 and again[worst] > _CULPRIT_RATIO * self._usual[worst]
             relieved = others_fit < _OTHERS_FIT[1] and much and relief > _RELIEF
             culprit = relief > -_RELIEF / 2 and (hopeless or relieved)
             if culprit:
                 self._distrusted[worst] = True
-                self._lacks[worst] = misleads and not (elsewhere or relieved)
+                self._lacks[worst] = surplus[worst] < _TORN * lacking[worst]
                 estimate, used, kept = replace(second, status=first.status), fewer, others
-                aside = aside_again
+                aside = _aside(lacking, surplus)
             else:
                 self._restore(after)
                 self._since_trial[worst], self._at_trial[worst] = 0, error[worst]
@@ -210,10 +211,8 @@ class Watch:
         self.tracker.restore(self.tracker.model(), state)
 
     def _errors(self, frame: Observation, estimate: Estimate) -> Float:
-        """(3, C) of the estimate's pose, of cameras left out, too: E_S; body outside the mask; mask outside the body.
-
-        The last two are shares of the mask or of the body, whichever is larger: a mask of which little is left says
-        little. NaN where a camera sees nobody.
+        """(2, C) the two parts of E_S at the estimate's pose, of cameras left out, too: body outside the mask, and mask
+        outside the body. NaN where a camera sees nobody.
         """
         tracker = self.tracker
         assert isinstance(tracker, ContourTracker)
@@ -228,11 +227,8 @@ class Watch:
         drawn = met.label[0] > 0
         seen = np.count_nonzero(evidence.person, axis=(1, 2)).astype(np.float64)
         seen[seen == 0] = np.nan
-        lacking, surplus = (
-            np.count_nonzero(part, axis=(1, 2)) for part in (drawn & ~evidence.person, evidence.person & ~drawn)
-        )
-        larger = seen + np.maximum(lacking - surplus, 0)
-        return np.stack([(lacking + surplus) / seen, lacking / larger, surplus / larger])
+        parts = drawn & ~evidence.person, evidence.person & ~drawn
+        return np.stack([np.count_nonzero(part, axis=(1, 2)) / seen for part in parts])
 
     def _judged(self, index: int, estimate: Estimate, used: Observation, aside: Float | None) -> Estimate:
         """The estimate, lost where it cannot be true."""
@@ -268,6 +264,7 @@ class Watch:
             "usual": self._usual,
             "distrusted": self._distrusted,
             "lacks": self._lacks,
+            "whole_for": self._whole_for,
             "since_trial": self._since_trial,
             "at_trial": self._at_trial,
             **{f"health/{name}": value for name, value in self._health.state().items()},
@@ -285,6 +282,7 @@ class Watch:
         self._usual = np.array(state["usual"], np.float64)
         self._distrusted = np.array(state["distrusted"], bool)
         self._lacks = np.array(state["lacks"], bool)
+        self._whole_for = np.array(state["whole_for"], np.int64)
         self._since_trial = np.array(state["since_trial"], np.int64)
         self._at_trial = np.array(state["at_trial"], np.float64)
         self._health.restore(part["health"])
@@ -293,6 +291,12 @@ class Watch:
         self._left_out = {key: (span[0], span[1], span[2]) for key, span in left_out.items()}
         self._lost = {key: (span[0], span[1], span[2]) for key, span in lost.items()}
         self._why_apart = {int(camera): reason for camera, reason in apart.items()}
+
+
+def _aside(lacking: Float, surplus: Float) -> Float:
+    """(C,) by how much masks lie beside a body: what they lack of it, but no more than they show beside it, as a share
+    of the mask or of the body, whichever is larger; of both parts of E_S."""
+    return np.asarray(np.minimum(lacking, surplus) / np.maximum(1.0 + lacking - surplus, 1.0))
 
 
 def _count(spans: dict[str, Span], key: str, index: int) -> None:
