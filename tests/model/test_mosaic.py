@@ -5,7 +5,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tk.model.mosaic import Mosaic
+from tk.model.mosaic import Mosaic, doubled
 
 HEIGHT, WIDTH = 20, 30
 
@@ -41,7 +41,12 @@ def test_tightened_boxes_hold_what_is_set_and_a_margin():
     mosaic = Mosaic.of(np.array([[4, 2, 20, 15], [0, 0, 0, 0], [0, 0, 30, 20]], np.int32), 2)
     marks = np.zeros(mosaic.shape, np.uint8)
     mosaic.part(marks, 0)[1, 6:9] = 1
-    tight = mosaic.tightened(marks, 3)
+    tight = mosaic.tightened(marks, 3, 2)
     np.testing.assert_array_equal(tight.boxes, [[7, 2, 9, 5], [0, 0, 0, 0], [0, 0, 0, 0]])
     part = mosaic.part_of(marks, 0, tight.boxes[0])
     assert part.shape == (5, 9) and part.sum() == 3 and part[1, 3:6].all()
+
+
+def test_a_doubled_picture_has_each_pixel_four_times():
+    picture = np.arange(35, dtype=np.uint8).reshape(5, 7) * 7
+    np.testing.assert_array_equal(doubled(picture), picture.repeat(2, axis=0).repeat(2, axis=1))

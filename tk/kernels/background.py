@@ -90,6 +90,7 @@ def _label_kernel(
     shades: ti.types.ndarray(dtype=ti.u8, ndim=1),
     labels: ti.types.ndarray(dtype=ti.u8, ndim=1),  # after an even number of iterations
     spare: ti.types.ndarray(dtype=ti.u8, ndim=1),  # after an odd one
+    open_pixels: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [mosaic] scratch: those whose labels neighbours can change
     precision: ti.types.ndarray(dtype=ti.f32, ndim=1),  # [C] 1 / noise variance
     brightness: ti.types.ndarray(dtype=ti.f32, ndim=2),  # [C, 2] least of what is bright, and of the scene
     boxes: ti.types.ndarray(dtype=ti.i32, ndim=2),  # [C, 4] left, top, width, height
@@ -121,6 +122,9 @@ def _label_kernel(
         line = w + 2  # of a row of squares: a pixel more on either side
         row_0 = c * 3 * (width + 2)
         smallest = difference_min / precision[c]
+        swing = 4 * per_neighbour
+        begin = corners[c, 0] * (labels.shape[0] // stride)  # of its open pixels
+        end = begin
         for y in range(-1, h + 1):  # the statistic is a row behind the squares
             row = row_0 + (y + 1) % 3 * line
             inside = 0 <= top + y < height
@@ -173,9 +177,14 @@ def _label_kernel(
                         t = 1.0 - s
                         residual = (dd + 2.0 * t * db + t * t * bb) / (1.0 + s * s)
                         difference[to + x] = _level(plain * (precision[c] / 54.0))
-                        level = _level(residual * weights[pixel] * (precision[c] / 27.0))
-                        collinearity[to + x] = level
-                        labels[to + x] = ti.cast(level >= threshold, ti.u8)
+                        level = ti.cast(_level(residual * weights[pixel] * (precision[c] / 27.0)), ti.i32)
+                        collinearity[to + x] = ti.cast(level, ti.u8)
+                        label = ti.cast(level >= threshold, ti.u8)
+                        labels[to + x] = label
+                        spare[to + x] = label
+                        if level > 0 and threshold - swing <= level < threshold + swing:
+                            open_pixels[end] = to + x
+                            end += 1
                         scene = 0
                         for k in ti.static(range(3)):
                             scene += GREY[k] * ti.cast(plates[3 * pixel + k], ti.i32)
@@ -187,15 +196,13 @@ def _label_kernel(
                             shade = DARK
                         shades[to + x] = ti.cast(shade, ti.u8)
         for turn_of_labels in range(iterations):
-            for y in range(h):
-                for x in range(w):
-                    i = corner + y * stride + x
-                    level = ti.cast(collinearity[i], ti.i32)
-                    if level > 0:
-                        if turn_of_labels % 2 == 0:
-                            spare[i] = _relaxed(labels, i, stride, level, per_neighbour, threshold)
-                        else:
-                            labels[i] = _relaxed(spare, i, stride, level, per_neighbour, threshold)
+            for k in range(begin, end):
+                i = open_pixels[k]
+                level = ti.cast(collinearity[i], ti.i32)
+                if turn_of_labels % 2 == 0:
+                    spare[i] = _relaxed(labels, i, stride, level, per_neighbour, threshold)
+                else:
+                    labels[i] = _relaxed(spare, i, stride, level, per_neighbour, threshold)
 
 
 class Statistic:
@@ -258,7 +265,8 @@ class Statistic:
         size = shape[0] * shape[1]
         if self._launch is None or size > self._planes.shape[1]:
             self._planes = np.zeros((5, size + size // 2), np.uint8)
-            self._launch = Launcher(_label_kernel, *self._inputs, self._squares, *self._planes)
+            pixels = np.zeros(self._planes.shape[1], np.int32)
+            self._launch = Launcher(_label_kernel, *self._inputs, self._squares, *self._planes, pixels)
             self._spread = spread_of(len(precision))
         self._planes[:, :size] = 0
         self._launch(

@@ -38,7 +38,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from tk.errors import ConfigError
 from tk.kernels.background import BRIGHT, DARK, GREY, Statistic
-from tk.model.mosaic import Mosaic
+from tk.model.look import CoarseLook
+from tk.model.mosaic import Mosaic, doubled
 from tk.model.regions import (
     beyond_shadows,
     clean_by_area,
@@ -64,14 +65,6 @@ from tk.model.scene import (
 # Pixels of the full picture that are one of the picture that is tested, each way: the sleeves of a grey man over a grey
 # floor show, and it takes a quarter of the time.
 _REDUCTION = 2
-
-# The coarse look. Its pixels are four of the full picture each way.
-_LOOK = 3.0  # noise deviations of a reduced pixel by which a coarse one differs
-_WHOLE = 128  # shares of the scene's light are counted in so many parts, to fit a byte
-_LOOK_CELLS = 4  # of a coarse pixel and its eight neighbours, how many differ: fewer are noise, or a speck
-# The margin about it, share of the picture's height. The boxes of 535 pictures of five rendered captures cut nothing
-# off with 20 of 240 pixels, a hand in five of them with 12.
-_LOOK_MARGIN = 0.085
 
 # A further foreground neighbour divides the threshold by 2 to this power. Griesser et al. derive such a term from a
 # Markov random field; the value is measured.
@@ -197,10 +190,6 @@ class CollinearityForeground:
         self._small_plates = reduced(plates, _REDUCTION)
         self._small = np.empty_like(self._small_plates)
         self._small_scenes = np.empty_like(self._small_plates)
-        self._coarse_plates = reduced(self._small_plates, 2)
-        self._coarse_scenes = np.empty_like(self._coarse_plates)
-        darkest = self._coarse_plates.min(axis=3)
-        self._darkest = darkest.reshape(-1, darkest.shape[2])
         self._noise_floor = noise_floor.astype(np.float32)
         self._plate_samples = samples(self._small_plates).astype(np.float32)
         self._noise_samples = samples(relative[..., None])[:, 0]
@@ -208,6 +197,7 @@ class CollinearityForeground:
         self._statistic = Statistic(self._small, self._small_scenes, (1.0 / relative).astype(np.float32))
         # of the reduced pictures
         self._height = int(np.median(sizes[:, 1])) // _REDUCTION
+        self._look = CoarseLook(self._small_plates, config.shadow_min, self._height)
         self._speck, self._hole = (
             share * float(np.median(np.prod(sizes, axis=1))) / _REDUCTION**2
             for share in (config.speck_area, config.hole_area)
@@ -264,10 +254,10 @@ class CollinearityForeground:
         """
         masks = np.zeros(images.shape[:3], np.uint8)
         doubtful = np.zeros(images.shape[:3], np.bool_)
-        self._small[...] = reduced(images, _REDUCTION)
+        reduced(images, _REDUCTION, out=self._small)
         gains, variances = gain_and_noise(samples(self._small), self._plate_samples, self._noise_samples)
         noise = variances + self._noise_floor
-        boxes = self._look(gains, _LOOK * np.sqrt(noise))
+        boxes = self._look.boxes(self._small, gains, noise)
         if not boxes.any():
             return masks, doubtful
         mosaic = Mosaic.of(boxes, self._gap)
@@ -293,46 +283,10 @@ class CollinearityForeground:
         decision, doubt = self._decide(mosaic)
         self._outline(images, gains, decision, mosaic, masks)
         full = mosaic.enlarged(_REDUCTION)
-        whole = cv2.resize(doubt, full.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        whole = doubled(doubt)
         for c in range(len(images)):
             np.greater(full.part(whole, c), full.crop(masks[c], c), out=full.crop(doubtful[c], c))  # 1 where 0
         return masks, doubtful
-
-    def _look(self, gains: NDArray[np.float32], least: NDArray[np.float32]) -> NDArray[np.int32]:
-        """A coarse look at the whole of each picture: (C, 4) boxes of the reduced ones that hold the person.
-
-        What is brighter than the scene, darker than a shadow makes it, or of another colour, and a margin about it that
-        is larger than what may look like a shadow. A box is empty, all 0, where there is nothing.
-
-        Args:
-            gains: (C, 3).
-            least: (C,) grey levels that noise does not make.
-        """
-        coarse = reduced(self._small, 2)
-        count, height, width = coarse.shape[:3]
-        for plate, gain, scene in zip(self._coarse_plates, gains, self._coarse_scenes, strict=True):
-            cv2.transform(plate, np.diag(gain), dst=scene)
-        # one below the other they are one picture
-        tall, scenes = coarse.reshape(-1, width, 3), self._coarse_scenes.reshape(-1, width, 3)
-        shaded = cv2.convertScaleAbs(scenes, alpha=self.config.shadow_min)
-        # a shadow leaves the same share of every colour
-        blue, green, red = cv2.split(cv2.divide(tall, scenes, scale=_WHOLE))
-        uneven = cv2.subtract(cv2.max(cv2.max(blue, green), red), cv2.min(cv2.min(blue, green), red))
-        tinted = cv2.multiply(uneven, self._darkest, scale=1 / _WHOLE)
-        blue, green, red = cv2.split(cv2.max(cv2.subtract(tall, scenes), cv2.subtract(shaded, tall)))
-        beyond = np.asarray(cv2.max(cv2.max(blue, green), cv2.max(red, tinted)), np.uint8).reshape(count, -1)
-        differs = (beyond > least.astype(np.uint8)[:, None]).reshape(-1, width).view(np.uint8)
-        crowd = cv2.boxFilter(differs, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-        differs &= crowd >= _LOOK_CELLS
-        margin = round(_LOOK_MARGIN * self._height)
-        boxes = np.zeros((count, 4), np.int32)
-        for c, picture in enumerate(differs.reshape(count, height, width)):
-            x, y, w, h = (2 * n for n in cv2.boundingRect(picture))
-            if w > 0:
-                left, top = max(x - margin, 0), max(y - margin, 0)
-                right, bottom = min(x + w + margin, 2 * width), min(y + h + margin, 2 * height)
-                boxes[c] = left, top, right - left, bottom - top
-        return boxes
 
     def _brightness(self, gains: NDArray[np.float32]) -> NDArray[np.float32]:
         """(C, 2) sums over a window of how much brighter a picture is than the scene: what is bright, what is usual.
@@ -347,7 +301,7 @@ class CollinearityForeground:
         return np.stack([usual + _BRIGHT * noise, usual], axis=1).astype(np.float32)
 
     def _decide(self, mosaic: Mosaic) -> tuple[Images, Images]:
-        """Mosaics of the reduced pictures: where the person is, 0 or 255, and where he may be as well, 0 or 1."""
+        """Mosaics of the reduced pictures: where the person is, and where he may be as well, 0 or 1."""
         statistic = self._statistic
         difference, collinearity, shades = statistic.difference, statistic.collinearity, statistic.shades
         seen = difference > 0
@@ -358,36 +312,35 @@ class CollinearityForeground:
         unsure &= ~certain
         foreground = certain | enclosed(unsure, certain, _ENCLOSURE)
         foreground |= unsure & closed(foreground, self._bridge)
-        foreground = joined(
+        person = joined(
             foreground,
             seen,
             collinearity,
             mosaic.corners[:, 0],
             seed=_SEED,
             least=self._speck,
+            hole=self._hole,
             reach=_GAP * self._height,
             width=max(round(_LIMB * self._height), 1),
         )
-        return clean_by_area(foreground, self._speck, self._hole), (seen & ~foreground).view(np.uint8)
+        return person, (seen.view(np.uint8) > person).view(np.uint8)
 
     def _outline(
         self, images: Images, gains: NDArray[np.float32], decision: Images, mosaic: Mosaic, masks: Images
     ) -> None:
         """Draw the outlines in the full pictures, into ``masks``: the rim goes where it shows the scene."""
-        tight = mosaic.tightened(decision, _RIM_LAYERS // _REDUCTION + 1)
+        tight = mosaic.tightened(decision, _RIM_LAYERS // _REDUCTION + 1, _RIM_LAYERS)
         small = np.zeros(tight.shape, np.uint8)
         for c in range(len(images)):
             tight.part(small, c)[...] = mosaic.part_of(decision, c, tight.boxes[c])
         full = tight.enlarged(_REDUCTION)
-        whole = cv2.resize(small, full.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        difference = np.zeros((*full.shape, 3), np.uint8)
+        contrast = np.zeros(full.shape, np.uint8)
         for c, gain in enumerate(gains):
             if full.boxes[c].any():
                 scene = cv2.transform(full.crop(self.plates[c], c), np.diag(gain))
-                cv2.absdiff(full.crop(images[c], c), scene, dst=full.part(difference, c))
-        blue, green, red = cv2.split(difference)
-        contrast = np.asarray(cv2.max(cv2.max(blue, green), red), np.uint8)
-        person = trim_rim(whole > 127, contrast, self.config.rim, _RIM_LAYERS)
+                blue, green, red = cv2.split(cv2.absdiff(full.crop(images[c], c), scene, dst=scene))
+                cv2.max(cv2.max(blue, green, dst=blue), red, dst=full.part(contrast, c))
+        person = trim_rim(doubled(small), contrast, self.config.rim, _RIM_LAYERS)
         clean = clean_by_area(person, self._speck * _REDUCTION**2, self._hole * _REDUCTION**2)
         for c in range(len(images)):
             full.crop(masks[c], c)[...] = full.part(clean, c)

@@ -9,6 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+#: a small closing at the edge of a box needs no more
+_FRAME = 2
+
 
 @dataclass(frozen=True)
 class Mosaic:
@@ -26,12 +29,11 @@ class Mosaic:
 
     @staticmethod
     def of(boxes: NDArray[np.int32], gap: int) -> Mosaic:
-        """Boxes (C, 4) from left to right, ``gap`` pixels between them and around them all."""
+        """Boxes (C, 4) from left to right, ``gap`` pixels between them and two around them all."""
         widths = boxes[:, 2] + gap
-        corners = np.empty((len(boxes), 2), np.int32)
-        corners[:, 0] = gap + np.cumsum(widths) - widths
-        corners[:, 1] = gap
-        return Mosaic(boxes, corners, (int(boxes[:, 3].max()) + 2 * gap, int(widths.sum()) + gap))
+        corners = np.full((len(boxes), 2), _FRAME, np.int32)
+        corners[:, 0] += np.cumsum(widths) - widths
+        return Mosaic(boxes, corners, (int(boxes[:, 3].max()) + 2 * _FRAME, int(widths.sum()) - gap + 2 * _FRAME))
 
     def enlarged(self, factor: int) -> Mosaic:
         """The same on pictures that are larger by a whole factor."""
@@ -53,8 +55,8 @@ class Mosaic:
         x, y = self.corners[c] + box[:2] - self.boxes[c, :2]
         return mosaic[y : y + box[3], x : x + box[2]]
 
-    def tightened(self, mosaic: NDArray[np.uint8], margin: int) -> Mosaic:
-        """The least boxes around what is not 0 in a mosaic, and ``margin`` more where the boxes have it."""
+    def tightened(self, mosaic: NDArray[np.uint8], margin: int, gap: int) -> Mosaic:
+        """The least boxes around what is not 0 in a mosaic, and ``margin`` more where they have it; see :meth:`of`."""
         boxes = np.zeros_like(self.boxes)
         for c, (left, top, width, height) in enumerate(self.boxes):
             x, y, w, h = cv2.boundingRect(self.part(mosaic, c)) if width > 0 else (0, 0, 0, 0)
@@ -62,4 +64,12 @@ class Mosaic:
                 right, bottom = min(x + w + margin, width), min(y + h + margin, height)
                 x, y = max(x - margin, 0), max(y - margin, 0)
                 boxes[c] = left + x, top + y, right - x, bottom - y
-        return Mosaic.of(boxes, int(self.corners[0, 1]))
+        return Mosaic.of(boxes, gap)
+
+
+def doubled(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(2 h, 2 w): each pixel of a picture (h, w) four times."""
+    height, width = picture.shape
+    result = np.empty((2 * height, 2 * width), np.uint8)
+    result[0::2] = result[1::2] = np.multiply(picture, 257, dtype=np.uint16).view(np.uint8)
+    return result

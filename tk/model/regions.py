@@ -62,14 +62,19 @@ def enclosed(unsure: Mask, certain: Mask, share: float) -> Mask:
     inside = _beside(certain) & unsure
     if not inside.any():
         return np.zeros_like(unsure)
-    count, numbers = cv2.connectedComponents(unsure.view(np.uint8), connectivity=4, ltype=cv2.CV_32S)
-    regions = np.asarray(numbers, np.int32)
+    few = np.count_nonzero(unsure) < 2**16
+    kind = cv2.CV_16U if few else cv2.CV_32S
+    count, numbers = cv2.connectedComponents(unsure.view(np.uint8), connectivity=4, ltype=kind)
+    regions = np.asarray(numbers).reshape(-1)
     outside = _beside(~(unsure | certain), beyond=1) & unsure
-    touching_outside = np.bincount(regions[outside], minlength=count)
-    touching_inside = np.bincount(regions[inside], minlength=count)
+    touching_outside = np.bincount(regions[np.flatnonzero(outside)], minlength=count)
+    touching_inside = np.bincount(regions[np.flatnonzero(inside)], minlength=count)
     chosen = touching_inside > share * (touching_inside + touching_outside)
-    chosen[0] = False
-    return chosen.take(regions)
+    result = np.zeros(unsure.shape, np.bool_)
+    if chosen.any():
+        pixels = np.flatnonzero(unsure)
+        result.reshape(-1)[pixels] = chosen[regions[pixels]]
+    return result
 
 
 def _beside(mask: Mask, beyond: int = 0) -> Mask:
@@ -93,40 +98,50 @@ def joined(
     *,
     seed: float,
     least: float,
+    hole: float,
     reach: float,
     width: int,
-) -> Mask:
-    """The parts that are the person, in one piece where that is possible.
+) -> Images:
+    """The parts that are the person, in one piece where that is possible, without small holes.
 
-    Of each picture's 8-connected parts the largest stays, and those that hold more than three pixels of ``seed`` noise
-    variances: the edges of shadows do not. Those of ``least`` pixels or more are then joined to the nearest other one
+    Of each picture's 8-connected parts of ``least`` pixels or more the largest stays, and those that hold more than
+    three pixels of ``seed`` noise variances: the edges of shadows do not. They are then joined to the nearest other one
     by a bar, where it is no farther than ``reach`` and everything between them was seen to differ from the scene.
 
     Args:
         mask, seen, statistic: (h, w) of pictures side by side.
         starts: (C,) their first columns.
+        hole: smaller holes are filled, pixels.
+
+    Returns:
+        (h, w) uint8, 0 or 1.
     """
-    contours, _ = cv2.findContours(mask.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    if len(contours) <= 1:
-        return mask
+    contours, inner = _outlines(mask.view(np.uint8))
     areas = np.array([_area(contour) for contour in contours])
-    boxes = np.array([cv2.boundingRect(contour) for contour in contours])
+    boxes = np.array([cv2.boundingRect(contour) for contour in contours]).reshape(-1, 4)
     picture = np.searchsorted(starts, boxes[:, 0], side="right")
     by_area = np.argsort(areas, kind="stable")
     largest = dict(zip(picture[by_area].tolist(), by_area.tolist(), strict=True)).values()
-    strong = mask & (statistic >= level_of(seed))
-    others = []  # than the largest
-    for k in by_area[areas[by_area] >= least]:
-        if k not in largest:
+    others, dropped = [], []  # than the largest
+    for k in by_area:
+        if areas[k] < least:
+            dropped.append(contours[k])
+        elif k not in largest:
             part = _filled(contours[k], boxes[k])
-            if np.count_nonzero(_crop(strong, boxes[k]) & part) > 3:
+            strong = _crop(mask, boxes[k]) & (_crop(statistic, boxes[k]) >= level_of(seed))
+            if np.count_nonzero(strong & part) > 3:
                 others.append((k, part))
-    result = np.zeros(mask.shape, np.uint8)
-    cv2.drawContours(result, [contours[k] for k in (*largest, *(k for k, _ in others))], -1, 1, cv2.FILLED)
-    kept = result.view(np.bool_) & mask
-    result &= mask
-    seen_closed: Images | None = None
+            else:
+                dropped.append(contours[k])
+    result = mask.view(np.uint8).copy()
+    _mend(result, inner, hole, dropped)
+    if not others:
+        return result
+    kept = mask & result.view(np.bool_)
     bounds = [0, *starts[1:].tolist(), mask.shape[1]]
+    closing = cv2.morphologyEx((seen | mask).view(np.uint8), cv2.MORPH_CLOSE, _SQUARE3)
+    seen_closed = np.asarray(closing, np.uint8)
+    bars = False
     for k, part in others:
         x, y, w, h = boxes[k].tolist()
         margin = int(reach) + 1  # nothing farther matters
@@ -138,15 +153,15 @@ def joined(
         ends = _shortest(here & near, near & ~here, reach)
         if ends is None:
             continue
-        if seen_closed is None:
-            closing = cv2.morphologyEx((seen | mask).view(np.uint8), cv2.MORPH_CLOSE, _SQUARE3)
-            seen_closed = np.asarray(closing, np.uint8)
         (ax, ay), (bx, by) = ends
         ends = (ax + left, ay + top), (bx + left, by + top)
         line = cv2.line(np.zeros_like(result), *ends, 1, 1)
         if np.mean(seen_closed[line > 0]) >= _SEEN:
             result |= np.asarray(cv2.line(line, *ends, 1, width), np.uint8) & seen_closed
-    return result.view(np.bool_)
+            bars = True
+    if bars:  # may have closed a ring
+        _mend(result, _outlines(result)[1], hole, [])
+    return result
 
 
 def _area(contour: NDArray[Any]) -> float:
@@ -161,7 +176,7 @@ def _filled(contour: NDArray[Any], box: NDArray[np.int32]) -> Mask:
     return part.view(np.bool_)
 
 
-def _crop(mask: Mask, box: NDArray[np.int32]) -> Mask:
+def _crop(mask: NDArray[Any], box: NDArray[np.int32]) -> NDArray[Any]:
     x, y, w, h = box
     return mask[y : y + h, x : x + w]
 
@@ -190,31 +205,45 @@ def _shortest(part: Mask, others: Mask, reach: float) -> tuple[tuple[int, int], 
 def clean_by_area(mask: Mask, speck: float, hole: float) -> Images:
     """Drop foreground (8-connected) of less than ``speck`` pixels, fill holes (4-connected) of less than ``hole``.
 
-    Works on outlines, which are short, not on regions. The outline of a hole runs on the foreground around it. What
-    lies inside an outline goes with it.
+    What lies inside an outline goes with it.
 
     Returns:
         (h, w) uint8, 0 or 255.
     """
     clean = mask.view(np.uint8) * np.uint8(255)
-    contours, hierarchy = cv2.findContours(clean, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    specks = []
-    for contour, (_, _, _, parent) in zip(contours, hierarchy[0] if len(contours) else (), strict=True):
-        if parent < 0 and _area(contour) < speck:
-            specks.append(contour)
-        elif parent >= 0 and _area(contour) - len(contour) < hole:
-            cv2.drawContours(clean, [contour], -1, 255, cv2.FILLED)
-    if specks:
-        cv2.drawContours(clean, specks, -1, 0, cv2.FILLED)
+    outer, inner = _outlines(clean)
+    _mend(clean, inner, hole, [contour for contour in outer if _area(contour) < speck], 255)
     return clean
 
 
-def trim_rim(mask: Mask, contrast: Images, share: float, layers: int) -> Mask:
-    """Take pixels off the outline, ``layers`` deep, that have less than a share of the largest contrast near them."""
+def _outlines(mask: Images) -> tuple[list[NDArray[Any]], list[NDArray[Any]]]:
+    """Of the 8-connected parts and of the 4-connected holes of a mask (h, w); a hole's runs on the part around it.
+
+    Outlines are short, regions are not.
+    """
+    contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    parents = hierarchy[0, :, 3].tolist() if len(contours) else []
+    outer = [contour for contour, parent in zip(contours, parents, strict=True) if parent < 0]
+    return outer, [contour for contour, parent in zip(contours, parents, strict=True) if parent >= 0]
+
+
+def _mend(mask: Images, holes: list[NDArray[Any]], most: float, dropped: list[NDArray[Any]], value: int = 1) -> None:
+    """Fill holes of less than ``most`` pixels in a mask and take parts off it, both given by their outlines."""
+    filled = [contour for contour in holes if _area(contour) - len(contour) < most]
+    for contour in filled:  # together, those within others would stay open
+        cv2.drawContours(mask, [contour], -1, value, cv2.FILLED)
+    if dropped:
+        cv2.drawContours(mask, dropped, -1, 0, cv2.FILLED)
+
+
+def trim_rim(mask: Images, contrast: Images, share: float, layers: int) -> Mask:
+    """Take pixels off the outline, ``layers`` deep, that have less than a share of the largest contrast near them.
+
+    ``mask`` (h, w) holds 0 and 1.
+    """
     size = 2 * layers - 1
     largest = cv2.dilate(contrast, np.ones((size, size), np.uint8))
-    weak = contrast < cv2.convertScaleAbs(largest, alpha=share)
+    strong = (contrast >= cv2.convertScaleAbs(largest, alpha=share)).view(np.uint8) & mask
     for _ in range(layers):
-        inside = cv2.erode(mask.view(np.uint8), _SQUARE3, borderValue=1).view(np.bool_)
-        mask = mask & (inside | ~weak)
-    return mask
+        mask = np.asarray(cv2.max(cv2.erode(mask, _SQUARE3, borderValue=1), strong), np.uint8)
+    return mask.view(np.bool_)

@@ -17,6 +17,8 @@ Float = NDArray[np.float32]
 _DARKEST, _BRIGHTEST = 20, 245  # grey levels between which a pixel is neither drowned in noise nor saturated
 _LEAST_SAMPLES = 64  # with fewer usable ones a picture keeps the plate's gain
 
+_ROUGHLY = 4  # every so many samples tell the first gain, which only finds out who shows the scene
+
 # Least noise variance of a pixel, as a share of its picture's: coding rounds small noise away in places and then lets
 # it jump. Measured on rendered captures and a real one.
 _LEAST_RELATIVE_NOISE = 0.5
@@ -67,13 +69,17 @@ def check_clips(clips: Sequence[Images], frame_shape: tuple[int, int], sizes: ND
             raise CaptureError(f"background: camera {c + 1} is larger than the frame {frame_shape}")
 
 
-def reduced(images: Images, factor: int) -> Images:
-    """(N, H // factor, W // factor, 3): means over squares of pixels; what is left over on the right and below goes."""
+def reduced(images: Images, factor: int, out: Images | None = None) -> Images:
+    """(N, H // factor, W // factor, 3): means over squares of pixels; what is left over on the right and below goes.
+
+    Into ``out``, where it is given, which is contiguous.
+    """
     count, height, width = len(images), images.shape[1] // factor, images.shape[2] // factor
     whole = np.ascontiguousarray(images[:, : factor * height, : factor * width])
     # one below the other they are one picture
     tall = whole.reshape(-1, *whole.shape[2:])
-    small = cv2.resize(tall, (width, count * height), interpolation=cv2.INTER_AREA)
+    into = None if out is None else out.reshape(count * height, width, 3)
+    small = cv2.resize(tall, (width, count * height), dst=into, interpolation=cv2.INTER_AREA)
     return np.asarray(small, np.uint8).reshape(count, height, width, 3)
 
 
@@ -99,9 +105,9 @@ def gain_and_noise(images: Images, plates: Float, relative: Float) -> tuple[Floa
     usable = (low > _DARKEST) & (high < _BRIGHTEST)
     count = np.count_nonzero(usable, axis=1)
     b = np.maximum(plates, 1)
-    rough = np.empty((len(a), 3), np.float32)
-    for k in range(3):
-        rough[:, k] = _medians(np.where(usable, a[:, k] / b[:, k], np.inf), count)
+    few = usable[:, ::_ROUGHLY]
+    ratios = np.where(few[:, None], a[:, :, ::_ROUGHLY] / b[:, :, ::_ROUGHLY], np.inf).reshape(-1, few.shape[1])
+    rough = _medians(ratios, np.repeat(np.count_nonzero(few, axis=1), 3)).reshape(-1, 3)
     rough[count < _LEAST_SAMPLES] = 1
     residual = np.abs(a - rough[:, :, None] * b).max(axis=1) / np.sqrt(relative)
     residual[~usable] = np.inf
