@@ -210,3 +210,10 @@ def test_one_core_needs_no_further_process(tiny: Path, monkeypatch: pytest.Monke
 def test_setting_out_of_range() -> None:
     with pytest.raises(ConfigError, match="ahead = -1: choose from 0 to 64"):
         Config(ahead=-1)
+
+
+def test_the_process_does_without_what_only_trackers_need() -> None:
+    """SciPy alone would take it half a second at each start."""
+    heavy = "tk.config", "tk.trackers.contours", "scipy", "h5py", "av", "open3d"
+    code = f"import sys, tk.ahead; print(*(name for name in {heavy} if name in sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split() == []

@@ -28,17 +28,20 @@ from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from types import TracebackType
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.config import Config
 from tk.errors import TkError, WorkerError
 from tk.io.capture import Capture
+from tk.model.foreground import ForegroundConfig
 from tk.segmentation import Labeller, make_labeller, mask_source
 from tk.trackers.base import Observation, Stopwatch
+
+if TYPE_CHECKING:
+    from tk.config import Config
 
 Note = Callable[[str], None]
 #: a frame, and what it took: seconds in "decode", "masks", and how long the tracker had to "wait" for it
@@ -146,10 +149,12 @@ class Serial:
 
 @dataclass(frozen=True)
 class _Task:
-    """What the process needs to begin with; the span of frames follows."""
+    """What the process needs to begin with; the span of frames follows. It has the settings that
+    :class:`tk.segmentation.MaskSettings` names."""
 
     capture: Capture
-    config: Config
+    segmentation: str
+    foreground: ForegroundConfig
     keep_images: bool
     slots: int
 
@@ -230,7 +235,7 @@ class Ahead:
         finally:
             theirs.close()
             os.close(handle)
-        self._send(_Task(capture, config, keep_images, slots))
+        self._send(_Task(capture, config.segmentation, config.foreground, keep_images, slots))
 
     def frames(self, start: int, stop: int) -> Iterator[Observed]:
         self._begun = True
@@ -363,7 +368,7 @@ def serve(socket: int, handle: int) -> None:
 
 def _serve(tracker: Connection, memory: mmap.mmap) -> None:
     task: _Task = tracker.recv()
-    label = make_labeller(task.capture, task.config, tracker.send)
+    label = make_labeller(task.capture, task, tracker.send)
     ring = _Ring(tracker, memory, task)
     span: tuple[int, int] = tracker.recv()
     for observation, watch in observe(task.capture, label, span, task.keep_images):

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.blas import one_blas_thread
-from tk.config import Config
 from tk.errors import CaptureError
 from tk.io.capture import Capture
 from tk.io.frames import FrameSet
-from tk.model.foreground import CollinearityForeground, Foreground
+from tk.model.foreground import CollinearityForeground, Foreground, ForegroundConfig
 from tk.model.mog2 import Mog2Foreground
 from tk.model.scene import median_plate
-from tk.model.subject import CoarseHull
 from tk.segmenters import INSTALL, load, names
-from tk.subject_masks import SubjectMasks
 
 Segmenter = Callable[[FrameSet], NDArray[np.uint8]]
 #: masks, and where they are 0 for what may be the person all the same; None where nobody says
@@ -43,6 +41,15 @@ _WAYS_OUT = (
 NO_SEGMENTER = f"no segmenter is installed; {INSTALL} brings one"
 
 
+class MaskSettings(Protocol):
+    """What of a :class:`tk.config.Config` tells how masks are made; that itself would import every tracker."""
+
+    @property
+    def segmentation(self) -> str: ...
+    @property
+    def foreground(self) -> ForegroundConfig: ...
+
+
 def mask_source(capture: Capture) -> str:
     """Where masks come from: "given", "none" (the empty scene), "median", or "segmenter NAME".
 
@@ -61,49 +68,53 @@ def mask_source(capture: Capture) -> str:
     return _SEGMENTER + installed[0]
 
 
-def make_segmenter(capture: Capture, config: Config, note: Callable[[str], None]) -> Segmenter:
+def make_segmenter(capture: Capture, config: MaskSettings, note: Callable[[str], None]) -> Segmenter:
     """Masks of each frame, from where :func:`mask_source` says."""
     label = make_labeller(capture, config, note)
     return lambda frame: label(frame)[0]
 
 
-def make_labeller(capture: Capture, config: Config, note: Callable[[str], None]) -> Labeller:
+def make_labeller(capture: Capture, config: MaskSettings, note: Callable[[str], None]) -> Labeller:
     """The same, and what is doubtful in them (:attr:`tk.trackers.base.Observation.doubtful`).
 
     Raises:
         CaptureError: there is nothing to make masks from, or the median is not the empty scene.
         ConfigError: the segmenter cannot be loaded.
     """
+    if mask_source(capture) in (_GIVEN, _SCENE):
+        return _labeller(capture, config, note)  # no product of matrices in it; SciPy takes long to import
     with one_blas_thread():
         return one_blas_thread()(_labeller(capture, config, note))
 
 
-def _labeller(capture: Capture, config: Config, note: Callable[[str], None]) -> Labeller:
+def _labeller(capture: Capture, config: MaskSettings, note: Callable[[str], None]) -> Labeller:
     source = mask_source(capture)
     if source == _GIVEN:
         return _given_masks
     if source.startswith(_SEGMENTER):
         name = source.removeprefix(_SEGMENTER)
         note(f"{capture.path}: no masks and no background/; the segmenter {name} makes the masks")
+        from tk.subject_masks import SubjectMasks  # SciPy, which takes a second to import
+
         made = SubjectMasks(load(name), name, capture.rig, capture.volume)
         return lambda frame: made.label(frame.images)
     foreground = _learn_median(capture, config, note) if source == _MEDIAN else _learn_scene(capture, config)
     return lambda frame: foreground.label(frame.images)
 
 
-def _learn_scene(capture: Capture, config: Config) -> Foreground:
+def _learn_scene(capture: Capture, config: MaskSettings) -> Foreground:
     clips = capture.background()
     assert clips is not None
     return _learn(capture, config, clips)
 
 
-def _learn(capture: Capture, config: Config, clips: tuple[NDArray[np.uint8], ...]) -> Foreground:
+def _learn(capture: Capture, config: MaskSettings, clips: tuple[NDArray[np.uint8], ...]) -> Foreground:
     sizes = [(camera.width, camera.height) for camera in capture.rig]
     learner = CollinearityForeground if config.segmentation == "collinearity" else Mog2Foreground
     return learner.learn(clips, capture.rig.frame_shape, sizes, config.foreground)
 
 
-def _learn_median(capture: Capture, config: Config, note: Callable[[str], None]) -> Foreground:
+def _learn_median(capture: Capture, config: MaskSettings, note: Callable[[str], None]) -> Foreground:
     """The median over the recording for the empty scene, and a look whether it is.
 
     Raises:
@@ -114,6 +125,8 @@ def _learn_median(capture: Capture, config: Config, note: Callable[[str], None])
         samples = [frame.images.copy() for frame in frames if frame.index % step == 0]
     foreground = _learn(capture, config, median_plate(samples, [(c.width, c.height) for c in capture.rig]))
     masks = np.array([foreground.segment(images) for images in samples]) > 0  # (K, C, H, W)
+    from tk.model.subject import CoarseHull  # SciPy
+
     hull = CoarseHull(capture.rig, capture.volume)
     litres = float(np.median([hull.litres(hull.subject(each.view(np.uint8))) for each in masks]))
     if litres < _LEAST_LITRES:

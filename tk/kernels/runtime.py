@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
 import io
 import logging
 import os
@@ -16,6 +17,8 @@ import tempfile
 import time
 import warnings
 from pathlib import Path
+
+from tk.kernels.source_notes import brief
 
 _LOG = logging.getLogger(__name__)
 
@@ -82,6 +85,8 @@ def ensure_runtime() -> None:
     if threads:
         options["cpu_max_num_threads"] = int(threads)
     _break_stale_lock()
+    with contextlib.suppress(ImportError, AttributeError):  # another Taichi
+        brief(importlib.import_module("taichi.lang.ast.ast_transformer_utils"), ti.lang.kernel_impl)
     _LOG.info("starting the kernels; what this machine has not compiled yet takes some seconds")
     with contextlib.redirect_stdout(io.StringIO()):  # it prints that it starts, whatever the log level
         ti.init(**options)

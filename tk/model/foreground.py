@@ -54,6 +54,7 @@ from tk.model.scene import (
     check_clips,
     gain_and_noise,
     learn_scene,
+    mean_scene,
     median,
     reduced,
     relative_noise,
@@ -236,8 +237,7 @@ class CollinearityForeground:
         relative = np.ones((len(clips), *(n // _REDUCTION for n in frame_shape)), np.float32)
         floor = np.array([_STILL_NOISE if len(clip) == 1 else _NOISE_FLOOR for clip in clips])
         for c, (clip, (width, height)) in enumerate(zip(clips, sizes, strict=True)):
-            plate, _ = learn_scene(clip)
-            plates[c, :height, :width] = np.clip(plate.round(), 0, 255)
+            plates[c, :height, :width] = np.clip(mean_scene(clip).round(), 0, 255)
             small_plate, variance = learn_scene(reduced(clip, _REDUCTION))
             noise = relative_noise(small_plate, variance, _NOISE_FLOOR)
             relative[c, : noise.shape[0], : noise.shape[1]] = noise

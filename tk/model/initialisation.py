@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.optimize import least_squares
 
 from tk.errors import CaptureError
 from tk.model.anthropometry import (
@@ -249,6 +248,8 @@ def rough_pose(
     def residual(p: Float) -> Float:
         # a little weight on plain angles settles what the joints leave open
         return np.concatenate([((skeleton.joints(p)[rows] - targets) / 0.02).ravel(), 0.2 * (p[3:] - rest[3:])])
+
+    from scipy.optimize import least_squares  # takes half a second to import
 
     lower, upper = skeleton.lower - 1e-9, skeleton.upper + 1e-9
     best = None

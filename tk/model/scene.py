@@ -136,6 +136,16 @@ def _medians(values: Float, count: NDArray[np.int_]) -> Float:
     return np.take_along_axis(ordered, ranks[:, None], axis=1)[:, 0]
 
 
+def mean_scene(clip: Images) -> Float:
+    """Mean (h, w, 3) of a clip of the empty scene, flicker taken off."""
+    total = np.zeros(clip.shape[1:], np.float32)
+    scaled = np.empty_like(total)
+    for frame, gain in zip(clip, _flicker(clip), strict=True):
+        np.multiply(frame, 1 / gain, out=scaled)
+        total += scaled
+    return total / len(clip)
+
+
 def learn_scene(clip: Images) -> tuple[Float, Float | None]:
     """Mean and temporal variance (h, w, 3) of a clip of the empty scene, flicker taken off; no variance for T = 1."""
     reference = clip[0].astype(np.float32)
@@ -143,10 +153,7 @@ def learn_scene(clip: Images) -> tuple[Float, Float | None]:
         return reference, None
     total = np.zeros_like(reference)
     squares = np.zeros_like(reference)
-    sample = samples(clip)
-    first = np.broadcast_to(sample[:1].astype(np.float32), sample.shape)
-    gains, _ = gain_and_noise(sample, first, np.ones((len(clip), sample.shape[2]), np.float32))
-    for frame, gain in zip(clip, gains, strict=True):
+    for frame, gain in zip(clip, _flicker(clip), strict=True):
         # sums of differences from the first frame: no cancellation in float32
         difference = frame / gain - reference
         total += difference
@@ -154,6 +161,15 @@ def learn_scene(clip: Images) -> tuple[Float, Float | None]:
     mean = total / len(clip)
     variance = (squares - total * mean) / (len(clip) - 1)
     return reference + mean, np.maximum(variance, 0)
+
+
+def _flicker(clip: Images) -> Float:
+    """(T, 3) the gains of a clip's pictures against its first."""
+    if len(clip) == 1:
+        return np.ones((1, 3), np.float32)
+    sample = samples(clip)
+    first = np.broadcast_to(sample[:1].astype(np.float32), sample.shape)
+    return gain_and_noise(sample, first, np.ones((len(clip), sample.shape[2]), np.float32))[0]
 
 
 def relative_noise(plate: Float, variance: Float | None, floor: float) -> Float:

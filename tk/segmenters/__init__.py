@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import importlib.util
 from importlib.metadata import entry_points
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
-from tk.model.subject import Sighting
+
+if TYPE_CHECKING:
+    from tk.model.subject import Sighting
 
 GROUP = "tk.segmenters"
 

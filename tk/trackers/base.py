@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.init_pose import InitPose
-from tk.model.hull import HullSurface
+if TYPE_CHECKING:  # who decodes and segments needs no tracker's parts
+    from tk.io.init_pose import InitPose
+    from tk.model.hull import HullSurface
 
 Float = NDArray[np.float64]
 
