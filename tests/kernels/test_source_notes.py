@@ -60,9 +60,12 @@ def test_another_taichi_is_left_as_it_is(utilities, kernels):
 
 def test_a_context_of_another_kind_gets_the_full_note():
     context = type("Context", (), {"get_pos_info": lambda self, node: "full"})
-    assert source_notes.brief(
-        SimpleNamespace(ASTTransformerContext=context), SimpleNamespace(textwrap=None, getsourcelines=None)
-    ) is False
+    assert (
+        source_notes.brief(
+            SimpleNamespace(ASTTransformerContext=context), SimpleNamespace(textwrap=None, getsourcelines=None)
+        )
+        is False
+    )
     assert source_notes.brief(SimpleNamespace(ASTTransformerContext=context), SimpleNamespace(textwrap=textwrap))
     assert context().get_pos_info(None) == "full"
 

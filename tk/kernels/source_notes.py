@@ -25,7 +25,7 @@ def brief(utilities: Any, kernels: Any) -> bool:
         utilities: the module ``taichi.lang.ast.ast_transformer_utils``.
         kernels: the module ``taichi.lang.kernel_impl``.
     """
-    context = getattr(utilities, "ASTTransformerContext", None)
+    context: Any = getattr(utilities, "ASTTransformerContext", None)
     full = getattr(context, "get_pos_info", None)
     if not callable(full) or getattr(kernels, "textwrap", None) is None:
         return False

@@ -143,7 +143,7 @@ def mean_scene(clip: Images) -> Float:
     for frame, gain in zip(clip, _flicker(clip), strict=True):
         np.multiply(frame, 1 / gain, out=scaled)
         total += scaled
-    return total / len(clip)
+    return total / np.float32(len(clip))
 
 
 def learn_scene(clip: Images) -> tuple[Float, Float | None]:
