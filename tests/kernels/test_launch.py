@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.kernels.test_runtime import run
-from tk.kernels.launch import Launcher, short_positions
+from tk.kernels.launch import Launcher
 from tk.kernels.runtime import ensure_runtime, ti
 
 
@@ -80,31 +80,6 @@ def test_a_runtime_made_anew_compiles_anew():
         """
     )
     assert printed.count("12.0") == 2
-
-
-def test_errors_in_kernels_name_file_and_line():
-    ensure_runtime()
-
-    @ti.kernel
-    def wrong(x: ti.types.ndarray(dtype=ti.f32, ndim=1)):
-        for i in range(x.shape[0]):
-            x[i] = nobody  # noqa: F821
-
-    for _ in range(2):
-        with pytest.raises(ti.TaichiCompilationError, match=r'test_launch\.py", line \d+, in wrong'), short_positions():
-            wrong(np.zeros(1, np.float32))
-
-
-def test_positions_are_drawn_again_behind_it(monkeypatch):
-    from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
-
-    drawn = ASTTransformerContext.get_pos_info
-    with short_positions():
-        assert ASTTransformerContext.get_pos_info is not drawn
-    assert ASTTransformerContext.get_pos_info is drawn
-    monkeypatch.delattr(ASTTransformerContext, "get_pos_info")  # another Taichi
-    with short_positions():
-        assert not hasattr(ASTTransformerContext, "get_pos_info")
 
 
 def test_threads_do_not_mix_their_arrays():

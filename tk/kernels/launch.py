@@ -8,9 +8,8 @@ below Taichi's public interface; where a Taichi has no such thing, and in debug 
 
 from __future__ import annotations
 
-import contextlib
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,34 +17,6 @@ import numpy as np
 from tk.kernels.runtime import ti
 
 _WHOLE = (ti.i32, ti.i64)
-
-
-@contextlib.contextmanager
-def short_positions() -> Iterator[None]:
-    """Have Taichi name places in kernels by file and line only.
-
-    It draws each expression's source text, wrapped and underlined, in case that something should be wrong with it: half
-    of the time that the transformation of a kernel takes.
-    """
-    try:
-        from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext as context
-
-        drawn = context.get_pos_info
-    except (ImportError, AttributeError):  # another Taichi than we know
-        yield
-        return
-
-    def told(self: Any, node: Any) -> str:
-        try:
-            return f'File "{self.file}", line {node.lineno + self.lineno_offset}, in {self.func.func.__name__}:\n'
-        except AttributeError:
-            return str(drawn(self, node))
-
-    context.get_pos_info = told
-    try:
-        yield
-    finally:
-        context.get_pos_info = drawn
 
 
 class Launcher:
@@ -72,8 +43,7 @@ class Launcher:
     def __call__(self, *arguments: Any) -> None:
         program = ti.lang.impl.get_runtime().prog
         if self._compiled is None or self._program is not program:
-            with short_positions():
-                self._kernel(*self._constants, *arguments)
+            self._kernel(*self._constants, *arguments)
             self._remember(arguments)
             return
         with self._lock:
