@@ -91,7 +91,7 @@ def track(
         frames: the first frame to tell and the one to stop before (None: the last).
         config: all settings; the defaults if None.
         seed: of the random generator, in the place of the configuration's.
-        init_pose: a file with a rough initial pose.
+        init_pose: a file with a rough initial pose, or a folder of 2D keypoints.
         body: a result or a TOML file whose body is taken.
         causal: leave it at the first pass. Without ``output`` there is no other.
         resume: go on where an earlier run with the same ``output`` stopped.

@@ -67,7 +67,12 @@ def main() -> None:
 @frames_option
 @seed_option
 @masks_option
-@click.option("--init-pose", type=click.Path(path_type=Path), metavar="FILE", help="Start from this rough pose (TOML).")
+@click.option(
+    "--init-pose",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Start from this rough pose (TOML), or from this folder of 2D keypoints.",
+)
 @body_option
 @causal_option
 @resume_option

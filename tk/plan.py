@@ -14,7 +14,8 @@ from tk.ahead import TIMING_STAGES, Source, open_source
 from tk.config import Config
 from tk.errors import CaptureError, ConfigError
 from tk.io.capture import Capture
-from tk.io.init_pose import InitPose, read_init_pose
+from tk.io.init_pose import InitPose
+from tk.io.keypoints import first_pose
 from tk.io.result import JointAngles, ResultMeta
 from tk.model.angles import ANGLES
 from tk.model.cone_body import ConeBody
@@ -147,7 +148,9 @@ def open_plan(
         body = read_body(body_file, capture.up) if body_file else None
         if body is not None and not isinstance(tracker, ContourTracker):
             raise ConfigError(f"--body {body_file}: the {method} tracker fits a body of its own; use --method region")
-        init = read_init_pose(init_pose, tracker.pose_names) if init_pose else None
+        init = first_pose(capture, tracker.pose_names, init_pose, frames[0])
+        if init_pose is None and init is not None:
+            init_pose = capture.init_keypoints
         if init and not ((capture.volume.lower <= init.center) & (init.center <= capture.volume.upper)).all():
             raise CaptureError(
                 f"{init_pose}: the body is at {init.center.round(2).tolist()}, outside the working volume "

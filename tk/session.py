@@ -120,7 +120,8 @@ def track(
         reporter: who hears of the progress.
         method: the tracker's name.
         frames: first frame to write and the one to stop before (None: the last).
-        init_pose: a file with a rough initial pose, see :mod:`tk.io.init_pose`.
+        init_pose: a file with a rough initial pose, see :mod:`tk.io.init_pose`, or a folder of 2D keypoints, see
+            :mod:`tk.io.keypoints`.
         resume: go on where an earlier run of the same command stopped.
         store_hull: keep the hull's surface in the result, too.
         body: a result or a TOML file whose body is taken; None fits one to the opening frames.

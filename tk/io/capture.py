@@ -57,6 +57,7 @@ class Capture:
         subject_height_m: metres, None if unknown.
         init_frame: the frame in which the subject stands in the initialisation pose.
         init_pose: "da-vinci", or "any" when no pose is promised.
+        init_keypoints: a folder of 2D keypoints that tell the first pose; None where there is none.
         warnings: what was put up with, a line each, for the user to read.
         clips: a clip a camera.
         mask_clips: a mask clip a camera, None without ready masks.
@@ -75,6 +76,7 @@ class Capture:
     subject_height_m: float | None
     init_frame: int
     init_pose: str
+    init_keypoints: Path | None
     warnings: tuple[str, ...]
     clips: tuple[Clip, ...]
     mask_clips: tuple[Clip, ...] | None
@@ -194,6 +196,7 @@ def open_capture(path: str | Path, cameras: Sequence[str] | None = None, masks: 
         subject_height_m=settings.subject_height_m,
         init_frame=settings.init_frame,
         init_pose=settings.init_pose,
+        init_keypoints=path / settings.init_keypoints if settings.init_keypoints else None,
         warnings=tuple(warnings),
         clips=clips,
         mask_clips=mask_clips,

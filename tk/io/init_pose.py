@@ -20,6 +20,7 @@ or angles by the names of `/pose`, in degrees, with the place of the pelvis; wha
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,6 +62,12 @@ class InitPose:
         return np.array([self.angles[name] for name in TRANSLATIONS])
 
 
+def spread_m(joints: Mapping[str, NDArray[np.float64]]) -> float:
+    """How far joints lie from the line that fits them best, metres, root of the sum of squares."""
+    places = np.array(list(joints.values()))
+    return float(np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1])
+
+
 def read_init_pose(path: str | Path, pose_names: tuple[str, ...]) -> InitPose:
     """Read an initial pose.
 
@@ -92,8 +99,7 @@ def read_init_pose(path: str | Path, pose_names: tuple[str, ...]) -> InitPose:
         found = {name: joints.array(name, (3,)) for name in JOINTS if name in joints}
         if len(found) < LEAST_JOINTS:
             raise CaptureError(f"{path}: {len(found)} joints are too few to place a body; give at least {LEAST_JOINTS}")
-        centered = np.array(list(found.values())) - np.mean(list(found.values()), axis=0)
-        if np.linalg.svd(centered, compute_uv=False)[1] < LEAST_SPREAD_M:
+        if spread_m(found) < LEAST_SPREAD_M:
             raise CaptureError(f"{path}: [joints] lie on a line, which places no body; give joints of both sides")
         return InitPose(found, {}, frame, height)
     angles = table.table("angles")

@@ -25,7 +25,7 @@ _MOST_VOLUME_M, _FARTHEST_M = 1000.0, 1e6
 _KEYS: dict[str, tuple[str, ...]] = {
     "volume": ("center", "size"),
     "subject": ("height",),
-    "init": ("frame", "pose"),
+    "init": ("frame", "pose", "keypoints"),
 }
 _TOP_KEYS = ("name", "fps", "up", *_KEYS)
 
@@ -43,6 +43,8 @@ class CaptureSettings:
         subject_height_m: the subject's height without shoes, metres.
         init_frame: the frame in which the subject stands in the initialisation pose.
         init_pose: one of :data:`INIT_POSES`.
+        init_keypoints: a folder of 2D keypoints that tell the first pose, relative to the capture's; None where there
+            is none.
         unknown: keys that mean nothing to us, e.g. a misspelt one.
     """
 
@@ -53,6 +55,7 @@ class CaptureSettings:
     subject_height_m: float | None = None
     init_frame: int = 0
     init_pose: str = "da-vinci"
+    init_keypoints: str | None = None
     unknown: tuple[str, ...] = ()
 
 
@@ -96,6 +99,7 @@ def read_settings(path: Path) -> CaptureSettings:
         subject_height_m=height_m,
         init_frame=init_frame,
         init_pose=init_pose,
+        init_keypoints=init.text("keypoints", "") if "keypoints" in init else None,
         unknown=_unknown_keys(document.values),
     )
 

@@ -284,4 +284,4 @@ def shape_rows(body: ConeBody, T_world_segment: Float, edgels: Edgels) -> Float:
     result = np.zeros((len(part), len(groups), SHAPE_NUMBERS))
     column = np.array([groups.index(group_of(p.name)) for p in body.parts])[part]
     result[np.arange(len(part)), column] = rows
-    return result.reshape(len(part), -1)
+    return result.reshape(len(part), SHAPE_NUMBERS * len(groups))

@@ -49,12 +49,15 @@ def walking_pose(skeleton: Skeleton, phase: float | None) -> Float:
     return pose
 
 
-def hypotheses(skeleton: Skeleton, headings: int, phases: int, p_pelvis: Float) -> Float:
-    """(B, D) walking phases, standing and Da Vinci pose at every heading, with the pelvis at ``p_pelvis`` (3,)."""
+def hypotheses(skeleton: Skeleton, headings: int, phases: int, p_pelvis: Float, first: float = 0.0) -> Float:
+    """(B, D) walking phases, standing and Da Vinci pose at every heading, with the pelvis at ``p_pelvis`` (3,).
+
+    Headings are evenly spaced, beginning with ``first``, radians.
+    """
     figures = [walking_pose(skeleton, i / phases) for i in range(phases)]
     figures += [standing_pose(skeleton), neutral_pose(skeleton)]
     poses = []
-    for heading in np.arange(headings) * 2 * np.pi / headings:
+    for heading in first + np.arange(headings) * 2 * np.pi / headings:
         for figure in figures:
             pose = figure.copy()
             pose[skeleton.index("torso_yaw")] = heading

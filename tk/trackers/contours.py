@@ -27,16 +27,16 @@ from tk.model.initialisation import rough_pose
 from tk.model.limbs import Limb, limbs_of
 from tk.model.part_colors import PartColors
 from tk.model.silhouettes import CleaningConfig, Pyramid, Views
-from tk.model.skeleton import ANKLES, WAIST, build_skeleton, join_pose, split_pose, up_rotation
+from tk.model.skeleton import ANKLES, WAIST, build_skeleton, join_pose, split_pose
 from tk.optim import gauss_newton
 from tk.optim.gauss_newton import Descent, GaussNewtonConfig, Prior
 from tk.trackers.base import Observation
+from tk.trackers.start import HEADINGS, PHASES, centroid, find_person, stature_of
 
 Float = NDArray[np.float64]
 
-# Headings and walking phases that the initialisation tries, and how many of them are followed through the first frames
-# before one is chosen.
-HEADINGS, PHASES, FINALISTS = 8, 8, 6
+# Standard deviation of the logarithm of a stature that was measured in the pictures and not given.
+MEASURED = 0.05
 # A lost frame is searched for the person from the silhouettes' centroid; of several lost ones every so many.
 RELOCATE_EVERY = 3
 # The fall of the cost, as a share of the person's pixels, that makes another place of a limb the pose.
@@ -171,48 +171,27 @@ class ContourTracker:
         """
         pyramids = [self.pyramid(frame) for frame in frames]
         preset = self.contours.body
+        rough: Float | None = None
+        stature = (init and init.height_m) or height_m
         if init is None:
-            p_centroid = self._centroid(pyramids[0], frames[0].index)
-            stature = height_m or self._stature(pyramids[0], p_centroid)
-            self.take_body(body or build_cone_body(BodyDimensions.from_stature(stature), self.up, preset))
-            start = self._choose(pyramids, p_centroid)
+            average = BodyDimensions.from_stature(stature or stature_of(self, pyramids))
         else:
-            stature = init.height_m or height_m or 0.0
-            dimensions, rough = rough_pose(init.joints, init.angles, stature or None, self.up)
-            stature = stature or dimensions.stature
-            self.take_body(body or build_cone_body(dimensions, self.up, preset))
-            skeleton = self.body.skeleton
-            start = join_pose(skeleton, rough, np.zeros(len(self.waist_names)), np.zeros(len(self.ankle_names)))
-            start = self.settle(pyramids[0], start[None]).states[0]
-        start = self.improved(frames[0], pyramids[0], start)
+            average, angles = rough_pose(init.joints, init.angles, stature, self.up)
+        self.take_body(body or build_cone_body(average, self.up, preset))
+        if init is not None:
+            unknown = np.zeros(len(self.waist_names)), np.zeros(len(self.ankle_names))
+            rough = self.settle(pyramids[0], join_pose(self.body.skeleton, angles, *unknown)[None]).states[0]
+        poses = find_person(self, frames, pyramids, rough)
         if self.contours.adapt and body is None:
-            start = self._adapt(frames, pyramids, start, stature)
-        return start
+            return self._adapt(pyramids, poses, average.stature, stature is not None)
+        return np.asarray(poses[0])
 
-    def _choose(self, pyramids: Sequence[Pyramid], p_centroid: Float) -> Float:
-        """Hypotheses settle on the first frame; the best are followed, and the one that keeps fitting is taken."""
-        poses = gait.hypotheses(self.body.skeleton, HEADINGS, PHASES, p_centroid)
-        poses = self.settle(pyramids[0], poses).states
-        error = self.fit_error(pyramids[0], poses)
-        firsts = poses[_distinct(poses, error, FINALISTS)]
-        error = self.fit_error(pyramids[0], firsts)
-        now = firsts
-        # every other frame is enough to tell who walks backwards
-        for pyramid in pyramids[2::2]:
-            now = self.settle(pyramid, now).states
-            error += self.fit_error(pyramid, now)
-        return np.asarray(firsts[int(np.argmin(error))])
-
-    def _adapt(self, frames: Sequence[Observation], pyramids: Sequence[Pyramid], start: Float, stature: float) -> Float:
-        """Track all frames with the average body, then fit body and poses together."""
-        poses = [start]
-        every = self.contours.search_every
-        for i, pyramid in enumerate(pyramids[1:], 1):
-            pose = self.settle(pyramid, poses[-1][None]).states[0]
-            poses.append(self.improved(frames[i], pyramid, pose) if every and i % every == 0 else pose)
+    def _adapt(self, pyramids: Sequence[Pyramid], poses: Float, stature: float, known: bool) -> Float:
+        """Fit the body to the opening, and (D,) the pose in its first frame; whether the stature is ``known``."""
         count = min(self.contours.fit.frames, len(pyramids))
         chosen = np.unique(np.linspace(0, len(pyramids) - 1, count).round().astype(int))
-        body, fitted = self.fit(pyramids, np.array(poses), chosen, stature, self.contours.fit)
+        config = self.contours.fit if known else replace(self.contours.fit, stature_deviation=MEASURED)
+        body, fitted = self.fit(pyramids, poses, chosen, stature, config)
         self.take_body(body)
         return np.asarray(fitted[0])
 
@@ -228,42 +207,6 @@ class ContourTracker:
         seen = [pyramids[i] for i in chosen]
         contours = self.contours
         return fit_body(contours.body, self.views, seen, poses[chosen], self.up, contours.search, stature, config)
-
-    def _centroid(self, pyramid: Pyramid, index: int) -> Float:
-        """(3,) the point nearest to the rays through the silhouettes' centroids, metres."""
-        A, y, count = np.zeros((3, 3)), np.zeros(3), 0
-        for mask, camera in zip(pyramid.masks[0], self.views.rig, strict=True):
-            ys, xs = np.nonzero(mask >= 128)
-            if len(xs) == 0:
-                continue
-            ray = camera.rays([[xs.mean(), ys.mean()]])[0]
-            across = np.eye(3) - np.outer(ray, ray)
-            A += across
-            y += across @ camera.center
-            count += 1
-        if count < 2:
-            raise CaptureError(
-                f"initialisation: {count} of {len(self.views.rig)} masks of frame {index} show anybody, two are "
-                "needed: check the masks, or choose another first frame"
-            )
-        return np.asarray(np.linalg.solve(A, y), np.float64)
-
-    def _stature(self, pyramid: Pyramid, p_centroid: Float) -> float:
-        """Median over the views of the silhouette's height at the depth of its centroid, metres."""
-        up = up_rotation(self.up)[:, 2]
-        heights = []
-        for mask, camera in zip(pyramid.masks[0], self.views.rig, strict=True):
-            rows, columns = np.nonzero(mask >= 128)
-            if len(rows) == 0:
-                continue
-            level = []
-            for i in (rows.argmin(), rows.argmax()):
-                ray = camera.rays([[columns[i], rows[i]]])[0]
-                flat = ray - (ray @ up) * up
-                away = (p_centroid - camera.center) - ((p_centroid - camera.center) @ up) * up
-                level.append((camera.center + ray * (away @ flat) / (flat @ flat)) @ up)
-            heights.append(abs(level[0] - level[1]))
-        return float(np.clip(np.median(heights), 0.8, 2.4))
 
     def start(
         self,
@@ -388,7 +331,7 @@ class ContourTracker:
     def relocate(self, pyramid: Pyramid, pose: Float, error: float) -> tuple[Float, float]:
         """The pose or, if that explains the silhouettes better, one found as at the start; and its E_S."""
         try:
-            p_centroid = self._centroid(pyramid, 0)
+            p_centroid = centroid(self.views.rig, pyramid, 0)
         except CaptureError:
             return pose, error
         starts = gait.hypotheses(self.body.skeleton, HEADINGS, PHASES, p_centroid)
@@ -438,14 +381,3 @@ def restore_body(model: Mapping[str, Any], up: str) -> ConeBody:
         a, b, h, m = (float(value) for value in shape)
         parts.append(ConePart(name, segment, int(kind), (a, b, h, m), np.asarray(T), ends.get(name, (False, False))))
     return replace(body, parts=tuple(parts))
-
-
-def _distinct(poses: Float, error: Float, count: int) -> NDArray[np.int64]:
-    """Indices of the best poses, at most ``count``, that differ from each other by more than 0.2 somewhere."""
-    chosen: list[int] = []
-    for i in np.argsort(error, kind="stable"):
-        if all(np.abs(poses[i] - poses[j]).max() > 0.2 for j in chosen):
-            chosen.append(int(i))
-        if len(chosen) == count:
-            break
-    return np.array(chosen)

@@ -1,0 +1,59 @@
+"""2D keypoints as a detector makes them: true joints projected, noise, confusions, files as OpenPose writes them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.io.keypoints import LAYOUTS
+from tk.model.camera import Rig
+from tk.model.skeleton import JOINTS
+
+Float = NDArray[np.float64]
+
+
+def detect(
+    camera_pixels: Float, rng: np.random.Generator, count: int, noise_px: float = 5.0, wrong: float = 0.1
+) -> list[float]:
+    """The numbers of one person of ``count`` keypoints, from joints (15, 2) in a picture, pixels.
+
+    Each is off by ``noise_px`` (one standard deviation a direction); a share ``wrong`` of them lies anywhere within the
+    person's box, with as much confidence as the others. What ``count`` keypoints have beside our joints is zeros.
+    """
+    numbers = np.zeros((count, 3))
+    low, high = camera_pixels.min(axis=0), camera_pixels.max(axis=0)
+    for name, k in LAYOUTS[count].items():
+        place = camera_pixels[JOINTS.index(name)] + noise_px * rng.normal(size=2)
+        if rng.random() < wrong:
+            place = rng.uniform(low, high)
+        numbers[k] = [*place, rng.uniform(0.5, 1.0)]
+    return [float(number) for number in numbers.ravel()]
+
+
+def write_keypoints(
+    folder: Path,
+    rig: Rig,
+    frame: int,
+    people: Sequence[Float],
+    rng: np.random.Generator,
+    count: int = 25,
+    noise_px: float = 5.0,
+    wrong: float = 0.1,
+) -> None:
+    """Files of one frame for all cameras: people with joints (15, 3) in metres, in another order in each camera."""
+    for camera in rig:
+        found = [camera.project(joints)[0] for joints in people]
+        order = rng.permutation(len(people))
+        document = {
+            "version": 1.3,
+            "people": [
+                {"person_id": [-1], "pose_keypoints_2d": detect(found[i], rng, count, noise_px, wrong)} for i in order
+            ],
+        }
+        path = folder / camera.name / f"{camera.name}_{frame:012d}_keypoints.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(document), encoding="utf-8")

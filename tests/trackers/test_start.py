@@ -1,0 +1,119 @@
+"""Who is looked for without any hint, on silhouettes of the tracker's own body, drawn by ray casting."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.model.ring import ring_of_cameras
+from tk.errors import CaptureError
+from tk.model.anthropometry import BodyDimensions
+from tk.model.body import neutral_pose
+from tk.model.cone_body import build_cone_body
+from tk.model.gait import standing_pose, walking_pose
+from tk.model.silhouettes import draw_silhouettes
+from tk.model.skeleton import JOINTS, shoulder_angles
+from tk.trackers.base import Observation
+from tk.trackers.silhouette import SilhouetteConfig, SilhouetteTracker
+from tk.trackers.start import find_person, stature_of
+
+STATURE = 1.75
+RIG = ring_of_cameras(3, width=200, height=250)
+BODY = build_cone_body(BodyDimensions.from_stature(STATURE))
+SKELETON = BODY.skeleton
+
+
+def placed(pose: np.ndarray, yaw: float, **angles: float) -> np.ndarray:
+    """A pose (D,) at its place, turned; further angles in degrees."""
+    result = pose.copy()
+    result[:3] = [0.05, -0.04, 0.93]
+    result[SKELETON.index("torso_yaw")] = yaw
+    for name, degrees in angles.items():
+        result[SKELETON.index(name)] = np.radians(degrees)
+    return result
+
+
+def arms(pose: np.ndarray, left: tuple[float, float, float], right: tuple[float, float, float]) -> np.ndarray:
+    """With upper arms in these directions: forwards, outwards, up."""
+    result = pose.copy()
+    for side, direction in (("l", left), ("r", right)):
+        yaw, pitch = shoulder_angles(np.array(direction) / np.linalg.norm(direction))
+        result[SKELETON.index(f"shoulder_{side}_yaw")] = yaw
+        result[SKELETON.index(f"shoulder_{side}_pitch")] = pitch
+    return result
+
+
+def tracker_of(stature: float = STATURE) -> SilhouetteTracker:
+    tracker = SilhouetteTracker(RIG, "z", SilhouetteConfig())
+    tracker.take_body(build_cone_body(BodyDimensions.from_stature(stature)))
+    return tracker
+
+
+def found(poses: np.ndarray) -> np.ndarray:
+    """(F, 15, 3) joints that are found in silhouettes of poses (F, D)."""
+    tracker = tracker_of()
+    frames = [Observation(i, np.zeros(0, np.uint8), m) for i, m in enumerate(draw_silhouettes(BODY, RIG, poses))]
+    poses = find_person(tracker, frames, [tracker.pyramid(frame) for frame in frames])
+    return np.array([SKELETON.joints(pose) for pose in poses])
+
+
+def error(joints: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """(F,) mean distance, metres."""
+    return np.linalg.norm(joints - [SKELETON.joints(p) for p in poses], axis=2).mean(axis=1)
+
+
+@pytest.mark.parametrize("yaw", [0.3, 2.0, 4.4])
+def test_front_and_back_of_a_t_pose(yaw: float) -> None:
+    """Arms level and straight, legs straight, standing still: only the feet tell."""
+    t_pose = arms(standing_pose(SKELETON), (0, 1, 0), (0, 1, 0))
+    poses = np.array([placed(t_pose, yaw)] * 2)
+    joints = found(poses)
+    assert error(joints, poses).max() < 0.03
+    left = joints[:, JOINTS.index("shoulder_l")] - joints[:, JOINTS.index("shoulder_r")]
+    expected = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+    assert (left @ expected > 0.25).all()
+
+
+@pytest.mark.parametrize("name", ["arms at 45°", "crouching", "one arm up, one forwards"])
+def test_other_poses(name: str) -> None:
+    standing = standing_pose(SKELETON)
+    bent = {"hip_l_pitch": -85.0, "hip_r_pitch": -85.0, "knee_l_flexion": 110.0, "knee_r_flexion": 110.0}
+    pose = {
+        "arms at 45°": placed(arms(standing, (0, 1, -1), (0, 1, -1)), 1.0),
+        "crouching": placed(arms(standing, (1, 0.3, -0.3), (1, 0.3, -0.3)), 2.5, **bent),
+        "one arm up, one forwards": placed(arms(standing, (0.2, 0.2, 1), (1, 0.2, 0)), 5.0),
+    }[name]
+    poses = np.array([pose, pose])
+    assert error(found(poses), poses).max() < 0.04
+
+
+def test_a_first_frame_that_is_hard_is_reached_from_an_easy_one() -> None:
+    """Bent over with an arm up and a leg lifted; then the person straightens up and walks."""
+    lifted = {"torso_pitch": 50.0, "hip_l_pitch": -100.0, "knee_l_flexion": 70.0, "hip_r_pitch": -40.0}
+    hard = placed(arms(standing_pose(SKELETON), (1, 0.4, 0.8), (-0.4, 0.6, 0.6)), 0.8, **lifted)
+    easy = placed(walking_pose(SKELETON, 0.3), 0.8)
+    poses = np.array([hard + k / 7 * (easy - hard) for k in range(8)])
+    errors = error(found(poses), poses)
+    assert errors[0] < 0.06 and errors[-1] < 0.04, errors
+
+
+@pytest.mark.parametrize("stature", [1.2, 1.6, 1.95])
+def test_the_stature_hardly_depends_on_the_pose(stature: float) -> None:
+    body = build_cone_body(BodyDimensions.from_stature(stature))
+    standing = standing_pose(SKELETON)
+    bowing = placed(standing, 1.0, hip_l_pitch=-45.0, hip_r_pitch=-45.0, torso_pitch=45.0)
+    statures = []
+    for pose in (placed(standing, 0.5), placed(neutral_pose(SKELETON), 0.5), bowing):
+        pose = pose.copy()
+        pose[2] *= stature / STATURE
+        tracker = tracker_of()
+        statures.append(stature_of(tracker, [tracker.pyramid(Observation(0, np.zeros(0, np.uint8), m))
+                                             for m in draw_silhouettes(body, RIG, pose[None])]))  # fmt: skip
+    np.testing.assert_allclose(statures, stature, rtol=0.09)
+
+
+def test_nobody_in_the_first_frame_is_told() -> None:
+    tracker = tracker_of()
+    empty = Observation(7, np.zeros(0, np.uint8), np.zeros((3, 250, 200), np.uint8))
+    with pytest.raises(CaptureError, match="0 of 3 masks of frame 7 show anybody, two are needed"):
+        find_person(tracker, [empty], [tracker.pyramid(empty)])

@@ -1,0 +1,212 @@
+"""Finds a person of whom nothing is known but silhouettes: any pose, any heading, any stature (silhouette paper,
+section 4.6: "multiple different poses can be hypothesized and tested").
+
+No frame of the opening is better than another, so the person is looked for in some of them until one is explained well,
+and followed from there to both ends. Whether he or she faces this way or the opposite one, all of the opening decides:
+feet, knees and elbows bend one way, and people walk forwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import CaptureError
+from tk.model import gait
+from tk.model.anthropometry import BodyDimensions
+from tk.model.camera import Rig
+from tk.model.cone_body import ConeBody, build_cone_body
+from tk.model.evidence import Evidence
+from tk.model.silhouettes import Pyramid
+from tk.model.skeleton import Skeleton
+from tk.trackers.base import Observation
+
+if TYPE_CHECKING:
+    from tk.trackers.contours import ContourTracker
+
+Float = NDArray[np.float64]
+
+# Headings and walking phases that are tried, counted from the direction to a camera, so that the result does not depend
+# on how the world lies.
+HEADINGS, PHASES = 8, 8
+# Of what they settle to, so many different poses are finished by a search for the limbs: of the best heading, and of
+# those that face the other way; with joints that far apart on an average, metres.
+FINALISTS, OPPOSITE, APART_M = 4, 2, 0.15
+# Frames of the opening in which the person is looked for, one after the other. A pose is believed at once that leaves
+# no more than this unexplained (E_S): in the development captures an average body of the right stature leaves 0.15 to
+# 0.31 in the right pose, and in a wrong one never less than 0.25.
+ANCHORS, CLEAR = 4, 0.2
+# Whoever faces the other way is followed, too, where that explains the frame nearly as well, by this factor.
+NEARLY = 1.4
+# A frame explained worse than the anchor by this factor is searched for lost limbs.
+WORSE = 1.2
+# The stature that the first guess renders.
+_AVERAGE_M = 1.7
+# A search that finds a better pose is repeated, at most so often.
+_SEARCHES = 2
+
+
+def find_person(
+    tracker: ContourTracker, frames: Sequence[Observation], pyramids: Sequence[Pyramid], pose: Float | None = None
+) -> Float:
+    """(F, D) poses in consecutive frames; the tracker has a body already.
+
+    Args:
+        tracker: see :class:`ContourTracker`.
+        frames: F observations, at least one.
+        pyramids: their silhouettes.
+        pose: (D,) that in the first frame, where it is known; it is followed then.
+
+    Raises:
+        CaptureError: nobody is seen in the first frame by two cameras.
+    """
+    centroid(tracker.views.rig, pyramids[0], frames[0].index)
+    if pose is not None:
+        return _follow(tracker, frames, pyramids, _searched(tracker, frames[0], pyramids[0], pose), 0)[0]
+    best: tuple[float, int, list[Float]] | None = None
+    for anchor in np.unique(np.linspace(0, len(frames) - 1, ANCHORS).astype(int)):
+        try:
+            error, poses = _find(tracker, frames[anchor], pyramids[anchor])
+        except CaptureError:
+            continue
+        if best is None or error < best[0]:
+            best = error, int(anchor), poses
+        if error < CLEAR:
+            break
+    assert best is not None  # the first frame shows somebody
+    ways = [_follow(tracker, frames, pyramids, pose, best[1]) for pose in best[2]]
+    return min(ways, key=lambda way: way[1])[0]
+
+
+def _find(tracker: ContourTracker, frame: Observation, pyramid: Pyramid) -> tuple[float, list[Float]]:
+    """E_S of the pose (D,) that explains a frame best; the pose, and one that faces the other way if it is nearly as
+    good."""
+    skeleton, rig = tracker.body.skeleton, tracker.views.rig
+    p_centroid = centroid(rig, pyramid, frame.index)
+    first = _heading_of_camera(skeleton, rig, p_centroid)
+    settled = tracker.settle(pyramid, gait.hypotheses(skeleton, HEADINGS, PHASES, p_centroid, first)).states
+    order = settled[np.argsort(tracker.fit_error(pyramid, settled), kind="stable")]
+    turned = _turned(skeleton, order, order[0])
+    finalists = _distinct(skeleton, order, FINALISTS) + _distinct(skeleton, order[turned], OPPOSITE)
+    poses = np.array([_searched(tracker, frame, pyramid, pose) for pose in finalists])
+    error = tracker.fit_error(pyramid, poses)
+    best = int(np.argmin(error))
+    found = [poses[best]]
+    others = np.flatnonzero(_turned(skeleton, poses, poses[best]) & (error < NEARLY * error[best]))
+    if len(others):
+        found.append(poses[others[int(np.argmin(error[others]))]])
+    return float(error[best]), found
+
+
+def _follow(
+    tracker: ContourTracker, frames: Sequence[Observation], pyramids: Sequence[Pyramid], pose: Float, anchor: int
+) -> tuple[Float, float]:
+    """Poses (F, D) from that of frame ``anchor`` to both ends, and their mean E_S."""
+    F = len(frames)
+    poses = np.tile(pose, (F, 1))
+    errors = np.full(F, np.nan)
+    errors[anchor] = tracker.fit_error(pyramids[anchor], pose[None])[0]
+    every = tracker.contours.search_every
+    for step, end in ((1, F), (-1, -1)):
+        for i in range(anchor + step, end, step):
+            before = poses[i - 2 * step] if abs(i - anchor) > 1 else poses[anchor]
+            expected = poses[i - step] + tracker.contours.prediction * (poses[i - step] - before)
+            now = tracker.settle(pyramids[i], expected[None]).states[0]
+            error = tracker.fit_error(pyramids[i], now[None])[0]
+            if not np.isfinite(error):  # nobody is in sight
+                poses[i] = poses[i - step]
+                continue
+            if every and (error > WORSE * errors[anchor] or abs(i - anchor) % every == 0):
+                now = tracker.improved(frames[i], pyramids[i], now)
+                error = tracker.fit_error(pyramids[i], now[None])[0]
+            poses[i], errors[i] = now, error
+    return poses, float(np.nanmean(errors))
+
+
+def _searched(tracker: ContourTracker, frame: Observation, pyramid: Pyramid, pose: Float) -> Float:
+    """The pose (D,) with limbs searched for until none is found elsewhere."""
+    for _ in range(_SEARCHES):
+        found = tracker.improved(frame, pyramid, pose)
+        if np.array_equal(found, pose):
+            break
+        pose = found
+    return pose
+
+
+def _distinct(skeleton: Skeleton, poses: Float, count: int) -> list[Float]:
+    """The first poses of (B, D), at most ``count``, whose joints lie apart from each other's."""
+    chosen: list[Float] = []
+    places: list[Float] = []
+    for pose in poses:
+        if len(chosen) == count:
+            break
+        if all(skeleton.apart(pose, other) > APART_M for other in places):
+            chosen.append(pose)
+            places.append(skeleton.joints(pose))
+    return chosen
+
+
+def _turned(skeleton: Skeleton, poses: Float, pose: Float) -> NDArray[np.bool_]:
+    """(B,) whether poses (B, D) face away from where ``pose`` (D,) does, by more than a right angle."""
+    yaw = skeleton.index("torso_yaw")
+    return np.asarray(np.cos(poses[:, yaw] - pose[yaw]) < 0)
+
+
+def _heading_of_camera(skeleton: Skeleton, rig: Rig, p_person: Float) -> float:
+    """The heading, radians, of somebody at ``p_person`` (3,) who looks at the camera that is farthest off sideways."""
+    toward = (rig.centers - p_person) @ skeleton.T_world_body
+    x, y = toward[int(np.argmax(np.linalg.norm(toward[:, :2], axis=1))), :2]
+    return float(np.arctan2(y, x))
+
+
+def centroid(rig: Rig, pyramid: Pyramid, index: int) -> Float:
+    """(3,) the point nearest to the rays through the silhouettes' centroids, metres; ``index`` is the frame's number.
+
+    Raises:
+        CaptureError: fewer than two cameras see anybody.
+    """
+    A, y, count = np.zeros((3, 3)), np.zeros(3), 0
+    for mask, camera in zip(pyramid.masks[0], rig, strict=True):
+        ys, xs = np.nonzero(mask >= 128)
+        if len(xs) == 0:
+            continue
+        ray = camera.rays([[xs.mean(), ys.mean()]])[0]
+        across = np.eye(3) - np.outer(ray, ray)
+        A += across
+        y += across @ camera.center
+        count += 1
+    if count < 2:
+        raise CaptureError(
+            f"initialisation: {count} of {len(rig)} masks of frame {index} show anybody, two are "
+            "needed: check the masks, or choose another first frame"
+        )
+    return np.asarray(np.linalg.solve(A, y), np.float64)
+
+
+def stature_of(tracker: ContourTracker, pyramids: Sequence[Pyramid]) -> float:
+    """The stature whose average body covers as much of the pictures as the silhouettes do, metres.
+
+    Areas hardly change when somebody bends or raises the arms, as the silhouette's height does; girth and clothes make
+    it err by 6 %. The median over the views of all frames, against the mean area of hanging and of spread arms.
+    """
+    body: ConeBody = build_cone_body(BodyDimensions.from_stature(_AVERAGE_M), tracker.up, tracker.contours.body)
+    group = np.zeros(len(body.parts), np.int32)
+    ratios: list[Float] = []
+    for pyramid in pyramids:
+        try:
+            p_centroid = centroid(tracker.views.rig, pyramid, 0)
+        except CaptureError:
+            continue
+        poses = gait.hypotheses(body.skeleton, 4, 0, p_centroid)  # standing, and the Da Vinci pose
+        evidence = Evidence.of(tracker.screen, pyramid.masks[0])
+        met = evidence.cast(body, group, poses, export=True)[1]
+        assert met is not None
+        covered = np.count_nonzero(met.label, axis=(2, 3)).mean(axis=0)
+        seen = np.count_nonzero(evidence.person, axis=(1, 2))
+        known = (covered > 0) & (seen > 0)
+        ratios.append(seen[known] / covered[known])
+    ratio = float(np.median(np.concatenate(ratios))) if ratios else 1.0
+    return float(np.clip(_AVERAGE_M * np.sqrt(ratio), 0.8, 2.4))
