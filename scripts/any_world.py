@@ -86,8 +86,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             degrees = np.degrees(Rotation.from_matrix(turn).magnitude())
             tilt = np.degrees(np.arccos(np.clip(other.up_axis @ turn @ capture.up_axis, -1, 1)))
             lost = int((found.status == Status.LOST).sum())
+            name = str(draw) if draw < given.draws else capture.rig[0].name
             print(
-                f"{draw if draw < given.draws else capture.rig[0].name:>4} {degrees:6.0f}° {tilt:7.1f}° {mm.max():6.2f} mm {mm.mean():5.2f} mm {lost:6}"
+                f"{name:>4} {degrees:6.0f}° {tilt:7.1f}° {mm.max():6.2f} mm {mm.mean():5.2f} mm {lost:6}"
                 f"  {' | '.join(said)}",
                 flush=True,
             )

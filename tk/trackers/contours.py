@@ -80,7 +80,7 @@ class SilhouetteConfig:
     search: SearchSettings = field(default_factory=SearchSettings)
     solver: GaussNewtonConfig = field(default_factory=lambda: GaussNewtonConfig(scales=3))
     cleaning: CleaningConfig = field(default_factory=CleaningConfig)
-    fit: BodyFitConfig = field(default_factory=lambda: BodyFitConfig(frames=8, rounds=3))
+    fit: BodyFitConfig = field(default_factory=lambda: BodyFitConfig(frames=8, rounds=6))
 
     def __post_init__(self) -> None:
         if self.body not in PRESETS:
@@ -174,6 +174,7 @@ class ContourTracker:
         rough: Float | None = None
         stature = (init and init.height_m) or height_m
         if init is None:
+            centroid(self.views.rig, pyramids[0], frames[0].index)  # or nobody is there, and no body is taken
             average = BodyDimensions.from_stature(stature or stature_of(self, pyramids))
         else:
             average, angles = rough_pose(init.joints, init.angles, stature, self.up)

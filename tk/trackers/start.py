@@ -63,7 +63,6 @@ def find_person(
     Raises:
         CaptureError: nobody is seen in the first frame by two cameras.
     """
-    centroid(tracker.views.rig, pyramids[0], frames[0].index)
     if pose is not None:
         return _follow(tracker, frames, pyramids, _searched(tracker, frames[0], pyramids[0], pose), 0)[0]
     best: tuple[float, int, list[Float]] | None = None
@@ -71,12 +70,14 @@ def find_person(
         try:
             error, poses = _find(tracker, frames[anchor], pyramids[anchor])
         except CaptureError:
+            if anchor == 0:
+                raise
             continue
         if best is None or error < best[0]:
             best = error, int(anchor), poses
         if error < CLEAR:
             break
-    assert best is not None  # the first frame shows somebody
+    assert best is not None
     ways = [_follow(tracker, frames, pyramids, pose, best[1]) for pose in best[2]]
     return min(ways, key=lambda way: way[1])[0]
 
