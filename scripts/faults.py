@@ -292,6 +292,8 @@ def run(folder: Path, truth: Path | None, result: Path, options: Sequence[str], 
     except subprocess.TimeoutExpired:
         return Outcome(None, [], np.zeros(0), np.zeros(0, np.uint8))
     lines = [line.replace(str(folder) + "/", "") for line in ran.stderr.splitlines()]
+    if (crash := "Traceback (most recent call last):") in lines:
+        lines = [*lines[: lines.index(crash)], f"crash: {lines[-1]}"]
     said = [line for line in lines if line and not line.startswith(("frame ", "["))]
     if not result.exists():
         return Outcome(ran.returncode, said, np.zeros(0), np.zeros(0, np.uint8))
