@@ -102,6 +102,16 @@ def errors(rig: Rig) -> tuple[float, float]:
 # --- derivatives and gauge --------------------------------------------------------------------------------------------
 
 
+def test_a_camera_that_shows_nothing_tells_nothing():
+    store = MaskStore()
+    for k in range(FRAMES):
+        masks = in_time().get(k).copy()
+        masks[2] = 0
+        store.put(k, masks)
+    agreement = camera_agreement(BODY, "z", RIG, moments(store, RIG), SEARCH)
+    assert np.isfinite(agreement.shift_px).all() and not agreement.astray.any()
+
+
 @pytest.mark.parametrize("kind", ["turn", "move", "focal", "shift"])
 def test_rows_by_a_camera_are_differences(kind):
     camera = replace(RIG[1], distortions=np.array([-0.08, 0.01, 0.001, -0.002, 0.0]))

@@ -180,7 +180,7 @@ def equations(
         ]
         loose = np.zeros((len(x), len(SEGMENTS), 3))
         loose[np.arange(len(x)), segment[edgels.part]] = edgels.row
-        rows = np.hstack([by_pose, loose.reshape(len(x), -1), *columns, rows_behind])
+        rows = np.hstack([by_pose, loose.reshape(len(x), 3 * len(SEGMENTS)), *columns, rows_behind])
         weighted = rows * (edgels.weight * INFORMATION)[:, None]
         A, y = weighted.T @ rows, weighted.T @ edgels.distance
         H, g = blocks[view.frame]
