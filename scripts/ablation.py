@@ -72,7 +72,7 @@ class Recorded:
     def error(self, config: Config) -> tuple[NDArray[np.float64], int]:
         """(F, 15) distances from the truth, metres, and how many frames said lost."""
         tracker = VolumetricTracker(self.capture.rig, self.capture.volume, self.capture.up, config)
-        tracker.start(self.frames[: config.tracking.init_frames], self.capture.subject_height_m, None)
+        tracker.start(self.frames[: tracker.opening_frames], self.capture.subject_height_m, None)
         found = [tracker.step(frame) for frame in self.frames]
         distance = np.linalg.norm(np.array([estimate.joints for estimate in found]) - self.truth, axis=2)
         return distance, sum(estimate.status == "lost" for estimate in found)

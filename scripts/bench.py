@@ -58,12 +58,14 @@ from tk.kernels.runtime import ti
 from tk.model.appearance import Appearance
 from tk.model.hull import VisualHull
 from tk.model.objective import BodyObjective
-from tk.model.skeleton import CHAINS
+from tk.model.skeleton import CHAINS, join_pose
+from tk.model.skin import lay_skin
 from tk.model.volume import VoxelGrid
 from tk.segmentation import make_segmenter
 from tk.trackers.base import Estimate
+from tk.trackers.bodies import body_and_poses
 from tk.trackers.silhouette import SilhouetteTracker
-from tk.trackers.volumetric import CELL_VOXELS, SAMPLING, restore_body
+from tk.trackers.volumetric import CELL_VOXELS, SAMPLING
 
 DEMO = Path(__file__).resolve().parents[1] / "tk" / "data" / "demo"
 WINDOW = 12  # frames that the stages alone are measured on
@@ -275,11 +277,13 @@ def _search_stages(
     capture: Capture, config: Config, frame: FrameSet, masks: np.ndarray, result: Result
 ) -> Iterator[Stage]:
     """Colour segmentation, nearest neighbours and the objective, at the tracked pose of a frame."""
-    restored = restore_body(result)
+    restored = body_and_poses(result)
     if restored is None:
-        raise SystemExit(f"{result.path}: has no body of superellipsoids in /model")
-    body, poses = restored
-    pose = poses[np.flatnonzero(result.frames == frame.index)[0]]
+        raise SystemExit(f"{result.path}: has no body in /model")
+    skin = lay_skin(restored[0], capture.up, config.body.waist)
+    row = np.flatnonzero(result.frames == frame.index)[0]
+    waist = np.zeros((0,)) if result.waist is None else result.waist[row]
+    pose = join_pose(skin.skeleton, result.pose[row], waist, np.zeros(0))
     hull = VisualHull(capture.rig, VoxelGrid.cover(capture.volume, config.voxels))
     hull.carve(masks)
     surface = hull.surface(frame.images)
@@ -297,12 +301,12 @@ def _search_stages(
     yield Stage("colour segmentation", median_ms(segmented), {})
 
     # the peer knows neither colours nor normals, so this comparison leaves them out of ours as well
-    objective = BodyObjective(body, config.objective.settings, SAMPLING)
+    objective = BodyObjective(skin, config.objective.settings, SAMPLING)
     rng = np.random.default_rng(0)
     samples = objective.draw(rng)
-    points, normals = (values[samples].astype(np.float32) for values in body.place(pose))
+    points, normals = (values[samples].astype(np.float32) for values in skin.place(pose))
     everything = np.full(len(surface), -1, np.int64)
-    patch = body.patch[samples]
+    patch = skin.patch[samples]
     index, tree = built(everything), cKDTree(surface.positions)
     found = nearest(index, points, normals, patch)
     distance = np.asarray(tree.query(points)[0])

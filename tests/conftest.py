@@ -30,8 +30,6 @@ init_frames = 3
 [silhouette.fit]
 frames = 2
 rounds = 2
-[tracking]
-init_frames = 3
 """
 
 

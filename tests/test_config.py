@@ -86,7 +86,7 @@ def test_what_a_file_leaves_out_keeps_its_default() -> None:
         ("voxels = 2", ["--voxels 2", "8 to 512"]),
         ("seed = -1", ["--seed -1"]),
         ("[tracking]\nprediction = 7.0", ["prediction = 7.0"]),
-        ("[tracking]\ninit_frames = 0", ["init_frames = 0"]),
+        ("[tracking]\nprediction = 2", ["prediction = 2"]),
         ("[smd]\nmemory = 0.3", ["unknown setting smd"]),
         ('effort = "utmost"', ["utmost", "fast, normal, thorough"]),
         ("effort = true", ["effort", "must be of type"]),
@@ -95,7 +95,7 @@ def test_what_a_file_leaves_out_keeps_its_default() -> None:
         ("[tracking]\nlost_ratio = 0.5", ["lost_ratio = 0.5"]),
         ("voxels = ", ["invalid TOML"]),
         ("tracking = " + 3000 * "[", ["invalid TOML"]),
-        ("[tracking]\ninit_frames = 1000000000\n", ["tracking.init_frames = 1000000000 is too large"]),
+        ("[silhouette]\ninit_frames = 1000000000\n", ["silhouette.init_frames = 1000000000 is too large"]),
         ("[contours]\nthreshold = 1e300\n", ["contours.threshold = 1e+300 is too large"]),
         (f"[contours]\nthreshold = 1{400 * '0'}\n", ["contours.threshold = 1000", "is too large"]),
         (f"voxels = 1{5000 * '0'}\n", ["invalid TOML"]),
@@ -173,7 +173,7 @@ def test_effort_is_iterations_below_one_and_points_above() -> None:
     assert (normal.sampling, normal.smd) == (SAMPLING, SMD)
     assert fast.sampling == SAMPLING and fast.smd.max_iterations == SMD.max_iterations // 2
     assert thorough.smd == SMD and thorough.sampling.scale == 5
-    assert Effort.of(0.05).fit.rounds >= 1
+    assert Effort.of(0.05).smd.max_iterations >= 1
 
 
 def test_there_are_no_more_settings_than_one_can_look_through() -> None:

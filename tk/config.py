@@ -17,10 +17,10 @@ import tomli_w
 from tk.errors import ConfigError
 from tk.io.toml import LARGE, parse_toml, read_text, shown
 from tk.model.appearance import AppearanceConfig
-from tk.model.body import BodyConfig
 from tk.model.contour_term import ContourConfig
 from tk.model.foreground import ForegroundConfig
 from tk.model.objective import ObjectiveConfig
+from tk.model.skin import BodyConfig
 from tk.trackers.contours import SilhouetteConfig
 from tk.trackers.region import RegionConfig
 
@@ -41,19 +41,15 @@ class TrackingConfig:
     Attributes:
         prediction: share of the last frame's motion that the next is expected to repeat. The paper does not say how it
             predicts; at 15 Hz an arm turns by up to 31° between frames (its section 7.4).
-        init_frames: frames from which the body is fitted.
         lost_ratio: a frame is lost whose objective exceeds that of the usual frame by this factor.
     """
 
     prediction: float = 0.9
-    init_frames: int = 4
     lost_ratio: float = 3.0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.prediction <= 1.5 or self.init_frames < 1:
-            raise ConfigError(
-                f"tracking: prediction = {self.prediction} must lie in [0, 1.5], init_frames = {self.init_frames} ≥ 1"
-            )
+        if not 0 <= self.prediction <= 1.5:
+            raise ConfigError(f"tracking.prediction = {self.prediction} must lie in [0, 1.5]")
         if not self.lost_ratio >= 1:
             raise ConfigError(f"tracking.lost_ratio = {self.lost_ratio} must be at least 1")
 

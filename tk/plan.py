@@ -146,8 +146,6 @@ def open_plan(
         _LOG.info("preparing the %s tracker", method)
         tracker = make_tracker(method, capture, config)
         body = read_body(body_file, capture.up) if body_file else None
-        if body is not None and not isinstance(tracker, ContourTracker):
-            raise ConfigError(f"--body {body_file}: the {method} tracker fits a body of its own; use --method region")
         init = first_pose(capture, tracker.pose_names, init_pose, frames[0])
         if init_pose is None and init is not None:
             init_pose = capture.init_keypoints
@@ -158,11 +156,6 @@ def open_plan(
             )
         first = init.frame if init and init.frame is not None else frames[0] if init else capture.init_frame
         if init is None and capture.init_pose == "any":
-            if not tracker.any_pose:
-                raise CaptureError(
-                    f'{capture.path / "capture.toml"}: init.pose = "any", so nobody stands in the Da Vinci pose; '
-                    f"give a rough pose with --init-pose FILE, or use --method {RegionTracker.method}"
-                )
             first = max(first, frames[0])  # no frame is better than another
         start, stop = choose_frames(capture, frames, note)
         if not first < capture.frame_count:

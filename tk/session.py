@@ -254,10 +254,7 @@ class _Run:
         try:
             with one_blas_thread():
                 seen = self.watch.start([o for o, _ in opening])
-                if plan.body is not None and isinstance(plan.tracker, ContourTracker):
-                    plan.tracker.start(seen, plan.capture.subject_height_m, plan.init, plan.body)
-                else:
-                    plan.tracker.start(seen, plan.capture.subject_height_m, plan.init)
+                plan.tracker.start(seen, plan.capture.subject_height_m, plan.init, plan.body)
                 self.watch.check_body()
         except CaptureError as error:
             raise CaptureError(f"{plan.capture.path}: {error}") from None

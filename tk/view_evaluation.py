@@ -1,7 +1,7 @@
 """How well a result fits the pictures: the silhouette paper's two measures (its section 5), view by view.
 
 - E_S (eq. 12), the share of wrongly classified pixels, against the capture's masks as they are given: the body that the
-  result holds, cones or superellipsoids, is drawn into every view.
+  result holds is drawn into every view.
 - The distance of chosen joints from the truth in pixels: "averaged across both feet and all marked frames, and averaged
   across all the views used for tracking". The paper says "mean squared" and gives
   pixels; here it is the mean distance.
@@ -12,7 +12,7 @@ Views that were not used for tracking are judged, too, and said to be so.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,16 +20,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import CaptureError, ConfigError, ResultError
+from tk.errors import CaptureError, ConfigError
 from tk.evaluation import plain_values
 from tk.io.capture import Capture, open_capture
 from tk.io.result import Result, blamed_on, read_joints, read_result
 from tk.model.camera import Rig
 from tk.model.silhouettes import draw_silhouettes, share_wrong
-from tk.model.skeleton import JOINTS, Skeleton
-from tk.model.superellipsoid_silhouettes import draw_body
+from tk.model.skeleton import JOINTS
 from tk.trackers.bodies import body_and_poses
-from tk.trackers.volumetric import restore_body as restore_superellipsoids
 
 Float = NDArray[np.float64]
 
@@ -169,11 +167,12 @@ def _pixel_error(view: Rig, estimate: Float, truth: Float, joints: Sequence[str]
 
 def _silhouette_errors(result: Result, capture: Capture) -> tuple[list[float] | None, str]:
     """E_S by view over the frames of the result, or why there is none."""
-    draw = _drawn(result, capture.rig)
-    if draw is None:
+    found = body_and_poses(result)
+    if found is None:
         return None, f"no E_S: {result.path} does not hold the body that it tracked with"
     if not capture.has_masks:
         return None, f"no E_S: {capture.path} has no masks/"
+    body, poses = found
     row_of = {int(frame): row for row, frame in enumerate(result.frames)}
     first, last = int(result.frames.min()), int(result.frames.max())
     errors = []
@@ -181,34 +180,12 @@ def _silhouette_errors(result: Result, capture: Capture) -> tuple[list[float] | 
         for frame in frames:
             row = row_of.get(frame.index)
             if row is not None and frame.masks is not None and np.isfinite(result.pose[row]).all():
-                errors.append(share_wrong(draw(row), frame.masks))
+                errors.append(share_wrong(draw_silhouettes(body, capture.rig, poses[row][None])[0], frame.masks))
     values = np.array(errors).reshape(-1, len(capture.rig))
     seen = np.isfinite(values)  # an empty mask has no share
     if not seen.any(axis=0).all():
         return None, f"no E_S: {capture.path} has a view whose masks are all empty"
     return [float(values[seen[:, v], v].mean()) for v in range(len(capture.rig))], ""
-
-
-def _drawn(result: Result, rig: Rig) -> Callable[[int], NDArray[np.uint8]] | None:
-    """What draws a row's body, (V, H, W) 0 or 255; None if the result has no body."""
-    found = body_and_poses(result)
-    if found is not None:
-        cones, whole = found
-        return lambda row: draw_silhouettes(cones, rig, whole[row][None])[0]
-    restored = restore_superellipsoids(result)
-    if restored is None:
-        return None
-    body, poses = restored
-    _check_poses(result, poses, body.skeleton)
-    return lambda row: draw_body(body, rig, poses[row])
-
-
-def _check_poses(result: Result, poses: Float, skeleton: Skeleton) -> None:
-    """Kernels do not look whether poses (F, D) have as many entries as the body has degrees of freedom."""
-    if poses.shape[1:] != (len(skeleton.names),):
-        raise ResultError(
-            f"{result.path}: a pose has {poses.shape[1]} entries, its body {len(skeleton.names)} degrees of freedom"
-        )
 
 
 def capture_of(truth: str | os.PathLike[str]) -> Path | None:

@@ -19,7 +19,7 @@ from tk.io.capture import open_capture
 from tk.kernels.nearest import SurfaceIndex
 from tk.model.contour_term import ContourTerm
 from tk.model.objective import CHAIN_NAMES, BodyObjective, FrameObjective
-from tk.model.skeleton import with_waist
+from tk.model.skeleton import join_pose
 from tk.optim import smd
 from tk.optim.schedule import CHAIN_LEVER_M, descent_basis, max_step
 from tk.segmentation import make_segmenter
@@ -61,7 +61,7 @@ def look(options: Options, paper: Config) -> Scene:
     config = Config()
     segment = make_segmenter(capture, config, lambda _: None)
     tracker = VolumetricTracker(capture.rig, capture.volume, capture.up, config)
-    opening = config.tracking.init_frames
+    opening = tracker.opening_frames
     with capture.frames(0, options.frames) as frames:
         seen = (Observation(f.index, f.images.copy(), segment(f).copy()) for f in frames)
         first = list(islice(seen, opening))
@@ -70,15 +70,15 @@ def look(options: Options, paper: Config) -> Scene:
             estimate = tracker.step(observation)
     surface = estimate.surface
     assert surface is not None
-    body = tracker.body
+    skin = tracker.skin
     # colours do not confine the neighbours here: the arm's own are what it could not mistake
     every = np.full(len(surface), -1, np.int64)
     index = SurfaceIndex.build(surface.positions, surface.normals, every, CELL_VOXELS * tracker.hull.grid.voxel_m)
-    term = ContourTerm(body, capture.rig, paper.contours)
-    objective = BodyObjective(body, paper.objective.settings, replace(SAMPLING, chain=ARM_POINTS), term)
+    term = ContourTerm(skin, capture.rig, paper.contours)
+    objective = BodyObjective(skin, paper.objective.settings, replace(SAMPLING, chain=ARM_POINTS), term)
     frame = FrameObjective(objective, index, np.random.default_rng(0), images=observation.images)
-    two = np.array([body.skeleton.index(name) for name in ANGLES])
-    return Scene(frame, with_waist(body.skeleton, estimate.pose, estimate.waist), two)
+    two = np.array([skin.skeleton.index(name) for name in ANGLES])
+    return Scene(frame, join_pose(skin.skeleton, estimate.pose, estimate.waist, estimate.ankles), two)
 
 
 def landscape(scene: Scene, seed: int, poses: Float, iteration: int = 0) -> Float:

@@ -13,7 +13,7 @@ import pytest
 
 from tk.io.result import FrameResult, ResultMeta, ResultWriter, Status
 from tk.model.anthropometry import BodyDimensions
-from tk.model.skeleton import WAIST, Skeleton, build_skeleton, without_waist
+from tk.model.skeleton import WAIST, Skeleton, build_skeleton, split_pose
 
 BODY = BodyDimensions.from_stature(1.75)
 SKELETON = build_skeleton(BODY, waist=True)
@@ -78,7 +78,7 @@ def write(tmp_path: Path) -> Write:
         with ResultWriter.create(path, fixed) as writer:
             writer.write_model({f"dimensions/{key}": value for key, value in asdict(BODY).items()})
             for f, pose in enumerate(poses(skeleton)):
-                short, waist = without_waist(skeleton, pose) if has_waist else (pose, np.zeros(0))
+                short, waist, _ = split_pose(skeleton, pose)
                 index = FIRST + f if frames is None else int(frames[f])
                 writer.append(
                     FrameResult(

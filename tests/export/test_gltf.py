@@ -9,8 +9,8 @@ import pygltflib
 from scipy.spatial.transform import Rotation
 
 from tests.export.conftest import FPS, FRAMES, LOST, Write, poses
+from tests.model.figures import skin_of
 from tk.export import export, read_motion
-from tk.model.body import build_body
 from tk.model.skeleton import JOINTS, SEGMENTS
 
 TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
@@ -98,7 +98,7 @@ def test_the_body_rides_on_the_nodes(write: Write) -> None:
     path = write()
     motion, _ = read_motion(path)
     f = 7
-    body = build_body(motion.dimensions, waist=True)
+    body = skin_of(motion.dimensions, waist=True)
     points, _ = body.place(poses()[f])
     file = load(export(path, ["gltf"]).files[0])
     T = frame_transforms(file, f)

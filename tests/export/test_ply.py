@@ -10,9 +10,9 @@ import pytest
 
 from tests.conftest import Tk
 from tests.export.conftest import BODY, FIRST, FRAMES, LOST, Write, poses
+from tests.model.figures import skin_of
 from tk.errors import ExportError
 from tk.export import export
-from tk.model.body import build_body
 
 
 def read(path: Path) -> open3d.geometry.TriangleMesh:
@@ -25,7 +25,7 @@ def test_every_frame_has_the_body_where_it_was(write: Write) -> None:
     assert folder.name == "walk_ply"
     files = sorted(folder.iterdir())
     assert [file.name for file in files] == [f"{FIRST + f:06d}.ply" for f in range(FRAMES)]
-    body = build_body(BODY, waist=True)
+    body = skin_of(BODY, waist=True)
     for f in (0, 7, FRAMES - 1):
         mesh = read(files[f])
         scene = open3d.t.geometry.RaycastingScene()

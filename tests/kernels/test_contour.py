@@ -8,13 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.kernels.test_occlusion import camera_at, random_pose
+from tests.model.figures import skin_of
 from tk.model.anthropometry import BodyDimensions
-from tk.model.body import build_body, neutral_pose
 from tk.model.camera import Camera, Rig
+from tk.model.gait import neutral_pose
 from tk.model.skeleton import SEGMENTS
 from tk.model.strips import build_strips, contour_kernel
 
-BODY = build_body(BodyDimensions.from_stature(1.75), up="-y")
+BODY = skin_of(BodyDimensions.from_stature(1.75), up="-y")
 STRIPS = build_strips(BODY)
 ALL = np.arange(len(STRIPS.piece))[None]
 

@@ -8,13 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.kernels import oracles
+from tests.model.figures import skin_of
 from tk.kernels.nearest import SurfaceIndex, nearest
 from tk.kernels.objective import Held, ObjectiveKernel, ObjectiveSettings
 from tk.model.anthropometry import BodyDimensions
-from tk.model.body import build_body, neutral_pose
+from tk.model.gait import neutral_pose
 from tk.model.skeleton import SEGMENTS
 
-BODY = build_body(BodyDimensions.from_stature(1.75))
+BODY = skin_of(BodyDimensions.from_stature(1.75))
 SKELETON = BODY.skeleton
 D = len(SKELETON.names)
 SAMPLE_DOF = SKELETON.segment_dof[BODY.segment]

@@ -7,10 +7,10 @@ import open3d as o3d
 import pytest
 
 from tests.kernels import oracles
+from tests.model.figures import skin_of
 from tk.kernels.occlusion import TOUCH, segment_enters
 from tk.kernels.runtime import ensure_runtime, ti
 from tk.model.anthropometry import BodyDimensions
-from tk.model.body import build_body
 from tk.model.camera import Camera, Rig
 from tk.model.skeleton import SEGMENTS
 from tk.model.strips import build_strips, contour_kernel
@@ -188,7 +188,7 @@ def random_pose(skeleton, rng):
 
 
 def test_visible_points_are_those_that_ray_casting_sees():
-    body = build_body(BodyDimensions.from_stature(1.75))
+    body = skin_of(BodyDimensions.from_stature(1.75))
     strips = build_strips(body)
     # one close, one overhead: strong perspective
     rig = Rig(tuple(camera_at(p) for p in ([3, 0, 1.2], [-1, 2.5, 1.8], [-2, -3, 0.6], [0.3, 0.2, 3.2])))

@@ -1,19 +1,23 @@
-"""A body of superellipsoids as voxels: what the tests of initialisation and fitting look at instead of a hull."""
+"""Bodies of superellipsoids of average shape, and such a body as voxels: what tests look at instead of a hull."""
 
 import numpy as np
 from scipy import ndimage
 
 from tk.kernels.nearest import SurfaceIndex
-from tk.model.body import Body
-from tk.model.skeleton import JOINTS, SEGMENTS
+from tk.model.anthropometry import BodyDimensions
+from tk.model.cone_body import build_cone_body
+from tk.model.skeleton import SEGMENTS
+from tk.model.skin import SPACING_M, Skin, lay_skin
 from tk.model.volume import Volume, VoxelGrid
 
 
-def voxelise(body: Body, pose: np.ndarray, grid: VoxelGrid) -> np.ndarray:
-    """(nx, ny, nz) bool: voxels in one of the body's pieces, or in the flesh that bridges shoulders and neck.
+def skin_of(dimensions: BodyDimensions, up: str = "z", waist: bool = False, spacing_m: float = SPACING_M) -> Skin:
+    """The skin of a body with these dimensions whose parts are as they are on an average."""
+    return lay_skin(build_cone_body(dimensions, up), up, waist, spacing_m)
 
-    Between trunk and arms, and trunk and neck, the pieces leave gaps of some centimetres that no person has.
-    """
+
+def voxelise(body: Skin, pose: np.ndarray, grid: VoxelGrid) -> np.ndarray:
+    """(nx, ny, nz) bool: voxels in one of the body's pieces."""
     T_world_segment = body.skeleton.segment_transforms(pose)
     B = np.eye(4)
     B[:3, :3] = body.skeleton.T_world_body
@@ -23,15 +27,10 @@ def voxelise(body: Body, pose: np.ndarray, grid: VoxelGrid) -> np.ndarray:
         T = np.linalg.inv(T_world_segment[SEGMENTS.index(piece.segment)] @ B @ piece.T_body_piece)
         near = np.flatnonzero(np.linalg.norm(centers - np.linalg.inv(T)[:3, 3], axis=1) < 1.8 * max(piece.radii))
         occupied[near] |= piece.contains(centers[near] @ T[:3, :3].T + T[:3, 3])
-    joints = dict(zip(JOINTS, body.skeleton.joints(pose), strict=True))
-    d = body.dimensions
-    flesh = (("neck", d.neck_radius), ("shoulder_l", d.upper_arm_radius), ("shoulder_r", d.upper_arm_radius))
-    for name, radius in flesh:
-        occupied |= np.linalg.norm(centers - joints[name], axis=1) < radius
     return occupied.reshape(grid.shape)
 
 
-def grid_around(body: Body, pose: np.ndarray, voxel_m: float = 0.025) -> VoxelGrid:
+def grid_around(body: Skin, pose: np.ndarray, voxel_m: float = 0.025) -> VoxelGrid:
     """The grid that holds a body at a pose with 10 cm to spare."""
     points, _ = body.place(pose)
     lower, upper = points.min(0) - 0.1, points.max(0) + 0.1

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tk.model.angles import ANGLES, joint_angles, joint_rotation, segment_quaternions, segment_rotations, standing_axes
 from tk.model.anthropometry import BodyDimensions
-from tk.model.body import neutral_pose
+from tk.model.gait import neutral_pose
 from tk.model.rotations import to_matrices
 from tk.model.skeleton import JOINTS, SEGMENTS, Skeleton, build_skeleton, shoulder_angles
 

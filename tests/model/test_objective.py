@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.model.figures import grid_around, surface_index, voxelise
+from tests.model.figures import grid_around, skin_of, surface_index, voxelise
 from tk.errors import ConfigError
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective import ObjectiveSettings
 from tk.model.anthropometry import BodyDimensions
-from tk.model.body import build_body, neutral_pose
+from tk.model.gait import neutral_pose
 from tk.model.objective import (
     CHAIN_NAMES,
     CHAIN_OF_SEGMENT,
@@ -24,7 +24,8 @@ from tk.model.objective import (
 )
 from tk.model.skeleton import CHAINS, JOINTS, SEGMENTS, WAIST_STIFFNESS
 
-BODY = build_body(BodyDimensions.from_stature(1.75))
+DIMENSIONS = BodyDimensions.from_stature(1.75)
+BODY = skin_of(DIMENSIONS)
 SKELETON = BODY.skeleton
 D = len(SKELETON.names)
 SAMPLING = SamplingConfig()
@@ -332,7 +333,7 @@ def test_a_leg_inside_the_other_finds_no_voxel(frame, index, truth, monkeypatch)
 
 def test_a_stiff_waist_costs_its_square_with_the_derivatives_to_it(index, truth):
     """Against the same body without stiffness: value, gradient, product and curvature."""
-    body = build_body(BODY.dimensions, waist=True)
+    body = skin_of(DIMENSIONS, waist=True)
     soft, stiff = (
         BodyObjective(body, ObjectiveSettings(), SAMPLING, waist_stiffness=w, dtype=np.float64) for w in (0.0, 0.7)
     )

@@ -8,7 +8,7 @@ from scipy.linalg import expm
 
 from tk.errors import ConfigError
 from tk.model.anthropometry import RAISED_SHOULDERS, TRUNK_LENGTH, BodyDimensions
-from tk.model.body import neutral_pose
+from tk.model.gait import neutral_pose
 from tk.model.skeleton import (
     ANKLES,
     CHAINS,
@@ -23,8 +23,6 @@ from tk.model.skeleton import (
     split_pose,
     twist_exp,
     up_rotation,
-    with_waist,
-    without_waist,
 )
 
 DIMENSIONS = BodyDimensions.from_stature(1.75)
@@ -165,7 +163,7 @@ def test_without_a_waist_all_limbs_keep_their_directions(up):
     skeleton, poses = waisted_poses(up=up)
     plain = build_skeleton(DIMENSIONS, up)
     for pose in poses:
-        told, waist = without_waist(skeleton, pose)
+        told, waist, none = split_pose(skeleton, pose)
         np.testing.assert_array_equal(waist, pose[skeleton.is_waist])
         R, R_told = (s.segment_transforms(p)[:, :3, :3] for s, p in ((skeleton, pose), (plain, told)))
         limbs = [SEGMENTS.index(s) for s in SEGMENTS if s != "pelvis"]
@@ -173,7 +171,7 @@ def test_without_a_waist_all_limbs_keep_their_directions(up):
         # the sockets are moved by less than the waist's angle times their distance from it
         away = np.linalg.norm(plain.joints(told) - skeleton.joints(pose), axis=1).max()
         assert away < 0.25 * np.linalg.norm(waist) + 1e-9
-        np.testing.assert_allclose(with_waist(skeleton, told, waist), pose, atol=1e-9)
+        np.testing.assert_allclose(join_pose(skeleton, told, waist, none), pose, atol=1e-9)
 
 
 # The whole skeleton, with waist and ankles

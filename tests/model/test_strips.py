@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from tests.model.figures import skin_of
 from tk.errors import ConfigError
 from tk.model.anthropometry import BodyDimensions
-from tk.model.body import build_body
 from tk.model.skeleton import SEGMENTS
 from tk.model.strips import LIMBS, build_strips
 
-BODY = build_body(BodyDimensions.from_stature(1.75))
+BODY = skin_of(BodyDimensions.from_stature(1.75))
 STRIPS = build_strips(BODY, circles=12, meridians=8, samples=16)
 PER_PIECE = 20
 

@@ -6,12 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
+from tests.model.figures import skin_of
 from tk.errors import ConfigError
 from tk.model.anthropometry import BodyDimensions
-from tk.model.body import build_pieces
 from tk.model.superellipsoid import Superellipsoid, signed_power
 
-PIECES = build_pieces(BodyDimensions.from_stature(1.75))
+PIECES = skin_of(BodyDimensions.from_stature(1.75)).pieces
 seeds = st.integers(0, 2**32 - 1)
 exponents = st.floats(0.3, 1.7)
 many = settings(max_examples=60, deadline=None)

@@ -25,20 +25,21 @@ from tk.io.result import (
     revise_result,
 )
 from tk.model.anthropometry import BodyDimensions
-from tk.model.body import Body, build_body, neutral_pose
 from tk.model.camera import Camera, Rig
 from tk.model.cone_body import ConeBody, build_cone_body
+from tk.model.gait import neutral_pose
 from tk.model.silhouettes import draw_silhouettes
-from tk.model.skeleton import JOINTS
+from tk.model.skeleton import JOINTS, build_skeleton
 from tk.render.canvas import View, draw_body, draw_joints
 from tk.render.figure import BONES, Figure, Outline, solids_of
 from tk.render.overlay import Grid, Overlay, write_sheets
 from tk.render.palette import BONE, LOST, SEGMENT_COLORS, sigma_colors
 from tk.session import track
-from tk.trackers.volumetric import restore_body
+from tk.trackers.bodies import body_and_poses
 
 DEMO = Path(__file__).resolve().parents[2] / "tk" / "data" / "demo"
-BODY = build_body(BodyDimensions.from_stature(1.7))
+BODY = build_cone_body(BodyDimensions.from_stature(1.7))
+SKELETON = build_skeleton(BODY.dimensions)
 
 
 def camera(distance_m: float = 4.0) -> Camera:
@@ -48,7 +49,7 @@ def camera(distance_m: float = 4.0) -> Camera:
     return Camera("cam1", 320, 240, matrix, np.zeros(5), rotation, np.array([0, 0, distance_m]))
 
 
-def figure(body: Body | ConeBody, pose: np.ndarray) -> Figure:
+def figure(body: ConeBody, pose: np.ndarray) -> Figure:
     """One frame."""
     joints, transforms = body.skeleton.joints(pose), body.skeleton.segment_transforms(pose[None])
     return Figure(np.zeros(1, int), joints[None], None, np.zeros(1, np.uint8), solids_of(body), transforms)
@@ -58,7 +59,7 @@ def figure(body: Body | ConeBody, pose: np.ndarray) -> Figure:
 def result(tmp_path: Path) -> Path:
     """A result of three frames of the demo: the neutral pose at the true pelvis; the last frame is lost."""
     path = tmp_path / "result.h5"
-    skeleton, truth = BODY.skeleton, read_joints(DEMO / "truth.h5")
+    skeleton, truth = SKELETON, read_joints(DEMO / "truth.h5")
     pose = neutral_pose(skeleton)
     meta = ResultMeta(
         skeleton.names, skeleton.units, ("all",), ("total",), 15.0, "z", "demo", "made", 0, Config().to_toml()
@@ -79,26 +80,11 @@ def test_bones_join_all_joints_into_one_tree() -> None:
 
 
 def test_body_is_built_anew_from_the_model(result: Path) -> None:
-    restored = restore_body(read_result(result))
+    restored = body_and_poses(read_result(result))
     assert restored is not None
     body, poses = restored
-    assert poses.shape == (3, 24) and body.dimensions == BODY.dimensions
-    np.testing.assert_array_equal(body.points, BODY.points)
-
-
-def test_outlines_hold_the_surface_samples() -> None:
-    pose = neutral_pose(BODY.skeleton)
-    cam = camera()
-    mask = np.zeros((240, 320), np.uint8)
-    found = figure(BODY, pose).seen(0, cam)[0]
-    assert [outline.depth for outline in found] == sorted((outline.depth for outline in found), reverse=True)
-    for outline in found:
-        for points in outline.points:
-            cv2.fillConvexPoly(mask, cv2.convexHull(np.rint(points).astype(np.int32)), 255)
-    xy = np.rint(cam.project(BODY.place(pose)[0])[0]).astype(int)
-    grown = cv2.dilate(mask, np.ones((3, 3), np.uint8))  # the outline has corners: a sample may lie just outside
-    assert (grown[xy[:, 1], xy[:, 0]] > 0).all()
-    assert (mask > 0).sum() < 1.3 * cv2.contourArea(cv2.convexHull(xy.astype(np.int32)))
+    assert poses.shape == (3, len(BODY.skeleton.names)) and body.dimensions == BODY.dimensions
+    np.testing.assert_array_equal(body.arrays.part_shape, BODY.arrays.part_shape)
 
 
 def test_outlines_of_cones_are_their_silhouette() -> None:

@@ -19,9 +19,9 @@ from tk.kernels.contour import ContourPoints
 from tk.kernels.edge_search import LINE_NUMBERS, PAIR, SINGLE, search_edges
 from tk.kernels.edges import EdgeConfig
 from tk.kernels.projection import pack_camera
-from tk.model.body import Body
 from tk.model.camera import Rig
 from tk.model.skeleton import CHAINS
+from tk.model.skin import Skin
 from tk.model.strips import LIMBS, Strips, build_strips, contour_kernel
 
 Float = NDArray[np.float64]
@@ -82,7 +82,7 @@ class ContourTerm:
         dtype: precision of the contours.
     """
 
-    def __init__(self, body: Body, rig: Rig, config: ContourConfig, scale: int = 1, dtype: type = np.float32) -> None:
+    def __init__(self, body: Skin, rig: Rig, config: ContourConfig, scale: int = 1, dtype: type = np.float32) -> None:
         self.config = config
         self.gradient = EdgeConfig()
         self.strips: Strips = build_strips(body)

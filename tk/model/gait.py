@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.body import neutral_pose
 from tk.model.skeleton import Skeleton, shoulder_angles
 
 Float = NDArray[np.float64]
@@ -46,6 +45,16 @@ def walking_pose(skeleton: Skeleton, phase: float | None) -> Float:
         pose[skeleton.index(f"shoulder_{side}_yaw")] = yaw
         pose[skeleton.index(f"shoulder_{side}_pitch")] = pitch
         pose[skeleton.index(f"elbow_{side}_flexion")] = np.radians(20.0 if phase is not None else 10.0)
+    return pose
+
+
+def neutral_pose(skeleton: Skeleton) -> Float:
+    """(D,) the Da Vinci pose: upright, arms level and sideways, legs 15° apart (Kehl 2006, section 6.3)."""
+    pose = np.zeros(len(skeleton.names))
+    for side in ("l", "r"):
+        pose[skeleton.index(f"shoulder_{side}_yaw")] = np.radians(30.0)
+        pose[skeleton.index(f"shoulder_{side}_pitch")] = np.arcsin(1 / np.sqrt(3))
+        pose[skeleton.index(f"hip_{side}_yaw")] = np.radians(15.0)
     return pose
 
 

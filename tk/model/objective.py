@@ -18,9 +18,9 @@ from tk.kernels.alignment import NU
 from tk.kernels.linearisation import Linearisation
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective import Held, ObjectiveKernel, ObjectiveSettings
-from tk.model.body import Body
 from tk.model.contour_term import RENEW, ContourTerm
 from tk.model.skeleton import CHAINS, SEGMENTS, WAIST_STIFFNESS
+from tk.model.skin import Skin
 
 Float = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -134,7 +134,7 @@ class BodyObjective:
 
     def __init__(
         self,
-        body: Body,
+        body: Skin,
         settings: ObjectiveSettings,
         sampling: SamplingConfig,
         contours: ContourTerm | None = None,
@@ -212,7 +212,7 @@ class BodyObjective:
         )
 
 
-def piece_patches(body: Body) -> NDArray[np.int64]:
+def piece_patches(body: Skin) -> NDArray[np.int64]:
     """(P,) bit masks of the colour patches on each piece; a piece without samples has those of its segment."""
     masks = np.zeros(len(body.pieces), np.int64)
     for index, piece in enumerate(body.pieces):

@@ -15,7 +15,8 @@ directions are hardly ever taken: a leg straight to the side, the trunk lying on
 back-out-up / forward-in-down, which is at least 54° away from hanging, raised, forward, backward and sideways.
 
 Beyond the paper: a waist, three rotations between trunk and pelvis about the lumbar spine. A dancer's hips stay level
-while the trunk leans; the paper's torso takes them along. :func:`without_waist` tells the same pose in the paper's 24
+while the trunk leans; the paper's torso takes them along.
+:func:`split_pose` tells the same pose in the paper's 24
 degrees of freedom.
 """
 
@@ -330,16 +331,6 @@ def join_pose(skeleton: Skeleton, pose: Float, waist: Float, ankles: Float) -> F
     whole = np.empty(len(skeleton.names))
     whole[skeleton.is_paper], whole[skeleton.is_waist], whole[skeleton.is_ankle] = pose, waist, ankles
     return _turn_hips(skeleton, whole, _waist_rotation(skeleton, whole).T)
-
-
-def without_waist(skeleton: Skeleton, pose: Float) -> tuple[Float, Float]:
-    """:func:`split_pose` of a body without ankles."""
-    return split_pose(skeleton, pose)[:2]
-
-
-def with_waist(skeleton: Skeleton, pose: Float, waist: Float) -> Float:
-    """:func:`join_pose` of a body without ankles."""
-    return join_pose(skeleton, pose, waist, np.zeros(0))
 
 
 def _waist_rotation(skeleton: Skeleton, pose: Float) -> Float:

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from tk.errors import ConfigError
 from tk.kernels.contour import ContourKernel
 from tk.kernels.projection import pack_camera
-from tk.model.body import Body
 from tk.model.camera import Rig
 from tk.model.skeleton import SEGMENTS
+from tk.model.skin import Skin
 from tk.model.superellipsoid import Superellipsoid, signed_power
 
 Float = NDArray[np.float64]
@@ -84,7 +84,7 @@ class Strips:
                 raise ConfigError(f"{wanted} contour {name} a limb: choose 0 to {count}, or lay out more strips")
 
 
-def build_strips(body: Body, circles: int = 20, meridians: int = 16, samples: int = 32) -> Strips:
+def build_strips(body: Skin, circles: int = 20, meridians: int = 16, samples: int = 32) -> Strips:
     """The strips of a body.
 
     Args:
@@ -117,7 +117,7 @@ def build_strips(body: Body, circles: int = 20, meridians: int = 16, samples: in
     )
 
 
-def contour_kernel(body: Body, strips: Strips, rig: Rig, dtype: type = np.float32) -> ContourKernel:
+def contour_kernel(body: Skin, strips: Strips, rig: Rig, dtype: type = np.float32) -> ContourKernel:
     """The kernel that finds this body's contour points in these cameras."""
     skeleton = body.skeleton
     T_world_body = np.eye(4)
@@ -172,6 +172,6 @@ def _equal_lengths(parameter: Float, curve: Float, count: int) -> Float:
     return np.interp((np.arange(count) + 0.5) / count * steps[-1], steps, parameter)
 
 
-def _longest_piece(body: Body, segment: str) -> int:
+def _longest_piece(body: Skin, segment: str) -> int:
     lengths = [p.z_upper - p.z_lower if p.segment == segment else 0.0 for p in body.pieces]
     return int(np.argmax(lengths))

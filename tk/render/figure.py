@@ -11,13 +11,10 @@ from numpy.typing import NDArray
 from tk.errors import ResultError
 from tk.io.result import Result, Status
 from tk.kernels.cones import ELLIPSOID
-from tk.model.body import Body
 from tk.model.camera import Camera
 from tk.model.cone_body import ConeBody, ConePart
 from tk.model.skeleton import JOINTS, SEGMENTS
-from tk.model.superellipsoid import Superellipsoid
 from tk.trackers.bodies import body_and_poses
-from tk.trackers.volumetric import restore_body
 
 Float = NDArray[np.float64]
 
@@ -31,7 +28,7 @@ BONES = (
 
 #: points around a solid
 AROUND = 24
-# circles along an ellipsoid and a superellipsoid; a frustum is the convex hull of two
+# circles along an ellipsoid; a frustum is the convex hull of two
 _ALONG = 9
 
 
@@ -174,7 +171,7 @@ def figure_of(result: Result) -> Figure:
         raise ResultError(f"{result.path}: /joints/position has no joint {missing[0]}; track anew")
     order = [names.index(name) for name in JOINTS]
     sigma = None if result.sigma is None else result.sigma[:, order]
-    restored = body_and_poses(result) or restore_body(result)
+    restored = body_and_poses(result)
     solids: tuple[Solid, ...] = ()
     transforms = np.zeros((len(result), 0, 4, 4))
     if restored is not None:
@@ -183,32 +180,20 @@ def figure_of(result: Result) -> Figure:
     return Figure(result.frames, result.joints[:, order], sigma, result.status, solids, transforms)
 
 
-def solids_of(body: Body | ConeBody) -> tuple[Solid, ...]:
+def solids_of(body: ConeBody) -> tuple[Solid, ...]:
     """The body's solids in their segments' frames."""
     T_body = np.eye(4)
     T_body[:3, :3] = body.skeleton.T_world_body
-    if isinstance(body, ConeBody):
-        found = [(part.segment, T_body @ part.T_body_part, _part_rings(part)) for part in body.parts]
-    else:
-        found = [(piece.segment, T_body @ piece.T_body_piece, _piece_rings(piece)) for piece in body.pieces]
+    found = [(part.segment, T_body @ part.T_body_part, _part_rings(part)) for part in body.parts]
     return tuple(Solid(SEGMENTS.index(name), rings @ T[:3, :3].T + T[:3, 3]) for name, T, rings in found)
 
 
 def _part_rings(part: ConePart) -> Float:
     """(R, AROUND, 3) circles of a frustum or an ellipsoid, its own frame."""
-    angle, z = np.meshgrid(_angles(), np.linspace(0, 1, _ALONG if part.kind == ELLIPSOID else 2))
+    around = np.linspace(-np.pi, np.pi, AROUND, endpoint=False)
+    angle, z = np.meshgrid(around, np.linspace(0, 1, _ALONG if part.kind == ELLIPSOID else 2))
     radius = np.ones_like(z)
     if part.kind == ELLIPSOID:
         radius, z = np.sin(np.pi * z), -np.cos(np.pi * z)
     unscaled = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)
     return part.surface(unscaled.reshape(-1, 3)).reshape(unscaled.shape)
-
-
-def _piece_rings(piece: Superellipsoid) -> Float:
-    """(R, AROUND, 3) circles of a piece, its own frame."""
-    omega, eta = np.meshgrid(_angles(), np.linspace(*piece.eta_range, _ALONG))
-    return piece.point(eta, omega)
-
-
-def _angles() -> Float:
-    return np.linspace(-np.pi, np.pi, AROUND, endpoint=False)

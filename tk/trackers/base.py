@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # who decodes and segments needs no tracker's parts
     from tk.io.init_pose import InitPose
+    from tk.model.cone_body import ConeBody
     from tk.model.hull import HullSurface
 
 Float = NDArray[np.float64]
@@ -82,16 +83,32 @@ class Tracker(Protocol):
     pose_units: tuple[str, ...]
     waist_names: tuple[str, ...]
     ankle_names: tuple[str, ...]
-    any_pose: bool
-    """Whether the person is found in any pose, not only in the Da Vinci pose."""
 
     @property
     def opening_frames(self) -> int:
         """Frames that :meth:`start` wants to look at."""
         ...
 
-    def start(self, frames: Sequence[Observation], height_m: float | None, init: InitPose | None) -> None:
-        """Find the subject in the first of the frames; nothing is returned, :meth:`step` begins with that frame."""
+    @property
+    def body(self) -> ConeBody:
+        """The person's body, once it is known."""
+        ...
+
+    def start(
+        self,
+        frames: Sequence[Observation],
+        height_m: float | None,
+        init: InitPose | None,
+        body: ConeBody | None = None,
+    ) -> None:
+        """Find the subject in the first of the frames; nothing is returned, :meth:`step` begins with that frame.
+
+        Args:
+            frames: consecutive observations.
+            height_m: the subject's height, if known.
+            init: a rough pose given by a person.
+            body: the body, if known; it is not fitted then.
+        """
         ...
 
     def step(self, frame: Observation) -> Estimate:

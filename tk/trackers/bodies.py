@@ -14,7 +14,7 @@ from tk.io.toml import parse_toml, read_text
 from tk.model.anthropometry import BodyDimensions
 from tk.model.cone_body import ConeBody, build_cone_body
 from tk.model.skeleton import DEGREES_OF_FREEDOM, join_pose
-from tk.trackers.contours import restore_body
+from tk.trackers.contours import restore_body, restore_dimensions
 
 
 def read_body(path: Path, up: str) -> ConeBody:
@@ -48,16 +48,20 @@ def read_body(path: Path, up: str) -> ConeBody:
 
 
 def body_and_poses(result: Result) -> tuple[ConeBody, NDArray[np.float64]] | None:
-    """The body of contours that a result was tracked with, and its poses (F, D); None where it holds no such body.
+    """The body that a result was tracked with, and its poses (F, D); None where it holds none.
 
-    Angles that the result does not tell, as results of version 1 do not tell the ankles', are 0.
+    Angles that the result does not tell, as the volumetric tracker's do not tell the ankles', are 0. Of the volumetric
+    tracker's results of 0.x only the dimensions are taken: their shapes were of another kind.
 
     Raises:
         ResultError: the poses are not of this body.
     """
-    if "parts/shape" not in result.model or "body" not in result.model:
+    if "parts/shape" in result.model and "body" in result.model:
+        body = restore_body(result.model, result.meta.up)
+    elif "dimensions/trunk" in result.model:
+        body = build_cone_body(restore_dimensions(result.model), result.meta.up)
+    else:
         return None
-    body = restore_body(result.model, result.meta.up)
     skeleton = body.skeleton
     F = len(result.frames)
     columns = []

@@ -106,8 +106,6 @@ class ContourTracker:
         config: see :class:`SilhouetteConfig`.
     """
 
-    any_pose = True
-
     def __init__(self, rig: Rig, up: str, config: SilhouetteConfig) -> None:
         self.contours = config
         self.up = up
@@ -363,11 +361,15 @@ class ContourTracker:
         }
 
 
+def restore_dimensions(model: Mapping[str, Any]) -> BodyDimensions:
+    """The dimensions that :meth:`ContourTracker.model` wrote down."""
+    prefix = "dimensions/"
+    return BodyDimensions(**{k[len(prefix) :]: float(v) for k, v in model.items() if k.startswith(prefix)})
+
+
 def restore_body(model: Mapping[str, Any], up: str) -> ConeBody:
     """The body that :meth:`ContourTracker.model` wrote down."""
-    prefix = "dimensions/"
-    dimensions = BodyDimensions(**{k[len(prefix) :]: float(v) for k, v in model.items() if k.startswith(prefix)})
-    body = build_cone_body(dimensions, up, str(model["body"]))
+    body = build_cone_body(restore_dimensions(model), up, str(model["body"]))
     # parts as they were written down: other versions of this program may lay the body out in other ones
     ends = {part.name: part.ends for part in body.parts}
     parts = []

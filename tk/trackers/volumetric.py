@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,23 +25,21 @@ from numpy.typing import NDArray
 from tk.config import Config
 from tk.errors import CaptureError
 from tk.io.init_pose import InitPose
-from tk.io.result_data import Result
 from tk.kernels.nearest import SurfaceIndex
-from tk.model import initialisation
-from tk.model.anthropometry import BodyDimensions
 from tk.model.appearance import LEARNING_M, Appearance
-from tk.model.body import Body, build_body
 from tk.model.camera import Rig
+from tk.model.cone_body import ConeBody
 from tk.model.contour_term import ContourTerm
-from tk.model.fitting import FitConfig, fit_body
 from tk.model.hull import HullSurface, VisualHull
 from tk.model.objective import CHAIN_OF_SEGMENT, BodyObjective, Fit, FrameObjective, SamplingConfig
-from tk.model.skeleton import CHAINS, JOINTS, WAIST, build_skeleton, with_waist, without_waist
+from tk.model.skeleton import CHAINS, JOINTS, WAIST, join_pose, split_pose
+from tk.model.skin import Skin, lay_skin
 from tk.model.volume import Volume, VoxelGrid
 from tk.optim import lm_schedule, schedule
 from tk.optim.levenberg_marquardt import LmConfig
 from tk.optim.smd import SmdConfig
 from tk.trackers.base import Estimate, Observation, Stopwatch
+from tk.trackers.contours import ContourTracker, restore_body
 
 Float = NDArray[np.float64]
 
@@ -64,7 +62,8 @@ SCHEDULE = schedule.ScheduleConfig()
 SAMPLING = SamplingConfig()
 SMD = SmdConfig()
 LM = LmConfig()
-FIT = FitConfig()
+# where a body has none
+NO_ANGLES = np.zeros(0)
 
 
 def _drift(usual: float, now: float) -> float:
@@ -79,7 +78,6 @@ class Effort:
     sampling: SamplingConfig
     smd: SmdConfig
     lm: LmConfig
-    fit: FitConfig
 
     @staticmethod
     def of(factor: float) -> Effort:
@@ -92,7 +90,6 @@ class Effort:
             replace(SAMPLING, scale=max(round(factor), 1) * SAMPLING.scale),
             replace(SMD, max_iterations=share(SMD.max_iterations)),
             replace(LM, max_iterations=share(LM.max_iterations)),
-            replace(FIT, rounds=share(FIT.rounds)),
         )
 
 
@@ -120,94 +117,63 @@ class VolumetricTracker:
         self.up = up
         self.rig = rig
         self.hull = VisualHull(rig, VoxelGrid.cover(volume, config.voxels), cache_dir)
-        skeleton = build_skeleton(BodyDimensions.from_stature(1.7), up, config.body.waist)
-        told = np.flatnonzero(~skeleton.is_waist)
-        self.pose_names = tuple(skeleton.names[k] for k in told)
-        self.pose_units = tuple(skeleton.units[k] for k in told)
-        self.waist_names = tuple(name for name in skeleton.names if name in WAIST)
+        self._finder = ContourTracker(rig, up, replace(config.silhouette, body="full"))
+        self.pose_names, self.pose_units = self._finder.pose_names, self._finder.pose_units
+        self.waist_names: tuple[str, ...] = WAIST if config.body.waist else ()
         self.ankle_names: tuple[str, ...] = ()
-        self._body: Body | None = None
+        self.skin: Skin
         self._objective: BodyObjective
         self._appearance: Appearance
-        self._pose = np.zeros(len(skeleton.names))
-        self._previous = self._pose
+        self._pose = self._previous = NO_ANGLES
         self._usual, self._usual_unexplained = np.inf, 1.0
         self._lost_for = 0
         self._fresh = True
 
     # --- initialisation (section 6.3) ---------------------------------------------------------------------------
 
-    def start(self, frames: Sequence[Observation], height_m: float | None, init: InitPose | None) -> None:
-        """Find the subject in the first frame and fit the body to the first few.
-
-        Args:
-            frames: consecutive observations from the initial one on, at least one.
-            height_m: the subject's height, if known.
-            init: a rough pose given by a person; None looks for the Da Vinci pose.
+    def start(
+        self,
+        frames: Sequence[Observation],
+        height_m: float | None,
+        init: InitPose | None,
+        body: ConeBody | None = None,
+    ) -> None:
+        """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourTracker.find`.
 
         Raises:
-            CaptureError: there is nobody, or nobody in the Da Vinci pose.
+            CaptureError: there is nobody.
         """
-        surfaces = []
-        for frame in frames:
-            self.hull.update(frame.masks)
-            surfaces.append(self.hull.surface(frame.images))
-            if len(surfaces) == 1:
-                occupancy = self.hull.occupancy
-        if len(surfaces[0]) < LEAST_VOXELS:
+        # the colours of the contours' search are none of this method's cues
+        blind = [Observation(f.index, f.images[:0], f.masks) for f in frames]
+        pose = self._finder.find(blind, height_m, init, body)
+        first = frames[0]
+        self.hull.update(first.masks)
+        surface = self.hull.surface(first.images)
+        if len(surface) < LEAST_VOXELS:
             raise CaptureError(
-                f"initialisation: only {len(surfaces[0])} surface voxels in frame {frames[0].index}: check the masks, "
+                f"initialisation: only {len(surface)} surface voxels in frame {first.index}: check the masks, "
                 "the calibration and the working volume ([volume] of capture.toml)"
             )
-        if init is None:
-            marks = initialisation.find_landmarks(occupancy, self.hull.grid, self.up)
-            dimensions, pose = initialisation.da_vinci_pose(marks, height_m, self.up)
-            anchor = initialisation.certainty(build_skeleton(dimensions, self.up))
-        else:
-            dimensions, pose = initialisation.rough_pose(init.joints, init.angles, init.height_m or height_m, self.up)
-            anchor = initialisation.rough_certainty(build_skeleton(dimensions, self.up))
-        surfaces = [s for s in surfaces if len(s) >= LEAST_VOXELS]
-        indices = [self._index(surface, np.full(len(surface), -1, np.int64)) for surface in surfaces]
-        dimensions, poses = fit_body(
-            dimensions,
-            np.repeat(pose[None], len(indices), axis=0),
-            indices,
-            self.up,
-            self.config.objective.settings,
-            self.effort.sampling,
-            anchor,
-            self.effort.fit,
-        )
-        self._take_body(dimensions)
-        # people stand upright for the fit: their waist is straight
-        waist = self.body.skeleton.is_waist
-        pose = np.zeros(len(waist))
-        pose[~waist] = poses[0]
-        self._pose = self._previous = pose
-        first = FrameObjective(self._objective, indices[0], np.random.default_rng(0), images=frames[0].images)
-        fit = first.fit(pose)
+        self._lay_skin()
+        paper, waist, _ = split_pose(self.body.skeleton, pose)
+        self._pose = self._previous = join_pose(self.skin.skeleton, paper, waist[: len(self.waist_names)], NO_ANGLES)
+        index = self._index(surface, np.full(len(surface), -1, np.int64))
+        fit = FrameObjective(self._objective, index, np.random.default_rng(0), images=first.images).fit(self._pose)
         self._usual, self._usual_unexplained = fit.value, fit.unexplained_share
-        self._learn_colours(surfaces[0], indices[0], pose)
+        patch, colors = self._correspondences(surface, index, fit)
+        self._appearance = Appearance.learn(len(self.skin.patch_names), patch, colors)
         self.hull.reset()
 
-    def _take_body(self, dimensions: BodyDimensions) -> None:
-        self._body = build_body(dimensions, self.up, waist=self.config.body.waist)
+    def _lay_skin(self) -> None:
+        self.skin = lay_skin(self.body, self.up, self.config.body.waist)
         edges, scale = self.config.contours, self.effort.sampling.scale
-        contours = ContourTerm(self._body, self.rig, edges, scale) if edges.edge_weight > 0 else None
         self._objective = BodyObjective(
-            self._body,
+            self.skin,
             self.config.objective.settings,
             self.effort.sampling,
-            contours,
+            ContourTerm(self.skin, self.rig, edges, scale) if edges.edge_weight > 0 else None,
             waist_stiffness=WAIST_STIFFNESS,
         )
-
-    def _learn_colours(self, surface: HullSurface, index: SurfaceIndex, pose: Float) -> None:
-        """Each patch takes the colours of the voxels under its samples."""
-        assert self._body is not None
-        fit = FrameObjective(self._objective, index, np.random.default_rng(0)).fit(pose)
-        patch, colors = self._correspondences(surface, index, fit)
-        self._appearance = Appearance.learn(len(self._body.patch_names), patch, colors)
 
     # --- tracking (section 6.4) ---------------------------------------------------------------------------------
 
@@ -245,11 +211,11 @@ class VolumetricTracker:
         self._lost_for = self._lost_for + 1 if lost else 0
         self._fresh = False
         watch.lap("update")
-        pose, waist = without_waist(self.body.skeleton, result.pose)
+        pose, waist, _ = split_pose(self.skin.skeleton, result.pose)
         return Estimate(
             pose=pose,
             waist=waist,
-            joints=self.body.skeleton.joints(result.pose),
+            joints=self.skin.skeleton.joints(result.pose),
             status=status,
             objective=fit.value,
             iterations=result.iterations,
@@ -261,23 +227,19 @@ class VolumetricTracker:
         """The pose that explains a frame best, from the starts (S, D)."""
         return schedule.optimise(problem, starts, SCHEDULE, self.effort.smd)
 
-    any_pose = False
-
     @property
     def opening_frames(self) -> int:
         """Frames that the body is fitted to."""
-        return self.config.tracking.init_frames
+        return self._finder.opening_frames
 
     @property
-    def body(self) -> Body:
+    def body(self) -> ConeBody:
         """The fitted body; only after :meth:`start` or :meth:`restore`."""
-        if self._body is None:
-            raise RuntimeError("the tracker has no body yet: call start() or restore() first")
-        return self._body
+        return self._finder.body
 
     def _starts(self, surface: HullSurface) -> Float:
         """(S, D) where the search may begin."""
-        skeleton = self.body.skeleton
+        skeleton = self.skin.skeleton
         # limbs swing on, or stop and turn: the objective tells which
         motion = self.config.tracking.prediction * (self._pose - self._previous)
         starts = [self._pose + motion, self._pose + motion / 2, self._pose]
@@ -295,7 +257,7 @@ class VolumetricTracker:
 
     def _is_lost(self, fit: Fit) -> bool:
         """Whether the person, or one of the limbs, is elsewhere."""
-        chain = CHAIN_OF_SEGMENT[self.body.segment[fit.samples]]
+        chain = CHAIN_OF_SEGMENT[self.skin.segment[fit.samples]]
         unmatched = np.bincount(chain[fit.unmatched] + 1, minlength=len(CHAINS) + 1)
         everywhere = np.bincount(chain + 1, minlength=len(CHAINS) + 1)
         return (
@@ -310,11 +272,11 @@ class VolumetricTracker:
         self._lost_for += 1
         for stage in ("colour", "optimise", "update"):
             watch.lap(stage)
-        pose, waist = without_waist(self.body.skeleton, self._pose)
+        pose, waist, _ = split_pose(self.skin.skeleton, self._pose)
         return Estimate(
             pose=pose,
             waist=waist,
-            joints=self.body.skeleton.joints(self._pose),
+            joints=self.skin.skeleton.joints(self._pose),
             status="lost",
             objective=1.0 + self.config.objective.coverage_weight,
             iterations=np.zeros(len(self.stages), np.int32),
@@ -333,21 +295,15 @@ class VolumetricTracker:
         near = np.linalg.norm(fit.linear.residual[:M], axis=1) < LEARNING_M
         partner = index.order[fit.linear.partner[:M]]
         sure = (fit.linear.partner[:M] >= 0) & near & (surface.seen[partner] > 0)
-        return self.body.patch[fit.samples[sure]], surface.colors[partner[sure]]
+        return self.skin.patch[fit.samples[sure]], surface.colors[partner[sure]]
 
     # --- what a result file keeps -------------------------------------------------------------------------------
 
     def model(self) -> Mapping[str, Any]:
         """The fitted body for `/model`."""
-        body = self.body
         return {
-            **{f"dimensions/{name}": value for name, value in asdict(body.dimensions).items()},
-            "pieces/segment": json.dumps([p.segment for p in body.pieces]),
-            "pieces/radii": np.array([p.radii for p in body.pieces]),
-            "pieces/exponents": np.array([(p.e1, p.e2) for p in body.pieces]),
-            "pieces/cut": np.array([(p.z_lower, p.z_upper) for p in body.pieces]),
-            "pieces/T_body_piece": np.array([p.T_body_piece for p in body.pieces]),
-            "patches/names": json.dumps(body.patch_names),
+            **self._finder.model(),
+            "patches/names": json.dumps(self.skin.patch_names),
             "patches/mean_yuv": self._appearance.initial,
             "patches/deviation_yuv": self._appearance.deviation,
             "patches/known": self._appearance.known.astype(np.uint8),
@@ -365,10 +321,8 @@ class VolumetricTracker:
 
     def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
         """Take up where a run with this model and state stopped."""
-        prefix = "dimensions/"
-        self._take_body(
-            BodyDimensions(**{k[len(prefix) :]: float(v) for k, v in model.items() if k.startswith(prefix)})
-        )
+        self._finder.take_body(restore_body(model, self.up))
+        self._lay_skin()
         initial = np.asarray(model["patches/mean_yuv"])
         learned = Appearance(
             initial,
@@ -382,22 +336,6 @@ class VolumetricTracker:
         self._usual, self._usual_unexplained = (float(v) for v in state["usual"])
         self._lost_for = int(state["lost_for"])
         self._fresh = False
-
-
-def restore_body(result: Result) -> tuple[Body, Float] | None:
-    """The fitted body of a result file, and its poses (F, D) with the waist's angles in their place.
-
-    None where `/model` does not hold a body of superellipsoids.
-    """
-    prefix = "dimensions/"
-    values = {field.name: result.model.get(prefix + field.name) for field in fields(BodyDimensions)}
-    if any(value is None for value in values.values()):
-        return None
-    dimensions = BodyDimensions(**{name: float(value) for name, value in values.items()})  # type: ignore[arg-type]
-    body = build_body(dimensions, result.meta.up, waist=result.waist is not None)
-    if result.waist is None:
-        return body, result.pose
-    return body, np.array([with_waist(body.skeleton, *row) for row in zip(result.pose, result.waist, strict=True)])
 
 
 class LevenbergMarquardtTracker(VolumetricTracker):

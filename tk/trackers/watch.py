@@ -117,7 +117,7 @@ class Watch:
         Raises:
             CaptureError: of the person's size.
         """
-        if self._capture.subject_height_m is None and isinstance(self.tracker, ContourTracker):
+        if self._capture.subject_height_m is None:
             check_stature(self.tracker.body.dimensions.stature)
 
     def step(self, frame: Observation) -> tuple[Estimate, Observation]:

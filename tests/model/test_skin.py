@@ -1,17 +1,24 @@
-"""The body of superellipsoids: surface, what is buried, patches, mirror symmetry."""
+"""The skin of superellipsoids: its pieces beside the parts, surface, what is buried, patches, mirror symmetry."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.model.figures import skin_of
 from tests.model.test_skeleton import UPS, mirrored
+from tk.kernels.cones import CONE
 from tk.model.anthropometry import BodyDimensions
-from tk.model.body import build_body, build_pieces, neutral_pose
+from tk.model.cone_body import build_cone_body
+from tk.model.gait import neutral_pose
 from tk.model.skeleton import JOINTS, SEGMENTS, up_rotation
+from tk.model.skin import piece_of
 
 DIMENSIONS = BodyDimensions.from_stature(1.75)
-BODY = build_body(DIMENSIONS)
+CONES = build_cone_body(DIMENSIONS)
+BODY = skin_of(DIMENSIONS)
 PIECE_SEGMENT = np.array([SEGMENTS.index(p.segment) for p in BODY.pieces])
 seeds = st.integers(0, 2**32 - 1)
 
@@ -25,10 +32,40 @@ def in_piece(body, index, points, pose):
     return points @ T[:3, :3].T + T[:3, 3]
 
 
+def profile(piece, z):
+    """The semi-axes of a piece's section at a height of its frame."""
+    (a1, a2, _), ring = piece.radii, (1 - abs(z / piece.radii[2]) ** (2 / piece.e1)) ** (piece.e1 / 2)
+    return np.array([a1, a2]) * ring
+
+
+@pytest.mark.parametrize("m", [0.5, 0.8, 1.0, 1.3])
+def test_a_limb_has_the_two_ends_of_its_cone_and_is_nearly_straight_between(m):
+    part = replace(CONES.parts[[p.name for p in CONES.parts].index("thigh_l")], shape=(0.1, 0.08, 0.4, m))
+    piece = piece_of(part)
+    for at, factor in ((0.0, 1.0), (0.5, 0.5 * (1 + m)), (1.0, m)):
+        z = piece.z_lower + at * 0.4
+        tolerance = 0.09 if at == 0.5 else 1e-9
+        np.testing.assert_allclose(profile(piece, z), np.array([0.1, 0.08]) * factor, rtol=tolerance)
+        there = piece.T_body_piece @ [0, 0, z, 1]
+        np.testing.assert_allclose(there, part.T_body_part @ [0, 0, at * 0.4, 1], atol=1e-12)
+    assert piece.z_upper - piece.z_lower == pytest.approx(0.4)
+
+
+def test_every_part_has_a_piece_in_its_place():
+    assert [piece.segment for piece in BODY.pieces] == [part.segment for part in CONES.parts]
+    for part, piece in zip(CONES.parts, BODY.pieces, strict=True):
+        h = part.shape[2]
+        middle = part.T_body_part @ [0, 0, 0.5 * h if part.kind == CONE else 0.0, 1]
+        np.testing.assert_allclose(
+            piece.T_body_piece @ [0, 0, 0.5 * (piece.z_lower + piece.z_upper), 1], middle, atol=1e-12
+        )
+        if part.name.startswith(("hand", "foot", "head")):  # closed: nothing is cut
+            assert (piece.z_lower, piece.z_upper) == (-piece.radii[2], piece.radii[2])
+
+
 def test_every_segment_has_samples_of_its_own_pieces():
     np.testing.assert_array_equal(PIECE_SEGMENT[BODY.piece], BODY.segment)
-    feet = {SEGMENTS.index("foot_l"), SEGMENTS.index("foot_r")}  # pieces of the calves: this body has no ankles
-    assert set(BODY.segment) == set(range(len(SEGMENTS))) - feet
+    assert set(BODY.segment) == set(range(len(SEGMENTS)))
     np.testing.assert_array_equal(BODY.diameter, np.array([p.diameter_m for p in BODY.pieces])[BODY.piece])
 
 
@@ -40,8 +77,6 @@ def test_samples_lie_on_their_pieces_at_any_pose(seed):
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-9)
     for i, piece in enumerate(BODY.pieces):
         mine = BODY.piece == i
-        if not mine.any():  # a cap inside the next piece
-            continue
         q, out = (in_piece(BODY, i, points[mine] + d * normals[mine], pose) for d in (0.0, 1e-3))
         np.testing.assert_allclose(piece.inside_outside(q), 1, atol=1e-8)
         assert (piece.inside_outside(out) > 1).all()
@@ -80,7 +115,7 @@ def test_patches_fit_an_integer_of_63_bits_and_cover_the_body():
 
 @pytest.mark.parametrize("stature", [1.2, 1.6, 2.0])
 def test_patches_do_not_depend_on_the_stature(stature):
-    assert build_body(BodyDimensions.from_stature(stature)).patch_names == BODY.patch_names
+    assert skin_of(BodyDimensions.from_stature(stature)).patch_names == BODY.patch_names
 
 
 def mirror_pieces():
@@ -106,7 +141,7 @@ def test_mirrored_pose_gives_the_mirrored_surface(seed):
 
 @pytest.mark.parametrize("up", UPS)
 def test_another_up_gives_the_rotated_body(up):
-    body, B = build_body(DIMENSIONS, up), up_rotation(up)
+    body, B = skin_of(DIMENSIONS, up), up_rotation(up)
     np.testing.assert_allclose(body.points, BODY.points @ B.T, atol=1e-12)
     np.testing.assert_allclose(body.normals, BODY.normals @ B.T, atol=1e-12)
     np.testing.assert_array_equal(body.patch, BODY.patch)
@@ -133,16 +168,8 @@ def test_the_surface_reaches_from_the_sole_to_the_crown():
 
 
 def test_spacing_sets_the_number_of_samples():
-    counts = [len(build_body(DIMENSIONS, spacing_m=s).points) for s in (0.02, 0.04)]
+    counts = [len(skin_of(DIMENSIONS, spacing_m=s).points) for s in (0.02, 0.04)]
     assert counts[0] / counts[1] == pytest.approx(4, rel=0.15)
-
-
-def test_without_extremities_hands_and_feet_are_gone():
-    plain = build_pieces(DIMENSIONS, extremities=False)
-    assert len(plain) == len(BODY.pieces) - 4
-    z = build_body(DIMENSIONS, extremities=False).points[:, 2]
-    ankle = -(DIMENSIONS.thigh + DIMENSIONS.calf)
-    assert z.min() > ankle - DIMENSIONS.ankle_radius
 
 
 def test_every_piece_has_a_rigid_frame():
