@@ -36,7 +36,6 @@ VOLUMETRIC = "tk.trackers.volumetric"
 ROWS: tuple[tuple[str, Changes], ...] = (
     ("defaults", {}),
     ("no coverage (data to model)", {"objective": {"coverage_weight": 0.0}}),
-    ("ν soft, then hard", {VOLUMETRIC: {"SCHEDULE": replace(SCHEDULE, soft=4.0, chain_soft=2.0)}}),
     (
         "σ is the limb's diameter",
         {VOLUMETRIC: {"SAMPLING": replace(SAMPLING, sigma_m=0.0)}, "tk.model.contour_term": {"SIGMA_M": 0.0}},
@@ -49,7 +48,6 @@ ROWS: tuple[tuple[str, Changes], ...] = (
     ("no prediction", {"tracking": {"prediction": 0.0}}),
     ("no waist", {"body": {"waist": False}}),
     ("no colour edges", {"contours": {"edge_weight": 0.0}}),
-    ("normals count", {"tk.model.objective": {"MIN_COSINE": 0.0}}),
     ("colours ignored", {"appearance": {"enabled": False}}),
     ("shoulders do not rise with the arms", {"tk.model.skeleton": {"RAISED_SHOULDERS": 0.0}}),
     ("parts may enter each other", {"tk.model.objective": {"BARRED": np.zeros_like(BARRED)}}),

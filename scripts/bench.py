@@ -296,19 +296,19 @@ def _search_stages(
         return colours.segment(surface.colors, surface.seen, config.appearance)
 
     def built(fits: np.ndarray) -> SurfaceIndex:
-        return SurfaceIndex.build(surface.positions, surface.normals, fits, CELL_VOXELS * hull.grid.voxel_m)
+        return SurfaceIndex.build(surface.positions, fits, CELL_VOXELS * hull.grid.voxel_m)
 
     yield Stage("colour segmentation", median_ms(segmented), {})
 
-    # the peer knows neither colours nor normals, so this comparison leaves them out of ours as well
+    # the peer knows no colours, so this comparison leaves them out of ours as well
     objective = BodyObjective(skin, config.objective.settings, SAMPLING)
     rng = np.random.default_rng(0)
     samples = objective.draw(rng)
-    points, normals = (values[samples].astype(np.float32) for values in skin.place(pose))
+    points = skin.place(pose)[samples].astype(np.float32)
     everything = np.full(len(surface), -1, np.int64)
     patch = skin.patch[samples]
     index, tree = built(everything), cKDTree(surface.positions)
-    found = nearest(index, points, normals, patch)
+    found = nearest(index, points, patch)
     distance = np.asarray(tree.query(points)[0])
     ours = np.linalg.norm(index.positions[found] - points, axis=1)
     np.testing.assert_allclose(ours[found >= 0], distance[found >= 0], atol=1e-4)  # the two do the same
@@ -319,7 +319,7 @@ def _search_stages(
     )
     query = Stage(
         f"neighbours: query of {len(points)} points",
-        median_ms(lambda: nearest(index, points, normals, patch)),
+        median_ms(lambda: nearest(index, points, patch)),
         {"SciPy cKDTree": median_ms(lambda: tree.query(points))},
     )
     yield build

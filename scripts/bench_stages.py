@@ -91,7 +91,7 @@ def contour_stages(
         evaluate = partial(objective.kernel.evaluate, index, *rows, poses, poses, settings, entries=given)
         linearise = partial(
             objective.kernel.linearise, index, rows[0][0], rows[1][0], pose, held, settings,
-            with_jacobian=False, entries=given,
+            entries=given,
         )  # fmt: skip
         yield Stage(f"objective {text}: value, gradient, H·v", median_ms(evaluate), {})
         yield Stage(f"objective {text}: Gauss-Newton Hessian", median_ms(linearise), {})

@@ -272,7 +272,10 @@ def test_results_without_a_body_of_contours_are_told(
     tk: Tk, quick: Path, tiny: Path, tracked: Path, causal: Path, tmp_path: Path
 ) -> None:
     command = ["track", tiny, "-o", tmp_path / "r.h5", "--config", quick]
-    tk(*command, "--body", tracked).complaint(tracked.name, "no body of contours", "--method region")
+    older = Path(shutil.copy(tracked, tmp_path / "older.h5"))
+    with h5py.File(older, "r+") as file:
+        del file["model/parts"]
+    tk(*command, "--body", older).complaint("older.h5", "no body of contours", "--method region")
     tk(*command, "--body", tmp_path / "none.h5").complaint("none.h5")
     tk(*command, "--body", tmp_path / "none.toml").complaint("none.toml")
     damaged = Path(shutil.copy(causal, tmp_path / "damaged.h5"))
@@ -280,7 +283,7 @@ def test_results_without_a_body_of_contours_are_told(
         del file["model/parts/name"]
     tk(*command, "--body", damaged).complaint("damaged.h5", "the body cannot be used")
     damaged.unlink()
-    tk(*command, "--body", causal, "--method", "volumetric").complaint("--body", "volumetric", "--method region")
+    older.unlink()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -320,3 +323,19 @@ def test_settings_are_checked() -> None:
     ):
         with pytest.raises(ConfigError, match=part):
             Config.from_toml(text)
+
+
+def test_the_volumetric_tracker_takes_a_body_in_any_pose_and_gives_one(
+    copy: Path, causal: Path, tracked: Path, tmp_path: Path
+) -> None:
+    """One body serves both skins."""
+    file = copy / "capture.toml"
+    file.write_text(file.read_text(encoding="utf-8").replace("da-vinci", "any"), encoding="utf-8")
+    for method, given in (("volumetric", causal), ("region", tracked)):
+        path = tmp_path / f"{method}.h5"
+        track(open_capture(copy), path, CONFIG, Silent(), method, (6, 9), body=given, causal=True)
+        found, expected = read_result(path), read_result(given)
+        assert found.frames.tolist() == [6, 7, 8] and not (found.status == Status.LOST).any()
+        np.testing.assert_array_equal(found.model["parts/shape"], expected.model["parts/shape"])
+        truth = read_joints(copy / "truth.h5").positions[6:9]
+        assert np.median(np.linalg.norm(found.joints - truth, axis=2)) < 0.08

@@ -52,7 +52,7 @@ class Scene:
     def fresh(self, seed: int) -> FrameObjective:
         """The same frame with draws of this seed."""
         f = self.frame
-        return FrameObjective(f.objective, f.index, np.random.default_rng(seed), f.outliers, images=f.images)
+        return FrameObjective(f.objective, f.index, np.random.default_rng(seed), images=f.images)
 
 
 def look(options: Options, paper: Config) -> Scene:
@@ -73,7 +73,7 @@ def look(options: Options, paper: Config) -> Scene:
     skin = tracker.skin
     # colours do not confine the neighbours here: the arm's own are what it could not mistake
     every = np.full(len(surface), -1, np.int64)
-    index = SurfaceIndex.build(surface.positions, surface.normals, every, CELL_VOXELS * tracker.hull.grid.voxel_m)
+    index = SurfaceIndex.build(surface.positions, every, CELL_VOXELS * tracker.hull.grid.voxel_m)
     term = ContourTerm(skin, capture.rig, paper.contours)
     objective = BodyObjective(skin, paper.objective.settings, replace(SAMPLING, chain=ARM_POINTS), term)
     frame = FrameObjective(objective, index, np.random.default_rng(0), images=observation.images)

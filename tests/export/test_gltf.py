@@ -99,7 +99,7 @@ def test_the_body_rides_on_the_nodes(write: Write) -> None:
     motion, _ = read_motion(path)
     f = 7
     body = skin_of(motion.dimensions, waist=True)
-    points, _ = body.place(poses()[f])
+    points = body.place(poses()[f])
     file = load(export(path, ["gltf"]).files[0])
     T = frame_transforms(file, f)
     assert {mesh.name for mesh in file.meshes} == {SEGMENTS[s] for s in np.unique(body.segment)}

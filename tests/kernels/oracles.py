@@ -18,10 +18,9 @@ def implicit_gradient(q, radii, e1, e2, h=1e-6):
 
 
 def project(q, radii, e1, e2, z_lower, z_upper):
-    """(N, 3) points and (N, 3) normals: onto the planes of truncation, then one Newton step along G's gradient."""
+    """(N, 3) points: onto the planes of truncation, then one Newton step along G's gradient."""
     c = q.copy()
     c[:, 2] = np.clip(q[:, 2], z_lower, z_upper)
     gradient = implicit_gradient(c, radii, e1, e2)
     square = np.sum(gradient**2, axis=1)
-    step = ((implicit(c, radii, e1, e2) - 1) / square)[:, None] * gradient
-    return c - step, gradient / np.sqrt(square)[:, None]
+    return c - ((implicit(c, radii, e1, e2) - 1) / square)[:, None] * gradient

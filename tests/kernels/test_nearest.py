@@ -7,40 +7,31 @@ from hypothesis import strategies as st
 
 from tk.kernels.nearest import SurfaceIndex, nearest
 
-# single precision: distances of metres, cosines of unit vectors
+# single precision: distances of metres
 SLACK = 2e-6
 seeds = st.integers(0, 2**32 - 1)
 
 
-def unit(rng, count):
-    v = rng.normal(size=(count, 3))
-    return v / np.linalg.norm(v, axis=1, keepdims=True)
-
-
 def surface(rng, count, spread=0.5, patches=63, share=0.3, cell_m=0.1):
-    """Random voxels; a tenth of them without a normal, each with a share of the patches."""
-    normals = unit(rng, count)
-    normals[rng.random(count) < 0.1] = 0
+    """Random voxels, each with a share of the patches."""
     fits = np.zeros(count, np.int64)
     for p in range(patches):
         fits |= (rng.random(count) < share).astype(np.int64) << p
-    return SurfaceIndex.build(rng.normal(0, spread, (count, 3)), normals, fits, cell_m)
+    return SurfaceIndex.build(rng.normal(0, spread, (count, 3)), fits, cell_m)
 
 
-def candidates(index, point, normal, patch, min_cosine, reach, slack):
+def candidates(index, point, patch, reach, slack):
     """(V,) distances, infinite where a voxel is no candidate; positive slack admits the doubtful ones."""
     distance = np.linalg.norm(index.positions.astype(np.float64) - point, axis=1)
-    normals = index.normals.astype(np.float64)
-    agrees = (normals @ normal >= min_cosine - slack) | ~normals.any(axis=1)
     colour = (index.fits >> np.int64(patch)) & 1 == 1
-    return np.where(agrees & colour & (distance < reach + slack), distance, np.inf)
+    return np.where(colour & (distance < reach + slack), distance, np.inf)
 
 
-def check(index, points, normals, patch, min_cosine, reach):
-    points, normals = points.astype(np.float32), normals.astype(np.float32)
-    found = nearest(index, points, normals, patch, min_cosine, reach)
+def check(index, points, patch, reach):
+    points = points.astype(np.float32)
+    found = nearest(index, points, patch, reach)
     for n, v in enumerate(found):
-        query = points[n].astype(np.float64), normals[n].astype(np.float64), patch[n], min_cosine, reach
+        query = points[n].astype(np.float64), patch[n], reach
         best = candidates(index, *query, slack=-SLACK).min()
         if v < 0:
             assert best == np.inf, f"query {n}: nothing found, yet there is a candidate at {best} m"
@@ -56,31 +47,30 @@ def check(index, points, normals, patch, min_cosine, reach):
     st.sampled_from([1, 2, 30, 400]),
     st.sampled_from([0.02, 0.1, 0.7, 5.0]),
     st.sampled_from([0.03, 0.3, 2.0]),
-    st.sampled_from([-1.0, 0.0, 0.6]),
     st.sampled_from([0.2, 1.0, 6.0]),
 )
 @settings(max_examples=80, deadline=None)
-def test_equals_all_pairs(seed, count, cell_m, reach, min_cosine, spread):
+def test_equals_all_pairs(seed, count, cell_m, reach, spread):
     """Cells smaller and larger than the reach, queries inside and far outside the grid."""
     rng = np.random.default_rng(seed)
     index = surface(rng, count, cell_m=cell_m)
     points = rng.normal(0, spread, (40, 3))
-    check(index, points, unit(rng, 40), rng.integers(0, 63, 40), min_cosine, reach)
+    check(index, points, rng.integers(0, 63, 40), reach)
 
 
 def test_something_is_found_and_something_is_not():
     """The property above is not met by -1 throughout."""
     rng = np.random.default_rng(0)
     index = surface(rng, 400)
-    found = check(index, rng.normal(0, 0.6, (200, 3)), unit(rng, 200), rng.integers(0, 63, 200), 0.3, 0.2)
+    found = check(index, rng.normal(0, 0.6, (200, 3)), rng.integers(0, 63, 200), 0.2)
     assert 0.1 < np.mean(found >= 0) < 0.9
 
 
 def test_queries_on_the_walls_between_cells():
     grid = np.stack(np.meshgrid(*[np.arange(6) * 0.1] * 3, indexing="ij"), -1).reshape(-1, 3)
-    index = SurfaceIndex.build(grid, np.zeros_like(grid), np.full(len(grid), -1), 0.1)
+    index = SurfaceIndex.build(grid, np.full(len(grid), -1), 0.1)
     walls = grid + index.grid[:3].astype(np.float64) - grid.min(0)
-    check(index, walls, np.zeros_like(walls), np.zeros(len(walls), np.int64), -1.0, 0.5)
+    check(index, walls, np.zeros(len(walls), np.int64), 0.5)
 
 
 @pytest.mark.parametrize("patch", [0, 31, 32, 62])
@@ -88,24 +78,15 @@ def test_each_bit_of_the_patches_counts(patch):
     """Two voxels, the nearer of another patch; bits beyond 32 are the ones that a narrow integer loses."""
     positions = np.array([[0.1, 0.0, 0.0], [0.3, 0.0, 0.0]])
     others = ~(np.int64(1) << np.int64(patch)) & np.int64(2**63 - 1)
-    index = SurfaceIndex.build(positions, np.zeros((2, 3)), np.array([others, np.int64(1) << np.int64(patch)]), 0.1)
-    found = nearest(index, np.zeros((1, 3)), np.zeros((1, 3)), np.array([patch]))
+    index = SurfaceIndex.build(positions, np.array([others, np.int64(1) << np.int64(patch)]), 0.1)
+    found = nearest(index, np.zeros((1, 3)), np.array([patch]))
     np.testing.assert_allclose(index.positions[found[0]], positions[1], atol=1e-7)
-
-
-def test_normals_gate_but_unknown_ones_agree():
-    positions = np.array([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0], [0.3, 0.0, 0.0]])
-    normals = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    index = SurfaceIndex.build(positions, normals, np.full(3, -1), 0.1)
-    query = np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]]), np.zeros(1, int)
-    assert index.order[nearest(index, *query, min_cosine=-1.0)[0]] == 0
-    assert index.order[nearest(index, *query, min_cosine=0.5)[0]] == 1
 
 
 def test_reach_is_a_ball():
     """A voxel in a corner of the cube that the rings cover is out of reach."""
-    index = SurfaceIndex.build(np.full((1, 3), 0.19), np.zeros((1, 3)), np.full(1, -1), 0.1)
-    query = np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1, int)
+    index = SurfaceIndex.build(np.full((1, 3), 0.19), np.full(1, -1), 0.1)
+    query = np.zeros((1, 3)), np.zeros(1, int)
     assert nearest(index, *query, reach_m=0.3)[0] == -1
     assert nearest(index, *query, reach_m=0.34)[0] == 0
 
@@ -114,11 +95,10 @@ def test_reach_is_a_ball():
 @settings(max_examples=30, deadline=None)
 def test_index_holds_every_voxel_once_and_in_its_cell(seed, count, cell_m):
     rng = np.random.default_rng(seed)
-    positions, normals = rng.normal(0, 0.5, (count, 3)), unit(rng, count)
-    index = SurfaceIndex.build(positions, normals, np.arange(count), cell_m)
+    positions = rng.normal(0, 0.5, (count, 3))
+    index = SurfaceIndex.build(positions, np.arange(count), cell_m)
     assert sorted(index.order) == list(range(count))
     np.testing.assert_array_equal(index.positions, positions.astype(np.float32)[index.order])
-    np.testing.assert_array_equal(index.normals, normals.astype(np.float32)[index.order])
     np.testing.assert_array_equal(index.fits, index.order)
     assert index.starts[0] == 0 and index.starts[-1] == count and len(index.starts) == np.prod(index.grid[4:]) + 1
     cell = np.repeat(np.arange(len(index.starts) - 1), np.diff(index.starts))

@@ -32,14 +32,14 @@ def voxelise(body: Skin, pose: np.ndarray, grid: VoxelGrid) -> np.ndarray:
 
 def grid_around(body: Skin, pose: np.ndarray, voxel_m: float = 0.025) -> VoxelGrid:
     """The grid that holds a body at a pose with 10 cm to spare."""
-    points, _ = body.place(pose)
+    points = body.place(pose)
     lower, upper = points.min(0) - 0.1, points.max(0) + 0.1
     center, size = (lower + upper) / 2, upper - lower
     return VoxelGrid.cover(Volume(tuple(center), tuple(size)), round(size.max() / voxel_m))
 
 
 def surface_index(occupancy: np.ndarray, grid: VoxelGrid) -> SurfaceIndex:
-    """Boundary voxels with the outward direction of falling occupancy; every colour patch fits.
+    """Boundary voxels; every colour patch fits.
 
     Their centres lie half an edge inside the surface, on average; here they are moved onto it.
     """
@@ -48,4 +48,4 @@ def surface_index(occupancy: np.ndarray, grid: VoxelGrid) -> SurfaceIndex:
     normals = -np.stack([g[surface] for g in np.gradient(smooth)], axis=-1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     positions = grid.centers(np.flatnonzero(surface)) + grid.voxel_m / 2 * normals
-    return SurfaceIndex.build(positions, normals, np.full(len(positions), -1), 2 * grid.voxel_m)
+    return SurfaceIndex.build(positions, np.full(len(positions), -1), 2 * grid.voxel_m)

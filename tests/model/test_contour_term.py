@@ -135,7 +135,7 @@ def test_the_truth_explains_its_own_edges():
 
 def test_pictures_pull_a_displaced_body_back():
     """The value grows, and its gradient points uphill, as an arm is turned away."""
-    index = SurfaceIndex.build(np.full((1, 3), 50.0), np.zeros((1, 3)), np.full(1, -1), 0.1)
+    index = SurfaceIndex.build(np.full((1, 3), 50.0), np.full(1, -1), 0.1)
     silent = ObjectiveSettings(coverage_weight=0.0, reach_m=1e-6)
     body = BodyObjective(BODY, silent, SamplingConfig(), term_of())
     frame = FrameObjective(body, index, np.random.default_rng(0), images=pictures())
@@ -170,13 +170,6 @@ def test_strips_of_the_chains_are_their_own():
     draws = [term.draw(np.random.default_rng(i)) for i in (0, 0, 1)]
     np.testing.assert_array_equal(draws[0], draws[1])
     assert not np.array_equal(draws[0], draws[2])
-
-
-def test_softness_widens_the_potential():
-    term = term_of()
-    chosen = term.draw(None)[None]
-    hard, soft = (term.assign(pictures(), TRUTH[None], chosen, s) for s in (1.0, 3.0))
-    np.testing.assert_allclose(soft[..., a.NU], 3 * hard[..., a.NU], rtol=1e-6)
 
 
 def test_a_body_that_nobody_sees_has_no_entries():

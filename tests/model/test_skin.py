@@ -73,13 +73,11 @@ def test_every_segment_has_samples_of_its_own_pieces():
 @settings(max_examples=10, deadline=None)
 def test_samples_lie_on_their_pieces_at_any_pose(seed):
     pose = np.random.default_rng(seed).uniform(-np.pi, np.pi, len(BODY.skeleton.names))
-    points, normals = BODY.place(pose)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-9)
+    points = BODY.place(pose)
     for i, piece in enumerate(BODY.pieces):
         mine = BODY.piece == i
-        q, out = (in_piece(BODY, i, points[mine] + d * normals[mine], pose) for d in (0.0, 1e-3))
+        q = in_piece(BODY, i, points[mine], pose)
         np.testing.assert_allclose(piece.inside_outside(q), 1, atol=1e-8)
-        assert (piece.inside_outside(out) > 1).all()
         assert q[:, 2].min() > piece.z_lower - 1e-9 and q[:, 2].max() < piece.z_upper + 1e-9
 
 
@@ -87,7 +85,7 @@ def test_buried_samples_and_the_crotch_are_left_out_and_no_others():
     """In the neutral pose no sample is inside another piece; all that are inside none are there."""
     pose = neutral_pose(BODY.skeleton)
     T = BODY.skeleton.segment_transforms(pose)
-    points, _ = BODY.place(pose)
+    points = BODY.place(pose)
     kept = buried = 0
     for i, piece in enumerate(BODY.pieces):
         at = piece.samples(0.03)
@@ -108,9 +106,9 @@ def test_patches_fit_an_integer_of_63_bits_and_cover_the_body():
     for patch, name in enumerate(BODY.patch_names):
         mine = BODY.patch == patch
         assert {SEGMENTS[s] for s in BODY.segment[mine]} == {name.removesuffix("_front").removesuffix("_back")[:-2]}
-        if name.endswith(("_front", "_back")):
-            forward = BODY.normals[mine, 0]
-            assert (forward >= 0).all() if name.endswith("_front") else (forward < 0).all()
+        if name.endswith("_front"):
+            behind = BODY.patch == BODY.patch_names.index(name.replace("_front", "_back"))
+            assert BODY.points[mine, 0].mean() > BODY.points[behind, 0].mean() + 0.05
 
 
 @pytest.mark.parametrize("stature", [1.2, 1.6, 2.0])
@@ -132,7 +130,7 @@ def test_mirrored_pose_gives_the_mirrored_surface(seed):
     """Every sample, reflected, lies on the partner of its piece at the reflected pose."""
     pose = np.random.default_rng(seed).uniform(-np.pi, np.pi, len(BODY.skeleton.names))
     there = mirrored(pose)
-    points, _ = BODY.place(pose)
+    points = BODY.place(pose)
     partners = mirror_pieces()
     for i in range(len(BODY.pieces)):
         q = in_piece(BODY, partners[i], points[BODY.piece == i] * [1, -1, 1], there)
@@ -143,10 +141,9 @@ def test_mirrored_pose_gives_the_mirrored_surface(seed):
 def test_another_up_gives_the_rotated_body(up):
     body, B = skin_of(DIMENSIONS, up), up_rotation(up)
     np.testing.assert_allclose(body.points, BODY.points @ B.T, atol=1e-12)
-    np.testing.assert_allclose(body.normals, BODY.normals @ B.T, atol=1e-12)
     np.testing.assert_array_equal(body.patch, BODY.patch)
     pose = neutral_pose(BODY.skeleton)
-    np.testing.assert_allclose(body.place(pose)[0], BODY.place(pose)[0] @ B.T, atol=1e-12)
+    np.testing.assert_allclose(body.place(pose), BODY.place(pose) @ B.T, atol=1e-12)
 
 
 def test_neutral_pose_is_da_vincis():
@@ -163,7 +160,7 @@ def test_neutral_pose_is_da_vincis():
 
 
 def test_the_surface_reaches_from_the_sole_to_the_crown():
-    z = BODY.place(np.zeros(len(BODY.skeleton.names)))[0][:, 2]
+    z = BODY.place(np.zeros(len(BODY.skeleton.names)))[:, 2]
     assert z.max() - z.min() == pytest.approx(DIMENSIONS.stature, abs=0.02)
 
 

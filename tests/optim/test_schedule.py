@@ -21,7 +21,7 @@ TORSO, CHAINS = slice(0, 4), (slice(4, 7), slice(7, 10))
 TARGET = np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.3, 0.2, -0.5, 0.3, 0.6])
 LIMIT = 3.0
 # one error potential, as in the paper
-PAPER = ScheduleConfig(soft=1.0, chain_soft=1.0, rate=0.5)
+PAPER = ScheduleConfig(rate=0.5)
 # long enough to converge
 LONG = SmdConfig(max_iterations=60)
 
@@ -38,7 +38,6 @@ class Toy:
         noise: standard deviation of the gradient, drawn anew for each iteration.
         asked_full, asked_chains: all poses that the objectives were asked for.
         held: the poses and owners that :meth:`chains` was called with.
-        softnesses: those of the objectives, in the order in which they were asked for.
     """
 
     target: Float = field(default_factory=lambda: TARGET.copy())
@@ -52,7 +51,6 @@ class Toy:
     asked_full: list[Float] = field(default_factory=list)
     asked_chains: list[Float] = field(default_factory=list)
     held: list[tuple[NDArray[np.intp], Float]] = field(default_factory=list)
-    softnesses: list[float] = field(default_factory=list)
 
     @property
     def free(self) -> NDArray[np.bool_]:
@@ -68,14 +66,14 @@ class Toy:
     def constrain(self, poses: Float) -> Float:
         return np.clip(poses, -LIMIT, LIMIT)
 
-    def damping(self, lever_m: float, softness: float) -> Float:
+    def damping(self, lever_m: float) -> Float:
         return np.full(D, lever_m**2)
 
-    def _chain(self, k: int, pose: Float, softness: float = 1.0) -> tuple[float, Float]:
+    def _chain(self, k: int, pose: Float) -> tuple[float, Float]:
         """Value and gradient (D,) of chain k."""
         gradient = np.zeros(D)
         value = 1.0
-        width2 = softness * self.width**2
+        width2 = self.width**2
         for depth, centre in ((1.0, self.target[CHAINS[k]]), (self.depth, self.decoys[k])):
             if centre is None:
                 continue
@@ -86,42 +84,33 @@ class Toy:
             gradient[2] -= self.coupling * well * away.sum() / width2
         return float(value), gradient
 
-    def _whole(self, pose: Float, softness: float = 1.0, chains: bool = True) -> tuple[float, Float]:
+    def _whole(self, pose: Float, chains: bool = True) -> tuple[float, Float]:
         away = np.zeros(D)
         away[TORSO] = (pose - self.target)[TORSO]
         value, gradient = 0.5 * float(away @ away), away
         for k in range(2 if chains else 0):
-            f, g = self._chain(k, pose, softness)
+            f, g = self._chain(k, pose)
             value, gradient = value + f, gradient + g
         return value, gradient
 
-    def _evaluation(self, rows: list[tuple[float, Float]], directions: Float, softness: float) -> Evaluation:
+    def _evaluation(self, rows: list[tuple[float, Float]], directions: Float) -> Evaluation:
         values, gradients = zip(*rows, strict=True)
         noise = self.noise * self.rng.normal(size=directions.shape) if self.noise else 0.0
-        return Evaluation(
-            np.array(values), np.array(gradients) + noise, directions @ self.curvature(self.target, softness)
-        )
+        return Evaluation(np.array(values), np.array(gradients) + noise, directions @ self.curvature(self.target))
 
-    def full(self, softness: float) -> Objective:
-        self.softnesses.append(softness)
-
+    def full(self) -> Objective:
         def evaluate(poses: Float, directions: Float, iteration: int) -> Evaluation:
             self.asked_full.append(poses.copy())
-            return self._evaluation(
-                [self._whole(p, softness, self.full_moves_chains) for p in poses], directions, softness
-            )
+            return self._evaluation([self._whole(p, self.full_moves_chains) for p in poses], directions)
 
         return evaluate
 
-    def chains(self, owner: NDArray[np.intp], pose: Float, softness: float) -> Objective:
-        self.softnesses.append(softness)
+    def chains(self, owner: NDArray[np.intp], pose: Float) -> Objective:
         self.held.append((owner.copy(), pose.copy()))
 
         def evaluate(poses: Float, directions: Float, iteration: int) -> Evaluation:
             self.asked_chains.append(poses.copy())
-            return self._evaluation(
-                [self._chain(k, p, softness) for k, p in zip(owner, poses, strict=True)], directions, softness
-            )
+            return self._evaluation([self._chain(k, p) for k, p in zip(owner, poses, strict=True)], directions)
 
         return evaluate
 
@@ -131,10 +120,10 @@ class Toy:
     def values(self, poses: Float) -> Float:
         return np.array([self.value(pose) for pose in poses])
 
-    def curvature(self, pose: Float, softness: float) -> Float:
+    def curvature(self, pose: Float) -> Float:
         rows = np.eye(D)  # the residuals' Jacobian: at the target the wells are bowls
         rows[4:, 2] -= self.coupling
-        rows[4:] /= self.width * np.sqrt(softness)
+        rows[4:] /= self.width
         return rows.T @ rows
 
 
@@ -234,21 +223,6 @@ def test_iterations_are_those_of_the_first_pass_and_of_each_chain_in_turn() -> N
         assert len(toy.asked_chains) == result.iterations[1 + slow] > 6
 
 
-def test_the_potential_hardens_from_pass_to_pass() -> None:
-    toy = Toy()
-    solve(toy, config=replace(PAPER, soft=5.0, chain_soft=3.0))
-    assert toy.softnesses == [5.0, 3.0]
-
-
-def test_a_soft_potential_reaches_a_limb_that_moved_far() -> None:
-    """Four widths away the true well is flat. It is not while it is soft, and in the end it is as narrow as ever."""
-    far = beside(TARGET, 0, TARGET[CHAINS[0]] + 1.2)
-    hard = solve(Toy(), far)
-    assert np.abs(hard.pose - TARGET)[CHAINS[0]].min() > 0.5
-    soft = solve(Toy(), far, config=replace(PAPER, soft=8.0, chain_soft=2.0))
-    np.testing.assert_allclose(soft.pose, TARGET, atol=0.01)
-
-
 def test_the_second_pass_has_the_iterations_of_the_first() -> None:
     toy = Toy()
     config = replace(PAPER, tolerance_deg=1e-6, tolerance_m=1e-8)
@@ -308,8 +282,6 @@ def test_the_descent_basis_makes_the_curvature_of_the_free_parameters_one(seed: 
         ("tolerance_deg", 0.0),
         ("tolerance_m", -1.0),
         ("refine", 0.0),
-        ("soft", 0.0),
-        ("chain_soft", -1.0),
     ],
 )
 def test_impossible_settings_are_refused(name: str, value: float) -> None:

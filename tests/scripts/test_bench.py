@@ -14,7 +14,7 @@ from tk.kernels.nearest import SurfaceIndex, nearest
 
 def test_launches_are_counted_by_kernel_only_inside_the_block() -> None:
     points = np.zeros((3, 3))
-    index = SurfaceIndex.build(points, points, np.full(3, -1), 0.1)
+    index = SurfaceIndex.build(points, np.full(3, -1), 0.1)
     patch = np.zeros(3, np.int32)
     with counted_launches() as counts:
         nearest(index, points, points, patch)

@@ -3,11 +3,12 @@
 An entry is two contour points a and b of one limb (a pair symmetric about its axis, or twice the same point), which are
 held as material points, and the picture point that their images' midpoint should meet:
 
-    e = ½ (‖½ (x^a + x^b) − x̄‖ / σ)²,    ρ(e) = 1 − exp(−e / ν)
+    e = ½ (n · (½ (x^a + x^b) − x̄) / σ)²,    ρ(e) = 1 − exp(−e / ν)
 
-A contour slides over the limb as it turns; as the limb's normal there is perpendicular to the viewing ray, the sliding
-moves the image along the contour only, to first order, so the derivative by the pose needs no term for it across. The
-distance along the contour may count less (``share``): edges do not tell how far along a limb one is.
+with n the contour's normal in the picture: the distance across the contour counts, where the paper takes the whole one,
+for a held edge does not tell how far along a limb its point is. A contour slides over the limb as it turns; as the
+limb's normal there is perpendicular to the viewing ray, the sliding moves the image along the contour only, to first
+order, so the derivative by the pose needs no term for it.
 
 A hidden contour point, or one without an edge, is an entry that costs ρ = 1 and pulls nowhere (6.1.2).
 """
@@ -19,7 +20,7 @@ from tk.kernels.wrench import MOTION, WRENCH, add_direction, add_wrench, load_wr
 
 # Columns of an entry. Points a and b are in the zero configuration (metres), target and unit normal in the picture.
 POINT_A, POINT_B, LAST_DOF, CAMERA, TARGET, NORMAL = 0, 3, 6, 7, 8, 10
-INV_SIGMA2, STATE, SCALE, NU, SHARE, ENTRY_NUMBERS = 12, 13, 14, 15, 16, 17  # 1/px²; its share of f
+INV_SIGMA2, STATE, SCALE, NU, ENTRY_NUMBERS = 12, 13, 14, 15, 16  # 1/px²; its share of f
 # States of an entry: padding, assigned, and a contour point that can have no edge.
 ABSENT, ASSIGNED, UNASSIGNABLE = 0, 1, 2
 
@@ -33,7 +34,8 @@ def load_entry(entries: ti.template(), b: int, e: int, first: ti.template()):
 def image_residual(
     frames: ti.template(), c: int, cameras: ti.template(), entries: ti.template(), b: int, e: int, origin
 ):
-    """(valid, residual (2,), L (2, 3), T (2, 3)): a twist (ω, v) about the origin moves the image by L ω + T v."""
+    """(valid, residual, l (3,), t (3,)): a twist (ω, v) about the origin moves the image across the contour by
+    l · ω + t · v, in pixels."""
     k = ti.cast(entries[b, e, LAST_DOF], ti.i32)
     v = ti.cast(entries[b, e, CAMERA], ti.i32)
     R, t = load_rotation(frames, c, k), load_translation(frames, c, k)
@@ -49,7 +51,8 @@ def image_residual(
         L = 0.5 * (L + _turned(J, x - origin))
         T = 0.5 * (T + J)
         valid = valid and depth > 1e-3
-    return valid, pixel - target, L, T
+    n = ti.Vector([entries[b, e, NORMAL], entries[b, e, NORMAL + 1]])
+    return valid, n.dot(pixel - target), L.transpose() @ n, T.transpose() @ n
 
 
 @ti.func
@@ -58,14 +61,6 @@ def _turned(J, x):
     first = x.cross(ti.Vector([J[0, a] for a in ti.static(range(3))]))
     second = x.cross(ti.Vector([J[1, a] for a in ti.static(range(3))]))
     return ti.Matrix.rows([first, second])
-
-
-@ti.func
-def metric_product(entries: ti.template(), b: int, e: int, r):
-    """(share·I + (1 − share)·n nᵀ) r."""
-    n = ti.Vector([entries[b, e, NORMAL], entries[b, e, NORMAL + 1]])
-    share = entries[b, e, SHARE]
-    return share * r + (1.0 - share) * n.dot(r) * n
 
 
 @ti.func
@@ -84,20 +79,18 @@ def add_alignment(
     if kind == UNASSIGNABLE:
         sums[c, 0] = sums[c, 0] + scale
     elif kind == ASSIGNED:
-        valid, r, L, T = image_residual(scratch, c, cameras, entries, b, e, ti.Vector([0.0, 0.0, 0.0]))
+        valid, r, moment, force = image_residual(scratch, c, cameras, entries, b, e, ti.Vector([0.0, 0.0, 0.0]))
         if not valid:
             sums[c, 0] = sums[c, 0] + scale
         else:
             nu, inv_sigma2 = entries[b, e, NU], entries[b, e, INV_SIGMA2]
-            Mr = metric_product(entries, b, e, r)
-            decay = ti.exp(-0.5 * r.dot(Mr) * inv_sigma2 / nu)
+            decay = ti.exp(-0.5 * r * r * inv_sigma2 / nu)
             sums[c, 0] = sums[c, 0] + scale * (1.0 - decay)
             weight = scale * decay / nu * inv_sigma2
             k = ti.cast(entries[b, e, LAST_DOF], ti.i32)
-            Jv = L @ load_wrench(scratch, c, k, MOTION) + T @ load_wrench(scratch, c, k, MOTION + 3)
-            MJv = metric_product(entries, b, e, Jv)
-            add_wrench(scratch, c, k, WRENCH, weight * (L.transpose() @ Mr), weight * (T.transpose() @ Mr))
-            add_wrench(scratch, c, k, WRENCH + 6, weight * (L.transpose() @ MJv), weight * (T.transpose() @ MJv))
+            moved = moment.dot(load_wrench(scratch, c, k, MOTION)) + force.dot(load_wrench(scratch, c, k, MOTION + 3))
+            add_wrench(scratch, c, k, WRENCH, weight * r * moment, weight * r * force)
+            add_wrench(scratch, c, k, WRENCH + 6, weight * moved * moment, weight * moved * force)
 
 
 @ti.func
@@ -112,16 +105,9 @@ def add_curvature(
 ):
     """Add entry e of pose 0 to the inertias; outliers weigh ``floor``."""
     if ti.cast(entries[0, e, STATE], ti.i32) == ASSIGNED:
-        valid, r, L, T = image_residual(scratch, c, cameras, entries, 0, e, origin)
+        valid, r, moment, force = image_residual(scratch, c, cameras, entries, 0, e, origin)
         if valid:
-            nu, inv_sigma2, share = entries[0, e, NU], entries[0, e, INV_SIGMA2], entries[0, e, SHARE]
-            decay = ti.exp(-0.5 * r.dot(metric_product(entries, 0, e, r)) * inv_sigma2 / nu)
+            nu, inv_sigma2 = entries[0, e, NU], entries[0, e, INV_SIGMA2]
+            decay = ti.exp(-0.5 * r * r * inv_sigma2 / nu)
             weight = entries[0, e, SCALE] * ti.max(decay, floor) / nu * inv_sigma2
-            k = ti.cast(entries[0, e, LAST_DOF], ti.i32)
-            n = ti.Vector([entries[0, e, NORMAL], entries[0, e, NORMAL + 1]])
-            add_direction(scratch, c, k, L.transpose() @ n, T.transpose() @ n, (1.0 - share) * weight)
-            if share > 0.0:
-                for i in ti.static(range(2)):
-                    moment = ti.Vector([L[i, a] for a in ti.static(range(3))])
-                    force = ti.Vector([T[i, a] for a in ti.static(range(3))])
-                    add_direction(scratch, c, k, moment, force, share * weight)
+            add_direction(scratch, c, ti.cast(entries[0, e, LAST_DOF], ti.i32), moment, force, weight)

@@ -192,13 +192,6 @@ def forward(
 
 
 @ti.func
-def velocity(joints: ti.template(), c: int, k: int, x):
-    """∂x/∂p_k of a point x below degree of freedom k, from :func:`forward_tree`'s scratch."""
-    w = ti.Vector([joints[c, k, TWIST + i] for i in ti.static(range(3))])
-    return w.cross(x) + ti.Vector([joints[c, k, TWIST + 3 + i] for i in ti.static(range(3))])
-
-
-@ti.func
 def point_velocity(prismatic: ti.template(), twists: ti.template(), c: int, k: int, x):
     """∂x/∂p_k of a point x below degree of freedom k (silhouette paper, eq. 6)."""
     w = ti.Vector([twists[c, k, 0], twists[c, k, 1], twists[c, k, 2]])

@@ -2,7 +2,7 @@
 
 The voxels are sorted into cubic cells once a frame. A query visits the cells ring by ring around its own and stops when
 nothing nearer can follow: some hundred candidates instead of all (the paper searches all that fit the colour).
-A voxel is a candidate when its bit of the query's colour patch is set and its normal agrees with the query's.
+A voxel is a candidate when its bit of the query's colour patch is set.
 """
 
 from dataclasses import dataclass
@@ -17,32 +17,21 @@ class SurfaceIndex:
     """Surface voxels in cell order. V voxels, G cells along each axis (3,).
 
     Attributes:
-        voxels: (V, 6) float32, position (metres) and normal; a zero normal is unknown and agrees with every query. One
-            array, as Taichi takes several microseconds for every array that a kernel is handed.
+        positions: (V, 3) float32, metres.
         fits: (V,) int64, bit p set where the voxel's colour fits patch p.
         starts: (G0·G1·G2 + 1,) int32, first voxel of each cell.
         grid: (7,) float32, lower corner of cell 0 and edge of a cell (metres), cells along each axis.
         order: (V,) the voxels' places in the arrays given to :meth:`build`.
     """
 
-    voxels: np.ndarray
+    positions: np.ndarray
     fits: np.ndarray
     starts: np.ndarray
     grid: np.ndarray
     order: np.ndarray
 
-    @property
-    def positions(self) -> np.ndarray:
-        """(V, 3) metres."""
-        return self.voxels[:, :3]
-
-    @property
-    def normals(self) -> np.ndarray:
-        """(V, 3) unit vectors, or zero."""
-        return self.voxels[:, 3:]
-
     @staticmethod
-    def build(positions: np.ndarray, normals: np.ndarray, fits: np.ndarray, cell_m: float) -> "SurfaceIndex":
+    def build(positions: np.ndarray, fits: np.ndarray, cell_m: float) -> "SurfaceIndex":
         """Sort V ≥ 1 voxels into cells of ``cell_m`` metres."""
         p = np.ascontiguousarray(positions, np.float32)
         origin = p.min(axis=0) - np.float32(1e-4)
@@ -54,7 +43,7 @@ class SurfaceIndex:
         starts = np.zeros(len(counts) + 1, np.int32)
         np.cumsum(counts, out=starts[1:])
         return SurfaceIndex(
-            voxels=np.hstack([p, np.asarray(normals, np.float32)])[order],
+            positions=p[order],
             fits=np.ascontiguousarray(fits, np.int64)[order],
             starts=starts,
             grid=np.array([*origin, cell_m, *cells], np.float32),
@@ -70,15 +59,13 @@ def _gap(cell: int, at: ti.f32):
 
 @ti.func
 def nearest_voxel(
-    voxels: ti.template(),  # (V, 6)
+    voxels: ti.template(),  # (V, 3)
     fits: ti.template(),  # (V,)
     starts: ti.template(),
     grid: ti.template(),  # (first + 7,)
     first: ti.template(),  # where grid's numbers begin
     x,  # query point
-    n,  # query normal
     patch: int,
-    min_cosine: ti.f32,
     reach: ti.f32,
 ):
     """Index of the nearest candidate within ``reach`` metres, or -1."""
@@ -88,7 +75,6 @@ def nearest_voxel(
     cells = ti.Vector([ti.cast(grid[first + 4 + a], ti.i32) for a in ti.static(range(3))])
     origin = ti.Vector([ti.cast(grid[first + a], ti.f32) for a in ti.static(range(3))])
     point = ti.Vector([ti.cast(x[a], ti.f32) for a in ti.static(range(3))])
-    normal = ti.Vector([ti.cast(n[a], ti.f32) for a in ti.static(range(3))])
     local = (point - origin) / cell_m
     home = ti.cast(ti.floor(local), ti.i32)
     # distance from the query to the nearest wall of its own cell: ring r lies at least (r - 1)·cell + margin away
@@ -117,24 +103,20 @@ def nearest_voxel(
                             if (fits[v] >> patch) & 1 == 1:
                                 d2 = (ti.Vector([voxels[v, a] for a in ti.static(range(3))]) - point).norm_sqr()
                                 if d2 < best_d2:
-                                    m = ti.Vector([voxels[v, 3 + a] for a in ti.static(range(3))])
-                                    if normal.dot(m) >= min_cosine or m.norm_sqr() == 0.0:
-                                        best_d2 = d2
-                                        best = v
+                                    best_d2 = d2
+                                    best = v
         ring += 1
     return best
 
 
 @ti.kernel
 def _nearest_kernel(
-    voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 6)
+    voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 3)
     fits: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (V,)
     starts: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (G + 1,)
     grid: ti.types.ndarray(dtype=ti.f32, ndim=1),  # (7,)
     points: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (N, 3)
-    point_normals: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (N, 3)
     patch: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,)
-    min_cosine: ti.f32,
     reach: ti.f32,
     spread: ti.i32,
     found: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,) out
@@ -144,25 +126,21 @@ def _nearest_kernel(
             continue
         q = turn // spread
         x = ti.Vector([points[q, a] for a in ti.static(range(3))])
-        n = ti.Vector([point_normals[q, a] for a in ti.static(range(3))])
-        found[q] = nearest_voxel(voxels, fits, starts, grid, 0, x, n, patch[q], min_cosine, reach)
+        found[q] = nearest_voxel(voxels, fits, starts, grid, 0, x, patch[q], reach)
 
 
 def nearest(
     index: SurfaceIndex,
     points: np.ndarray,
-    normals: np.ndarray,
     patch: np.ndarray,
-    min_cosine: float = -1.0,
     reach_m: float = 1.0,
 ) -> np.ndarray:
-    """The nearest voxel of each query that fits its patch and whose normal agrees.
+    """The nearest voxel of each query that fits its patch.
 
     Args:
         index: the frame's surface voxels.
-        points, normals: (N, 3) queries, metres and unit vectors.
+        points: (N, 3) queries, metres.
         patch: (N,) colour patch of each query, 0…62.
-        min_cosine: least cosine between the normals of query and voxel; -1 ignores them.
         reach_m: greatest distance searched.
 
     Returns:
@@ -171,14 +149,12 @@ def nearest(
     ensure_runtime()
     found = np.empty(len(points), np.int32)
     _nearest_kernel(
-        index.voxels,
+        index.positions,
         index.fits,
         index.starts,
         index.grid,
         np.ascontiguousarray(points, np.float32),
-        np.ascontiguousarray(normals, np.float32),
         np.ascontiguousarray(patch, np.int32),
-        min_cosine,
         reach_m,
         spread_of(len(points)),
         found,

@@ -29,8 +29,6 @@ from tk.kernels.kinematics import (
     load_translation,
     load_vector3,
     pack_tree,
-    parent_of,
-    velocity,
 )
 from tk.kernels.launch import Launcher
 from tk.kernels.linearisation import Linearisation
@@ -42,7 +40,6 @@ from tk.kernels.wrench import (
     MOTION,
     SCRATCH_NUMBERS,
     WRENCH,
-    add_direction,
     add_inertia,
     add_wrench,
     collect_inertias,
@@ -60,7 +57,7 @@ ENTRIES_PER_POINT = 4
 
 # Columns of the packed arrays. Every array that a launch is handed costs about 6 µs, so the body comes in few.
 # Of a sample, after its position; the weight is 1/σ²:
-SAMPLE_NORMAL, SAMPLE_DOF, SAMPLE_PATCH, SAMPLE_WEIGHT, SAMPLE_BARRED = 3, 6, 7, 8, 9
+SAMPLE_DOF, SAMPLE_PATCH, SAMPLE_WEIGHT, SAMPLE_BARRED = range(3, 7)
 # Of a piece, after the 3×4 frame: a1 a2 a3 ε1 ε2 z_lower z_upper, and so on. Its colour patches, a bit mask of 63, are
 # in three numbers of 21 bits, which a float32 holds.
 PIECE_SHAPE, PIECE_DOF, PIECE_WEIGHT, PIECE_PART, PIECE_PATCHES, PIECE_NUMBERS = 12, 19, 20, 21, 22, 25
@@ -70,7 +67,7 @@ SPHERE, SPHERE_RADIUS = 12, 15
 # Deep inside: G (1 on the surface, growing linearly from the centre) below this.
 BURIED = 0.8
 # Places in the packed settings; what grid (tk.kernels.nearest) follows.
-NU, TANGENTIAL, MIN_COSINE, REACH, COVERAGE_NU, COVERAGE_COSINE, COVERAGE_REACH, SCALE, COVERAGE_SCALE, GRID = range(10)
+NU, REACH, COVERAGE_NU, COVERAGE_REACH, SCALE, COVERAGE_SCALE, GRID = range(7)
 
 
 @ti.func
@@ -121,8 +118,6 @@ def _nearest_piece(
     pieces: ti.template(),  # (P, 25)
     fits: ti.i64,  # the voxel's
     y,  # voxel, world
-    y_normal,
-    min_cosine,
     reach,
 ):
     """(index or -1, x, y, z of the projection in the zero configuration) of the piece nearest to a voxel."""
@@ -155,16 +150,13 @@ def _nearest_piece(
             ]
         )
         if over.norm_sqr() < best_d * best_d and _has_patch(pieces, i, fits):
-            s = project(q, radii, pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4], z_lower, z_upper)
-            on = ti.Vector([s[0], s[1], s[2]])
+            on = project(q, radii, pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4], z_lower, z_upper)
             d = (q - on).norm()
             # of two pieces as near as each other the first, in whatever order they are visited
             if d < best_d or (d == best_d and i < best):
-                n = R @ ti.Vector([s[3], s[4], s[5]])
-                if n.dot(y_normal) >= min_cosine or y_normal.norm_sqr() == 0.0:
-                    best = i
-                    best_d = d
-                    best_on = on
+                best = i
+                best_d = d
+                best_on = on
     best_x = best_on
     if best >= 0:
         Rp = ti.Matrix([[pieces[best, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
@@ -180,22 +172,17 @@ def _add_residual(
     k: int,  # last degree of freedom above x
     x,
     r,
-    y_normal,
-    share,
     inv_sigma2,
     nu,
     scale,
 ):
     """Add scale·ρ(e) of one pair to row c of the sums, its gradient and Hessian-vector product to the wrenches."""
-    # Mr = (share·I + (1 − share)·y yᵀ) r: with share = 1 the paper's distance, with 0 the one along the normal
-    Mr = share * r + (1.0 - share) * y_normal.dot(r) * y_normal
-    decay = ti.exp(-0.5 * r.dot(Mr) * inv_sigma2 / nu)
+    decay = ti.exp(-0.5 * r.norm_sqr() * inv_sigma2 / nu)
     sums[c, 0] = sums[c, 0] + scale * (1.0 - decay)
     weight = scale * decay / nu * inv_sigma2
     Jv = load_wrench(scratch, c, k, MOTION).cross(x) + load_wrench(scratch, c, k, MOTION + 3)
-    MJv = share * Jv + (1.0 - share) * y_normal.dot(Jv) * y_normal
-    add_wrench(scratch, c, k, WRENCH, weight * x.cross(Mr), weight * Mr)
-    add_wrench(scratch, c, k, WRENCH + 6, weight * x.cross(MJv), weight * MJv)
+    add_wrench(scratch, c, k, WRENCH, weight * x.cross(r), weight * r)
+    add_wrench(scratch, c, k, WRENCH + 6, weight * x.cross(Jv), weight * Jv)
 
 
 @ti.func
@@ -249,7 +236,6 @@ def _pair_sample(
     v = -1
     barred = ti.cast(samples[n, SAMPLE_BARRED], ti.i32)
     if barred == 0 or not _is_buried(scratch, c, D, pieces, barred, x):
-        normal = ti.Vector([samples[n, SAMPLE_NORMAL + a] for a in ti.static(range(3))])
         v = nearest_voxel(
             voxels,
             fits,
@@ -257,9 +243,7 @@ def _pair_sample(
             settings,
             GRID,
             x,
-            R @ normal,
             ti.cast(samples[n, SAMPLE_PATCH], ti.i32),
-            ti.cast(settings[MIN_COSINE], ti.f32),
             ti.cast(settings[REACH], ti.f32),
         )
     return v
@@ -270,20 +254,20 @@ def _objective_kernel(real):
     @ti.kernel
     def objective(
         tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
-        samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 10)
+        samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 7)
         pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 25)
         cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
-        voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 6)
+        voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 3)
         fits: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (V,)
         starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        settings: ti.types.ndarray(dtype=real, ndim=1),  # (16,)
+        settings: ti.types.ndarray(dtype=real, ndim=1),  # (13,)
         spread: ti.i32,
         hold: ti.i32,
         M: ti.i32,
         Q: ti.i32,
         E: ti.i32,
         chosen: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, M + Q) samples, then voxels of the coverage term
-        entries: ti.types.ndarray(dtype=real, ndim=3),  # (B, E, 17) of the alignment term
+        entries: ti.types.ndarray(dtype=real, ndim=3),  # (B, E, 16) of the alignment term
         state: ti.types.ndarray(dtype=real, ndim=2),  # (2 B, D) poses, then directions
         scratch: ti.types.ndarray(dtype=real, ndim=3),  # (C, D + P, 39)
         assigned: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, M) out, in when hold = 1
@@ -308,7 +292,7 @@ def _objective_kernel(real):
                 v = -1
                 k = 0
                 x0 = ti.Vector([settings[0] * 0.0, settings[0] * 0.0, settings[0] * 0.0])
-                inv_sigma2, nu, share, scale = x0[0], settings[NU], settings[TANGENTIAL], settings[SCALE]
+                inv_sigma2, nu, scale = x0[0], settings[NU], settings[SCALE]
                 if m < M:
                     n = chosen[b, m]
                     if hold == 0:
@@ -320,17 +304,13 @@ def _objective_kernel(real):
                     x0 = load_vector3(samples, n)
                     inv_sigma2 = samples[n, SAMPLE_WEIGHT]
                 else:
-                    scale, nu, share = settings[COVERAGE_SCALE], settings[COVERAGE_NU], x0[0] + 1.0
+                    scale, nu = settings[COVERAGE_SCALE], settings[COVERAGE_NU]
                     q = m - M
                     v = chosen[b, m]
                     i = -1
                     if hold == 0:
                         y = ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
-                        y_normal = ti.Vector([ti.cast(voxels[v, 3 + a], real) for a in ti.static(range(3))])
-                        i, x0 = _nearest_piece(
-                            scratch, c, D, pieces, fits[v], y, y_normal,
-                            settings[COVERAGE_COSINE], settings[COVERAGE_REACH],
-                        )  # fmt: skip
+                        i, x0 = _nearest_piece(scratch, c, D, pieces, fits[v], y, settings[COVERAGE_REACH])
                         covering[b, q, 0] = ti.cast(i, real)
                         for a in ti.static(range(3)):
                             covering[b, q, 1 + a] = x0[a]
@@ -346,11 +326,8 @@ def _objective_kernel(real):
                     sums[c, 0] = sums[c, 0] + scale
                 else:
                     y = ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
-                    y_normal = ti.Vector([ti.cast(voxels[v, 3 + a], real) for a in ti.static(range(3))])
                     x = load_rotation(scratch, c, k) @ x0 + load_translation(scratch, c, k)
-                    if y_normal.norm_sqr() == 0.0:
-                        share = share * 0.0 + 1.0
-                    _add_residual(scratch, sums, c, k, x, x - y, y_normal, share, inv_sigma2, nu, scale)
+                    _add_residual(scratch, sums, c, k, x, x - y, inv_sigma2, nu, scale)
             collect_wrenches(tree, c, scratch, sums)
 
     return objective
@@ -365,25 +342,23 @@ def _linearise_kernel(real):
     @ti.kernel
     def linearise(
         tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
-        samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 10)
+        samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 7)
         pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 25)
         cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
-        voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 6)
-        settings: ti.types.ndarray(dtype=real, ndim=1),  # (16,)
+        voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 3)
+        settings: ti.types.ndarray(dtype=real, ndim=1),  # (13,)
         spread: ti.i32,
         floor: real,
-        want_jacobian: ti.i32,
         M: ti.i32,
         Q: ti.i32,
         E: ti.i32,
         chosen: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M + Q,)
-        entries: ti.types.ndarray(dtype=real, ndim=3),  # (1, E, 17)
+        entries: ti.types.ndarray(dtype=real, ndim=3),  # (1, E, 16)
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (1, D)
         scratch: ti.types.ndarray(dtype=real, ndim=3),  # (C, D or more, 39)
         assigned: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M,)
         covering: ti.types.ndarray(dtype=real, ndim=2),  # (Q, 4)
         residual: ti.types.ndarray(dtype=real, ndim=2),  # (M + Q, 4) out, metres, and the voxel or -1
-        jacobian: ti.types.ndarray(dtype=real, ndim=3),  # (M + Q, D, 3) out if wanted, zeroed by the caller
         hessian: ti.types.ndarray(dtype=real, ndim=3),  # (C, D, D) out, zeroed by the caller; the lower triangle
     ):
         for turn in range(spread * hessian.shape[0]):
@@ -401,7 +376,7 @@ def _linearise_kernel(real):
                 k_last = 0
                 v = -1
                 x0 = ti.Vector([pose[0, 0] * 0.0, pose[0, 0] * 0.0, pose[0, 0] * 0.0])
-                inv_sigma2, nu, scale, share = x0[0], settings[NU], settings[SCALE], settings[TANGENTIAL]
+                inv_sigma2, nu, scale = x0[0], settings[NU], settings[SCALE]
                 if m < M:
                     n = chosen[m]
                     k_last = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
@@ -424,22 +399,8 @@ def _linearise_kernel(real):
                     r = x - ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
                     for a in ti.static(range(3)):
                         residual[m, a] = r[a]
-                    y_normal = ti.Vector([ti.cast(voxels[v, 3 + a], real) for a in ti.static(range(3))])
-                    if y_normal.norm_sqr() == 0.0 or m >= M:
-                        share = share * 0.0 + 1.0
-                    across = y_normal.dot(r)
-                    decay = ti.exp(-0.5 * (share * r.norm_sqr() + (1.0 - share) * across * across) * inv_sigma2 / nu)
-                    weight = scale * inv_sigma2 / nu * ti.max(decay, floor)
-                    seen = x - origin
-                    add_inertia(scratch, c, k_last, seen, share * weight)
-                    if share != 1.0:
-                        add_direction(scratch, c, k_last, seen.cross(y_normal), y_normal, (1.0 - share) * weight)
-                    k = k_last
-                    while want_jacobian == 1 and k >= 0:
-                        J = velocity(scratch, c, k, x)
-                        for a in ti.static(range(3)):
-                            jacobian[m, k, a] = J[a]
-                        k = parent_of(tree, k)
+                    decay = ti.exp(-0.5 * r.norm_sqr() * inv_sigma2 / nu)
+                    add_inertia(scratch, c, k_last, x - origin, scale * inv_sigma2 / nu * ti.max(decay, floor))
             collect_inertias(tree, c, scratch, origin, hessian)
 
     return linearise
@@ -451,21 +412,16 @@ class ObjectiveSettings:
 
     Attributes:
         nu: Leclerc's ν of the surface term, in units of ½ (d/σ)².
-        tangential: weight of the distance along the data's surface; 1 is the paper's distance, 0 point-to-plane.
-        min_cosine: least cosine between a sample's normal and its voxel's; -1 ignores normals, as the paper does.
         reach_m: greatest distance at which a voxel is looked for.
         coverage_weight: w_c of the coverage term beside the surface term's 1; 0 leaves it out, as the paper does.
-        coverage_nu, coverage_cosine, coverage_reach_m: the same for the coverage term.
+        coverage_nu, coverage_reach_m: the same for the coverage term.
         surface_weight: w_s of eq. 8; 0 leaves the surface term out.
     """
 
     nu: float = 0.35
-    tangential: float = 0.3
-    min_cosine: float = 0.0
     reach_m: float = 0.3
     coverage_weight: float = 0.7
     coverage_nu: float = 0.7
-    coverage_cosine: float = 0.0
     coverage_reach_m: float = 0.5
     surface_weight: float = 1.0
 
@@ -483,7 +439,7 @@ class ObjectiveKernel:
 
     Args:
         axis, point: (D, 3) twists; prismatic, parent: (D,).
-        local, normal: (N, 3) surface samples in the zero configuration; last_dof, patch: (N,).
+        local: (N, 3) surface samples in the zero configuration; last_dof, patch: (N,).
         sigma: (N,) σ of eq. 10 at the samples, metres.
         piece_dof: (P,) last degree of freedom above each superellipsoid.
         piece_frame: (P, 3, 4) from its frame to the zero configuration.
@@ -506,7 +462,6 @@ class ObjectiveKernel:
         prismatic: np.ndarray,
         parent: np.ndarray,
         local: np.ndarray,
-        normal: np.ndarray,
         last_dof: np.ndarray,
         sigma: np.ndarray,
         patch: np.ndarray,
@@ -539,7 +494,7 @@ class ObjectiveKernel:
         if piece_patches is None:
             piece_patches = np.full(len(piece_dof), 2**63 - 1, np.int64)
         patches = [piece_patches >> PATCH_BITS * part & (1 << PATCH_BITS) - 1 for part in range(3)]
-        samples = real(np.column_stack([local, normal, last_dof, patch, weight, barred]))
+        samples = real(np.column_stack([local, last_dof, patch, weight, barred]))
         frame = np.reshape(piece_frame, (-1, 12))
         self._pieces = real(np.column_stack([frame, piece_shape, piece_dof, piece_weight, piece_part, *patches]))
         packed_cameras = real(np.zeros((1, CAMERA_NUMBERS)) if cameras is None else cameras)
@@ -563,7 +518,7 @@ class ObjectiveKernel:
 
     def _packed(self, s: ObjectiveSettings, M: int, Q: int, index: SurfaceIndex) -> np.ndarray:
         """The settings in the order in which the kernels read them."""
-        values = [s.nu, s.tangential, s.min_cosine, s.reach_m, s.coverage_nu, s.coverage_cosine, s.coverage_reach_m]
+        values = [s.nu, s.reach_m, s.coverage_nu, s.coverage_reach_m]
         shares = [s.surface_weight / max(M, 1), s.coverage_weight / max(Q, 1)]
         return np.array([*values, *shares, *index.grid.tolist()], self.dtype)
 
@@ -588,7 +543,7 @@ class ObjectiveKernel:
             direction: (B, D) the v of H·v; None for zeros.
             settings: constants.
             held: assignments to keep instead of searching anew.
-            entries: (B, E, 17) of the alignment term (:mod:`tk.kernels.alignment`), if any.
+            entries: (B, E, 16) of the alignment term (:mod:`tk.kernels.alignment`), if any.
 
         Returns:
             f (B,): ``surface_weight`` times mean ρ over the samples plus ``coverage_weight`` times mean ρ over the
@@ -608,7 +563,7 @@ class ObjectiveKernel:
         else:
             found = Held(np.array(held.assigned, np.int32), np.array(held.covering, self.dtype))
         self._kernel(
-            index.voxels,
+            index.positions,
             index.fits,
             index.starts,
             self._packed(settings, M, Q, index),
@@ -639,32 +594,28 @@ class ObjectiveKernel:
         held: Held,
         settings: ObjectiveSettings,
         floor: float = 0.0,
-        with_jacobian: bool = True,
         entries: np.ndarray | None = None,
     ) -> Linearisation:
-        """Residuals, their Jacobian and the Gauss-Newton Hessian at one pose.
+        """Residuals and the Gauss-Newton Hessian at one pose.
 
         Args:
             chosen: (M,) samples; voxels: (Q,) voxels of the coverage term.
             pose: (D,).
             held: assignments of :meth:`evaluate` at this pose, with B = 1.
             floor: least weight of an outlier in the Hessian.
-            with_jacobian: False leaves the Jacobian out; the Hessian is summed in the kernel either way.
-            entries: (1, E, 17) of the alignment term: they count in the Hessian, and are no pairs.
+            entries: (1, E, 16) of the alignment term: they count in the Hessian, and are no pairs.
         """
         E = 0 if entries is None else entries.shape[1]
         M, Q = len(chosen), len(voxels) if settings.coverage_weight > 0 else 0
         tasks = max(-(-(M + Q + E // ENTRIES_PER_POINT) // PAIRS_PER_TASK), 1)
         D = self.degrees
         found: np.ndarray = np.empty((M + Q, 4), self.dtype)
-        jacobian: np.ndarray = np.zeros((M + Q if with_jacobian else 1, D, 3), self.dtype)
         hessian: np.ndarray = np.zeros((tasks, D, D), self.dtype)
         self._linearise(
-            index.voxels,
+            index.positions,
             self._packed(settings, M, Q, index),
             spread_of(tasks),
             floor,
-            int(with_jacobian),
             M,
             Q,
             E,
@@ -675,7 +626,6 @@ class ObjectiveKernel:
             np.ascontiguousarray(held.assigned[0], np.int32),
             np.ascontiguousarray(held.covering[0], self.dtype),
             found,
-            jacobian,
             hessian,
         )
         self.launches += 1
@@ -684,12 +634,7 @@ class ObjectiveKernel:
         partner = found[:, 3].astype(np.int32)
         return Linearisation(
             residual=found[:, :3].astype(np.float64),
-            jacobian=jacobian.transpose(0, 2, 1).astype(np.float64),
             hessian=lower + np.tril(lower, -1).T,
             partner=partner,
-            voxel_normals=index.normals,
-            share=np.repeat([settings.tangential, 1.0], [M, Q]),
             inv_sigma2=np.concatenate([weight[chosen], piece_weight[held.covering[0, :Q, 0].astype(np.int64)]]),
-            nu=np.repeat([settings.nu, settings.coverage_nu], [M, Q]),
-            scale=np.repeat([settings.surface_weight / max(M, 1), settings.coverage_weight / max(Q, 1)], [M, Q]),
         )

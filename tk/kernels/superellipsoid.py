@@ -65,7 +65,7 @@ def _away_from_zero(x):
 
 @ti.func
 def project(q, radii, e1, e2, z_lower, z_upper):
-    """The surface point nearest to q, to first order, and its outward normal: (x, y, z, nx, ny, nz).
+    """The surface point nearest to q, to first order.
 
     Points beyond a cutting plane are first moved onto it, so that a truncated piece attracts to its rim.
     """
@@ -80,5 +80,4 @@ def project(q, radii, e1, e2, z_lower, z_upper):
     limit = 2.0 * ti.max(radii[0], ti.max(radii[1], radii[2]))
     if g[0] < 1.0 and (s - c).norm_sqr() > limit * limit:
         s = c
-    normal = gradient / ti.sqrt(square)
-    return ti.Vector([s[0], s[1], s[2], normal[0], normal[1], normal[2]])
+    return s

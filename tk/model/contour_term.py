@@ -31,10 +31,6 @@ Entries = NDArray[np.float32]
 
 # Iterations for which assigned edges are held. The paper assigns them at every iteration.
 RENEW = 5
-# Weight of the distance along the contour; 1 is the paper's (eqs. 13, 15). A held edge does not tell how far along the
-# limb its point is.
-ALONG = 0.0
-
 
 # σ of eqs. 13 and 15, metres at the limb; 0 would take the limb's diameter, as the paper does.
 SIGMA_M = 0.1
@@ -115,14 +111,13 @@ class ContourTerm:
             ]
         )
 
-    def assign(self, images: NDArray[np.uint8], poses: Float, chosen: Ints, softness: float = 1.0) -> Entries:
-        """(B, E, 17) entries at poses (B, D) from strips (B, K) and the pictures (C, H, W, 3)."""
+    def assign(self, images: NDArray[np.uint8], poses: Float, chosen: Ints) -> Entries:
+        """(B, E, 16) entries at poses (B, D) from strips (B, K) and the pictures (C, H, W, 3)."""
         (pose_of, entries), lines = self._pairs(self.kernel(poses, chosen))
         found = search_edges(images, self.sizes, lines, self.config.threshold, self.gradient)
         wanted = entries[:, alignment.STATE] == alignment.ASSIGNED
         entries[:, alignment.TARGET : alignment.TARGET + 2] = 0.5 * (found[:, 1:3] + found[:, 3:5])
         entries[wanted & (found[:, 0] == 0), alignment.STATE] = alignment.UNASSIGNABLE
-        entries[:, alignment.NU] *= softness
         return _by_pose(pose_of, entries, len(poses))
 
     def _pairs(self, points: ContourPoints) -> tuple[tuple[Ints, NDArray[np.float32]], NDArray[np.float32]]:
@@ -139,17 +134,15 @@ class ContourTerm:
         both, any_seen = seen.all(axis=1), seen.any(axis=1)
         first = np.where(seen[:, 0], 0, 1)
         second = np.where(both, 1, first)
-        entries, lines = self._rows(points, b, v, k, first, second)
+        entries, lines, pixels_a_metre = self._rows(points, b, v, k, first, second)
         lines[:, 0] = np.where(both, PAIR, SINGLE)
-        lines[:, 10] = c.reach_m * entries[:, alignment.SHARE]  # pixels a metre, until below
-        pixels_a_metre = entries[:, alignment.SHARE].copy()
+        lines[:, 10] = c.reach_m * pixels_a_metre
         diameter = np.where(
             both, np.hypot(*(lines[:, 2:4] - lines[:, 4:6]).T), self._diameter[points.strip[b, k]] * pixels_a_metre
         )
         sigma = SIGMA_M * pixels_a_metre if SIGMA_M else np.maximum(diameter, 1.0)
         entries[:, alignment.INV_SIGMA2] = 1 / sigma**2
         entries[:, alignment.STATE] = np.where(any_seen, alignment.ASSIGNED, alignment.UNASSIGNABLE)
-        entries[:, alignment.SHARE] = ALONG
         entries[:, alignment.NU] = EDGE_NU
         # every contour point counts the same, whether it stands for itself or in a pair;
         # the hidden half of a half-hidden pair has an entry of its own
@@ -174,9 +167,8 @@ class ContourTerm:
         k: NDArray[np.intp],
         first: NDArray[np.intp],
         second: NDArray[np.intp],
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Entries with points, camera, normal; their SHARE holds the pixels a metre. And the lines of the same
-        points."""
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Entries with points, camera and normal, the lines of the same points, and pixels a metre there."""
         entries = np.zeros((len(b), alignment.ENTRY_NUMBERS), np.float32)
         lines = np.zeros((len(b), LINE_NUMBERS), np.float32)
         a = alignment
@@ -185,13 +177,12 @@ class ContourTerm:
         entries[:, a.LAST_DOF] = self._last_dof[points.strip[b, k]]
         entries[:, a.CAMERA] = v
         entries[:, a.NORMAL : a.NORMAL + 2] = points.normals[b, v, k, first]
-        entries[:, a.SHARE] = points.scale[b, v, k, first]
         lines[:, 1] = v
         lines[:, 2:4] = points.pixels[b, v, k, first]
         lines[:, 4:6] = points.pixels[b, v, k, second]
         lines[:, 6:8] = points.normals[b, v, k, first]
         lines[:, 8:10] = points.normals[b, v, k, second]
-        return entries, lines
+        return entries, lines, points.scale[b, v, k, first].astype(np.float32)
 
 
 def _some(row: NDArray[np.integer], count: int, rng: np.random.Generator | None) -> Ints:
@@ -205,7 +196,7 @@ def _some(row: NDArray[np.integer], count: int, rng: np.random.Generator | None)
 
 
 def _by_pose(pose_of: Ints, entries: NDArray[np.float32], poses: int) -> NDArray[np.float32]:
-    """(B, E, 17): each pose's entries in a row, padded with absent ones."""
+    """(B, E, 16): each pose's entries in a row, padded with absent ones."""
     if poses == 1:
         return entries[None]
     counts = np.bincount(pose_of, minlength=poses)

@@ -7,14 +7,13 @@ of, voxels, colours, samples, stays here.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
-from tk.kernels.alignment import NU
 from tk.kernels.linearisation import Linearisation
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective import Held, ObjectiveKernel, ObjectiveSettings
@@ -56,9 +55,6 @@ COVERAGE_SOFTNESS = 2.0
 OUTLIERS = 0.1
 # Leclerc's ν of eq. 9, in units of ½ (d/σ)²; the paper prints none.
 SURFACE_NU = 0.35
-# Weight of the distance along the data's surface, and the least cosine between a sample's normal and its voxel's: as in
-# the paper's eq. 10, which is the plain distance and ignores normals. Point-to-plane would be 0.
-TANGENTIAL, MIN_COSINE = 1.0, -1.0
 
 
 @dataclass(frozen=True)
@@ -83,12 +79,9 @@ class ObjectiveConfig:
         """What the kernel takes."""
         return ObjectiveSettings(
             nu=SURFACE_NU,
-            tangential=TANGENTIAL,
-            min_cosine=MIN_COSINE,
             reach_m=REACH_M,
             coverage_weight=self.coverage_weight,
             coverage_nu=COVERAGE_SOFTNESS * SURFACE_NU,
-            coverage_cosine=MIN_COSINE,
             coverage_reach_m=COVERAGE_REACH_M,
             surface_weight=self.surface_weight,
         )
@@ -160,7 +153,6 @@ class BodyObjective:
             prismatic=skeleton.prismatic,
             parent=skeleton.parent,
             local=body.points,
-            normal=body.normals,
             last_dof=skeleton.segment_dof[body.segment],
             sigma=np.full(len(body.points), fixed) if fixed else body.diameter,
             patch=body.patch,
@@ -260,7 +252,7 @@ class Fit:
         value: the objective over evenly spread samples and voxels.
         linear: the linearisation at the pose (M + Q pairs); held: its assignments.
         samples: (M,) the samples used; voxels: (Q,) the voxels used.
-        entries: (1, E, 17) of the contour cues, if any.
+        entries: (1, E, 16) of the contour cues, if any.
     """
 
     value: float
@@ -307,8 +299,6 @@ class FrameObjective:
         objective: the body's.
         index: the frame's surface voxels.
         rng: where samples are drawn from.
-        outliers: least weight of a pair in the Hessian.
-        with_jacobian: whether :meth:`fit` keeps the pairs' Jacobian.
         images: (C, H, W, 3) the pictures of the edge term; without them, or without that term, the hull alone counts.
     """
 
@@ -317,15 +307,11 @@ class FrameObjective:
         objective: BodyObjective,
         index: SurfaceIndex,
         rng: np.random.Generator,
-        outliers: float = OUTLIERS,
-        with_jacobian: bool = False,
         images: NDArray[np.uint8] | None = None,
     ) -> None:
         self.objective = objective
         self.index = index
         self.rng = rng
-        self.outliers = outliers
-        self.with_jacobian = with_jacobian
         self.contours = None if images is None else objective.contours
         self.images = images
         self.voxel_count = len(index.positions)
@@ -341,48 +327,44 @@ class FrameObjective:
         """Poses (B, D) mapped into the joints' limits (eq. 22)."""
         return self.objective.body.skeleton.clip(poses)
 
-    def damping(self, lever_m: float, softness: float = 1.0) -> Float:
+    def damping(self, lever_m: float) -> Float:
         """See :meth:`BodyObjective.damping`."""
-        return self.objective.damping(lever_m) / softness
+        return self.objective.damping(lever_m)
 
-    def full(self, softness: float = 1.0) -> Callable[[Float, Float, int], Evaluation]:
+    def full(self) -> Callable[[Float, Float, int], Evaluation]:
         """All degrees of freedom: new samples for every iteration number, the same in all rows."""
         draws = _Draws(self._draw_full)
-        settings = self._softened(softness)
-        renewed = self._renewing(lambda B: np.repeat(self._term.draw(self.rng)[None], B, 0), softness)
+        renewed = self._renewing(lambda B: np.repeat(self._term.draw(self.rng)[None], B, 0))
 
         def evaluate(poses: Float, directions: Float, iteration: int) -> Evaluation:
             samples, voxels = draws(iteration)
             B = len(poses)
             rows = np.repeat(samples[None], B, 0), np.repeat(voxels[None], B, 0)
-            return self._evaluate(*rows, poses, directions, settings, renewed(poses, iteration))
+            return self._evaluate(*rows, poses, directions, renewed(poses, iteration))
 
         return evaluate
 
-    def chains(
-        self, owner: NDArray[np.intp], pose: Float, softness: float = 1.0
-    ) -> Callable[[Float, Float, int], Evaluation]:
+    def chains(self, owner: NDArray[np.intp], pose: Float) -> Callable[[Float, Float, int], Evaluation]:
         """Row b is chain ``owner[b]`` with its own samples, and voxels that are its own or nobody's at ``pose``."""
         self._pools = self._chain_pools(self.fit(pose))
-        settings = self._softened(softness)
         draws = _Draws(lambda: self._draw_chains(owner))
-        renewed = self._renewing(lambda _: self._term.draw_chains(self.rng)[owner], softness)
+        renewed = self._renewing(lambda _: self._term.draw_chains(self.rng)[owner])
 
         def evaluate(poses: Float, directions: Float, iteration: int) -> Evaluation:
-            return self._evaluate(*draws(iteration), poses, directions, settings, renewed(poses, iteration))
+            return self._evaluate(*draws(iteration), poses, directions, renewed(poses, iteration))
 
         return evaluate
 
-    def fixed(self, softness: float = 1.0) -> FixedObjective:
+    def fixed(self) -> FixedObjective:
         """All degrees of freedom on one draw of points that stays: what Levenberg-Marquardt minimises (section 7.3)."""
         strips = None if self.contours is None else self._term.draw(self.rng)
-        return FixedObjective(self, *self._draw_full(), strips, softness)
+        return FixedObjective(self, *self._draw_full(), strips)
 
-    def fixed_chain(self, chain: int, pose: Float, softness: float = 1.0) -> FixedObjective:
+    def fixed_chain(self, chain: int, pose: Float) -> FixedObjective:
         """The same for one chain, the rest of the body being at ``pose``; points as in :meth:`chains`."""
         self._pools = self._chain_pools(self.fit(pose))
         strips = None if self.contours is None else self._term.draw_chains(self.rng)[chain]
-        return FixedObjective(self, *self._draw_chain(chain), strips, softness)
+        return FixedObjective(self, *self._draw_chain(chain), strips)
 
     def value(self, pose: Float) -> float:
         """The objective at ``pose`` (D,) on even samples and evenly spread voxels."""
@@ -395,15 +377,15 @@ class FrameObjective:
             self._look(np.array(unknown))
         return np.array([self._looks[pose.tobytes()].value for pose in poses])
 
-    def curvature(self, pose: Float, softness: float = 1.0) -> Float:
-        """(D, D) Gauss-Newton Hessian at ``pose`` (D,), outliers weighing at least :attr:`outliers`."""
-        return self._linearise(pose, softness, with_jacobian=False).hessian + np.diag(self.objective.stiffness)
+    def curvature(self, pose: Float) -> Float:
+        """(D, D) Gauss-Newton Hessian at ``pose`` (D,), outliers weighing at least :data:`OUTLIERS`."""
+        return self._linearise(pose).hessian + np.diag(self.objective.stiffness)
 
     def fit(self, pose: Float) -> Fit:
         """How well ``pose`` (D,) explains the frame, on samples that do not change from call to call."""
         key = pose.tobytes()
         if key not in self._fits:
-            linear = self._linearise(pose, 1.0, self.with_jacobian)
+            linear = self._linearise(pose)
             look = self._looks[key]
             self._fits[key] = Fit(look.value, linear, look.held, self._even_samples, self._even_voxels, look.entries)
         return self._fits[key]
@@ -428,23 +410,18 @@ class FrameObjective:
             own = Held(held.assigned[b : b + 1], held.covering[b : b + 1])
             self._looks[pose.tobytes()] = _Look(float(value[b]), own, None if entries is None else entries[b : b + 1])
 
-    def _linearise(self, pose: Float, softness: float, with_jacobian: bool) -> Linearisation:
+    def _linearise(self, pose: Float) -> Linearisation:
         self.values(pose[None])
         look = self._looks[pose.tobytes()]
-        entries = look.entries
-        if entries is not None and softness != 1:
-            entries = entries.copy()
-            entries[:, :, NU] *= softness
         return self.objective.kernel.linearise(
             self.index,
             self._even_samples,
             self._even_voxels,
             pose,
             look.held,
-            self._softened(softness),
-            self.outliers,
-            with_jacobian=with_jacobian,
-            entries=entries,
+            self.objective.settings,
+            OUTLIERS,
+            entries=look.entries,
         )
 
     def _chain_pools(self, fit: Fit) -> list[Ints]:
@@ -475,22 +452,16 @@ class FrameObjective:
         samples, voxels = zip(*(self._draw_chain(c) for c in range(len(CHAINS))), strict=True)
         return np.stack(samples)[owner], np.stack(voxels)[owner]
 
-    def _softened(self, softness: float) -> ObjectiveSettings:
-        s = self.objective.settings
-        return replace(s, nu=softness * s.nu, coverage_nu=softness * s.coverage_nu)
-
     @property
     def _term(self) -> ContourTerm:
         assert self.contours is not None
         return self.contours
 
-    def _entries(self, poses: Float, chosen: Ints, softness: float = 1.0) -> NDArray[np.floating]:
+    def _entries(self, poses: Float, chosen: Ints) -> NDArray[np.floating]:
         assert self.images is not None
-        return self._term.assign(self.images, poses, chosen, softness)
+        return self._term.assign(self.images, poses, chosen)
 
-    def _renewing(
-        self, draw: Callable[[int], Ints], softness: float
-    ) -> Callable[[Float, int], NDArray[np.floating] | None]:
+    def _renewing(self, draw: Callable[[int], Ints]) -> Callable[[Float, int], NDArray[np.floating] | None]:
         """The contour cues' entries at an iteration: held for some, then made anew at the poses as they are."""
         drawn: tuple[int, Ints] | None = None
         last: NDArray[np.floating] | None = None
@@ -504,7 +475,7 @@ class FrameObjective:
             if last is None or calls % RENEW == 0:
                 if drawn is None or drawn[0] != iteration:
                     drawn = iteration, draw(len(poses))
-                last = self._entries(poses, drawn[1], softness)
+                last = self._entries(poses, drawn[1])
             calls += 1
             return last
 
@@ -516,11 +487,10 @@ class FrameObjective:
         voxels: Ints,
         poses: Float,
         directions: Float | None,
-        settings: ObjectiveSettings,
         entries: NDArray[np.floating] | None = None,
     ) -> Evaluation:
         value, gradient, product, _ = self.objective.kernel.evaluate(
-            self.index, samples, voxels, poses, directions, settings, entries=entries
+            self.index, samples, voxels, poses, directions, self.objective.settings, entries=entries
         )
         return self.objective.with_stiffness(poses, directions, value, gradient, product)
 
@@ -531,17 +501,12 @@ class FixedObjective:
     Args:
         frame: the frame.
         samples: (M,); voxels: (Q,); strips: (K,) of the contour cues, if they count.
-        softness: see :meth:`FrameObjective.full`.
     """
 
-    def __init__(
-        self, frame: FrameObjective, samples: Ints, voxels: Ints, strips: Ints | None, softness: float
-    ) -> None:
+    def __init__(self, frame: FrameObjective, samples: Ints, voxels: Ints, strips: Ints | None) -> None:
         self._frame = frame
         self._points = samples, voxels
         self._strips = strips
-        self._softness = softness
-        self._settings = frame._softened(softness)
 
     def value(self, pose: Float) -> float:
         """The objective at ``pose`` (D,)."""
@@ -555,18 +520,17 @@ class FixedObjective:
             *self._points,
             pose,
             held,
-            self._settings,
-            self._frame.outliers,
-            with_jacobian=False,
+            self._frame.objective.settings,
+            OUTLIERS,
             entries=entries,
         )
         return float(value[0]), gradient[0], linear.hessian + np.diag(self._frame.objective.stiffness)
 
     def _evaluate(self, pose: Float) -> tuple[tuple[Float, Float, Float, Held], NDArray[np.floating] | None]:
         frame, (samples, voxels) = self._frame, self._points
-        entries = None if self._strips is None else frame._entries(pose[None], self._strips[None], self._softness)
+        entries = None if self._strips is None else frame._entries(pose[None], self._strips[None])
         value, gradient, product, held = frame.objective.kernel.evaluate(
-            frame.index, samples[None], voxels[None], pose[None], None, self._settings, entries=entries
+            frame.index, samples[None], voxels[None], pose[None], None, frame.objective.settings, entries=entries
         )
         return (*frame.objective.with_stiffness(pose[None], None, value, gradient, product), held), entries
 

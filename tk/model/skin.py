@@ -55,7 +55,6 @@ class Skin:
         skeleton: the kinematic tree.
         pieces: the superellipsoids.
         points: (N, 3) surface samples in the zero configuration, world frame, metres.
-        normals: (N, 3) their outward unit normals.
         segment: (N,) index of each sample's segment.
         piece: (N,) index of each sample's piece.
         diameter: (N,) the limb diameter σ at each sample, metres (eq. 10).
@@ -66,18 +65,16 @@ class Skin:
     skeleton: Skeleton
     pieces: tuple[Superellipsoid, ...]
     points: Float
-    normals: Float
     segment: NDArray[np.int32]
     piece: NDArray[np.int32]
     diameter: Float
     patch: NDArray[np.int32]
     patch_names: tuple[str, ...]
 
-    def place(self, pose: Float) -> tuple[Float, Float]:
-        """Surface samples (N, 3) and normals (N, 3) at a pose, world frame. Float64 reference for the kernels."""
+    def place(self, pose: Float) -> Float:
+        """Surface samples (N, 3) at a pose, world frame. Float64 reference for the kernels."""
         T = self.skeleton.segment_transforms(pose)[self.segment]
-        points = np.einsum("nab,nb->na", T[:, :3, :3], self.points) + T[:, :3, 3]
-        return points, np.einsum("nab,nb->na", T[:, :3, :3], self.normals)
+        return np.asarray(np.einsum("nab,nb->na", T[:, :3, :3], self.points) + T[:, :3, 3])
 
 
 def lay_skin(body: ConeBody, up: str = "z", waist: bool = False, spacing_m: float = SPACING_M) -> Skin:
@@ -111,7 +108,6 @@ def lay_skin(body: ConeBody, up: str = "z", waist: bool = False, spacing_m: floa
         skeleton=skeleton,
         pieces=pieces,
         points=(p_zero @ B.T)[keep],
-        normals=(n_zero @ B.T)[keep],
         segment=segment[keep],
         piece=owner[keep],
         diameter=np.array([p.diameter_m for p in pieces])[owner][keep],

@@ -47,15 +47,15 @@ class FixedProblem(Protocol):
         """The objective at a pose (D,) on samples that do not change from call to call."""
         ...
 
-    def damping(self, lever_m: float, softness: float) -> Float:
+    def damping(self, lever_m: float) -> Float:
         """(D,) curvature that a parameter would have, were all points ``lever_m`` from its axis."""
         ...
 
-    def fixed(self, softness: float) -> Fixed:
+    def fixed(self) -> Fixed:
         """All parameters, on one draw of points."""
         ...
 
-    def fixed_chain(self, chain: int, pose: Float, softness: float) -> Fixed:
+    def fixed_chain(self, chain: int, pose: Float) -> Fixed:
         """One chain, the rest of the body being at ``pose``, on one draw of points."""
         ...
 
@@ -64,15 +64,13 @@ def optimise(problem: FixedProblem, starts: Float, config: ScheduleConfig, lm_co
     """Both passes, from the best of the starts (S, D)."""
     starts = problem.constrain(starts)
     start = starts[0] if len(starts) == 1 else min(starts, key=problem.value)
-    torso = np.logical_not(np.asarray(problem.free.any(axis=0)))
-    first = torso if config.hierarchical else np.ones_like(torso)
-    pose, made = _descend(problem, problem.fixed(config.soft), start, first, LEVER_M, config.soft, lm_config)
+    pose, made = _descend(problem, problem.fixed(), start, np.ones(len(start), bool), LEVER_M, lm_config)
     result, iterations = pose.copy(), [made]
     # ε₂ of section 6.4: the chains are held to a finer tolerance
     finer = replace(lm_config, tolerance=config.refine * lm_config.tolerance)
     for k, free in enumerate(problem.free):
-        objective = problem.fixed_chain(k, pose, config.chain_soft)
-        moved, made = _descend(problem, objective, pose, free, CHAIN_LEVER_M, config.chain_soft, finer)
+        objective = problem.fixed_chain(k, pose)
+        moved, made = _descend(problem, objective, pose, free, CHAIN_LEVER_M, finer)
         result[free] = moved[free]
         iterations.append(made)
     return ScheduleResult(result, np.array(iterations, np.int32))
@@ -84,7 +82,6 @@ def _descend(
     start: Float,
     free: NDArray[np.bool_],
     lever_m: float,
-    softness: float,
     config: lm.LmConfig,
 ) -> tuple[Float, int]:
     """The pose (D,) after a descent in the free parameters, and its iterations."""
@@ -103,7 +100,7 @@ def _descend(
         lambda part: objective.value(whole(part)),
         start[free],
         lambda part: problem.constrain(whole(part)[None])[0, free],
-        problem.damping(lever_m, softness)[free],
+        problem.damping(lever_m)[free],
         config,
     )
     return whole(found.pose), found.iterations

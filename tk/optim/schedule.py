@@ -1,14 +1,10 @@
 """The two passes of a frame (Kehl 2006, section 6.4): all degrees of freedom at ε₁, then the chains at ε₂ < ε₁ with the
 torso held, as one batch. What they optimise is known only as a :class:`Problem`.
 
-Beyond the paper:
-
-* SMD works in directions that whiten the Gauss-Newton Hessian at the start of each pass. The paper's step sizes (2500
-  for most angles, 5000 for rolls, 10000 for knees and elbows) are a diagonal guess at the inverse Hessian in its own
-  units; here the same is read off the data, so that a step of 1 is a Newton step. ``whiten = False`` takes the diagonal
-  alone.
-* ``soft`` and ``chain_soft`` can start the error potential soft, so that a limb that has moved by two σ since the last
-  frame still feels its data. They are 1, as in the paper: with the tight ε₁ it is not needed.
+Beyond the paper, SMD works in directions that whiten the Gauss-Newton Hessian at the start of each pass. The paper's
+step sizes (2500 for most angles, 5000 for rolls, 10000 for knees and elbows) are a diagonal guess at the inverse
+Hessian in its own units; here the same is read off the data, so that a step of 1 is a Newton step. ``whiten = False``
+takes the diagonal alone.
 """
 
 from __future__ import annotations
@@ -49,23 +45,23 @@ class Problem(Protocol):
         """Poses (B, D) mapped into the limits."""
         ...
 
-    def full(self, softness: float) -> smd.Objective:
-        """The objective of all parameters; ``softness`` multiplies Leclerc's ν: outliers count from farther away."""
+    def full(self) -> smd.Objective:
+        """The objective of all parameters."""
         ...
 
     def values(self, poses: Float) -> Float:
         """(B,) the objective at poses (B, D) on samples that do not change from call to call."""
         ...
 
-    def curvature(self, pose: Float, softness: float) -> Float:
+    def curvature(self, pose: Float) -> Float:
         """(D, D) Gauss-Newton Hessian at a pose."""
         ...
 
-    def damping(self, lever_m: float, softness: float) -> Float:
+    def damping(self, lever_m: float) -> Float:
         """(D,) curvature that a parameter would have, were all points ``lever_m`` from its axis."""
         ...
 
-    def chains(self, owner: NDArray[np.intp], pose: Float, softness: float) -> smd.Objective:
+    def chains(self, owner: NDArray[np.intp], pose: Float) -> smd.Objective:
         """The objective whose row b is chain ``owner[b]``, the rest of the body being at ``pose``."""
         ...
 
@@ -80,8 +76,6 @@ class ScheduleConfig:
         refine: ε₂ / ε₁ (paper: ½).
         rate: first step size, as a share of a Newton step.
         whiten: see the module's docstring.
-        soft, chain_soft: by how much Leclerc's ν is multiplied in the first pass and for the chains (paper: 1).
-        hierarchical: the earlier tracker of section 6.4: the torso alone first, then the chains.
     """
 
     tolerance_deg: float = 0.2
@@ -89,12 +83,9 @@ class ScheduleConfig:
     refine: float = 0.5
     rate: float = 0.6
     whiten: bool = True
-    soft: float = 1.0
-    chain_soft: float = 1.0
-    hierarchical: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("tolerance_deg", "tolerance_m", "refine", "soft", "chain_soft"):
+        for name in ("tolerance_deg", "tolerance_m", "refine"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"schedule.{name} = {getattr(self, name)} must be positive")
         if not 0 < self.rate <= 2:
@@ -132,13 +123,11 @@ def optimise(problem: Problem, starts: Float, config: ScheduleConfig, smd_config
 def _all(
     problem: Problem, start: Float, tolerance: Float, config: ScheduleConfig, smd_config: smd.SmdConfig
 ) -> smd.SmdResult:
-    """The pass over all parameters, or over the torso's, from ``start`` (D,)."""
-    torso = np.logical_not(np.asarray(problem.free.any(axis=0)))
-    free = torso if config.hierarchical else np.ones_like(torso)
-    damping = problem.damping(LEVER_M, config.soft)
-    basis, inverse = descent_basis(problem.curvature(start, config.soft), free, damping, config.whiten)
+    """The pass over all parameters, from ``start`` (D,)."""
+    free = np.ones(len(start), bool)
+    basis, inverse = descent_basis(problem.curvature(start), free, problem.damping(LEVER_M), config.whiten)
     return smd.minimise(
-        problem.full(config.soft),
+        problem.full(),
         start[None],
         config.rate,
         tolerance,
@@ -155,11 +144,11 @@ def _chains(
 ) -> smd.SmdResult:
     """The pass over the chains, a row each, with the torso at ``pose`` (D,)."""
     K = len(problem.free)
-    H = problem.curvature(pose, config.chain_soft)
-    damping = problem.damping(CHAIN_LEVER_M, config.chain_soft)
+    H = problem.curvature(pose)
+    damping = problem.damping(CHAIN_LEVER_M)
     pairs = [descent_basis(H, free, damping, config.whiten) for free in problem.free]
     return smd.minimise(
-        problem.chains(np.arange(K), pose, config.chain_soft),
+        problem.chains(np.arange(K), pose),
         np.repeat(pose[None], K, axis=0),
         config.rate,
         tolerance,

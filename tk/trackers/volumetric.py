@@ -285,7 +285,7 @@ class VolumetricTracker:
         )
 
     def _index(self, surface: HullSurface, fits: NDArray[np.int64]) -> SurfaceIndex:
-        return SurfaceIndex.build(surface.positions, surface.normals, fits, CELL_VOXELS * self.hull.grid.voxel_m)
+        return SurfaceIndex.build(surface.positions, fits, CELL_VOXELS * self.hull.grid.voxel_m)
 
     def _correspondences(
         self, surface: HullSurface, index: SurfaceIndex, fit: Fit
