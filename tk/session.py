@@ -247,8 +247,7 @@ class _Run:
         count = plan.tracker.opening_frames
         observations = plan.source.frames(plan.first, max(plan.stop, plan.first + count))
         _LOG.info("reading the first frames and learning what the scene looks like")
-        if isinstance(plan.tracker, ContourTracker):
-            plan.tracker.prepare()
+        plan.tracker.prepare()
         opening, broken = _take(observations, count)
         _LOG.info("finding the person in frame %d and fitting the body to %d frames", plan.first, len(opening))
         try:

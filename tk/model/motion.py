@@ -12,7 +12,7 @@ Float = NDArray[np.float64]
 
 # The points of the feet, in the order of :func:`foot_points`.
 FOOT_POINTS = ("heel_l", "toe_l", "heel_r", "toe_r")
-# Behind and ahead of the ankle's centre, as shares of the foot's length: where tk.model.body lays the foot.
+# Behind and ahead of the ankle's centre, as shares of the foot's length: where tk.model.cone_body lays the foot.
 _HEEL, _TOE = -0.2, 0.8
 
 

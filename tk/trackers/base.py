@@ -94,6 +94,10 @@ class Tracker(Protocol):
         """The person's body, once it is known."""
         ...
 
+    def prepare(self) -> None:
+        """Have kernels compiled while there is nothing else to do."""
+        ...
+
     def start(
         self,
         frames: Sequence[Observation],

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.config import Config
-from tk.errors import CaptureError
+from tk.errors import CaptureError, ConfigError
 from tk.io.init_pose import InitPose
 from tk.kernels.nearest import SurfaceIndex
 from tk.model.appearance import LEARNING_M, Appearance
@@ -131,6 +131,10 @@ class VolumetricTracker:
 
     # --- initialisation (section 6.3) ---------------------------------------------------------------------------
 
+    def prepare(self) -> None:
+        """Have the kernels of the initialisation compiled while there is nothing else to do."""
+        self._finder.prepare()
+
     def start(
         self,
         frames: Sequence[Observation],
@@ -142,7 +146,10 @@ class VolumetricTracker:
 
         Raises:
             CaptureError: there is nobody.
+            ConfigError: a body that is given has not all parts.
         """
+        if body is not None and body.preset != "full":
+            raise ConfigError(f'the body given is "{body.preset}": --method {self.method} needs a full one')
         # the colours of the contours' search are none of this method's cues
         blind = [Observation(f.index, f.images[:0], f.masks) for f in frames]
         pose = self._finder.find(blind, height_m, init, body)
