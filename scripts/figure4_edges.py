@@ -27,9 +27,10 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
+from scripts.paper.edge_maps import follow_edges, rgb_gradient, thin_edges
 from tk.errors import CaptureError, TkError
 from tk.io.capture import open_capture
-from tk.kernels.edges import EdgeConfig, follow_edges, rgb_gradient, thin_edges
+from tk.kernels.edges import EdgeConfig
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -57,7 +58,7 @@ def grey_canny(image: Image) -> Detect:
 
 
 def rgb_edges(image: Image, config: EdgeConfig | None = None) -> Detect:
-    """The colour edges of :mod:`tk.kernels.edges`; thresholds of its magnitude."""
+    """The colour edges of :mod:`scripts.paper.edge_maps`; thresholds of its magnitude."""
     thin = thin_edges(*rgb_gradient(image[None], config))
     return lambda low, high: follow_edges(thin, low, high)[0]
 

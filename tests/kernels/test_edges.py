@@ -10,8 +10,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from scripts.paper.edge_maps import HIGH, edge_map, follow_edges, rgb_gradient, thin_edges
 from tk.errors import ConfigError
-from tk.kernels.edges import HIGH, EdgeConfig, edge_map, follow_edges, rgb_gradient, rgb_gradient_at, thin_edges
+from tk.kernels.edges import EdgeConfig, rgb_gradient_at
 from tk.kernels.runtime import ensure_runtime, ti
 
 PAIRS = ((1, 0), (0, 1), (1, 1), (1, -1))

@@ -20,7 +20,7 @@ from scripts.figure4_edges import (
     rgb_edges,
     run,
 )
-from tk.kernels.edges import HIGH
+from scripts.paper.edge_maps import HIGH
 
 WALK = Path(__file__).resolve().parents[3] / "shared" / "captures" / "walk"
 
