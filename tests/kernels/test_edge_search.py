@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from scripts.paper.edge_maps import rgb_gradient
 from tk.kernels.edge_search import MOST_EDGES, PAIR, SINGLE, search_edges
-from tk.kernels.edges import EdgeConfig, rgb_gradient
+from tk.kernels.edges import EdgeConfig
 
 CONFIG = EdgeConfig()
 THRESHOLD = 0.12
