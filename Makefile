@@ -1,6 +1,8 @@
 # `make demo` and `make test` are enough by themselves: they set up what is missing first.
 VENV ?= .venv
 RUN = "$(VENV)/bin/python" -m
+# a file's tests stay together, for they share what they have tracked
+EACH_CORE = -n auto --dist loadfile
 
 .PHONY: help install demo test test-slow test-random lint format docs bench clean
 .DEFAULT_GOAL := help
@@ -28,13 +30,13 @@ demo: install
 	@"$(VENV)/bin/tk" demo --force
 
 test: install
-	@$(RUN) pytest
+	@$(RUN) pytest $(EACH_CORE)
 
 test-slow: install
 	@$(RUN) pytest -m slow
 
 test-random: install
-	@$(RUN) pytest --hypothesis-profile default
+	@$(RUN) pytest $(EACH_CORE) --hypothesis-profile default
 
 lint: install
 	@$(RUN) ruff check .

@@ -1,7 +1,12 @@
-"""A tiny capture with everything in it, and the command line as a function."""
+"""A tiny capture with everything in it, and the command line as a function.
+
+Workers of pytest-xdist (`-n 2`) make what costs seconds once among them, and share the cores.
+"""
 
 from __future__ import annotations
 
+import fcntl
+import os
 import re
 import shutil
 from collections.abc import Callable
@@ -17,6 +22,10 @@ from scripts.synthetic.capture import Options, plan_capture, write_capture
 # every run draws the same examples; `pytest --hypothesis-profile default` draws new ones
 hypothesis.settings.register_profile("same", derandomize=True)
 hypothesis.settings.load_profile("same")
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # before any kernel runs: the results are the same with fewer threads
+    _cores = len(os.sched_getaffinity(0))
+    os.environ.setdefault("TK_THREADS", str(max(_cores // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]), 1)))
 
 FRAMES = 14
 
@@ -86,13 +95,29 @@ def tk(capfd: pytest.CaptureFixture[str]) -> Tk:
     return run
 
 
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """A path that ``make`` has written, whichever worker of this test run came first."""
+    root = factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        root = root.parent
+    (root / "shared").mkdir(exist_ok=True)
+    path, done = root / "shared" / name, root / "shared" / f".{name}.done"
+    with (root / "shared" / f".{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # goes with its process, however that ends
+        if not done.exists():
+            make(path)
+            done.touch()
+    return path
+
+
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A rendered capture: 4 cameras of 160×120, :data:`FRAMES` frames, backgrounds, masks, truth. Not to be changed."""
-    folder = tmp_path_factory.mktemp("captures") / "tiny"
-    plan = plan_capture(Options(frames=FRAMES, cameras=4, size=(160, 120), seed=3))
-    write_capture(plan, folder, masks=True)
-    return folder
+
+    def make(folder: Path) -> None:
+        write_capture(plan_capture(Options(frames=FRAMES, cameras=4, size=(160, 120), seed=3)), folder, masks=True)
+
+    return made_once(tmp_path_factory, "tiny", make)
 
 
 @pytest.fixture
@@ -108,9 +133,10 @@ def tracked(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tk.io.capture import open_capture
     from tk.session import track
 
-    path = tmp_path_factory.mktemp("results") / "unbroken.h5"
-    track(open_capture(tiny), path, Config.from_toml(QUICK), Silent(), method="volumetric", store_hull=True)
-    return path
+    def make(path: Path) -> None:
+        track(open_capture(tiny), path, Config.from_toml(QUICK), Silent(), method="volumetric", store_hull=True)
+
+    return made_once(tmp_path_factory, "unbroken.h5", make)
 
 
 @pytest.fixture(scope="session")

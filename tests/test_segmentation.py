@@ -150,10 +150,9 @@ def test_a_process_ahead_makes_the_same_masks(walk: Path, tmp_path: Path, monkey
     with capture.frames(3, 6) as frames:
         here = {frame.index: segment(frame) for frame in frames}
     config = Config.from_toml(QUICK.replace("ahead = 0", "ahead = 2"))
-    for start in (3, 5):
-        with Ahead(capture, config, lambda _: None) as source:
-            for observation, _ in source.frames(start, 6):
-                np.testing.assert_array_equal(observation.masks, here[observation.index], strict=True)
+    with Ahead(capture, config, lambda _: None) as source:
+        for observation, _ in source.frames(4, 6):
+            np.testing.assert_array_equal(observation.masks, here[observation.index], strict=True)
 
 
 def test_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

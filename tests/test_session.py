@@ -1,6 +1,6 @@
-"""The loop: same seed, same file; runs that are stopped, killed, prolonged or taken up again; where a run starts.
+"""The loop: same seed, same file; runs that are stopped, prolonged or taken up again; where a run starts.
 
-By the volumetric tracker; tests/test_region_track.py has what is the default's own.
+By the volumetric tracker; tests/test_region_track.py has what is the default's own, and kills a run.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def send(number: int, frame: int, *arguments: Any) -> subprocess.CompletedProces
         env={**os.environ, "TEST_FRAME": str(frame), "TEST_SIGNAL": str(int(number))},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
     )
 
 
@@ -103,37 +103,6 @@ def test_another_seed_gives_another_result(tiny: Path, tracked: Path, tmp_path: 
 
 
 # --- stopped and taken up again ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs POSIX signals")
-def test_a_killed_run_is_taken_up_again(tk: Tk, quick: Path, tiny: Path, tracked: Path, tmp_path: Path) -> None:
-    result = tmp_path / "r.h5"
-    command = ["track", tiny, "--method", "volumetric", "-o", result, "--config", quick, "--store-hull"]
-    killed = send(signal.SIGKILL, 5, *command)
-    assert killed.returncode == -signal.SIGKILL, killed.stderr
-    assert killed.stdout == ""
-    assert_same(result, tracked, slice(0, 6))  # read by plain h5py
-    ran = tk(*command, "--resume")
-    assert ran.code == 0, ran.err
-    assert ran.told[0] == f"note: 6 of {FRAMES} frames are there already"
-    assert ran.err.splitlines()[-1].startswith(f"{FRAMES} frames in {result}, 0 lost")
-    assert_same(result, tracked)
-    assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]  # the killed run's scraps are gone
-    done = tk(*command, "--resume")  # nothing is left to do
-    assert done.code == 0 and f"{FRAMES} of {FRAMES} frames are there already" in done.err
-    assert_same(result, tracked)
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
-def test_ctrl_c_ends_cleanly_and_the_run_is_taken_up_again(tiny: Path, quick: Path, tmp_path: Path) -> None:
-    result = tmp_path / "r.h5"
-    stopped = send(signal.SIGINT, 3, "track", tiny, "--method", "volumetric", "-o", result, "--config", quick)
-    assert stopped.returncode == 1, stopped.stderr
-    assert stopped.stdout == "" and "Traceback" not in stopped.stderr
-    assert stopped.stderr.splitlines()[-1] == "tk: interrupted; go on with the same command and --resume"
-    assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]
-    with h5py.File(result, "r") as file:
-        np.testing.assert_array_equal(file["frames"], np.arange(4))
 
 
 def test_a_run_that_is_stopped_twice_equals_an_unbroken_one(tiny: Path, tracked: Path, tmp_path: Path) -> None:

@@ -18,8 +18,9 @@ from tk.model.skeleton import JOINTS
 from tk.plan import METHODS
 from tk.session import Summary, track
 
-# few frames to fit the body to
+# no process ahead, and few frames to fit the body to
 QUICK = """
+ahead = 0
 [silhouette]
 init_frames = 3
 [silhouette.fit]
@@ -107,10 +108,10 @@ def test_settings_are_checked(tiny: Path, tk: Tk, tmp_path: Path) -> None:
     said.complaint("bad.toml", "silhouette.bodies")
 
 
-def test_nobody_in_the_masks_is_told_in_one_line(copy: Path, tk: Tk, tmp_path: Path) -> None:
+def test_nobody_in_the_masks_is_told_in_one_line(copy: Path, quick: Path, tk: Tk, tmp_path: Path) -> None:
     import cv2
 
     for picture in (copy / "masks").rglob("*.png"):
         cv2.imwrite(str(picture), np.zeros_like(cv2.imread(str(picture), cv2.IMREAD_UNCHANGED)))
-    said = tk("track", copy, "-o", tmp_path / "r.h5", "--method", "silhouette")
+    said = tk("track", copy, "-o", tmp_path / "r.h5", "--method", "silhouette", "--config", quick)
     said.complaint(str(copy), "0 of 4 masks of frame 0 show anybody")

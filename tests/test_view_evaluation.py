@@ -21,6 +21,7 @@ from tk.trackers.bodies import body_and_poses
 from tk.view_evaluation import capture_of, evaluate_views
 
 SETTINGS = """
+ahead = 0
 [silhouette]
 init_frames = 2
 [silhouette.fit]

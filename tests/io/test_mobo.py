@@ -67,7 +67,7 @@ def test_cameras_and_masks_can_be_chosen(walk: Path) -> None:
 
 def test_a_walk_is_tracked(tk: Tk, walk: Path, tmp_path: Path) -> None:
     settings = tmp_path / "s.toml"
-    lines = ["[silhouette]", "init_frames = 2", "adapt = false"]
+    lines = ["ahead = 0", "[silhouette]", "init_frames = 2", "adapt = false"]
     settings.write_text("\n".join(lines), encoding="utf-8")
     output = tmp_path / "r.h5"
     ran = tk("track", walk, "-o", output, "--method", "silhouette", "--config", settings)

@@ -33,10 +33,10 @@ def test_first_call_does_not_count() -> None:
     assert len(calls) == 4
 
 
-def test_the_demo_at_a_small_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_small_capture(tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("open3d", exc_type=ImportError)
     file = tmp_path / "bench.json"
-    main(["--voxels", "40", "--repeat", "1", "--frames", "4", "--json", str(file)])
+    main([str(tiny), "--voxels", "40", "--repeat", "1", "--frames", "4", "--json", str(file)])
     printed = capsys.readouterr().out
     report = json.loads(file.read_text(encoding="utf-8"))
     assert report["machine"]["cores"] >= 1 and report["growth"] == []
@@ -57,14 +57,16 @@ def test_the_demo_at_a_small_size(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert alone["neighbours: build and query"]["peers"].keys() == {"SciPy cKDTree"}
     contours = [name for name in alone if name.startswith(("contours:", "colour edges:", "objective "))]
     assert len(contours) == 7 and all(alone[name]["ms"] > 0 for name in contours)
-    for text in ("kernel launches a frame", "peak memory", "Open3D carve_silhouette", "demo at 40³"):
+    for text in ("kernel launches a frame", "peak memory", "Open3D carve_silhouette", "tiny at 40³"):
         assert text in printed
 
 
-def test_the_silhouette_tracker_has_stages_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_silhouette_tracker_has_stages_of_its_own(
+    tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "bench.json"
-    cameras = "cam1,cam2,cam4"
-    main(["--method", "silhouette", "--cameras", cameras, "--repeat", "1", "--frames", "4", "--json", str(file)])
+    options = ["--method", "silhouette", "--cameras", "cam1,cam2,cam4", "--repeat", "1", "--frames", "4"]
+    main([str(tiny), *options, "--json", str(file)])
     (found,) = json.loads(file.read_text(encoding="utf-8"))["runs"]
     assert found["method"] == "silhouette" and found["cameras"] == 3 and found["voxels"] is found["hull_ms"] is None
     run = Run(**found["end_to_end"])
@@ -74,7 +76,7 @@ def test_the_silhouette_tracker_has_stages_of_its_own(tmp_path: Path, capsys: py
     assert sum(name.startswith("contours, search, equations") for name in alone) == 3
     assert all(ms > 0 for name, ms in alone.items() if name != "masks")
     printed = capsys.readouterr().out
-    assert "fitting alone: " in printed and "demo, silhouettes" in printed
+    assert "fitting alone: " in printed and "tiny, silhouettes" in printed
 
 
 def test_a_capture_that_is_not_there_is_named(tmp_path: Path) -> None:

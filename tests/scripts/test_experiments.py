@@ -13,6 +13,7 @@ from scripts.experiments import EXPERIMENTS, main
 from scripts.paper import common, cues, sampling, views
 from scripts.paper.common import Options, Track, spread, table
 from scripts.paper.motion import turned_deg
+from tests.conftest import QUICK
 from tk.config import Config
 from tk.model.skeleton import JOINTS
 
@@ -98,13 +99,22 @@ def test_a_table_is_markdown() -> None:
 
 
 def test_a_track_is_of_the_capture() -> None:
-    track = common.track(DEMO, Config(voxels=48), 4)
+    track = common.track(DEMO, replace(Config.from_toml(QUICK), voxels=48), 4)
     assert track.error_cm.shape == (4, len(JOINTS)) and track.pose.shape[0] == 4
     assert 0.5 < track.mean_cm < 15 and track.astray <= 4
     assert (track.optimise_ms > 0).all() and (track.iterations > 0).all()
 
 
-def test_an_arm_is_displaced_and_comes_back_or_not(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def scene() -> sampling.Scene:
+    """The demo's fifth frame, tracked to."""
+    return sampling.look(Options(DEMO, 5, 1, Path("none.png")), Config.preset("kehl2006"))
+
+
+def test_an_arm_is_displaced_and_comes_back_or_not(
+    scene: sampling.Scene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(sampling, "look", lambda options, paper: scene)
     monkeypatch.setattr(sampling, "AVERAGED", 2)
     monkeypatch.setattr(sampling, "STEP_DEG", 12.0)
     text = sampling.run(Options(DEMO, 5, 2, tmp_path / "sampling.png"))
@@ -112,8 +122,7 @@ def test_an_arm_is_displaced_and_comes_back_or_not(monkeypatch: pytest.MonkeyPat
     assert (tmp_path / "sampling.png").stat().st_size < 200_000
 
 
-def test_deterministic_points_stay_and_stochastic_ones_do_not() -> None:
-    scene = sampling.look(Options(DEMO, 5, 1, Path("none.png")), Config.preset("kehl2006"))
+def test_deterministic_points_stay_and_stochastic_ones_do_not(scene: sampling.Scene) -> None:
     start = sampling.moved(scene, np.array([[10.0, 5.0]]))
     values = [sampling.landscape(scene, 3, start)[0] for _ in range(2)]
     assert values[0] == values[1] != sampling.landscape(scene, 4, start)[0]
