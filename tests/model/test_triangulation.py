@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tk.model.body import neutral_pose
 
 from tests.model.ring import ring_of_cameras
 from tk.model.anthropometry import BodyDimensions
+from tk.model.gait import neutral_pose
 from tk.model.skeleton import build_skeleton
 from tk.model.triangulation import same_person, triangulate_joints
 

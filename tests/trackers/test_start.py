@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tk.model.body import neutral_pose
 
 from tests.model.ring import ring_of_cameras
 from tk.errors import CaptureError
 from tk.model.anthropometry import BodyDimensions
 from tk.model.cone_body import build_cone_body
-from tk.model.gait import standing_pose, walking_pose
+from tk.model.gait import neutral_pose, standing_pose, walking_pose
 from tk.model.silhouettes import draw_silhouettes
 from tk.model.skeleton import JOINTS, shoulder_angles
 from tk.trackers.base import Observation
