@@ -26,7 +26,7 @@ SINGLE_M, SINGLE_PX = 2e-5, 0.02
 # eq. 5 on strips of 32 steps: how far its point is from the rim of eq. 3
 INTERPOLATION_LIMB_M = 5e-4
 # the same on the box-like trunk, along its flat sides
-INTERPOLATION_M = 5e-3
+INTERPOLATION_M = 6e-3
 
 
 def cameras() -> Rig:

@@ -17,9 +17,9 @@ def test_launches_are_counted_by_kernel_only_inside_the_block() -> None:
     index = SurfaceIndex.build(points, np.full(3, -1), 0.1)
     patch = np.zeros(3, np.int32)
     with counted_launches() as counts:
-        nearest(index, points, points, patch)
-        nearest(index, points, points, patch)
-    nearest(index, points, points, patch)
+        nearest(index, points, patch)
+        nearest(index, points, patch)
+    nearest(index, points, patch)
     assert dict(counts) == {"nearest_kernel": 2}
 
 
