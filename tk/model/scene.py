@@ -17,8 +17,6 @@ Float = NDArray[np.float32]
 _DARKEST, _BRIGHTEST = 20, 245  # grey levels between which a pixel is neither drowned in noise nor saturated
 _LEAST_SAMPLES = 64  # with fewer usable ones a picture keeps the plate's gain
 
-_ROUGHLY = 4  # every so many samples tell the first gain, which only finds out who shows the scene
-
 # Least noise variance of a pixel, as a share of its picture's: coding rounds small noise away in places and then lets
 # it jump. Measured on rendered captures and a real one.
 _LEAST_RELATIVE_NOISE = 0.5
@@ -105,9 +103,8 @@ def gain_and_noise(images: Images, plates: Float, relative: Float) -> tuple[Floa
     usable = (low > _DARKEST) & (high < _BRIGHTEST)
     count = np.count_nonzero(usable, axis=1)
     b = np.maximum(plates, 1)
-    few = usable[:, ::_ROUGHLY]
-    ratios = np.where(few[:, None], a[:, :, ::_ROUGHLY] / b[:, :, ::_ROUGHLY], np.inf).reshape(-1, few.shape[1])
-    rough = _medians(ratios, np.repeat(np.count_nonzero(few, axis=1), 3)).reshape(-1, 3)
+    ratios = np.where(usable[:, None], a / b, np.inf).reshape(-1, usable.shape[1])
+    rough = _medians(ratios, np.repeat(count, 3)).reshape(-1, 3)
     rough[count < _LEAST_SAMPLES] = 1
     residual = np.abs(a - rough[:, :, None] * b).max(axis=1) / np.sqrt(relative)
     residual[~usable] = np.inf
