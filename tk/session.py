@@ -143,7 +143,9 @@ def track(
     with open_plan(capture, config, note, method, frames, init_pose, body) as plan:
         meta = plan.meta()
         writer, done = ResultWriter.resume(output, meta) if resume else (ResultWriter.create(output, meta), 0)
-        run = _Run(plan, _Output(writer, done, plan.origin(store_hull), store_hull))
+        again = not causal and isinstance(plan.tracker, RegionTracker)  # the second pass asks for the masks
+        masks = MaskStore(output.with_name(f".{output.name}.masks"), resume) if again else MaskStore()
+        run = _Run(plan, _Output(writer, done, plan.origin(store_hull), store_hull), masks)
         started = time.perf_counter()
         interrupted = False
         try:
@@ -158,6 +160,7 @@ def track(
                     finish(output, plan, run.masks, note, causal)
                 if said:
                     revise_result(output, notes=said)
+            masks.remove()
         except KeyboardInterrupt:
             # caught outside the writer, which then leaves an older result alone if nothing is done
             interrupted = True
@@ -222,11 +225,11 @@ class _Output:
 class _Run:
     """One run of a tracker through a capture; how far it got stands in ``tracked`` and ``lost`` whatever ends it."""
 
-    def __init__(self, plan: Plan, output: _Output | None) -> None:
+    def __init__(self, plan: Plan, output: _Output | None, masks: MaskStore | None = None) -> None:
         self.plan, self.output = plan, output
         self.tracked = 0
         self.lost = 0
-        self.masks = MaskStore()
+        self.masks = masks or MaskStore()
         self.watch = Watch(plan.tracker, plan.capture)
 
     def estimates(self) -> Iterator[Estimate]:

@@ -70,18 +70,51 @@ def test_those_of_a_long_recording_are_on_disk(monkeypatch, tmp_path):
     store = MaskStore()
     for index, frame in enumerate(masks):
         store.put(index, frame)
-    assert store._file._rolled, "a file by now"
+    assert store._opened._rolled, "a file by now"
     for index in (11, 0, 5):
         np.testing.assert_array_equal(store.get(index), masks[index])
     assert list(tmp_path.iterdir()) == [], "without a name"
 
 
-def test_a_full_disk_is_one_line(monkeypatch):
+def test_a_full_disk_is_one_line(monkeypatch, tmp_path):
     def full(_):
         raise OSError(28, "No space left on device")
 
     store = MaskStore()
-    monkeypatch.setattr(store._file, "write", full)
+    store.put(0, np.zeros((1, 2, 2), np.uint8))
+    monkeypatch.setattr(store._opened, "write", full)
     with pytest.raises(TkError, match="masks cannot be kept there: No space left"):
-        store.put(0, np.zeros((1, 2, 2), np.uint8))
-    assert 0 not in store
+        store.put(1, np.zeros((1, 2, 2), np.uint8))
+    assert 1 not in store
+    with pytest.raises(TkError, match=r"nowhere.*masks cannot be kept there: No such"):
+        MaskStore(tmp_path / "nowhere" / "masks").put(0, np.zeros((1, 2, 2), np.uint8))
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None)
+def test_a_run_that_was_killed_is_taken_up(seed, tmp_path_factory):
+    """However its file was damaged: what is there is right."""
+    rng = np.random.default_rng(seed)
+    path = tmp_path_factory.mktemp("run") / ".r.h5.masks"
+    masks = (rng.random((6, 2, 7, 9)) < 0.5).astype(np.uint8) * 255
+    store = MaskStore(path)
+    assert not path.exists(), "made with the first of them"
+    for index, frame in enumerate(masks):
+        store.put(index, frame)
+    whole = MaskStore(path, resume=True)
+    for index, frame in enumerate(masks):
+        np.testing.assert_array_equal(whole.get(index), frame)
+    data = bytearray(path.read_bytes())
+    kept = len(data) // 6 * int(rng.integers(0, 6)) + int(rng.integers(0, 30))
+    path.write_bytes(bytes(data[:kept]) + rng.bytes(int(rng.integers(0, 40))))
+    after = MaskStore(path, resume=True)
+    found = [index for index in range(6) if index in after]
+    assert found == list(range(len(found)))
+    for index in found:
+        np.testing.assert_array_equal(after.get(index), masks[index])
+    after.put(5, masks[5])
+    np.testing.assert_array_equal(MaskStore(path, resume=True).get(5), masks[5])
+    MaskStore(path).put(0, masks[0])
+    assert 5 not in MaskStore(path, resume=True), "a run that starts afresh"
+    after.remove()
+    assert not path.exists()

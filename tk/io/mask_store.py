@@ -1,16 +1,19 @@
 """Masks of a whole recording in little memory: a bit a pixel, compressed; some 10 kB for five pictures of 640×480.
 
-Those of a long recording go to a temporary file without a name, so that memory stays flat.
+Those of a long recording go to a file, so that memory stays flat: a temporary one without a name, or one beside the
+result, from which a run that was killed is taken up.
 """
 
 from __future__ import annotations
 
 import os
+import struct
 import tempfile
 import weakref
 import zlib
 from collections.abc import Iterator, Sequence
-from typing import overload
+from pathlib import Path
+from typing import IO, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +26,62 @@ Masks = NDArray[np.uint8]
 IN_MEMORY = 32 * 2**20
 
 
-class MaskStore:
-    """Masks (C, H, W), 0 or 255, by frame number."""
+#: before each frame: its number, the bytes that follow, and the masks' shape
+_HEAD = struct.Struct("<qqiii")
 
-    def __init__(self) -> None:
-        self._file = tempfile.SpooledTemporaryFile(IN_MEMORY)  # noqa: SIM115 (closed with the store)
-        weakref.finalize(self, self._file.close)
+
+class MaskStore:
+    """Masks (C, H, W), 0 or 255, by frame number.
+
+    Args:
+        path: a file to keep them in, made with the first of them; None: memory, or a file without a name.
+        resume: take up what the file holds; what is damaged in it, and all behind that, is left out.
+    """
+
+    def __init__(self, path: Path | None = None, resume: bool = False) -> None:
+        self._path = path
         self._places: dict[int, tuple[int, int]] = {}  # where a frame begins, and its bytes
         self._shape: tuple[int, ...] = ()
+        self._opened: IO[bytes] | None = None
+        if path is not None and resume and path.is_file():
+            self._take_up(self._open("r+b"))
+
+    def _open(self, mode: str) -> IO[bytes]:
+        try:
+            # closed with the store
+            file = self._path.open(mode) if self._path else tempfile.SpooledTemporaryFile(IN_MEMORY)  # noqa: SIM115
+        except OSError as error:
+            raise self._no_room(error) from None
+        weakref.finalize(self, file.close)
+        self._opened = file
+        return file
+
+    def _no_room(self, error: OSError) -> TkError:
+        where = self._path or tempfile.gettempdir()
+        return TkError(f"{where}: masks cannot be kept there: {error.strerror or error}")
+
+    def _take_up(self, file: IO[bytes]) -> None:
+        """Find the frames that are in the file already; what cannot be read is cut off."""
+        whole, end = os.fstat(file.fileno()).st_size, 0
+        while end + _HEAD.size <= whole:
+            index, size, *shape = _HEAD.unpack(file.read(_HEAD.size))
+            begin = end + _HEAD.size
+            if not 0 < size <= whole - begin or min(shape) <= 0 or self._shape not in ((), tuple(shape)):
+                break
+            reader = zlib.decompressobj()
+            count = -(-int(np.prod(shape, dtype=object)) // 8)
+            try:
+                if len(reader.decompress(file.read(size), count + 1)) != count or not reader.eof:
+                    break
+            except zlib.error:
+                break
+            self._shape, self._places[index], end = tuple(shape), (begin, size), begin + size
+        file.truncate(end)
+
+    def remove(self) -> None:
+        """The masks are needed no longer: delete the file that they are in."""
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
 
     def __contains__(self, index: int) -> bool:
         return index in self._places
@@ -43,20 +94,22 @@ class MaskStore:
         """
         self._shape = masks.shape
         packed = zlib.compress(np.packbits(masks >= 128).tobytes(), 1)
+        file = self._opened or self._open("w+b")
         try:
-            self._file.seek(0, os.SEEK_END)
-            place = self._file.tell()
-            self._file.write(packed)
-            self._file.flush()
+            file.seek(0, os.SEEK_END)
+            place = file.tell() + _HEAD.size
+            file.write(_HEAD.pack(index, len(packed), *masks.shape) + packed)
+            file.flush()
         except OSError as error:
-            raise TkError(f"{tempfile.gettempdir()}: masks cannot be kept there: {error.strerror or error}") from None
+            raise self._no_room(error) from None
         self._places[index] = (place, len(packed))
 
     def get(self, index: int) -> Masks:
         """(C, H, W) the masks of a frame that was put."""
         place, size = self._places[index]
-        self._file.seek(place)
-        bits = np.frombuffer(zlib.decompress(self._file.read(size)), np.uint8)
+        assert self._opened is not None
+        self._opened.seek(place)
+        bits = np.frombuffer(zlib.decompress(self._opened.read(size)), np.uint8)
         count = int(np.prod(self._shape))
         return np.unpackbits(bits, count=count).reshape(self._shape) * np.uint8(255)
 
