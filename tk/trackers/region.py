@@ -45,7 +45,7 @@ Float = NDArray[np.float64]
 # Information of one pixel of contour, 1/px²: edgels err by 2 px, and together along 10 px.
 INFORMATION = 1.0 / (2.0**2 * 10.0)
 # Standard deviations of the priors: waist and ankles about straight ones, the others about their prediction.
-WAIST_DEG, ANKLE_DEG, ANGLE_DEG, TRANSLATION_M = 20.0, 20.0, 40.0, 0.3
+WAIST_DEG, ANKLE_DEG, ANGLE_DEG, TRANSLATION_M = 12.0, 20.0, 40.0, 0.3
 # How long a hypothesis may live beside the best one, in frames, and how much of its running cost a frame replaces.
 PATIENCE, RENEWAL = 6, 0.4
 # Hypotheses that cost this much more than the best one, as a share of the person's pixels, are dropped.
