@@ -52,6 +52,8 @@ PROMISING = 0.01
 FINISHED = 2
 # Poses whose joints lie farther apart than this are different ones, metres.
 APART_M = 0.05
+# What a person who is found again may explain worse, as E_S, for facing as before and not the other way.
+FACING = 0.04
 # Rays a picture's height: to screen many places of a limb, and to choose among few poses.
 SCREEN_ROWS, CHOICE_ROWS = 54, 96
 
@@ -328,15 +330,22 @@ class ContourTracker:
         return np.asarray(poses[best if cost[best] < cost[0] - GAIN else 0])
 
     def relocate(self, pyramid: Pyramid, pose: Float, error: float) -> tuple[Float, float]:
-        """The pose or, if that explains the silhouettes better, one found as at the start; and its E_S."""
+        """The pose or, if that explains the silhouettes better, one found as at the start; and its E_S.
+
+        The pose as it was, moved to where the person is now, is tried, too. Seen from one instant a person may face
+        either way: who faces as before is preferred by :data:`FACING`.
+        """
         try:
             p_centroid = centroid(self.views.rig, pyramid, 0)
         except CaptureError:
             return pose, error
-        starts = gait.hypotheses(self.body.skeleton, HEADINGS, PHASES, p_centroid)
+        skeleton = self.body.skeleton
+        moved, yaw = pose.copy(), skeleton.index("torso_yaw")
+        moved[skeleton.prismatic] = p_centroid
+        starts = np.concatenate([moved[None], gait.hypotheses(skeleton, HEADINGS, PHASES, p_centroid, pose[yaw])])
         settled = self.settle(pyramid, starts).states
         errors = self.fit_error(pyramid, settled)
-        i = int(np.argmin(errors))
+        i = int(np.argmin(errors + FACING * (1 - np.cos(settled[:, yaw] - pose[yaw])) / 2))
         return (settled[i], float(errors[i])) if errors[i] < error else (pose, error)
 
     def told(self, pose: Float) -> dict[str, Any]:
