@@ -9,6 +9,7 @@ below Taichi's public interface; where a Taichi has no such thing, and in debug 
 from __future__ import annotations
 
 import threading
+import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -17,6 +18,10 @@ import numpy as np
 from tk.kernels.runtime import ti
 
 _WHOLE = (ti.i32, ti.i64)
+
+
+def _nothing() -> None:
+    """In the place of a reference to an array where there was none yet."""
 
 
 class Launcher:
@@ -38,7 +43,8 @@ class Launcher:
         self._context: Any = None
         self._expected: list[tuple[tuple[int], Any, int]] = []
         self._lock = threading.Lock()
-        self._last: list[Any] = []  # held, so that no other array comes to lie where one was
+        # what the context has: numbers, and weak references to arrays, so that none is held beyond its use
+        self._last: list[Any] = []
 
     def __call__(self, *arguments: Any) -> None:
         program = ti.lang.impl.get_runtime().prog
@@ -53,20 +59,22 @@ class Launcher:
     def _update(self, arguments: tuple[Any, ...]) -> None:
         context, last = self._context, self._last
         for i, ((slot, kind, ndim), value) in enumerate(zip(self._expected, arguments, strict=True)):
-            if value is last[i]:
+            if kind is float or kind is int:
+                if value != last[i]:
+                    set_number = context.set_arg_float if kind is float else context.set_arg_int
+                    set_number(slot, kind(value))
+                    last[i] = value
                 continue
-            if kind is float:
-                context.set_arg_float(slot, float(value))
-            elif kind is int:
-                context.set_arg_int(slot, int(value))
-            elif value.dtype == kind and value.ndim == ndim and value.flags.c_contiguous:
+            if last[i]() is value:
+                continue
+            if value.dtype == kind and value.ndim == ndim and value.flags.c_contiguous:
                 context.set_arg_external_array_with_shape(slot, value.ctypes.data, value.nbytes, value.shape, 0)
             else:
                 raise TypeError(
                     f"argument {slot[0]} is {value.dtype} of {value.ndim} dimensions, "
                     f"contiguous: {value.flags.c_contiguous}; the first call had {kind} of {ndim}"
                 )
-            last[i] = value
+            last[i] = weakref.ref(value)
 
     def _launch(self, program: Any, context: Any) -> None:
         program.launch_kernel(self._compiled, context)
@@ -96,5 +104,5 @@ class Launcher:
             else ((i,), int if annotations[i] in _WHOLE else float, 0)
             for i, value in enumerate(arguments, first)
         ]
-        self._last = [None] * len(arguments)
+        self._last = [_nothing if kind is not int and kind is not float else None for _, kind, _ in self._expected]
         self._program, self._context, self._compiled = program, context, compiled
