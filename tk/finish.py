@@ -32,12 +32,13 @@ REFINED = "refined"
 _LESS_SURE = 2.0
 
 
-def finish(output: Path, plan: Plan, masks: MaskStore, note: Callable[[str], None], causal: bool) -> None:
-    """What needs all frames: the second pass unless ``causal``; segments, feet and angles; the smoothed copy; cameras.
+def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[str], None]) -> None:
+    """What needs all frames: the second pass; segments, feet and angles; the smoothed copy; cameras.
 
-    The second pass settles every frame anew, with the body fitted to frames of the whole recording where that did not
-    begin with the initialisation pose; by refined cameras where they disagree, unless ``config.refine`` is False. The
-    result is replaced in one step; if this does not end, the first pass's stays.
+    The second pass, which ``masks`` are for (None: there is none), settles every frame anew, with the body fitted to
+    frames of the whole recording where that did not begin with the initialisation pose; by refined cameras where they
+    disagree, unless ``config.refine`` is False. The result is replaced in one step; if this does not end, the first
+    pass's stays.
     """
     tracker = plan.tracker
     if not isinstance(tracker, ContourTracker):
@@ -52,7 +53,7 @@ def finish(output: Path, plan: Plan, masks: MaskStore, note: Callable[[str], Non
     columns: dict[str, NDArray[Any]] = {}
     model: Mapping[str, Value] | None = None
     cameras = UsedCameras(plan.capture.rig, np.array(plan.capture.time_offset_s))
-    if isinstance(tracker, RegionTracker) and not causal:
+    if isinstance(tracker, RegionTracker) and masks is not None:
         _LOG.info("second pass")
         # the initialisation pose shows all of the body; what else a recording may begin with does not
         shown = plan.init is None and plan.capture.init_pose != "any"

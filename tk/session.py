@@ -144,7 +144,10 @@ def track(
         meta = plan.meta()
         writer, done = ResultWriter.resume(output, meta) if resume else (ResultWriter.create(output, meta), 0)
         again = not causal and isinstance(plan.tracker, RegionTracker)  # the second pass asks for the masks
-        masks = MaskStore(output.with_name(f".{output.name}.masks"), resume) if again else MaskStore()
+        kept = output.with_name(f".{output.name}.masks")
+        if not done:
+            kept.unlink(missing_ok=True)  # of a run that was stopped, whose result is replaced
+        masks = MaskStore(kept, resume=bool(done)) if again else None
         run = _Run(plan, _Output(writer, done, plan.origin(store_hull), store_hull), masks)
         started = time.perf_counter()
         interrupted = False
@@ -157,10 +160,10 @@ def track(
                 for line in run.watch.report():
                     note(line)
                 with one_blas_thread():
-                    finish(output, plan, run.masks, note, causal)
+                    finish(output, plan, masks, note)
                 if said:
                     revise_result(output, notes=said)
-            masks.remove()
+            kept.unlink(missing_ok=True)
         except KeyboardInterrupt:
             # caught outside the writer, which then leaves an older result alone if nothing is done
             interrupted = True
@@ -229,7 +232,7 @@ class _Run:
         self.plan, self.output = plan, output
         self.tracked = 0
         self.lost = 0
-        self.masks = masks or MaskStore()
+        self.masks = masks
         self.watch = Watch(plan.tracker, plan.capture)
 
     def estimates(self) -> Iterator[Estimate]:
@@ -293,7 +296,7 @@ class _Run:
                 estimate, used = self.watch.step(observation)
             if observation.index < plan.begin:
                 continue
-            if output and isinstance(plan.tracker, RegionTracker):
+            if self.masks is not None:
                 self.masks.put(observation.index, _kept(observation, used, estimate))
             finished = time.perf_counter()
             total = laps["wait"] + writing + finished - started

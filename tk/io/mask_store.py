@@ -78,11 +78,6 @@ class MaskStore:
             self._shape, self._places[index], end = tuple(shape), (begin, size), begin + size
         file.truncate(end)
 
-    def remove(self) -> None:
-        """The masks are needed no longer: delete the file that they are in."""
-        if self._path is not None:
-            self._path.unlink(missing_ok=True)
-
     def __contains__(self, index: int) -> bool:
         return index in self._places
 
