@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from tk.io.capture import open_capture
 from tk.io.result import read_joints
-from tk.kernels.silhouette import SearchSettings
+from tk.kernels.line_search import SearchSettings
 from tk.model.camera import Rig
 from tk.model.evidence import Evidence, RayGrid
 from tk.model.skeleton import JOINTS, join_pose

@@ -13,8 +13,8 @@ from tests.model.ring import ring_of_cameras
 from tk.errors import ConfigError
 from tk.kernels import silhouette
 from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A, SIDE_B, curve_of, enter, point_on
+from tk.kernels.line_search import COLOR_BINS, SearchSettings, search_colors
 from tk.kernels.runtime import ensure_runtime, ti
-from tk.kernels.silhouette import COLOR_BINS, SearchSettings, _search_colors
 from tk.model import gait
 from tk.model.anthropometry import BodyDimensions
 from tk.model.body_fit import pose_rows
@@ -338,7 +338,7 @@ def _border(
 ):
     x, n = ti.Vector([start[0], start[1]]), ti.Vector([normal[0], normal[1]])
     for _ in range(1):
-        certainty, place = _search_colors(
+        certainty, place = search_colors(
             image, likelihood, 0, image.shape[2], image.shape[1], x, n, window, scale, 0, 1
         )
         found[0], found[1] = certainty, place

@@ -8,7 +8,8 @@ import pytest
 from tests.model.ring import ring_of_cameras
 from tk.errors import ConfigError
 from tk.kernels.cones import CONE
-from tk.kernels.silhouette import Edgels, SearchSettings
+from tk.kernels.line_search import SearchSettings
+from tk.kernels.silhouette import Edgels
 from tk.model import body_fit
 from tk.model.anthropometry import BodyDimensions
 from tk.model.body_fit import (

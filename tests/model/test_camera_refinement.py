@@ -12,7 +12,7 @@ from tests.model.test_body_fit import edgels_all_over, walk
 from tk.errors import ConfigError
 from tk.io.mask_store import MaskStore
 from tk.kernels.cones import CONE
-from tk.kernels.silhouette import SearchSettings
+from tk.kernels.line_search import SearchSettings
 from tk.model.anthropometry import BodyDimensions
 from tk.model.body_family import Family, shapes_of
 from tk.model.bundle import camera_rows, gather

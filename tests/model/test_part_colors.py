@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tk.kernels.silhouette import COLOR_BINS
+from tk.kernels.line_search import COLOR_BINS
 from tk.model.anthropometry import BodyDimensions
 from tk.model.cone_body import PRESETS, build_cone_body
 from tk.model.part_colors import GROUPS, PartColors, color_bins

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tk.kernels.kinematics import JOINT_NUMBERS, forward_tree, pack_tree
-from tk.kernels.objective import PIECE_SHAPE
+from tk.kernels.objective_pairs import PIECE_SHAPE
 from tk.kernels.occlusion import (
     PLACED_CAMERA,
     PLACED_NUMBERS,

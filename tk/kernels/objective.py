@@ -32,19 +32,30 @@ from tk.kernels.kinematics import (
 )
 from tk.kernels.launch import Launcher
 from tk.kernels.linearisation import Linearisation
-from tk.kernels.nearest import SurfaceIndex, nearest_voxel
+from tk.kernels.nearest import SurfaceIndex
+from tk.kernels.objective_pairs import (
+    COVERAGE_NU,
+    COVERAGE_REACH,
+    COVERAGE_SCALE,
+    NU,
+    PATCH_BITS,
+    PIECE_DOF,
+    PIECE_WEIGHT,
+    SAMPLE_DOF,
+    SAMPLE_WEIGHT,
+    SCALE,
+    add_residual,
+    nearest_piece,
+    pair_sample,
+    place_pieces,
+)
 from tk.kernels.projection import CAMERA_NUMBERS
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
-from tk.kernels.superellipsoid import implicit, project
 from tk.kernels.wrench import (
-    MOTION,
     SCRATCH_NUMBERS,
-    WRENCH,
     add_inertia,
-    add_wrench,
     collect_inertias,
     collect_wrenches,
-    load_wrench,
     start_inertias,
     start_wrenches,
 )
@@ -54,199 +65,6 @@ from tk.kernels.wrench import (
 # many are absent, counts a quarter.
 POINTS_PER_TASK = 52
 ENTRIES_PER_POINT = 4
-
-# Columns of the packed arrays. Every array that a launch is handed costs about 6 µs, so the body comes in few.
-# Of a sample, after its position; the weight is 1/σ²:
-SAMPLE_DOF, SAMPLE_PATCH, SAMPLE_WEIGHT, SAMPLE_BARRED = range(3, 7)
-# Of a piece, after the 3×4 frame: a1 a2 a3 ε1 ε2 z_lower z_upper, and so on. Its colour patches, a bit mask of 63, are
-# in three numbers of 21 bits, which a float32 holds.
-PIECE_SHAPE, PIECE_DOF, PIECE_WEIGHT, PIECE_PART, PIECE_PATCHES, PIECE_NUMBERS = 12, 19, 20, 21, 22, 25
-PATCH_BITS = 21
-# Of the scratch's rows after the joints, one a piece: after the 3×4 frame in the world the bounding sphere.
-SPHERE, SPHERE_RADIUS = 12, 15
-# Deep inside: G (1 on the surface, growing linearly from the centre) below this.
-BURIED = 0.8
-# Places in the packed settings; what grid (tk.kernels.nearest) follows.
-NU, REACH, COVERAGE_NU, COVERAGE_REACH, SCALE, COVERAGE_SCALE, GRID = range(7)
-
-
-@ti.func
-def _place_pieces(
-    scratch: ti.template(),  # (C, D + P, 39), joints placed
-    c: int,
-    D: int,
-    pieces: ti.template(),  # (P, 25)
-):
-    """Fill the scratch's rows of the pieces: frames in the world, bounding spheres."""
-    for i in range(pieces.shape[0]):
-        k = ti.cast(pieces[i, PIECE_DOF], ti.i32)
-        R, t = load_rotation(scratch, c, k), load_translation(scratch, c, k)
-        Rp = ti.Matrix([[pieces[i, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
-        tp = ti.Vector([pieces[i, 4 * a + 3] for a in ti.static(range(3))])
-        R_world, t_world = R @ Rp, R @ tp + t
-        low, high = pieces[i, PIECE_SHAPE + 5], pieces[i, PIECE_SHAPE + 6]
-        half = 0.5 * (high - low)
-        for a in ti.static(range(3)):
-            for b in ti.static(range(3)):
-                scratch[c, D + i, 4 * a + b] = R_world[a, b]
-            scratch[c, D + i, 4 * a + 3] = t_world[a]
-            scratch[c, D + i, SPHERE + a] = t_world[a] + 0.5 * (low + high) * R_world[a, 2]
-        a1, a2 = pieces[i, PIECE_SHAPE], pieces[i, PIECE_SHAPE + 1]
-        scratch[c, D + i, SPHERE_RADIUS] = ti.sqrt(a1 * a1 + a2 * a2 + half * half)
-
-
-@ti.func
-def _sphere(scratch: ti.template(), c: int, row: int):
-    return ti.Vector([scratch[c, row, SPHERE + a] for a in ti.static(range(3))])
-
-
-@ti.func
-def _has_patch(pieces: ti.template(), i: int, fits: ti.i64):
-    """Whether piece i has any of the patches of a bit mask."""
-    common = 0
-    for part in ti.static(range(3)):
-        patches = ti.cast(pieces[i, PIECE_PATCHES + part], ti.i32)
-        common |= patches & ti.cast((fits >> (PATCH_BITS * part)) & ((1 << PATCH_BITS) - 1), ti.i32)
-    return common != 0
-
-
-@ti.func
-def _nearest_piece(
-    scratch: ti.template(),  # (C, D + P, 39), joints and pieces placed
-    c: int,
-    D: int,
-    pieces: ti.template(),  # (P, 25)
-    fits: ti.i64,  # the voxel's
-    y,  # voxel, world
-    reach,
-):
-    """(index or -1, x, y, z of the projection in the zero configuration) of the piece nearest to a voxel."""
-    best = -1
-    best_d = reach
-    best_on = y * 0.0
-    # the piece that the voxel is deepest in or least outside of, by its bounding sphere, bounds the others' distances
-    likely = 0
-    least = y[0] * 0.0 + 1e30
-    for i in range(pieces.shape[0]):
-        radius = scratch[c, D + i, SPHERE_RADIUS]
-        power = (y - _sphere(scratch, c, D + i)).norm_sqr() - radius * radius
-        if power < least:
-            least, likely = power, i
-    for turn in range(pieces.shape[0] + 1):
-        i = ti.select(turn == 0, likely, turn - 1)
-        within = best_d + scratch[c, D + i, SPHERE_RADIUS]
-        if turn > 0 and (i == likely or (y - _sphere(scratch, c, D + i)).norm_sqr() >= within * within):
-            continue
-        R = load_rotation(scratch, c, D + i)
-        q = R.transpose() @ (y - load_translation(scratch, c, D + i))
-        radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
-        z_lower, z_upper = pieces[i, PIECE_SHAPE + 5], pieces[i, PIECE_SHAPE + 6]
-        # a box about the piece: what lies further outside it than the best so far cannot win
-        over = ti.Vector(
-            [
-                ti.max(ti.abs(q[0]) - radii[0], 0.0),
-                ti.max(ti.abs(q[1]) - radii[1], 0.0),
-                ti.max(ti.max(z_lower - q[2], q[2] - z_upper), 0.0),
-            ]
-        )
-        if over.norm_sqr() < best_d * best_d and _has_patch(pieces, i, fits):
-            on = project(q, radii, pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4], z_lower, z_upper)
-            d = (q - on).norm()
-            # of two pieces as near as each other the first, in whatever order they are visited
-            if d < best_d or (d == best_d and i < best):
-                best = i
-                best_d = d
-                best_on = on
-    best_x = best_on
-    if best >= 0:
-        Rp = ti.Matrix([[pieces[best, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
-        best_x = Rp @ best_on + ti.Vector([pieces[best, 4 * a + 3] for a in ti.static(range(3))])
-    return best, best_x
-
-
-@ti.func
-def _add_residual(
-    scratch: ti.template(),
-    sums: ti.template(),
-    c: int,
-    k: int,  # last degree of freedom above x
-    x,
-    r,
-    inv_sigma2,
-    nu,
-    scale,
-):
-    """Add scale·ρ(e) of one pair to row c of the sums, its gradient and Hessian-vector product to the wrenches."""
-    decay = ti.exp(-0.5 * r.norm_sqr() * inv_sigma2 / nu)
-    sums[c, 0] = sums[c, 0] + scale * (1.0 - decay)
-    weight = scale * decay / nu * inv_sigma2
-    Jv = load_wrench(scratch, c, k, MOTION).cross(x) + load_wrench(scratch, c, k, MOTION + 3)
-    add_wrench(scratch, c, k, WRENCH, weight * x.cross(r), weight * r)
-    add_wrench(scratch, c, k, WRENCH + 6, weight * x.cross(Jv), weight * Jv)
-
-
-@ti.func
-def _is_buried(
-    scratch: ti.template(),  # (C, D + P, 39), joints and pieces placed
-    c: int,
-    D: int,
-    pieces: ti.template(),  # (P, 25)
-    barred: int,
-    x,
-):
-    """Whether a world point lies deep inside a piece of one of the parts of the bit mask ``barred``."""
-    buried = False
-    i = 0
-    while not buried and i < pieces.shape[0]:
-        radius = scratch[c, D + i, SPHERE_RADIUS]
-        if (
-            barred >> ti.cast(pieces[i, PIECE_PART], ti.i32) & 1 == 1
-            and (x - _sphere(scratch, c, D + i)).norm_sqr() < radius * radius
-        ):
-            q = load_rotation(scratch, c, D + i).transpose() @ (x - load_translation(scratch, c, D + i))
-            radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
-            # G is at least the greatest of |q| / a
-            if (
-                q[2] > pieces[i, PIECE_SHAPE + 5]
-                and q[2] < pieces[i, PIECE_SHAPE + 6]
-                and ti.abs(q / radii).max() < BURIED
-            ):
-                buried = implicit(q, radii, pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4])[0] < BURIED
-        i += 1
-    return buried
-
-
-@ti.func
-def _pair_sample(
-    samples: ti.template(),
-    pieces: ti.template(),
-    voxels: ti.template(),
-    fits: ti.template(),
-    starts: ti.template(),
-    settings: ti.template(),
-    scratch: ti.template(),
-    c: int,
-    D: int,
-    n: int,
-):
-    """The voxel of surface sample n, or -1."""
-    k = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
-    R = load_rotation(scratch, c, k)
-    x = R @ load_vector3(samples, n) + load_translation(scratch, c, k)
-    v = -1
-    barred = ti.cast(samples[n, SAMPLE_BARRED], ti.i32)
-    if barred == 0 or not _is_buried(scratch, c, D, pieces, barred, x):
-        v = nearest_voxel(
-            voxels,
-            fits,
-            starts,
-            settings,
-            GRID,
-            x,
-            ti.cast(samples[n, SAMPLE_PATCH], ti.i32),
-            ti.cast(settings[REACH], ti.f32),
-        )
-    return v
 
 
 @functools.cache
@@ -285,7 +103,7 @@ def _objective_kernel(real):
             forward_tree(tree, state, b, c, scratch)
             start_wrenches(tree, state, state.shape[0] // 2 + b, c, scratch)
             if hold == 0:
-                _place_pieces(scratch, c, D, pieces)
+                place_pieces(scratch, c, D, pieces)
             for e in range(E * part // tasks, E * (part + 1) // tasks):
                 add_alignment(scratch, cameras, entries, sums, b, c, e)
             for m in range((M + Q) * part // tasks, (M + Q) * (part + 1) // tasks):
@@ -296,7 +114,7 @@ def _objective_kernel(real):
                 if m < M:
                     n = chosen[b, m]
                     if hold == 0:
-                        v = _pair_sample(samples, pieces, voxels, fits, starts, settings, scratch, c, D, n)
+                        v = pair_sample(samples, pieces, voxels, fits, starts, settings, scratch, c, D, n)
                         assigned[b, m] = v
                     else:
                         v = assigned[b, m]
@@ -310,7 +128,7 @@ def _objective_kernel(real):
                     i = -1
                     if hold == 0:
                         y = ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
-                        i, x0 = _nearest_piece(scratch, c, D, pieces, fits[v], y, settings[COVERAGE_REACH])
+                        i, x0 = nearest_piece(scratch, c, D, pieces, fits[v], y, settings[COVERAGE_REACH])
                         covering[b, q, 0] = ti.cast(i, real)
                         for a in ti.static(range(3)):
                             covering[b, q, 1 + a] = x0[a]
@@ -327,7 +145,7 @@ def _objective_kernel(real):
                 else:
                     y = ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
                     x = load_rotation(scratch, c, k) @ x0 + load_translation(scratch, c, k)
-                    _add_residual(scratch, sums, c, k, x, x - y, inv_sigma2, nu, scale)
+                    add_residual(scratch, sums, c, k, x, x - y, inv_sigma2, nu, scale)
             collect_wrenches(tree, c, scratch, sums)
 
     return objective

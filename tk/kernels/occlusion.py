@@ -14,7 +14,7 @@ not hide each other, or every seam of the model would flicker.
 """
 
 from tk.kernels.kinematics import load_rotation, load_translation
-from tk.kernels.objective import PIECE_DOF, PIECE_SHAPE
+from tk.kernels.objective_pairs import PIECE_DOF, PIECE_SHAPE
 from tk.kernels.runtime import ti
 from tk.kernels.superellipsoid import implicit, inside_outside, is_quadric, power
 

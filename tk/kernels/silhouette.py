@@ -8,13 +8,11 @@ second row, 0 leaves it out.
 """
 
 import functools
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import ConfigError
 from tk.kernels.cone_arrays import NEAREST_M, ConeArrays, keep, place_part, shape_of
 from tk.kernels.cones import (
     SIDE_B,
@@ -27,6 +25,7 @@ from tk.kernels.cones import (
 )
 from tk.kernels.kinematics import forward, load_rotation, load_translation
 from tk.kernels.launch import Launcher
+from tk.kernels.line_search import COLOR_BINS, Regions, SearchSettings, in_picture, search_colors, search_mask
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.wrench import INERTIA_NUMBERS
@@ -40,76 +39,6 @@ HIDING_SHRINK = 0.95
 _SUMS = 3 + 6 + INERTIA_NUMBERS
 # Columns of an exported sample: see Edgels.
 _EXPORT = 12
-# Colours are told apart by 16 levels of each channel.
-COLOR_BINS = 4096
-# A pixel says no more than this about which of two parts it shows: models are never that sure.
-_MOST_LOG_RATIO = 3.0
-# Neighbouring pixels of a line are alike (texture, blur, coding): so many of them count as one.
-_ALIKE_PIXELS = 3.0
-
-
-@dataclass(frozen=True)
-class SearchSettings:
-    """How the silhouette is searched.
-
-    Attributes:
-        window_px: how far along the normal, in pixels of the scale (the paper: typically 8).
-        spacing_px: distance between samples, in pixels of the scale (the paper: typically every pixel; three are as
-            good to a millimetre and take a third of the time).
-        most_samples: of a curve; longer ones are sampled more coarsely, with more weight each.
-        ambiguous_px: an edgel nearer than this, in pixels of the scale, to a model edge of another limb is shared with
-            it (4.4); 0 gives every edgel its full weight. The paper does not say how near; 8, its window, suits.
-        tangential: weight of the row along the contour (1: the paper's dx and dy; 0: the distance along the normal).
-        robust_px: where the Geman-McClure weights (1 + (d/s)²)⁻² have fallen to a quarter, in pixels of the scale; 0:
-            the paper's least squares, which shadows at the feet pull at. 8, the window, was chosen with the treadmill
-            and dance captures in view.
-        lost_px: what a sample costs, as a distance, that finds no edge. Only poses are compared by it.
-        interior: whether contours before another part are searched, too, as in the paper. No silhouette edge is
-            expected there, and most of what they find belongs to others: sharing ambiguous edgels (4.4) mends part of
-            that, leaving the contours out mends more, and there is little left to share.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
-
-    window_px: float = 8.0
-    spacing_px: float = 3.0
-    most_samples: int = 64
-    ambiguous_px: float = 0.0
-    tangential: float = 0.3
-    robust_px: float = 8.0
-    lost_px: float = 16.0
-    interior: bool = False
-
-    def __post_init__(self) -> None:
-        for name, value, valid, expected in (
-            ("window_px", self.window_px, 1 <= self.window_px <= 64, "in [1, 64]"),
-            ("spacing_px", self.spacing_px, 0.25 <= self.spacing_px <= 32, "in [0.25, 32]"),
-            ("most_samples", self.most_samples, 2 <= self.most_samples <= 1024, "in [2, 1024]"),
-            ("ambiguous_px", self.ambiguous_px, 0 <= self.ambiguous_px <= 64, "in [0, 64]"),
-            ("tangential", self.tangential, 0 <= self.tangential <= 1, "in [0, 1]"),
-            ("robust_px", self.robust_px, 0 <= self.robust_px <= 1000, "in [0, 1000]"),
-            ("lost_px", self.lost_px, 0 <= self.lost_px <= 1000, "in [0, 1000]"),
-        ):
-            if not valid:
-                raise ConfigError(f"silhouette search: {name} = {value} must lie {expected}")
-
-
-class Regions(NamedTuple):
-    """What the colours on either side of a contour tell where it lies before another part (region-based tracking,
-    Stoiber et al. 2022, SRT3D).
-
-    Attributes:
-        image: (V, H, W, 3) uint8 BGR, the full picture.
-        log_likelihood: (G, :data:`COLOR_BINS`) float32 log p(colour | group), see :func:`color_bin`.
-        group: (P,) int32 the colour group of each part.
-        weight: of a contour whose place the colours tell exactly, beside that of a silhouette's edge.
-    """
-
-    image: NDArray[np.uint8]
-    log_likelihood: NDArray[np.float32]
-    group: NDArray[np.int32]
-    weight: float
 
 
 class NormalEquations(NamedTuple):
@@ -148,84 +77,6 @@ class Edgels(NamedTuple):
     weight: NDArray[np.float64]
     row: NDArray[np.float64]
     pixel: NDArray[np.float64]
-
-
-@ti.func
-def _bilinear(mask: ti.template(), v: int, width: int, height: int, x):
-    """Mask value, 0 to 255, at a place inside the picture."""
-    i = ti.min(ti.max(ti.cast(ti.floor(x[0]), ti.i32), 0), width - 2)
-    j = ti.min(ti.max(ti.cast(ti.floor(x[1]), ti.i32), 0), height - 2)
-    s, t = x[0] - i, x[1] - j
-    top = (1.0 - s) * mask[v, j, i] + s * mask[v, j, i + 1]
-    low = (1.0 - s) * mask[v, j + 1, i] + s * mask[v, j + 1, i + 1]
-    return (1.0 - t) * top + t * low
-
-
-@ti.func
-def _in_picture(width: int, height: int, x):
-    return x[0] >= 0.0 and x[1] >= 0.0 and x[0] <= width - 1.0 and x[1] <= height - 1.0
-
-
-@ti.func
-def _search(mask: ti.template(), v: int, width: int, height: int, x, n, window):
-    """(found, signed distance) of the transition along ±n: outwards from foreground, inwards from background."""
-    inside = _bilinear(mask, v, width, height, x) >= 127.5
-    way = 1.0 + 0.0 * window
-    if not inside:
-        way = -way
-    found = 0
-    distance = 0.0 * window
-    before = _bilinear(mask, v, width, height, x)
-    step = 1
-    while step <= window and found == 0:
-        place = x + way * step * n
-        if not _in_picture(width, height, place):
-            step = 1 << 20
-        else:
-            value = _bilinear(mask, v, width, height, place)
-            if (value >= 127.5) != inside:
-                found = 1
-                distance = way * (step - 1.0 + (before - 127.5) / (before - value))
-            before = value
-            step += 1
-    return found, distance
-
-
-@ti.func
-def color_bin(image: ti.template(), v: int, j: int, i: int):
-    """The bin of a pixel's colour: its blue, green and red in 16 levels each."""
-    b, g, r = ti.cast(image[v, j, i, 0], ti.i32), ti.cast(image[v, j, i, 1], ti.i32), ti.cast(image[v, j, i, 2], ti.i32)
-    return ((b >> 4) << 8) | ((g >> 4) << 4) | (r >> 4)
-
-
-@ti.func
-def _search_colors(
-    image: ti.template(), likelihood: ti.template(), v: int, width: int, height: int, x, n, window, scale, front, back
-):
-    """(certainty in [0, 1], mean place) of the border between two colour groups on the line x + s n.
-
-    The border lies behind step d with probability ∝ exp of the summed log ratios of the pixels before it (Stoiber et
-    al. 2022, eqs. 3-8 with a hard step); its mean is the Newton step, its variance beside a uniform one's the weight.
-    """
-    log_sum = 0.0 * window
-    total, first, second = 1.0 + 0.0 * window, -(window + 0.5), (window + 0.5) ** 2
-    reach = ti.cast(window, ti.i32)
-    for k in range(-reach, reach + 1):
-        place = x + (k * scale) * n
-        i, j = ti.cast(ti.round(place[0]), ti.i32), ti.cast(ti.round(place[1]), ti.i32)
-        if i >= 0 and j >= 0 and i < width and j < height:
-            bin = color_bin(image, v, j, i)
-            ratio = likelihood[front, bin] - likelihood[back, bin]
-            log_sum += ti.min(ti.max(ratio, -_MOST_LOG_RATIO), _MOST_LOG_RATIO) / _ALIKE_PIXELS
-        p = ti.exp(log_sum)
-        d = k + 0.5
-        total += p
-        first += p * d
-        second += p * d * d
-    mean = first / total
-    variance = second / total - mean * mean
-    certainty = ti.max(1.0 - 3.0 * variance / ((window + 1.0) * (window + 1.0)), 0.0)
-    return certainty * certainty, mean
 
 
 @ti.func
@@ -375,7 +226,7 @@ def _equations_kernel(real):
                     norm = along.norm()
                     n = ti.Vector([along[1], -along[0]]) * (sign / ti.max(norm, 1e-9))
                     at = (pixel + 0.5) / scale - 0.5
-                    use = norm > 1e-6 and _in_picture(width, height, at)
+                    use = norm > 1e-6 and in_picture(width, height, at)
                     behind, depth = -1, 1e9 + 0.0 * scale
                     if use:
                         ray = x - eye
@@ -402,7 +253,7 @@ def _equations_kernel(real):
                     if use and behind >= 0 and interior == 0:
                         use = False
                         if colors > 0.0 and part_limb[behind] != part_limb[p] and group[behind] != group[p]:
-                            certainty, place = _search_colors(
+                            certainty, place = search_colors(
                                 image, likelihood, v, image.shape[2], image.shape[1], pixel, n, window, scale,
                                 group[p], group[behind],
                             )  # fmt: skip
@@ -410,7 +261,7 @@ def _equations_kernel(real):
                             d = place * scale
                             found = 2
                     elif use:
-                        found, d = _search(mask, v, width, height, at, n, window)
+                        found, d = search_mask(mask, v, width, height, at, n, window)
                         d *= scale
                         if found == 0:
                             cost += share * lost * lost

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from tk.errors import ConfigError
 from tk.kernels.cones import CONE
-from tk.kernels.silhouette import Edgels, SearchSettings
+from tk.kernels.line_search import SearchSettings
+from tk.kernels.silhouette import Edgels
 from tk.model.anthropometry import BodyDimensions
 from tk.model.cone_body import SHAPE_NUMBERS, ConeBody, build_cone_body, group_of
 from tk.model.silhouettes import Pyramid, Views

@@ -17,8 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.line_search import SearchSettings
 from tk.kernels.projection import project_points
-from tk.kernels.silhouette import Edgels, SearchSettings
+from tk.kernels.silhouette import Edgels
 from tk.model.body_fit import pose_rows
 from tk.model.camera import Camera, Rig
 from tk.model.cone_body import ConeBody

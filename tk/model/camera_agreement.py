@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.line_search import SearchSettings
 from tk.kernels.projection import project_points
-from tk.kernels.silhouette import SearchSettings
 from tk.model.body_family import Family
 from tk.model.bundle import Moment, Seen, equations, look
 from tk.model.camera import Rig

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
-from tk.kernels.silhouette import SearchSettings
+from tk.kernels.line_search import SearchSettings
 from tk.model.body_family import Family
 from tk.model.bundle import KINDS, Moment, equations, look
 from tk.model.camera import Camera, Rig

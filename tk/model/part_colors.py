@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from tk.kernels.silhouette import COLOR_BINS, Regions
+from tk.kernels.line_search import COLOR_BINS, Regions
 from tk.model.cone_body import ConeBody
 
 Float = NDArray[np.float64]

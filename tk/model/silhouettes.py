@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from tk.errors import ConfigError
 from tk.kernels import silhouette as kernels
 from tk.kernels.cone_arrays import ConeArrays
+from tk.kernels.line_search import Regions, SearchSettings
 from tk.kernels.projection import pack_camera
 from tk.kernels.raycast import cast
-from tk.kernels.silhouette import Edgels, NormalEquations, Regions, SearchSettings
+from tk.kernels.silhouette import Edgels, NormalEquations
 from tk.model.camera import Rig
 from tk.model.cone_body import ConeBody
 from tk.model.regions import clean_by_area

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ConfigError
 from tk.io.init_pose import InitPose
+from tk.kernels.line_search import SearchSettings
 from tk.kernels.raycast import Cast
-from tk.kernels.silhouette import SearchSettings
 from tk.model import gait
 from tk.model.anthropometry import BodyDimensions
 from tk.model.body_fit import BodyFitConfig, fit_body
