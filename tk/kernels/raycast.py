@@ -19,14 +19,12 @@ from tk.kernels.cones import enclosing_radius, enter, interior_point
 from tk.kernels.kinematics import forward, load_rotation, load_translation
 from tk.kernels.launch import Launcher
 from tk.kernels.projection import camera_center, project
-from tk.kernels.runtime import ensure_runtime, spread_of, ti
+from tk.kernels.runtime import ensure_runtime, on_one_thread, spread_of, ti
 
 # How much larger than its first-order size a part's disc is taken when rays are cast.
 DISC_MARGIN = 1.1
 # Depth of a ray that meets nothing.
 FAR = 1e9
-# Most parts that one row of rays can meet.
-MOST_PARTS = 64
 
 
 class Cast(NamedTuple):
@@ -42,7 +40,7 @@ class Cast(NamedTuple):
 
 
 @functools.cache
-def _cast_kernel(real):
+def _cast_kernel(real, alone):
     @ti.kernel
     def cast_rows(
         axis: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
@@ -77,6 +75,7 @@ def _cast_kernel(real):
     ):
         B, V, H, W = pose.shape[0], rays.shape[0], rays.shape[1], rays.shape[2]
         K = drawn.shape[0]
+        ti.loop_config(serialize=alone)
         for turn in range(spread_poses * B):
             if turn % spread_poses != 0:
                 continue
@@ -107,6 +106,7 @@ def _cast_kernel(real):
                             out += ti.cast(ti.max(cost[v, j, i, group[p] + 1] - cost[v, j, i, 0], 0.0), real)
                             seen += 1.0
             outside[b] = out / seen
+        ti.loop_config(serialize=alone)
         for turn in range(spread * (B * V)):
             if turn % spread != 0:
                 continue
@@ -208,13 +208,14 @@ def cast(
     label, depth = np.empty(shape, np.uint8), np.empty(shape, np.float32)
     if export:
         label[:], depth[:] = before.label, before.depth
-    _cast_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
+    alone = on_one_thread(B)
+    _cast_kernel(ti.f64 if dtype == np.float64 else ti.f32, alone)(
         *body[:8],
         group,
         np.ascontiguousarray(cameras, dtype),
         drawn,
-        spread_of(B * V),
-        spread_of(B),
+        1 if alone else spread_of(B * V),
+        1 if alone else spread_of(B),
         step,
         rays,
         cost,

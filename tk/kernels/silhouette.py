@@ -27,7 +27,7 @@ from tk.kernels.kinematics import forward, load_rotation, load_translation
 from tk.kernels.launch import Launcher
 from tk.kernels.line_search import COLOR_BINS, Regions, SearchSettings, in_picture, search_colors, search_mask
 from tk.kernels.projection import camera_center, project
-from tk.kernels.runtime import ensure_runtime, spread_of, ti
+from tk.kernels.runtime import ensure_runtime, on_one_thread, spread_of, ti
 from tk.kernels.wrench import INERTIA_NUMBERS
 
 # Chords that stand for a curve when its length is measured and when edgels are compared with it.
@@ -95,8 +95,29 @@ def _twist_about(twists: ti.template(), b: int, k: int, origin):
     return ti.Vector([w[0], w[1], w[2], v[0], v[1], v[2]])
 
 
+@ti.func
+def _may_hide(ball: ti.template(), b: int, p: int, P: int, eye):
+    """Bits of the parts whose spheres meet that of part p in the picture: most are far from it."""
+    bits = ti.i64(0)
+    own = ti.Vector([ball[b, p, a] for a in ti.static(range(3))]) - eye
+    own_square = own.norm_sqr()
+    own_sine = ball[b, p, 3] / own_square
+    for o in range(P):
+        to = ti.Vector([ball[b, o, a] for a in ti.static(range(3))]) - eye
+        square = to.norm_sqr()
+        sine = ball[b, o, 3] / square
+        # the angle between them is at most the sum of their radii's
+        apart = 1.0 + 0.0 * square
+        if own_sine < 0.5 and sine < 0.5:
+            apart = ti.sqrt((1.0 - sine) * (1.0 - own_sine)) - ti.sqrt(sine * own_sine)
+            apart = own.dot(to) - apart * ti.sqrt(own_square * square)
+        if o != p and apart >= 0.0:
+            bits |= ti.i64(1) << o
+    return bits
+
+
 @functools.cache
-def _equations_kernel(real):
+def _equations_kernel(real, alone):
     @ti.kernel
     def silhouette_equations(
         # the body
@@ -141,6 +162,7 @@ def _equations_kernel(real):
         B, V, Q = pose.shape[0], camera.shape[0], curve_part.shape[0]
         P, D = part_dof.shape[0], axis.shape[0]
 
+        ti.loop_config(serialize=alone)
         for turn in range(spread_poses * B):
             if turn % spread_poses != 0:
                 continue
@@ -154,6 +176,7 @@ def _equations_kernel(real):
                     ball[b, p, a] = middle[a]
                 ball[b, p, 3] = enclosing_radius(part_kind[p], shape_of(part_shape, p)) ** 2
 
+        ti.loop_config(serialize=alone)
         for turn in range(spread * (B * V * Q)):
             if turn % spread != 0:
                 continue
@@ -192,6 +215,7 @@ def _equations_kernel(real):
             facts[c, 0] = visible
             facts[c, 1], facts[c, 2], facts[c, 3], facts[c, 4] = params[0], params[1], length, sign
 
+        ti.loop_config(serialize=alone)
         for turn in range(spread * (B * V * Q)):
             if turn % spread != 0:
                 continue
@@ -218,6 +242,7 @@ def _equations_kernel(real):
                 wanted = ti.cast(ti.ceil(length / (spacing * scale)), ti.i32)
                 count = ti.min(ti.max(wanted, 1), most_samples)
                 share = length / count
+                hiding = _may_hide(ball, b, p, P, eye)
                 for i in range(count):
                     x_part, tangent = point_on(kind, shape, center, params, (i + 0.5 + 0.0 * scale) / count)
                     x = R @ x_part + t
@@ -231,12 +256,18 @@ def _equations_kernel(real):
                     if use:
                         ray = x - eye
                         long = ray.norm_sqr()
-                        for o in range(P):
-                            to = ti.Vector([ball[b, o, a] for a in ti.static(range(3))]) - eye
-                            ahead = to.dot(ray)
-                            # most parts are far from most rays
-                            close = ahead > 0.0 and to.norm_sqr() * long - ahead * ahead < ball[b, o, 3] * long
-                            if use and o != p and close:
+                        others = hiding
+                        o = -1
+                        while use and others != 0:
+                            o += 1
+                            this = others & 1
+                            others >>= 1
+                            close = False
+                            if this == 1:
+                                to = ti.Vector([ball[b, o, a] for a in ti.static(range(3))]) - eye
+                                ahead = to.dot(ray)
+                                close = ahead > 0.0 and to.norm_sqr() * long - ahead * ahead < ball[b, o, 3] * long
+                            if close:
                                 Ro = load_rotation(placed, b, o)
                                 co = Ro.transpose() @ (eye - load_translation(placed, b, o))
                                 t_o = enter(
@@ -326,6 +357,7 @@ def _equations_kernel(real):
                 sums[c, 9 + i] = inertia[i]
 
         # in a fixed order: the same sums every time
+        ti.loop_config(serialize=alone)
         for turn in range(spread_poses * B):
             if turn % spread_poses != 0:
                 continue
@@ -387,9 +419,10 @@ def _launch(
     V, Q, P = len(cameras), len(body.curve_part), len(body.part_kind)
     tasks = B * V * Q
     regions = regions or _no_regions(len(body.part_kind))
+    alone = on_one_thread(B)
     total = np.empty((B, 3 + D + D * D))
     samples = np.zeros((tasks, settings.most_samples, _EXPORT) if export else (1, 1, _EXPORT), dtype)
-    _equations_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
+    _equations_kernel(ti.f64 if dtype == np.float64 else ti.f32, alone)(
         *body,
         np.ascontiguousarray(cameras, dtype),
         np.ascontiguousarray(sizes, np.int32),
@@ -398,8 +431,8 @@ def _launch(
         regions.log_likelihood,
         regions.group,
         _numbers(settings, scale, regions.weight, dtype),
-        spread_of(tasks),
-        spread_of(B),
+        1 if alone else spread_of(tasks),
+        1 if alone else spread_of(B),
         settings.most_samples,
         int(settings.interior),
         int(export),
