@@ -135,6 +135,7 @@ def silhouette_stages(
         return median_ms(lambda: views.equations(body.arrays, last, pose, scale, search))
 
     window = settings.search.window_px
+    one_step = replace(settings.solver, scales=1, iterations=1)
     found = [Stage("masks cleaned, scales", median_ms(lambda: views.pyramid(masks[-1], scales, settings.cleaning)), {})]
     found += [
         Stage(f"contours, search, equations: 1/{2**scale} scale, one launch", equations(scale, window), {})
@@ -144,7 +145,7 @@ def silhouette_stages(
         Stage("the same in full scale, search one pixel far", equations(0, 1.0), {}),
         Stage(
             "damped step",
-            median_ms(lambda: gauss_newton.step(here.hessian, here.gradient, pose, *limits, settings.solver)),
+            median_ms(lambda: gauss_newton.minimise(lambda *_: here, pose, *limits, one_step)),
             {},
         ),
         Stage(

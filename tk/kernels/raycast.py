@@ -19,7 +19,7 @@ from tk.kernels.cones import enclosing_radius, enter, interior_point
 from tk.kernels.kinematics import forward, load_rotation, load_translation
 from tk.kernels.launch import Launcher
 from tk.kernels.projection import camera_center, project
-from tk.kernels.runtime import ensure_runtime, on_one_thread, spread_of, ti
+from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
 # How much larger than its first-order size a part's disc is taken when rays are cast.
 DISC_MARGIN = 1.1
@@ -40,7 +40,7 @@ class Cast(NamedTuple):
 
 
 @functools.cache
-def _cast_kernel(real, alone):
+def _cast_kernel(real):
     @ti.kernel
     def cast_rows(
         axis: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
@@ -55,7 +55,6 @@ def _cast_kernel(real, alone):
         camera: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
         drawn: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (K,) the parts to draw
         spread: ti.i32,
-        spread_poses: ti.i32,
         step: ti.i32,  # pixels between rays; the first is at step // 2
         rays: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (V, H, W, 3) world; zero outside the picture
         cost: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (V, H, W, G + 1)
@@ -75,11 +74,11 @@ def _cast_kernel(real, alone):
     ):
         B, V, H, W = pose.shape[0], rays.shape[0], rays.shape[1], rays.shape[2]
         K = drawn.shape[0]
-        ti.loop_config(serialize=alone)
-        for turn in range(spread_poses * B):
-            if turn % spread_poses != 0:
+        # a pose is one thread's, see tk.kernels.silhouette
+        for turn in range(spread * B):
+            if turn % spread != 0:
                 continue
-            b = turn // spread_poses
+            b = turn // spread
             forward(axis, point, prismatic, parent, pose, b, b, frames, twists)
             out, seen = ti.cast(0.0, real), ti.cast(1e-6, real)
             for k in range(drawn.shape[0]):
@@ -106,53 +105,49 @@ def _cast_kernel(real, alone):
                             out += ti.cast(ti.max(cost[v, j, i, group[p] + 1] - cost[v, j, i, 0], 0.0), real)
                             seen += 1.0
             outside[b] = out / seen
-        ti.loop_config(serialize=alone)
-        for turn in range(spread * (B * V)):
-            if turn % spread != 0:
-                continue
-            c = turn // spread
-            b, v = c // V, c % V
             if outside[b] > most_outside:
                 continue
-            eye = camera_center(camera, v)
-            for j in range(H):
-                row = j * step + step // 2
-                # the stretch of this row that the drawn parts' discs cover
-                low, high = W, -1
-                for k in range(K):
-                    across = disc[b, v, drawn[k], 2] - (row - disc[b, v, drawn[k], 1]) ** 2
-                    if across > 0.0:
-                        half = ti.sqrt(across)
-                        middle = disc[b, v, drawn[k], 0] - step // 2
-                        low = ti.min(low, ti.max(ti.cast(ti.ceil((middle - half) / step), ti.i32), 0))
-                        high = ti.max(high, ti.min(ti.cast(ti.floor((middle + half) / step), ti.i32), W - 1))
-                total = ti.cast(0.0, ti.f32)
-                for i in range(low, high + 1):
-                    ray = ti.Vector([ti.cast(rays[v, j, i, a], real) for a in ti.static(range(3))])
-                    nearest = ti.cast(before_depth[v, j, i], real)
-                    met = -1
-                    if ray.norm_sqr() > 0.0:
-                        column = i * step + step // 2
-                        for k in range(K):
-                            p = drawn[k]
-                            dx, dy = column - disc[b, v, p, 0], row - disc[b, v, p, 1]
-                            if dx * dx + dy * dy < disc[b, v, p, 2]:
-                                R = load_rotation(placed, b, p).transpose()
-                                local = R @ (eye - load_translation(placed, b, p))
-                                t = enter(part_kind[p], shape_of(part_shape, p), local, R @ ray, 1.0)
-                                if t > 0.0 and t < nearest:
-                                    nearest = t
-                                    met = p
-                    if met >= 0:
-                        old = ti.cast(before_label[v, j, i], ti.i32)
-                        was = 0
-                        if old > 0:
-                            was = group[old - 1] + 1
-                        total += cost[v, j, i, group[met] + 1] - cost[v, j, i, was]
-                        if export == 1:
-                            label[b, v, j, i] = ti.cast(met + 1, ti.u8)
-                            depth[b, v, j, i] = ti.cast(nearest, ti.f32)
-                change[c, j] = total
+            for v in range(V):
+                c = b * V + v
+                eye = camera_center(camera, v)
+                for j in range(H):
+                    row = j * step + step // 2
+                    # the stretch of this row that the drawn parts' discs cover
+                    low, high = W, -1
+                    for k in range(K):
+                        across = disc[b, v, drawn[k], 2] - (row - disc[b, v, drawn[k], 1]) ** 2
+                        if across > 0.0:
+                            half = ti.sqrt(across)
+                            middle = disc[b, v, drawn[k], 0] - step // 2
+                            low = ti.min(low, ti.max(ti.cast(ti.ceil((middle - half) / step), ti.i32), 0))
+                            high = ti.max(high, ti.min(ti.cast(ti.floor((middle + half) / step), ti.i32), W - 1))
+                    total = ti.cast(0.0, ti.f32)
+                    for i in range(low, high + 1):
+                        ray = ti.Vector([ti.cast(rays[v, j, i, a], real) for a in ti.static(range(3))])
+                        nearest = ti.cast(before_depth[v, j, i], real)
+                        met = -1
+                        if ray.norm_sqr() > 0.0:
+                            column = i * step + step // 2
+                            for k in range(K):
+                                p = drawn[k]
+                                dx, dy = column - disc[b, v, p, 0], row - disc[b, v, p, 1]
+                                if dx * dx + dy * dy < disc[b, v, p, 2]:
+                                    R = load_rotation(placed, b, p).transpose()
+                                    local = R @ (eye - load_translation(placed, b, p))
+                                    t = enter(part_kind[p], shape_of(part_shape, p), local, R @ ray, 1.0)
+                                    if t > 0.0 and t < nearest:
+                                        nearest = t
+                                        met = p
+                        if met >= 0:
+                            old = ti.cast(before_label[v, j, i], ti.i32)
+                            was = 0
+                            if old > 0:
+                                was = group[old - 1] + 1
+                            total += cost[v, j, i, group[met] + 1] - cost[v, j, i, was]
+                            if export == 1:
+                                label[b, v, j, i] = ti.cast(met + 1, ti.u8)
+                                depth[b, v, j, i] = ti.cast(nearest, ti.f32)
+                    change[c, j] = total
 
     return Launcher(cast_rows)
 
@@ -208,14 +203,12 @@ def cast(
     label, depth = np.empty(shape, np.uint8), np.empty(shape, np.float32)
     if export:
         label[:], depth[:] = before.label, before.depth
-    alone = on_one_thread(B)
-    _cast_kernel(ti.f64 if dtype == np.float64 else ti.f32, alone)(
+    _cast_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
         *body[:8],
         group,
         np.ascontiguousarray(cameras, dtype),
         drawn,
-        1 if alone else spread_of(B * V),
-        1 if alone else spread_of(B),
+        spread_of(B),
         step,
         rays,
         cost,

@@ -56,14 +56,10 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # taichi's own deprecation notices are not ours to mend
     import taichi as ti
 
-__all__ = ["ensure_runtime", "on_one_thread", "spread_of", "ti"]
+__all__ = ["ensure_runtime", "spread_of", "ti"]
 
 # Taichi hands a CPU thread at least so many turns of a loop; what loop_config says of block_dim changes nothing.
 _LEAST_TURNS = 512
-
-# Poses of which one thread evaluates a batch sooner than several do: to wake them costs 0.1 ms at each of a kernel's
-# loops, as long as a tenth of a pose's work.
-_FEW_POSES = 4
 
 # Taichi locks its cache of compiled kernels for milliseconds; an older lock was left by a process that was killed
 _STALE_S = 60.0
@@ -108,11 +104,6 @@ def _break_stale_lock() -> None:
         lock = folder / "ticache.lock"
         if time.time() - lock.stat().st_mtime > _STALE_S:
             lock.unlink()
-
-
-def on_one_thread(poses: int) -> bool:
-    """Whether the loops of a kernel that evaluates so many poses had better run on the thread that launches it."""
-    return poses <= _FEW_POSES
 
 
 def spread_of(tasks: int) -> int:

@@ -27,16 +27,13 @@ from tk.kernels.kinematics import forward, load_rotation, load_translation
 from tk.kernels.launch import Launcher
 from tk.kernels.line_search import COLOR_BINS, Regions, SearchSettings, in_picture, search_colors, search_mask
 from tk.kernels.projection import camera_center, project
-from tk.kernels.runtime import ensure_runtime, on_one_thread, spread_of, ti
+from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.wrench import INERTIA_NUMBERS
 
 # Chords that stand for a curve when its length is measured and when edgels are compared with it.
 CHORDS = 12
 # A sample is hidden by another part if it lies this far inside its cross-section: neighbours at a joint touch.
 HIDING_SHRINK = 0.95
-# Columns of a task's sums: cost, weight of the edgels found, weight of all samples; the wrench of the pulls and the
-# inertia of the edgels, lower triangle, both about an origin in the body (tk.kernels.wrench).
-_SUMS = 3 + 6 + INERTIA_NUMBERS
 # Columns of an exported sample: see Edgels.
 _EXPORT = 12
 
@@ -117,7 +114,7 @@ def _may_hide(ball: ti.template(), b: int, p: int, P: int, eye):
 
 
 @functools.cache
-def _equations_kernel(real, alone):
+def _equations_kernel(real):
     @ti.kernel
     def silhouette_equations(
         # the body
@@ -142,7 +139,6 @@ def _equations_kernel(real, alone):
         # settings; scale: pixels of the full picture in one of this scale
         numbers: ti.types.ndarray(dtype=real, ndim=1),  # (8,) in _launch's order
         spread: ti.i32,
-        spread_poses: ti.i32,
         most_samples: ti.i32,
         interior: ti.i32,
         export: ti.i32,
@@ -154,19 +150,19 @@ def _equations_kernel(real, alone):
         ball: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 4) scratch, a sphere about each part, world
         lines: ti.types.ndarray(dtype=real, ndim=3),  # (B V Q, CHORDS + 1, 2) scratch, pixels of the full picture
         facts: ti.types.ndarray(dtype=real, ndim=2),  # (B V Q, 5) scratch: visible, q0, q1, length, outward sign
-        collected: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 6 + 21) scratch
-        sums: ti.types.ndarray(dtype=real, ndim=2),  # (B V Q, _SUMS) scratch
+        # scratch (B, D, 6 + 21): wrench of the pulls and inertia of the edgels about the root, see tk.kernels.wrench
+        collected: ti.types.ndarray(dtype=real, ndim=3),
         samples: ti.types.ndarray(dtype=real, ndim=3),  # (V Q, most_samples, _EXPORT) out, if export
         total: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (B, 3 + D + D D) out
     ):
         B, V, Q = pose.shape[0], camera.shape[0], curve_part.shape[0]
         P, D = part_dof.shape[0], axis.shape[0]
 
-        ti.loop_config(serialize=alone)
-        for turn in range(spread_poses * B):
-            if turn % spread_poses != 0:
+        # a pose is one thread's: to wake the threads for a loop costs as much as a tenth of its work
+        for turn in range(spread * B):
+            if turn % spread != 0:
                 continue
-            b = turn // spread_poses
+            b = turn // spread
             forward(axis, point, prismatic, parent, pose, b, b, frames, twists)
             for p in range(P):
                 R, t = place_part(frames, part_dof, part_frame, b, p)
@@ -175,206 +171,185 @@ def _equations_kernel(real, alone):
                 for a in ti.static(range(3)):
                     ball[b, p, a] = middle[a]
                 ball[b, p, 3] = enclosing_radius(part_kind[p], shape_of(part_shape, p)) ** 2
-
-        ti.loop_config(serialize=alone)
-        for turn in range(spread * (B * V * Q)):
-            if turn % spread != 0:
-                continue
-            c = turn // spread
-            b, v, q = c // (V * Q), (c // Q) % V, c % Q
-            p, kind = curve_part[q], curve_kind[q]
-            shape = shape_of(part_shape, p)
-            R, t = load_rotation(placed, b, p), load_translation(placed, b, p)
-            center = R.transpose() @ (camera_center(camera, v) - t)
-            visible, params = curve_of(kind, shape, center)
-            chords = CHORDS
-            if kind <= SIDE_B:
-                chords = 1
-            length = 0.0 * shape[0]
-            sign = 0.0 * shape[0]
-            last = ti.Vector([0.0 * length, 0.0 * length])
-            for i in range(chords + 1):
-                if visible == 1:
-                    x, tangent = point_on(kind, shape, center, params, (i + 0.0 * length) / chords)
-                    pixel, J, z = project(camera, v, R @ x + t)
-                    if z < NEAREST_M:
-                        visible = 0
-                    if i > 0:
-                        length += (pixel - last).norm()
-                    if i == 0:
-                        # the plane of viewing ray and tangent, turned away from the part's inside
-                        n = tangent.cross(x - center)
-                        if n.dot(interior_point(part_kind[p], shape) - x) > 0.0:
-                            n = -n
-                        along, out = J @ (R @ tangent), J @ (R @ n)
-                        sign = 1.0 + 0.0 * length
-                        if along[1] * out[0] - along[0] * out[1] < 0.0:
-                            sign = -sign
-                    last = pixel
-                    lines[c, i, 0], lines[c, i, 1] = pixel[0], pixel[1]
-            facts[c, 0] = visible
-            facts[c, 1], facts[c, 2], facts[c, 3], facts[c, 4] = params[0], params[1], length, sign
-
-        ti.loop_config(serialize=alone)
-        for turn in range(spread * (B * V * Q)):
-            if turn % spread != 0:
-                continue
-            c = turn // spread
-            b, v, q = c // (V * Q), (c // Q) % V, c % Q
-            p, kind = curve_part[q], curve_kind[q]
-            scale, window, spacing, ambiguous = numbers[0], numbers[1], numbers[2], numbers[3]
-            tangential, robust, lost, colors = numbers[4], numbers[5], numbers[6], numbers[7]
-            cost, met, all_samples = 0.0 * scale, 0.0 * scale, 0.0 * scale
-            pull = ti.Vector([0.0 * scale for _ in range(6)])
-            inertia = ti.Vector([0.0 * scale for _ in range(INERTIA_NUMBERS)])
-            origin = load_translation(placed, b, 0)
-            if export == 1:
-                for i in range(most_samples):
-                    samples[c, i, 0] = 0.0
-            if facts[c, 0] > 0.0:
+            for task in range(V * Q):
+                c, v, q = b * V * Q + task, task // Q, task % Q
+                p, kind = curve_part[q], curve_kind[q]
                 shape = shape_of(part_shape, p)
                 R, t = load_rotation(placed, b, p), load_translation(placed, b, p)
-                eye = camera_center(camera, v)
-                center = R.transpose() @ (eye - t)
-                params = ti.Vector([facts[c, 1], facts[c, 2]])
-                length, sign = facts[c, 3], facts[c, 4]
-                width, height = size[v, 0], size[v, 1]
-                wanted = ti.cast(ti.ceil(length / (spacing * scale)), ti.i32)
-                count = ti.min(ti.max(wanted, 1), most_samples)
-                share = length / count
-                hiding = _may_hide(ball, b, p, P, eye)
-                for i in range(count):
-                    x_part, tangent = point_on(kind, shape, center, params, (i + 0.5 + 0.0 * scale) / count)
-                    x = R @ x_part + t
-                    pixel, J, _ = project(camera, v, x)
-                    along = J @ (R @ tangent)
-                    norm = along.norm()
-                    n = ti.Vector([along[1], -along[0]]) * (sign / ti.max(norm, 1e-9))
-                    at = (pixel + 0.5) / scale - 0.5
-                    use = norm > 1e-6 and in_picture(width, height, at)
-                    behind, depth = -1, 1e9 + 0.0 * scale
-                    if use:
-                        ray = x - eye
-                        long = ray.norm_sqr()
-                        others = hiding
-                        o = -1
-                        while use and others != 0:
-                            o += 1
-                            this = others & 1
-                            others >>= 1
-                            close = False
-                            if this == 1:
-                                to = ti.Vector([ball[b, o, a] for a in ti.static(range(3))]) - eye
-                                ahead = to.dot(ray)
-                                close = ahead > 0.0 and to.norm_sqr() * long - ahead * ahead < ball[b, o, 3] * long
-                            if close:
-                                Ro = load_rotation(placed, b, o)
-                                co = Ro.transpose() @ (eye - load_translation(placed, b, o))
-                                t_o = enter(
-                                    part_kind[o], shape_of(part_shape, o), co, Ro.transpose() @ ray, HIDING_SHRINK
-                                )
-                                # behind another part it is not seen
-                                if t_o > 0.0 and t_o < 1.0:
-                                    use = False
-                                elif t_o > 0.0 and t_o < depth:
-                                    behind = o
-                                    depth = t_o
-                    # before another part it is no edge of the silhouette
-                    found, d, weight = 0, 0.0 * scale, share
-                    if use and behind >= 0 and interior == 0:
-                        use = False
-                        if colors > 0.0 and part_limb[behind] != part_limb[p] and group[behind] != group[p]:
-                            certainty, place = search_colors(
-                                image, likelihood, v, image.shape[2], image.shape[1], pixel, n, window, scale,
-                                group[p], group[behind],
-                            )  # fmt: skip
-                            weight = share * colors * certainty
-                            d = place * scale
-                            found = 2
-                    elif use:
-                        found, d = search_mask(mask, v, width, height, at, n, window)
-                        d *= scale
-                        if found == 0:
-                            cost += share * lost * lost
-                            all_samples += share
-                        else:
-                            if ambiguous > 0.0:
-                                edgel = pixel + d * n
-                                nearest = (ambiguous * scale) ** 2
-                                near = False
-                                for q2 in range(Q):
-                                    c2 = c - q + q2
-                                    if part_limb[curve_part[q2]] != part_limb[p] and facts[c2, 0] > 0.0:
-                                        chords = CHORDS
-                                        if curve_kind[q2] <= SIDE_B:
-                                            chords = 1
-                                        for s in range(chords):
-                                            e0 = ti.Vector([lines[c2, s, 0], lines[c2, s, 1]])
-                                            e1 = ti.Vector([lines[c2, s + 1, 0], lines[c2, s + 1, 1]])
-                                            # an edge that faces the other way has its foreground on the other side
-                                            facing = ti.Vector([e1[1] - e0[1], e0[0] - e1[0]]).dot(n) * facts[c2, 4]
-                                            if facing > 0.0:
-                                                square = _to_segment(edgel, e0, e1)
-                                                if square < nearest:
-                                                    nearest = square
-                                                    near = True
-                                if near:
-                                    other = ti.sqrt(nearest)
-                                    weight *= 0.5 * other / ti.max(other + ti.abs(d), 1e-6)
-                            if robust > 0.0:
-                                weight *= 1.0 / (1.0 + (d / (robust * scale)) ** 2) ** 2
-                            cost += share * ti.min(d * d, lost * lost)
-                            met += share
-                            all_samples += share
-                    if found > 0 and weight > 0.0:
-                        g = J.transpose() @ n
-                        h = J.transpose() @ ti.Vector([-n[1], n[0]])
-                        # what a twist does to the distance, and to the place along the contour
-                        arm = x - origin
-                        gm, hm = arm.cross(g), arm.cross(h)
-                        across = ti.Vector([gm[0], gm[1], gm[2], g[0], g[1], g[2]])
-                        beside = ti.Vector([hm[0], hm[1], hm[2], h[0], h[1], h[2]])
-                        pull += weight * d * across
-                        for j in ti.static(range(6)):
-                            for k in ti.static(range(j + 1)):
-                                inertia[j * (j + 1) // 2 + k] += weight * (
-                                    across[j] * across[k] + tangential * beside[j] * beside[k]
-                                )
-                        if export == 1:
-                            s = unscaled(kind, shape, x_part)
-                            samples[c, i, 0] = 1.0
-                            samples[c, i, 1] = d
-                            samples[c, i, 2] = weight
-                            for a in ti.static(range(3)):
-                                samples[c, i, 3 + a] = s[a]
-                                samples[c, i, 6 + a] = g[a]
-                            samples[c, i, 9], samples[c, i, 10] = pixel[0], pixel[1]
-
-            sums[c, 0], sums[c, 1], sums[c, 2] = cost, met, all_samples
-            for i in ti.static(range(6)):
-                sums[c, 3 + i] = pull[i]
-            for i in ti.static(range(INERTIA_NUMBERS)):
-                sums[c, 9 + i] = inertia[i]
-
-        # in a fixed order: the same sums every time
-        ti.loop_config(serialize=alone)
-        for turn in range(spread_poses * B):
-            if turn % spread_poses != 0:
-                continue
-            b = turn // spread_poses
+                center = R.transpose() @ (camera_center(camera, v) - t)
+                visible, params = curve_of(kind, shape, center)
+                chords = CHORDS
+                if kind <= SIDE_B:
+                    chords = 1
+                length = 0.0 * shape[0]
+                sign = 0.0 * shape[0]
+                last = ti.Vector([0.0 * length, 0.0 * length])
+                for i in range(chords + 1):
+                    if visible == 1:
+                        x, tangent = point_on(kind, shape, center, params, (i + 0.0 * length) / chords)
+                        pixel, J, z = project(camera, v, R @ x + t)
+                        if z < NEAREST_M:
+                            visible = 0
+                        if i > 0:
+                            length += (pixel - last).norm()
+                        if i == 0:
+                            # the plane of viewing ray and tangent, turned away from the part's inside
+                            n = tangent.cross(x - center)
+                            if n.dot(interior_point(part_kind[p], shape) - x) > 0.0:
+                                n = -n
+                            along, out = J @ (R @ tangent), J @ (R @ n)
+                            sign = 1.0 + 0.0 * length
+                            if along[1] * out[0] - along[0] * out[1] < 0.0:
+                                sign = -sign
+                        last = pixel
+                        lines[c, i, 0], lines[c, i, 1] = pixel[0], pixel[1]
+                facts[c, 0] = visible
+                facts[c, 1], facts[c, 2], facts[c, 3], facts[c, 4] = params[0], params[1], length, sign
             for i in range(total.shape[1]):
                 total[b, i] = 0.0
             for k in range(D):
                 for i in range(6 + INERTIA_NUMBERS):
                     collected[b, k, i] = 0.0
-            for j in range(V * Q):
-                c = b * V * Q + j
+            for task in range(V * Q):
+                c, v, q = b * V * Q + task, task // Q, task % Q
+                p, kind = curve_part[q], curve_kind[q]
+                scale, window, spacing, ambiguous = numbers[0], numbers[1], numbers[2], numbers[3]
+                tangential, robust, lost, colors = numbers[4], numbers[5], numbers[6], numbers[7]
+                cost, met, all_samples = 0.0 * scale, 0.0 * scale, 0.0 * scale
+                pull = ti.Vector([0.0 * scale for _ in range(6)])
+                inertia = ti.Vector([0.0 * scale for _ in range(INERTIA_NUMBERS)])
+                origin = load_translation(placed, b, 0)
+                if export == 1:
+                    for i in range(most_samples):
+                        samples[c, i, 0] = 0.0
                 if facts[c, 0] > 0.0:
-                    k = part_dof[curve_part[j % Q]]
-                    for i in ti.static(range(3)):
-                        total[b, i] = total[b, i] + sums[c, i]
-                    for i in range(6 + INERTIA_NUMBERS):
-                        collected[b, k, i] = collected[b, k, i] + sums[c, 3 + i]
+                    shape = shape_of(part_shape, p)
+                    R, t = load_rotation(placed, b, p), load_translation(placed, b, p)
+                    eye = camera_center(camera, v)
+                    center = R.transpose() @ (eye - t)
+                    params = ti.Vector([facts[c, 1], facts[c, 2]])
+                    length, sign = facts[c, 3], facts[c, 4]
+                    width, height = size[v, 0], size[v, 1]
+                    wanted = ti.cast(ti.ceil(length / (spacing * scale)), ti.i32)
+                    count = ti.min(ti.max(wanted, 1), most_samples)
+                    share = length / count
+                    hiding = _may_hide(ball, b, p, P, eye)
+                    for i in range(count):
+                        x_part, tangent = point_on(kind, shape, center, params, (i + 0.5 + 0.0 * scale) / count)
+                        x = R @ x_part + t
+                        pixel, J, _ = project(camera, v, x)
+                        along = J @ (R @ tangent)
+                        norm = along.norm()
+                        n = ti.Vector([along[1], -along[0]]) * (sign / ti.max(norm, 1e-9))
+                        at = (pixel + 0.5) / scale - 0.5
+                        use = norm > 1e-6 and in_picture(width, height, at)
+                        behind, depth = -1, 1e9 + 0.0 * scale
+                        if use:
+                            ray = x - eye
+                            long = ray.norm_sqr()
+                            others = hiding
+                            o = -1
+                            while use and others != 0:
+                                o += 1
+                                this = others & 1
+                                others >>= 1
+                                close = False
+                                if this == 1:
+                                    to = ti.Vector([ball[b, o, a] for a in ti.static(range(3))]) - eye
+                                    ahead = to.dot(ray)
+                                    close = ahead > 0.0 and to.norm_sqr() * long - ahead * ahead < ball[b, o, 3] * long
+                                if close:
+                                    Ro = load_rotation(placed, b, o)
+                                    co = Ro.transpose() @ (eye - load_translation(placed, b, o))
+                                    t_o = enter(
+                                        part_kind[o], shape_of(part_shape, o), co, Ro.transpose() @ ray, HIDING_SHRINK
+                                    )
+                                    # behind another part it is not seen
+                                    if t_o > 0.0 and t_o < 1.0:
+                                        use = False
+                                    elif t_o > 0.0 and t_o < depth:
+                                        behind = o
+                                        depth = t_o
+                        # before another part it is no edge of the silhouette
+                        found, d, weight = 0, 0.0 * scale, share
+                        if use and behind >= 0 and interior == 0:
+                            use = False
+                            if colors > 0.0 and part_limb[behind] != part_limb[p] and group[behind] != group[p]:
+                                certainty, place = search_colors(
+                                    image, likelihood, v, image.shape[2], image.shape[1], pixel, n, window, scale,
+                                    group[p], group[behind],
+                                )  # fmt: skip
+                                weight = share * colors * certainty
+                                d = place * scale
+                                found = 2
+                        elif use:
+                            found, d = search_mask(mask, v, width, height, at, n, window)
+                            d *= scale
+                            if found == 0:
+                                cost += share * lost * lost
+                                all_samples += share
+                            else:
+                                if ambiguous > 0.0:
+                                    edgel = pixel + d * n
+                                    nearest = (ambiguous * scale) ** 2
+                                    near = False
+                                    for q2 in range(Q):
+                                        c2 = c - q + q2
+                                        if part_limb[curve_part[q2]] != part_limb[p] and facts[c2, 0] > 0.0:
+                                            chords = CHORDS
+                                            if curve_kind[q2] <= SIDE_B:
+                                                chords = 1
+                                            for s in range(chords):
+                                                e0 = ti.Vector([lines[c2, s, 0], lines[c2, s, 1]])
+                                                e1 = ti.Vector([lines[c2, s + 1, 0], lines[c2, s + 1, 1]])
+                                                # an edge that faces the other way has its foreground on the other side
+                                                facing = ti.Vector([e1[1] - e0[1], e0[0] - e1[0]]).dot(n) * facts[c2, 4]
+                                                if facing > 0.0:
+                                                    square = _to_segment(edgel, e0, e1)
+                                                    if square < nearest:
+                                                        nearest = square
+                                                        near = True
+                                    if near:
+                                        other = ti.sqrt(nearest)
+                                        weight *= 0.5 * other / ti.max(other + ti.abs(d), 1e-6)
+                                if robust > 0.0:
+                                    weight *= 1.0 / (1.0 + (d / (robust * scale)) ** 2) ** 2
+                                cost += share * ti.min(d * d, lost * lost)
+                                met += share
+                                all_samples += share
+                        if found > 0 and weight > 0.0:
+                            g = J.transpose() @ n
+                            h = J.transpose() @ ti.Vector([-n[1], n[0]])
+                            # what a twist does to the distance, and to the place along the contour
+                            arm = x - origin
+                            gm, hm = arm.cross(g), arm.cross(h)
+                            across = ti.Vector([gm[0], gm[1], gm[2], g[0], g[1], g[2]])
+                            beside = ti.Vector([hm[0], hm[1], hm[2], h[0], h[1], h[2]])
+                            pull += weight * d * across
+                            for j in ti.static(range(6)):
+                                for k in ti.static(range(j + 1)):
+                                    inertia[j * (j + 1) // 2 + k] += weight * (
+                                        across[j] * across[k] + tangential * beside[j] * beside[k]
+                                    )
+                            if export == 1:
+                                s = unscaled(kind, shape, x_part)
+                                samples[c, i, 0] = 1.0
+                                samples[c, i, 1] = d
+                                samples[c, i, 2] = weight
+                                for a in ti.static(range(3)):
+                                    samples[c, i, 3 + a] = s[a]
+                                    samples[c, i, 6 + a] = g[a]
+                                samples[c, i, 9], samples[c, i, 10] = pixel[0], pixel[1]
+
+                # always in the same order: the same sums every time
+                k = part_dof[p]
+                total[b, 0] = total[b, 0] + cost
+                total[b, 1] = total[b, 1] + met
+                total[b, 2] = total[b, 2] + all_samples
+                for a in ti.static(range(6)):
+                    collected[b, k, a] = collected[b, k, a] + pull[a]
+                for a in ti.static(range(INERTIA_NUMBERS)):
+                    collected[b, k, 6 + a] = collected[b, k, 6 + a] + inertia[a]
             # handed down the tree, from the leaves to the root
             origin = load_translation(placed, b, 0)
             for back in range(D):
@@ -419,10 +394,9 @@ def _launch(
     V, Q, P = len(cameras), len(body.curve_part), len(body.part_kind)
     tasks = B * V * Q
     regions = regions or _no_regions(len(body.part_kind))
-    alone = on_one_thread(B)
     total = np.empty((B, 3 + D + D * D))
     samples = np.zeros((tasks, settings.most_samples, _EXPORT) if export else (1, 1, _EXPORT), dtype)
-    _equations_kernel(ti.f64 if dtype == np.float64 else ti.f32, alone)(
+    _equations_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
         *body,
         np.ascontiguousarray(cameras, dtype),
         np.ascontiguousarray(sizes, np.int32),
@@ -431,8 +405,7 @@ def _launch(
         regions.log_likelihood,
         regions.group,
         _numbers(settings, scale, regions.weight, dtype),
-        1 if alone else spread_of(tasks),
-        1 if alone else spread_of(B),
+        spread_of(B),
         settings.most_samples,
         int(settings.interior),
         int(export),
@@ -456,7 +429,6 @@ def _scratch(B: int, V: int, Q: int, D: int, P: int, dtype: np.dtype) -> tuple[N
     tasks = B * V * Q
     shapes: tuple[tuple[int, ...], ...] = (
         (B, D, 12), (B, D, 6), (B, P, 12), (B, P, 4), (tasks, CHORDS + 1, 2), (tasks, 5), (B, D, 6 + INERTIA_NUMBERS),
-        (tasks, _SUMS),
     )  # fmt: skip
     return tuple(np.empty(shape, dtype) for shape in shapes)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter1d
 
 from tk.kernels.line_search import COLOR_BINS, Regions
 from tk.model.cone_body import ConeBody
@@ -23,6 +23,7 @@ Float = NDArray[np.float64]
 GROUPS = ("torso", "pelvis", "head", "upper_arm", "forearm", "hand", "thigh", "calf", "foot")
 # Standard deviation of the smoothing over bins, in bins: gain and white balance differ a little from camera to camera.
 _SMOOTHING = 0.7
+_SMOOTH = gaussian_filter1d(np.eye(16, dtype=np.float32), _SMOOTHING, axis=0, mode="nearest").T
 # Share of a part's pixels that may have any colour: outlines, shadows, what the person carries.
 _ANYTHING = 0.02
 # How much of the models a frame's colours replace.
@@ -107,7 +108,9 @@ def color_bins(images: NDArray[np.uint8]) -> NDArray[np.int32]:
 def _smooth(counts: Float) -> NDArray[np.float32]:
     """Histograms (N, COLOR_BINS), each smoothed over its neighbouring bins."""
     cubes = counts.reshape(-1, 16, 16, 16).astype(np.float32)
-    return np.asarray(gaussian_filter(cubes, (0, *[_SMOOTHING] * 3), mode="nearest").reshape(counts.shape))
+    for _ in range(3):  # along the last axis, which then becomes the first of the three
+        cubes = np.moveaxis(cubes @ _SMOOTH, 3, 1)
+    return cubes.reshape(counts.shape)
 
 
 def _group(component: str) -> str:

@@ -210,6 +210,22 @@ class Skeleton:
         """(..., D, 4, 4) transforms T_k after each degree of freedom of poses (..., D), float64. Kernels have their
         own."""
         pose = np.asarray(pose, dtype=np.float64)
+        if pose.ndim > 1:
+            return self._transforms(pose)
+        # joints, twists and directions of one pose are asked for in turn
+        key = pose.tobytes()
+        told, placed = self._last[0]
+        if told != key:
+            placed = self._transforms(pose)
+            placed.flags.writeable = False
+            self._last[0] = key, placed
+        return placed
+
+    @cached_property
+    def _last(self) -> list[tuple[bytes, Float]]:
+        return [(b"", np.zeros(0))]
+
+    def _transforms(self, pose: Float) -> Float:
         K, squares = self._generators
         steps = np.zeros((*pose.shape, 4, 4))
         R = np.eye(3) + np.sin(pose)[..., None, None] * K + (1 - np.cos(pose))[..., None, None] * squares

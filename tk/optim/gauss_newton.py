@@ -117,46 +117,47 @@ def minimise(
     config = config or GaussNewtonConfig()
     state = np.array(start, np.float64)
     hessian = np.zeros((*state.shape, state.shape[1]))
+    room = _Room(np.flatnonzero(free), lower, upper, config, prior)
     for scale in range(config.scales - 1, -1, -1) if levels is None else levels:
         for _ in range(config.iterations):
             here = equations(state, scale)
-            state += step(here.hessian, here.gradient, state, free, lower, upper, config, prior)
+            state[:, room.index] += room.step(here.hessian, here.gradient, state)
             hessian = here.hessian
     return Descent(state, hessian)
 
 
-def step(
-    hessian: Float,
-    gradient: Float,
-    state: Float,
-    free: NDArray[np.bool_],
-    lower: Float,
-    upper: Float,
-    config: GaussNewtonConfig,
-    prior: Prior | None = None,
-) -> Float:
-    """One damped step (B, D) of each state, limits included; zero for parameters that are not free."""
-    index = np.flatnonzero(free)
-    H = hessian[:, index[:, None], index]
-    g = gradient[:, index].copy()
-    p = state[:, index]
-    B, n = g.shape
-    diagonal = np.einsum("bii->bi", H).copy()
-    seen = diagonal > 0
-    mean = diagonal.sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
-    unit = np.where(mean > 0, mean, 1.0)[:, None]
-    excess = np.clip(p, lower[index], upper[index]) - p
-    beyond = excess != 0
-    added = config.damping * diagonal + config.stiffness * unit + config.limit_weight * unit * beyond + 1e-9 * unit
-    g += config.limit_weight * unit * excess
-    if prior is not None:
-        precision = prior.precision[index]
-        added = added + precision
-        g += precision * (np.broadcast_to(prior.mean, state.shape)[:, index] - p)
-    H[:, range(n), range(n)] += added
-    delta = np.linalg.solve(H, g[:, :, None])[:, :, 0]
-    longest = np.abs(delta).max(axis=1, initial=0.0)
-    delta *= np.minimum(1.0, config.longest_step / np.maximum(longest, 1e-12))[:, None]
-    result = np.zeros((B, state.shape[1]))
-    result[:, index] = delta
-    return result
+class _Room:
+    """Where the states may go: the free parameters ``index`` (n,), their limits, and what is known of them."""
+
+    def __init__(
+        self, index: NDArray[np.intp], lower: Float, upper: Float, config: GaussNewtonConfig, prior: Prior | None
+    ) -> None:
+        self.index = index
+        self._rows = index[:, None]
+        self._lower, self._upper = lower[index], upper[index]
+        self._config = config
+        self._known = None if prior is None else (prior.mean[..., index], prior.precision[index])
+
+    def step(self, hessian: Float, gradient: Float, state: Float) -> Float:
+        """One damped step (B, n) of each state (B, D), the limits' pull included."""
+        config = self._config
+        H = hessian[:, self._rows, self.index]
+        g = gradient[:, self.index]
+        p = state[:, self.index]
+        diagonal = np.einsum("bii->bi", H)  # a view
+        count = np.count_nonzero(diagonal > 0, axis=1)
+        unit = diagonal.sum(axis=1) / np.maximum(count, 1)
+        unit[unit <= 0] = 1.0
+        unit = unit[:, None]
+        excess = np.minimum(np.maximum(p, self._lower), self._upper) - p
+        pull = config.limit_weight * unit
+        g += pull * excess
+        added = config.damping * diagonal + (config.stiffness + 1e-9) * unit + pull * (excess != 0)
+        if self._known is not None:
+            mean, precision = self._known
+            added += precision
+            g += precision * (mean - p)
+        diagonal += added
+        delta = np.linalg.solve(H, g[:, :, None])[:, :, 0]
+        longest = np.maximum(delta.max(axis=1, initial=0.0), -delta.min(axis=1, initial=0.0))
+        return np.asarray(delta * np.minimum(1.0, config.longest_step / np.maximum(longest, 1e-12))[:, None])
