@@ -194,6 +194,17 @@ def test_equations_are_the_sums_of_the_edgels_rows():
     assert 0 < total.found[0] <= 1
 
 
+def test_rows_are_the_normals_of_the_picture_in_the_world():
+    edgels = edgels_of(BODY, MASKS, POSE, PLAIN)
+    np.testing.assert_allclose(np.linalg.norm(edgels.normal, axis=1), 1.0, atol=1e-9)
+    x = BODY.place(POSE, edgels.part, edgels.unscaled)
+    for v, camera in enumerate(RIG):
+        here = edgels.view == v
+        moved = [camera.project(x[here] + s * step)[0] for step in np.eye(3) for s in (1e-6, -1e-6)]
+        J = np.stack([(moved[2 * a] - moved[2 * a + 1]) / 2e-6 for a in range(3)], axis=2)
+        np.testing.assert_allclose(edgels.row[here], np.einsum("ni,nij->nj", edgels.normal[here], J), atol=1e-3)
+
+
 @pytest.mark.parametrize("k", range(D))
 def test_rows_are_derivatives_of_the_contour(k):
     """A generator's image is a line; where it meets the old normal moves as the row says."""

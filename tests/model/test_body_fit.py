@@ -15,7 +15,6 @@ from tk.model.anthropometry import BodyDimensions
 from tk.model.body_fit import (
     BodyFitConfig,
     fit_body,
-    part_transforms,
     pose_rows,
     shape_rows,
 )
@@ -60,7 +59,9 @@ def edgels_all_over(body, count=400):
     unscaled = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.where(cone, np.abs(z), z)])
     row = rng.normal(size=(count, 3))
     nothing = np.zeros(count)
-    return Edgels(nothing.astype(np.int32), part, unscaled, nothing, nothing, row, np.zeros((count, 2)))
+    return Edgels(
+        nothing.astype(np.int32), part, unscaled, nothing, nothing, row, np.zeros((count, 2)), np.zeros((count, 2))
+    )
 
 
 EDGELS = edgels_all_over(AVERAGE)
@@ -136,7 +137,7 @@ def test_transforms_of_many_poses_are_the_skeletons(up):
     B[:3, :3] = body.skeleton.T_world_body
     for p, part in enumerate(body.parts):
         expected = T[:, SEGMENTS.index(part.segment)] @ B @ part.T_body_part
-        np.testing.assert_allclose(part_transforms(body, T)[:, p], expected, atol=1e-12)
+        np.testing.assert_allclose(body.part_transforms(T)[:, p], expected, atol=1e-12)
 
 
 def test_lengths_of_a_known_body_are_found(monkeypatch):

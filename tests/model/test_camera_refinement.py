@@ -122,7 +122,7 @@ def test_rows_by_a_camera_are_differences(kind):
     normal = rng.normal(size=(len(x), 2))
     step = 1e-6 * np.eye(3)
     J = np.stack([(camera.project(x + s)[0] - camera.project(x - s)[0]) / 2e-6 for s in step], axis=2)
-    edgels = edgels._replace(pixel=pixel, row=np.einsum("ni,nij->nj", normal, J))
+    edgels = edgels._replace(pixel=pixel, normal=normal, row=np.einsum("ni,nij->nj", normal, J))
     rows = camera_rows(camera, x, edgels, kind)
 
     def changed(row):

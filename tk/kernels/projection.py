@@ -4,12 +4,10 @@ A camera is a row of 22 numbers: rotation (9, row by row, world to camera), tran
 (pixels), five distortion coefficients, and 1 for the fisheye model or 0. Like OpenCV, skew is ignored.
 """
 
-import functools
-
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.runtime import ensure_runtime, ti
+from tk.kernels.runtime import ti
 
 CAMERA_NUMBERS = 22
 
@@ -87,54 +85,3 @@ def project(camera: ti.template(), v: int, x):
         ]
     )
     return pixel, J @ R, z
-
-
-@functools.cache
-def _project_kernel(real):
-    @ti.kernel
-    def kernel(
-        camera: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
-        view: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,)
-        world: ti.types.ndarray(dtype=real, ndim=2),  # (N, 3)
-        pixels: ti.types.ndarray(dtype=real, ndim=2),  # (N, 2) out
-        jacobian: ti.types.ndarray(dtype=real, ndim=3),  # (N, 2, 3) out
-        depth: ti.types.ndarray(dtype=real, ndim=1),  # (N,) out
-    ):
-        for n in range(world.shape[0]):
-            x = ti.Vector([world[n, i] for i in ti.static(range(3))])
-            pixel, J, z = project(camera, view[n], x)
-            depth[n] = z
-            for i in ti.static(range(2)):
-                pixels[n, i] = pixel[i]
-                for j in ti.static(range(3)):
-                    jacobian[n, i, j] = J[i, j]
-
-    return kernel
-
-
-def project_points(
-    cameras: np.ndarray, view: np.ndarray, p_world: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Project points, each by a camera of its own.
-
-    Args:
-        cameras: (V, 22) rows of :func:`pack_camera`.
-        view: (N,) which camera.
-        p_world: (N, 3) metres, float32 or float64: the precision of the computation.
-
-    Returns:
-        pixels (N, 2), their derivatives (N, 2, 3) by the world points, depth (N,) in metres.
-    """
-    ensure_runtime()
-    dtype = p_world.dtype
-    N = len(p_world)
-    pixels, jacobian, depth = np.empty((N, 2), dtype), np.empty((N, 2, 3), dtype), np.empty(N, dtype)
-    _project_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
-        np.ascontiguousarray(cameras, dtype),
-        np.ascontiguousarray(view, np.int32),
-        np.ascontiguousarray(p_world),
-        pixels,
-        jacobian,
-        depth,
-    )
-    return pixels, jacobian, depth

@@ -35,7 +35,7 @@ CHORDS = 12
 # A sample is hidden by another part if it lies this far inside its cross-section: neighbours at a joint touch.
 HIDING_SHRINK = 0.95
 # Columns of an exported sample: see Edgels.
-_EXPORT = 12
+_EXPORT = 13
 
 
 class NormalEquations(NamedTuple):
@@ -65,6 +65,7 @@ class Edgels(NamedTuple):
         row: (N, 3) derivative of the contour's position along its normal by the point's world coordinates, pixels per
             metre.
         pixel: (N, 2) of the sample.
+        normal: (N, 2) of the contour in the picture, outwards.
     """
 
     view: NDArray[np.int32]
@@ -74,6 +75,7 @@ class Edgels(NamedTuple):
     weight: NDArray[np.float64]
     row: NDArray[np.float64]
     pixel: NDArray[np.float64]
+    normal: NDArray[np.float64]
 
 
 @ti.func
@@ -339,7 +341,9 @@ def _equations_kernel(real):
                                 for a in ti.static(range(3)):
                                     samples[c, i, 3 + a] = s[a]
                                     samples[c, i, 6 + a] = g[a]
-                                samples[c, i, 9], samples[c, i, 10] = pixel[0], pixel[1]
+                                for a in ti.static(range(2)):
+                                    samples[c, i, 9 + a] = pixel[a]
+                                    samples[c, i, 11 + a] = n[a]
 
                 # always in the same order: the same sums every time
                 k = part_dof[p]
@@ -497,4 +501,5 @@ def find_edgels(
         weight=chosen[:, 2],
         row=chosen[:, 6:9],
         pixel=chosen[:, 9:11],
+        normal=chosen[:, 11:13],
     )

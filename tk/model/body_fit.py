@@ -200,8 +200,8 @@ class BodyProblem:
 
         def points(values: Float) -> Float:
             body = self.build(values)
-            placed = part_transforms(body, body.skeleton.segment_transforms(poses))
-            return _surface_points(body, placed[frame, part], part, unscaled)
+            placed = body.part_transforms(body.skeleton.segment_transforms(poses))
+            return body.placed(placed[frame, part], part, unscaled)
 
         here = points(shared)
         for k in range(len(_DIMENSIONS)):
@@ -223,34 +223,12 @@ class BodyProblem:
         g += row * np.log(self.average.stature / stature) / self.stature_deviation
 
 
-def part_transforms(body: ConeBody, T_world_segment: Float) -> Float:
-    """(..., P, 4, 4) from each part to the world, from the segments' (..., S, 4, 4)."""
-    B = np.eye(4)
-    B[:3, :3] = body.skeleton.T_world_body
-    segments = [SEGMENTS.index(part.segment) for part in body.parts]
-    inside = B @ np.array([part.T_body_part for part in body.parts])
-    return np.asarray(T_world_segment[..., segments, :, :] @ inside)
-
-
-def _local(body: ConeBody, part: NDArray[np.integer], unscaled: Float) -> tuple[Float, Float, Float]:
-    """Shape (N, 4) and radius factor (N,) of the parts, points (N, 3) in their frames."""
-    shape = np.array([p.shape for p in body.parts])[part]
-    cone = np.array([p.kind == CONE for p in body.parts])[part]
-    r = np.where(cone, 1 + (shape[:, 3] - 1) * unscaled[:, 2], 1.0)
-    return shape, r, unscaled * np.column_stack([shape[:, 0] * r, shape[:, 1] * r, shape[:, 2]])
-
-
-def _surface_points(body: ConeBody, T_world_part: Float, part: NDArray[np.integer], unscaled: Float) -> Float:
-    """(N, 3) world points of the surface, see :meth:`ConeBody.place`, from each one's part's transform (N, 4, 4)."""
-    local = _local(body, part, unscaled)[2]
-    return (T_world_part[:, :3, :3] @ local[:, :, None])[:, :, 0] + T_world_part[:, :3, 3]
-
-
-def pose_rows(body: ConeBody, pose: Float, edgels: Edgels) -> Float:
-    """(N, D) derivative of the contour's position along its normal by the pose, pixels."""
+def pose_rows(body: ConeBody, pose: Float, edgels: Edgels, x_world: Float | None = None) -> Float:
+    """(N, D) derivative of the contour's position along its normal by the pose, pixels; ``x_world`` (N, 3) are the
+    edgels' points on the surface, if at hand."""
     s = body.skeleton
     w, v = s.twists(pose)
-    x = body.place(pose, edgels.part, edgels.unscaled)
+    x = body.place(pose, edgels.part, edgels.unscaled) if x_world is None else x_world
     moves = s.ancestors()[[SEGMENTS.index(part.segment) for part in body.parts]][edgels.part]
     # n · (ω × x + v) = ω · (x × n) + v · n
     return np.where(moves, np.cross(x, edgels.row) @ w.T + edgels.row @ v.T, 0.0)
@@ -263,9 +241,9 @@ def shape_rows(body: ConeBody, T_world_segment: Float, edgels: Edgels) -> Float:
     """
     groups = body.shape_groups
     part = edgels.part
-    T = part_transforms(body, T_world_segment)[part]
+    T = body.part_transforms(T_world_segment)[part]
     n = np.einsum("nab,na->nb", T[:, :3, :3], edgels.row)  # the row in the part's frame
-    shape, _, local = _local(body, part, edgels.unscaled)
+    shape, _, local = body.local(part, edgels.unscaled)
     cone = np.array([p.kind == CONE for p in body.parts])[part]
     mirror = np.array([-1.0 if p.name.endswith("_r") else 1.0 for p in body.parts])[part]
     u = edgels.unscaled

@@ -18,12 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.line_search import SearchSettings
-from tk.kernels.projection import project_points
 from tk.kernels.silhouette import Edgels
 from tk.model.body_fit import pose_rows
 from tk.model.camera import Camera, Rig
 from tk.model.cone_body import ConeBody
-from tk.model.silhouettes import CleaningConfig, Pyramid, Views, pack_rig
+from tk.model.silhouettes import CleaningConfig, Pyramid, Views
 from tk.model.skeleton import SEGMENTS
 
 Float = NDArray[np.float64]
@@ -130,12 +129,9 @@ def camera_rows(camera: Camera, x_world: Float, edgels: Edgels, kind: str) -> Fl
         return row
     if kind == "turn":
         return np.cross(camera.to_camera(x_world), row)
-    # the normal in the picture, of which the row is n·Jπ
-    _, J, _ = project_points(pack_rig(Rig((camera,))), np.zeros(len(x_world), np.int32), x_world)
-    normal = np.linalg.solve(J @ J.transpose(0, 2, 1), np.einsum("nij,nj->ni", J, edgels.row)[..., None])[..., 0]
     if kind == "shift":
-        return normal
-    return np.einsum("ni,ni->n", normal, edgels.pixel - camera.matrix[:2, 2])[:, None]
+        return edgels.normal
+    return np.einsum("ni,ni->n", edgels.normal, edgels.pixel - camera.matrix[:2, 2])[:, None]
 
 
 def equations(
@@ -172,7 +168,7 @@ def equations(
     for view, rows_behind, T in zip(seen, further, transforms, strict=True):
         edgels = view.edgels
         x = body.place(view.pose, edgels.part, edgels.unscaled, T)
-        by_pose = pose_rows(body, view.pose, edgels)
+        by_pose = pose_rows(body, view.pose, edgels, x)
         columns = [
             (by_pose @ moments[view.frame].velocity)[:, None]
             if kind == "offset"

@@ -15,17 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.line_search import SearchSettings
-from tk.kernels.projection import project_points
 from tk.model.body_family import Family
 from tk.model.bundle import Moment, Seen, equations, look
 from tk.model.camera import Rig
 from tk.model.cone_body import ConeBody
-from tk.model.silhouettes import pack_rig
 
 Float = NDArray[np.float64]
 
 # One standard deviation of what is expected of a shift, pixels, and of a delay, frames, before any picture was seen.
 _SHIFT_PX, _OFFSET_FRAMES = 5.0, 2.0
+# Of differences that stand for a derivative.
+_STEP_M = 1e-4
 # Cameras disagree where a shift is more than this angle, a delay more than this part of a frame, and each more than so
 # many standard deviations. Captures with exact cameras (walk, dance) show 0.02° and 0.01 frames.
 ASTRAY_DEG, LATE_FRAMES, SURELY = 0.06, 0.2, 3.0
@@ -127,7 +127,9 @@ def _common(rig: Rig, p_world: Float) -> Float:
     """(3 C, 4) how the pictures of a point shift when it moves along x, y, z, and a delay of all."""
     C = len(rig)
     modes = np.zeros((C, 3, 4))
-    modes[:, :2, :3] = project_points(pack_rig(rig), np.arange(C, dtype=np.int32), np.tile(p_world, (C, 1)))[1]
+    steps = np.concatenate([_STEP_M * np.eye(3), -_STEP_M * np.eye(3)])
+    pixels = np.array([camera.project(p_world + steps)[0] for camera in rig])
+    modes[:, :2, :3] = np.nan_to_num(pixels[:, :3] - pixels[:, 3:]).transpose(0, 2, 1) / (2 * _STEP_M)
     modes[:, 2, 3] = 1.0
     return modes.reshape(3 * C, 4)
 

@@ -151,9 +151,7 @@ class ConeBody:
     def pack(self, dtype: type[np.floating]) -> ConeArrays:
         """The body for the kernels in this precision."""
         s = self.skeleton
-        B = np.eye(4)
-        B[:3, :3] = s.T_world_body
-        segments = [SEGMENTS.index(part.segment) for part in self.parts]
+        segments, inside = self._frames
         curves: list[tuple[int, int]] = []
         for p, part in enumerate(self.parts):
             if part.kind == ELLIPSOID:
@@ -168,7 +166,7 @@ class ConeBody:
             parent=s.parent.astype(np.int32),
             part_kind=np.array([part.kind for part in self.parts], np.int32),
             part_shape=np.array([part.shape for part in self.parts], dtype),
-            part_frame=np.array([(B @ part.T_body_part)[:3].ravel() for part in self.parts], dtype),
+            part_frame=inside[:, :3].reshape(len(inside), 12).astype(dtype),
             part_dof=s.segment_dof[segments].astype(np.int32),
             part_limb=np.array([_LIMBS[part.segment] for part in self.parts], np.int32),
             curve_part=np.array([p for p, _ in curves], np.int32),
@@ -204,15 +202,33 @@ class ConeBody:
         """
         if T_world_segment is None:
             T_world_segment = self.skeleton.segment_transforms(pose)
+        T = self.part_transforms(T_world_segment)[part]
+        return self.placed(T, part, unscaled)
+
+    def placed(self, T_world_part: Float, part: NDArray[np.integer], unscaled: Float) -> Float:
+        """The same from each point's part's transform (N, 4, 4)."""
+        local = self.local(part, unscaled)[2]
+        return np.asarray((T_world_part[:, :3, :3] @ local[:, :, None])[:, :, 0] + T_world_part[:, :3, 3])
+
+    def part_transforms(self, T_world_segment: Float) -> Float:
+        """(..., P, 4, 4) from each part to the world, from the segments' (..., S, 4, 4)."""
+        segments, inside = self._frames
+        return np.asarray(T_world_segment[..., segments, :, :] @ inside)
+
+    def local(self, part: NDArray[np.integer], unscaled: Float) -> tuple[Float, Float, Float]:
+        """Shape (N, 4) and radius factor (N,) of the parts, points (N, 3) in their frames."""
+        shape = np.array([p.shape for p in self.parts])[part]
+        cone = np.array([p.kind == CONE for p in self.parts])[part]
+        r = np.where(cone, 1 + (shape[:, 3] - 1) * unscaled[:, 2], 1.0)
+        return shape, r, unscaled * np.column_stack([shape[:, 0] * r, shape[:, 1] * r, shape[:, 2]])
+
+    @cached_property
+    def _frames(self) -> tuple[NDArray[np.int64], Float]:
+        """(P,) each part's segment, and (P, 4, 4) from the part to it."""
         B = np.eye(4)
         B[:3, :3] = self.skeleton.T_world_body
-        result = np.empty((len(part), 3))
-        for p in np.unique(part):
-            here = self.parts[p]
-            chosen = part == p
-            T = T_world_segment[SEGMENTS.index(here.segment)] @ B @ here.T_body_part
-            result[chosen] = here.surface(unscaled[chosen]) @ T[:3, :3].T + T[:3, 3]
-        return result
+        segments = np.array([SEGMENTS.index(part.segment) for part in self.parts])
+        return segments, B @ np.array([part.T_body_part for part in self.parts])
 
 
 def _reshape(part: ConePart, row: Float, right: bool) -> ConePart:

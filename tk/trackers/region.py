@@ -355,7 +355,8 @@ class RegionTracker(ContourTracker):
             return poses, error, variance
 
         def believed(i: int) -> NDArray[np.uint8]:
-            return np.where(np.isfinite(error[i])[:, None, None], masks[i], np.uint8(0))
+            shown, out = masks[i], np.isnan(error[i])
+            return np.where(out[:, None, None], np.uint8(0), shown) if out.any() else shown
 
         if not keep_body and self.contours.adapt:
             opening = tracked[: self.contours.init_frames : 3]
