@@ -128,10 +128,9 @@ def fit_body(
     problem = BodyProblem(preset, up, BodyDimensions.from_stature(stature_m), config.stature_deviation)
     shared = problem.mean.copy()
     poses, start = np.array(poses), np.array(poses)
-    F, D, K = len(poses), poses.shape[1], len(shared)
+    K = len(shared)
     # of one pixel of contour
     information = 1.0 / (_EDGE_NOISE_PX**2 * _CORRELATION_PX * max(len(poses) / _TELLING_FRAMES, 1.0))
-    body_at = slice(F * D, F * D + K)
     for _ in range(config.rounds):
         here = problem.build(shared)
         skeleton = here.skeleton
@@ -140,34 +139,33 @@ def fit_body(
         mean = np.where(straight, 0.0, start)
         seen = [views.edgels(here, pyramid, pose, 0, settings) for pyramid, pose in zip(pyramids, poses, strict=True)]
         by_dimension = problem.dimension_rows(shared, poses, seen)
-        H, g = np.zeros((F * D + K, F * D + K)), np.zeros(F * D + K)
+        free = np.flatnonzero(here.free)
+        H, g = np.zeros((K, K)), np.zeros(K)
+        problem.add_prior(shared, H, g)
         transforms = skeleton.segment_transforms(poses)
+        steps = []
         for f, edgels in enumerate(seen):
             rows = np.hstack(
-                [pose_rows(here, poses[f], edgels), by_dimension[f], shape_rows(here, transforms[f], edgels)]
+                [pose_rows(here, poses[f], edgels)[:, free], by_dimension[f], shape_rows(here, transforms[f], edgels)]
             )
             weight = edgels.weight * information
             A = (rows * weight[:, None]).T @ rows
             y = rows.T @ (weight * edgels.distance)
-            at = slice(f * D, (f + 1) * D)
-            H[at, at] += A[:D, :D]
-            H[at, body_at] += A[:D, D:]
-            H[body_at, at] += A[D:, :D]
-            H[body_at, body_at] += A[D:, D:]
-            g[at] += y[:D]
-            g[body_at] += y[D:]
             # joints beyond a limit are pulled back
             excess = skeleton.clip(poses[f]) - poses[f]
             limit = np.where(excess != 0, 1e3, 0.0)
-            H[at, at] += np.diag(pose_precision + limit)
-            g[at] += pose_precision * (mean[f] - poses[f]) + limit * excess
-        problem.add_prior(shared, H[body_at, body_at], g[body_at])
-        free = np.flatnonzero(here.free)
-        chosen = np.concatenate([*(f * D + free for f in range(F)), F * D + np.arange(K)])
-        delta = np.zeros(len(g))
-        delta[chosen] = np.linalg.solve(H[np.ix_(chosen, chosen)], g[chosen])
-        poses += np.clip(delta[: F * D].reshape(F, D), -0.3, 0.3)
-        shared += np.clip(delta[body_at], -0.1, 0.1)
+            own = np.diag((pose_precision + limit)[free])
+            pull = (pose_precision * (mean[f] - poses[f]) + limit * excess)[free]
+            # a frame's pose is eliminated: what is left tells of the body alone (Schur complement)
+            n = len(free)
+            solved = np.linalg.solve(A[:n, :n] + own, np.column_stack([y[:n] + pull, A[:n, n:]]))
+            H += A[n:, n:] - A[n:, :n] @ solved[:, 1:]
+            g += y[n:] - A[n:, :n] @ solved[:, 0]
+            steps.append(solved)
+        change = np.linalg.solve(H, g)
+        for pose, solved in zip(poses, steps, strict=True):
+            pose[free] += np.clip(solved[:, 0] - solved[:, 1:] @ change, -0.3, 0.3)
+        shared += np.clip(change, -0.1, 0.1)
     return problem.build(shared), poses
 
 

@@ -91,8 +91,8 @@ def _find(tracker: ContourTracker, frame: Observation, pyramid: Pyramid) -> tupl
     settled = tracker.settle(pyramid, gait.hypotheses(skeleton, HEADINGS, PHASES, p_centroid, first)).states
     order = settled[np.argsort(tracker.fit_error(pyramid, settled), kind="stable")]
     turned = _turned(skeleton, order, order[0])
-    finalists = _distinct(skeleton, order, FINALISTS) + _distinct(skeleton, order[turned], OPPOSITE)
-    poses = np.array([_searched(tracker, frame, pyramid, pose) for pose in finalists])
+    finalists = np.array(_distinct(skeleton, order, FINALISTS) + _distinct(skeleton, order[turned], OPPOSITE))
+    poses = np.array([_searched(tracker, frame, pyramid, pose) for pose in np.unique(finalists, axis=0)])
     error = tracker.fit_error(pyramid, poses)
     best = int(np.argmin(error))
     found = [poses[best]]
