@@ -12,6 +12,7 @@ from tk.model.cone_body import build_cone_body
 from tk.model.gait import neutral_pose, standing_pose, walking_pose
 from tk.model.silhouettes import draw_silhouettes
 from tk.model.skeleton import JOINTS, shoulder_angles
+from tk.optim.gauss_newton import Descent
 from tk.trackers.base import Observation
 from tk.trackers.silhouette import SilhouetteConfig, SilhouetteTracker
 from tk.trackers.start import find_person, stature_of
@@ -116,3 +117,23 @@ def test_nobody_in_the_first_frame_is_told() -> None:
     empty = Observation(7, np.zeros(0, np.uint8), np.zeros((3, 250, 200), np.uint8))
     with pytest.raises(CaptureError, match="0 of 3 masks of frame 7 show anybody, two are needed"):
         find_person(tracker, [empty], [tracker.pyramid(empty)])
+
+
+@pytest.mark.parametrize("yaw", [0.4, 0.4 + np.pi])
+def test_who_is_found_again_faces_as_before_where_silhouettes_leave_that_open(monkeypatch, yaw):
+    tracker = tracker_of()
+    before, there = (placed(standing_pose(SKELETON), yaw) for _ in range(2))
+    before[0] += 1.0
+    pyramid = tracker.pyramid(Observation(0, np.zeros(0, np.uint8), draw_silhouettes(BODY, RIG, there[None])[0]))
+    facing = SKELETON.index("torso_yaw")
+    monkeypatch.setattr(tracker, "settle", lambda _, starts: Descent(starts, np.zeros(0)))
+
+    def explained(better_if_turned):
+        return lambda _, poses: 0.2 - better_if_turned * (np.cos(poses[:, facing] - yaw) < -0.9)
+
+    for gain, turned in ((0.0, False), (0.03, False), (0.1, True)):
+        monkeypatch.setattr(tracker, "fit_error", explained(gain))
+        pose, error = tracker.relocate(pyramid, before, 1.0)
+        assert (np.cos(pose[facing] - yaw) < 0) == turned
+        assert error == pytest.approx(0.2 - gain * turned)
+    np.testing.assert_array_equal(tracker.relocate(pyramid, before, 0.05)[0], before)
