@@ -118,7 +118,9 @@ def silhouette_stages(
     variants = limb.candidates(pose[0], NEARBY, np.random.default_rng(0))
     group = PartColors(body).group
     evidence = Evidence.of(RayGrid(capture.rig, SCREEN_ROWS), last.masks[0])
-    _, rest = evidence.cast(body, group, pose, limb.others, export=True)
+    _, rest = evidence.cast(
+        body, group, pose, np.setdiff1d(np.arange(len(group), dtype=np.int32), limb.parts), export=True
+    )
     assert rest is not None
     others = Cast(rest.label[0], rest.depth[0])
     here = views.equations(body.arrays, last, pose, 0, settings.search)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from tk.model.anthropometry import BodyDimensions
 from tk.model.cone_body import PRESETS, build_cone_body
 from tk.model.gait import standing_pose
-from tk.model.limbs import DISTINCT_M, LIMBS, limbs_of
+from tk.model.limbs import DISTINCT_M, LIMBS, limbs_of, pairs
 from tk.model.skeleton import JOINTS
 
 BODY = build_cone_body(BodyDimensions.from_stature(1.75))
@@ -26,8 +26,10 @@ def test_limbs_have_the_parts_and_angles_that_the_body_has(preset):
     for limb in limbs:
         assert limb.places.shape[1] == len(limb.dofs) and len(np.unique(limb.places, axis=0)) == len(limb.places)
         assert body.free[limb.dofs].all() and body.skeleton.chain_dofs(limb.name)[limb.dofs].all()
-        assert sorted([*limb.parts, *limb.others]) == list(range(len(body.parts)))
         assert {body.parts[p].segment[-1] for p in limb.parts} == {limb.name[-1]}
+    assert [tuple(limb.name for limb in pair) for pair in pairs(limbs)] == [
+        (f"{kind}_l", f"{kind}_r") for kind in (("leg",) if preset == "walker" else ("arm", "leg"))
+    ]
 
 
 @pytest.mark.parametrize("name", LIMBS)
@@ -102,3 +104,12 @@ def test_distinct_places_lie_apart_and_the_cheapest_comes_first(seed, count):
 def test_the_same_place_twice_is_one():
     limb = LIMB["arm_l"]
     assert len(limb.distinct(SKELETON, np.repeat(POSE[None], 5, axis=0), np.arange(5.0), 3)) == 1
+
+
+def test_combined_are_all_places_of_one_limb_with_all_of_another():
+    rng = np.random.default_rng(0)
+    left, right = (LIMB[name].candidates(POSE, 0, rng)[:n] for name, n in (("leg_l", 3), ("leg_r", 4)))
+    found = LIMB["leg_r"].combined(left, right)
+    assert found.shape == (12, len(POSE)) and len(np.unique(found, axis=0)) == 12
+    wanted = {(*a[LIMB["leg_l"].dofs], *b[LIMB["leg_r"].dofs]) for a in left for b in right}
+    assert {(*p[LIMB["leg_l"].dofs], *p[LIMB["leg_r"].dofs]) for p in found} == wanted

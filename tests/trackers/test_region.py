@@ -14,7 +14,7 @@ from tk.io.init_pose import InitPose
 from tk.model.camera import Rig
 from tk.model.cone_body import ConeBody, build_cone_body
 from tk.model.evidence import Evidence, RayGrid
-from tk.model.gait import walking_pose
+from tk.model.gait import standing_pose, walking_pose
 from tk.model.part_colors import GROUPS, PartColors
 from tk.model.silhouettes import draw_silhouettes
 from tk.model.skeleton import JOINTS, join_pose, shoulder_angles, split_pose
@@ -133,6 +133,33 @@ def test_a_frame_that_is_explained_badly_is_searched_unasked() -> None:
     estimate = tracker.step(observe(draw_silhouettes(BODY, RIG, raised[None])[0], 1))
     assert estimate.iterations[1] == 1
     assert errors(estimate, raised)[JOINTS.index("wrist_r")] < 0.08
+
+
+@pytest.mark.parametrize(
+    ("forward_deg", "across_deg", "heading"), [(25.0, 12.0, 0.7), (0.0, 24.0, 0.0), (15.0, 18.0, 1.5)]
+)
+def test_legs_that_cross_are_not_exchanged(forward_deg: float, across_deg: float, heading: float) -> None:
+    """Each leg is then near the other one's place, and neither can leave it for its own alone."""
+    spread = standing_pose(SKELETON)
+    spread[:3], spread[NAMES.index("torso_yaw")] = POSES[0][:3], heading
+    crossed = spread.copy()
+    for side in "lr":
+        spread[NAMES.index(f"hip_{side}_yaw")] = np.radians(across_deg)
+        crossed[NAMES.index(f"hip_{side}_yaw")] = -np.radians(across_deg)
+    spread[NAMES.index("hip_r_pitch")] = crossed[NAMES.index("hip_l_pitch")] = -np.radians(forward_deg)
+    before, now = (SKELETON.clip(pose) for pose in (spread, crossed))
+    masks = draw_silhouettes(BODY, RIG, np.array([before, now]))
+    tracker = tracker_at(before, masks[0])
+    tracker.step(observe(masks[0]))
+    frame = observe(masks[1], 1)
+    pyramid = tracker.pyramid(frame)
+    exchanged = tracker.settle(pyramid, before[None]).states[0]
+    assert SKELETON.apart(exchanged, SKELETON.joints(now)) > 0.3
+    alone, _ = tracker.search(frame, pyramid, exchanged)
+    in_pairs, cost = tracker.search(frame, pyramid, exchanged, in_pairs=True)
+    assert SKELETON.apart(alone, SKELETON.joints(now)).min() > 0.2
+    assert SKELETON.apart(in_pairs[int(np.argmin(cost))], SKELETON.joints(now)) < 0.06
+    assert errors(tracker.step(frame), now).max() < 0.06
 
 
 def test_nobody_in_sight_is_a_lost_frame_and_then_the_person_is_recovered() -> None:

@@ -6,6 +6,7 @@ several sides; a leg's are hip and knee angles on a grid. Both are relative to t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +42,7 @@ class Limb:
         name: of :data:`LIMBS`.
         dofs: (L,) its degrees of freedom.
         free: (D,) bool, where those are.
-        parts: (K,) int32 its parts; others: (P - K,) all others.
+        parts: (K,) int32 its parts.
         arrays: the body for the kernels, with the contours of these parts only.
         joints: elbow and wrist, or knee and ankle, as indices into the skeleton's joints.
         places: (N, L) candidates.
@@ -52,7 +53,6 @@ class Limb:
     dofs: NDArray[np.int64]
     free: NDArray[np.bool_]
     parts: NDArray[np.int32]
-    others: NDArray[np.int32]
     arrays: ConeArrays
     joints: tuple[int, int]
     places: Float
@@ -67,19 +67,30 @@ class Limb:
         result[:, self.dofs] = places
         return result
 
+    def combined(self, poses: Float, places: Float) -> Float:
+        """(B·N, D) each of the poses (B, D) with the limb as in each of others (N, D)."""
+        result = np.repeat(poses, len(places), axis=0)
+        result[:, self.dofs] = np.tile(places[:, self.dofs], (len(poses), 1))
+        return result
+
     def distinct(self, skeleton: Skeleton, poses: Float, cost: Float, count: int) -> Float:
         """(C, D) the cheapest of the poses whose limbs lie apart by more than :data:`DISTINCT_M`, at most ``count``."""
         # beyond these only neighbours of the first follow
         best = np.argsort(cost, kind="stable")[: 20 * count]
         best = best[np.isfinite(cost[best])]
         ends = skeleton.joints(poses[best])[:, list(self.joints)]
-        chosen: list[int] = []
-        for i, end in enumerate(ends):
-            if all(np.linalg.norm(end - ends[j], axis=1).max() > DISTINCT_M for j in chosen):
-                chosen.append(i)
-            if len(chosen) == count:
-                break
-        return np.asarray(poses[best[chosen]])
+        return np.asarray(poses[best[distinct(ends, count)]])
+
+
+def distinct(places: Float, count: int, present: Float | None = None) -> list[int]:
+    """The first of the places (N, J, 3) that lie apart from each other and from the present one (J, 3)."""
+    kept = [] if present is None else [present]
+    chosen: list[int] = []
+    for i, place in enumerate(places):
+        if len(chosen) < count and all(np.linalg.norm(place - other, axis=1).max() > DISTINCT_M for other in kept):
+            kept.append(place)
+            chosen.append(i)
+    return chosen
 
 
 def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
@@ -108,7 +119,6 @@ def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
                 dofs=dofs,
                 free=free,
                 parts=np.flatnonzero(parts).astype(np.int32),
-                others=np.flatnonzero(~parts).astype(np.int32),
                 arrays=body.arrays._replace(
                     curve_part=body.arrays.curve_part[own], curve_kind=body.arrays.curve_kind[own]
                 ),
@@ -119,6 +129,12 @@ def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
             )
         )
     return tuple(result)
+
+
+def pairs(limbs: Sequence[Limb]) -> list[tuple[Limb, ...]]:
+    """Both arms, and both legs."""
+    kinds = [[limb for limb in limbs if limb.name.startswith(kind)] for kind in ("arm", "leg")]
+    return [tuple(pair) for pair in kinds if len(pair) == 2]
 
 
 def _arm_places() -> Float:

@@ -24,7 +24,7 @@ from tk.model.camera import Rig
 from tk.model.cone_body import PRESETS, ConeBody, ConePart, build_cone_body
 from tk.model.evidence import Evidence, RayGrid, mean_of_views
 from tk.model.initialisation import rough_pose
-from tk.model.limbs import Limb, limbs_of
+from tk.model.limbs import Limb, distinct, limbs_of, pairs
 from tk.model.part_colors import PartColors
 from tk.model.silhouettes import CleaningConfig, Pyramid, Views
 from tk.model.skeleton import ANKLES, WAIST, build_skeleton, join_pose, split_pose
@@ -48,8 +48,8 @@ PLACES, MORE_PLACES, NEARBY = 3, 8, 80
 OUTSIDE = 0.5
 # A limb's place that costs this much more than its present one, once the limb alone has settled there, is given up.
 PROMISING = 0.01
-# Poses that a search descends from with all limbs, beside the present one.
-FINISHED = 2
+# Poses that a search descends from with all limbs, beside the present one; and for each pair of limbs.
+FINISHED, FINISHED_PAIRS = 2, 4
 # Poses whose joints lie farther apart than this are different ones, metres.
 APART_M = 0.05
 # What a person who is found again may explain worse, as E_S, for facing as before and not the other way.
@@ -272,9 +272,13 @@ class ContourTracker:
         pose: Float,
         images: NDArray[np.uint8] | None = None,
         misplaced: Sequence[Limb] = (),
+        in_pairs: bool = False,
     ) -> tuple[Float, Float]:
         """Other places of the limbs: all of a limb's are screened in one launch, the best ones descended from, first by
         the limb alone, then, where that promises something, by the whole body.
+
+        With ``in_pairs`` both arms, and both legs, are taken away at once: where one of them is in the other's place,
+        neither finds its own while the other stays.
 
         Returns:
             Poses (B, D), that which was given first, and their costs (B,).
@@ -287,37 +291,45 @@ class ContourTracker:
         own, unmet = mean_of_views(by_view)[0], coarse.unmet(met.label[0])
         joints = skeleton.joints(pose)
         level = (min(1, self.contours.solver.scales - 1),)
-        found: list[tuple[Limb, Float]] = []
-        for limb in self.limbs:
-            without, rest = coarse.cast(self.body, group, pose[None], limb.others, export=True)
+        found: list[tuple[NDArray[np.int64], Float]] = []
+        for limbs in pairs(self.limbs) if in_pairs else [(limb,) for limb in self.limbs]:
+            moved = np.concatenate([limb.parts for limb in limbs])
+            others = np.setdiff1d(np.arange(len(group), dtype=np.int32), moved)
+            without, rest = coarse.cast(self.body, group, pose[None], others, export=True)
             assert rest is not None
-            if limb not in misplaced and mean_of_views(without)[0] - own > unmet:
+            if not in_pairs and limbs[0] not in misplaced and mean_of_views(without)[0] - own > unmet:
                 continue  # it explains more where it is than there is to explain elsewhere
             before = Cast(rest.label[0].copy(), rest.depth[0].copy())
-            tried = limb.candidates(pose, NEARBY, rng)
-            cost, _ = coarse.cast(self.body, group, tried, limb.parts, before, most_outside=OUTSIDE)
-            places = limb.distinct(skeleton, tried, mean_of_views(cost), MORE_PLACES if limb in misplaced else PLACES)
-            if not len(places):
-                continue
-            settled = self.settle(pyramid, places, level, images, limb=limb).states
-            cost, _ = coarse.cast(self.body, group, settled, limb.parts, before)
+            settled = pose[None]
+            for limb in limbs:
+                tried = limb.candidates(pose, NEARBY, rng)
+                cost, _ = coarse.cast(self.body, group, tried, limb.parts, before, most_outside=OUTSIDE)
+                count = MORE_PLACES if in_pairs or limb in misplaced else PLACES
+                places = limb.distinct(skeleton, tried, mean_of_views(cost), count)
+                if len(places):
+                    places = self.settle(pyramid, places, level, images, limb=limb).states
+                settled = limb.combined(settled, np.concatenate([pose[None], places]))
+            cost, _ = coarse.cast(self.body, group, settled, moved, before)
             told = mean_of_views(cost)
             order = np.argsort(told, kind="stable")
             settled, told = settled[order], told[order]
-            others = settled[(told < own + PROMISING) & (skeleton.apart(settled, joints) > APART_M)]
-            if len(others):
-                found.append((limb, others[:2]))
+            if in_pairs:  # the trunk has gone with the limbs as they are: only the whole body tells what a pair costs
+                better = settled[distinct(skeleton.joints(settled), FINISHED_PAIRS, joints)]
+            else:
+                better = settled[(told < own + PROMISING) & (skeleton.apart(settled, joints) > APART_M)][:2]
+            if len(better):
+                found.append((np.concatenate([limb.dofs for limb in limbs]), better))
         if not found:
             return pose[None], np.array([own])
-        # a limb elsewhere, and pairs of limbs
+        # limbs elsewhere, and those of two groups
         poses = [place for _, places in found for place in places]
         for i, (_, places) in enumerate(found):
-            for limb, others in found[i + 1 :]:
+            for dofs, others in found[i + 1 :]:
                 both = places[0].copy()
-                both[limb.dofs] = others[0][limb.dofs]
+                both[dofs] = others[0][dofs]
                 poses.append(both)
         cost = mean_of_views(coarse.cast(self.body, group, np.array(poses))[0])
-        best = np.argsort(cost, kind="stable")[:FINISHED]
+        best = np.argsort(cost, kind="stable")[: None if in_pairs else FINISHED]
         chosen = np.concatenate([pose[None], np.array(poses)[best]])
         settled = self.settle(pyramid, chosen, (0,), images).states
         fine = self.evidence(self.choice, frame, pyramid)

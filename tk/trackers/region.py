@@ -166,14 +166,17 @@ class RegionTracker(ContourTracker):
         misplaced = self.misplaced(evidence, label)
         searched = self._needs_search(frame, float(np.nanmean(error)), misplaced)
         if searched:
-            before = self._best.pose
-            self._propose(frame, pyramid, images, misplaced)
-            if self._best.pose is not before:
-                best = self._best.pose[None]
-                _, again = evidence.cast(self.body, self.colors.group, best, export=True)
-                assert again is not None
-                label, curvature = again.label[0], self._curvature(pyramid, best, images)
-                error = evidence.fit_error(label)
+            for in_pairs in (False, True):
+                before = self._best.pose
+                self._propose(frame, pyramid, images, misplaced, in_pairs)
+                if self._best.pose is not before:
+                    best = self._best.pose[None]
+                    _, again = evidence.cast(self.body, self.colors.group, best, export=True)
+                    assert again is not None
+                    label, curvature = again.label[0], self._curvature(pyramid, best, images)
+                    error, misplaced = evidence.fit_error(label), self.misplaced(evidence, label)
+                if not self._worse(float(np.nanmean(error))):
+                    break  # no limb is where the other one of its pair should be
         watch.lap("search")
         lost = self._follow(pyramid, float(np.nanmean(error)))
         self._learn(evidence, label, float(np.nanmean(error)), lost)
@@ -262,15 +265,23 @@ class RegionTracker(ContourTracker):
         around."""
         every = self.contours.search_every
         due = every > 0 and frame.index % every == 0
-        worse = error > self.config.search_ratio * self._usual
-        return self.contours.body != "walker" and (due or worse or bool(misplaced))
+        return self.contours.body != "walker" and (due or self._worse(error) or bool(misplaced))
+
+    def _worse(self, error: float) -> bool:
+        """Whether a frame is explained worse than is usual for this person."""
+        return error > self.config.search_ratio * self._usual
 
     def _propose(
-        self, frame: Observation, pyramid: Pyramid, images: NDArray[np.uint8] | None, misplaced: Sequence[Limb]
+        self,
+        frame: Observation,
+        pyramid: Pyramid,
+        images: NDArray[np.uint8] | None,
+        misplaced: Sequence[Limb],
+        in_pairs: bool,
     ) -> None:
         """Other places of the limbs join the hypotheses, with what they cost above the best one's running mean."""
         best = self._best
-        poses, cost = self.search(frame, pyramid, best.pose, images, misplaced)
+        poses, cost = self.search(frame, pyramid, best.pose, images, misplaced, in_pairs)
         gain = cost[0] - cost
         # a jump must pay more than noise makes of two casts; less must show in the frames that follow
         self._alive += [
