@@ -35,7 +35,7 @@ from tk.model.joint_sigma import contour_variance, directions, posture_variance
 from tk.model.limbs import Limb
 from tk.model.part_colors import color_bins
 from tk.model.silhouettes import Pyramid
-from tk.model.skeleton import JOINTS
+from tk.model.skeleton import JOINTS, Skeleton
 from tk.optim.gauss_newton import Prior
 from tk.trackers.base import Estimate, Observation, Stopwatch
 from tk.trackers.contours import APART_M, GAIN, RELOCATE_EVERY, ContourTracker, SilhouetteConfig, restore_body
@@ -326,10 +326,8 @@ class RegionTracker(ContourTracker):
         self._usual_posture += (directions(skeleton, pose) - self._usual_posture) / self._postures
         variance += posture_variance(skeleton, pose, self._usual_posture)
         if len(self._alive) > 1:
-            weight = np.exp(-(np.array([h.cost for h in self._alive]) - self._best.cost) / GAIN)
-            places = np.array([skeleton.joints(h.pose) for h in self._alive])
-            mean = np.einsum("h,hja->ja", weight / weight.sum(), places)
-            variance += np.einsum("h,hja->j", weight / weight.sum(), (places - mean) ** 2) / 3
+            poses, cost = (np.array(column) for column in zip(*((h.pose, h.cost) for h in self._alive), strict=True))
+            variance += _disagreement(skeleton, poses, cost)
         return np.asarray(np.sqrt(variance))
 
     def second_pass(
@@ -340,12 +338,14 @@ class RegionTracker(ContourTracker):
         error: Float,
         height_m: float | None,
         keep_body: bool = False,
+        searched: NDArray[np.bool_] | None = None,
     ) -> tuple[Float, Float, Float]:
         """Fit the body to frames of the whole recording, and settle every frame anew with it.
 
         Frames of differing poses show what an opening without the initialisation pose may not: where a knee or an elbow
         is, only a bent one tells. Each frame stays near the pose that the first pass found, so that what colours told
-        of a limb inside the silhouette is not lost.
+        of a limb inside the silhouette is not lost. Where a search has found another pose, that is followed backwards
+        beside the poses of the frames before it: what explains them better stands, and σ has the spread of the two.
 
         Args:
             masks: (C, H, W) of F frames.
@@ -354,6 +354,7 @@ class RegionTracker(ContourTracker):
             error: (F, C) E_S of the first pass; NaN where a camera was left out, and is again.
             height_m: the subject's height, if known.
             keep_body: leave the body as it is.
+            searched: (F,) bool, where the first pass searched; nowhere by default.
 
         Returns:
             Poses (F, D), E_S (F, C), and one standard deviation (F, 15) of the joints' positions along an axis, metres,
@@ -379,17 +380,39 @@ class RegionTracker(ContourTracker):
             body, _ = self.fit(seen, poses[chosen], np.arange(len(chosen)), stature, fit)
             self.take_body(body)
         result, errors = poses.copy(), np.array(error)
-        for i in tracked:
+        later: Hypothesis | None = None
+        for i in tracked[::-1]:
+            if i + 1 == len(poses) or lost[i + 1]:
+                later = None
+            elif later is None and searched is not None and searched[i + 1]:
+                later = Hypothesis(result[i + 1], result[i + 1], 0.0)
             pyramid = self.views.pyramid(believed(int(i)), scales, cleaning)
-            prior = self._prior(poses[i], SECOND_ANGLE_DEG)
-            settled = self.settle(pyramid, poses[i][None], (0,), prior=prior)
+            starts = poses[i][None] if later is None else np.stack([poses[i], later.pose])
+            prior = self._prior(starts, SECOND_ANGLE_DEG)
+            settled = self.settle(pyramid, starts, (0,), prior=prior)
             evidence = Evidence.of(self.screen, pyramid.masks[0])
-            result[i], errors[i] = settled.states[0], evidence.cast(self.body, self.colors.group, settled.states)[0][0]
-            precision = INFORMATION * (settled.hessian[0] + np.diag(prior.precision))
+            by_view = evidence.cast(self.body, self.colors.group, settled.states)[0]
+            later = later and self._backwards(later, settled.states, mean_of_views(by_view))
+            k = int(later is not None and later.cost < -GAIN)
+            result[i], errors[i] = settled.states[k], by_view[k]
+            precision = INFORMATION * (settled.hessian[k] + np.diag(prior.precision))
             variance[i] = contour_variance(self.body.skeleton, result[i], precision, self.body.free)
+            if later is not None:
+                variance[i] += _disagreement(self.body.skeleton, settled.states, np.array([0.0, later.cost]))
         usual = np.median(directions(self.body.skeleton, result[tracked]), axis=0)
         variance[tracked] += posture_variance(self.body.skeleton, result[tracked], usual)
         return result, errors, np.sqrt(variance)
+
+    def _backwards(self, later: Hypothesis, poses: Float, cost: Float) -> Hypothesis | None:
+        """The hypothesis that comes from the frame after, by what it costs more than that frame's own pose; both are at
+        ``poses`` (2, D), the own one first. None where they are the same, or it explains too little."""
+        more = float(cost[1] - cost[0])
+        if later.age:
+            more = later.cost + RENEWAL * (more - later.cost)
+        skeleton = self.body.skeleton
+        if more > MARGIN or skeleton.apart(poses[1], skeleton.joints(poses[0])) <= APART_M:
+            return None
+        return Hypothesis(poses[1], later.pose, more, later.age + 1)
 
     def _nobody(self, frame: Observation, watch: Stopwatch) -> Estimate:
         """Nobody is in sight: the last pose stands, as lost."""
@@ -433,6 +456,15 @@ class RegionTracker(ContourTracker):
         self._lost_for = int(state["lost_for"])
         self.colors.restore(state)
         self._fresh = False
+
+
+def _disagreement(skeleton: Skeleton, poses: Float, cost: Float) -> Float:
+    """(J,) variance of the joints' places along an axis over poses (H, D) that cost so much (H,), metres²."""
+    weight = np.exp((cost.min() - cost) / GAIN)
+    weight /= weight.sum()
+    places = skeleton.joints(poses)
+    mean = np.einsum("h,hja->ja", weight, places)
+    return np.asarray(np.einsum("h,hja->j", weight, (places - mean) ** 2) / 3)
 
 
 def _spread(frames: NDArray[np.int64], error: Float, count: int) -> NDArray[np.int64]:
