@@ -254,7 +254,8 @@ class _Video:
         self._stream = self._container.add_stream("libx264", rate=Fraction(FPS).limit_denominator(1000))
         self._stream.width, self._stream.height = camera.width, camera.height
         self._stream.pix_fmt = "yuv420p"
-        self._stream.options = {"crf": str(crf), "preset": "slow", "threads": "1"}
+        # with macroblock trees some files of a hundred differ from run to run on a busy machine, one thread or not
+        self._stream.options = {"crf": str(crf), "preset": "slow", "threads": "1", "x264-params": "mbtree=0"}
 
     def write(self, image: NDArray[np.uint8]) -> None:
         frame = av.VideoFrame.from_ndarray(image, format="rgb24")
