@@ -58,7 +58,6 @@ def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[st
         # the initialisation pose shows all of the body; what else a recording may begin with does not
         shown = plan.init is None and plan.capture.init_pose != "any"
         assert result.fit_error is not None
-        searched = result.iterations[:, tracker.stages.index("search")] > 0
         missing = [int(f) for f in result.frames if int(f) not in masks]
         if missing:  # what an earlier run has tracked
             with open_source(plan.capture, plan.config, lambda _: None) as source:
@@ -76,7 +75,6 @@ def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[st
                     told_again = [again[int(frame)] for frame in result.frames[rows]]
                     poses[rows] = [join_pose(skeleton, e.pose, e.waist, e.ankles) for e in told_again]
                     lost[rows] = [e.status == "lost" for e in told_again]
-                    searched[rows] = [e.iterations[tracker.stages.index("search")] > 0 for e in told_again]
                     columns |= _replaced(result, rows, told_again)
         poses, columns["fit_error"], sigma = tracker.second_pass(
             masks.sequence(result.frames),
@@ -85,7 +83,6 @@ def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[st
             columns.get("fit_error", result.fit_error),
             plan.capture.subject_height_m,
             keep_body=plan.body is not None or shown,
-            searched=searched,
         )
         # where the first pass was much less sure, or NaN, it followed several poses, or none was found for a limb
         assert result.sigma is not None

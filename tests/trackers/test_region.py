@@ -275,17 +275,16 @@ def test_frames_before_a_limb_was_found_again_are_mended_backwards() -> None:
     masks = draw_silhouettes(BODY, RIG, raised)
     first = np.concatenate([POSES[:4], raised[4:]])  # until it is found again in frame 4 the arm hangs
     tracker, wrist = tracker_at(POSES[0]), JOINTS.index("wrist_l")
-    searched, lost = np.arange(6) == 4, np.zeros(6, bool)
 
-    def told(searched: np.ndarray, lost: np.ndarray) -> np.ndarray:
-        poses, _, sigma = tracker.second_pass(masks, first, lost, np.zeros((6, 3)), None, True, searched)
+    def told(lost: np.ndarray) -> np.ndarray:
+        poses, _, sigma = tracker.second_pass(masks, first, lost, np.zeros((6, 3)), None, True)
         assert np.isfinite(sigma).all()
         return np.linalg.norm(SKELETON.joints(poses) - SKELETON.joints(raised), axis=-1)[:, wrist]
 
-    assert (told(np.zeros(6, bool), lost) > 0.25).tolist() == [True] * 4 + [False] * 2
-    assert told(searched, lost).max() < 0.06
+    assert told(np.zeros(6, bool)).max() < 0.06
     # nothing passes over a frame that is lost
-    assert (told(searched, np.arange(6) == 1) > 0.25).tolist() == [True] * 2 + [False] * 4
+    assert (told(np.arange(6) == 1) > 0.25).tolist() == [True] * 2 + [False] * 4
+    assert (told(np.arange(6) == 3) > 0.25).tolist() == [True] * 4 + [False] * 2
 
 
 def test_two_poses_that_explain_a_frame_alike_make_its_sigma_large() -> None:
@@ -293,14 +292,14 @@ def test_two_poses_that_explain_a_frame_alike_make_its_sigma_large() -> None:
     hanging = np.repeat(POSES[:1], 3, axis=0)
     raised = np.array([with_arm(pose, "l", (0.1, 1.0, 0.3), 15.0) for pose in hanging])
     half = draw_silhouettes(BODY, RIG, np.array([hanging[0], raised[0]])).max(axis=0)
-    masks = np.array([half, half, draw_silhouettes(BODY, RIG, raised[:1])[0]])
-    first = np.concatenate([hanging[:2], raised[2:]])
     tracker, wrist = tracker_at(POSES[0]), JOINTS.index("wrist_l")
-    sigma = [
-        tracker.second_pass(masks, first, np.zeros(3, bool), np.zeros((3, 3)), None, True, searched)[2][:2, wrist]
-        for searched in (np.arange(3) == 2, np.zeros(3, bool))
-    ]
-    assert (sigma[0] > 0.1).all() and (sigma[1] < 0.05).all()
+
+    def sigma(masks: np.ndarray, poses: np.ndarray) -> np.ndarray:
+        return tracker.second_pass(masks, poses, np.zeros(3, bool), np.zeros((3, 3)), None, True)[2][:2, wrist]
+
+    there = draw_silhouettes(BODY, RIG, raised[:1])[0]
+    assert (sigma(np.array([half, half, there]), np.concatenate([hanging[:2], raised[2:]])) > 0.1).all()
+    assert (sigma(np.array([half, half, half]), hanging) < 0.05).all()
 
 
 def test_a_body_that_was_given_is_kept_in_the_second_pass() -> None:

@@ -62,6 +62,8 @@ MISPLACED = 0.25
 # The second pass: what the body is fitted to, and how near a frame stays to its pose of the first pass.
 SECOND_FIT = BodyFitConfig(frames=24, rounds=4)
 SECOND_ANGLE_DEG = 15.0
+# A step of a joint that is longer than its neighbours by this is a jump, metres: twice what makes two poses of one.
+JUMP_M = 2 * APART_M
 # Over so many frames the usual posture of the first pass is a plain mean, then one that forgets.
 USUAL_FRAMES = 200
 
@@ -338,14 +340,14 @@ class RegionTracker(ContourTracker):
         error: Float,
         height_m: float | None,
         keep_body: bool = False,
-        searched: NDArray[np.bool_] | None = None,
     ) -> tuple[Float, Float, Float]:
         """Fit the body to frames of the whole recording, and settle every frame anew with it.
 
         Frames of differing poses show what an opening without the initialisation pose may not: where a knee or an elbow
         is, only a bent one tells. Each frame stays near the pose that the first pass found, so that what colours told
-        of a limb inside the silhouette is not lost. Where a search has found another pose, that is followed backwards
-        beside the poses of the frames before it: what explains them better stands, and σ has the spread of the two.
+        of a limb inside the silhouette is not lost. Where a limb jumps, for a search has found it elsewhere, the pose
+        behind that is followed backwards beside those of the frames before: what explains them better stands, and σ
+        has the spread of the two.
 
         Args:
             masks: (C, H, W) of F frames.
@@ -354,7 +356,6 @@ class RegionTracker(ContourTracker):
             error: (F, C) E_S of the first pass; NaN where a camera was left out, and is again.
             height_m: the subject's height, if known.
             keep_body: leave the body as it is.
-            searched: (F,) bool, where the first pass searched; nowhere by default.
 
         Returns:
             Poses (F, D), E_S (F, C), and one standard deviation (F, 15) of the joints' positions along an axis, metres,
@@ -381,10 +382,11 @@ class RegionTracker(ContourTracker):
             self.take_body(body)
         result, errors = poses.copy(), np.array(error)
         later: Hypothesis | None = None
+        jumps = _jumps(self.body.skeleton, poses)
         for i in tracked[::-1]:
             if i + 1 == len(poses) or lost[i + 1]:
                 later = None
-            elif later is None and searched is not None and searched[i + 1]:
+            elif later is None and jumps[i + 1]:
                 later = Hypothesis(result[i + 1], result[i + 1], 0.0)
             pyramid = self.views.pyramid(believed(int(i)), scales, cleaning)
             starts = poses[i][None] if later is None else np.stack([poses[i], later.pose])
@@ -465,6 +467,14 @@ def _disagreement(skeleton: Skeleton, poses: Float, cost: Float) -> Float:
     places = skeleton.joints(poses)
     mean = np.einsum("h,hja->ja", weight, places)
     return np.asarray(np.einsum("h,hja->j", weight, (places - mean) ** 2) / 3)
+
+
+def _jumps(skeleton: Skeleton, poses: Float) -> NDArray[np.bool_]:
+    """(F,) whether a joint comes to the pose of a frame, of (F, D), by a step longer than those before and behind it,
+    by :data:`JUMP_M`."""
+    steps = np.pad(np.linalg.norm(np.diff(skeleton.joints(poses), axis=0), axis=2), ((1, 1), (0, 0)))
+    beside = np.maximum(steps[:-2], steps[2:])
+    return np.concatenate([[False], (steps[1:-1] > beside + JUMP_M).any(axis=1)])
 
 
 def _spread(frames: NDArray[np.int64], error: Float, count: int) -> NDArray[np.int64]:
