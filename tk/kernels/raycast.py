@@ -68,7 +68,7 @@ def _cast_kernel(real):
         placed: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 12) scratch
         disc: ti.types.ndarray(dtype=real, ndim=4),  # (B, V, P, 3) scratch, centre and square radius in pixels
         outside: ti.types.ndarray(dtype=real, ndim=1),  # (B,) out: mean cost at the drawn parts' middles
-        change: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (B V, H) out: what drawing changes of a row's cost
+        change: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (B, V) out: what drawing changes of the cost
         label: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (B, V, H, W) out, if export; before_label when called
         depth: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (B, V, H, W) out, if export; before_depth when called
     ):
@@ -108,11 +108,19 @@ def _cast_kernel(real):
             if outside[b] > most_outside:
                 continue
             for v in range(V):
-                c = b * V + v
                 eye = camera_center(camera, v)
-                for j in range(H):
+                # the rows that the drawn parts' discs cover
+                top, bottom = H, -1
+                for k in range(K):
+                    if disc[b, v, drawn[k], 2] > 0.0:
+                        half = ti.sqrt(disc[b, v, drawn[k], 2])
+                        middle = disc[b, v, drawn[k], 1] - step // 2
+                        top = ti.min(top, ti.max(ti.cast(ti.ceil((middle - half) / step), ti.i32), 0))
+                        bottom = ti.max(bottom, ti.min(ti.cast(ti.floor((middle + half) / step), ti.i32), H - 1))
+                total = ti.cast(0.0, ti.f64)
+                for j in range(top, bottom + 1):
                     row = j * step + step // 2
-                    # the stretch of this row that the drawn parts' discs cover
+                    # and the stretch of this row
                     low, high = W, -1
                     for k in range(K):
                         across = disc[b, v, drawn[k], 2] - (row - disc[b, v, drawn[k], 1]) ** 2
@@ -121,7 +129,7 @@ def _cast_kernel(real):
                             middle = disc[b, v, drawn[k], 0] - step // 2
                             low = ti.min(low, ti.max(ti.cast(ti.ceil((middle - half) / step), ti.i32), 0))
                             high = ti.max(high, ti.min(ti.cast(ti.floor((middle + half) / step), ti.i32), W - 1))
-                    total = ti.cast(0.0, ti.f32)
+                    in_row = ti.cast(0.0, ti.f32)
                     for i in range(low, high + 1):
                         ray = ti.Vector([ti.cast(rays[v, j, i, a], real) for a in ti.static(range(3))])
                         nearest = ti.cast(before_depth[v, j, i], real)
@@ -143,11 +151,12 @@ def _cast_kernel(real):
                             was = 0
                             if old > 0:
                                 was = group[old - 1] + 1
-                            total += cost[v, j, i, group[met] + 1] - cost[v, j, i, was]
+                            in_row += cost[v, j, i, group[met] + 1] - cost[v, j, i, was]
                             if export == 1:
                                 label[b, v, j, i] = ti.cast(met + 1, ti.u8)
                                 depth[b, v, j, i] = ti.cast(nearest, ti.f32)
-                    change[c, j] = total
+                    total += in_row
+                change[b, v] = total
 
     return Launcher(cast_rows)
 
@@ -198,7 +207,7 @@ def cast(
     if drawn is None:
         drawn = np.arange(P, dtype=np.int32)
     before = before or nothing((V, H, W))
-    change, outside = np.empty((B * V, H), np.float32), np.empty(B, dtype)
+    change, outside = np.empty((B, V)), np.empty(B, dtype)
     shape = (B, V, H, W) if export else (1, 1, 1, 1)
     label, depth = np.empty(shape, np.uint8), np.empty(shape, np.float32)
     if export:
@@ -226,11 +235,10 @@ def cast(
         label,
         depth,
     )
-    change.reshape(B, V, H)[outside > most_outside] = np.inf
+    change[outside > most_outside] = np.inf
     if before.label.any():
         columns = np.concatenate([[0], group + 1])[before.label]
         base = np.take_along_axis(cost, columns[..., None], axis=-1)[..., 0].sum(axis=(1, 2), dtype=np.float64)
     else:
         base = cost[..., 0].sum(axis=(1, 2), dtype=np.float64)
-    total = base + change.reshape(B, V, H).sum(axis=2, dtype=np.float64)
-    return total, Cast(label, depth) if export else None
+    return base + change, Cast(label, depth) if export else None

@@ -292,8 +292,11 @@ class ContourTracker:
         joints = skeleton.joints(pose)
         level = (min(1, self.contours.solver.scales - 1),)
         found: list[tuple[NDArray[np.int64], Float]] = []
+        told_by, rays = coarse.cost_of_parts(group, met.label[0])
         for limbs in pairs(self.limbs) if in_pairs else [(limb,) for limb in self.limbs]:
             moved = np.concatenate([limb.parts for limb in limbs])
+            if in_pairs and told_by[moved].sum() * rays.sum() <= told_by.sum() * rays[moved].sum():
+                continue  # where they are they explain more than the rest of the body does
             others = np.setdiff1d(np.arange(len(group), dtype=np.int32), moved)
             without, rest = coarse.cast(self.body, group, pose[None], others, export=True)
             assert rest is not None
