@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -179,6 +180,32 @@ def test_nobody_in_sight_is_a_lost_frame_and_then_the_person_is_recovered() -> N
 
 def test_somebody_who_comes_back_elsewhere_is_found() -> None:
     find_again_elsewhere(tracker_at(POSES[0]), RIG, POSES[:4], 2 * CLOSE_M)
+
+
+def test_who_stays_in_a_wrong_pose_is_looked_for_as_if_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a pose from which no limb alone leads out, below what says lost."""
+    tracker = tracker_at(POSES[0])
+    for _ in range(3):
+        tracker.step(observe(MASKS[0]))
+    state = dict(tracker.state())
+    wrong = POSES[0].copy()
+    wrong[SKELETON.index("torso_yaw")] += np.radians(75)
+    looked_for = []
+    relocate = tracker.relocate
+
+    def watched(*arguments: Any) -> Any:
+        looked_for.append(relocate(*arguments))
+        return looked_for[-1]
+
+    monkeypatch.setattr(tracker, "relocate", watched)
+    monkeypatch.setattr(tracker, "search", lambda _frame, _pyramid, pose, *_: (pose[None], np.zeros(1)))
+    tracker.restore(tracker.model(), {**state, "poses": wrong[None], "previous": wrong[None]})
+    usual = tracker.state()["usual"]
+    estimates = [tracker.step(observe(MASKS[0])) for _ in range(4)]
+    assert [e.status for e in estimates] == ["tracked"] * 4
+    assert errors(estimates[1], POSES[0]).mean() > 2 * CLOSE_M
+    assert len(looked_for) == 1 and errors(estimates[3], POSES[0]).mean() < CLOSE_M
+    assert tracker.state()["usual"] < 1.1 * usual
 
 
 def test_the_person_is_found_without_any_hint() -> None:

@@ -46,11 +46,13 @@ Float = NDArray[np.float64]
 INFORMATION = 1.0 / (2.0**2 * 10.0)
 # Standard deviations of the priors: waist and ankles about straight ones, the others about their prediction.
 WAIST_DEG, ANKLE_DEG, ANGLE_DEG, TRANSLATION_M = 12.0, 20.0, 40.0, 0.3
+# Who is explained worse than usual by this factor for RELOCATE_EVERY frames, searched or not, is looked for as if lost.
+STRANDED = 1.6
 # How long a hypothesis may live beside the best one, in frames, and how much of its running cost a frame replaces.
 PATIENCE, RENEWAL = 6, 0.4
 # Hypotheses that cost this much more than the best one, as a share of the person's pixels, are dropped.
 MARGIN = 0.02
-# Colours are learned only in frames that are explained about as well as is usual.
+# Colours are learned only in frames that are explained about as well as is usual; nothing worse counts as usual either.
 LEARN_RATIO = 1.15
 # Masks are searched for what is carried where this share of their pixels has colours that are not the person's; smaller
 # things than this many pixels across stay.
@@ -122,6 +124,7 @@ class RegionTracker(ContourTracker):
         self._usual_posture: Float = np.zeros((len(JOINTS), 3))
         self._postures = 0
         self._lost_for = 0
+        self._stranded = 0
         self._fresh = True
 
     def start(
@@ -137,6 +140,7 @@ class RegionTracker(ContourTracker):
         self._usual = np.inf
         self._usual_posture, self._postures = np.zeros((len(JOINTS), 3)), 0
         self._lost_for = 0
+        self._stranded = 0
         self._fresh = True
 
     def step(self, frame: Observation) -> Estimate:
@@ -296,11 +300,13 @@ class RegionTracker(ContourTracker):
     def _follow(self, pyramid: Pyramid, error: float) -> bool:
         """Whether the person is lost; whoever is lost is looked for as at the start."""
         limit = self.contours.lost_error
+        self._stranded = self._stranded + 1 if error > STRANDED * self._usual else 0
         due = self._lost_for > 0 if error <= limit else self._lost_for % RELOCATE_EVERY == 0
-        if not due:
+        stranded = not due and self._stranded > 0 and self._stranded % RELOCATE_EVERY == 0
+        if not (due or stranded):
             return error > limit
         pose, found = self.relocate(pyramid, self._best.pose, error)
-        if found < error:
+        if found < (error / self.config.search_ratio if stranded else error):
             self._alive = [Hypothesis(pose, pose, self._best.cost)]
         return found > limit
 
@@ -310,8 +316,8 @@ class RegionTracker(ContourTracker):
         usual = error if not np.isfinite(self._usual) else self._usual
         if self.config.colors and evidence.bins is not None and error <= LEARN_RATIO * usual:
             self.colors.learn(evidence.bins[evidence.person], label[evidence.person])
-        # quick to learn that it can be better, slow to put up with worse
-        self._usual = usual + (0.1 if error < usual else 0.05) * (error - usual)
+        # quick to learn that it can be better, slow to put up with worse: how bad a wrong pose is tells nothing
+        self._usual = usual + (0.1 if error < usual else 0.05) * (min(error, LEARN_RATIO * usual) - usual)
 
     def _curvature(self, pyramid: Pyramid, poses: Float, images: NDArray[np.uint8] | None) -> Float:
         """(D, D) JᵀWJ at the first of the poses."""
@@ -444,6 +450,7 @@ class RegionTracker(ContourTracker):
             "usual_posture": self._usual_posture.copy(),
             "postures": self._postures,
             "lost_for": self._lost_for,
+            "stranded": self._stranded,
             **self.colors.state(),
         }
 
@@ -456,6 +463,7 @@ class RegionTracker(ContourTracker):
         self._usual_posture = np.array(state["usual_posture"], np.float64)
         self._postures = int(state["postures"])
         self._lost_for = int(state["lost_for"])
+        self._stranded = int(state.get("stranded", 0))  # results of before have none
         self.colors.restore(state)
         self._fresh = False
 
