@@ -145,9 +145,9 @@ def track(
         writer, done = ResultWriter.resume(output, meta) if resume else (ResultWriter.create(output, meta), 0)
         again = not causal and isinstance(plan.tracker, RegionTracker)  # the second pass asks for the masks
         kept = output.with_name(f".{output.name}.masks")
-        if not done:
-            kept.unlink(missing_ok=True)  # of a run that was stopped, whose result is replaced
         masks = MaskStore(kept, resume=bool(done)) if again else None
+        if not (done or again):
+            kept.unlink(missing_ok=True)  # of a stopped run; a second pass's replace them at the first frame
         run = _Run(plan, _Output(writer, done, plan.origin(store_hull), store_hull), masks)
         started = time.perf_counter()
         interrupted = False

@@ -1,9 +1,12 @@
 """The cone body: its parts, presets and symmetry."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tk.errors import ConfigError
+from tk.kernels.cone_arrays import MOST_PARTS
 from tk.kernels.cones import CONE, ELLIPSOID
 from tk.model.anthropometry import HAIR, BodyDimensions
 from tk.model.cone_body import PRESETS, ConePart, build_cone_body
@@ -117,3 +120,11 @@ def test_wrong_input_is_told():
         build_cone_body(DIMENSIONS, preset="stick")
     with pytest.raises(ConfigError, match="part spike"):
         ConePart("spike", "torso", CONE, (0.1, 0.1, -1.0, 1.0), np.eye(4))
+
+
+def test_a_body_of_more_parts_than_the_kernels_tell_apart_is_refused():
+    body = build_cone_body(DIMENSIONS)
+    parts = body.parts * (MOST_PARTS // len(body.parts) + 1)
+    with pytest.raises(ConfigError, match=f"{len(parts)} parts"):
+        replace(body, parts=parts).pack(np.float32)
+    assert len(replace(body, parts=parts[:MOST_PARTS]).pack(np.float32).part_kind) == MOST_PARTS

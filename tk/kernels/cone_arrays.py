@@ -10,6 +10,8 @@ from tk.kernels.runtime import ti
 
 # Nearer than this to a camera nothing is projected, metres.
 NEAREST_M = 0.1
+# Which parts may hide another is told by the bits of a number.
+MOST_PARTS = 64
 
 
 class ConeArrays(NamedTuple):

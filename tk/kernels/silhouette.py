@@ -160,7 +160,7 @@ def _equations_kernel(real):
         B, V, Q = pose.shape[0], camera.shape[0], curve_part.shape[0]
         P, D = part_dof.shape[0], axis.shape[0]
 
-        # a pose is one thread's: to wake the threads for a loop costs as much as a tenth of its work
+        # a pose is one thread's: to wake the threads for a loop takes 0.1 ms, a sixth of its work
         for turn in range(spread * B):
             if turn % spread != 0:
                 continue

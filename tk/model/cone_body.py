@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
-from tk.kernels.cone_arrays import ConeArrays
+from tk.kernels.cone_arrays import MOST_PARTS, ConeArrays
 from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A, SIDE_B
 from tk.model.anthropometry import (
     ANKLE_OUTWARD,
@@ -149,7 +149,13 @@ class ConeBody:
         return self.pack(np.float32)
 
     def pack(self, dtype: type[np.floating]) -> ConeArrays:
-        """The body for the kernels in this precision."""
+        """The body for the kernels in this precision.
+
+        Raises:
+            ConfigError: it has more parts than the kernels can tell apart.
+        """
+        if len(self.parts) > MOST_PARTS:
+            raise ConfigError(f"a body of {len(self.parts)} parts; {MOST_PARTS} are the most")
         s = self.skeleton
         segments, inside = self._frames
         curves: list[tuple[int, int]] = []
