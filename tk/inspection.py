@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.blas import one_blas_thread
 from tk.config import Config
 from tk.io.capture import Capture
 from tk.leveling import Leveling, find_up
@@ -27,6 +26,7 @@ from tk.model.regions import clean_by_area
 from tk.model.silhouettes import CleaningConfig
 from tk.model.up import up_vector
 from tk.segmentation import make_labeller
+from tk.threads import one_thread
 
 Masks = NDArray[np.uint8]
 
@@ -147,7 +147,7 @@ class Seen:
     step: int
 
 
-@one_blas_thread()
+@one_thread()
 def inspect(capture: Capture, config: Config, pictures: int = 3) -> tuple[Inspection, list[Seen]]:
     """Look at a capture.
 

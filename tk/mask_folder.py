@@ -11,7 +11,6 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from tk.blas import one_blas_thread
 from tk.errors import CaptureError, ConfigError
 from tk.io.capture import MASKS_RECORD, Capture
 from tk.io.toml import load_toml
@@ -20,6 +19,7 @@ from tk.segmentation import NO_SEGMENTER
 from tk.segmenters import load, names
 from tk.session import Reporter
 from tk.subject_masks import SubjectMasks
+from tk.threads import one_thread
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Written:
     empty: dict[str, int]
 
 
-@one_blas_thread()
+@one_thread()
 def write_masks(
     capture: Capture,
     folder: Path,

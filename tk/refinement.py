@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.ahead import open_source
-from tk.blas import one_blas_thread
 from tk.config import Config
 from tk.errors import CaptureError, ConfigError, ResultError
 from tk.io.calibration import write_calibration
@@ -24,6 +23,7 @@ from tk.model.camera_agreement import LATE_FRAMES, camera_agreement
 from tk.model.camera_refinement import Refined, RefinementConfig, refine_cameras
 from tk.model.cone_body import ConeBody
 from tk.model.silhouettes import Views
+from tk.threads import one_thread
 from tk.trackers.bodies import body_and_poses
 from tk.trackers.contours import SilhouetteConfig
 from tk.trackers.region import RegionTracker
@@ -89,7 +89,7 @@ class Refinement:
         return "\n".join(lines)
 
 
-@one_blas_thread()
+@one_thread()
 def refine_capture(
     capture: Capture,
     result: Path,

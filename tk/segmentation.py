@@ -8,7 +8,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.blas import one_blas_thread
 from tk.errors import CaptureError
 from tk.io.capture import Capture
 from tk.io.frames import FrameSet
@@ -16,6 +15,7 @@ from tk.model.foreground import CollinearityForeground, Foreground, ForegroundCo
 from tk.model.mog2 import Mog2Foreground
 from tk.model.scene import median_plate
 from tk.segmenters import INSTALL, load, names
+from tk.threads import one_thread
 
 Segmenter = Callable[[FrameSet], NDArray[np.uint8]]
 #: masks, and where they are 0 for what may be the person all the same; None where nobody says
@@ -83,8 +83,8 @@ def make_labeller(capture: Capture, config: MaskSettings, note: Callable[[str], 
     """
     if mask_source(capture) in (_GIVEN, _SCENE):
         return _labeller(capture, config, note)  # no product of matrices in it; SciPy takes long to import
-    with one_blas_thread():
-        return one_blas_thread()(_labeller(capture, config, note))
+    with one_thread():
+        return one_thread()(_labeller(capture, config, note))
 
 
 def _labeller(capture: Capture, config: MaskSettings, note: Callable[[str], None]) -> Labeller:

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.ahead import Observed
-from tk.blas import one_blas_thread
 from tk.config import Config
 from tk.errors import CaptureError, ResultError, TkError
 from tk.finish import REFINED, finish
@@ -33,6 +32,7 @@ from tk.io.result import (
 from tk.io.result_files import check_output
 from tk.model.hull import HullSurface
 from tk.plan import Plan, open_plan
+from tk.threads import one_thread
 from tk.trackers.base import Estimate, Observation
 from tk.trackers.contours import ContourTracker
 from tk.trackers.region import RegionTracker
@@ -159,7 +159,7 @@ def track(
             if run.tracked or run.restore_unfinished(output, causal):
                 for line in run.watch.report():
                     note(line)
-                with one_blas_thread():
+                with one_thread():
                     finish(output, plan, masks, note)
                 if said:
                     revise_result(output, notes=said)
@@ -257,7 +257,7 @@ class _Run:
         opening, broken = _take(observations, count)
         _LOG.info("finding the person in frame %d and fitting the body to %d frames", plan.first, len(opening))
         try:
-            with one_blas_thread():
+            with one_thread():
                 seen = self.watch.start([o for o, _ in opening])
                 plan.tracker.start(seen, plan.capture.subject_height_m, plan.init, plan.body)
                 self.watch.check_body()
@@ -292,7 +292,7 @@ class _Run:
             if observation.index >= plan.stop:
                 return
             started = time.perf_counter()
-            with one_blas_thread():
+            with one_thread():
                 estimate, used = self.watch.step(observation)
             if observation.index < plan.begin:
                 continue

@@ -30,7 +30,7 @@ from tk.model.cone_body import ConeBody, build_cone_body
 from tk.model.gait import neutral_pose
 from tk.model.silhouettes import draw_silhouettes
 from tk.model.skeleton import JOINTS, build_skeleton
-from tk.render.canvas import View, draw_body, draw_joints
+from tk.render.canvas import View, dots, draw_body, draw_joints
 from tk.render.figure import BONES, Figure, Outline, solids_of
 from tk.render.overlay import Grid, Overlay, write_sheets
 from tk.render.palette import BONE, LOST, SEGMENT_COLORS, sigma_colors
@@ -168,7 +168,7 @@ def test_a_joint_tells_its_standard_deviation() -> None:
     sigma = np.full(len(JOINTS), 0.01)
     sigma[1], sigma[3] = 0.04, np.nan
     tile = np.full((40, 40, 3), 100, np.uint8)
-    draw_joints(tile, xy, sigma)
+    draw_joints(tile, xy, dots(sigma))
     certain, uncertain = sigma_colors([0.01, 0.04])
     np.testing.assert_array_equal(tile[10, 10], certain)
     np.testing.assert_array_equal(tile[10, 30], uncertain)

@@ -14,6 +14,7 @@ from tk.render.files import check_target
 from tk.render.overlay import Overlay, write_sheets
 from tk.render.scene import Scene
 from tk.render.video import check_encoder, video_writer
+from tk.threads import one_thread
 
 VIEWS = ("overlay", "3d", "hull")
 
@@ -41,6 +42,7 @@ class Request:
     force: bool = False
 
 
+@one_thread()
 def render(result_path: Path, capture_path: Path | None, request: Request) -> list[Path]:
     """Draw a result; the files that were written.
 

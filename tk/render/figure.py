@@ -115,20 +115,16 @@ class Figure:
         """(N, 3) the points of all solids' circles in a frame, solid by solid; metres, world frame."""
         if row not in self._placed:  # every camera asks for the same
             self._placed.clear()
-            T = self.transforms[row][self._segments]
-            points = np.concatenate([solid.rings.reshape(-1, 3) for solid in self.solids])
-            self._placed[row] = np.einsum("nab,nb->na", T[:, :3, :3], points) + T[:, :3, 3]
+            T = self.transforms[row]
+            self._placed[row] = np.concatenate(
+                [s.rings.reshape(-1, 3) @ T[s.segment, :3, :3].T + T[s.segment, :3, 3] for s in self.solids]
+            )
         return self._placed[row]
 
     @cached_property
     def starts(self) -> NDArray[np.int64]:
         """(S + 1,) where each solid's points begin among those of all, and their number."""
         return np.cumsum([0, *(solid.rings.size // 3 for solid in self.solids)])
-
-    @cached_property
-    def _segments(self) -> NDArray[np.int64]:
-        """(N,) the segment of each point."""
-        return np.repeat([solid.segment for solid in self.solids], np.diff(self.starts))
 
     def seen(self, row: int, camera: Camera) -> tuple[list[Outline], Float]:
         """What a camera sees of the body, farthest segment first, and of the joints, pixels (15, 2).

@@ -20,7 +20,7 @@ from tk.io.capture import Capture
 from tk.io.result import Result, Status, read_joints
 from tk.io.result_data import STATUS_MEANING
 from tk.model.camera import Camera, Rig
-from tk.render.canvas import Image, View, draw_body, draw_joints, draw_truth, text_width, write
+from tk.render.canvas import Image, View, dots, draw_body, draw_joints, draw_truth, text_width, write
 from tk.render.figure import Figure, figure_of
 from tk.render.palette import INK, LOST, SEGMENT_COLORS, SIGMA_MOST_M, TEXT, Color, sigma_colors
 
@@ -28,6 +28,8 @@ Float = NDArray[np.float64]
 
 _GAP = 6  # pixels between the tiles of a sheet
 _STRIP, _BAR = 30, 6  # heights of a video's legend and of its bar of time
+# widths of what the legend tells, of a lost frame or another, and of the colours' key with a margin
+_TOLD, _KEY = {False: 280, True: 360}, 330
 #: pixels that a video is wide at most, and at least if that means to enlarge
 WIDEST, _NARROWEST = 1280, 640
 _ASPECT = 9 / 16  # of the tiles together, at most
@@ -67,6 +69,9 @@ class Overlay:
         self.rig = self.capture.rig
         self.grid = Grid.of(self.rig, widest)
         self._canvas = np.full((self.grid.height + _STRIP + _BAR, self.grid.width, 3), 24, np.uint8)
+        self._timeline = timeline(self.figure.status, self.grid.width)
+        self._keys: dict[bool, Image] = {}
+        self._colors: dict[int, Sequence[Color | None]] = {}
         self._views = [self._steady_view(camera, full) for camera in self.rig]
         self.row_of = {int(frame): row for row, frame in enumerate(result.frames)}
         truth_file = capture.path / "truth.h5"
@@ -74,12 +79,17 @@ class Overlay:
         self._truth = {} if truth is None else dict(zip(truth.frames.tolist(), truth.positions, strict=True))
 
     def pictures(self, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """The chosen frames, ascending, and their pictures (C, H, W, 3)."""
+        """The chosen frames, ascending, and their pictures (C, H, W, 3); decoding begins at once."""
         wanted = set(frames)
-        with self.capture.frames(min(wanted), max(wanted) + 1) as reader:
-            for frame in reader:
-                if frame.index in wanted:
-                    yield frame.index, frame.images
+        reader = self.capture.frames(min(wanted), max(wanted) + 1)
+
+        def taken() -> Iterator[tuple[int, NDArray[np.uint8]]]:
+            with reader:
+                for frame in reader:
+                    if frame.index in wanted:
+                        yield frame.index, frame.images
+
+        return taken()
 
     def chosen(self, frames: Sequence[int] = (), count: int = 8) -> list[int]:
         """These frames, ascending; without any, ``count`` spread over the result.
@@ -128,9 +138,15 @@ class Overlay:
         view.cut(image[: camera.height, : camera.width], tile)
         outlines, joints = self.figure.seen(row, camera)
         draw_body(tile, view, outlines, lost)
-        draw_joints(tile, view.place(joints), None if self.figure.sigma is None else self.figure.sigma[row], lost)
+        draw_joints(tile, view.place(joints), self._dots(row), lost)
         if lost:
             cv2.rectangle(tile, (0, 0), (view.width - 1, view.height - 1), LOST, 5)
+
+    def _dots(self, row: int) -> Sequence[Color | None]:
+        if row not in self._colors:  # every camera asks for the same
+            sigma = None if self.figure.sigma is None else self.figure.sigma[row]
+            self._colors = {row: dots(sigma, self.figure.lost(row))}
+        return self._colors[row]
 
     def _true(self, frame: int, camera: Camera) -> list[Float]:
         return [camera.project(self._truth[frame])[0]] if frame in self._truth else []
@@ -149,9 +165,8 @@ class Overlay:
             tile = canvas[y : y + view.height, x : x + view.width]
             self._draw(tile, row, camera, image, view)
             self._name(tile, row, camera)
-        canvas[grid.height :] = 24
         self._legend(canvas[grid.height : grid.height + _STRIP], row)
-        draw_timeline(canvas[grid.height + _STRIP :], self.figure.status, row)
+        draw_timeline(canvas[grid.height + _STRIP :], self._timeline, (row + 0.5) / len(self.result))
         return canvas
 
     def _steady_view(self, camera: Camera, full: bool) -> View:
@@ -179,13 +194,14 @@ class Overlay:
     def _legend(self, strip: Image, row: int) -> None:
         """Frame, time and status on the left; what the colours mean on the right, as far as there is room."""
         lost = self.figure.lost(row)
-        if lost:
-            strip[...] = LOST
+        if lost not in self._keys:
+            key = self._keys[lost] = np.full_like(strip, LOST if lost else 24)
+            if strip.shape[1] > _TOLD[lost] + _KEY:
+                draw_key(key, strip.shape[1] - _KEY + 20, self.figure.sigma is not None)
+        strip[...] = self._keys[lost]
         state = "LOST: do not use this pose" if lost else STATUS_MEANING[self.figure.status[row]]
         text = f"frame {self.figure.frames[row]}   {self.result.time[row]:.2f} s   {state}"
-        end = write(strip, text, 10, 20, TEXT, 0.5)
-        if strip.shape[1] - end > 330:
-            draw_key(strip, strip.shape[1] - 310, self.figure.sigma is not None)
+        write(strip, text, 10, 20, TEXT, 0.5)
 
 
 @dataclass(frozen=True)
@@ -236,16 +252,21 @@ def draw_key(strip: Image, left: int, sigma: bool) -> None:
     write(strip, f"{100 * SIGMA_MOST_M:.0f} cm", left + 68, 20)
 
 
-def draw_timeline(bar: Image, status: NDArray[np.uint8], row: int) -> None:
-    """The status of all frames along a bar, lost ones red, and where this frame is."""
-    width = bar.shape[1]
-    colors = np.array([_STATUS_COLORS[int(value)] for value in status], np.uint8)
-    place = np.arange(width) * len(status) // width
-    line = colors[place]
+def timeline(status: NDArray[np.uint8], width: int) -> Image:
+    """(1, width, 3) the status of all frames along a bar, lost ones red."""
+    of_status = np.zeros((max(_STATUS_COLORS) + 1, 3), np.uint8)
+    for value, color in _STATUS_COLORS.items():
+        of_status[value] = color
+    line = of_status[status[np.arange(width) * len(status) // width]]
     # a single lost frame of a long recording takes less than a pixel, and must not vanish
     line[np.flatnonzero(status == Status.LOST) * width // len(status)] = LOST
-    bar[...] = line[None]
-    at = round((row + 0.5) / len(status) * width)
+    return line[None]
+
+
+def draw_timeline(bar: Image, line: Image, share: float) -> None:
+    """Draw a :func:`timeline`, and where this frame is, a share of all."""
+    bar[...] = line
+    at = round(share * bar.shape[1])
     bar[:, max(at - 2, 0) : at + 2] = (255, 255, 255)
 
 

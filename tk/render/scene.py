@@ -15,9 +15,9 @@ from tk.io.result_data import STATUS_MEANING
 from tk.model.camera import Camera, Rig
 from tk.model.skeleton import SEGMENTS
 from tk.model.up import up_vector
-from tk.render.canvas import Image, draw_joints, fixed, write
+from tk.render.canvas import Image, dots, draw_joints, fixed, write
 from tk.render.figure import Figure, figure_of
-from tk.render.overlay import choose_frames, draw_key, draw_timeline
+from tk.render.overlay import choose_frames, draw_key, draw_timeline, timeline
 from tk.render.palette import LOST, LOST_BODY, SEGMENT_COLORS, TEXT
 
 Float = NDArray[np.float64]
@@ -93,6 +93,7 @@ class Scene:
         self.result, self.hull = result, result.hull if hull else None
         figure = figure_of(result)
         self.figure = replace(figure, solids=tuple(solid.divided for solid in figure.solids), _placed={})
+        self._timeline = timeline(self.figure.status, WIDTH)
         self.stage = Stage.of(result, self.figure)
         self.rig = rig or (result.cameras.rig if result.cameras else None)
         away = [] if self.rig is None else np.linalg.norm(self.rig.centers - self.stage.middle, axis=1)
@@ -124,11 +125,11 @@ class Scene:
         else:
             self._draw_body(tile, eye, row, lost)
         sigma = None if self.figure.sigma is None else self.figure.sigma[row]
-        draw_joints(tile, eye.project(self.figure.joints[row])[0], sigma, lost)
+        draw_joints(tile, eye.project(self.figure.joints[row])[0], dots(sigma, lost), lost)
         if lost:
             cv2.rectangle(tile, (0, 0), (WIDTH - 1, HEIGHT - 1), LOST, 5)
         self._draw_legend(canvas[HEIGHT : HEIGHT + _STRIP], row, lost)
-        draw_timeline(canvas[HEIGHT + _STRIP :], self.figure.status, row)
+        draw_timeline(canvas[HEIGHT + _STRIP :], self._timeline, (row + 0.5) / len(self.result))
         return canvas
 
     def _camera(self, turn: float) -> Camera:

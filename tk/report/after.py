@@ -14,9 +14,10 @@ from tk.render.video import made_here as is_our_video
 from tk.report.page import build_page, write_page
 from tk.report.page import made_here as is_our_page
 from tk.report.pictures import choose_rows, embedded, shot
+from tk.threads import one_thread
 
 # Of the video. Every run pays for it: `tk render` makes a larger one for who wants to look closely.
-_WIDEST = 1024
+_WIDEST = 960
 
 
 def leave_pictures(
@@ -39,24 +40,26 @@ def leave_pictures(
     return []
 
 
+@one_thread()
 def _write(capture: Capture, result_path: Path) -> list[Path]:
     video, page = result_path.with_suffix(".mp4"), result_path.with_suffix(".html")
     # a folder of recordings may hold a video of the result's name
     for path, ours in ((video, is_our_video), (page, is_our_page)):
         if path.exists() and not ours(path):
             raise ExportError(f"{path} was not made by tk and is not replaced; name the result otherwise")
-    check_encoder()
     result = read_result(result_path)
     overlay = Overlay(capture, result, _WIDEST)
     choices = choose_rows(result)
     wanted = {choice.row for choice in choices}
-    frames = overlay.chosen(count=len(result))
+    pictures = overlay.pictures(overlay.chosen(count=len(result)))
+    check_encoder()  # takes its time, and decoding has begun
     shots: dict[int, bytes] = {}
     with video_writer(video, capture.fps) as add:
-        for frame, images in overlay.pictures(frames):
+        for frame, images in pictures:
             add(overlay.mosaic(frame, images))
             row = overlay.row_of[frame]
             if row in wanted:
                 shots[row] = shot(overlay, frame, images)
-    write_page(page, build_page(result, embedded(choices, shots), overlay.rig))
+        text = build_page(result, embedded(choices, shots), overlay.rig)
+    write_page(page, text)
     return [video, page]

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.linalg  # noqa: F401  (its pool is one of those that are looked at)
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from tk.blas import one_blas_thread
+from tk.threads import one_thread
 
 
 def blas_threads() -> list[int]:
@@ -14,7 +14,7 @@ def blas_threads() -> list[int]:
     return [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
 
 
-@one_blas_thread()
+@one_thread()
 def inside() -> list[int]:
     return blas_threads()
 
@@ -24,7 +24,7 @@ def test_pools_have_one_thread_inside_and_their_own_outside() -> None:
         before = blas_threads()
         assert before and set(before) <= {1, 2}
         for _ in range(2):  # a decorated function may be called again, and within itself
-            with one_blas_thread():
+            with one_thread():
                 assert set(inside()) == {1}
                 assert set(blas_threads()) == {1}
             assert blas_threads() == before
