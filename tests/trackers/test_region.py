@@ -200,12 +200,12 @@ def test_who_stays_in_a_wrong_pose_is_looked_for_as_if_lost(monkeypatch: pytest.
     monkeypatch.setattr(tracker, "relocate", watched)
     monkeypatch.setattr(tracker, "search", lambda _frame, _pyramid, pose, *_: (pose[None], np.zeros(1)))
     tracker.restore(tracker.model(), {**state, "poses": wrong[None], "previous": wrong[None]})
-    usual = tracker.state()["usual"]
+    sound = tracker.state()["sound"]
     estimates = [tracker.step(observe(MASKS[0])) for _ in range(4)]
     assert [e.status for e in estimates] == ["tracked"] * 4
     assert errors(estimates[1], POSES[0]).mean() > 2 * CLOSE_M
     assert len(looked_for) == 1 and errors(estimates[3], POSES[0]).mean() < CLOSE_M
-    assert tracker.state()["usual"] < 1.1 * usual
+    assert tracker.state()["sound"] < 1.1 * sound
 
 
 def test_the_person_is_found_without_any_hint() -> None:

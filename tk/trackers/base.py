@@ -144,3 +144,9 @@ class Stopwatch:
         now = time.perf_counter()
         self.laps[stage] = self.laps.get(stage, 0.0) + now - self._last
         self._last = now
+
+
+def drift(usual: float, now: float) -> float:
+    """What is usual after one more frame: quick to learn that it can be better, slow to put up with worse; infinite as
+    long as nothing is known."""
+    return now if not np.isfinite(usual) else usual + (0.1 if now < usual else 0.05) * (now - usual)

@@ -37,7 +37,7 @@ from tk.model.part_colors import color_bins
 from tk.model.silhouettes import Pyramid
 from tk.model.skeleton import JOINTS, Skeleton
 from tk.optim.gauss_newton import Prior
-from tk.trackers.base import Estimate, Observation, Stopwatch
+from tk.trackers.base import Estimate, Observation, Stopwatch, drift
 from tk.trackers.contours import APART_M, GAIN, RELOCATE_EVERY, ContourTracker, SilhouetteConfig, restore_body
 
 Float = NDArray[np.float64]
@@ -46,13 +46,15 @@ Float = NDArray[np.float64]
 INFORMATION = 1.0 / (2.0**2 * 10.0)
 # Standard deviations of the priors: waist and ankles about straight ones, the others about their prediction.
 WAIST_DEG, ANKLE_DEG, ANGLE_DEG, TRANSLATION_M = 12.0, 20.0, 40.0, 0.3
-# Who is explained worse than usual by this factor for RELOCATE_EVERY frames, searched or not, is looked for as if lost.
+# Who is explained worse than at best is usual by this factor for RELOCATE_EVERY frames, searched or not, is looked for
+# as if lost.
 STRANDED = 1.6
 # How long a hypothesis may live beside the best one, in frames, and how much of its running cost a frame replaces.
 PATIENCE, RENEWAL = 6, 0.4
 # Hypotheses that cost this much more than the best one, as a share of the person's pixels, are dropped.
 MARGIN = 0.02
-# Colours are learned only in frames that are explained about as well as is usual; nothing worse counts as usual either.
+# Colours are learned only in frames that are explained about as well as sound ones, and nothing worse counts as sound:
+# a wrong pose that lasts becomes usual, and need not be searched in every frame, but it stays stranded.
 LEARN_RATIO = 1.15
 # Masks are searched for what is carried where this share of their pixels has colours that are not the person's; smaller
 # things than this many pixels across stay.
@@ -120,7 +122,7 @@ class RegionTracker(ContourTracker):
         super().__init__(rig, up, contours or SilhouetteConfig())
         self.config = config or RegionConfig()
         self._alive: list[Hypothesis] = []
-        self._usual = np.inf
+        self._usual = self._sound = np.inf
         self._usual_posture: Float = np.zeros((len(JOINTS), 3))
         self._postures = 0
         self._lost_for = 0
@@ -137,7 +139,7 @@ class RegionTracker(ContourTracker):
         """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourTracker.find`."""
         pose = self.find(frames, height_m, init, body)
         self._alive = [Hypothesis(pose, pose, 0.0)]
-        self._usual = np.inf
+        self._usual = self._sound = np.inf
         self._usual_posture, self._postures = np.zeros((len(JOINTS), 3)), 0
         self._lost_for = 0
         self._stranded = 0
@@ -300,7 +302,7 @@ class RegionTracker(ContourTracker):
     def _follow(self, pyramid: Pyramid, error: float) -> bool:
         """Whether the person is lost; whoever is lost is looked for as at the start."""
         limit = self.contours.lost_error
-        self._stranded = self._stranded + 1 if error > STRANDED * self._usual else 0
+        self._stranded = self._stranded + 1 if error > STRANDED * self._sound else 0
         due = self._lost_for > 0 if error <= limit else self._lost_for % RELOCATE_EVERY == 0
         stranded = not due and self._stranded > 0 and self._stranded % RELOCATE_EVERY == 0
         if not (due or stranded):
@@ -313,11 +315,10 @@ class RegionTracker(ContourTracker):
     def _learn(self, evidence: Evidence, label: NDArray[np.uint8], error: float, lost: bool) -> None:
         if lost:
             return
-        usual = error if not np.isfinite(self._usual) else self._usual
-        if self.config.colors and evidence.bins is not None and error <= LEARN_RATIO * usual:
+        if self.config.colors and evidence.bins is not None and error <= LEARN_RATIO * self._sound:
             self.colors.learn(evidence.bins[evidence.person], label[evidence.person])
-        # quick to learn that it can be better, slow to put up with worse: how bad a wrong pose is tells nothing
-        self._usual = usual + (0.1 if error < usual else 0.05) * (min(error, LEARN_RATIO * usual) - usual)
+        self._usual = drift(self._usual, error)
+        self._sound = drift(self._sound, min(error, LEARN_RATIO * self._sound))
 
     def _curvature(self, pyramid: Pyramid, poses: Float, images: NDArray[np.uint8] | None) -> Float:
         """(D, D) JᵀWJ at the first of the poses."""
@@ -447,6 +448,7 @@ class RegionTracker(ContourTracker):
             "costs": np.array([h.cost for h in self._alive]),
             "ages": np.array([h.age for h in self._alive]),
             "usual": self._usual,
+            "sound": self._sound,
             "usual_posture": self._usual_posture.copy(),
             "postures": self._postures,
             "lost_for": self._lost_for,
@@ -460,6 +462,7 @@ class RegionTracker(ContourTracker):
         rows = zip(state["poses"], state["previous"], state["costs"], state["ages"], strict=True)
         self._alive = [Hypothesis(np.asarray(p), np.asarray(q), float(c), int(a)) for p, q, c, a in rows]
         self._usual = float(state["usual"])
+        self._sound = float(state.get("sound", self._usual))  # results of before have none
         self._usual_posture = np.array(state["usual_posture"], np.float64)
         self._postures = int(state["postures"])
         self._lost_for = int(state["lost_for"])

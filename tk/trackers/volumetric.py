@@ -38,7 +38,7 @@ from tk.model.volume import Volume, VoxelGrid
 from tk.optim import lm_schedule, schedule
 from tk.optim.levenberg_marquardt import LmConfig
 from tk.optim.smd import SmdConfig
-from tk.trackers.base import Estimate, Observation, Stopwatch
+from tk.trackers.base import Estimate, Observation, Stopwatch, drift
 from tk.trackers.contours import ContourTracker, restore_body
 
 Float = NDArray[np.float64]
@@ -64,11 +64,6 @@ SMD = SmdConfig()
 LM = LmConfig()
 # where a body has none
 NO_ANGLES = np.zeros(0)
-
-
-def _drift(usual: float, now: float) -> float:
-    """What is usual after one more frame: quick to learn that it can be better, slow to put up with worse."""
-    return usual + (0.1 if now < usual else 0.05) * (now - usual)
 
 
 @dataclass(frozen=True)
@@ -209,8 +204,8 @@ class VolumetricTracker:
         status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
         if not lost:
             # (4) the colour models follow (eq. 16)
-            self._usual = _drift(self._usual, fit.value)
-            self._usual_unexplained = _drift(self._usual_unexplained, fit.unexplained_share)
+            self._usual = drift(self._usual, fit.value)
+            self._usual_unexplained = drift(self._usual_unexplained, fit.unexplained_share)
             patch, colors = self._correspondences(surface, index, fit)
             self._appearance = self._appearance.updated(patch, colors, config.appearance)
         self._previous = result.pose if lost or self._lost_for else self._pose
