@@ -182,17 +182,27 @@ class ContourTracker:
         if init is not None:
             unknown = np.zeros(len(self.waist_names)), np.zeros(len(self.ankle_names))
             rough = self.settle(pyramids[0], join_pose(self.body.skeleton, angles, *unknown)[None]).states[0]
-        poses = find_person(self, frames, pyramids, rough)
-        if self.contours.adapt and body is None:
-            return self._adapt(pyramids, poses, average.stature, stature is not None)
-        return np.asarray(poses[0])
+        ways = find_person(self, frames, pyramids, rough)
+        if not self.contours.adapt or body is not None:
+            return np.asarray(ways[0][0])
+        return self._adapt(pyramids, ways, average.stature, stature is not None)
 
-    def _adapt(self, pyramids: Sequence[Pyramid], poses: Float, stature: float, known: bool) -> Float:
-        """Fit the body to the opening, and (D,) the pose in its first frame; whether the stature is ``known``."""
+    def _adapt(self, pyramids: Sequence[Pyramid], ways: Sequence[Float], stature: float, known: bool) -> Float:
+        """Fit the body to the opening, and (D,) the pose in its first frame; whether the stature is ``known``.
+
+        Of several ways (F, D) to explain the opening, that is believed whose own body explains it best.
+        """
         count = min(self.contours.fit.frames, len(pyramids))
         chosen = np.unique(np.linspace(0, len(pyramids) - 1, count).round().astype(int))
         config = self.contours.fit if known else replace(self.contours.fit, stature_deviation=MEASURED)
-        body, fitted = self.fit(pyramids, poses, chosen, stature, config)
+        fits = [self.fit(pyramids, poses, chosen, stature, config) for poses in ways]
+
+        def error(fit: tuple[ConeBody, Float]) -> float:
+            self.take_body(fit[0])
+            told = [self.fit_error(pyramids[i], pose[None])[0] for i, pose in zip(chosen, fit[1], strict=True)]
+            return float(np.mean(told))
+
+        body, fitted = fits[0] if len(fits) == 1 else min(fits, key=error)
         self.take_body(body)
         return np.asarray(fitted[0])
 

@@ -2,7 +2,7 @@
 section 4.6: "multiple different poses can be hypothesized and tested").
 
 No frame of the opening is better than another, so the person is looked for in some of them until one is explained well,
-and followed from there to both ends. Whether he or she faces this way or the opposite one, all of the opening decides:
+and followed from each to both ends. Whether he or she faces this way or the opposite one, all of the opening decides:
 feet, knees and elbows bend one way, and people walk forwards.
 """
 
@@ -39,6 +39,8 @@ FINALISTS, OPPOSITE, APART_M = 4, 2, 0.15
 # no more than this unexplained (E_S): in the development captures an average body of the right stature leaves 0.15 to
 # 0.31 in the right pose, and in a wrong one never less than 0.25.
 ANCHORS, CLEAR = 4, 0.2
+# Over the opening, what is explained worse than the best by more than this factor is wrong.
+AMBIGUOUS = 1.1
 # Whoever faces the other way is followed, too, where that explains the frame nearly as well, by this factor.
 NEARLY = 1.4
 # A frame explained worse than the anchor by this factor is searched for lost limbs.
@@ -51,8 +53,9 @@ _SEARCHES = 2
 
 def find_person(
     tracker: ContourTracker, frames: Sequence[Observation], pyramids: Sequence[Pyramid], pose: Float | None = None
-) -> Float:
-    """(F, D) poses in consecutive frames; the tracker has a body already.
+) -> list[Float]:
+    """Poses (F, D) in consecutive frames, the best explained ones first, and others that are explained nearly as well:
+    only a body fitted to each tells then. The tracker has an average body already.
 
     Args:
         tracker: see :class:`ContourTracker`.
@@ -64,8 +67,8 @@ def find_person(
         CaptureError: nobody is seen in the first frame by two cameras.
     """
     if pose is not None:
-        return _follow(tracker, frames, pyramids, _searched(tracker, frames[0], pyramids[0], pose), 0)[0]
-    best: tuple[float, int, list[Float]] | None = None
+        return [_follow(tracker, frames, pyramids, _searched(tracker, frames[0], pyramids[0], pose), 0)[0]]
+    found: list[tuple[float, int, list[Float]]] = []
     for anchor in np.unique(np.linspace(0, len(frames) - 1, ANCHORS).astype(int)):
         try:
             error, poses = _find(tracker, frames[anchor], pyramids[anchor])
@@ -73,13 +76,23 @@ def find_person(
             if anchor == 0:
                 raise
             continue
-        if best is None or error < best[0]:
-            best = error, int(anchor), poses
+        found.append((error, int(anchor), poses))
         if error < CLEAR:
             break
-    assert best is not None
-    ways = [_follow(tracker, frames, pyramids, pose, best[1]) for pose in best[2]]
-    return min(ways, key=lambda way: way[1])[0]
+    _, anchor, (_, *opposite) = min(found, key=lambda one: one[0])
+    ways: list[tuple[Float, float]] = []
+    for pose, at in [(poses[0], at) for _, at, poses in found] + [(pose, anchor) for pose in opposite]:
+        joints = tracker.body.skeleton.joints(pose)
+        if all(tracker.body.skeleton.apart(way[at], joints) > APART_M for way, _ in ways):
+            ways.append(_follow(tracker, frames, pyramids, pose, at))
+    ways.sort(key=lambda way: way[1])
+    kept: list[Float] = []
+    for way, error in ways:
+        joints = tracker.body.skeleton.joints(way)
+        apart = [np.mean(tracker.body.skeleton.apart(other, joints)) for other in kept]
+        if error <= AMBIGUOUS * ways[0][1] and all(distance > APART_M for distance in apart):
+            kept.append(way)
+    return kept
 
 
 def _find(tracker: ContourTracker, frame: Observation, pyramid: Pyramid) -> tuple[float, list[Float]]:
