@@ -1,9 +1,9 @@
 """Finds a person of whom nothing is known but silhouettes: any pose, any heading, any stature (silhouette paper,
 section 4.6: "multiple different poses can be hypothesized and tested").
 
-No frame of the opening is better than another, so the person is looked for in some of them until one is explained well,
-and followed from each to both ends. Whether he or she faces this way or the opposite one, all of the opening decides:
-feet, knees and elbows bend one way, and people walk forwards.
+No frame of the opening is better than another, so the person is looked for in some of them, and followed from each to
+both ends, until one is explained well or two tell the same. Whether he or she faces this way or the opposite one, all
+of the opening decides: feet, knees and elbows bend one way, and people walk forwards.
 """
 
 from __future__ import annotations
@@ -68,7 +68,9 @@ def find_person(
     """
     if pose is not None:
         return [_follow(tracker, frames, pyramids, _searched(tracker, frames[0], pyramids[0], pose), 0)[0]]
-    found: list[tuple[float, int, list[Float]]] = []
+    skeleton = tracker.body.skeleton
+    ways: list[tuple[Float, float]] = []
+    best, opposite = np.inf, list[tuple[int, Float]]()
     for anchor in np.unique(np.linspace(0, len(frames) - 1, ANCHORS).astype(int)):
         try:
             error, poses = _find(tracker, frames[anchor], pyramids[anchor])
@@ -76,20 +78,20 @@ def find_person(
             if anchor == 0:
                 raise
             continue
-        found.append((error, int(anchor), poses))
+        if error < best:
+            best, opposite = error, [(int(anchor), pose) for pose in poses[1:]]
+        joints = skeleton.joints(poses[0])
+        if any(skeleton.apart(way[anchor], joints) < APART_M for way, _ in ways):
+            break  # found twice
+        ways.append(_follow(tracker, frames, pyramids, poses[0], anchor))
         if error < CLEAR:
             break
-    _, anchor, (_, *opposite) = min(found, key=lambda one: one[0])
-    ways: list[tuple[Float, float]] = []
-    for pose, at in [(poses[0], at) for _, at, poses in found] + [(pose, anchor) for pose in opposite]:
-        joints = tracker.body.skeleton.joints(pose)
-        if all(tracker.body.skeleton.apart(way[at], joints) > APART_M for way, _ in ways):
-            ways.append(_follow(tracker, frames, pyramids, pose, at))
+    ways += [_follow(tracker, frames, pyramids, pose, anchor) for anchor, pose in opposite]
     ways.sort(key=lambda way: way[1])
     kept: list[Float] = []
     for way, error in ways:
-        joints = tracker.body.skeleton.joints(way)
-        apart = [np.mean(tracker.body.skeleton.apart(other, joints)) for other in kept]
+        joints = skeleton.joints(way)
+        apart = [np.mean(skeleton.apart(other, joints)) for other in kept]
         if error <= AMBIGUOUS * ways[0][1] and all(distance > APART_M for distance in apart):
             kept.append(way)
     return kept
