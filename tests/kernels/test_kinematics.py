@@ -146,6 +146,7 @@ def _velocities(
     point: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (D, 3)
     prismatic: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
     parent: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
+    chain: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
     pose: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (1, D)
     x: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (N, 3) world points
     frames: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (1, D, 12) scratch
@@ -153,7 +154,7 @@ def _velocities(
     velocities: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (N, D, 3) out
 ):
     for _ in range(1):
-        kinematics.forward(axis, point, prismatic, parent, pose, 0, 0, frames, twists)
+        kinematics.forward(axis, point, prismatic, parent, chain, pose, 0, 0, frames, twists)
         for n in range(x.shape[0]):
             for k in range(axis.shape[0]):
                 v = kinematics.point_velocity(prismatic, twists, 0, k, kinematics.load_vector3(x, n))
@@ -174,6 +175,7 @@ def test_velocity_of_a_point_is_the_derivative_of_its_place(seed):
         s.anchor,
         s.prismatic.astype(np.int32),
         s.parent,
+        np.arange(D, dtype=np.int32),
         pose[None],
         place(local, segment, pose[None])[0],
         np.empty((1, D, 12)),

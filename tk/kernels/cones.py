@@ -139,45 +139,72 @@ def enter(part_kind: int, shape, c, d, shrink):
     along = middle.dot(d)
     dd = d.norm_sqr()
     if along > 0.0 and middle.norm_sqr() * dd - along * along < reach * reach * dd:
-        a, b = shape[0] * shrink, shape[1] * shrink
-        # A t² + 2 B t + C < 0 inside, for lower < t < upper
-        A = (d[0] / a) ** 2 + (d[1] / b) ** 2
-        B = c[0] * d[0] / (a * a) + c[1] * d[1] / (b * b)
-        C = (c[0] / a) ** 2 + (c[1] / b) ** 2
-        lower, upper = 0.0 * dd, 1e9 + 0.0 * dd
-        if part_kind == ELLIPSOID:
-            h = shape[2] * shrink
-            A += (d[2] / h) ** 2
-            B += c[2] * d[2] / (h * h)
-            C += (c[2] / h) ** 2 - 1.0
-        else:
-            g = (shape[3] - 1.0) / shape[2]
-            r0 = 1.0 + g * c[2]
-            A -= (g * d[2]) ** 2
-            B -= g * d[2] * r0
-            C -= r0 * r0
-            if ti.abs(d[2]) > 1e-12:
-                t0, t1 = -c[2] / d[2], (shape[2] - c[2]) / d[2]
-                lower = ti.max(lower, ti.min(t0, t1))
-                upper = ti.min(upper, ti.max(t0, t1))
-            elif c[2] < 0.0 or c[2] > shape[2]:
-                upper = -1.0 + 0.0 * dd
-        if lower < upper:
-            square = B * B - A * C
-            if A > 0.0:
-                if square > 0.0:
-                    root = ti.sqrt(square)
-                    first = ti.max(lower, (-B - root) / A)
-                    if first < ti.min(upper, (-B + root) / A):
-                        result = first
-            elif square <= 0.0:
-                result = lower
-            else:
-                # the ray crosses both nappes: inside before the smaller and after the greater root
+        size = extent(part_kind, shape, shrink)
+        result = enter_unit(part_kind, shape[3], c / size, d / size)
+    return result
+
+
+@ti.func
+def capsule(part_kind: int, shape):
+    """(z0, z1, radius): spheres of this radius at both places of the axis, and all between them, hold the part."""
+    radius = ti.max(shape[0], shape[1])
+    z0, z1 = 0.0 * radius, shape[2]
+    if part_kind == CONE:
+        radius *= ti.max(shape[3], 1.0)
+    else:
+        z1 = ti.max(shape[2] - radius, 0.0)
+        z0 = -z1
+    return z0, z1, radius
+
+
+@ti.func
+def extent(part_kind: int, shape, shrink):
+    """What a part's coordinates are divided by to make it :func:`enter_unit`'s."""
+    length = shape[2]
+    if part_kind == ELLIPSOID:
+        length *= shrink
+    return ti.Vector([shape[0] * shrink, shape[1] * shrink, length])
+
+
+@ti.func
+def enter_unit(part_kind: int, m, c, d):
+    """The same for the unit ball, or the frustum of radius 1 at z = 0 and m at z = 1; from outside of it or inside."""
+    # A t² + 2 B t + C < 0 inside, for lower < t < upper
+    A, B, C = d[0] * d[0] + d[1] * d[1], c[0] * d[0] + c[1] * d[1], c[0] * c[0] + c[1] * c[1]
+    lower, upper = 0.0 * A, 1e9 + 0.0 * A
+    result = -1.0 + 0.0 * A
+    if part_kind == ELLIPSOID:
+        A += d[2] * d[2]
+        B += c[2] * d[2]
+        C += c[2] * c[2] - 1.0
+    else:
+        g = m - 1.0
+        r0, slope = 1.0 + g * c[2], g * d[2]
+        A -= slope * slope
+        B -= slope * r0
+        C -= r0 * r0
+        if ti.abs(d[2]) > 1e-12:
+            t0, t1 = -c[2] / d[2], (1.0 - c[2]) / d[2]
+            lower = ti.max(lower, ti.min(t0, t1))
+            upper = ti.min(upper, ti.max(t0, t1))
+        elif c[2] < 0.0 or c[2] > 1.0:
+            upper = -1.0 + 0.0 * A
+    if lower < upper:
+        square = B * B - A * C
+        if A > 0.0:
+            if square > 0.0:
                 root = ti.sqrt(square)
-                small, great = (-B + root) / ti.min(A, -1e-30), (-B - root) / ti.min(A, -1e-30)
-                if lower < small:
-                    result = lower
-                elif ti.max(lower, great) < upper:
-                    result = ti.max(lower, great)
+                first = ti.max(lower, (-B - root) / A)
+                if first < ti.min(upper, (-B + root) / A):
+                    result = first
+        elif square <= 0.0:
+            result = lower
+        else:
+            # the ray crosses both nappes: inside before the smaller and after the greater root
+            root = ti.sqrt(square)
+            small, great = (-B + root) / ti.min(A, -1e-30), (-B - root) / ti.min(A, -1e-30)
+            if lower < small:
+                result = lower
+            elif ti.max(lower, great) < upper:
+                result = ti.max(lower, great)
     return result

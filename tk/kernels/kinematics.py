@@ -168,14 +168,16 @@ def forward(
     point: ti.template(),  # (D, 3), or (D, 6) with the rise
     prismatic: ti.template(),  # (D,) 0 or 1
     parent: ti.template(),  # (D,)
+    chain: ti.template(),  # (N,) the degrees of freedom that are wanted, ascending, with all above them
     pose: ti.template(),  # (B, D)
     b: int,
     c: int,
     frames: ti.template(),  # (C, D, 12) out
     twists: ti.template(),  # (C, D, 6) out
 ):
-    """The same from a tree in four arrays, into two."""
-    for k in range(axis.shape[0]):
+    """The same from a tree in four arrays, into two; of some degrees of freedom only."""
+    for n in range(chain.shape[0]):
+        k = chain[n]
         up = parent[k]
         first = k
         rise = load_vector3(axis, k) * 0.0

@@ -15,14 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.cone_arrays import NEAREST_M, ConeArrays, keep, place_part, shape_of
-from tk.kernels.cones import enclosing_radius, enter, interior_point
-from tk.kernels.kinematics import forward, load_rotation, load_translation
+from tk.kernels.cones import capsule, enter_unit, extent, interior_point
+from tk.kernels.kinematics import forward, load_rotation
 from tk.kernels.launch import Launcher
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
-# How much larger than its first-order size a part's disc is taken when rays are cast.
-DISC_MARGIN = 1.1
+# How much larger than to first order spheres are taken in the pictures when rays are cast, and by how many pixels more:
+# distorted lines bend.
+MARGIN, MARGIN_PX = 1.1, 1.0
+# Columns of a part's outline in a picture: its beginning, its axis, the radius and, across the axis, that radius.
+_BEGIN, _AXIS, _RADIUS, _ACROSS, _ORIGIN, _COLUMNS = 0, 2, 4, 5, 7, 10
 # Depth of a ray that meets nothing.
 FAR = 1e9
 
@@ -37,6 +40,28 @@ class Cast(NamedTuple):
 
     label: NDArray[np.uint8]
     depth: NDArray[np.float32]
+
+
+@ti.func
+def _in_row(outline: ti.template(), b: int, v: int, p: int, y: int):
+    """Where a row of a picture enters and leaves the capsule that holds a part; the wrong way round if it does not."""
+    radius = outline[b, v, p, _RADIUS]
+    left, right = 1e9 + 0.0 * radius, -1e9 + 0.0 * radius
+    if radius > 0.0:
+        x0, dx, dy = outline[b, v, p, _BEGIN], outline[b, v, p, _AXIS], outline[b, v, p, _AXIS + 1]
+        h = y - outline[b, v, p, _BEGIN + 1]
+        for end in ti.static(range(2)):
+            square = radius * radius - (h - end * dy) ** 2
+            if square > 0.0:
+                half = ti.sqrt(square)
+                left, right = ti.min(left, x0 + end * dx - half), ti.max(right, x0 + end * dx + half)
+        if ti.abs(dy) > 1e-6:
+            for side in ti.static((-1, 1)):
+                share = (h - side * outline[b, v, p, _ACROSS + 1]) / dy
+                if share > 0.0 and share < 1.0:
+                    x = x0 + side * outline[b, v, p, _ACROSS] + share * dx
+                    left, right = ti.min(left, x), ti.max(right, x)
+    return left, right
 
 
 @functools.cache
@@ -54,6 +79,7 @@ def _cast_kernel(real):
         group: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,) colour group of each part
         camera: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
         drawn: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (K,) the parts to draw
+        chain: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,) the degrees of freedom that move them
         spread: ti.i32,
         step: ti.i32,  # pixels between rays; the first is at step // 2
         rays: ti.types.ndarray(dtype=ti.f32, ndim=4),  # (V, H, W, 3) world; zero outside the picture
@@ -65,8 +91,10 @@ def _cast_kernel(real):
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
         frames: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 12) scratch
         twists: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 6) scratch
-        placed: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 12) scratch
-        disc: ti.types.ndarray(dtype=real, ndim=4),  # (B, V, P, 3) scratch, centre and square radius in pixels
+        placed: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 12) scratch, world to unit parts
+        # (B, V, P, _COLUMNS) scratch: what holds the part, a capsule in pixels; and the camera, in the unit part
+        outline: ti.types.ndarray(dtype=real, ndim=4),
+        stretch: ti.types.ndarray(dtype=ti.i32, ndim=3),  # (B, K, 2) scratch: first and last column in a row
         outside: ti.types.ndarray(dtype=real, ndim=1),  # (B,) out: mean cost at the drawn parts' middles
         change: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (B, V) out: what drawing changes of the cost
         label: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (B, V, H, W) out, if export; before_label when called
@@ -79,70 +107,86 @@ def _cast_kernel(real):
             if turn % spread != 0:
                 continue
             b = turn // spread
-            forward(axis, point, prismatic, parent, pose, b, b, frames, twists)
+            forward(axis, point, prismatic, parent, chain, pose, b, b, frames, twists)
             out, seen = ti.cast(0.0, real), ti.cast(1e-6, real)
             for k in range(drawn.shape[0]):
                 p = drawn[k]
                 R, t = place_part(frames, part_dof, part_frame, b, p)
-                keep(placed, b, p, R, t)
-                # a disc in each picture that holds the part: most pixels are far from most parts
                 shape = shape_of(part_shape, p)
+                size = extent(part_kind[p], shape, 1.0)
+                M = ti.Matrix([[R[j, i] / size[i] for j in ti.static(range(3))] for i in ti.static(range(3))])
+                keep(placed, b, p, M, t)
+                # what holds the part in each picture: most pixels are far from most parts
                 middle = R @ interior_point(part_kind[p], shape) + t
-                reach = enclosing_radius(part_kind[p], shape)
+                z0, z1, reach = capsule(part_kind[p], shape)
+                axis_p = ti.Vector([R[i, 2] for i in ti.static(range(3))])
                 for v in range(V):
-                    pixel, J, z = project(camera, v, middle)
-                    radius = 0.0 * z
-                    if z > 1.5 * reach + NEAREST_M:
+                    begin, J0, depth0 = project(camera, v, t + z0 * axis_p)
+                    end, J1, depth1 = project(camera, v, t + z1 * axis_p)
+                    radius = 0.0 * depth0
+                    nearest, farthest = ti.min(depth0, depth1), ti.max(depth0, depth1)
+                    if nearest > 1.5 * reach + NEAREST_M:
                         # the Frobenius norm of the derivative is at least its growth in any direction
-                        radius = DISC_MARGIN * J.norm() * reach * z / (z - reach)
-                    elif z > -reach:
-                        radius = 1e6 + 0.0 * z
-                    disc[b, v, p, 0], disc[b, v, p, 1], disc[b, v, p, 2] = pixel[0], pixel[1], radius * radius
-                    if radius > 0.0 and radius < 1e6:
+                        growth = ti.max(J0.norm() * depth0 / (depth0 - reach), J1.norm() * depth1 / (depth1 - reach))
+                        radius = MARGIN * growth * reach + MARGIN_PX
+                        pixel, _, _ = project(camera, v, middle)
                         i = ti.cast(ti.round((pixel[0] - step // 2) / step), ti.i32)
                         j = ti.cast(ti.round((pixel[1] - step // 2) / step), ti.i32)
                         if i >= 0 and j >= 0 and i < W and j < H:
                             out += ti.cast(ti.max(cost[v, j, i, group[p] + 1] - cost[v, j, i, 0], 0.0), real)
                             seen += 1.0
+                    elif farthest > -reach:
+                        radius = 1e6 + 0.0 * radius
+                        begin *= 0.0
+                        end = begin
+                    along = end - begin
+                    across = radius / ti.max(along.norm(), 1e-6)
+                    origin = M @ (camera_center(camera, v) - t)
+                    outline[b, v, p, _RADIUS] = radius
+                    outline[b, v, p, _ACROSS], outline[b, v, p, _ACROSS + 1] = across * along[1], -across * along[0]
+                    for a in ti.static(range(2)):
+                        outline[b, v, p, _BEGIN + a], outline[b, v, p, _AXIS + a] = begin[a], along[a]
+                    for a in ti.static(range(3)):
+                        outline[b, v, p, _ORIGIN + a] = origin[a]
             outside[b] = out / seen
             if outside[b] > most_outside:
                 continue
             for v in range(V):
-                eye = camera_center(camera, v)
-                # the rows that the drawn parts' discs cover
+                # the rows that the drawn parts cover
                 top, bottom = H, -1
                 for k in range(K):
-                    if disc[b, v, drawn[k], 2] > 0.0:
-                        half = ti.sqrt(disc[b, v, drawn[k], 2])
-                        middle = disc[b, v, drawn[k], 1] - step // 2
-                        top = ti.min(top, ti.max(ti.cast(ti.ceil((middle - half) / step), ti.i32), 0))
-                        bottom = ti.max(bottom, ti.min(ti.cast(ti.floor((middle + half) / step), ti.i32), H - 1))
+                    p = drawn[k]
+                    radius = outline[b, v, p, _RADIUS]
+                    if radius > 0.0:
+                        y0 = outline[b, v, p, _BEGIN + 1] - step // 2
+                        y1 = y0 + outline[b, v, p, _AXIS + 1]
+                        top = ti.min(top, ti.max(ti.cast(ti.ceil((ti.min(y0, y1) - radius) / step), ti.i32), 0))
+                        last = ti.cast(ti.floor((ti.max(y0, y1) + radius) / step), ti.i32)
+                        bottom = ti.max(bottom, ti.min(last, H - 1))
                 total = ti.cast(0.0, ti.f64)
                 for j in range(top, bottom + 1):
-                    row = j * step + step // 2
-                    # and the stretch of this row
+                    # and the stretches of this row
                     low, high = W, -1
                     for k in range(K):
-                        across = disc[b, v, drawn[k], 2] - (row - disc[b, v, drawn[k], 1]) ** 2
-                        if across > 0.0:
-                            half = ti.sqrt(across)
-                            middle = disc[b, v, drawn[k], 0] - step // 2
-                            low = ti.min(low, ti.max(ti.cast(ti.ceil((middle - half) / step), ti.i32), 0))
-                            high = ti.max(high, ti.min(ti.cast(ti.floor((middle + half) / step), ti.i32), W - 1))
+                        left, right = _in_row(outline, b, v, drawn[k], j * step + step // 2)
+                        first, last = W, -1
+                        if left < right:
+                            first = ti.max(ti.cast(ti.ceil((left - step // 2) / step), ti.i32), 0)
+                            last = ti.min(ti.cast(ti.floor((right - step // 2) / step), ti.i32), W - 1)
+                        stretch[b, k, 0], stretch[b, k, 1] = first, last
+                        low, high = ti.min(low, first), ti.max(high, last)
                     in_row = ti.cast(0.0, ti.f32)
                     for i in range(low, high + 1):
                         ray = ti.Vector([ti.cast(rays[v, j, i, a], real) for a in ti.static(range(3))])
                         nearest = ti.cast(before_depth[v, j, i], real)
                         met = -1
                         if ray.norm_sqr() > 0.0:
-                            column = i * step + step // 2
                             for k in range(K):
-                                p = drawn[k]
-                                dx, dy = column - disc[b, v, p, 0], row - disc[b, v, p, 1]
-                                if dx * dx + dy * dy < disc[b, v, p, 2]:
-                                    R = load_rotation(placed, b, p).transpose()
-                                    local = R @ (eye - load_translation(placed, b, p))
-                                    t = enter(part_kind[p], shape_of(part_shape, p), local, R @ ray, 1.0)
+                                if i >= stretch[b, k, 0] and i <= stretch[b, k, 1]:
+                                    p = drawn[k]
+                                    origin = ti.Vector([outline[b, v, p, _ORIGIN + a] for a in ti.static(range(3))])
+                                    local = load_rotation(placed, b, p) @ ray
+                                    t = enter_unit(part_kind[p], part_shape[p, 3], origin, local)
                                     if t > 0.0 and t < nearest:
                                         nearest = t
                                         met = p
@@ -217,6 +261,7 @@ def cast(
         group,
         np.ascontiguousarray(cameras, dtype),
         drawn,
+        _above(body, drawn),
         spread_of(B),
         step,
         rays,
@@ -229,7 +274,8 @@ def cast(
         np.empty((B, D, 12), dtype),
         np.empty((B, D, 6), dtype),
         np.empty((B, P, 12), dtype),
-        np.empty((B, V, P, 3), dtype),
+        np.empty((B, V, P, _COLUMNS), dtype),
+        np.empty((B, len(drawn), 2), np.int32),
         outside,
         change,
         label,
@@ -242,3 +288,13 @@ def cast(
     else:
         base = cost[..., 0].sum(axis=(1, 2), dtype=np.float64)
     return base + change, Cast(label, depth) if export else None
+
+
+def _above(body: ConeArrays, drawn: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The degrees of freedom that move some of the parts, ascending."""
+    moves = np.zeros(len(body.parent), np.bool_)
+    moves[body.part_dof[drawn]] = True
+    for k in range(len(moves) - 1, -1, -1):
+        if moves[k] and body.parent[k] >= 0:
+            moves[body.parent[k]] = True
+    return np.flatnonzero(moves).astype(np.int32)

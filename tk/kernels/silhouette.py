@@ -131,6 +131,7 @@ def _equations_kernel(real):
         part_limb: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
         curve_part: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (Q,)
         curve_kind: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (Q,)
+        chain: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,) 0, 1, …
         # the frame
         camera: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
         size: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (V, 2) width, height at this scale
@@ -165,7 +166,7 @@ def _equations_kernel(real):
             if turn % spread != 0:
                 continue
             b = turn // spread
-            forward(axis, point, prismatic, parent, pose, b, b, frames, twists)
+            forward(axis, point, prismatic, parent, chain, pose, b, b, frames, twists)
             for p in range(P):
                 R, t = place_part(frames, part_dof, part_frame, b, p)
                 keep(placed, b, p, R, t)
@@ -402,6 +403,7 @@ def _launch(
     samples = np.zeros((tasks, settings.most_samples, _EXPORT) if export else (1, 1, _EXPORT), dtype)
     _equations_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
         *body,
+        _all_of(D),
         np.ascontiguousarray(cameras, dtype),
         np.ascontiguousarray(sizes, np.int32),
         np.ascontiguousarray(masks),
@@ -419,6 +421,11 @@ def _launch(
         total,
     )
     return total, samples
+
+
+@functools.cache
+def _all_of(count: int) -> NDArray[np.int32]:
+    return np.arange(count, dtype=np.int32)
 
 
 @functools.lru_cache(64)

@@ -47,7 +47,7 @@ INFORMATION = 1.0 / (2.0**2 * 10.0)
 # Standard deviations of the priors: waist and ankles about straight ones, the others about their prediction.
 WAIST_DEG, ANKLE_DEG, ANGLE_DEG, TRANSLATION_M = 12.0, 20.0, 40.0, 0.3
 # Who is explained worse than at best is usual by this factor for RELOCATE_EVERY frames, searched or not, is looked for
-# as if lost.
+# as if lost; if that is in vain, again after twice as long.
 STRANDED = 1.6
 # How long a hypothesis may live beside the best one, in frames, and how much of its running cost a frame replaces.
 PATIENCE, RENEWAL = 6, 0.4
@@ -304,7 +304,8 @@ class RegionTracker(ContourTracker):
         limit = self.contours.lost_error
         self._stranded = self._stranded + 1 if error > STRANDED * self._sound else 0
         due = self._lost_for > 0 if error <= limit else self._lost_for % RELOCATE_EVERY == 0
-        stranded = not due and self._stranded > 0 and self._stranded % RELOCATE_EVERY == 0
+        waits, odd = divmod(self._stranded, RELOCATE_EVERY)
+        stranded = not due and not odd and waits.bit_count() == 1
         if not (due or stranded):
             return error > limit
         pose, found = self.relocate(pyramid, self._best.pose, error)
