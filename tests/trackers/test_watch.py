@@ -85,8 +85,9 @@ def blind(cameras: list[int], frames: range) -> Spoil:
     return spoil
 
 
-def torn(camera: int, frames: range, part: tuple[float, float]) -> Spoil:
-    """A part of the person, as shares of the height in the picture, is not in the camera's masks of these frames."""
+def torn(camera: int, frames: range, part: tuple[float, float], in_doubt: bool = False) -> Spoil:
+    """A part of the person, as shares of the height in the picture, is not in the camera's masks of these frames; it is
+    background there, or in doubt."""
 
     def spoil(frame: Observation) -> Observation:
         if frame.index not in frames:
@@ -95,8 +96,10 @@ def torn(camera: int, frames: range, part: tuple[float, float]) -> Spoil:
         rows = np.flatnonzero(masks[camera].any(axis=1))
         first, last = rows[0], rows[-1] + 1
         low, high = (round(first + share * (last - first)) for share in part)
+        doubtful = np.zeros(masks.shape, np.bool_)
+        doubtful[camera, low:high] = in_doubt & (masks[camera, low:high] > 0)
         masks[camera, low:high] = 0
-        return replace(frame, masks=masks)
+        return replace(frame, masks=masks, doubtful=doubtful)
 
     return spoil
 
@@ -156,6 +159,21 @@ def test_a_mask_with_a_piece_missing_is_no_camera_that_disagrees(scene: Scene, p
     assert [bool(u[1]) for u in used] == [True] * 2 + [False] * 9 + [True] * (FRAMES - 11)
     assert watch.report() == ["camera cam2 misses a part of the person: left out of frames 2 to 10"]
     assert not any(e.status == "lost" for e in estimates)
+    assert scene.error(estimates, range(FRAMES)) < 0.05
+
+
+@pytest.mark.parametrize("part", [(0.0, 0.2), (0.7, 1.0)], ids=["the head", "the shanks"])
+def test_a_mask_in_doubt_is_no_reason_to_go_without_what_it_does_show(scene: Scene, part: tuple[float, float]) -> None:
+    watch, estimates, used = scene.follow(torn(1, range(2, 8), part, in_doubt=True))
+    assert np.all(used) and watch.report() == []
+    assert not any(e.status == "lost" for e in estimates)
+    assert scene.error(estimates, range(FRAMES)) < 0.05
+
+
+def test_of_a_mask_that_lacks_half_too_little_is_left_in_doubt_or_not(scene: Scene) -> None:
+    watch, estimates, used = scene.follow(torn(1, range(2, 8), (0.0, 0.5), in_doubt=True))
+    assert not any(u[1] for u in used[2:8]) and all(u[1] for u in used[:2])
+    assert watch.report() == ["camera cam2 misses a part of the person: left out of frames 2 to 13"]
     assert scene.error(estimates, range(FRAMES)) < 0.05
 
 

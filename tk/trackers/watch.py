@@ -7,10 +7,10 @@ but does the others, the camera was what was wrong and not the pose. It comes ba
 explains it again. This is the iteratively reweighted fit of robust statistics with weights of 0 and 1 and the camera as
 the unit: what is wrong with one picture is wrong everywhere in it.
 
-A poor mask is no wrong camera. What a camera that is turned, moved or late lacks of the body on one side it shows
-beside the body on the other; a mask with pieces missing shows nothing there. It would still pull limbs out of what is
-missing, so the camera is left out, too, but the pose that the others found is not doubted for it, and it comes back
-when its masks have been whole for some frames.
+A poor mask is no wrong camera: where it is in doubt it contradicts nothing. What a camera that is turned, moved or late
+lacks of the body on one side it shows beside the body on the other; a mask with pieces missing shows nothing there. It
+would still pull limbs out of what is missing, so the camera is left out, too, but the pose that the others found is not
+doubted for it, and it comes back when its masks have been whole for some frames.
 
 Only for trackers of contours: a visual hull without one of its masks is empty, so those of hulls take all cameras.
 """
@@ -47,6 +47,8 @@ _CULPRIT_RATIO, _RELIEF, _HOPELESS = 3.0, 0.15, 0.2
 _OTHERS_FIT = 1.5, 1.3
 # A mask of which the person explains less than a quarter shows anything.
 _BLOB = 0.75
+# What it lacks where its mask is in doubt counts only if it is more than so much of the mask: then too little is left.
+_TOO_LITTLE = 0.5
 # Its mask has pieces missing if it shows beside the body no more than this share of what it lacks.
 _TORN = 0.5
 # It comes back when the others' body leaves no more than its usual times this unexplained; with a torn mask, when it
@@ -211,8 +213,8 @@ class Watch:
         self.tracker.restore(self.tracker.model(), state)
 
     def _errors(self, frame: Observation, estimate: Estimate) -> Float:
-        """(2, C) the two parts of E_S at the estimate's pose, of cameras left out, too: body outside the mask, and mask
-        outside the body. NaN where a camera sees nobody.
+        """(2, C) the two parts of E_S at the estimate's pose, of cameras left out, too: body outside the mask, unless
+        that is in doubt there and much is left, and mask outside the body. NaN where a camera sees nobody.
         """
         tracker = self.tracker
         assert isinstance(tracker, ContourTracker)
@@ -227,8 +229,12 @@ class Watch:
         drawn = met.label[0] > 0
         seen = np.count_nonzero(evidence.person, axis=(1, 2)).astype(np.float64)
         seen[seen == 0] = np.nan
-        parts = drawn & ~evidence.person, evidence.person & ~drawn
-        return np.stack([np.count_nonzero(part, axis=(1, 2)) / seen for part in parts])
+        missing, surplus = drawn & ~evidence.person, evidence.person & ~drawn
+        lacking = np.count_nonzero(missing, axis=(1, 2)) / seen
+        if frame.doubtful is not None:
+            excused = np.count_nonzero(missing & tracker.screen.sample(frame.doubtful), axis=(1, 2)) / seen
+            lacking -= np.where(excused < _TOO_LITTLE, excused, 0.0)
+        return np.stack([lacking, np.count_nonzero(surplus, axis=(1, 2)) / seen])
 
     def _judged(self, index: int, estimate: Estimate, used: Observation, aside: Float | None) -> Estimate:
         """The estimate, lost where it cannot be true."""
