@@ -185,9 +185,16 @@ class ContourTracker:
         ways = find_person(self, frames, pyramids, rough)
         if not self.contours.adapt or body is not None:
             return np.asarray(ways[0][0])
-        return self._adapt(pyramids, ways, average.stature, stature is not None)
+        return self._adapt(frames, pyramids, ways, average.stature, stature is not None)
 
-    def _adapt(self, pyramids: Sequence[Pyramid], ways: Sequence[Float], stature: float, known: bool) -> Float:
+    def _adapt(
+        self,
+        frames: Sequence[Observation],
+        pyramids: Sequence[Pyramid],
+        ways: Sequence[Float],
+        stature: float,
+        known: bool,
+    ) -> Float:
         """Fit the body to the opening, and (D,) the pose in its first frame; whether the stature is ``known``.
 
         Of several ways (F, D) to explain the opening, that is believed whose own body explains it best.
@@ -199,7 +206,10 @@ class ContourTracker:
 
         def error(fit: tuple[ConeBody, Float]) -> float:
             self.take_body(fit[0])
-            told = [self.fit_error(pyramids[i], pose[None])[0] for i, pose in zip(chosen, fit[1], strict=True)]
+            told = [
+                self.fit_error(pyramids[i], pose[None], frames[i].doubtful)[0]
+                for i, pose in zip(chosen, fit[1], strict=True)
+            ]
             return float(np.mean(told))
 
         body, fitted = fits[0] if len(fits) == 1 else min(fits, key=error)
@@ -270,9 +280,10 @@ class ContourTracker:
         """What the frame shows on a grid."""
         return Evidence.of(grid, pyramid.masks[0], frame.doubtful, frame.images, self.colors)
 
-    def fit_error(self, pyramid: Pyramid, poses: Float) -> Float:
-        """(B,) E_S averaged over the views that see anybody; inf where none does."""
-        evidence = Evidence.of(self.screen, pyramid.masks[0])
+    def fit_error(self, pyramid: Pyramid, poses: Float, doubtful: NDArray[np.bool_] | None = None) -> Float:
+        """(B,) E_S averaged over the views that see anybody, inf where none does; what is met where the masks are
+        ``doubtful`` counts half."""
+        evidence = Evidence.of(self.screen, pyramid.masks[0], doubtful)
         return mean_of_views(evidence.cast(self.body, self.colors.group, poses)[0])
 
     def search(

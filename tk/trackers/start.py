@@ -104,11 +104,11 @@ def _find(tracker: ContourTracker, frame: Observation, pyramid: Pyramid) -> tupl
     p_centroid = centroid(rig, pyramid, frame.index)
     first = _heading_of_camera(skeleton, rig, p_centroid)
     settled = tracker.settle(pyramid, gait.hypotheses(skeleton, HEADINGS, PHASES, p_centroid, first)).states
-    order = settled[np.argsort(tracker.fit_error(pyramid, settled), kind="stable")]
+    order = settled[np.argsort(tracker.fit_error(pyramid, settled, frame.doubtful), kind="stable")]
     turned = _turned(skeleton, order, order[0])
     finalists = np.array(_distinct(skeleton, order, FINALISTS) + _distinct(skeleton, order[turned], OPPOSITE))
     poses = np.array([_searched(tracker, frame, pyramid, pose) for pose in np.unique(finalists, axis=0)])
-    error = tracker.fit_error(pyramid, poses)
+    error = tracker.fit_error(pyramid, poses, frame.doubtful)
     best = int(np.argmin(error))
     found = [poses[best]]
     others = np.flatnonzero(_turned(skeleton, poses, poses[best]) & (error < NEARLY * error[best]))
@@ -124,20 +124,24 @@ def _follow(
     F = len(frames)
     poses = np.tile(pose, (F, 1))
     errors = np.full(F, np.nan)
-    errors[anchor] = tracker.fit_error(pyramids[anchor], pose[None])[0]
+
+    def told(i: int, pose: Float) -> float:
+        return float(tracker.fit_error(pyramids[i], pose[None], frames[i].doubtful)[0])
+
+    errors[anchor] = told(anchor, pose)
     every = tracker.contours.search_every
     for step, end in ((1, F), (-1, -1)):
         for i in range(anchor + step, end, step):
             before = poses[i - 2 * step] if abs(i - anchor) > 1 else poses[anchor]
             expected = poses[i - step] + tracker.contours.prediction * (poses[i - step] - before)
             now = tracker.settle(pyramids[i], expected[None]).states[0]
-            error = tracker.fit_error(pyramids[i], now[None])[0]
+            error = told(i, now)
             if not np.isfinite(error):  # nobody is in sight
                 poses[i] = poses[i - step]
                 continue
             if every and (error > WORSE * errors[anchor] or abs(i - anchor) % every == 0):
                 now = tracker.improved(frames[i], pyramids[i], now)
-                error = tracker.fit_error(pyramids[i], now[None])[0]
+                error = told(i, now)
             poses[i], errors[i] = now, error
     return poses, float(np.nanmean(errors))
 
