@@ -20,7 +20,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scripts.bench_pictures import Silent
 from scripts.synthetic.capture import write_calibration
 from tk import session
 from tk.config import Config
@@ -85,7 +84,7 @@ def _children() -> list[int]:
     return sorted(int(pid) for task in tasks for pid in (task / "children").read_text().split())
 
 
-class Telling(Silent):
+class Telling(session.Silent):
     """Tells what is held."""
 
     def __init__(self, every: int) -> None:
