@@ -184,37 +184,39 @@ class ContourTracker:
             rough = self.settle(pyramids[0], join_pose(self.body.skeleton, angles, *unknown)[None]).states[0]
         ways = find_person(self, frames, pyramids, rough)
         if not self.contours.adapt or body is not None:
-            return np.asarray(ways[0][0])
+            return np.asarray(ways[0][0][0])
         return self._adapt(frames, pyramids, ways, average.stature, stature is not None)
 
     def _adapt(
         self,
         frames: Sequence[Observation],
         pyramids: Sequence[Pyramid],
-        ways: Sequence[Float],
+        ways: Sequence[tuple[Float, float]],
         stature: float,
         known: bool,
     ) -> Float:
         """Fit the body to the opening, and (D,) the pose in its first frame; whether the stature is ``known``.
 
-        Of several ways (F, D) to explain the opening, that is believed whose own body explains it best.
+        Of several ways (F, D) to explain the opening that is believed which both the average body, as its mean E_S
+        tells, and its own explain best: a body that is fitted to a wrong way makes up for some of it.
         """
         count = min(self.contours.fit.frames, len(pyramids))
         chosen = np.unique(np.linspace(0, len(pyramids) - 1, count).round().astype(int))
         config = self.contours.fit if known else replace(self.contours.fit, stature_deviation=MEASURED)
-        fits = [self.fit(pyramids, poses, chosen, stature, config) for poses in ways]
-
-        def error(fit: tuple[ConeBody, Float]) -> float:
-            self.take_body(fit[0])
-            told = [
-                self.fit_error(pyramids[i], pose[None], frames[i].doubtful)[0]
-                for i, pose in zip(chosen, fit[1], strict=True)
-            ]
-            return float(np.mean(told))
-
-        body, fitted = fits[0] if len(fits) == 1 else min(fits, key=error)
+        found: list[tuple[float, ConeBody, Float]] = []
+        for poses, error in ways:
+            body, fitted = self.fit(pyramids, poses, chosen, stature, config)
+            if len(ways) > 1:
+                self.take_body(body)
+                error *= float(np.mean(list(map(self._misfit, frames, pyramids, poses))))
+            found.append((error, body, fitted[0]))
+        _, body, pose = min(found, key=lambda one: one[0])
         self.take_body(body)
-        return np.asarray(fitted[0])
+        return np.asarray(pose)
+
+    def _misfit(self, frame: Observation, pyramid: Pyramid, pose: Float) -> float:
+        """E_S where a pose (D,) settles, masks in doubt counted half."""
+        return float(self.fit_error(pyramid, self.settle(pyramid, pose[None]).states, frame.doubtful)[0])
 
     def fit(
         self,

@@ -53,9 +53,9 @@ _SEARCHES = 2
 
 def find_person(
     tracker: ContourTracker, frames: Sequence[Observation], pyramids: Sequence[Pyramid], pose: Float | None = None
-) -> list[Float]:
-    """Poses (F, D) in consecutive frames, the best explained ones first, and others that are explained nearly as well:
-    only a body fitted to each tells then. The tracker has an average body already.
+) -> list[tuple[Float, float]]:
+    """Poses (F, D) in consecutive frames and their mean E_S, the best explained ones first, and others that are
+    explained nearly as well: only a body fitted to each tells then. The tracker has an average body already.
 
     Args:
         tracker: see :class:`ContourTracker`.
@@ -67,7 +67,7 @@ def find_person(
         CaptureError: nobody is seen in the first frame by two cameras.
     """
     if pose is not None:
-        return [_follow(tracker, frames, pyramids, _searched(tracker, frames[0], pyramids[0], pose), 0)[0]]
+        return [_follow(tracker, frames, pyramids, _searched(tracker, frames[0], pyramids[0], pose), 0)]
     skeleton = tracker.body.skeleton
     ways: list[tuple[Float, float]] = []
     best, opposite = np.inf, list[tuple[int, Float]]()
@@ -88,12 +88,12 @@ def find_person(
             break
     ways += [_follow(tracker, frames, pyramids, pose, anchor) for anchor, pose in opposite]
     ways.sort(key=lambda way: way[1])
-    kept: list[Float] = []
+    kept: list[tuple[Float, float]] = []
     for way, error in ways:
         joints = skeleton.joints(way)
-        apart = [np.mean(skeleton.apart(other, joints)) for other in kept]
+        apart = [np.mean(skeleton.apart(other, joints)) for other, _ in kept]
         if error <= AMBIGUOUS * ways[0][1] and all(distance > APART_M for distance in apart):
-            kept.append(way)
+            kept.append((way, error))
     return kept
 
 
