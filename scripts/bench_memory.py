@@ -76,7 +76,7 @@ def make_loop(folder: Path, count: int) -> Capture:
 def held_mib(process: int | str = "self") -> float:
     """What a process holds, MiB: in memory, and of it what the system has put aside."""
     fields = dict(line.split(":", 1) for line in Path(f"/proc/{process}/status").read_text().splitlines())
-    return sum(int(fields[name].split()[0]) for name in ("VmRSS", "VmSwap")) / 1024
+    return sum(int(fields.get(name, "0").split()[0]) for name in ("VmRSS", "VmSwap")) / 1024  # none once it has ended
 
 
 def _children() -> list[int]:
