@@ -1,8 +1,10 @@
-"""One BLAS thread inside, as many as before afterwards."""
+"""One thread in BLAS and OpenCV inside, as many as before afterwards."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
+import pytest
 import scipy.linalg  # noqa: F401  (its pool is one of those that are looked at)
 from threadpoolctl import threadpool_info, threadpool_limits
 
@@ -28,3 +30,11 @@ def test_pools_have_one_thread_inside_and_their_own_outside() -> None:
                 assert set(inside()) == {1}
                 assert set(blas_threads()) == {1}
             assert blas_threads() == before
+
+
+def test_opencv_has_its_own_number_again_even_after_an_error() -> None:
+    before = cv2.getNumThreads()
+    with pytest.raises(ZeroDivisionError), one_thread():
+        assert cv2.getNumThreads() == 1
+        1 / 0  # noqa: B018
+    assert cv2.getNumThreads() == before

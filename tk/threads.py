@@ -2,7 +2,8 @@
 
 Cameras, processes and captures are what runs side by side here. A pool of threads divides a matrix product otherwise
 than one thread does, so that a run's last digits would hang on who started it. And pools wait for work by spinning:
-matrices and pictures are small, so `tk refine` takes 2.3 times the processor time with one, drawing 1.9 times.
+matrices and pictures are small, so `tk refine` takes 2.3 times the processor time with one, and drawing with nothing
+beside 1.9 times.
 """
 
 from __future__ import annotations
