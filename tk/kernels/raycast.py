@@ -21,10 +21,11 @@ from tk.kernels.launch import Launcher
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
-# How much larger than to first order spheres are taken in the pictures when rays are cast, and by how many pixels more:
-# distorted lines bend.
-MARGIN, MARGIN_PX = 1.1, 1.0
-# Columns of a part's outline in a picture: its beginning, its axis, the radius and, across the axis, that radius.
+# How much larger than to first order spheres are taken in the pictures when rays are cast; and how many times as much
+# as its middle a distorted axis lies beside the chord anywhere.
+MARGIN, BEND = 1.1, 1.5
+# Columns of a part's outline in a picture: its beginning, its axis, the radius and, across the axis, that radius; then
+# where the camera is in the unit part.
 _BEGIN, _AXIS, _RADIUS, _ACROSS, _ORIGIN, _COLUMNS = 0, 2, 4, 5, 7, 10
 # Depth of a ray that meets nothing.
 FAR = 1e9
@@ -128,8 +129,10 @@ def _cast_kernel(real):
                     if nearest > 1.5 * reach + NEAREST_M:
                         # the Frobenius norm of the derivative is at least its growth in any direction
                         growth = ti.max(J0.norm() * depth0 / (depth0 - reach), J1.norm() * depth1 / (depth1 - reach))
-                        radius = MARGIN * growth * reach + MARGIN_PX
                         pixel, _, _ = project(camera, v, middle)
+                        chord = end - begin
+                        aside = ti.abs(chord.cross(pixel - begin)) / ti.max(chord.norm(), 1e-6)
+                        radius = MARGIN * growth * reach + BEND * aside
                         i = ti.cast(ti.round((pixel[0] - step // 2) / step), ti.i32)
                         j = ti.cast(ti.round((pixel[1] - step // 2) / step), ti.i32)
                         if i >= 0 and j >= 0 and i < W and j < H:

@@ -208,7 +208,8 @@ class ContourTracker:
             body, fitted = self.fit(pyramids, poses, chosen, stature, config)
             if len(ways) > 1:
                 self.take_body(body)
-                error *= float(np.mean(list(map(self._misfit, frames, pyramids, poses))))
+                told = np.array(list(map(self._misfit, frames, pyramids, poses)))
+                error *= float(told[np.isfinite(told)].mean())  # in the others nobody is in sight
             found.append((error, body, fitted[0]))
         _, body, pose = min(found, key=lambda one: one[0])
         self.take_body(body)

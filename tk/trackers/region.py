@@ -304,8 +304,8 @@ class RegionTracker(ContourTracker):
         limit = self.contours.lost_error
         self._stranded = self._stranded + 1 if error > STRANDED * self._sound else 0
         due = self._lost_for > 0 if error <= limit else self._lost_for % RELOCATE_EVERY == 0
-        waits, odd = divmod(self._stranded, RELOCATE_EVERY)
-        stranded = not due and not odd and waits.bit_count() == 1
+        waits, rest = divmod(self._stranded, RELOCATE_EVERY)
+        stranded = not due and rest == 0 and waits.bit_count() == 1
         if not (due or stranded):
             return error > limit
         pose, found = self.relocate(pyramid, self._best.pose, error)
