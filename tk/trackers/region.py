@@ -101,12 +101,15 @@ class Hypothesis:
         pose, previous: (D,) now and a frame before.
         cost: running mean of what it leaves unexplained.
         age: frames since it was proposed.
+        jumped: a search has just found it: ``previous`` is that of the pose which it replaces, so that it may be moving
+            fast, or that pose had lost it.
     """
 
     pose: Float
     previous: Float
     cost: float
     age: int = 0
+    jumped: bool = False
 
 
 class RegionTracker(ContourTracker):
@@ -153,6 +156,7 @@ class RegionTracker(ContourTracker):
         pyramid = self.pyramid(frame)
         images = frame.images if config.colors else None
         watch.lap("masks_clean")
+        self._alive += [replace(h, previous=h.pose, jumped=False) for h in self._alive if h.jumped]
         starts = np.array([h.pose + contours.prediction * (h.pose - h.previous) for h in self._alive])
         poses, hessian = self.settle(pyramid, starts, images=images, prior=self._prior(starts))
         watch.lap("optimise")
@@ -293,7 +297,7 @@ class RegionTracker(ContourTracker):
         gain = cost[0] - cost
         # a jump must pay more than noise makes of two casts; less must show in the frames that follow
         self._alive += [
-            Hypothesis(pose, pose, best.cost - RENEWAL * float(g if g > GAIN else min(g, 0.0)))
+            Hypothesis(pose, best.previous, best.cost - RENEWAL * float(g if g > GAIN else min(g, 0.0)), jumped=True)
             for pose, g in zip(poses[1:], gain[1:], strict=True)
             if g > -MARGIN / 2
         ]
