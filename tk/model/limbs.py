@@ -75,21 +75,25 @@ class Limb:
 
     def distinct(self, skeleton: Skeleton, poses: Float, cost: Float, count: int) -> Float:
         """(C, D) the cheapest of the poses whose limbs lie apart by more than :data:`DISTINCT_M`, at most ``count``."""
-        # beyond these only neighbours of the first follow
-        best = np.argsort(cost, kind="stable")[: 20 * count]
+        best = np.argsort(cost, kind="stable")
         best = best[np.isfinite(cost[best])]
-        ends = skeleton.joints(poses[best])[:, list(self.joints)]
-        return np.asarray(poses[best[distinct(ends, count)]])
+        chosen: list[int] = []
+        for many in (5 * count, 20 * count):  # beyond these only neighbours of the first follow
+            if len(chosen) < count:
+                chosen = distinct(skeleton.joints(poses[best[:many]])[:, list(self.joints)], count)
+        return np.asarray(poses[best[chosen]])
 
 
 def distinct(places: Float, count: int, present: Float | None = None) -> list[int]:
     """The first of the places (N, J, 3) that lie apart from each other and from the present one (J, 3)."""
-    kept = [] if present is None else [present]
+    def apart(place: Float) -> NDArray[np.bool_]:
+        return np.asarray(np.linalg.norm(places - place, axis=-1).max(axis=-1) > DISTINCT_M)
+
+    free = np.ones(len(places), np.bool_) if present is None else apart(present)
     chosen: list[int] = []
-    for i, place in enumerate(places):
-        if len(chosen) < count and all(np.linalg.norm(place - other, axis=1).max() > DISTINCT_M for other in kept):
-            kept.append(place)
-            chosen.append(i)
+    while len(chosen) < count and free.any():
+        chosen.append(int(np.argmax(free)))
+        free &= apart(places[chosen[-1]])
     return chosen
 
 

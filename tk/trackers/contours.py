@@ -39,15 +39,18 @@ Float = NDArray[np.float64]
 MEASURED = 0.05
 # A lost frame is searched for the person from the silhouettes' centroid; of several lost ones every so many.
 RELOCATE_EVERY = 3
+# One in so many places of a lost person goes on to the finer scales.
+RELOCATED = 4
 # The fall of the cost, as a share of the person's pixels, that makes another place of a limb the pose.
 GAIN = 0.004
 # Places of a limb that are descended from, more of one that is known to be misplaced, and random ones about its own
 # place that are looked at beside the grid.
 PLACES, MORE_PLACES, NEARBY = 3, 8, 80
 # Places of a limb are not looked at where that much of it is outside the silhouettes.
-OUTSIDE = 0.5
-# A limb's place that costs this much more than its present one, once the limb alone has settled there, is given up.
-PROMISING = 0.01
+OUTSIDE = 0.4
+# A limb's place is not descended from where the body costs more than now by this factor; and is given up if, once the
+# limb alone has settled there, it costs more by this share of the person's pixels.
+PROPOSED, PROMISING = 1.5, 0.01
 # Poses that a search descends from with all limbs, beside the present one; and for each pair of limbs.
 FINISHED, FINISHED_PAIRS = 2, 4
 # Poses whose joints lie farther apart than this are different ones, metres.
@@ -293,6 +296,7 @@ class ContourTracker:
         self,
         frame: Observation,
         pyramid: Pyramid,
+        evidence: Evidence,
         pose: Float,
         images: NDArray[np.uint8] | None = None,
         misplaced: Sequence[Limb] = (),
@@ -302,27 +306,26 @@ class ContourTracker:
         the limb alone, then, where that promises something, by the whole body.
 
         With ``in_pairs`` both arms, and both legs, are taken away at once: where one of them is in the other's place,
-        neither finds its own while the other stays.
+        neither finds its own while the other stays. ``evidence`` is the frame's on the screen's grid.
 
         Returns:
             Poses (B, D), that which was given first, and their costs (B,).
         """
         skeleton, group = self.body.skeleton, self.colors.group
         rng = np.random.default_rng([7, frame.index])
-        coarse = self.evidence(self.screen, frame, pyramid)
-        by_view, met = coarse.cast(self.body, group, pose[None], export=True)
+        by_view, met = evidence.cast(self.body, group, pose[None], export=True)
         assert met is not None
-        own, unmet = mean_of_views(by_view)[0], coarse.unmet(met.label[0])
+        own, unmet = mean_of_views(by_view)[0], evidence.unmet(met.label[0])
         joints = skeleton.joints(pose)
         level = (min(1, self.contours.solver.scales - 1),)
         found: list[tuple[NDArray[np.int64], Float]] = []
-        told_by, rays = coarse.cost_of_parts(group, met.label[0])
+        told_by, rays = evidence.cost_of_parts(group, met.label[0])
         for limbs in pairs(self.limbs) if in_pairs else [(limb,) for limb in self.limbs]:
             moved = np.concatenate([limb.parts for limb in limbs])
             if in_pairs and told_by[moved].sum() * rays.sum() <= told_by.sum() * rays[moved].sum():
                 continue  # where they are they explain more than the rest of the body does
             others = np.setdiff1d(np.arange(len(group), dtype=np.int32), moved)
-            without, rest = coarse.cast(self.body, group, pose[None], others, export=True)
+            without, rest = evidence.cast(self.body, group, pose[None], others, export=True)
             assert rest is not None
             if not in_pairs and limbs[0] not in misplaced and mean_of_views(without)[0] - own > unmet:
                 continue  # it explains more where it is than there is to explain elsewhere
@@ -330,13 +333,16 @@ class ContourTracker:
             settled = pose[None]
             for limb in limbs:
                 tried = limb.candidates(pose, NEARBY, rng)
-                cost, _ = coarse.cast(self.body, group, tried, limb.parts, before, most_outside=OUTSIDE)
+                cost, _ = evidence.cast(self.body, group, tried, limb.parts, before, most_outside=OUTSIDE)
+                told = mean_of_views(cost)
+                if not in_pairs:
+                    told[told > PROPOSED * own] = np.inf
                 count = MORE_PLACES if in_pairs or limb in misplaced else PLACES
-                places = limb.distinct(skeleton, tried, mean_of_views(cost), count)
+                places = limb.distinct(skeleton, tried, told, count)
                 if len(places):
                     places = self.settle(pyramid, places, level, images, limb=limb).states
                 settled = limb.combined(settled, np.concatenate([pose[None], places]))
-            cost, _ = coarse.cast(self.body, group, settled, moved, before)
+            cost, _ = evidence.cast(self.body, group, settled, moved, before)
             told = mean_of_views(cost)
             order = np.argsort(told, kind="stable")
             settled, told = settled[order], told[order]
@@ -355,7 +361,7 @@ class ContourTracker:
                 both = places[0].copy()
                 both[dofs] = others[0][dofs]
                 poses.append(both)
-        cost = mean_of_views(coarse.cast(self.body, group, np.array(poses))[0])
+        cost = mean_of_views(evidence.cast(self.body, group, np.array(poses))[0])
         best = np.argsort(cost, kind="stable")[: None if in_pairs else FINISHED]
         chosen = np.concatenate([pose[None], np.array(poses)[best]])
         settled = self.settle(pyramid, chosen, (0,), images).states
@@ -364,7 +370,7 @@ class ContourTracker:
 
     def improved(self, frame: Observation, pyramid: Pyramid, pose: Float) -> Float:
         """(D,) the pose, or what a search finds that costs :data:`GAIN` less."""
-        poses, cost = self.search(frame, pyramid, pose)
+        poses, cost = self.search(frame, pyramid, self.evidence(self.screen, frame, pyramid), pose)
         best = int(np.argmin(cost))
         return np.asarray(poses[best if cost[best] < cost[0] - GAIN else 0])
 
@@ -381,8 +387,11 @@ class ContourTracker:
         skeleton = self.body.skeleton
         moved, yaw = pose.copy(), skeleton.index("torso_yaw")
         moved[skeleton.prismatic] = p_centroid
+        levels = range(self.contours.solver.scales - 1, -1, -1)
         starts = np.concatenate([moved[None], gait.hypotheses(skeleton, HEADINGS, PHASES, p_centroid, pose[yaw])])
-        settled = self.settle(pyramid, starts).states
+        coarse = self.settle(pyramid, starts, levels[:1]).states
+        best = np.argsort(self.fit_error(pyramid, coarse), kind="stable")[: len(starts) // RELOCATED]
+        settled = self.settle(pyramid, coarse[best], levels[1:]).states
         errors = self.fit_error(pyramid, settled)
         i = int(np.argmin(errors + FACING * (1 - np.cos(settled[:, yaw] - pose[yaw])) / 2))
         return (settled[i], float(errors[i])) if errors[i] < error else (pose, error)

@@ -180,7 +180,7 @@ class RegionTracker(ContourTracker):
         if searched:
             for in_pairs in (False, True):
                 before = self._best.pose
-                self._propose(frame, pyramid, images, misplaced, in_pairs)
+                self._propose(frame, pyramid, evidence, images, misplaced, in_pairs)
                 if self._best.pose is not before:
                     best = self._best.pose[None]
                     _, again = evidence.cast(self.body, self.colors.group, best, export=True)
@@ -287,13 +287,14 @@ class RegionTracker(ContourTracker):
         self,
         frame: Observation,
         pyramid: Pyramid,
+        evidence: Evidence,
         images: NDArray[np.uint8] | None,
         misplaced: Sequence[Limb],
         in_pairs: bool,
     ) -> None:
         """Other places of the limbs join the hypotheses, with what they cost above the best one's running mean."""
         best = self._best
-        poses, cost = self.search(frame, pyramid, best.pose, images, misplaced, in_pairs)
+        poses, cost = self.search(frame, pyramid, evidence, best.pose, images, misplaced, in_pairs)
         gain = cost[0] - cost
         # a jump must pay more than noise makes of two casts; less must show in the frames that follow
         self._alive += [
