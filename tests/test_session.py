@@ -36,8 +36,9 @@ track = partial(session.track, method="volumetric")
 # `tk` that sends itself a signal once a frame is finished
 VICTIM = """
 import os, signal, sys
-from tk import cli, console
+from tk import cli, console, session
 
+session.WRITE_EVERY_S = float(os.environ["TEST_WRITE_EVERY_S"])
 tell = console.Report.advance
 
 def advance(self, frame, estimate):
@@ -65,11 +66,16 @@ def assert_same(path: Path, expected: Path, frames: slice = slice(None)) -> None
             assert a[f"model/dimensions/{name}"][()] == b[f"model/dimensions/{name}"][()], name
 
 
-def send(number: int, frame: int, *arguments: Any) -> subprocess.CompletedProcess[str]:
+def send(number: int, frame: int, *arguments: Any, write_every_s: float = 0.0) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-c", VICTIM, *map(str, arguments)],
         cwd=ROOT,
-        env={**os.environ, "TEST_FRAME": str(frame), "TEST_SIGNAL": str(int(number))},
+        env={
+            **os.environ,
+            "TEST_FRAME": str(frame),
+            "TEST_SIGNAL": str(int(number)),
+            "TEST_WRITE_EVERY_S": str(write_every_s),
+        },
         capture_output=True,
         text=True,
         timeout=600,
@@ -105,7 +111,10 @@ def test_another_seed_gives_another_result(tiny: Path, tracked: Path, tmp_path: 
 # --- stopped and taken up again ---------------------------------------------------------------------------------------
 
 
-def test_a_run_that_is_stopped_twice_equals_an_unbroken_one(tiny: Path, tracked: Path, tmp_path: Path) -> None:
+def test_a_run_that_is_stopped_twice_equals_an_unbroken_one(
+    tiny: Path, tracked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "WRITE_EVERY_S", 0)
     result, capture = tmp_path / "r.h5", open_capture(tiny)
     for frame in (0, 8):
         summary = track(capture, result, CONFIG, stop_at(frame), resume=True, store_hull=True)
@@ -115,6 +124,32 @@ def test_a_run_that_is_stopped_twice_equals_an_unbroken_one(tiny: Path, tracked:
     assert (summary.interrupted, summary.frames, summary.tracked_now) == (False, FRAMES, FRAMES - 9)
     assert (reporter.total, reporter.done, reporter.frames) == (FRAMES, 9, list(range(9, FRAMES)))
     assert_same(result, tracked)
+
+
+def test_frames_that_are_written_together_are_told_of_when_they_are_in_the_file(
+    tiny: Path, tracked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "WRITE_EVERY_S", 1e9)
+    result, capture = tmp_path / "r.h5", open_capture(tiny)
+    stopped = stop_at(3)
+    summary = track(capture, result, CONFIG, stopped, frames=(0, 8), store_hull=True)
+    assert summary.interrupted and stopped.frames == [0, 1, 2, 3]  # by then all of them were finished
+    assert summary.frames == summary.tracked_now == 8
+    assert_same(result, tracked, slice(0, 8))
+    run(tiny, result, resume=True, store_hull=True)
+    assert_same(result, tracked)
+
+
+def test_a_killed_run_leaves_what_it_has_told_of(tiny: Path, tracked: Path, tmp_path: Path) -> None:
+    """With frames that are written together, as many as it may be."""
+    result, settings = tmp_path / "r.h5", tmp_path / "s.toml"
+    settings.write_text(QUICK, encoding="utf-8")
+    command = ["track", tiny, "-o", result, "--method", "volumetric", "--config", settings]
+    killed = send(signal.SIGKILL, 5, *command, write_every_s=0.05)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    done = len(read_result(result).frames)
+    assert 6 <= done < FRAMES
+    assert_same(result, tracked, slice(0, done))
 
 
 @pytest.mark.parametrize("frames", [(0, 1), (0, 6)])
@@ -177,8 +212,9 @@ def test_results_of_other_software_are_not_taken_up(tk: Tk, quick: Path, tiny: P
     assert other.read_text() == "not HDF5"
 
 
-def test_lost_frames_of_all_runs_are_counted(copy: Path, tmp_path: Path) -> None:
+def test_lost_frames_of_all_runs_are_counted(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody is there in frames 3 to 5; the run is stopped in their midst."""
+    monkeypatch.setattr(session, "WRITE_EVERY_S", 0)
     for camera in (copy / "masks").iterdir():
         for index in (3, 4, 5):
             write_picture(camera / f"{index:06d}.png", np.zeros((120, 160), np.uint8))

@@ -192,6 +192,9 @@ def estimates(
             note(line)
 
 
+# Frames go to the file together that are finished within this time, seconds, and are told of then.
+WRITE_EVERY_S = 0.25
+
 _ORIGIN, _LOST, _WATCH = "run/", "lost frames", "watch/"
 
 
@@ -286,30 +289,53 @@ class _Run:
             self.watch.restore(_below(_WATCH, output.writer.state))
 
     def _step_through(self, observations: Iterator[Observed]) -> Iterator[Estimate]:
-        plan, output = self.plan, self.output
-        writing = 0.0
-        for observation, laps in observations:
-            if observation.index >= plan.stop:
-                return
-            started = time.perf_counter()
-            with one_thread():
-                estimate, used = self.watch.step(observation)
-            if observation.index < plan.begin:
-                continue
-            if self.masks is not None:
-                self.masks.put(observation.index, _kept(observation, used, estimate))
-            finished = time.perf_counter()
-            total = laps["wait"] + writing + finished - started
-            timing = {**laps, **estimate.timing, "total": total}
-            index = observation.index
-            # masks are large, and a view of the ring of frames at that: nobody who keeps the estimate keeps them
-            estimate = replace(estimate, frame=index, time=index / plan.capture.fps, timing=timing, masks=None)
-            self.lost += estimate.status == "lost"
-            if output:
-                output.writer.append(_row(estimate, output.store_hull), self._state(output))
-            self.tracked += 1
-            writing = time.perf_counter() - finished
-            yield estimate
+        """Step the tracker to the end; frames are handed out when they are in the file."""
+        output = self.output
+        finished: list[Estimate] = []
+        written, writing = time.perf_counter(), 0.0
+        try:
+            for observation, laps in observations:
+                if observation.index >= self.plan.stop:
+                    break
+                started = time.perf_counter()
+                estimate = self._step(observation)
+                if estimate is None:
+                    continue
+                stepped = time.perf_counter()
+                timing = {**laps, **estimate.timing, "total": laps["wait"] + writing + stepped - started}
+                estimate = replace(estimate, timing=timing)
+                due = not output or stepped - written > WRITE_EVERY_S
+                if output:
+                    output.writer.append(_row(estimate, output.store_hull), self._state(output), flush=due)
+                self.tracked += 1
+                finished.append(estimate)
+                writing = time.perf_counter() - stepped
+                if due:
+                    written = stepped + writing
+                    yield from finished
+                    finished.clear()
+        except TkError:  # what could be read counts
+            yield from self._written(finished)
+            raise
+        yield from self._written(finished)
+
+    def _step(self, observation: Observation) -> Estimate | None:
+        """The estimate in a frame, its masks kept for the second pass; None before the first frame that is asked for."""
+        plan, index = self.plan, observation.index
+        with one_thread():
+            estimate, used = self.watch.step(observation)
+        if index < plan.begin:
+            return None
+        if self.masks is not None:
+            self.masks.put(index, _kept(observation, used, estimate))
+        self.lost += estimate.status == "lost"
+        # masks are large, and a view of the ring of frames at that: nobody who keeps the estimate keeps them
+        return replace(estimate, frame=index, time=index / plan.capture.fps, masks=None)
+
+    def _written(self, finished: list[Estimate]) -> Iterator[Estimate]:
+        if self.output and finished:
+            self.output.writer.flush()
+        yield from finished
 
     def _state(self, output: _Output) -> Mapping[str, Value]:
         origin = {_ORIGIN + name: value for name, value in output.origin.items()}

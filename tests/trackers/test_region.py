@@ -157,7 +157,7 @@ def test_legs_that_cross_are_not_exchanged(forward_deg: float, across_deg: float
     pyramid = tracker.pyramid(frame)
     exchanged = tracker.settle(pyramid, before[None]).states[0]
     assert SKELETON.apart(exchanged, SKELETON.joints(now)) > 0.3
-    alone, _ = tracker.search(frame, pyramid, exchanged)
+    alone, _ = tracker.search(frame, pyramid, tracker.evidence(tracker.screen, frame, pyramid), exchanged)
     assert SKELETON.apart(alone, SKELETON.joints(now)).min() > 0.2
     # what a search misses those of the frames that follow find
     estimates = [tracker.step(observe(masks[1], i)) for i in (1, 2, 3)]
@@ -199,7 +199,7 @@ def test_who_stays_in_a_wrong_pose_is_looked_for_as_if_lost(monkeypatch: pytest.
         return looked_for[-1]
 
     monkeypatch.setattr(tracker, "relocate", watched)
-    monkeypatch.setattr(tracker, "search", lambda _frame, _pyramid, pose, *_: (pose[None], np.zeros(1)))
+    monkeypatch.setattr(tracker, "search", lambda _frame, _pyramid, _evidence, pose, *_: (pose[None], np.zeros(1)))
     tracker.restore(tracker.model(), {**state, "poses": wrong[None], "previous": wrong[None]})
     sound = tracker.state()["sound"]
     estimates = [tracker.step(observe(MASKS[0])) for _ in range(4)]

@@ -83,7 +83,7 @@ __all__ = [
 class ResultWriter:
     """Writes a result; a context manager. Make one with :meth:`create` or :meth:`resume`.
 
-    When :meth:`append` returns, the frame is in the file. Before the first frame an older result of the same name
+    When :meth:`append` returns, the frame is in the file, unless it was asked not to flush. Before the first frame an older result of the same name
     is still there. Leaving the ``with`` block by an exception keeps all finished frames.
     """
 
@@ -179,13 +179,15 @@ class ResultWriter:
         self._cameras = cameras
         self._cameras_version += 1
 
-    def append(self, result: FrameResult, state: Mapping[str, Value] | None = None) -> None:
+    def append(self, result: FrameResult, state: Mapping[str, Value] | None = None, flush: bool = True) -> None:
         """Add a finished frame; on return it is in the file, whatever happens to this process.
 
         Args:
             result: the frame.
             state: what the tracker needs to continue from here bit for bit: a few small arrays, numbers and strings.
                 Only the latest is kept.
+            flush: False leaves the frame in memory until the next one, :meth:`flush` or :meth:`close`: most of the
+                time that a frame takes goes to opening and closing the file's columns, not to what is written.
 
         Raises:
             ResultError: the disk is full, or the folder has gone.
@@ -193,10 +195,11 @@ class ResultWriter:
         self._requireopen_for_writing()
         rows = self._recent[-1].index + 1 if self._recent else self._twins[1].rows
         self._recent.append(Row.of(rows, result, state, self.meta))
-        self.flush()
+        if flush:
+            self.flush()
 
     def flush(self) -> None:
-        """Bring the file up to date. :meth:`append` does it by itself; this is for a model without frames."""
+        """Bring the file up to date."""
         self._requireopen_for_writing()
         with as_result_error(self.path):
             self._intact = False
@@ -234,7 +237,7 @@ class ResultWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is not None and not self._published:
+        if kind is not None and not (self._published or self._recent):
             self._intact = False  # nothing was finished: an older result stays
         if kind is None:
             self.close()

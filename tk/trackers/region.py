@@ -214,26 +214,27 @@ class RegionTracker(ContourTracker):
     def without_foreign(self, frame: Observation) -> Observation:
         """The frame, where it shows things of colours that are not the person's without those in its masks: what is
         carried. They stay in doubt, for parts may be before or behind them."""
-        foreign, grid = self.colors.foreign, self.screen
         if not (self.config.colors and self.colors.known and frame.images.size):
             return frame
-        person = np.flatnonzero(grid.sample(frame.masks) >= 128)
-        colors = grid.sample(frame.images).reshape(-1, 3).take(person, axis=0)
-        if np.count_nonzero(foreign[color_bins(colors)]) < FOREIGN_SHARE * len(person):
+        foreign, grid = self.colors.foreign, self.screen
+        person = grid.sample(frame.masks) >= 128
+        strange = foreign[color_bins(grid.sample(frame.images)[person])]
+        view = np.nonzero(person)[0]
+        seen, odd = (np.bincount(of, minlength=len(person)) for of in (view, view[strange]))
+        if odd.sum() < FOREIGN_SHARE * seen.sum():
             return frame
         masks = frame.masks.copy()
         doubtful = np.zeros(masks.shape, np.bool_) if frame.doubtful is None else frame.doubtful.copy()
-        for mask, image, doubt in zip(masks, frame.images, doubtful, strict=True):
-            x, y, w, h = cv2.boundingRect(mask)
-            if w == 0:
-                continue
+        for c in np.flatnonzero(odd >= FOREIGN_SHARE * np.maximum(seen, 1)):
+            x, y, w, h = cv2.boundingRect(masks[c])
             box = slice(y, y + h), slice(x, x + w)
-            shown = np.flatnonzero(mask[box] >= 128)
-            strange = np.zeros((h, w), np.uint8)
-            strange.ravel()[shown] = foreign[color_bins(image[box].reshape(-1, 3).take(shown, axis=0))]
-            thing = cv2.morphologyEx(strange, cv2.MORPH_OPEN, _THING).view(np.bool_)
-            mask[box][thing] = 0
-            doubt[box][thing] = True
+            shown = np.flatnonzero(masks[c][box] >= 128)
+            colors = frame.images[c][box].reshape(-1, 3).take(shown, axis=0)
+            odd_ones = np.zeros((h, w), np.uint8)
+            odd_ones.ravel()[shown] = foreign[color_bins(colors)]
+            thing = cv2.morphologyEx(odd_ones, cv2.MORPH_OPEN, _THING).view(np.bool_)
+            masks[c][box][thing] = 0
+            doubtful[c][box][thing] = True
         return replace(frame, masks=masks, doubtful=doubtful)
 
     @property
