@@ -320,7 +320,7 @@ class _Run:
         yield from self._written(finished)
 
     def _step(self, observation: Observation) -> Estimate | None:
-        """The estimate in a frame, its masks kept for the second pass; None before the first frame that is asked for."""
+        """The estimate in a frame, its masks kept for the second pass; None before the first frame to be written."""
         plan, index = self.plan, observation.index
         with one_thread():
             estimate, used = self.watch.step(observation)

@@ -70,6 +70,25 @@ def test_damping_shortens_and_iterations_make_up_for_it():
     assert errors[0] > errors[1] > errors[2] and errors[2] < 1e-4
 
 
+def test_longer_steps_reach_where_equations_tell_half_of_the_way_and_do_no_harm_where_they_tell_all():
+    A, y, start = problem(2)
+    expected = np.linalg.lstsq(A, y, rcond=None)[0]
+    told = np.array([0.4, 0.5, 1.0, 1.0])  # of the way along each parameter
+
+    def equations(states, scale):
+        way = (expected - states) * told
+        H = np.repeat(np.eye(4)[None], len(states), 0)
+        return Sums(H, way, (way**2).sum(axis=1))
+
+    def error(relaxation, iterations):
+        config = GaussNewtonConfig(1, iterations, relaxation, damping=0.0, stiffness=0.0, longest_step=100.0)
+        return np.abs(minimise(equations, start, ALL, *NONE, config) - expected).max(axis=0)
+
+    plain, relaxed = error(1.0, 4), error(1.6, 3)  # as many equations
+    assert (relaxed[:2] < 0.5 * plain[:2]).all()
+    assert (relaxed[2:] < 1e-6).all() and (error(1.6, 1)[2:] < 1e-6).all()  # the last step is a plain one
+
+
 def test_parameters_that_are_not_free_stay():
     A, y, start = problem(2)
     free = np.array([True, False, True, False])
@@ -170,7 +189,12 @@ def test_a_prior_places_what_the_data_does_not_see():
 
 @pytest.mark.parametrize(
     ("values", "message"),
-    [({"scales": 0}, "scales = 0"), ({"iterations": 0}, "iterations = 0"), ({"damping": -1.0}, "damping -1")],
+    [
+        ({"scales": 0}, "scales = 0"),
+        ({"iterations": 0}, "iterations = 0"),
+        ({"damping": -1.0}, "damping -1"),
+        ({"relaxation": 2.0}, "relaxation = 2"),
+    ],
 )
 def test_settings_out_of_range_are_told(values, message):
     with pytest.raises(ConfigError, match=message):

@@ -139,7 +139,7 @@ def test_who_is_found_again_faces_as_before_where_silhouettes_leave_that_open(mo
     before[0] += 1.0
     pyramid = tracker.pyramid(Observation(0, np.zeros(0, np.uint8), draw_silhouettes(BODY, RIG, there[None])[0]))
     facing = SKELETON.index("torso_yaw")
-    monkeypatch.setattr(tracker, "settle", lambda _, starts: Descent(starts, np.zeros(0)))
+    monkeypatch.setattr(tracker, "settle", lambda _, starts, levels: Descent(starts, np.zeros(0)))
 
     def explained(better_if_turned):
         return lambda _, poses: 0.2 - better_if_turned * (np.cos(poses[:, facing] - yaw) < -0.9)

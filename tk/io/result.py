@@ -83,8 +83,8 @@ __all__ = [
 class ResultWriter:
     """Writes a result; a context manager. Make one with :meth:`create` or :meth:`resume`.
 
-    When :meth:`append` returns, the frame is in the file, unless it was asked not to flush. Before the first frame an older result of the same name
-    is still there. Leaving the ``with`` block by an exception keeps all finished frames.
+    When :meth:`append` returns, the frame is in the file, unless it was asked not to flush. Before the first frame an
+    older result of the same name is still there. Leaving the ``with`` block by an exception keeps all finished frames.
     """
 
     def __init__(self, path: Path, meta: ResultMeta, workshop: Workshop, twins: list[Twin]) -> None:

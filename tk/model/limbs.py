@@ -86,6 +86,7 @@ class Limb:
 
 def distinct(places: Float, count: int, present: Float | None = None) -> list[int]:
     """The first of the places (N, J, 3) that lie apart from each other and from the present one (J, 3)."""
+
     def apart(place: Float) -> NDArray[np.bool_]:
         return np.asarray(np.linalg.norm(places - place, axis=-1).max(axis=-1) > DISTINCT_M)
 

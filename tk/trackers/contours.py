@@ -83,7 +83,7 @@ class SilhouetteConfig:
     search_every: int = 10
     lost_error: float = 0.6
     search: SearchSettings = field(default_factory=SearchSettings)
-    solver: GaussNewtonConfig = field(default_factory=lambda: GaussNewtonConfig(scales=3))
+    solver: GaussNewtonConfig = field(default_factory=lambda: GaussNewtonConfig(scales=3, relaxation=1.6))
     cleaning: CleaningConfig = field(default_factory=CleaningConfig)
     fit: BodyFitConfig = field(default_factory=lambda: BodyFitConfig(frames=8, rounds=6))
 
@@ -389,11 +389,15 @@ class ContourTracker:
         moved[skeleton.prismatic] = p_centroid
         levels = range(self.contours.solver.scales - 1, -1, -1)
         starts = np.concatenate([moved[None], gait.hypotheses(skeleton, HEADINGS, PHASES, p_centroid, pose[yaw])])
+
+        def turned(states: Float) -> Float:
+            return np.asarray(FACING * (1 - np.cos(states[:, yaw] - pose[yaw])) / 2)
+
         coarse = self.settle(pyramid, starts, levels[:1]).states
-        best = np.argsort(self.fit_error(pyramid, coarse), kind="stable")[: len(starts) // RELOCATED]
-        settled = self.settle(pyramid, coarse[best], levels[1:]).states
+        order = np.argsort(self.fit_error(pyramid, coarse) + turned(coarse), kind="stable")
+        settled = self.settle(pyramid, coarse[order[: len(starts) // RELOCATED]], levels[1:]).states
         errors = self.fit_error(pyramid, settled)
-        i = int(np.argmin(errors + FACING * (1 - np.cos(settled[:, yaw] - pose[yaw])) / 2))
+        i = int(np.argmin(errors + turned(settled)))
         return (settled[i], float(errors[i])) if errors[i] < error else (pose, error)
 
     def told(self, pose: Float) -> dict[str, Any]:
