@@ -126,15 +126,17 @@ def counted_launches() -> Iterator[Counter[str]]:
 
 
 class _Clock(session.Silent):
-    """Notes when frames are finished and how many launches there had been."""
+    """Notes when frames are told of, which some are together, what each took, and how many launches there had been."""
 
     def __init__(self, counts: Counter[str]) -> None:
         self._counts = counts
         self.times: list[float] = []
+        self.took: list[float] = []
         self.launches: list[Counter[str]] = []
 
     def advance(self, frame: int, estimate: Estimate | None) -> None:
         self.times.append(time.perf_counter())
+        self.took.append(estimate.timing["total"] if estimate else np.nan)
         self.launches.append(Counter(self._counts))
 
 
@@ -146,10 +148,10 @@ class Run:
         frames, lost: frames tracked, and those of them that say lost.
         seconds: from opening the capture to the closed file.
         first_frame_s: from opening the capture to the first finished frame: compiling, tables, background, body.
-        loop_ms: from a finished frame to the next; the median.
+        loop_ms: a frame, with the wait for it; the median.
         frames_per_second: of the frames after the first, by their mean.
-        launches: kernel launches a frame, by kernel; medians.
-        launches_per_frame: of all kernels; the median.
+        launches: kernel launches a frame, by kernel; means.
+        launches_per_frame: of all kernels; the mean.
         peak_mib: most memory that the process held.
     """
 
@@ -180,19 +182,17 @@ def run_once(options: Options, output: Path) -> Run:
             force=True,
         )
     seconds = time.perf_counter() - started
-    loop = np.diff(clock.times)
-    each = [after - before for before, after in zip(clock.launches, clock.launches[1:], strict=False)]
+    count = max(summary.frames - 1, 1)
+    launches = {name: total / count for name, total in sorted((clock.launches[-1] - clock.launches[0]).items())}
     return Run(
         frames=summary.frames,
         lost=summary.lost,
         seconds=seconds,
         first_frame_s=clock.times[0] - started,
-        loop_ms=1e3 * float(np.median(loop)),
-        frames_per_second=float(1 / np.mean(loop)),
-        launches={
-            name: statistics.median(row[name] for row in each) for name in sorted({k for row in each for k in row})
-        },
-        launches_per_frame=statistics.median(sum(row.values()) for row in each),
+        loop_ms=1e3 * float(np.median(clock.took[1:])),
+        frames_per_second=count / (clock.times[-1] - clock.times[0]),
+        launches=launches,
+        launches_per_frame=sum(launches.values()),
         peak_mib=_peak_mib(),
     )
 

@@ -19,7 +19,7 @@ from tk.trackers.base import Estimate
 
 
 class _Clock(session.Silent):
-    """Remembers when each frame was finished."""
+    """Remembers when each frame was told of, which some are together."""
 
     def __init__(self) -> None:
         self.times: list[float] = []
@@ -34,20 +34,22 @@ class Speed:
 
     Attributes:
         decoding: milliseconds a set of pictures, decoded by nobody but this run's reader.
-        frames: (F - 1,) milliseconds from a finished frame to the next.
+        mean: milliseconds a frame, from the first finished one to the last.
+        frames: (F - 1,) milliseconds that each of them took, as the tracker's own clock says.
         searched: (F - 1,) frames whose limbs were looked for.
         first_s: from opening the capture to the first pose.
         after_s: what followed the last frame: the second pass, unless causal.
     """
 
     decoding: float
+    mean: float
     frames: np.ndarray
     searched: np.ndarray
     first_s: float
     after_s: float
 
     def line(self) -> str:
-        mean, median = float(self.frames.mean()), float(np.median(self.frames))
+        mean, median = self.mean, float(np.median(self.frames))
         whole = mean + 1e3 * self.after_s / len(self.frames)
         easy = self.frames[~self.searched].mean() if (~self.searched).any() else np.nan
         hard = self.frames[self.searched].mean() if self.searched.any() else np.nan
@@ -71,8 +73,10 @@ def run_once(folder: Path, masks: str, output: Path, causal: bool) -> Speed:
         count = sum(1 for _ in reader)
         decoding = 1e3 * (time.perf_counter() - started) / count
     times = np.array(clock.times)
-    searched = read_result(output).iterations[1:, 1] > 0
-    return Speed(decoding, 1e3 * np.diff(times), searched, times[0] - opened, ended - times[-1])
+    result = read_result(output)
+    frames = 1e3 * result.timing["total"][1:]
+    mean = 1e3 * (times[-1] - times[0]) / len(frames)
+    return Speed(decoding, mean, frames, result.iterations[1:, 1] > 0, times[0] - opened, ended - times[-1])
 
 
 def measure(capture: Path, masks: str, repeat: int) -> str:
@@ -85,6 +89,6 @@ def measure(capture: Path, masks: str, repeat: int) -> str:
                 with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:
                     output = Path(folder) / f"{k}.h5"
                     runs.append(process.submit(run_once, capture, masks, output, causal).result())
-            chosen = sorted(runs, key=lambda run: run.frames.mean() / run.decoding)[(len(runs) - 1) // 2]
+            chosen = sorted(runs, key=lambda run: run.mean / run.decoding)[(len(runs) - 1) // 2]
             lines.append(f"{capture.name}, {'causal' if causal else 'by default'}: {chosen.line()}")
     return "\n".join(lines)

@@ -292,7 +292,7 @@ class _Run:
         """Step the tracker to the end; frames are handed out when they are in the file."""
         output = self.output
         finished: list[Estimate] = []
-        written, writing = time.perf_counter(), 0.0
+        written, writing = -np.inf, 0.0  # the first frame is told of at once
         try:
             for observation, laps in observations:
                 if observation.index >= self.plan.stop:
