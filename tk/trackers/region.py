@@ -130,6 +130,7 @@ class RegionTracker(ContourTracker):
         self._postures = 0
         self._lost_for = 0
         self._stranded = 0
+        self._in_vain = False
         self._fresh = True
 
     def start(
@@ -146,6 +147,7 @@ class RegionTracker(ContourTracker):
         self._usual_posture, self._postures = np.zeros((len(JOINTS), 3)), 0
         self._lost_for = 0
         self._stranded = 0
+        self._in_vain = False
         self._fresh = True
 
     def step(self, frame: Observation) -> Estimate:
@@ -178,17 +180,17 @@ class RegionTracker(ContourTracker):
         misplaced = self.misplaced(evidence, label)
         searched = self._needs_search(frame, float(np.nanmean(error)), misplaced)
         if searched:
-            for in_pairs in (False, True):
-                before = self._best.pose
-                self._propose(frame, pyramid, evidence, images, misplaced, in_pairs)
-                if self._best.pose is not before:
-                    best = self._best.pose[None]
-                    _, again = evidence.cast(self.body, self.colors.group, best, export=True)
-                    assert again is not None
-                    label, curvature = again.label[0], self._curvature(pyramid, best, images)
-                    error, misplaced = evidence.fit_error(label), self.misplaced(evidence, label)
-                if not self._worse(float(np.nanmean(error))):
-                    break  # no limb is where the other one of its pair should be
+            in_pairs, before = self._in_vain, self._best.pose
+            self._propose(frame, pyramid, evidence, images, misplaced, in_pairs)
+            if self._best.pose is not before:
+                best = self._best.pose[None]
+                _, again = evidence.cast(self.body, self.colors.group, best, export=True)
+                assert again is not None
+                label, curvature = again.label[0], self._curvature(pyramid, best, images)
+                error, misplaced = evidence.fit_error(label), self.misplaced(evidence, label)
+            self._in_vain = not in_pairs and self._worse(float(np.nanmean(error)))
+        else:
+            self._in_vain = False
         watch.lap("search")
         lost = self._follow(pyramid, float(np.nanmean(error)))
         self._learn(evidence, label, float(np.nanmean(error)), lost)
@@ -460,6 +462,7 @@ class RegionTracker(ContourTracker):
             "postures": self._postures,
             "lost_for": self._lost_for,
             "stranded": self._stranded,
+            "in_vain": self._in_vain,
             **self.colors.state(),
         }
 
@@ -474,6 +477,7 @@ class RegionTracker(ContourTracker):
         self._postures = int(state["postures"])
         self._lost_for = int(state["lost_for"])
         self._stranded = int(state.get("stranded", 0))  # results of before have none
+        self._in_vain = bool(state.get("in_vain", False))
         self.colors.restore(state)
         self._fresh = False
 
