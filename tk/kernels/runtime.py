@@ -58,8 +58,9 @@ with warnings.catch_warnings():
 
 __all__ = ["ensure_runtime", "spread_of", "ti"]
 
-# Taichi hands a CPU thread at least so many turns of a loop; what loop_config says of block_dim changes nothing.
-_LEAST_TURNS = 512
+# Taichi hands a CPU thread so many turns of a loop at once; what loop_config says of block_dim changes nothing. Few long
+# tasks are handed out in about so many shares a thread: one that wakes late, or has the longer tasks, is made up for.
+_LEAST_TURNS, _SHARES = 512, 8
 
 # Taichi locks its cache of compiled kernels for milliseconds; an older lock was left by a process that was killed
 _STALE_S = 60.0
@@ -117,7 +118,7 @@ def spread_of(tasks: int) -> int:
                 continue
             task = turn // spread
     """
-    return max(-(-_LEAST_TURNS * _threads() // max(tasks, 1)), 1)
+    return max(-(-_LEAST_TURNS * min(_SHARES * _threads(), tasks) // max(tasks, 1)), 1)
 
 
 @functools.cache

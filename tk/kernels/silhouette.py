@@ -135,7 +135,8 @@ def _equations_kernel(real):
         # the frame
         camera: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
         size: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (V, 2) width, height at this scale
-        mask: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (V, H, W) at this scale
+        mask: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (M V, H, W) at this scale, of M frames
+        moment: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (B,) each pose's frame
         image: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (V, H, W, 3) of the full picture
         likelihood: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (G, COLOR_BINS)
         group: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,)
@@ -286,7 +287,7 @@ def _equations_kernel(real):
                                 d = place * scale
                                 found = 2
                         elif use:
-                            found, d = search_mask(mask, v, width, height, at, n, window)
+                            found, d = search_mask(mask, moment[b] * V + v, width, height, at, n, window)
                             d *= scale
                             if found == 0:
                                 cost += share * lost * lost
@@ -399,6 +400,8 @@ def _launch(
     V, Q, P = len(cameras), len(body.curve_part), len(body.part_kind)
     tasks = B * V * Q
     regions = regions or _no_regions(len(body.part_kind))
+    if len(masks) not in (V, B * V):
+        raise ValueError(f"{len(masks)} masks of {V} views: one set, or one for each of {B} poses")
     total = np.empty((B, 3 + D + D * D))
     samples = np.zeros((tasks, settings.most_samples, _EXPORT) if export else (1, 1, _EXPORT), dtype)
     _equations_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
@@ -407,6 +410,7 @@ def _launch(
         np.ascontiguousarray(cameras, dtype),
         np.ascontiguousarray(sizes, np.int32),
         np.ascontiguousarray(masks),
+        _all_of(B) if len(masks) > V else _none_of(B),
         regions.image,
         regions.log_likelihood,
         regions.group,
@@ -426,6 +430,11 @@ def _launch(
 @functools.cache
 def _all_of(count: int) -> NDArray[np.int32]:
     return np.arange(count, dtype=np.int32)
+
+
+@functools.cache
+def _none_of(count: int) -> NDArray[np.int32]:
+    return np.zeros(count, dtype=np.int32)
 
 
 @functools.lru_cache(64)
@@ -467,11 +476,15 @@ def normal_equations(
         body: the cone body; its real type is the precision of the computation.
         cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_camera`, of the full picture.
         sizes: (V, 2) width and height of each camera's mask at this scale.
-        masks: (V, H, W) uint8 at this scale; values between 0 and 255 where a pixel is partly covered.
+        masks: (V, H, W) uint8 at this scale; values between 0 and 255 where a pixel is partly covered. Or (B V, H, W),
+            those of another frame for each pose.
         scale: pixels of the full picture in one of this scale (1, 2, …).
         poses: (B, D).
         settings: see :class:`SearchSettings`.
         regions: what colours tell inside the silhouette; None: nothing.
+
+    Raises:
+        ValueError: another number of masks.
     """
     total, _ = _launch(body, cameras, sizes, masks, scale, poses, settings, False, regions)
     B, D = poses.shape

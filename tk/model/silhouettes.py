@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -66,12 +67,17 @@ class Pyramid:
     """Masks at several scales, a factor of two apart.
 
     Attributes:
-        masks: for each scale (V, H, W) uint8; scale 0 is the full picture.
+        masks: for each scale (V, H, W) uint8; scale 0 is the full picture. Of F frames (F V, H, W).
         sizes: for each scale (V, 2) width and height of each camera's part.
     """
 
     masks: tuple[Masks, ...]
     sizes: tuple[NDArray[np.int32], ...]
+
+    @staticmethod
+    def of_all(frames: Sequence[Pyramid]) -> Pyramid:
+        """Those of several frames as one."""
+        return Pyramid(tuple(map(np.concatenate, zip(*(f.masks for f in frames), strict=True))), frames[0].sizes)
 
 
 class Views:
@@ -115,7 +121,7 @@ class Views:
         settings: SearchSettings,
         regions: Regions | None = None,
     ) -> NormalEquations:
-        """Normal equations of poses (B, D) at a scale's index."""
+        """Normal equations of poses (B, D) at a scale's index, all in one frame or each in its own of B."""
         return kernels.normal_equations(
             body,
             self._cameras32,

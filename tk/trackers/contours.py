@@ -264,7 +264,8 @@ class ContourTracker:
         prior: Prior | None = None,
         limb: Limb | None = None,
     ) -> Descent:
-        """Gauss-Newton from poses (B, D), through all scales or those of ``levels``, 0 the finest.
+        """Gauss-Newton from poses (B, D), through all scales or those of ``levels``, 0 the finest; all in one frame, or
+        each in its own of B.
 
         With ``images``, colours pull at contours inside the silhouette, too. With ``limb`` all else stays where it is.
         """

@@ -66,6 +66,8 @@ MISPLACED = 0.25
 # The second pass: what the body is fitted to, and how near a frame stays to its pose of the first pass.
 SECOND_FIT = BodyFitConfig(frames=24, rounds=4)
 SECOND_ANGLE_DEG = 15.0
+# Frames that the second pass settles in one launch.
+AT_ONCE = 8
 # A step of a joint that is longer than its neighbours by this is a jump, metres: twice what makes two poses of one.
 JUMP_M = 2 * APART_M
 # Over so many frames the usual posture of the first pass is a plain mean, then one that forgets.
@@ -377,7 +379,7 @@ class RegionTracker(ContourTracker):
             Poses (F, D), E_S (F, C), and one standard deviation (F, 15) of the joints' positions along an axis, metres,
             0 in lost frames. The tracker has the new body.
         """
-        cleaning, scales = self.contours.cleaning, 1
+        cleaning = self.contours.cleaning
         tracked = np.flatnonzero(~lost)
         variance = np.zeros((len(poses), len(JOINTS)))
         if not len(tracked):
@@ -391,32 +393,44 @@ class RegionTracker(ContourTracker):
             opening = tracked[: self.contours.init_frames : 3]
             spread = _spread(tracked, np.nanmean(error[tracked], axis=1), SECOND_FIT.frames - len(opening))
             chosen = np.union1d(opening, spread)
-            seen = [self.views.pyramid(believed(int(i)), scales, cleaning) for i in chosen]
+            seen = [self.views.pyramid(believed(int(i)), 1, cleaning) for i in chosen]
             stature = height_m or self.body.dimensions.stature
             fit = SECOND_FIT if height_m else replace(SECOND_FIT, stature_deviation=0.03)
             body, _ = self.fit(seen, poses[chosen], np.arange(len(chosen)), stature, fit)
             self.take_body(body)
         result, errors = poses.copy(), np.array(error)
+        body, group = self.body, self.colors.group
+        for chunk in np.array_split(tracked, -(-len(tracked) // AT_ONCE)):
+            seen = [self.views.pyramid(believed(int(i)), 1, cleaning) for i in chunk]
+            prior = self._prior(poses[chunk], SECOND_ANGLE_DEG)
+            settled = self.settle(Pyramid.of_all(seen), poses[chunk], (0,), prior=prior)
+            result[chunk] = settled.states
+            precision = INFORMATION * (settled.hessian + np.diag(prior.precision))
+            for i, pyramid, information in zip(chunk, seen, precision, strict=True):
+                errors[i] = Evidence.of(self.screen, pyramid.masks[0]).cast(body, group, result[i][None])[0][0]
+                variance[i] = contour_variance(body.skeleton, result[i], information, body.free)
+        jumps = _jumps(body.skeleton, poses)
         later: Hypothesis | None = None
-        jumps = _jumps(self.body.skeleton, poses)
         for i in tracked[::-1]:
             if i + 1 == len(poses) or lost[i + 1]:
                 later = None
             elif later is None and jumps[i + 1]:
                 later = Hypothesis(result[i + 1], result[i + 1], 0.0)
-            pyramid = self.views.pyramid(believed(int(i)), scales, cleaning)
-            starts = poses[i][None] if later is None else np.stack([poses[i], later.pose])
-            prior = self._prior(starts, SECOND_ANGLE_DEG)
-            settled = self.settle(pyramid, starts, (0,), prior=prior)
-            evidence = Evidence.of(self.screen, pyramid.masks[0])
-            by_view = evidence.cast(self.body, self.colors.group, settled.states)[0]
-            later = later and self._backwards(later, settled.states, mean_of_views(by_view))
-            k = int(later is not None and later.cost < -GAIN)
-            result[i], errors[i] = settled.states[k], by_view[k]
-            precision = INFORMATION * (settled.hessian[k] + np.diag(prior.precision))
-            variance[i] = contour_variance(self.body.skeleton, result[i], precision, self.body.free)
-            if later is not None:
-                variance[i] += _disagreement(self.body.skeleton, settled.states, np.array([0.0, later.cost]))
+            if later is None:
+                continue
+            pyramid = self.views.pyramid(believed(int(i)), 1, cleaning)
+            prior = self._prior(later.pose[None], SECOND_ANGLE_DEG)
+            settled = self.settle(pyramid, later.pose[None], (0,), prior=prior)
+            both = np.stack([result[i], settled.states[0]])
+            by_view = Evidence.of(self.screen, pyramid.masks[0]).cast(body, group, both)[0]
+            later = self._backwards(later, both, mean_of_views(by_view))
+            if later is None:
+                continue
+            if later.cost < -GAIN:
+                result[i], errors[i] = both[1], by_view[1]
+                precision = INFORMATION * (settled.hessian[0] + np.diag(prior.precision))
+                variance[i] = contour_variance(body.skeleton, result[i], precision, body.free)
+            variance[i] += _disagreement(body.skeleton, both, np.array([0.0, later.cost]))
         usual = np.median(directions(self.body.skeleton, result[tracked]), axis=0)
         variance[tracked] += posture_variance(self.body.skeleton, result[tracked], usual)
         return result, errors, np.sqrt(variance)
