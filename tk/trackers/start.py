@@ -70,7 +70,7 @@ def find_person(
         return [_follow(tracker, frames, pyramids, _searched(tracker, frames[0], pyramids[0], pose), 0)]
     skeleton = tracker.body.skeleton
     ways: list[tuple[Float, float]] = []
-    best, opposite = np.inf, list[tuple[int, Float]]()
+    others: list[tuple[int, Float]] = []
     for anchor in np.unique(np.linspace(0, len(frames) - 1, ANCHORS).astype(int)):
         try:
             error, poses = _find(tracker, frames[anchor], pyramids[anchor])
@@ -78,15 +78,15 @@ def find_person(
             if anchor == 0:
                 raise
             continue
-        if error < best:
-            best, opposite = error, [(int(anchor), pose) for pose in poses[1:]]
-        joints = skeleton.joints(poses[0])
-        if any(skeleton.apart(way[anchor], joints) < APART_M for way, _ in ways):
+        others += [(int(anchor), pose) for pose in poses[1:]]
+        if _is_on(skeleton, ways, anchor, poses[0]):
             break  # found twice
         ways.append(_follow(tracker, frames, pyramids, poses[0], anchor))
         if error < CLEAR:
             break
-    ways += [_follow(tracker, frames, pyramids, pose, anchor) for anchor, pose in opposite]
+    for anchor, pose in others:
+        if not _is_on(skeleton, ways, anchor, pose):
+            ways.append(_follow(tracker, frames, pyramids, pose, anchor))
     ways.sort(key=lambda way: way[1])
     kept: list[tuple[Float, float]] = []
     for way, error in ways:
@@ -97,9 +97,15 @@ def find_person(
     return kept
 
 
+def _is_on(skeleton: Skeleton, ways: Sequence[tuple[Float, float]], frame: int, pose: Float) -> bool:
+    """Whether one of the ways passes by a pose (D,) in a frame."""
+    joints = skeleton.joints(pose)
+    return any(skeleton.apart(way[frame], joints) < APART_M for way, _ in ways)
+
+
 def _find(tracker: ContourTracker, frame: Observation, pyramid: Pyramid) -> tuple[float, list[Float]]:
-    """E_S of the pose (D,) that explains a frame best; the pose, and one that faces the other way if it is nearly as
-    good."""
+    """E_S of the pose (D,) that explains a frame best; the pose, and others that are nearly as good: one that faces the
+    other way, and those that few cameras cannot tell from it."""
     skeleton, rig = tracker.body.skeleton, tracker.views.rig
     p_centroid = centroid(rig, pyramid, frame.index)
     first = _heading_of_camera(skeleton, rig, p_centroid)
@@ -110,11 +116,12 @@ def _find(tracker: ContourTracker, frame: Observation, pyramid: Pyramid) -> tupl
     poses = np.array([_searched(tracker, frame, pyramid, pose) for pose in np.unique(finalists, axis=0)])
     error = tracker.fit_error(pyramid, poses, frame.doubtful)
     best = int(np.argmin(error))
-    found = [poses[best]]
     others = np.flatnonzero(_turned(skeleton, poses, poses[best]) & (error < NEARLY * error[best]))
-    if len(others):
-        found.append(poses[others[int(np.argmin(error[others]))]])
-    return float(error[best]), found
+    opposite = others[np.argsort(error[others], kind="stable")[:1]]
+    alike = np.flatnonzero(error < AMBIGUOUS * error[best])
+    rest = np.union1d(opposite, alike)
+    rest = rest[np.argsort(error[rest], kind="stable")]
+    return float(error[best]), _distinct(skeleton, poses[np.concatenate([[best], rest])], len(poses))
 
 
 def _follow(
