@@ -110,6 +110,26 @@ def test_of_two_ways_to_explain_the_opening_the_one_whose_own_body_explains_it_b
     assert error(SKELETON.joints(pose)[None], right[None])[0] < 0.02
 
 
+def test_poses_that_one_frame_cannot_tell_apart_are_all_followed(monkeypatch) -> None:
+    """The first frame says that the arms are elsewhere, and only nearly as well where they are."""
+    right = placed(arms(standing_pose(SKELETON), (1, 0.6, 0.3), (0.2, 1, -0.6)), 0.6)
+    wrong = placed(arms(standing_pose(SKELETON), (0.2, 0.3, 1), (-0.3, 1, 0.6)), 0.6)
+    masks = draw_silhouettes(BODY, RIG, np.array([right] * 4))
+    frames = [Observation(i, np.zeros(0, np.uint8), m) for i, m in enumerate(masks)]
+    tracker = tracker_of()
+    monkeypatch.setattr(tracker, "settle", lambda _, starts, *__: Descent(np.array(starts), np.zeros(0)))
+    monkeypatch.setattr("tk.trackers.start.gait.hypotheses", lambda *_: np.array([wrong, right]))
+    monkeypatch.setattr("tk.trackers.start._searched", lambda _, __, ___, pose: pose)
+    explained = {False: 0.21, True: 0.22}
+    monkeypatch.setattr(
+        tracker, "fit_error", lambda _, poses, __: np.array([explained[np.allclose(p, right)] for p in poses])
+    )
+    monkeypatch.setattr(tracker, "improved", lambda _, __, pose: pose)
+    ways = find_person(tracker, frames, [tracker.pyramid(frame) for frame in frames])
+    assert [error for _, error in ways] == pytest.approx([0.21, 0.22])
+    assert error(SKELETON.joints(ways[1][0][0])[None], right[None])[0] < 1e-6
+
+
 @pytest.mark.parametrize("stature", [1.2, 1.6, 1.95])
 def test_the_stature_hardly_depends_on_the_pose(stature: float) -> None:
     body = build_cone_body(BodyDimensions.from_stature(stature))
