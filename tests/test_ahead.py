@@ -114,7 +114,9 @@ def test_a_defect_keeps_its_traceback(tiny: Path) -> None:
     assert "in _serve" in str(raised.value)
 
 
-def test_a_killed_process_is_told_in_one_line(tiny: Path, tmp_path: Path) -> None:
+def test_a_killed_process_is_told_in_one_line(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "WRITE_EVERY_S", 0)
+
     class Killer(Silent):
         def advance(self, frame: int, estimate: object) -> None:
             super().advance(frame, estimate)

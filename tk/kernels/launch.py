@@ -47,12 +47,12 @@ class Launcher:
         self._last: list[Any] = []
 
     def __call__(self, *arguments: Any) -> None:
-        program = ti.lang.impl.get_runtime().prog
-        if self._compiled is None or self._program is not program:
-            self._kernel(*self._constants, *arguments)
-            self._remember(arguments)
-            return
         with self._lock:
+            program = ti.lang.impl.get_runtime().prog
+            if self._compiled is None or self._program is not program:
+                self._kernel(*self._constants, *arguments)
+                self._remember(arguments)
+                return
             self._update(arguments)
             self._launch(program, self._context)
 
