@@ -19,7 +19,7 @@ Float = NDArray[np.float64]
 # A joint's place in the flesh, metres along an axis, and what a bend of the waist by one radian adds to all joints.
 # Chosen on walk, dance, fold, cube and treadmill such that as many errors are within 1 and 2 σ as are of a normal's.
 # The first is about what the joints' constant offsets are on these.
-IN_THE_FLESH_M, BENT_M = 0.007, 0.015
+IN_THE_FLESH_M, BENT_M = 0.0067, 0.0145
 
 # The bone whose direction tells how a joint is turned, by the joints at its ends; the trunk's own joints have none.
 _BONES = {
