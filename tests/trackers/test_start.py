@@ -15,7 +15,7 @@ from tk.model.skeleton import JOINTS, shoulder_angles
 from tk.optim.gauss_newton import Descent
 from tk.trackers.base import Observation
 from tk.trackers.silhouette import SilhouetteConfig, SilhouetteTracker
-from tk.trackers.start import find_person, stature_of
+from tk.trackers.start import Way, find_person, stature_of
 
 STATURE = 1.75
 RIG = ring_of_cameras(3, width=200, height=250)
@@ -53,7 +53,7 @@ def found(poses: np.ndarray) -> np.ndarray:
     """(F, 15, 3) joints that are found in silhouettes of poses (F, D)."""
     tracker = tracker_of()
     frames = [Observation(i, np.zeros(0, np.uint8), m) for i, m in enumerate(draw_silhouettes(BODY, RIG, poses))]
-    poses = find_person(tracker, frames, [tracker.pyramid(frame) for frame in frames])[0][0]
+    poses = find_person(tracker, frames, [tracker.pyramid(frame) for frame in frames])[0].poses
     return np.array([SKELETON.joints(pose) for pose in poses])
 
 
@@ -103,7 +103,7 @@ def test_of_two_ways_to_explain_the_opening_the_one_whose_own_body_explains_it_b
     wrong = placed(arms(standing_pose(SKELETON), (0.2, 1, -0.6), (1, 0.6, 0.3)), 0.6)
     masks = draw_silhouettes(BODY, RIG, np.array([right] * 4))
     frames = [Observation(i, np.zeros(0, np.uint8), m) for i, m in enumerate(masks)]
-    ways = [(np.array([pose] * 4), error) for pose, error in ((wrong, 0.10), (right, 0.105))]
+    ways = [Way(np.array([pose] * 4), error) for pose, error in ((wrong, 0.10), (right, 0.105))]
     monkeypatch.setattr("tk.trackers.contours.find_person", lambda *_: ways)
     tracker = tracker_of()
     pose = tracker.find(frames, STATURE, None)
@@ -126,8 +126,9 @@ def test_poses_that_one_frame_cannot_tell_apart_are_all_followed(monkeypatch) ->
     )
     monkeypatch.setattr(tracker, "improved", lambda _, __, pose: pose)
     ways = find_person(tracker, frames, [tracker.pyramid(frame) for frame in frames])
-    assert [error for _, error in ways] == pytest.approx([0.21, 0.22])
-    assert error(SKELETON.joints(ways[1][0][0])[None], right[None])[0] < 1e-6
+    assert [way.error for way in ways] == pytest.approx([0.21, 0.22])
+    assert ways[0].handicap == 1.0 < ways[1].handicap
+    assert error(SKELETON.joints(ways[1].poses[0])[None], right[None])[0] < 1e-6
 
 
 @pytest.mark.parametrize("stature", [1.2, 1.6, 1.95])

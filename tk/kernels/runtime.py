@@ -58,7 +58,7 @@ with warnings.catch_warnings():
 
 __all__ = ["ensure_runtime", "spread_of", "ti"]
 
-# Taichi hands a CPU thread so many turns of a loop at once; what loop_config says of block_dim changes nothing. Few long
+# Taichi hands a CPU thread so many turns of a loop at once; what loop_config says of block_dim changes nothing. Long
 # tasks are handed out in about so many shares a thread: one that wakes late, or has the longer tasks, is made up for.
 _LEAST_TURNS, _SHARES = 512, 8
 

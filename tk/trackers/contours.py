@@ -31,7 +31,7 @@ from tk.model.skeleton import ANKLES, WAIST, build_skeleton, join_pose, split_po
 from tk.optim import gauss_newton
 from tk.optim.gauss_newton import Descent, GaussNewtonConfig, Prior
 from tk.trackers.base import Observation
-from tk.trackers.start import HEADINGS, PHASES, centroid, find_person, stature_of
+from tk.trackers.start import HEADINGS, PHASES, Way, centroid, find_person, stature_of
 
 Float = NDArray[np.float64]
 
@@ -187,31 +187,32 @@ class ContourTracker:
             rough = self.settle(pyramids[0], join_pose(self.body.skeleton, angles, *unknown)[None]).states[0]
         ways = find_person(self, frames, pyramids, rough)
         if not self.contours.adapt or body is not None:
-            return np.asarray(ways[0][0][0])
+            return np.asarray(ways[0].poses[0])
         return self._adapt(frames, pyramids, ways, average.stature, stature is not None)
 
     def _adapt(
         self,
         frames: Sequence[Observation],
         pyramids: Sequence[Pyramid],
-        ways: Sequence[tuple[Float, float]],
+        ways: Sequence[Way],
         stature: float,
         known: bool,
     ) -> Float:
         """Fit the body to the opening, and (D,) the pose in its first frame; whether the stature is ``known``.
 
-        Of several ways (F, D) to explain the opening that is believed which both the average body, as its mean E_S
+        Of several ways to explain the opening that is believed which both the average body, as its mean E_S
         tells, and its own explain best: a body that is fitted to a wrong way makes up for some of it.
         """
         count = min(self.contours.fit.frames, len(pyramids))
         chosen = np.unique(np.linspace(0, len(pyramids) - 1, count).round().astype(int))
         config = self.contours.fit if known else replace(self.contours.fit, stature_deviation=MEASURED)
         found: list[tuple[float, ConeBody, Float]] = []
-        for poses, error in ways:
-            body, fitted = self.fit(pyramids, poses, chosen, stature, config)
+        for way in ways:
+            body, fitted = self.fit(pyramids, way.poses, chosen, stature, config)
+            error = way.error * way.handicap
             if len(ways) > 1:
                 self.take_body(body)
-                told = np.array(list(map(self._misfit, frames, pyramids, poses)))
+                told = np.array(list(map(self._misfit, frames, pyramids, way.poses)))
                 error *= float(told[np.isfinite(told)].mean())  # in the others nobody is in sight
             found.append((error, body, fitted[0]))
         _, body, pose = min(found, key=lambda one: one[0])

@@ -9,7 +9,7 @@ of the opening decides: feet, knees and elbows bend one way, and people walk for
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,9 @@ FINALISTS, OPPOSITE, APART_M = 4, 2, 0.15
 ANCHORS, CLEAR = 4, 0.2
 # Over the opening, what is explained worse than the best by more than this factor is wrong.
 AMBIGUOUS = 1.1
+# Of those that face alike the best in its frame is believed unless another way is better by this factor: legs that
+# change places explain a walk as well, but for noise.
+HANDICAP = 1.1
 # Whoever faces the other way is followed, too, where that explains the frame nearly as well, by this factor.
 NEARLY = 1.4
 # A frame explained worse than the anchor by this factor is searched for lost limbs.
@@ -51,11 +54,25 @@ _AVERAGE_M = 1.7
 _SEARCHES = 2
 
 
+class Way(NamedTuple):
+    """How the opening can be explained.
+
+    Attributes:
+        poses: (F, D).
+        error: their mean E_S.
+        handicap: by which that counts more.
+    """
+
+    poses: Float
+    error: float
+    handicap: float = 1.0
+
+
 def find_person(
     tracker: ContourTracker, frames: Sequence[Observation], pyramids: Sequence[Pyramid], pose: Float | None = None
-) -> list[tuple[Float, float]]:
-    """Poses (F, D) in consecutive frames and their mean E_S, the best explained ones first, and others that are
-    explained nearly as well: only a body fitted to each tells then. The tracker has an average body already.
+) -> list[Way]:
+    """Poses in F consecutive frames, the best explained ones first, and others that are explained nearly as well: only
+    a body fitted to each tells then. The tracker has an average body already.
 
     Args:
         tracker: see :class:`ContourTracker`.
@@ -69,8 +86,8 @@ def find_person(
     if pose is not None:
         return [_follow(tracker, frames, pyramids, _searched(tracker, frames[0], pyramids[0], pose), 0)]
     skeleton = tracker.body.skeleton
-    ways: list[tuple[Float, float]] = []
-    others: list[tuple[int, Float]] = []
+    ways: list[Way] = []
+    others: list[tuple[int, Float, float]] = []
     for anchor in np.unique(np.linspace(0, len(frames) - 1, ANCHORS).astype(int)):
         try:
             error, poses = _find(tracker, frames[anchor], pyramids[anchor])
@@ -78,29 +95,32 @@ def find_person(
             if anchor == 0:
                 raise
             continue
-        others += [(int(anchor), pose) for pose in poses[1:]]
+        for pose in poses[1:]:
+            turned = _turned(skeleton, pose[None], poses[0])[0]
+            others.append((int(anchor), pose, 1.0 if turned else HANDICAP))
         if _is_on(skeleton, ways, anchor, poses[0]):
             break  # found twice
         ways.append(_follow(tracker, frames, pyramids, poses[0], anchor))
         if error < CLEAR:
             break
-    for anchor, pose in others:
+    for anchor, pose, handicap in others:
         if not _is_on(skeleton, ways, anchor, pose):
-            ways.append(_follow(tracker, frames, pyramids, pose, anchor))
-    ways.sort(key=lambda way: way[1])
-    kept: list[tuple[Float, float]] = []
-    for way, error in ways:
-        joints = skeleton.joints(way)
-        apart = [np.mean(skeleton.apart(other, joints)) for other, _ in kept]
-        if error <= AMBIGUOUS * ways[0][1] and all(distance > APART_M for distance in apart):
-            kept.append((way, error))
+            ways.append(_follow(tracker, frames, pyramids, pose, anchor)._replace(handicap=handicap))
+    ways.sort(key=lambda way: way.error * way.handicap)
+    least = min(way.error for way in ways)
+    kept: list[Way] = []
+    for way in ways:
+        joints = skeleton.joints(way.poses)
+        apart = [np.max(skeleton.apart(other.poses, joints)) for other in kept]
+        if way.error <= AMBIGUOUS * least and all(distance > APART_M for distance in apart):
+            kept.append(way)
     return kept
 
 
-def _is_on(skeleton: Skeleton, ways: Sequence[tuple[Float, float]], frame: int, pose: Float) -> bool:
+def _is_on(skeleton: Skeleton, ways: Sequence[Way], frame: int, pose: Float) -> bool:
     """Whether one of the ways passes by a pose (D,) in a frame."""
     joints = skeleton.joints(pose)
-    return any(skeleton.apart(way[frame], joints) < APART_M for way, _ in ways)
+    return any(skeleton.apart(way.poses[frame], joints) < APART_M for way in ways)
 
 
 def _find(tracker: ContourTracker, frame: Observation, pyramid: Pyramid) -> tuple[float, list[Float]]:
@@ -126,8 +146,8 @@ def _find(tracker: ContourTracker, frame: Observation, pyramid: Pyramid) -> tupl
 
 def _follow(
     tracker: ContourTracker, frames: Sequence[Observation], pyramids: Sequence[Pyramid], pose: Float, anchor: int
-) -> tuple[Float, float]:
-    """Poses (F, D) from that of frame ``anchor`` to both ends, and their mean E_S."""
+) -> Way:
+    """Poses from that of frame ``anchor`` to both ends."""
     F = len(frames)
     poses = np.tile(pose, (F, 1))
     errors = np.full(F, np.nan)
@@ -150,7 +170,7 @@ def _follow(
                 now = tracker.improved(frames[i], pyramids[i], now)
                 error = told(i, now)
             poses[i], errors[i] = now, error
-    return poses, float(np.nanmean(errors))
+    return Way(poses, float(np.nanmean(errors)))
 
 
 def _searched(tracker: ContourTracker, frame: Observation, pyramid: Pyramid, pose: Float) -> Float:
