@@ -113,7 +113,8 @@ def _track_again(
         return {}
     start = poses[np.searchsorted(frames, begin)][None]
     once = {"poses": start, "previous": start, "costs": np.zeros(1), "ages": np.ones(1, int)}
-    tracker.restore(tracker.model(), {**tracker.state(), **once, "usual": np.inf, "sound": np.inf, "lost_for": 0})
+    nothing = {"usual": np.inf, "sound": np.inf, "lost_for": 0, "in_vain": False, "jumped": np.zeros(1, bool)}
+    tracker.restore(tracker.model(), {**tracker.state(), **once, **nothing})
     with open_source(capture, plan.config, lambda _: None) as source:
         return {observation.index: tracker.step(observation) for observation, _ in source.frames(begin, stop)}
 

@@ -136,6 +136,21 @@ def test_a_frame_that_is_explained_badly_is_searched_unasked() -> None:
     assert errors(estimate, raised)[JOINTS.index("wrist_r")] < 0.08
 
 
+def test_a_run_that_stops_behind_a_jump_goes_on_as_an_unbroken_one() -> None:
+    """The arm has come from where it was: its motion is tried as a prediction, and none."""
+    further = [with_arm(POSES[1], "r", direction, 15.0) for direction in ((0.1, 1.0, 0.5), (0.1, 0.6, 1.0))]
+    masks = draw_silhouettes(BODY, RIG, np.array(further))
+    first = tracker_at(POSES[0])
+    first.step(observe(MASKS[0]))
+    jumped = first.step(observe(masks[0], 1))
+    assert jumped.iterations[1] == 1 and any(h.jumped for h in first._alive)
+    second = RegionTracker(RIG, "z", first.contours, first.config)
+    second.restore(first.model(), first.state())
+    a, b = (tracker.step(observe(masks[1], 2)) for tracker in (first, second))
+    np.testing.assert_array_equal(a.joints, b.joints)
+    assert errors(a, further[1])[JOINTS.index("wrist_r")] < 0.08
+
+
 @pytest.mark.parametrize(
     ("forward_deg", "across_deg", "heading"),
     [(25.0, 12.0, 0.7), (25.0, 12.0, 2.1), (0.0, 24.0, 0.0), (15.0, 18.0, 1.5)],

@@ -470,6 +470,7 @@ class RegionTracker(ContourTracker):
             "previous": np.array([h.previous for h in self._alive]),
             "costs": np.array([h.cost for h in self._alive]),
             "ages": np.array([h.age for h in self._alive]),
+            "jumped": np.array([h.jumped for h in self._alive]),
             "usual": self._usual,
             "sound": self._sound,
             "usual_posture": self._usual_posture.copy(),
@@ -483,8 +484,9 @@ class RegionTracker(ContourTracker):
     def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
         """Take up where a run with this model and state stopped."""
         self.take_body(restore_body(model, self.up))
-        rows = zip(state["poses"], state["previous"], state["costs"], state["ages"], strict=True)
-        self._alive = [Hypothesis(np.asarray(p), np.asarray(q), float(c), int(a)) for p, q, c, a in rows]
+        jumped = state.get("jumped", np.zeros(len(state["poses"]), np.bool_))  # results of before have none
+        rows = zip(state["poses"], state["previous"], state["costs"], state["ages"], jumped, strict=True)
+        self._alive = [Hypothesis(np.asarray(p), np.asarray(q), float(c), int(a), bool(j)) for p, q, c, a, j in rows]
         self._usual = float(state["usual"])
         self._sound = float(state.get("sound", self._usual))  # results of before have none
         self._usual_posture = np.array(state["usual_posture"], np.float64)
