@@ -100,6 +100,24 @@ def test_an_appended_frame_is_in_the_file_at_once(tmp_path: Path) -> None:
             assert assert_complete(snapshot, index + 1) == index + 1
 
 
+@pytest.mark.parametrize("done", [0, 2])
+def test_frames_that_wait_to_be_written_are_kept_whatever_ends_the_run(tmp_path: Path, done: int) -> None:
+    """Whether one is in the file already, or an older result is still there."""
+    path = tmp_path / "result.h5"
+    with ResultWriter.create(path, META) as writer:
+        writer.append(make_frame(9), make_state(9))
+    with pytest.raises(KeyboardInterrupt), ResultWriter.create(path, META) as writer:
+        for index in range(done):
+            writer.append(make_frame(index), make_state(index))
+        for index in range(done, done + 3):
+            writer.append(make_frame(index), make_state(index), flush=False)
+        waiting = tmp_path / "waiting.h5"
+        waiting.write_bytes(path.read_bytes())
+        assert list(read_result(waiting).frames) == [make_frame(index).frame for index in range(done) or [9]]
+        raise KeyboardInterrupt
+    assert assert_complete(path, done + 3) == done + 3
+
+
 def test_arrays_may_be_reused_after_append(tmp_path: Path) -> None:
     """Each frame is written twice, the second time after the next one was computed."""
     path = tmp_path / "result.h5"

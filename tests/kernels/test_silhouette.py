@@ -307,6 +307,19 @@ def test_equations_are_the_same_every_time_and_in_any_batch():
         np.testing.assert_array_equal(a[3:4], c)
 
 
+def test_poses_may_each_have_a_frame_of_their_own():
+    poses = np.array([standing(torso_yaw=0.2 * k, hip_l_pitch=-0.3 * k) for k in range(3)])
+    masks = draw_silhouettes(BODY, RIG, poses[::-1])
+    together = equations_of(BODY, np.concatenate(masks), poses, SearchSettings())
+    for k in range(3):
+        alone = equations_of(BODY, masks[k], poses[k : k + 1], SearchSettings())
+        for several, one in zip(together, alone, strict=True):
+            np.testing.assert_array_equal(several[k], one[0])
+    assert not np.array_equal(together.gradient[:1], equations_of(BODY, masks[2], poses[:1], SearchSettings()).gradient)
+    with pytest.raises(ValueError, match="6 masks of 3 views: one set, or one for each of 3 poses"):
+        equations_of(BODY, np.concatenate(masks[:2]), poses, SearchSettings())
+
+
 def test_a_body_that_no_camera_sees_has_no_equations():
     away = POSE.copy()
     away[2] += 50

@@ -180,7 +180,7 @@ class ResultWriter:
         self._cameras_version += 1
 
     def append(self, result: FrameResult, state: Mapping[str, Value] | None = None, flush: bool = True) -> None:
-        """Add a finished frame; on return it is in the file, whatever happens to this process.
+        """Add a finished frame; on return it is in the file, whatever happens to this process, if ``flush`` is True.
 
         Args:
             result: the frame.

@@ -410,7 +410,7 @@ def _launch(
         np.ascontiguousarray(cameras, dtype),
         np.ascontiguousarray(sizes, np.int32),
         np.ascontiguousarray(masks),
-        _all_of(B) if len(masks) > V else _none_of(B),
+        _all_of(B) if len(masks) > V else _zeros(B),
         regions.image,
         regions.log_likelihood,
         regions.group,
@@ -433,7 +433,7 @@ def _all_of(count: int) -> NDArray[np.int32]:
 
 
 @functools.cache
-def _none_of(count: int) -> NDArray[np.int32]:
+def _zeros(count: int) -> NDArray[np.int32]:
     return np.zeros(count, dtype=np.int32)
 
 

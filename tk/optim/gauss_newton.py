@@ -76,6 +76,11 @@ class GaussNewtonConfig:
                 f"{self.limit_weight} must not be negative, longest_step {self.longest_step} must be positive"
             )
 
+    def steps(self, scale: int) -> list[float]:
+        """How long each step at a scale is, as a share of what the equations tell."""
+        plain = [1.0] if scale == 0 and self.relaxation > 1 else []
+        return [self.relaxation] * self.iterations + plain
+
 
 @dataclass(frozen=True)
 class Prior:
@@ -128,10 +133,7 @@ def minimise(
     hessian = np.zeros((*state.shape, state.shape[1]))
     room = _Room(np.flatnonzero(free), lower, upper, config, prior)
     for scale in range(config.scales - 1, -1, -1) if levels is None else levels:
-        shares = [config.relaxation] * config.iterations
-        if scale == 0 and config.relaxation > 1:
-            shares.append(1.0)
-        for share in shares:
+        for share in config.steps(scale):
             here = equations(state, scale)
             state[:, room.index] += share * room.step(here.hessian, here.gradient, state)
             hessian = here.hessian

@@ -155,7 +155,7 @@ class RegionTracker(ContourTracker):
     def step(self, frame: Observation) -> Estimate:
         """The pose in the next frame."""
         watch = Stopwatch()
-        contours, config = self.contours, self.config
+        contours, config, solver = self.contours, self.config, self.contours.solver
         frame = self.without_foreign(frame)
         pyramid = self.pyramid(frame)
         images = frame.images if config.colors else None
@@ -182,6 +182,7 @@ class RegionTracker(ContourTracker):
         misplaced = self.misplaced(evidence, label)
         searched = self._needs_search(frame, float(np.nanmean(error)), misplaced)
         if searched:
+            # where no limb alone was better in the frame before, one may be where the other one of its pair should be
             in_pairs, before = self._in_vain, self._best.pose
             self._propose(frame, pyramid, evidence, images, misplaced, in_pairs)
             if self._best.pose is not before:
@@ -208,7 +209,7 @@ class RegionTracker(ContourTracker):
             **self.told(pose),
             status=status,
             objective=float(self._best.cost),
-            iterations=np.array([contours.solver.scales * contours.solver.iterations, int(searched)], np.int32),
+            iterations=np.array([sum(len(solver.steps(k)) for k in range(solver.scales)), int(searched)], np.int32),
             timing=watch.laps,
             sigma=sigma,
             fit_error=error,
@@ -493,7 +494,7 @@ class RegionTracker(ContourTracker):
         self._postures = int(state["postures"])
         self._lost_for = int(state["lost_for"])
         self._stranded = int(state.get("stranded", 0))  # results of before have none
-        self._in_vain = bool(state.get("in_vain", False))
+        self._in_vain = bool(state.get("in_vain", False))  # results of before have none
         self.colors.restore(state)
         self._fresh = False
 

@@ -81,7 +81,7 @@ class SilhouetteTracker(ContourTracker):
             **self.told(pose),
             status=status,
             objective=error,
-            iterations=np.full(len(self.stages), config.solver.iterations, np.int32),
+            iterations=np.array([len(config.solver.steps(k)) for k in reversed(range(len(self.stages)))], np.int32),
             timing=watch.laps,
         )
 
