@@ -13,7 +13,7 @@ from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
 def run(code, **environment):
     """What a fresh interpreter prints; its environment is this one's with these variables."""
-    inherited = {
+    inherited = {"PYTHONFAULTHANDLER": "1"} | {
         k: v for k, v in os.environ.items() if k not in ("TK_DEBUG", "TK_THREADS", "ENABLE_TAICHI_HEADER_PRINT")
     }
     done = subprocess.run(
@@ -92,6 +92,24 @@ def test_a_killed_process_does_not_switch_the_cache_off_for_good(tmp_path, age_s
         TI_OFFLINE_CACHE_FILE_PATH=str(tmp_path),
     )
     assert lock.exists() == stays
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="needs a list of the process's threads")
+def test_the_threads_end_before_the_interpreter_does():
+    """A runtime that is taken apart with the interpreter has crashed one in some thousand processes at its end."""
+    before, running, after = run(
+        """
+        import atexit, os
+        def count():
+            print(len(os.listdir("/proc/self/task")))
+        from tk.kernels.runtime import ensure_runtime
+        count()
+        atexit.register(count)
+        ensure_runtime()
+        count()
+        """
+    )
+    assert after == before < running
 
 
 @ti.kernel

@@ -7,6 +7,7 @@ Never ``fork`` after it has started: use the ``spawn`` start method for worker p
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import functools
 import importlib
@@ -91,6 +92,8 @@ def ensure_runtime() -> None:
     _LOG.info("starting the kernels; what this machine has not compiled yet takes some seconds")
     with contextlib.redirect_stdout(io.StringIO()):  # it prints that it starts, whatever the log level
         ti.init(**options)
+    # Taichi leaves its program, and the threads of it, to the interpreter's end, which takes modules apart in any order
+    atexit.register(ti.reset)
 
 
 def _break_stale_lock() -> None:
