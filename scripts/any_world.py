@@ -25,10 +25,10 @@ from scripts.any_start import Quiet
 from tk.config import Config
 from tk.io.capture import Capture, open_capture
 from tk.io.result import Result, Status, read_result
-from tk.model.camera import Rig
 from tk.model.mounting import infer_up
 from tk.model.up import up_text
 from tk.model.volume import Volume
+from tk.model.world import seen_from
 from tk.session import track
 
 Float = NDArray[np.float64]
@@ -37,11 +37,7 @@ Float = NDArray[np.float64]
 def turned(capture: Capture, turn: Float, shift: Float, up: bool = True) -> Capture:
     """The capture in a world in which point p has become ``turn @ p + shift``; the volume is the box about the turned
     one. Without ``up`` the cameras tell what points up."""
-    cameras = []
-    for camera in capture.rig:
-        rotation = camera.rotation @ turn.T
-        cameras.append(replace(camera, rotation=rotation, translation=camera.translation - rotation @ shift))
-    rig = Rig(tuple(cameras))
+    rig = seen_from(capture.rig, turn.T, -turn.T @ shift)
     low, high = capture.volume.lower, capture.volume.upper
     corners = np.array(list(product(*zip(low, high, strict=True)))) @ turn.T + shift
     middle, size = (corners.min(axis=0) + corners.max(axis=0)) / 2, np.ptp(corners, axis=0)
