@@ -118,10 +118,11 @@ def track(data: Sequence3D, name: str, views: int, config: SilhouetteConfig) -> 
     joints = np.array([e.joints for e in estimates])
     every = max(1, len(frames) // 68)
     grid = RayGrid(data.rig, data.rig.frame_shape[0] // 2)
+    body = tracker.body.standing(data.up)
     error = []
     for i in range(0, len(frames), every):
-        pose = join_pose(tracker.body.skeleton, estimates[i].pose, estimates[i].waist, estimates[i].ankles)
-        shares, _ = Evidence.of(grid, data.masks[i]).cast(tracker.body, tracker.colors.group, pose[None])
+        pose = join_pose(body.skeleton, estimates[i].pose, estimates[i].waist, estimates[i].ankles)
+        shares, _ = Evidence.of(grid, data.masks[i]).cast(body, tracker.colors.group, pose[None])
         error.append(np.nanmean(shares))
     found, true = joints[:, ANKLES], data.truth[:, ANKLES]
     off, height = [], []

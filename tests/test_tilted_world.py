@@ -18,6 +18,9 @@ from tests.test_silhouette_track import QUICK as QUICK_SILHOUETTE
 from tk.config import Config
 from tk.io.capture import open_capture
 from tk.io.result import read_joints, read_result
+from tk.model.up import up_text
+from tk.model.volume import Volume
+from tk.model.world import seen_from
 from tk.session import track
 
 TURN = Rotation.from_euler("xyz", [-1.2, 0.3, 0.5]).as_matrix()
@@ -62,3 +65,36 @@ def test_the_person_is_tracked(tiny: Path, tilted: Path, tmp_path: Path, method:
     truth = read_joints(tiny / "truth.h5").positions[:6] @ TURN.T
     found = read_result(path).joints
     assert np.linalg.norm(found - truth, axis=-1).mean() < 0.10
+
+
+@pytest.mark.parametrize("method", ["region", "silhouette"])
+def test_a_turned_world_makes_no_difference(tiny: Path, tmp_path: Path, method: str) -> None:
+    """Not even to rounding, which would decide between poses that explain the pictures alike."""
+    capture, shift = open_capture(tiny), np.array([3.0, -2.0, 0.7])
+    side = 1.15 * max(capture.volume.size)
+    center = TURN @ capture.volume.center + shift
+    turned = replace(
+        capture,
+        rig=seen_from(capture.rig, TURN.T, -TURN.T @ shift),
+        volume=Volume((center[0], center[1], center[2]), (side, side, side)),
+        up=up_text(TURN @ capture.up_axis),
+    )
+    results = []
+    for name, one in (("as it is", capture), ("turned", turned)):
+        track(one, tmp_path / name, Config.from_toml(QUICK_SILHOUETTE), Silent(), method, (0, 6))
+        results.append(read_result(tmp_path / name))
+    expected, found = results
+    assert found.smoothed is not None and expected.smoothed is not None
+    for a, b in (
+        (found.joints, expected.joints),
+        (found.feet, expected.feet),
+        (found.smoothed["joints/position"], expected.smoothed["joints/position"]),
+    ):
+        assert a is not None and b is not None
+        np.testing.assert_allclose(a, b @ TURN.T + shift, atol=1e-9)
+    np.testing.assert_array_equal(found.status, expected.status)
+    np.testing.assert_array_equal(found.objective, expected.objective)
+    np.testing.assert_array_equal(found.model["parts/shape"], expected.model["parts/shape"])
+    for joint, angles in expected.angles.items():
+        if joint != "pelvis":  # its heading is counted from an axis of the capture's world
+            np.testing.assert_allclose(found.angles[joint], angles, atol=1e-6)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tk.ahead import open_source
 from tk.io.mask_store import MaskStore
 from tk.io.result import Result, Status, UsedCameras, Value, read_result, revise_result
+from tk.model.cone_body import ConeBody
 from tk.model.derived import derive
 from tk.model.skeleton import join_pose, split_pose
 from tk.model.smoothing import smooth
@@ -67,7 +68,7 @@ def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[st
             refined = refine_if_astray(tracker, masks, result.frames, poses, ~lost, note)
             if refined is not None:
                 tracker, masks, offsets = refined
-                cameras = UsedCameras(tracker.views.rig, cameras.time_offset_s + offsets / plan.capture.fps)
+                cameras = UsedCameras(tracker.rig, cameras.time_offset_s + offsets / plan.capture.fps)
                 if np.round(offsets).any():
                     note("tracking again: the first pass had the pictures out of step")
                     again = _track_again(plan, tracker, cameras, result.frames, poses)
@@ -92,9 +93,10 @@ def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[st
     _LOG.info("angles, feet, and the smoothed copy")
     # the first pass's poses stand as they are
     told = ("pose", "waist", "ankles", "joints/position") if model is None else ()
-    columns |= {name: values for name, values in _columns(tracker, poses).items() if name not in told}
-    filtered = smooth(tracker.body.skeleton, poses, ~lost, plan.capture.fps)
-    smoothed = {**_columns(tracker, filtered.poses), "bridged": filtered.bridged}
+    body = tracker.body.standing(plan.capture.up)
+    columns |= {name: values for name, values in _columns(body, poses).items() if name not in told}
+    filtered = smooth(body.skeleton, poses, ~lost, plan.capture.fps)
+    smoothed = {**_columns(body, filtered.poses), "bridged": filtered.bridged}
     revise_result(output, columns, smoothed=smoothed, model=model, cameras=cameras)
 
 
@@ -111,7 +113,7 @@ def _track_again(
     stop = min(*ends, int(frames[-1]) + 1)
     if begin >= stop:
         return {}
-    start = poses[np.searchsorted(frames, begin)][None]
+    start = tracker.world.poses_in(poses[np.searchsorted(frames, begin)][None])
     once = {"poses": start, "previous": start, "costs": np.zeros(1), "ages": np.ones(1, int)}
     nothing = {"usual": np.inf, "sound": np.inf, "lost_for": 0, "in_vain": False, "jumped": np.zeros(1, bool)}
     tracker.restore(tracker.model(), {**tracker.state(), **once, **nothing})
@@ -136,16 +138,16 @@ def _replaced(result: Result, rows: NDArray[np.int64], estimates: Sequence[Estim
     return columns
 
 
-def _columns(tracker: ContourTracker, poses: NDArray[np.float64]) -> dict[str, NDArray[np.floating]]:
-    """The datasets that tell poses (F, D) and what follows from them."""
-    skeleton = tracker.body.skeleton
+def _columns(body: ConeBody, poses: NDArray[np.float64]) -> dict[str, NDArray[np.floating]]:
+    """The datasets that tell poses (F, D) of a body and what follows from them."""
+    skeleton = body.skeleton
     paper, waist, ankles = (np.array(part) for part in zip(*(split_pose(skeleton, p) for p in poses), strict=True))
-    derived = derive(skeleton, tracker.body.dimensions, poses)
+    derived = derive(skeleton, body.dimensions, poses)
     columns = {"pose": paper, "joints/position": derived.joints, "segments/rotation": derived.rotations}
     columns["feet/position"] = derived.feet
     columns |= {f"angles/{joint}": values for joint, values in derived.angles.items()}
-    if tracker.waist_names:
+    if skeleton.is_waist.any():
         columns["waist"] = waist
-    if tracker.ankle_names:
+    if skeleton.is_ankle.any():
         columns["ankles"] = ankles
     return columns

@@ -23,6 +23,7 @@ from tk.model.camera_agreement import LATE_FRAMES, camera_agreement
 from tk.model.camera_refinement import Refined, RefinementConfig, refine_cameras
 from tk.model.cone_body import ConeBody
 from tk.model.silhouettes import Views
+from tk.model.world import World
 from tk.threads import one_thread
 from tk.trackers.bodies import body_and_poses
 from tk.trackers.contours import SilhouetteConfig
@@ -48,7 +49,7 @@ class Refinement:
     """Refined cameras, and what a person wants to know of them.
 
     Attributes:
-        refined: the cameras; its ``offset_frames`` hold the whole delay, whole frames included.
+        refined: the cameras, in their own world; its ``offset_frames`` hold the whole delay, whole frames included.
         names: of the cameras.
         frames: that took part.
     """
@@ -115,26 +116,25 @@ def refine_capture(
         raise ResultError(
             f"{result}: was tracked with the cameras {', '.join(found.cameras.rig.names)}; give them with --cameras"
         )
-    store = MaskStore()
+    world, store = World.of(capture.rig, capture.up), MaskStore()
     with open_source(capture, config, note, keep_images=False) as source:
         for observation, _ in source.frames(int(found.frames.min()), int(found.frames.max()) + 1):
             store.put(observation.index, observation.masks)
-    body, poses = tracked
+    body, poses = tracked[0].standing("z"), world.poses_in(tracked[1])
     usable = found.status != Status.LOST
-    done = refine_rig(body, capture.up, capture.rig, store, found.frames, poses, usable, config.silhouette, how)
+    done = refine_rig(body, world.rig, store, found.frames, poses, usable, config.silhouette, how)
     if done is None:
         raise CaptureError(
             f"{result}: has too few tracked frames in a row to refine {capture.path} by; {FEWEST} are needed"
         )
     read = np.array(capture.late_frames) / capture.fps
     late = read + done.refined.offset_frames / capture.fps
-    write_calibration(output, capture.calibration, done.refined.rig, late.tolist())
+    write_calibration(output, capture.calibration, world.rig_out(done.refined.rig), late.tolist())
     return done
 
 
 def refine_rig(
     body: ConeBody,
-    up: str,
     rig: Rig,
     store: MaskStore,
     frames: NDArray[np.int64],
@@ -145,6 +145,7 @@ def refine_rig(
 ) -> Refinement | None:
     """Refine cameras by poses (F, D) of frames (F,) whose masks are in the store; None where too few are usable.
 
+    Body, cameras and poses, and the cameras that are returned, are those of a world in which z is up.
     A video that is late by whole frames is shown by its other frames, until less than one half is left.
     """
     how = how or RefinementConfig()
@@ -161,7 +162,7 @@ def refine_rig(
             break
         count = len(moments)
         before = None if done is None else done.before_px
-        done = refine_cameras(body, up, rig, moments, contours.search, how)
+        done = refine_cameras(body, rig, moments, contours.search, how)
         done = replace(
             done,
             offset_frames=done.offset_frames + late,
@@ -187,14 +188,15 @@ def refine_if_astray(
     Args:
         tracker: that has gone over the frames.
         store: the frames' masks.
-        frames, poses, usable: (F,), (F, D), (F,) of :func:`refine_rig`.
+        frames, poses, usable: (F,), (F, D), (F,) of :func:`refine_rig`, the poses in the capture's world.
         note: who hears what was found.
 
     Returns:
         A tracker with the refined cameras and the same body, the masks that belong together, and by how many frames
         each camera is late (C,).
     """
-    rig, contours = tracker.views.rig, tracker.contours
+    world, contours = tracker.world, tracker.contours
+    poses = world.poses_in(poses)
     masks = lru_cache(16)(store.get)
     moments = gather(
         lambda frame, camera: masks(frame)[camera],
@@ -208,25 +210,25 @@ def refine_if_astray(
     )
     if len(moments) < FEWEST:
         return None
-    agreement = camera_agreement(tracker.body, tracker.up, rig, moments, contours.search)
+    agreement = camera_agreement(tracker.body, world.rig, moments, contours.search)
     if not (agreement.astray.any() or agreement.late.any()):
         return None
-    done = refine_rig(tracker.body, tracker.up, rig, store, frames, poses, usable, contours)
+    done = refine_rig(tracker.body, world.rig, store, frames, poses, usable, contours)
     if done is None:
         return None
     refined = done.refined
     before, after = float(np.mean(refined.before_px)), float(np.mean(refined.after_px))
     if not after < _WORTH * before:
         return None
-    worst = int(np.argmax(refined.turn_deg))
-    told = [f"{name} is {n:+.2f} frames late" for name, n in zip(rig.names, refined.offset_frames, strict=True)
+    names, worst = world.rig.names, int(np.argmax(refined.turn_deg))
+    told = [f"{name} is {n:+.2f} frames late" for name, n in zip(names, refined.offset_frames, strict=True)
             if abs(n) > LATE_FRAMES]  # fmt: skip
     note(
         f"the cameras disagreed and are refined from {done.frames} frames: contours {before:.2f} px off, now "
-        f"{after:.2f}; {', '.join([f'{rig.names[worst]} is turned most, by {refined.turn_deg[worst]:.2f}°', *told])} "
+        f"{after:.2f}; {', '.join([f'{names[worst]} is turned most, by {refined.turn_deg[worst]:.2f}°', *told])} "
         "(refine = false leaves them)"
     )
-    fresh = RegionTracker(refined.rig, tracker.up, contours, tracker.config)
+    fresh = RegionTracker(world.rig_out(refined.rig), tracker.up, contours, tracker.config)
     fresh.take_body(tracker.body)
     fresh.colors.restore(tracker.colors.state())
     return fresh, retimed(store, frames, np.round(refined.offset_frames).astype(np.int64)), refined.offset_frames

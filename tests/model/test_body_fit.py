@@ -101,9 +101,8 @@ def test_no_edgels_have_no_rows():
     assert rows.shape == (0, SHAPE_NUMBERS * len(AVERAGE.shape_groups))
 
 
-@pytest.mark.parametrize("up", ["z", "-y"])
-def test_rows_by_dimensions_are_differences(up):
-    problem = body_fit.BodyProblem("full", up, AVERAGE.dimensions, 0.01)
+def test_rows_by_dimensions_are_differences():
+    problem = body_fit.BodyProblem("full", AVERAGE.dimensions, 0.01)
     shared = problem.mean + np.random.default_rng(2).normal(0, 0.02, len(problem.mean)) * (problem.deviation > 1e-5)
     (rows,) = problem.dimension_rows(shared, POSE[None], [EDGELS])
     assert rows.shape == (len(EDGELS.part), len(DIMENSIONS))
@@ -112,13 +111,13 @@ def test_rows_by_dimensions_are_differences(up):
         pair = []
         for sign in (1, -1):
             values = np.exp(shared[: len(DIMENSIONS)] + sign * 1e-5 * np.eye(len(DIMENSIONS))[k])
-            body = build_cone_body(BodyDimensions(*values), up).reshaped(change)
+            body = build_cone_body(BodyDimensions(*values)).reshaped(change)
             pair.append(along_rows(body, POSE))
         np.testing.assert_allclose(rows[:, k], (pair[0] - pair[1]) / 2e-5, atol=1e-6, err_msg=name)
 
 
 def test_frames_are_told_apart_in_rows_by_dimensions():
-    problem = body_fit.BodyProblem("full", "z", AVERAGE.dimensions, 0.01)
+    problem = body_fit.BodyProblem("full", AVERAGE.dimensions, 0.01)
     poses = walk(AVERAGE, 2)
     both = problem.dimension_rows(problem.mean, poses, [EDGELS, EDGELS])
     for pose, rows in zip(poses, both, strict=True):
@@ -149,7 +148,7 @@ def test_lengths_of_a_known_body_are_found(monkeypatch):
     poses = walk(body, 4)
     start = poses + np.random.default_rng(0).normal(0, 0.01, poses.shape)
     found, fitted = fit_body(
-        "full", VIEWS, pyramids_of(body, poses), start, "z", SEARCH, true.stature, BodyFitConfig(rounds=4)
+        "full", VIEWS, pyramids_of(body, poses), start, SEARCH, true.stature, BodyFitConfig(rounds=4)
     )
     for name in ("thigh", "calf", "upper_arm", "forearm"):
         assert getattr(found.dimensions, name) == pytest.approx(getattr(true, name), rel=0.02), name
@@ -170,7 +169,7 @@ def test_shapes_are_found_and_left_and_right_are_mirror_images():
     true = AVERAGE.reshaped(change)
     poses = walk(true, 3)
     seen = pyramids_of(true, poses)
-    found, fitted = fit_body("full", VIEWS, seen, poses, "z", SEARCH, STATURE, BodyFitConfig(rounds=4))
+    found, fitted = fit_body("full", VIEWS, seen, poses, SEARCH, STATURE, BodyFitConfig(rounds=4))
     grid, group = RayGrid(VIEWS.rig, 150), PartColors(AVERAGE).group
 
     def error(body, poses):
@@ -194,7 +193,6 @@ def test_without_rounds_the_average_body_is_told():
         VIEWS,
         pyramids_of(AVERAGE, poses),
         poses[:, AVERAGE.skeleton.is_paper],
-        "z",
         SEARCH,
         STATURE,
         BodyFitConfig(rounds=0),
@@ -213,7 +211,7 @@ def test_every_preset_is_fitted(preset):
     start = pose.copy()
     start[:3] += 0.01
     found, fitted = fit_body(
-        preset, VIEWS, [VIEWS.pyramid(masks[0], 1, None)], start[None], "z", SEARCH, STATURE, BodyFitConfig(rounds=2)
+        preset, VIEWS, [VIEWS.pyramid(masks[0], 1, None)], start[None], SEARCH, STATURE, BodyFitConfig(rounds=2)
     )
     assert found.preset == preset and len(found.parts) == len(body.parts)
     np.testing.assert_array_equal(fitted[0][~body.free], start[~body.free])

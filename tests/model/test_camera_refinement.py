@@ -108,7 +108,7 @@ def test_a_camera_that_shows_nothing_tells_nothing():
         masks = in_time().get(k).copy()
         masks[2] = 0
         store.put(k, masks)
-    agreement = camera_agreement(BODY, "z", RIG, moments(store, RIG), SEARCH)
+    agreement = camera_agreement(BODY, RIG, moments(store, RIG), SEARCH)
     assert np.isfinite(agreement.shift_px).all() and not agreement.astray.any()
 
 
@@ -174,8 +174,8 @@ def test_the_family_begins_at_the_body():
     body = BODY.reshaped(change)
     ellipsoid = [group_of(p.name) for p in BODY.parts if p.kind != CONE]
     change[[BODY.shape_groups.index(name) for name in ellipsoid], 2] = 0.0  # nothing tapers there
-    np.testing.assert_allclose(shapes_of(body, "z"), change, atol=2e-4)
-    family = Family(body, "z")
+    np.testing.assert_allclose(shapes_of(body), change, atol=2e-4)
+    family = Family(body)
     again = family.build(family.start)
     for one, other in zip(again.parts, body.parts, strict=True):
         np.testing.assert_allclose(one.shape, other.shape, rtol=2e-3)
@@ -188,7 +188,7 @@ def test_the_family_begins_at_the_body():
 def test_perturbed_cameras_are_found_again():
     # what is drawn exactly is to be trusted more than a prior
     how = replace(QUICK, rounds=6, trust=5.0, offsets=False)
-    found = refine_cameras(BODY, "z", PERTURBED, moments(in_time(), PERTURBED), SEARCH, how)
+    found = refine_cameras(BODY, PERTURBED, moments(in_time(), PERTURBED), SEARCH, how)
     (was_turned, was_moved), (turned, moved) = errors(PERTURBED), errors(found.rig)
     assert turned < 0.08 and turned < was_turned / 2.5, (was_turned, turned)
     assert moved < 0.006 and moved < was_moved, (was_moved, moved)
@@ -197,7 +197,7 @@ def test_perturbed_cameras_are_found_again():
 
 
 def test_true_cameras_stay():
-    found = refine_cameras(BODY, "z", RIG, moments(in_time(), RIG), SEARCH, QUICK)
+    found = refine_cameras(BODY, RIG, moments(in_time(), RIG), SEARCH, QUICK)
     assert found.turn_deg.max() < 0.05 and found.move_m.max() < 0.004
     # the gauge: as a whole the cameras have neither moved nor grown
     weight = np.tile(np.repeat([1 / np.radians(TURN_DEG), 1 / MOVE_M], 3), len(RIG))
@@ -219,16 +219,14 @@ def test_focal_lengths_are_found():
             for c in RIG
         )
     )
-    found = refine_cameras(BODY, "z", wide, moments(in_time(), wide), SEARCH, replace(QUICK, focal=True))
+    found = refine_cameras(BODY, wide, moments(in_time(), wide), SEARCH, replace(QUICK, focal=True))
     assert found.focal[2] < 0.997 and np.abs(np.delete(found.focal, 2) - 1).max() < 0.004, found.focal
 
 
 @pytest.mark.parametrize("late", [(0, 0, 1, 0), (0, 0.4, 0, 0)])
 def test_late_videos_are_found(late):
     store = drawn(late)
-    done = refine_rig(
-        BODY, "z", RIG, store, np.arange(FRAMES), motion(), np.ones(FRAMES, bool), SilhouetteConfig(), QUICK
-    )
+    done = refine_rig(BODY, RIG, store, np.arange(FRAMES), motion(), np.ones(FRAMES, bool), SilhouetteConfig(), QUICK)
     assert done is not None
     np.testing.assert_allclose(done.refined.offset_frames, late, atol=0.12)
     assert (done.refined.offset_sigma_frames < 0.2).all()
@@ -238,16 +236,16 @@ def test_too_few_frames_are_said():
     usable = np.zeros(FRAMES, bool)
     usable[3:8] = True
     args = (np.arange(FRAMES), motion(), usable, SilhouetteConfig(), QUICK)
-    assert refine_rig(BODY, "z", RIG, in_time(), *args) is None
+    assert refine_rig(BODY, RIG, in_time(), *args) is None
 
 
 def test_the_agreement_names_the_camera_that_is_off():
-    fine = camera_agreement(BODY, "z", RIG, moments(in_time(), RIG), SEARCH)
+    fine = camera_agreement(BODY, RIG, moments(in_time(), RIG), SEARCH)
     assert not fine.astray.any() and not fine.late.any()
     one = Rig(tuple(astray(c, np.random.default_rng(5), 0.5, 0.0) if c.name == "c1" else c for c in RIG))
-    found = camera_agreement(BODY, "z", one, moments(in_time(), one), SEARCH)
+    found = camera_agreement(BODY, one, moments(in_time(), one), SEARCH)
     assert found.astray[1] and np.linalg.norm(found.shift_px, axis=1).argmax() == 1
-    late = camera_agreement(BODY, "z", RIG, moments(drawn((0, 0, 0, 1)), RIG), SEARCH)
+    late = camera_agreement(BODY, RIG, moments(drawn((0, 0, 0, 1)), RIG), SEARCH)
     assert late.late.tolist() == [False, False, False, True]
 
 

@@ -54,7 +54,7 @@ def found(poses: np.ndarray) -> np.ndarray:
     tracker = tracker_of()
     frames = [Observation(i, np.zeros(0, np.uint8), m) for i, m in enumerate(draw_silhouettes(BODY, RIG, poses))]
     poses = find_person(tracker, frames, [tracker.pyramid(frame) for frame in frames])[0].poses
-    return np.array([SKELETON.joints(pose) for pose in poses])
+    return tracker.world.points_out(SKELETON.joints(poses))
 
 
 def error(joints: np.ndarray, poses: np.ndarray) -> np.ndarray:
@@ -106,7 +106,8 @@ def test_of_two_ways_to_explain_the_opening_the_one_whose_own_body_explains_it_b
     ways = [Way(np.array([pose] * 4), error) for pose, error in ((wrong, 0.10), (right, 0.105))]
     monkeypatch.setattr("tk.trackers.contours.find_person", lambda *_: ways)
     tracker = tracker_of()
-    pose = tracker.find(frames, STATURE, None)
+    ways = [way._replace(poses=tracker.world.poses_in(way.poses)) for way in ways]
+    pose = tracker.world.poses_out(tracker.find(frames, STATURE, None))
     assert error(SKELETON.joints(pose)[None], right[None])[0] < 0.02
 
 

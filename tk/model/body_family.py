@@ -22,10 +22,10 @@ STATURE_DEVIATION = 0.03
 class Family:
     """The bodies about a given one: its dimensions and shapes may change, as in :mod:`tk.model.body_fit`."""
 
-    def __init__(self, body: ConeBody, up: str) -> None:
-        self._problem = Problem(body.preset, up, body.dimensions, STATURE_DEVIATION)
+    def __init__(self, body: ConeBody) -> None:
+        self._problem = Problem(body.preset, body.dimensions, STATURE_DEVIATION)
         self.start: Float = self._problem.mean.copy()
-        self.start[-SHAPE_NUMBERS * len(self._problem.groups) :] = shapes_of(body, up).ravel()
+        self.start[-SHAPE_NUMBERS * len(self._problem.groups) :] = shapes_of(body).ravel()
 
     def build(self, shared: Float) -> ConeBody:
         return self._problem.build(shared)
@@ -45,10 +45,10 @@ class Family:
         ]
 
 
-def shapes_of(body: ConeBody, up: str) -> Float:
+def shapes_of(body: ConeBody) -> Float:
     """(G, 8) what :meth:`ConeBody.reshaped` did to the body that its dimensions describe; zero where that is laid out
     in other parts."""
-    average = {part.name: part for part in build_cone_body(body.dimensions, up, body.preset).parts}
+    average = {part.name: part for part in build_cone_body(body.dimensions, preset=body.preset).parts}
     result = np.zeros((len(body.shape_groups), SHAPE_NUMBERS))
     for g, group in enumerate(body.shape_groups):
         # the right side is the left's mirror image

@@ -103,7 +103,6 @@ def fit_body(
     views: Views,
     pyramids: Sequence[Pyramid],
     poses: Float,
-    up: str,
     settings: SearchSettings,
     stature_m: float,
     config: BodyFitConfig | None = None,
@@ -115,7 +114,6 @@ def fit_body(
         views: the cameras.
         pyramids: F frames' silhouettes.
         poses: (F, D) their poses, close enough for the search to find the right edges.
-        up: the world axis that points up.
         settings: of the search.
         stature_m: the subject's height without shoes, given or measured.
         config: see :class:`BodyFitConfig`.
@@ -125,7 +123,7 @@ def fit_body(
     """
     config = config or BodyFitConfig()
     settings = replace(settings, spacing_px=_SPACING_PX)
-    problem = BodyProblem(preset, up, BodyDimensions.from_stature(stature_m), config.stature_deviation)
+    problem = BodyProblem(preset, BodyDimensions.from_stature(stature_m), config.stature_deviation)
     shared = problem.mean.copy()
     poses, start = np.array(poses), np.array(poses)
     K = len(shared)
@@ -172,10 +170,10 @@ def fit_body(
 class BodyProblem:
     """The family of bodies: 24 logarithms of dimensions, then 8 numbers for each group of parts."""
 
-    def __init__(self, preset: str, up: str, average: BodyDimensions, stature_deviation: float) -> None:
-        self.preset, self.up, self.average = preset, up, average
+    def __init__(self, preset: str, average: BodyDimensions, stature_deviation: float) -> None:
+        self.preset, self.average = preset, average
         self.stature_deviation = stature_deviation
-        self.groups = build_cone_body(average, up, preset).shape_groups
+        self.groups = build_cone_body(average, preset=preset).shape_groups
         shapes = [_SHAPES.get(name, _LIMB if name.endswith("_") else _TRUNK) for name in self.groups]
         logs = np.log([getattr(average, name) for name in _DIMENSIONS])
         self.mean = np.concatenate([logs, np.zeros(SHAPE_NUMBERS * len(self.groups))])
@@ -185,7 +183,7 @@ class BodyProblem:
         values = np.exp(shared[: len(_DIMENSIONS)])
         dimensions = BodyDimensions(**dict(zip(_DIMENSIONS, values.tolist(), strict=True)))
         change = shared[len(_DIMENSIONS) :].reshape(len(self.groups), SHAPE_NUMBERS)
-        return build_cone_body(dimensions, self.up, self.preset).reshaped(change)
+        return build_cone_body(dimensions, preset=self.preset).reshaped(change)
 
     def dimension_rows(self, shared: Float, poses: Float, seen: Sequence[Edgels]) -> list[Float]:
         """For each frame (N, 24): rows by the dimensions, by differences of the surface points."""

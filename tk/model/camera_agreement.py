@@ -75,13 +75,12 @@ class CameraAgreement:
 
 
 def camera_agreement(
-    body: ConeBody, up: str, rig: Rig, moments: Sequence[Moment], settings: SearchSettings | None = None
+    body: ConeBody, rig: Rig, moments: Sequence[Moment], settings: SearchSettings | None = None
 ) -> CameraAgreement:
     """How the cameras disagree over F frames of the tracked body, see the module.
 
     Args:
-        body: that was tracked.
-        up: the world axis that points up.
+        body: that was tracked, in a world in which z is up.
         rig: C cameras.
         moments: F frames, their poses and velocities, of :func:`tk.model.bundle.gather`; 24 that are spread over the
             recording are enough.
@@ -94,7 +93,7 @@ def camera_agreement(
         raise ValueError("no frames to compare the cameras in")
     settings = replace(settings or SearchSettings(), spacing_px=SPACING_PX, robust_px=ROBUST_PX)
     C = len(rig)
-    family = Family(body, up)
+    family = Family(body)
     poses = np.array([moment.pose for moment in moments])
     seen = look(body, rig, np.zeros(C), moments, poses, 0, settings)
     found = equations(body, rig, moments, poses, seen, ("shift", "offset"), family.rows(family.start, seen))

@@ -98,7 +98,6 @@ class Refined:
 
 def refine_cameras(
     body: ConeBody,
-    up: str,
     rig: Rig,
     moments: Sequence[Moment],
     settings: SearchSettings,
@@ -107,8 +106,7 @@ def refine_cameras(
     """Adjust C cameras to F frames; see the module.
 
     Args:
-        body: that was tracked.
-        up: the world axis that points up.
+        body: that was tracked, in a world in which z is up.
         rig: the cameras as calibrated.
         moments: the frames, with pyramids of at least ``config.scales`` scales.
         settings: of the search.
@@ -122,7 +120,7 @@ def refine_cameras(
     sigma = np.concatenate([np.full(KINDS[kind], sigmas[kind]) for kind in kinds])
     C, k = len(rig), len(sigma)
     cameras = slice(0, C * k)
-    family = Family(body, up)
+    family = Family(body)
     shared = family.start
     # what the cameras have changed by, to first order: the prior looks at it
     change, offsets = np.zeros((C, k)), np.zeros(C)

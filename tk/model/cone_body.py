@@ -27,7 +27,7 @@ from tk.model.anthropometry import (
     PELVIS_FORWARD,
     BodyDimensions,
 )
-from tk.model.skeleton import SEGMENTS, Skeleton, build_skeleton
+from tk.model.skeleton import SEGMENTS, Skeleton, build_skeleton, up_rotation
 
 Float = NDArray[np.float64]
 
@@ -133,6 +133,12 @@ class ConeBody:
     skeleton: Skeleton
     parts: tuple[ConePart, ...]
     preset: str = "full"
+
+    def standing(self, up: str) -> ConeBody:
+        """The same body in a world in which ``up`` (see :func:`tk.model.up.up_vector`) points up."""
+        if np.array_equal(self.skeleton.T_world_body, up_rotation(up)):
+            return self
+        return replace(self, skeleton=_skeleton(self.dimensions, up, self.preset))
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
@@ -310,8 +316,12 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
             parts.append(_limb(f"thigh_{side}", hip, -z, d.thigh, d.thigh_radius, d.knee_radius, x))
             reach = d.calf + d.ankle_height
             parts.append(_limb(f"calf_{side}", knee, -z, reach, d.knee_radius, d.ankle_radius, x, (False, True)))
+    return ConeBody(d, _skeleton(d, up, preset), tuple(parts), preset)
+
+
+def _skeleton(dimensions: BodyDimensions, up: str, preset: str) -> Skeleton:
     full = preset == "full"
-    return ConeBody(d, build_skeleton(d, up, waist=full, ankles=full), tuple(parts), preset)
+    return build_skeleton(dimensions, up, waist=full, ankles=full)
 
 
 def _calf(side: str, knee: Float, ankle: Float, d: BodyDimensions) -> list[ConePart]:

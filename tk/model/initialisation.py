@@ -17,6 +17,7 @@ from tk.model.anthropometry import (
 )
 from tk.model.gait import neutral_pose
 from tk.model.skeleton import JOINTS, build_skeleton, shoulder_angles
+from tk.model.world import World
 
 Float = NDArray[np.float64]
 
@@ -25,30 +26,30 @@ LEAST_STATURE, GREATEST_STATURE = 0.8, 2.4
 
 
 def rough_pose(
-    joints: dict[str, Float], angles: dict[str, float], height_m: float | None, up: str
+    joints: dict[str, Float], angles: dict[str, float], height_m: float | None, world: World
 ) -> tuple[BodyDimensions, Float]:
-    """Average body and pose from what a person wrote down.
+    """Average body, and its pose in the cameras' own world, from what a person wrote down in the capture's.
 
     Args:
         joints: name → (3,) metres of some joints; or empty.
         angles: name → value of some entries of the configuration vector (radians, metres); or empty.
         height_m: the subject's height; without it, the joints' distances tell, else 1.72 m.
-        up: the world axis that points up.
+        world: the cameras'.
 
     Returns:
         Dimensions and pose (D,).
     """
     stature = height_m or _stature_of(joints) or 1.72
     dimensions = BodyDimensions.from_stature(stature)
-    skeleton = build_skeleton(dimensions, up)
+    skeleton = build_skeleton(dimensions)
     pose = np.zeros(len(skeleton.names))
     if angles:
         pose = neutral_pose(skeleton)
         for name, value in angles.items():
             pose[skeleton.index(name)] = value
-        return dimensions, skeleton.clip(pose)
+        return dimensions, world.poses_in(skeleton.clip(pose))
     rows = [JOINTS.index(name) for name in joints]
-    targets = np.array([joints[name] for name in joints])
+    targets = world.points_in(list(joints.values()))
 
     def residual(p: Float) -> Float:
         # a little weight on plain angles settles what the joints leave open

@@ -74,7 +74,7 @@ class Estimate:
 
 
 class Tracker(Protocol):
-    """Follows one person from frame to frame."""
+    """Follows one person from frame to frame. Poses are those of the capture's world, but for the state's."""
 
     method: str
     stages: tuple[str, ...]

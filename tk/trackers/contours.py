@@ -28,9 +28,10 @@ from tk.model.limbs import Limb, distinct, limbs_of, pairs
 from tk.model.part_colors import PartColors
 from tk.model.silhouettes import CleaningConfig, Pyramid, Views
 from tk.model.skeleton import ANKLES, WAIST, build_skeleton, join_pose, split_pose
+from tk.model.world import World
 from tk.optim import gauss_newton
 from tk.optim.gauss_newton import Descent, GaussNewtonConfig, Prior
-from tk.trackers.base import Observation
+from tk.trackers.base import Estimate, Observation
 from tk.trackers.start import HEADINGS, PHASES, Way, centroid, find_person, stature_of
 
 Float = NDArray[np.float64]
@@ -105,19 +106,23 @@ class SilhouetteConfig:
 class ContourTracker:
     """The person, the body and the descent; what a frame's way is, a subclass says.
 
+    It counts in a world of its own: there stands :attr:`body`, and there are all poses but those that the protocol of
+    :class:`~tk.trackers.base.Tracker` hands in and out, which are the capture's.
+
     Args:
         rig: the cameras.
-        up: the world axis that points up.
+        up: what points up in their world, see :func:`tk.model.up.up_vector`.
         config: see :class:`SilhouetteConfig`.
     """
 
     def __init__(self, rig: Rig, up: str, config: SilhouetteConfig) -> None:
         self.contours = config
-        self.up = up
-        self.views = Views(rig)
-        self.screen, self.choice = RayGrid(rig, SCREEN_ROWS), RayGrid(rig, CHOICE_ROWS)
+        self.rig, self.up = rig, up
+        self.world = World.of(rig, up)
+        self.views = Views(self.world.rig)
+        self.screen, self.choice = (RayGrid(self.world.rig, rows) for rows in (SCREEN_ROWS, CHOICE_ROWS))
         full = config.body == "full"
-        skeleton = build_skeleton(BodyDimensions.from_stature(1.7), up, waist=full, ankles=full)
+        skeleton = build_skeleton(BodyDimensions.from_stature(1.7), waist=full, ankles=full)
         paper = np.flatnonzero(skeleton.is_paper)
         self.pose_names = tuple(skeleton.names[k] for k in paper)
         self.pose_units = tuple(skeleton.units[k] for k in paper)
@@ -135,22 +140,23 @@ class ContourTracker:
 
     @property
     def body(self) -> ConeBody:
-        """The body; only after :meth:`start` or :meth:`restore`."""
+        """The body, as it stands in the tracker's own world; only after :meth:`start` or :meth:`restore`."""
         if self._body is None:
             raise RuntimeError("the tracker has no body yet: call start() or restore() first")
         return self._body
 
     def take_body(self, body: ConeBody) -> None:
-        """Track this body from now on; the colours of its parts are kept where there are any."""
+        """Track this body from now on, whichever world it stands in; the colours of its parts are kept where there are
+        any."""
         known = self.colors.state() if self._body is not None else {}
-        self._body = body
+        self._body = body = body.standing("z")
         self.colors = PartColors(body)
         self.colors.restore(known)
         self.limbs = limbs_of(body)
 
     def prepare(self) -> None:
         """Have the kernels compiled while there is nothing else to do. Without it that is done where one is needed."""
-        body = build_cone_body(BodyDimensions.from_stature(1.7), self.up, self.contours.body)
+        body = build_cone_body(BodyDimensions.from_stature(1.7), preset=self.contours.body)
         empty = np.zeros((len(self.views.rig), *self.views.rig.frame_shape), np.uint8)
         pose = np.zeros((1, len(body.skeleton.names)))
         self.views.equations(body.arrays, self.views.pyramid(empty, 1, None), pose, 0, self.contours.search)
@@ -166,7 +172,8 @@ class ContourTracker:
         Args:
             frames: consecutive observations from the initial one on, at least one; better a whole stride.
             height_m: the subject's height, if known.
-            init: a rough pose given by a person; None tries walking phases, standing and the Da Vinci pose.
+            init: a rough pose given by a person, in the capture's world; None tries walking phases, standing and the Da
+                Vinci pose.
             body: the body, if known; it is not fitted then.
 
         Raises:
@@ -180,8 +187,8 @@ class ContourTracker:
             centroid(self.views.rig, pyramids[0], frames[0].index)  # or nobody is there, and no body is taken
             average = BodyDimensions.from_stature(stature or stature_of(self, pyramids))
         else:
-            average, angles = rough_pose(init.joints, init.angles, stature, self.up)
-        self.take_body(body or build_cone_body(average, self.up, preset))
+            average, angles = rough_pose(init.joints, init.angles, stature, self.world)
+        self.take_body(body or build_cone_body(average, preset=preset))
         if init is not None:
             unknown = np.zeros(len(self.waist_names)), np.zeros(len(self.ankle_names))
             rough = self.settle(pyramids[0], join_pose(self.body.skeleton, angles, *unknown)[None]).states[0]
@@ -234,7 +241,7 @@ class ContourTracker:
         """The body that suits the chosen ones of several frames, and their poses."""
         seen = [pyramids[i] for i in chosen]
         contours = self.contours
-        return fit_body(contours.body, self.views, seen, poses[chosen], self.up, contours.search, stature, config)
+        return fit_body(contours.body, self.views, seen, poses[chosen], contours.search, stature, config)
 
     def start(
         self,
@@ -245,6 +252,19 @@ class ContourTracker:
     ) -> None:
         """Find the subject in the first frame; what is kept of it, a subclass says."""
         self.find(frames, height_m, init, body)
+
+    def state(self) -> Mapping[str, Any]:
+        """What :meth:`restore` needs beside the model to go on from the last frame.
+
+        Its poses are those of the tracker's own world, for turned out and in again they would not be the same bit for
+        bit; ``world`` (3, 4) is the way from there to the capture's.
+        """
+        return {"world": np.column_stack([self.world.rotation, self.world.origin])}
+
+    def poses_of(self, state: Mapping[str, Any], name: str) -> Float:
+        """Poses that a state tells; results of before told those of the capture's world."""
+        poses = np.asarray(state[name])
+        return poses if "world" in state else self.world.poses_in(poses)
 
     def lose(self) -> None:
         """The last frame's pose is not believed: the person is looked for in the next one."""
@@ -403,10 +423,15 @@ class ContourTracker:
         return (settled[i], float(errors[i])) if errors[i] < error else (pose, error)
 
     def told(self, pose: Float) -> dict[str, Any]:
-        """A pose (D,) as an :class:`~tk.trackers.base.Estimate` tells it."""
-        skeleton = self.body.skeleton
-        paper, waist, ankles = split_pose(skeleton, pose)
-        return {"pose": paper, "waist": waist, "ankles": ankles, "joints": skeleton.joints(pose)}
+        """A pose (D,) as an :class:`~tk.trackers.base.Estimate` tells it, in the capture's world."""
+        skeleton, world = self.body.skeleton, self.world
+        paper, waist, ankles = split_pose(skeleton, world.poses_out(pose))
+        return {"pose": paper, "waist": waist, "ankles": ankles, "joints": world.points_out(skeleton.joints(pose))}
+
+    def pose_of(self, estimate: Estimate) -> Float:
+        """(D,) the inverse of :meth:`told`."""
+        whole = join_pose(self.body.skeleton, estimate.pose, estimate.waist, estimate.ankles)
+        return self.world.poses_in(whole)
 
     # --- what a result file keeps -------------------------------------------------------------------------------
 
@@ -430,7 +455,7 @@ def restore_dimensions(model: Mapping[str, Any]) -> BodyDimensions:
     return BodyDimensions(**{k[len(prefix) :]: float(v) for k, v in model.items() if k.startswith(prefix)})
 
 
-def restore_body(model: Mapping[str, Any], up: str) -> ConeBody:
+def restore_body(model: Mapping[str, Any], up: str = "z") -> ConeBody:
     """The body that :meth:`ContourTracker.model` wrote down."""
     body = build_cone_body(restore_dimensions(model), up, str(model["body"]))
     # parts as they were written down: other versions of this program may lay the body out in other ones

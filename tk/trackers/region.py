@@ -370,21 +370,22 @@ class RegionTracker(ContourTracker):
 
         Args:
             masks: (C, H, W) of F frames.
-            poses: (F, D) of the first pass.
+            poses: (F, D) of the first pass, in the capture's world.
             lost: (F,) bool; such frames neither teach nor change.
             error: (F, C) E_S of the first pass; NaN where a camera was left out, and is again.
             height_m: the subject's height, if known.
             keep_body: leave the body as it is.
 
         Returns:
-            Poses (F, D), E_S (F, C), and one standard deviation (F, 15) of the joints' positions along an axis, metres,
-            0 in lost frames. The tracker has the new body.
+            Poses (F, D) in the capture's world, E_S (F, C), and one standard deviation (F, 15) of the joints' positions
+            along an axis, metres, 0 in lost frames. The tracker has the new body.
         """
         cleaning = self.contours.cleaning
+        given, poses = poses, self.world.poses_in(poses)
         tracked = np.flatnonzero(~lost)
         variance = np.zeros((len(poses), len(JOINTS)))
         if not len(tracked):
-            return poses, error, variance
+            return given, error, variance
 
         def believed(i: int) -> NDArray[np.uint8]:
             shown, out = masks[i], np.isnan(error[i])
@@ -434,7 +435,7 @@ class RegionTracker(ContourTracker):
             variance[i] += _disagreement(body.skeleton, both, np.array([0.0, later.cost]))
         usual = np.median(directions(self.body.skeleton, result[tracked]), axis=0)
         variance[tracked] += posture_variance(self.body.skeleton, result[tracked], usual)
-        return result, errors, np.sqrt(variance)
+        return np.where(lost[:, None], given, self.world.poses_out(result)), errors, np.sqrt(variance)
 
     def _backwards(self, later: Hypothesis, poses: Float, cost: Float) -> Hypothesis | None:
         """The hypothesis that comes from the frame after, by what it costs more than that frame's own pose; both are at
@@ -467,6 +468,7 @@ class RegionTracker(ContourTracker):
     def state(self) -> Mapping[str, Any]:
         """What :meth:`restore` needs beside the model to go on from the last frame."""
         return {
+            **super().state(),
             "poses": np.array([h.pose for h in self._alive]),
             "previous": np.array([h.previous for h in self._alive]),
             "costs": np.array([h.cost for h in self._alive]),
@@ -484,10 +486,11 @@ class RegionTracker(ContourTracker):
 
     def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
         """Take up where a run with this model and state stopped."""
-        self.take_body(restore_body(model, self.up))
-        jumped = state.get("jumped", np.zeros(len(state["poses"]), np.bool_))  # results of before have none
-        rows = zip(state["poses"], state["previous"], state["costs"], state["ages"], jumped, strict=True)
-        self._alive = [Hypothesis(np.asarray(p), np.asarray(q), float(c), int(a), bool(j)) for p, q, c, a, j in rows]
+        self.take_body(restore_body(model))
+        poses, previous = (self.poses_of(state, name) for name in ("poses", "previous"))
+        jumped = state.get("jumped", np.zeros(len(poses), np.bool_))  # results of before have none
+        rows = zip(poses, previous, state["costs"], state["ages"], jumped, strict=True)
+        self._alive = [Hypothesis(p, q, float(c), int(a), bool(j)) for p, q, c, a, j in rows]
         self._usual = float(state["usual"])
         self._sound = float(state.get("sound", self._usual))  # results of before have none
         self._usual_posture = np.array(state["usual_posture"], np.float64)

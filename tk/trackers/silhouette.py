@@ -87,12 +87,11 @@ class SilhouetteTracker(ContourTracker):
 
     def state(self) -> Mapping[str, Any]:
         """What :meth:`restore` needs beside the model to go on from the last frame."""
-        return {"pose": self._pose, "previous": self._previous, "lost_for": self._lost_for}
+        return {**super().state(), "pose": self._pose, "previous": self._previous, "lost_for": self._lost_for}
 
     def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
         """Take up where a run with this model and state stopped."""
-        self.take_body(restore_body(model, self.up))
-        self._pose = np.asarray(state["pose"])
-        self._previous = np.asarray(state["previous"])
+        self.take_body(restore_body(model))
+        self._pose, self._previous = (self.poses_of(state, name) for name in ("pose", "previous"))
         self._lost_for = int(state["lost_for"])
         self._fresh = False

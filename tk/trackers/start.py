@@ -239,7 +239,7 @@ def stature_of(tracker: ContourTracker, pyramids: Sequence[Pyramid]) -> float:
     Areas hardly change when somebody bends or raises the arms, as the silhouette's height does; girth and clothes make
     it err by 6 %. The median over the views of all frames, against the mean area of hanging and of spread arms.
     """
-    body: ConeBody = build_cone_body(BodyDimensions.from_stature(_AVERAGE_M), tracker.up, tracker.contours.body)
+    body: ConeBody = build_cone_body(BodyDimensions.from_stature(_AVERAGE_M), preset=tracker.contours.body)
     group = np.zeros(len(body.parts), np.int32)
     ratios: list[Float] = []
     for pyramid in pyramids:

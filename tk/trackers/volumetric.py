@@ -157,7 +157,7 @@ class VolumetricTracker:
                 "the calibration and the working volume ([volume] of capture.toml)"
             )
         self._lay_skin()
-        paper, waist, _ = split_pose(self.body.skeleton, pose)
+        paper, waist, _ = split_pose(self.body.skeleton, self._finder.world.poses_out(pose))
         self._pose = self._previous = join_pose(self.skin.skeleton, paper, waist[: len(self.waist_names)], NO_ANGLES)
         index = self._index(surface, np.full(len(surface), -1, np.int64))
         fit = FrameObjective(self._objective, index, np.random.default_rng(0), images=first.images).fit(self._pose)
@@ -237,7 +237,7 @@ class VolumetricTracker:
     @property
     def body(self) -> ConeBody:
         """The fitted body; only after :meth:`start` or :meth:`restore`."""
-        return self._finder.body
+        return self._finder.body.standing(self.up)
 
     def _starts(self, surface: HullSurface) -> Float:
         """(S, D) where the search may begin."""
@@ -323,7 +323,7 @@ class VolumetricTracker:
 
     def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
         """Take up where a run with this model and state stopped."""
-        self._finder.take_body(restore_body(model, self.up))
+        self._finder.take_body(restore_body(model))
         self._lay_skin()
         initial = np.asarray(model["patches/mean_yuv"])
         learned = Appearance(

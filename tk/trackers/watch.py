@@ -30,7 +30,7 @@ from tk.model.evidence import Evidence
 from tk.model.mask_agreement import MaskAgreement
 from tk.model.picture_health import PictureHealth, described
 from tk.model.plausibility import Plausibility, check_extent, check_stature
-from tk.model.skeleton import JOINTS, join_pose
+from tk.model.skeleton import JOINTS
 from tk.trackers.base import Estimate, Observation, Tracker
 from tk.trackers.contours import ContourTracker
 
@@ -218,7 +218,7 @@ class Watch:
         """
         tracker = self.tracker
         assert isinstance(tracker, ContourTracker)
-        pose = join_pose(tracker.body.skeleton, estimate.pose, estimate.waist, estimate.ankles)
+        pose = tracker.pose_of(estimate)
         masks = frame.masks
         if estimate.masks is not None:  # what it took for the person, where it had the camera
             had = np.asarray(estimate.masks.any(axis=(1, 2)))
