@@ -29,8 +29,7 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-# Headings and walking phases that are tried, counted from the direction to a camera, so that the result does not depend
-# on how the world lies.
+# Headings and walking phases that are tried.
 HEADINGS, PHASES = 8, 8
 # Of what they settle to, so many different poses are finished by a search for the limbs: of the best heading, and of
 # those that face the other way; with joints that far apart on an average, metres.
@@ -126,10 +125,9 @@ def _is_on(skeleton: Skeleton, ways: Sequence[Way], frame: int, pose: Float) -> 
 def _find(tracker: ContourTracker, frame: Observation, pyramid: Pyramid) -> tuple[float, list[Float]]:
     """E_S of the pose (D,) that explains a frame best; the pose, and others that are nearly as good: one that faces the
     other way, and those that few cameras cannot tell from it."""
-    skeleton, rig = tracker.body.skeleton, tracker.views.rig
-    p_centroid = centroid(rig, pyramid, frame.index)
-    first = _heading_of_camera(skeleton, rig, p_centroid)
-    settled = tracker.settle(pyramid, gait.hypotheses(skeleton, HEADINGS, PHASES, p_centroid, first)).states
+    skeleton = tracker.body.skeleton
+    p_centroid = centroid(tracker.views.rig, pyramid, frame.index)
+    settled = tracker.settle(pyramid, gait.hypotheses(skeleton, HEADINGS, PHASES, p_centroid)).states
     order = settled[np.argsort(tracker.fit_error(pyramid, settled, frame.doubtful), kind="stable")]
     turned = _turned(skeleton, order, order[0])
     finalists = np.array(_distinct(skeleton, order, FINALISTS) + _distinct(skeleton, order[turned], OPPOSITE))
@@ -200,13 +198,6 @@ def _turned(skeleton: Skeleton, poses: Float, pose: Float) -> NDArray[np.bool_]:
     """(B,) whether poses (B, D) face away from where ``pose`` (D,) does, by more than a right angle."""
     yaw = skeleton.index("torso_yaw")
     return np.asarray(np.cos(poses[:, yaw] - pose[yaw]) < 0)
-
-
-def _heading_of_camera(skeleton: Skeleton, rig: Rig, p_person: Float) -> float:
-    """The heading, radians, of somebody at ``p_person`` (3,) who looks at the camera that is farthest off sideways."""
-    toward = (rig.centers - p_person) @ skeleton.T_world_body
-    x, y = toward[int(np.argmax(np.linalg.norm(toward[:, :2], axis=1))), :2]
-    return float(np.arctan2(y, x))
 
 
 def centroid(rig: Rig, pyramid: Pyramid, index: int) -> Float:
