@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from tk.kernels.kinematics import load_rotation, load_translation
 from tk.kernels.runtime import ti
+from tk.kernels.vectors import product, times
 
 # Nearer than this to a camera nothing is projected, metres.
 NEAREST_M = 0.1
@@ -52,7 +53,7 @@ def place_part(frames: ti.template(), part_dof: ti.template(), part_frame: ti.te
     R0 = ti.Matrix([[part_frame[p, 4 * i + j] for j in ti.static(range(3))] for i in ti.static(range(3))])
     t0 = ti.Vector([part_frame[p, 4 * i + 3] for i in ti.static(range(3))])
     R = load_rotation(frames, b, part_dof[p])
-    return R @ R0, R @ t0 + load_translation(frames, b, part_dof[p])
+    return product(R, R0), times(R, t0) + load_translation(frames, b, part_dof[p])
 
 
 @ti.func

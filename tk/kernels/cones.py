@@ -12,6 +12,7 @@ A curve is one of these pieces; u in [0, 1] runs along it.
 """
 
 from tk.kernels.runtime import ti
+from tk.kernels.vectors import cross, dot, norm_sqr
 
 CONE, ELLIPSOID = 0, 1
 # kinds of curves: the two generators, the rims at z = 0 and z = h, the outline of an ellipsoid
@@ -28,7 +29,7 @@ def curve_of(kind: int, shape, c):
     visible = 1
     if kind == OUTLINE:
         s = ti.Vector([c[0] / shape[0], c[1] / shape[1], c[2] / shape[2]])
-        if s.norm_sqr() <= 1.0:
+        if norm_sqr(s) <= 1.0:
             visible = 0
     else:
         x, y = c[0] / shape[0], c[1] / shape[1]
@@ -69,7 +70,7 @@ def point_on(kind: int, shape, c, q, u):
     if kind == OUTLINE:
         radii = ti.Vector([shape[0], shape[1], shape[2]])
         s = c / radii
-        k = s.norm()
+        k = ti.sqrt(norm_sqr(s))
         e3 = s / k
         # a direction across e3: from the coordinate axis that is farthest from it
         axis = c * 0.0
@@ -77,8 +78,9 @@ def point_on(kind: int, shape, c, q, u):
             axis[2] += 1.0
         else:
             axis[0] += 1.0
-        e1 = axis.cross(e3).normalized()
-        e2 = e3.cross(e1)
+        e1 = cross(axis, e3)
+        e1 /= ti.sqrt(norm_sqr(e1))
+        e2 = cross(e3, e1)
         r = ti.sqrt(ti.max(1.0 - 1.0 / (k * k), 0.0))
         angle = 6.28318530717959 * u
         x = radii * (e3 / k + r * (ti.cos(angle) * e1 + ti.sin(angle) * e2))
@@ -136,9 +138,9 @@ def enter(part_kind: int, shape, c, d, shrink):
     result = -1.0 + 0.0 * d[0]
     middle = interior_point(part_kind, shape) - c
     reach = enclosing_radius(part_kind, shape)
-    along = middle.dot(d)
-    dd = d.norm_sqr()
-    if along > 0.0 and middle.norm_sqr() * dd - along * along < reach * reach * dd:
+    along = dot(middle, d)
+    dd = norm_sqr(d)
+    if along > 0.0 and norm_sqr(middle) * dd - along * along < reach * reach * dd:
         size = extent(part_kind, shape, shrink)
         result = enter_unit(part_kind, shape[3], c / size, d / size)
     return result

@@ -12,6 +12,7 @@ over the horizontal in the trunk's frame, which its own angle and the next one m
 import numpy as np
 
 from tk.kernels.runtime import ti
+from tk.kernels.vectors import cross, norm_sqr, product, times
 
 # The arm's elevation u from a shoulder's first two angles, the arm being level in the zero configuration:
 # u = ARM_UP[0] cos(second) sin(first) + ARM_UP[1] sin(second).
@@ -79,7 +80,7 @@ def rodrigues(w, angle):
     eye = ti.Matrix(
         [[1.0 + 0.0 * s, 0.0 * s, 0.0 * s], [0.0 * s, 1.0 + 0.0 * s, 0.0 * s], [0.0 * s, 0.0 * s, 1.0 + 0.0 * s]]
     )
-    return eye + s * K + (1.0 - c) * (K @ K)
+    return eye + s * K + (1.0 - c) * product(K, K)
 
 
 @ti.func
@@ -106,14 +107,14 @@ def _move(
     if up >= 0:
         R = load_rotation(frames, c, up)
         t = load_translation(frames, c, up)
-    w_world = R @ w
-    q_world = R @ q + t
+    w_world = times(R, w)
+    q_world = times(R, q) + t
     rate = q_world * zero
     if rise[0] != 0.0 or rise[1] != 0.0 or rise[2] != 0.0:
         second = ti.select(first == k, k + 1, k)
-        lifted = R @ rise
+        lifted = times(R, rise)
         if first != k and above >= 0:
-            lifted = load_rotation(frames, c, above) @ rise
+            lifted = times(load_rotation(frames, c, above), rise)
         # of the pose's precision, which a literal need not have
         a, d = -ti.sqrt((zero + 2.0) / 3.0), ti.sqrt((zero + 1.0) / 3.0)
         s1, c1 = ti.sin(pose[b, first]), ti.cos(pose[b, first])
@@ -128,9 +129,9 @@ def _move(
         t += w_world * pose[b, k]
         w_world = w_world * 0.0
     else:
-        R = R @ rodrigues(w, pose[b, k])
-        t = q_world - R @ q
-        v_world = q_world.cross(w_world) + rate
+        R = product(R, rodrigues(w, pose[b, k]))
+        t = q_world - times(R, q)
+        v_world = cross(q_world, w_world) + rate
     for i in ti.static(range(3)):
         for j in ti.static(range(3)):
             frames[c, k, 4 * i + j] = R[i, j]
@@ -154,7 +155,7 @@ def forward_tree(
         rise = _load_columns(tree, k, TREE_RISE)
         if up >= 0:
             its = _load_columns(tree, up, TREE_RISE)
-            if its.norm_sqr() > 0.0:
+            if norm_sqr(its) > 0.0:
                 first, rise = up, its
         _move(
             _load_columns(tree, k, 0), _load_columns(tree, k, TREE_POINT), ti.cast(tree[k, TREE_PRISMATIC], ti.i32),
@@ -185,7 +186,7 @@ def forward(
             rise = _load_columns(point, k, RISE)
             if up >= 0:
                 its = _load_columns(point, up, RISE)
-                if its.norm_sqr() > 0.0:
+                if norm_sqr(its) > 0.0:
                     first, rise = up, its
         _move(
             load_vector3(axis, k), load_vector3(point, k), prismatic[k],
@@ -197,4 +198,4 @@ def forward(
 def point_velocity(prismatic: ti.template(), twists: ti.template(), c: int, k: int, x):
     """∂x/∂p_k of a point x below degree of freedom k (silhouette paper, eq. 6)."""
     w = ti.Vector([twists[c, k, 0], twists[c, k, 1], twists[c, k, 2]])
-    return w.cross(x) + ti.Vector([twists[c, k, 3], twists[c, k, 4], twists[c, k, 5]])
+    return cross(w, x) + ti.Vector([twists[c, k, 3], twists[c, k, 4], twists[c, k, 5]])

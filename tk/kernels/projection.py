@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.runtime import ti
+from tk.kernels.vectors import product, times, transposed_times
 
 CAMERA_NUMBERS = 22
 
@@ -41,7 +42,7 @@ def camera_center(camera: ti.template(), v: int):
     """(3,) centre of projection of camera v, world frame."""
     R = ti.Matrix([[camera[v, 3 * i + j] for j in ti.static(range(3))] for i in ti.static(range(3))])
     t = ti.Vector([camera[v, 9 + i] for i in ti.static(range(3))])
-    return -(R.transpose() @ t)
+    return -transposed_times(R, t)
 
 
 @ti.func
@@ -49,7 +50,7 @@ def project(camera: ti.template(), v: int, x):
     """Pixel (2,), its derivative (2, 3) by the world point, depth. Behind the camera only the depth is valid."""
     R = ti.Matrix([[camera[v, 3 * i + j] for j in ti.static(range(3))] for i in ti.static(range(3))])
     t = ti.Vector([camera[v, 9 + i] for i in ti.static(range(3))])
-    p = R @ x + t
+    p = times(R, x) + t
     z = p[2]
     inverse = 1.0 / z
     a, b = p[0] * inverse, p[1] * inverse
@@ -84,4 +85,4 @@ def project(camera: ti.template(), v: int, x):
             [fy * D01 * inverse, fy * D11 * inverse, -fy * (D01 * a + D11 * b) * inverse],
         ]
     )
-    return pixel, J @ R, z
+    return pixel, product(J, R), z

@@ -16,17 +16,18 @@ from numpy.typing import NDArray
 
 from tk.kernels.cone_arrays import NEAREST_M, ConeArrays, keep, place_part, shape_of
 from tk.kernels.cones import capsule, enter_unit, extent, interior_point
-from tk.kernels.kinematics import forward, load_rotation
+from tk.kernels.kinematics import forward, load_rotation, load_translation
 from tk.kernels.launch import Launcher
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
+from tk.kernels.vectors import norm_sqr, times
 
 # How much larger than to first order spheres are taken in the pictures when rays are cast; and how many times as much
 # as its middle a distorted axis lies beside the chord anywhere.
 MARGIN, BEND = 1.1, 1.5
 # Columns of a part's outline in a picture: its beginning, its axis, the radius and, across the axis, that radius; then
-# where the camera is in the unit part.
-_BEGIN, _AXIS, _RADIUS, _ACROSS, _ORIGIN, _COLUMNS = 0, 2, 4, 5, 7, 10
+# where the camera is in the unit part, and the pixel of the part's middle.
+_BEGIN, _AXIS, _RADIUS, _ACROSS, _ORIGIN, _MIDDLE, _COLUMNS = 0, 2, 4, 5, 7, 10, 12
 # Depth of a ray that meets nothing.
 FAR = 1e9
 
@@ -66,7 +67,7 @@ def _in_row(outline: ti.template(), b: int, v: int, p: int, y: int):
 
 
 @functools.cache
-def _cast_kernel(real):
+def _cast_kernel(real, alone):
     @ti.kernel
     def cast_rows(
         axis: ti.types.ndarray(dtype=real, ndim=2),  # (D, 3)
@@ -104,56 +105,66 @@ def _cast_kernel(real):
         B, V, H, W = pose.shape[0], rays.shape[0], rays.shape[1], rays.shape[2]
         K = drawn.shape[0]
         # a pose is one thread's, see tk.kernels.silhouette
+        ti.loop_config(serialize=alone)
         for turn in range(spread * B):
             if turn % spread != 0:
                 continue
             b = turn // spread
             forward(axis, point, prismatic, parent, chain, pose, b, b, frames, twists)
             out, seen = ti.cast(0.0, real), ti.cast(1e-6, real)
-            for k in range(drawn.shape[0]):
+            for k in range(K):
                 p = drawn[k]
                 R, t = place_part(frames, part_dof, part_frame, b, p)
                 shape = shape_of(part_shape, p)
                 size = extent(part_kind[p], shape, 1.0)
                 M = ti.Matrix([[R[j, i] / size[i] for j in ti.static(range(3))] for i in ti.static(range(3))])
                 keep(placed, b, p, M, t)
-                # what holds the part in each picture: most pixels are far from most parts
-                middle = R @ interior_point(part_kind[p], shape) + t
-                z0, z1, reach = capsule(part_kind[p], shape)
-                axis_p = ti.Vector([R[i, 2] for i in ti.static(range(3))])
+                middle = times(R, interior_point(part_kind[p], shape)) + t
                 for v in range(V):
-                    begin, J0, depth0 = project(camera, v, t + z0 * axis_p)
-                    end, J1, depth1 = project(camera, v, t + z1 * axis_p)
+                    pixel, _, depth_m = project(camera, v, middle)
+                    outline[b, v, p, _MIDDLE], outline[b, v, p, _MIDDLE + 1] = pixel[0], pixel[1]
+                    i = ti.cast(ti.round((pixel[0] - step // 2) / step), ti.i32)
+                    j = ti.cast(ti.round((pixel[1] - step // 2) / step), ti.i32)
+                    if depth_m > NEAREST_M and i >= 0 and j >= 0 and i < W and j < H:
+                        out += ti.cast(ti.max(cost[v, j, i, group[p] + 1] - cost[v, j, i, 0], 0.0), real)
+                        seen += 1.0
+            outside[b] = out / seen
+            if outside[b] > most_outside:
+                continue
+            # what holds each part in each picture: most pixels are far from most parts
+            for k in range(K):
+                p = drawn[k]
+                shape = shape_of(part_shape, p)
+                size = extent(part_kind[p], shape, 1.0)
+                M, t = load_rotation(placed, b, p), load_translation(placed, b, p)
+                z0, z1, reach = capsule(part_kind[p], shape)
+                along_part = ti.Vector([M[2, i] * size[2] for i in ti.static(range(3))])
+                for v in range(V):
+                    begin, J0, depth0 = project(camera, v, t + z0 * along_part)
+                    end, J1, depth1 = project(camera, v, t + z1 * along_part)
                     radius = 0.0 * depth0
                     nearest, farthest = ti.min(depth0, depth1), ti.max(depth0, depth1)
                     if nearest > 1.5 * reach + NEAREST_M:
                         # the Frobenius norm of the derivative is at least its growth in any direction
                         growth = ti.max(J0.norm() * depth0 / (depth0 - reach), J1.norm() * depth1 / (depth1 - reach))
-                        pixel, _, _ = project(camera, v, middle)
                         chord = end - begin
-                        aside = ti.abs(chord.cross(pixel - begin)) / ti.max(chord.norm(), 1e-6)
+                        x = outline[b, v, p, _MIDDLE] - begin[0]
+                        y = outline[b, v, p, _MIDDLE + 1] - begin[1]
+                        aside = ti.abs(chord[0] * y - chord[1] * x) / ti.max(chord.norm(), 1e-6)
                         radius = MARGIN * growth * reach + BEND * aside
-                        i = ti.cast(ti.round((pixel[0] - step // 2) / step), ti.i32)
-                        j = ti.cast(ti.round((pixel[1] - step // 2) / step), ti.i32)
-                        if i >= 0 and j >= 0 and i < W and j < H:
-                            out += ti.cast(ti.max(cost[v, j, i, group[p] + 1] - cost[v, j, i, 0], 0.0), real)
-                            seen += 1.0
                     elif farthest > -reach:
                         radius = 1e6 + 0.0 * radius
                         begin *= 0.0
                         end = begin
                     along = end - begin
                     across = radius / ti.max(along.norm(), 1e-6)
-                    origin = M @ (camera_center(camera, v) - t)
+                    origin = times(M, camera_center(camera, v) - t)
                     outline[b, v, p, _RADIUS] = radius
                     outline[b, v, p, _ACROSS], outline[b, v, p, _ACROSS + 1] = across * along[1], -across * along[0]
                     for a in ti.static(range(2)):
                         outline[b, v, p, _BEGIN + a], outline[b, v, p, _AXIS + a] = begin[a], along[a]
                     for a in ti.static(range(3)):
                         outline[b, v, p, _ORIGIN + a] = origin[a]
-            outside[b] = out / seen
-            if outside[b] > most_outside:
-                continue
             for v in range(V):
                 # the rows that the drawn parts cover
                 top, bottom = H, -1
@@ -183,12 +194,12 @@ def _cast_kernel(real):
                         ray = ti.Vector([ti.cast(rays[v, j, i, a], real) for a in ti.static(range(3))])
                         nearest = ti.cast(before_depth[v, j, i], real)
                         met = -1
-                        if ray.norm_sqr() > 0.0:
+                        if norm_sqr(ray) > 0.0:
                             for k in range(K):
                                 if i >= stretch[b, k, 0] and i <= stretch[b, k, 1]:
                                     p = drawn[k]
                                     origin = ti.Vector([outline[b, v, p, _ORIGIN + a] for a in ti.static(range(3))])
-                                    local = load_rotation(placed, b, p) @ ray
+                                    local = times(load_rotation(placed, b, p), ray)
                                     t = enter_unit(part_kind[p], part_shape[p, 3], origin, local)
                                     if t > 0.0 and t < nearest:
                                         nearest = t
@@ -259,7 +270,7 @@ def cast(
     label, depth = np.empty(shape, np.uint8), np.empty(shape, np.float32)
     if export:
         label[:], depth[:] = before.label, before.depth
-    _cast_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
+    _cast_kernel(ti.f64 if dtype == np.float64 else ti.f32, B == 1)(
         *body[:8],
         group,
         np.ascontiguousarray(cameras, dtype),

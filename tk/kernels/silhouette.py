@@ -28,6 +28,7 @@ from tk.kernels.launch import Launcher
 from tk.kernels.line_search import COLOR_BINS, Regions, SearchSettings, in_picture, search_colors, search_mask
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
+from tk.kernels.vectors import cross, dot, norm_sqr, pulled, times, transposed_times
 from tk.kernels.wrench import INERTIA_NUMBERS
 
 # Chords that stand for a curve when its length is measured and when edgels are compared with it.
@@ -82,15 +83,17 @@ class Edgels(NamedTuple):
 def _to_segment(e, a, b):
     """Squared distance of e from the segment a b."""
     ab = b - a
-    t = ti.min(ti.max((e - a).dot(ab) / ti.max(ab.norm_sqr(), 1e-12), 0.0), 1.0)
-    return (e - a - t * ab).norm_sqr()
+    along = (e[0] - a[0]) * ab[0] + (e[1] - a[1]) * ab[1]
+    t = ti.min(ti.max(along / ti.max(ab[0] * ab[0] + ab[1] * ab[1], 1e-12), 0.0), 1.0)
+    off = e - a - t * ab
+    return off[0] * off[0] + off[1] * off[1]
 
 
 @ti.func
 def _twist_about(twists: ti.template(), b: int, k: int, origin):
     """The twist of a degree of freedom with the velocity of the origin."""
     w = ti.Vector([twists[b, k, i] for i in ti.static(range(3))])
-    v = ti.Vector([twists[b, k, 3 + i] for i in ti.static(range(3))]) + w.cross(origin)
+    v = ti.Vector([twists[b, k, 3 + i] for i in ti.static(range(3))]) + cross(w, origin)
     return ti.Vector([w[0], w[1], w[2], v[0], v[1], v[2]])
 
 
@@ -99,24 +102,24 @@ def _may_hide(ball: ti.template(), b: int, p: int, P: int, eye):
     """Bits of the parts whose spheres meet that of part p in the picture: most are far from it."""
     bits = ti.i64(0)
     own = ti.Vector([ball[b, p, a] for a in ti.static(range(3))]) - eye
-    own_square = own.norm_sqr()
+    own_square = norm_sqr(own)
     own_sine = ball[b, p, 3] / own_square
     for o in range(P):
         to = ti.Vector([ball[b, o, a] for a in ti.static(range(3))]) - eye
-        square = to.norm_sqr()
+        square = norm_sqr(to)
         sine = ball[b, o, 3] / square
         # the angle between them is at most the sum of their radii's
         apart = 1.0 + 0.0 * square
         if own_sine < 0.5 and sine < 0.5:
             apart = ti.sqrt((1.0 - sine) * (1.0 - own_sine)) - ti.sqrt(sine * own_sine)
-            apart = own.dot(to) - apart * ti.sqrt(own_square * square)
+            apart = dot(own, to) - apart * ti.sqrt(own_square * square)
         if o != p and apart >= 0.0:
             bits |= ti.i64(1) << o
     return bits
 
 
 @functools.cache
-def _equations_kernel(real):
+def _equations_kernel(real, alone):
     @ti.kernel
     def silhouette_equations(
         # the body
@@ -163,6 +166,7 @@ def _equations_kernel(real):
         P, D = part_dof.shape[0], axis.shape[0]
 
         # a pose is one thread's: to wake the threads for a loop takes 0.1 ms, a sixth of its work
+        ti.loop_config(serialize=alone)
         for turn in range(spread * B):
             if turn % spread != 0:
                 continue
@@ -171,7 +175,7 @@ def _equations_kernel(real):
             for p in range(P):
                 R, t = place_part(frames, part_dof, part_frame, b, p)
                 keep(placed, b, p, R, t)
-                middle = R @ interior_point(part_kind[p], shape_of(part_shape, p)) + t
+                middle = times(R, interior_point(part_kind[p], shape_of(part_shape, p))) + t
                 for a in ti.static(range(3)):
                     ball[b, p, a] = middle[a]
                 ball[b, p, 3] = enclosing_radius(part_kind[p], shape_of(part_shape, p)) ** 2
@@ -180,7 +184,7 @@ def _equations_kernel(real):
                 p, kind = curve_part[q], curve_kind[q]
                 shape = shape_of(part_shape, p)
                 R, t = load_rotation(placed, b, p), load_translation(placed, b, p)
-                center = R.transpose() @ (camera_center(camera, v) - t)
+                center = transposed_times(R, camera_center(camera, v) - t)
                 visible, params = curve_of(kind, shape, center)
                 chords = CHORDS
                 if kind <= SIDE_B:
@@ -191,17 +195,17 @@ def _equations_kernel(real):
                 for i in range(chords + 1):
                     if visible == 1:
                         x, tangent = point_on(kind, shape, center, params, (i + 0.0 * length) / chords)
-                        pixel, J, z = project(camera, v, R @ x + t)
+                        pixel, J, z = project(camera, v, times(R, x) + t)
                         if z < NEAREST_M:
                             visible = 0
                         if i > 0:
                             length += (pixel - last).norm()
                         if i == 0:
                             # the plane of viewing ray and tangent, turned away from the part's inside
-                            n = tangent.cross(x - center)
-                            if n.dot(interior_point(part_kind[p], shape) - x) > 0.0:
+                            n = cross(tangent, x - center)
+                            if dot(n, interior_point(part_kind[p], shape) - x) > 0.0:
                                 n = -n
-                            along, out = J @ (R @ tangent), J @ (R @ n)
+                            along, out = times(J, times(R, tangent)), times(J, times(R, n))
                             sign = 1.0 + 0.0 * length
                             if along[1] * out[0] - along[0] * out[1] < 0.0:
                                 sign = -sign
@@ -230,7 +234,7 @@ def _equations_kernel(real):
                     shape = shape_of(part_shape, p)
                     R, t = load_rotation(placed, b, p), load_translation(placed, b, p)
                     eye = camera_center(camera, v)
-                    center = R.transpose() @ (eye - t)
+                    center = transposed_times(R, eye - t)
                     params = ti.Vector([facts[c, 1], facts[c, 2]])
                     length, sign = facts[c, 3], facts[c, 4]
                     width, height = size[v, 0], size[v, 1]
@@ -240,9 +244,9 @@ def _equations_kernel(real):
                     hiding = _may_hide(ball, b, p, P, eye)
                     for i in range(count):
                         x_part, tangent = point_on(kind, shape, center, params, (i + 0.5 + 0.0 * scale) / count)
-                        x = R @ x_part + t
+                        x = times(R, x_part) + t
                         pixel, J, _ = project(camera, v, x)
-                        along = J @ (R @ tangent)
+                        along = times(J, times(R, tangent))
                         norm = along.norm()
                         n = ti.Vector([along[1], -along[0]]) * (sign / ti.max(norm, 1e-9))
                         at = (pixel + 0.5) / scale - 0.5
@@ -250,7 +254,7 @@ def _equations_kernel(real):
                         behind, depth = -1, 1e9 + 0.0 * scale
                         if use:
                             ray = x - eye
-                            long = ray.norm_sqr()
+                            long = norm_sqr(ray)
                             others = hiding
                             o = -1
                             while use and others != 0:
@@ -260,14 +264,13 @@ def _equations_kernel(real):
                                 close = False
                                 if this == 1:
                                     to = ti.Vector([ball[b, o, a] for a in ti.static(range(3))]) - eye
-                                    ahead = to.dot(ray)
-                                    close = ahead > 0.0 and to.norm_sqr() * long - ahead * ahead < ball[b, o, 3] * long
+                                    ahead = dot(to, ray)
+                                    close = ahead > 0.0 and norm_sqr(to) * long - ahead * ahead < ball[b, o, 3] * long
                                 if close:
                                     Ro = load_rotation(placed, b, o)
-                                    co = Ro.transpose() @ (eye - load_translation(placed, b, o))
-                                    t_o = enter(
-                                        part_kind[o], shape_of(part_shape, o), co, Ro.transpose() @ ray, HIDING_SHRINK
-                                    )
+                                    co = transposed_times(Ro, eye - load_translation(placed, b, o))
+                                    ro = transposed_times(Ro, ray)
+                                    t_o = enter(part_kind[o], shape_of(part_shape, o), co, ro, HIDING_SHRINK)
                                     # behind another part it is not seen
                                     if t_o > 0.0 and t_o < 1.0:
                                         use = False
@@ -322,11 +325,11 @@ def _equations_kernel(real):
                                 met += share
                                 all_samples += share
                         if found > 0 and weight > 0.0:
-                            g = J.transpose() @ n
-                            h = J.transpose() @ ti.Vector([-n[1], n[0]])
+                            g = pulled(J, n)
+                            h = pulled(J, ti.Vector([-n[1], n[0]]))
                             # what a twist does to the distance, and to the place along the contour
                             arm = x - origin
-                            gm, hm = arm.cross(g), arm.cross(h)
+                            gm, hm = cross(arm, g), cross(arm, h)
                             across = ti.Vector([gm[0], gm[1], gm[2], g[0], g[1], g[2]])
                             beside = ti.Vector([hm[0], hm[1], hm[2], h[0], h[1], h[2]])
                             pull += weight * d * across
@@ -404,7 +407,7 @@ def _launch(
         raise ValueError(f"{len(masks)} masks of {V} views: one set, or one for each of {B} poses")
     total = np.empty((B, 3 + D + D * D))
     samples = np.zeros((tasks, settings.most_samples, _EXPORT) if export else (1, 1, _EXPORT), dtype)
-    _equations_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
+    _equations_kernel(ti.f64 if dtype == np.float64 else ti.f32, B == 1)(
         *body,
         _all_of(D),
         np.ascontiguousarray(cameras, dtype),
@@ -415,7 +418,7 @@ def _launch(
         regions.log_likelihood,
         regions.group,
         _numbers(settings, scale, regions.weight, dtype),
-        spread_of(B),
+        spread_of(B) if B > 1 else 1,
         settings.most_samples,
         int(settings.interior),
         int(export),
