@@ -16,6 +16,7 @@ A hidden contour point, or one without an edge, is an entry that costs ρ = 1 an
 from tk.kernels.kinematics import load_rotation, load_translation
 from tk.kernels.projection import project
 from tk.kernels.runtime import ti
+from tk.kernels.vectors import cross, dot, norm_sqr, pulled, times
 from tk.kernels.wrench import MOTION, WRENCH, add_direction, add_wrench, load_wrench
 
 # Columns of an entry. Points a and b are in the zero configuration (metres), target and unit normal in the picture.
@@ -40,26 +41,26 @@ def image_residual(
     v = ti.cast(entries[b, e, CAMERA], ti.i32)
     R, t = load_rotation(frames, c, k), load_translation(frames, c, k)
     target = ti.Vector([entries[b, e, TARGET], entries[b, e, TARGET + 1]])
-    x = R @ load_entry(entries, b, e, POINT_A) + t
+    x = times(R, load_entry(entries, b, e, POINT_A)) + t
     pixel, T, z = project(cameras, v, x)
     L = _turned(T, x - origin)
     valid = z > 1e-3
-    if (load_entry(entries, b, e, POINT_A) - load_entry(entries, b, e, POINT_B)).norm_sqr() > 0.0:
-        x = R @ load_entry(entries, b, e, POINT_B) + t
+    if norm_sqr(load_entry(entries, b, e, POINT_A) - load_entry(entries, b, e, POINT_B)) > 0.0:
+        x = times(R, load_entry(entries, b, e, POINT_B)) + t
         other, J, depth = project(cameras, v, x)
         pixel = 0.5 * (pixel + other)
         L = 0.5 * (L + _turned(J, x - origin))
         T = 0.5 * (T + J)
         valid = valid and depth > 1e-3
     n = ti.Vector([entries[b, e, NORMAL], entries[b, e, NORMAL + 1]])
-    return valid, n.dot(pixel - target), L.transpose() @ n, T.transpose() @ n
+    return valid, n.dot(pixel - target), pulled(L, n), pulled(T, n)
 
 
 @ti.func
 def _turned(J, x):
     """L (2, 3) with L ω = J (ω × x)."""
-    first = x.cross(ti.Vector([J[0, a] for a in ti.static(range(3))]))
-    second = x.cross(ti.Vector([J[1, a] for a in ti.static(range(3))]))
+    first = cross(x, ti.Vector([J[0, a] for a in ti.static(range(3))]))
+    second = cross(x, ti.Vector([J[1, a] for a in ti.static(range(3))]))
     return ti.Matrix.rows([first, second])
 
 
@@ -88,7 +89,7 @@ def add_alignment(
             sums[c, 0] = sums[c, 0] + scale * (1.0 - decay)
             weight = scale * decay / nu * inv_sigma2
             k = ti.cast(entries[b, e, LAST_DOF], ti.i32)
-            moved = moment.dot(load_wrench(scratch, c, k, MOTION)) + force.dot(load_wrench(scratch, c, k, MOTION + 3))
+            moved = dot(moment, load_wrench(scratch, c, k, MOTION)) + dot(force, load_wrench(scratch, c, k, MOTION + 3))
             add_wrench(scratch, c, k, WRENCH, weight * r * moment, weight * r * force)
             add_wrench(scratch, c, k, WRENCH + 6, weight * moved * moment, weight * moved * force)
 

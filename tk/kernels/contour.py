@@ -40,6 +40,7 @@ from tk.kernels.occlusion import (
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.superellipsoid import power
+from tk.kernels.vectors import times
 
 # Strips that one parallel task handles, each task with its own forward kinematics (some microseconds).
 STRIPS_PER_TASK = 10
@@ -118,15 +119,15 @@ def rim_point(placed: ti.template(), c: int, pieces: ti.template(), i: int, eta,
     R = load_placed_rotation(placed, c, i)
     turns = ti.Vector([ti.cos(eta), ti.sin(eta), ti.cos(omega), ti.sin(omega)])
     q = surface_point(turns, radii, e1, e2)
-    n = R @ surface_normal(turns, radii, e1, e2).normalized()
-    return q, R @ q + load_placed_vector(placed, c, i, PLACED_TRANSLATION), n
+    n = times(R, surface_normal(turns, radii, e1, e2).normalized())
+    return q, times(R, q) + load_placed_vector(placed, c, i, PLACED_TRANSLATION), n
 
 
 @ti.func
 def to_zero_configuration(pieces: ti.template(), i: int, q):
     """A point of piece i from the piece's frame to the zero configuration, where it is a material point."""
     R = ti.Matrix([[pieces[i, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
-    return R @ q + ti.Vector([pieces[i, 4 * a + 3] for a in ti.static(range(3))])
+    return times(R, q) + ti.Vector([pieces[i, 4 * a + 3] for a in ti.static(range(3))])
 
 
 @ti.func
@@ -137,7 +138,7 @@ def image_normal(J, n):
     to the viewing ray, which is J's null space, so Jᵀ m ∝ n has the solution m ∝ (J Jᵀ)⁻¹ J n.
     """
     A = J @ J.transpose()
-    g = J @ n
+    g = times(J, n)
     m = ti.Vector([A[1, 1] * g[0] - A[0, 1] * g[1], A[0, 0] * g[1] - A[0, 1] * g[0]])
     return m / ti.sqrt(ti.max(m.norm_sqr(), 1e-30))
 

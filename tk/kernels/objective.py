@@ -51,6 +51,7 @@ from tk.kernels.objective_pairs import (
 )
 from tk.kernels.projection import CAMERA_NUMBERS
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
+from tk.kernels.vectors import norm_sqr, times
 from tk.kernels.wrench import (
     SCRATCH_NUMBERS,
     add_inertia,
@@ -144,7 +145,7 @@ def _objective_kernel(real):
                     sums[c, 0] = sums[c, 0] + scale
                 else:
                     y = ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
-                    x = load_rotation(scratch, c, k) @ x0 + load_translation(scratch, c, k)
+                    x = times(load_rotation(scratch, c, k), x0) + load_translation(scratch, c, k)
                     add_residual(scratch, sums, c, k, x, x - y, inv_sigma2, nu, scale)
             collect_wrenches(tree, c, scratch, sums)
 
@@ -210,14 +211,14 @@ def _linearise_kernel(real):
                         nu, scale = settings[COVERAGE_NU], settings[COVERAGE_SCALE]
                         inv_sigma2 = pieces[i, PIECE_WEIGHT]
                 residual[m, 3] = ti.cast(v, real)
-                x = load_rotation(scratch, c, k_last) @ x0 + load_translation(scratch, c, k_last)
+                x = times(load_rotation(scratch, c, k_last), x0) + load_translation(scratch, c, k_last)
                 for a in ti.static(range(3)):
                     residual[m, a] = 0.0
                 if v >= 0:
                     r = x - ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
                     for a in ti.static(range(3)):
                         residual[m, a] = r[a]
-                    decay = ti.exp(-0.5 * r.norm_sqr() * inv_sigma2 / nu)
+                    decay = ti.exp(-0.5 * norm_sqr(r) * inv_sigma2 / nu)
                     add_inertia(scratch, c, k_last, x - origin, scale * inv_sigma2 / nu * ti.max(decay, floor))
             collect_inertias(tree, c, scratch, origin, hessian)
 

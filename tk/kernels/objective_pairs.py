@@ -7,6 +7,7 @@ from tk.kernels.kinematics import load_rotation, load_translation, load_vector3
 from tk.kernels.nearest import nearest_voxel
 from tk.kernels.runtime import ti
 from tk.kernels.superellipsoid import implicit, project
+from tk.kernels.vectors import cross, norm_sqr, product, times, transposed_times
 from tk.kernels.wrench import MOTION, WRENCH, add_wrench, load_wrench
 
 # Columns of the packed arrays. Every array that a launch is handed costs about 6 µs, so the body comes in few.
@@ -37,7 +38,7 @@ def place_pieces(
         R, t = load_rotation(scratch, c, k), load_translation(scratch, c, k)
         Rp = ti.Matrix([[pieces[i, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
         tp = ti.Vector([pieces[i, 4 * a + 3] for a in ti.static(range(3))])
-        R_world, t_world = R @ Rp, R @ tp + t
+        R_world, t_world = product(R, Rp), times(R, tp) + t
         low, high = pieces[i, PIECE_SHAPE + 5], pieces[i, PIECE_SHAPE + 6]
         half = 0.5 * (high - low)
         for a in ti.static(range(3)):
@@ -83,16 +84,16 @@ def nearest_piece(
     least = y[0] * 0.0 + 1e30
     for i in range(pieces.shape[0]):
         radius = scratch[c, D + i, SPHERE_RADIUS]
-        power = (y - sphere(scratch, c, D + i)).norm_sqr() - radius * radius
+        power = norm_sqr(y - sphere(scratch, c, D + i)) - radius * radius
         if power < least:
             least, likely = power, i
     for turn in range(pieces.shape[0] + 1):
         i = ti.select(turn == 0, likely, turn - 1)
         within = best_d + scratch[c, D + i, SPHERE_RADIUS]
-        if turn > 0 and (i == likely or (y - sphere(scratch, c, D + i)).norm_sqr() >= within * within):
+        if turn > 0 and (i == likely or norm_sqr(y - sphere(scratch, c, D + i)) >= within * within):
             continue
         R = load_rotation(scratch, c, D + i)
-        q = R.transpose() @ (y - load_translation(scratch, c, D + i))
+        q = transposed_times(R, y - load_translation(scratch, c, D + i))
         radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
         z_lower, z_upper = pieces[i, PIECE_SHAPE + 5], pieces[i, PIECE_SHAPE + 6]
         # a box about the piece: what lies further outside it than the best so far cannot win
@@ -103,9 +104,9 @@ def nearest_piece(
                 ti.max(ti.max(z_lower - q[2], q[2] - z_upper), 0.0),
             ]
         )
-        if over.norm_sqr() < best_d * best_d and has_patch(pieces, i, fits):
+        if norm_sqr(over) < best_d * best_d and has_patch(pieces, i, fits):
             on = project(q, radii, pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4], z_lower, z_upper)
-            d = (q - on).norm()
+            d = ti.sqrt(norm_sqr(q - on))
             # of two pieces as near as each other the first, in whatever order they are visited
             if d < best_d or (d == best_d and i < best):
                 best = i
@@ -114,7 +115,7 @@ def nearest_piece(
     best_x = best_on
     if best >= 0:
         Rp = ti.Matrix([[pieces[best, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
-        best_x = Rp @ best_on + ti.Vector([pieces[best, 4 * a + 3] for a in ti.static(range(3))])
+        best_x = times(Rp, best_on) + ti.Vector([pieces[best, 4 * a + 3] for a in ti.static(range(3))])
     return best, best_x
 
 
@@ -131,12 +132,12 @@ def add_residual(
     scale,
 ):
     """Add scale·ρ(e) of one pair to row c of the sums, its gradient and Hessian-vector product to the wrenches."""
-    decay = ti.exp(-0.5 * r.norm_sqr() * inv_sigma2 / nu)
+    decay = ti.exp(-0.5 * norm_sqr(r) * inv_sigma2 / nu)
     sums[c, 0] = sums[c, 0] + scale * (1.0 - decay)
     weight = scale * decay / nu * inv_sigma2
-    Jv = load_wrench(scratch, c, k, MOTION).cross(x) + load_wrench(scratch, c, k, MOTION + 3)
-    add_wrench(scratch, c, k, WRENCH, weight * x.cross(r), weight * r)
-    add_wrench(scratch, c, k, WRENCH + 6, weight * x.cross(Jv), weight * Jv)
+    Jv = cross(load_wrench(scratch, c, k, MOTION), x) + load_wrench(scratch, c, k, MOTION + 3)
+    add_wrench(scratch, c, k, WRENCH, weight * cross(x, r), weight * r)
+    add_wrench(scratch, c, k, WRENCH + 6, weight * cross(x, Jv), weight * Jv)
 
 
 @ti.func
@@ -155,9 +156,9 @@ def is_buried(
         radius = scratch[c, D + i, SPHERE_RADIUS]
         if (
             barred >> ti.cast(pieces[i, PIECE_PART], ti.i32) & 1 == 1
-            and (x - sphere(scratch, c, D + i)).norm_sqr() < radius * radius
+            and norm_sqr(x - sphere(scratch, c, D + i)) < radius * radius
         ):
-            q = load_rotation(scratch, c, D + i).transpose() @ (x - load_translation(scratch, c, D + i))
+            q = transposed_times(load_rotation(scratch, c, D + i), x - load_translation(scratch, c, D + i))
             radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
             # G is at least the greatest of |q| / a
             if (
@@ -186,7 +187,7 @@ def pair_sample(
     """The voxel of surface sample n, or -1."""
     k = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
     R = load_rotation(scratch, c, k)
-    x = R @ load_vector3(samples, n) + load_translation(scratch, c, k)
+    x = times(R, load_vector3(samples, n)) + load_translation(scratch, c, k)
     v = -1
     barred = ti.cast(samples[n, SAMPLE_BARRED], ti.i32)
     if barred == 0 or not is_buried(scratch, c, D, pieces, barred, x):

@@ -17,6 +17,7 @@ from tk.kernels.kinematics import load_rotation, load_translation
 from tk.kernels.objective_pairs import PIECE_DOF, PIECE_SHAPE
 from tk.kernels.runtime import ti
 from tk.kernels.superellipsoid import implicit, inside_outside, is_quadric, power
+from tk.kernels.vectors import dot, norm_sqr, product, times, transposed_times
 
 # Rounds of the bisection. A ray undecided after them runs less than 1/4096 of its clipped length inside the piece.
 DEPTH = 12
@@ -45,15 +46,15 @@ def place_pieces(
         R = load_rotation(frames, c, k)
         Rp = ti.Matrix([[pieces[i, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
         tp = ti.Vector([pieces[i, 4 * a + 3] for a in ti.static(range(3))])
-        R_world = R @ Rp
-        t_world = R @ tp + load_translation(frames, c, k)
-        camera = R_world.transpose() @ (center - t_world)
+        R_world = product(R, Rp)
+        t_world = times(R, tp) + load_translation(frames, c, k)
+        camera = transposed_times(R_world, center - t_world)
         lower, upper = pieces[i, PIECE_SHAPE + 5], pieces[i, PIECE_SHAPE + 6]
         half = 0.5 * (upper - lower)
         middle = 0.5 * (upper + lower)
         radius = ti.sqrt(pieces[i, PIECE_SHAPE] ** 2 + pieces[i, PIECE_SHAPE + 1] ** 2 + half * half)
         sphere = t_world + middle * ti.Vector([R_world[a, 2] for a in ti.static(range(3))]) - center
-        distance = ti.max(sphere.norm(), 1e-6)
+        distance = ti.max(ti.sqrt(norm_sqr(sphere)), 1e-6)
         for a in ti.static(range(3)):
             for b in ti.static(range(3)):
                 placed[c, i, 3 * a + b] = R_world[a, b]
@@ -92,8 +93,8 @@ def segment_enters(q, d, radii, e1, e2, z_lower, z_upper):
     hit = 0
     if start < end and is_quadric(e1, e2):
         u, v = q / radii, d / radii
-        nearest = ti.min(ti.max(-u.dot(v) / ti.max(v.norm_sqr(), 1e-12), start), end)
-        hit = ti.cast((u + nearest * v).norm() < 1.0 - TOUCH, ti.i32)
+        nearest = ti.min(ti.max(-dot(u, v) / ti.max(norm_sqr(v), 1e-12), start), end)
+        hit = ti.cast(ti.sqrt(norm_sqr(u + nearest * v)) < 1.0 - TOUCH, ti.i32)
     elif start < end:
         if start == 0.0 and power(inside_outside(q, radii, e1, e2), 0.5 * e1) < 1.0 - TOUCH:
             hit = 1
@@ -137,7 +138,7 @@ def pieces_beside(
     for i in range(pieces.shape[0]):
         other = placed[c, i, PLACED_CONE + 3]
         limit = cosine * other - sine * ti.sqrt(ti.max(1.0 - other * other, 0.0)) - _SLACK
-        meets = u.dot(load_placed_vector(placed, c, i, PLACED_CONE)) > limit
+        meets = dot(u, load_placed_vector(placed, c, i, PLACED_CONE)) > limit
         if i != own and (inside or other < 0.0 or meets):
             beside |= ti.cast(1, ti.i64) << ti.cast(i, ti.i64)
     return beside
@@ -154,7 +155,7 @@ def is_occluded(
 ):
     """1 if one of some pieces lies between a point and the camera that row c of the scratch was placed for."""
     ray = x - center
-    distance = ti.max(ray.norm(), 1e-6)
+    distance = ti.max(ti.sqrt(norm_sqr(ray)), 1e-6)
     ray = ray / distance
     hit = 0
     i = 0
@@ -162,11 +163,11 @@ def is_occluded(
     while hit == 0 and rest != 0:
         if (
             rest & 1 == 1
-            and ray.dot(load_placed_vector(placed, c, i, PLACED_CONE)) > placed[c, i, PLACED_CONE + 3]
+            and dot(ray, load_placed_vector(placed, c, i, PLACED_CONE)) > placed[c, i, PLACED_CONE + 3]
             and placed[c, i, PLACED_NEAR] < distance
         ):
             R = load_placed_rotation(placed, c, i)
-            q = R.transpose() @ (x - load_placed_vector(placed, c, i, PLACED_TRANSLATION))
+            q = transposed_times(R, x - load_placed_vector(placed, c, i, PLACED_TRANSLATION))
             hit = segment_enters(
                 q,
                 load_placed_vector(placed, c, i, PLACED_CAMERA) - q,

@@ -21,6 +21,7 @@ triangle of the inertia, row by row.
 
 from tk.kernels.kinematics import JOINT_NUMBERS, TWIST, parent_of
 from tk.kernels.runtime import ti
+from tk.kernels.vectors import cross, norm_sqr
 
 MOTION, WRENCH = JOINT_NUMBERS, JOINT_NUMBERS + 6
 INERTIA = JOINT_NUMBERS
@@ -85,7 +86,7 @@ def start_inertias(tree: ti.template(), c: int, scratch: ti.template()):
 @ti.func
 def add_inertia(scratch: ti.template(), c: int, k: int, x, weight):
     """Add weight·PᵀP of a point x, seen from the origin, to row k."""
-    square = x.norm_sqr()
+    square = norm_sqr(x)
     for i in ti.static(range(3)):
         for j in ti.static(range(i + 1)):
             a = INERTIA + i * (i + 1) // 2 + j
@@ -111,7 +112,7 @@ def add_direction(scratch: ti.template(), c: int, k: int, moment, force, weight)
 @ti.func
 def _twist_about(scratch: ti.template(), c: int, k: int, origin):
     w, v = load_wrench(scratch, c, k, TWIST), load_wrench(scratch, c, k, TWIST + 3)
-    v += w.cross(origin)
+    v += cross(w, origin)
     return ti.Vector([w[0], w[1], w[2], v[0], v[1], v[2]])
 
 
