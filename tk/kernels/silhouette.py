@@ -155,6 +155,7 @@ def _equations_kernel(real, alone):
         twists: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 6) scratch
         placed: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 12) scratch, parts to world
         ball: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 4) scratch, a sphere about each part, world
+        hiders: ti.types.ndarray(dtype=ti.i64, ndim=3),  # (B, V, P) scratch, bits of the parts that may hide each one
         lines: ti.types.ndarray(dtype=real, ndim=3),  # (B V Q, CHORDS + 1, 2) scratch, pixels of the full picture
         facts: ti.types.ndarray(dtype=real, ndim=2),  # (B V Q, 5) scratch: visible, q0, q1, length, outward sign
         # scratch (B, D, 6 + 21): wrench of the pulls and inertia of the edgels about the root, see tk.kernels.wrench
@@ -179,6 +180,10 @@ def _equations_kernel(real, alone):
                 for a in ti.static(range(3)):
                     ball[b, p, a] = middle[a]
                 ball[b, p, 3] = enclosing_radius(part_kind[p], shape_of(part_shape, p)) ** 2
+            for v in range(V):
+                eye = camera_center(camera, v)
+                for p in range(P):
+                    hiders[b, v, p] = _may_hide(ball, b, p, P, eye)
             for task in range(V * Q):
                 c, v, q = b * V * Q + task, task // Q, task % Q
                 p, kind = curve_part[q], curve_kind[q]
@@ -241,7 +246,6 @@ def _equations_kernel(real, alone):
                     wanted = ti.cast(ti.ceil(length / (spacing * scale)), ti.i32)
                     count = ti.min(ti.max(wanted, 1), most_samples)
                     share = length / count
-                    hiding = _may_hide(ball, b, p, P, eye)
                     for i in range(count):
                         x_part, tangent = point_on(kind, shape, center, params, (i + 0.5 + 0.0 * scale) / count)
                         x = times(R, x_part) + t
@@ -255,7 +259,7 @@ def _equations_kernel(real, alone):
                         if use:
                             ray = x - eye
                             long = norm_sqr(ray)
-                            others = hiding
+                            others = hiders[b, v, p]
                             o = -1
                             while use and others != 0:
                                 o += 1
@@ -448,12 +452,12 @@ def _numbers(s: SearchSettings, scale: float, weight: float, dtype: np.dtype) ->
 
 
 @functools.lru_cache(8)
-def _scratch(B: int, V: int, Q: int, D: int, P: int, dtype: np.dtype) -> tuple[NDArray[np.floating], ...]:
+def _scratch(B: int, V: int, Q: int, D: int, P: int, dtype: np.dtype) -> tuple[NDArray, ...]:
     tasks = B * V * Q
-    shapes: tuple[tuple[int, ...], ...] = (
-        (B, D, 12), (B, D, 6), (B, P, 12), (B, P, 4), (tasks, CHORDS + 1, 2), (tasks, 5), (B, D, 6 + INERTIA_NUMBERS),
-    )  # fmt: skip
-    return tuple(np.empty(shape, dtype) for shape in shapes)
+    before = (B, D, 12), (B, D, 6), (B, P, 12), (B, P, 4)
+    behind = (tasks, CHORDS + 1, 2), (tasks, 5), (B, D, 6 + INERTIA_NUMBERS)
+    arrays = [[np.empty(shape, dtype) for shape in shapes] for shapes in (before, behind)]
+    return (*arrays[0], np.empty((B, V, P), np.int64), *arrays[1])
 
 
 @functools.cache
