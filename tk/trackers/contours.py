@@ -158,9 +158,11 @@ class ContourTracker:
         """Have the kernels compiled while there is nothing else to do. Without it that is done where one is needed."""
         body = build_cone_body(BodyDimensions.from_stature(1.7), preset=self.contours.body)
         empty = np.zeros((len(self.views.rig), *self.views.rig.frame_shape), np.uint8)
-        pose = np.zeros((1, len(body.skeleton.names)))
-        self.views.equations(body.arrays, self.views.pyramid(empty, 1, None), pose, 0, self.contours.search)
-        Evidence.of(self.screen, empty).cast(body, np.zeros(len(body.parts), np.int32), pose)
+        seen = self.views.pyramid(empty, 1, None)
+        for poses in (1, 2):  # one pose, and several at once
+            pose = np.zeros((poses, len(body.skeleton.names)))
+            self.views.equations(body.arrays, seen, pose, 0, self.contours.search)
+            Evidence.of(self.screen, empty).cast(body, np.zeros(len(body.parts), np.int32), pose)
 
     # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
 
