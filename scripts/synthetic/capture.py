@@ -16,7 +16,7 @@ import tomli_w
 from numpy.typing import NDArray
 
 from scripts.synthetic.actor import Actor, Look, make_actor
-from scripts.synthetic.motion import FPS, MOTIONS, Motion, plan_path, pose_at
+from scripts.synthetic.motion import MOTIONS, Motion, plan_path, pose_at
 from scripts.synthetic.motion import Path as PelvisPath
 from scripts.synthetic.render import Body, composite, render_actor, sample_rays, shadow_maps
 from scripts.synthetic.rig import make_rig
@@ -31,7 +31,7 @@ Float = NDArray[np.float64]
 BACKGROUND_FRAMES = 25
 VOLUME_MARGIN_M = 0.15
 EXPOSURE_FRAMES = 0.25
-"""Shutter time, in frames: 1/60 s at 15 frames a second."""
+"""Shutter time, in frames: 1/60 s at 15 frames a second, 1/120 s at 30."""
 # Four samples a pixel: a rotated grid in space, in an order of moments that has no drift across the pixel.
 _OFFSETS = np.array([[-0.125, -0.375], [0.375, -0.125], [-0.375, 0.125], [0.125, 0.375]])
 _MOMENTS = EXPOSURE_FRAMES * np.array([-0.375, 0.125, 0.375, -0.125])
@@ -187,15 +187,14 @@ def write_capture(
         (folder / kind).mkdir(exist_ok=True)
     renderers = [CameraRenderer(plan, index) for index in range(len(plan.rig))]
     for renderer in renderers:
-        with _Video(folder / "background" / f"{renderer.camera.name}.mp4", renderer.camera, plan.options.crf) as video:
+        with _Video(folder / "background" / f"{renderer.camera.name}.mp4", renderer.camera, plan) as video:
             for image in renderer.background():
                 video.write(image)
         if masks:
             (folder / "masks" / renderer.camera.name).mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         videos = [
-            stack.enter_context(_Video(folder / "videos" / f"{camera.name}.mp4", camera, plan.options.crf))
-            for camera in plan.rig
+            stack.enter_context(_Video(folder / "videos" / f"{camera.name}.mp4", camera, plan)) for camera in plan.rig
         ]
         for frame in range(plan.frame_count):
             shadow = plan.shadow(frame)
@@ -227,7 +226,7 @@ def write_calibration(rig: Rig, path: Path) -> None:
 def _write_settings(plan: Plan, name: str, path: Path) -> None:
     settings = {
         "name": name,
-        "fps": FPS,
+        "fps": plan.motion.fps,
         "up": "z",
         "volume": {"center": list(plan.volume.center), "size": list(plan.volume.size)},
         "subject": {"height": plan.options.stature_m},
@@ -240,22 +239,23 @@ def _write_truth(plan: Plan, name: str, path: Path) -> None:
     with h5py.File(path, "w") as file:
         frames = np.arange(plan.frame_count, dtype=np.int64)
         file["frames"] = frames
-        file["time"] = frames / FPS
+        file["time"] = frames / plan.motion.fps
         position = file.create_dataset("joints/position", data=plan.joints)
         position.attrs.create("names", list(JOINTS), dtype=h5py.string_dtype())
-        file.attrs.update({"capture": name, "fps": FPS, "units": "m", "up": "z"})
+        file.attrs.update({"capture": name, "fps": plan.motion.fps, "units": "m", "up": "z"})
 
 
 class _Video:
     """An H.264 file, written picture by picture."""
 
-    def __init__(self, path: Path, camera: Camera, crf: int) -> None:
+    def __init__(self, path: Path, camera: Camera, plan: Plan) -> None:
         self._container = av.open(str(path), "w")
-        self._stream = self._container.add_stream("libx264", rate=Fraction(FPS).limit_denominator(1000))
+        self._stream = self._container.add_stream("libx264", rate=Fraction(plan.motion.fps).limit_denominator(1000))
         self._stream.width, self._stream.height = camera.width, camera.height
         self._stream.pix_fmt = "yuv420p"
         # with macroblock trees some files of a hundred differ from run to run on a busy machine, one thread or not
-        self._stream.options = {"crf": str(crf), "preset": "slow", "threads": "1", "x264-params": "mbtree=0"}
+        crf = str(plan.options.crf)
+        self._stream.options = {"crf": crf, "preset": "slow", "threads": "1", "x264-params": "mbtree=0"}
 
     def write(self, image: NDArray[np.uint8]) -> None:
         frame = av.VideoFrame.from_ndarray(image, format="rgb24")

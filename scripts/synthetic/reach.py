@@ -1,15 +1,22 @@
-"""Arm angles that bring a wrist to a place, within the joint limits."""
+"""Arm angles that bring a wrist to a place and leg angles that bring the toes to one, within the joint limits."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from scripts.synthetic.skeleton import LIMITS_DEG, Skeleton, forward
+from scripts.synthetic.skeleton import LIMITS_DEG, Angles, Skeleton, forward, sole_points
+
+Float = NDArray[np.float64]
 
 _NAMES = ("shoulder_abd", "shoulder_flex", "shoulder_in", "elbow")
+_LEG_NAMES = ("hip_open", "hip_abd", "hip_flex", "hip_in", "knee")
+_LEG_GUESS_DEG = (0.0, 5.0, 15.0, 0.0, 25.0)
+_LEG_WEIGHT = np.array([2e-3, 1e-3, 0.0, 2e-3, 0.0])
+"""Metres a radian: of the ways to reach a place, the one that turns the hip least about its lesser axes."""
 
 
 def arm_angles(
@@ -33,3 +40,45 @@ def arm_angles(
     begin = np.clip(start, limits[:, 0] + margin, limits[:, 1] - margin)
     solved = least_squares(residual, begin, bounds=(limits[:, 0], limits[:, 1]), x_scale=10.0).x
     return dict(zip(names, map(float, solved), strict=True))
+
+
+def leg_angles(skeleton: Skeleton, side: str, angles: Angles, root: Float, toe: Float, heading: Float) -> Angles:
+    """Radians of the five leg angles of ``side`` at T times, one after the other: Newton's method with damping.
+
+    The toe tip's place and the foot's direction fix four of the five; the ankle keeps the sole level as far as it goes
+    and lifts the heel beyond (see `forward`), so that one rule serves for standing, squatting and kneeling.
+
+    Args:
+        skeleton: the tree.
+        side: "_l" or "_r".
+        angles: (T,) radians of the pelvis and of this leg's ankle, at least.
+        root: (T, 3) the pelvis, metres.
+        toe: (T, 3) where the sole of the toe tip is to be, metres.
+        heading: (T,) radians about z to which the foot points.
+    """
+    names = [name + side for name in _LEG_NAMES]
+    low, high = np.radians([LIMITS_DEG[name] for name in names]).T
+    foot, ankle = ("_l", "_r").index(side), skeleton.index("ankle" + side)
+    ahead = np.stack([np.cos(heading), np.sin(heading), np.zeros_like(heading)], axis=1)
+    given = {name: angles[name] for name in ("yaw", "pitch", "roll", "ankle" + side)}
+
+    def residual(x: Float, at: int) -> Float:
+        rows = np.full(len(x), at)
+        legs = {name: x[:, i] for i, name in enumerate(names)}
+        pose = forward(skeleton, {name: values[rows] for name, values in given.items()} | legs, root[rows])
+        sideways = (pose.rotation[:, ankle, :, 1] * ahead[at]).sum(axis=1)
+        return np.column_stack([sole_points(skeleton, pose)[:, foot, 2] - toe[at], 0.2 * sideways, _LEG_WEIGHT * x])
+
+    step, solved = 1e-5, np.empty((len(toe), len(names)))
+    probes = np.concatenate([np.zeros((1, len(names))), step * np.eye(len(names))])
+    x = np.radians(_LEG_GUESS_DEG)
+    for at in range(len(toe)):  # from the time before: there are other ways to reach the same place
+        for _ in range(40):
+            miss = residual(x + probes, at)
+            jacobian = (miss[1:] - miss[0]).T / step
+            change = np.linalg.solve(jacobian.T @ jacobian + 1e-7 * np.eye(len(names)), -jacobian.T @ miss[0])
+            x = np.clip(x + np.clip(change, -0.1, 0.1), low, high)
+            if np.abs(change).max() < 1e-4:
+                break
+        solved[at] = x
+    return {name: solved[:, i] for i, name in enumerate(names)}

@@ -40,7 +40,8 @@ _SIDE_LIMITS: dict[str, tuple[float, float]] = {
     "hip_abd": (-25, 45),
     "hip_flex": (-25, 120),
     "hip_in": (-45, 45),
-    "knee": (0, 140),
+    "hip_open": (-20, 45),  # horizontal abduction, which a bent hip needs: abduction turns a thigh at 90 about itself
+    "knee": (0, 155),  # 140 by its own muscles; the body's weight bends it further in kneeling
     "ankle": (-45, 20),
 }
 LIMITS_DEG: dict[str, tuple[float, float]] = {
@@ -175,7 +176,10 @@ def forward(skeleton: Skeleton, angles: Angles, root: Float | None = None) -> Po
         local["wrist" + side] = rot_z(-s * get("pronate" + side)) @ rot_x(-s * get("wrist_flex" + side))
         local["knuckles" + side] = local["fingertips" + side] = rot_x(-s * get("fingers" + side))
         local["hip" + side] = (
-            rot_x(s * get("hip_abd" + side)) @ rot_y(-get("hip_flex" + side)) @ rot_z(-s * get("hip_in" + side))
+            rot_z(s * get("hip_open" + side))
+            @ rot_x(s * get("hip_abd" + side))
+            @ rot_y(-get("hip_flex" + side))
+            @ rot_z(-s * get("hip_in" + side))
         )
         local["knee" + side] = rot_y(get("knee" + side))
 

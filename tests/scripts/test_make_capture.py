@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from scripts.make_capture import main
 from scripts.synthetic.actor import Look, make_actor
 from scripts.synthetic.capture import BACKGROUND_FRAMES, CameraRenderer, Options, Plan, plan_capture
-from scripts.synthetic.motion import HOLD, MOTIONS
+from scripts.synthetic.motion import HOLD, KNEE_RADIUS, MOTIONS
 from scripts.synthetic.render import CLOSE_M, Body, distances
 from scripts.synthetic.rig import RIGS
 from scripts.synthetic.skeleton import JOINTS, LIMITS_DEG, forward, make_skeleton, sole_points
@@ -137,6 +137,58 @@ def test_paper_sequences_do_what_they_are_for() -> None:
     apart = (joint(pedal, "wrist_l") - joint(pedal, "wrist_r"))[30:90]
     turns = np.unwrap(np.arctan2(apart[:, 2], apart[:, 0]))
     assert abs(turns[-1] - turns[0]) > 2 * 2 * np.pi
+
+
+def test_turn_leads_all_the_way_round_on_feet_that_step() -> None:
+    plan = plan_capture(Options(motion="turn", size=(80, 60)))
+    across = (joint(plan, "hip_l") - joint(plan, "hip_r"))[:, :2]
+    heading = np.degrees(np.unwrap(np.arctan2(across[:, 1], across[:, 0])))
+    assert heading[-1] - heading[0] == pytest.approx(360, abs=1)
+    turning = (np.abs(heading - heading[0]) > 4) & (np.abs(heading - heading[-1]) > 4)
+    assert turning.sum() / plan.motion.fps < 3
+    tips = sole_points(plan.skeleton, plan.poses)[:, :, 2]
+    assert tips[..., 2].max(axis=0).min() > 0.03
+    on_floor = (tips[1:, :, 2] < 0.003) & (tips[:-1, :, 2] < 0.003)
+    assert np.linalg.norm(np.diff(tips[..., :2], axis=0), axis=2)[on_floor].max() < 0.005
+    for side in range(2):  # up and down, five times at least, the steps out of the Da Vinci pose not counted
+        assert (np.diff((tips[30:, side, 2] > 0.03).astype(int)) == 1).sum() >= 5
+    feet = np.stack([plan.poses.rotation[:, plan.skeleton.index("ankle" + side), :2, 0] for side in ("_l", "_r")], 1)
+    pointing = np.degrees(np.arctan2(feet[..., 1], feet[..., 0])) - (heading - 90)[:, None]
+    assert np.abs((pointing + 180) % 360 - 180).max() < 45  # hips turn no further
+    elbows = np.degrees([plan.motion.angles(np.arange(30.0, 120))["elbow" + side] for side in ("_l", "_r")])
+    assert (elbows.max(axis=1) > 70).all()
+    assert (elbows.min(axis=1) < 45).all()
+
+
+def test_crouch_goes_over_one_knee_to_the_heels_and_up_again() -> None:
+    plan = plan_capture(Options(motion="crouch", size=(80, 60)))
+    h = plan.options.stature_m
+    clear = np.stack([joint(plan, "knee" + side)[:, 2] for side in ("_l", "_r")], axis=1) - KNEE_RADIUS * h
+    assert clear.min() > -0.003
+    kneels = clear < 0.003
+    assert ((kneels.sum(axis=1) == 1) & (clear.max(axis=1) > 0.3)).sum() > 5  # on one knee, the other one up
+    assert kneels.all(axis=1).sum() > 15
+    low = joint(plan, "pelvis")[:, 2] / h
+    squat = ~kneels.any(axis=1) & (low < 0.26)
+    assert squat.any()
+    hands = (joint(plan, "wrist_l") + joint(plan, "wrist_r")) / 2 - joint(plan, "neck")
+    assert hands[squat, 0].min() > 0.2
+    heels = sole_points(plan.skeleton, plan.poses)[:, :, 0]
+    apart = np.linalg.norm(np.stack([joint(plan, "hip_l"), joint(plan, "hip_r")], axis=1) - heels, axis=2)
+    sits = kneels.all(axis=1) & (apart.max(axis=1) < 0.15 * h)
+    assert sits.sum() > 5
+    assert low[0] - low[-1] < 0.02
+    assert np.flatnonzero(squat)[0] < np.flatnonzero(kneels.any(axis=1))[0] < np.flatnonzero(sits)[0]
+
+
+@pytest.mark.parametrize("name", ["turn", "crouch"])
+def test_legs_reach_their_steps_at_every_stature(name: str) -> None:
+    for stature in (1.5, 2.0):
+        plan = plan_capture(Options(motion=name, size=(80, 60), stature_m=stature))
+        lowest = sole_points(plan.skeleton, plan.poses)[..., 2].min(axis=(1, 2))
+        assert np.abs(lowest).max() < 1e-3
+        knees = [plan.poses.origin[:, plan.skeleton.index("knee" + side), 2].min() for side in ("_l", "_r")]
+        assert min(knees) > KNEE_RADIUS * stature - 0.004
 
 
 def oracle_distance(actor_body: Body, pose, points: np.ndarray) -> np.ndarray:  # type: ignore[no-untyped-def]
