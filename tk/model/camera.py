@@ -172,3 +172,8 @@ class Rig:
     def centers(self) -> Float:
         """(C, 3) centres of projection, metres."""
         return np.array([c.center for c in self.cameras])
+
+    def pixels_per_metre(self, point: ArrayLike) -> float:
+        """How long a metre across the view is in a picture where the world point (3,) is; the median of the cameras."""
+        focal = np.array([c.matrix[0, 0] for c in self.cameras])
+        return float(np.median(focal / np.linalg.norm(self.centers - np.asarray(point), axis=1)))

@@ -44,6 +44,8 @@ Float = NDArray[np.float64]
 
 # Information of one pixel of contour, 1/px²: edgels err by 2 px, and together along 10 px.
 INFORMATION = 1.0 / (2.0**2 * 10.0)
+# A frame is gone through at this many scales at least: at the finest alone a descent does not come all the way.
+FEWEST = 2
 # Standard deviations of the priors: waist and ankles about straight ones, the others about their prediction.
 WAIST_DEG, ANKLE_DEG, ANGLE_DEG, TRANSLATION_M = 12.0, 20.0, 40.0, 0.3
 # Who is explained worse than at best is usual by this factor for RELOCATE_EVERY frames, searched or not, is looked for
@@ -162,7 +164,8 @@ class RegionTracker(ContourTracker):
         watch.lap("masks_clean")
         self._alive += [replace(h, previous=h.pose, jumped=False) for h in self._alive if h.jumped]
         starts = np.array([h.pose + contours.prediction * (h.pose - h.previous) for h in self._alive])
-        poses, hessian = self.settle(pyramid, starts, images=images, prior=self._prior(starts))
+        levels = self._levels()
+        poses, hessian = self.settle(pyramid, starts, levels, images, self._prior(starts))
         watch.lap("optimise")
         evidence = self.evidence(self.screen, frame, pyramid)
         by_view, met = evidence.cast(self.body, self.colors.group, poses, export=True)
@@ -209,7 +212,7 @@ class RegionTracker(ContourTracker):
             **self.told(pose),
             status=status,
             objective=float(self._best.cost),
-            iterations=np.array([sum(len(solver.steps(k)) for k in range(solver.scales)), int(searched)], np.int32),
+            iterations=np.array([sum(len(solver.steps(k)) for k in levels), int(searched)], np.int32),
             timing=watch.laps,
             sigma=sigma,
             fit_error=error,
@@ -245,6 +248,22 @@ class RegionTracker(ContourTracker):
     @property
     def _best(self) -> Hypothesis:
         return self._alive[0]
+
+    def _levels(self) -> list[int]:
+        """The scales to go through. A coarse one sees far, and so other limbs' edges: the first is the one that sees as
+        far as the prediction leaves to go of what a joint went in the frame before; the coarsest, after a jump."""
+        contours, skeleton = self.contours, self.body.skeleton
+        first = contours.solver.scales - 1
+        if not any(h.jumped for h in self._alive):
+            now, before = (
+                skeleton.joints(np.array(poses))
+                for poses in zip(*((h.pose, h.previous) for h in self._alive), strict=True)
+            )
+            left_m = abs(1 - contours.prediction) * np.linalg.norm(now - before, axis=2).max()
+            left_px = left_m * self.views.rig.pixels_per_metre(now[0, 0])
+            while first > FEWEST - 1 and contours.search.window_px * 2 ** (first - 1) >= left_px:
+                first -= 1
+        return list(range(first, -1, -1))
 
     def _prior(self, mean: Float, angle_deg: float = ANGLE_DEG) -> Prior:
         """Waist and ankles are about straight, all else is about where it was expected."""
