@@ -263,6 +263,14 @@ class ContourTracker:
         """
         return {"world": np.column_stack([self.world.rotation, self.world.origin])}
 
+    def rewind(self, state: Mapping[str, Any]) -> None:
+        """Go back to a state; what of it there is, a subclass says."""
+
+    def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
+        """Take up where a run with this model and state stopped."""
+        self.take_body(restore_body(model))
+        self.rewind(state)
+
     def poses_of(self, state: Mapping[str, Any], name: str) -> Float:
         """Poses that a state tells; results of before told those of the capture's world."""
         poses = np.asarray(state[name])

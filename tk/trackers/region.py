@@ -38,7 +38,7 @@ from tk.model.silhouettes import Pyramid
 from tk.model.skeleton import JOINTS, Skeleton
 from tk.optim.gauss_newton import Prior
 from tk.trackers.base import Estimate, Observation, Stopwatch, drift
-from tk.trackers.contours import APART_M, GAIN, RELOCATE_EVERY, ContourTracker, SilhouetteConfig, restore_body
+from tk.trackers.contours import APART_M, GAIN, RELOCATE_EVERY, ContourTracker, SilhouetteConfig
 
 Float = NDArray[np.float64]
 
@@ -251,10 +251,11 @@ class RegionTracker(ContourTracker):
 
     def _levels(self) -> list[int]:
         """The scales to go through. A coarse one sees far, and so other limbs' edges: the first is the one that sees as
-        far as the prediction leaves to go of what a joint went in the frame before; the coarsest, after a jump."""
+        far as the prediction leaves to go of what a joint went in the frame before; the coarsest, after a jump and for
+        who is lost or stranded."""
         contours, skeleton = self.contours, self.body.skeleton
         first = contours.solver.scales - 1
-        if not any(h.jumped for h in self._alive):
+        if not (self._lost_for or self._stranded or any(h.jumped for h in self._alive)):
             now, before = (
                 skeleton.joints(np.array(poses))
                 for poses in zip(*((h.pose, h.previous) for h in self._alive), strict=True)
@@ -503,9 +504,8 @@ class RegionTracker(ContourTracker):
             **self.colors.state(),
         }
 
-    def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
-        """Take up where a run with this model and state stopped."""
-        self.take_body(restore_body(model))
+    def rewind(self, state: Mapping[str, Any]) -> None:
+        """Go back to a state."""
         poses, previous = (self.poses_of(state, name) for name in ("poses", "previous"))
         jumped = state.get("jumped", np.zeros(len(poses), np.bool_))  # results of before have none
         rows = zip(poses, previous, state["costs"], state["ages"], jumped, strict=True)

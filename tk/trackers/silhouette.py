@@ -20,7 +20,7 @@ from tk.io.init_pose import InitPose
 from tk.model.camera import Rig
 from tk.model.cone_body import ConeBody
 from tk.trackers.base import Estimate, Observation, Stopwatch
-from tk.trackers.contours import RELOCATE_EVERY, ContourTracker, SilhouetteConfig, restore_body
+from tk.trackers.contours import RELOCATE_EVERY, ContourTracker, SilhouetteConfig
 
 Float = NDArray[np.float64]
 
@@ -89,9 +89,8 @@ class SilhouetteTracker(ContourTracker):
         """What :meth:`restore` needs beside the model to go on from the last frame."""
         return {**super().state(), "pose": self._pose, "previous": self._previous, "lost_for": self._lost_for}
 
-    def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
-        """Take up where a run with this model and state stopped."""
-        self.take_body(restore_body(model))
+    def rewind(self, state: Mapping[str, Any]) -> None:
+        """Go back to a state."""
         self._pose, self._previous = (self.poses_of(state, name) for name in ("pose", "previous"))
         self._lost_for = int(state["lost_for"])
         self._fresh = False

@@ -174,14 +174,16 @@ class Watch:
             (self._since_trial[suspects] > _PAUSE) | (error[suspects] > _WORSE * self._at_trial[suspects])
         ]
         estimate = first
+        tracker = self.tracker
+        assert isinstance(tracker, ContourTracker)
         if len(suspects) and kept.sum() >= 3:
             worst = int(suspects[np.argmax(ratio[suspects])])
             others = kept.copy()
             others[worst] = False
-            after = self.tracker.state()
+            after = tracker.state()
             fewer = _without(used, ~others)
-            self._restore(before)
-            second = self.tracker.step(fewer)
+            tracker.rewind(before)
+            second = tracker.step(fewer)
             lacking, surplus = self._errors(frame, second)
             again = lacking + surplus
             relief = 1.0 - float(np.mean(again[others]) / np.mean(error[others]))
@@ -199,7 +201,7 @@ class Watch:
                 estimate, used, kept = replace(second, status=first.status), fewer, others
                 aside = _aside(lacking, surplus)
             else:
-                self._restore(after)
+                tracker.rewind(after)
                 self._since_trial[worst], self._at_trial[worst] = 0, error[worst]
         told = error if estimate is first else again
         self._beside_usual = float(np.mean((told / self._usual)[kept])) if kept.any() else np.inf
@@ -208,9 +210,6 @@ class Watch:
             self._usual = np.where(kept, np.maximum(self._usual + rate * (error - self._usual), 0.05), self._usual)
         self._distrusted &= ~back
         return estimate, used, np.where(kept, aside, np.nan)
-
-    def _restore(self, state: Mapping[str, Any]) -> None:
-        self.tracker.restore(self.tracker.model(), state)
 
     def _errors(self, frame: Observation, estimate: Estimate) -> Float:
         """(2, C) the two parts of E_S at the estimate's pose, of cameras left out, too: body outside the mask, unless
