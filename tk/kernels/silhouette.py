@@ -422,7 +422,7 @@ def _launch(
         regions.log_likelihood,
         regions.group,
         _numbers(settings, scale, regions.weight, dtype),
-        spread_of(B) if B > 1 else 1,
+        spread_of(B),
         settings.most_samples,
         int(settings.interior),
         int(export),
