@@ -141,6 +141,17 @@ def test_a_frame_that_is_explained_badly_is_searched_unasked() -> None:
     assert errors(estimate, raised)[JOINTS.index("wrist_r")] < 0.08
 
 
+def test_the_frame_behind_one_that_is_explained_badly_is_searched_once_more() -> None:
+    """What was lost in a frame that shows little is found in the first that shows more."""
+    tracker = tracker_at(POSES[0])
+    headless = MASKS[0].copy()
+    for mask in headless:
+        rows = np.flatnonzero(mask.any(axis=1))
+        mask[: int(rows[0] + 0.15 * np.ptp(rows))] = 0
+    searched = [tracker.step(observe(masks)).iterations[1] for masks in (MASKS[0], headless, MASKS[0], MASKS[0])]
+    assert searched == [0, 1, 1, 0]
+
+
 def test_a_run_that_stops_behind_a_jump_goes_on_as_an_unbroken_one() -> None:
     """The arm has come from where it was: its motion is tried as a prediction, and none."""
     further = [with_arm(POSES[1], "r", direction, 15.0) for direction in ((0.1, 1.0, 0.5), (0.1, 0.6, 1.0))]
@@ -222,12 +233,12 @@ def test_who_stays_in_a_wrong_pose_is_looked_for_as_if_lost(monkeypatch: pytest.
     monkeypatch.setattr(tracker, "relocate", watched)
     monkeypatch.setattr(tracker, "search", lambda _frame, _pyramid, _evidence, pose, *_: (pose[None], np.zeros(1)))
     tracker.restore(tracker.model(), {**state, "poses": wrong[None], "previous": wrong[None]})
-    sound = tracker.state()["sound"]
+    usual = tracker.state()["usual"]
     estimates = [tracker.step(observe(MASKS[0])) for _ in range(4)]
     assert [e.status for e in estimates] == ["tracked"] * 4
     assert errors(estimates[1], POSES[0]).mean() > 2 * CLOSE_M
     assert len(looked_for) == 1 and errors(estimates[3], POSES[0]).mean() < CLOSE_M
-    assert tracker.state()["sound"] < 1.1 * sound
+    assert tracker.state()["usual"] < 1.1 * usual
 
 
 def test_a_frame_begins_at_the_scale_that_sees_as_far_as_joints_may_come() -> None:

@@ -48,15 +48,12 @@ INFORMATION = 1.0 / (2.0**2 * 10.0)
 FEWEST = 2
 # Standard deviations of the priors: waist and ankles about straight ones, the others about their prediction.
 WAIST_DEG, ANKLE_DEG, ANGLE_DEG, TRANSLATION_M = 12.0, 20.0, 40.0, 0.3
-# Who is explained worse than at best is usual by this factor for RELOCATE_EVERY frames, searched or not, is looked for
-# as if lost; if that is in vain, again after twice as long.
-STRANDED = 1.6
 # How long a hypothesis may live beside the best one, in frames, and how much of its running cost a frame replaces.
 PATIENCE, RENEWAL = 6, 0.4
 # Hypotheses that cost this much more than the best one, as a share of the person's pixels, are dropped.
 MARGIN = 0.02
-# Colours are learned only in frames that are explained about as well as sound ones, and nothing worse counts as sound:
-# a wrong pose that lasts becomes usual, and need not be searched in every frame, but it stays stranded.
+# Colours are learned only in frames that are explained about as well as is usual, and what is worse than that counts as
+# this much worse: a wrong pose that lasts does not become usual.
 LEARN_RATIO = 1.15
 # Masks are searched for what is carried where this share of their pixels has colours that are not the person's; smaller
 # things than this many pixels across stay.
@@ -82,12 +79,13 @@ class RegionConfig:
 
     Attributes:
         hypotheses: most poses that are followed at once.
-        search_ratio: a frame that is explained worse than is usual for this person, by this factor, is searched.
+        search_ratio: a frame that is explained worse than is usual for this person, by this factor, is searched, and
+            the one after it; who stays so, searched or not, is looked for as if lost.
         colors: whether the colours of the parts are learned and used.
     """
 
     hypotheses: int = 3
-    search_ratio: float = 1.3
+    search_ratio: float = 1.6
     colors: bool = True
 
     def __post_init__(self) -> None:
@@ -129,12 +127,13 @@ class RegionTracker(ContourTracker):
         super().__init__(rig, up, contours or SilhouetteConfig())
         self.config = config or RegionConfig()
         self._alive: list[Hypothesis] = []
-        self._usual = self._sound = np.inf
+        self._usual = np.inf
         self._usual_posture: Float = np.zeros((len(JOINTS), 3))
         self._postures = 0
         self._lost_for = 0
         self._stranded = 0
         self._in_vain = False
+        self._was_worse = False
         self._fresh = True
 
     def start(
@@ -147,11 +146,12 @@ class RegionTracker(ContourTracker):
         """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourTracker.find`."""
         pose = self.find(frames, height_m, init, body)
         self._alive = [Hypothesis(pose, pose, 0.0)]
-        self._usual = self._sound = np.inf
+        self._usual = np.inf
         self._usual_posture, self._postures = np.zeros((len(JOINTS), 3)), 0
         self._lost_for = 0
         self._stranded = 0
         self._in_vain = False
+        self._was_worse = False
         self._fresh = True
 
     def step(self, frame: Observation) -> Estimate:
@@ -183,12 +183,15 @@ class RegionTracker(ContourTracker):
         error = evidence.fit_error(label)
         watch.lap("check")
         misplaced = self.misplaced(evidence, label)
-        searched = self._needs_search(frame, float(np.nanmean(error)), misplaced)
+        # what was lost in a frame that shows little is looked for once more in the first that shows more
+        worse, before = self._worse(float(np.nanmean(error))), self._was_worse
+        searched = self._needs_search(frame, worse or before, misplaced)
+        self._was_worse = worse
         if searched:
             # where no limb alone was better in the frame before, one may be where the other one of its pair should be
-            in_pairs, before = self._in_vain, self._best.pose
+            in_pairs, settled = self._in_vain, self._best.pose
             self._propose(frame, pyramid, evidence, images, misplaced, in_pairs)
-            if self._best.pose is not before:
+            if self._best.pose is not settled:
                 best = self._best.pose[None]
                 _, again = evidence.cast(self.body, self.colors.group, best, export=True)
                 assert again is not None
@@ -298,12 +301,12 @@ class RegionTracker(ContourTracker):
             limb for limb in self.limbs if cost[limb.parts].sum() > MISPLACED * max(count[limb.parts].sum(), 1)
         )
 
-    def _needs_search(self, frame: Observation, error: float, misplaced: Sequence[Limb]) -> bool:
-        """Whether a limb is where it cannot be, the body leaves more unexplained than is usual, or it is time to look
-        around."""
+    def _needs_search(self, frame: Observation, worse: bool, misplaced: Sequence[Limb]) -> bool:
+        """Whether a limb is where it cannot be, this frame or the one before is explained worse than is usual, or it is
+        time to look around."""
         every = self.contours.search_every
         due = every > 0 and frame.index % every == 0
-        return self.contours.body != "walker" and (due or self._worse(error) or bool(misplaced))
+        return self.contours.body != "walker" and (due or worse or bool(misplaced))
 
     def _worse(self, error: float) -> bool:
         """Whether a frame is explained worse than is usual for this person."""
@@ -331,9 +334,10 @@ class RegionTracker(ContourTracker):
         self._rank()
 
     def _follow(self, pyramid: Pyramid, error: float) -> bool:
-        """Whether the person is lost; whoever is lost is looked for as at the start."""
+        """Whether the person is lost; who is, or stays badly explained, is looked for as at the start. If that is in vain,
+        again after twice as long."""
         limit = self.contours.lost_error
-        self._stranded = self._stranded + 1 if error > STRANDED * self._sound else 0
+        self._stranded = self._stranded + 1 if self._worse(error) else 0
         due = self._lost_for > 0 if error <= limit else self._lost_for % RELOCATE_EVERY == 0
         waits, rest = divmod(self._stranded, RELOCATE_EVERY)
         stranded = not due and rest == 0 and waits.bit_count() == 1
@@ -347,10 +351,9 @@ class RegionTracker(ContourTracker):
     def _learn(self, evidence: Evidence, label: NDArray[np.uint8], error: float, lost: bool) -> None:
         if lost:
             return
-        if self.config.colors and evidence.bins is not None and error <= LEARN_RATIO * self._sound:
+        if self.config.colors and evidence.bins is not None and error <= LEARN_RATIO * self._usual:
             self.colors.learn(evidence.bins[evidence.person], label[evidence.person])
-        self._usual = drift(self._usual, error)
-        self._sound = drift(self._sound, min(error, LEARN_RATIO * self._sound))
+        self._usual = drift(self._usual, min(error, LEARN_RATIO * self._usual))
 
     def _curvature(self, pyramid: Pyramid, poses: Float, images: NDArray[np.uint8] | None) -> Float:
         """(D, D) JᵀWJ at the first of the poses."""
@@ -495,12 +498,12 @@ class RegionTracker(ContourTracker):
             "ages": np.array([h.age for h in self._alive]),
             "jumped": np.array([h.jumped for h in self._alive]),
             "usual": self._usual,
-            "sound": self._sound,
             "usual_posture": self._usual_posture.copy(),
             "postures": self._postures,
             "lost_for": self._lost_for,
             "stranded": self._stranded,
             "in_vain": self._in_vain,
+            "was_worse": self._was_worse,
             **self.colors.state(),
         }
 
@@ -511,12 +514,12 @@ class RegionTracker(ContourTracker):
         rows = zip(poses, previous, state["costs"], state["ages"], jumped, strict=True)
         self._alive = [Hypothesis(p, q, float(c), int(a), bool(j)) for p, q, c, a, j in rows]
         self._usual = float(state["usual"])
-        self._sound = float(state.get("sound", self._usual))  # results of before have none
         self._usual_posture = np.array(state["usual_posture"], np.float64)
         self._postures = int(state["postures"])
         self._lost_for = int(state["lost_for"])
         self._stranded = int(state.get("stranded", 0))  # results of before have none
         self._in_vain = bool(state.get("in_vain", False))  # results of before have none
+        self._was_worse = bool(state.get("was_worse", False))  # results of before have none
         self.colors.restore(state)
         self._fresh = False
 
