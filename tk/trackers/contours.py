@@ -42,6 +42,8 @@ MEASURED = 0.05
 RELOCATE_EVERY = 3
 # One in so many places of a lost person goes on to the finer scales.
 RELOCATED = 4
+# No finer scale halves what a place leaves unexplained.
+HALVED = 2.0
 # The fall of the cost, as a share of the person's pixels, that makes another place of a limb the pose.
 GAIN = 0.004
 # Places of a limb that are descended from, more of one that is known to be misplaced, and random ones about its own
@@ -426,8 +428,12 @@ class ContourTracker:
             return np.asarray(FACING * (1 - np.cos(states[:, yaw] - pose[yaw])) / 2)
 
         coarse = self.settle(pyramid, starts, levels[:1]).states
-        order = np.argsort(self.fit_error(pyramid, coarse) + turned(coarse), kind="stable")
-        settled = self.settle(pyramid, coarse[order[: len(starts) // RELOCATED]], levels[1:]).states
+        rough = self.fit_error(pyramid, coarse)
+        order = np.argsort(rough + turned(coarse), kind="stable")[: len(starts) // RELOCATED]
+        order = order[rough[order] < HALVED * error]
+        if not len(order):
+            return pose, error
+        settled = self.settle(pyramid, coarse[order], levels[1:]).states
         errors = self.fit_error(pyramid, settled)
         i = int(np.argmin(errors + turned(settled)))
         return (settled[i], float(errors[i])) if errors[i] < error else (pose, error)
