@@ -318,7 +318,7 @@ def test_any_pose_will_do_in_any_frame(copy: Path, tmp_path: Path) -> None:
 def test_settings_are_checked() -> None:
     for text, part in (
         ("[region]\nhypotheses = 0\n", "hypotheses"),
-        ("[region]\nsearch_ratio = 0.2\n", "search_ratio"),
+        ("[region]\nsearch_excess = 1.2\n", "search_excess"),
     ):
         with pytest.raises(ConfigError, match=part):
             Config.from_toml(text)

@@ -21,7 +21,7 @@ from tk.model.silhouettes import draw_silhouettes
 from tk.model.skeleton import JOINTS, join_pose, shoulder_angles, split_pose
 from tk.optim.gauss_newton import GaussNewtonConfig
 from tk.trackers.contours import SilhouetteConfig
-from tk.trackers.region import RegionConfig, RegionTracker
+from tk.trackers.region import BEHIND, MOST_A_VIEW, RegionConfig, RegionTracker
 
 RIG = ring_of_cameras(3, width=160, height=200)
 SKELETON = BODY.skeleton
@@ -121,7 +121,7 @@ def test_an_arm_elsewhere_is_found_again_by_the_search() -> None:
     found = {}
     for every in (0, 1):
         # without a search where a frame is explained badly, the arm stays where it was
-        config = RegionConfig(search_ratio=1.1 if every else 1000.0)
+        config = RegionConfig(search_excess=0.02 if every else 1.0)
         tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=every), config=config)
         tracker.step(observe(MASKS[0]))
         for i in range(1, 4):
@@ -141,15 +141,27 @@ def test_a_frame_that_is_explained_badly_is_searched_unasked() -> None:
     assert errors(estimate, raised)[JOINTS.index("wrist_r")] < 0.08
 
 
-def test_the_frame_behind_one_that_is_explained_badly_is_searched_once_more() -> None:
-    """What was lost in a frame that shows little is found in the first that shows more."""
+def test_frames_behind_one_that_is_explained_badly_are_searched_too() -> None:
+    """What was lost in a frame that shows little is found in those that show more."""
     tracker = tracker_at(POSES[0])
     headless = MASKS[0].copy()
     for mask in headless:
         rows = np.flatnonzero(mask.any(axis=1))
         mask[: int(rows[0] + 0.15 * np.ptp(rows))] = 0
-    searched = [tracker.step(observe(masks)).iterations[1] for masks in (MASKS[0], headless, MASKS[0], MASKS[0])]
-    assert searched == [0, 1, 1, 0]
+    shown = (MASKS[0], headless, *(MASKS[0] for _ in range(BEHIND + 1)))
+    assert [tracker.step(observe(masks)).iterations[1] for masks in shown] == [0, 1, *(1 for _ in range(BEHIND)), 0]
+
+
+def test_a_mask_that_is_torn_in_one_view_of_many_calls_for_no_search() -> None:
+    """A lost limb shows in most views."""
+    tracker = tracker_at(POSES[0])
+    tracker.step(observe(MASKS[0]))
+    usual = tracker.state()["usual"]
+    views = np.arange(len(usual))
+    one, all_views = (np.where(np.isin(views, torn), 0.3, 0.0) for torn in ([0], views))
+    tracker.config = replace(tracker.config, search_excess=MOST_A_VIEW / 2)
+    assert not tracker._worse(usual + one) and tracker._worse(usual + all_views)
+    assert not tracker._worse(np.where(views == 0, np.nan, usual))
 
 
 def test_a_run_that_stops_behind_a_jump_goes_on_as_an_unbroken_one() -> None:
@@ -233,12 +245,12 @@ def test_who_stays_in_a_wrong_pose_is_looked_for_as_if_lost(monkeypatch: pytest.
     monkeypatch.setattr(tracker, "relocate", watched)
     monkeypatch.setattr(tracker, "search", lambda _frame, _pyramid, _evidence, pose, *_: (pose[None], np.zeros(1)))
     tracker.restore(tracker.model(), {**state, "poses": wrong[None], "previous": wrong[None]})
-    usual = tracker.state()["usual"]
+    usual = tracker.state()["usual"].mean()
     estimates = [tracker.step(observe(MASKS[0])) for _ in range(4)]
     assert [e.status for e in estimates] == ["tracked"] * 4
     assert errors(estimates[1], POSES[0]).mean() > 2 * CLOSE_M
     assert len(looked_for) == 1 and errors(estimates[3], POSES[0]).mean() < CLOSE_M
-    assert tracker.state()["usual"] < 1.1 * usual
+    assert tracker.state()["usual"].mean() < 1.1 * usual
 
 
 def test_a_frame_begins_at_the_scale_that_sees_as_far_as_joints_may_come() -> None:
@@ -389,7 +401,7 @@ def test_a_body_that_was_given_is_kept_in_the_second_pass() -> None:
 
 
 def test_settings_out_of_range_are_told() -> None:
-    for values, message in (({"hypotheses": 0}, "hypotheses = 0"), ({"search_ratio": 0.5}, "search_ratio = 0.5")):
+    for values, message in (({"hypotheses": 0}, "hypotheses = 0"), ({"search_excess": -0.5}, "search_excess = -0.5")):
         with pytest.raises(ConfigError, match=message):
             RegionConfig(**values)
     with pytest.raises(ConfigError, match="scales = 0"):

@@ -185,18 +185,21 @@ def turn_between(one: Camera, other: Camera) -> float:
     return float(np.degrees(np.linalg.norm(cv2.Rodrigues(one.rotation @ other.rotation.T)[0])))
 
 
-def aligned(rig: Rig, target: Rig, turn: float, move: float) -> Rig:
-    """The rig after the motion and scaling of the world that brings it closest to the target.
+def aligned(rig: Rig, target: Rig, turn: float, move: float, scaling: bool = True) -> Rig:
+    """The rig after the motion of the world, and its scaling unless that is held, that brings it closest to the target.
 
     Args:
         rig, target: the same C cameras.
         turn, move: standard deviations, radians and metres, that turns and places of cameras are weighed by.
+        scaling: whether the world may grow, too.
     """
+    free = 7 if scaling else 6
     weight = np.tile(np.repeat([1 / turn, 1 / move], 3), len(rig))
     for _ in range(5):
         away = np.concatenate([_twist(c, t) for c, t in zip(rig, target, strict=True)])
-        modes = world_motions(rig)
-        s = np.linalg.lstsq(modes * weight[:, None], -away * weight, rcond=None)[0]
+        modes = world_motions(rig)[:, :free]
+        s = np.zeros(7)
+        s[:free] = np.linalg.lstsq(modes * weight[:, None], -away * weight, rcond=None)[0]
         Q, scale = np.asarray(cv2.Rodrigues(s[:3])[0]), float(np.exp(s[6]))
         cameras = []
         for c in rig:

@@ -146,7 +146,8 @@ class Stopwatch:
         self._last = now
 
 
-def drift(usual: float, now: float) -> float:
-    """What is usual after one more frame: quick to learn that it can be better, slow to put up with worse; infinite as
-    long as nothing is known."""
-    return now if not np.isfinite(usual) else usual + (0.1 if now < usual else 0.05) * (now - usual)
+def drift(usual: Float, now: Float) -> Float:
+    """What is usual after one more frame, element by element: quick to learn that it can be better, slow to put up with
+    worse; infinite as long as nothing is known."""
+    known = np.where(np.isfinite(usual), usual, now)
+    return np.asarray(known + np.where(now < known, 0.1, 0.05) * (now - known))

@@ -52,6 +52,11 @@ WAIST_DEG, ANKLE_DEG, ANGLE_DEG, TRANSLATION_M = 12.0, 20.0, 40.0, 0.3
 PATIENCE, RENEWAL = 6, 0.4
 # Hypotheses that cost this much more than the best one, as a share of the person's pixels, are dropped.
 MARGIN = 0.02
+# A limb that is lost shows in most views, a torn mask in one: no view adds more than this to what a frame is explained
+# worse than usual.
+MOST_A_VIEW = 0.15
+# So many frames behind one that is explained worse than usual are searched, too.
+BEHIND = 3
 # Colours are learned only in frames that are explained about as well as is usual, and what is worse than that counts as
 # this much worse: a wrong pose that lasts does not become usual.
 LEARN_RATIO = 1.15
@@ -79,20 +84,22 @@ class RegionConfig:
 
     Attributes:
         hypotheses: most poses that are followed at once.
-        search_ratio: a frame that is explained worse than is usual for this person, by this factor, is searched, and
-            the one after it; who stays so, searched or not, is looked for as if lost.
+        search_excess: a frame that leaves more of the person's pixels unexplained, or covers more beside them, than is
+            usual is searched, if this share more by the mean over the views, and so are those just behind it; who
+            stays so, searched or not, is looked for as if lost. An arm has about twice this share, but part of it lies
+            before or behind the trunk.
         colors: whether the colours of the parts are learned and used.
     """
 
     hypotheses: int = 3
-    search_ratio: float = 1.6
+    search_excess: float = 0.065
     colors: bool = True
 
     def __post_init__(self) -> None:
         if not 1 <= self.hypotheses <= 20:
             raise ConfigError(f"region: hypotheses = {self.hypotheses} must lie in [1, 20]")
-        if not 1 <= self.search_ratio <= 1000:
-            raise ConfigError(f"region: search_ratio = {self.search_ratio} must lie in [1, 1000]")
+        if not 0 <= self.search_excess <= 1:
+            raise ConfigError(f"region: search_excess = {self.search_excess} must lie in [0, 1]")
 
 
 @dataclass(frozen=True)
@@ -127,13 +134,13 @@ class RegionTracker(ContourTracker):
         super().__init__(rig, up, contours or SilhouetteConfig())
         self.config = config or RegionConfig()
         self._alive: list[Hypothesis] = []
-        self._usual = np.inf
+        self._usual: Float = np.full(len(rig), np.inf)
         self._usual_posture: Float = np.zeros((len(JOINTS), 3))
         self._postures = 0
         self._lost_for = 0
         self._stranded = 0
         self._in_vain = False
-        self._was_worse = False
+        self._behind_worse = 0
         self._fresh = True
 
     def start(
@@ -146,12 +153,12 @@ class RegionTracker(ContourTracker):
         """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourTracker.find`."""
         pose = self.find(frames, height_m, init, body)
         self._alive = [Hypothesis(pose, pose, 0.0)]
-        self._usual = np.inf
+        self._usual = np.full(len(self._usual), np.inf)
         self._usual_posture, self._postures = np.zeros((len(JOINTS), 3)), 0
         self._lost_for = 0
         self._stranded = 0
         self._in_vain = False
-        self._was_worse = False
+        self._behind_worse = 0
         self._fresh = True
 
     def step(self, frame: Observation) -> Estimate:
@@ -183,10 +190,10 @@ class RegionTracker(ContourTracker):
         error = evidence.fit_error(label)
         watch.lap("check")
         misplaced = self.misplaced(evidence, label)
-        # what was lost in a frame that shows little is looked for once more in the first that shows more
-        worse, before = self._worse(float(np.nanmean(error))), self._was_worse
-        searched = self._needs_search(frame, worse or before, misplaced)
-        self._was_worse = worse
+        # what was lost in a frame that shows little is looked for in those behind it, too, which show more
+        worse, behind = self._worse(error), self._behind_worse > 0
+        searched = self._needs_search(frame, worse or behind, misplaced)
+        self._behind_worse = BEHIND if worse else max(self._behind_worse - 1, 0)
         if searched:
             # where no limb alone was better in the frame before, one may be where the other one of its pair should be
             in_pairs, settled = self._in_vain, self._best.pose
@@ -197,12 +204,12 @@ class RegionTracker(ContourTracker):
                 assert again is not None
                 label, curvature = again.label[0], self._curvature(pyramid, best, images)
                 error, misplaced = evidence.fit_error(label), self.misplaced(evidence, label)
-            self._in_vain = not in_pairs and self._worse(float(np.nanmean(error)))
+            self._in_vain = not in_pairs and self._worse(error)
         else:
             self._in_vain = False
         watch.lap("search")
-        lost = self._follow(pyramid, float(np.nanmean(error)))
-        self._learn(evidence, label, float(np.nanmean(error)), lost)
+        lost = self._follow(pyramid, error)
+        self._learn(evidence, label, error, lost)
         status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
         self._lost_for = self._lost_for + 1 if lost else 0
         self._fresh = False
@@ -302,15 +309,17 @@ class RegionTracker(ContourTracker):
         )
 
     def _needs_search(self, frame: Observation, worse: bool, misplaced: Sequence[Limb]) -> bool:
-        """Whether a limb is where it cannot be, this frame or the one before is explained worse than is usual, or it is
-        time to look around."""
+        """Whether a limb is where it cannot be, this frame or one just before is explained worse than is usual, or it
+        is time to look around."""
         every = self.contours.search_every
         due = every > 0 and frame.index % every == 0
         return self.contours.body != "walker" and (due or worse or bool(misplaced))
 
-    def _worse(self, error: float) -> bool:
-        """Whether a frame is explained worse than is usual for this person."""
-        return error > self.config.search_ratio * self._usual
+    def _worse(self, error: Float) -> bool:
+        """Whether a frame is explained worse than is usual for this person, by views (C,): by as much as a limb leaves
+        that is lost."""
+        excess = np.minimum(error - self._usual, MOST_A_VIEW)
+        return bool(np.nanmean(excess) > self.config.search_excess)
 
     def _propose(
         self,
@@ -333,27 +342,29 @@ class RegionTracker(ContourTracker):
         ]
         self._rank()
 
-    def _follow(self, pyramid: Pyramid, error: float) -> bool:
-        """Whether the person is lost; who is, or stays badly explained, is looked for as at the start. If that is in vain,
-        again after twice as long."""
-        limit = self.contours.lost_error
-        self._stranded = self._stranded + 1 if self._worse(error) else 0
+    def _follow(self, pyramid: Pyramid, by_view: Float) -> bool:
+        """Whether the person is lost; who is, or stays badly explained, is looked for as at the start, and if that is in
+        vain, again after twice as long."""
+        error, limit = float(np.nanmean(by_view)), self.contours.lost_error
+        self._stranded = self._stranded + 1 if self._worse(by_view) else 0
         due = self._lost_for > 0 if error <= limit else self._lost_for % RELOCATE_EVERY == 0
         waits, rest = divmod(self._stranded, RELOCATE_EVERY)
         stranded = not due and rest == 0 and waits.bit_count() == 1
         if not (due or stranded):
             return error > limit
         pose, found = self.relocate(pyramid, self._best.pose, error)
-        if found < (error / self.config.search_ratio if stranded else error):
+        if found < (error - self.config.search_excess if stranded else error):
             self._alive = [Hypothesis(pose, pose, self._best.cost)]
         return found > limit
 
-    def _learn(self, evidence: Evidence, label: NDArray[np.uint8], error: float, lost: bool) -> None:
+    def _learn(self, evidence: Evidence, label: NDArray[np.uint8], by_view: Float, lost: bool) -> None:
         if lost:
             return
-        if self.config.colors and evidence.bins is not None and error <= LEARN_RATIO * self._usual:
+        seen = np.isfinite(by_view)
+        error, usual = by_view[seen], self._usual[seen]
+        if self.config.colors and evidence.bins is not None and error.sum() <= LEARN_RATIO * usual.sum():
             self.colors.learn(evidence.bins[evidence.person], label[evidence.person])
-        self._usual = drift(self._usual, min(error, LEARN_RATIO * self._usual))
+        self._usual[seen] = drift(usual, np.minimum(error, LEARN_RATIO * usual))
 
     def _curvature(self, pyramid: Pyramid, poses: Float, images: NDArray[np.uint8] | None) -> Float:
         """(D, D) JᵀWJ at the first of the poses."""
@@ -497,13 +508,13 @@ class RegionTracker(ContourTracker):
             "costs": np.array([h.cost for h in self._alive]),
             "ages": np.array([h.age for h in self._alive]),
             "jumped": np.array([h.jumped for h in self._alive]),
-            "usual": self._usual,
+            "usual": self._usual.copy(),
             "usual_posture": self._usual_posture.copy(),
             "postures": self._postures,
             "lost_for": self._lost_for,
             "stranded": self._stranded,
             "in_vain": self._in_vain,
-            "was_worse": self._was_worse,
+            "behind_worse": self._behind_worse,
             **self.colors.state(),
         }
 
@@ -513,13 +524,13 @@ class RegionTracker(ContourTracker):
         jumped = state.get("jumped", np.zeros(len(poses), np.bool_))  # results of before have none
         rows = zip(poses, previous, state["costs"], state["ages"], jumped, strict=True)
         self._alive = [Hypothesis(p, q, float(c), int(a), bool(j)) for p, q, c, a, j in rows]
-        self._usual = float(state["usual"])
+        self._usual = np.full(len(self.views.rig), state["usual"], np.float64)
         self._usual_posture = np.array(state["usual_posture"], np.float64)
         self._postures = int(state["postures"])
         self._lost_for = int(state["lost_for"])
         self._stranded = int(state.get("stranded", 0))  # results of before have none
         self._in_vain = bool(state.get("in_vain", False))  # results of before have none
-        self._was_worse = bool(state.get("was_worse", False))  # results of before have none
+        self._behind_worse = int(state.get("behind_worse", 0))  # results of before have none
         self.colors.restore(state)
         self._fresh = False
 

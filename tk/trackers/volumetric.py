@@ -120,7 +120,7 @@ class VolumetricTracker:
         self._objective: BodyObjective
         self._appearance: Appearance
         self._pose = self._previous = NO_ANGLES
-        self._usual, self._usual_unexplained = np.inf, 1.0
+        self._usual: Float = np.array([np.inf, 1.0])  # objective, unexplained share
         self._lost_for = 0
         self._fresh = True
 
@@ -161,7 +161,7 @@ class VolumetricTracker:
         self._pose = self._previous = join_pose(self.skin.skeleton, paper, waist[: len(self.waist_names)], NO_ANGLES)
         index = self._index(surface, np.full(len(surface), -1, np.int64))
         fit = FrameObjective(self._objective, index, np.random.default_rng(0), images=first.images).fit(self._pose)
-        self._usual, self._usual_unexplained = fit.value, fit.unexplained_share
+        self._usual = np.array([fit.value, fit.unexplained_share])
         patch, colors = self._correspondences(surface, index, fit)
         self._appearance = Appearance.learn(len(self.skin.patch_names), patch, colors)
         self.hull.reset()
@@ -204,8 +204,7 @@ class VolumetricTracker:
         status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
         if not lost:
             # (4) the colour models follow (eq. 16)
-            self._usual = drift(self._usual, fit.value)
-            self._usual_unexplained = drift(self._usual_unexplained, fit.unexplained_share)
+            self._usual = drift(self._usual, np.array([fit.value, fit.unexplained_share]))
             patch, colors = self._correspondences(surface, index, fit)
             self._appearance = self._appearance.updated(patch, colors, config.appearance)
         self._previous = result.pose if lost or self._lost_for else self._pose
@@ -263,8 +262,8 @@ class VolumetricTracker:
         unmatched = np.bincount(chain[fit.unmatched] + 1, minlength=len(CHAINS) + 1)
         everywhere = np.bincount(chain + 1, minlength=len(CHAINS) + 1)
         return (
-            fit.value > self.config.tracking.lost_ratio * self._usual
-            or fit.unexplained_share > self._usual_unexplained + LOST_UNEXPLAINED
+            fit.value > self.config.tracking.lost_ratio * self._usual[0]
+            or fit.unexplained_share > self._usual[1] + LOST_UNEXPLAINED
             or bool((unmatched > LOST_LIMB * everywhere).any())
         )
 
@@ -316,7 +315,7 @@ class VolumetricTracker:
         return {
             "pose": self._pose,
             "previous": self._previous,
-            "usual": np.array([self._usual, self._usual_unexplained]),
+            "usual": self._usual.copy(),
             "lost_for": self._lost_for,
             "mean_yuv": self._appearance.mean,
         }
@@ -335,7 +334,7 @@ class VolumetricTracker:
         self._appearance = replace(learned, mean=np.asarray(state["mean_yuv"]))
         self._pose = np.asarray(state["pose"])
         self._previous = np.asarray(state["previous"])
-        self._usual, self._usual_unexplained = (float(v) for v in state["usual"])
+        self._usual = np.array(state["usual"], np.float64)
         self._lost_for = int(state["lost_for"])
         self._fresh = False
 
