@@ -343,7 +343,7 @@ class RegionTracker(ContourTracker):
         self._rank()
 
     def _follow(self, pyramid: Pyramid, by_view: Float) -> bool:
-        """Whether the person is lost; who is, or stays badly explained, is looked for as at the start, and if that is in
+        """Whether the person is lost; who is, or stays badly explained, is looked for as at the start; if that is in
         vain, again after twice as long."""
         error, limit = float(np.nanmean(by_view)), self.contours.lost_error
         self._stranded = self._stranded + 1 if self._worse(by_view) else 0
