@@ -63,7 +63,7 @@ def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[st
         if missing:  # what an earlier run has tracked
             with open_source(plan.capture, plan.config, lambda _: None) as source:
                 for observation, _ in source.frames(min(missing), max(missing) + 1):
-                    masks.put(observation.index, tracker.without_foreign(observation).masks)
+                    masks.put(observation.index, tracker.cleaned(tracker.without_foreign(observation).masks))
         if plan.config.refine:
             refined = refine_if_astray(tracker, masks, result.frames, poses, ~lost, note)
             if refined is not None:

@@ -206,7 +206,7 @@ def refine_if_astray(
         usable,
         LOOKED_AT,
         1,
-        contours.cleaning,
+        None,
     )
     if len(moments) < FEWEST:
         return None

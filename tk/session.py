@@ -327,10 +327,22 @@ class _Run:
         if index < plan.begin:
             return None
         if self.masks is not None:
-            self.masks.put(index, _kept(observation, used, estimate))
+            self.masks.put(index, self._kept(observation, used, estimate))
         self.lost += estimate.status == "lost"
         # masks are large, and a view of the ring of frames at that: nobody who keeps the estimate keeps them
         return replace(estimate, frame=index, time=index / plan.capture.fps, masks=None)
+
+    def _kept(self, observation: Observation, used: Observation, estimate: Estimate) -> NDArray[np.uint8]:
+        """The masks (C, H, W) of a frame, cleaned, as the tracker took them; those of cameras that were left out, too,
+        for these may be refined."""
+        tracker = self.plan.tracker
+        assert isinstance(tracker, ContourTracker)
+        taken = tracker.cleaned(used.masks) if estimate.masks is None else estimate.masks
+        out = np.asarray(observation.masks.any(axis=(1, 2)) & ~used.masks.any(axis=(1, 2)))
+        if out.any():
+            taken = taken.copy()
+            taken[out] = tracker.cleaned(observation.masks[out])
+        return taken
 
     def _written(self, finished: list[Estimate]) -> Iterator[Estimate]:
         if self.output and finished:
@@ -341,14 +353,6 @@ class _Run:
         origin = {_ORIGIN + name: value for name, value in output.origin.items()}
         watched = {_WATCH + name: value for name, value in self.watch.state().items()}
         return {**self.plan.tracker.state(), **watched, **origin, _ORIGIN + _LOST: self.lost}
-
-
-def _kept(observation: Observation, used: Observation, estimate: Estimate) -> NDArray[np.uint8]:
-    """The masks (C, H, W) of a frame as the tracker took them; those of cameras that were left out as they were, for
-    these may be refined."""
-    taken = used.masks if estimate.masks is None else estimate.masks
-    out = np.asarray(observation.masks.any(axis=(1, 2)) & ~used.masks.any(axis=(1, 2)))
-    return np.where(out[:, None, None], observation.masks, taken) if out.any() else taken
 
 
 def _below(prefix: str, state: Mapping[str, Value]) -> dict[str, Value]:

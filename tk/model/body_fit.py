@@ -194,9 +194,13 @@ class BodyProblem:
         row = np.concatenate([edgels.row for edgels in seen])
         rows = np.zeros((len(part), len(_DIMENSIONS)))
 
+        # the cameras of a frame share its pose
+        different, which = np.unique(poses, axis=0, return_inverse=True)
+        frame = which.ravel()[frame]
+
         def points(values: Float) -> Float:
             body = self.build(values)
-            placed = body.part_transforms(body.skeleton.segment_transforms(poses))
+            placed = body.part_transforms(body.skeleton.segment_transforms(different))
             return body.placed(placed[frame, part], part, unscaled)
 
         here = points(shared)

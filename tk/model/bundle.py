@@ -219,7 +219,7 @@ def gather(
     usable: NDArray[np.bool_],
     count: int,
     scales: int,
-    cleaning: CleaningConfig,
+    cleaning: CleaningConfig | None,
     late: NDArray[np.int64] | None = None,
 ) -> list[Moment]:
     """Frames that are spread evenly over a recording, whose neighbours are usable, too: they tell the velocity.
@@ -232,7 +232,7 @@ def gather(
         usable: (F,) bool, rows whose pose is to be trusted.
         count: most frames that are taken.
         scales: of the pyramids.
-        cleaning: of the masks.
+        cleaning: of the masks; None: they are clean.
         late: (C,) whole frames by which a camera's pictures are late; its frame k - late is shown beside frame k of
             the others. None: by none.
     """

@@ -36,22 +36,22 @@ _TRUNK = SEGMENTS.index("torso")
 
 
 def contour_variance(skeleton: Skeleton, pose: Float, precision: Float, free: NDArray[np.bool_]) -> Float:
-    """(15,) variance of the joints' places along an axis, metres², that the contours' noise makes.
+    """(..., 15) variance of the joints' places along an axis, metres², that the contours' noise makes.
 
     Args:
         skeleton: of D degrees of freedom.
-        pose: (D,).
-        precision: (D, D) the information about the pose that contours and priors give.
+        pose: (..., D).
+        precision: (..., D, D) the information about the pose that contours and priors give.
         free: (D,) what was free to change.
     """
     index = np.flatnonzero(free)
-    covariance = np.linalg.inv(precision[np.ix_(index, index)])
+    covariance = np.linalg.inv(precision[..., index[:, None], index])
     w, v = skeleton.twists(pose)
     moves = skeleton.ancestors()[skeleton.joint_segment][:, index]
-    J = np.where(
-        moves[:, :, None], np.cross(w[index][None], skeleton.joints(pose)[:, None]) + v[index][None], 0.0
-    ).transpose(0, 2, 1)  # (15, 3, free)
-    return np.asarray((J * (J @ covariance)).sum(axis=(1, 2)) / 3)
+    w, v = w[..., None, index, :], v[..., None, index, :]
+    J = np.where(moves[:, :, None], np.cross(w, skeleton.joints(pose)[..., None, :]) + v, 0.0)  # (..., 15, free, 3)
+    J = np.swapaxes(J, -1, -2)
+    return np.asarray((J * (J @ covariance[..., None, :, :])).sum(axis=(-1, -2)) / 3)
 
 
 def directions(skeleton: Skeleton, poses: Float) -> Float:

@@ -247,17 +247,18 @@ class Skeleton:
         return np.concatenate([self.point, self.rise], axis=1)
 
     def twists(self, pose: Float) -> tuple[Float, Float]:
-        """World twists (ω, v), each (D, 3): a point x below degree of freedom k moves at ω_k × x + v_k (eqs. 6-8)."""
+        """World twists (ω, v), each (..., D, 3), at poses (..., D): a point x below degree of freedom k moves at
+        ω_k × x + v_k (eqs. 6-8)."""
         T = self.transforms(pose)
-        above = np.where((self.parent >= 0)[:, None, None], T[self.parent], np.eye(4))
-        axis = (above[:, :3, :3] @ self.axis[:, :, None])[..., 0]
+        above = np.where((self.parent >= 0)[:, None, None], T[..., self.parent, :, :], np.eye(4))
+        axis = (above[..., :3, :3] @ self.axis[:, :, None])[..., 0]
         # the joint's place, its rise included, does not move when it turns
-        q = (T[:, :3, :3] @ self.point[:, :, None])[..., 0] + T[:, :3, 3]
+        q = (T[..., :3, :3] @ self.point[:, :, None])[..., 0] + T[..., :3, 3]
         v = np.where(self.prismatic[:, None], axis, np.cross(q, axis))
         for k in self._raised:
-            lift = above[k, :3, :3] @ self.rise[k]
+            lift = above[..., k, :3, :3] @ self.rise[k]
             for by in (0, 1):
-                v[k + by] += lift * arm_elevation(pose[k], pose[k + 1], by=by)
+                v[..., k + by, :] += lift * arm_elevation(pose[..., k], pose[..., k + 1], by=by)[..., None]
         return np.where(self.prismatic[:, None], 0.0, axis), v
 
     def segment_transforms(self, pose: Float) -> Float:

@@ -52,8 +52,8 @@ class Estimate:
         sigma: (15,) one standard deviation of each joint's position along an axis, metres; None where the tracker does
             not say.
         fit_error: (C,) E_S of each camera; None where the tracker does not say.
-        masks: (C, H, W) uint8, what the tracker took for the person; None where that is the observation's, and in
-            what :func:`tk.track` hands out.
+        masks: (C, H, W) uint8, what the tracker took for the person, cleaned; None where that is the observation's, and
+            in what :func:`tk.track` hands out.
         frame, time: the frame's number in the capture, and seconds; whoever steps the tracker knows them.
     """
 

@@ -226,7 +226,7 @@ class RegionTracker(ContourTracker):
             timing=watch.laps,
             sigma=sigma,
             fit_error=error,
-            masks=frame.masks,
+            masks=pyramid.masks[0],
         )
 
     def without_foreign(self, frame: Observation) -> Observation:
@@ -403,7 +403,7 @@ class RegionTracker(ContourTracker):
         has the spread of the two.
 
         Args:
-            masks: (C, H, W) of F frames.
+            masks: (C, H, W) of F frames, as :meth:`step` told them: cleaned.
             poses: (F, D) of the first pass, in the capture's world.
             lost: (F,) bool; such frames neither teach nor change.
             error: (F, C) E_S of the first pass; NaN where a camera was left out, and is again.
@@ -414,7 +414,6 @@ class RegionTracker(ContourTracker):
             Poses (F, D) in the capture's world, E_S (F, C), and one standard deviation (F, 15) of the joints' positions
             along an axis, metres, 0 in lost frames. The tracker has the new body.
         """
-        cleaning = self.contours.cleaning
         given, poses = poses, self.world.poses_in(poses)
         tracked = np.flatnonzero(~lost)
         variance = np.zeros((len(poses), len(JOINTS)))
@@ -429,7 +428,7 @@ class RegionTracker(ContourTracker):
             opening = tracked[: self.contours.init_frames : 3]
             spread = _spread(tracked, np.nanmean(error[tracked], axis=1), SECOND_FIT.frames - len(opening))
             chosen = np.union1d(opening, spread)
-            seen = [self.views.pyramid(believed(int(i)), 1, cleaning) for i in chosen]
+            seen = [self.views.pyramid(believed(int(i)), 1, None) for i in chosen]
             stature = height_m or self.body.dimensions.stature
             fit = SECOND_FIT if height_m else replace(SECOND_FIT, stature_deviation=0.03)
             body, _ = self.fit(seen, poses[chosen], np.arange(len(chosen)), stature, fit)
@@ -437,14 +436,14 @@ class RegionTracker(ContourTracker):
         result, errors = poses.copy(), np.array(error)
         body, group = self.body, self.colors.group
         for chunk in np.array_split(tracked, -(-len(tracked) // AT_ONCE)):
-            seen = [self.views.pyramid(believed(int(i)), 1, cleaning) for i in chunk]
+            seen = [self.views.pyramid(believed(int(i)), 1, None) for i in chunk]
             prior = self._prior(poses[chunk], SECOND_ANGLE_DEG)
             settled = self.settle(Pyramid.of_all(seen), poses[chunk], (0,), prior=prior)
             result[chunk] = settled.states
             precision = INFORMATION * (settled.hessian + np.diag(prior.precision))
-            for i, pyramid, information in zip(chunk, seen, precision, strict=True):
+            variance[chunk] = contour_variance(body.skeleton, result[chunk], precision, body.free)
+            for i, pyramid in zip(chunk, seen, strict=True):
                 errors[i] = Evidence.of(self.screen, pyramid.masks[0]).cast(body, group, result[i][None])[0][0]
-                variance[i] = contour_variance(body.skeleton, result[i], information, body.free)
         jumps = _jumps(body.skeleton, poses)
         later: Hypothesis | None = None
         for i in tracked[::-1]:
@@ -454,7 +453,7 @@ class RegionTracker(ContourTracker):
                 later = Hypothesis(result[i + 1], result[i + 1], 0.0)
             if later is None:
                 continue
-            pyramid = self.views.pyramid(believed(int(i)), 1, cleaning)
+            pyramid = self.views.pyramid(believed(int(i)), 1, None)
             prior = self._prior(later.pose[None], SECOND_ANGLE_DEG)
             settled = self.settle(pyramid, later.pose[None], (0,), prior=prior)
             both = np.stack([result[i], settled.states[0]])

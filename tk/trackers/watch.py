@@ -218,11 +218,14 @@ class Watch:
         tracker = self.tracker
         assert isinstance(tracker, ContourTracker)
         pose = tracker.pose_of(estimate)
-        masks = frame.masks
-        if estimate.masks is not None:  # what it took for the person, where it had the camera
-            had = np.asarray(estimate.masks.any(axis=(1, 2)))
-            masks = np.where(had[:, None, None], estimate.masks, masks)
-        evidence = Evidence.of(tracker.screen, tracker.views.pyramid(masks, 1, tracker.contours.cleaning).masks[0])
+        if estimate.masks is None:
+            masks = tracker.cleaned(frame.masks)
+        else:  # what it took for the person, where it had the camera
+            masks, had = estimate.masks, estimate.masks.any(axis=(1, 2))
+            if not had.all():
+                masks = masks.copy()
+                masks[~had] = tracker.cleaned(frame.masks[~had])
+        evidence = Evidence.of(tracker.screen, masks)
         _, met = evidence.cast(tracker.body, tracker.colors.group, pose[None], export=True)
         assert met is not None
         drawn = met.label[0] > 0
