@@ -38,6 +38,15 @@ def test_what_may_not_change_has_no_variance() -> None:
     assert [JOINTS[j] for j in np.flatnonzero(variance > 1e-12)] == ["wrist_l"]
 
 
+def test_the_variances_of_many_poses_are_those_of_each() -> None:
+    D = len(NAMES)
+    root = np.random.default_rng(4).normal(size=(6, D, D))
+    precision, free = root @ root.swapaxes(1, 2) + np.eye(D), SKELETON.is_paper
+    many = contour_variance(SKELETON, poses(6).reshape(2, 3, D), precision.reshape(2, 3, D, D), free)
+    each = [contour_variance(SKELETON, pose, p, free) for pose, p in zip(poses(6), precision, strict=True)]
+    np.testing.assert_allclose(many.reshape(6, -1), each, rtol=1e-9)
+
+
 def test_directions_stay_when_the_person_walks_and_turns() -> None:
     pose = poses(5)
     elsewhere = pose.copy()
