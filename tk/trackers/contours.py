@@ -26,7 +26,7 @@ from tk.model.evidence import Evidence, RayGrid, mean_of_views
 from tk.model.initialisation import rough_pose
 from tk.model.limbs import Limb, distinct, limbs_of, pairs
 from tk.model.part_colors import PartColors
-from tk.model.silhouettes import CleaningConfig, Pyramid, Views, clean
+from tk.model.silhouettes import CleaningConfig, Pyramid, Views
 from tk.model.skeleton import ANKLES, WAIST, build_skeleton, join_pose, split_pose
 from tk.model.world import World
 from tk.optim import gauss_newton
@@ -290,7 +290,7 @@ class ContourTracker:
 
     def cleaned(self, masks: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Masks (V, H, W) as contours are looked for in them."""
-        return np.stack([clean(mask, self.contours.cleaning) for mask in masks]) if len(masks) else masks
+        return self.views.pyramid(masks, 1, self.contours.cleaning).masks[0]
 
     def settle(
         self,

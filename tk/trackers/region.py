@@ -86,8 +86,8 @@ class RegionConfig:
         hypotheses: most poses that are followed at once.
         search_excess: a frame that leaves more of the person's pixels unexplained, or covers more beside them, than is
             usual is searched, if this share more by the mean over the views, and so are those just behind it; who
-            stays so, searched or not, is looked for as if lost. An arm has about twice this share, but part of it lies
-            before or behind the trunk.
+            stays so, searched or not, is looked for as if lost. No view counts for more than 0.15, so from there on
+            nothing is searched for this reason.
         colors: whether the colours of the parts are learned and used.
     """
 
