@@ -401,8 +401,8 @@ class ContourTracker:
                 poses.append(both)
         cost = mean_of_views(evidence.cast(self.body, group, np.array(poses))[0])
         best = np.argsort(cost, kind="stable")[: None if in_pairs else FINISHED]
-        chosen = np.concatenate([pose[None], np.array(poses)[best]])
-        settled = self.settle(pyramid, chosen, (0,), images).states
+        chosen = np.array(poses)[best]
+        settled = np.concatenate([pose[None], self.settle(pyramid, chosen, (0,), images).states])
         fine = self.evidence(self.choice, frame, pyramid)
         return settled, mean_of_views(fine.cast(self.body, group, settled)[0])
 
