@@ -1,5 +1,7 @@
 """Damped Gauss-Newton on small problems with known answers; it is shown no body."""
 
+from dataclasses import replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -144,14 +146,36 @@ def test_scales_run_from_coarse_to_fine():
     np.testing.assert_allclose(found.hessian, np.repeat((A.T @ A)[None], len(start), 0))
 
 
-def test_a_batch_is_as_good_as_one_at_a_time():
+@pytest.mark.parametrize("tolerance", [0.0, 0.05])
+def test_a_batch_is_as_good_as_one_at_a_time(tolerance):
     A, y, start = problem(5)
-    config = GaussNewtonConfig()
+    start[0] = np.linalg.lstsq(A, y)[0]  # is done at once
+    config = GaussNewtonConfig(iterations=6, damping=0.5, tolerance=tolerance)
     together = minimise(linear(A, y), start, ALL, *NONE, config)
     for i in range(len(start)):
         np.testing.assert_allclose(
             minimise(linear(A, y), start[i : i + 1], ALL, *NONE, config)[0], together[i], rtol=1e-12
         )
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=30, deadline=None)
+def test_a_scale_is_left_when_nothing_moves_by_more_than_the_tolerance(seed):
+    A, y, start = problem(seed)
+    made = []
+
+    def watched(states, scale):
+        made.append(states.copy())
+        return linear(A, y)(states, scale)
+
+    config = GaussNewtonConfig(scales=2, iterations=30, damping=0.5, longest_step=100.0, tolerance=0.01)
+    found = gauss_newton.minimise(watched, start, ALL, *NONE, config)
+    assert found.iterations.sum() == len(made)
+    steps = [np.abs(after - before).max() for before, after in pairwise([*made, found.states])]
+    last = found.iterations.cumsum() - 1
+    assert all((step <= 0.01) == (i in last) for i, step in enumerate(steps)) or found.iterations.max() == 30
+    plain = gauss_newton.minimise(linear(A, y), start, ALL, *NONE, replace(config, tolerance=0.0))
+    assert plain.iterations.tolist() == [30, 30]
 
 
 @given(seed=st.integers(0, 10**6), each=st.booleans())

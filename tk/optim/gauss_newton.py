@@ -1,12 +1,12 @@
 """Damped Gauss-Newton over a batch of states, coarse to fine, with quadratic penalties beyond limits.
 
 The silhouette paper's solver (eqs. 9-11 and section 4.5): a fixed number of iterations a scale, no line search, for the
-correspondences are found anew at every iteration. Damping is not in the paper; without it a limb that is hidden in
-every view makes its equation singular. Nor is over-relaxation. Correspondences that are found anew give way less than
-their equations tell: an edgel that is far off weighs little, the next edge along a normal may be another limb's, and a
-border between colours is told by the few pixels about it. So a full step leaves a share of the way, the same again in
-the next one; longer steps leave less, and a plain one at the end takes back what they overshot where equations are
-exact.
+correspondences are found anew at every iteration. Not in the paper: a scale is left once its steps are short. Damping
+is not in the paper; without it a limb that is hidden in every view makes its equation singular. Nor is over-relaxation.
+Correspondences that are found anew give way less than their equations tell: an edgel that is far off weighs little, the
+next edge along a normal may be another limb's, and a border between colours is told by the few pixels about it. So a
+full step leaves a share of the way, the same again in the next one; longer steps leave less, and a plain one at the end
+takes back what they overshot where equations are exact.
 """
 
 from __future__ import annotations
@@ -53,6 +53,8 @@ class GaussNewtonConfig:
         limit_weight: weight of the squared excess over a limit, as a share of the same mean (4.5, which gives no
             number).
         longest_step: largest change of a parameter in one iteration; steps are shortened to it as a whole.
+        tolerance: a state is done with a scale once no parameter changes by more, radians or metres; 0 (the paper): all
+            iterations are made.
     """
 
     scales: int = 2
@@ -62,6 +64,7 @@ class GaussNewtonConfig:
     stiffness: float = 0.0005
     limit_weight: float = 1.0
     longest_step: float = 0.5
+    tolerance: float = 0.0
 
     def __post_init__(self) -> None:
         if not 1 <= self.scales <= 5 or not 1 <= self.iterations <= 100:
@@ -70,10 +73,12 @@ class GaussNewtonConfig:
             )
         if not 0 < self.relaxation < 2:
             raise ConfigError(f"gauss_newton: relaxation = {self.relaxation} must lie in (0, 2)")
-        if min(self.damping, self.stiffness, self.limit_weight) < 0 or not self.longest_step > 0:
+        least = min(self.damping, self.stiffness, self.limit_weight, self.tolerance)
+        if not least >= 0 or not self.longest_step > 0:
             raise ConfigError(
-                f"gauss_newton: damping {self.damping}, stiffness {self.stiffness} and limit_weight "
-                f"{self.limit_weight} must not be negative, longest_step {self.longest_step} must be positive"
+                f"gauss_newton: damping {self.damping}, stiffness {self.stiffness}, limit_weight "
+                f"{self.limit_weight} and tolerance {self.tolerance} must not be negative, longest_step "
+                f"{self.longest_step} must be positive"
             )
 
     def steps(self, scale: int) -> list[float]:
@@ -101,10 +106,12 @@ class Descent(NamedTuple):
     Attributes:
         states: (B, D) after the last iteration.
         hessian: (B, D, D) JᵀWJ where the last step was taken from.
+        iterations: (L,) made at each of the scales, in the order in which they were gone through.
     """
 
     states: Float
     hessian: Float
+    iterations: NDArray[np.int32]
 
 
 def minimise(
@@ -132,12 +139,20 @@ def minimise(
     state = np.array(start, np.float64)
     hessian = np.zeros((*state.shape, state.shape[1]))
     room = _Room(np.flatnonzero(free), lower, upper, config, prior)
-    for scale in range(config.scales - 1, -1, -1) if levels is None else levels:
+    scales = range(config.scales - 1, -1, -1) if levels is None else levels
+    iterations = np.zeros(len(scales), np.int32)
+    for i, scale in enumerate(scales):
+        moving = np.ones(len(state), np.bool_)  # what a state comes to does not depend on those beside it
         for share in config.steps(scale):
             here = equations(state, scale)
-            state[:, room.index] += share * room.step(here.hessian, here.gradient, state)
-            hessian = here.hessian
-    return Descent(state, hessian)
+            step = share * room.step(here.hessian, here.gradient, state)
+            state[:, room.index] += np.where(moving[:, None], step, 0.0)
+            hessian[moving] = here.hessian[moving]
+            iterations[i] += 1
+            moving &= np.abs(step).max(axis=1, initial=0.0) > config.tolerance
+            if not moving.any():
+                break
+    return Descent(state, hessian, iterations)
 
 
 class _Room:

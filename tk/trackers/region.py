@@ -164,15 +164,14 @@ class RegionTracker(ContourTracker):
     def step(self, frame: Observation) -> Estimate:
         """The pose in the next frame."""
         watch = Stopwatch()
-        contours, config, solver = self.contours, self.config, self.contours.solver
+        contours, config = self.contours, self.config
         frame = self.without_foreign(frame)
         pyramid = self.pyramid(frame)
         images = frame.images if config.colors else None
         watch.lap("masks_clean")
         self._alive += [replace(h, previous=h.pose, jumped=False) for h in self._alive if h.jumped]
         starts = np.array([h.pose + contours.prediction * (h.pose - h.previous) for h in self._alive])
-        levels = self._levels()
-        poses, hessian = self.settle(pyramid, starts, levels, images, self._prior(starts))
+        poses, hessian, iterations = self.settle(pyramid, starts, self._levels(), images, self._prior(starts))
         watch.lap("optimise")
         evidence = self.evidence(self.screen, frame, pyramid)
         by_view, met = evidence.cast(self.body, self.colors.group, poses, export=True)
@@ -222,7 +221,7 @@ class RegionTracker(ContourTracker):
             **self.told(pose),
             status=status,
             objective=float(self._best.cost),
-            iterations=np.array([sum(len(solver.steps(k)) for k in levels), int(searched)], np.int32),
+            iterations=np.array([iterations.sum(), int(searched)], np.int32),
             timing=watch.laps,
             sigma=sigma,
             fit_error=error,

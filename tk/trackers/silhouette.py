@@ -59,7 +59,8 @@ class SilhouetteTracker(ContourTracker):
         pyramid = self.pyramid(frame)
         watch.lap("masks_clean")
         start = self._pose + config.prediction * (self._pose - self._previous)
-        pose = self.settle(pyramid, start[None]).states[0]
+        settled = self.settle(pyramid, start[None])
+        pose = settled.states[0]
         watch.lap("optimise")
         if config.search_every and frame.index % config.search_every == 0:
             pose = self.improved(Observation(frame.index, frame.images[:0], frame.masks), pyramid, pose)
@@ -81,7 +82,7 @@ class SilhouetteTracker(ContourTracker):
             **self.told(pose),
             status=status,
             objective=error,
-            iterations=np.array([len(config.solver.steps(k)) for k in reversed(range(len(self.stages)))], np.int32),
+            iterations=settled.iterations,
             timing=watch.laps,
         )
 
