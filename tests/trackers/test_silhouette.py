@@ -47,7 +47,8 @@ def test_a_disturbed_pose_is_recovered():
     assert errors(estimate, POSES[0]).mean() < CLOSE_M
     assert estimate.status == "initialised" and estimate.objective < 0.1
     assert set(estimate.timing) == set(tracker.timing_stages)
-    assert estimate.iterations.tolist() == [3, 3, 4] and len(tracker.stages) == 3
+    assert len(tracker.stages) == 3 and estimate.iterations[0] == 3  # far from there all iterations are made
+    assert (estimate.iterations <= [3, 3, 4]).all()
 
 
 def test_a_walk_is_followed_and_can_be_taken_up_again():

@@ -118,7 +118,9 @@ def test_poses_that_one_frame_cannot_tell_apart_are_all_followed(monkeypatch) ->
     masks = draw_silhouettes(BODY, RIG, np.array([right] * 4))
     frames = [Observation(i, np.zeros(0, np.uint8), m) for i, m in enumerate(masks)]
     tracker = tracker_of()
-    monkeypatch.setattr(tracker, "settle", lambda _, starts, *__: Descent(np.array(starts), np.zeros(0)))
+    monkeypatch.setattr(
+        tracker, "settle", lambda _, starts, *__: Descent(np.array(starts), np.zeros(0), np.zeros(3, np.int32))
+    )
     monkeypatch.setattr("tk.trackers.start.gait.hypotheses", lambda *_: np.array([wrong, right]))
     monkeypatch.setattr("tk.trackers.start._searched", lambda _, __, ___, pose: pose)
     explained = {False: 0.21, True: 0.22}
@@ -161,7 +163,9 @@ def test_who_is_found_again_faces_as_before_where_silhouettes_leave_that_open(mo
     before[0] += 1.0
     pyramid = tracker.pyramid(Observation(0, np.zeros(0, np.uint8), draw_silhouettes(BODY, RIG, there[None])[0]))
     facing = SKELETON.index("torso_yaw")
-    monkeypatch.setattr(tracker, "settle", lambda _, starts, levels: Descent(starts, np.zeros(0)))
+    monkeypatch.setattr(
+        tracker, "settle", lambda _, starts, levels: Descent(starts, np.zeros(0), np.zeros(len(levels), np.int32))
+    )
 
     def explained(better_if_turned):
         return lambda _, poses: 0.2 - better_if_turned * (np.cos(poses[:, facing] - yaw) < -0.9)
