@@ -227,7 +227,7 @@ def test_whoever_is_killed_nothing_is_lost_or_done_twice(
 ) -> None:
     """A scheduler and two workers. A worker is killed in the middle of a capture, then the scheduler; the same command,
     on workers of its own, finishes. A capture that cannot be read is in the way all the time."""
-    # a result is written four times a second: it takes more frames than the tiny capture's to be met half done
+    # a result is written twice a second: it takes more frames than the tiny capture's to be met half done
     demo, frames = ROOT / "tk" / "data" / "demo", 75
     captures = [tmp_path / name for name in ("one", "two", "three")]
     for capture in captures:  # a link to the demo itself would be the same capture again

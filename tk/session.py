@@ -193,7 +193,7 @@ def estimates(
 
 
 # Frames go to the file together that are finished within this time, seconds, and are told of then.
-WRITE_EVERY_S = 0.25
+WRITE_EVERY_S = 0.5
 
 _ORIGIN, _LOST, _WATCH = "run/", "lost frames", "watch/"
 

@@ -122,6 +122,8 @@ WAIST_STIFFNESS = (1.0, 3.0, 5.0)
 ANKLES = ("ankle_l_flexion", "ankle_l_inversion", "ankle_r_flexion", "ankle_r_inversion")
 # Where the waist bends, as a share of the trunk's length above the hip centres: about L4, in the middle of what bends.
 WAIST_HEIGHT = 0.25
+# Single poses whose transforms are kept.
+REMEMBERED = 8
 
 
 @dataclass(frozen=True)
@@ -212,18 +214,20 @@ class Skeleton:
         pose = np.asarray(pose, dtype=np.float64)
         if pose.ndim > 1:
             return self._transforms(pose)
-        # joints, twists and directions of one pose are asked for in turn
+        # joints, twists and directions of one pose are asked for in turn, and the joints once more in the next frame
         key = pose.tobytes()
-        told, placed = self._last[0]
-        if told != key:
+        placed = self._placed.get(key)
+        if placed is None:
             placed = self._transforms(pose)
             placed.flags.writeable = False
-            self._last[0] = key, placed
+            if len(self._placed) >= REMEMBERED:
+                self._placed.pop(next(iter(self._placed)), None)
+            self._placed[key] = placed
         return placed
 
     @cached_property
-    def _last(self) -> list[tuple[bytes, Float]]:
-        return [(b"", np.zeros(0))]
+    def _placed(self) -> dict[bytes, Float]:
+        return {}
 
     def _transforms(self, pose: Float) -> Float:
         K, squares = self._generators

@@ -265,12 +265,9 @@ class RegionTracker(ContourTracker):
         contours, skeleton = self.contours, self.body.skeleton
         first = contours.solver.scales - 1
         if not (self._lost_for or self._stranded or any(h.jumped for h in self._alive)):
-            now, before = (
-                skeleton.joints(np.array(poses))
-                for poses in zip(*((h.pose, h.previous) for h in self._alive), strict=True)
-            )
-            left_m = abs(1 - contours.prediction) * np.linalg.norm(now - before, axis=2).max()
-            left_px = left_m * self.views.rig.pixels_per_metre(now[0, 0])
+            went_m = max(skeleton.apart(h.pose, skeleton.joints(h.previous)) for h in self._alive)
+            left_m = abs(1 - contours.prediction) * went_m
+            left_px = left_m * self.views.rig.pixels_per_metre(skeleton.joints(self._best.pose)[0])
             while first > FEWEST - 1 and contours.search.window_px * 2 ** (first - 1) >= left_px:
                 first -= 1
         return list(range(first, -1, -1))
