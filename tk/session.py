@@ -330,7 +330,7 @@ class _Run:
             self.masks.put(index, self._kept(observation, used, estimate))
         self.lost += estimate.status == "lost"
         # masks are large, and a view of the ring of frames at that: nobody who keeps the estimate keeps them
-        return replace(estimate, frame=index, time=index / plan.capture.fps, masks=None)
+        return replace(estimate, frame=index, time=index / plan.capture.fps, masks=None, drawn=None)
 
     def _kept(self, observation: Observation, used: Observation, estimate: Estimate) -> NDArray[np.uint8]:
         """The masks (C, H, W) of a frame, cleaned, as the tracker took them; those of cameras that were left out, too,

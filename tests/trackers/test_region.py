@@ -250,6 +250,11 @@ def test_who_stays_in_a_wrong_pose_is_looked_for_as_if_lost(monkeypatch: pytest.
     assert [e.status for e in estimates] == ["tracked"] * 4
     assert errors(estimates[1], POSES[0]).mean() > 2 * CLOSE_M
     assert len(looked_for) == 1 and errors(estimates[3], POSES[0]).mean() < CLOSE_M
+    # what is told with it is of the pose found, not of the one given up
+    person = tracker.screen.sample(estimates[3].masks) >= 128
+    wrong_rays = np.count_nonzero(estimates[3].drawn != person, axis=(1, 2)) / np.count_nonzero(person, axis=(1, 2))
+    np.testing.assert_allclose(estimates[3].fit_error, wrong_rays)
+    assert wrong_rays.mean() < estimates[1].fit_error.mean() / 2
     assert tracker.state()["usual"].mean() < 1.1 * usual
 
 

@@ -53,7 +53,8 @@ class Estimate:
             not say.
         fit_error: (C,) E_S of each camera; None where the tracker does not say.
         masks: (C, H, W) uint8, what the tracker took for the person, cleaned; None where that is the observation's, and
-            in what :func:`tk.track` hands out.
+            in what :func:`tk.track` hands out. drawn: (C, h, w) bool, where the body is on the tracker's grid of rays,
+            cameras left out included; None likewise.
         frame, time: the frame's number in the capture, and seconds; whoever steps the tracker knows them.
     """
 
@@ -69,6 +70,7 @@ class Estimate:
     sigma: Float | None = None
     fit_error: Float | None = None
     masks: NDArray[np.uint8] | None = None
+    drawn: NDArray[np.bool_] | None = None
     frame: int = -1
     time: float = 0.0
 

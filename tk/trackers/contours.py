@@ -31,7 +31,7 @@ from tk.model.skeleton import ANKLES, WAIST, build_skeleton, join_pose, split_po
 from tk.model.world import World
 from tk.optim import gauss_newton
 from tk.optim.gauss_newton import Descent, GaussNewtonConfig, Prior
-from tk.trackers.base import Estimate, Observation
+from tk.trackers.base import Observation
 from tk.trackers.start import HEADINGS, PHASES, Way, centroid, find_person, stature_of
 
 Float = NDArray[np.float64]
@@ -452,11 +452,6 @@ class ContourTracker:
         skeleton, world = self.body.skeleton, self.world
         paper, waist, ankles = split_pose(skeleton, world.poses_out(pose))
         return {"pose": paper, "waist": waist, "ankles": ankles, "joints": world.points_out(skeleton.joints(pose))}
-
-    def pose_of(self, estimate: Estimate) -> Float:
-        """(D,) the inverse of :meth:`told`."""
-        whole = join_pose(self.body.skeleton, estimate.pose, estimate.waist, estimate.ankles)
-        return self.world.poses_in(whole)
 
     # --- what a result file keeps -------------------------------------------------------------------------------
 

@@ -198,16 +198,16 @@ class RegionTracker(ContourTracker):
             in_pairs, settled = self._in_vain, self._best.pose
             self._propose(frame, pyramid, evidence, images, misplaced, in_pairs)
             if self._best.pose is not settled:
-                best = self._best.pose[None]
-                _, again = evidence.cast(self.body, self.colors.group, best, export=True)
-                assert again is not None
-                label, curvature = again.label[0], self._curvature(pyramid, best, images)
-                error, misplaced = evidence.fit_error(label), self.misplaced(evidence, label)
+                label, curvature, error = self._look(evidence, pyramid, images)
+                misplaced = self.misplaced(evidence, label)
             self._in_vain = not in_pairs and self._worse(error)
         else:
             self._in_vain = False
         watch.lap("search")
+        followed = self._best.pose
         lost = self._follow(pyramid, error)
+        if self._best.pose is not followed:
+            label, curvature, error = self._look(evidence, pyramid, images)
         self._learn(evidence, label, error, lost)
         status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
         self._lost_for = self._lost_for + 1 if lost else 0
@@ -226,6 +226,7 @@ class RegionTracker(ContourTracker):
             sigma=sigma,
             fit_error=error,
             masks=pyramid.masks[0],
+            drawn=label > 0,
         )
 
     def without_foreign(self, frame: Observation) -> Observation:
@@ -362,10 +363,16 @@ class RegionTracker(ContourTracker):
             self.colors.learn(evidence.bins[evidence.person], label[evidence.person])
         self._usual[seen] = drift(usual, np.minimum(error, LEARN_RATIO * usual))
 
-    def _curvature(self, pyramid: Pyramid, poses: Float, images: NDArray[np.uint8] | None) -> Float:
-        """(D, D) JᵀWJ at the first of the poses."""
+    def _look(
+        self, evidence: Evidence, pyramid: Pyramid, images: NDArray[np.uint8] | None
+    ) -> tuple[NDArray[np.uint8], Float, Float]:
+        """The best pose's labels on the screen (V, h, w), JᵀWJ (D, D), and E_S (V,)."""
+        best = self._best.pose[None]
+        _, met = evidence.cast(self.body, self.colors.group, best, export=True)
+        assert met is not None
         regions = None if images is None else self.colors.regions(images)
-        return self.views.equations(self.body.arrays, pyramid, poses, 0, self.contours.search, regions).hessian[0]
+        here = self.views.equations(self.body.arrays, pyramid, best, 0, self.contours.search, regions)
+        return met.label[0], here.hessian[0], evidence.fit_error(met.label[0])
 
     def _sigma(self, pose: Float, curvature: Float) -> Float:
         """(15,) one standard deviation of each joint's position along an axis, metres: of the contours' noise, the

@@ -26,7 +26,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.capture import Capture
-from tk.model.evidence import Evidence
 from tk.model.mask_agreement import MaskAgreement
 from tk.model.picture_health import PictureHealth, described
 from tk.model.plausibility import Plausibility, check_extent, check_stature
@@ -213,25 +212,22 @@ class Watch:
 
     def _errors(self, frame: Observation, estimate: Estimate) -> Float:
         """(2, C) the two parts of E_S at the estimate's pose, of cameras left out, too: body outside the mask, unless
-        that is in doubt there and much is left, and mask outside the body. NaN where a camera sees nobody.
+        that is in doubt there and much is left, and mask outside the body. NaN where a camera sees nobody, or no body
+        was fitted.
         """
-        tracker = self.tracker
+        tracker, drawn = self.tracker, estimate.drawn
         assert isinstance(tracker, ContourTracker)
-        pose = tracker.pose_of(estimate)
-        if estimate.masks is None:
-            masks = tracker.cleaned(frame.masks)
-        else:  # what it took for the person, where it had the camera
-            masks, had = estimate.masks, estimate.masks.any(axis=(1, 2))
-            if not had.all():
-                masks = masks.copy()
-                masks[~had] = tracker.cleaned(frame.masks[~had])
-        evidence = Evidence.of(tracker.screen, masks)
-        _, met = evidence.cast(tracker.body, tracker.colors.group, pose[None], export=True)
-        assert met is not None
-        drawn = met.label[0] > 0
-        seen = np.count_nonzero(evidence.person, axis=(1, 2)).astype(np.float64)
+        if drawn is None or estimate.masks is None:
+            return np.full((2, len(frame.masks)), np.nan)
+        # what it took for the person, where it had the camera
+        masks, had = estimate.masks, estimate.masks.any(axis=(1, 2))
+        if not had.all():
+            masks = masks.copy()
+            masks[~had] = tracker.cleaned(frame.masks[~had])
+        person = tracker.screen.sample(masks) >= 128
+        seen = np.count_nonzero(person, axis=(1, 2)).astype(np.float64)
         seen[seen == 0] = np.nan
-        missing, surplus = drawn & ~evidence.person, evidence.person & ~drawn
+        missing, surplus = drawn & ~person, person & ~drawn
         lacking = np.count_nonzero(missing, axis=(1, 2)) / seen
         if frame.doubtful is not None:
             excused = np.count_nonzero(missing & tracker.screen.sample(frame.doubtful), axis=(1, 2)) / seen
