@@ -73,8 +73,8 @@ class GaussNewtonConfig:
             )
         if not 0 < self.relaxation < 2:
             raise ConfigError(f"gauss_newton: relaxation = {self.relaxation} must lie in (0, 2)")
-        least = min(self.damping, self.stiffness, self.limit_weight, self.tolerance)
-        if not least >= 0 or not self.longest_step > 0:
+        weights = self.damping, self.stiffness, self.limit_weight, self.tolerance
+        if not all(value >= 0 for value in weights) or not self.longest_step > 0:
             raise ConfigError(
                 f"gauss_newton: damping {self.damping}, stiffness {self.stiffness}, limit_weight "
                 f"{self.limit_weight} and tolerance {self.tolerance} must not be negative, longest_step "

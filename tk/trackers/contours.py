@@ -63,7 +63,6 @@ FACING = 0.04
 # Rays a picture's height: to screen many places of a limb, and to choose among few poses.
 SCREEN_ROWS, CHOICE_ROWS = 54, 96
 
-
 # A tolerance of half as much, or of none, leaves the mean of the joints' errors as it is on eight captures, to 0.02 cm;
 # twice as much makes fast arms worse by 0.1.
 _SOLVER = GaussNewtonConfig(scales=3, relaxation=1.6, tolerance=0.012)
