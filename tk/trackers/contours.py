@@ -47,8 +47,9 @@ HALVED = 2.0
 # The fall of the cost, as a share of the person's pixels, that makes another place of a limb the pose.
 GAIN = 0.004
 # Places of a limb that are descended from, more of one that is known to be misplaced, and random ones about its own
-# place that are looked at beside the grid.
-PLACES, MORE_PLACES, NEARBY = 3, 8, 80
+# place that are looked at beside the grid. With 3 and 8, half as many again of the limbs that are elsewhere stay there
+# (scripts/search_recall.py).
+PLACES, MORE_PLACES, NEARBY = 8, 16, 80
 # Places of a limb are not looked at where that much of it is outside the silhouettes.
 OUTSIDE = 0.4
 # A limb's place is not descended from where the body costs more than now by this factor; and is given up if, once the
