@@ -47,6 +47,7 @@ ROWS: tuple[tuple[str, Changes], ...] = (
     ),
     ("no prediction", {"tracking": {"prediction": 0.0}}),
     ("no waist", {"body": {"waist": False}}),
+    ("no other places of the limbs looked at", {"silhouette": {"search_every": 0}}),
     ("no colour edges", {"contours": {"edge_weight": 0.0}}),
     ("colours ignored", {"appearance": {"enabled": False}}),
     ("shoulders do not rise with the arms", {"tk.model.skeleton": {"RAISED_SHOULDERS": 0.0}}),

@@ -206,9 +206,11 @@ def test_each_setting_is_explained() -> None:
     check(Config())
 
 
-def test_the_papers_preset_is_the_default_but_for_the_waist() -> None:
+def test_the_papers_preset_is_the_default_but_for_the_waist_and_the_search() -> None:
     c = Config.preset("kehl2006")
-    assert dataclasses.replace(c, body=Config().body) == Config()
+    assert not c.body.waist and c.silhouette.search_every == 0
+    silhouette = dataclasses.replace(c.silhouette, search_every=Config().silhouette.search_every)
+    assert dataclasses.replace(c, body=Config().body, silhouette=silhouette) == Config()
 
 
 def test_a_file_wins_over_a_preset(tmp_path: Path) -> None:

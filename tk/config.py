@@ -73,7 +73,8 @@ class Config:
         objective: the objective (section 6.1).
         contours: the edge term of the objective (section 6.1.2).
         tracking: following a person from frame to frame.
-        silhouette: how contours are followed, by --method region and silhouette.
+        silhouette: how contours are followed, by --method region and silhouette; and, for every method, how the body is
+            fitted and how often other places of the limbs are tried.
         region: how --method region searches.
         refine: whether cameras that disagree about the person are refined before the second pass.
     """

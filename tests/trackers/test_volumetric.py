@@ -1,12 +1,19 @@
-"""The volumetric tracker's start: what tests/test_session.py and test_region_track.py do not see from outside."""
+"""The volumetric tracker: what tests/test_session.py and test_region_track.py do not see from outside."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 
 from tests.model.ring import ring_of_cameras
+from tests.trackers.walker import BODY, STATURE, errors, observe, walk
 from tk.config import Config
 from tk.errors import ConfigError
 from tk.model.anthropometry import BodyDimensions
 from tk.model.cone_body import build_cone_body
+from tk.model.contour_term import ContourConfig
+from tk.model.silhouettes import draw_silhouettes
+from tk.model.skeleton import JOINTS
 from tk.model.volume import Volume
 from tk.trackers.volumetric import VolumetricTracker
 
@@ -17,3 +24,26 @@ def test_a_body_without_hands_and_feet_is_refused() -> None:
     walker = build_cone_body(BodyDimensions.from_stature(1.7), preset="walker")
     with pytest.raises(ConfigError, match=r'the body given is "walker": --method volumetric needs a full one'):
         tracker.start([], None, None, walker)
+
+
+# level, somewhat forward; hanging, with the forearm folded up against the upper arm
+@pytest.mark.parametrize("angles", [(0.0, 1.5, 0.0, 0.0), (1.5, 0.0, 0.0, 2.3)], ids=["raised", "folded"])
+def test_an_arm_left_behind_is_found_by_the_search_that_looks_around(angles: tuple[float, ...], tmp_path: Path) -> None:
+    rig = ring_of_cameras(4, width=240, height=300)
+    pose = walk(1)[0]
+    masks = draw_silhouettes(BODY, rig, pose[None])[0]
+    images = np.full((*masks.shape, 3), 90, np.uint8)
+    config = Config(voxels=48, contours=ContourConfig(edge_weight=0.0))  # one colour has no edges
+    tracker = VolumetricTracker(rig, Volume((0, 0, 1), (2, 2, 2.2)), "z", config, tmp_path)
+    tracker.start([observe(masks, 0, images)], STATURE, None, BODY)
+    model, state = dict(tracker.model()), dict(tracker.state())
+    wrong = state["pose"].copy()
+    names = ("shoulder_l_yaw", "shoulder_l_pitch", "shoulder_l_roll", "elbow_l_flexion")
+    wrong[[tracker.skin.skeleton.index(name) for name in names]] = angles
+    off = {}
+    due = config.silhouette.search_every
+    for index in (due, due + 1):
+        tracker.restore(model, {**state, "pose": wrong, "previous": wrong})
+        off[index] = errors(tracker.step(observe(masks, index, images)), pose)[JOINTS.index("wrist_l")]
+    assert off[due + 1] > 0.4  # a descent alone does not come back
+    assert off[due] < 0.05

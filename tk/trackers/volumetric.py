@@ -157,8 +157,7 @@ class VolumetricTracker:
                 "the calibration and the working volume ([volume] of capture.toml)"
             )
         self._lay_skin()
-        paper, waist, _ = split_pose(self.body.skeleton, self._finder.world.poses_out(pose))
-        self._pose = self._previous = join_pose(self.skin.skeleton, paper, waist[: len(self.waist_names)], NO_ANGLES)
+        self._pose = self._previous = self._from_contours(pose)
         index = self._index(surface, np.full(len(surface), -1, np.int64))
         fit = FrameObjective(self._objective, index, np.random.default_rng(0), images=first.images).fit(self._pose)
         self._usual = np.array([fit.value, fit.unexplained_share])
@@ -198,6 +197,9 @@ class VolumetricTracker:
         problem = FrameObjective(self._objective, index, rng, images=frame.images)
         # (2) all degrees of freedom at ε₁, (3) five chains at ε₂ (section 6.4)
         result = self._search(problem, self._starts(surface))
+        every = config.silhouette.search_every
+        if every and frame.index % every == 0:
+            result = self._elsewhere(frame, problem, result)
         fit = problem.fit(result.pose)
         watch.lap("optimise")
         lost = self._is_lost(fit)
@@ -227,6 +229,39 @@ class VolumetricTracker:
     def _search(self, problem: FrameObjective, starts: Float) -> schedule.ScheduleResult:
         """The pose that explains a frame best, from the starts (S, D)."""
         return schedule.optimise(problem, starts, SCHEDULE, self.effort.smd)
+
+    def _elsewhere(
+        self, frame: Observation, problem: FrameObjective, found: schedule.ScheduleResult
+    ) -> schedule.ScheduleResult:
+        """The result or, if this method's objective is lower there, one that begins where the contours' search has
+        found another place of a limb. Not in the paper: a limb that was left behind finds other voxels, and stays.
+        """
+        finder = self._finder
+        # the colours of the contours' search are none of this method's cues
+        blind = Observation(frame.index, frame.images[:0], frame.masks, frame.doubtful)
+        pyramid = finder.pyramid(blind)
+        settled = finder.settle(pyramid, self._to_contours(found.pose)[None]).states[0]
+        places, _ = finder.search(blind, pyramid, finder.evidence(finder.screen, blind, pyramid), settled)
+        starts = problem.constrain(np.array([self._from_contours(place) for place in places]))
+        values = problem.values(starts)
+        best, here = int(np.argmin(values)), problem.value(found.pose)
+        if values[best] >= here:
+            return found
+        again = self._search(problem, starts[best : best + 1])
+        return again if problem.value(again.pose) < here else found
+
+    def _from_contours(self, pose: Float) -> Float:
+        """A pose of the contours' body, in their own world, as one of the skin; its feet are rigid."""
+        paper, waist, _ = split_pose(self.body.skeleton, self._finder.world.poses_out(pose))
+        return join_pose(self.skin.skeleton, paper, waist[: len(self.waist_names)], NO_ANGLES)
+
+    def _to_contours(self, pose: Float) -> Float:
+        """The way back."""
+        finder = self._finder
+        paper, bent, _ = split_pose(self.skin.skeleton, pose)
+        waist = np.pad(bent, (0, len(finder.waist_names) - len(bent)))
+        whole = join_pose(self.body.skeleton, paper, waist, np.zeros(len(finder.ankle_names)))
+        return finder.world.poses_in(whole)
 
     @property
     def opening_frames(self) -> int:
