@@ -262,6 +262,11 @@ def test_what_is_compressed_honestly_is_read(truth: Path) -> None:
     np.testing.assert_array_equal(read_joints(truth).positions, values)
 
 
+def test_a_file_that_this_process_holds_open_is_read(truth: Path) -> None:
+    with h5py.File(truth) as held:  # as in a notebook
+        np.testing.assert_array_equal(read_joints(truth).positions, held["joints/position"][:])
+
+
 def test_whole_numbers_and_single_precision_will_do(truth: Path) -> None:
     values = np.random.default_rng(0).integers(-2, 3, (COUNT, 15, 3))
     for frames, dtype in ((np.arange(COUNT, dtype=np.float64), np.int32), (np.arange(COUNT, dtype="u1"), np.float32)):

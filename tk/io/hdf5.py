@@ -280,7 +280,10 @@ def open_hdf5(path: Path) -> Iterator[Hdf5Reader]:
             raise ResultError(f"{path}: {'is a folder; name a file' if path.is_dir() else 'is not a file'}")
         raise ResultError(f"{path}: {'is a link to nowhere' if path.is_symlink() else 'no such file'}")
     try:
-        file = h5py.File(path, "r", locking=False)
+        try:
+            file = h5py.File(path, "r", locking=False)
+        except OSError:  # HDF5 refuses, too, if this process holds the file open with locks, as h5py does by default
+            file = h5py.File(path, "r")
     except PermissionError:
         raise ResultError(f"{path}: no permission to read it") from None
     except Exception as error:  # almost any, if it is damaged
