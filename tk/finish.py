@@ -115,7 +115,7 @@ def _track_again(
         return {}
     start = tracker.world.poses_in(poses[np.searchsorted(frames, begin)][None])
     once = {"poses": start, "previous": start, "costs": np.zeros(1), "ages": np.ones(1, int)}
-    nothing = {"usual": np.inf, "lost_for": 0, "stranded": 0, "in_vain": False, "behind_worse": 0}
+    nothing = {"usual": np.inf, "lost_for": 0, "stranded": 0, "in_vain": False}
     tracker.rewind({**tracker.state(), **once, **nothing, "jumped": np.zeros(1, bool)})
     with open_source(capture, plan.config, lambda _: None) as source:
         return {observation.index: tracker.step(observation) for observation, _ in source.frames(begin, stop)}

@@ -21,7 +21,7 @@ from tk.model.silhouettes import draw_silhouettes
 from tk.model.skeleton import JOINTS, join_pose, shoulder_angles, split_pose
 from tk.optim.gauss_newton import GaussNewtonConfig
 from tk.trackers.contours import SilhouetteConfig
-from tk.trackers.region import BEHIND, MOST_A_VIEW, RegionConfig, RegionTracker
+from tk.trackers.region import MOST_A_VIEW, RegionConfig, RegionTracker
 
 RIG = ring_of_cameras(3, width=160, height=200)
 SKELETON = BODY.skeleton
@@ -139,17 +139,6 @@ def test_a_frame_that_is_explained_badly_is_searched_unasked() -> None:
     estimate = tracker.step(observe(draw_silhouettes(BODY, RIG, raised[None])[0], 1))
     assert estimate.iterations[1] == 1
     assert errors(estimate, raised)[JOINTS.index("wrist_r")] < 0.08
-
-
-def test_frames_behind_one_that_is_explained_badly_are_searched_too() -> None:
-    """What was lost in a frame that shows little is found in those that show more."""
-    tracker = tracker_at(POSES[0])
-    headless = MASKS[0].copy()
-    for mask in headless:
-        rows = np.flatnonzero(mask.any(axis=1))
-        mask[: int(rows[0] + 0.15 * np.ptp(rows))] = 0
-    shown = (MASKS[0], headless, *(MASKS[0] for _ in range(BEHIND + 1)))
-    assert [tracker.step(observe(masks)).iterations[1] for masks in shown] == [0, 1, *(1 for _ in range(BEHIND)), 0]
 
 
 def test_a_mask_that_is_torn_in_one_view_of_many_calls_for_no_search() -> None:

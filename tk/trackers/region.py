@@ -55,8 +55,6 @@ MARGIN = 0.02
 # A limb that is lost shows in most views, a torn mask in one: no view adds more than this to what a frame is explained
 # worse than usual.
 MOST_A_VIEW = 0.15
-# So many frames behind one that is explained worse than usual are searched, too.
-BEHIND = 3
 # Colours are learned only in frames that are explained about as well as is usual, and what is worse than that counts as
 # this much worse: a wrong pose that lasts does not become usual.
 LEARN_RATIO = 1.15
@@ -85,9 +83,8 @@ class RegionConfig:
     Attributes:
         hypotheses: most poses that are followed at once.
         search_excess: a frame that leaves more of the person's pixels unexplained, or covers more beside them, than is
-            usual is searched, if this share more by the mean over the views, and so are those just behind it; who
-            stays so, searched or not, is looked for as if lost. No view counts for more than 0.15, so from there on
-            nothing is searched for this reason.
+            usual is searched, if this share more by the mean over the views; who stays so, searched or not, is looked
+            for as if lost. No view counts for more than 0.15, so from there on nothing is searched for this reason.
         colors: whether the colours of the parts are learned and used.
     """
 
@@ -140,7 +137,6 @@ class RegionTracker(ContourTracker):
         self._lost_for = 0
         self._stranded = 0
         self._in_vain = False
-        self._behind_worse = 0
         self._fresh = True
 
     def start(
@@ -158,7 +154,6 @@ class RegionTracker(ContourTracker):
         self._lost_for = 0
         self._stranded = 0
         self._in_vain = False
-        self._behind_worse = 0
         self._fresh = True
 
     def step(self, frame: Observation) -> Estimate:
@@ -189,10 +184,7 @@ class RegionTracker(ContourTracker):
         error = evidence.fit_error(label)
         watch.lap("check")
         misplaced = self.misplaced(evidence, label)
-        # what was lost in a frame that shows little is looked for in those behind it, too, which show more
-        worse, behind = self._worse(error), self._behind_worse > 0
-        searched = self._needs_search(frame, worse or behind, misplaced)
-        self._behind_worse = BEHIND if worse else max(self._behind_worse - 1, 0)
+        searched = self._needs_search(frame, self._worse(error), misplaced)
         if searched:
             # where no limb alone was better in the frame before, one may be where the other one of its pair should be
             in_pairs, settled = self._in_vain, self._best.pose
@@ -306,8 +298,8 @@ class RegionTracker(ContourTracker):
         )
 
     def _needs_search(self, frame: Observation, worse: bool, misplaced: Sequence[Limb]) -> bool:
-        """Whether a limb is where it cannot be, this frame or one just before is explained worse than is usual, or it
-        is time to look around."""
+        """Whether a limb is where it cannot be, this frame is explained worse than is usual, or it is time to look
+        around."""
         every = self.contours.search_every
         due = every > 0 and frame.index % every == 0
         return self.contours.body != "walker" and (due or worse or bool(misplaced))
@@ -516,7 +508,6 @@ class RegionTracker(ContourTracker):
             "lost_for": self._lost_for,
             "stranded": self._stranded,
             "in_vain": self._in_vain,
-            "behind_worse": self._behind_worse,
             **self.colors.state(),
         }
 
@@ -532,7 +523,6 @@ class RegionTracker(ContourTracker):
         self._lost_for = int(state["lost_for"])
         self._stranded = int(state.get("stranded", 0))  # results of before have none
         self._in_vain = bool(state.get("in_vain", False))  # results of before have none
-        self._behind_worse = int(state.get("behind_worse", 0))  # results of before have none
         self.colors.restore(state)
         self._fresh = False
 
