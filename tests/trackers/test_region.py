@@ -21,7 +21,7 @@ from tk.model.silhouettes import draw_silhouettes
 from tk.model.skeleton import JOINTS, join_pose, shoulder_angles, split_pose
 from tk.optim.gauss_newton import GaussNewtonConfig
 from tk.trackers.contours import SilhouetteConfig
-from tk.trackers.region import MOST_A_VIEW, RegionConfig, RegionTracker
+from tk.trackers.region import MOST_A_VIEW, UNKNOWN_AFTER, RegionConfig, RegionTracker
 
 RIG = ring_of_cameras(3, width=160, height=200)
 SKELETON = BODY.skeleton
@@ -151,6 +151,19 @@ def test_a_mask_that_is_torn_in_one_view_of_many_calls_for_no_search() -> None:
     tracker.config = replace(tracker.config, search_excess=MOST_A_VIEW / 2)
     assert not tracker._worse(usual + one) and tracker._worse(usual + all_views)
     assert not tracker._worse(np.where(views == 0, np.nan, usual))
+
+
+def test_who_is_looked_for_in_vain_has_no_sigma() -> None:
+    tracker = tracker_at(POSES[0])
+    nonsense = MASKS[0].copy()
+    for mask in nonsense:  # half of the person's pixels beside the person
+        rows, columns = np.nonzero(mask)
+        across = int(0.5 * len(rows) / np.ptp(rows))
+        mask[rows.min() : rows.max(), max(columns.min() - across, 0) : columns.min()] = 255
+    estimates = [tracker.step(observe(masks)) for masks in (MASKS[0], *[nonsense] * UNKNOWN_AFTER, MASKS[0])]
+    assert all(estimate.status != "lost" for estimate in estimates)
+    known = [np.isfinite(estimate.sigma).any() for estimate in estimates if estimate.sigma is not None]
+    assert known == [True] * UNKNOWN_AFTER + [False, True]
 
 
 def test_a_run_that_stops_behind_a_jump_goes_on_as_an_unbroken_one() -> None:

@@ -55,6 +55,8 @@ MARGIN = 0.02
 # A limb that is lost shows in most views, a torn mask in one: no view adds more than this to what a frame is explained
 # worse than usual.
 MOST_A_VIEW = 0.15
+# Who stays worse explained for so many frames has been looked for twice in vain: where the joints are is not known.
+UNKNOWN_AFTER = 2 * RELOCATE_EVERY
 # Colours are learned only in frames that are explained about as well as is usual, and what is worse than that counts as
 # this much worse: a wrong pose that lasts does not become usual.
 LEARN_RATIO = 1.15
@@ -208,6 +210,8 @@ class RegionTracker(ContourTracker):
         sigma = self._sigma(pose, curvature)
         for limb in self.misplaced(evidence, label):  # no search has found it
             sigma[list(limb.joints)] = np.nan
+        if self._stranded >= UNKNOWN_AFTER and self._worse(error):
+            sigma[:] = np.nan
         watch.lap("check")
         return Estimate(
             **self.told(pose),
