@@ -38,6 +38,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 from rich.console import Console
@@ -116,13 +117,11 @@ def counted_launches() -> Iterator[Counter[str]]:
         counts[self._kernel.__name__.strip("_")] += 1
         remembered(self, *args)
 
-    kernel_class.launch_kernel = count_ordinary
-    Launcher._launch = count_remembered  # type: ignore[method-assign]
-    try:
+    with (
+        mock.patch.object(kernel_class, "launch_kernel", count_ordinary),
+        mock.patch.object(Launcher, "_launch", count_remembered),
+    ):
         yield counts
-    finally:
-        kernel_class.launch_kernel = ordinary
-        Launcher._launch = remembered  # type: ignore[method-assign]
 
 
 class _Clock(session.Silent):

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -109,8 +110,9 @@ def test_an_error_in_learning(copy: Path) -> None:
 
 
 def test_a_defect_keeps_its_traceback(tiny: Path) -> None:
+    no_number: Any = "3"
     with Ahead(open_capture(tiny), AHEAD, nobody) as source, pytest.raises(RuntimeError, match="TypeError") as raised:
-        next(source.frames(0, "3"))  # type: ignore[arg-type]
+        next(source.frames(0, no_number))
     assert "in _serve" in str(raised.value)
 
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -50,13 +51,13 @@ def make_truth(count: int = 20, seed: int = 0) -> JointTrack:
     return JointTrack(Path("truth.h5"), np.arange(count), positions)
 
 
-def as_result(truth: JointTrack, **changes: object) -> JointTrack:
-    values: dict[str, object] = {
+def as_result(truth: JointTrack, **changes: Any) -> JointTrack:
+    values: dict[str, Any] = {
         "path": Path("result.h5"),
         "positions": truth.positions.copy(),
         "status": np.zeros(len(truth.frames), dtype=np.uint8),
     }
-    return replace(truth, **(values | changes))  # type: ignore[arg-type]
+    return replace(truth, **(values | changes))
 
 
 def test_the_truth_itself_is_perfect() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import h5py
@@ -83,13 +84,13 @@ def test_pictures_out_of_step_are_tracked_again(tiny: Path, tmp_path: Path, monk
     """The delays are made up: here it is about which pictures are tracked then, and that every frame keeps its row."""
     asked: list[np.ndarray] = []
 
-    def made_up(tracker, store, frames, poses, usable, note):  # type: ignore[no-untyped-def]
+    def made_up(tracker: Any, store: Any, frames: Any, *_: Any) -> Any:
         late = np.array([0, 0, 1, -1])
         return tracker, retimed(store, frames, late), late.astype(float)
 
-    def remember(capture, config, note, keep_images=True):  # type: ignore[no-untyped-def]
+    def remember(capture: Any, *more: Any, **options: Any) -> Any:
         asked.append(np.array(capture.late_frames))
-        return open_source(capture, config, note, keep_images)
+        return open_source(capture, *more, **options)
 
     monkeypatch.setattr(finish, "refine_if_astray", made_up)
     for module in (plan, finish):

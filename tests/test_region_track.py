@@ -25,7 +25,9 @@ from tk.io.capture import open_capture
 from tk.io.result import Result, Status, read_joints, read_result
 from tk.model.anthropometry import BodyDimensions
 from tk.session import Summary, estimates, track
+from tk.trackers.base import Estimate, Observation
 from tk.trackers.bodies import body_and_poses, read_body
+from tk.trackers.region import RegionTracker
 
 CONFIG = Config.from_toml(QUICK)
 COLUMNS = ("frames", "time", "pose", "waist", "ankles", "joints", "sigma", "fit_error", "status", "objective")
@@ -226,6 +228,29 @@ def test_lost_frames_stay_as_they_are_in_the_second_pass(copy: Path, tmp_path: P
     np.testing.assert_array_equal(np.isnan(result.fit_error).all(axis=1), result.status == Status.LOST)
     assert np.isfinite(result.joints).all()
     assert "fewer than two cameras see anybody: lost, frames 3 to 4" in result.notes
+
+
+@pytest.mark.parametrize("causal", [False, True])
+def test_frames_of_which_nothing_is_known_are_told(
+    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, causal: bool
+) -> None:
+    step = RegionTracker.step
+
+    def unsure(tracker: RegionTracker, frame: Observation) -> Estimate:
+        estimate = step(tracker, frame)
+        return replace(estimate, sigma=np.full(15, np.nan)) if frame.index in (2, 3) else estimate
+
+    monkeypatch.setattr(RegionTracker, "step", unsure)
+    reporter = Silent()
+    assert run(tiny, tmp_path / "r.h5", reporter, frames=(0, 5), causal=causal).lost == 0
+    result = read_result(tmp_path / "r.h5")
+    assert result.sigma is not None
+    assert np.isnan(result.sigma).all(axis=1).tolist() == [False, False, True, True, False]
+    (line,) = (note for note in result.notes if "σ is unknown" in note)
+    assert line.endswith("σ is unknown, frames 2 to 3") and line in reporter.notes
+    notes: list[str] = []
+    assert len(list(estimates(open_capture(tiny), CONFIG, notes.append, frames=(0, 5)))) == 5
+    assert line in notes
 
 
 # --- bodies from files ------------------------------------------------------------------------------------------------

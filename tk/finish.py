@@ -16,6 +16,7 @@ from tk.io.mask_store import MaskStore
 from tk.io.result import Result, Status, UsedCameras, Value, read_result, revise_result
 from tk.model.cone_body import ConeBody
 from tk.model.derived import derive
+from tk.model.picture_health import described
 from tk.model.skeleton import join_pose, split_pose
 from tk.model.smoothing import smooth
 from tk.plan import Plan
@@ -90,6 +91,9 @@ def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[st
         before = columns.get("joints/sigma", result.sigma)
         columns["joints/sigma"] = np.where(before <= _LESS_SURE * sigma, sigma, before)
         model = {**tracker.model(), REFINED: 1}
+    sigma = columns.get("joints/sigma", result.sigma)
+    if sigma is not None:
+        tell_unknown(result.frames[np.isnan(sigma).all(axis=1) & ~lost], note)
     _LOG.info("angles, feet, and the smoothed copy")
     # the first pass's poses stand as they are
     told = ("pose", "waist", "ankles", "joints/position") if model is None else ()
@@ -98,6 +102,13 @@ def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[st
     filtered = smooth(body.skeleton, poses, ~lost, plan.capture.fps)
     smoothed = {**_columns(body, filtered.poses), "bridged": filtered.bridged}
     revise_result(output, columns, smoothed=smoothed, model=model, cameras=cameras)
+
+
+def tell_unknown(frames: Sequence[int] | NDArray[np.int64], note: Callable[[str], None]) -> None:
+    """Tell of frames (F,) that are not lost and of which no joint has a σ."""
+    if len(frames):
+        which = described(int(frames[0]), int(frames[-1]), len(frames))
+        note(f"the person is explained far worse than usual, and not found elsewhere: σ is unknown, {which}")
 
 
 def _track_again(

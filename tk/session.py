@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tk.ahead import Observed
 from tk.config import Config
 from tk.errors import CaptureError, ResultError, TkError
-from tk.finish import REFINED, finish
+from tk.finish import REFINED, finish, tell_unknown
 from tk.io.capture import Capture
 from tk.io.mask_store import MaskStore
 from tk.io.result import (
@@ -187,9 +187,14 @@ def estimates(
         note(warning)
     with open_plan(capture, config, note, method, frames, init_pose, body) as plan:
         run = _Run(plan, None)
-        yield from run.estimates()
+        unknown: list[int] = []
+        for estimate in run.estimates():
+            if estimate.status != "lost" and estimate.sigma is not None and np.isnan(estimate.sigma).all():
+                unknown.append(estimate.frame)
+            yield estimate
         for line in run.watch.report():
             note(line)
+        tell_unknown(unknown, note)
 
 
 # Frames go to the file together that are finished within this time, seconds, and are told of then.

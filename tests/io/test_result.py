@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -193,12 +194,12 @@ def test_result_without_pose_or_joints(tmp_path: Path) -> None:
         {"angles": {"knee_l": np.zeros(2)}},
     ],
 )
-def test_a_frame_of_the_wrong_shape_is_refused_and_the_rest_kept(tmp_path: Path, change: dict[str, object]) -> None:
+def test_a_frame_of_the_wrong_shape_is_refused_and_the_rest_kept(tmp_path: Path, change: dict[str, Any]) -> None:
     path = tmp_path / "result.h5"
     with ResultWriter.create(path, META) as writer:
         writer.append(make_frame(0), make_state(0))
         with pytest.raises(ValueError):
-            writer.append(replace(make_frame(1), **change))  # type: ignore[arg-type]
+            writer.append(replace(make_frame(1), **change))
         writer.append(make_frame(1), make_state(1))
     assert assert_complete(path, 2) == 2
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -133,12 +134,12 @@ def test_frames_after_the_last_state_are_done_again(tmp_path: Path) -> None:
         ({"config_toml": META.config_toml + "[hull]\nvoxels = 64\n"}, "config hull is not set"),
     ],
 )
-def test_resuming_another_run_is_refused(tmp_path: Path, change: dict[str, object], message: str) -> None:
+def test_resuming_another_run_is_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
     path = tmp_path / "result.h5"
     write(path, 2)
     before = path.read_bytes()
     with pytest.raises(ResultError, match=rf"result\.h5: .*{message}.*--resume"):
-        ResultWriter.resume(path, replace(META, **change))  # type: ignore[arg-type]
+        ResultWriter.resume(path, replace(META, **change))
     assert path.read_bytes() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["result.h5"]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -85,12 +86,12 @@ def test_what_was_smoothed_does_not_outlive_what_it_was_made_of(tmp_path: Path) 
         {"smoothed": {"status": np.zeros(4), "bridged": np.zeros(4)}},
     ],
 )
-def test_a_second_pass_of_the_wrong_shape_changes_nothing(tmp_path: Path, change: dict[str, object]) -> None:
+def test_a_second_pass_of_the_wrong_shape_changes_nothing(tmp_path: Path, change: dict[str, Any]) -> None:
     path = tmp_path / "result.h5"
     write(path, 4)
     before = path.read_bytes()
     with pytest.raises(ValueError):
-        revise_result(path, **change)  # type: ignore[arg-type]
+        revise_result(path, **change)
     assert path.read_bytes() == before
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
@@ -191,7 +192,7 @@ def test_legs_reach_their_steps_at_every_stature(name: str) -> None:
         assert min(knees) > KNEE_RADIUS * stature - 0.004
 
 
-def oracle_distance(actor_body: Body, pose, points: np.ndarray) -> np.ndarray:  # type: ignore[no-untyped-def]
+def oracle_distance(actor_body: Body, pose: Any, points: np.ndarray) -> np.ndarray:
     """Distance to the union of the cones, one by one by dense sampling of the family of spheres; no blending."""
     actor, best = actor_body.actor, np.full(len(points), np.inf)
     for i in range(len(actor.bones)):

@@ -216,23 +216,6 @@ def test_an_estimate_that_cannot_be_true_is_lost(scene: Scene) -> None:
     assert watch.report() == ["the pose found cannot be true: it jumps: lost, frame 3"]
 
 
-class Unsure:
-    """A tracker that knows nothing of two frames."""
-
-    def step(self, frame: Observation) -> Estimate:
-        sigma = np.full(15, np.nan if frame.index in (2, 3) else 0.01)
-        return Estimate(np.zeros(24), np.zeros((15, 3)), "tracked", 0.0, np.zeros(0, np.int32), {}, sigma=sigma)
-
-
-def test_frames_of_which_nothing_is_known_are_told(scene: Scene) -> None:
-    tracker: Any = Unsure()
-    watch = Watch(tracker, scene.capture)
-    assert [watch.step(frame)[0].status for frame in scene.frames[:5]] == ["tracked"] * 5
-    (line,) = watch.report()
-    assert line.startswith("the person is explained far worse than usual")
-    assert line.endswith("σ is unknown, frames 2 to 3")
-
-
 def test_it_is_taken_up_again(scene: Scene) -> None:
     spoil = moved(1, range(4, 9))
     whole, expected, _ = scene.follow(spoil)

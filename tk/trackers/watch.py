@@ -63,8 +63,6 @@ _FIRST_USUAL, _BETTER, _SLOWLY = 0.12, 0.1, 0.02
 _DISAGREES, _TOO_FEW = "disagrees with the others", "fewer than two cameras see anybody"
 _LACKS = "misses a part of the person"
 _IMPLAUSIBLE = "the pose found cannot be true"
-_LOST = "lost"
-_UNKNOWN = "the person is explained far worse than usual, and not found elsewhere: σ is unknown"
 
 Span = tuple[int, int, int]
 """Of frames: the first, the last, how many."""
@@ -91,7 +89,7 @@ class Watch:
         self._since_trial = np.full(C, _PAUSE)
         self._at_trial = np.zeros(C)
         self._left_out: dict[str, Span] = {}  # by "camera/reason"
-        self._told: dict[str, Span] = {}  # of frames, by what is told
+        self._lost: dict[str, Span] = {}  # by reason
         self._why_apart: dict[int, str] = {}
         self._beside_usual = 1.0  # E_S of the last frame beside the usual
 
@@ -241,30 +239,28 @@ class Watch:
         if estimate.status == "lost":
             self._plausibility.forget()
             if not used.masks.any():
-                _count(self._told, f"{_TOO_FEW}: {_LOST}", index)
+                _count(self._lost, _TOO_FEW, index)
             return estimate
         reason = self._plausibility.judge(index, estimate.joints, aside)
         if aside is not None and estimate.status == "recovered" and self._beside_usual > _FOUND:
             reason = reason or "after a loss it does not explain the masks yet"
         if reason is None:
-            if estimate.sigma is not None and np.isnan(estimate.sigma).all():
-                _count(self._told, _UNKNOWN, index)
             return estimate
-        _count(self._told, f"{_IMPLAUSIBLE}: {reason}: {_LOST}", index)
+        _count(self._lost, f"{_IMPLAUSIBLE}: {reason}", index)
         self._plausibility.forget()
         if isinstance(self.tracker, ContourTracker):
             self.tracker.lose()
         return replace(estimate, status="lost", sigma=None if estimate.sigma is None else np.full(len(JOINTS), np.nan))
 
     def report(self) -> list[str]:
-        """What was left out or lost, and of what nothing is known, a line a camera and reason."""
+        """What was left out or lost, a line a camera and reason."""
         lines = []
         for key, span in sorted(self._left_out.items()):
             camera, _, reason = key.partition("/")
             because = self._why_apart.get(int(camera)) if reason == _DISAGREES else None
             more = f" ({because})" if because else ""
             lines.append(f"camera {self._names[int(camera)]} {reason}{more}: left out of {described(*span)}")
-        return lines + [f"{said}, {described(*span)}" for said, span in self._told.items()]
+        return lines + [f"{reason}: lost, {described(*span)}" for reason, span in self._lost.items()]
 
     def state(self) -> Mapping[str, Any]:
         """What :meth:`restore` needs beside the tracker's own state."""
@@ -277,7 +273,7 @@ class Watch:
             "at_trial": self._at_trial,
             **{f"health/{name}": value for name, value in self._health.state().items()},
             **{f"plausibility/{name}": value for name, value in self._plausibility.state().items()},
-            "spans": json.dumps([self._left_out, self._told, self._why_apart]),
+            "spans": json.dumps([self._left_out, self._lost, self._why_apart]),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -295,9 +291,9 @@ class Watch:
         self._at_trial = np.array(state["at_trial"], np.float64)
         self._health.restore(part["health"])
         self._plausibility.restore(part["plausibility"])
-        left_out, told, apart = json.loads(str(state["spans"]))
+        left_out, lost, apart = json.loads(str(state["spans"]))
         self._left_out = {key: (span[0], span[1], span[2]) for key, span in left_out.items()}
-        self._told = {key: (span[0], span[1], span[2]) for key, span in told.items()}
+        self._lost = {key: (span[0], span[1], span[2]) for key, span in lost.items()}
         self._why_apart = {int(camera): reason for camera, reason in apart.items()}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -54,7 +55,7 @@ def rodrigues(camera: Camera) -> list[float]:
     return cv2.Rodrigues(camera.rotation)[0].ravel().tolist()
 
 
-def tables(rig: Rig, unit_m: float = 1.0) -> dict[str, dict[str, object]]:
+def tables(rig: Rig, unit_m: float = 1.0) -> dict[str, dict[str, Any]]:
     """The tables of a TOML calibration, as Anipose writes them, by the cameras' names."""
     return {
         camera.name: {

@@ -38,7 +38,7 @@ def write_pose2sim(session: Path) -> Rig:
     document = tables(named)
     for table in document.values():
         table["size"] = [float(WIDTH), float(HEIGHT)]
-        table["distortions"] = table["distortions"][:4]  # type: ignore[index]
+        table["distortions"] = table["distortions"][:4]
         table["fisheye"] = False
     (session / "calibration").mkdir()
     write_toml(
