@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import tk
-from tk.io.result import read_joints
+from tk.io.results.writer import read_joints
 
 DEMO = Path(tk.__file__).parent / "data" / "demo"
 LIMBS = slice(3, 15)  # shoulders, elbows, wrists, hips, knees, ankles
@@ -22,7 +22,7 @@ parser.add_argument("capture", nargs="?", type=Path, default=DEMO)
 parser.add_argument("--frames", type=int, default=45, help="how many, at most")
 parser.add_argument("--config", type=Path, help="settings, TOML")
 options = parser.parse_args()
-config = tk.Config.read(options.config) if options.config else tk.Config()
+config = tk.Settings.read(options.config) if options.config else tk.Settings()
 
 truth = read_joints(options.capture / "truth.h5")  # positions (F, 15, 3) metres
 cameras = tk.open_capture(options.capture).rig.names

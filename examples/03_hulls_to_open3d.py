@@ -12,8 +12,8 @@ import numpy as np
 import open3d as o3d
 
 import tk
-from tk.model.volume import VoxelGrid
-from tk.segmentation import make_segmenter
+from tk.model.cameras.volume import VoxelGrid
+from tk.run.segmentation import make_segmenter
 
 DEMO = Path(tk.__file__).parent / "data" / "demo"
 
@@ -27,7 +27,7 @@ options = parser.parse_args()
 options.out.mkdir(parents=True, exist_ok=True)
 
 capture = tk.open_capture(options.capture)
-segment = make_segmenter(capture, tk.Config(), print)  # its masks, or those made against the empty scene
+segment = make_segmenter(capture, tk.Settings(), print)  # its masks, or those made against the empty scene
 grid = VoxelGrid.cover(capture.volume, options.voxels)
 hull = tk.VisualHull(capture.rig, grid)
 

@@ -20,12 +20,12 @@ from unittest import mock
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.config import Config
-from tk.io.capture import Capture, open_capture
-from tk.io.result import read_joints
-from tk.model.objective import BARRED
-from tk.segmentation import make_labeller
-from tk.trackers.base import Observation
+from tk.io.captures.capture import Capture, open_capture
+from tk.io.results.writer import read_joints
+from tk.model.cues.objective import BARRED
+from tk.run.segmentation import make_labeller
+from tk.settings import Settings
+from tk.trackers.protocol import Observation
 from tk.trackers.volumetric import SAMPLING, SCHEDULE, VolumetricTracker
 
 Changes = dict[str, dict[str, Any]]
@@ -38,7 +38,7 @@ ROWS: tuple[tuple[str, Changes], ...] = (
     ("no coverage (data to model)", {"objective": {"coverage_weight": 0.0}}),
     (
         "σ is the limb's diameter",
-        {VOLUMETRIC: {"SAMPLING": replace(SAMPLING, sigma_m=0.0)}, "tk.model.contour_term": {"SIGMA_M": 0.0}},
+        {VOLUMETRIC: {"SAMPLING": replace(SAMPLING, sigma_m=0.0)}, "tk.model.cues.edge_term": {"SIGMA_M": 0.0}},
     ),
     ("SMD not whitened", {VOLUMETRIC: {"SCHEDULE": replace(SCHEDULE, whiten=False)}}),
     (
@@ -50,8 +50,8 @@ ROWS: tuple[tuple[str, Changes], ...] = (
     ("no other places of the limbs looked at", {"silhouette": {"search_every": 0}}),
     ("no colour edges", {"contours": {"edge_weight": 0.0}}),
     ("colours ignored", {"appearance": {"enabled": False}}),
-    ("shoulders do not rise with the arms", {"tk.model.skeleton": {"RAISED_SHOULDERS": 0.0}}),
-    ("parts may enter each other", {"tk.model.objective": {"BARRED": np.zeros_like(BARRED)}}),
+    ("shoulders do not rise with the arms", {"tk.model.body.skeleton": {"RAISED_SHOULDERS": 0.0}}),
+    ("parts may enter each other", {"tk.model.cues.objective": {"BARRED": np.zeros_like(BARRED)}}),
 )
 
 
@@ -60,7 +60,7 @@ class Recorded:
 
     def __init__(self, path: Path) -> None:
         self.capture: Capture = open_capture(path, None, "none")
-        label = make_labeller(self.capture, Config(), lambda _: None)
+        label = make_labeller(self.capture, Settings(), lambda _: None)
         with self.capture.frames() as frames:
             self.frames = [
                 Observation(frame.index, np.array(frame.images), *(np.array(layer) for layer in label(frame)))
@@ -68,7 +68,7 @@ class Recorded:
             ]
         self.truth = read_joints(path / "truth.h5").positions
 
-    def error(self, config: Config) -> tuple[NDArray[np.float64], int]:
+    def error(self, config: Settings) -> tuple[NDArray[np.float64], int]:
         """(F, 15) distances from the truth, metres, and how many frames said lost."""
         tracker = VolumetricTracker(self.capture.rig, self.capture.volume, self.capture.up, config)
         tracker.start(self.frames[: tracker.opening_frames], self.capture.subject_height_m, None)
@@ -78,9 +78,9 @@ class Recorded:
 
 
 @contextmanager
-def changed(changes: Changes) -> Iterator[Config]:
+def changed(changes: Changes) -> Iterator[Settings]:
     """The configuration with changes; and, for the row, other constants."""
-    config = Config()
+    config = Settings()
     with ExitStack() as stack:
         for place, values in changes.items():
             if "." in place:

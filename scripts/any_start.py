@@ -20,10 +20,10 @@ import numpy as np
 
 from scripts.faults import OFF_M
 from scripts.synthetic.keypoints import write_keypoints
-from tk.config import Config
-from tk.io.capture import Capture, open_capture
-from tk.io.result import Status, read_joints, read_result
-from tk.session import track
+from tk.io.captures.capture import Capture, open_capture
+from tk.io.results.writer import Status, read_joints, read_result
+from tk.run.session import track
+from tk.settings import Settings
 
 FROM = 22
 """The development captures hold the initialisation pose for 10 frames and leave it during the 12 that follow."""
@@ -68,7 +68,7 @@ def compare(capture: Capture, begin: int, work: Path, names: Sequence[str]) -> I
             continue
         said = Quiet()
         output = work / f"{capture.name}-{name.replace(', ', '-').replace(' ', '-')}.h5"
-        track(started, output, Config(), said, frames=(0 if name == "normal" else begin, None), force=True)
+        track(started, output, Settings(), said, frames=(0 if name == "normal" else begin, None), force=True)
         result = read_result(output)
         kept = result.frames >= begin
         expected = truth.positions[[rows[int(frame)] for frame in result.frames[kept]]]

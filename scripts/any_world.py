@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from scripts.any_start import Quiet
-from tk.config import Config
-from tk.io.capture import Capture, open_capture
-from tk.io.result import Result, Status, read_result
-from tk.model.mounting import infer_up
-from tk.model.up import up_text
-from tk.model.volume import Volume
-from tk.model.world import seen_from
-from tk.session import track
+from tk.io.captures.capture import Capture, open_capture
+from tk.io.results.writer import Result, Status, read_result
+from tk.model.cameras.mounting import infer_up
+from tk.model.cameras.tracker_frame import seen_from
+from tk.model.cameras.up import up_text
+from tk.model.cameras.volume import Volume
+from tk.run.session import track
+from tk.settings import Settings
 
 Float = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ def turned(capture: Capture, turn: Float, shift: Float, up: bool = True) -> Capt
 def run(capture: Capture, frames: tuple[int, int | None], work: Path) -> tuple[Result, list[str]]:
     """Track it."""
     said = Quiet()
-    track(capture, work / "r.h5", Config(), said, frames=frames, force=True)
+    track(capture, work / "r.h5", Settings(), said, frames=frames, force=True)
     return read_result(work / "r.h5"), said.said
 
 

@@ -47,24 +47,25 @@ from scipy.spatial import cKDTree
 
 from scripts import bench_hull, bench_pictures, bench_speed
 from scripts.bench_stages import Stage, contour_stages, median_ms, silhouette_stages
-from tk import __version__, session
-from tk.config import Config
+from tk import __version__
 from tk.errors import TkError
-from tk.io.capture import Capture, open_capture
-from tk.io.frames import FrameSet
-from tk.io.result import Result, read_result
+from tk.io.captures.capture import Capture, open_capture
+from tk.io.captures.frames import FrameSet
+from tk.io.results.writer import Result, read_result
 from tk.kernels.launch import Launcher
 from tk.kernels.nearest import SurfaceIndex, nearest
 from tk.kernels.runtime import ti
-from tk.model.appearance import Appearance
-from tk.model.hull import VisualHull
-from tk.model.objective import BodyObjective
-from tk.model.skeleton import CHAINS, join_pose
-from tk.model.skin import lay_skin
-from tk.model.volume import VoxelGrid
-from tk.segmentation import make_segmenter
-from tk.trackers.base import Estimate
+from tk.model.body.skeleton import CHAINS, join_pose
+from tk.model.body.superellipsoid_body import build_superellipsoid_body
+from tk.model.cameras.volume import VoxelGrid
+from tk.model.cues.appearance import Appearance
+from tk.model.cues.objective import BodyObjective
+from tk.model.hull.hull import VisualHull
+from tk.run import session
+from tk.run.segmentation import make_segmenter
+from tk.settings import Settings
 from tk.trackers.bodies import body_and_poses
+from tk.trackers.protocol import Estimate
 from tk.trackers.silhouette import SilhouetteTracker
 from tk.trackers.volumetric import CELL_VOXELS, SAMPLING
 
@@ -90,8 +91,8 @@ class Options:
         return open_capture(self.capture, self.cameras, self.masks)
 
     @property
-    def config(self) -> Config:
-        return Config(voxels=self.voxels) if self.voxels else Config()
+    def config(self) -> Settings:
+        return Settings(voxels=self.voxels) if self.voxels else Settings()
 
     @property
     def title(self) -> str:
@@ -273,13 +274,13 @@ def _decode_ms(capture: Capture, first: int, stop: int, repeats: int) -> float:
 
 
 def _search_stages(
-    capture: Capture, config: Config, frame: FrameSet, masks: np.ndarray, result: Result
+    capture: Capture, config: Settings, frame: FrameSet, masks: np.ndarray, result: Result
 ) -> Iterator[Stage]:
     """Colour segmentation, nearest neighbours and the objective, at the tracked pose of a frame."""
     restored = body_and_poses(result)
     if restored is None:
         raise SystemExit(f"{result.path}: has no body in /model")
-    skin = lay_skin(restored[0], capture.up, config.body.waist)
+    skin = build_superellipsoid_body(restored[0], capture.up, config.body.waist)
     row = np.flatnonzero(result.frames == frame.index)[0]
     waist = np.zeros((0,)) if result.waist is None else result.waist[row]
     pose = join_pose(skin.skeleton, result.pose[row], waist, np.zeros(0))

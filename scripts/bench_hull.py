@@ -20,11 +20,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.calibration import read_calibration
+from tk.io.captures.calibration import read_calibration
 from tk.io.toml import load_toml
-from tk.model.camera import Rig
-from tk.model.hull import VisualHull
-from tk.model.volume import Volume, VoxelGrid
+from tk.model.cameras.camera import Rig
+from tk.model.cameras.volume import Volume, VoxelGrid
+from tk.model.hull.hull import VisualHull
 
 RESOLUTIONS = (64, 128)
 GROWTH = (4, 5, 9)  # cameras, as in the paper's table 1

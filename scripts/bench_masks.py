@@ -19,10 +19,10 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from tk.config import Config
-from tk.io.capture import Capture, open_capture
-from tk.io.video import MASK_THRESHOLD
-from tk.segmentation import make_labeller
+from tk.io.captures.capture import Capture, open_capture
+from tk.io.captures.video import MASK_THRESHOLD
+from tk.run.segmentation import make_labeller
+from tk.settings import Settings
 
 TIMED = 40
 """Frames that are held in memory to be segmented while nothing is decoded."""
@@ -49,7 +49,7 @@ def truth_of(folder: Path, capture: Capture, index: int) -> np.ndarray:
 def measure(path: Path, frames: int | None) -> str:
     """The line of one capture."""
     capture = open_capture(path, masks="none")
-    label = make_labeller(capture, Config(), print)
+    label = make_labeller(capture, Settings(), print)
     label(next(capture.frames(0, 1)))  # compiles
     stop = min(frames or capture.frame_count, capture.frame_count)
     with capture.frames(0, stop) as reader:

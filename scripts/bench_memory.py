@@ -21,12 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scripts.synthetic.capture import write_calibration
-from tk import session
-from tk.config import Config
-from tk.io.capture import Capture, open_capture
-from tk.model.camera import Camera, Rig
+from tk.io.captures.capture import Capture, open_capture
+from tk.model.cameras.camera import Camera, Rig
 from tk.render.video import video_writer
-from tk.trackers.base import Estimate
+from tk.run import session
+from tk.settings import Settings
+from tk.trackers.protocol import Estimate
 
 DEMO = Path(__file__).resolve().parents[1] / "tk" / "data" / "demo"
 #: of the demo's pictures, along each side
@@ -107,7 +107,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         os.mkdir(folder := Path(scratch) / "loop")
         capture = make_loop(folder, chosen.frames)
         print(f"{len(capture.rig)} cameras of {capture.rig[0].width}×{capture.rig[0].height}", flush=True)
-        done = session.track(capture, Path(scratch) / "loop.h5", Config(), Telling(chosen.every), causal=chosen.causal)
+        done = session.track(
+            capture, Path(scratch) / "loop.h5", Settings(), Telling(chosen.every), causal=chosen.causal
+        )
         print(f"{done.frames} frames in {done.seconds:.0f} s, {done.lost} lost; at the end {held_mib():.1f} MiB")
 
 

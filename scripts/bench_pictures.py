@@ -10,10 +10,10 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from tk import session
-from tk.config import Config
-from tk.io.capture import open_capture
+from tk.io.captures.capture import open_capture
 from tk.report.after import leave_pictures
+from tk.run import session
+from tk.settings import Settings
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def run_once(capture_path: Path, masks: str, frames: int | None, output: Path) -
     """A default run and its pictures; meant for a process of its own."""
     started = _clocks()
     capture = open_capture(capture_path, masks=masks)
-    summary = session.track(capture, output, Config(), session.Silent(), frames=(0, frames))
+    summary = session.track(capture, output, Settings(), session.Silent(), frames=(0, frames))
     tracked = _clocks()
     warnings: list[str] = []
     leave_pictures(capture, output, warnings.append)

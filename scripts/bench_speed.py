@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from tk import session
-from tk.config import Config
-from tk.io.capture import open_capture
-from tk.io.result import read_result
-from tk.trackers.base import Estimate
+from tk.io.captures.capture import open_capture
+from tk.io.results.writer import read_result
+from tk.run import session
+from tk.settings import Settings
+from tk.trackers.protocol import Estimate
 
 
 class _Clock(session.Silent):
@@ -66,7 +66,7 @@ def run_once(folder: Path, masks: str, output: Path, causal: bool) -> Speed:
     opened = time.perf_counter()
     capture = open_capture(folder, masks=masks)
     clock = _Clock()
-    session.track(capture, output, Config(), clock, causal=causal, force=True)
+    session.track(capture, output, Settings(), clock, causal=causal, force=True)
     ended = time.perf_counter()
     with capture.frames() as reader:
         started = time.perf_counter()

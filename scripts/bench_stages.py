@@ -10,22 +10,22 @@ from functools import partial
 
 import numpy as np
 
-from tk.config import Config
-from tk.io.capture import Capture
-from tk.io.frames import FrameSet
-from tk.io.result import Result
+from tk.io.captures.capture import Capture
+from tk.io.captures.frames import FrameSet
+from tk.io.results.writer import Result
 from tk.kernels.edge_search import search_edges
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.raycast import Cast
-from tk.model.contour_term import ContourTerm
-from tk.model.evidence import Evidence, RayGrid
-from tk.model.limbs import limbs_of
-from tk.model.objective import BodyObjective
-from tk.model.part_colors import PartColors
-from tk.model.silhouettes import Pyramid, Views
+from tk.model.body.limb_candidates import limbs_of
+from tk.model.cues.edge_term import ContourTerm
+from tk.model.cues.objective import BodyObjective
+from tk.model.cues.part_colors import PartColors
+from tk.model.cues.ray_costs import Evidence, RayGrid
+from tk.model.masks.silhouettes import Pyramid, Views
 from tk.optim import gauss_newton
+from tk.settings import Settings
 from tk.trackers.bodies import body_and_poses
-from tk.trackers.contours import NEARBY, SCREEN_ROWS
+from tk.trackers.contour_tracker import NEARBY, SCREEN_ROWS
 from tk.trackers.volumetric import SAMPLING
 
 Float = np.ndarray
@@ -59,7 +59,7 @@ def median_ms(call: Callable[[], object], repeats: int = 20) -> float:
 def contour_stages(
     objective: BodyObjective,
     capture: Capture,
-    config: Config,
+    config: Settings,
     frame: FrameSet,
     pose: Float,
     index: SurfaceIndex,
@@ -98,7 +98,7 @@ def contour_stages(
 
 
 def silhouette_stages(
-    capture: Capture, config: Config, frames: Sequence[FrameSet], masks: Sequence[np.ndarray], result: Result
+    capture: Capture, config: Settings, frames: Sequence[FrameSet], masks: Sequence[np.ndarray], result: Result
 ) -> list[Stage]:
     """The silhouette tracker's work on consecutive frames with masks (V, H, W) each, two frames at least.
 

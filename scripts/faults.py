@@ -30,12 +30,12 @@ import tomli_w
 from numpy.typing import NDArray
 
 from scripts.synthetic.capture import write_calibration
-from tk.config import Config
-from tk.io.calibration import read_calibration
-from tk.io.capture import Capture, open_capture
-from tk.io.result import Status, read_joints
-from tk.model.camera import Rig
-from tk.segmentation import make_labeller
+from tk.io.captures.calibration import read_calibration
+from tk.io.captures.capture import Capture, open_capture
+from tk.io.results.writer import Status, read_joints
+from tk.model.cameras.camera import Rig
+from tk.run.segmentation import make_labeller
+from tk.settings import Settings
 
 Video = list[NDArray[np.uint8]]
 
@@ -175,7 +175,7 @@ def exposure(spoiled: Spoiled) -> None:
 def bystander(spoiled: Spoiled) -> None:
     """Somebody beside the person in two of the views, cut out of the same recording at another time."""
     original = spoiled.original
-    label = make_labeller(original, Config(), lambda _: None)
+    label = make_labeller(original, Settings(), lambda _: None)
     with original.frames() as frames:
         masks = [label(frame)[0].copy() for frame in frames]
     for camera in (spoiled.camera, (spoiled.camera + 2) % len(original.rig)):

@@ -19,16 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import TkError
-from tk.io.capture import open_capture
-from tk.io.result import read_result
+from tk.io.captures.capture import open_capture
+from tk.io.results.writer import read_result
 from tk.kernels.contour import ContourPoints
-from tk.model.anthropometry import BodyDimensions
-from tk.model.camera import Camera, Rig
-from tk.model.cone_body import build_cone_body
-from tk.model.gait import neutral_pose
-from tk.model.skeleton import SEGMENTS
-from tk.model.skin import Skin, lay_skin
-from tk.model.strips import Strips, build_strips, contour_kernel
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.cone_body import build_cone_body
+from tk.model.body.gait_poses import neutral_pose
+from tk.model.body.skeleton import SEGMENTS
+from tk.model.body.strips import Strips, build_strips, contour_kernel
+from tk.model.body.superellipsoid_body import SuperellipsoidBody, build_superellipsoid_body
+from tk.model.cameras.camera import Camera, Rig
 from tk.trackers.bodies import body_and_poses
 
 Float = NDArray[np.float64]
@@ -41,7 +41,7 @@ STRIP, BOLD, BOX = (150, 150, 150), (40, 40, 230), (200, 160, 90)
 BLANK = 40  # grey level
 
 
-def example_pose(body: Skin) -> Float:
+def example_pose(body: SuperellipsoidBody) -> Float:
     """A walking step with one arm before the trunk: every kind of occlusion."""
     pose = neutral_pose(body.skeleton)
     for name, degrees in {
@@ -98,7 +98,7 @@ def draw_pairs(canvas: Image, points: ContourPoints, view: int) -> None:
         polyline(canvas, points.pixels[0, view, k].astype(float), PAIR, 1)
 
 
-def draw_strips(canvas: Image, body: Skin, strips: Strips, pose: Float, camera: Camera) -> None:
+def draw_strips(canvas: Image, body: SuperellipsoidBody, strips: Strips, pose: Float, camera: Camera) -> None:
     """The panel on the right of figure 6: sampling, bounding boxes, one strip of each kind in bold on each limb."""
     T_body = np.eye(4)
     T_body[:3, :3] = body.skeleton.T_world_body
@@ -120,7 +120,7 @@ def draw_strips(canvas: Image, body: Skin, strips: Strips, pose: Float, camera: 
             polyline(canvas, xy, BOLD if s in bold else STRIP, 3 if s in bold else 1)
 
 
-def figure(body: Skin, pose: Float, rig: Rig, images: Sequence[Image]) -> Image:
+def figure(body: SuperellipsoidBody, pose: Float, rig: Rig, images: Sequence[Image]) -> Image:
     """All panels side by side: a view each, then the strips in the first view."""
     fine, coarse = build_strips(body, circles=40, meridians=24, samples=64), build_strips(body, 10, 12)
     tracked = build_strips(body)
@@ -148,7 +148,7 @@ def from_capture(capture: Path, result: Path, frame: int, cameras: Sequence[str]
     restored = body_and_poses(tracked)
     if restored is None:
         raise TkError(f"{result}: holds no body")
-    body = lay_skin(restored[0], tracked.meta.up)
+    body = build_superellipsoid_body(restored[0], tracked.meta.up)
     row = np.flatnonzero(tracked.frames == frame)
     if not len(row):
         raise TkError(f"{result}: has no frame {frame}; it has {tracked.frames.min()} to {tracked.frames.max()}")
@@ -160,7 +160,7 @@ def from_capture(capture: Path, result: Path, frame: int, cameras: Sequence[str]
 
 def from_example() -> Image:
     """The figure of a made-up pose in three views, one of them overhead."""
-    body = lay_skin(build_cone_body(BodyDimensions.from_stature(1.78)))
+    body = build_superellipsoid_body(build_cone_body(BodyDimensions.from_stature(1.78)))
     rig = Rig(
         (
             example_camera("front", (2.6, -1.0, 1.3)),

@@ -24,14 +24,14 @@ import numpy as np
 from scripts.any_start import Quiet
 from scripts.faults import spoil
 from scripts.synthetic.capture import write_calibration
-from tk.config import Config
-from tk.evaluation import evaluate
-from tk.io.calibration import read_calibration
-from tk.io.capture import open_capture
-from tk.io.result import read_joints, read_result
-from tk.model.camera import Camera, Rig
-from tk.model.camera_refinement import aligned, turn_between
-from tk.session import track
+from tk.evaluation.joints import evaluate
+from tk.io.captures.calibration import read_calibration
+from tk.io.captures.capture import open_capture
+from tk.io.results.writer import read_joints, read_result
+from tk.model.cameras.camera import Camera, Rig
+from tk.model.cameras.refinement import aligned, turn_between
+from tk.run.session import track
+from tk.settings import Settings
 
 TURN_DEG, MOVE_M = 0.25, 0.010
 # Turns and places are weighed by these, degrees and metres, when the rigid motion is taken off: the goal.
@@ -71,7 +71,7 @@ def compare(capture: Path, seeds: int, late: bool, masks: str, work: Path) -> It
         opened, told = open_capture(folder, masks=masks), []
         for refine in (False, True):
             output = work / f"{folder.name}-{refine}.h5"
-            track(opened, output, Config(refine=refine), Quiet(), force=True)
+            track(opened, output, Settings(refine=refine), Quiet(), force=True)
             result = read_result(output)
             judged = evaluate(read_joints(output), truth)
             told.append(f"{judged.raw.all.mean_cm:.2f} {judged.corrected.limbs.mean_cm:.2f}")

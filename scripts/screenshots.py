@@ -15,8 +15,8 @@ from pathlib import Path
 from PIL import Image  # comes with Matplotlib
 
 from scripts.browser import browser_page, find_browser
-from tk.io.capture import open_capture
-from tk.io.result import read_result
+from tk.io.captures.capture import open_capture
+from tk.io.results.writer import read_result
 from tk.render.overlay import Overlay, joined
 from tk.report.page import report
 

@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 
 from scripts.ablation import Recorded
-from tk.model.evidence import mean_of_views
-from tk.model.limbs import Limb
-from tk.trackers.base import Observation
+from tk.model.body.limb_candidates import Limb
+from tk.model.cues.ray_costs import mean_of_views
+from tk.trackers.protocol import Observation
 from tk.trackers.region import RegionTracker
 
 # Places of a limb that are tried a frame.

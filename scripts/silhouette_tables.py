@@ -19,15 +19,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.capture import open_capture
-from tk.io.result import read_joints
+from tk.io.captures.capture import open_capture
+from tk.io.results.writer import read_joints
 from tk.kernels.line_search import SearchSettings
-from tk.model.camera import Rig
-from tk.model.evidence import Evidence, RayGrid
-from tk.model.skeleton import JOINTS, join_pose
-from tk.optim.gauss_newton import GaussNewtonConfig
-from tk.trackers.base import Observation
-from tk.trackers.contours import SilhouetteConfig
+from tk.model.body.skeleton import JOINTS, join_pose
+from tk.model.cameras.camera import Rig
+from tk.model.cues.ray_costs import Evidence, RayGrid
+from tk.optim.gauss_newton import GaussNewtonSettings
+from tk.trackers.contour_tracker import SilhouetteSettings
+from tk.trackers.protocol import Observation
 from tk.trackers.silhouette import SilhouetteTracker
 
 Float = NDArray[np.float64]
@@ -36,11 +36,11 @@ Float = NDArray[np.float64]
 CAMERAS = ("cam3", "cam6", "cam1", "cam4")
 ANKLES = [JOINTS.index("ankle_l"), JOINTS.index("ankle_r")]
 
-PAPER = SilhouetteConfig(
+PAPER = SilhouetteSettings(
     prediction=0.0,
     search_every=0,
     search=SearchSettings(interior=True, ambiguous_px=8.0, tangential=1.0, spacing_px=1.0, robust_px=0.0),
-    solver=GaussNewtonConfig(scales=2),
+    solver=GaussNewtonSettings(scales=2),
 )
 
 
@@ -83,15 +83,15 @@ def load(folder: Path, cameras: Sequence[str], frames: int, every: int = 1) -> S
     return Sequence3D(rig, capture.up, masks, truth.positions[:frames:every], capture.subject_height_m)
 
 
-def variants() -> list[tuple[str, int, SilhouetteConfig]]:
+def variants() -> list[tuple[str, int, SilhouetteSettings]]:
     """Names, views and settings of table 1, then ours."""
 
-    def iterations(n: int) -> SilhouetteConfig:
+    def iterations(n: int) -> SilhouetteSettings:
         return replace(PAPER, solver=replace(PAPER.solver, iterations=n))
 
     blind = replace(PAPER, search=replace(PAPER.search, ambiguous_px=0.0))
     single = replace(PAPER, solver=replace(PAPER.solver, scales=1, iterations=6))
-    ours = SilhouetteConfig()
+    ours = SilhouetteSettings()
     return [
         ("paper, no ambiguity weights", 2, blind),
         ("paper", 2, PAPER),
@@ -107,7 +107,7 @@ def variants() -> list[tuple[str, int, SilhouetteConfig]]:
     ]
 
 
-def track(data: Sequence3D, name: str, views: int, config: SilhouetteConfig) -> tuple[Row, Float]:
+def track(data: Sequence3D, name: str, views: int, config: SilhouetteSettings) -> tuple[Row, Float]:
     """Track with the first views; a row of the tables and the joints (F, 15, 3)."""
     rig = Rig(data.rig.cameras[:views])
     empty = np.zeros(0, np.uint8)

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.export import read_motion
-from tk.io.result import Status, read_joints
-from tk.model.skeleton import JOINTS
+from tk.io.results.writer import Status, read_joints
+from tk.model.body.skeleton import JOINTS
 
 Float = NDArray[np.float64]
 

@@ -129,12 +129,12 @@ def copy(tiny: Path, tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def tracked(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The result of an unbroken run of the volumetric tracker over the tiny capture. Not to be changed."""
-    from tk.config import Config
-    from tk.io.capture import open_capture
-    from tk.session import track
+    from tk.io.captures.capture import open_capture
+    from tk.run.session import track
+    from tk.settings import Settings
 
     def make(path: Path) -> None:
-        track(open_capture(tiny), path, Config.from_toml(QUICK), Silent(), method="volumetric", store_hull=True)
+        track(open_capture(tiny), path, Settings.from_toml(QUICK), Silent(), method="volumetric", store_hull=True)
 
     return made_once(tmp_path_factory, "unbroken.h5", make)
 

@@ -16,7 +16,7 @@ import tomli_w
 
 from scripts.synthetic.capture import write_calibration
 from tests.model.ring import ring_of_cameras
-from tk.model.camera import Camera, Rig
+from tk.model.cameras.camera import Camera, Rig
 
 #: where a person stands in a frame: x, y, metres; None for nobody
 Path2 = Callable[[int], tuple[float, float] | None]
@@ -30,7 +30,7 @@ SEGMENTER = '''
 import cv2
 import numpy as np
 
-from tk.model.subject import Sighting
+from tk.model.masks.subject import Sighting
 
 
 class Red:

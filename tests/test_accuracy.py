@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from tests.conftest import Silent, Tk
-from tk.config import Config
-from tk.evaluation import Evaluation, evaluate_files
-from tk.io.capture import open_capture
-from tk.io.result import read_result
-from tk.session import track
+from tk.evaluation.joints import Evaluation, evaluate_files
+from tk.io.captures.capture import open_capture
+from tk.io.results.writer import read_result
+from tk.run.session import track
+from tk.settings import Settings
 
 pytestmark = pytest.mark.slow
 
@@ -56,7 +56,7 @@ def test_captures_with_an_initial_pose_from_their_videos(name: str, tmp_path: Pa
     means = []
     for seed in range(SEEDS):
         result = tmp_path / f"{seed}.h5"
-        track(open_capture(folder, masks="none"), result, Config(seed=seed), Silent())
+        track(open_capture(folder, masks="none"), result, Settings(seed=seed), Silent())
         found = evaluate_files(result, folder / "truth.h5")
         assert_complete(found, FRAMES[name])
         means.append(found.raw.all.mean_cm)
@@ -68,7 +68,7 @@ def test_the_same_seed_gives_the_same_poses(name: str, tmp_path: Path) -> None:
     capture = open_capture(shared(name), masks="none")
     poses = []
     for run in ("a.h5", "b.h5"):
-        track(capture, tmp_path / run, Config(), Silent(), frames=(0, 30))
+        track(capture, tmp_path / run, Settings(), Silent(), frames=(0, 30))
         poses.append(read_result(tmp_path / run).pose)
     assert len(poses[0]) == 30
     np.testing.assert_array_equal(poses[0], poses[1])

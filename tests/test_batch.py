@@ -21,14 +21,14 @@ from tests.conftest import QUICK, Silent, Tk
 from tk.batch import Job, Outcome, TrackOptions, exit_code
 from tk.batch.jobs import DONE, FAILED, make_jobs
 from tk.batch.summary import write_summary
-from tk.config import Config
 from tk.errors import ConfigError, ResultBusyError, ResultError
-from tk.io.capture import open_capture
-from tk.io.result_files import Workshop
-from tk.session import track
+from tk.io.captures.capture import open_capture
+from tk.io.results.files import Workshop
+from tk.run.session import track
+from tk.settings import Settings
 
 ROOT = Path(__file__).parents[1]
-CONFIG = Config.from_toml(QUICK)
+CONFIG = Settings.from_toml(QUICK)
 
 
 def folders(*paths: Path) -> list[Path]:

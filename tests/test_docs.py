@@ -13,12 +13,12 @@ import pytest
 
 from tests.conftest import Tk
 from tk.cli import main
-from tk.config import Config
-from tk.io.calibration import read_calibration
-from tk.io.init_pose import read_init_pose
-from tk.io.settings import read_settings
-from tk.model.anthropometry import BodyDimensions
-from tk.model.skeleton import JOINTS, build_skeleton
+from tk.io.captures.calibration import read_calibration
+from tk.io.captures.capture_toml import read_settings
+from tk.io.captures.init_pose import read_init_pose
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.skeleton import JOINTS, build_skeleton
+from tk.settings import Settings
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -123,13 +123,13 @@ def test_python_examples_compile(page: Path) -> None:
 
 
 def test_settings_example_is_accepted() -> None:
-    config = Config.from_toml(toml_block("segmentation ="))
-    assert config != Config() and config.voxels == 128 and not config.appearance.enabled
+    config = Settings.from_toml(toml_block("segmentation ="))
+    assert config != Settings() and config.voxels == 128 and not config.appearance.enabled
 
 
 @pytest.mark.parametrize("page", [HOW_TO, ROOT / "docs" / "method.md"], ids=lambda page: page.name)
 def test_named_settings_exist(page: Path) -> None:
-    tree = tomllib.loads(Config().to_toml())
+    tree = tomllib.loads(Settings().to_toml())
     tables = {name for name, value in tree.items() if isinstance(value, dict)}
     named = re.findall(r"`(\w+)\.(\w+)(?: = [^`]*)?`", page.read_text(encoding="utf-8"))
     named = [(table, name) for table, name in named if table in tables]

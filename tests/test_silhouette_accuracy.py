@@ -9,11 +9,11 @@ import pytest
 
 from scripts.silhouette_tables import CAMERAS, load, track
 from tests.conftest import Silent
-from tk.config import Config
-from tk.io.capture import open_capture
-from tk.io.result import read_joints
-from tk.session import track as track_capture
-from tk.trackers.contours import SilhouetteConfig
+from tk.io.captures.capture import open_capture
+from tk.io.results.writer import read_joints
+from tk.run.session import track as track_capture
+from tk.settings import Settings
+from tk.trackers.contour_tracker import SilhouetteSettings
 
 CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "captures"
 TREADMILL = CAPTURES / "treadmill-slow"
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 @pytest.mark.skipif(not TREADMILL.is_dir(), reason=f"no {TREADMILL.name} among the shared captures")
 def test_treadmill_with_four_views() -> None:
     data = load(TREADMILL, CAMERAS, 340)
-    row, _ = track(data, "tk", 4, SilhouetteConfig())
+    row, _ = track(data, "tk", 4, SilhouetteSettings())
     assert row.ankle_share <= 2.0 and row.joints_cm <= 4.0 and row.swaps == 0
     assert row.error_share <= 12.0
 
@@ -34,7 +34,7 @@ def test_masks_from_the_video(name: str, most_cm: float, tmp_path: Path) -> None
     if not (CAPTURES / name).is_dir():
         pytest.skip(f"no {name} among the shared captures")
     capture = open_capture(CAPTURES / name, masks="none")
-    summary = track_capture(capture, tmp_path / "r.h5", Config(), Silent(), method="silhouette")
+    summary = track_capture(capture, tmp_path / "r.h5", Settings(), Silent(), method="silhouette")
     truth = read_joints(CAPTURES / name / "truth.h5")
     found = read_joints(tmp_path / "r.h5")
     assert summary.lost == 0

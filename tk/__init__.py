@@ -16,19 +16,19 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tk.api import open_capture, track
-    from tk.config import Config
-    from tk.io.result import Result, read_result
-    from tk.model.cone_body import ConeBody as Body
-    from tk.model.hull import VisualHull
-    from tk.trackers.base import Estimate
+    from tk.io.results.writer import Result, read_result
+    from tk.model.body.cone_body import ConeBody as Body
+    from tk.model.hull.hull import VisualHull
+    from tk.settings import Settings
+    from tk.trackers.protocol import Estimate
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Body",
-    "Config",
     "Estimate",
     "Result",
+    "Settings",
     "VisualHull",
     "__version__",
     "open_capture",
@@ -37,13 +37,13 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Body": ("tk.model.cone_body", "ConeBody"),
-    "Config": ("tk.config", "Config"),
-    "Estimate": ("tk.trackers.base", "Estimate"),
-    "Result": ("tk.io.result", "Result"),
-    "VisualHull": ("tk.model.hull", "VisualHull"),
+    "Body": ("tk.model.body.cone_body", "ConeBody"),
+    "Settings": ("tk.settings", "Settings"),
+    "Estimate": ("tk.trackers.protocol", "Estimate"),
+    "Result": ("tk.io.results.writer", "Result"),
+    "VisualHull": ("tk.model.hull.hull", "VisualHull"),
     "open_capture": ("tk.api", "open_capture"),
-    "read_result": ("tk.io.result", "read_result"),
+    "read_result": ("tk.io.results.writer", "read_result"),
     "track": ("tk.api", "track"),
 }
 

@@ -9,12 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict, overload
 
-from tk import session
-from tk.config import Config
-from tk.io.capture import Capture
-from tk.io.capture import open_capture as _open_capture
-from tk.io.result import Result, read_result
-from tk.trackers.base import Estimate
+from tk.io.captures.capture import Capture
+from tk.io.captures.capture import open_capture as _open_capture
+from tk.io.results.writer import Result, read_result
+from tk.run import session
+from tk.settings import Settings
+from tk.trackers.protocol import Estimate
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack  # in typing from Python 3.11 on
@@ -51,7 +51,7 @@ class _Options(TypedDict, total=False):
 
     method: str
     frames: tuple[int, int | None]
-    config: Config | None
+    config: Settings | None
     seed: int | None
     init_pose: PathLike | None
     body: PathLike | None
@@ -74,7 +74,7 @@ def track(
     *,
     method: str = "region",
     frames: tuple[int, int | None] = (0, None),
-    config: Config | None = None,
+    config: Settings | None = None,
     seed: int | None = None,
     init_pose: PathLike | None = None,
     body: PathLike | None = None,
@@ -98,15 +98,16 @@ def track(
         force: replace a result that exists under ``output``; without it that is an error.
 
     Returns:
-        Without ``output`` an iterator of :class:`~tk.trackers.base.Estimate`: ``frame``, ``time`` (seconds), ``pose``
+        Without ``output`` an iterator of :class:`~tk.trackers.protocol.Estimate`: ``frame``, ``time`` (seconds),
+        ``pose``
         (24,), ``joints`` (15, 3) metres, ``sigma`` (15,) metres, ``status`` … With it the finished
-        :class:`~tk.io.result.Result`.
+        :class:`~tk.io.results.writer.Result`.
 
     Raises:
         tk.errors.TkError: bad input, in one line; what was finished before it is in the file.
         KeyboardInterrupt: somebody stopped it; with ``output`` the finished frames are in the file.
     """
-    chosen = config or Config()
+    chosen = config or Settings()
     if seed is not None:
         chosen = replace(chosen, seed=seed)
     pose_file = Path(init_pose) if init_pose is not None else None

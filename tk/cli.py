@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tk import __version__
-from tk.cli_base import (
+from tk.commands.base import (
     Commands,
     body_option,
     cameras_option,
@@ -36,12 +36,12 @@ from tk.cli_base import (
     voxels_option,
     working,
 )
-from tk.console import Report
+from tk.commands.console import Report
 from tk.errors import CaptureError, ConfigError, WorkerError
 
 if TYPE_CHECKING:
-    from tk.io.capture import Capture
-    from tk.session import Summary
+    from tk.io.captures.capture import Capture
+    from tk.run.session import Summary
 
 #: more than half of the frames are lost
 EXIT_LOST = 3
@@ -111,9 +111,9 @@ def track(
     span = frame_span(frames)
     with Report(quiet) as report:
         report.stage("loading")
-        from tk import session  # the heavy imports wait until a command needs them
-        from tk.io.capture import open_capture
-        from tk.io.result_files import check_output
+        from tk.io.captures.capture import open_capture
+        from tk.io.results.files import check_output
+        from tk.run import session  # the heavy imports wait until a command needs them
 
         config = configuration(config_file, preset, voxels=voxels, seed=seed)
         check_output(output, force, resume)
@@ -219,8 +219,8 @@ def reconstruct(
     started = time.perf_counter()
     with Report(quiet) as report:
         report.stage("loading")
-        from tk import reconstruction
-        from tk.io.capture import open_capture
+        from tk.io.captures.capture import open_capture
+        from tk.run import reconstruction
 
         config = configuration(config_file, voxels=voxels)
         report.stage(f"opening {capture}")
@@ -249,8 +249,8 @@ def masks(
     span = frame_span(frames)
     with Report(quiet) as report:
         report.stage("loading")
-        from tk import mask_folder
-        from tk.io.capture import open_capture
+        from tk.io.captures.capture import open_capture
+        from tk.run import mask_folder
 
         opened = open_capture(capture, listed(cameras), "none")
         written = mask_folder.write_masks(opened, output, report, segmenter, span)
@@ -272,9 +272,9 @@ def inspect(
     import json
 
     with working(f"looking at {capture}"):
-        from tk.inspection import inspect as look
-        from tk.inspection_sheet import write_sheet
-        from tk.io.capture import open_capture
+        from tk.inspection.checks import inspect as look
+        from tk.inspection.pictures import write_sheet
+        from tk.io.captures.capture import open_capture
 
         opened = open_capture(capture, listed(cameras), masks)
         found, seen = look(opened, configuration(config_file))
@@ -292,9 +292,9 @@ def inspect(
 def level(capture: Path, masks: str, config_file: Path | None) -> None:
     """Find what points up from cameras and person, and write it into CAPTURE/capture.toml."""
     with working(f"looking at {capture}"):
-        from tk.inspection import inspect as look
-        from tk.io.capture import open_capture
-        from tk.leveling import write_up
+        from tk.inspection.checks import inspect as look
+        from tk.inspection.leveling import write_up
+        from tk.io.captures.capture import open_capture
 
         found, _ = look(open_capture(capture, None, masks), configuration(config_file), pictures=0)
         write_up(capture, found.leveling)
@@ -332,13 +332,13 @@ def refine(
     """Refine the cameras of CAPTURE, and the time offsets of its videos, by RESULT.h5, which was tracked with them."""
     with Report(quiet) as report:
         report.stage("loading")
-        from tk.io.capture import open_capture
-        from tk.model.camera_refinement import RefinementConfig
-        from tk.refinement import refine_capture
+        from tk.io.captures.capture import open_capture
+        from tk.model.cameras.refinement import RefinementSettings
+        from tk.run.refinement import refine_capture
 
         if output.exists() and not force:
             raise ConfigError(f"{output}: exists already; give another name, or --force")
-        how = RefinementConfig(focal=focal, offsets=offsets, trust=trust)
+        how = RefinementSettings(focal=focal, offsets=offsets, trust=trust)
         config = configuration(config_file)
         report.stage(f"opening {capture}")
         opened = open_capture(capture, listed(cameras), masks)
@@ -366,8 +366,8 @@ def evaluate(result: Path, truth: Path, capture: Path | None, joints: str, masks
     """Compare RESULT.h5 with TRUTH.h5: joint distances, PCK, lost frames, frames/s; pixels and silhouettes by view."""
     seen, note = None, ""
     with working(f"comparing {result} with {truth}"):
-        from tk.evaluation import evaluate_files
-        from tk.view_evaluation import capture_of, evaluate_views
+        from tk.evaluation.joints import evaluate_files
+        from tk.evaluation.views import capture_of, evaluate_views
 
         found = evaluate_files(result, truth)
         folder = capture or capture_of(truth)
@@ -552,10 +552,10 @@ def demo(output: Path, voxels: int | None, resume: bool, force: bool, no_report:
     with as_file(files("tk") / "data" / "demo") as folder:
         with Report(quiet) as report:
             report.stage("loading")
-            from tk import session
-            from tk.evaluation import evaluate_files
-            from tk.io.capture import open_capture
-            from tk.io.result_files import check_output
+            from tk.evaluation.joints import evaluate_files
+            from tk.io.captures.capture import open_capture
+            from tk.io.results.files import check_output
+            from tk.run import session
 
             check_output(output, force, resume)
             report.stage(f"opening the capture that ships with tk, {folder}")
@@ -575,6 +575,6 @@ def demo(output: Path, voxels: int | None, resume: bool, force: bool, no_report:
 @config_option
 def config(preset: str | None, config_file: Path | None) -> None:
     """Print all settings with what they mean, as TOML that --config takes."""
-    from tk.config_text import annotated_toml
+    from tk.commands.config_text import annotated_toml
 
     click.echo(annotated_toml(configuration(config_file, preset)), nl=False)

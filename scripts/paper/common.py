@@ -13,11 +13,11 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
-from tk import session
-from tk.config import Config
-from tk.io.capture import open_capture
-from tk.io.result import read_joints
-from tk.model.skeleton import JOINTS
+from tk.io.captures.capture import open_capture
+from tk.io.results.writer import read_joints
+from tk.model.body.skeleton import JOINTS
+from tk.run import session
+from tk.settings import Settings
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -86,7 +86,11 @@ class Track:
 
 
 def track(
-    capture: Path, config: Config, frames: int | None, method: str = "volumetric", cameras: Sequence[str] | None = None
+    capture: Path,
+    config: Settings,
+    frames: int | None,
+    method: str = "volumetric",
+    cameras: Sequence[str] | None = None,
 ) -> Track:
     """Track a capture, with its exact masks where it has some, and compare with its truth.
 
@@ -108,13 +112,13 @@ def track(
     return Track(error, pose, units, iterations, optimise, lost)
 
 
-def contours(config: Config, **values: Any) -> Config:
+def contours(config: Settings, **values: Any) -> Settings:
     """The configuration with other settings of the contour cues."""
     return replace(config, contours=replace(config.contours, **values))
 
 
 def over_seeds(
-    options: Options, config: Config, method: str = "volumetric", cameras: Sequence[str] | None = None
+    options: Options, config: Settings, method: str = "volumetric", cameras: Sequence[str] | None = None
 ) -> list[Track]:
     """A track for every seed."""
     return [

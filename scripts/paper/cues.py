@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 from scripts.paper.common import Options, contours, over_seeds, plt, save, spread, table
-from tk.config import Config
+from tk.settings import Settings
 
 
-def variants() -> dict[str, Config]:
+def variants() -> dict[str, Settings]:
     """The cues by name."""
-    default = Config()
+    default = Settings()
     without = replace(default, objective=replace(default.objective, coverage_weight=0.0))
     return {
         "surface": contours(without, edge_weight=0.0),

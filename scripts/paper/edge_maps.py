@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.edges import EdgeConfig, rgb_gradient_at
+from tk.kernels.edges import EdgeSettings, rgb_gradient_at
 from tk.kernels.runtime import ensure_runtime, ti
 
 # Thresholds of :func:`edge_map` on the magnitude: edges count from the high one on, and are followed down to the low
@@ -76,7 +76,7 @@ def _thin_kernel(
 
 
 def rgb_gradient(
-    images: NDArray[np.uint8], config: EdgeConfig | None = None, sizes: NDArray[np.integer] | None = None
+    images: NDArray[np.uint8], config: EdgeSettings | None = None, sizes: NDArray[np.integer] | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Colour gradient of whole pictures (Kehl 2006, section 4.2).
 
@@ -93,7 +93,7 @@ def rgb_gradient(
     Raises:
         ValueError: ``images`` is no stack of colour pictures.
     """
-    config = config or EdgeConfig()
+    config = config or EdgeSettings()
     if images.ndim != 4 or images.shape[3] != 3 or images.dtype != np.uint8:
         raise ValueError(f"images must be (C, H, W, 3) uint8, not {images.shape} {images.dtype}")
     ensure_runtime()
@@ -141,13 +141,13 @@ def follow_edges(thin: NDArray[np.float32], low: float, high: float) -> NDArray[
 
 
 def edge_map(
-    images: NDArray[np.uint8], config: EdgeConfig | None = None, sizes: NDArray[np.integer] | None = None
+    images: NDArray[np.uint8], config: EdgeSettings | None = None, sizes: NDArray[np.integer] | None = None
 ) -> NDArray[np.bool_]:
     """Thin edges of whole pictures, (C, H, W): colour gradient, non-maximum suppression, hysteresis.
 
     The paper thresholds its gradients and does not say how; these are Canny's steps, so that the two can be compared.
     Arguments as for :func:`rgb_gradient`.
     """
-    config = config or EdgeConfig()
+    config = config or EdgeSettings()
     magnitude, direction = rgb_gradient(images, config, sizes)
     return follow_edges(thin_edges(magnitude, direction), LOW, HIGH)

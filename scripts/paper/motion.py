@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from scripts.paper.common import Options, Track, over_seeds, plt, save, table
-from tk.config import Config
+from tk.settings import Settings
 
 BINS_DEG = (0.0, 5.0, 10.0, 20.0, 30.0, np.inf)
 
@@ -21,7 +21,7 @@ def turned_deg(track: Track) -> np.ndarray:
 
 def run(options: Options) -> str:
     """Write the figure and give the table."""
-    tracks = over_seeds(options, Config())
+    tracks = over_seeds(options, Settings())
     turned = np.concatenate([turned_deg(t) for t in tracks])
     error = np.concatenate([t.frame_cm[1:] for t in tracks])
     rows = []

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from scripts.paper.common import Options, over_seeds, plt, save, spread, table
-from tk.config import Config
+from tk.settings import Settings
 
 VARIANTS = (
     ("SMD, 1× points", "volumetric", 1),
@@ -21,7 +21,7 @@ def run(options: Options) -> str:
     """Write the figure and give the table."""
     figure, (above, below) = plt.subplots(2, 1, figsize=(9, 6), sharex=True)
     rows = []
-    base = Config()
+    base = Settings()
     for name, method, scale in VARIANTS:
         config = replace(base, effort=float(scale))
         tracks = over_seeds(options, config, method)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from scripts.paper.common import Options, over_seeds, plt, save, spread, table
-from tk.config import Config
+from tk.settings import Settings
 
 
 def run(options: Options) -> str:
@@ -15,7 +15,7 @@ def run(options: Options) -> str:
     figure, axes = plt.subplots(figsize=(9, 4))
     rows = []
     for voxels in (64, 128):
-        tracks = over_seeds(options, replace(Config(), voxels=voxels))
+        tracks = over_seeds(options, replace(Settings(), voxels=voxels))
         rows.append(
             {
                 "voxels": f"{voxels}³",

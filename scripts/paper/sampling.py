@@ -14,16 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scripts.paper.common import Float, Options, plt, save, table
-from tk.config import Config
-from tk.io.capture import open_capture
+from tk.io.captures.capture import open_capture
 from tk.kernels.nearest import SurfaceIndex
-from tk.model.contour_term import ContourTerm
-from tk.model.objective import CHAIN_NAMES, BodyObjective, FrameObjective
-from tk.model.skeleton import join_pose
+from tk.model.body.skeleton import join_pose
+from tk.model.cues.edge_term import ContourTerm
+from tk.model.cues.objective import CHAIN_NAMES, BodyObjective, FrameObjective
 from tk.optim import smd
 from tk.optim.schedule import CHAIN_LEVER_M, descent_basis, max_step
-from tk.segmentation import make_segmenter
-from tk.trackers.base import Observation
+from tk.run.segmentation import make_segmenter
+from tk.settings import Settings
+from tk.trackers.protocol import Observation
 from tk.trackers.volumetric import CELL_VOXELS, SAMPLING, SCHEDULE, SMD, VolumetricTracker
 
 ANGLES = ("shoulder_r_pitch", "elbow_r_flexion")
@@ -55,10 +55,10 @@ class Scene:
         return FrameObjective(f.objective, f.index, np.random.default_rng(seed), images=f.images)
 
 
-def look(options: Options, paper: Config) -> Scene:
+def look(options: Options, paper: Settings) -> Scene:
     """Track to the last of the frames with the defaults, and set up ``paper``'s objective there."""
     capture = open_capture(options.capture)
-    config = Config()
+    config = Settings()
     segment = make_segmenter(capture, config, lambda _: None)
     tracker = VolumetricTracker(capture.rig, capture.volume, capture.up, config)
     opening = tracker.opening_frames
@@ -121,7 +121,7 @@ def descend(scene: Scene, start: Float, seed: int, shuffle: bool) -> tuple[Float
 
 def run(options: Options) -> str:
     """Write the figure and give the table."""
-    paper = Config.preset("kehl2006")
+    paper = Settings.preset("kehl2006")
     scene = look(options, paper)
     axis = np.arange(-WIDTH_DEG, WIDTH_DEG + 0.1, STEP_DEG)
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)

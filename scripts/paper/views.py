@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from scripts.paper.common import Options, over_seeds, plt, save, spread, table
-from tk.config import Config
-from tk.io.capture import open_capture
+from tk.io.captures.capture import open_capture
+from tk.settings import Settings
 
 VIEWS = (4, 5, 9)
 
@@ -18,7 +18,7 @@ def run(options: Options) -> str:
         # evenly spread over the rig's order, which goes around the room
         wanted = min(count, len(names))
         chosen = [names[i * len(names) // wanted] for i in range(wanted)]
-        tracks = over_seeds(options, Config(), cameras=chosen)
+        tracks = over_seeds(options, Settings(), cameras=chosen)
         rows.append(
             {
                 "views": str(len(chosen)),

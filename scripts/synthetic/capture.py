@@ -23,8 +23,8 @@ from scripts.synthetic.rig import make_rig
 from scripts.synthetic.scene import Lamps, RoomView, make_lamps, view_room
 from scripts.synthetic.sensor import Sensor
 from scripts.synthetic.skeleton import JOINTS, Pose, Skeleton, joint_positions, make_skeleton
-from tk.model.camera import Camera, Rig
-from tk.model.volume import Volume
+from tk.model.cameras.camera import Camera, Rig
+from tk.model.cameras.volume import Volume
 
 Float = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.keypoints import LAYOUTS
-from tk.model.camera import Rig
-from tk.model.skeleton import JOINTS
+from tk.io.captures.keypoints import LAYOUTS
+from tk.model.body.skeleton import JOINTS
+from tk.model.cameras.camera import Rig
 
 Float = NDArray[np.float64]
 

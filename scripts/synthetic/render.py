@@ -18,7 +18,7 @@ from scripts.synthetic.noise import noise3
 from scripts.synthetic.scene import Lamps, RoomView
 from scripts.synthetic.skeleton import Pose
 from tk.kernels.runtime import ensure_runtime, ti
-from tk.model.camera import Camera
+from tk.model.cameras.camera import Camera
 
 TILE = 8
 MAX_STEPS = 120

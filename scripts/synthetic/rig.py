@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scripts.synthetic.scene import look_at
-from tk.model.camera import Camera, Rig
+from tk.model.cameras.camera import Camera, Rig
 
 Float = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from scripts.synthetic.noise import hash3, noise3
 from tk.kernels.runtime import ensure_runtime, ti
-from tk.model.camera import Camera
+from tk.model.cameras.camera import Camera
 
 HALF_ROOM_M = (4.9, 4.6)
 """Half the room's extent along x and y; the cameras hang inside."""

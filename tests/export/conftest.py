@@ -11,9 +11,9 @@ import h5py
 import numpy as np
 import pytest
 
-from tk.io.result import FrameResult, ResultMeta, ResultWriter, Status
-from tk.model.anthropometry import BodyDimensions
-from tk.model.skeleton import WAIST, Skeleton, build_skeleton, split_pose
+from tk.io.results.writer import FrameResult, ResultMeta, ResultWriter, Status
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.skeleton import WAIST, Skeleton, build_skeleton, split_pose
 
 BODY = BodyDimensions.from_stature(1.75)
 SKELETON = build_skeleton(BODY, waist=True)

@@ -9,8 +9,8 @@ from bvh import Bvh
 
 from tests.export.conftest import FPS, FRAMES, LOST, SKELETON, Write
 from tk.export import export, read_motion
-from tk.model.rotations import turn
-from tk.model.skeleton import JOINTS, build_skeleton
+from tk.model.body.rotations import turn
+from tk.model.body.skeleton import JOINTS, build_skeleton
 
 
 def places(path: Path, at: int | None) -> dict[str, np.ndarray]:

@@ -12,8 +12,8 @@ import pytest
 from tests.export.conftest import FPS, FRAMES, LOST, Write
 from tk.errors import ExportError
 from tk.export import export, read_motion
-from tk.io.result import ResultError
-from tk.model.skeleton import JOINTS, SEGMENTS
+from tk.io.results.writer import ResultError
+from tk.model.body.skeleton import JOINTS, SEGMENTS
 
 
 def test_points_and_segments(write: Write) -> None:

@@ -13,11 +13,11 @@ from tests.conftest import Tk
 from tests.export.conftest import FIRST, FPS, FRAMES, LOST, SKELETON, Write, poses, status
 from tk.errors import ExportError, ResultError
 from tk.export import FORMATS, export, read_motion
-from tk.io.result import Status
-from tk.model.angles import segment_quaternions
-from tk.model.anthropometry import BodyDimensions
-from tk.model.motion import FOOT_POINTS
-from tk.model.skeleton import JOINTS, SEGMENTS, build_skeleton
+from tk.io.results.writer import Status
+from tk.model.body.angles import segment_quaternions
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.skeleton import JOINTS, SEGMENTS, build_skeleton
+from tk.model.motion.segments import FOOT_POINTS
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from tests.export.conftest import FPS, FRAMES, LOST, Write
 from tk.export import export, read_motion
-from tk.io.result import read_result
+from tk.io.results.writer import read_result
 from tk.kernels.cones import CONE
-from tk.model.skeleton import JOINTS
+from tk.model.body.skeleton import JOINTS
 from tk.trackers.bodies import body_and_poses
 
 TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}

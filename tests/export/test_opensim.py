@@ -10,8 +10,8 @@ import numpy as np
 from tests.export.conftest import FIRST, FPS, FRAMES, LOST, SKELETON, Write, poses
 from tk.export import export, read_motion
 from tk.export.mot import coordinates
-from tk.model.rotations import turn
-from tk.model.skeleton import JOINTS, build_skeleton
+from tk.model.body.rotations import turn
+from tk.model.body.skeleton import JOINTS, build_skeleton
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 
-from tk.io.result import FrameResult, HullPoints, JointAngles, ResultMeta, ResultWriter, Status
+from tk.io.results.writer import FrameResult, HullPoints, JointAngles, ResultMeta, ResultWriter, Status
 
 META = ResultMeta(
     pose_names=tuple(f"p{i}" for i in range(24)),

@@ -13,13 +13,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.io.result_files import make_cameras, make_smoothed, write_truth
 from tests.io.result_victim import META, make_frame, make_state
-from tests.io.results import make_cameras, make_smoothed, write_truth
 from tk.errors import ResultError, TkError
-from tk.evaluation import evaluate_files
+from tk.evaluation.joints import evaluate_files
 from tk.io.hdf5 import DEEPEST, open_hdf5
-from tk.io.result import ResultWriter, read_joints, read_result, revise_result
-from tk.model.skeleton import JOINTS
+from tk.io.results.writer import ResultWriter, read_joints, read_result, revise_result
+from tk.model.body.skeleton import JOINTS
 
 COUNT = 6
 

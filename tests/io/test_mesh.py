@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from tk.errors import ResultError
 from tk.io.mesh import Mesh, hull_mesh, write_mesh
-from tk.io.result import HullPoints
-from tk.model.volume import VoxelGrid
+from tk.io.results.writer import HullPoints
+from tk.model.cameras.volume import VoxelGrid
 
 GRID = VoxelGrid((1.0, -2.0, 0.5), 0.04, (24, 20, 30))
 

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from tests.io.conftest import MakeCapture
 from tk.errors import CaptureError, ResultError
-from tk.io.capture import Capture, open_capture
+from tk.io.captures.capture import Capture, open_capture
 from tk.io.point_cloud import write_hulls, write_ply
-from tk.io.result import HullPoints
-from tk.model.volume import VoxelGrid
+from tk.io.results.writer import HullPoints
+from tk.model.cameras.volume import VoxelGrid
 
 
 def points(count: int, seed: int = 0) -> HullPoints:

@@ -8,22 +8,22 @@ import pytest
 from tests.kernels.test_contour import BODY, RIG, some_poses
 from tk.kernels import alignment as a
 from tk.kernels.nearest import SurfaceIndex
-from tk.kernels.objective import ObjectiveSettings
-from tk.model.contour_term import ContourConfig, ContourTerm
-from tk.model.objective import BodyObjective, SamplingConfig
+from tk.kernels.objective import ObjectiveParameters
+from tk.model.cues.edge_term import ContourSettings, ContourTerm
+from tk.model.cues.objective import BodyObjective, SamplingSettings
 
 SKELETON = BODY.skeleton
 D = len(SKELETON.names)
 # nothing but the entries: one sample that finds no voxel, a constant
-SILENT = ObjectiveSettings(coverage_weight=0.0, reach_m=1e-6)
+SILENT = ObjectiveParameters(coverage_weight=0.0, reach_m=1e-6)
 INDEX = SurfaceIndex.build(np.full((1, 3), 50.0), np.full(1, -1), 0.1)
 # sums of some sixty terms near 1 in double precision
 EXACT = 1e-10
 
 
 def kernel_of(dtype=np.float64):
-    term = ContourTerm(BODY, RIG, ContourConfig(), dtype=dtype)
-    return BodyObjective(BODY, SILENT, SamplingConfig(), term, dtype).kernel
+    term = ContourTerm(BODY, RIG, ContourSettings(), dtype=dtype)
+    return BodyObjective(BODY, SILENT, SamplingSettings(), term, dtype).kernel
 
 
 @pytest.fixture(scope="module")

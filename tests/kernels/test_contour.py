@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from tests.kernels.test_occlusion import camera_at, random_pose
 from tests.model.figures import skin_of
-from tk.model.anthropometry import BodyDimensions
-from tk.model.camera import Camera, Rig
-from tk.model.gait import neutral_pose
-from tk.model.skeleton import SEGMENTS
-from tk.model.strips import build_strips, contour_kernel
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.gait_poses import neutral_pose
+from tk.model.body.skeleton import SEGMENTS
+from tk.model.body.strips import build_strips, contour_kernel
+from tk.model.cameras.camera import Camera, Rig
 
 BODY = skin_of(BodyDimensions.from_stature(1.75), up="-y")
 STRIPS = build_strips(BODY)

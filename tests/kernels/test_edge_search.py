@@ -5,9 +5,9 @@ import pytest
 
 from scripts.paper.edge_maps import rgb_gradient
 from tk.kernels.edge_search import MOST_EDGES, PAIR, SINGLE, search_edges
-from tk.kernels.edges import EdgeConfig
+from tk.kernels.edges import EdgeSettings
 
-CONFIG = EdgeConfig()
+CONFIG = EdgeSettings()
 THRESHOLD = 0.12
 H, W = 48, 64
 # float32 of pixels below a hundred

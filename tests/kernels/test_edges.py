@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 
 from scripts.paper.edge_maps import HIGH, edge_map, follow_edges, rgb_gradient, thin_edges
 from tk.errors import ConfigError
-from tk.kernels.edges import EdgeConfig, rgb_gradient_at
+from tk.kernels.edges import EdgeSettings, rgb_gradient_at
 from tk.kernels.runtime import ensure_runtime, ti
 
 PAIRS = ((1, 0), (0, 1), (1, 1), (1, -1))
 FLOAT32 = 2e-5  # magnitudes are at most 1; the sigmoid's exponent is up to 20
-EUCLIDEAN = EdgeConfig(angle_share=0.0)
+EUCLIDEAN = EdgeSettings(angle_share=0.0)
 SIZE = 21
 
 
-def distance(a: NDArray, b: NDArray, config: EdgeConfig) -> tuple[float, NDArray]:
+def distance(a: NDArray, b: NDArray, config: EdgeSettings) -> tuple[float, NDArray]:
     """The mixed distance of two colours and its signed parts (6,), by the formula in the module."""
     weight = config.angle_share
     for color in (a, b):
@@ -33,7 +33,7 @@ def distance(a: NDArray, b: NDArray, config: EdgeConfig) -> tuple[float, NDArray
     return value, np.concatenate([weight * chord, (1 - weight) * step])
 
 
-def oracle_gradient(image: NDArray, config: EdgeConfig) -> tuple[NDArray, NDArray, NDArray]:
+def oracle_gradient(image: NDArray, config: EdgeSettings) -> tuple[NDArray, NDArray, NDArray]:
     """Magnitude (h, w), direction (h, w, 2), and the lead of the greatest pair over the next (h, w)."""
     h, w = image.shape[:2]
     magnitude, direction, lead = np.zeros((h, w)), np.zeros((h, w, 2)), np.zeros((h, w))
@@ -107,13 +107,13 @@ def halves(
     return np.rint((1 - t) * np.array(left) + t * np.array(right)).astype(np.uint8)
 
 
-def strength(image: NDArray[np.uint8], config: EdgeConfig | None = None) -> float:
+def strength(image: NDArray[np.uint8], config: EdgeSettings | None = None) -> float:
     """Greatest magnitude in the picture."""
     return float(rgb_gradient(image[None], config)[0].max())
 
 
-@pytest.mark.parametrize("config", [EdgeConfig(), EUCLIDEAN, EdgeConfig(30.0, 0.05, 1.2, 1.0)])
-def test_gradient_agrees_with_slow_numpy(config: EdgeConfig) -> None:
+@pytest.mark.parametrize("config", [EdgeSettings(), EUCLIDEAN, EdgeSettings(30.0, 0.05, 1.2, 1.0)])
+def test_gradient_agrees_with_slow_numpy(config: EdgeSettings) -> None:
     images = random_pictures(1, (2, 14, 17))
     magnitude, direction = rgb_gradient(images, config)
     assert magnitude.max() <= 1 + FLOAT32
@@ -175,7 +175,7 @@ def test_on_demand_equals_whole_picture() -> None:
     images = random_pictures(4, (2, 20, 30))
     pixels = np.array([(c, i // 2, i) for c in range(2) for i in range(30)], np.int32)
     found = np.empty((len(pixels), 3), np.float32)
-    config = EdgeConfig()
+    config = EdgeSettings()
     _along_line(*config.constants, images, pixels, found)
     magnitude, direction = rgb_gradient(images, config)
     c, y, x = pixels.T
@@ -207,7 +207,7 @@ def test_hue_step_without_luminance_is_an_edge() -> None:
 def test_dark_noise_does_not_fire() -> None:
     noise = np.random.default_rng(5).integers(0, 14, (1, 60, 60, 3)).astype(np.uint8)
     assert not edge_map(noise).any()
-    everywhere = EdgeConfig(intensity_offset=0, intensity_slope=10, angle_share=1)
+    everywhere = EdgeSettings(intensity_offset=0, intensity_slope=10, angle_share=1)
     assert edge_map(noise, everywhere).mean() > 0.1, "the angle alone fires: the weight is what holds it back"
 
 
@@ -298,7 +298,7 @@ def test_hysteresis_agrees_with_slow_numpy() -> None:
 )
 def test_config_says_what_is_wrong(setting: dict[str, float], message: str) -> None:
     with pytest.raises(ConfigError) as error:
-        EdgeConfig(**setting)
+        EdgeSettings(**setting)
     assert message in str(error.value)
 
 

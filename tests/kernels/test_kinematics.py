@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from tk.kernels import kinematics
 from tk.kernels.kinematics import forward_tree, load_rotation, load_translation, load_vector3
 from tk.kernels.runtime import ensure_runtime, ti
-from tk.model.anthropometry import BodyDimensions
-from tk.model.skeleton import SEGMENTS, build_skeleton
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.skeleton import SEGMENTS, build_skeleton
 
 SKELETON = build_skeleton(BodyDimensions.from_stature(1.75))
 D = len(SKELETON.names)

@@ -21,7 +21,7 @@ def surface(rng, count, spread=0.5, patches=63, share=0.3, cell_m=0.1):
 
 
 def candidates(index, point, patch, reach, slack):
-    """(V,) distances, infinite where a voxel is no candidate; positive slack admits the doubtful ones."""
+    """(V,) distances, infinite where a voxel is no candidate; positive slack admits the uncertain ones."""
     distance = np.linalg.norm(index.positions.astype(np.float64) - point, axis=1)
     colour = (index.fits >> np.int64(patch)) & 1 == 1
     return np.where(colour & (distance < reach + slack), distance, np.inf)

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from tests.kernels import oracles
 from tests.model.figures import skin_of
 from tk.kernels.nearest import SurfaceIndex, nearest
-from tk.kernels.objective import Held, ObjectiveKernel, ObjectiveSettings
-from tk.model.anthropometry import BodyDimensions
-from tk.model.gait import neutral_pose
-from tk.model.skeleton import SEGMENTS
+from tk.kernels.objective import Held, ObjectiveKernel, ObjectiveParameters
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.gait_poses import neutral_pose
+from tk.model.body.skeleton import SEGMENTS
 
 BODY = skin_of(BodyDimensions.from_stature(1.75))
 SKELETON = BODY.skeleton
@@ -22,10 +22,10 @@ SAMPLE_DOF = SKELETON.segment_dof[BODY.segment]
 PIECE_DOF = SKELETON.segment_dof[[SEGMENTS.index(p.segment) for p in BODY.pieces]]
 PIECE_SIGMA = np.linspace(0.08, 0.15, len(BODY.pieces))
 
-BOTH = ObjectiveSettings()
-SURFACE = ObjectiveSettings(coverage_weight=0.0)
+BOTH = ObjectiveParameters()
+SURFACE = ObjectiveParameters(coverage_weight=0.0)
 # the surface term all but silent: every sample is an outlier and pulls nowhere
-COVERAGE = ObjectiveSettings(reach_m=1e-6)
+COVERAGE = ObjectiveParameters(reach_m=1e-6)
 # sums of some hundred terms near 1 / 100 in double precision
 EXACT = 1e-11
 # derivatives by central differences of 1e-6
@@ -128,7 +128,7 @@ cases = pytest.mark.parametrize(
         BOTH,
         SURFACE,
         COVERAGE,
-        ObjectiveSettings(2.0, coverage_weight=2.5, coverage_nu=0.3),
+        ObjectiveParameters(2.0, coverage_weight=2.5, coverage_nu=0.3),
     ],
     ids=["both", "surface", "coverage", "others"],
 )

@@ -10,11 +10,11 @@ from tests.kernels import oracles
 from tests.model.figures import skin_of
 from tk.kernels.occlusion import TOUCH, segment_enters
 from tk.kernels.runtime import ensure_runtime, ti
-from tk.model.anthropometry import BodyDimensions
-from tk.model.camera import Camera, Rig
-from tk.model.skeleton import SEGMENTS
-from tk.model.strips import build_strips, contour_kernel
-from tk.model.superellipsoid import Superellipsoid
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.skeleton import SEGMENTS
+from tk.model.body.strips import build_strips, contour_kernel
+from tk.model.body.superellipsoid import Superellipsoid
+from tk.model.cameras.camera import Camera, Rig
 
 # A point is grazing if moving it by this much, to any side or along the ray, changes what the mesh says.
 GRAZING_M = 0.003

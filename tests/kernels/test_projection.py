@@ -7,7 +7,7 @@ import pytest
 
 from tk.kernels.projection import pack_camera, project
 from tk.kernels.runtime import ensure_runtime, ti
-from tk.model.camera import Camera
+from tk.model.cameras.camera import Camera
 
 # double precision, hundreds of pixels
 EXACT_PX = 1e-9

@@ -8,13 +8,13 @@ import pytest
 from tests.model.ring import ring_of_cameras
 from tk.kernels.cones import CONE
 from tk.kernels.raycast import FAR, Cast, cast, nothing
-from tk.model import gait
-from tk.model.anthropometry import BodyDimensions
-from tk.model.camera import Rig
-from tk.model.cone_body import ConeBody, build_cone_body
-from tk.model.part_colors import GROUPS, PartColors
-from tk.model.silhouettes import pack_rig, pixel_rays
-from tk.model.skeleton import CHAINS, SEGMENTS
+from tk.model.body import gait_poses as gait
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.cone_body import ConeBody, build_cone_body
+from tk.model.body.skeleton import CHAINS, SEGMENTS
+from tk.model.cameras.camera import Rig
+from tk.model.cues.part_colors import GROUPS, PartColors
+from tk.model.masks.silhouettes import pack_rig, pixel_rays
 
 BODY = build_cone_body(BodyDimensions.from_stature(1.75))
 GROUP = PartColors(BODY).group

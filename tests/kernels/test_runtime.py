@@ -135,7 +135,7 @@ def test_nan_and_infinity_keep_their_meaning():
     np.testing.assert_array_equal(found, [2, 1])
 
 
-@pytest.mark.parametrize("module", ["tk.kernels.objective", "tk.model.objective", "tk.model.initialisation"])
+@pytest.mark.parametrize("module", ["tk.kernels.objective", "tk.model.cues.objective", "tk.model.body.initial_pose"])
 def test_importing_starts_nothing(module):
     code = f"import {module}; from tk.kernels.runtime import ti; print(ti.lang.impl.get_runtime().prog is None)"
     assert run(code) == ["True"]

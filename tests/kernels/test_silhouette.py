@@ -15,12 +15,12 @@ from tk.kernels import silhouette
 from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A, SIDE_B, curve_of, enter, point_on
 from tk.kernels.line_search import COLOR_BINS, SearchSettings, search_colors
 from tk.kernels.runtime import ensure_runtime, ti
-from tk.model import gait
-from tk.model.anthropometry import BodyDimensions
-from tk.model.body_fit import pose_rows
-from tk.model.camera import Rig
-from tk.model.cone_body import build_cone_body
-from tk.model.silhouettes import Views, draw_silhouettes
+from tk.model.body import gait_poses as gait
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.body_fit import pose_rows
+from tk.model.body.cone_body import build_cone_body
+from tk.model.cameras.camera import Rig
+from tk.model.masks.silhouettes import Views, draw_silhouettes
 
 BODY = build_cone_body(BodyDimensions.from_stature(1.75))
 D = len(BODY.skeleton.names)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from tests.kernels import oracles
 from tk.kernels import superellipsoid as functions
 from tk.kernels.runtime import ensure_runtime, ti
-from tk.model.superellipsoid import Superellipsoid
+from tk.model.body.superellipsoid import Superellipsoid
 
 # logarithm and exponential instead of powers; in double precision, relative
 EXACT = 1e-9

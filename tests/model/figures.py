@@ -4,19 +4,21 @@ import numpy as np
 from scipy import ndimage
 
 from tk.kernels.nearest import SurfaceIndex
-from tk.model.anthropometry import BodyDimensions
-from tk.model.cone_body import build_cone_body
-from tk.model.skeleton import SEGMENTS
-from tk.model.skin import SPACING_M, Skin, lay_skin
-from tk.model.volume import Volume, VoxelGrid
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.cone_body import build_cone_body
+from tk.model.body.skeleton import SEGMENTS
+from tk.model.body.superellipsoid_body import SPACING_M, SuperellipsoidBody, build_superellipsoid_body
+from tk.model.cameras.volume import Volume, VoxelGrid
 
 
-def skin_of(dimensions: BodyDimensions, up: str = "z", waist: bool = False, spacing_m: float = SPACING_M) -> Skin:
+def skin_of(
+    dimensions: BodyDimensions, up: str = "z", waist: bool = False, spacing_m: float = SPACING_M
+) -> SuperellipsoidBody:
     """The skin of a body with these dimensions whose parts are as they are on an average."""
-    return lay_skin(build_cone_body(dimensions, up), up, waist, spacing_m)
+    return build_superellipsoid_body(build_cone_body(dimensions, up), up, waist, spacing_m)
 
 
-def voxelise(body: Skin, pose: np.ndarray, grid: VoxelGrid) -> np.ndarray:
+def voxelise(body: SuperellipsoidBody, pose: np.ndarray, grid: VoxelGrid) -> np.ndarray:
     """(nx, ny, nz) bool: voxels in one of the body's pieces."""
     T_world_segment = body.skeleton.segment_transforms(pose)
     B = np.eye(4)
@@ -30,7 +32,7 @@ def voxelise(body: Skin, pose: np.ndarray, grid: VoxelGrid) -> np.ndarray:
     return occupied.reshape(grid.shape)
 
 
-def grid_around(body: Skin, pose: np.ndarray, voxel_m: float = 0.025) -> VoxelGrid:
+def grid_around(body: SuperellipsoidBody, pose: np.ndarray, voxel_m: float = 0.025) -> VoxelGrid:
     """The grid that holds a body at a pose with 10 cm to spare."""
     points = body.place(pose)
     lower, upper = points.min(0) - 0.1, points.max(0) + 0.1

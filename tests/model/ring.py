@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tk.model.camera import Camera, Rig
+from tk.model.cameras.camera import Camera, Rig
 
 
 def ring_of_cameras(count: int, width: int, height: int, radius_m: float = 3.5) -> Rig:

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from tk.errors import ConfigError
 from tk.optim import gauss_newton
-from tk.optim.gauss_newton import GaussNewtonConfig, Prior
+from tk.optim.gauss_newton import GaussNewtonSettings, Prior
 
-UNDAMPED = GaussNewtonConfig(scales=1, iterations=1, damping=0.0, stiffness=0.0, longest_step=100.0)
+UNDAMPED = GaussNewtonSettings(scales=1, iterations=1, damping=0.0, stiffness=0.0, longest_step=100.0)
 NONE = (np.full(4, -np.inf), np.full(4, np.inf))
 ALL = np.ones(4, bool)
 
@@ -63,7 +63,7 @@ def test_damping_shortens_and_iterations_make_up_for_it():
                 start,
                 ALL,
                 *NONE,
-                GaussNewtonConfig(scales=1, iterations=n, damping=0.5, longest_step=100.0),
+                GaussNewtonSettings(scales=1, iterations=n, damping=0.5, longest_step=100.0),
             )
             - expected
         ).max()
@@ -83,7 +83,7 @@ def test_longer_steps_reach_where_equations_tell_half_of_the_way_and_do_no_harm_
         return Sums(H, way, (way**2).sum(axis=1))
 
     def error(relaxation, iterations):
-        config = GaussNewtonConfig(1, iterations, relaxation, damping=0.0, stiffness=0.0, longest_step=100.0)
+        config = GaussNewtonSettings(1, iterations, relaxation, damping=0.0, stiffness=0.0, longest_step=100.0)
         return np.abs(minimise(equations, start, ALL, *NONE, config) - expected).max(axis=0)
 
     plain, relaxed = error(1.0, 4), error(1.6, 3)  # as many equations
@@ -103,9 +103,9 @@ def test_parameters_that_are_not_free_stay():
 def test_unseen_parameters_stay_where_they_are():
     A, y, start = problem(3)
     A[:, 2] = 0.0
-    found = minimise(linear(A, y), start, ALL, *NONE, GaussNewtonConfig(scales=1, iterations=4))
+    found = minimise(linear(A, y), start, ALL, *NONE, GaussNewtonSettings(scales=1, iterations=4))
     np.testing.assert_array_equal(found[:, 2], start[:, 2])
-    nothing = minimise(linear(0 * A, y), start, ALL, *NONE, GaussNewtonConfig())
+    nothing = minimise(linear(0 * A, y), start, ALL, *NONE, GaussNewtonSettings())
     np.testing.assert_array_equal(nothing, start)
 
 
@@ -114,7 +114,7 @@ def test_a_limit_pulls_back_in_proportion_and_only_beyond_it():
     A, y = np.eye(4), np.ones(4)
     upper = np.array([0.5, np.inf, 2.0, np.inf])
     for weight in (0.0, 1.0, 10.0):
-        config = GaussNewtonConfig(
+        config = GaussNewtonSettings(
             scales=1, iterations=60, damping=0.0, stiffness=0.0, limit_weight=weight, longest_step=100.0
         )
         found = minimise(linear(A, y), np.full((1, 4), 0.9), ALL, NONE[0], upper, config)
@@ -124,7 +124,7 @@ def test_a_limit_pulls_back_in_proportion_and_only_beyond_it():
 
 def test_steps_are_shortened_as_a_whole():
     goal = np.array([4.0, 2.0, 0.0, -1.0])
-    config = GaussNewtonConfig(scales=1, iterations=1, damping=0.0, stiffness=0.0, longest_step=0.1)
+    config = GaussNewtonSettings(scales=1, iterations=1, damping=0.0, stiffness=0.0, longest_step=0.1)
     delta = minimise(linear(np.eye(4), goal), np.zeros((1, 4)), ALL, *NONE, config)
     np.testing.assert_allclose(delta, 0.1 * goal[None] / 4.0, rtol=1e-6)
 
@@ -137,7 +137,7 @@ def test_scales_run_from_coarse_to_fine():
         seen.append(scale)
         return linear(A, y)(states, scale)
 
-    config = GaussNewtonConfig(scales=3, iterations=2)
+    config = GaussNewtonSettings(scales=3, iterations=2)
     minimise(watched, start, ALL, *NONE, config)
     assert seen == [2, 2, 1, 1, 0, 0]
     seen.clear()
@@ -150,7 +150,7 @@ def test_scales_run_from_coarse_to_fine():
 def test_a_batch_is_as_good_as_one_at_a_time(tolerance):
     A, y, start = problem(5)
     start[0] = np.linalg.lstsq(A, y)[0]  # is done at once
-    config = GaussNewtonConfig(iterations=6, damping=0.5, tolerance=tolerance)
+    config = GaussNewtonSettings(iterations=6, damping=0.5, tolerance=tolerance)
     together = minimise(linear(A, y), start, ALL, *NONE, config)
     for i in range(len(start)):
         np.testing.assert_allclose(
@@ -168,7 +168,7 @@ def test_a_scale_is_left_when_nothing_moves_by_more_than_the_tolerance(seed):
         made.append(states.copy())
         return linear(A, y)(states, scale)
 
-    config = GaussNewtonConfig(scales=2, iterations=30, damping=0.5, longest_step=100.0, tolerance=0.01)
+    config = GaussNewtonSettings(scales=2, iterations=30, damping=0.5, longest_step=100.0, tolerance=0.01)
     found = gauss_newton.minimise(watched, start, ALL, *NONE, config)
     assert found.iterations.sum() == len(made)
     steps = [np.abs(after - before).max() for before, after in pairwise([*made, found.states])]
@@ -193,7 +193,7 @@ def test_a_prior_is_a_further_measurement(seed, each):
 
 def test_a_precise_prior_holds_the_state_and_none_leaves_it_alone():
     A, y, start = problem(6)
-    config = GaussNewtonConfig(scales=1, iterations=5)
+    config = GaussNewtonSettings(scales=1, iterations=5)
     held = Prior(start, np.array([1e9, 0.0, 1e9, 0.0]))
     found = minimise(linear(A, y), start, ALL, *NONE, config, held)
     np.testing.assert_allclose(found[:, [0, 2]], start[:, [0, 2]], atol=1e-6)
@@ -207,7 +207,9 @@ def test_a_prior_places_what_the_data_does_not_see():
     A, y, start = problem(7)
     A[:, 2] = 0.0
     prior = Prior(np.array([0, 0, 0.3, 0]), np.array([0, 0, 1e3, 0.0]))
-    found = minimise(linear(A, y), start, ALL, *NONE, GaussNewtonConfig(scales=1, iterations=8, longest_step=9), prior)
+    found = minimise(
+        linear(A, y), start, ALL, *NONE, GaussNewtonSettings(scales=1, iterations=8, longest_step=9), prior
+    )
     np.testing.assert_allclose(found[:, 2], 0.3, atol=1e-3)
 
 
@@ -222,4 +224,4 @@ def test_a_prior_places_what_the_data_does_not_see():
 )
 def test_settings_out_of_range_are_told(values, message):
     with pytest.raises(ConfigError, match=message):
-        GaussNewtonConfig(**values)
+        GaussNewtonSettings(**values)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tk.errors import ConfigError
-from tk.optim.levenberg_marquardt import Float, LmConfig, LmResult, Quadratic, minimise
+from tk.optim.levenberg_marquardt import Float, LmResult, LmSettings, Quadratic, minimise
 
 Residuals = Callable[[Float], Float]
 Jacobian = Callable[[Float], Float]
@@ -45,7 +45,7 @@ def least_squares(
     start: Float,
     limits: tuple[Float | float, Float | float] = (-np.inf, np.inf),
     floor: Float | float = 0.0,
-    config: LmConfig | None = None,
+    config: LmSettings | None = None,
 ) -> tuple[LmResult, list[float]]:
     """The result, and the values at the states that were accepted."""
     accepted: list[float] = []
@@ -71,7 +71,7 @@ def linear(seed: int, rows: int, columns: int) -> tuple[Float, Float]:
 @settings(max_examples=30, deadline=None)
 def test_a_quadratic_takes_one_step(seed: int, n: int) -> None:
     A, y = linear(seed, n + 5, n)
-    config = LmConfig(damping=1e-12, max_iterations=1)
+    config = LmSettings(damping=1e-12, max_iterations=1)
     result, _ = least_squares(lambda p: A @ p - y, lambda p: A, np.zeros(n), config=config)
     np.testing.assert_allclose(result.pose, np.linalg.lstsq(A, y, rcond=None)[0], atol=1e-7)
     assert result.iterations == 1
@@ -88,7 +88,7 @@ def test_a_parameter_without_a_gradient_moves_with_the_others() -> None:
     def model(p: Float) -> Quadratic:
         return Quadratic(value(p), np.array([-1.0, 0.0]), hessian)
 
-    result = minimise(model, value, np.zeros(2), lambda p: p, config=LmConfig(damping=1e-9, max_iterations=1))
+    result = minimise(model, value, np.zeros(2), lambda p: p, config=LmSettings(damping=1e-9, max_iterations=1))
     np.testing.assert_allclose(result.pose, optimum, atol=1e-6)
 
 
@@ -101,7 +101,7 @@ def test_a_parameter_without_a_gradient_moves_with_the_others() -> None:
     ],
 )
 def test_agrees_with_scipy(residuals: Residuals, jacobian: Jacobian, start: list[float]) -> None:
-    config = LmConfig(tolerance=1e-12, max_iterations=200)
+    config = LmSettings(tolerance=1e-12, max_iterations=200)
     result, _ = least_squares(residuals, jacobian, np.array(start), config=config)
     expected = scipy.optimize.least_squares(residuals, start, jacobian, xtol=1e-12, ftol=1e-12, gtol=1e-12)
     assert result.converged
@@ -121,7 +121,7 @@ def test_agrees_with_scipy_on_a_box(
     residuals: Residuals, jacobian: Jacobian, start: list[float], limits: tuple[list[float], list[float]]
 ) -> None:
     lower, upper = np.array(limits)
-    config = LmConfig(tolerance=1e-12, max_iterations=200)
+    config = LmSettings(tolerance=1e-12, max_iterations=200)
     result, _ = least_squares(residuals, jacobian, np.array(start), (lower, upper), config=config)
     expected = scipy.optimize.least_squares(
         residuals, start, jacobian, bounds=(lower, upper), xtol=1e-14, ftol=1e-14, gtol=1e-14
@@ -138,7 +138,7 @@ def test_agrees_with_scipy_on_a_box(
 def test_the_optimum_of_a_coupled_bowl_on_a_box(seed: int) -> None:
     """The gradient vanishes in the parameters between their limits and pushes outwards in those on one."""
     A, y = linear(seed, 9, 5)
-    config = LmConfig(damping=1e-6, tolerance=1e-14, max_iterations=300)
+    config = LmSettings(damping=1e-6, tolerance=1e-14, max_iterations=300)
     result, _ = least_squares(lambda p: A @ p - 3 * y, lambda p: A, np.zeros(5), (-0.4, 0.4), config=config)
     gradient = A.T @ (A @ result.pose - 3 * y)
     scale = np.abs(A.T @ y).max()
@@ -157,7 +157,7 @@ def test_floor_holds_what_the_data_does_not_see() -> None:
         return 1 + 0.5 * (p[0] - 1) ** 2 + 1e-4 * p[1]
 
     def step(floor: Float | float) -> Float:
-        return minimise(model, value, np.zeros(2), lambda p: p, floor, LmConfig(max_iterations=1)).pose
+        return minimise(model, value, np.zeros(2), lambda p: p, floor, LmSettings(max_iterations=1)).pose
 
     assert abs(step(0.0)[1]) > 1e3
     assert abs(step(np.array([0.0, 1.0]))[1]) <= 1e-2
@@ -166,7 +166,7 @@ def test_floor_holds_what_the_data_does_not_see() -> None:
 
 @pytest.mark.parametrize("start", [[-1.2, 1.0], [3.0, -4.0], [0.0, 7.0]])
 def test_no_step_goes_uphill(start: list[float]) -> None:
-    _, accepted = least_squares(rosenbrock, rosenbrock_jacobian, np.array(start), config=LmConfig(damping=1e-6))
+    _, accepted = least_squares(rosenbrock, rosenbrock_jacobian, np.array(start), config=LmSettings(damping=1e-6))
     assert len(accepted) > 3
     assert np.all(np.diff(accepted) < 0)
 
@@ -181,18 +181,20 @@ def test_a_step_that_overshoots_is_shortened_until_it_falls() -> None:
         root = value(p)
         return Quadratic(root, p / root, np.array([[root**-3]]))
 
-    result = minimise(model, value, np.array([20.0]), lambda p: p, config=LmConfig(damping=1e-6, tolerance=1e-9))
+    result = minimise(model, value, np.array([20.0]), lambda p: p, config=LmSettings(damping=1e-6, tolerance=1e-9))
     assert result.converged
     assert result.pose[0] == pytest.approx(0, abs=1e-3)
 
 
 def test_says_whether_it_converged() -> None:
-    few, _ = least_squares(rosenbrock, rosenbrock_jacobian, np.array([-1.2, 1.0]), config=LmConfig(max_iterations=3))
+    few, _ = least_squares(rosenbrock, rosenbrock_jacobian, np.array([-1.2, 1.0]), config=LmSettings(max_iterations=3))
     assert (few.iterations, few.converged) == (3, False)
-    many, _ = least_squares(rosenbrock, rosenbrock_jacobian, np.array([-1.2, 1.0]), config=LmConfig(max_iterations=99))
+    many, _ = least_squares(
+        rosenbrock, rosenbrock_jacobian, np.array([-1.2, 1.0]), config=LmSettings(max_iterations=99)
+    )
     assert many.converged and many.iterations < 99
     # any fall is less than the whole value, and so the first step is the last
-    once, _ = least_squares(rosenbrock, rosenbrock_jacobian, np.array([-1.2, 1.0]), config=LmConfig(tolerance=1.0))
+    once, _ = least_squares(rosenbrock, rosenbrock_jacobian, np.array([-1.2, 1.0]), config=LmSettings(tolerance=1.0))
     assert (once.iterations, once.converged) == (1, True)
 
 
@@ -217,7 +219,7 @@ def test_a_value_that_is_not_finite_refuses_the_step() -> None:
     def model(p: Float) -> Quadratic:
         return Quadratic(value(p), 1 - 1 / p, np.diag(p**-2))
 
-    result = minimise(model, value, np.array([5.0]), lambda p: p, config=LmConfig(damping=1e-6, tolerance=1e-9))
+    result = minimise(model, value, np.array([5.0]), lambda p: p, config=LmSettings(damping=1e-6, tolerance=1e-9))
     assert result.converged
     assert result.pose[0] == pytest.approx(1, abs=1e-3)
 
@@ -230,4 +232,4 @@ def test_a_model_that_is_not_finite_is_an_error() -> None:
 @pytest.mark.parametrize("wrong", [{"damping": 0.0}, {"max_iterations": 0}, {"tolerance": -1.0}])
 def test_impossible_settings_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
-        LmConfig(**wrong)
+        LmSettings(**wrong)

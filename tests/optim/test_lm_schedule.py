@@ -5,9 +5,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from tk.optim.levenberg_marquardt import LmConfig
+from tk.optim.levenberg_marquardt import LmSettings
 from tk.optim.lm_schedule import optimise
-from tk.optim.schedule import ScheduleConfig
+from tk.optim.schedule import ScheduleSettings
 
 D = 6
 FREE = np.array([[0, 0, 1, 1, 0, 0], [0, 0, 0, 0, 1, 1]], bool)
@@ -61,8 +61,8 @@ class Problem:
         return self.bowls[-1]
 
 
-TWO_PASSES = ScheduleConfig()
-FINE = LmConfig(tolerance=1e-12)
+TWO_PASSES = ScheduleSettings()
+FINE = LmSettings(tolerance=1e-12)
 
 
 def test_all_then_each_chain_with_the_rest_held():
@@ -99,6 +99,6 @@ def test_limits_hold():
 @pytest.mark.parametrize("refine", [0.5, 1e-6])
 def test_chains_are_held_to_the_finer_tolerance(refine):
     problem = Problem()
-    rough = LmConfig(tolerance=0.5, damping=5.0)
+    rough = LmSettings(tolerance=0.5, damping=5.0)
     result = optimise(problem, np.zeros((1, D)), replace(TWO_PASSES, refine=refine), rough)
     assert result.iterations[1:].max() > 3 if refine < 0.01 else result.iterations[1:].max() <= 3

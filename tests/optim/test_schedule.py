@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 from tests.optim.problems import Evaluation
 from tk.errors import ConfigError
 from tk.optim import schedule
-from tk.optim.schedule import Float, Problem, ScheduleConfig, ScheduleResult, descent_basis, optimise
-from tk.optim.smd import Objective, SmdConfig
+from tk.optim.schedule import Float, Problem, ScheduleResult, ScheduleSettings, descent_basis, optimise
+from tk.optim.smd import Objective, SmdSettings
 
 D = 10
 TORSO, CHAINS = slice(0, 4), (slice(4, 7), slice(7, 10))
 TARGET = np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.3, 0.2, -0.5, 0.3, 0.6])
 LIMIT = 3.0
 # one error potential, as in the paper
-PAPER = ScheduleConfig(rate=0.5)
+PAPER = ScheduleSettings(rate=0.5)
 # long enough to converge
-LONG = SmdConfig(max_iterations=60)
+LONG = SmdSettings(max_iterations=60)
 
 
 @dataclass
@@ -128,7 +128,7 @@ class Toy:
 
 
 def solve(
-    toy: Toy, start: Float | None = None, config: ScheduleConfig = PAPER, smd_config: SmdConfig = LONG
+    toy: Toy, start: Float | None = None, config: ScheduleSettings = PAPER, smd_config: SmdSettings = LONG
 ) -> ScheduleResult:
     problem: Problem = toy
     start = toy.target + 0.2 if start is None else start
@@ -155,7 +155,7 @@ def test_finds_the_target(whiten: bool, coupling: float) -> None:
 def test_the_second_pass_holds_the_torso_and_the_other_chains() -> None:
     toy = Toy(coupling=0.3)
     # so short a first pass leaves the torso where the chains would like to pull it
-    result = solve(toy, TARGET + 0.6, smd_config=SmdConfig(max_iterations=4))
+    result = solve(toy, TARGET + 0.6, smd_config=SmdSettings(max_iterations=4))
     owner, pose = toy.held[-1]
     assert np.abs(pose - TARGET)[TORSO].min() > 0.01
     np.testing.assert_array_equal(result.pose[TORSO], pose[TORSO])
@@ -226,7 +226,7 @@ def test_iterations_are_those_of_the_first_pass_and_of_each_chain_in_turn() -> N
 def test_the_second_pass_has_the_iterations_of_the_first() -> None:
     toy = Toy()
     config = replace(PAPER, tolerance_deg=1e-6, tolerance_m=1e-8)
-    result = solve(toy, config=config, smd_config=SmdConfig(max_iterations=5))
+    result = solve(toy, config=config, smd_config=SmdSettings(max_iterations=5))
     assert result.iterations.tolist() == [5, 5, 5]
     assert (len(toy.asked_full), len(toy.asked_chains)) == (5, 5)
 
@@ -249,7 +249,7 @@ def test_no_iteration_moves_further_than_its_bound(monkeypatch: pytest.MonkeyPat
     toy = Toy()
     monkeypatch.setattr(schedule, "MAX_STEP_DEG", 2.0)
     monkeypatch.setattr(schedule, "MAX_STEP_M", 0.01)
-    solve(toy, TARGET + 0.5, smd_config=SmdConfig(max_iterations=6))
+    solve(toy, TARGET + 0.5, smd_config=SmdSettings(max_iterations=6))
     bound = np.where(toy.angular, np.radians(2.0), 0.01)
     for path in (np.array(toy.asked_full)[:, 0], np.array(toy.asked_chains)[:, 0], np.array(toy.asked_chains)[:, 1]):
         share = np.max(np.abs(np.diff(path, axis=0)) / bound, axis=1)
@@ -286,4 +286,4 @@ def test_the_descent_basis_makes_the_curvature_of_the_free_parameters_one(seed: 
 )
 def test_impossible_settings_are_refused(name: str, value: float) -> None:
     with pytest.raises(ConfigError, match=name):
-        replace(ScheduleConfig(), **{name: value})
+        replace(ScheduleSettings(), **{name: value})

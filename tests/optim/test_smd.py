@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tests.optim.problems import Evaluation, anywhere, bowl, box, cliff, rippled, rosenbrock, scripted
 from tk.errors import ConfigError
-from tk.optim.smd import Float, SmdConfig, minimise
+from tk.optim.smd import Float, SmdSettings, minimise
 
 # two implementations of the same sums, in another order, over tens of iterations
 ROUNDING = 1e-10
@@ -33,7 +33,7 @@ def slow_smd(
     start: list[float],
     step: float,
     limits: tuple[float, float],
-    config: SmdConfig,
+    config: SmdSettings,
     constrained_gradient: bool = True,
 ) -> list[list[float]]:
     """Eqs. 17-19, 22, 23 one number at a time, ``max_iterations`` of them; all states."""
@@ -63,7 +63,7 @@ def test_every_state_is_that_of_the_equations(memory: float, limits: tuple[float
     hessian = basis @ np.diag([0.4, 1.0, 2.5]) @ basis.T
     noise = rng.normal(scale=0.3, size=(count, B, D))
     start = rng.uniform(-0.5, 0.8, size=(B, D))
-    config = SmdConfig(meta_step=0.7, memory=memory, max_iterations=count)
+    config = SmdSettings(meta_step=0.7, memory=memory, max_iterations=count)
 
     def evaluate(poses: Float, directions: Float, iteration: int) -> Evaluation:
         return Evaluation(np.zeros(B), (poses - 1) @ hessian + noise[iteration], directions @ hessian)
@@ -85,7 +85,7 @@ def test_descent_in_a_basis_is_descent_on_the_problem_seen_through_it() -> None:
     centre = np.array([1.0, -2.0, 0.5])
     start = rng.normal(size=(1, 3))
     basis = rng.normal(size=(3, 2))
-    config = SmdConfig(max_iterations=20, average=False)
+    config = SmdSettings(max_iterations=20, average=False)
     inside = minimise(bowl(hessian, centre), start, 0.1, np.zeros(3), anywhere, basis[None], config, keep_path=True)
 
     def seen(u: Float, directions: Float, iteration: int) -> Evaluation:
@@ -101,7 +101,7 @@ def test_descent_in_a_basis_is_descent_on_the_problem_seen_through_it() -> None:
 def test_a_step_size_is_at_most_halved() -> None:
     """Eq. 18: after gradients of 100 and -100 the factor 1 + μvg would be far below zero."""
     gradients = np.array([100.0, -100.0, -100.0]).reshape(3, 1, 1)
-    config = SmdConfig(meta_step=1.0, memory=0.0, max_iterations=2)
+    config = SmdSettings(meta_step=1.0, memory=0.0, max_iterations=2)
     path = minimise(scripted(gradients), [[0.0]], 0.5, NEVER, anywhere, config=config, keep_path=True).path
     assert path is not None
     np.testing.assert_array_equal(np.diff(path[:, 0, 0]), [-50.0, 25.0])
@@ -111,7 +111,7 @@ def test_pushing_against_a_limit_leaves_the_step_size_alone() -> None:
     """Eq. 23: at a limit p does not move, so there is no effect of the step size to learn from. With the plain gradient
     in eq. 19 ten iterations against the limit make the step size explode."""
     pull = [1.0] * 10 + [-1.0]
-    config = SmdConfig(meta_step=1.0, memory=0.3, max_iterations=11)
+    config = SmdSettings(meta_step=1.0, memory=0.3, max_iterations=11)
     gradients = np.array(pull).reshape(-1, 1, 1)
     path = minimise(scripted(gradients), [[0.0]], 0.5, NEVER, box(0, np.inf), config=config, keep_path=True).path
     assert path is not None
@@ -136,7 +136,7 @@ def test_pushing_against_a_limit_leaves_the_step_size_alone() -> None:
 def test_no_state_leaves_the_limits(seed: int, scale: float, memory: float, lower: float, width: float) -> None:
     rng = np.random.default_rng(seed)
     gradients = scale * rng.normal(size=(12, 3, 2))
-    config = SmdConfig(memory=memory, max_iterations=12, meta_step=1 / scale)
+    config = SmdSettings(memory=memory, max_iterations=12, meta_step=1 / scale)
     basis = np.linalg.inv(rng.normal(size=(3, 2, 2)) + 3 * np.eye(2))
     start = rng.normal(size=(3, 2))
     limited = box(lower, lower + width)
@@ -161,7 +161,7 @@ def test_stops_when_the_moving_average_stands_still(
     """Eq. 20 in its long form, with the means, for two rows of two parameters."""
     steps = np.array(moves, float).reshape(12, 2, 2)
     tolerance = (np.array(limits) + 0.5) / window  # whole steps, so never a tie that rounding would decide
-    config = SmdConfig(meta_step=0, memory=0, max_iterations=12, window=window, average=False)
+    config = SmdSettings(meta_step=0, memory=0, max_iterations=12, window=window, average=False)
     result = minimise(scripted(-steps), np.zeros((2, 2)), 1.0, tolerance, anywhere, config=config)
     for b in range(2):
         states = np.vstack([np.zeros((1, 2)), np.cumsum(steps[:, b], axis=0)])
@@ -177,7 +177,7 @@ def test_stops_when_the_moving_average_stands_still(
 
 def test_a_change_of_the_tolerance_itself_is_small_enough() -> None:
     gradients = np.full((10, 1, 1), 0.25)
-    config = SmdConfig(meta_step=0, memory=0, window=1, max_iterations=10)
+    config = SmdSettings(meta_step=0, memory=0, window=1, max_iterations=10)
     exact = minimise(scripted(gradients), [[0.0]], 1.0, np.array([0.25]), anywhere, config=config)
     less = minimise(scripted(gradients), [[0.0]], 1.0, np.array([0.25 - 1e-12]), anywhere, config=config)
     assert (exact.iterations[0], bool(exact.converged[0])) == (1, True)
@@ -188,7 +188,7 @@ def test_a_change_of_the_tolerance_itself_is_small_enough() -> None:
 def test_returns_the_mean_of_the_last_states(window: int) -> None:
     """All there are where the descent was shorter than the window, the start among them."""
     gradients = np.random.default_rng(0).normal(size=(9, 2, 2))
-    config = SmdConfig(max_iterations=9, window=window)
+    config = SmdSettings(max_iterations=9, window=window)
     result = minimise(scripted(gradients), np.zeros((2, 2)), 0.1, NEVER, anywhere, config=config, keep_path=True)
     assert result.path is not None
     np.testing.assert_allclose(result.pose, result.path[-window:].mean(axis=0), atol=1e-15)
@@ -203,7 +203,7 @@ def test_a_row_is_the_same_alone_and_in_company() -> None:
     phases = rng.uniform(0, 2 * np.pi, size=(count, B, 6))
     start = rng.uniform(-3, 3, size=(B, 1))
     tolerance = np.array([0.02])
-    config = SmdConfig(max_iterations=count)
+    config = SmdSettings(max_iterations=count)
     company = minimise(rippled(phases), start, 0.05, tolerance, box(-4, 4), config=config, keep_path=True)
     assert company.path is not None and len(set(company.iterations.tolist())) > 2  # some wait for others
     for b in range(B):
@@ -223,7 +223,7 @@ def test_a_finished_row_is_not_asked_for_more() -> None:
     gradients = np.ones((20, 2, 1))
     gradients[:, 0] = 0
     gradients[5:, 0] = np.nan
-    config = SmdConfig(max_iterations=20, meta_step=0)
+    config = SmdSettings(max_iterations=20, meta_step=0)
     result = minimise(scripted(gradients), np.full((2, 1), 7.0), 0.1, np.array([0.01]), anywhere, config=config)
     assert result.iterations.tolist() == [3, 20]
     assert result.pose[0, 0] == 7.0
@@ -238,7 +238,7 @@ def test_a_finished_rows_direction_does_not_run_away() -> None:
         gradient = np.array([[0.0 if iteration else 1e-3], [1.0]])
         return Evaluation(np.zeros(2), gradient, 100 * along)
 
-    config = SmdConfig(max_iterations=30, meta_step=0)
+    config = SmdSettings(max_iterations=30, meta_step=0)
     result = minimise(evaluate, np.zeros((2, 1)), 0.1, np.array([1e-3]), anywhere, config=config)
     assert result.iterations.tolist() == [3, 30]
     assert directions[3] != 0
@@ -271,7 +271,7 @@ def test_columns_of_zeros_hold_parameters_still() -> None:
     for b in range(2):
         index = np.flatnonzero(free[b])
         bases[b][np.ix_(index, index)] = np.linalg.inv(np.linalg.cholesky(hessian[np.ix_(index, index)])).T
-    config = SmdConfig(max_iterations=60)
+    config = SmdSettings(max_iterations=60)
     result = minimise(bowl(hessian, centre), start, 0.5, np.full(4, 1e-9), anywhere, bases, config, keep_path=True)
     assert result.path is not None
     for b in range(2):
@@ -289,7 +289,7 @@ def test_columns_of_zeros_hold_parameters_still() -> None:
 def test_a_round_bowl(shuffle: bool) -> None:
     hessian = np.diag([1.0, 0.7, 1.4])
     centre = np.array([3.0, -2.0, 0.1])
-    config = SmdConfig(max_iterations=100, shuffle=shuffle)
+    config = SmdSettings(max_iterations=100, shuffle=shuffle)
     result = minimise(bowl(hessian, centre), np.zeros((1, 3)), 0.5, np.full(3, 1e-9), anywhere, config=config)
     assert result.converged[0]
     np.testing.assert_allclose(result.pose[0], centre, atol=1e-6)
@@ -303,7 +303,7 @@ def test_a_whitening_basis_makes_any_bowl_round() -> None:
     hessian = axes @ np.diag([1e3, 30.0, 1.0, 1e-2]) @ axes.T
     centre = rng.normal(size=4)
     start = np.zeros((1, 4))
-    config = SmdConfig(max_iterations=60)
+    config = SmdSettings(max_iterations=60)
     tolerance = np.full(4, 1e-9)
     whitening = np.linalg.inv(np.linalg.cholesky(hessian)).T
     round_ = minimise(bowl(hessian, centre), start, 1.0, tolerance, anywhere, whitening[None], config)
@@ -318,7 +318,13 @@ def test_the_step_sizes_find_their_way_through_a_curved_valley() -> None:
     start, step, tolerance = [[-1.2, 1.0]], 5e-4, np.full(2, 1e-12)
     adapted, fixed = (
         minimise(
-            rosenbrock, start, step, tolerance, anywhere, None, SmdConfig(meta_step=mu, memory=0.9, max_iterations=2000)
+            rosenbrock,
+            start,
+            step,
+            tolerance,
+            anywhere,
+            None,
+            SmdSettings(meta_step=mu, memory=0.9, max_iterations=2000),
         )
         for mu in (0.1, 0.0)
     )
@@ -341,7 +347,7 @@ def test_new_samples_escape_the_minima_that_fixed_samples_keep() -> None:
             0.1,
             tolerance,
             anywhere,
-            config=SmdConfig(max_iterations=count, shuffle=s),
+            config=SmdSettings(max_iterations=count, shuffle=s),
             max_step=0.5,
         ).pose
         for s in (True, False)
@@ -379,7 +385,7 @@ def test_leclerc_regression_ignores_outliers() -> None:
         )
 
     start = np.array([[0.0, 0.0], [1.5, 0.2], [0.3, -0.8]])
-    result = minimise(evaluate, start, 0.1, np.full(2, 1e-3), anywhere, config=SmdConfig(max_iterations=80))
+    result = minimise(evaluate, start, 0.1, np.full(2, 1e-3), anywhere, config=SmdSettings(max_iterations=80))
     assert result.converged.all()
     np.testing.assert_allclose(result.pose, np.broadcast_to(truth, (3, 2)), atol=0.02)
     least_squares = np.linalg.lstsq(design, y, rcond=None)[0]
@@ -396,7 +402,7 @@ def test_an_explosion_is_an_error_and_a_bound_prevents_it() -> None:
         np.errstate(all="ignore"),
     ):
         minimise(cliff, start, 1.0, np.full(2, 1e-3), anywhere)
-    config = SmdConfig(max_iterations=400)
+    config = SmdSettings(max_iterations=400)
     result = minimise(cliff, start, 1.0, np.full(2, 1e-3), anywhere, None, config, max_step=np.array([0.5, 0.4]))
     assert result.converged[0]
     np.testing.assert_allclose(result.pose[0], 0, atol=0.1)
@@ -409,7 +415,7 @@ def test_the_bound_scales_an_update_as_a_whole(seed: int, scale: float) -> None:
     gradients = scale * rng.normal(size=(1, 3, 4))
     basis = rng.normal(size=(3, 4, 4))
     bound = np.array([0.1, 0.2, np.inf, 0.4])
-    config = SmdConfig(max_iterations=1, average=False)
+    config = SmdSettings(max_iterations=1, average=False)
     free, bounded = (
         minimise(scripted(gradients), np.zeros((3, 4)), 0.5, NEVER, anywhere, basis, config, max_step=most).pose
         for most in (None, bound)
@@ -422,7 +428,7 @@ def test_step_sizes_do_not_grow_while_the_bound_holds() -> None:
     """A steep slope, then a gentle one: on the first the bound sets the pace, on the second it is out of the way again,
     and the step size goes on from where it began."""
     gradients = np.array([1e6] * 5 + [0.1]).reshape(6, 1, 1)
-    config = SmdConfig(max_iterations=6, memory=0.0, meta_step=1e-3)
+    config = SmdSettings(max_iterations=6, memory=0.0, meta_step=1e-3)
     path = minimise(scripted(gradients), [[0.0]], 2.0, NEVER, anywhere, None, config, keep_path=True, max_step=0.5).path
     assert path is not None
     moves = -np.diff(path[:, 0, 0])
@@ -460,7 +466,7 @@ def test_a_gradient_that_is_not_finite_is_an_error(which: str, value: float) -> 
 @pytest.mark.parametrize("settings", [{"memory": 1.1}, {"meta_step": -1.0}, {"max_iterations": 0}, {"window": 0}])
 def test_impossible_settings_are_refused(settings: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match=next(iter(settings))):
-        SmdConfig(**settings)
+        SmdSettings(**settings)
 
 
 @pytest.mark.parametrize("wrong", [{"step": 0.0}, {"step": np.nan}, {"max_step": [0.1, 0.0]}, {"max_step": np.nan}])

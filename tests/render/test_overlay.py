@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from tests.conftest import QUICK, Silent, Tk
-from tk.config import Config
 from tk.errors import ResultError
-from tk.io.capture import open_capture
-from tk.io.result import (
+from tk.io.captures.capture import open_capture
+from tk.io.results.writer import (
     FrameResult,
     ResultMeta,
     ResultWriter,
@@ -24,17 +23,18 @@ from tk.io.result import (
     read_result,
     revise_result,
 )
-from tk.model.anthropometry import BodyDimensions
-from tk.model.camera import Camera, Rig
-from tk.model.cone_body import ConeBody, build_cone_body
-from tk.model.gait import neutral_pose
-from tk.model.silhouettes import draw_silhouettes
-from tk.model.skeleton import JOINTS, build_skeleton
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.cone_body import ConeBody, build_cone_body
+from tk.model.body.gait_poses import neutral_pose
+from tk.model.body.skeleton import JOINTS, build_skeleton
+from tk.model.cameras.camera import Camera, Rig
+from tk.model.masks.silhouettes import draw_silhouettes
 from tk.render.canvas import View, dots, draw_body, draw_joints
 from tk.render.figure import BONES, Figure, Outline, solids_of
 from tk.render.overlay import Grid, Overlay, write_sheets
 from tk.render.palette import BONE, LOST, SEGMENT_COLORS, sigma_colors
-from tk.session import track
+from tk.run.session import track
+from tk.settings import Settings
 from tk.trackers.bodies import body_and_poses
 
 DEMO = Path(__file__).resolve().parents[2] / "tk" / "data" / "demo"
@@ -62,7 +62,7 @@ def result(tmp_path: Path) -> Path:
     skeleton, truth = SKELETON, read_joints(DEMO / "truth.h5")
     pose = neutral_pose(skeleton)
     meta = ResultMeta(
-        skeleton.names, skeleton.units, ("all",), ("total",), 15.0, "z", "demo", "made", 0, Config().to_toml()
+        skeleton.names, skeleton.units, ("all",), ("total",), 15.0, "z", "demo", "made", 0, Settings().to_toml()
     )
     with ResultWriter.create(path, meta) as writer:
         writer.write_model({f"dimensions/{name}": value for name, value in asdict(BODY.dimensions).items()})
@@ -105,7 +105,7 @@ def test_outlines_of_cones_are_their_silhouette() -> None:
 
 def test_results_of_the_region_tracker_are_drawn(tiny: Path, tmp_path: Path) -> None:
     path = tmp_path / "region.h5"
-    track(open_capture(tiny), path, Config.from_toml(QUICK), Silent(), frames=(0, 2))
+    track(open_capture(tiny), path, Settings.from_toml(QUICK), Silent(), frames=(0, 2))
     capture = open_capture(tiny, masks="none")
     (sheet,) = write_sheets(Overlay(capture, read_result(path)), tmp_path, [1], full=True)
     picture = cv2.imread(str(sheet))

@@ -9,7 +9,7 @@ import pytest
 
 from tests.conftest import Tk
 from tk.errors import ExportError
-from tk.io.result import read_result
+from tk.io.results.writer import read_result
 from tk.render.files import replacing
 from tk.render.scene import Scene
 from tk.render.video import made_here, video_writer

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from tests.conftest import FRAMES
-from tk.config import Config
-from tk.io.capture import open_capture
-from tk.io.result import FrameResult, JointAngles, ResultMeta, ResultWriter, Status, read_joints, revise_result
-from tk.model.angles import ANGLES
-from tk.model.anthropometry import BodyDimensions
-from tk.model.cone_body import build_cone_body
-from tk.model.derived import derive
-from tk.model.skeleton import ANKLES, SEGMENTS, WAIST, split_pose
-from tk.trackers.contours import ContourTracker
+from tk.io.captures.capture import open_capture
+from tk.io.results.writer import FrameResult, JointAngles, ResultMeta, ResultWriter, Status, read_joints, revise_result
+from tk.model.body.angles import ANGLES
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.cone_body import build_cone_body
+from tk.model.body.skeleton import ANKLES, SEGMENTS, WAIST, split_pose
+from tk.model.motion.derived import derive
+from tk.settings import Settings
+from tk.trackers.contour_tracker import ContourTracker
 
 LOST = (6, 7)
 NOTE = 'said </script><b>"loudly"</b> & more'
@@ -35,7 +35,7 @@ def complete_result(path: Path, capture_path: Path, count: int = FRAMES) -> Path
     meta = ResultMeta(
         pose_names=tuple(paper), pose_units=tuple(units), stages=("all",),
         timing_stages=("decode", "optimise", "total"),
-        fps=capture.fps, up=capture.up, capture="made <up>", method="region", seed=0, config_toml=Config().to_toml(),
+        fps=capture.fps, up=capture.up, capture="made <up>", method="region", seed=0, config_toml=Settings().to_toml(),
         waist_names=WAIST, ankle_names=ANKLES, sigma=True, fit_cameras=capture.rig.names, segment_names=SEGMENTS,
         feet=True, angles=tuple(JointAngles(a.joint, a.names, a.convention) for a in ANGLES), objective_kind="E_S",
     )  # fmt: skip

@@ -8,7 +8,7 @@ import pytest
 
 from tests.conftest import Tk
 from tk.errors import ExportError
-from tk.io.capture import open_capture
+from tk.io.captures.capture import open_capture
 from tk.render.video import made_here as is_our_video
 from tk.report import after
 from tk.report.after import leave_pictures

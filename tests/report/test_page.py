@@ -17,8 +17,8 @@ import pytest
 from scripts.browser import Page, browser_page, find_browser
 from tests.conftest import FRAMES, Tk
 from tests.report.conftest import LOST, NOTE
-from tk.io.result import Result, Status, read_result
-from tk.model.skeleton import JOINTS
+from tk.io.results.writer import Result, Status, read_result
+from tk.model.body.skeleton import JOINTS
 from tk.render.figure import figure_of
 from tk.report.data import hinge_sigma_deg
 from tk.report.page import build_page, made_here

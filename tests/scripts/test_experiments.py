@@ -14,8 +14,8 @@ from scripts.paper import common, cues, sampling, views
 from scripts.paper.common import Options, Track, spread, table
 from scripts.paper.motion import turned_deg
 from tests.conftest import QUICK
-from tk.config import Config
-from tk.model.skeleton import JOINTS
+from tk.model.body.skeleton import JOINTS
+from tk.settings import Settings
 
 DEMO = Path(__file__).resolve().parents[2] / "tk" / "data" / "demo"
 
@@ -39,7 +39,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     calls: list[tuple[Any, ...]] = []
 
     def track(
-        capture: Path, config: Config, frames: int | None, method: str = "volumetric", cameras: Any = None
+        capture: Path, config: Settings, frames: int | None, method: str = "volumetric", cameras: Any = None
     ) -> Track:
         calls.append((config, frames, method, cameras))
         return made_up()
@@ -67,7 +67,7 @@ def test_optimisers_differ_in_method_and_points_alone(asked: list[tuple[Any, ...
         ("volumetric", 1), ("volumetric", 5), ("lm", 1), ("lm", 5),
     ]  # fmt: skip
     same = {replace(config, effort="normal") for config, *_ in asked}
-    assert same == {Config()}
+    assert same == {Settings()}
 
 
 def test_cues_are_what_their_names_say() -> None:
@@ -99,7 +99,7 @@ def test_a_table_is_markdown() -> None:
 
 
 def test_a_track_is_of_the_capture() -> None:
-    track = common.track(DEMO, replace(Config.from_toml(QUICK), voxels=48), 4)
+    track = common.track(DEMO, replace(Settings.from_toml(QUICK), voxels=48), 4)
     assert track.error_cm.shape == (4, len(JOINTS)) and track.pose.shape[0] == 4
     assert 0.5 < track.mean_cm < 15 and track.astray <= 4
     assert (track.optimise_ms > 0).all() and (track.iterations > 0).all()
@@ -108,7 +108,7 @@ def test_a_track_is_of_the_capture() -> None:
 @pytest.fixture(scope="module")
 def scene() -> sampling.Scene:
     """The demo's fifth frame, tracked to."""
-    return sampling.look(Options(DEMO, 5, 1, Path("none.png")), Config.preset("kehl2006"))
+    return sampling.look(Options(DEMO, 5, 1, Path("none.png")), Settings.preset("kehl2006"))
 
 
 def test_an_arm_is_displaced_and_comes_back_or_not(

@@ -21,7 +21,7 @@ from scripts.synthetic.motion import HOLD, KNEE_RADIUS, MOTIONS
 from scripts.synthetic.render import CLOSE_M, Body, distances
 from scripts.synthetic.rig import RIGS
 from scripts.synthetic.skeleton import JOINTS, LIMITS_DEG, forward, make_skeleton, sole_points
-from tk.model.camera import Camera
+from tk.model.cameras.camera import Camera
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -29,7 +29,7 @@ def test_the_cost_of_pictures(tiny: Path, tmp_path: Path, monkeypatch: pytest.Mo
         complete_result(output, tiny)
         return SimpleNamespace(frames=14)
 
-    monkeypatch.setattr("tk.session.track", track)
+    monkeypatch.setattr("tk.run.session.track", track)
     cost = bench_pictures.run_once(tiny, "auto", None, tmp_path / "r.h5")
     assert cost.frames == 14 and min(*cost.run, *cost.pictures) > 0
     assert cost.shares == pytest.approx([p / (p + r) for p, r in zip(cost.pictures, cost.run, strict=True)])

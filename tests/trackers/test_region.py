@@ -11,23 +11,23 @@ import pytest
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, EMPTY, NAMES, STATURE, errors, find_again_elsewhere, observe, walk
 from tk.errors import CaptureError, ConfigError
-from tk.io.init_pose import InitPose
-from tk.model.camera import Rig
-from tk.model.cone_body import ConeBody, build_cone_body
-from tk.model.evidence import Evidence, RayGrid
-from tk.model.gait import standing_pose, walking_pose
-from tk.model.part_colors import GROUPS, PartColors
-from tk.model.silhouettes import draw_silhouettes
-from tk.model.skeleton import JOINTS, join_pose, shoulder_angles, split_pose
-from tk.optim.gauss_newton import GaussNewtonConfig
-from tk.trackers.contours import SilhouetteConfig
-from tk.trackers.region import MOST_A_VIEW, UNKNOWN_AFTER, RegionConfig, RegionTracker
+from tk.io.captures.init_pose import InitPose
+from tk.model.body.cone_body import ConeBody, build_cone_body
+from tk.model.body.gait_poses import standing_pose, walking_pose
+from tk.model.body.skeleton import JOINTS, join_pose, shoulder_angles, split_pose
+from tk.model.cameras.camera import Rig
+from tk.model.cues.part_colors import GROUPS, PartColors
+from tk.model.cues.ray_costs import Evidence, RayGrid
+from tk.model.masks.silhouettes import draw_silhouettes
+from tk.optim.gauss_newton import GaussNewtonSettings
+from tk.trackers.contour_tracker import SilhouetteSettings
+from tk.trackers.region import MOST_A_VIEW, UNKNOWN_AFTER, RegionSettings, RegionTracker
 
 RIG = ring_of_cameras(3, width=160, height=200)
 SKELETON = BODY.skeleton
 # A pixel is 1.4 cm wide at the subject; a joint rests on dozens of edgels in three views.
 CLOSE_M = 0.025
-SETTINGS = SilhouetteConfig(adapt=False, search_every=0)
+SETTINGS = SilhouetteSettings(adapt=False, search_every=0)
 
 
 def with_arm(pose: np.ndarray, side: str, direction: tuple[float, float, float], elbow_deg: float) -> np.ndarray:
@@ -54,8 +54,8 @@ def tracker_at(
     pose: np.ndarray,
     masks: np.ndarray = MASKS[0],
     body: ConeBody = BODY,
-    contours: SilhouetteConfig = SETTINGS,
-    config: RegionConfig | None = None,
+    contours: SilhouetteSettings = SETTINGS,
+    config: RegionSettings | None = None,
     images: np.ndarray = EMPTY,
 ) -> RegionTracker:
     """A tracker of this body that starts near a pose."""
@@ -121,7 +121,7 @@ def test_an_arm_elsewhere_is_found_again_by_the_search() -> None:
     found = {}
     for every in (0, 1):
         # without a search where a frame is explained badly, the arm stays where it was
-        config = RegionConfig(search_excess=0.02 if every else 1.0)
+        config = RegionSettings(search_excess=0.02 if every else 1.0)
         tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=every), config=config)
         tracker.step(observe(MASKS[0]))
         for i in range(1, 4):
@@ -325,7 +325,7 @@ def test_colors_show_a_forearm_that_silhouettes_do_not() -> None:
     for poses in map(crossing, range(8, 13)):
         images, masks = clothed(poses), draw_silhouettes(BODY, FRONT, poses)
         for colored in (True, False):
-            tracker = RegionTracker(FRONT, "z", SETTINGS, RegionConfig(colors=colored))
+            tracker = RegionTracker(FRONT, "z", SETTINGS, RegionSettings(colors=colored))
             tracker.start([observe(masks[0], 0, images[0])], None, init_of(poses[0]), BODY)
             found = [tracker.step(observe(m, i, p)) for i, (m, p) in enumerate(zip(masks, images, strict=True))]
             off[colored] += [errors(e, p)[wrist] for e, p in zip(found[-3:], poses[-3:], strict=True)]
@@ -412,6 +412,6 @@ def test_a_body_that_was_given_is_kept_in_the_second_pass() -> None:
 def test_settings_out_of_range_are_told() -> None:
     for values, message in (({"hypotheses": 0}, "hypotheses = 0"), ({"search_excess": -0.5}, "search_excess = -0.5")):
         with pytest.raises(ConfigError, match=message):
-            RegionConfig(**values)
+            RegionSettings(**values)
     with pytest.raises(ConfigError, match="scales = 0"):
-        replace(SETTINGS, solver=GaussNewtonConfig(scales=0))
+        replace(SETTINGS, solver=GaussNewtonSettings(scales=0))

@@ -8,12 +8,12 @@ import pytest
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, NAMES, STATURE, errors, find_again_elsewhere, observe, walk
 from tk.errors import CaptureError, ConfigError
-from tk.io.init_pose import InitPose
-from tk.model.body_fit import BodyFitConfig
-from tk.model.cone_body import build_cone_body
-from tk.model.silhouettes import draw_silhouettes
-from tk.model.skeleton import JOINTS
-from tk.trackers.silhouette import SilhouetteConfig, SilhouetteTracker
+from tk.io.captures.init_pose import InitPose
+from tk.model.body.body_fit import BodyFitSettings
+from tk.model.body.cone_body import build_cone_body
+from tk.model.body.skeleton import JOINTS
+from tk.model.masks.silhouettes import draw_silhouettes
+from tk.trackers.silhouette import SilhouetteSettings, SilhouetteTracker
 
 RIG = ring_of_cameras(3, width=240, height=300)
 # A pixel is 1 cm wide at the subject; a joint rests on dozens of edgels in three views.
@@ -31,7 +31,7 @@ def init_of(pose) -> InitPose:
 
 def tracker_at(pose, **settings) -> SilhouetteTracker:
     """A tracker of the true body that starts near a pose."""
-    tracker = SilhouetteTracker(RIG, "z", SilhouetteConfig(adapt=False, **settings))
+    tracker = SilhouetteTracker(RIG, "z", SilhouetteSettings(adapt=False, **settings))
     init = init_of(pose)
     tracker.start([observe(MASKS[0])], None, init)
     return tracker
@@ -67,7 +67,7 @@ def test_a_walk_is_followed_and_can_be_taken_up_again():
 
 
 def test_the_subject_is_found_without_any_hint():
-    config = SilhouetteConfig(adapt=False)
+    config = SilhouetteSettings(adapt=False)
     tracker = SilhouetteTracker(RIG, "z", config)
     tracker.start([observe(m, i) for i, m in enumerate(MASKS)], STATURE, None)
     estimate = tracker.step(observe(MASKS[0]))
@@ -79,7 +79,7 @@ def test_the_subject_is_found_without_any_hint():
 
 
 def test_the_stature_is_read_off_the_silhouettes():
-    tracker = SilhouetteTracker(RIG, "z", SilhouetteConfig(adapt=False))
+    tracker = SilhouetteTracker(RIG, "z", SilhouetteSettings(adapt=False))
     tracker.start([observe(MASKS[0])], None, None)
     assert tracker.body.dimensions.stature == pytest.approx(STATURE, rel=0.06)
 
@@ -87,7 +87,7 @@ def test_the_stature_is_read_off_the_silhouettes():
 def test_dimensions_are_adapted_in_start():
     thick = BODY.dimensions.scaled(thigh_radius=1.25, head_radius=1.15)
     masks = draw_silhouettes(build_cone_body(thick), RIG, POSES[:3])
-    config = SilhouetteConfig(fit=BodyFitConfig(frames=2, rounds=5))
+    config = SilhouetteSettings(fit=BodyFitSettings(frames=2, rounds=5))
     tracker = SilhouetteTracker(RIG, "z", config)
     init = init_of(POSES[0])
     tracker.start([observe(m, i) for i, m in enumerate(masks)], None, init)
@@ -135,8 +135,8 @@ def test_nobody_in_the_first_frame_is_told():
 
 def test_settings_out_of_range_are_told():
     with pytest.raises(ConfigError, match="prediction = 2"):
-        replace(SilhouetteConfig(), prediction=2.0)
+        replace(SilhouetteSettings(), prediction=2.0)
     with pytest.raises(ConfigError, match="init_frames = 0"):
-        SilhouetteConfig(init_frames=0)
+        SilhouetteSettings(init_frames=0)
     with pytest.raises(ConfigError, match='body = "robot"'):
-        SilhouetteConfig(body="robot")
+        SilhouetteSettings(body="robot")

@@ -7,20 +7,20 @@ import pytest
 
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, STATURE, errors, observe, walk
-from tk.config import Config
 from tk.errors import ConfigError
-from tk.model.anthropometry import BodyDimensions
-from tk.model.cone_body import build_cone_body
-from tk.model.contour_term import ContourConfig
-from tk.model.silhouettes import draw_silhouettes
-from tk.model.skeleton import JOINTS
-from tk.model.volume import Volume
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.cone_body import build_cone_body
+from tk.model.body.skeleton import JOINTS
+from tk.model.cameras.volume import Volume
+from tk.model.cues.edge_term import ContourSettings
+from tk.model.masks.silhouettes import draw_silhouettes
+from tk.settings import Settings
 from tk.trackers.volumetric import VolumetricTracker
 
 
 def test_a_body_without_hands_and_feet_is_refused() -> None:
     rig = ring_of_cameras(2, width=48, height=60)
-    tracker = VolumetricTracker(rig, Volume((0, 0, 1), (2, 2, 2)), "z", Config(voxels=16))
+    tracker = VolumetricTracker(rig, Volume((0, 0, 1), (2, 2, 2)), "z", Settings(voxels=16))
     walker = build_cone_body(BodyDimensions.from_stature(1.7), preset="walker")
     with pytest.raises(ConfigError, match=r'the body given is "walker": --method volumetric needs a full one'):
         tracker.start([], None, None, walker)
@@ -33,7 +33,7 @@ def test_an_arm_left_behind_is_found_by_the_search_that_looks_around(angles: tup
     pose = walk(1)[0]
     masks = draw_silhouettes(BODY, rig, pose[None])[0]
     images = np.full((*masks.shape, 3), 90, np.uint8)
-    config = Config(voxels=48, contours=ContourConfig(edge_weight=0.0))  # one colour has no edges
+    config = Settings(voxels=48, contours=ContourSettings(edge_weight=0.0))  # one colour has no edges
     tracker = VolumetricTracker(rig, Volume((0, 0, 1), (2, 2, 2.2)), "z", config, tmp_path)
     tracker.start([observe(masks, 0, images)], STATURE, None, BODY)
     model, state = dict(tracker.model()), dict(tracker.state())

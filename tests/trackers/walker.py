@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from tk.model.anthropometry import BodyDimensions
-from tk.model.camera import Rig
-from tk.model.cone_body import build_cone_body
-from tk.model.gait import walking_pose
-from tk.model.silhouettes import draw_silhouettes
-from tk.trackers.base import Estimate, Observation
-from tk.trackers.contours import ContourTracker
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.cone_body import build_cone_body
+from tk.model.body.gait_poses import walking_pose
+from tk.model.cameras.camera import Rig
+from tk.model.masks.silhouettes import draw_silhouettes
+from tk.trackers.contour_tracker import ContourTracker
+from tk.trackers.protocol import Estimate, Observation
 
 STATURE = 1.75
 BODY = build_cone_body(BodyDimensions.from_stature(STATURE))

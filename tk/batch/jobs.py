@@ -15,8 +15,8 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from tk.config import Config
 from tk.errors import ConfigError, ResultError
+from tk.settings import Settings
 
 #: of the batch's folder: one record a capture
 RECORDS = "jobs"
@@ -26,7 +26,7 @@ WAITING, BEGUN, DONE, FAILED = "waiting", "begun", "done", "failed"
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """Options of `tk track` that are the same for every capture; see :func:`tk.session.track`.
+    """Options of `tk track` that are the same for every capture; see :func:`tk.run.session.track`.
 
     Attributes:
         body: a result or a TOML file whose body all captures share: they show the same person.
@@ -39,7 +39,7 @@ class TrackOptions:
     body: Path | None = None
     causal: bool = False
     store_hull: bool = False
-    config: Config = field(default_factory=Config)
+    config: Settings = field(default_factory=Settings)
 
     def told(self) -> dict[str, str]:
         """Each option as text: what must be the same when a batch is taken up again.

@@ -48,10 +48,10 @@ def work(job: Job) -> Outcome:
 
 
 def _track(job: Job, reporter: _Reporter) -> Outcome:
-    from tk import session  # the driver needs none of it
-    from tk.io.capture import open_capture
-    from tk.io.result import Status, read_result
+    from tk.io.captures.capture import open_capture
+    from tk.io.results.writer import Status, read_result
     from tk.report.after import leave_pictures
+    from tk.run import session  # the driver needs none of it
 
     options = job.options
     capture = open_capture(job.capture, options.cameras, options.masks)
@@ -87,7 +87,7 @@ def _track(job: Job, reporter: _Reporter) -> Outcome:
 
 def _errors(job: Job, note: Callable[[str], None]) -> tuple[float | None, float | None]:
     """The distances from the capture's truth, where it has one: of all joints, and of the limbs without offsets."""
-    from tk.evaluation import evaluate_files
+    from tk.evaluation.joints import evaluate_files
 
     truth = job.capture / "truth.h5"
     if not truth.exists():

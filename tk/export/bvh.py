@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tk.export.motion import Motion
 from tk.export.tree import Tree, build_tree
-from tk.model.rotations import decompose, follow
+from tk.model.body.rotations import decompose, follow
 
 _PLACE = ("Xposition", "Yposition", "Zposition")
 _TURN = ("Zrotation", "Xrotation", "Yrotation")

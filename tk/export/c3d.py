@@ -1,6 +1,7 @@
 """C3D: points and rotations, the file of motion laboratories, written through ezc3d.
 
-World frame as in the result, millimetres. A point's residual is its standard deviation in whole millimetres (127 at
+World frame as in the result, millimetres. A point's residual is its standard deviation in whole millimetres
+(127 at
 most) where the result tells one, else 0. In frames that are not known it is -1, and the coordinates are 0, which is how
 the format says that a point is missing; ROTATION, each segment's 4×4 transform to the world, has the reliability -1.
 """

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from tk.export.motion import Motion
-from tk.model.angles import ANGLES, joint_angles
+from tk.model.body.angles import ANGLES, joint_angles
 
 
 def write_points_csv(motion: Motion, path: Path) -> None:
@@ -25,7 +25,8 @@ def write_points_csv(motion: Motion, path: Path) -> None:
 
 
 def write_angles_csv(motion: Motion, path: Path) -> None:
-    """Write ``frame,time,status,joint,angle,degrees`` after :data:`tk.model.angles.ANGLES`; blank where not known."""
+    """Write ``frame,time,status,joint,angle,degrees`` after :data:`tk.model.body.angles.ANGLES`; blank where not
+    known."""
     degrees = joint_angles(motion.rotations, motion.T_world_body, motion.segments)
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream)

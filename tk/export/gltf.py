@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from tk import __version__
 from tk.export.motion import Motion
 from tk.export.tree import Tree, build_tree, rest_axes
-from tk.model.angles import standing_axes
-from tk.model.rotations import continuous, to_quaternions
-from tk.model.skeleton import JOINTS, SEGMENTS, WAIST_HEIGHT, build_skeleton
+from tk.model.body.angles import standing_axes
+from tk.model.body.rotations import continuous, to_quaternions
+from tk.model.body.skeleton import JOINTS, SEGMENTS, WAIST_HEIGHT, build_skeleton
 from tk.render.figure import AROUND, Solid, figure_of
 
 Float = NDArray[np.float64]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.export.motion import FORWARD_UP_RIGHT, Motion
-from tk.model.rotations import decompose, follow
+from tk.model.body.rotations import decompose, follow
 
 Float = NDArray[np.float64]
 

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError, ResultError
-from tk.io.result import Result, Status, read_result
-from tk.model.angles import segment_rotations
-from tk.model.anthropometry import BodyDimensions
-from tk.model.derived import derive
-from tk.model.motion import FOOT_POINTS, sole_offset
-from tk.model.rotations import to_matrices
-from tk.model.skeleton import JOINTS, SEGMENTS, Skeleton, build_skeleton, join_pose, split_pose
-from tk.model.smoothing import smooth
+from tk.io.results.writer import Result, Status, read_result
+from tk.model.body.angles import segment_rotations
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.rotations import to_matrices
+from tk.model.body.skeleton import JOINTS, SEGMENTS, Skeleton, build_skeleton, join_pose, split_pose
+from tk.model.motion.derived import derive
+from tk.model.motion.segments import FOOT_POINTS, sole_offset
+from tk.model.motion.smoothing import smooth
 
 Float = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ class Motion:
         known: (F,) False where the person was lost and the gap was not bridged.
         point_names: P joints and points of the feet; points: (F, P, 3) metres, world frame.
         sigma: (F, P) one standard deviation of a point, metres; NaN where nobody says.
-        segments: S names; rotations: (F, S, 3, 3) segment to world, axes as in :mod:`tk.model.angles`.
+        segments: S names; rotations: (F, S, 3, 3) segment to world, axes as in :mod:`tk.model.body.angles`.
         dimensions: of the fitted body.
         T_world_body: (3, 3) the world's forward, left and up as columns.
         result: what all this was read from; its smoothed copy where that was asked for.
@@ -89,7 +89,7 @@ def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[M
         smoothed: take the smoothed copy; it is made here where the result has none.
 
     Raises:
-        ResultError: as :func:`tk.io.result.read_result`, or no body or no known frame is in it.
+        ResultError: as :func:`tk.io.results.writer.read_result`, or no body or no known frame is in it.
     """
     result = read_result(path)
     bridged = np.zeros(len(result), dtype=bool)

@@ -1,6 +1,7 @@
 """The body's surface as a sequence of meshes: a folder with a PLY file a frame, named by the source frame.
 
-World frame, metres; the parts of the body are closed meshes that reach into each other, in the colours of the overlays.
+World frame, metres; the parts of the body are closed meshes that reach into each other, in the colours of the
+overlays.
 A frame that is not known holds the body before.
 """
 
@@ -13,7 +14,7 @@ import numpy as np
 from tk.errors import ExportError
 from tk.export.motion import Motion
 from tk.io.mesh import Mesh, write_mesh
-from tk.model.skeleton import SEGMENTS
+from tk.model.body.skeleton import SEGMENTS
 from tk.render.figure import figure_of
 from tk.render.palette import SEGMENT_COLORS
 

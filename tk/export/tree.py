@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.export.motion import LEFT_UP_FORWARD, Motion
-from tk.model.rotations import turn
-from tk.model.skeleton import WAIST_HEIGHT
+from tk.model.body.rotations import turn
+from tk.model.body.skeleton import WAIST_HEIGHT
 
 Float = NDArray[np.float64]
 
@@ -86,7 +86,7 @@ def _sided(row: tuple[str, ...], side: str) -> tuple[str, ...]:
 
 
 def rest_axes(segment: str) -> Float:
-    """(3, 3) a segment's axes (:mod:`tk.model.angles`) in the rest pose: X to the left, Y up, Z forward."""
+    """(3, 3) a segment's axes (:mod:`tk.model.body.angles`) in the rest pose: X to the left, Y up, Z forward."""
     level = {"_l": 0.5 * np.pi, "_r": -0.5 * np.pi}.get(segment[-2:], 0.0) if "arm" in segment else 0.0
     return LEFT_UP_FORWARD @ turn("x", np.array(level))
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tk.io.point_cloud import claim, full, load_open3d
-from tk.io.result import HullPoints
-from tk.model.volume import VoxelGrid
+from tk.io.results.writer import HullPoints
+from tk.model.cameras.volume import VoxelGrid
 
 Float = NDArray[np.float64]
 

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from tk import __version__
 from tk.errors import ResultError
-from tk.io.capture import Capture
+from tk.io.captures.capture import Capture
 from tk.io.hdf5 import open_hdf5
-from tk.io.result import HullPoints
-from tk.model.volume import VoxelGrid
+from tk.io.results.writer import HullPoints
+from tk.model.cameras.volume import VoxelGrid
 
 HULL_FORMAT = "tk-hull"
 

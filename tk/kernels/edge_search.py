@@ -17,7 +17,7 @@ numerator is 0 then; a length is known to about a pixel, so one pixel is added. 
 
 import numpy as np
 
-from tk.kernels.edges import EdgeConfig, rgb_gradient_at
+from tk.kernels.edges import EdgeSettings, rgb_gradient_at
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
 PAIR, SINGLE = 0, 1
@@ -111,7 +111,7 @@ def search_edges(
     sizes: np.ndarray,
     lines: np.ndarray,
     threshold: float,
-    config: EdgeConfig,
+    config: EdgeSettings,
 ) -> np.ndarray:
     """The edges assigned to R lines.
 

@@ -33,7 +33,7 @@ from tk.kernels.runtime import ti
 
 
 @dataclass(frozen=True)
-class EdgeConfig:
+class EdgeSettings:
     """What makes a colour edge. The paper tuned its own by hand for each camera and prints none of them.
 
     The defaults were chosen with ``scripts/figure4_edges.py`` (two rendered captures): little clutter at equal recall
@@ -101,7 +101,7 @@ def rgb_gradient_at(
     """(magnitude, dx, dy) of the colour gradient at pixel (y, x) of picture c; see the module.
 
     The pixel must lie in the picture; beyond its border the picture is continued by its last row or column. (dx, dy) is
-    a unit vector, (1, 0) where the magnitude is 0. The last four arguments are :attr:`EdgeConfig.constants`.
+    a unit vector, (1, 0) where the magnitude is 0. The last four arguments are :attr:`EdgeSettings.constants`.
     """
     magnitude = ti.f32(-1.0)
     winner = ti.Vector([0.0] * 6, ti.f32)

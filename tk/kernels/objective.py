@@ -226,7 +226,7 @@ def _linearise_kernel(real):
 
 
 @dataclass(frozen=True)
-class ObjectiveSettings:
+class ObjectiveParameters:
     """Constants of the objective.
 
     Attributes:
@@ -335,7 +335,7 @@ class ObjectiveKernel:
             self._no_entries if entries is None or not entries.shape[1] else np.ascontiguousarray(entries, self.dtype)
         )
 
-    def _packed(self, s: ObjectiveSettings, M: int, Q: int, index: SurfaceIndex) -> np.ndarray:
+    def _packed(self, s: ObjectiveParameters, M: int, Q: int, index: SurfaceIndex) -> np.ndarray:
         """The settings in the order in which the kernels read them."""
         values = [s.nu, s.reach_m, s.coverage_nu, s.coverage_reach_m]
         shares = [s.surface_weight / max(M, 1), s.coverage_weight / max(Q, 1)]
@@ -348,7 +348,7 @@ class ObjectiveKernel:
         voxels: np.ndarray,
         pose: np.ndarray,
         direction: np.ndarray | None,
-        settings: ObjectiveSettings,
+        settings: ObjectiveParameters,
         held: Held | None = None,
         entries: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Held]:
@@ -411,7 +411,7 @@ class ObjectiveKernel:
         voxels: np.ndarray,
         pose: np.ndarray,
         held: Held,
-        settings: ObjectiveSettings,
+        settings: ObjectiveParameters,
         floor: float = 0.0,
         entries: np.ndarray | None = None,
     ) -> Linearisation:

@@ -39,7 +39,7 @@ class Equations(Protocol):
 
 
 @dataclass(frozen=True)
-class GaussNewtonConfig:
+class GaussNewtonSettings:
     """Settings.
 
     Attributes:
@@ -120,7 +120,7 @@ def minimise(
     free: NDArray[np.bool_],
     lower: Float,
     upper: Float,
-    config: GaussNewtonConfig | None = None,
+    config: GaussNewtonSettings | None = None,
     prior: Prior | None = None,
     levels: Sequence[int] | None = None,
 ) -> Descent:
@@ -131,11 +131,11 @@ def minimise(
         start: (B, D).
         free: (D,) parameters that may change.
         lower, upper: (D,) limits; infinite where there is none.
-        config: see :class:`GaussNewtonConfig`.
+        config: see :class:`GaussNewtonSettings`.
         prior: what is known beside the equations.
         levels: the scales to go through; all from the coarsest to the finest if None.
     """
-    config = config or GaussNewtonConfig()
+    config = config or GaussNewtonSettings()
     state = np.array(start, np.float64)
     hessian = np.zeros((*state.shape, state.shape[1]))
     room = _Room(np.flatnonzero(free), lower, upper, config, prior)
@@ -159,7 +159,7 @@ class _Room:
     """Where the states may go: the free parameters ``index`` (n,), their limits, and what is known of them."""
 
     def __init__(
-        self, index: NDArray[np.intp], lower: Float, upper: Float, config: GaussNewtonConfig, prior: Prior | None
+        self, index: NDArray[np.intp], lower: Float, upper: Float, config: GaussNewtonSettings, prior: Prior | None
     ) -> None:
         self.index = index
         self._rows = index[:, None]

@@ -27,7 +27,7 @@ class Quadratic(NamedTuple):
 
 
 @dataclass(frozen=True)
-class LmConfig:
+class LmSettings:
     """Settings.
 
     Attributes:
@@ -71,7 +71,7 @@ def minimise(
     start: Float,
     constrain: Callable[[Float], Float],
     floor: Float | float = 0.0,
-    config: LmConfig | None = None,
+    config: LmSettings | None = None,
 ) -> LmResult:
     """Minimise from ``start``.
 
@@ -85,12 +85,12 @@ def minimise(
         start: (D,).
         constrain: maps a state into the feasible region, each parameter by itself.
         floor: (D,) least diagonal of the damping term: keeps parameters that the data does not see in place.
-        config: see :class:`LmConfig`.
+        config: see :class:`LmSettings`.
 
     Raises:
         FloatingPointError: when the model is not finite. A value that is not finite refuses its step.
     """
-    config = config or LmConfig()
+    config = config or LmSettings()
     p = constrain(np.asarray(start, np.float64))
     damping = config.damping
     now = _finite(model(p))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.optim import levenberg_marquardt as lm
-from tk.optim.schedule import CHAIN_LEVER_M, LEVER_M, ScheduleConfig, ScheduleResult
+from tk.optim.schedule import CHAIN_LEVER_M, LEVER_M, ScheduleResult, ScheduleSettings
 
 Float = NDArray[np.float64]
 
@@ -60,7 +60,9 @@ class FixedProblem(Protocol):
         ...
 
 
-def optimise(problem: FixedProblem, starts: Float, config: ScheduleConfig, lm_config: lm.LmConfig) -> ScheduleResult:
+def optimise(
+    problem: FixedProblem, starts: Float, config: ScheduleSettings, lm_config: lm.LmSettings
+) -> ScheduleResult:
     """Both passes, from the best of the starts (S, D)."""
     starts = problem.constrain(starts)
     start = starts[0] if len(starts) == 1 else min(starts, key=problem.value)
@@ -82,7 +84,7 @@ def _descend(
     start: Float,
     free: NDArray[np.bool_],
     lever_m: float,
-    config: lm.LmConfig,
+    config: lm.LmSettings,
 ) -> tuple[Float, int]:
     """The pose (D,) after a descent in the free parameters, and its iterations."""
 

@@ -67,7 +67,7 @@ class Problem(Protocol):
 
 
 @dataclass(frozen=True)
-class ScheduleConfig:
+class ScheduleSettings:
     """Settings of the two passes. How many iterations each may take is ``smd.max_iterations``.
 
     Attributes:
@@ -100,7 +100,7 @@ class ScheduleResult:
     iterations: NDArray[np.int32]
 
 
-def optimise(problem: Problem, starts: Float, config: ScheduleConfig, smd_config: smd.SmdConfig) -> ScheduleResult:
+def optimise(problem: Problem, starts: Float, config: ScheduleSettings, smd_config: smd.SmdSettings) -> ScheduleResult:
     """Both passes.
 
     Args:
@@ -121,7 +121,7 @@ def optimise(problem: Problem, starts: Float, config: ScheduleConfig, smd_config
 
 
 def _all(
-    problem: Problem, start: Float, tolerance: Float, config: ScheduleConfig, smd_config: smd.SmdConfig
+    problem: Problem, start: Float, tolerance: Float, config: ScheduleSettings, smd_config: smd.SmdSettings
 ) -> smd.SmdResult:
     """The pass over all parameters, from ``start`` (D,)."""
     free = np.ones(len(start), bool)
@@ -140,7 +140,7 @@ def _all(
 
 
 def _chains(
-    problem: Problem, pose: Float, tolerance: Float, config: ScheduleConfig, smd_config: smd.SmdConfig
+    problem: Problem, pose: Float, tolerance: Float, config: ScheduleSettings, smd_config: smd.SmdSettings
 ) -> smd.SmdResult:
     """The pass over the chains, a row each, with the torso at ``pose`` (D,)."""
     K = len(problem.free)

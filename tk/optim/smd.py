@@ -46,7 +46,7 @@ Objective = Callable[[Float, Float, int], Evaluation]
 
 
 @dataclass(frozen=True)
-class SmdConfig:
+class SmdSettings:
     """Settings of SMD. The paper's values where it gives any that do not depend on its units.
 
     Attributes:
@@ -103,7 +103,7 @@ def minimise(
     tolerance: Float,
     constrain: Callable[[Float], Float],
     basis: Float | None = None,
-    config: SmdConfig | None = None,
+    config: SmdSettings | None = None,
     keep_path: bool = False,
     max_step: Float | float | None = None,
     basis_inverse: Float | None = None,
@@ -121,7 +121,7 @@ def minimise(
             directions; the unit vectors of p by default, as in the paper. With a basis that whitens the Hessian the
             diagonal step sizes lose nothing to the coupling of the joints along a limb. Columns of zeros hold a row's
             parameters still.
-        config: see :class:`SmdConfig`.
+        config: see :class:`SmdSettings`.
         keep_path: record every state.
         max_step: (D,) most that an iteration may change each parameter, in its own unit, positive; None for no bound.
         basis_inverse: (B, U, D) the pseudo-inverse of ``basis``, where the caller has it at hand.
@@ -132,7 +132,7 @@ def minimise(
             descent diverges until its state is not. To take such a gradient for zero would end the descent wherever it
             is and call it converged.
     """
-    config = config or SmdConfig()
+    config = config or SmdSettings()
     p = constrain(np.array(start, dtype=np.float64, ndmin=2))
     B, D = p.shape
     W = np.broadcast_to(np.eye(D), (B, D, D)) if basis is None else np.asarray(basis, np.float64)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tk.errors import ConfigError, ResultError
-from tk.io.capture import Capture, open_capture
-from tk.io.result import Result, read_result
+from tk.io.captures.capture import Capture, open_capture
+from tk.io.results.writer import Result, read_result
 from tk.render.files import check_target
 from tk.render.overlay import Overlay, write_sheets
 from tk.render.scene import Scene

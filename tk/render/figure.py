@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ResultError
-from tk.io.result import Result, Status
+from tk.io.results.writer import Result, Status
 from tk.kernels.cones import ELLIPSOID
-from tk.model.camera import Camera
-from tk.model.cone_body import ConeBody, ConePart
-from tk.model.skeleton import JOINTS, SEGMENTS
+from tk.model.body.cone_body import ConeBody, ConePart
+from tk.model.body.skeleton import JOINTS, SEGMENTS
+from tk.model.cameras.camera import Camera
 from tk.trackers.bodies import body_and_poses
 
 Float = NDArray[np.float64]
@@ -37,7 +37,7 @@ class Solid:
     """A convex solid that rides on a segment.
 
     Attributes:
-        segment: its index in :data:`~tk.model.skeleton.SEGMENTS`.
+        segment: its index in :data:`~tk.model.body.skeleton.SEGMENTS`.
         rings: (R, AROUND, 3) circles from one end to the other in the segment's frame, zero configuration; metres.
     """
 
@@ -156,7 +156,7 @@ class Figure:
 
 
 def figure_of(result: Result) -> Figure:
-    """The person of a result; its joints in the order of :data:`~tk.model.skeleton.JOINTS`.
+    """The person of a result; its joints in the order of :data:`~tk.model.body.skeleton.JOINTS`.
 
     Raises:
         ResultError: the body and the poses do not belong together, or a joint is missing.

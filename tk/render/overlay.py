@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ExportError, ResultError
-from tk.io.capture import Capture
-from tk.io.result import Result, Status, read_joints
-from tk.io.result_data import STATUS_MEANING
-from tk.model.camera import Camera, Rig
+from tk.io.captures.capture import Capture
+from tk.io.results.data import STATUS_MEANING
+from tk.io.results.writer import Result, Status, read_joints
+from tk.model.cameras.camera import Camera, Rig
 from tk.render.canvas import Image, View, dots, draw_body, draw_joints, draw_truth, text_width, write
 from tk.render.figure import Figure, figure_of
 from tk.render.palette import INK, LOST, SEGMENT_COLORS, SIGMA_MOST_M, TEXT, Color, sigma_colors

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ResultError
-from tk.io.result import Result
-from tk.io.result_data import STATUS_MEANING
-from tk.model.camera import Camera, Rig
-from tk.model.skeleton import SEGMENTS
-from tk.model.up import up_vector
+from tk.io.results.data import STATUS_MEANING
+from tk.io.results.writer import Result
+from tk.model.body.skeleton import SEGMENTS
+from tk.model.cameras.camera import Camera, Rig
+from tk.model.cameras.up import up_vector
 from tk.render.canvas import Image, dots, draw_joints, fixed, write
 from tk.render.figure import Figure, figure_of
 from tk.render.overlay import choose_frames, draw_key, draw_timeline, timeline

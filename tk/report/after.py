@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tk.errors import ExportError, TkError
-from tk.io.capture import Capture
-from tk.io.result import read_result
+from tk.io.captures.capture import Capture
+from tk.io.results.writer import read_result
 from tk.render.overlay import Overlay
 from tk.render.video import check_encoder, video_writer
 from tk.render.video import made_here as is_our_video

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tk.io.result import Result, Status
-from tk.io.result_data import STATUS_MEANING
-from tk.model.camera import Rig
-from tk.model.skeleton import JOINTS, SEGMENTS
+from tk.io.results.data import STATUS_MEANING
+from tk.io.results.writer import Result, Status
+from tk.model.body.skeleton import JOINTS, SEGMENTS
+from tk.model.cameras.camera import Rig
 from tk.render.figure import AROUND, BONES, Figure, figure_of
 from tk.render.palette import BONE, LOST, LOST_BODY, SEGMENT_COLORS, SIGMA_MOST_M, hexadecimal, sigma_colors
 from tk.render.scene import Stage

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from tk.errors import ResultError
-from tk.io.capture import open_capture
-from tk.io.result import Result, read_result
-from tk.model.camera import Rig
+from tk.io.captures.capture import open_capture
+from tk.io.results.writer import Result, read_result
+from tk.model.cameras.camera import Rig
 from tk.render.files import check_target, replacing
 from tk.render.overlay import Overlay
 from tk.report.data import describe

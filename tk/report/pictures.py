@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.result import Result, Status
+from tk.io.results.writer import Result, Status
 from tk.render.overlay import Overlay
 
 _WORST, _TYPICAL = 3, 2

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tk.errors import ConfigError
 
 if TYPE_CHECKING:
-    from tk.model.subject import Sighting
+    from tk.model.masks.subject import Sighting
 
 GROUP = "tk.segmenters"
 

@@ -17,7 +17,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 from tk.errors import ConfigError
-from tk.model.hull_tables import default_cache_dir
+from tk.model.hull.tables import default_cache_dir
 
 WHEEL = "mediapipe==0.10.14"
 

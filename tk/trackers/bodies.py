@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError, ResultError
-from tk.io.result import Result, blamed_on, read_result
+from tk.io.results.writer import Result, blamed_on, read_result
 from tk.io.toml import parse_toml, read_text
-from tk.model.anthropometry import BodyDimensions
-from tk.model.cone_body import ConeBody, build_cone_body
-from tk.model.skeleton import DEGREES_OF_FREEDOM, join_pose
-from tk.trackers.contours import restore_body, restore_dimensions
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.cone_body import ConeBody, build_cone_body
+from tk.model.body.skeleton import DEGREES_OF_FREEDOM, join_pose
+from tk.trackers.contour_tracker import restore_body, restore_dimensions
 
 
 def read_body(path: Path, up: str) -> ConeBody:

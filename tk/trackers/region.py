@@ -26,19 +26,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
-from tk.io.init_pose import InitPose
-from tk.model.body_fit import BodyFitConfig
-from tk.model.camera import Rig
-from tk.model.cone_body import ConeBody
-from tk.model.evidence import Evidence, mean_of_views
-from tk.model.joint_sigma import contour_variance, directions, posture_variance
-from tk.model.limbs import Limb
-from tk.model.part_colors import color_bins
-from tk.model.silhouettes import Pyramid
-from tk.model.skeleton import JOINTS, Skeleton
+from tk.io.captures.init_pose import InitPose
+from tk.model.body.body_fit import BodyFitSettings
+from tk.model.body.cone_body import ConeBody
+from tk.model.body.joint_sigma import contour_variance, directions, posture_variance
+from tk.model.body.limb_candidates import Limb
+from tk.model.body.skeleton import JOINTS, Skeleton
+from tk.model.cameras.camera import Rig
+from tk.model.cues.part_colors import color_bins
+from tk.model.cues.ray_costs import Evidence, mean_of_views
+from tk.model.masks.silhouettes import Pyramid
 from tk.optim.gauss_newton import Prior
-from tk.trackers.base import Estimate, Observation, Stopwatch, drift
-from tk.trackers.contours import APART_M, GAIN, RELOCATE_EVERY, ContourTracker, SilhouetteConfig
+from tk.trackers.contour_tracker import APART_M, GAIN, RELOCATE_EVERY, ContourTracker, SilhouetteSettings
+from tk.trackers.protocol import Estimate, Observation, Stopwatch, drift
 
 Float = NDArray[np.float64]
 
@@ -68,7 +68,7 @@ _THING = np.ones((5, 5), np.uint8)
 # captures no limb that lay within 15 cm of the truth had 0.25, and of those farther off most had 0.3 to 0.4.
 MISPLACED = 0.25
 # The second pass: what the body is fitted to, and how near a frame stays to its pose of the first pass.
-SECOND_FIT = BodyFitConfig(frames=24, rounds=4)
+SECOND_FIT = BodyFitSettings(frames=24, rounds=4)
 SECOND_ANGLE_DEG = 15.0
 # Frames that the second pass settles in one launch.
 AT_ONCE = 8
@@ -79,7 +79,7 @@ USUAL_FRAMES = 200
 
 
 @dataclass(frozen=True)
-class RegionConfig:
+class RegionSettings:
     """How the region tracker searches.
 
     Attributes:
@@ -128,10 +128,10 @@ class RegionTracker(ContourTracker):
     timing_stages: tuple[str, ...] = ("masks_clean", "optimise", "check", "search")
 
     def __init__(
-        self, rig: Rig, up: str, contours: SilhouetteConfig | None = None, config: RegionConfig | None = None
+        self, rig: Rig, up: str, contours: SilhouetteSettings | None = None, config: RegionSettings | None = None
     ) -> None:
-        super().__init__(rig, up, contours or SilhouetteConfig())
-        self.config = config or RegionConfig()
+        super().__init__(rig, up, contours or SilhouetteSettings())
+        self.config = config or RegionSettings()
         self._alive: list[Hypothesis] = []
         self._usual: Float = np.full(len(rig), np.inf)
         self._usual_posture: Float = np.zeros((len(JOINTS), 3))
@@ -238,7 +238,7 @@ class RegionTracker(ContourTracker):
         if odd.sum() < FOREIGN_SHARE * seen.sum():
             return frame
         masks = frame.masks.copy()
-        doubtful = np.zeros(masks.shape, np.bool_) if frame.doubtful is None else frame.doubtful.copy()
+        uncertain = np.zeros(masks.shape, np.bool_) if frame.uncertain is None else frame.uncertain.copy()
         for c in np.flatnonzero(odd >= FOREIGN_SHARE * np.maximum(seen, 1)):
             x, y, w, h = cv2.boundingRect(masks[c])
             box = slice(y, y + h), slice(x, x + w)
@@ -248,8 +248,8 @@ class RegionTracker(ContourTracker):
             odd_ones.ravel()[shown] = foreign[color_bins(colors)]
             thing = cv2.morphologyEx(odd_ones, cv2.MORPH_OPEN, _THING).view(np.bool_)
             masks[c][box][thing] = 0
-            doubtful[c][box][thing] = True
-        return replace(frame, masks=masks, doubtful=doubtful)
+            uncertain[c][box][thing] = True
+        return replace(frame, masks=masks, uncertain=uncertain)
 
     @property
     def _best(self) -> Hypothesis:

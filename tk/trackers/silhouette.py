@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.init_pose import InitPose
-from tk.model.camera import Rig
-from tk.model.cone_body import ConeBody
-from tk.trackers.base import Estimate, Observation, Stopwatch
-from tk.trackers.contours import RELOCATE_EVERY, ContourTracker, SilhouetteConfig
+from tk.io.captures.init_pose import InitPose
+from tk.model.body.cone_body import ConeBody
+from tk.model.cameras.camera import Rig
+from tk.trackers.contour_tracker import RELOCATE_EVERY, ContourTracker, SilhouetteSettings
+from tk.trackers.protocol import Estimate, Observation, Stopwatch
 
 Float = NDArray[np.float64]
 
@@ -31,8 +31,8 @@ class SilhouetteTracker(ContourTracker):
     method = "silhouette"
     timing_stages: tuple[str, ...] = ("masks_clean", "optimise", "check")
 
-    def __init__(self, rig: Rig, up: str, config: SilhouetteConfig | None = None) -> None:
-        super().__init__(rig, up, config or SilhouetteConfig())
+    def __init__(self, rig: Rig, up: str, config: SilhouetteSettings | None = None) -> None:
+        super().__init__(rig, up, config or SilhouetteSettings())
         self.stages = tuple(f"scale_{i}" for i in reversed(range(self.contours.solver.scales)))
         self._pose = self._previous = np.zeros(len(self.pose_names))
         self._lost_for = 0

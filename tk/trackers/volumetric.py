@@ -22,24 +22,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.config import Config
 from tk.errors import CaptureError, ConfigError
-from tk.io.init_pose import InitPose
+from tk.io.captures.init_pose import InitPose
 from tk.kernels.nearest import SurfaceIndex
-from tk.model.appearance import LEARNING_M, Appearance
-from tk.model.camera import Rig
-from tk.model.cone_body import ConeBody
-from tk.model.contour_term import ContourTerm
-from tk.model.hull import HullSurface, VisualHull
-from tk.model.objective import CHAIN_OF_SEGMENT, BodyObjective, Fit, FrameObjective, SamplingConfig
-from tk.model.skeleton import CHAINS, JOINTS, WAIST, join_pose, split_pose
-from tk.model.skin import Skin, lay_skin
-from tk.model.volume import Volume, VoxelGrid
+from tk.model.body.cone_body import ConeBody
+from tk.model.body.skeleton import CHAINS, JOINTS, WAIST, join_pose, split_pose
+from tk.model.body.superellipsoid_body import SuperellipsoidBody, build_superellipsoid_body
+from tk.model.cameras.camera import Rig
+from tk.model.cameras.volume import Volume, VoxelGrid
+from tk.model.cues.appearance import LEARNING_M, Appearance
+from tk.model.cues.edge_term import ContourTerm
+from tk.model.cues.objective import CHAIN_OF_SEGMENT, BodyObjective, Fit, FrameObjective, SamplingSettings
+from tk.model.hull.hull import HullSurface, VisualHull
 from tk.optim import lm_schedule, schedule
-from tk.optim.levenberg_marquardt import LmConfig
-from tk.optim.smd import SmdConfig
-from tk.trackers.base import Estimate, Observation, Stopwatch, drift
-from tk.trackers.contours import ContourTracker, restore_body
+from tk.optim.levenberg_marquardt import LmSettings
+from tk.optim.smd import SmdSettings
+from tk.settings import Settings
+from tk.trackers.contour_tracker import ContourTracker, restore_body
+from tk.trackers.protocol import Estimate, Observation, Stopwatch, drift
 
 Float = NDArray[np.float64]
 
@@ -58,10 +58,10 @@ LOST_UNEXPLAINED = 0.25
 WAIST_STIFFNESS = 0.1
 
 # The paper's schedule (6.2, 6.4), and what stands in for numbers that it does not print: see docs/method.md.
-SCHEDULE = schedule.ScheduleConfig()
-SAMPLING = SamplingConfig()
-SMD = SmdConfig()
-LM = LmConfig()
+SCHEDULE = schedule.ScheduleSettings()
+SAMPLING = SamplingSettings()
+SMD = SmdSettings()
+LM = LmSettings()
 # where a body has none
 NO_ANGLES = np.zeros(0)
 
@@ -70,13 +70,13 @@ NO_ANGLES = np.zeros(0)
 class Effort:
     """What ``effort`` makes of the paper's numbers of iterations and points."""
 
-    sampling: SamplingConfig
-    smd: SmdConfig
-    lm: LmConfig
+    sampling: SamplingSettings
+    smd: SmdSettings
+    lm: LmSettings
 
     @staticmethod
     def of(factor: float) -> Effort:
-        """See :class:`tk.config.Config`."""
+        """See :class:`tk.settings.Settings`."""
 
         def share(count: int) -> int:
             return max(round(min(factor, 1.0) * count), 1)
@@ -106,7 +106,7 @@ class VolumetricTracker:
     stages: tuple[str, ...] = ("all", *CHAINS)
     timing_stages: tuple[str, ...] = ("hull", "surface", "colour", "optimise", "update")
 
-    def __init__(self, rig: Rig, volume: Volume, up: str, config: Config, cache_dir: Path | None = None) -> None:
+    def __init__(self, rig: Rig, volume: Volume, up: str, config: Settings, cache_dir: Path | None = None) -> None:
         self.config = config
         self.effort = Effort.of(config.effort_factor)
         self.up = up
@@ -116,7 +116,7 @@ class VolumetricTracker:
         self.pose_names, self.pose_units = self._finder.pose_names, self._finder.pose_units
         self.waist_names: tuple[str, ...] = WAIST if config.body.waist else ()
         self.ankle_names: tuple[str, ...] = ()
-        self.skin: Skin
+        self.skin: SuperellipsoidBody
         self._objective: BodyObjective
         self._appearance: Appearance
         self._pose = self._previous = NO_ANGLES
@@ -156,7 +156,7 @@ class VolumetricTracker:
                 f"initialisation: only {len(surface)} surface voxels in frame {first.index}: check the masks, "
                 "the calibration and the working volume ([volume] of capture.toml)"
             )
-        self._lay_skin()
+        self._build()
         self._pose = self._previous = self._from_contours(pose)
         index = self._index(surface, np.full(len(surface), -1, np.int64))
         fit = FrameObjective(self._objective, index, np.random.default_rng(0), images=first.images).fit(self._pose)
@@ -165,8 +165,8 @@ class VolumetricTracker:
         self._appearance = Appearance.learn(len(self.skin.patch_names), patch, colors)
         self.hull.reset()
 
-    def _lay_skin(self) -> None:
-        self.skin = lay_skin(self.body, self.up, self.config.body.waist)
+    def _build(self) -> None:
+        self.skin = build_superellipsoid_body(self.body, self.up, self.config.body.waist)
         edges, scale = self.config.contours, self.effort.sampling.scale
         self._objective = BodyObjective(
             self.skin,
@@ -238,7 +238,7 @@ class VolumetricTracker:
         """
         finder = self._finder
         # the colours of the contours' search are none of this method's cues
-        blind = Observation(frame.index, frame.images[:0], frame.masks, frame.doubtful)
+        blind = Observation(frame.index, frame.images[:0], frame.masks, frame.uncertain)
         pyramid = finder.pyramid(blind)
         settled = finder.settle(pyramid, self._to_contours(found.pose)[None]).states[0]
         places, _ = finder.search(blind, pyramid, finder.evidence(finder.screen, blind, pyramid), settled)
@@ -358,7 +358,7 @@ class VolumetricTracker:
     def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
         """Take up where a run with this model and state stopped."""
         self._finder.take_body(restore_body(model))
-        self._lay_skin()
+        self._build()
         initial = np.asarray(model["patches/mean_yuv"])
         learned = Appearance(
             initial,

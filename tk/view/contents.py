@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.result import Result, read_joints
-from tk.io.result_data import STATUS_MEANING
-from tk.model.camera import Rig
+from tk.io.results.data import STATUS_MEANING
+from tk.io.results.writer import Result, read_joints
+from tk.model.cameras.camera import Rig
 from tk.render.figure import Figure, figure_of
 from tk.render.scene import Stage
 from tk.view import shapes

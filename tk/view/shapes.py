@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.result import HullPoints
-from tk.model.camera import Rig
-from tk.model.skeleton import JOINTS, SEGMENTS
+from tk.io.results.writer import HullPoints
+from tk.model.body.skeleton import JOINTS, SEGMENTS
+from tk.model.cameras.camera import Rig
 from tk.render.figure import BONES, Figure
 from tk.render.palette import LOST_BODY, SEGMENT_COLORS, sigma_colors
 from tk.render.scene import Stage

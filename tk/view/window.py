@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from tk.errors import ConfigError, DisplayError, ExportError, ResultError
-from tk.io.capture import open_capture
-from tk.io.result import read_result
+from tk.io.captures.capture import open_capture
+from tk.io.results.writer import read_result
 from tk.view.contents import BACKGROUND, FIELD_OF_VIEW_DEG, SIZE, WIRE, Contents, truth_of
 from tk.view.display import has_graphics_card, require_display
 from tk.view.plain import PlainWindow

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from tests.io.conftest import CENTER, look_at, picture, read_tag, write_video
-from tk.io.capture import Capture, open_capture
+from tk.io.captures.capture import Capture, open_capture
 from tk.io.importers import Imported, import_project
-from tk.model.camera import Camera, Rig
+from tk.model.cameras.camera import Camera, Rig
 
 WIDTH, HEIGHT = 320, 240
 FRAMES = 3

@@ -16,7 +16,7 @@ from tests.io.importers.test_xml_formats import write_qca, write_xcp
 from tk.errors import CaptureError
 from tk.io.importers import read_project
 from tk.io.importers.project import Request
-from tk.model.mounting import infer_up
+from tk.model.cameras.mounting import infer_up
 
 NAMES = ["26578", "26579", "26580", "26581"]
 RIG = renamed(make_rig(), *NAMES)

@@ -13,10 +13,10 @@ from tests.io.conftest import write_toml
 from tests.io.importers.conftest import HEIGHT, WIDTH, Import, make_rig, points, renamed, tables, write_clips
 from tests.io.importers.test_xml_formats import write_qca
 from tk.errors import CalibrationError, CaptureError, VideoError
-from tk.io.capture import open_capture
+from tk.io.captures.capture import open_capture
 from tk.io.importers import FORMATS, import_project
 from tk.io.importers.files import LARGEST
-from tk.model.camera import Rig
+from tk.model.cameras.camera import Rig
 
 CAMS = ["cam1", "cam2", "cam3", "cam4"]
 

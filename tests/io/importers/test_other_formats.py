@@ -26,7 +26,7 @@ from tests.io.importers.conftest import (
 from tk.errors import CalibrationError, CaptureError
 from tk.io.importers import import_project
 from tk.io.importers.projections import take_apart
-from tk.model.camera import Rig
+from tk.model.cameras.camera import Rig
 
 MANUAL = Path(__file__).resolve().parents[3] / "docs" / "import.md"
 

@@ -23,10 +23,10 @@ from tests.io.importers.conftest import (
 )
 from tests.io.importers.test_xml_formats import write_qca
 from tk.errors import CalibrationError, VideoError
-from tk.io.capture import open_capture
+from tk.io.captures.capture import open_capture
 from tk.io.importers import import_project
-from tk.model.camera import Rig
-from tk.model.up import up_vector
+from tk.model.cameras.camera import Rig
+from tk.model.cameras.up import up_vector
 
 CAMS = ["cam1", "cam2", "cam3", "cam4"]
 

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from tests.io.importers.conftest import make_rig, points
 from tk.io.importers.world import find_volume
-from tk.model.camera import Rig
-from tk.model.mounting import infer_up
-from tk.model.up import UP_AXES, up_vector
+from tk.model.cameras.camera import Rig
+from tk.model.cameras.mounting import infer_up
+from tk.model.cameras.up import UP_AXES, up_vector
 
 seeds = st.integers(0, 2**32 - 1)
 

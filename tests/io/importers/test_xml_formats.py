@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from tests.io.importers.conftest import HEIGHT, WIDTH, Import, make_rig, points, renamed, write_clips
 from tk.errors import CalibrationError, VideoError
-from tk.io.capture import open_capture
+from tk.io.captures.capture import open_capture
 from tk.io.importers import import_project
-from tk.model.camera import Camera, Rig
+from tk.model.cameras.camera import Camera, Rig
 
 SERIALS = ["26578", "26579", "26580", "26581"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from tk.errors import CaptureError
-from tk.io.capture import open_capture
+from tk.io.captures.capture import open_capture
 from tk.io.importers import (
     anipose,
     caliscope,

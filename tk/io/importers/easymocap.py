@@ -21,7 +21,7 @@ from tk.errors import CalibrationError
 from tk.io.importers.files import read_text
 from tk.io.importers.project import Cameras, Project, Request, assemble, check_camera, in_metres
 from tk.io.importers.videos import Places
-from tk.model.camera import Camera, Rig
+from tk.model.cameras.camera import Camera, Rig
 
 TOOL = "EasyMocap"
 LOOKS_FOR = "intri.yml and extri.yml"

@@ -19,7 +19,7 @@ from tk.io.importers.files import matching, only, read_text
 from tk.io.importers.project import Cameras, Project, Request, assemble, check_camera, in_metres
 from tk.io.importers.videos import Places
 from tk.io.toml import Table
-from tk.model.camera import Camera, Rig
+from tk.model.cameras.camera import Camera, Rig
 
 TOOL = "CMU Panoptic"
 LOOKS_FOR = "calibration_*.json"

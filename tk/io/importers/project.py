@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 
 from tk.errors import CalibrationError, VideoError
-from tk.io.calibration import scale_world
+from tk.io.captures.calibration import scale_world
+from tk.io.captures.units import LEAST_APART_M, MOST_APART_M, FoundUnit, apart, infer_unit
 from tk.io.importers.videos import Places, Wanted, find_clips
-from tk.io.units import LEAST_APART_M, MOST_APART_M, FoundUnit, apart, infer_unit
-from tk.model.camera import Camera, Rig
+from tk.model.cameras.camera import Camera, Rig
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from tk.errors import CalibrationError
 from tk.io.importers.files import check_file, matching
 from tk.io.importers.project import Cameras, Project, Request, assemble, check_camera, in_metres
 from tk.io.importers.videos import Places
-from tk.model.camera import Camera, Rig
+from tk.model.cameras.camera import Camera, Rig
 
 TOOL = "projection matrices"
 LOOKS_FOR = "a .txt or .npy file a camera with a 3×4 projection matrix, in the folder, calibration/ or cameras/"

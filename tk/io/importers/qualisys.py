@@ -20,7 +20,7 @@ from tk.io.importers.files import matching, only, read_xml
 from tk.io.importers.project import Cameras, Project, Request, assemble, check_camera, in_metres
 from tk.io.importers.videos import Places
 from tk.io.importers.xml_values import Attributes
-from tk.model.camera import Camera, Rig
+from tk.model.cameras.camera import Camera, Rig
 
 TOOL = "Qualisys"
 LOOKS_FOR = "*.qca.txt"

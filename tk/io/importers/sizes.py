@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from tk.errors import CalibrationError
-from tk.model.camera import Camera
+from tk.model.cameras.camera import Camera
 
 #: codecs pad pictures to blocks of 16 pixels: a difference below this is padding that has been cut off, or left on
 _BLOCK = 16

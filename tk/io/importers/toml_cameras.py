@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from tk.errors import CalibrationError
-from tk.io.calibration import calibration_of, camera_tables, given_unit
+from tk.io.captures.calibration import calibration_of, camera_tables, given_unit
 from tk.io.importers.files import read_toml
 from tk.io.importers.project import Cameras, Request, in_metres
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tk.errors import CaptureError, VideoError
-from tk.io.calibration import match_camera
-from tk.io.video import PICTURE_SUFFIXES, VIDEO_SUFFIXES
+from tk.io.captures.calibration import match_camera
+from tk.io.captures.video import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 
 #: video files that tk does not read; they are named when nothing else is found
 _OTHER_VIDEOS = (".m4v", ".mts", ".m2ts", ".webm", ".wmv", ".mpg", ".mpeg", ".flv", ".3gp", ".ts")

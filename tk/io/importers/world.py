@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from tk.errors import VolumeError
-from tk.model.camera import Rig
-from tk.model.common_view import closest_to_axes, common_boxes
-from tk.model.volume import Volume
+from tk.model.cameras.camera import Rig
+from tk.model.cameras.common_view import closest_to_axes, common_boxes
+from tk.model.cameras.volume import Volume
 
 #: a working volume that is narrower than this has no room for a person, metres
 ROOM_M = 1.5

@@ -16,15 +16,15 @@ import numpy as np
 import tomli_w
 
 from tk.errors import CaptureError
-from tk.io.capture import open_capture
+from tk.io.captures.capture import open_capture
+from tk.io.captures.video import PICTURE_SUFFIXES, probe
 from tk.io.importers.project import Project
 from tk.io.importers.sizes import fit_size
 from tk.io.importers.world import find_volume
-from tk.io.video import PICTURE_SUFFIXES, probe
-from tk.model.camera import Camera, Rig
-from tk.model.mounting import FoundUp, infer_up
-from tk.model.up import up_text
-from tk.model.volume import Volume
+from tk.model.cameras.camera import Camera, Rig
+from tk.model.cameras.mounting import FoundUp, infer_up
+from tk.model.cameras.up import up_text
+from tk.model.cameras.volume import Volume
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,141 @@
+"""Pixels and silhouettes by view, against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.conftest import Silent, Tk
+from tk.evaluation.views import capture_of, evaluate_views
+from tk.io.captures.capture import open_capture
+from tk.io.results.writer import read_joints, read_result
+from tk.model.body.skeleton import JOINTS
+from tk.model.masks.silhouettes import draw_silhouettes
+from tk.run.session import track
+from tk.settings import Settings
+from tk.trackers.bodies import body_and_poses
+
+SETTINGS = """
+ahead = 0
+[silhouette]
+init_frames = 2
+[silhouette.fit]
+frames = 2
+rounds = 2
+"""
+
+
+@pytest.fixture(scope="module")
+def three_views(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("views") / "r.h5"
+    capture = open_capture(tiny, open_capture(tiny).rig.names[:3])
+    track(capture, path, Settings.from_toml(SETTINGS), Silent(), method="silhouette", frames=(0, 3))
+    return path
+
+
+def test_every_view_is_judged_as_by_hand(tiny: Path, three_views: Path) -> None:
+    found = evaluate_views(three_views, tiny / "truth.h5", tiny, ("wrist_l",))
+    result, truth = read_result(three_views), read_joints(tiny / "truth.h5")
+    capture = open_capture(tiny)
+    restored = body_and_poses(result)
+    assert restored is not None
+    body, poses = restored
+    # the poses are whole: their joints are those of the file
+    np.testing.assert_allclose([body.skeleton.joints(pose) for pose in poses], result.joints, atol=1e-9)
+    with capture.frames(0, 3) as frames:
+        masks = np.array([frame.masks for frame in frames])
+    drawn = draw_silhouettes(body, capture.rig, poses)
+    wrist = JOINTS.index("wrist_l")
+    assert [view.tracked for view in found.views] == [True, True, True, False]
+    for v, (camera, view) in enumerate(zip(capture.rig, found.views, strict=True)):
+        a, b = (camera.project(p[:, wrist])[0] for p in (result.joints, truth.positions[:3]))
+        assert view.joint_px == pytest.approx(np.linalg.norm(a - b, axis=1).mean())
+        wrong = [(drawn[i, v] >= 128) != (masks[i, v] >= 128) for i in range(3)]
+        shares = [w.sum() / (masks[i, v] >= 128).sum() for i, w in enumerate(wrong)]
+        assert view.silhouette_error == pytest.approx(np.mean(shares))
+    assert found.joint_px == pytest.approx(np.mean([view.joint_px for view in found.views[:3]]))
+    assert found.silhouette_error == pytest.approx(np.mean([view.silhouette_error for view in found.views]))
+
+
+def test_the_command_finds_the_capture_beside_the_truth(tk: Tk, tiny: Path, three_views: Path, tmp_path: Path) -> None:
+    ran = tk("evaluate", three_views, tiny / "truth.h5", "--json")
+    views = json.loads(ran.out)["views"]
+    assert ran.code == 0 and len(views["views"]) == 4 and views["joints"] == ["ankle_l", "ankle_r"]
+    assert "E_S %" in tk("evaluate", three_views, tiny / "truth.h5").out
+    shutil.copy(tiny / "truth.h5", tmp_path)
+    assert capture_of(tmp_path / "truth.h5") is None
+    assert "E_S" not in tk("evaluate", three_views, tmp_path / "truth.h5").out
+    assert "E_S %" in tk("evaluate", three_views, tmp_path / "truth.h5", "--capture", tiny).out
+
+
+def test_results_of_both_skins_are_judged_alike(tk: Tk, tiny: Path, tracked: Path) -> None:
+    """The volumetric tracker's are: its body is the contours'."""
+    found = evaluate_views(tracked, tiny / "truth.h5", tiny)
+    assert found.note == "" and found.joint_px > 0
+    assert all(view.silhouette_error is not None and 0 < view.silhouette_error < 0.5 for view in found.views)
+    assert "E_S %" in tk("evaluate", tracked, tiny / "truth.h5").out
+
+
+def test_of_older_volumetric_results_the_dimensions_are_taken(tiny: Path, tracked: Path, tmp_path: Path) -> None:
+    older = Path(shutil.copy(tracked, tmp_path / "older.h5"))
+    with h5py.File(older, "a") as file:
+        del file["model/parts"], file["model/body"]
+    restored = body_and_poses(read_result(older))
+    assert restored is not None
+    body, poses = restored
+    np.testing.assert_allclose([body.skeleton.joints(pose) for pose in poses], read_result(tracked).joints, atol=1e-9)
+    assert evaluate_views(older, tiny / "truth.h5", tiny).silhouette_error is not None
+
+
+def test_results_without_a_body_have_pixels_only(tiny: Path, tracked: Path, tmp_path: Path) -> None:
+    bare = Path(shutil.copy(tracked, tmp_path / "bare.h5"))
+    with h5py.File(bare, "a") as file:
+        del file["model"]
+        file.create_group("model")
+    found = evaluate_views(bare, tiny / "truth.h5", tiny)
+    assert found.silhouette_error is None and str(bare) in found.note and found.joint_px > 0
+
+
+def test_what_cannot_be_judged_is_told(tk: Tk, tiny: Path, three_views: Path, copy: Path, tmp_path: Path) -> None:
+    tk("evaluate", three_views, tiny / "truth.h5", "--joints", "toe").complaint("--joints toe")
+    tk("evaluate", three_views, tiny / "truth.h5", "--capture", tmp_path).complaint(str(tmp_path))
+    shutil.rmtree(copy / "videos")
+    ran = tk("evaluate", three_views, copy / "truth.h5")
+    assert ran.code == 0 and "not judged in the pictures" in ran.err and "PCK5" in ran.out
+    with h5py.File(three_views) as file:
+        assert "state" in file["resume"]
+
+
+def test_waist_and_ankles_are_drawn(tiny: Path, three_views: Path, tmp_path: Path) -> None:
+    """A body whose ankles or waist are bent otherwise covers other pixels; without them it is drawn straight."""
+    straight = evaluate_views(three_views, tiny / "truth.h5", tiny)
+    for name in ("ankles", "waist"):
+        bent = Path(shutil.copy(three_views, tmp_path / f"{name}.h5"))
+        with h5py.File(bent, "a") as file:
+            file[name][...] = file[name][()] + 0.4
+        found = evaluate_views(bent, tiny / "truth.h5", tiny)
+        assert found.silhouette_error is not None and straight.silhouette_error is not None
+        assert found.silhouette_error > straight.silhouette_error + 0.005, name
+    old = Path(shutil.copy(three_views, tmp_path / "old.h5"))
+    with h5py.File(old, "a") as file:
+        del file["ankles"]
+    restored = body_and_poses(read_result(old))
+    assert restored is not None
+    body, poses = restored
+    assert not poses[:, body.skeleton.is_ankle].any() and poses[:, body.skeleton.is_waist].any()
+
+
+def test_poses_of_another_body_are_told(tk: Tk, tiny: Path, three_views: Path, tmp_path: Path) -> None:
+    spoilt = Path(shutil.copy(three_views, tmp_path / "r.h5"))
+    with h5py.File(spoilt, "a") as file:
+        values, attributes = file["waist"][:, :2], dict(file["waist"].attrs)
+        del file["waist"]
+        file["waist"] = values
+        for key, value in attributes.items():
+            file["waist"].attrs[key] = value[:2]
+    tk("evaluate", spoilt, tiny / "truth.h5", "--capture", tiny).complaint("r.h5", "waist")

@@ -1,0 +1,169 @@
+"""`tk inspect` and `tk level` on the tiny capture, and on spoilt ones."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from scripts.synthetic.capture import write_calibration
+from tests.conftest import Tk
+from tests.io.conftest import write_picture
+from tests.model.ring import ring_of_cameras
+from tk.errors import CaptureError
+from tk.inspection.leveling import Leveling, find_up, write_up
+from tk.io.captures.capture import open_capture
+from tk.model.body import gait_poses as gait
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.cone_body import build_cone_body
+from tk.model.cameras.camera import Rig
+from tk.model.cameras.up import up_vector
+from tk.model.masks.silhouettes import draw_silhouettes
+
+
+def turned(folder: Path, camera: int, degrees: float) -> None:
+    """Turn a camera of the calibration to the side."""
+    rig = open_capture(folder).rig
+    turn = cv2.Rodrigues(np.radians([0.0, degrees, 0.0]))[0]
+    cameras = list(rig)
+    old = cameras[camera]
+    cameras[camera] = replace(old, rotation=turn @ old.rotation, translation=turn @ old.translation)
+    write_calibration(Rig(tuple(cameras)), folder / "calibration.toml")
+
+
+def test_a_good_capture_is_told_so_with_pictures(tk: Tk, tiny: Path, tmp_path: Path) -> None:
+    ran = tk("inspect", tiny, "-o", tmp_path / "looks")
+    assert ran.code == 0, ran.err
+    assert "Nothing is the matter." in ran.out and all(f"cam{c}" in ran.out for c in range(1, 5))
+    sheet = cv2.imread(str(tmp_path / "looks" / "inspect.png"))
+    # a row of four cameras for each of three frames, below the text
+    assert sheet.shape[0] > 900 and sheet.shape[1] > 1600
+
+
+def test_the_odd_camera_is_named(tk: Tk, copy: Path) -> None:
+    turned(copy, 1, 6.0)
+    ran = tk("inspect", copy, "--json")
+    assert ran.code == 0, ran.err
+    found = json.loads(ran.out)
+    assert [bool(c["verdict"]) for c in found["cameras"]] == [False, True, False, False]
+    assert found["findings"][0].startswith("camera cam2 disagrees with the others: off by ")
+    assert found["cameras"][1]["shift_px"] > 5 and found["cameras"][1]["outside"] > 0.1
+
+
+def test_a_video_that_starts_late_is_told_by_frames(tk: Tk, tmp_path: Path) -> None:
+    """Drawn masks of a walker; the masks of one camera are those of three frames later."""
+    rig, count, late = ring_of_cameras(4, 160, 120), 24, 3
+    body = build_cone_body(BodyDimensions.from_stature(1.75), "z", "full")
+    poses = []
+    for i in range(count + late):
+        pose = gait.walking_pose(body.skeleton, i / 15 % 1)
+        pose[:3] = 0.05 * i - 0.6, 0.0, 0.95
+        poses.append(pose)
+    drawn = draw_silhouettes(body, rig, np.array(poses))
+    for c, camera in enumerate(rig):
+        for i in range(count):
+            write_picture(tmp_path / "images" / camera.name / f"{i:06d}.png", np.zeros((120, 160, 3), np.uint8) + 90)
+            mask = drawn[i + late if c == 2 else i, c]
+            write_picture(tmp_path / "masks" / camera.name / f"{i:06d}.png", mask)
+    write_calibration(rig, tmp_path / "calibration.toml")
+    volume = "[volume]\ncenter = [0.0, 0.0, 1.0]\nsize = [2.6, 2.6, 2.4]\n"
+    (tmp_path / "capture.toml").write_text(f"fps = 15.0\n{volume}")
+    ran = tk("inspect", tmp_path, "--json")
+    assert ran.code == 0, ran.err
+    assert [c["late_frames"] for c in json.loads(ran.out)["cameras"]] == [0, 0, late, 0]
+
+
+def test_empty_masks_and_a_volume_elsewhere_are_told(tk: Tk, copy: Path) -> None:
+    for path in (copy / "masks").rglob("*.png"):
+        cv2.imwrite(str(path), np.zeros((120, 160), np.uint8))
+    ran = tk("inspect", copy)
+    assert ran.code == 0, ran.err
+    assert "no hull in common" in ran.out and "shows nobody in 100% of the frames" in ran.out
+
+
+# --- up ---------------------------------------------------------------------------------------------------------------
+
+
+def standing(count: int = 8) -> list[np.ndarray]:
+    """Points of somebody who stands here and there."""
+    rng = np.random.default_rng(0)
+    body = rng.uniform([-0.25, -0.15, 0.0], [0.25, 0.15, 1.75], (2000, 3))
+    return [body + np.array([x, y, 0.0]) for x, y in rng.uniform(-0.8, 0.8, (count, 2))]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_up_is_found_in_a_world_that_nobody_has_laid(seed: int) -> None:
+    R = Rotation.random(random_state=seed).as_matrix()
+    rig = Rig(tuple(replace(c, rotation=c.rotation @ R.T) for c in ring_of_cameras(4, 160, 120)))
+    found = find_up(rig, "z", [hull @ R.T for hull in standing()])
+    assert np.degrees(np.arccos(up_vector(found.up) @ R[:, 2])) < 1.5
+    assert abs(found.floor_m) < 0.1
+
+
+def test_cameras_mounted_sideways_are_overruled_by_a_standing_person() -> None:
+    quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    cameras = []
+    for c in ring_of_cameras(4, 160, 120):
+        cameras.append(replace(c, rotation=quarter @ c.rotation, translation=quarter @ c.translation))
+    found = find_up(Rig(tuple(cameras)), "z", standing())
+    assert up_vector(found.up)[2] > np.cos(np.radians(3.0))
+
+
+def test_up_is_written_down_and_all_else_stays(tk: Tk, copy: Path) -> None:
+    R = Rotation.from_euler("xyz", [-1.2, 0.3, 0.5]).as_matrix()
+    original = open_capture(copy)
+    write_calibration(
+        Rig(tuple(replace(c, rotation=c.rotation @ R.T) for c in original.rig)), copy / "calibration.toml"
+    )
+    center = (R @ original.volume.center).tolist()
+    text = f"# mine\nfps = 15.0  # as it was\n[volume]\ncenter = {center}\nsize = [3.2, 3.2, 3.2]\n"
+    (copy / "capture.toml").write_text(text)
+    inferred = open_capture(copy)
+    assert any("gives no up" in warning and "tk level" in warning for warning in inferred.warnings)
+    assert np.degrees(np.arccos(inferred.up_axis @ R[:, 2])) < 6
+    ran = tk("level", copy)
+    assert ran.code == 0 and ran.out.startswith("up = "), ran.err
+    opened = open_capture(copy)
+    assert not any("up" in warning for warning in opened.warnings)
+    assert np.degrees(np.arccos(opened.up_axis @ R[:, 2])) < 4
+    written = (copy / "capture.toml").read_text()
+    assert written.startswith("# mine\nfps = 15.0  # as it was\nup = [") and "[volume]" in written
+    shutil.rmtree(copy / "videos")
+    tk("level", copy).complaint("videos")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        'up = "y"\n',
+        "up = [0.0,\n  1.0, # rows\n  0.0]  # old\nfps = 3.0\n",
+        "fps = 3.0\n[volume]\ncenter = [\n 0.0, 0.0, 1.0\n]\nsize = [2.0, 2.0, 2.0]\n",
+        "[subject]\nheight = 1.8",
+    ],
+)
+@pytest.mark.parametrize("up", ["z", "[0.6, 0.0, 0.8]"])
+def test_up_is_put_where_toml_wants_it(tmp_path: Path, text: str, up: str) -> None:
+    from tk.io.toml import load_toml
+
+    path = tmp_path / "capture.toml"
+    path.write_text(text)
+    before = load_toml(path)
+    write_up(tmp_path, Leveling(up, "how", 0.0, ""))
+    after = load_toml(path)
+    np.testing.assert_allclose(up_vector(str(after.pop("up"))), up_vector(up))
+    before.pop("up", None)
+    assert after == before
+
+
+def test_a_broken_file_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "capture.toml").write_text("up = \n")
+    with pytest.raises(CaptureError, match=r"capture.toml: invalid TOML"):
+        write_up(tmp_path, Leveling("z", "how", 0.0, ""))
+    assert (tmp_path / "capture.toml").read_text() == "up = \n"

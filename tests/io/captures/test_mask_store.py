@@ -1,0 +1,118 @@
+"""Masks are kept bit for bit, in little memory, and unpacked one at a time."""
+
+import tempfile
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+
+from tk.errors import TkError
+from tk.io.captures import mask_store
+from tk.io.captures.mask_store import MaskStore
+
+
+@given(masks=array_shapes(min_dims=3, max_dims=3, max_side=13).flatmap(lambda s: arrays(np.uint8, s)))
+@settings(max_examples=60, deadline=None)
+def test_masks_come_back_as_person_and_background(masks):
+    store = MaskStore()
+    store.put(7, masks)
+    found = store.get(7)
+    assert found.dtype == np.uint8
+    np.testing.assert_array_equal(found, np.where(masks >= 128, 255, 0))
+    store.put(7, found)
+    np.testing.assert_array_equal(store.get(7), found)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_frames_are_a_sequence_in_the_order_that_was_asked_for(seed):
+    rng = np.random.default_rng(seed)
+    store, masks = MaskStore(), {}
+    for index in rng.permutation(20)[:6].tolist():
+        masks[index] = (rng.random((2, 5, 9)) < 0.5).astype(np.uint8) * 255
+        store.put(index, masks[index])
+    wanted = rng.permutation(list(masks))
+    frames = store.sequence(wanted)
+    assert len(frames) == 6 and all(i in store for i in masks) and 99 not in store
+    for i, index in enumerate(wanted):
+        np.testing.assert_array_equal(frames[i], masks[int(index)])
+    for index, found in zip(wanted, frames, strict=True):
+        np.testing.assert_array_equal(found, masks[int(index)])
+    part = frames[1:5:2]
+    assert len(part) == 2
+    np.testing.assert_array_equal(part[1], masks[int(wanted[3])])
+    np.testing.assert_array_equal(frames[-1], masks[int(wanted[-1])])
+    with pytest.raises(IndexError):
+        frames[6]
+
+
+def test_silhouettes_take_little_memory():
+    masks = np.zeros((5, 480, 640), np.uint8)
+    masks[:, 100:400, 250:350] = 255
+    store = MaskStore()
+    for index in range(10):
+        store.put(index, masks)
+    assert sum(size for _, size in store._places.values()) < 10 * 10_000
+
+
+def test_a_frame_that_was_not_put_is_told():
+    with pytest.raises(KeyError):
+        MaskStore().get(0)
+
+
+def test_those_of_a_long_recording_are_on_disk(monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(mask_store, "IN_MEMORY", 2000)
+    rng = np.random.default_rng(0)
+    masks = (rng.random((12, 2, 30, 40)) < 0.5).astype(np.uint8) * 255
+    store = MaskStore()
+    for index, frame in enumerate(masks):
+        store.put(index, frame)
+    assert store._opened._rolled, "a file by now"
+    for index in (11, 0, 5):
+        np.testing.assert_array_equal(store.get(index), masks[index])
+    assert list(tmp_path.iterdir()) == [], "without a name"
+
+
+def test_a_full_disk_is_one_line(monkeypatch, tmp_path):
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    store = MaskStore()
+    store.put(0, np.zeros((1, 2, 2), np.uint8))
+    monkeypatch.setattr(store._opened, "write", full)
+    with pytest.raises(TkError, match="masks cannot be kept there: No space left"):
+        store.put(1, np.zeros((1, 2, 2), np.uint8))
+    assert 1 not in store
+    with pytest.raises(TkError, match=r"nowhere.*masks cannot be kept there: No such"):
+        MaskStore(tmp_path / "nowhere" / "masks").put(0, np.zeros((1, 2, 2), np.uint8))
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None)
+def test_a_run_that_was_killed_is_taken_up(seed, tmp_path_factory):
+    """However its file was damaged: what is there is right."""
+    rng = np.random.default_rng(seed)
+    path = tmp_path_factory.mktemp("run") / ".r.h5.masks"
+    masks = (rng.random((6, 2, 7, 9)) < 0.5).astype(np.uint8) * 255
+    store = MaskStore(path)
+    assert not path.exists(), "made with the first of them"
+    for index, frame in enumerate(masks):
+        store.put(index, frame)
+    whole = MaskStore(path, resume=True)
+    for index, frame in enumerate(masks):
+        np.testing.assert_array_equal(whole.get(index), frame)
+    data = bytearray(path.read_bytes())
+    kept = len(data) // 6 * int(rng.integers(0, 6)) + int(rng.integers(0, 30))
+    path.write_bytes(bytes(data[:kept]) + rng.bytes(int(rng.integers(0, 40))))
+    after = MaskStore(path, resume=True)
+    found = [index for index in range(6) if index in after]
+    assert found == list(range(len(found)))
+    for index in found:
+        np.testing.assert_array_equal(after.get(index), masks[index])
+    after.put(5, masks[5])
+    np.testing.assert_array_equal(MaskStore(path, resume=True).get(5), masks[5])
+    MaskStore(path).put(0, masks[0])
+    assert 5 not in MaskStore(path, resume=True), "a run that starts afresh"

@@ -1,0 +1,373 @@
+from __future__ import annotations
+
+import dataclasses
+import gc
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.io.conftest import HEIGHT, WIDTH, picture, read_tag, write_picture, write_video
+from tk.errors import VideoError
+from tk.io.captures.frames import FrameReader
+from tk.io.captures.video import Clip, Image, list_clips, probe, probe_video
+
+
+@pytest.fixture(autouse=True)
+def no_thread_left_behind() -> Iterator[None]:
+    before = set(threading.enumerate())
+    yield
+    assert set(threading.enumerate()) <= before
+
+
+def read_all(clip: Clip, start: int = 0) -> list[np.ndarray]:
+    with closing(clip.open()) as reader:
+        for _ in range(start):
+            reader.skip()
+        pictures = []
+        for _ in range(start, clip.frame_count):
+            out = np.zeros((clip.height, clip.width, 3), np.uint8)
+            reader.read(out)
+            pictures.append(out)
+    return pictures
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.avi", "a.mkv", "a.mov", "A.MP4"])
+def test_a_video_is_read_in_order(tmp_path: Path, name: str) -> None:
+    written = tmp_path / name.lower()
+    write_video(written, [picture(1, k) for k in range(12)], fps=25)
+    path = written.rename(tmp_path / name)
+    clip = probe(path)
+    assert (clip.width, clip.height, clip.frame_count) == (WIDTH, HEIGHT, 12)
+    assert clip.fps == pytest.approx(25)
+    assert [read_tag(image) for image in read_all(clip)] == [(1, k) for k in range(12)]
+    assert [read_tag(image) for image in read_all(clip, start=7)] == [(1, k) for k in range(7, 12)]
+
+
+def test_reading_into_part_of_an_array_equals_reading_into_its_own(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", [picture(0, k) for k in range(3)])
+    clip = probe(tmp_path / "a.mp4")
+    larger = np.zeros((HEIGHT + 2, WIDTH + 2, 3), np.uint8)
+    with closing(clip.open()) as reader:
+        reader.read(larger[:HEIGHT, :WIDTH])
+    np.testing.assert_array_equal(larger[:HEIGHT, :WIDTH], read_all(clip)[0])
+    assert not larger[HEIGHT:].any() and not larger[:, WIDTH:].any()
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("pattern", ["{:06d}.png", "frame_{:03d}.jpg"])
+def test_numbered_pictures(tmp_path: Path, first: int, pattern: str) -> None:
+    for k in range(11):
+        write_picture(tmp_path / "cam" / pattern.format(k + first), picture(2, k))
+    clip = probe(tmp_path / "cam")
+    assert (clip.frame_count, clip.fps) == (11, None)
+    assert [read_tag(image) for image in read_all(clip, start=4)] == [(2, k) for k in range(4, 11)]
+
+
+def test_bad_folders_of_pictures(tmp_path: Path) -> None:
+    folder = tmp_path / "cam"
+    folder.mkdir()
+    with pytest.raises(VideoError, match="holds no pictures"):
+        probe(folder)
+    for k in (0, 1, 2, 4):
+        write_picture(folder / f"{k:06d}.png", picture(0, k))
+    with pytest.raises(VideoError, match=r"picture 3 is missing between 000002\.png and 000004\.png"):
+        probe(folder)
+    write_picture(folder / "3.jpg", picture(0, 3))
+    write_picture(folder / "000003.png", picture(0, 3))
+    with pytest.raises(VideoError, match=r"are picture 3; keep one"):
+        probe(folder)
+    (folder / "3.jpg").unlink()
+    (folder / "000000.png").write_bytes((folder / "000000.png").read_bytes()[:40])
+    with pytest.raises(VideoError, match=r"000000\.png: is not a picture that can be decoded"):
+        probe(folder)
+    write_picture(folder / "cover.png", picture(0, 3))
+    with pytest.raises(VideoError, match=r"cover\.png: its name has no number"):
+        probe(folder)
+
+
+def test_pictures_must_start_at_the_start(tmp_path: Path) -> None:
+    write_picture(tmp_path / "cam" / "000100.png", picture(0, 0))
+    with pytest.raises(VideoError, match=r"starts with 000100\.png"):
+        probe(tmp_path / "cam")
+
+
+def test_masks_are_black_and_white_from_128_on(tmp_path: Path) -> None:
+    grey = np.array([[0, 1, 127, 128, 200, 255]], np.uint8)
+    write_picture(tmp_path / "cam" / "000000.png", grey)
+    clip = probe(tmp_path / "cam", is_mask=True)
+    out = np.full((2, 8), 7, np.uint8)
+    with closing(clip.open()) as reader:
+        reader.read(out[:1, :6])
+    np.testing.assert_array_equal(out[0], [0, 0, 0, 255, 255, 255, 7, 7])
+
+    blob = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    blob[8:40, 16:48] = 255
+    write_video(tmp_path / "m.mp4", [blob] * 3)
+    with closing(probe(tmp_path / "m.mp4", is_mask=True).open()) as reader:
+        mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+        reader.read(mask)
+    assert set(np.unique(mask)) == {0, 255}
+    assert np.mean(mask != blob[..., 0]) < 0.03  # coding blurs the outline
+
+
+def test_a_mask_of_ones_is_not_taken_for_empty(tmp_path: Path) -> None:
+    write_picture(tmp_path / "cam" / "000000.png", np.eye(8, dtype=np.uint8))
+    with closing(probe(tmp_path / "cam", is_mask=True).open()) as reader, pytest.raises(VideoError, match="255"):
+        reader.read(np.zeros((8, 8), np.uint8))
+
+
+def test_a_picture_of_another_size_is_named(tmp_path: Path) -> None:
+    write_picture(tmp_path / "cam" / "0.png", picture(0, 0))
+    write_picture(tmp_path / "cam" / "1.png", picture(0, 1, (32, 32)))
+    with pytest.raises(VideoError, match=r"1\.png: is 32×32; the pictures before it are 64×48"):
+        read_all(probe(tmp_path / "cam"))
+
+
+def noise_video(path: Path, frames: int) -> None:
+    rng = np.random.default_rng(0)
+    write_video(path, [rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8) for _ in range(frames)])
+
+
+def index_first(data: bytes) -> bytes:
+    """An mp4 with its index (moov) moved before the pictures (mdat), as cameras for streaming write it."""
+    boxes, at = [], 0
+    while at < len(data):
+        size = int.from_bytes(data[at : at + 4], "big")
+        boxes.append(data[at : at + size])
+        at += size
+    moov = next(box for box in boxes if box[4:8] == b"moov")
+    before = sum(len(box) for box in boxes[: boxes.index(moov)] if box[4:8] != b"moov")
+    assert before > 0
+    table = moov.index(b"stco") + 8
+    count = int.from_bytes(moov[table : table + 4], "big")
+    shifted = bytearray(moov)
+    for k in range(count):
+        entry = slice(table + 4 + 4 * k, table + 8 + 4 * k)
+        shifted[entry] = (int.from_bytes(moov[entry], "big") + len(moov)).to_bytes(4, "big")
+    rest = [box for box in boxes if box is not moov]
+    return rest[0] + bytes(shifted) + b"".join(rest[1:])
+
+
+def test_a_video_that_is_cut_off(tmp_path: Path) -> None:
+    noise_video(tmp_path / "whole.mp4", 40)
+    data = (tmp_path / "whole.mp4").read_bytes()
+    path = tmp_path / "cut.mp4"
+    path.write_bytes(data[: len(data) // 2])  # the index stood at the end
+    with pytest.raises(VideoError, match=r"cut\.mp4: is cut off: the index"):
+        probe(path)
+    data = index_first(data)
+    path.write_bytes(data)
+    assert probe(path).frame_count == 40
+    path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(VideoError, match=r"cut\.mp4: is cut off: \d+ of its 40 frames are there"):
+        probe(path)
+
+
+def test_a_video_that_ends_before_its_count(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", [picture(0, k) for k in range(12)])
+    clip = dataclasses.replace(probe_video(tmp_path / "a.mp4"), frame_count=20)
+    reader = FrameReader([clip, clip], None, (HEIGHT, WIDTH), 0, 20)
+    seen = []
+    with pytest.raises(VideoError, match=r"a\.mp4: ends after 12 of its 20 frames; .*--frames 0:12"):
+        for frame_set in reader:
+            seen.append(read_tag(frame_set.images[1])[1])
+    assert seen == list(range(12))
+
+
+def test_files_that_are_no_video(tmp_path: Path) -> None:
+    path = tmp_path / "cam.mp4"
+    path.write_text("These are the minutes of the meeting.\n" * 20)
+    with pytest.raises(VideoError, match=r"cam\.mp4: is not a video"):
+        probe(path)
+    path.write_bytes(b"")
+    with pytest.raises(VideoError, match=r"cam\.mp4: is an empty file"):
+        probe(path)
+    path.unlink()
+    with pytest.raises(VideoError, match=r"cam\.mp4: cannot be read"):
+        probe(path)
+
+
+def test_opencv_and_ffmpeg_keep_silent(tmp_path: Path) -> None:
+    noise_video(tmp_path / "whole.mp4", 20)
+    data = index_first((tmp_path / "whole.mp4").read_bytes())
+    (tmp_path / "cut.mp4").write_bytes(data[: len(data) // 2])
+    (tmp_path / "text.mp4").write_text("not a video" * 50)
+    for suffix in ("png", "jpg"):
+        write_picture(tmp_path / f"cut.{suffix}", picture(0, 5))
+        coded = (tmp_path / f"cut.{suffix}").read_bytes()
+        (tmp_path / f"cut.{suffix}").write_bytes(coded[: len(coded) * 2 // 3])
+    (tmp_path / "empty.png").touch()
+    program = (
+        "import cv2, sys, pathlib\n"  # OpenCV first, as a user's script may do
+        "from tk.io.captures.video import probe\n"
+        "from tk.errors import VideoError\n"
+        "for name in ('cut.mp4', 'text.mp4', 'cut.png', 'cut.jpg', 'none.mp4', 'empty.png'):\n"
+        "    try: probe(pathlib.Path(sys.argv[1]) / name)\n"
+        "    except VideoError as error: print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program, str(tmp_path)], capture_output=True, text=True, check=True)
+    assert len(done.stdout.splitlines()) == 6
+    assert done.stderr == ""
+
+
+def test_list_clips(tmp_path: Path) -> None:
+    for name in ("a.mp4", "b.MOV", "c.png", "notes.txt", ".hidden.mp4"):
+        (tmp_path / name).touch()
+    (tmp_path / "d.1").mkdir()
+    assert set(list_clips(tmp_path)) == {"a", "b", "d.1"}
+    assert set(list_clips(tmp_path, pictures=True)) == {"a", "b", "c", "d.1"}
+    (tmp_path / "a.avi").touch()
+    with pytest.raises(VideoError, match=r"holds both a\.avi and a\.mp4"):
+        list_clips(tmp_path)
+
+
+# ---------------------------------------------------------------------------------------------------- reading ahead
+
+
+@dataclass
+class FakeClip:
+    """A clip in memory that records how far it was read and fails where it is told to."""
+
+    camera: int
+    frame_count: int = 100
+    fails_at: int | None = None
+    width: int = 4
+    height: int = 3
+    path: Path = Path("fake.mp4")
+    fps: float | None = None
+    position: int = 0
+    opened: int = 0
+    closed: int = 0
+
+    def open(self) -> FakeClip:
+        self.opened += 1
+        return self
+
+    def skip(self) -> None:
+        self.position += 1
+
+    def read(self, out: Image) -> None:
+        if self.position == self.fails_at:
+            raise VideoError(f"camera {self.camera} fails at {self.position}")
+        out[...] = 10 * self.camera + self.position
+        self.position += 1
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def reader_of(
+    clips: list[FakeClip], start: int = 0, stop: int = 100, masks: list[FakeClip] | None = None
+) -> FrameReader:
+    return FrameReader(clips, masks, (4, 6), start, stop)
+
+
+def test_frame_sets_are_packed_and_padded() -> None:
+    clips = [FakeClip(0), FakeClip(1, width=6, height=4)]
+    masks = [FakeClip(5), FakeClip(6, width=6, height=4)]
+    with reader_of(clips, 3, 9, masks) as reader:
+        assert len(reader) == 6
+        frame_sets = list(reader)
+    assert [frame_set.index for frame_set in frame_sets] == list(range(3, 9))
+    for frame_set in frame_sets:
+        assert frame_set.images.shape == (2, 4, 6, 3) and frame_set.images.dtype == np.uint8
+        expected = np.zeros((2, 4, 6), np.uint8)
+        expected[0, :3, :4] = frame_set.index
+        expected[1] = 10 + frame_set.index
+        np.testing.assert_array_equal(frame_set.images, np.repeat(expected[..., None], 3, axis=-1))
+        assert frame_set.masks is not None
+        np.testing.assert_array_equal(frame_set.masks, np.where(expected > 0, expected + 50, 0))
+    assert all(clip.opened == clip.closed == 1 for clip in clips + masks)
+
+
+def test_reading_ahead_is_bounded() -> None:
+    clips = [FakeClip(0), FakeClip(1)]
+    with reader_of(clips) as reader:
+        for _ in range(5):
+            next(reader)
+        assert all(clip.position <= 5 + 8 for clip in clips)
+
+
+def test_memory_is_used_again_once_nobody_holds_it() -> None:
+    clips = [FakeClip(0), FakeClip(1)]
+    with reader_of(clips) as reader:
+        held = [next(reader).images[1:, ::2] for _ in range(3)]
+        copies = [view.copy() for view in held]
+        addresses = set()
+        for _ in range(60):
+            addresses.add(next(reader).images.ctypes.data)
+        # those that lie ready, that are being filled, and the one at hand
+        assert len(addresses) <= 8 + 2
+        for view, copy in zip(held, copies, strict=True):
+            np.testing.assert_array_equal(view, copy)
+
+
+def test_everything_before_an_error_is_handed_out() -> None:
+    clips = [FakeClip(0), FakeClip(1, fails_at=20), FakeClip(2, fails_at=20)]
+    seen = []
+    reader = reader_of(clips)
+    with pytest.raises(VideoError, match="camera 1 fails at 20"):
+        for frame_set in reader:
+            seen.append(frame_set.index)
+    assert seen == list(range(20))
+    with pytest.raises(StopIteration):
+        next(reader)
+    assert all(clip.closed == 1 for clip in clips)
+
+
+def test_an_error_on_opening_is_raised_on_the_first_frame() -> None:
+    class Locked(FakeClip):
+        def open(self) -> FakeClip:
+            raise VideoError("locked")
+
+    with reader_of([FakeClip(0), Locked(1)], start=4) as reader, pytest.raises(VideoError, match="locked"):
+        next(reader)
+
+
+def test_a_consumer_that_raises_ends_the_threads() -> None:
+    clips = [FakeClip(0), FakeClip(1)]
+    with pytest.raises(ZeroDivisionError), reader_of(clips) as reader:
+        for _ in reader:
+            _ = 1 // 0
+    assert all(clip.closed == 1 for clip in clips)
+
+
+def test_a_reader_that_is_dropped_ends_the_threads() -> None:
+    clips = [FakeClip(0), FakeClip(1)]
+    for frame_set in reader_of(clips):
+        if frame_set.index == 3:
+            break
+    gc.collect()
+    assert all(clip.closed == 1 for clip in clips)
+
+
+def test_closing_early_twice_and_while_skipping() -> None:
+    clips = [FakeClip(0, frame_count=10**9)]
+    reader = reader_of(clips, start=10**9 - 1, stop=10**9)
+    reader.close()
+    reader.close()
+    assert list(reader) == []
+    assert clips[0].closed == 1
+
+
+def test_a_reader_left_open_does_not_hold_up_the_interpreter(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", [picture(0, k) for k in range(30)])
+    program = (
+        "import sys, pathlib\n"
+        "from tk.io.captures.video import probe\n"
+        "from tk.io.captures.frames import FrameReader\n"
+        "clip = probe(pathlib.Path(sys.argv[1]))\n"
+        "reader = FrameReader([clip, clip], None, (clip.height, clip.width), 0, 30)\n"
+        "print(next(reader).index)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "a.mp4")], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert (done.stdout, done.stderr) == ("0\n", "")

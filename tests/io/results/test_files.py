@@ -1,0 +1,194 @@
+"""Files that cannot be used as results, and places where none can be written."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.io.result_files import assert_complete, write
+from tests.io.result_victim import META, make_frame, make_state
+from tk.errors import ResultError
+from tk.io.results.writer import ResultWriter, read_joints, read_result
+
+ROOT = Path(__file__).parents[3]
+
+
+def other_software(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["data"] = np.arange(3)
+
+
+def not_hdf5(path: Path) -> None:
+    path.write_text("frame,x,y,z\n")
+
+
+def newer_version(path: Path) -> None:
+    write(path, 1)
+    with h5py.File(path, "r+") as file:
+        file.attrs["format_version"] = 3
+
+
+def truncated(path: Path) -> None:
+    write(path, 1)
+    path.write_bytes(path.read_bytes()[:3000])
+
+
+def incomplete(path: Path) -> None:
+    write(path, 1)
+    with h5py.File(path, "r+") as file:
+        del file["frames"]
+
+
+def missing(path: Path) -> None:
+    pass
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (other_software, "other software|neither"),
+        (not_hdf5, "not an HDF5 file"),
+        (newer_version, "format_version is 3"),
+        (truncated, "damaged"),
+        (incomplete, "no /frames"),
+        (missing, "no such file"),
+        (Path.mkdir, "is a folder"),
+    ],
+)
+@pytest.mark.parametrize("read", [read_result, read_joints])
+def test_unusable_files_are_named(tmp_path: Path, make, message: str, read) -> None:
+    path = tmp_path / "some.h5"
+    make(path)
+    with pytest.raises(ResultError, match=message) as caught:
+        read(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("make", [other_software, not_hdf5])
+def test_files_of_others_are_neither_overwritten_nor_resumed(tmp_path: Path, make) -> None:
+    path = tmp_path / "some.h5"
+    make(path)
+    before = path.read_bytes()
+    with pytest.raises(ResultError, match=r"some\.h5: .*not overwritten"):
+        ResultWriter.create(path, META)
+    with pytest.raises(ResultError, match=r"some\.h5: .*not an? (HDF5|tk-result)"):
+        ResultWriter.resume(path, META)
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["some.h5"]
+
+
+def test_paths_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for path, message in [
+        (tmp_path / "no" / "result.h5", "does not exist"),
+        (tmp_path / "file" / "result.h5", "does not exist"),
+        (tmp_path, "is a folder"),
+        (Path("/dev/null"), "cannot be written"),
+    ]:
+        for start in (ResultWriter.create, ResultWriter.resume):
+            with pytest.raises(ResultError, match=message) as caught:
+                start(path, META)
+            assert str(path) in str(caught.value)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_folder_without_permission(tmp_path: Path) -> None:
+    tmp_path.chmod(stat.S_IRUSR | stat.S_IXUSR)
+    with pytest.raises(ResultError, match="Permission denied"):
+        ResultWriter.create(tmp_path / "result.h5", META)
+
+
+def test_an_old_result_stays_until_the_first_new_frame(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    write(path, 3)
+    before = path.read_bytes()
+    with pytest.raises(KeyboardInterrupt), ResultWriter.create(path, META):
+        raise KeyboardInterrupt
+    assert path.read_bytes() == before
+    with pytest.raises(KeyboardInterrupt), ResultWriter.create(path, META) as writer:
+        writer.append(make_frame(0), make_state(0))
+        raise KeyboardInterrupt
+    assert assert_complete(path, 1) == 1
+
+
+def test_a_link_is_followed(tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    link = tmp_path / "result.h5"
+    link.symlink_to(tmp_path / "disk" / "real.h5")
+    write(link, 2)
+    assert link.is_symlink()
+    assert assert_complete(tmp_path / "disk" / "real.h5", 2) == 2
+
+
+def test_two_runs_do_not_write_one_file(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    with ResultWriter.create(path, META) as writer:
+        with pytest.raises(ResultError, match=r"result\.h5: another run"):
+            ResultWriter.create(path, META)
+        writer.append(make_frame(0), make_state(0))
+    assert assert_complete(path, 1) == 1
+
+
+def test_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
+    path = tmp_path / "result.h5"
+    write(path, 5)
+    assert assert_complete(path, 5) == 5
+
+
+def test_a_full_disk_is_one_line_and_keeps_the_finished_frames(tmp_path: Path) -> None:
+    """On a real file system of 1 MB, in a process of its own: after a failed write HDF5 likes to crash at exit."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    script = f"""
+import sys
+from tests.io.result_victim import META, make_frame, make_state
+from tk.errors import ResultError
+from tk.io.results.writer import ResultWriter
+try:
+    with ResultWriter.create(r"{disk}/result.h5", META) as writer:
+        for index in range(2000):
+            writer.append(make_frame(index), make_state(index))
+            print(index + 1)
+except ResultError as error:
+    print(error, file=sys.stderr)
+    import h5py, shutil
+    with h5py.File(r"{disk}/result.h5", "r") as file:
+        assert len(file["frames"])
+    shutil.copyfile(r"{disk}/result.h5", r"{tmp_path}/kept.h5")
+    sys.exit(2)
+"""
+    mount = f"mount -t tmpfs -o size=1m none '{disk}'"
+    isolate = ["unshare", "--map-root-user", "--mount", "sh", "-c"]
+    if shutil.which("unshare") is None or subprocess.run([*isolate, mount], capture_output=True).returncode:
+        pytest.skip("no permission to mount a small file system")
+    done = subprocess.run(
+        [*isolate, f'{mount} && exec "$@"', "sh", sys.executable, "-c", script],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2, done.stderr
+    assert done.stderr == f"{disk}/result.h5: cannot be written: No space left on device\n"
+    appended = int(done.stdout.split()[-1])
+    assert assert_complete(tmp_path / "kept.h5", appended) == appended
+
+
+def test_use_after_close_is_a_defect(tmp_path: Path) -> None:
+    writer = ResultWriter.create(tmp_path / "result.h5", META)
+    writer.close()
+    writer.close()
+    with pytest.raises(ValueError, match="closed"):
+        writer.append(make_frame(0))

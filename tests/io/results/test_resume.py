@@ -1,0 +1,153 @@
+"""Runs that are killed, and results that are taken up again."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.io.result_files import assert_complete, assert_equal_values, write
+from tests.io.result_victim import META, make_frame, make_state
+from tk.errors import ResultError
+from tk.io.results.writer import ResultWriter, read_result
+
+ROOT = Path(__file__).parents[3]
+
+
+# --- kill -9 ----------------------------------------------------------------------------------------------------------
+
+
+def kill_at_random(path: Path, frames: int, delay_s: float) -> int:
+    """Run the victim, kill it some time after its first frame; returns the frames that it had reported."""
+    with subprocess.Popen(
+        [sys.executable, "-m", "tests.io.result_victim", str(path), str(frames)],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as victim:
+        assert victim.stdout is not None
+        reported = [victim.stdout.readline()]
+        try:
+            victim.wait(delay_s)
+        except subprocess.TimeoutExpired:
+            os.kill(victim.pid, signal.SIGKILL)
+        reported += victim.stdout.read().splitlines()
+    assert victim.returncode in (0, -signal.SIGKILL)
+    return int([line for line in reported if line.strip()][-1])
+
+
+def survive_kills(path: Path, kills: int, seed: int) -> None:
+    generator = random.Random(seed)
+    done = 0
+    for _ in range(kills):
+        reported = kill_at_random(path, done + 2000, generator.uniform(0.0, 0.05))
+        assert reported > done  # the next run took up where the last one stopped
+        done = assert_complete(path, reported)
+        assert done <= reported + 1
+        if done > 600:
+            path.unlink()
+            done = 0
+
+
+def test_a_killed_run_leaves_every_finished_frame_and_is_resumed(tmp_path: Path) -> None:
+    survive_kills(tmp_path / "result.h5", kills=4, seed=1)
+
+
+@pytest.mark.slow
+def test_a_hundred_and_twenty_kills(tmp_path: Path) -> None:
+    survive_kills(tmp_path / "result.h5", kills=120, seed=2)
+
+
+# --- resuming ---------------------------------------------------------------------------------------------------------
+
+
+def test_resumed_equals_uninterrupted(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    write(path, 7)
+    created = read_result(path).created
+    writer, done = ResultWriter.resume(path, META)
+    with writer:
+        assert done == 7
+        assert_equal_values(writer.state, make_state(6))
+        for index in range(done, 12):
+            writer.append(make_frame(index), make_state(index))
+    assert assert_complete(path, 12) == 12
+    assert read_result(path).created == created
+
+
+def test_a_resumed_writer_knows_the_model(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    model = {"height_m": 1.7, "torso/radii_m": np.arange(3.0), "names": '["torso"]'}
+    with ResultWriter.create(path, META) as writer:
+        writer.write_model(model)
+        writer.append(make_frame(0), make_state(0))
+    with ResultWriter.resume(path, META)[0] as writer:
+        assert_equal_values(writer.model, model)
+    assert_equal_values(read_result(path).model, model)
+
+
+def test_resume_without_a_file_starts_one(tmp_path: Path) -> None:
+    writer, done = ResultWriter.resume(tmp_path / "result.h5", META)
+    with writer:
+        assert done == 0
+        assert writer.state == {}
+
+
+def test_frames_after_the_last_state_are_done_again(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    with ResultWriter.create(path, META) as writer:
+        for index in range(9):
+            writer.append(make_frame(index), make_state(index) if index <= 5 else None)
+    writer, done = ResultWriter.resume(path, META)
+    with writer:
+        assert done == 6
+        assert_equal_values(writer.state, make_state(5))
+        for index in range(6, 10):
+            writer.append(make_frame(index), make_state(index))
+    assert assert_complete(path, 10) == 10
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"capture": "dance"}, "capture is walk, not dance"),
+        ({"method": "silhouette"}, "method is volumetric, not silhouette"),
+        ({"seed": 8}, "seed is 7, not 8"),
+        ({"seed": 0}, "seed is 7, not 0"),
+        ({"fps": 30.0}, "fps is 15.0, not 30.0"),
+        ({"pose_names": ("x",), "pose_units": ("m",)}, "the pose has 24 entries, not 1"),
+        ({"stages": ("all",)}, "stages are all, chains; not all"),
+        ({"ankle_names": ()}, "ankle_names are ankle_pitch_l, .*; not none"),
+        ({"sigma": False}, "sigma is True, not False"),
+        ({"objective_kind": ""}, "objective_kind is negative log-likelihood, not none"),
+        ({"angles": ()}, "angles are knee_l, hip_l; not none"),
+        ({"angles": (replace(META.angles[0], convention="other"), META.angles[1])}, "differ in their convention"),
+        ({"config_toml": META.config_toml.replace("0.1", "0.2")}, r"config smd\.mu is 0\.1, not 0\.2"),
+        ({"config_toml": META.config_toml + "[hull]\nvoxels = 64\n"}, "config hull is not set"),
+    ],
+)
+def test_resuming_another_run_is_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    path = tmp_path / "result.h5"
+    write(path, 2)
+    before = path.read_bytes()
+    with pytest.raises(ResultError, match=rf"result\.h5: .*{message}.*--resume"):
+        ResultWriter.resume(path, replace(META, **change))
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["result.h5"]
+
+
+def test_config_that_only_looks_different_is_the_same(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    write(path, 1)
+    same = '# a comment\nmethod = "volumetric"\nsmd = { mu = 0.10 }\n'
+    writer, done = ResultWriter.resume(path, replace(META, config_toml=same))
+    writer.close()
+    assert done == 1

@@ -1,0 +1,64 @@
+"""Results as tables of pandas and datasets of xarray."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tk
+from tests.conftest import QUICK
+from tk.errors import ExportError
+from tk.io.results.writer import FOOT_POINTS, Result, read_result
+
+
+@pytest.fixture(scope="module")
+def result(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Result:
+    path = tmp_path_factory.mktemp("tables") / "r.h5"
+    return tk.track(tk.open_capture(tiny), path, config=tk.Settings.from_toml(QUICK), frames=(2, 5), causal=True)
+
+
+def test_a_table_has_a_row_a_frame_and_all_that_the_file_tells(result: Result) -> None:
+    pytest.importorskip("pandas")
+    table = result.to_pandas()
+    assert list(table.index) == [2, 3, 4] and table.index.name == "frame"
+    assert table.columns.is_unique and not table.isna().to_numpy().any()
+    elbow = result.meta.joint_names.index("elbow_l")
+    np.testing.assert_array_equal(table[["elbow_l_x", "elbow_l_y", "elbow_l_z"]], result.joints[:, elbow])
+    np.testing.assert_array_equal(table["toe_r_z"], result.feet[:, FOOT_POINTS.index("toe_r"), 2])
+    np.testing.assert_array_equal(table[list(result.meta.pose_names)], result.pose)
+    np.testing.assert_array_equal(table["knee_l_flexion_deg"], result.angles["knee_l"][:, 0])
+    assert set(table["status"]) == {"tracked"}
+    expected = 3 + 15 * 3 + 15 + 4 * 3 + 24 + 3 + 4 + sum(len(a.names) for a in result.meta.angles)
+    assert len(table.columns) == expected + len(result.meta.fit_cameras)
+
+
+def test_a_dataset_names_its_dimensions(result: Result) -> None:
+    pytest.importorskip("xarray")
+    data = result.to_xarray()
+    assert data.sizes["frame"] == 3 and data.sizes["dof"] == 24 + 3 + 4
+    np.testing.assert_array_equal(
+        data["joints"].sel(joint="knee_r", axis="z"),
+        result.joints[:, result.meta.joint_names.index("knee_r"), 2],
+    )
+    np.testing.assert_array_equal(data["time"], result.time)
+    np.testing.assert_array_equal(data["angles"].sel(angle="knee_l flexion"), result.angles["knee_l"][:, 0])
+    np.testing.assert_array_equal(data["pose"].sel(dof=result.meta.pose_names[5]), result.pose[:, 5])
+    assert data["joints"].attrs["units"] == "m" and data.attrs["fps"] == 15.0
+
+
+def test_what_a_tracker_does_not_tell_is_left_out(tracked: Path) -> None:
+    pytest.importorskip("pandas")
+    pytest.importorskip("xarray")
+    volumetric = read_result(tracked)
+    assert volumetric.sigma is None and not [c for c in volumetric.to_pandas().columns if c.endswith("_sigma")]
+    assert not {"sigma", "feet", "angles"} & set(volumetric.to_xarray())
+
+
+@pytest.mark.parametrize("package", ["pandas", "xarray"])
+def test_a_missing_package_is_one_line(tracked: Path, monkeypatch: pytest.MonkeyPatch, package: str) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ExportError, match=f"pip install {package}"):
+        getattr(read_result(tracked), f"to_{package}")()

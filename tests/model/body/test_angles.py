@@ -1,0 +1,217 @@
+"""Joint angles: known poses, left and right, there and back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tk.model.body.angles import (
+    ANGLES,
+    joint_angles,
+    joint_rotation,
+    segment_quaternions,
+    segment_rotations,
+    standing_axes,
+)
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.gait_poses import neutral_pose
+from tk.model.body.rotations import to_matrices
+from tk.model.body.skeleton import JOINTS, SEGMENTS, Skeleton, build_skeleton, shoulder_angles
+
+BODY = BodyDimensions.from_stature(1.75)
+SKELETON = build_skeleton(BODY, waist=True)
+BY_JOINT = {angles.joint: angles for angles in ANGLES}
+
+
+def pose_of(skeleton: Skeleton = SKELETON, **degrees: float) -> np.ndarray:
+    """A pose in which these degrees of freedom have these values, and both arms hang."""
+    pose = np.zeros(len(skeleton.names))
+    for side, outward in (("l", 1.0), ("r", -1.0)):
+        point_arm(pose, skeleton, side, np.array([0.0, 0.0, -1.0]), outward)
+    for name, value in degrees.items():
+        pose[skeleton.index(name)] = np.radians(value)
+    return pose
+
+
+def point_arm(pose: np.ndarray, skeleton: Skeleton, side: str, direction: np.ndarray, outward: float) -> None:
+    """Turn an arm to ``direction`` (forward, left, up)."""
+    yaw, pitch = shoulder_angles(direction * [1.0, outward, 1.0])
+    pose[skeleton.index(f"shoulder_{side}_yaw")] = yaw
+    pose[skeleton.index(f"shoulder_{side}_pitch")] = pitch
+
+
+def angles_of(pose: np.ndarray, skeleton: Skeleton = SKELETON) -> dict[str, dict[str, float]]:
+    found = joint_angles(segment_rotations(skeleton, pose[None]), skeleton.T_world_body)
+    names = {joint: angles.names for joint, angles in BY_JOINT.items()}
+    return {joint: dict(zip(names[joint], map(float, values[0]), strict=True)) for joint, values in found.items()}
+
+
+KNOWN = [
+    ({"knee_l_flexion": 30.0}, "knee_l", "flexion", 30.0),
+    ({"knee_r_flexion": 30.0}, "knee_r", "flexion", 30.0),
+    ({"elbow_l_flexion": 75.0}, "elbow_l", "flexion", 75.0),
+    ({"elbow_r_flexion": 75.0}, "elbow_r", "flexion", 75.0),
+    ({"hip_l_pitch": -40.0}, "hip_l", "flexion", 40.0),
+    ({"hip_r_pitch": -40.0}, "hip_r", "flexion", 40.0),
+    ({"hip_l_yaw": 25.0}, "hip_l", "adduction", -25.0),
+    ({"hip_r_yaw": 25.0}, "hip_r", "adduction", -25.0),
+    ({"hip_l_roll": 20.0}, "hip_l", "rotation", 20.0),
+    ({"hip_r_roll": 20.0}, "hip_r", "rotation", 20.0),
+    ({"waist_pitch": 15.0}, "lumbar", "flexion", 15.0),
+    ({"neck_pitch": 20.0}, "neck", "flexion", 20.0),
+    ({"neck_yaw": 12.0}, "neck", "lateral_bending", 12.0),
+    ({"waist_yaw": -10.0}, "lumbar", "rotation", 10.0),
+    ({"torso_pitch": 8.0}, "pelvis", "tilt", 8.0),
+    ({"torso_roll": 5.0}, "pelvis", "obliquity", 5.0),
+    ({"torso_yaw": 170.0}, "pelvis", "rotation", 170.0),
+]
+
+
+@pytest.mark.parametrize(("degrees", "joint", "name", "expected"), KNOWN)
+def test_known_poses(degrees: dict[str, float], joint: str, name: str, expected: float) -> None:
+    found = angles_of(pose_of(**degrees))
+    assert found[joint][name] == pytest.approx(expected, abs=1e-9)
+    for other, value in found[joint].items():
+        if other != name:
+            assert value == pytest.approx(0, abs=1e-9), other
+
+
+def test_directions_are_what_the_convention_says() -> None:
+    """By joint positions, so that a sign that is wrong in both skeleton and angles is seen."""
+    at = {name: j for j, name in enumerate(JOINTS)}
+
+    def moved(**degrees: float) -> np.ndarray:
+        joints = SKELETON.joints(pose_of(**degrees)) - SKELETON.joints(pose_of())
+        return joints
+
+    assert moved(hip_r_pitch=-30.0)[at["knee_r"], 0] > 0.1  # flexion: the knee comes forward
+    assert moved(hip_r_yaw=30.0)[at["knee_r"], 1] < -0.1  # abduction: out to the right
+    assert moved(knee_l_flexion=30.0)[at["ankle_l"], 0] < -0.1  # the heel goes back
+    assert moved(torso_roll=10.0)[at["hip_l"], 2] > 0.01  # left side up
+    assert moved(neck_yaw=20.0)[at["head_top"], 1] < -0.05  # to the right
+    assert moved(neck_pitch=20.0)[at["head_top"], 0] > 0.05  # forward
+    assert moved(torso_yaw=20.0)[at["hip_l"], 0] < -0.02  # to the left: the left hip goes back
+
+
+@pytest.mark.parametrize("side", ["l", "r"])
+@pytest.mark.parametrize(
+    ("direction", "plane", "elevation"),
+    [((0, 1, 0), 0, 90), ((1, 0, 0), 90, 90), ((0, 1, -1), 0, 45), ((1, 1, 0), 45, 90), ((-1, 0, -2), -90, 26.565)],
+)
+def test_shoulder_points_where_it_says(
+    side: str, direction: tuple[float, float, float], plane: float, elevation: float
+) -> None:
+    outward = 1.0 if side == "l" else -1.0
+    pose = pose_of()
+    unit = np.array(direction) * [1.0, outward, 1.0] / np.linalg.norm(direction)
+    point_arm(pose, SKELETON, side, unit, outward)
+    joints = dict(zip(JOINTS, SKELETON.joints(pose), strict=True))
+    arm = joints[f"elbow_{side}"] - joints[f"shoulder_{side}"]
+    np.testing.assert_allclose(arm / np.linalg.norm(arm), unit, atol=1e-9)
+    found = angles_of(pose)[f"shoulder_{side}"]
+    assert found["plane"] == pytest.approx(plane, abs=1e-3)
+    assert found["elevation"] == pytest.approx(elevation, abs=1e-3)
+
+
+@pytest.mark.parametrize("side", ["l", "r"])
+def test_internal_rotation_of_a_level_arm_lowers_the_hand(side: str) -> None:
+    """An arm out to the side, the elbow bent: internal rotation takes the hand from up over forward to down."""
+    outward = 1.0 if side == "l" else -1.0
+    hands, rotations = [], []
+    for roll in np.linspace(-60, 60, 5):
+        pose = pose_of(**{f"elbow_{side}_flexion": 90.0})
+        point_arm(pose, SKELETON, side, np.array([0.0, outward, 0.0]), outward)
+        pose[SKELETON.index(f"shoulder_{side}_roll")] = np.radians(roll)
+        joints = dict(zip(JOINTS, SKELETON.joints(pose), strict=True))
+        hands.append(joints[f"wrist_{side}"][2] - joints[f"elbow_{side}"][2])
+        rotations.append(angles_of(pose)[f"shoulder_{side}"]["rotation"])
+    np.testing.assert_allclose(np.abs(np.diff(rotations)), 30, atol=1e-6)
+    hands_in_order = np.array(hands)[np.argsort(rotations)]
+    assert (np.diff(hands_in_order) < 0.02).all() and hands_in_order[0] - hands_in_order[-1] > 0.1
+
+
+@settings(deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_mirrored_poses_have_mirrored_angles(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pose = np.zeros(len(SKELETON.names))
+    free = [k for k, name in enumerate(SKELETON.names) if name.startswith(("shoulder", "elbow", "hip", "knee"))]
+    pose[free] = rng.uniform(-0.6, 0.6, len(free))
+    mirrored = pose.copy()
+    for name in SKELETON.names:
+        if "_l_" in name:
+            other = name.replace("_l_", "_r_")
+            mirrored[[SKELETON.index(name), SKELETON.index(other)]] = pose[
+                [SKELETON.index(other), SKELETON.index(name)]
+            ]
+    a, b = angles_of(pose), angles_of(mirrored)
+    for joint in BY_JOINT:
+        if joint.endswith("_l"):
+            assert a[joint] == pytest.approx(b[joint[:-2] + "_r"], abs=1e-6)
+
+
+@pytest.mark.parametrize("up", ["z", "-y", "x"])
+def test_angles_do_not_depend_on_the_axis_that_is_up(up: str) -> None:
+    pose = np.random.default_rng(3).uniform(-0.5, 0.5, len(SKELETON.names))
+    skeleton = build_skeleton(BODY, up, waist=True)
+    a, b = angles_of(pose), angles_of(pose, skeleton)
+    for joint in BY_JOINT:
+        assert a[joint] == pytest.approx(b[joint], abs=1e-6)
+
+
+@settings(deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_angles_give_the_rotation_back(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pose = np.zeros((1, len(SKELETON.names)))
+    low, high = np.maximum(SKELETON.lower, -1.5), np.minimum(SKELETON.upper, 1.5)
+    pose[0] = rng.uniform(low, high)
+    R = segment_rotations(SKELETON, pose)
+    for joint, degrees in joint_angles(R, SKELETON.T_world_body).items():
+        angles = BY_JOINT[joint]
+        if angles.child not in SEGMENTS:
+            continue
+        parent = np.eye(3) if angles.parent is None else R[:, SEGMENTS.index(angles.parent)]
+        child = R[:, SEGMENTS.index(angles.child)]
+        np.testing.assert_allclose(parent @ joint_rotation(angles, degrees), child, atol=1e-6)
+
+
+@pytest.mark.parametrize("side", ["l", "r"])
+def test_ankles(side: str) -> None:
+    """A foot of its own, as a segment beyond ours: toes up is dorsiflexion, the sole turned inward is inversion."""
+    segments = ("calf_l", "calf_r", "foot_l", "foot_r")
+    angles = BY_JOINT[f"ankle_{side}"]
+    foot = joint_rotation(angles, np.array([[20.0, 10.0]]))
+    R = np.tile(np.eye(3), (1, 4, 1, 1))
+    R[:, segments.index(f"foot_{side}")] = foot
+    assert foot[0, 2, 0] > 0.3  # the toes point up
+    inward = -1.0 if side == "l" else 1.0
+    assert (foot[0] @ [0, 0, -1.0])[1] * inward > 0.1  # the sole faces the other foot
+    all_segments = (*SEGMENTS, *(s for s in segments if s not in SEGMENTS))
+    whole = np.tile(np.eye(3), (1, len(all_segments), 1, 1))
+    whole[:, all_segments.index(f"foot_{side}")] = foot
+    np.testing.assert_allclose(joint_angles(whole, np.eye(3), all_segments)[angles.joint], [[20.0, 10.0]], atol=1e-9)
+
+
+def test_feet_that_ride_on_the_shins_have_no_angle() -> None:
+    found = joint_angles(segment_rotations(SKELETON, pose_of()[None]), np.eye(3), SEGMENTS[:11])
+    np.testing.assert_array_equal(found["ankle_l"], [[0.0, 0.0]])
+
+
+def test_standing_segments_are_aligned() -> None:
+    R = segment_rotations(SKELETON, pose_of()[None])[0]
+    np.testing.assert_allclose(R[..., 2], np.tile([0.0, 0.0, 1.0], (len(SEGMENTS), 1)), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.det(standing_axes()), 1.0)
+    np.testing.assert_allclose(to_matrices(segment_quaternions(SKELETON, pose_of()[None]))[0], R, atol=1e-12)
+
+
+def test_da_vinci_pose() -> None:
+    pose = neutral_pose(SKELETON)
+    found = angles_of(pose)
+    for side in ("l", "r"):
+        assert found[f"shoulder_{side}"]["elevation"] == pytest.approx(90, abs=1e-6)
+        assert found[f"shoulder_{side}"]["plane"] == pytest.approx(0, abs=1e-6)
+        assert found[f"hip_{side}"]["adduction"] == pytest.approx(-15, abs=1e-6)
+    assert all(name and angles.convention for angles in ANGLES for name in angles.names)

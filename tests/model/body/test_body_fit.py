@@ -1,0 +1,253 @@
+"""The body's fit: rows against finite differences, a known body found again from its own drawn silhouettes."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from tests.model.ring import ring_of_cameras
+from tk.errors import ConfigError
+from tk.kernels.cones import CONE
+from tk.kernels.line_search import SearchSettings
+from tk.kernels.silhouette import Edgels
+from tk.model.body import body_fit
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.body_fit import (
+    BodyFitSettings,
+    fit_body,
+    pose_rows,
+    shape_rows,
+)
+from tk.model.body.cone_body import PRESETS, SHAPE_NUMBERS, build_cone_body
+from tk.model.body.gait_poses import walking_pose
+from tk.model.body.skeleton import SEGMENTS
+from tk.model.cues.part_colors import PartColors
+from tk.model.cues.ray_costs import Evidence, RayGrid
+from tk.model.masks.silhouettes import Views, draw_silhouettes
+
+STATURE = 1.75
+VIEWS = Views(ring_of_cameras(3, width=240, height=300))
+AVERAGE = build_cone_body(BodyDimensions.from_stature(STATURE))
+SEARCH = SearchSettings()
+DIMENSIONS = [field.name for field in fields(BodyDimensions)]
+
+
+def walk(body, count):
+    """(count, D) a stride, arms out and elbows bent more than walking people have them: every joint shows itself."""
+    skeleton = body.skeleton
+    poses = np.array([walking_pose(skeleton, 0.05 + i / count) for i in range(count)])
+    poses[:, 2] = 0.93
+    for side in "lr":
+        poses[:, skeleton.index(f"elbow_{side}_flexion")] = np.linspace(0.3, 1.6, count)
+        poses[:, skeleton.index(f"shoulder_{side}_roll")] = np.linspace(-0.4, 0.4, count)
+        poses[:, skeleton.index(f"hip_{side}_pitch")] -= 0.5
+        poses[:, skeleton.index(f"knee_{side}_flexion")] += 0.6
+    return poses
+
+
+def pyramids_of(body, poses):
+    return [VIEWS.pyramid(masks, 1, None) for masks in draw_silhouettes(body, VIEWS.rig, poses)]
+
+
+def edgels_all_over(body, count=400):
+    """Edgels that hold to random places of all parts, with random rows: what the rows are of need not be contours."""
+    rng = np.random.default_rng(8)
+    part = rng.integers(len(body.parts), size=count)
+    angle, z = rng.uniform(0, 2 * np.pi, count), rng.uniform(-1, 1, count)
+    cone = np.array([p.kind == CONE for p in body.parts])[part]
+    radius = np.where(cone, 1.0, np.sqrt(1 - z**2))
+    unscaled = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.where(cone, np.abs(z), z)])
+    row = rng.normal(size=(count, 3))
+    nothing = np.zeros(count)
+    return Edgels(
+        nothing.astype(np.int32), part, unscaled, nothing, nothing, row, np.zeros((count, 2)), np.zeros((count, 2))
+    )
+
+
+EDGELS = edgels_all_over(AVERAGE)
+POSE = walk(AVERAGE, 3)[1] + np.random.default_rng(1).normal(0, 0.1, len(AVERAGE.skeleton.names))
+
+
+def along_rows(body, pose):
+    """(N,) the edgels' places along their rows, pixels."""
+    return np.einsum("na,na->n", EDGELS.row, body.place(pose, EDGELS.part, EDGELS.unscaled))
+
+
+def test_rows_by_the_pose_are_differences():
+    rows = pose_rows(AVERAGE, POSE, EDGELS)
+    for k, step in enumerate(1e-6 * np.eye(len(POSE))):
+        expected = (along_rows(AVERAGE, POSE + step) - along_rows(AVERAGE, POSE - step)) / 2e-6
+        np.testing.assert_allclose(rows[:, k], expected, atol=1e-7, err_msg=AVERAGE.skeleton.names[k])
+
+
+def test_rows_by_shapes_are_differences():
+    groups = AVERAGE.shape_groups
+    rows = shape_rows(AVERAGE, AVERAGE.skeleton.segment_transforms(POSE), EDGELS)
+    for k in range(len(groups) * SHAPE_NUMBERS):
+        step = np.zeros(len(groups) * SHAPE_NUMBERS)
+        step[k] = 1e-6
+        pair = [AVERAGE.reshaped(change.reshape(-1, SHAPE_NUMBERS)) for change in (step, -step)]
+        expected = (along_rows(pair[0], POSE) - along_rows(pair[1], POSE)) / 2e-6
+        name = f"{groups[k // SHAPE_NUMBERS]} {k % SHAPE_NUMBERS}"
+        np.testing.assert_allclose(rows[:, k], expected, atol=1e-6, err_msg=name)
+        if k % SHAPE_NUMBERS < 2:
+            assert np.abs(expected).max() > 0.01, f"{name}: no edgel tells"
+
+
+def test_no_edgels_have_no_rows():
+    """A camera that shows nothing in any frame."""
+    none = Edgels(*(values[:0] for values in EDGELS))
+    rows = shape_rows(AVERAGE, AVERAGE.skeleton.segment_transforms(POSE), none)
+    assert rows.shape == (0, SHAPE_NUMBERS * len(AVERAGE.shape_groups))
+
+
+def test_rows_by_dimensions_are_differences():
+    problem = body_fit.BodyProblem("full", AVERAGE.dimensions, 0.01)
+    shared = problem.mean + np.random.default_rng(2).normal(0, 0.02, len(problem.mean)) * (problem.deviation > 1e-5)
+    (rows,) = problem.dimension_rows(shared, POSE[None], [EDGELS])
+    assert rows.shape == (len(EDGELS.part), len(DIMENSIONS))
+    change = shared[len(DIMENSIONS) :].reshape(-1, SHAPE_NUMBERS)
+    for k, name in enumerate(DIMENSIONS):
+        pair = []
+        for sign in (1, -1):
+            values = np.exp(shared[: len(DIMENSIONS)] + sign * 1e-5 * np.eye(len(DIMENSIONS))[k])
+            body = build_cone_body(BodyDimensions(*values)).reshaped(change)
+            pair.append(along_rows(body, POSE))
+        np.testing.assert_allclose(rows[:, k], (pair[0] - pair[1]) / 2e-5, atol=1e-6, err_msg=name)
+
+
+def test_frames_are_told_apart_in_rows_by_dimensions():
+    problem = body_fit.BodyProblem("full", AVERAGE.dimensions, 0.01)
+    poses = walk(AVERAGE, 2)
+    both = problem.dimension_rows(problem.mean, poses, [EDGELS, EDGELS])
+    for pose, rows in zip(poses, both, strict=True):
+        np.testing.assert_allclose(rows, problem.dimension_rows(problem.mean, pose[None], [EDGELS])[0], atol=1e-9)
+    assert np.abs(both[0] - both[1]).max() > 0.01
+
+
+@pytest.mark.parametrize("up", ["z", "x"])
+def test_transforms_of_many_poses_are_the_skeletons(up):
+    body = build_cone_body(AVERAGE.dimensions, up)
+    poses = np.random.default_rng(0).uniform(-1, 1, (4, len(body.skeleton.names)))
+    T = body.skeleton.segment_transforms(poses)
+    for pose, found in zip(poses, T, strict=True):
+        np.testing.assert_allclose(found, body.skeleton.segment_transforms(pose), atol=1e-12)
+    B = np.eye(4)
+    B[:3, :3] = body.skeleton.T_world_body
+    for p, part in enumerate(body.parts):
+        expected = T[:, SEGMENTS.index(part.segment)] @ B @ part.T_body_part
+        np.testing.assert_allclose(body.part_transforms(T)[:, p], expected, atol=1e-12)
+
+
+def test_lengths_of_a_known_body_are_found(monkeypatch):
+    """Silhouettes without noise: an edgel errs by what a pixel hides, not by ragged masks."""
+    monkeypatch.setattr(body_fit, "_EDGE_NOISE_PX", 0.5)
+    # where a forearm ends and a hand begins hardly shows: only both together are told
+    true = AVERAGE.dimensions.scaled(thigh=0.95, calf=1.05, upper_arm=1.05, thigh_radius=1.1)
+    body = build_cone_body(true)
+    poses = walk(body, 4)
+    start = poses + np.random.default_rng(0).normal(0, 0.01, poses.shape)
+    found, fitted = fit_body(
+        "full", VIEWS, pyramids_of(body, poses), start, SEARCH, true.stature, BodyFitSettings(rounds=4)
+    )
+    for name in ("thigh", "calf", "upper_arm", "forearm"):
+        assert getattr(found.dimensions, name) == pytest.approx(getattr(true, name), rel=0.02), name
+    off = [
+        np.linalg.norm(found.skeleton.joints(a) - body.skeleton.joints(b), axis=1).mean()
+        for a, b in zip(fitted, poses, strict=True)
+    ]
+    assert np.mean(off) < 0.012
+    assert found.dimensions.stature == pytest.approx(true.stature, rel=0.01)
+
+
+def test_shapes_are_found_and_left_and_right_are_mirror_images():
+    """Feet that are longer and point elsewhere: no dimension explains both."""
+    groups = AVERAGE.shape_groups
+    change = np.zeros((len(groups), SHAPE_NUMBERS))
+    change[groups.index("foot_"), [3, 6]] = [0.15, 0.03]
+    change[groups.index("thigh_"), 0] = 0.2
+    true = AVERAGE.reshaped(change)
+    poses = walk(true, 3)
+    seen = pyramids_of(true, poses)
+    found, fitted = fit_body("full", VIEWS, seen, poses, SEARCH, STATURE, BodyFitSettings(rounds=4))
+    grid, group = RayGrid(VIEWS.rig, 150), PartColors(AVERAGE).group
+
+    def error(body, poses):
+        return np.mean(
+            [Evidence.of(grid, p.masks[0]).cast(body, group, q[None])[0] for p, q in zip(seen, poses, strict=True)]
+        )
+
+    assert error(found, fitted) < 0.6 * error(AVERAGE, poses)
+    parts = {part.name: part for part in found.parts}
+    for part in found.parts:
+        if part.name.endswith("_l"):
+            assert parts[part.name[:-2] + "_r"].shape == pytest.approx(part.shape)
+    start = {part.name: part for part in AVERAGE.parts}
+    assert parts["thigh_l"].shape[0] > 1.08 * start["thigh_l"].shape[0]
+
+
+def test_without_rounds_the_average_body_is_told():
+    poses = walk(AVERAGE, 1)
+    found, fitted = fit_body(
+        "limbs",
+        VIEWS,
+        pyramids_of(AVERAGE, poses),
+        poses[:, AVERAGE.skeleton.is_paper],
+        SEARCH,
+        STATURE,
+        BodyFitSettings(rounds=0),
+    )
+    np.testing.assert_array_equal(fitted, poses[:, AVERAGE.skeleton.is_paper])
+    for name in DIMENSIONS:
+        assert getattr(found.dimensions, name) == pytest.approx(getattr(AVERAGE.dimensions, name), rel=1e-12)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_is_fitted(preset):
+    body = build_cone_body(AVERAGE.dimensions, preset=preset)
+    pose = walking_pose(body.skeleton, 0.2)
+    pose[2] = 0.93
+    masks = draw_silhouettes(body, VIEWS.rig, pose[None])
+    start = pose.copy()
+    start[:3] += 0.01
+    found, fitted = fit_body(
+        preset, VIEWS, [VIEWS.pyramid(masks[0], 1, None)], start[None], SEARCH, STATURE, BodyFitSettings(rounds=2)
+    )
+    assert found.preset == preset and len(found.parts) == len(body.parts)
+    np.testing.assert_array_equal(fitted[0][~body.free], start[~body.free])
+    assert np.linalg.norm(fitted[0][:3] - pose[:3]) < np.linalg.norm(start[:3] - pose[:3])
+
+
+def test_either_end_moves_alone_and_mirrored():
+    change = np.zeros((len(AVERAGE.shape_groups), SHAPE_NUMBERS))
+    change[AVERAGE.shape_groups.index("upper_arm_"), 4:] = [0.01, 0.02, 0.0, 0.0]
+    change[AVERAGE.shape_groups.index("head"), 4:] = [0.03, 0.0, 0.0, 0.0]
+    body = AVERAGE.reshaped(change)
+
+    def ends(which, name):
+        part = next(p for p in which.parts if p.name == name)
+        low = 0.0 if part.kind == CONE else -part.shape[2]
+        return [part.T_body_part[:3] @ [0.0, 0.0, z, 1.0] for z in (low, part.shape[2])]
+
+    for near, far in zip(ends(body, "upper_arm_l"), ends(body, "upper_arm_r"), strict=True):
+        np.testing.assert_allclose(near, far * [1, -1, 1], atol=1e-12)
+    begin, end = ends(body, "upper_arm_l")
+    begin_before, end_before = ends(AVERAGE, "upper_arm_l")
+    assert np.linalg.norm(begin - begin_before) == pytest.approx(np.hypot(0.01, 0.02), abs=1e-9)
+    assert np.linalg.norm(end - end_before) < 2e-3  # a limb keeps its length: its far end swings a little nearer
+    chin, crown = (np.subtract(a, b) for a, b in zip(ends(body, "head"), ends(AVERAGE, "head"), strict=True))
+    assert np.linalg.norm(chin) == pytest.approx(0.03, rel=0.1) and np.linalg.norm(crown) < 3e-3
+    same = AVERAGE.reshaped(np.zeros_like(change))
+    for a, b in zip(same.parts, AVERAGE.parts, strict=True):
+        assert a.shape == b.shape
+        np.testing.assert_allclose(a.T_body_part, b.T_body_part, atol=1e-12)
+
+
+def test_settings_out_of_range_are_told():
+    for settings, message in (
+        ({"frames": 0}, "frames = 0"),
+        ({"rounds": 51}, "rounds = 51"),
+        ({"stature_deviation": 0.0}, "stature_deviation = 0"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            BodyFitSettings(**settings)

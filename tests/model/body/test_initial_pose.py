@@ -1,0 +1,57 @@
+"""Poses written down by hand."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.model.ring import ring_of_cameras
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.gait_poses import neutral_pose
+from tk.model.body.initial_pose import rough_pose
+from tk.model.body.skeleton import JOINTS, build_skeleton, shoulder_angles
+from tk.model.cameras.tracker_frame import TrackerFrame
+
+WORLD = TrackerFrame.of(ring_of_cameras(3, width=160, height=200), "z")
+seeds = st.integers(0, 2**32 - 1)
+
+
+@given(seeds)
+@settings(max_examples=3, deadline=None)
+def test_rough_pose_meets_the_joints(seed):
+    """Of a body of average proportions in an everyday pose: all but the ends of the joints' ranges."""
+    rng = np.random.default_rng(seed)
+    skeleton = build_skeleton(BodyDimensions.from_stature(1.8))
+    rest = neutral_pose(skeleton)
+    for side in ("l", "r"):
+        hanging = shoulder_angles(np.array([0.1, 0.3, -0.95]))
+        rest[[skeleton.index(f"shoulder_{side}_{a}") for a in ("yaw", "pitch")]] = hanging
+        rest[skeleton.index(f"elbow_{side}_flexion")] = 0.4
+        rest[skeleton.index(f"knee_{side}_flexion")] = 0.3
+    pose = skeleton.clip(rest + rng.normal(0, 0.12, len(rest)) * ~skeleton.prismatic)
+    pose[:4] = [*rng.uniform(-1, 1, 3), rng.uniform(-np.pi, np.pi)]
+    joints = dict(zip(JOINTS, skeleton.joints(pose), strict=True))
+    dimensions, found = rough_pose(joints, {}, 1.8, WORLD)
+    error = np.linalg.norm(build_skeleton(dimensions).joints(WORLD.poses_out(found)) - skeleton.joints(pose), axis=1)
+    assert error.max() < 0.04 and error.mean() < 0.02
+
+
+def test_rough_pose_takes_the_stature_from_the_joints():
+    skeleton = build_skeleton(BodyDimensions.from_stature(1.62))
+    joints = dict(zip(JOINTS, skeleton.joints(neutral_pose(skeleton)), strict=True))
+    limbs = {name: x for name, x in joints.items() if name not in ("head_top", "pelvis")}
+    dimensions, _ = rough_pose(limbs, {}, None, WORLD)
+    assert dimensions.thigh == pytest.approx(BodyDimensions.from_stature(1.62).thigh, rel=0.01)
+
+
+def test_rough_pose_from_angles_is_clipped_and_otherwise_taken_as_written():
+    angles = {"torso_x": 0.4, "torso_yaw": 1.0, "knee_l_flexion": 9.0}
+    world = TrackerFrame.of(ring_of_cameras(2, width=160, height=200), "-y")
+    dimensions, pose = rough_pose({}, angles, 1.7, world)
+    skeleton, written = build_skeleton(dimensions), world.poses_out(pose)
+    np.testing.assert_allclose(
+        written[[skeleton.index("torso_x"), skeleton.index("torso_yaw")]], [0.4, 1.0], atol=1e-12
+    )
+    k = skeleton.index("knee_l_flexion")
+    assert pose[k] == skeleton.upper[k]
+    assert dimensions == BodyDimensions.from_stature(1.7)

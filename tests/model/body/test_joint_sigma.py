@@ -1,0 +1,88 @@
+"""Standard deviations of joints: from the curvature, and from how far the posture is from the usual one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.joint_sigma import BENT_M, IN_THE_FLESH_M, contour_variance, directions, posture_variance
+from tk.model.body.skeleton import JOINTS, build_skeleton
+
+SKELETON = build_skeleton(BodyDimensions.from_stature(1.75), waist=True, ankles=True)
+NAMES = SKELETON.names
+
+
+def poses(count: int, spread: float = 0.3) -> np.ndarray:
+    return np.random.default_rng(3).normal(scale=spread, size=(count, len(NAMES)))
+
+
+def test_the_contours_variance_is_that_of_poses_drawn_from_their_information() -> None:
+    rng = np.random.default_rng(1)
+    pose = poses(1)[0]
+    D = len(pose)
+    root = rng.normal(size=(D, D)) / np.sqrt(D)
+    precision = (root @ root.T + np.eye(D)) * 1e6  # deviations of about a thousandth: joints move as the pose does
+    free = np.ones(D, bool)
+    drawn = pose + rng.multivariate_normal(np.zeros(D), np.linalg.inv(precision), 4000)
+    moved = SKELETON.joints(drawn) - SKELETON.joints(pose)
+    np.testing.assert_allclose(
+        contour_variance(SKELETON, pose, precision, free), (moved**2).mean(axis=(0, 2)), rtol=0.1
+    )
+
+
+def test_what_may_not_change_has_no_variance() -> None:
+    free = np.zeros(len(NAMES), bool)
+    free[SKELETON.index("elbow_l_flexion")] = True
+    variance = contour_variance(SKELETON, poses(1)[0], 1e4 * np.eye(len(NAMES)), free)
+    assert [JOINTS[j] for j in np.flatnonzero(variance > 1e-12)] == ["wrist_l"]
+
+
+def test_the_variances_of_many_poses_are_those_of_each() -> None:
+    D = len(NAMES)
+    root = np.random.default_rng(4).normal(size=(6, D, D))
+    precision, free = root @ root.swapaxes(1, 2) + np.eye(D), SKELETON.is_paper
+    many = contour_variance(SKELETON, poses(6).reshape(2, 3, D), precision.reshape(2, 3, D, D), free)
+    each = [contour_variance(SKELETON, pose, p, free) for pose, p in zip(poses(6), precision, strict=True)]
+    np.testing.assert_allclose(many.reshape(6, -1), each, rtol=1e-9)
+
+
+def test_directions_stay_when_the_person_walks_and_turns() -> None:
+    pose = poses(5)
+    elsewhere = pose.copy()
+    elsewhere[:, [NAMES.index(f"torso_{name}") for name in ("x", "y", "z", "yaw", "roll", "pitch")]] += 0.4
+    there = directions(SKELETON, pose)
+    np.testing.assert_allclose(directions(SKELETON, elsewhere), there, atol=1e-9)
+    length = np.linalg.norm(there, axis=-1)
+    own = np.isin(JOINTS, ("pelvis", "neck"))
+    assert not length[:, own].any()
+    np.testing.assert_allclose(length[:, ~own], 1.0)
+
+
+def test_the_usual_posture_adds_nothing_and_an_arm_that_is_turned_over_all_there_is() -> None:
+    straight = np.zeros(len(NAMES))
+    usual = directions(SKELETON, straight)
+    assert posture_variance(SKELETON, straight, usual).max() < 1e-12
+    over = usual.copy()
+    arm = [JOINTS.index(f"{joint}_l") for joint in ("shoulder", "elbow")]
+    over[arm] *= -3.0  # a mean is shorter than one, its length says nothing
+    found = posture_variance(SKELETON, straight, over)
+    np.testing.assert_allclose(found[arm], (2 * IN_THE_FLESH_M) ** 2)
+    assert np.delete(found, arm).max() < 1e-12
+
+
+def test_a_bent_waist_is_told_of_all_joints() -> None:
+    pose = np.zeros(len(NAMES))
+    pose[SKELETON.index("waist_pitch")] = 0.5
+    found = posture_variance(SKELETON, pose, directions(SKELETON, pose))
+    np.testing.assert_allclose(found, (0.5 * BENT_M) ** 2)
+
+
+@pytest.mark.parametrize("shape", [(), (4,), (2, 3)])
+def test_batches_are_what_single_poses_are(shape: tuple[int, ...]) -> None:
+    batch = poses(int(np.prod(shape, dtype=int))).reshape(*shape, -1)
+    usual = directions(SKELETON, poses(8)).mean(axis=0)
+    whole = posture_variance(SKELETON, batch, usual)
+    assert whole.shape == (*shape, len(JOINTS))
+    for at in np.ndindex(shape):
+        np.testing.assert_allclose(whole[at], posture_variance(SKELETON, batch[at], usual), rtol=0, atol=1e-15)

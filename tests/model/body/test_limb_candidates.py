@@ -1,0 +1,115 @@
+"""Where a limb is looked for: all over the sphere, within the limits; and which of the places are kept."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.cone_body import PRESETS, build_cone_body
+from tk.model.body.gait_poses import standing_pose
+from tk.model.body.limb_candidates import DISTINCT_M, LIMBS, limbs_of, pairs
+from tk.model.body.skeleton import JOINTS
+
+BODY = build_cone_body(BodyDimensions.from_stature(1.75))
+SKELETON = BODY.skeleton
+POSE = standing_pose(SKELETON)
+LIMB = {limb.name: limb for limb in limbs_of(BODY)}
+FORWARD, UP = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_limbs_have_the_parts_and_angles_that_the_body_has(preset):
+    body = build_cone_body(BODY.dimensions, preset=preset)
+    limbs = limbs_of(body)
+    assert [limb.name for limb in limbs] == list(LIMBS[2:] if preset == "walker" else LIMBS)
+    for limb in limbs:
+        assert limb.places.shape[1] == len(limb.dofs) and len(np.unique(limb.places, axis=0)) == len(limb.places)
+        assert body.free[limb.dofs].all() and body.skeleton.chain_dofs(limb.name)[limb.dofs].all()
+        assert {body.parts[p].segment[-1] for p in limb.parts} == {limb.name[-1]}
+    assert [tuple(limb.name for limb in pair) for pair in pairs(limbs)] == [
+        (f"{kind}_l", f"{kind}_r") for kind in (("leg",) if preset == "walker" else ("arm", "leg"))
+    ]
+
+
+@pytest.mark.parametrize("name", LIMBS)
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=10, deadline=None)
+def test_candidates_stay_within_the_limits_and_change_the_limb_only(name, seed):
+    limb, rng = LIMB[name], np.random.default_rng(seed)
+    pose = SKELETON.clip(rng.normal(0, 0.6, len(POSE)))
+    found = limb.candidates(pose, 40, rng)
+    assert found.shape == (len(limb.places) + 40, len(pose))
+    np.testing.assert_array_equal(SKELETON.clip(found), found)
+    others = np.delete(np.arange(len(pose)), limb.dofs)
+    np.testing.assert_array_equal(found[:, others], np.repeat(pose[None, others], len(found), axis=0))
+    # the last ones are near the present place: within four standard deviations of 25°, or at a limit
+    near = np.abs(found[-40:, limb.dofs] - pose[limb.dofs])
+    assert near.max() < np.radians(4.5 * 25) and near.max() > 0
+
+
+def directions(name, ends):
+    """(N, 3) of the upper arm or thigh, in candidates of a limb of the upright body."""
+    joints = np.array([SKELETON.joints(p) for p in LIMB[name].candidates(POSE, 0, np.random.default_rng(0))])
+    a, b = (joints[:, JOINTS.index(f"{end}_{name[-1]}")] for end in ends)
+    return (b - a) / np.linalg.norm(b - a, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("name", ["arm_l", "arm_r"])
+def test_arms_are_looked_for_in_all_directions(name):
+    """But through the back and far across; no direction is farther than 35° from one that is tried."""
+    found = directions(name, ("shoulder", "elbow"))
+    wanted = np.random.default_rng(1).normal(size=(500, 3))
+    wanted /= np.linalg.norm(wanted, axis=1, keepdims=True)
+    outward = wanted[:, 1] * (1 if name == "arm_l" else -1)
+    wanted = wanted[(wanted[:, 0] > -0.6) & (outward > -0.65)]
+    assert np.degrees(np.arccos((wanted @ found.T).max(axis=1))).max() < 35
+
+
+@pytest.mark.parametrize("name", ["arm_l", "arm_r"])
+def test_elbows_are_stretched_and_bent_to_all_sides(name):
+    elbow = list(LIMB[name].dofs).index(SKELETON.index(f"elbow_{name[-1]}_flexion"))
+    bends = np.degrees(LIMB[name].places[:, elbow])
+    assert bends.min() < 20 and bends.max() > 110 and len(np.unique(bends.round())) >= 3
+
+
+@pytest.mark.parametrize("name", ["leg_l", "leg_r"])
+def test_legs_are_looked_for_from_behind_to_a_high_kick(name):
+    found = directions(name, ("hip", "knee"))
+    forward = np.degrees(np.arctan2(found @ FORWARD, -found @ UP))
+    assert forward.min() < -15 and forward.max() > 90
+    knees = np.degrees(LIMB[name].places[:, 3])
+    assert knees.min() < 10 and knees.max() > 120
+    assert not LIMB[name].places[:, 4:].any()
+
+
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 6))
+@settings(max_examples=20, deadline=None)
+def test_distinct_places_lie_apart_and_the_cheapest_comes_first(seed, count):
+    rng = np.random.default_rng(seed)
+    limb = LIMB[LIMBS[rng.integers(4)]]
+    poses = limb.candidates(POSE, 20, rng)
+    cost = rng.uniform(size=len(poses))
+    chosen = limb.distinct(SKELETON, poses, cost, count)
+    assert 1 <= len(chosen) <= count
+    np.testing.assert_array_equal(chosen[0], poses[np.argmin(cost)])
+    ends = np.array([SKELETON.joints(p)[list(limb.joints)] for p in chosen])
+    for i in range(len(ends)):
+        for j in range(i):
+            assert np.linalg.norm(ends[i] - ends[j], axis=1).max() > DISTINCT_M
+    costs = [cost[np.flatnonzero((poses == p).all(axis=1))].min() for p in chosen]
+    assert costs == sorted(costs)
+
+
+def test_the_same_place_twice_is_one():
+    limb = LIMB["arm_l"]
+    assert len(limb.distinct(SKELETON, np.repeat(POSE[None], 5, axis=0), np.arange(5.0), 3)) == 1
+
+
+def test_combined_are_all_places_of_one_limb_with_all_of_another():
+    rng = np.random.default_rng(0)
+    left, right = (LIMB[name].candidates(POSE, 0, rng)[:n] for name, n in (("leg_l", 3), ("leg_r", 4)))
+    found = LIMB["leg_r"].combined(left, right)
+    assert found.shape == (12, len(POSE)) and len(np.unique(found, axis=0)) == 12
+    wanted = {(*a[LIMB["leg_l"].dofs], *b[LIMB["leg_r"].dofs]) for a in left for b in right}
+    assert {(*p[LIMB["leg_l"].dofs], *p[LIMB["leg_r"].dofs]) for p in found} == wanted

@@ -1,0 +1,510 @@
+"""The tree of twists: group axioms, anatomy, limits, mirror symmetry, directions of up."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from tk.errors import ConfigError
+from tk.model.body.anthropometry import RAISED_SHOULDERS, TRUNK_LENGTH, BodyDimensions
+from tk.model.body.gait_poses import neutral_pose
+from tk.model.body.skeleton import (
+    ANKLES,
+    CHAINS,
+    DEGREES_OF_FREEDOM,
+    JOINTS,
+    SEGMENTS,
+    WAIST,
+    arm_elevation,
+    build_skeleton,
+    join_pose,
+    shoulder_angles,
+    split_pose,
+    twist_exp,
+    up_rotation,
+)
+
+DIMENSIONS = BodyDimensions.from_stature(1.75)
+SKELETON = build_skeleton(DIMENSIONS)
+D = DEGREES_OF_FREEDOM
+EXACT = 1e-12
+UPS = ("x", "y", "z", "-x", "-y", "-z")
+FORWARD, LEFT, UP = np.eye(3)
+
+angles = st.one_of(st.floats(-7, 7), st.floats(-1e-7, 1e-7))
+coordinates = st.floats(-2, 2)
+points = st.tuples(coordinates, coordinates, coordinates).map(np.array)
+axes = points.filter(lambda v: np.linalg.norm(v) > 1e-2).map(lambda v: v / np.linalg.norm(v))
+seeds = st.integers(0, 2**32 - 1)
+many = settings(max_examples=60, deadline=None)
+
+
+def random_pose(seed):
+    return np.random.default_rng(seed).uniform(-np.pi, np.pi, D)
+
+
+def posed(**degrees):
+    """The zero pose but for these angles, degrees."""
+    pose = np.zeros(D)
+    for name, value in degrees.items():
+        pose[SKELETON.index(name)] = np.radians(value)
+    return pose
+
+
+def joints(pose, skeleton=SKELETON):
+    return dict(zip(JOINTS, skeleton.joints(pose), strict=True))
+
+
+def mirrored(pose):
+    """The pose of the body reflected in the plane y = 0 of the zero configuration."""
+    result = np.empty(D)
+    for k, name in enumerate(SKELETON.names):
+        partner = name.replace("_l_", "_#_").replace("_r_", "_l_").replace("_#_", "_r_")
+        # what moves along y, or turns about an axis in the plane of symmetry, changes its sign
+        sign = -1 if name in ("torso_y", "torso_yaw", "torso_roll", "neck_yaw") else 1
+        result[SKELETON.index(partner)] = sign * pose[k]
+    return result
+
+
+# Twists
+
+
+@given(axes, points, angles)
+@many
+def test_twist_exp_equals_the_matrix_exponential(w, q, angle):
+    xi = np.zeros((4, 4))
+    xi[:3, :3] = np.cross(np.eye(3), w)
+    xi[:3, 3] = -np.cross(w, q)
+    np.testing.assert_allclose(twist_exp(w, q, angle), expm(xi * angle), rtol=0, atol=1e-11)
+
+
+@given(axes, points, angles, angles)
+@many
+def test_twists_about_one_axis_form_a_group(w, q, a, b):
+    product = twist_exp(w, q, a) @ twist_exp(w, q, b)
+    np.testing.assert_allclose(product, twist_exp(w, q, a + b), rtol=0, atol=EXACT)
+    np.testing.assert_allclose(product, twist_exp(w, q, b) @ twist_exp(w, q, a), rtol=0, atol=EXACT)
+    np.testing.assert_allclose(twist_exp(w, q, a) @ twist_exp(w, q, -a), np.eye(4), rtol=0, atol=EXACT)
+    np.testing.assert_allclose(np.linalg.inv(twist_exp(w, q, a)), twist_exp(w, q, -a), rtol=0, atol=EXACT)
+    np.testing.assert_array_equal(twist_exp(w, q, 0.0), np.eye(4))
+
+
+@given(axes, points, angles, st.floats(-3, 3))
+@many
+def test_twist_is_rigid_and_keeps_its_axis(w, q, angle, along):
+    T = twist_exp(w, q, angle)
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), rtol=0, atol=EXACT)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1, abs=1e-12)
+    np.testing.assert_allclose(T[:3, :3] @ (q + along * w) + T[:3, 3], q + along * w, rtol=0, atol=EXACT)
+    # only the foot of the axis counts, not which point of it is named
+    np.testing.assert_allclose(twist_exp(w, q + along * w, angle), T, rtol=0, atol=EXACT)
+
+
+# The tree
+
+
+def test_layout():
+    s = SKELETON
+    assert len(s.names) == len(set(s.names)) == D == 24
+    assert s.units == ("m",) * 3 + ("rad",) * 21
+    assert (s.parent < np.arange(D)).all() and s.parent[0] == -1
+    np.testing.assert_allclose(np.linalg.norm(s.axis, axis=1), 1)
+    assert [s.names[k] for k in s.segment_dof] == [
+        "torso_pitch",
+        "neck_yaw",
+        "shoulder_l_roll",
+        "elbow_l_flexion",
+        "shoulder_r_roll",
+        "elbow_r_flexion",
+        "hip_l_roll",
+        "knee_l_flexion",
+        "hip_r_roll",
+        "knee_r_flexion",
+        "torso_pitch",  # the pelvis, part of the trunk
+        "knee_l_flexion",  # the feet, parts of the calves
+        "knee_r_flexion",
+    ]
+
+
+# The waist
+
+WAISTED = build_skeleton(DIMENSIONS, waist=True)
+
+
+def waisted_poses(count=20, up="z"):
+    skeleton = build_skeleton(DIMENSIONS, up, waist=True)
+    poses = np.random.default_rng(3).normal(0, 0.4, (count, len(skeleton.names)))
+    return skeleton, skeleton.clip(poses)
+
+
+def test_a_waist_is_three_more_degrees_of_freedom_between_trunk_and_pelvis():
+    assert tuple(np.array(WAISTED.names)[~WAISTED.is_waist]) == SKELETON.names
+    assert tuple(np.array(WAISTED.names)[WAISTED.is_waist]) == WAIST
+    assert (WAISTED.parent < np.arange(27)).all()
+    moved = WAISTED.ancestors()[:, WAISTED.is_waist]
+    below = {SEGMENTS[s] for s in np.flatnonzero(moved.all(axis=1))}
+    assert (
+        below == {"pelvis", "thigh_l", "calf_l", "foot_l", "thigh_r", "calf_r", "foot_r"}
+        and (moved.any(axis=1) == moved.all(axis=1)).all()
+    )
+    assert not np.array([WAISTED.chain_dofs(c) for c in CHAINS])[:, WAISTED.is_waist].any()
+
+
+def test_a_straight_waist_changes_nothing():
+    _, poses = waisted_poses()
+    poses[:, WAISTED.is_waist] = 0
+    for pose in poses:
+        np.testing.assert_allclose(WAISTED.joints(pose), SKELETON.joints(pose[~WAISTED.is_waist]), atol=EXACT)
+
+
+@pytest.mark.parametrize("up", ["z", "-y"])
+def test_without_a_waist_all_limbs_keep_their_directions(up):
+    skeleton, poses = waisted_poses(up=up)
+    plain = build_skeleton(DIMENSIONS, up)
+    for pose in poses:
+        told, waist, none = split_pose(skeleton, pose)
+        np.testing.assert_array_equal(waist, pose[skeleton.is_waist])
+        R, R_told = (s.segment_transforms(p)[:, :3, :3] for s, p in ((skeleton, pose), (plain, told)))
+        limbs = [SEGMENTS.index(s) for s in SEGMENTS if s != "pelvis"]
+        np.testing.assert_allclose(R_told[limbs], R[limbs], atol=1e-9)
+        # the sockets are moved by less than the waist's angle times their distance from it
+        away = np.linalg.norm(plain.joints(told) - skeleton.joints(pose), axis=1).max()
+        assert away < 0.25 * np.linalg.norm(waist) + 1e-9
+        np.testing.assert_allclose(join_pose(skeleton, told, waist, none), pose, atol=1e-9)
+
+
+# The whole skeleton, with waist and ankles
+
+
+def whole(up="z"):
+    return build_skeleton(DIMENSIONS, up, waist=True, ankles=True)
+
+
+def test_ankles_are_two_more_degrees_of_freedom_a_side_that_move_the_foot_only():
+    skeleton = whole()
+    assert len(skeleton.names) == 31 and tuple(np.array(skeleton.names)[skeleton.is_ankle]) == ANKLES
+    assert tuple(np.array(skeleton.names)[skeleton.is_paper]) == SKELETON.names
+    assert (skeleton.is_paper ^ skeleton.is_waist ^ skeleton.is_ankle).all()
+    for side in "lr":
+        moved = skeleton.ancestors()[:, [skeleton.index(f"ankle_{side}_{n}") for n in ("flexion", "inversion")]]
+        assert [s for s, m in zip(SEGMENTS, moved.any(axis=1), strict=True) if m] == [f"foot_{side}"]
+        assert moved[SEGMENTS.index(f"foot_{side}")].all()
+    pose = np.random.default_rng(0).uniform(-0.5, 0.5, 31)
+    bent = pose.copy()
+    bent[skeleton.is_ankle] = 0.3
+    np.testing.assert_array_equal(skeleton.joints(bent), skeleton.joints(pose), err_msg="no joint is below an ankle")
+
+
+@pytest.mark.parametrize("side", ["l", "r"])
+def test_signs_of_the_ankles_are_anatomical(side):
+    """Flexion lifts the toes, inversion turns the sole inwards; the limits are those of a foot."""
+    skeleton = whole()
+    foot = SEGMENTS.index(f"foot_{side}")
+
+    def turned(name):
+        pose = np.zeros(31)
+        pose[skeleton.index(f"ankle_{side}_{name}")] = 0.2
+        return skeleton.segment_transforms(pose)[foot][:3, :3]
+
+    assert (turned("flexion") @ FORWARD)[2] == pytest.approx(np.sin(0.2))
+    inward = -1 if side == "l" else 1
+    assert (turned("inversion") @ -UP)[1] * inward == pytest.approx(np.sin(0.2))
+    for name, low, high in (("flexion", -60, 40), ("inversion", -30, 40)):
+        k = skeleton.index(f"ankle_{side}_{name}")
+        np.testing.assert_allclose(np.degrees([skeleton.lower[k], skeleton.upper[k]]), [low, high])
+    assert (skeleton.clip(np.full(31, -9.0))[skeleton.is_ankle] < 0).all()
+
+
+@pytest.mark.parametrize("up", ["z", "-y"])
+@given(seed=seeds)
+@settings(max_examples=20, deadline=None)
+def test_poses_are_split_and_joined(up, seed):
+    """A round trip; in between, what is told has the same limbs, and the legs hang elsewhere by the waist only."""
+    skeleton = whole(up)
+    pose = skeleton.clip(np.random.default_rng(seed).normal(0, 0.5, 31))
+    paper, waist, ankles = split_pose(skeleton, pose)
+    assert (len(paper), len(waist), len(ankles)) == (24, 3, 4)
+    np.testing.assert_array_equal(waist, pose[skeleton.is_waist])
+    np.testing.assert_array_equal(ankles, pose[skeleton.is_ankle])
+    joined = join_pose(skeleton, paper, waist, ankles)
+    np.testing.assert_allclose(joined, pose, atol=1e-9)
+    np.testing.assert_allclose(skeleton.joints(joined), skeleton.joints(pose), atol=1e-9)
+    plain = build_skeleton(DIMENSIONS, up)
+    R, R_told = (s.segment_transforms(p)[:, :3, :3] for s, p in ((skeleton, pose), (plain, paper)))
+    limbs = [SEGMENTS.index(s) for s in SEGMENTS if s != "pelvis" and not s.startswith("foot")]
+    np.testing.assert_allclose(R_told[limbs], R[limbs], atol=1e-9)
+
+
+def test_bodies_without_waist_or_ankles_are_split_into_nothing_more():
+    pose = random_pose(3)
+    paper, waist, ankles = split_pose(SKELETON, SKELETON.clip(pose))
+    np.testing.assert_allclose(paper, SKELETON.clip(pose), atol=1e-12)
+    assert waist.shape == ankles.shape == (0,)
+    np.testing.assert_allclose(join_pose(SKELETON, paper, waist, ankles), SKELETON.clip(pose), atol=1e-12)
+
+
+@pytest.mark.parametrize("up", ["z", "-y"])
+@given(seed=seeds)
+@settings(max_examples=20, deadline=None)
+def test_transforms_are_the_products_of_exponentials(up, seed):
+    """T_k = T_parent(k) exp(ξ_k p_k), one after the other; a raised arm lifts its shoulder."""
+    skeleton = whole(up)
+    pose = np.random.default_rng(seed).uniform(-np.pi, np.pi, 31)
+    expected = []
+    for k, parent in enumerate(skeleton.parent):
+        step = np.eye(4)
+        if skeleton.prismatic[k]:
+            step[:3, 3] = skeleton.axis[k] * pose[k]
+        else:
+            step = twist_exp(skeleton.axis[k], skeleton.point[k], pose[k])
+        if skeleton.rise[k].any():
+            step[:3, 3] += skeleton.rise[k] * arm_elevation(pose[k], pose[k + 1])
+        expected.append(step if parent < 0 else expected[parent] @ step)
+    np.testing.assert_allclose(skeleton.transforms(pose), expected, atol=1e-12)
+
+
+def test_chains_and_torso_share_out_the_degrees_of_freedom():
+    free = np.array([SKELETON.chain_dofs(c) for c in CHAINS])
+    assert free.sum(axis=0).max() == 1
+    assert free.sum(axis=1).tolist() == [2, 4, 4, 4, 4]
+    assert [SKELETON.names[k] for k in np.flatnonzero(~free.any(axis=0))] == [
+        "torso_x",
+        "torso_y",
+        "torso_z",
+        "torso_yaw",
+        "torso_roll",
+        "torso_pitch",
+    ]
+    for chain, moved in zip(CHAINS, free, strict=True):
+        # a chain's degrees of freedom move its own segments and no others
+        affected = SKELETON.ancestors()[:, moved].any(axis=1)
+        assert {s for s, a in zip(SEGMENTS, affected, strict=True) if a} == set(CHAINS[chain])
+
+
+def test_ancestors_are_what_moves_a_segment():
+    pose = random_pose(0)
+    before = SKELETON.segment_transforms(pose)
+    for k in range(D):
+        moved = np.abs(SKELETON.segment_transforms(pose + 0.1 * np.eye(D)[k]) - before).max(axis=(1, 2)) > 1e-9
+        np.testing.assert_array_equal(moved, SKELETON.ancestors()[:, k])
+
+
+@given(seeds)
+@many
+def test_lengths_do_not_depend_on_the_pose(seed):
+    d, j = DIMENSIONS, joints(random_pose(seed))
+    pelvis = (j["hip_l"] + j["hip_r"]) / 2
+    np.testing.assert_allclose(j["pelvis"], pelvis, atol=EXACT)
+    lengths = {("pelvis", "neck"): d.trunk, ("neck", "head_top"): d.head, ("hip_l", "hip_r"): 2 * d.hip_half_width}
+    for s in "lr":
+        lengths |= {(f"shoulder_{s}", f"elbow_{s}"): d.upper_arm, (f"elbow_{s}", f"wrist_{s}"): d.forearm}
+        lengths |= {(f"hip_{s}", f"knee_{s}"): d.thigh, (f"knee_{s}", f"ankle_{s}"): d.calf}
+    for (a, b), length in lengths.items():
+        assert np.linalg.norm(j[a] - j[b]) == pytest.approx(length, abs=1e-12), (a, b)
+
+
+def test_shoulders_rise_with_the_arms():
+    """By the same amount from hanging to level as from level to upright; sideways or forward makes no difference."""
+    heights = {}
+    for name, direction in (("hanging", -UP), ("forward", FORWARD), ("sideways", LEFT), ("upright", UP)):
+        pose = np.zeros(D)
+        local = np.array([direction @ FORWARD, direction @ LEFT, direction @ UP])
+        pose[SKELETON.index("shoulder_l_yaw")], pose[SKELETON.index("shoulder_l_pitch")] = shoulder_angles(local)
+        heights[name] = joints(pose)["shoulder_l"] @ UP
+    lift = RAISED_SHOULDERS * DIMENSIONS.trunk / TRUNK_LENGTH
+    level = DIMENSIONS.trunk - DIMENSIONS.shoulder_drop
+    np.testing.assert_allclose(list(heights.values()), [level - lift, level, level, level + lift], atol=1e-12)
+
+
+@given(seeds)
+@many
+def test_twists_are_derivatives(seed):
+    pose = random_pose(seed)
+    x = SKELETON.joints(pose)
+    w, v = SKELETON.twists(pose)
+    h = 1e-6
+    for k in range(D):
+        step = h * np.eye(D)[k]
+        numeric = (SKELETON.joints(pose + step) - SKELETON.joints(pose - step)) / (2 * h)
+        moves = SKELETON.ancestors()[SKELETON.joint_segment, k]
+        np.testing.assert_allclose((np.cross(w[k], x) + v[k])[moves], numeric[moves], atol=1e-8)
+        np.testing.assert_array_equal(numeric[~moves], 0)
+
+
+# Anatomy: which way is positive
+
+
+def test_zero_configuration():
+    j = joints(np.zeros(D))
+    diagonal = (FORWARD + LEFT) / np.sqrt(2)
+    np.testing.assert_allclose(j["wrist_l"] - j["shoulder_l"], (DIMENSIONS.upper_arm + DIMENSIONS.forearm) * diagonal)
+    np.testing.assert_allclose(j["ankle_r"] - j["hip_r"], -(DIMENSIONS.thigh + DIMENSIONS.calf) * UP, atol=EXACT)
+    assert j["shoulder_l"] @ LEFT > 0 > j["shoulder_r"] @ LEFT
+
+
+@pytest.mark.parametrize("side", ["l", "r"])
+def test_signs_are_anatomical(side):
+    rest, outward = joints(np.zeros(D)), LEFT if side == "l" else -LEFT
+
+    def moved(joint, **degrees):
+        return joints(posed(**degrees))[joint] - rest[joint]
+
+    assert moved(f"ankle_{side}", **{f"knee_{side}_flexion": 60}) @ FORWARD < -0.1, "knees bend backwards"
+    assert moved(f"knee_{side}", **{f"hip_{side}_pitch": -60}) @ FORWARD > 0.1, "hip flexion is negative pitch"
+    assert moved(f"knee_{side}", **{f"hip_{side}_yaw": 30}) @ outward > 0.1, "abduction is positive yaw"
+    assert moved("head_top", neck_pitch=30) @ FORWARD > 0.05, "a nod is positive pitch"
+    assert moved("head_top", torso_pitch=30) @ FORWARD > 0.1, "a bow is positive pitch"
+
+
+@pytest.mark.parametrize("side", ["l", "r"])
+@pytest.mark.parametrize(("arm", "towards"), [("hanging", FORWARD), ("raised", None)])
+def test_elbow_bends_forward_when_the_arm_hangs_and_inward_when_it_is_raised(side, arm, towards):
+    """By more than 45° at zero twist: where a bend begins that the optimiser knows nothing about."""
+    towards = (-LEFT if side == "l" else LEFT) if towards is None else towards
+    along = -UP if arm == "hanging" else UP
+    yaw, pitch = np.degrees(shoulder_angles(along))
+    angles = {f"shoulder_{side}_yaw": yaw, f"shoulder_{side}_pitch": pitch}
+    straight, bent = joints(posed(**angles)), joints(posed(**angles, **{f"elbow_{side}_flexion": 90}))
+    elbow, wrist = f"elbow_{side}", f"wrist_{side}"
+    np.testing.assert_allclose(straight[wrist] - straight[elbow], DIMENSIONS.forearm * along, atol=1e-9)
+    bend = (bent[wrist] - bent[elbow]) / DIMENSIONS.forearm
+    assert abs(bend @ along) < 1e-9 and bend @ towards > np.cos(np.pi / 4)
+
+
+@pytest.mark.parametrize("side", ["l", "r"])
+@pytest.mark.parametrize(("ball", "end"), [("shoulder", "elbow"), ("hip", "knee")])
+def test_ball_joints_turn_about_three_perpendicular_axes_the_last_along_the_limb(ball, end, side):
+    rows = [k for k, name in enumerate(SKELETON.names) if name.startswith(f"{ball}_{side}_")]
+    axis, j = SKELETON.axis[rows], joints(np.zeros(D))
+    np.testing.assert_allclose(axis @ axis.T, np.eye(3), atol=1e-12)
+    limb = j[f"{end}_{side}"] - j[f"{ball}_{side}"]
+    assert abs(axis[-1] @ limb) == pytest.approx(np.linalg.norm(limb))
+
+
+# Limits
+
+
+def test_limits_hold_the_zero_and_the_neutral_pose():
+    for pose in (np.zeros(D), neutral_pose(SKELETON)):
+        np.testing.assert_array_equal(SKELETON.clip(pose), pose)
+    assert (SKELETON.lower < SKELETON.upper).all()
+    assert np.isinf(SKELETON.upper[SKELETON.prismatic]).all()
+
+
+@given(seeds)
+@many
+def test_clip_is_a_projection(seed):
+    poses = np.random.default_rng(seed).uniform(-6, 6, (5, D))
+    clipped = SKELETON.clip(poses)
+    assert ((clipped >= SKELETON.lower) & (clipped <= SKELETON.upper)).all()
+    np.testing.assert_array_equal(SKELETON.clip(clipped), clipped)
+    inside = (poses >= SKELETON.lower) & (poses <= SKELETON.upper)
+    np.testing.assert_array_equal(clipped[inside], poses[inside])
+
+
+def arm_directions(plane, degrees):
+    """Unit vectors (forward, outward, up) of an arm raised by these angles from hanging, or swung from sideways."""
+    t = np.radians(degrees)
+    zero, one = np.zeros_like(t), np.ones_like(t)
+    return {
+        "sagittal": np.stack([np.sin(t), zero, -np.cos(t)], -1),
+        "frontal": np.stack([zero, np.sin(t), -np.cos(t)], -1),
+        "horizontal": np.stack([np.sin(t), np.cos(t), zero * one], -1),
+    }[plane]
+
+
+@pytest.mark.parametrize(
+    ("plane", "lower", "upper"),
+    [("sagittal", -62, 167), ("frontal", 0, 184), ("horizontal", -45, 141)],
+    ids=["flexion", "abduction", "horizontal adduction"],
+)
+@pytest.mark.parametrize("side", ["l", "r"])
+def test_limits_hold_the_shoulders_clinical_range(plane, lower, upper, side):
+    """Boone & Azen's mean active ranges and 10° beyond, as directions of the arm; and the angles lead there."""
+    yaw, pitch = SKELETON.index(f"shoulder_{side}_yaw"), SKELETON.index(f"shoulder_{side}_pitch")
+    outward = LEFT if side == "l" else -LEFT
+    for direction in arm_directions(plane, np.linspace(lower - 10, upper + 10, 60)):
+        pose = np.zeros(D)
+        pose[yaw], pose[pitch] = shoulder_angles(direction)
+        np.testing.assert_array_equal(SKELETON.clip(pose), pose)
+        j = joints(pose)
+        arm = (j[f"elbow_{side}"] - j[f"shoulder_{side}"]) / DIMENSIONS.upper_arm
+        np.testing.assert_allclose(arm, direction @ [FORWARD, outward, UP], atol=1e-12)
+
+
+@given(st.floats(-180, 180), st.floats(-90, 90))
+@many
+def test_only_a_cone_about_the_singular_diagonal_is_out_of_reach(azimuth, elevation):
+    a, e = np.radians([azimuth, elevation])
+    direction = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    pose = np.zeros(D)
+    yaw, pitch = SKELETON.index("shoulder_l_yaw"), SKELETON.index("shoulder_l_pitch")
+    pose[yaw], pose[pitch] = shoulder_angles(direction)
+    from_diagonal = np.degrees(np.arccos(np.clip(np.abs(direction @ [-1, 1, 1]) / np.sqrt(3), 0, 1)))
+    reachable = (SKELETON.clip(pose) == pose).all()
+    assert reachable or from_diagonal < 10 + 1e-6
+
+
+def test_the_singular_diagonal_lies_apart_from_plain_directions():
+    """54° from hanging, raised, forward, backward and sideways, as the module says."""
+    pole = SKELETON.axis[SKELETON.index("shoulder_l_yaw")]
+    for plain in (-UP, UP, FORWARD, -FORWARD, LEFT):
+        assert np.degrees(np.arccos(abs(pole @ plain))) > 54
+
+
+# Mirror symmetry
+
+
+@given(seeds)
+@many
+def test_mirrored_pose_gives_mirrored_joints(seed):
+    pose = random_pose(seed)
+    there = joints(mirrored(pose))
+    for name, x in joints(pose).items():
+        partner = name[:-1] + {"l": "r", "r": "l"}[name[-1]] if name[-2:] in ("_l", "_r") else name
+        np.testing.assert_allclose(there[partner], x * [1, -1, 1], rtol=0, atol=EXACT, err_msg=name)
+    np.testing.assert_array_equal(mirrored(mirrored(pose)), pose)
+
+
+def test_limits_are_mirror_symmetric():
+    spans = mirrored(SKELETON.upper), mirrored(SKELETON.lower)
+    np.testing.assert_array_equal(np.maximum(*spans)[3:], SKELETON.upper[3:])
+    np.testing.assert_array_equal(np.minimum(*spans)[3:], SKELETON.lower[3:])
+
+
+# Up
+
+
+@pytest.mark.parametrize("up", UPS)
+def test_up_rotation_is_a_rotation_that_lifts_z(up):
+    B = up_rotation(up)
+    np.testing.assert_array_equal(B @ B.T, np.eye(3))
+    assert np.linalg.det(B) == pytest.approx(1)
+    expected = np.zeros(3)
+    expected["xyz".index(up[-1])] = -1 if up.startswith("-") else 1
+    np.testing.assert_array_equal(B @ UP, expected)
+
+
+@pytest.mark.parametrize("up", UPS)
+@given(seed=seeds)
+@settings(max_examples=10, deadline=None)
+def test_another_up_gives_the_rotated_result(up, seed):
+    """Angles mean the same; translations are along the world's axes."""
+    skeleton, B = build_skeleton(DIMENSIONS, up), up_rotation(up)
+    pose = random_pose(seed)
+    turned = pose.copy()
+    turned[:3] = B @ pose[:3]
+    np.testing.assert_allclose(skeleton.joints(turned), SKELETON.joints(pose) @ B.T, rtol=0, atol=EXACT)
+    np.testing.assert_array_equal(skeleton.lower, SKELETON.lower)
+
+
+def test_z_is_the_default_and_leaves_the_body_frame():
+    np.testing.assert_array_equal(up_rotation("z"), np.eye(3))
+    np.testing.assert_array_equal(build_skeleton(DIMENSIONS).T_world_body, np.eye(3))
+
+
+@pytest.mark.parametrize("up", ["", "w", "zz", "north", "-"])
+def test_unknown_up_is_named(up):
+    with pytest.raises(ConfigError, match="must be one of x, y, z"):
+        up_rotation(up)

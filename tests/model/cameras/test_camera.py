@@ -1,0 +1,153 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tk.model.cameras.camera import Camera, Rig
+
+MATRIX = np.array([[600.0, 0.0, 321.5], [0.0, 590.0, 238.0], [0.0, 0.0, 1.0]])
+
+#: pixels; undistortion iterates to 1e-12 in normalised coordinates, at a focal length of 600
+ROUND_TRIP_PX = 1e-6
+
+
+def camera(
+    distortions: tuple[float, ...] = (0.0,) * 5,
+    rotation: tuple[float, float, float] = (1.6, 0.3, -0.2),
+    translation: tuple[float, float, float] = (0.1, 0.9, 3.5),
+    fisheye: bool = False,
+) -> Camera:
+    return Camera(
+        name="cam",
+        width=640,
+        height=480,
+        matrix=MATRIX,
+        distortions=np.array(distortions),
+        rotation=cv2.Rodrigues(np.array(rotation))[0],
+        translation=np.array(translation),
+        fisheye=fisheye,
+    )
+
+
+LENSES = {
+    "none": camera(),
+    "barrel": camera((-0.3, 0.1, 0.001, -0.002, 0.0)),
+    "pincushion": camera((0.08, 0.02, -0.001, 0.001)),
+    "third order": camera((-0.2, 0.05, 0.0, 0.0, -0.02)),
+    "fisheye": camera((0.05, -0.01, 0.002, -0.001), fisheye=True),
+}
+
+pixels = st.tuples(st.floats(0, 639), st.floats(0, 479))
+angles = st.floats(-3, 3)
+metres = st.floats(-5, 5)
+
+
+def by_hand(cam: Camera, p_world: np.ndarray) -> np.ndarray:
+    """One point through OpenCV's published lens models, step by step: the oracle of `project`."""
+    x, y, z = cam.rotation @ p_world + cam.translation
+    a, b = x / z, y / z
+    if cam.fisheye:
+        r = np.hypot(a, b)
+        theta = np.arctan(r)
+        k = cam.distortions
+        bent = theta * (1 + k[0] * theta**2 + k[1] * theta**4 + k[2] * theta**6 + k[3] * theta**8)
+        scale = bent / r if r > 1e-9 else 1.0
+        a, b = a * scale, b * scale
+    else:
+        k1, k2, p1, p2, *rest = cam.distortions
+        k3 = rest[0] if rest else 0.0
+        r2 = a * a + b * b
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        a, b = (
+            a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a),
+            b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b,
+        )
+    return np.array([MATRIX[0, 0] * a + MATRIX[0, 2], MATRIX[1, 1] * b + MATRIX[1, 2]])
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_projection_equals_the_published_model(lens: str) -> None:
+    cam = LENSES[lens]
+    rng = np.random.default_rng(1)
+    p_camera = np.column_stack([rng.uniform(-0.5, 0.5, (50, 2)), np.ones(50)]) * rng.uniform(1, 6, (50, 1))
+    p_world = (p_camera - cam.translation) @ cam.rotation
+    found, depth = cam.project(p_world)
+    np.testing.assert_allclose(found, [by_hand(cam, p) for p in p_world], atol=1e-9)
+    np.testing.assert_allclose(depth, p_camera[:, 2], rtol=1e-12)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@given(pixel=pixels, distance_m=st.floats(0.3, 20))
+def test_a_point_on_a_pixels_ray_projects_to_the_pixel(
+    lens: str, pixel: tuple[float, float], distance_m: float
+) -> None:
+    cam = LENSES[lens]
+    (ray,) = cam.rays([pixel])
+    assert np.linalg.norm(ray) == pytest.approx(1)
+    found, depth = cam.project([cam.center + distance_m * ray])
+    np.testing.assert_allclose(found[0], pixel, atol=ROUND_TRIP_PX)
+    assert 0 < depth[0] <= distance_m * (1 + 1e-12)
+
+
+@given(rotation=st.tuples(angles, angles, angles), translation=st.tuples(metres, metres, metres))
+def test_the_centre_is_where_the_rays_meet(
+    rotation: tuple[float, float, float], translation: tuple[float, float, float]
+) -> None:
+    cam = camera(rotation=rotation, translation=translation)
+    np.testing.assert_allclose(cam.to_camera([cam.center]), np.zeros((1, 3)), atol=1e-12)
+    homogeneous = cam.projection @ np.append(cam.center + 2 * cam.rotation[2], 1.0)
+    np.testing.assert_allclose(homogeneous[:2] / homogeneous[2], MATRIX[:2, 2], atol=1e-9)  # the axis meets (cx, cy)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_points_behind_are_not_seen(lens: str) -> None:
+    cam = LENSES[lens]
+    ahead = cam.center + cam.rotation[2]
+    behind = cam.center - cam.rotation[2]
+    found, depth = cam.project([behind, cam.center, ahead])
+    assert np.isnan(found[:2]).all() and np.isfinite(found[2]).all()
+    assert depth[0] == pytest.approx(-1)
+    assert cam.sees([behind, cam.center, ahead]).tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("cam", "fold"),
+    [
+        # r (1 - 0.3 r²) turns back at r = 1.054 = tan 46.5°
+        (camera((-0.3, 0.0, 0.0, 0.0)), np.arctan(np.sqrt(1 / 0.9))),
+        # θ (1 - 0.3 θ²) turns back at θ = 1.054
+        (camera((-0.3, 0.0, 0.0, 0.0), fisheye=True), np.sqrt(1 / 0.9)),
+    ],
+)
+def test_points_beyond_the_fold_of_the_distortion_are_not_seen(cam: Camera, fold: float) -> None:
+    """Past the fold a point far outside the field of view would come back into the picture."""
+    angle = np.array([0.2, 0.95 * fold, 1.02 * fold, 1.2 * fold])
+    p_camera = np.column_stack([np.sin(angle), np.zeros(4), np.cos(angle)])
+    found, _ = cam.project((p_camera - cam.translation) @ cam.rotation)
+    assert np.isfinite(found[:, 0]).tolist() == [True, True, False, False]
+
+
+def test_sees_rounds_to_pixels() -> None:
+    cam = camera()
+    edges = np.array([[-0.49, 0.0], [-0.51, 0.0], [639.49, 479.49], [639.51, 0.0], [0.0, 479.51]])
+    p_world = cam.center + 3 * cam.rays(edges)
+    assert cam.sees(p_world).tolist() == [True, False, True, False, False]
+
+
+def test_empty_arrays_pass_through() -> None:
+    for cam in LENSES.values():
+        found, depth = cam.project(np.zeros((0, 3)))
+        assert found.shape == (0, 2) and depth.shape == (0,)
+        assert cam.sees(np.zeros((0, 3))).shape == (0,)
+        assert cam.rays(np.zeros((0, 2))).shape == (0, 3)
+
+
+def test_rig() -> None:
+    tall = Camera("tall", 300, 700, MATRIX, np.zeros(5), np.eye(3), np.array([0.0, 0.0, 2.0]))
+    rig = Rig((camera(), tall))
+    assert rig.names == ("cam", "tall") and len(rig) == 2 and list(rig)[1] is rig[1]
+    assert rig.frame_shape == (700, 640)
+    np.testing.assert_allclose(rig.centers[1], [0, 0, -2])

@@ -1,0 +1,254 @@
+"""Cameras and clocks found again from a person who is drawn exactly; rows against finite differences."""
+
+from dataclasses import replace
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.model.body.test_body_fit import edgels_all_over, walk
+from tests.model.ring import ring_of_cameras
+from tk.errors import ConfigError
+from tk.io.captures.mask_store import MaskStore
+from tk.kernels.cones import CONE
+from tk.kernels.line_search import SearchSettings
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.body_parameters import Family, shapes_of
+from tk.model.body.cone_body import SHAPE_NUMBERS, build_cone_body, group_of
+from tk.model.cameras.agreement import camera_agreement
+from tk.model.cameras.bundle import camera_rows, gather
+from tk.model.cameras.camera import Camera, Rig
+from tk.model.cameras.refinement import (
+    MOVE_M,
+    TURN_DEG,
+    RefinementSettings,
+    aligned,
+    refine_cameras,
+    turn_between,
+    world_motions,
+)
+from tk.model.masks.silhouettes import CleaningSettings, Views, draw_silhouettes
+from tk.run.refinement import refine_rig
+from tk.trackers.contour_tracker import SilhouetteSettings
+
+RIG = ring_of_cameras(4, width=320, height=400)
+BODY = build_cone_body(BodyDimensions.from_stature(1.75))
+FRAMES = 12
+SEARCH, CLEANING = SearchSettings(), CleaningSettings()
+QUICK = RefinementSettings(rounds=4, scales=1)
+
+
+@cache
+def motion() -> np.ndarray:
+    """(F, D) a person who walks forwards and turns."""
+    poses = walk(BODY, FRAMES)
+    names = BODY.skeleton.names
+    poses[:, names.index("torso_x")] = np.linspace(-0.4, 0.4, FRAMES)
+    poses[:, names.index("torso_y")] = 0.3 * np.sin(np.linspace(0, 3, FRAMES))
+    poses[:, names.index("torso_yaw")] = np.linspace(0, 2.0, FRAMES)
+    return poses
+
+
+def drawn(late: tuple[float, ...] = (0, 0, 0, 0)) -> MaskStore:
+    """Masks of the motion; picture k of a camera shows the pose of frame k + late."""
+    frame = np.arange(FRAMES)
+    layers = []
+    for camera, delay in zip(RIG, late, strict=True):
+        at = np.clip(frame + delay, 0, FRAMES - 1)
+        poses = np.column_stack([np.interp(at, frame, column) for column in motion().T])
+        layers.append(draw_silhouettes(BODY, Rig((camera,)), poses)[:, 0])
+    store = MaskStore()
+    for k, masks in enumerate(np.stack(layers, axis=1)):
+        store.put(k, masks)
+    return store
+
+
+@cache
+def in_time() -> MaskStore:
+    return drawn()
+
+
+def moments(store: MaskStore, rig: Rig):
+    return gather(
+        lambda k, c: store.get(k)[c],
+        Views(rig),
+        np.arange(FRAMES),
+        motion(),
+        np.ones(FRAMES, bool),
+        FRAMES,
+        1,
+        CLEANING,
+    )
+
+
+def astray(camera: Camera, rng: np.random.Generator, deg: float = 0.25, metres: float = 0.01) -> Camera:
+    axis, way = rng.normal(size=(2, 3))
+    turn = np.asarray(cv2.Rodrigues(np.radians(deg) * axis / np.linalg.norm(axis))[0])
+    center = camera.center + metres * way / np.linalg.norm(way)
+    return replace(camera, rotation=turn @ camera.rotation, translation=-turn @ camera.rotation @ center)
+
+
+PERTURBED = Rig(tuple(astray(camera, np.random.default_rng(20 + i)) for i, camera in enumerate(RIG)))
+
+
+def errors(rig: Rig) -> tuple[float, float]:
+    """Largest turn (degrees) and distance of the centres (metres) from the truth, the world's motion taken off."""
+    rig = aligned(rig, RIG, np.radians(0.1), 0.005)
+    turns = [turn_between(one, other) for one, other in zip(rig, RIG, strict=True)]
+    return max(turns), float(np.linalg.norm(rig.centers - RIG.centers, axis=1).max())
+
+
+# --- derivatives and gauge --------------------------------------------------------------------------------------------
+
+
+def test_a_camera_that_shows_nothing_tells_nothing():
+    store = MaskStore()
+    for k in range(FRAMES):
+        masks = in_time().get(k).copy()
+        masks[2] = 0
+        store.put(k, masks)
+    agreement = camera_agreement(BODY, RIG, moments(store, RIG), SEARCH)
+    assert np.isfinite(agreement.shift_px).all() and not agreement.astray.any()
+
+
+@pytest.mark.parametrize("kind", ["turn", "move", "focal", "shift"])
+def test_rows_by_a_camera_are_differences(kind):
+    camera = replace(RIG[1], distortions=np.array([-0.08, 0.01, 0.001, -0.002, 0.0]))
+    rng = np.random.default_rng(3)
+    edgels = edgels_all_over(BODY, 60)
+    x = BODY.place(motion()[3], edgels.part, edgels.unscaled)
+    pixel, _ = camera.project(x)
+    normal = rng.normal(size=(len(x), 2))
+    step = 1e-6 * np.eye(3)
+    J = np.stack([(camera.project(x + s)[0] - camera.project(x - s)[0]) / 2e-6 for s in step], axis=2)
+    edgels = edgels._replace(pixel=pixel, normal=normal, row=np.einsum("ni,nij->nj", normal, J))
+    rows = camera_rows(camera, x, edgels, kind)
+
+    def changed(row):
+        if kind == "turn":
+            turn = np.asarray(cv2.Rodrigues(row)[0])
+            return replace(camera, rotation=turn @ camera.rotation, translation=turn @ camera.translation)
+        if kind == "move":
+            return replace(camera, translation=camera.translation + row)
+        K = camera.matrix.copy()
+        if kind == "focal":
+            K[[0, 1], [0, 1]] *= np.exp(row[0])
+        else:
+            K[:2, 2] += row
+        return replace(camera, matrix=K)
+
+    for k, way in enumerate(1e-5 * np.eye(rows.shape[1])):
+        moved = (changed(way).project(x)[0] - changed(-way).project(x)[0]) / 2e-5
+        np.testing.assert_allclose(rows[:, k], np.einsum("ni,ni->n", normal, moved), rtol=1e-4, atol=1e-3)
+
+
+def test_the_worlds_motions_change_no_picture():
+    modes = world_motions(RIG).reshape(len(RIG), 6, 7)
+    x = np.random.default_rng(1).uniform([-0.5, -0.5, 0], [0.5, 0.5, 1.8], (30, 3))
+    for k in range(7):
+        a, b, s = 1e-6 * np.eye(7)[k, :3], 1e-6 * np.eye(7)[k, 3:6], 1e-6 * np.eye(7)[k, 6]
+        world = x + np.cross(a, x) + b + s * x
+        for camera, mode in zip(RIG, modes, strict=True):
+            turn = np.asarray(cv2.Rodrigues(1e-6 * mode[:3, k])[0])
+            moved = replace(
+                camera, rotation=turn @ camera.rotation, translation=turn @ camera.translation + 1e-6 * mode[3:, k]
+            )
+            np.testing.assert_allclose(moved.project(world)[0], camera.project(x)[0], atol=1e-6)
+
+
+def test_a_world_that_was_moved_and_grew_is_brought_back():
+    Q, t = np.asarray(cv2.Rodrigues(np.array([0.02, -0.05, 0.1]))[0]), np.array([0.1, -0.2, 0.05])
+    moved = []
+    for camera in RIG:
+        rotation = camera.rotation @ Q.T
+        moved.append(replace(camera, rotation=rotation, translation=-rotation @ (1.02 * Q @ camera.center + t)))
+    back = aligned(Rig(tuple(moved)), RIG, 0.002, 0.005)
+    np.testing.assert_allclose(back.centers, RIG.centers, atol=1e-5)
+    assert max(turn_between(one, other) for one, other in zip(back, RIG, strict=True)) < 1e-3
+
+
+def test_the_family_begins_at_the_body():
+    change = np.random.default_rng(4).normal(0, 0.01, (len(BODY.shape_groups), SHAPE_NUMBERS))
+    # what ends a part may move; the lengths of parts between joints stay
+    body = BODY.reshaped(change)
+    ellipsoid = [group_of(p.name) for p in BODY.parts if p.kind != CONE]
+    change[[BODY.shape_groups.index(name) for name in ellipsoid], 2] = 0.0  # nothing tapers there
+    np.testing.assert_allclose(shapes_of(body), change, atol=2e-4)
+    family = Family(body)
+    again = family.build(family.start)
+    for one, other in zip(again.parts, body.parts, strict=True):
+        np.testing.assert_allclose(one.shape, other.shape, rtol=2e-3)
+        np.testing.assert_allclose(one.T_body_part, other.T_body_part, atol=3e-4)
+
+
+# --- what is found ----------------------------------------------------------------------------------------------------
+
+
+def test_perturbed_cameras_are_found_again():
+    # what is drawn exactly is to be trusted more than a prior
+    how = replace(QUICK, rounds=6, trust=5.0, offsets=False)
+    found = refine_cameras(BODY, PERTURBED, moments(in_time(), PERTURBED), SEARCH, how)
+    (was_turned, was_moved), (turned, moved) = errors(PERTURBED), errors(found.rig)
+    assert turned < 0.08 and turned < was_turned / 2.5, (was_turned, turned)
+    assert moved < 0.006 and moved < was_moved, (was_moved, moved)
+    assert (found.after_px < found.before_px).all()
+    assert found.told.all()
+
+
+def test_true_cameras_stay():
+    found = refine_cameras(BODY, RIG, moments(in_time(), RIG), SEARCH, QUICK)
+    assert found.turn_deg.max() < 0.05 and found.move_m.max() < 0.004
+    # the gauge: as a whole the cameras have neither moved nor grown
+    weight = np.tile(np.repeat([1 / np.radians(TURN_DEG), 1 / MOVE_M], 3), len(RIG))
+    change = np.concatenate(
+        [
+            np.concatenate([cv2.Rodrigues(n.rotation @ o.rotation.T)[0].ravel(), -n.rotation @ (n.center - o.center)])
+            for n, o in zip(found.rig, RIG, strict=True)
+        ]
+    )
+    common = (world_motions(found.rig) * weight[:, None]).T @ (change * weight)
+    assert np.abs(common).max() < 1e-2 * np.abs(change * weight).max() * weight.max()
+
+
+def test_focal_lengths_are_found():
+    longer = np.diag([1.01, 1.01, 1.0])
+    wide = Rig(
+        tuple(
+            replace(c, matrix=np.where(np.eye(3) > 0, c.matrix @ longer, c.matrix)) if c.name == "c2" else c
+            for c in RIG
+        )
+    )
+    found = refine_cameras(BODY, wide, moments(in_time(), wide), SEARCH, replace(QUICK, focal=True))
+    assert found.focal[2] < 0.997 and np.abs(np.delete(found.focal, 2) - 1).max() < 0.004, found.focal
+
+
+@pytest.mark.parametrize("late", [(0, 0, 1, 0), (0, 0.4, 0, 0)])
+def test_late_videos_are_found(late):
+    store = drawn(late)
+    done = refine_rig(BODY, RIG, store, np.arange(FRAMES), motion(), np.ones(FRAMES, bool), SilhouetteSettings(), QUICK)
+    assert done is not None
+    np.testing.assert_allclose(done.refined.offset_frames, late, atol=0.12)
+    assert (done.refined.offset_sigma_frames < 0.2).all()
+
+
+def test_too_few_frames_are_said():
+    usable = np.zeros(FRAMES, bool)
+    usable[3:8] = True
+    args = (np.arange(FRAMES), motion(), usable, SilhouetteSettings(), QUICK)
+    assert refine_rig(BODY, RIG, in_time(), *args) is None
+
+
+def test_the_agreement_names_the_camera_that_is_off():
+    fine = camera_agreement(BODY, RIG, moments(in_time(), RIG), SEARCH)
+    assert not fine.astray.any() and not fine.late.any()
+    one = Rig(tuple(astray(c, np.random.default_rng(5), 0.5, 0.0) if c.name == "c1" else c for c in RIG))
+    found = camera_agreement(BODY, one, moments(in_time(), one), SEARCH)
+    assert found.astray[1] and np.linalg.norm(found.shift_px, axis=1).argmax() == 1
+    late = camera_agreement(BODY, RIG, moments(drawn((0, 0, 0, 1)), RIG), SEARCH)
+    assert late.late.tolist() == [False, False, False, True]
+
+
+def test_settings_out_of_range():
+    with pytest.raises(ConfigError, match="trust = 0"):
+        RefinementSettings(trust=0.0)

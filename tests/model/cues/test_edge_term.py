@@ -1,0 +1,194 @@
+"""The contour cues of a body: which points, views and weights; and that the truth explains its own pictures."""
+
+import functools
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.kernels.test_contour import BODY, RIG, piece_transforms, some_poses
+from tk.errors import ConfigError
+from tk.kernels import alignment as a
+from tk.kernels.nearest import SurfaceIndex
+from tk.kernels.objective import ObjectiveParameters
+from tk.model.body.skeleton import CHAINS, SEGMENTS
+from tk.model.body.strips import LIMBS
+from tk.model.cameras.camera import Camera, Rig
+from tk.model.cues.edge_term import ContourSettings, ContourTerm
+from tk.model.cues.objective import BodyObjective, FrameObjective, SamplingSettings
+
+EDGES = ContourSettings(edge_weight=1.0)
+TRUTH = some_poses(1, seed=21)[0]
+# rendered from 3 × 10⁴ triangles a piece, sampled at whole pixels, searched at half pixels
+NEAR_PX = 1.5
+
+
+def term_of(config=EDGES, rig=RIG):
+    return ContourTerm(BODY, rig, config)
+
+
+@functools.cache
+def pictures():
+    """The body's pieces as filled polygons on a dark ground: each limb a colour, nearest last."""
+    H, W = RIG.frame_shape
+    images = np.full((len(RIG), H, W, 3), 30, np.uint8)
+    colors = np.random.default_rng(0).integers(90, 256, (len(SEGMENTS), 3))
+    T = piece_transforms(BODY, TRUTH)
+    for c, camera in enumerate(RIG):
+        for i in np.argsort([-np.linalg.norm(t[:3, 3] - camera.center) for t in T]):
+            piece = BODY.pieces[i]
+            eta, omega = np.linspace(*piece.eta_range, 60), np.linspace(-np.pi, np.pi, 120)
+            x = piece.point(*np.meshgrid(eta, omega, indexing="ij")).reshape(-1, 3)
+            hull = cv2.convexHull(camera.project(x @ T[i][:3, :3].T + T[i][:3, 3])[0].astype(np.float32))
+            polygon = np.rint(hull * 16).astype(np.int32)
+            cv2.fillPoly(images[c], [polygon], colors[SEGMENTS.index(piece.segment)].tolist(), shift=4)
+    return images
+
+
+def residual_px(entries, pose, b=0):
+    """(E,) distance across the contour from each assigned entry to its target, pixels; NaN elsewhere."""
+    result = np.full(len(entries[b]), np.nan)
+    T = BODY.skeleton.segment_transforms(pose)
+    segment_of = {int(dof): s for s, dof in enumerate(BODY.skeleton.segment_dof)}
+    for e, row in enumerate(entries[b]):
+        if row[a.STATE] == a.ASSIGNED:
+            M = T[segment_of[int(row[a.LAST_DOF])]]
+            camera = RIG[int(row[a.CAMERA])]
+            ends = [M[:3, :3] @ row[first : first + 3] + M[:3, 3] for first in (a.POINT_A, a.POINT_B)]
+            pixel = np.mean([camera.project(x[None])[0][0] for x in ends], axis=0)
+            result[e] = abs((pixel - row[a.TARGET : a.TARGET + 2]) @ row[a.NORMAL : a.NORMAL + 2])
+    return result
+
+
+def assigned(term, poses, chosen=None):
+    poses = np.atleast_2d(poses)
+    chosen = np.repeat(term.draw(None)[None], len(poses), 0) if chosen is None else chosen
+    return term.assign(pictures(), poses, chosen), term.kernel(poses, chosen)
+
+
+def on_limbs(term, points):
+    """(B, K) whether each strip lies on a limb's tapered piece: hands and feet have no colour edges."""
+    return np.isin(term.strips.piece[points.strip], term.strips.limb_piece)
+
+
+def test_colour_edges_are_looked_for_in_the_views_with_the_fewest_hidden_points():
+    poses = some_poses(6, seed=22)
+    term = term_of(EDGES)
+    entries, points = assigned(term, poses)
+    limb = on_limbs(term, points)
+    hidden = np.sum((points.found != points.visible) & limb[:, None, :, None], axis=(2, 3))
+    fewer = False
+    for b in range(len(poses)):
+        used = {int(c) for c in entries[b, entries[b, :, a.STATE] != a.ABSENT, a.CAMERA]}
+        assert len(used) == EDGES.views
+        rest = set(range(len(RIG))) - used
+        assert max(hidden[b, list(used)]) <= min(hidden[b, list(rest)])
+        fewer |= max(hidden[b, list(used)]) < min(hidden[b, list(rest)])
+    assert fewer, "all views were alike: nothing was tested"
+
+
+def test_limbs_only_have_edges():
+    limbs = {int(BODY.skeleton.segment_dof[SEGMENTS.index(s)]) for s in LIMBS}
+    term = term_of()
+    head = list(CHAINS).index("head")
+    for chosen in (term.draw(None)[None], term.draw_chains(None)[[head]]):
+        entries = term.assign(pictures(), TRUTH[None], chosen)[0]
+        found = {int(k) for k in entries[entries[:, a.STATE] != a.ABSENT, a.LAST_DOF]}
+        assert found == (limbs if len(chosen[0]) > 20 else set())
+
+
+@pytest.mark.parametrize("hidden", [1.0, 0.25])
+def test_hidden_points_cost_and_pull_nowhere(hidden):
+    """6.1.2: 1 each. A circle with both points hidden is two points and counts as a pair does."""
+    term = term_of(replace(EDGES, hidden=hidden))
+    poses = some_poses(6, seed=23)
+    entries, points = assigned(term, poses)
+    lost = 0
+    for b in range(len(poses)):
+        rows = entries[b][entries[b, :, a.STATE] != a.ABSENT]
+        used = sorted({int(c) for c in rows[:, a.CAMERA]})
+        limb = on_limbs(term, points)[b]
+        both_hidden = (points.found[b].any(axis=2) & ~points.visible[b].any(axis=2))[used][:, limb].sum()
+        lost += both_hidden
+        per_pair = rows[:, a.SCALE].max()
+        at_least = hidden * per_pair * both_hidden
+        assert rows[rows[:, a.STATE] == a.UNASSIGNABLE][:, a.SCALE].sum() >= at_least - 1e-6
+    assert lost > 0
+
+
+def test_weights_sum_to_the_terms_weight():
+    config = replace(EDGES, edge_weight=0.7)
+    entries, _ = assigned(term_of(config), some_poses(3, seed=24))
+    scale = np.where(entries[..., a.STATE] == a.ABSENT, 0, entries[..., a.SCALE])
+    np.testing.assert_allclose(scale.sum(axis=1), 0.7, rtol=1e-5)
+    assert (scale >= 0).all()
+
+
+def test_the_truth_explains_its_own_edges():
+    entries, _ = assigned(term_of(replace(EDGES, hidden=0.0)), TRUTH)
+    entries = entries[:, entries[0, :, a.SCALE] > 0]  # hidden points can have no edge
+    distance = residual_px(entries, TRUTH)
+    assert np.isnan(distance).mean() <= 0.2
+    assert np.mean(distance[~np.isnan(distance)] < NEAR_PX) > 0.6
+
+
+def test_pictures_pull_a_displaced_body_back():
+    """The value grows, and its gradient points uphill, as an arm is turned away."""
+    index = SurfaceIndex.build(np.full((1, 3), 50.0), np.full(1, -1), 0.1)
+    silent = ObjectiveParameters(coverage_weight=0.0, reach_m=1e-6)
+    body = BodyObjective(BODY, silent, SamplingSettings(), term_of())
+    frame = FrameObjective(body, index, np.random.default_rng(0), images=pictures())
+    for axis in (0, 2):
+        for sign in (-1, 1):
+            pose = TRUTH.copy()
+            pose[axis] += sign * 0.04
+            assert frame.value(pose) > frame.value(TRUTH)
+            gradient = frame.full()(pose[None], np.zeros((1, len(pose))), 0).gradient[0]
+            assert sign * gradient[axis] > 0, (axis, sign)
+
+
+def test_a_batch_is_its_poses_one_by_one():
+    term = term_of()
+    poses = some_poses(3, seed=25)
+    chosen = np.stack([term.draw(np.random.default_rng(i)) for i in range(3)])
+    together = term.assign(pictures(), poses, chosen)
+    for b in range(3):
+        alone = term.assign(pictures(), poses[b : b + 1], chosen[b : b + 1])[0]
+        np.testing.assert_array_equal(together[b, : len(alone)], alone)
+        assert not together[b, len(alone) :].any()
+
+
+def test_strips_of_the_chains_are_their_own():
+    term = term_of()
+    for generator in (None, np.random.default_rng(0)):
+        drawn = term.draw_chains(generator)
+        for row, chain in zip(drawn, CHAINS.values(), strict=True):
+            assert {SEGMENTS[s] for s in term.strips.segment[row]} == set(chain) & {*LIMBS, "head"}
+            assert len(set(row.tolist())) == len(row)
+    np.testing.assert_array_equal(term.draw(None), term.draw(None))
+    draws = [term.draw(np.random.default_rng(i)) for i in (0, 0, 1)]
+    np.testing.assert_array_equal(draws[0], draws[1])
+    assert not np.array_equal(draws[0], draws[2])
+
+
+def test_a_body_that_nobody_sees_has_no_entries():
+    looks_away = RIG[0]
+    turned = Camera(
+        "away",
+        looks_away.width,
+        looks_away.height,
+        looks_away.matrix,
+        looks_away.distortions,
+        np.diag([-1.0, 1, -1]) @ looks_away.rotation,
+        np.diag([-1.0, 1, -1]) @ looks_away.translation,
+    )
+    term = term_of(EDGES, Rig((turned,)))
+    entries = term.assign(pictures()[:1], TRUTH[None], term.draw(None)[None])
+    assert not (entries[..., a.STATE] != a.ABSENT).any()
+
+
+@pytest.mark.parametrize("bad", [{"edge_weight": -1.0}, {"views": 0}, {"pairs": 0}, {"reach_m": 0.0}, {"hidden": -1.0}])
+def test_bad_settings_are_refused(bad):
+    with pytest.raises(ConfigError, match=f"contours.{next(iter(bad))}"):
+        ContourSettings(**bad)

@@ -1,0 +1,350 @@
+"""A body's objective in one frame: samples, voxels, terms, and what is kept from call to call."""
+
+import numpy as np
+import pytest
+
+from tests.model.figures import grid_around, skin_of, surface_index, voxelise
+from tk.errors import ConfigError
+from tk.kernels.nearest import SurfaceIndex
+from tk.kernels.objective import ObjectiveParameters
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.gait_poses import neutral_pose
+from tk.model.body.skeleton import CHAINS, JOINTS, SEGMENTS, WAIST_STIFFNESS
+from tk.model.cues.objective import (
+    CHAIN_NAMES,
+    CHAIN_OF_SEGMENT,
+    UNEXPLAINED_M,
+    BodyObjective,
+    FrameObjective,
+    ObjectiveSettings,
+    SamplingSettings,
+    even,
+    pick,
+)
+
+DIMENSIONS = BodyDimensions.from_stature(1.75)
+BODY = skin_of(DIMENSIONS)
+SKELETON = BODY.skeleton
+D = len(SKELETON.names)
+SAMPLING = SamplingSettings()
+ALL_CHAINS = np.arange(len(CHAINS))
+
+
+@pytest.fixture(scope="module")
+def objective():
+    return BodyObjective(BODY, ObjectiveParameters(), SAMPLING)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    pose = neutral_pose(SKELETON)
+    pose[:4] = 0.2, 0.1, 0.95, 0.5
+    return pose
+
+
+@pytest.fixture(scope="module")
+def index(truth):
+    grid = grid_around(BODY, truth, 0.03)
+    return surface_index(voxelise(BODY, truth, grid), grid)
+
+
+@pytest.fixture
+def frame(objective, index):
+    return FrameObjective(objective, index, np.random.default_rng(0))
+
+
+# Samples
+
+
+@pytest.mark.parametrize("scale", [1, 2])
+def test_draw_has_the_proportions_of_section_6_4(objective, scale):
+    samples = objective.draw(np.random.default_rng(0), scale)
+    assert len(set(samples)) == len(samples)
+    chain = CHAIN_OF_SEGMENT[BODY.segment[samples]]
+    counts = [np.sum(chain == c) for c in (-1, *range(5))]
+    assert counts == [60 * scale] + [20 * scale] * 5
+
+
+def test_draw_follows_the_generator(objective):
+    a, b = (objective.draw(np.random.default_rng(s)) for s in (1, 2))
+    np.testing.assert_array_equal(a, objective.draw(np.random.default_rng(1)))
+    assert not np.array_equal(a, b)
+
+
+def test_every_sample_is_drawn_sooner_or_later(objective):
+    rng = np.random.default_rng(0)
+    seen = set()
+    for _ in range(400):
+        seen |= set(objective.draw(rng).tolist())
+    assert len(seen) > 0.99 * len(BODY.points)
+
+
+def test_spread_is_even_and_always_the_same(objective):
+    samples = objective.spread()
+    np.testing.assert_array_equal(samples, objective.spread())
+    assert len(set(samples)) == len(samples)
+    # every piece that has samples worth the name has some among them
+    counts = np.bincount(BODY.piece, minlength=len(BODY.pieces))
+    assert set(np.flatnonzero(counts > 30)) <= set(BODY.piece[samples])
+
+
+@pytest.mark.parametrize("count", [1, 7, 10, 50])
+def test_pick_and_even(count):
+    samples = np.arange(100, 110, dtype=np.int32)
+    for chosen in (pick(np.random.default_rng(0), samples, count), even(samples, count)):
+        assert len(chosen) == min(count, 10) == len(set(chosen)) and set(chosen) <= set(samples)
+
+
+@pytest.mark.parametrize("bad", [{"torso": 0}, {"chain": -1}, {"voxels": 0}, {"chain_voxels": 0}, {"sigma_m": -0.1}])
+def test_bad_sampling_is_refused(bad):
+    with pytest.raises(ConfigError, match="sampling"):
+        SamplingSettings(**bad)
+
+
+def test_chains_of_segments():
+    assert [s for s, c in zip(SEGMENTS, CHAIN_OF_SEGMENT, strict=True) if c < 0] == ["torso", "pelvis"]
+    for c, name in enumerate(CHAIN_NAMES):
+        assert tuple(s for s, k in zip(SEGMENTS, CHAIN_OF_SEGMENT, strict=True) if k == c) == CHAINS[name]
+
+
+# All degrees of freedom
+
+
+def test_same_iteration_same_samples_in_all_rows(frame, truth):
+    evaluate = frame.full()
+    poses = np.repeat(truth[None] + 0.02, 3, 0)
+    first, again, next_one = (evaluate(poses, np.ones((3, D)), i) for i in (0, 0, 1))
+    np.testing.assert_array_equal(first.value, again.value)
+    np.testing.assert_array_equal(first.gradient, again.gradient)
+    assert not np.array_equal(first.gradient, next_one.gradient)
+    assert np.ptp(first.value) == 0 and np.ptp(first.gradient, axis=0).max() == 0
+    assert first.value.shape == (3,) and first.gradient.shape == first.hessian_vector.shape == (3, D)
+
+
+def test_same_seed_same_bits(objective, index, truth):
+    def run():
+        frame = FrameObjective(objective, index, np.random.default_rng(7))
+        evaluate = frame.full()
+        return [evaluate(truth[None] + 0.02, np.ones((1, D)), i) for i in range(4)]
+
+    for a, b in zip(run(), run(), strict=True):
+        for x, y in zip(a, b, strict=True):
+            np.testing.assert_array_equal(x, y)
+
+
+def test_gradient_leads_back_to_the_truth(frame, truth):
+    """On average over draws, −∇f of a displaced body points towards its place, along each axis."""
+    evaluate = frame.full()
+    for axis in range(3):
+        for sign in (-1, 1):
+            pose = truth.copy()
+            pose[axis] += sign * 0.05
+            mean = np.mean([evaluate(pose[None], np.zeros((1, D)), i).gradient[0] for i in range(10)], axis=0)
+            assert sign * mean[axis] > 0
+
+
+def test_hessian_vector_product_is_the_curvatures(frame, truth, monkeypatch):
+    """The stochastic product and the curvature on even samples are estimates of one matrix."""
+    evaluate = frame.full()
+    direction = np.zeros(D)
+    direction[:3] = 1.0
+    products = [evaluate(truth[None], direction[None], i).hessian_vector[0] for i in range(40)]
+    monkeypatch.setattr("tk.model.cues.objective.OUTLIERS", 0.0)
+    expected = FrameObjective(frame.objective, frame.index, frame.rng).curvature(truth) @ direction
+    np.testing.assert_allclose(np.mean(products, axis=0)[:3], expected[:3], rtol=0.1)
+
+
+# How well a pose explains a frame
+
+
+def test_value_is_least_at_the_truth(frame, truth):
+    best = frame.value(truth)
+    rng = np.random.default_rng(3)
+    for _ in range(15):
+        assert frame.value(truth + rng.normal(0, 0.1, D)) > best
+    assert frame.value(truth + 0.3 * np.eye(D)[0]) > 5 * best
+
+
+def test_fit_at_the_truth_leaves_nothing_over(frame, truth):
+    fit = frame.fit(truth)
+    assert fit.unmatched.mean() < 0.01 and fit.unexplained.mean() < 0.01
+    assert len(fit.unmatched) == len(fit.samples) and len(fit.unexplained) == len(fit.voxels)
+    assert len(set(fit.voxels)) == len(fit.voxels) >= 600
+
+
+def test_an_arm_elsewhere_is_stranded_and_leaves_its_voxels_astray(frame, truth):
+    """The left arm hangs in the model and is level in the data."""
+    pose = truth.copy()
+    pose[SKELETON.index("shoulder_l_pitch")] -= np.radians(60)
+    fit = frame.fit(pose)
+    chain = CHAIN_OF_SEGMENT[BODY.segment[fit.samples]]
+    left = CHAIN_NAMES.index("arm_l")
+    assert fit.unmatched[chain == left].mean() > 0.5 and fit.unmatched[chain != left].mean() < 0.02
+    # the voxels that are left over are the real arm's: to the left of the body
+    x = frame.index.positions[fit.voxels[fit.unexplained]] - SKELETON.joints(truth)[0]
+    yaw = truth[3]
+    assert fit.unexplained.mean() > 0.02 and (x @ [-np.sin(yaw), np.cos(yaw), 0] > 0.1).all()
+
+
+def test_astray_is_beyond_a_distance(frame, truth):
+    fit = frame.fit(truth + 0.12 * np.eye(D)[0])
+    distance = np.linalg.norm(fit.linear.residual[len(fit.samples) :], axis=1)
+    np.testing.assert_array_equal(
+        fit.unexplained, (distance > UNEXPLAINED_M) | (fit.linear.partner[len(fit.samples) :] < 0)
+    )
+    assert 0 < fit.unexplained.mean() < 1
+
+
+def test_fit_is_kept_for_its_pose_and_only_for_it(frame, truth):
+    first = frame.fit(truth)
+    launches = frame.objective.kernel.launches
+    assert frame.fit(truth.copy()) is first and frame.objective.kernel.launches == launches
+    assert frame.fit(truth + 1e-9) is not first
+
+
+def test_curvature_is_symmetric_and_positive(frame, truth):
+    H = frame.curvature(truth + 0.05)
+    np.testing.assert_allclose(H, H.T, rtol=1e-12)
+    assert np.linalg.eigvalsh(H).min() > -1e-4 * np.abs(H).max()
+    # translations, with the paper's distance: every pair pulls with its weight along each axis alike
+    assert H[0, 0] == pytest.approx(H[1, 1], rel=1e-3) == pytest.approx(H[2, 2], rel=1e-3)
+
+
+def test_damping_is_what_inliers_would_give(frame, truth):
+    """Near the truth the translations' curvature approaches it."""
+    damping = frame.damping(0.3)
+    assert damping.shape == (D,) and (damping > 0).all()
+    np.testing.assert_allclose(damping[3:], damping[0] * 0.09)
+    assert 0.7 * damping[0] < frame.curvature(truth)[0, 0] < 1.05 * damping[0]
+
+
+# Chains
+
+
+def test_a_chains_samples_pull_at_it_and_the_torso_only(index, truth):
+    settings = ObjectiveParameters(coverage_weight=0.0)
+    frame = FrameObjective(BodyObjective(BODY, settings, SAMPLING), index, np.random.default_rng(0))
+    result = frame.chains(ALL_CHAINS, truth)(np.repeat(truth[None], 5, 0) + 0.03, np.zeros((5, D)), 0)
+    torso = ~frame.free.any(axis=0)
+    for c in ALL_CHAINS:
+        assert (np.abs(result.gradient[c][frame.free[c] | torso]) > 1e-6).all()
+        np.testing.assert_array_equal(result.gradient[c][~frame.free[c] & ~torso], 0)
+
+
+def test_rows_of_a_chain_share_its_samples(frame, truth):
+    owner = np.array([2, 0, 2])
+    evaluate = frame.chains(owner, truth)
+    result = evaluate(np.repeat(truth[None] + 0.02, 3, 0), np.zeros((3, D)), 0)
+    np.testing.assert_array_equal(result.gradient[0], result.gradient[2])
+    assert not np.array_equal(result.gradient[0], result.gradient[1])
+
+
+def test_pools_are_the_chains_own_voxels_and_nobodys(frame, truth):
+    """With a leg lost in the model, its voxels are offered to every chain."""
+    pose = truth.copy()
+    pose[SKELETON.index("hip_l_pitch")] -= np.radians(80)
+    fit = frame.fit(pose)
+    assert fit.unexplained.any()
+    nobody = set(fit.voxels[fit.unexplained])
+    for pool in frame._chain_pools(fit):
+        assert nobody <= set(pool) <= set(fit.voxels)
+
+
+def test_constrain_is_the_skeletons_clip(frame):
+    poses = np.random.default_rng(0).uniform(-6, 6, (4, D))
+    np.testing.assert_array_equal(frame.constrain(poses), SKELETON.clip(poses))
+
+
+# Settings
+
+
+def test_without_coverage_no_voxel_counts(index, truth):
+    settings = ObjectiveParameters(coverage_weight=0.0)
+    frame = FrameObjective(BodyObjective(BODY, settings, SAMPLING), index, np.random.default_rng(0))
+    fit = frame.fit(truth)
+    assert len(fit.linear.residual) == len(fit.samples) and not fit.unexplained.any() and fit.value < 0.1
+    result = frame.chains(ALL_CHAINS, truth)(np.repeat(truth[None], 5, 0), np.zeros((5, D)), 0)
+    assert np.isfinite(result.value).all()
+
+
+def test_sigma_zero_takes_the_limbs_diameter(index, truth):
+    """Eq. 10 as the paper has it."""
+    objective = BodyObjective(BODY, ObjectiveParameters(), SamplingSettings(sigma_m=0.0))
+    fit = FrameObjective(objective, index, np.random.default_rng(0)).fit(truth)
+    np.testing.assert_allclose(fit.linear.inv_sigma2[: len(fit.samples)], 1 / BODY.diameter[fit.samples] ** 2)
+    assert (objective.damping(0.3) > 0).all()
+
+
+@pytest.mark.parametrize("sampling", [SamplingSettings(1, 1, 1, 1), SamplingSettings(5000, 500, 3000, 500)])
+def test_few_and_more_points_than_there_are(index, truth, sampling):
+    frame = FrameObjective(BodyObjective(BODY, ObjectiveParameters(), sampling), index, np.random.default_rng(0))
+    poses = np.repeat(truth[None], 5, 0)
+    for evaluate in (frame.full(), frame.chains(ALL_CHAINS, truth)):
+        result = evaluate(poses, np.zeros((5, D)), 0)
+        assert np.isfinite(result.value).all() and np.isfinite(result.gradient).all()
+
+
+def test_a_frame_of_one_voxel(objective, truth):
+    """A hull that is all but lost must not end the run."""
+    index = SurfaceIndex.build(truth[None, :3], np.full(1, -1), 0.06)
+    frame = FrameObjective(objective, index, np.random.default_rng(0))
+    assert np.isfinite(frame.value(truth)) and np.isfinite(frame.curvature(truth)).all()
+    result = frame.chains(ALL_CHAINS, truth)(np.repeat(truth[None], 5, 0), np.zeros((5, D)), 0)
+    assert np.isfinite(result.value).all()
+
+
+def test_a_leg_inside_the_other_finds_no_voxel(frame, index, truth, monkeypatch):
+    """Two limbs cannot be in one place. Where the legs cross, the right one's samples are unmatched; allowed in, none
+    is."""
+    folded = truth.copy()
+    knee_l = SKELETON.joints(truth)[JOINTS.index("knee_l")]
+
+    def miss(yaw):
+        folded[SKELETON.index("hip_r_yaw")] = yaw
+        return np.linalg.norm(SKELETON.joints(folded)[JOINTS.index("knee_r")] - knee_l)
+
+    folded[SKELETON.index("hip_r_yaw")] = min(np.linspace(-1, 0.5, 200), key=miss)
+    leg = CHAIN_OF_SEGMENT[BODY.segment] == CHAIN_NAMES.index("leg_r")
+
+    def unmatched(problem, pose):
+        fit = problem.fit(pose)
+        return (fit.linear.partner[: len(fit.samples)][leg[fit.samples]] < 0).mean()
+
+    monkeypatch.setattr("tk.model.cues.objective.BARRED", np.zeros(len(SEGMENTS), np.int32))
+    free = FrameObjective(BodyObjective(BODY, ObjectiveParameters(), SAMPLING), index, np.random.default_rng(0))
+    assert unmatched(frame, truth) == unmatched(free, truth) == unmatched(free, folded) == 0
+    assert unmatched(frame, folded) > 0.1
+
+
+def test_a_stiff_waist_costs_its_square_with_the_derivatives_to_it(index, truth):
+    """Against the same body without stiffness: value, gradient, product and curvature."""
+    body = skin_of(DIMENSIONS, waist=True)
+    soft, stiff = (
+        BodyObjective(body, ObjectiveParameters(), SAMPLING, waist_stiffness=w, dtype=np.float64) for w in (0.0, 0.7)
+    )
+    pose = np.zeros((1, 27))
+    pose[0, body.skeleton.is_waist] = [0.2, -0.1, 0.3]
+    pose[0, ~body.skeleton.is_waist] = truth
+    k = np.zeros(27)
+    k[body.skeleton.is_waist] = 0.7 * np.array(WAIST_STIFFNESS)
+    cost = 0.5 * float(k @ pose[0] ** 2)
+    v = np.random.default_rng(0).normal(size=(1, 27))
+    plain, bent = (FrameObjective(o, index, np.random.default_rng(0)).full()(pose, v, 0) for o in (soft, stiff))
+    np.testing.assert_allclose(bent.value - plain.value, cost, atol=1e-12)
+    np.testing.assert_allclose(bent.gradient - plain.gradient, k * pose, atol=1e-12)
+    np.testing.assert_allclose(bent.hessian_vector - plain.hessian_vector, k * v, atol=1e-12)
+    a, b = (FrameObjective(o, index, np.random.default_rng(0)) for o in (soft, stiff))
+    np.testing.assert_allclose(b.curvature(pose[0]) - a.curvature(pose[0]), np.diag(k), atol=1e-12)
+    np.testing.assert_allclose(b.value(pose[0]) - a.value(pose[0]), cost, atol=1e-12)
+
+
+@pytest.mark.parametrize("bad", [{"coverage_weight": -1.0}, {"surface_weight": float("nan")}])
+def test_bad_objectives_are_refused(bad):
+    with pytest.raises(ConfigError, match=f"objective.{next(iter(bad))}"):
+        ObjectiveSettings(**bad)
+
+
+def test_the_kernel_takes_the_settings():
+    settings = ObjectiveSettings(coverage_weight=0.4, surface_weight=0.9).settings
+    assert (settings.coverage_weight, settings.surface_weight) == (0.4, 0.9)
+    assert settings.coverage_nu == 2 * settings.nu

@@ -1,0 +1,125 @@
+"""What rays cost: E_S without colours, doubts and colours on top of it, and views that see nobody."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.model.ring import ring_of_cameras
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.cone_body import build_cone_body
+from tk.model.body.gait_poses import walking_pose
+from tk.model.cameras.camera import Rig
+from tk.model.cues.part_colors import PartColors
+from tk.model.cues.ray_costs import COLOR_COST, DOUBT_COST, Evidence, RayGrid, mean_of_views
+from tk.model.masks.silhouettes import draw_silhouettes, share_wrong
+
+RIG = ring_of_cameras(3, width=120, height=160)
+BODY = build_cone_body(BodyDimensions.from_stature(1.75))
+COLORS = PartColors(BODY)
+FINE = RayGrid(RIG, 160)
+POSE = walking_pose(BODY.skeleton, 0.2)
+POSE[2] = 0.92
+OTHER = POSE.copy()
+OTHER[:2] += 0.08
+POSES = np.stack([POSE, OTHER])
+DRAWN = draw_silhouettes(BODY, RIG, POSES)
+MASKS = DRAWN[0]
+
+
+def cast(evidence, poses=POSES, **options):
+    return evidence.cast(BODY, COLORS.group, poses, **options)
+
+
+def test_grids_sample_the_middle_of_their_squares():
+    assert FINE.step == 1 and RayGrid(RIG, 40).step == 4 and RayGrid(RIG, 10_000).step == 1
+    grid = RayGrid(RIG, 40)
+    pictures = np.arange(3 * 160 * 120).reshape(3, 160, 120)
+    sampled = grid.sample(pictures)
+    assert sampled.shape == grid.rays.shape[:3] == (3, 40, 30)
+    assert sampled[1, 2, 3] == pictures[1, 2 + 8, 2 + 12]
+
+
+def test_without_colors_the_cost_is_the_papers_error():
+    total, met = cast(Evidence.of(FINE, MASKS), export=True)
+    assert met is not None
+    expected = np.array([share_wrong(drawn, MASKS) for drawn in DRAWN])
+    np.testing.assert_allclose(total, expected, atol=1e-6)
+    assert (total[1] > 0.1).all() and (total[0] < 1e-6).all()
+    np.testing.assert_allclose(Evidence.of(FINE, MASKS).fit_error(met.label[1]), expected[1], atol=1e-12)
+    np.testing.assert_allclose(mean_of_views(total), expected.mean(axis=1), atol=1e-6)
+
+
+def test_a_coarse_grid_says_nearly_the_same():
+    coarse, _ = cast(Evidence.of(RayGrid(RIG, 54), MASKS))
+    np.testing.assert_allclose(coarse[1], share_wrong(DRAWN[1], MASKS), rtol=0.2)
+
+
+def test_a_view_that_sees_nobody_does_not_count():
+    masks = MASKS.copy()
+    masks[1] = 0
+    evidence = Evidence.of(FINE, masks)
+    total, met = cast(evidence, export=True)
+    assert np.isnan(total[:, 1]).all() and np.isfinite(total[:, [0, 2]]).all()
+    assert met is not None and np.isnan(evidence.fit_error(met.label[0])).tolist() == [False, True, False]
+    np.testing.assert_allclose(mean_of_views(total), total[:, [0, 2]].mean(axis=1))
+    nobody, _ = cast(Evidence.of(FINE, 0 * masks))
+    assert np.isnan(nobody).all() and np.isinf(mean_of_views(nobody)).all()
+
+
+def test_doubt_halves_what_a_part_costs_outside_the_mask():
+    """Where the mask may have missed the person, a part that covers it costs less; what it holds costs the same."""
+    whole, _ = cast(Evidence.of(FINE, MASKS))
+    doubted, _ = cast(Evidence.of(FINE, MASKS, MASKS == 0))
+    outside = ((DRAWN[1] > 0) & (MASKS == 0)).sum(axis=(1, 2)) / (MASKS > 0).sum(axis=(1, 2))
+    np.testing.assert_allclose(whole[1] - doubted[1], (1 - DOUBT_COST) * outside, atol=1e-6)
+    np.testing.assert_allclose(cast(Evidence.of(FINE, MASKS, MASKS == 255))[0], whole, atol=1e-6)
+
+
+def test_colors_cost_where_they_belong_to_another_part():
+    """A picture in the parts' own colours costs the pose nothing; with arms and trunk changed about it does."""
+    _, met = cast(Evidence.of(FINE, MASKS), POSES[:1], export=True)
+    assert met is not None
+    label = met.label[0]
+    palette = np.random.default_rng(3).permutation(15)[: len(set(COLORS.group.tolist()))] * 17
+    lookup = np.zeros((len(BODY.parts) + 1, 3), np.uint8)
+    groups = sorted(set(COLORS.group.tolist()))
+    for p, g in enumerate(COLORS.group, 1):
+        level = palette[groups.index(g)]
+        lookup[p] = (level, 255 - level, (7 * level) % 255)
+    images = lookup[label]
+    colors = PartColors(BODY)
+    blind = Evidence.of(FINE, MASKS, None, images, colors)
+    assert blind.bins is not None
+    colors.learn(blind.bins[label > 0], label[label > 0])
+    right, _ = cast(Evidence.of(FINE, MASKS, None, images, colors), POSES[:1])
+    assert right.max() < 0.02
+    arm, trunk = (GROUP_OF[name] for name in ("forearm_l", "chest"))
+    swapped = label.copy()
+    is_arm, is_trunk = (np.isin(label, np.flatnonzero(COLORS.group == g) + 1) for g in (arm, trunk))
+    swapped[is_arm], swapped[is_trunk] = NAMES.index("chest") + 1, NAMES.index("forearm_l") + 1
+    wrong, _ = cast(Evidence.of(FINE, MASKS, None, lookup[swapped], colors), POSES[:1])
+    share = (is_arm | is_trunk).sum(axis=(1, 2)) / (MASKS > 0).sum(axis=(1, 2))
+    np.testing.assert_allclose(wrong[0], COLOR_COST * share, rtol=0.1)
+    # no pictures, no colours
+    assert Evidence.of(FINE, MASKS, None, images[:0], colors).bins is None
+
+
+NAMES = [part.name for part in BODY.parts]
+GROUP_OF = dict(zip(NAMES, COLORS.group.tolist(), strict=True))
+
+
+def test_pictures_of_different_sizes_are_told_apart():
+    narrow = Rig((RIG[0], replace(RIG[1], width=80, height=100), RIG[2]))
+    masks = MASKS.copy()
+    masks[1, 100:], masks[1, :, 80:] = 0, 0
+    drawn = draw_silhouettes(BODY, narrow, POSES)
+    total, _ = cast(Evidence.of(RayGrid(narrow, 160), masks))
+    np.testing.assert_allclose(total, [share_wrong(d, masks) for d in drawn], atol=1e-6)
+
+
+@pytest.mark.parametrize("views", [[0], [0, 1], [0, 1, 2]])
+def test_the_mean_is_over_the_views_that_tell(views):
+    cost = np.full((2, 3), np.nan)
+    cost[:, views] = [[0.2] * len(views), np.arange(len(views)) / 10]
+    np.testing.assert_allclose(mean_of_views(cost), [0.2, np.mean(np.arange(len(views)) / 10)])

@@ -1,0 +1,98 @@
+"""Pictures that show nothing, or stand still while others move."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tk.model.masks.image_health import BLANK, FROZEN, ImageHealth, described
+
+C, H, W = 4, 96, 128
+
+
+def frame(t: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Images (C, H, W, 3) with noise and a bright bar that moves; masks of the bar."""
+    images = rng.integers(90, 110, (C, H, W, 3)).astype(np.uint8)
+    masks = np.zeros((C, H, W), np.uint8)
+    images[:, 20:80, 10 + 3 * t : 30 + 3 * t] += 80
+    masks[:, 20:80, 10 + 3 * t : 30 + 3 * t] = 255
+    return images, masks
+
+
+def test_healthy_pictures_are_fine() -> None:
+    rng, health = np.random.default_rng(0), ImageHealth()
+    assert all(health.look(*frame(t, rng)) == [None] * C for t in range(12))
+
+
+def test_a_frozen_camera_is_told_once_the_others_have_moved_and_not_when_it_goes_on() -> None:
+    rng, health = np.random.default_rng(0), ImageHealth()
+    held = None
+    told = []
+    for t in range(14):
+        images, masks = frame(t, rng)
+        if 4 <= t < 10:
+            assert held is not None
+            images[1], masks[1] = held
+        held = images[1].copy(), masks[1].copy()
+        told.append(health.look(images, masks))
+    assert all(reasons[c] is None for reasons in told for c in (0, 2, 3))
+    frozen = [t for t in range(14) if told[t][1] == FROZEN]
+    # a frame's movement is a sixth of the bar: more than the threshold from the first or second frame on
+    assert frozen in (list(range(4, 10)), list(range(5, 10)))
+
+
+def test_nobody_moves_and_nothing_is_frozen() -> None:
+    images, masks = frame(0, np.random.default_rng(0))
+    health = ImageHealth()
+    assert all(health.look(images, masks) == [None] * C for _ in range(5))
+
+
+@pytest.mark.parametrize(("frozen", "told"), [((0, 1), [FROZEN, FROZEN, None, None]), ((0, 1, 3), [None] * C)])
+def test_several_cameras_are_frozen_as_long_as_half_of_the_others_go_on(frozen: tuple[int, ...], told: list) -> None:
+    rng, health = np.random.default_rng(0), ImageHealth()
+    first = frame(0, rng)
+    for t in range(8):
+        images, masks = frame(t, rng)
+        for c in frozen:
+            images[c], masks[c] = first[0][c], first[1][c]
+        found = health.look(images, masks)
+    assert found == told
+
+
+@pytest.mark.parametrize("level", [0, 128])
+def test_a_picture_of_one_grey_shows_nothing(level: int) -> None:
+    images, masks = frame(0, np.random.default_rng(0))
+    images[2] = level
+    assert ImageHealth().look(images, masks) == [None, None, BLANK, None]
+
+
+def test_masks_stand_for_pictures_that_nobody_gives() -> None:
+    rng, health = np.random.default_rng(0), ImageHealth()
+    first = frame(0, rng)[1]
+    told = []
+    for t in range(8):
+        masks = frame(t, rng)[1]
+        masks[3] = first[3]
+        told.append(health.look(np.empty((C, 0, 0, 3), np.uint8), masks))
+    assert told[0] == [None] * C and told[-1] == [None, None, None, FROZEN]
+
+
+def test_it_is_taken_up_again() -> None:
+    rng, health = np.random.default_rng(0), ImageHealth()
+    frames = [frame(t, rng) for t in range(10)]
+    for images, masks in frames:
+        images[0], masks[0] = frames[0][0][0], frames[0][1][0]
+    for f in frames[:3]:
+        health.look(*f)
+    again = ImageHealth()
+    again.restore({name: np.asarray(value) for name, value in health.state().items()})
+    told = [again.look(*f) for f in frames[3:]]
+    assert told == [health.look(*f) for f in frames[3:]] and told[-1][0] == FROZEN
+    again.restore({})
+    assert again.look(*frames[-1]) == [None] * C
+
+
+def test_frames_are_described() -> None:
+    assert described(12, 12, 1) == "frame 12"
+    assert described(30, 74, 45) == "frames 30 to 74"
+    assert described(30, 74, 12) == "12 of the frames 30 to 74"

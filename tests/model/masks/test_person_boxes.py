@@ -1,0 +1,60 @@
+"""The coarse look: a box about the person, wherever the clutter flickers."""
+
+import numpy as np
+import pytest
+
+from tk.model.masks.person_boxes import PersonBoxes
+
+SHAPE = (240, 320)
+PERSON = (slice(60, 200), slice(120, 170))
+MARGIN = 20  # of the 240 rows
+
+
+def look(change, shape=SHAPE):
+    """The box in a picture of an even scene, after ``change``."""
+    plate = np.full((1, *shape, 3), 120, np.uint8)
+    picture = plate.copy()
+    change(picture[0])
+    gains, noise = np.ones((1, 3), np.float32), np.array([2.0], np.float32)
+    return PersonBoxes(plate, 0.7, SHAPE[0]).boxes(picture, gains, noise)[0].tolist()
+
+
+def person(picture):
+    picture[PERSON] = (30, 30, 200)
+
+
+ABOUT_THE_PERSON = [120 - MARGIN, 60 - MARGIN, 50 + 2 * MARGIN, 140 + 2 * MARGIN]
+
+
+def test_the_box_is_about_the_person():
+    assert look(person) == ABOUT_THE_PERSON
+
+
+def test_an_empty_scene_and_a_shadow_have_no_box():
+    def shadow(picture):
+        picture[150:180, 40:120] = 96
+
+    assert look(lambda picture: None) == [0, 0, 0, 0] == look(shadow)
+
+
+def test_small_things_far_away_are_left_out():
+    def flicker(picture):
+        person(picture)
+        picture[20:26, 20:26] = 180
+        picture[220:226, 300:306] = 180
+
+    assert look(flicker) == ABOUT_THE_PERSON
+
+
+@pytest.mark.parametrize("at, size", [((100, 260), 16), ((100, 180), 6)], ids=["a hand far away", "a finger close by"])
+def test_a_hand_beyond_a_sleeve_that_is_not_seen_is_held(at, size):
+    def hand(picture):
+        person(picture)
+        picture[at[0] : at[0] + size, at[1] : at[1] + size] = (120, 150, 220)
+
+    left, _, width, _ = look(hand)
+    assert left == ABOUT_THE_PERSON[0] and left + width == at[1] + size + MARGIN
+
+
+def test_sizes_that_are_no_multiple_of_a_cell():
+    assert look(person, (243, 322)) == ABOUT_THE_PERSON

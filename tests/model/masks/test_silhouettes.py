@@ -1,0 +1,81 @@
+"""Cleaning, scales and E_S of masks."""
+
+import numpy as np
+import pytest
+
+from tests.model.ring import ring_of_cameras
+from tk.errors import ConfigError
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.cone_body import build_cone_body
+from tk.model.body.gait_poses import hip_and_knee, hypotheses, walking_pose
+from tk.model.masks.silhouettes import CleaningSettings, Views, clean, draw_silhouettes, pixel_rays, share_wrong
+
+RIG = ring_of_cameras(2, width=101, height=133)
+BODY = build_cone_body(BodyDimensions.from_stature(1.7))
+POSE = walking_pose(BODY.skeleton, 0.2)
+POSE[2] = 0.9
+MASKS = draw_silhouettes(BODY, RIG, POSE[None])[0]
+
+
+def test_cleaning_removes_specks_and_holes_and_leaves_the_rest():
+    mask = MASKS[0]
+    dirty = mask.copy()
+    dirty[2:4, 2:5] = 255
+    y, x = (int(np.median(v)) for v in np.nonzero(mask[:50]))
+    dirty[y : y + 2, x : x + 1] = 0
+    np.testing.assert_array_equal(clean(dirty, CleaningSettings()), mask)
+    np.testing.assert_array_equal(clean(mask, CleaningSettings()), mask)
+    nothing = np.zeros_like(mask)
+    np.testing.assert_array_equal(clean(nothing, CleaningSettings()), nothing)
+
+
+def test_gaps_between_limbs_stay_open():
+    mask = np.zeros((100, 80), np.uint8)
+    mask[10:90, 20:60] = 255
+    mask[40:60, 35:45] = 0
+    np.testing.assert_array_equal(clean(mask, CleaningSettings()), mask)
+
+
+def test_scales_halve_pictures_of_any_size():
+    pyramid = Views(RIG).pyramid(MASKS, 3, None)
+    assert [m.shape for m in pyramid.masks] == [(2, 133, 101), (2, 67, 51), (2, 34, 26)]
+    assert pyramid.sizes[2].tolist() == [[26, 34]] * 2
+    fine = MASKS[:, :132, :100].astype(float).reshape(2, 66, 2, 50, 2).mean(axis=(2, 4))
+    assert np.abs(pyramid.masks[1][:, :66, :50] - fine).max() <= 1
+
+
+def test_the_share_of_wrong_pixels_is_the_papers():
+    other = POSE.copy()
+    other[0] += 0.1
+    drawn = draw_silhouettes(BODY, RIG, other[None])[0]
+    expected = ((drawn > 0) ^ (MASKS > 0)).sum(axis=(1, 2)) / (MASKS > 0).sum(axis=(1, 2))
+    np.testing.assert_allclose(share_wrong(drawn, MASKS), expected)
+    assert (expected > 0.1).all() and not share_wrong(MASKS, MASKS).any()
+    assert np.isinf(share_wrong(MASKS, 0 * MASKS)).all()
+
+
+def test_rays_go_through_the_pixels():
+    rays = pixel_rays(RIG, 5)
+    x, y = 2 + 5 * 7, 2 + 5 * 11
+    pixels, _ = RIG[1].project(RIG[1].center + 2.0 * rays[1, 11, 7].astype(float)[None])
+    np.testing.assert_allclose(pixels, [[x, y]], atol=1e-3)
+
+
+def test_hypotheses_cover_headings_and_phases():
+    poses = hypotheses(BODY.skeleton, 4, 3, np.array([1.0, 2, 3]))
+    assert poses.shape == (4 * (3 + 2), len(BODY.skeleton.names))
+    assert (poses[:, :3] == [1, 2, 3]).all()
+    assert len(np.unique(poses.round(6), axis=0)) == len(poses)
+    assert (poses >= BODY.skeleton.lower).all() and (poses <= BODY.skeleton.upper).all()
+
+
+def test_a_stride_is_periodic_and_bends_knees_backwards():
+    for phase in np.linspace(0, 1, 11):
+        assert hip_and_knee(phase) == pytest.approx(hip_and_knee(phase + 1))
+        assert hip_and_knee(phase)[1] > 0
+    assert hip_and_knee(0.0)[0] > hip_and_knee(0.5)[0]
+
+
+def test_settings_out_of_range_are_told():
+    with pytest.raises(ConfigError, match="hole_share = 2"):
+        CleaningSettings(hole_share=2.0)

@@ -1,0 +1,220 @@
+"""The process that decodes and segments ahead: the same frames, its errors at their frame, and nothing left behind."""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.conftest import FRAMES, QUICK, Silent
+from tests.people import write_people
+from tests.run.test_session import assert_same, send
+from tk.errors import ConfigError, VideoError, WorkerError
+from tk.io.captures.capture import open_capture
+from tk.io.results.writer import read_result
+from tk.run import session
+from tk.run.prefetch import Ahead, Serial, Source, open_source
+from tk.settings import Settings
+
+AHEAD = Settings.from_toml(QUICK.replace("ahead = 0", "ahead = 2"))
+ROOT = Path(__file__).parents[2]
+track = partial(session.track, method="volumetric")
+
+
+def arrays(source: Source, start: int, stop: int) -> list[tuple[int, np.ndarray, np.ndarray, np.ndarray | None]]:
+    """Index, images, masks, and what is uncertain."""
+    with source:
+        return [
+            (o.index, o.images.copy(), o.masks.copy(), None if o.uncertain is None else o.uncertain.copy())
+            for o, _ in source.frames(start, stop)
+        ]
+
+
+def nobody(text: str) -> None:
+    raise AssertionError(text)
+
+
+@pytest.mark.parametrize(
+    ("masks", "keep_images", "doubts"), [("auto", True, False), ("none", True, True), ("none", False, False)]
+)
+def test_frames_are_the_same(tiny: Path, masks: str, keep_images: bool, doubts: bool) -> None:
+    """Given masks are not in doubt; without pictures nobody asks for what is."""
+    capture = open_capture(tiny, masks=masks)
+    theirs = arrays(Ahead(capture, AHEAD, nobody, keep_images), 2, FRAMES)
+    ours = arrays(Serial(capture, AHEAD, nobody, keep_images), 2, FRAMES)
+    assert [frame[0] for frame in theirs] == list(range(2, FRAMES))
+    assert ours[0][2].any() and (ours[0][1].size > 0) == keep_images
+    for a, b in zip(theirs, ours, strict=True):
+        np.testing.assert_array_equal(a[1], b[1], strict=True)
+        np.testing.assert_array_equal(a[2], b[2], strict=True)
+        assert (a[3] is not None) == (b[3] is not None) == doubts
+        if a[3] is not None and b[3] is not None:
+            assert a[3].any()
+            np.testing.assert_array_equal(a[3], b[3], strict=True)
+
+
+def test_frames_stay_as_they_are_while_they_are_held(tiny: Path) -> None:
+    """More of them than the ring has slots, some dropped in between, and views after their frame."""
+    capture = open_capture(tiny)
+    expected = arrays(Serial(capture, AHEAD, nobody), 0, FRAMES)
+    with Ahead(capture, AHEAD, nobody) as source:
+        held = {o.index: o.masks[1:, ::2] for o, _ in source.frames(0, FRAMES) if o.index % 4 != 2}
+    assert len(held) > FRAMES // 2
+    for index, masks in held.items():
+        np.testing.assert_array_equal(masks, expected[index][2][1:, ::2])
+
+
+def test_a_result_is_the_same(tiny: Path, tracked: Path, tmp_path: Path) -> None:
+    capture = open_capture(tiny)
+    track(capture, tmp_path / "r.h5", AHEAD, Silent(), frames=(0, 6), store_hull=True)
+    assert_same(tmp_path / "r.h5", tracked, slice(0, 6))
+    track(capture, tmp_path / "r.h5", AHEAD, Silent(), resume=True, store_hull=True)
+    assert_same(tmp_path / "r.h5", tracked)
+    timing = read_result(tmp_path / "r.h5").timing
+    work = sum(seconds for stage, seconds in timing.items() if stage not in ("decode", "masks", "total"))
+    assert (timing["total"] >= work - 1e-6).all() and (timing["masks"] > 0).all()
+
+
+def test_notes_are_handed_on(tmp_path: Path) -> None:
+    folder = write_people(tmp_path / "walk", [lambda k: (0.85 * np.cos(k / 2), 0.85 * np.sin(k / 2))], 12)
+    notes: list[str] = []
+    assert len(arrays(Ahead(open_capture(folder, masks="median"), AHEAD, notes.append), 0, 1)) == 1
+    assert "the median of 12 frames is taken for the empty scene" in notes[0]
+
+
+def test_an_error_comes_at_its_frame(copy: Path, tmp_path: Path) -> None:
+    capture = open_capture(copy)
+    broken = sorted((copy / "masks").iterdir())[1] / "000007.png"
+    broken.write_bytes(broken.read_bytes()[:40])
+    with pytest.raises(VideoError, match=r"000007\.png: is not a picture that can be decoded"):
+        track(capture, tmp_path / "r.h5", AHEAD, Silent())
+    np.testing.assert_array_equal(read_result(tmp_path / "r.h5").frames, np.arange(7))
+
+
+def test_an_error_in_learning(copy: Path) -> None:
+    capture = open_capture(copy, masks="none")
+    next((copy / "background").iterdir()).unlink()
+    with Ahead(capture, AHEAD, nobody) as source, pytest.raises(VideoError, match="has no background"):
+        next(source.frames(0, 3))
+
+
+def test_a_defect_keeps_its_traceback(tiny: Path) -> None:
+    no_number: Any = "3"
+    with Ahead(open_capture(tiny), AHEAD, nobody) as source, pytest.raises(RuntimeError, match="TypeError") as raised:
+        next(source.frames(0, no_number))
+    assert "in _serve" in str(raised.value)
+
+
+def test_a_killed_process_is_told_in_one_line(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "WRITE_EVERY_S", 0)
+
+    class Killer(Silent):
+        def advance(self, frame: int, estimate: object) -> None:
+            super().advance(frame, estimate)
+            if frame == 4:
+                (source,) = (o for o in gc.get_objects() if isinstance(o, Ahead))
+                source._process.kill()
+
+    killer = Killer()
+    with pytest.raises(
+        WorkerError, match=r"tiny: the process .* was ended by SIGKILL \(out of memory\?\); set ahead = 0"
+    ):
+        track(open_capture(tiny), tmp_path / "r.h5", AHEAD, killer)
+    done = len(killer.frames)
+    assert 5 <= done < FRAMES  # those that lay ready are tracked
+    np.testing.assert_array_equal(read_result(tmp_path / "r.h5").frames, np.arange(done))
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc")
+def test_nothing_is_left_behind(tiny: Path) -> None:
+    def open_files() -> int:
+        gc.collect()
+        return len(os.listdir("/proc/self/fd"))
+
+    capture = open_capture(tiny)
+    before = open_files()
+    with Ahead(capture, AHEAD, nobody) as source:
+        frames: Iterator[object] = source.frames(0, FRAMES)
+        next(frames)
+        assert open_files() > before
+    assert source._process.returncode == 0  # it ended by itself
+    source.close()
+    with Ahead(capture, AHEAD, nobody) as unused:
+        pass
+    assert unused._process.returncode is not None
+    del source, frames, unused
+    assert open_files() == before
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="needs /proc")
+def test_it_ends_with_the_tracker(tiny: Path) -> None:
+    """Killed, the tracker cannot tell it to."""
+    script = (
+        "import os, signal, sys, tk.run.prefetch, tk.settings, tk.io.captures.capture as c\n"
+        "source = tk.run.prefetch.Ahead(c.open_capture(sys.argv[1]), tk.settings.Settings(ahead=1), print)\n"
+        "frames = source.frames(0, 14); next(frames)\n"
+        "print(source._process.pid, flush=True)\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", script, tiny], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert ran.returncode == -signal.SIGKILL and ran.stderr == ""  # all ends of its stderr are closed, too
+    pid, deadline = int(ran.stdout), time.monotonic() + 20
+    while _runs(pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not _runs(pid)
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_ctrl_c_of_the_command_line(tiny: Path, tmp_path: Path) -> None:
+    settings = tmp_path / "s.toml"
+    settings.write_text(QUICK.replace("ahead = 0", "ahead = 2"), encoding="utf-8")
+    result = tmp_path / "r.h5"
+    stopped = send(signal.SIGINT, 3, "track", tiny, "-o", result, "--config", settings)
+    assert stopped.returncode == 1, stopped.stderr
+    assert stopped.stdout == "" and "Traceback" not in stopped.stderr
+    assert stopped.stderr.splitlines()[-1] == "tk: interrupted; go on with the same command and --resume"
+    # the masks are for the second pass of the run that goes on
+    assert {path.name for path in tmp_path.iterdir()} == {"r.h5", ".r.h5.masks", "s.toml"}
+    with h5py.File(result, "r") as file:
+        np.testing.assert_array_equal(file["frames"], np.arange(4))
+
+
+def test_one_core_needs_no_further_process(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = open_capture(tiny)
+    assert isinstance(open_source(capture, Settings(ahead=0), nobody), Serial)
+    monkeypatch.setattr("tk.run.prefetch._cores", lambda: 1)
+    assert isinstance(open_source(capture, Settings(), nobody), Serial)
+    monkeypatch.setattr("tk.run.prefetch._cores", lambda: 2)
+    with open_source(capture, Settings(), nobody) as source:
+        assert isinstance(source, Ahead)
+
+
+def test_setting_out_of_range() -> None:
+    with pytest.raises(ConfigError, match="ahead = -1: choose from 0 to 64"):
+        Settings(ahead=-1)
+
+
+def test_the_process_does_without_what_only_trackers_need() -> None:
+    """SciPy alone would take it half a second at each start."""
+    heavy = "tk.settings", "tk.trackers.contour_tracker", "scipy", "h5py", "av", "open3d"
+    code = f"import sys, tk.run.prefetch; print(*(name for name in {heavy} if name in sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split() == []

@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import open3d
+import pytest
+
+from tests.conftest import FRAMES, QUICK, Silent, Tk
+from tests.io.conftest import write_picture
+from tk.io.captures.capture import open_capture
+from tk.io.results.writer import read_result
+from tk.run.reconstruction import reconstruct
+from tk.settings import Settings
+
+CONFIG = Settings.from_toml(QUICK)
+
+
+def test_the_hull_is_the_trackers(tk: Tk, tiny: Path, tmp_path: Path) -> None:
+    settings, tracked = tmp_path / "settings.toml", tmp_path / "tracked.h5"
+    settings.write_text(QUICK, encoding="utf-8")
+    ran = tk("track", tiny, "--method", "volumetric", "-o", tracked, "--config", settings, "--store-hull")
+    assert ran.code == 0, ran.err
+    reporter = Silent()
+    assert reconstruct(open_capture(tiny), tmp_path / "h.h5", CONFIG, reporter) == FRAMES
+    assert reporter.frames == list(range(FRAMES)) and reporter.total == FRAMES
+    kept = read_result(tracked).hull
+    assert kept is not None
+    with h5py.File(tmp_path / "h.h5", "r") as file:
+        assert dict(file.attrs).items() >= {"format": "tk-hull", "fps": 15.0, "units": "m", "up": "z"}.items()
+        np.testing.assert_array_equal(file["frames"], np.arange(FRAMES))
+        np.testing.assert_allclose(file["time"], np.arange(FRAMES) / 15.0)
+        np.testing.assert_array_equal(file["hull/offsets"], kept.offsets)
+        np.testing.assert_array_equal(file["hull/positions"], kept.positions)
+        np.testing.assert_array_equal(file["hull/colors"], kept.colors)
+
+
+def test_ply_files_hold_the_same_points(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    hull, folder = tmp_path / "h.h5", tmp_path / "ply" / "deeper"
+    ran = tk("reconstruct", tiny, "-o", hull, "--ply", folder, "--config", quick, "--frames", "5:7")
+    assert ran.code == 0, ran.err
+    assert ran.out == ""
+    assert ran.err.splitlines()[-1] == f"2 frames in {hull}"
+    assert sorted(path.name for path in folder.iterdir()) == ["000005.ply", "000006.ply"]
+    with h5py.File(hull, "r") as file:
+        for row, frame in enumerate((5, 6)):
+            cloud = open3d.io.read_point_cloud(folder / f"{frame:06d}.ply")
+            part = slice(*file["hull/offsets"][row : row + 2])
+            np.testing.assert_allclose(np.asarray(cloud.points), file["hull/positions"][part], atol=1e-6)
+            np.testing.assert_allclose(np.asarray(cloud.colors) * 255, file["hull/colors"][part], atol=0.51)
+
+
+def test_frames_without_anybody_are_empty(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
+    for camera in (copy / "masks").iterdir():
+        write_picture(camera / "000001.png", np.zeros((120, 160), np.uint8))
+    ply = tmp_path / "ply"
+    ran = tk("reconstruct", copy, "-o", tmp_path / "h.h5", "--ply", ply, "--config", quick, "--frames", ":3")
+    assert (ran.code, ran.out) == (0, ""), ran.err
+    with h5py.File(tmp_path / "h.h5", "r") as file:
+        counts = np.diff(file["hull/offsets"][()])
+    assert counts[1] == 0 and (counts[[0, 2]] > 60).all()
+    assert len(open3d.io.read_point_cloud(ply / "000001.ply").points) == 0
+
+
+def test_what_is_finished_is_kept_when_a_mask_breaks(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
+    (copy / "masks" / "cam1" / "000003.png").write_text("white")
+    ran = tk("reconstruct", copy, "-o", tmp_path / "h.h5", "--config", quick)
+    ran.complaint("masks/cam1/000003.png")
+    with h5py.File(tmp_path / "h.h5", "r") as file:
+        np.testing.assert_array_equal(file["frames"], np.arange(3))
+        assert len(file["hull/offsets"]) == 4
+
+
+def test_an_older_hull_is_replaced(tiny: Path, tmp_path: Path) -> None:
+    for stop in (3, 2):
+        done = reconstruct(open_capture(tiny), tmp_path / "h.h5", CONFIG, Silent(), (0, stop), force=True)
+        assert done == stop
+    with h5py.File(tmp_path / "h.h5", "r") as file:
+        assert len(file["frames"]) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["h.h5"]
+
+
+@pytest.mark.parametrize("options", [["--frames", "14:"], ["--frames", "3:3"], ["--cameras", "cam9"]])
+def test_bad_options(tk: Tk, quick: Path, tiny: Path, tmp_path: Path, options: list[str]) -> None:
+    tk("reconstruct", tiny, "-o", tmp_path / "h.h5", "--config", quick, *options).complaint(*options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_ply_files_that_cannot_be_written(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    command = ["reconstruct", tiny, "-o", tmp_path / "h.h5", "--config", quick, "--frames", ":1", "--ply"]
+    tk(*command, tmp_path / "file").complaint(str(tmp_path / "file"))
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_meshes_are_closed_and_lie_where_the_voxels_do(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    hull, folder = tmp_path / "h.h5", tmp_path / "mesh"
+    ran = tk("reconstruct", tiny, "-o", hull, "--mesh", folder, "--config", quick, "--frames", "5:7")
+    assert ran.code == 0, ran.err
+    assert sorted(path.name for path in folder.iterdir()) == ["000005.ply", "000006.ply"]
+    with h5py.File(hull, "r") as file:
+        voxel = float(file.attrs["voxel_m"])
+        positions = file["hull/positions"][: file["hull/offsets"][1]]
+    mesh = open3d.io.read_triangle_mesh(folder / "000005.ply")
+    assert mesh.is_watertight() and mesh.has_vertex_colors()
+    scene = open3d.t.geometry.RaycastingScene()
+    scene.add_triangles(open3d.t.geometry.TriangleMesh.from_legacy(mesh))
+    distance = scene.compute_distance(open3d.core.Tensor(positions.astype(np.float32))).numpy()
+    assert np.median(distance) < 0.6 * voxel and distance.max() < 2 * voxel
+    low, high = np.asarray(mesh.vertices).min(axis=0), np.asarray(mesh.vertices).max(axis=0)
+    np.testing.assert_allclose(low, positions.min(axis=0), atol=1.1 * voxel)
+    np.testing.assert_allclose(high, positions.max(axis=0), atol=1.1 * voxel)

@@ -1,0 +1,131 @@
+"""`tk refine` and what `tk track` does by itself: a rendered capture whose cameras are off, a video that is late."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+import tomli_w
+
+from tests.conftest import FRAMES, QUICK, Silent, Tk
+from tk.io.captures.calibration import read_calibration
+from tk.io.captures.capture import open_capture
+from tk.io.captures.mask_store import MaskStore
+from tk.io.results.writer import Status, read_result
+from tk.io.toml import load_toml
+from tk.model.cameras.camera import Rig
+from tk.model.cameras.refinement import turn_between
+from tk.run import offline as finish
+from tk.run import plan
+from tk.run.prefetch import open_source
+from tk.run.refinement import retimed
+from tk.run.session import track
+from tk.settings import Settings
+
+TURNED = 1.0  # degrees, of cam2: a camera that is further off is left out instead
+
+
+@pytest.fixture(scope="module")
+def astray(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tiny capture, its second camera turned by :data:`TURNED` degrees about its vertical."""
+    folder = Path(shutil.copytree(tiny, tmp_path_factory.mktemp("astray") / "capture"))
+    document = load_toml(folder / "calibration.toml")
+    name = sorted(key for key in document if key != "metadata")[1]
+    turn = np.asarray(cv2.Rodrigues(np.radians([0.0, TURNED, 0.0]))[0])
+    table = document[name]
+    table["rotation"] = cv2.Rodrigues(turn @ cv2.Rodrigues(np.array(table["rotation"]))[0])[0].ravel().tolist()
+    table["translation"] = (turn @ np.array(table["translation"])).tolist()
+    (folder / "calibration.toml").write_text(tomli_w.dumps(document), encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(astray: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Silent]:
+    """A result, and what was said."""
+    path, reporter = tmp_path_factory.mktemp("results") / "result.h5", Silent()
+    assert track(open_capture(astray), path, Settings.from_toml(QUICK), reporter).lost == 0
+    return path, reporter
+
+
+def turns(one: Rig, other: Rig) -> np.ndarray:
+    """(C,) degrees between the cameras of two rigs."""
+    return np.array([turn_between(a, b) for a, b in zip(one, other, strict=True)])
+
+
+def test_tracking_refines_cameras_that_disagree(run: tuple[Path, Silent], astray: Path, tiny: Path) -> None:
+    path, reporter = run
+    said = [note for note in reporter.notes if "the cameras disagreed" in note]
+    assert len(said) == 1 and "px off" in said[0]
+    used = read_result(path).cameras
+    assert used is not None
+    true, given = open_capture(tiny).rig, open_capture(astray).rig
+    assert turns(used.rig, true).max() < 0.75 * turns(given, true).max()
+
+
+def test_refine_writes_a_calibration(
+    run: tuple[Path, Silent], astray: Path, tiny: Path, tk: Tk, tmp_path: Path
+) -> None:
+    path, _ = run
+    output = tmp_path / "refined.toml"
+    ran = tk("refine", astray, path, "-o", output, "--trust", "4")
+    assert ran.code == 0 and "cam2" in ran.out and "±" in ran.out, ran.err
+    true, given = open_capture(tiny).rig, open_capture(astray).rig
+    refined = read_calibration(output)
+    assert turns(refined.rig, true).max() < 0.75 * turns(given, true).max()
+    assert len(refined.time_offset_s) == len(given)
+    tk("refine", astray, path, "-o", output).complaint(str(output), "--force")
+
+
+def test_pictures_out_of_step_are_tracked_again(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The delays are made up: here it is about which pictures are tracked then, and that every frame keeps its row."""
+    asked: list[np.ndarray] = []
+
+    def made_up(tracker: Any, store: Any, frames: Any, *_: Any) -> Any:
+        late = np.array([0, 0, 1, -1])
+        return tracker, retimed(store, frames, late), late.astype(float)
+
+    def remember(capture: Any, *more: Any, **options: Any) -> Any:
+        asked.append(np.array(capture.late_frames))
+        return open_source(capture, *more, **options)
+
+    monkeypatch.setattr(finish, "refine_if_astray", made_up)
+    for module in (plan, finish):
+        monkeypatch.setattr(module, "open_source", remember)
+    path, reporter = tmp_path / "again.h5", Silent()
+    assert track(open_capture(tiny), path, Settings.from_toml(QUICK), reporter, frames=(2, None)).lost == 0
+    assert [late.tolist() for late in asked] == [[0, 0, 0, 0], [0, 0, 1, -1]]
+    assert any("tracking again" in note for note in reporter.notes)
+    result = read_result(path)
+    assert result.frames.tolist() == list(range(2, FRAMES)) and (result.status != Status.LOST).all()
+    assert result.cameras is not None
+    np.testing.assert_allclose(result.cameras.time_offset_s * open_capture(tiny).fps, [0, 0, 1, -1])
+    # a camera that is late or early has no mask at an end
+    assert result.fit_error is not None
+    assert np.isnan(result.fit_error[[0, -1], [2, 3]]).all() and np.isfinite(result.fit_error[1:-1]).all()
+
+
+def test_what_does_not_belong_together_is_refused(tiny: Path, tracked: Path, tk: Tk, tmp_path: Path) -> None:
+    output = tmp_path / "refined.toml"
+    bare = tmp_path / "bare.h5"
+    shutil.copy(tracked, bare)
+    with h5py.File(bare, "r+") as file:
+        del file["model"]
+    tk("refine", tiny, bare, "-o", output).complaint(str(bare), "no body")
+    tk("refine", tiny, tracked, "-o", output, "--trust", "0").complaint("trust = 0")
+    assert not output.exists()
+
+
+def test_masks_of_late_cameras_come_from_other_frames() -> None:
+    store = MaskStore()
+    for frame in range(4):
+        store.put(frame, (np.arange(8) == frame).astype(np.uint8)[None, None] * np.full((3, 2, 1), 255, np.uint8))
+    late = retimed(store, np.arange(4), np.array([0, 1, -2]))
+    for frame in range(4):
+        shown = [np.flatnonzero(mask[0]).tolist() for mask in late.get(frame)]
+        assert shown == [[frame], [frame - 1] if frame >= 1 else [], [frame + 2] if frame < 2 else []]
+    assert retimed(store, np.arange(4), np.zeros(3, np.int64)) is store

@@ -1,0 +1,230 @@
+"""Where masks come from: given, the empty scene, a segmenter, or nowhere; and whom a segmenter's masks show."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.conftest import QUICK, Silent, Tk
+from tests.people import RIG, install, person_mask, truth, write_people
+from tk.errors import CaptureError, ConfigError
+from tk.io.captures.capture import open_capture
+from tk.run.mask_folder import write_masks
+from tk.run.prefetch import Ahead
+from tk.run.segmentation import make_segmenter, mask_source
+from tk.segmenters import load, names
+from tk.segmenters.subject_masks import SubjectMasks
+from tk.settings import Settings
+
+FRAMES = 20
+
+
+def walking(k: int) -> tuple[float, float]:
+    """Once around in 20 frames."""
+    return 0.85 * np.cos(0.1 * np.pi * k), 0.85 * np.sin(0.1 * np.pi * k)
+
+
+def standing(k: int) -> tuple[float, float]:
+    return 0.1, 0.02 * np.sin(k)
+
+
+def bystander(k: int) -> tuple[float, float]:
+    """Beyond the volume."""
+    return 1.55, 1.7
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One who walks, and one who looks on. Not to be changed."""
+    return write_people(tmp_path_factory.mktemp("people") / "walk", [walking, bystander], FRAMES)
+
+
+@pytest.fixture
+def alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever is installed here: no segmenter is."""
+    monkeypatch.setattr("tk.segmenters.names", lambda: ())
+    monkeypatch.setattr("tk.run.segmentation.names", lambda: ())
+    monkeypatch.setattr("tk.run.mask_folder.names", lambda: ())
+
+
+def wrong(masks: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """(C,) E_S."""
+    return np.asarray((masks > 0) ^ true).sum(axis=(1, 2)) / true.sum(axis=(1, 2))
+
+
+# --------------------------------------------------------------------------------------------------------- the order
+
+
+def test_what_is_there_decides(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(tmp_path / "site", monkeypatch, red="Red")
+    assert names()[0] == "red"
+    assert mask_source(open_capture(copy)) == "given"
+    assert mask_source(open_capture(copy, masks="none")) == "none"
+    assert mask_source(open_capture(copy, masks="median")) == "median"
+    shutil.rmtree(copy / "background")
+    assert mask_source(open_capture(copy)) == "given"
+    assert mask_source(open_capture(copy, masks="none")) == "segmenter red"
+    shutil.rmtree(copy / "masks")
+    assert mask_source(open_capture(copy)) == "segmenter red"
+
+
+@pytest.mark.usefixtures("alone")
+@pytest.mark.parametrize("command", ["track", "reconstruct"])
+def test_nothing_to_make_masks_from_is_refused(tk: Tk, walk: Path, tmp_path: Path, command: str) -> None:
+    ran = tk(command, walk, "-o", tmp_path / "r.h5")
+    ran.complaint(str(walk), "--masks DIR", "background/", "pip install tk-mocap[segmenter]")
+    assert not (tmp_path / "r.h5").exists()
+
+
+def test_a_segmenter_that_is_not_there(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(tmp_path / "site", monkeypatch, red="Red", lost="Missing", wrong="Wrong")
+    with pytest.raises(ConfigError, match=r"segmenter blue: is not installed; installed: .*red"):
+        load("blue")
+    with pytest.raises(ConfigError, match="segmenter lost: redsegmenter:Missing cannot be loaded"):
+        load("lost")
+    with pytest.raises(ConfigError, match="segmenter wrong: gave values outside 0 to 1"):
+        write_masks(open_capture(walk), tmp_path / "masks", Silent(), "wrong")
+
+
+# ------------------------------------------------------------------------------------------------------- the median
+
+
+def test_a_median_where_the_person_moves(walk: Path) -> None:
+    notes: list[str] = []
+    capture = open_capture(walk, masks="median")
+    segment = make_segmenter(capture, Settings(), notes.append)
+    assert notes == [f"{walk}: the median of 20 frames is taken for the empty scene"]
+    with capture.frames(10, 11) as frames:
+        found = wrong(segment(next(frames)), truth(walk, 10))
+    assert np.sort(found)[-2] < 0.1, "one camera sees the bystander behind, who is of the same colour"
+
+
+@pytest.mark.parametrize("masks", ["median", "none"])
+@pytest.mark.usefixtures("alone")
+def test_a_median_where_nobody_moves_is_refused(tmp_path: Path, masks: str) -> None:
+    folder = write_people(tmp_path / "still", [standing], 12)
+    with pytest.raises(CaptureError, match="hardly moves" if masks == "median" else "nothing tells") as caught:
+        make_segmenter(open_capture(folder, masks=masks), Settings(), lambda _: None)
+    assert "--masks DIR" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_median_that_holds_parts_of_the_person_says_so(tmp_path: Path) -> None:
+    folder = write_people(tmp_path / "slow", [lambda k: (-0.75, 0.0) if k < 9 else (-0.75 + 0.13 * (k - 8), 0.0)], 20)
+    notes: list[str] = []
+    make_segmenter(open_capture(folder, masks="median"), Settings(), notes.append)
+    assert len(notes) == 2 and "the median shows parts" in notes[1] and "c1, c2" in notes[1]
+
+
+# ---------------------------------------------------------------------------------------------------- the segmenter
+
+
+@pytest.mark.parametrize("segmenter", ["Red", "Finding"])
+def test_the_subject_is_who_stands_in_the_volume(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, segmenter: str
+) -> None:
+    """The bystander is nearer to some cameras, so larger, and red as well."""
+    near = np.ones((21, 21), np.uint8)  # what is this near to the hull is taken for a part of the person
+    install(tmp_path / "site", monkeypatch, red=segmenter)
+    capture = open_capture(walk)
+    notes: list[str] = []
+    segment = make_segmenter(capture, Settings(), notes.append)
+    assert len(notes) == 1 and "the segmenter red makes the masks" in notes[0]
+    with capture.frames() as frames:
+        for frame in frames:
+            true = truth(walk, frame.index)
+            clear = [not (cv2.dilate(person_mask(c, bystander(0)), near) * true[i]).any() for i, c in enumerate(RIG)]
+            assert sum(clear) >= 2  # elsewhere the two are one red thing
+            assert wrong(segment(frame), true)[clear].max() < 0.1, frame.index
+
+
+def test_a_process_ahead_makes_the_same_masks(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From another frame on, too: nothing is carried over."""
+    install(tmp_path / "site", monkeypatch, red="Finding")
+    capture = open_capture(walk)
+    segment = make_segmenter(capture, Settings(), lambda _: None)
+    with capture.frames(3, 6) as frames:
+        here = {frame.index: segment(frame) for frame in frames}
+    config = Settings.from_toml(QUICK.replace("ahead = 0", "ahead = 2"))
+    with Ahead(capture, config, lambda _: None) as source:
+        for observation, _ in source.frames(4, 6):
+            np.testing.assert_array_equal(observation.masks, here[observation.index], strict=True)
+
+
+def test_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(tmp_path / "site", monkeypatch, red="Finding")
+    folder = write_people(tmp_path / "left", [lambda k: None], 2)
+    capture = open_capture(folder)
+    with capture.frames() as frames:
+        assert not make_segmenter(capture, Settings(), lambda _: None)(next(frames)).any()
+
+
+# --------------------------------------------------------------------------------------------------------- tk masks
+
+
+def test_masks_of_ones_own_for_track(tk: Tk, walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(tmp_path / "site", monkeypatch, red="Finding")
+    out = tmp_path / "made"
+    ran = tk("masks", walk, "-o", out, "--frames", ":5")
+    assert ran.code == 0 and "masks of 5 frames" in ran.err
+    first = (out / "c1" / "000002.png").read_bytes()
+    (out / "c2" / "000003.png").unlink()
+    (out / "c1" / "000002.png").write_bytes(b"kept")
+    ran = tk("masks", walk, "-o", out, "--segmenter", "red")
+    assert ran.code == 0 and "masks of 20 frames" in ran.err and "16 of them new" in ran.err
+    assert (out / "c1" / "000002.png").read_bytes() == b"kept"
+    (out / "c1" / "000002.png").write_bytes(first)
+    capture = open_capture(walk, masks=str(out))
+    assert capture.frame_count == FRAMES
+    with capture.frames() as frames:
+        for frame in frames:
+            assert frame.masks is not None
+            file = cv2.imread(str(out / "c0" / f"{frame.index:06d}.png"), cv2.IMREAD_UNCHANGED)
+            assert file.dtype == np.uint8 and set(np.unique(file)) == {0, 255}
+            np.testing.assert_array_equal(frame.masks[0], file)
+    assert not [path for path in out.rglob("*") if path.name.endswith(".part")]
+
+
+def test_masks_that_another_command_has_made(
+    tk: Tk, walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(tmp_path / "site", monkeypatch, red="Finding", plain="Red")
+    command = ("masks", walk, "-o", tmp_path / "made", "--frames", "1:2", "--segmenter")
+    ran = tk(*command, "red")
+    assert ran.code == 0 and "frames before 1 are missing" in ran.err
+    with pytest.raises(CaptureError, match=r"starts with 000001.png, so frame 0 has no mask; .* tk masks"):
+        open_capture(walk, masks=str(tmp_path / "made"))
+    tk(*command, "plain").complaint("masks.toml", "segmenter: red, not plain")
+    tk(*command, "red", "--cameras", "c0,c1").complaint("cameras")
+    tk("masks", walk, "-o", walk).complaint(str(walk), "choose another folder")
+    tk(*command, "green").complaint("segmenter green", "is not installed")
+
+
+@pytest.mark.usefixtures("alone")
+def test_no_segmenter_for_masks(tk: Tk, walk: Path, tmp_path: Path) -> None:
+    tk("masks", walk, "-o", tmp_path / "made").complaint("no segmenter is installed", "pip install tk-mocap[segmenter]")
+    assert not (tmp_path / "made").exists()
+
+
+# ------------------------------------------------------------------------------------------------ the built-in network
+
+HAS_LITERT = importlib.util.find_spec("ai_edge_litert") is not None
+
+
+@pytest.mark.skipif(not HAS_LITERT, reason="the extra segmenter is not installed")
+def test_the_network_knows_a_rendered_person(tiny: Path) -> None:
+    from tk.segmenters.weights import FILES, default_cache_dir
+
+    if not all((default_cache_dir() / "segmenter" / name).is_file() for name in FILES):
+        pytest.skip("the network's weights were never fetched on this machine")
+    capture = open_capture(tiny, masks="none")
+    made = SubjectMasks(load("mediapipe"), "mediapipe", capture.rig, capture.volume)
+    with open_capture(tiny).frames(0, 1) as frames:
+        frame = next(frames)
+    assert frame.masks is not None
+    level = wrong(made.segment(frame.images), frame.masks > 0)[:3]  # the last camera looks from above
+    assert level.max() < 0.3

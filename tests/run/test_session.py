@@ -1,0 +1,325 @@
+"""The loop: same seed, same file; runs that are stopped, prolonged or taken up again; where a run starts.
+
+By the volumetric tracker; tests/test_region_track.py has what is the default's own, and kills a run.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import tomli_w
+
+from tests.conftest import FRAMES, QUICK, Silent, Tk
+from tests.io.conftest import write_picture
+from tk.errors import ConfigError
+from tk.io.captures.capture import open_capture
+from tk.io.results.writer import Status, read_joints, read_result
+from tk.model.body.skeleton import JOINTS
+from tk.run import session
+from tk.run.plan import choose_frames, make_tracker
+from tk.run.session import Summary
+from tk.settings import Settings
+
+ROOT = Path(__file__).parents[2]
+CONFIG = Settings.from_toml(QUICK)
+track = partial(session.track, method="volumetric")
+
+# `tk` that sends itself a signal once a frame is finished
+VICTIM = """
+import os, signal, sys
+from tk.commands import console
+from tk.run import session
+from tk import cli
+
+session.WRITE_EVERY_S = float(os.environ["TEST_WRITE_EVERY_S"])
+tell = console.Report.advance
+
+def advance(self, frame, estimate):
+    tell(self, frame, estimate)
+    if frame == int(os.environ["TEST_FRAME"]):
+        os.kill(os.getpid(), int(os.environ["TEST_SIGNAL"]))
+
+console.Report.advance = advance
+cli.main(prog_name="tk")
+"""
+
+
+def run(capture: Path, output: Path, **options: Any) -> Summary:
+    return track(open_capture(capture), output, options.pop("config", CONFIG), Silent(), **options)
+
+
+def assert_same(path: Path, expected: Path, frames: slice = slice(None)) -> None:
+    """Bit for bit, times apart."""
+    with h5py.File(path, "r") as a, h5py.File(expected, "r") as b:
+        for name in ("frames", "time", "pose", "joints/position", "status", "objective", "iterations"):
+            np.testing.assert_array_equal(a[name][()], b[name][frames], err_msg=name)
+        for name in b["model/patches"]:
+            np.testing.assert_array_equal(a[f"model/patches/{name}"][()], b[f"model/patches/{name}"][()], err_msg=name)
+        for name in b["model/dimensions"]:
+            assert a[f"model/dimensions/{name}"][()] == b[f"model/dimensions/{name}"][()], name
+
+
+def send(number: int, frame: int, *arguments: Any, write_every_s: float = 0.0) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", VICTIM, *map(str, arguments)],
+        cwd=ROOT,
+        env={
+            **os.environ,
+            "TEST_FRAME": str(frame),
+            "TEST_SIGNAL": str(int(number)),
+            "TEST_WRITE_EVERY_S": str(write_every_s),
+        },
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+
+
+def stop_at(frame: int) -> Silent:
+    """A reporter during which somebody presses Ctrl-C."""
+
+    class Stop(Silent):
+        def advance(self, index: int, estimate: object) -> None:
+            super().advance(index, estimate)
+            if index == frame:
+                signal.raise_signal(signal.SIGINT)
+
+    return Stop()
+
+
+# --- the same again ---------------------------------------------------------------------------------------------------
+
+
+def test_the_same_seed_gives_the_same_result(tiny: Path, tracked: Path, tmp_path: Path) -> None:
+    summary = run(tiny, tmp_path / "again.h5", store_hull=True)
+    assert (summary.frames, summary.tracked_now, summary.interrupted) == (FRAMES, FRAMES, False)
+    assert_same(tmp_path / "again.h5", tracked)
+
+
+def test_another_seed_gives_another_result(tiny: Path, tracked: Path, tmp_path: Path) -> None:
+    run(tiny, tmp_path / "other.h5", config=Settings.from_toml(f"seed = 1\n{QUICK}"), frames=(0, 4))
+    assert np.abs(read_result(tmp_path / "other.h5").pose - read_result(tracked).pose[:4]).max() > 1e-6
+
+
+# --- stopped and taken up again ---------------------------------------------------------------------------------------
+
+
+def test_a_run_that_is_stopped_twice_equals_an_unbroken_one(
+    tiny: Path, tracked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "WRITE_EVERY_S", 0)
+    result, capture = tmp_path / "r.h5", open_capture(tiny)
+    for frame in (0, 8):
+        summary = track(capture, result, CONFIG, stop_at(frame), resume=True, store_hull=True)
+        assert summary.interrupted and summary.frames == frame + 1
+    reporter = Silent()
+    summary = track(capture, result, CONFIG, reporter, resume=True, store_hull=True)
+    assert (summary.interrupted, summary.frames, summary.tracked_now) == (False, FRAMES, FRAMES - 9)
+    assert (reporter.total, reporter.done, reporter.frames) == (FRAMES, 9, list(range(9, FRAMES)))
+    assert_same(result, tracked)
+
+
+def test_frames_that_are_written_together_are_told_of_when_they_are_in_the_file(
+    tiny: Path, tracked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "WRITE_EVERY_S", 1e9)
+    result, capture = tmp_path / "r.h5", open_capture(tiny)
+    stopped = stop_at(3)
+    summary = track(capture, result, CONFIG, stopped, frames=(0, 8), store_hull=True)
+    assert summary.interrupted and stopped.frames == [0, 1, 2, 3]  # by then all of them were finished
+    assert summary.frames == summary.tracked_now == 8
+    assert_same(result, tracked, slice(0, 8))
+    run(tiny, result, resume=True, store_hull=True)
+    assert_same(result, tracked)
+
+
+def test_a_killed_run_leaves_what_it_has_told_of(tiny: Path, tracked: Path, tmp_path: Path) -> None:
+    """With frames that are written together, as many as it may be."""
+    result, settings = tmp_path / "r.h5", tmp_path / "s.toml"
+    settings.write_text(QUICK, encoding="utf-8")
+    command = ["track", tiny, "-o", result, "--method", "volumetric", "--config", settings]
+    killed = send(signal.SIGKILL, 5, *command, write_every_s=0.05)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    done = len(read_result(result).frames)
+    assert 6 <= done < FRAMES
+    assert_same(result, tracked, slice(0, done))
+
+
+@pytest.mark.parametrize("frames", [(0, 1), (0, 6)])
+def test_a_run_may_be_prolonged(tiny: Path, tracked: Path, tmp_path: Path, frames: tuple[int, int]) -> None:
+    """The body is fitted to the same frames however few are asked for."""
+    run(tiny, tmp_path / "r.h5", frames=frames, store_hull=True)
+    assert_same(tmp_path / "r.h5", tracked, slice(*frames))
+    run(tiny, tmp_path / "r.h5", resume=True, store_hull=True)
+    assert_same(tmp_path / "r.h5", tracked)
+
+
+def test_ctrl_c_before_the_first_frame_leaves_an_older_result(tiny: Path, tmp_path: Path) -> None:
+    class Impatient(Silent):
+        def begin(self, total: int, done: int) -> None:
+            signal.raise_signal(signal.SIGINT)
+
+    result = tmp_path / "r.h5"
+    run(tiny, result, frames=(0, 2))
+    before = result.read_bytes()
+    summary = track(open_capture(tiny), result, CONFIG, Impatient(), force=True)
+    assert summary.interrupted and summary.frames == 0
+    assert result.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("options", "difference"),
+    [
+        (["--frames", "1:"], "first frame: 0, not 1"),
+        (["--cameras", "cam1,cam2,cam3"], "cameras: cam1, cam2, cam3, cam4, not cam1, cam2, cam3"),
+        (["--masks", "none"], "masks: masks, not none"),
+        (["--seed", "8"], "seed is 0, not 8"),
+        (["--voxels", "40"], "config voxels is 32, not 40"),
+        (["--store-hull"], "stored hull: no, not yes"),
+    ],
+)
+def test_only_the_same_command_is_taken_up_again(
+    tk: Tk, quick: Path, tiny: Path, begun: Path, options: list[str], difference: str
+) -> None:
+    before = begun.read_bytes()
+    ran = tk("track", tiny, "--method", "volumetric", "-o", begun, "--config", quick, "--resume", *options)
+    ran.complaint(str(begun), difference, "--force in the place of --resume")
+    assert begun.read_bytes() == before
+
+
+@pytest.fixture(scope="module")
+def begun(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("begun") / "r.h5"
+    run(tiny, path, frames=(0, 1))
+    return path
+
+
+def test_results_of_other_software_are_not_taken_up(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.h5"
+    with h5py.File(other, "w") as file:
+        file["frames"] = np.arange(3)
+    command = ["track", tiny, "--method", "volumetric", "-o", other, "--config", quick, "--resume"]
+    tk(*command).complaint("other.h5", "other software")
+    other.write_text("not HDF5")
+    tk(*command).complaint("other.h5", "not an HDF5 file")
+    assert other.read_text() == "not HDF5"
+
+
+def test_lost_frames_of_all_runs_are_counted(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody is there in frames 3 to 5; the run is stopped in their midst."""
+    monkeypatch.setattr(session, "WRITE_EVERY_S", 0)
+    for camera in (copy / "masks").iterdir():
+        for index in (3, 4, 5):
+            write_picture(camera / f"{index:06d}.png", np.zeros((120, 160), np.uint8))
+    result, capture = tmp_path / "r.h5", open_capture(copy)
+    assert track(capture, result, CONFIG, stop_at(4)).lost == 2
+    assert track(capture, result, CONFIG, Silent(), resume=True).lost == 3
+    status = read_result(result).status
+    assert list(status[:3]) == [Status.INITIALISED, Status.TRACKED, Status.TRACKED]
+    assert list(status[3:7]) == [Status.LOST, Status.LOST, Status.LOST, Status.RECOVERED]
+    assert (status[7:] == Status.TRACKED).all()
+
+
+# --- what is kept -----------------------------------------------------------------------------------------------------
+
+
+def test_the_hull_is_kept_where_it_is_asked_for(tracked: Path) -> None:
+    result = read_result(tracked)
+    assert result.hull is not None and len(result.hull.offsets) == FRAMES + 1
+    assert result.hull.positions.dtype == np.float32 and result.hull.colors.dtype == np.uint8
+    for row in range(FRAMES):
+        points = result.hull[row]
+        assert len(points.positions) == len(points.colors) > 60
+        assert np.linalg.norm(points.positions.mean(axis=0) - result.joints[row].mean(axis=0)) < 0.3
+
+
+# --- where a run starts -----------------------------------------------------------------------------------------------
+
+
+def pose_file(path: Path, document: dict[str, Any]) -> Path:
+    path.write_text(tomli_w.dumps(document), encoding="utf-8")
+    return path
+
+
+def test_starts_from_rough_joints(copy: Path, tmp_path: Path) -> None:
+    truth = read_joints(copy / "truth.h5")
+    rough = truth.positions[4] + np.random.default_rng(0).normal(0, 0.04, (15, 3))
+    joints = {name: rough[k].tolist() for k, name in enumerate(JOINTS) if not name.startswith("elbow")}
+    file = pose_file(tmp_path / "pose.toml", {"frame": 4, "joints": joints, "subject": {"height": 1.75}})
+    settings = (copy / "capture.toml").read_text(encoding="utf-8").replace("da-vinci", "any")
+    (copy / "capture.toml").write_text(settings, encoding="utf-8")
+    run(copy, tmp_path / "r.h5", init_pose=file, frames=(0, 9))
+    found = read_result(tmp_path / "r.h5")
+    np.testing.assert_array_equal(found.frames, np.arange(4, 9))
+    assert found.status[0] == Status.INITIALISED and not (found.status == Status.LOST).any()
+    assert np.median(np.linalg.norm(found.joints - truth.positions[4:9], axis=2)) < 0.12
+
+
+def test_starts_from_angles(tiny: Path, tracked: Path, tmp_path: Path) -> None:
+    known = read_result(tracked)
+    names, pose = known.meta.pose_names, known.pose[5]
+    angles = {
+        n: float(v) if n in ("torso_x", "torso_y", "torso_z") else float(np.degrees(v))
+        for n, v in zip(names, pose, strict=True)
+    }
+    angles = {name: round(value, 1) for name, value in angles.items()}
+    run(tiny, tmp_path / "r.h5", init_pose=pose_file(tmp_path / "pose.toml", {"angles": angles}), frames=(5, 9))
+    found = read_result(tmp_path / "r.h5")
+    np.testing.assert_array_equal(found.frames, np.arange(5, 9))
+    assert np.median(np.linalg.norm(found.joints - known.joints[5:9], axis=2)) < 0.06
+
+
+def test_an_initial_pose_past_the_end(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    joints = {name: [0.1 * (k % 2), 0.05 * k, 1.0] for k, name in enumerate(JOINTS)}
+    file = pose_file(tmp_path / "pose.toml", {"frame": 99, "joints": joints})
+    tk(
+        "track", tiny, "--method", "volumetric", "-o", tmp_path / "r.h5", "--config", quick, "--init-pose", file
+    ).complaint("pose.toml", "99", "13")
+
+
+def test_an_initial_pose_in_millimetres(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    joints = {name: [100.0 * (k % 2), 50.0 * k, 1000.0] for k, name in enumerate(JOINTS)}
+    file = pose_file(tmp_path / "pose.toml", {"joints": joints})
+    ran = tk("track", tiny, "--method", "volumetric", "-o", tmp_path / "r.h5", "--config", quick, "--init-pose", file)
+    ran.complaint("pose.toml", "outside the working volume", "metres")
+
+
+def test_frames_before_the_initial_one_are_left_out(copy: Path, tmp_path: Path) -> None:
+    settings = (copy / "capture.toml").read_text(encoding="utf-8").replace("frame = 0", "frame = 3")
+    (copy / "capture.toml").write_text(settings, encoding="utf-8")
+    reporter = Silent()
+    track(open_capture(copy), tmp_path / "r.h5", CONFIG, reporter, frames=(1, 6))
+    assert reporter.frames == [3, 4, 5]
+    assert any("frames before 3 are left out" in note for note in reporter.notes)
+    with pytest.raises(ConfigError, match=r"--frames 0:2: the subject is found in frame 3"):
+        run(copy, tmp_path / "other.h5", frames=(0, 2))
+
+
+def test_frames_that_are_asked_for(tiny: Path) -> None:
+    capture, notes = open_capture(tiny), list[str]()
+    assert choose_frames(capture, (0, None), notes.append) == (0, FRAMES)
+    assert choose_frames(capture, (3, 7), notes.append) == (3, 7)
+    assert not notes
+    assert choose_frames(capture, (3, 70), notes.append) == (3, FRAMES)
+    assert "ends with frame 13" in notes[0]
+    with pytest.raises(ConfigError, match=r"--frames 14:: .* has only frames 0 to 13"):
+        choose_frames(capture, (14, None), notes.append)
+
+
+def test_mog2_is_a_further_choice(tiny: Path, tmp_path: Path) -> None:
+    config = Settings.from_toml(f'segmentation = "mog2"\n{QUICK}')
+    assert track(open_capture(tiny, masks="none"), tmp_path / "r.h5", config, Silent(), frames=(0, 4)).lost == 0
+
+
+def test_unknown_method(tiny: Path) -> None:
+    with pytest.raises(ConfigError, match=r"--method neural: choose one of .*volumetric"):
+        make_tracker("neural", open_capture(tiny), CONFIG)

@@ -1,0 +1,100 @@
+"""A world that nobody has laid along the floor, like the frame of a camera: `up` is a direction, not an axis."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+import tomli_w
+from scipy.spatial.transform import Rotation
+
+from tests.conftest import QUICK, Silent
+from tests.trackers.test_silhouette_track import QUICK as QUICK_SILHOUETTE
+from tk.io.captures.capture import open_capture
+from tk.io.results.writer import read_joints, read_result
+from tk.model.cameras.tracker_frame import seen_from
+from tk.model.cameras.up import up_text
+from tk.model.cameras.volume import Volume
+from tk.run.session import track
+from tk.settings import Settings
+
+TURN = Rotation.from_euler("xyz", [-1.2, 0.3, 0.5]).as_matrix()
+
+
+@pytest.fixture(scope="module")
+def tilted(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tiny capture with its world turned by :data:`TURN`."""
+    folder = tmp_path_factory.mktemp("tilted") / "capture"
+    shutil.copytree(tiny, folder)
+    original = open_capture(tiny)
+    tables: dict[str, object] = {}
+    for camera in original.rig:
+        turned = replace(camera, rotation=camera.rotation @ TURN.T)
+        tables[camera.name] = {
+            "size": [camera.width, camera.height],
+            "matrix": camera.matrix.tolist(),
+            "distortions": camera.distortions.tolist(),
+            "rotation": cv2.Rodrigues(turned.rotation)[0].ravel().tolist(),
+            "translation": camera.translation.tolist(),
+        }
+    (folder / "calibration.toml").write_text(tomli_w.dumps(tables))
+    side = 1.15 * max(original.volume.size)
+    settings = {
+        "up": (3 * TURN[:, 2]).tolist(),
+        "volume": {"center": (TURN @ original.volume.center).tolist(), "size": [side] * 3},
+    }
+    (folder / "capture.toml").write_text(tomli_w.dumps(settings))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("method", "quick"), [("volumetric", QUICK), ("silhouette", QUICK_SILHOUETTE)], ids=["volumetric", "silhouette"]
+)
+def test_the_person_is_tracked(tiny: Path, tilted: Path, tmp_path: Path, method: str, quick: str) -> None:
+    path = tmp_path / "r.h5"
+    track(open_capture(tilted), path, Settings.from_toml(quick), Silent(), method, (0, 6))
+    with h5py.File(path) as file:
+        up = file.attrs["up"]
+    np.testing.assert_allclose(open_capture(tilted).up_axis, TURN[:, 2], atol=1e-12)
+    assert up == open_capture(tilted).up  # the very text
+    truth = read_joints(tiny / "truth.h5").positions[:6] @ TURN.T
+    found = read_result(path).joints
+    assert np.linalg.norm(found - truth, axis=-1).mean() < 0.10
+
+
+@pytest.mark.parametrize("method", ["region", "silhouette"])
+def test_a_turned_world_makes_no_difference(tiny: Path, tmp_path: Path, method: str) -> None:
+    """Not even to rounding, which would decide between poses that explain the pictures alike."""
+    capture, shift = open_capture(tiny), np.array([3.0, -2.0, 0.7])
+    side = 1.15 * max(capture.volume.size)
+    center = TURN @ capture.volume.center + shift
+    turned = replace(
+        capture,
+        rig=seen_from(capture.rig, TURN.T, -TURN.T @ shift),
+        volume=Volume((center[0], center[1], center[2]), (side, side, side)),
+        up=up_text(TURN @ capture.up_axis),
+    )
+    results = []
+    for name, one in (("as it is", capture), ("turned", turned)):
+        track(one, tmp_path / name, Settings.from_toml(QUICK_SILHOUETTE), Silent(), method, (0, 6))
+        results.append(read_result(tmp_path / name))
+    expected, found = results
+    assert found.smoothed is not None and expected.smoothed is not None
+    for a, b in (
+        (found.joints, expected.joints),
+        (found.feet, expected.feet),
+        (found.smoothed["joints/position"], expected.smoothed["joints/position"]),
+    ):
+        assert a is not None and b is not None
+        np.testing.assert_allclose(a, b @ TURN.T + shift, atol=1e-9)
+    np.testing.assert_array_equal(found.status, expected.status)
+    np.testing.assert_array_equal(found.objective, expected.objective)
+    np.testing.assert_array_equal(found.model["parts/shape"], expected.model["parts/shape"])
+    for joint, angles in expected.angles.items():
+        if joint != "pelvis":  # its heading is counted from an axis of the capture's world
+            np.testing.assert_allclose(found.angles[joint], angles, atol=1e-6)

@@ -1,0 +1,225 @@
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tk.commands.config_text import annotated_toml, meanings
+from tk.errors import ConfigError
+from tk.settings import PRESETS, Settings
+from tk.trackers.volumetric import SAMPLING, SCHEDULE, SMD, Effort
+
+
+def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """(name with dots, default) of every setting."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from leaves(value, f"{prefix}{field.name}.")
+        else:
+            yield f"{prefix}{field.name}", value
+
+
+DEFAULTS = dict(leaves(Settings()))
+NUMBERS = [name for name, value in DEFAULTS.items() if isinstance(value, float)]
+
+
+def toml(name: str, value: str) -> str:
+    table, _, key = name.rpartition(".")
+    return f"[{table}]\n{key} = {value}\n" if table else f"{key} = {value}\n"
+
+
+def test_defaults_round_trip() -> None:
+    assert Settings.from_toml(Settings().to_toml()) == Settings()
+    assert Settings.from_toml("") == Settings()
+
+
+@settings(deadline=None)
+@given(
+    voxels=st.integers(8, 512),
+    seed=st.integers(0, 2**62),
+    prediction=st.floats(0, 1.5, allow_subnormal=False),
+    effort=st.one_of(st.sampled_from(["fast", "normal", "thorough"]), st.floats(0.05, 20)),
+    enabled=st.booleans(),
+    segmentation=st.sampled_from(["collinearity", "mog2"]),
+)
+def test_values_round_trip(
+    voxels: int, seed: int, segmentation: str, prediction: float, effort: str | float, enabled: bool
+) -> None:
+    config = Settings(voxels=voxels, seed=seed, segmentation=segmentation, effort=effort)
+    config = dataclasses.replace(
+        config,
+        tracking=dataclasses.replace(config.tracking, prediction=prediction),
+        appearance=dataclasses.replace(config.appearance, enabled=enabled),
+    )
+    assert Settings.from_toml(config.to_toml()) == config
+
+
+def test_what_a_file_leaves_out_keeps_its_default() -> None:
+    config = Settings.from_toml("voxels = 128\n[tracking]\nprediction = 1\n")
+    assert config.voxels == 128 and config.tracking.prediction == 1.0
+    assert isinstance(config.tracking.prediction, float)
+    changed = {name for name, value in leaves(config) if value != DEFAULTS[name]}
+    assert changed == {"voxels", "tracking.prediction"}
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("voxel = 3", ["unknown setting voxel", "voxels"]),
+        ("[tracking]\nspeed = 3", ["unknown setting tracking.speed", "prediction"]),
+        ("[traking]\n", ["unknown setting traking"]),
+        ('voxels = "64"', ["voxels", "int"]),
+        ("voxels = 64.0", ["voxels", "int"]),
+        ("voxels = true", ["voxels", "int"]),
+        ("[tracking]\nprediction = true", ["tracking.prediction", "float"]),
+        ("[appearance]\nenabled = 1", ["appearance.enabled", "bool"]),
+        ("tracking = 3", ["tracking", "table"]),
+        ("segmentation = 1", ["segmentation", "str"]),
+        ('segmentation = "magic"', ["magic", "collinearity", "mog2"]),
+        ("voxels = 2", ["--voxels 2", "8 to 512"]),
+        ("seed = -1", ["--seed -1"]),
+        ("[tracking]\nprediction = 7.0", ["prediction = 7.0"]),
+        ("[tracking]\nprediction = 2", ["prediction = 2"]),
+        ("[smd]\nmemory = 0.3", ["unknown setting smd"]),
+        ('effort = "utmost"', ["utmost", "fast, normal, thorough"]),
+        ("effort = true", ["effort", "must be of type"]),
+        ("effort = 0.0", ["effort = 0", "from 0.05 to 20"]),
+        ("[appearance]\nrate = 2.0", ["rate = 2.0"]),
+        ("[tracking]\nlost_ratio = 0.5", ["lost_ratio = 0.5"]),
+        ("voxels = ", ["invalid TOML"]),
+        ("tracking = " + 3000 * "[", ["invalid TOML"]),
+        ("[silhouette]\ninit_frames = 1000000000\n", ["silhouette.init_frames = 1000000000 is too large"]),
+        ("[contours]\nthreshold = 1e300\n", ["contours.threshold = 1e+300 is too large"]),
+        (f"[contours]\nthreshold = 1{400 * '0'}\n", ["contours.threshold = 1000", "is too large"]),
+        (f"voxels = 1{5000 * '0'}\n", ["invalid TOML"]),
+        ("seed = 99999999999999999999", ["seed"]),
+    ],
+)
+def test_mistakes_are_one_line_that_names_file_and_setting(tmp_path: Path, text: str, parts: list[str]) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        Settings.read(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ") and "\n" not in message
+    for part in parts:
+        assert part in message
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf"])
+@pytest.mark.parametrize("name", NUMBERS)
+def test_no_setting_takes_what_is_not_finite(name: str, value: str) -> None:
+    with pytest.raises(ConfigError, match=name.rpartition(".")[2]):
+        Settings.from_toml(toml(name, value))
+
+
+@pytest.mark.parametrize("name", [name for name in DEFAULTS if not isinstance(DEFAULTS[name], str)])
+@pytest.mark.parametrize("value", [-1, 0, 10**6])
+def test_extreme_values_are_taken_or_refused_as_the_users_mistake(name: str, value: int) -> None:
+    default = DEFAULTS[name]
+    text = str(bool(value)).lower() if isinstance(default, bool) else str(value)
+    try:
+        config = Settings.from_toml(toml(name, text))
+    except ConfigError as error:
+        table, _, key = name.rpartition(".")
+        assert key in str(error) or f"{table}: " in str(error)  # it names the setting, or at least its table
+    else:
+        assert dict(leaves(config))[name] == value or isinstance(default, bool)
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"nowhere\.toml: cannot be read"):
+        Settings.read(tmp_path / "nowhere.toml")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        Settings.read(tmp_path)
+    (tmp_path / "latin.toml").write_bytes(b'segmentation = "\xe4"')
+    with pytest.raises(ConfigError, match=r"latin\.toml: is not UTF-8"):
+        Settings.read(tmp_path / "latin.toml")
+
+
+def test_every_default_is_finite() -> None:
+    assert len(NUMBERS) > 20
+    assert all(math.isfinite(DEFAULTS[name]) for name in NUMBERS)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_are_valid_and_unlike_the_defaults(name: str) -> None:
+    config = Settings.preset(name)
+    assert config != Settings()
+    assert Settings.from_toml(config.to_toml()) == config
+
+
+def test_the_papers_preset_has_the_papers_numbers() -> None:
+    c = Settings.preset("kehl2006")
+    effort = Effort.of(c.effort_factor)
+    assert (c.contours.views, c.contours.pairs, c.contours.hidden) == (3, 5, 1)
+    assert (c.voxels, c.body.waist, c.appearance.rate) == (64, False, 0.3)
+    assert (effort.sampling.torso, effort.sampling.chain, effort.sampling.scale) == (60, 20, 1)
+    assert SCHEDULE.refine == 0.5
+    assert (effort.smd.memory, effort.smd.max_iterations, effort.smd.window) == (0.3, 40, 3)
+    assert effort.smd.shuffle
+
+
+def test_effort_is_iterations_below_one_and_points_above() -> None:
+    fast, normal, thorough = (Effort.of(Settings(effort=e).effort_factor) for e in ("fast", "normal", "thorough"))
+    assert (normal.sampling, normal.smd) == (SAMPLING, SMD)
+    assert fast.sampling == SAMPLING and fast.smd.max_iterations == SMD.max_iterations // 2
+    assert thorough.smd == SMD and thorough.sampling.scale == 5
+    assert Effort.of(0.05).smd.max_iterations >= 1
+
+
+def test_there_are_no_more_settings_than_one_can_look_through() -> None:
+    assert len(DEFAULTS) <= 60
+
+
+@pytest.mark.parametrize("config", [Settings(), Settings.preset("kehl2006")], ids=["defaults", "kehl2006"])
+def test_the_annotated_settings_are_the_settings(config: Settings) -> None:
+    text = annotated_toml(config)
+    assert Settings.from_toml(text) == config
+    lines = text.splitlines()
+    for number, line in enumerate(lines):
+        name, equals, _ = line.partition(" = ")
+        if equals and not line.startswith("#"):
+            assert lines[number - 1].startswith("# "), name  # each is explained
+    assert all(len(line) <= 120 for line in lines)
+    for default in ("Default: 64", 'Default: "normal"', "Default: true"):
+        assert default in text
+
+
+def test_each_setting_is_explained() -> None:
+    def check(config: Any) -> None:
+        said = meanings(type(config))
+        for field in dataclasses.fields(config):
+            value = getattr(config, field.name)
+            if dataclasses.is_dataclass(value):
+                check(value)
+            else:
+                assert len(said[field.name]) > 15, field.name
+
+    check(Settings())
+
+
+def test_the_papers_preset_is_the_default_but_for_the_waist_and_the_search() -> None:
+    c = Settings.preset("kehl2006")
+    assert not c.body.waist and c.silhouette.search_every == 0
+    silhouette = dataclasses.replace(c.silhouette, search_every=Settings().silhouette.search_every)
+    assert dataclasses.replace(c, body=Settings().body, silhouette=silhouette) == Settings()
+
+
+def test_a_file_wins_over_a_preset(tmp_path: Path) -> None:
+    file = tmp_path / "own.toml"
+    file.write_text("voxels = 128\n[contours]\nviews = 2\n")
+    config = Settings.read(file, Settings.preset("kehl2006"))
+    assert (config.voxels, config.contours.views, config.body.waist) == (128, 2, False)
+
+
+def test_an_unknown_preset_is_named() -> None:
+    with pytest.raises(ConfigError, match="--preset mine: choose one of kehl2006"):
+        Settings.preset("mine")

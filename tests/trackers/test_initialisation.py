@@ -1,0 +1,178 @@
+"""Who is looked for without any hint, on silhouettes of the tracker's own body, drawn by ray casting."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.model.ring import ring_of_cameras
+from tk.errors import CaptureError
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.cone_body import build_cone_body
+from tk.model.body.gait_poses import neutral_pose, standing_pose, walking_pose
+from tk.model.body.skeleton import JOINTS, shoulder_angles
+from tk.model.masks.silhouettes import draw_silhouettes
+from tk.optim.gauss_newton import Descent
+from tk.trackers.initialisation import Way, find_person, stature_of
+from tk.trackers.protocol import Observation
+from tk.trackers.silhouette import SilhouetteSettings, SilhouetteTracker
+
+STATURE = 1.75
+RIG = ring_of_cameras(3, width=200, height=250)
+BODY = build_cone_body(BodyDimensions.from_stature(STATURE))
+SKELETON = BODY.skeleton
+
+
+def placed(pose: np.ndarray, yaw: float, **angles: float) -> np.ndarray:
+    """A pose (D,) at its place, turned; further angles in degrees."""
+    result = pose.copy()
+    result[:3] = [0.05, -0.04, 0.93]
+    result[SKELETON.index("torso_yaw")] = yaw
+    for name, degrees in angles.items():
+        result[SKELETON.index(name)] = np.radians(degrees)
+    return result
+
+
+def arms(pose: np.ndarray, left: tuple[float, float, float], right: tuple[float, float, float]) -> np.ndarray:
+    """With upper arms in these directions: forwards, outwards, up."""
+    result = pose.copy()
+    for side, direction in (("l", left), ("r", right)):
+        yaw, pitch = shoulder_angles(np.array(direction) / np.linalg.norm(direction))
+        result[SKELETON.index(f"shoulder_{side}_yaw")] = yaw
+        result[SKELETON.index(f"shoulder_{side}_pitch")] = pitch
+    return result
+
+
+def tracker_of(stature: float = STATURE) -> SilhouetteTracker:
+    tracker = SilhouetteTracker(RIG, "z", SilhouetteSettings())
+    tracker.take_body(build_cone_body(BodyDimensions.from_stature(stature)))
+    return tracker
+
+
+def found(poses: np.ndarray) -> np.ndarray:
+    """(F, 15, 3) joints that are found in silhouettes of poses (F, D)."""
+    tracker = tracker_of()
+    frames = [Observation(i, np.zeros(0, np.uint8), m) for i, m in enumerate(draw_silhouettes(BODY, RIG, poses))]
+    poses = find_person(tracker, frames, [tracker.pyramid(frame) for frame in frames])[0].poses
+    return tracker.world.points_out(SKELETON.joints(poses))
+
+
+def error(joints: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """(F,) mean distance, metres."""
+    return np.linalg.norm(joints - [SKELETON.joints(p) for p in poses], axis=2).mean(axis=1)
+
+
+@pytest.mark.parametrize("yaw", [0.3, 2.0, 4.4])
+def test_front_and_back_of_a_t_pose(yaw: float) -> None:
+    """Arms level and straight, legs straight, standing still: only the feet tell."""
+    t_pose = arms(standing_pose(SKELETON), (0, 1, 0), (0, 1, 0))
+    poses = np.array([placed(t_pose, yaw)] * 2)
+    joints = found(poses)
+    assert error(joints, poses).max() < 0.03
+    left = joints[:, JOINTS.index("shoulder_l")] - joints[:, JOINTS.index("shoulder_r")]
+    expected = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+    assert (left @ expected > 0.25).all()
+
+
+@pytest.mark.parametrize("name", ["arms at 45°", "crouching", "one arm up, one forwards"])
+def test_other_poses(name: str) -> None:
+    standing = standing_pose(SKELETON)
+    bent = {"hip_l_pitch": -85.0, "hip_r_pitch": -85.0, "knee_l_flexion": 110.0, "knee_r_flexion": 110.0}
+    pose = {
+        "arms at 45°": placed(arms(standing, (0, 1, -1), (0, 1, -1)), 1.0),
+        "crouching": placed(arms(standing, (1, 0.3, -0.3), (1, 0.3, -0.3)), 2.5, **bent),
+        "one arm up, one forwards": placed(arms(standing, (0.2, 0.2, 1), (1, 0.2, 0)), 5.0),
+    }[name]
+    poses = np.array([pose, pose])
+    assert error(found(poses), poses).max() < 0.04
+
+
+def test_a_first_frame_that_is_hard_is_reached_from_an_easy_one() -> None:
+    """Bent over with an arm up and a leg lifted; then the person straightens up and walks."""
+    lifted = {"torso_pitch": 50.0, "hip_l_pitch": -100.0, "knee_l_flexion": 70.0, "hip_r_pitch": -40.0}
+    hard = placed(arms(standing_pose(SKELETON), (1, 0.4, 0.8), (-0.4, 0.6, 0.6)), 0.8, **lifted)
+    easy = placed(walking_pose(SKELETON, 0.3), 0.8)
+    poses = np.array([hard + k / 7 * (easy - hard) for k in range(8)])
+    errors = error(found(poses), poses)
+    assert errors[0] < 0.06 and errors[-1] < 0.04, errors
+
+
+def test_of_two_ways_to_explain_the_opening_the_one_whose_own_body_explains_it_better_is_believed(monkeypatch) -> None:
+    """The arms change places: the wrong way comes first, as if the average body told little."""
+    right = placed(arms(standing_pose(SKELETON), (1, 0.6, 0.3), (0.2, 1, -0.6)), 0.6)
+    wrong = placed(arms(standing_pose(SKELETON), (0.2, 1, -0.6), (1, 0.6, 0.3)), 0.6)
+    masks = draw_silhouettes(BODY, RIG, np.array([right] * 4))
+    frames = [Observation(i, np.zeros(0, np.uint8), m) for i, m in enumerate(masks)]
+    ways = [Way(np.array([pose] * 4), error) for pose, error in ((wrong, 0.10), (right, 0.105))]
+    monkeypatch.setattr("tk.trackers.contour_tracker.find_person", lambda *_: ways)
+    tracker = tracker_of()
+    ways = [way._replace(poses=tracker.world.poses_in(way.poses)) for way in ways]
+    pose = tracker.world.poses_out(tracker.find(frames, STATURE, None))
+    assert error(SKELETON.joints(pose)[None], right[None])[0] < 0.02
+
+
+def test_poses_that_one_frame_cannot_tell_apart_are_all_followed(monkeypatch) -> None:
+    """The first frame says that the arms are elsewhere, and only nearly as well where they are."""
+    right = placed(arms(standing_pose(SKELETON), (1, 0.6, 0.3), (0.2, 1, -0.6)), 0.6)
+    wrong = placed(arms(standing_pose(SKELETON), (0.2, 0.3, 1), (-0.3, 1, 0.6)), 0.6)
+    masks = draw_silhouettes(BODY, RIG, np.array([right] * 4))
+    frames = [Observation(i, np.zeros(0, np.uint8), m) for i, m in enumerate(masks)]
+    tracker = tracker_of()
+    monkeypatch.setattr(
+        tracker, "settle", lambda _, starts, *__: Descent(np.array(starts), np.zeros(0), np.zeros(3, np.int32))
+    )
+    monkeypatch.setattr("tk.trackers.initialisation.gait.hypotheses", lambda *_: np.array([wrong, right]))
+    monkeypatch.setattr("tk.trackers.initialisation._searched", lambda _, __, ___, pose: pose)
+    explained = {False: 0.21, True: 0.22}
+    monkeypatch.setattr(
+        tracker, "fit_error", lambda _, poses, __: np.array([explained[np.allclose(p, right)] for p in poses])
+    )
+    monkeypatch.setattr(tracker, "improved", lambda _, __, pose: pose)
+    ways = find_person(tracker, frames, [tracker.pyramid(frame) for frame in frames])
+    assert [way.error for way in ways] == pytest.approx([0.21, 0.22])
+    assert ways[0].handicap == 1.0 < ways[1].handicap
+    assert error(SKELETON.joints(ways[1].poses[0])[None], right[None])[0] < 1e-6
+
+
+@pytest.mark.parametrize("stature", [1.2, 1.6, 1.95])
+def test_the_stature_hardly_depends_on_the_pose(stature: float) -> None:
+    body = build_cone_body(BodyDimensions.from_stature(stature))
+    standing = standing_pose(SKELETON)
+    bowing = placed(standing, 1.0, hip_l_pitch=-45.0, hip_r_pitch=-45.0, torso_pitch=45.0)
+    statures = []
+    for pose in (placed(standing, 0.5), placed(neutral_pose(SKELETON), 0.5), bowing):
+        pose = pose.copy()
+        pose[2] *= stature / STATURE
+        tracker = tracker_of()
+        statures.append(stature_of(tracker, [tracker.pyramid(Observation(0, np.zeros(0, np.uint8), m))
+                                             for m in draw_silhouettes(body, RIG, pose[None])]))  # fmt: skip
+    np.testing.assert_allclose(statures, stature, rtol=0.09)
+
+
+def test_nobody_in_the_first_frame_is_told() -> None:
+    tracker = tracker_of()
+    empty = Observation(7, np.zeros(0, np.uint8), np.zeros((3, 250, 200), np.uint8))
+    with pytest.raises(CaptureError, match="0 of 3 masks of frame 7 show anybody, two are needed"):
+        find_person(tracker, [empty], [tracker.pyramid(empty)])
+
+
+@pytest.mark.parametrize("yaw", [0.4, 0.4 + np.pi])
+def test_who_is_found_again_faces_as_before_where_silhouettes_leave_that_open(monkeypatch, yaw):
+    tracker = tracker_of()
+    before, there = (placed(standing_pose(SKELETON), yaw) for _ in range(2))
+    before[0] += 1.0
+    pyramid = tracker.pyramid(Observation(0, np.zeros(0, np.uint8), draw_silhouettes(BODY, RIG, there[None])[0]))
+    facing = SKELETON.index("torso_yaw")
+    monkeypatch.setattr(
+        tracker, "settle", lambda _, starts, levels: Descent(starts, np.zeros(0), np.zeros(len(levels), np.int32))
+    )
+
+    def explained(better_if_turned):
+        return lambda _, poses: 0.2 - better_if_turned * (np.cos(poses[:, facing] - yaw) < -0.9)
+
+    for gain, turned in ((0.0, False), (0.03, False), (0.1, True)):
+        monkeypatch.setattr(tracker, "fit_error", explained(gain))
+        pose, error = tracker.relocate(pyramid, before, 1.0)
+        assert (np.cos(pose[facing] - yaw) < 0) == turned
+        assert error == pytest.approx(0.2 - gain * turned)
+    np.testing.assert_array_equal(tracker.relocate(pyramid, before, 0.05)[0], before)

@@ -1,0 +1,365 @@
+"""``tk track`` as it is by default: the region tracker, its second pass, bodies from files, runs that are taken up."""
+
+from __future__ import annotations
+
+import logging
+import re
+import shutil
+import signal
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import tomli_w
+
+from tests.conftest import FRAMES, QUICK, Silent, Tk
+from tests.io.conftest import write_picture
+from tests.run.test_session import send
+from tk.errors import ConfigError, ResultError
+from tk.io.captures.capture import open_capture
+from tk.io.results.writer import Result, Status, read_joints, read_result
+from tk.model.body.anthropometry import BodyDimensions
+from tk.run.offline import REFINED
+from tk.run.session import Summary, estimates, track
+from tk.settings import Settings
+from tk.trackers.bodies import body_and_poses, read_body
+from tk.trackers.protocol import Estimate, Observation
+from tk.trackers.region import RegionTracker
+
+CONFIG = Settings.from_toml(QUICK)
+COLUMNS = ("frames", "time", "pose", "waist", "ankles", "joints", "sigma", "fit_error", "status", "objective")
+
+
+def run(capture: Path, output: Path, reporter: Silent | None = None, **options: Any) -> Summary:
+    return track(open_capture(capture), output, CONFIG, reporter or Silent(), **options)
+
+
+def assert_same(path: Path, expected: Path, frames: slice = slice(None)) -> None:
+    """Bit for bit, times apart, whatever process made them."""
+    a, b = read_result(path), read_result(expected)
+    for name in COLUMNS:
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name)[frames], err_msg=name)
+    for name in ("parts/shape", "parts/T_body_part"):
+        np.testing.assert_array_equal(a.model[name], b.model[name], err_msg=name)
+
+
+def mean_error(result: Result, tiny: Path) -> float:
+    truth = read_joints(tiny / "truth.h5").positions[result.frames]
+    return float(np.linalg.norm(result.joints - truth, axis=2).mean())
+
+
+@pytest.fixture(scope="module")
+def causal(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An unbroken first pass over the tiny capture. Not to be changed."""
+    path = tmp_path_factory.mktemp("region") / "causal.h5"
+    assert run(tiny, path, causal=True).lost == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def refined(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Both passes. Not to be changed."""
+    path = tmp_path_factory.mktemp("region") / "refined.h5"
+    reporter = Silent()
+    assert run(tiny, path, reporter).lost == 0
+    assert reporter.notes == []
+    return path
+
+
+# --- the passes -------------------------------------------------------------------------------------------------------
+
+
+def test_the_second_pass_replaces_poses(tiny: Path, causal: Path, refined: Path) -> None:
+    first, second = read_result(causal), read_result(refined)
+    assert first.meta.method == second.meta.method == "region"
+    assert REFINED not in first.model and second.model[REFINED] == 1
+    for name in ("frames", "time", "status"):
+        np.testing.assert_array_equal(getattr(second, name), getattr(first, name), err_msg=name)
+    assert first.fit_error is not None and second.fit_error is not None
+    assert second.fit_error.mean() < 1.03 * first.fit_error.mean()
+    assert np.abs(second.pose - first.pose).max() > 1e-3
+    # the initialisation pose has shown the body
+    np.testing.assert_array_equal(second.model["parts/shape"], first.model["parts/shape"])
+    # pictures 160 pixels wide and a hasty fit: the person is found, and no limb is elsewhere
+    for result in (first, second):
+        assert mean_error(result, tiny) < 0.08
+        found = body_and_poses(result)
+        assert found is not None
+        body, poses = found
+        np.testing.assert_allclose([body.skeleton.joints(p) for p in poses], result.joints, atol=1e-9)
+
+
+def test_without_the_initialisation_pose_the_body_is_fitted_again(tiny: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(tiny, tmp_path / "any")
+    settings = folder / "capture.toml"
+    settings.write_text(re.sub(r'pose = "[a-z-]*"', 'pose = "any"', settings.read_text()))
+    models = []
+    for causal in (True, False):
+        track(open_capture(folder), tmp_path / "r.h5", CONFIG, Silent(), frames=(0, 8), causal=causal, force=True)
+        models.append(read_result(tmp_path / "r.h5").model)
+    assert np.abs(models[0]["parts/shape"] - models[1]["parts/shape"]).max() > 1e-4
+
+
+def test_runs_repeat_and_the_seed_does_not_matter(tiny: Path, causal: Path, tmp_path: Path) -> None:
+    config = Settings.from_toml(f"seed = 5\n{QUICK}")
+    track(open_capture(tiny), tmp_path / "r.h5", config, Silent(), frames=(0, 6), causal=True)
+    assert_same(tmp_path / "r.h5", causal, slice(0, 6))
+
+
+def test_estimates_are_those_of_the_first_pass(tiny: Path, causal: Path) -> None:
+    found = list(estimates(open_capture(tiny), CONFIG, frames=(0, 4)))
+    expected = read_result(causal)
+    assert [e.frame for e in found] == [0, 1, 2, 3]
+    np.testing.assert_array_equal([e.joints for e in found], expected.joints[:4])
+    np.testing.assert_array_equal([e.sigma for e in found], np.asarray(expected.sigma)[:4])
+
+
+def test_estimates_keep_no_pictures_alive(tiny: Path) -> None:
+    """Whoever collects them holds some kilobytes a frame."""
+    found = list(estimates(open_capture(tiny), CONFIG, frames=(0, 4)))
+    assert len(found) == 4
+    for estimate in found:
+        arrays = [value for value in vars(estimate).values() if isinstance(value, np.ndarray)]
+        assert len(arrays) > 5 and sum(map(memory_behind, arrays)) < 10_000
+
+
+def memory_behind(array: np.ndarray) -> int:
+    """Bytes of what an array is a view of, or its own."""
+    while isinstance(array.base, np.ndarray):
+        array = array.base
+    return array.nbytes if array.base is None else len(memoryview(array.base))
+
+
+# --- stopped and taken up again ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs POSIX signals")
+def test_a_killed_causal_run_is_taken_up_and_equals_an_unbroken_one(
+    tk: Tk, quick: Path, tiny: Path, causal: Path, tmp_path: Path
+) -> None:
+    result = tmp_path / "r.h5"
+    command = ["track", tiny, "-o", result, "--config", quick, "--causal"]
+    killed = send(signal.SIGKILL, 5, *command)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    assert killed.stdout == ""
+    assert_same(result, causal, slice(0, 6))
+    ran = tk(*command, "--resume")
+    assert ran.code == 0, ran.err
+    assert ran.told[0] == f"note: 6 of {FRAMES} frames are there already"
+    assert ran.err.splitlines()[-1].startswith(f"{FRAMES} frames in {result}, 0 lost")
+    assert_same(result, causal)
+    assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]  # the killed run's scraps are gone
+    done = tk(*command, "--resume")  # nothing is left to do
+    assert done.code == 0 and f"{FRAMES} of {FRAMES} frames are there already" in done.err
+    assert_same(result, causal)
+
+
+def test_a_broken_run_is_refined_when_it_is_complete(tiny: Path, refined: Path, tmp_path: Path) -> None:
+    """The first pass in two runs, the second over frames of both: masks of the earlier run are read again."""
+
+    class Stop(Silent):
+        def advance(self, index: int, estimate: object) -> None:
+            super().advance(index, estimate)
+            if index == 7:
+                signal.raise_signal(signal.SIGINT)
+
+    result = tmp_path / "r.h5"
+    config = replace(CONFIG, ahead=2)
+    summary = track(open_capture(tiny), result, config, Stop())
+    assert summary.interrupted and REFINED not in read_result(result).model
+    assert not track(open_capture(tiny), result, config, Silent(), resume=True).interrupted
+    assert_same(result, refined)
+
+
+def test_a_run_killed_in_its_second_pass_gets_it_when_it_is_taken_up(
+    tiny: Path, causal: Path, refined: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """All frames are there, and what follows from all of them is not."""
+    result = tmp_path / "r.h5"
+    shutil.copyfile(causal, result)
+    with h5py.File(result, "r+") as file:  # what the end of a causal run adds
+        del file["smoothed"]
+        del file["cameras"]
+    caplog.set_level(logging.INFO, "tk")
+    summary = run(tiny, result, resume=True)
+    assert (summary.frames, summary.tracked_now) == (FRAMES, 0) and "second pass" in caplog.text
+    assert_same(result, refined)
+    assert read_result(result).smoothed is not None
+    caplog.clear()
+    assert run(tiny, result, resume=True).tracked_now == 0
+    assert "second pass" not in caplog.text
+    assert_same(result, refined)
+
+
+def test_a_refined_result_is_not_prolonged(tk: Tk, tiny: Path, quick: Path, tmp_path: Path) -> None:
+    result = tmp_path / "r.h5"
+    run(tiny, result, frames=(0, 4))
+    before = result.read_bytes()
+    with pytest.raises(ResultError, match=r"a second pass has gone over .* --force .* with --causal"):
+        run(tiny, result, frames=(0, 6), resume=True)
+    assert result.read_bytes() == before
+    # nothing to be done is no mistake, and changes nothing
+    ran = tk("track", tiny, "-o", result, "--config", quick, "--frames", ":4", "--resume")
+    assert ran.code == 0 and "4 of 4 frames are there already" in ran.err
+    assert result.read_bytes() == before
+
+
+@pytest.mark.parametrize("frames", [(0, 1), (0, 6)])
+def test_a_causal_run_may_be_prolonged(tiny: Path, causal: Path, tmp_path: Path, frames: tuple[int, int]) -> None:
+    run(tiny, tmp_path / "r.h5", frames=frames, causal=True)
+    assert_same(tmp_path / "r.h5", causal, slice(*frames))
+    run(tiny, tmp_path / "r.h5", resume=True, causal=True)
+    assert_same(tmp_path / "r.h5", causal)
+
+
+def test_lost_frames_stay_as_they_are_in_the_second_pass(copy: Path, tmp_path: Path) -> None:
+    for camera in (copy / "masks").iterdir():
+        for index in (3, 4):
+            write_picture(camera / f"{index:06d}.png", np.zeros((120, 160), np.uint8))
+    summary = run(copy, tmp_path / "r.h5", frames=(0, 8))
+    assert (summary.frames, summary.lost) == (8, 2)
+    result = read_result(tmp_path / "r.h5")
+    assert result.status.tolist() == [1, 0, 0, Status.LOST, Status.LOST, Status.RECOVERED, 0, 0]
+    assert result.sigma is not None and result.fit_error is not None
+    np.testing.assert_array_equal(np.isnan(result.sigma).all(axis=1), result.status == Status.LOST)
+    np.testing.assert_array_equal(np.isnan(result.fit_error).all(axis=1), result.status == Status.LOST)
+    assert np.isfinite(result.joints).all()
+    assert "fewer than two cameras see anybody: lost, frames 3 to 4" in result.notes
+
+
+@pytest.mark.parametrize("causal", [False, True])
+def test_frames_of_which_nothing_is_known_are_told(
+    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, causal: bool
+) -> None:
+    step = RegionTracker.step
+
+    def unsure(tracker: RegionTracker, frame: Observation) -> Estimate:
+        estimate = step(tracker, frame)
+        return replace(estimate, sigma=np.full(15, np.nan)) if frame.index in (2, 3) else estimate
+
+    monkeypatch.setattr(RegionTracker, "step", unsure)
+    reporter = Silent()
+    assert run(tiny, tmp_path / "r.h5", reporter, frames=(0, 5), causal=causal).lost == 0
+    result = read_result(tmp_path / "r.h5")
+    assert result.sigma is not None
+    assert np.isnan(result.sigma).all(axis=1).tolist() == [False, False, True, True, False]
+    (line,) = (note for note in result.notes if "σ is unknown" in note)
+    assert line.endswith("σ is unknown, frames 2 to 3") and line in reporter.notes
+    notes: list[str] = []
+    assert len(list(estimates(open_capture(tiny), CONFIG, notes.append, frames=(0, 5)))) == 5
+    assert line in notes
+
+
+# --- bodies from files ------------------------------------------------------------------------------------------------
+
+
+def test_a_body_of_an_earlier_result_is_taken_and_kept(tiny: Path, causal: Path, refined: Path, tmp_path: Path) -> None:
+    run(tiny, tmp_path / "r.h5", body=refined, frames=(0, 5))
+    found, expected = read_result(tmp_path / "r.h5"), read_result(refined)
+    np.testing.assert_array_equal(found.model["parts/shape"], expected.model["parts/shape"])
+    np.testing.assert_allclose(found.model["dimensions/thigh"], expected.model["dimensions/thigh"])
+    assert found.model[REFINED] == 1, "the second pass settles the frames, and leaves the body"
+    assert mean_error(found, tiny) < 0.08
+
+
+def test_a_body_of_dimensions_is_taken(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    file = tmp_path / "body.toml"
+    file.write_text(tomli_w.dumps({"stature": 1.8, "dimensions": {"thigh": 0.45}}), encoding="utf-8")
+    ran = tk("track", tiny, "-o", tmp_path / "r.h5", "--config", quick, "--frames", ":2", "--body", file)
+    assert ran.code == 0, ran.err
+    model = read_result(tmp_path / "r.h5").model
+    average = BodyDimensions.from_stature(1.8)
+    assert (model["dimensions/thigh"], model["dimensions/calf"]) == pytest.approx((0.45, average.calf))
+    body = read_body(file, "-y")
+    assert body.dimensions.thigh == 0.45 and body.skeleton.T_world_body[1, 2] == -1
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("[dimensions]\nlegs = 1.0\n", ["unknown dimension legs", "thigh"]),
+        ("[dimensions]\nthigh = 'long'\n", ["thigh = long", "between 0 and 3"]),
+        ("[dimensions]\nthigh = 45\n", ["thigh = 45", "metres"]),
+        ("stature = true\n", ["stature = True"]),
+        ("dimensions = 3\n", ["dimensions"]),
+        ("stature = \n", ["body.toml"]),
+    ],
+)
+def test_bodies_that_cannot_be_used_are_one_line(
+    tk: Tk, quick: Path, tiny: Path, tmp_path: Path, text: str, parts: list[str]
+) -> None:
+    file = tmp_path / "body.toml"
+    file.write_text(text, encoding="utf-8")
+    tk("track", tiny, "-o", tmp_path / "r.h5", "--config", quick, "--body", file).complaint(str(file), *parts)
+
+
+def test_results_without_a_body_of_contours_are_told(
+    tk: Tk, quick: Path, tiny: Path, tracked: Path, causal: Path, tmp_path: Path
+) -> None:
+    command = ["track", tiny, "-o", tmp_path / "r.h5", "--config", quick]
+    older = Path(shutil.copy(tracked, tmp_path / "older.h5"))
+    with h5py.File(older, "r+") as file:
+        del file["model/parts"]
+    tk(*command, "--body", older).complaint("older.h5", "no body of contours", "--method region")
+    tk(*command, "--body", tmp_path / "none.h5").complaint("none.h5")
+    tk(*command, "--body", tmp_path / "none.toml").complaint("none.toml")
+    damaged = Path(shutil.copy(causal, tmp_path / "damaged.h5"))
+    with h5py.File(damaged, "r+") as file:
+        del file["model/parts/name"]
+    tk(*command, "--body", damaged).complaint("damaged.h5", "the body cannot be used")
+    damaged.unlink()
+    older.unlink()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_another_body_is_another_run(tiny: Path, refined: Path, tmp_path: Path) -> None:
+    run(tiny, tmp_path / "begun.h5", frames=(0, 2), causal=True)
+    with pytest.raises(ResultError, match=r"given body \(its hash\): none, not "):
+        run(tiny, tmp_path / "begun.h5", frames=(0, 4), causal=True, resume=True, body=refined)
+
+
+# --- how it ends ------------------------------------------------------------------------------------------------------
+
+
+def test_exit_codes(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+    result = tmp_path / "r.h5"
+    command = ["track", tiny, "-o", result, "--config", quick, "--causal", "--frames", ":2"]
+    assert tk(*command).code == 0
+    assert tk("track", tmp_path / "nowhere", "-o", tmp_path / "s.h5").code == 2
+    assert tk("track", tiny).code == 2
+
+
+def test_any_pose_will_do_in_any_frame(copy: Path, tmp_path: Path) -> None:
+    file = copy / "capture.toml"
+    file.write_text(file.read_text(encoding="utf-8").replace("da-vinci", "any"), encoding="utf-8")
+    run(copy, tmp_path / "r.h5", frames=(4, 7), causal=True)
+    found = read_result(tmp_path / "r.h5")
+    assert found.frames.tolist() == [4, 5, 6] and found.status[0] == Status.INITIALISED
+
+
+def test_settings_are_checked() -> None:
+    for text, part in (
+        ("[region]\nhypotheses = 0\n", "hypotheses"),
+        ("[region]\nsearch_excess = 1.2\n", "search_excess"),
+    ):
+        with pytest.raises(ConfigError, match=part):
+            Settings.from_toml(text)
+
+
+def test_the_volumetric_tracker_takes_a_body_in_any_pose_and_gives_one(
+    copy: Path, causal: Path, tracked: Path, tmp_path: Path
+) -> None:
+    """One body serves both skins."""
+    file = copy / "capture.toml"
+    file.write_text(file.read_text(encoding="utf-8").replace("da-vinci", "any"), encoding="utf-8")
+    for method, given in (("volumetric", causal), ("region", tracked)):
+        path = tmp_path / f"{method}.h5"
+        track(open_capture(copy), path, CONFIG, Silent(), method, (6, 9), body=given, causal=True)
+        found, expected = read_result(path), read_result(given)
+        assert found.frames.tolist() == [6, 7, 8] and not (found.status == Status.LOST).any()
+        np.testing.assert_array_equal(found.model["parts/shape"], expected.model["parts/shape"])
+        truth = read_joints(copy / "truth.h5").positions[6:9]
+        assert np.median(np.linalg.norm(found.joints - truth, axis=2)) < 0.08

@@ -1,0 +1,1 @@
+"""The commands of `tk`: one module each."""

@@ -1,0 +1,83 @@
+"""The settings as a file that explains itself: `tk config`.
+
+What a setting means, its unit and its source stand once, in the docstring of its class; here they become comments.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import re
+import textwrap
+from typing import Any
+
+import tomli_w
+
+from tk.errors import ConfigError
+from tk.settings import PRESETS, Settings
+
+_WIDTH = 110
+_HEAD = f"""\
+All settings of tk. A file with some of them, given with --config, changes these and leaves the rest.
+Presets, given with --preset: {", ".join(PRESETS)}."""
+
+
+def annotated_toml(config: Settings) -> str:
+    """The configuration as TOML; before each setting what it means, and its default."""
+    blocks = [_comment(_HEAD)]
+    blocks += _table(config, Settings(), "", "")
+    return "\n\n".join(blocks) + "\n"
+
+
+def meanings(kind: type) -> dict[str, str]:
+    """What the docstring of a settings class says of each of its attributes, in its order.
+
+    Raises:
+        ConfigError: Python runs without docstrings (``-OO``).
+    """
+    text = inspect.getdoc(kind)
+    if text is None:
+        raise ConfigError("tk config: Python runs without docstrings (-OO), and the explanations are in them")
+    found = re.search(r"^Attributes:\n((?:[ ]{4}.*\n?|\n)+)", text, re.M)
+    told: dict[str, str] = {}
+    names: list[str] = []
+    for line in textwrap.dedent(found[1]).splitlines() if found else ():
+        start = re.match(r"([a-z_]\w*(?:, [a-z_]\w*)*): (.*)", line)
+        if start:
+            names = start[1].split(", ")
+            told |= dict.fromkeys(names, start[2])
+        else:
+            told |= {name: f"{told[name]} {line.strip()}".strip() for name in names}
+    return told
+
+
+def _table(values: Any, defaults: Any, path: str, title: str) -> list[str]:
+    """The blocks of a table and of those within it."""
+    said = meanings(type(values))
+    lines, inner = [], []
+    for field in dataclasses.fields(values):
+        value, default = getattr(values, field.name), getattr(defaults, field.name)
+        if dataclasses.is_dataclass(value):
+            about = said.get(field.name) or (inspect.getdoc(type(value)) or "").partition("\n\n")[0]
+            inner += _table(value, default, f"{path}{field.name}.", about)
+            continue
+        usual = _toml(field.name, default).partition(" = ")[2]
+        lines.append(f"{_comment(f'{_sentence(said[field.name])} Default: {usual}')}\n{_toml(field.name, value)}")
+    if lines and path:
+        lines[0] = f"{_comment(_sentence(title))}\n[{path[:-1]}]\n{lines[0]}"
+    return lines + inner
+
+
+def _sentence(text: str) -> str:
+    """With a capital, unless a symbol begins it, and a full stop."""
+    symbol = not re.match(r"[a-z]{2}|a ", text)
+    return (text if symbol else text[0].upper() + text[1:]).rstrip(".") + "."
+
+
+def _toml(name: str, value: object) -> str:
+    return tomli_w.dumps({name: value}).strip()
+
+
+def _comment(text: str) -> str:
+    wrapped = (textwrap.fill(line, _WIDTH) for line in text.splitlines())
+    return textwrap.indent("\n".join(wrapped), "# ", lambda line: True)

@@ -1,0 +1,330 @@
+"""How far a result is from the truth (``tk evaluate``).
+
+Frames are matched by their source index. What a tracker failed at is never averaged away:
+
+- A joint that is NaN in the result has an infinite error. Means over it are infinite (``null`` in JSON), medians and
+  PCK stay meaningful: it lies above every threshold.
+- A frame that says *lost* (status 3) is a miss of every joint for PCK. Its distances stay in the means: they are what
+  the user would get.
+- A frame that is missing between the first and the last frame of the result counts like one full of NaN. Frames before
+  and after it, which the user did not ask for or which a stopped run did not reach, are counted and not judged.
+- A joint that the truth itself does not know (NaN) cannot be judged: it is left out, and counted.
+
+Different definitions of a joint (skin or bone, hip centre or hip marker) give a constant offset that is no error of the
+tracking. The corrected figures take it off: the median, a joint and an axis, of ``R_t^T (estimate - truth)`` over the
+frames that are not lost, where the columns of ``R_t`` are the axes of the truth's trunk. The truth's, and not the
+estimate's, because only then an offset that is constant vanishes exactly, for the trunk's own joints too, and a wrong
+hip in the estimate does not spoil all other joints. Kehl 2006 reports no errors in centimetres, so this is ours.
+
+What else is told - flexion, runs of bad frames, σ - is defined in :mod:`tk.evaluation.details`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ResultError
+from tk.evaluation.details import (
+    ASTRAY_CM,
+    LIMB_JOINTS,
+    FlexionError,
+    Run,
+    SigmaShares,
+    flexion_errors,
+    longest_run,
+    sigma_shares,
+)
+from tk.io.results.writer import JointTrack, Status, read_joints
+from tk.model.body.skeleton import JOINTS
+
+Float = NDArray[np.float64]
+
+PCK_CM = (5, 10, 15)
+
+
+@dataclass(frozen=True)
+class Score:
+    """Distances of some joints over all judged frames.
+
+    Attributes:
+        mean_cm, median_cm: infinite where NaN joints make them so; NaN where there is nothing to judge.
+        pck: share of joints that are nearer than so many centimetres.
+    """
+
+    mean_cm: float
+    median_cm: float
+    pck: Mapping[int, float]
+
+
+@dataclass(frozen=True)
+class Scores:
+    """``all`` 15 joints, the 12 ``limbs``, and each of ``joints`` by name."""
+
+    all: Score
+    limbs: Score
+    joints: Mapping[str, Score]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Accuracy of a result.
+
+    Attributes:
+        raw: distances as they are.
+        corrected: the same with each joint's median offset in the trunk's frame taken off.
+        offsets_cm: that offset by joint: forward, left, up.
+        judged: frames that are judged: common to both files, or missing inside the result.
+        missing_inside: frames of the truth between the result's first and last that the result lacks.
+        missing_outside: frames of the truth before the result's first or after its last.
+        without_truth: frames of the result that the truth lacks.
+        lost: frames that say so, of those judged.
+        nan_frames: judged frames with at least one NaN joint in the result, missing ones included.
+        unknown_joints: joints of judged frames that the truth does not know.
+        frames_per_second: frames of the whole result over the wall time spent on them; None if not recorded.
+        median_frames_per_second: of the median frame: without start-up and compilation.
+        flexion: errors of the flexion by ``knee_l`` … ``elbow_r``, and of all ``knees`` and ``elbows``.
+        longest_astray, longest_astray_raw: the longest run of frames with a limb joint more than 15 cm off, with the
+            joints' offsets taken off and as it is.
+        sigma: how many errors are within 1 and 2 σ, of ``all`` joints and of the ``limbs``; None where there is no σ.
+    """
+
+    raw: Scores
+    corrected: Scores
+    offsets_cm: Mapping[str, tuple[float, float, float]]
+    judged: int
+    missing_inside: int
+    missing_outside: int
+    without_truth: int
+    lost: int
+    nan_frames: int
+    unknown_joints: int
+    frames_per_second: float | None
+    median_frames_per_second: float | None
+    flexion: Mapping[str, FlexionError]
+    longest_astray: Run
+    longest_astray_raw: Run
+    sigma: Mapping[str, SigmaShares] | None
+
+    @property
+    def lost_share(self) -> float:
+        """Share of the judged frames that say they are lost."""
+        return self.lost / self.judged
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON: shares added, infinite and NaN as None."""
+        values = asdict(self) | {"lost_share": self.lost_share, "nan_share": self.nan_frames / self.judged}
+        plain = plain_values(values)
+        assert isinstance(plain, dict)
+        return plain
+
+    def to_json(self) -> str:
+        return json.dumps(self.to_dict(), indent=2, allow_nan=False)
+
+    def format_table(self) -> str:
+        """A table for people, lines of up to 100 characters."""
+        thresholds = "".join(f"{f'PCK{cm}':>8}" for cm in PCK_CM)
+        half = f"{'mean':>8}{'median':>8}{thresholds}"
+        lines = [
+            f"{'':12}{'as it is [cm, %]':>{len(half)}}  {'offset taken off [cm, %]':>{len(half)}}",
+            f"{'':12}{half}  {half}",
+        ]
+        named = [("all 15", self.raw.all, self.corrected.all), ("12 limb", self.raw.limbs, self.corrected.limbs)]
+        named += [(name, self.raw.joints[name], self.corrected.joints[name]) for name in JOINTS]
+        for name, raw, corrected in named:
+            lines.append(f"{name:12}{_format_score(raw)}  {_format_score(corrected)}")
+        lines += ["", *self._details(), ""]
+        lines.append(
+            f"{self.judged} frames judged: {self.lost} lost ({100 * self.lost_share:.1f} %), "
+            f"{self.nan_frames} with NaN or missing joints"
+        )
+        if self.missing_inside:
+            lines.append(f"{self.missing_inside} frames are missing inside the result; they count as errors")
+        if self.missing_outside:
+            lines.append(f"{self.missing_outside} frames of the truth lie outside the result; they are not judged")
+        if self.without_truth:
+            lines.append(f"{self.without_truth} frames of the result have no truth; they are not judged")
+        if self.unknown_joints:
+            lines.append(f"{self.unknown_joints} joint positions are unknown in the truth; they are not judged")
+        if self.frames_per_second is not None and self.median_frames_per_second is not None:
+            lines.append(
+                f"{self.frames_per_second:.1f} frames/s, {self.median_frames_per_second:.1f} by the median frame"
+            )
+        return "\n".join(lines)
+
+    def _details(self) -> list[str]:
+        """Flexion, the longest run astray, and shares within σ, a line each."""
+        parts = [
+            f"{kind}s {self.flexion[f'{kind}s'].mean_deg:.1f}° "
+            f"(left {self.flexion[f'{kind}_l'].mean_deg:.1f}°, right {self.flexion[f'{kind}_r'].mean_deg:.1f}°)"
+            for kind in ("knee", "elbow")
+        ]
+        run = self.longest_astray
+        where = f", {run.first} to {run.last}" if run.frames else ""
+        lines = [
+            f"flexion, mean error: {', '.join(parts)}",
+            f"longest run with a limb joint over {ASTRAY_CM:g} cm off, offset taken off: {run.frames} frames{where}",
+        ]
+        for name, shares in (self.sigma or {}).items():
+            within, expected = shares.corrected, shares.expected
+            label = {"all": "all 15", "limbs": "12 limb"}[name]
+            lines.append(
+                f"{label}: {100 * within[1]:.1f} % within 1 σ, {100 * within[2]:.1f} % within 2 σ, offset taken off"
+                f" (if normal: {100 * expected[1]:.1f} %, {100 * expected[2]:.1f} %)"
+            )
+        return lines
+
+
+def evaluate_files(result: str | os.PathLike[str], truth: str | os.PathLike[str]) -> Evaluation:
+    """Compare two files; see :func:`evaluate`."""
+    return evaluate(read_joints(result), read_joints(truth))
+
+
+def evaluate(result: JointTrack, truth: JointTrack) -> Evaluation:
+    """Compare a result with the truth.
+
+    Raises:
+        ResultError: the two have no frame in common, or the result has no frames.
+    """
+    if not np.isin(result.frames, truth.frames).any():
+        raise ResultError(
+            f"{result.path}: has no frame in common with {truth.path}: "
+            f"{_span(result.frames)} in the one, {_span(truth.frames)} in the other"
+        )
+    inside = (truth.frames >= result.frames.min()) & (truth.frames <= result.frames.max())
+    frames = truth.frames[inside]
+    row_of = {int(frame): row for row, frame in enumerate(result.frames)}
+    rows = np.array([row_of.get(int(frame), -1) for frame in frames])
+    found = rows >= 0
+    p_truth = truth.positions[inside]
+    p_result = np.full_like(p_truth, np.nan)
+    p_result[found] = result.positions[rows[found]]
+    lost = np.zeros(len(frames), dtype=bool)
+    if result.status is not None:
+        lost[found] = result.status[rows[found]] == Status.LOST
+
+    known = np.isfinite(p_truth).all(axis=2)
+    failed = ~np.isfinite(p_result).all(axis=2)
+    difference = np.where((known & ~failed)[..., None], p_result - p_truth, np.nan)  # (F, J, 3)
+    axes = trunk_axes(p_truth)
+    in_trunk = np.einsum("fki,fjk->fji", axes, difference)
+    offsets = _median_where_finite(in_trunk[~lost])  # (J, 3)
+    known_trunk = known & np.isfinite(axes.sum(axis=(1, 2)))[:, None]
+    distances = {
+        "raw": _distances(difference, known),
+        "corrected": _distances(in_trunk - offsets, known_trunk),
+    }
+    limbs = [JOINTS.index(name) for name in LIMB_JOINTS]
+    sigma: Float | None = None
+    if result.sigma is not None:
+        sigma = np.full(known.shape, np.nan)
+        sigma[found] = result.sigma[rows[found]]
+    mean_rate, median_rate = _frames_per_second(result.seconds)
+    return Evaluation(
+        raw=_scores(distances["raw"], lost),
+        corrected=_scores(distances["corrected"], lost),
+        offsets_cm={name: _triple(100 * offset) for name, offset in zip(JOINTS, offsets, strict=True)},
+        judged=len(frames),
+        missing_inside=int((~found).sum()),
+        missing_outside=int((~inside).sum()),
+        without_truth=int((~np.isin(result.frames, truth.frames)).sum()),
+        lost=int(lost.sum()),
+        nan_frames=int((failed & known).any(axis=1).sum()),
+        unknown_joints=int((~known).sum()),
+        frames_per_second=mean_rate,
+        median_frames_per_second=median_rate,
+        flexion=flexion_errors(p_result, p_truth),
+        longest_astray=longest_run(frames, distances["corrected"][:, limbs]),
+        longest_astray_raw=longest_run(frames, distances["raw"][:, limbs]),
+        sigma=None
+        if sigma is None
+        else {
+            name: sigma_shares(sigma[:, chosen], distances["raw"][:, chosen], distances["corrected"][:, chosen])
+            for name, chosen in (("all", list(range(len(JOINTS)))), ("limbs", limbs))
+        },
+    )
+
+
+def trunk_axes(p_world: Float) -> Float:
+    """The trunk-fixed frame of joints (F, 15, 3): rotations (F, 3, 3) whose columns point forward, left and up.
+
+    Up runs from the pelvis to the neck. Left is the sum of the hips' and the shoulders' lines from right to left, made
+    perpendicular to up; forward completes a right-handed frame. NaN where the trunk is unknown or degenerate.
+    """
+    joint = {name: p_world[:, index] for index, name in enumerate(JOINTS)}
+    up = _unit(joint["neck"] - joint["pelvis"])
+    left = joint["hip_l"] - joint["hip_r"] + joint["shoulder_l"] - joint["shoulder_r"]
+    left = _unit(left - np.sum(left * up, axis=1, keepdims=True) * up)
+    return np.stack([np.cross(left, up), left, up], axis=2)
+
+
+def _unit(vectors: Float) -> Float:
+    """(F, 3) vectors of length one; NaN where there is no direction."""
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(lengths > 1e-6, lengths, np.nan)
+
+
+def _median_where_finite(values: Float) -> Float:
+    """(F, J, 3) to (J, 3): the median of what is finite; NaN where nothing is."""
+    result = np.full(values.shape[1:], np.nan)
+    for joint in range(values.shape[1]):
+        finite = values[np.isfinite(values[:, joint]).all(axis=1), joint]
+        if len(finite):
+            result[joint] = np.median(finite, axis=0)
+    return result
+
+
+def _distances(difference: Float, known: NDArray[np.bool_]) -> Float:
+    """(F, J) metres: infinite where the result fails, NaN where the truth does not know."""
+    lengths = np.linalg.norm(difference, axis=2)
+    return np.where(known, np.where(np.isnan(lengths), np.inf, lengths), np.nan)
+
+
+def _scores(distances: Float, lost: NDArray[np.bool_]) -> Scores:
+    def score(names: Iterable[str]) -> Score:
+        chosen = distances[:, [JOINTS.index(name) for name in names]]
+        judged = ~np.isnan(chosen)
+        hit = ~lost[:, None] & judged
+        values = 100 * chosen[judged]
+        if len(values) == 0:
+            return Score(math.nan, math.nan, dict.fromkeys(PCK_CM, math.nan))
+        pck = {cm: float((100 * chosen[hit] < cm).sum() / len(values)) for cm in PCK_CM}
+        return Score(float(values.mean()), float(np.median(values)), pck)
+
+    return Scores(score(JOINTS), score(LIMB_JOINTS), {name: score([name]) for name in JOINTS})
+
+
+def _frames_per_second(seconds: Float | None) -> tuple[float | None, float | None]:
+    """Over all frames, and of the median frame; None where the file does not tell."""
+    if seconds is None or len(seconds) == 0 or not np.isfinite(seconds).all() or not np.median(seconds) > 0:
+        return None, None
+    return float(len(seconds) / seconds.sum()), float(1 / np.median(seconds))
+
+
+def _format_score(score: Score) -> str:
+    shares = "".join(f"{100 * share:8.1f}" for share in score.pck.values())
+    return f"{score.mean_cm:8.2f}{score.median_cm:8.2f}{shares}"
+
+
+def plain_values(value: Any) -> Any:
+    """JSON has no infinity and no NaN."""
+    if isinstance(value, Mapping):
+        return {str(key): plain_values(item) for key, item in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [plain_values(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _triple(values: Float) -> tuple[float, float, float]:
+    return float(values[0]), float(values[1]), float(values[2])
+
+
+def _span(frames: NDArray[np.int64]) -> str:
+    return f"frames {frames.min()} to {frames.max()}" if len(frames) else "no frames"

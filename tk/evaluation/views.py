@@ -1,0 +1,198 @@
+"""How well a result fits the pictures: the silhouette paper's two measures (its section 5), view by view.
+
+- E_S (eq. 12), the share of wrongly classified pixels, against the capture's masks as they are given: the body that the
+  result holds is drawn into every view.
+- The distance of chosen joints from the truth in pixels: "averaged across both feet and all marked frames, and averaged
+  across all the views used for tracking". The paper says "mean squared" and gives
+  pixels; here it is the mean distance.
+
+Views that were not used for tracking are judged, too, and said to be so.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import CaptureError, ConfigError
+from tk.evaluation.joints import plain_values
+from tk.io.captures.capture import Capture, open_capture
+from tk.io.results.writer import Result, blamed_on, read_joints, read_result
+from tk.model.body.skeleton import JOINTS
+from tk.model.cameras.camera import Rig
+from tk.model.masks.silhouettes import draw_silhouettes, share_wrong
+from tk.trackers.bodies import body_and_poses
+
+Float = NDArray[np.float64]
+
+ANKLES = ("ankle_l", "ankle_r")
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """One camera's.
+
+    Attributes:
+        camera: its name.
+        tracked: whether the result was made with it; None if the result does not say.
+        joint_px: mean distance of the chosen joints, pixels.
+        joint_share: the same as a share of the subject's height in this view.
+        silhouette_error: E_S, averaged over the frames; None without masks or body.
+    """
+
+    camera: str
+    tracked: bool | None
+    joint_px: float
+    joint_share: float
+    silhouette_error: float | None
+
+
+@dataclass(frozen=True)
+class ViewEvaluation:
+    """All views of a capture.
+
+    Attributes:
+        joints: the chosen joints.
+        frames: how many frames are in both the result and the truth.
+        views: one score a camera.
+        note: why there is no E_S; empty if there is.
+    """
+
+    joints: tuple[str, ...]
+    frames: int
+    views: tuple[ViewScore, ...]
+    note: str = ""
+
+    @property
+    def joint_px(self) -> float:
+        """Over the views that were used for tracking (section 5.1)."""
+        return float(np.mean([view.joint_px for view in self._used]))
+
+    @property
+    def joint_share(self) -> float:
+        return float(np.mean([view.joint_share for view in self._used]))
+
+    @property
+    def silhouette_error(self) -> float | None:
+        """Over all views, tracked or not (section 5.2)."""
+        values = [view.silhouette_error for view in self.views if view.silhouette_error is not None]
+        return float(np.mean(values)) if values else None
+
+    @property
+    def _used(self) -> list[ViewScore]:
+        return [view for view in self.views if view.tracked is not False]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON, what is not finite as None."""
+        means = {"joint_px": self.joint_px, "joint_share": self.joint_share, "silhouette_error": self.silhouette_error}
+        plain = plain_values(asdict(self) | means)
+        assert isinstance(plain, dict)
+        return plain
+
+    def format_table(self) -> str:
+        """A table for people."""
+        lines = [f"{'view':14}{'tracked':>8}{'joints px':>11}{'% height':>10}{'E_S %':>8}"]
+        for view in self.views:
+            used = {True: "yes", False: "no", None: "?"}[view.tracked]
+            lines.append(
+                f"{view.camera:14}{used:>8}{view.joint_px:11.2f}{100 * view.joint_share:10.2f}"
+                f"{_percent(view.silhouette_error):>8}"
+            )
+        lines.append(
+            f"{'mean':14}{'':>8}{self.joint_px:11.2f}{100 * self.joint_share:10.2f}{_percent(self.silhouette_error):>8}"
+        )
+        lines.append(f"joints: {', '.join(self.joints)}, over the tracked views; E_S over all views")
+        return "\n".join([*lines, self.note] if self.note else lines)
+
+
+def evaluate_views(
+    result: str | os.PathLike[str],
+    truth: str | os.PathLike[str],
+    capture: str | Path,
+    joints: Sequence[str] = ANKLES,
+    masks: str = "auto",
+) -> ViewEvaluation:
+    """Judge a result in all views of its capture.
+
+    Args:
+        result: the result file.
+        truth: the true joints.
+        capture: the capture's folder.
+        joints: the joints whose distance is taken.
+        masks: as for :func:`~tk.io.captures.capture.open_capture`.
+
+    Raises:
+        ConfigError: an unknown joint.
+        CaptureError: the capture cannot be read, or is of another recording.
+    """
+    for name in joints:
+        if name not in JOINTS:
+            raise ConfigError(f"--joints {name}: choose from {', '.join(JOINTS)}")
+    found, true, opened = read_result(result), read_joints(truth), open_capture(capture, masks=masks)
+    common, rows, true_rows = np.intersect1d(found.frames, true.frames, return_indices=True)
+    if len(common) == 0 or common[-1] >= opened.frame_count:
+        raise CaptureError(f"{capture}: {found.path} is of frames that this capture and {truth} do not share")
+    estimate, position = found.joints[rows], true.positions[true_rows]
+    used = found.state.get("run/cameras")
+    names = None if used is None else [name.strip() for name in str(used).split(",")]
+    with blamed_on(found.path, "the body or a pose"):
+        error, note = _silhouette_errors(found, opened)
+    views = []
+    for v, camera in enumerate(opened.rig):
+        px, share = _pixel_error(Rig((camera,)), estimate, position, joints)
+        views.append(
+            ViewScore(
+                camera.name, None if names is None else camera.name in names, px, share, error[v] if error else None
+            )
+        )
+    return ViewEvaluation(tuple(joints), len(common), tuple(views), note)
+
+
+def _pixel_error(view: Rig, estimate: Float, truth: Float, joints: Sequence[str]) -> tuple[float, float]:
+    """Mean distance in one view over joints and frames, and as a share of the truth's height from ankles to crown."""
+    camera = view[0]
+    chosen = [JOINTS.index(name) for name in joints]
+    a, b = (camera.project(p[:, chosen].reshape(-1, 3))[0] for p in (estimate, truth))
+    ankles = truth[:, [JOINTS.index(name) for name in ANKLES]].mean(axis=1)
+    crown, foot = (camera.project(p)[0] for p in (truth[:, JOINTS.index("head_top")], ankles))
+    distance = float(np.nanmean(np.linalg.norm(a - b, axis=1)))
+    return distance, distance / float(np.nanmean(np.linalg.norm(crown - foot, axis=1)))
+
+
+def _silhouette_errors(result: Result, capture: Capture) -> tuple[list[float] | None, str]:
+    """E_S by view over the frames of the result, or why there is none."""
+    found = body_and_poses(result)
+    if found is None:
+        return None, f"no E_S: {result.path} does not hold the body that it tracked with"
+    if not capture.has_masks:
+        return None, f"no E_S: {capture.path} has no masks/"
+    body, poses = found
+    row_of = {int(frame): row for row, frame in enumerate(result.frames)}
+    first, last = int(result.frames.min()), int(result.frames.max())
+    errors = []
+    with capture.frames(first, last + 1) as frames:
+        for frame in frames:
+            row = row_of.get(frame.index)
+            if row is not None and frame.masks is not None and np.isfinite(result.pose[row]).all():
+                errors.append(share_wrong(draw_silhouettes(body, capture.rig, poses[row][None])[0], frame.masks))
+    values = np.array(errors).reshape(-1, len(capture.rig))
+    seen = np.isfinite(values)  # an empty mask has no share
+    if not seen.any(axis=0).all():
+        return None, f"no E_S: {capture.path} has a view whose masks are all empty"
+    return [float(values[seen[:, v], v].mean()) for v in range(len(capture.rig))], ""
+
+
+def capture_of(truth: str | os.PathLike[str]) -> Path | None:
+    """The capture that a truth file lies in, if it does."""
+    folder = Path(truth).parent
+    return folder if (folder / "calibration.toml").is_file() else None
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.1f}"

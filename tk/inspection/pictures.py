@@ -1,0 +1,147 @@
+"""The pictures of `tk inspect`: masks against the hull of the other cameras, the working volume, and what points up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import CaptureError
+from tk.inspection.checks import Inspection, Seen
+from tk.io.captures.capture import Capture
+from tk.model.cameras.camera import Camera
+from tk.model.cameras.up import up_vector
+
+Image = NDArray[np.uint8]
+Float = NDArray[np.float64]
+
+#: pixels: a tile's height, what lies between tiles, a line of text
+_TILE, _GAP, _LINE = 300, 6, 20
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+_PAPER, _INK, _BAD = (255, 255, 255), (40, 40, 40), (40, 40, 200)
+#: BGR
+_MASK, _HULL, _OUTSIDE, _BOX, _UP = (80, 220, 80), (230, 120, 230), (40, 40, 255), (230, 190, 90), (60, 190, 250)
+_LEGEND = (
+    ("mask", _MASK),
+    ("hull of the others", _HULL),
+    ("mask outside of it", _OUTSIDE),
+    ("volume", _BOX),
+    ("up", _UP),
+)
+
+
+def write_sheet(path: Path, capture: Capture, inspection: Inspection, seen: Sequence[Seen]) -> None:
+    """Write the sheet as a PNG: a row a frame, a column a camera, the findings above.
+
+    Raises:
+        CaptureError: it cannot be written.
+    """
+    tiles = []
+    for frame in seen:
+        cameras = [_tile(capture, inspection, frame, c) for c in range(len(capture.rig))]
+        tiles.append(np.hstack([part for tile in cameras for part in (tile, _blank(_TILE, _GAP))]))
+    width = max([row.shape[1] for row in tiles], default=900)
+    rows = [_text(inspection, width)]
+    for row in tiles:
+        rows += [np.hstack([row, _blank(_TILE, width - row.shape[1])]), _blank(_GAP, width)]
+    ok, coded = cv2.imencode(".png", np.vstack(rows))
+    try:
+        if not ok:
+            raise OSError("the picture is too large")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(coded.tobytes())
+    except OSError as reason:
+        raise CaptureError(f"{path}: cannot be written ({reason.strerror or reason})") from None
+
+
+def _blank(height: int, width: int) -> Image:
+    return np.full((height, max(width, 0), 3), 255, np.uint8)
+
+
+def _text(inspection: Inspection, width: int) -> Image:
+    lines = [(line, _INK) for line in inspection.format_table().split("\n")[: -max(len(inspection.findings), 1)]]
+    lines += [(line, _BAD) for line in inspection.findings] or [("Nothing is the matter.", (60, 140, 60))]
+    wrapped = [(part, color) for line, color in lines for part in _wrapped(line, (width - 20) // 8)]
+    image = _blank((len(wrapped) + 2) * _LINE, width)
+    for i, (line, color) in enumerate(wrapped):
+        _columns(image, line, (i + 1) * _LINE, color)
+    x = 10
+    for name, color in _LEGEND:
+        y = (len(wrapped) + 1) * _LINE
+        cv2.line(image, (x, y - 5), (x + 24, y - 5), color, 3, cv2.LINE_AA)
+        cv2.putText(image, name, (x + 30, y), _FONT, 0.45, _INK, 1, cv2.LINE_AA)
+        x += 50 + 9 * len(name)
+    return image
+
+
+def _wrapped(line: str, most: int) -> list[str]:
+    parts = [""]
+    for word in line.replace("—", "-").split(" "):
+        if len(parts[-1]) + len(word) >= most:
+            parts.append("  ")
+        parts[-1] += word + " "
+    return [part.rstrip() for part in parts]
+
+
+def _columns(image: Image, line: str, y: int, color: tuple[int, int, int]) -> None:
+    """A line with every character in its place, as a terminal sets it: OpenCV's letters differ in width."""
+    for i, character in enumerate(line):
+        if character != " ":
+            shown = {"°": "o", "±": "+"}.get(character, character)
+            cv2.putText(image, shown, (10 + 8 * i, y), _FONT, 0.45, color, 1, cv2.LINE_AA)
+
+
+def _tile(capture: Capture, inspection: Inspection, frame: Seen, c: int) -> Image:
+    camera = capture.rig[c]
+    picture = frame.images[c, : camera.height, : camera.width].copy()
+    mask = (frame.masks[c, : camera.height, : camera.width] >= 128).astype(np.uint8)
+    thick = max(1, round(camera.height / 240))
+    if frame.hulls is not None:
+        hull = np.repeat(np.repeat(frame.hulls[c].astype(np.uint8), frame.step, 0), frame.step, 1)
+        hull = np.pad(hull, [(0, max(0, n - m)) for n, m in zip(mask.shape, hull.shape, strict=True)])
+        hull = np.ascontiguousarray(hull[: camera.height, : camera.width])
+        outside = (mask > 0) & (hull == 0)
+        picture[outside] = (0.4 * picture[outside] + 0.6 * np.array(_OUTSIDE)).astype(np.uint8)
+        _outline(picture, hull, _HULL, thick)
+    _outline(picture, mask, _MASK, thick)
+    volume = capture.volume
+    corners = np.array(np.meshgrid(*zip(volume.lower, volume.upper, strict=True), indexing="ij")).reshape(3, 8).T
+    for i in range(8):
+        for bit in (1, 2, 4):
+            if not i & bit:
+                _segment(picture, camera, corners[i], corners[i | bit], _BOX, thick)
+    up = up_vector(inspection.leveling.up)
+    foot = np.array(volume.center)
+    if np.isfinite(inspection.leveling.floor_m):
+        foot = foot + up * (inspection.leveling.floor_m - foot @ up)
+    _segment(picture, camera, foot, foot + up, _UP, 2 * thick)
+    scale = _TILE / camera.height
+    tile = cv2.resize(picture, (round(camera.width * scale), _TILE), interpolation=cv2.INTER_AREA)
+    report = inspection.cameras[c]
+    name = f"{camera.name}  frame {frame.index}"
+    (width, _), _ = cv2.getTextSize(name, _FONT, 0.5, 1)
+    cv2.rectangle(tile, (0, 0), (width + 14, 24), _INK, cv2.FILLED)
+    cv2.putText(tile, name, (7, 17), _FONT, 0.5, _PAPER, 1, cv2.LINE_AA)
+    if report.verdict:
+        cv2.rectangle(tile, (0, 0), (tile.shape[1] - 1, _TILE - 1), _BAD, 4)
+    return np.asarray(tile, np.uint8)
+
+
+def _outline(picture: Image, mask: Image, color: tuple[int, int, int], thick: int) -> None:
+    contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(picture, contours, -1, color, thick, cv2.LINE_AA)
+
+
+def _segment(
+    picture: Image, camera: Camera, a: Float, b: Float, color: tuple[int, int, int], thick: int, steps: int = 24
+) -> None:
+    """A line in the world, drawn where the camera sees it: lenses bend it."""
+    pixels, _ = camera.project(a + np.linspace(0, 1, steps)[:, None] * (b - a))
+    for p, q in pairwise(pixels):
+        if np.isfinite(p).all() and np.isfinite(q).all() and max(np.abs(p).max(), np.abs(q).max()) < 1e5:
+            start, end = (int(p[0]), int(p[1])), (int(q[0]), int(q[1]))
+            cv2.line(picture, start, end, color, thick, cv2.LINE_AA)

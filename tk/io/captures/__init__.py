@@ -1,0 +1,1 @@
+"""Captures: the folder that goes in."""

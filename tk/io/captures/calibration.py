@@ -1,0 +1,254 @@
+"""`calibration.toml`: the camera file that Anipose, Pose2Sim, FreeMoCap and Caliscope exchange."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from tk.errors import CalibrationError, CaptureError
+from tk.io.captures.units import UNITS, FoundUnit, infer_unit
+from tk.io.toml import Table, load_toml
+from tk.model.cameras.camera import Camera, Rig
+
+#: a reciprocal condition number below this is a singular intrinsic matrix: focal lengths of 10^-9 of the rest
+_SINGULAR = 1e-9
+
+#: pixels of a side of a picture
+_MOST_PIXELS = 2**16
+#: seconds by which a video may be late
+_MOST_OFFSET_S = 3600.0
+#: how far a 3×3 rotation may be from orthonormal: files are written with six digits and more
+_ORTHONORMAL = 1e-4
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a calibration file says.
+
+    Attributes:
+        path: the file.
+        rig: its cameras, in the file's order.
+        keys: the table's key of each camera, which may differ from its name.
+        notes: what was inferred, a line each, for the user to read.
+        time_offset_s: seconds by which each camera's pictures are taken later than their number says; empty: by none.
+        metres: in a unit of the file's translations.
+    """
+
+    path: Path
+    rig: Rig
+    keys: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    time_offset_s: tuple[float, ...] = ()
+    metres: float = 1.0
+
+    def select(self, names: Sequence[str] | None) -> Calibration:
+        """The calibration of these cameras only, still in the file's order; all of them for None.
+
+        Raises:
+            CaptureError: a name is unknown, or fewer than two cameras are left.
+        """
+        known = self.rig.names
+        wanted = known if names is None else [name.strip() for name in names]
+        for name in wanted:
+            if name not in known:
+                raise CaptureError(f"--cameras: no camera {name!r} in {self.path}, which has {', '.join(known)}")
+        chosen = [index for index, name in enumerate(known) if name in wanted]
+        if len(chosen) < 2:
+            source = self.path if names is None else f"--cameras {','.join(wanted)}"
+            raise CaptureError(f"{source}: {len(chosen)} camera; a visual hull needs at least 2")
+        return replace(
+            self,
+            rig=Rig(tuple(self.rig[i] for i in chosen)),
+            keys=tuple(self.keys[i] for i in chosen),
+            time_offset_s=tuple(self.time_offset_s[i] for i in chosen if self.time_offset_s),
+        )
+
+
+def read_calibration(path: str | Path) -> Calibration:
+    """Read and check a calibration file.
+
+    One table a camera, `metadata` skipped; Caliscope's ``[cameras.1]`` is read too. Each has ``size = [width, height]``
+    (pixels), ``matrix`` (3×3), ``distortions`` (4 or 5 numbers in OpenCV's order), ``rotation`` (Rodrigues vector or
+    3×3, world to camera), ``translation`` (in ``[metadata] units``; without these, metres unless the cameras' distances
+    say otherwise, see :func:`tk.io.captures.units.infer_unit`) and, optionally, ``name`` (by default the table's key),
+    ``fisheye`` and ``time_offset`` (seconds by which picture k was taken later than k / fps; 0 by default).
+
+    Raises:
+        CalibrationError: with the file, the camera and the key that is wrong.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise CalibrationError(f"{path}: there is no such file; a capture needs its cameras' calibration")
+    document = load_toml(path, CalibrationError)
+    tables = camera_tables(document, path)
+    return calibration_of(path, tables, given_unit(document, path))
+
+
+def camera_tables(document: Mapping[str, object], path: Path) -> dict[str, Mapping[str, object]]:
+    """The tables of a calibration document that are cameras, by key.
+
+    Raises:
+        CalibrationError: there are none.
+    """
+    tables: Mapping[str, object] = {key: value for key, value in document.items() if key != "metadata"}
+    nested = tables.get("cameras")
+    if isinstance(nested, Mapping) and all(isinstance(value, Mapping) for value in nested.values()):
+        tables = nested
+    # plain values beside the tables (a date, a tool's version) are nobody's camera
+    found = {key: value for key, value in tables.items() if isinstance(value, Mapping)}
+    if not found:
+        raise CalibrationError(f"{path}: has no cameras; it needs one table a camera")
+    return found
+
+
+def given_unit(document: Mapping[str, object], path: Path) -> str | None:
+    """``[metadata] units`` of a calibration document, None where it has none.
+
+    Raises:
+        CalibrationError: it is no unit that is known.
+    """
+    metadata = Table(document, str(path), CalibrationError).table("metadata")
+    if "units" not in metadata:
+        return None
+    units = metadata.text("units", "m")
+    if units not in UNITS:
+        metadata.fail(f"units = {units!r} must be one of {', '.join(UNITS)}")
+    return units
+
+
+def calibration_of(path: Path, tables: Mapping[str, Mapping[str, object]], unit: str | None) -> Calibration:
+    """The calibration in these tables; ``unit`` is that of the translations, None to infer it.
+
+    Raises:
+        CalibrationError: with the file, the camera and the key that is wrong.
+    """
+    cameras: list[Camera] = []
+    late: list[float] = []
+    for key, values in tables.items():
+        camera = _camera(key, values, path)
+        late.append(_time_offset(camera.name, values, path))
+        if camera.name in [other.name for other in cameras]:
+            raise CalibrationError(f"{path}: two cameras have the name {camera.name!r}; give each its own")
+        cameras.append(camera)
+    found = FoundUnit(unit) if unit else infer_unit(Rig(tuple(cameras)).centers)
+    notes = (f"{path}: {found.note}; [metadata] units says it for sure",) if found.note else ()
+    rig = scale_world(Rig(tuple(cameras)), found.metres)
+    return Calibration(path, rig, tuple(tables), notes, tuple(late), found.metres)
+
+
+def write_calibration(path: Path, source: Calibration, rig: Rig, time_offset_s: Sequence[float]) -> None:
+    """Write the file that ``source`` was read from with other cameras: all that is not said here stays as it is.
+
+    Args:
+        path: the new file.
+        source: the calibration as it was read.
+        rig: its cameras, in its order, metres.
+        time_offset_s: of each camera, seconds.
+
+    Raises:
+        CalibrationError: the source is no TOML file, or the new one cannot be written.
+    """
+    document = load_toml(source.path, CalibrationError)
+    tables = camera_tables(document, source.path)
+    for key, camera, late in zip(source.keys, rig, time_offset_s, strict=True):
+        table = dict(tables[key])
+        table["matrix"] = camera.matrix.tolist()
+        table["rotation"] = np.asarray(cv2.Rodrigues(camera.rotation)[0]).ravel().tolist()
+        table["translation"] = (camera.translation / source.metres).tolist()
+        table["time_offset"] = float(late)
+        (document if key in document else document["cameras"])[key] = table
+    try:
+        path.write_text(tomli_w.dumps(document), encoding="utf-8")
+    except OSError as reason:
+        raise CalibrationError(f"{path}: cannot be written ({reason.strerror or reason})") from None
+
+
+def _time_offset(name: str, values: Mapping[str, object], path: Path) -> float:
+    table = Table(values, f"{path}: camera {name!r}", CalibrationError)
+    late = table.number("time_offset", 0.0)
+    if abs(late) > _MOST_OFFSET_S:
+        table.fail(f"time_offset = {late:g} must be seconds, {_MOST_OFFSET_S:g} at most")
+    return late
+
+
+def scale_world(rig: Rig, metres: float) -> Rig:
+    """The rig with its translations multiplied by ``metres``, the metres in a unit: its projections stay."""
+    return Rig(tuple(replace(camera, translation=camera.translation * metres) for camera in rig))
+
+
+def _camera(key: str, values: Mapping[str, object], path: Path) -> Camera:
+    """One table's camera, its translation in the file's unit."""
+    name = Table(values, f"{path}: camera {key!r}", CalibrationError).text("name", key)
+    table = Table(values, f"{path}: camera {name!r}", CalibrationError)
+
+    size = table.array("size", (2,))
+    if (size <= 0).any() or (size != np.round(size)).any():
+        table.fail(f"size = {values['size']} must be two positive whole numbers [width, height]")
+    if (size > _MOST_PIXELS).any():
+        table.fail(f"size = {values['size']} is too large; {_MOST_PIXELS} pixels a side are the most")
+
+    matrix = table.array("matrix", (3, 3))
+    if np.linalg.cond(matrix) > 1 / _SINGULAR:
+        table.fail("matrix is singular; it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or matrix[1, 0] != 0 or (matrix[2] != (0, 0, 1)).any():
+        table.fail("matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal lengths")
+
+    fisheye = table.flag("fisheye", False)
+    distortions = table.array("distortions", (4,), (5,))
+    if fisheye and len(distortions) == 5:
+        if distortions[4] != 0:
+            table.fail("distortions has 5 numbers; a fisheye lens has 4 (k1 k2 k3 k4)")
+        distortions = distortions[:4]
+
+    return Camera(
+        name=name,
+        width=int(size[0]),
+        height=int(size[1]),
+        matrix=matrix,
+        distortions=distortions,
+        rotation=_rotation(table),
+        translation=table.array("translation", (3,)),
+        fisheye=fisheye,
+    )
+
+
+def _rotation(table: Table) -> NDArray[np.float64]:
+    """(3, 3) world to camera, from a Rodrigues vector or a matrix."""
+    given = table.array("rotation", (3,), (3, 3))
+    if given.shape == (3, 3):
+        off = float(np.abs(given @ given.T - np.eye(3)).max())
+        if off > _ORTHONORMAL or np.linalg.det(given) < 0:
+            table.fail(f"rotation is no rotation matrix: R Rᵀ is off the identity by {off:.2g}, det R has to be 1")
+        given = np.asarray(cv2.Rodrigues(given)[0], dtype=np.float64)  # of the nearest orthonormal matrix
+    return np.asarray(cv2.Rodrigues(given)[0], dtype=np.float64)
+
+
+def match_camera(name: str, key: str, stems: Iterable[str]) -> str | None:
+    """The file stem that belongs to a camera, None when there is none.
+
+    It is the one that equals the camera's ``name``, else its table's ``key``, else the one that equals either once
+    everything but letters and digits is dropped (`cam_01` and `cam01`).
+
+    Raises:
+        CaptureError: several stems are equal in that last sense.
+    """
+    stems = list(stems)
+    for exact in (name, key):
+        if exact in stems:
+            return exact
+    bare = {_bare(name), _bare(key)} - {""}
+    close = [stem for stem in stems if _bare(stem) in bare]
+    if len(close) > 1:
+        raise CaptureError(f"camera {name!r} could be any of {', '.join(sorted(close))}; rename the files to the names")
+    return close[0] if close else None
+
+
+def _bare(text: str) -> str:
+    return re.sub(r"[\W_]", "", text)

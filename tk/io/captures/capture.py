@@ -1,0 +1,350 @@
+"""A capture: the folder that goes in. Opening one checks everything that can be checked without decoding it all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import CaptureError, VideoError, VolumeError
+from tk.io.captures.calibration import Calibration, match_camera, read_calibration
+from tk.io.captures.capture_toml import CaptureSettings, read_settings
+from tk.io.captures.frames import FrameReader, FrameSet
+from tk.io.captures.mobo import SETTINGS as MOBO_SETTINGS
+from tk.io.captures.mobo import find_walk, read_cameras
+from tk.io.captures.video import Clip, Image, PictureClip, list_clips, picture_number, probe
+from tk.model.cameras.camera import Camera, Rig
+from tk.model.cameras.common_view import infer_volume, sample_box, views_of
+from tk.model.cameras.mounting import infer_up
+from tk.model.cameras.up import up_vector
+from tk.model.cameras.volume import Volume
+
+__all__ = ["Capture", "FrameReader", "FrameSet", "open_capture"]
+
+#: in a folder of masks that `tk masks` has made: where they come from
+MASKS_RECORD = "masks.toml"
+
+#: frames a second when neither `capture.toml` nor the videos say
+DEFAULT_FPS = 30.0
+
+#: pictures of the empty scene that are kept a camera, and the bytes that all of them may take
+_BACKGROUND_FRAMES = 50
+_BACKGROUND_BYTES = 384 * 2**20
+
+#: what points up when `capture.toml` does not say, unless the cameras' mounting is farther from it, degrees
+DEFAULT_UP, _UP_DEG = "z", 25.0
+
+#: cameras farther apart than this, in metres, are taken for millimetres in disguise
+_FAR_APART_M = 100.0
+
+
+@dataclass(frozen=True)
+class Capture:
+    """An open capture folder: a few numbers, and where the pictures are. Pictures are read by :meth:`frames`.
+
+    Attributes:
+        path: the folder.
+        name: from `capture.toml`, else the folder's name.
+        fps: frames a second, from `capture.toml`, else from the videos, else 30.
+        up: what points up in the world: x, y, z, -x, -y or -z, or a unit vector's text, "[0.02, -0.9998, 0.01]".
+        rig: the cameras, in the calibration file's order.
+        volume: the working volume, world frame, metres; inferred from the rig where `capture.toml` has none.
+        frame_count: frames that all cameras (and masks) have.
+        subject_height_m: metres, None if unknown.
+        init_frame: the frame in which the subject stands in the initialisation pose.
+        init_pose: "da-vinci", or "any" when no pose is promised.
+        init_keypoints: a folder of 2D keypoints that tell the first pose; None where there is none.
+        warnings: what was put up with, a line each, for the user to read.
+        clips: a clip a camera.
+        mask_clips: a mask clip a camera, None without ready masks.
+        masks: what :func:`open_capture` was asked for, which says where masks come from if there are none.
+        time_offset_s: seconds by which each camera's pictures are later than their number says, from the calibration;
+            whole frames of it are put right by :meth:`frames`.
+    """
+
+    path: Path
+    name: str
+    fps: float
+    up: str
+    rig: Rig
+    volume: Volume
+    frame_count: int
+    subject_height_m: float | None
+    init_frame: int
+    init_pose: str
+    init_keypoints: Path | None
+    warnings: tuple[str, ...]
+    clips: tuple[Clip, ...]
+    mask_clips: tuple[Clip, ...] | None
+    masks: str
+    _calibration: Calibration
+    time_offset_s: tuple[float, ...]
+
+    @property
+    def late_frames(self) -> tuple[int, ...]:
+        """The time offsets in whole frames: frame k of the capture holds picture k - late of each camera."""
+        return tuple(round(late * self.fps) for late in self.time_offset_s)
+
+    @property
+    def first_frame(self) -> int:
+        """The first frame of which every camera has a picture."""
+        return max(0, *self.late_frames)
+
+    def as_recorded(self) -> Capture:
+        """The capture without its time offsets: frame k holds picture k of every camera."""
+        clips = (*self.clips, *(self.mask_clips or ()))
+        return replace(self, time_offset_s=(0.0,) * len(self.rig), frame_count=min(clip.frame_count for clip in clips))
+
+    @property
+    def calibration(self) -> Calibration:
+        """The calibration file's cameras that are used."""
+        return self._calibration
+
+    @property
+    def has_masks(self) -> bool:
+        return self.mask_clips is not None
+
+    @property
+    def up_axis(self) -> NDArray[np.float64]:
+        """(3,) unit vector that points up, world frame."""
+        return up_vector(self.up)
+
+    def frames(self, start: int = 0, stop: int | None = None) -> FrameReader:
+        """The frames ``start`` … ``stop - 1``, decoded ahead; up to the capture's end by default.
+
+        Before :attr:`first_frame` a camera whose video begins later shows its first picture.
+
+        Raises:
+            CaptureError: there are no such frames.
+        """
+        stop = self.frame_count if stop is None else min(stop, self.frame_count)
+        if not 0 <= start < stop:
+            raise CaptureError(
+                f"{self.path}: no frames from {start} to {stop}; it has frames 0 to {self.frame_count - 1}"
+            )
+        return FrameReader(self.clips, self.mask_clips, self.rig.frame_shape, start, stop, self.late_frames)
+
+    def background(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """The empty scene: an array (T, h, w, 3) uint8 BGR a camera, None without a `background/` folder.
+
+        T is 1 for a picture. Of a clip at most 50 frames are kept, spread evenly over it, and fewer of large
+        pictures (384 MiB over all cameras): enough for a mean and a variance.
+
+        Raises:
+            VideoError: a camera has no background, or it cannot be read, or has another size.
+        """
+        folder = self.path / "background"
+        if not folder.is_dir():
+            return None
+        clips = _clips_of(self._calibration, folder, "background", "png", pictures=True)
+        pixels = sum(camera.width * camera.height for camera in self.rig)
+        most = min(_BACKGROUND_FRAMES, max(2, _BACKGROUND_BYTES // (3 * pixels)))
+        return tuple(_read_some(clip, most) for clip in clips)
+
+
+def open_capture(path: str | Path, cameras: Sequence[str] | None = None, masks: str = "auto") -> Capture:
+    """Open a capture folder.
+
+    Args:
+        path: the folder.
+        cameras: names of the cameras to use; all of them by default.
+        masks: "auto" takes the capture's `masks/` where there is one; "none" and "median" take no masks, and leave it
+            to :mod:`tk.run.segmentation` to make some; anything else is a folder in the layout of `masks/`.
+
+    Raises:
+        CaptureError: or one of its subclasses, with one line that names the file and what is wrong with it.
+    """
+    path, masks_asked = Path(path), masks
+    if not path.is_dir():
+        raise CaptureError(f"{path}: is not a folder; a capture is a folder with calibration.toml and videos/")
+    walk = find_walk(path)
+    calibration = (read_cameras(walk) if walk else read_calibration(path / "calibration.toml")).select(cameras)
+    rig = calibration.rig
+    settings = read_settings(path / "capture.toml")
+    if walk and not (path / "capture.toml").exists():
+        settings = MOBO_SETTINGS
+
+    clips = _clips_of(calibration, path, "folder of pictures", "jpg") if walk else _open_clips(calibration, path)
+    if walk and walk.masks is not None and masks == "auto":
+        masks = str(walk.masks)
+    mask_clips = _open_masks(calibration, path, masks)
+    warnings: list[str] = list(calibration.notes)
+    if settings.unknown:
+        warnings.append(f"{path / 'capture.toml'}: unknown keys are ignored: {', '.join(settings.unknown)}")
+    _warn_of_units(calibration, warnings.append)
+    fps = _frame_rate(settings, clips, path, warnings.append)
+    offsets = calibration.time_offset_s or (0.0,) * len(rig)
+    frame_count = _common_length(
+        [*clips, *(mask_clips or ())], [round(late * fps) for late in offsets], warnings.append
+    )
+    if settings.init_frame >= frame_count:
+        raise CaptureError(
+            f"{path / 'capture.toml'}: [init]: frame = {settings.init_frame} is past the last frame, {frame_count - 1}"
+        )
+    return Capture(
+        path=path,
+        name=settings.name or path.resolve().name,
+        fps=fps,
+        up=_up(settings, rig, path, warnings.append),
+        rig=rig,
+        volume=_working_volume(settings, rig, path, warnings.append),
+        frame_count=frame_count,
+        subject_height_m=settings.subject_height_m,
+        init_frame=settings.init_frame,
+        init_pose=settings.init_pose,
+        init_keypoints=path / settings.init_keypoints if settings.init_keypoints else None,
+        warnings=tuple(warnings),
+        clips=clips,
+        mask_clips=mask_clips,
+        masks=masks_asked,
+        _calibration=calibration,
+        time_offset_s=offsets,
+    )
+
+
+def _open_clips(calibration: Calibration, path: Path) -> tuple[Clip, ...]:
+    for folder in (path / "videos", path / "images"):
+        if folder.is_dir():
+            return _clips_of(calibration, folder, "video" if folder.name == "videos" else "folder of pictures", "mp4")
+    raise VideoError(f"{path}: has neither videos/ nor images/")
+
+
+def _open_masks(calibration: Calibration, path: Path, masks: str) -> tuple[Clip, ...] | None:
+    if masks in ("none", "median"):
+        return None
+    folder = path / "masks" if masks == "auto" else Path(masks)
+    if not folder.is_dir():
+        if masks == "auto":
+            return None
+        raise CaptureError(f"--masks {masks}: is not a folder; give auto, none, median or a folder of masks")
+    clips = _clips_of(calibration, folder, "masks", "mp4", is_mask=True)
+    if (folder / MASKS_RECORD).is_file():
+        for clip in clips:
+            if isinstance(clip, PictureClip) and picture_number(clip.files[0]) != 0:
+                raise CaptureError(
+                    f"{clip.path}: starts with {clip.files[0].name}, so frame 0 has no mask; "
+                    f"make the missing ones: tk masks {path} -o {folder}"
+                )
+    return clips
+
+
+def _clips_of(
+    calibration: Calibration, folder: Path, what: str, suffix: str, *, pictures: bool = False, is_mask: bool = False
+) -> tuple[Clip, ...]:
+    """The clip in ``folder`` of each camera, probed and of the camera's size."""
+    found = list_clips(folder, pictures)
+    taken: dict[str, Camera] = {}
+    clips: list[Clip] = []
+    for camera, key in zip(calibration.rig, calibration.keys, strict=True):
+        try:
+            stem = match_camera(camera.name, key, found)
+        except CaptureError as ambiguous:
+            raise VideoError(f"{folder}: {ambiguous}") from None
+        if stem is None:
+            expected = folder / (camera.name if folder.name == "images" else f"{camera.name}.{suffix}")
+            there = ", ".join(file.name for file in found.values()) or "nothing"
+            raise VideoError(f"{expected}: camera {camera.name!r} has no {what}; {folder.name}/ holds {there}")
+        if stem in taken:
+            raise VideoError(
+                f"{found[stem]}: fits both cameras {taken[stem].name!r} and {camera.name!r}; rename it to its camera"
+            )
+        taken[stem] = camera
+        clip = probe(found[stem], is_mask)
+        if (clip.width, clip.height) != (camera.width, camera.height):
+            raise VideoError(
+                f"{clip.path}: is {clip.width}×{clip.height}, but {calibration.path.name} gives camera {camera.name!r} "
+                f"{camera.width}×{camera.height}; calibrate for this size or scale the pictures"
+            )
+        clips.append(clip)
+    return tuple(clips)
+
+
+def _common_length(clips: Sequence[Clip], late: Sequence[int], warn: Callable[[str], None]) -> int:
+    """Frames until the first clip ends; each clip (those of masks behind those of videos) is so many frames late."""
+    counts = [clip.frame_count + late[i % len(late)] for i, clip in enumerate(clips)]
+    common = min(counts)
+    if common <= max(0, *late):
+        raise CaptureError(
+            f"{clips[counts.index(common)].path}: ends before all cameras have begun; check time_offset in the "
+            "calibration"
+        )
+    if any(late):
+        first, last = max(0, *late), common - 1
+        told = ", ".join(f"{clip.path.stem} {n:+d}" for clip, n in zip(clips, late, strict=False) if n)
+        warn(f"time offsets: {told} frames; all cameras have pictures of frames {first} to {last}")
+        return common
+    if common < max(counts):
+        short = ", ".join(str(clip.path) for clip in clips if clip.frame_count == common)
+        warn(f"{short}: has {common} frames, others up to {max(counts)}; only the first {common} are used")
+    return common
+
+
+def _frame_rate(settings: CaptureSettings, clips: Sequence[Clip], path: Path, warn: Callable[[str], None]) -> float:
+    if settings.fps is not None:
+        return settings.fps
+    rates = [clip.fps for clip in clips if clip.fps is not None]
+    if not rates:
+        warn(f"{path / 'capture.toml'}: gives no fps, and neither do the pictures; {DEFAULT_FPS:g} is assumed")
+        return DEFAULT_FPS
+    if max(rates) > 1.01 * min(rates):
+        listed = ", ".join(f"{clip.path.name} {clip.fps:g}" for clip in clips if clip.fps is not None)
+        warn(
+            f"{path / 'videos'}: frame rates differ ({listed}); {rates[0]:g} is used, fps in capture.toml overrides it"
+        )
+    return rates[0]
+
+
+def _up(settings: CaptureSettings, rig: Rig, path: Path, warn: Callable[[str], None]) -> str:
+    """What points up: z unless `capture.toml` says otherwise, or says nothing and the cameras are mounted otherwise."""
+    if settings.up is not None:
+        return settings.up
+    found = infer_up(rig)
+    if up_vector(found.up) @ up_vector(DEFAULT_UP) > np.cos(np.radians(_UP_DEG)):
+        return DEFAULT_UP
+    warn(f"{path / 'capture.toml'}: gives no up; {found.up} is taken, {found.how}; tk level looks closer")
+    return found.up
+
+
+def _working_volume(settings: CaptureSettings, rig: Rig, path: Path, warn: Callable[[str], None]) -> Volume:
+    """The volume from `capture.toml`, or the inferred one; checked to be in sight of two cameras somewhere."""
+    file = path / "capture.toml"
+    if settings.volume is None:
+        try:
+            volume = infer_volume(rig)
+        except VolumeError as reason:
+            raise VolumeError(f"{file}: gives no [volume], and none can be inferred: {reason}; add one") from None
+        center, size = ([round(x, 2) for x in values] for values in (volume.center, volume.size))
+        warn(f"{file}: gives no [volume]; inferred from the cameras: center = {center}, size = {size} (metres)")
+        return volume
+    if not (views_of(rig, sample_box(settings.volume)) >= 2).any():
+        raise VolumeError(
+            f"{file}: [volume]: no two cameras see center = {list(settings.volume.center)}, "
+            f"size = {list(settings.volume.size)}; move it (metres), or check the units in calibration.toml"
+        )
+    return settings.volume
+
+
+def _warn_of_units(calibration: Calibration, warn: Callable[[str], None]) -> None:
+    centers = calibration.rig.centers
+    if np.linalg.norm(np.ptp(centers, axis=0)) > _FAR_APART_M:
+        warn(f'{calibration.path}: the cameras are over {_FAR_APART_M:g} m apart; is [metadata] units = "mm" missing?')
+
+
+def _read_some(clip: Clip, most: int) -> Image:
+    """(T, h, w, 3): at most ``most`` frames, spread evenly over the clip."""
+    count = min(clip.frame_count, most)
+    chosen = (np.arange(count) * clip.frame_count) // count
+    result = np.empty((count, clip.height, clip.width, 3), np.uint8)
+    position = 0
+    with closing(clip.open()) as reader:
+        for out, index in zip(result, chosen, strict=True):
+            while position < index:
+                reader.skip()
+                position += 1
+            reader.read(out)
+            position += 1
+    return result

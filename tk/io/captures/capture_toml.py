@@ -1,0 +1,137 @@
+"""`capture.toml`: what a person says about a capture. Everything in it is optional."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tk.errors import ConfigError, VolumeError
+from tk.io.toml import Table, load_toml
+from tk.model.cameras.up import up_text
+from tk.model.cameras.volume import Volume
+
+#: known initialisation poses; "any" promises none
+INIT_POSES = ("da-vinci", "any")
+
+#: frames a second, from one picture in 100 s to the fastest cameras
+FPS_RANGE = (0.01, 1e5)
+
+#: metres: the largest side of a working volume, and how far away its middle may be
+_MOST_VOLUME_M, _FARTHEST_M = 1000.0, 1e6
+
+_KEYS: dict[str, tuple[str, ...]] = {
+    "volume": ("center", "size"),
+    "subject": ("height",),
+    "init": ("frame", "pose", "keypoints"),
+}
+_TOP_KEYS = ("name", "fps", "up", *_KEYS)
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """What `capture.toml` says; None where it is silent and the default comes from elsewhere.
+
+    Attributes:
+        name: of the capture.
+        fps: frames a second.
+        up: what points up in the world, as :func:`tk.model.cameras.up.up_text` tells it: "z", or a unit vector's
+            text; None
+            where the cameras have to tell.
+        volume: the working volume, metres.
+        subject_height_m: the subject's height without shoes, metres.
+        init_frame: the frame in which the subject stands in the initialisation pose.
+        init_pose: one of :data:`INIT_POSES`.
+        init_keypoints: a folder of 2D keypoints that tell the first pose, relative to the capture's; None where there
+            is none.
+        unknown: keys that mean nothing to us, e.g. a misspelt one.
+    """
+
+    name: str | None = None
+    fps: float | None = None
+    up: str | None = None
+    volume: Volume | None = None
+    subject_height_m: float | None = None
+    init_frame: int = 0
+    init_pose: str = "da-vinci"
+    init_keypoints: str | None = None
+    unknown: tuple[str, ...] = ()
+
+
+def read_settings(path: Path) -> CaptureSettings:
+    """Read `capture.toml`; a missing file is an empty one.
+
+    Raises:
+        CaptureError: invalid TOML or a value out of range, with the file and the key.
+        VolumeError: the working volume is empty.
+    """
+    if not path.exists():
+        return CaptureSettings()
+    document = Table(load_toml(path), str(path))
+
+    fps = document.number("fps") if "fps" in document else None
+    if fps is not None and fps <= 0:
+        document.fail(f"fps = {fps:g} must be positive")
+    if fps is not None and not FPS_RANGE[0] <= fps <= FPS_RANGE[1]:
+        document.fail(f"fps = {fps:g} must be between {FPS_RANGE[0]:g} and {FPS_RANGE[1]:g}")
+
+    up = _up(document) if "up" in document else None
+
+    subject = document.table("subject")
+    height_m = subject.number("height") if "height" in subject else None
+    if height_m is not None and not 0.3 <= height_m <= 3.0:
+        subject.fail(f"height = {height_m:g} must be between 0.3 and 3 metres")
+
+    init = document.table("init")
+    init_frame = init.integer("frame", 0)
+    if init_frame < 0:
+        init.fail(f"frame = {init_frame} must not be negative")
+    init_pose = init.text("pose", "da-vinci")
+    if init_pose not in INIT_POSES:
+        init.fail(f"pose = {init_pose!r} must be one of {', '.join(INIT_POSES)}")
+
+    return CaptureSettings(
+        name=document.text("name", "") if "name" in document else None,
+        fps=fps,
+        up=up,
+        volume=_volume(document.table("volume")) if "volume" in document else None,
+        subject_height_m=height_m,
+        init_frame=init_frame,
+        init_pose=init_pose,
+        init_keypoints=init.text("keypoints", "") if "keypoints" in init else None,
+        unknown=_unknown_keys(document.values),
+    )
+
+
+def _up(document: Table) -> str:
+    """The text of ``up``: the name of an axis, or an array that need not be of unit length."""
+    value = document.values.get("up", "z")
+    try:
+        return up_text(document.array("up", (3,)) if isinstance(value, list) else document.text("up", "z"))
+    except ConfigError as reason:
+        document.fail(str(reason))
+
+
+def _volume(table: Table) -> Volume:
+    table.error = VolumeError
+    center = table.array("center", (3,))
+    size = table.array("size", (3,))
+    if (size <= 0).any():
+        table.fail(f"size = {size.tolist()} is empty; give three positive lengths in metres")
+    if (size > _MOST_VOLUME_M).any() or (np.abs(center) > _FARTHEST_M).any():
+        table.fail(f"center = {center.tolist()}, size = {size.tolist()}: is too large or too far away; give metres")
+    return Volume(_triple(center), _triple(size))
+
+
+def _unknown_keys(document: Any) -> tuple[str, ...]:
+    unknown = [key for key in document if key not in _TOP_KEYS]
+    for table, keys in _KEYS.items():
+        unknown += [f"{table}.{key}" for key in document.get(table, {}) if key not in keys]
+    return tuple(unknown)
+
+
+def _triple(values: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z

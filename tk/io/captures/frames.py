@@ -1,0 +1,267 @@
+"""Synchronised frames of all cameras, decoded ahead of whoever consumes them."""
+
+from __future__ import annotations
+
+import math
+import threading
+import weakref
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.io.captures.video import Clip
+
+#: frames decoded ahead at most, and the bytes that they may take
+_AHEAD = 8
+_AHEAD_BYTES = 128 * 2**20
+
+
+@dataclass(frozen=True)
+class FrameSet:
+    """What all cameras saw at one instant.
+
+    Attributes:
+        index: source frame.
+        images: (C, H, W, 3) uint8 BGR; a smaller camera's picture is padded with zeros at the right and bottom.
+        masks: (C, H, W) uint8 with 0 or 255 (the person), or None.
+    """
+
+    index: int
+    images: NDArray[np.uint8]
+    masks: NDArray[np.uint8] | None
+
+
+class FrameReader(Iterator[FrameSet]):
+    """Iterates over the frames ``start`` … ``stop - 1``, one decoding thread a camera.
+
+    Every thread decodes straight into its layer of a shared stack, up to 8 frames (128 MiB) ahead. Use it as a
+    context manager, or let the iteration run out, or drop it: each ends the threads.
+
+    An error in a picture is raised when the iteration gets to that frame: all frames before it have been handed out.
+    """
+
+    def __init__(
+        self,
+        clips: Sequence[Clip],
+        mask_clips: Sequence[Clip] | None,
+        frame_shape: tuple[int, int],
+        start: int,
+        stop: int,
+        late: Sequence[int] = (),
+    ) -> None:
+        """``late``: for each clip, by how many frames its pictures are later than their number says; picture
+        k - late is handed out in frame k. Before a clip's first picture and after its last these stand in.
+        """
+        late = tuple(late) or (0,) * len(clips)
+        self.start = start
+        self.stop = stop
+        self._index = start
+        count = len(clips)
+
+        set_bytes = count * frame_shape[0] * frame_shape[1] * (4 if mask_clips else 3)
+        ahead = max(2, min(_AHEAD, _AHEAD_BYTES // set_bytes))
+        images = _Stacks((count, *frame_shape, 3), ahead)
+        masks = _Stacks((count, *frame_shape), ahead) if mask_clips else None
+
+        def blank(index: int) -> FrameSet:
+            return FrameSet(index, images.take(), masks.take() if masks else None)
+
+        window = _Window(blank, count, start, ahead)
+        self._window = window
+        # The threads know the window, not this reader: dropping the reader closes the window. Daemons, so that a
+        # reader that is still referenced when the interpreter ends does not hold it up.
+        self._threads = [
+            threading.Thread(
+                target=_decode,
+                args=(window, camera, clip, mask_clips[camera] if mask_clips else None, start, stop, late[camera]),
+                name=f"tk-decode-{camera}",
+                daemon=True,
+            )
+            for camera, clip in enumerate(clips)
+        ]
+        self._finalizer = weakref.finalize(self, _shut, window, self._threads)
+        for thread in self._threads:
+            thread.start()
+
+    def __len__(self) -> int:
+        """Frames still to come."""
+        return self.stop - self._index
+
+    def __iter__(self) -> FrameReader:
+        return self
+
+    def __next__(self) -> FrameSet:
+        try:
+            frame_set = self._window.take() if self._index < self.stop else None
+        except BaseException:
+            self.close()
+            raise
+        if frame_set is None:
+            self.close()
+            raise StopIteration
+        self._index += 1
+        return frame_set
+
+    def __enter__(self) -> FrameReader:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop decoding and wait for the threads to end. Closing twice is fine."""
+        self._finalizer()
+
+
+class _Stacks:
+    """Stacks of pictures whose memory is used again once nobody holds them.
+
+    Allocated afresh, each decoding thread would keep freed ones in its own part of the heap: measured, 20 MB more in
+    1,000 frames; and fresh memory has to be cleared.
+    """
+
+    def __init__(self, shape: tuple[int, ...], most: int) -> None:
+        """At most ``most`` lie ready."""
+        self._shape = shape
+        self._free: deque[bytearray] = deque(maxlen=most)
+
+    def take(self) -> NDArray[np.uint8]:
+        """A stack of the shape. What was never written in it is zero."""
+        try:
+            memory = self._free.pop()
+        except IndexError:
+            memory = bytearray(math.prod(self._shape))
+        stack = np.frombuffer(memory, np.uint8)
+        # every view has this array for its base, so it goes with the last of them
+        weakref.finalize(stack, self._free.append, memory).atexit = False
+        return stack.reshape(self._shape)
+
+
+class _Slot:
+    """A frame set in the making."""
+
+    def __init__(self, frame_set: FrameSet, cameras: int) -> None:
+        self.frame_set = frame_set
+        self.pending = cameras
+        self.failures: dict[int, BaseException] = {}
+
+
+class _Window:
+    """The frame sets between the consumer and the fastest camera: all that the threads share."""
+
+    def __init__(self, blank: Callable[[int], FrameSet], cameras: int, start: int, ahead: int) -> None:
+        self._blank = blank
+        self._cameras = cameras
+        self._next = start  # the consumer's frame
+        self._ahead = ahead
+        self._slots: dict[int, _Slot] = {}
+        self.closed = False
+        self._changed = threading.Condition()
+
+    def claim(self, index: int) -> _Slot | None:
+        """The slot to decode frame ``index`` into, once it is within reach; None when there is no more use for it."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.closed or index < self._next + self._ahead)
+            if self.closed:
+                return None
+            if index not in self._slots:
+                self._slots[index] = _Slot(self._blank(index), self._cameras)
+            return self._slots[index]
+
+    def finish(self, slot: _Slot, camera: int, failure: BaseException | None = None) -> None:
+        with self._changed:
+            slot.pending -= 1
+            if failure is not None:
+                slot.failures[camera] = failure
+            if slot.pending == 0:
+                self._changed.notify_all()
+
+    def take(self) -> FrameSet | None:
+        """The consumer's next frame set, None once closed. Waits for all cameras; raises the first one's failure."""
+        with self._changed:
+            self._changed.wait_for(self._ready)
+            if self.closed:
+                return None
+            slot = self._slots.pop(self._next)
+            self._next += 1
+            self._changed.notify_all()
+        if slot.failures:
+            raise slot.failures[min(slot.failures)]
+        return slot.frame_set
+
+    def _ready(self) -> bool:
+        slot = self._slots.get(self._next)
+        return self.closed or (slot is not None and slot.pending == 0)
+
+    def close(self) -> None:
+        with self._changed:
+            self.closed = True
+            self._slots.clear()
+            self._changed.notify_all()
+
+
+def _decode(window: _Window, camera: int, clip: Clip, mask_clip: Clip | None, start: int, stop: int, late: int) -> None:
+    """A camera's thread."""
+    index = start
+    slot: _Slot | None = None
+    last = clip.frame_count - 1 if mask_clip is None else min(clip.frame_count, mask_clip.frame_count) - 1
+    kept, kept_mask = np.empty((2, 0), np.uint8)  # what is handed out again
+
+    def picture_of(index: int) -> int:
+        return min(max(index - late, 0), last)
+
+    try:
+        with ExitStack() as stack:
+            pictures = stack.enter_context(closing(clip.open()))
+            masks = stack.enter_context(closing(mask_clip.open())) if mask_clip else None
+            for _ in range(picture_of(start)):
+                if window.closed:
+                    return
+                pictures.skip()
+                if masks is not None:
+                    masks.skip()
+            for index in range(start, stop):
+                slot = window.claim(index)
+                if slot is None:
+                    return
+                layer = slot.frame_set.images[camera, : clip.height, : clip.width]
+                # a first or last picture that was read for the frame before, or that the next frame shows, too
+                stands_in = index > start and picture_of(index) == picture_of(index - 1)
+                again = picture_of(index) == picture_of(index + 1)
+                if stands_in:
+                    layer[...] = kept
+                else:
+                    pictures.read(layer)
+                if masks is not None and slot.frame_set.masks is not None:
+                    mask_layer = slot.frame_set.masks[camera, : clip.height, : clip.width]
+                    if stands_in:
+                        mask_layer[...] = kept_mask
+                    else:
+                        masks.read(mask_layer)
+                    if again:
+                        kept_mask = mask_layer.copy()
+                if again:
+                    kept = layer.copy()
+                window.finish(slot, camera)
+                slot = None
+    except BaseException as failure:
+        slot = slot or window.claim(index)
+        if slot is not None:
+            window.finish(slot, camera, failure)
+
+
+def _shut(window: _Window, threads: Sequence[threading.Thread]) -> None:
+    window.close()
+    # The garbage collector may call this from a decoding thread, which cannot wait for itself or its siblings.
+    if threading.current_thread() in threads:
+        return
+    for thread in threads:
+        if thread.ident is not None:
+            thread.join()

@@ -1,0 +1,134 @@
+"""The folders and camera files of the CMU Motion of Body (MoBo) database, as a capture.
+
+R. Gross and J. Shi, *The CMU Motion of Body (MoBo) Database*, CMU-RI-TR-01-18, 2001: 25 subjects on a treadmill, four
+walks, six cameras (vr03_7, vr05_7, vr07_7, vr13_7, vr16_7, vr17_7), 30 frames/s, masks from a background subtraction.
+
+    ROOT/moboJpg/04002/slowWalk/vr03_7/*.jpg       pictures: the capture is the folder of the walk
+    ROOT/moboBgSub/04002/slowWalk/vr03_7/*         masks, in a tree beside it; optional
+    ROOT/calibration/vr03_7.cal                    cameras; or beside the pictures, or in any folder between
+
+A camera file holds the parameters of Tsai's model, one number after the other, as R. Willson's programs order them:
+Ncx, Nfx, dx, dy, dpx, dpy, Cx, Cy, sx, f, kappa1, Tx, Ty, Tz, Rx, Ry, Rz (millimetres, radians).
+
+Neither the database nor the report's section on files was at hand when this was written: the names of folders and
+files, the order of the numbers and the vertical axis (z) are from memory, and tested on generated data only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import CalibrationError
+from tk.io.captures.calibration import Calibration
+from tk.io.captures.capture_toml import CaptureSettings
+from tk.model.cameras.camera import Camera, Rig
+
+#: frames a second; nobody stands in the Da Vinci pose
+SETTINGS = CaptureSettings(fps=30.0, up="z", init_pose="any")
+
+_PICTURES, _MASKS = "moboJpg", "moboBgSub"
+_NUMBERS = (
+    *("Ncx", "Nfx", "dx", "dy", "dpx", "dpy", "Cx", "Cy", "sx"),
+    *("f", "kappa1", "Tx", "Ty", "Tz", "Rx", "Ry", "Rz"),
+)
+
+
+@dataclass(frozen=True)
+class MoboWalk:
+    """One walk of one subject.
+
+    Attributes:
+        path: the folder that holds a folder of pictures a camera.
+        files: the camera files, by camera.
+        masks: the folder of the masks, None if there is none.
+    """
+
+    path: Path
+    files: dict[str, Path]
+    masks: Path | None
+
+
+def find_walk(path: Path) -> MoboWalk | None:
+    """The walk at ``path``; None if this is no such folder: no ``vr…`` folders, or a ``calibration.toml``."""
+    cameras = sorted(folder.name for folder in path.glob("vr[0-9][0-9]*") if folder.is_dir())
+    if not cameras or (path / "calibration.toml").exists():
+        return None
+    files: dict[str, Path] = {}
+    full = path.resolve()
+    for folder in [full, *full.parents[:3]]:
+        for name in cameras:
+            for file in (folder / f"{name}.cal", folder / "calibration" / f"{name}.cal", folder / name / f"{name}.cal"):
+                if name not in files and file.is_file():
+                    files[name] = file
+    parts = list(full.parts)
+    masks = None
+    if _PICTURES in parts:
+        parts[parts.index(_PICTURES)] = _MASKS
+        masks = Path(*parts) if Path(*parts).is_dir() else None
+    return MoboWalk(path, files, masks)
+
+
+def read_cameras(walk: MoboWalk) -> Calibration:
+    """The cameras of a walk that have a camera file; their sizes are those of the pictures.
+
+    Raises:
+        CalibrationError: fewer than two have one, or one cannot be read.
+    """
+    if len(walk.files) < 2:
+        raise CalibrationError(
+            f"{walk.path}: looks like a MoBo walk, but {len(walk.files)} of its vr… folders have a camera file; put "
+            "vr03_7.cal and so on beside them, or write a calibration.toml"
+        )
+    cameras = tuple(_read_camera(name, file, _picture_size(walk.path / name)) for name, file in walk.files.items())
+    return Calibration(walk.path, Rig(cameras), tuple(walk.files))
+
+
+def _read_camera(name: str, file: Path, size: tuple[int, int]) -> Camera:
+    try:
+        values = np.array([float(word) for word in file.read_text(encoding="utf-8").split()])
+    except (OSError, ValueError) as error:
+        raise CalibrationError(f"{file}: cannot be read as numbers: {error}") from None
+    if len(values) != len(_NUMBERS) or not np.isfinite(values).all():
+        raise CalibrationError(f"{file}: holds {len(values)} numbers; the {len(_NUMBERS)} are {' '.join(_NUMBERS)}")
+    return camera_from_tsai(name, dict(zip(_NUMBERS, values.tolist(), strict=True)), size, file)
+
+
+def camera_from_tsai(name: str, tsai: dict[str, float], size: tuple[int, int], file: Path) -> Camera:
+    """A camera from Tsai's parameters (millimetres, radians).
+
+    Tsai undistorts by 1 + kappa1 r² in the sensor's plane; the camera here distorts. The inverse's series gives
+    k1 = -κf², k2 = 3κ²f⁴, k3 = -12κ³f⁶.
+
+    Raises:
+        CalibrationError: a length that must be positive is not.
+    """
+    for key in ("dpx", "dpy", "sx", "f"):
+        if not tsai[key] > 0:
+            raise CalibrationError(f"{file}: {key} = {tsai[key]} must be positive")
+    f = tsai["f"]
+    K = np.array([[tsai["sx"] * f / tsai["dpx"], 0, tsai["Cx"]], [0, f / tsai["dpy"], tsai["Cy"]], [0, 0, 1.0]])
+    k = tsai["kappa1"] * f * f
+    rotation = rotation_zyx(tsai["Rx"], tsai["Ry"], tsai["Rz"])
+    translation = 1e-3 * np.array([tsai["Tx"], tsai["Ty"], tsai["Tz"]])
+    distortions = np.array([-k, 3 * k * k, 0.0, 0.0, -12 * k**3])
+    return Camera(name, size[0], size[1], K, distortions, rotation, translation)
+
+
+def rotation_zyx(x: float, y: float, z: float) -> NDArray[np.float64]:
+    """(3, 3) Rz Ry Rx."""
+    axes = np.diag([x, y, z])
+    Rx, Ry, Rz = (cv2.Rodrigues(axis)[0] for axis in axes)
+    return np.asarray(Rz @ Ry @ Rx, np.float64)
+
+
+def _picture_size(folder: Path) -> tuple[int, int]:
+    for file in sorted(folder.iterdir()):
+        picture = cv2.imread(str(file)) if file.is_file() and file.suffix != ".cal" else None
+        if picture is not None:
+            return picture.shape[1], picture.shape[0]
+    raise CalibrationError(f"{folder}: holds no pictures")

@@ -1,0 +1,285 @@
+"""How a result file is read: all of it, or the joints alone, which a capture's truth has, too."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ResultError
+from tk.io.hdf5 import Hdf5Reader, open_hdf5
+from tk.io.results.columns import FAR_M, LARGE, LAST_FRAME, LAST_STATUS, columns_of
+from tk.io.results.data import (
+    FORMAT,
+    READABLE_VERSIONS,
+    Float,
+    Hull,
+    JointAngles,
+    JointTrack,
+    Result,
+    ResultMeta,
+    UsedCameras,
+    Value,
+    can_be_smoothed,
+)
+from tk.model.body.skeleton import JOINTS
+from tk.model.cameras.camera import Camera, Rig
+
+
+def read_result(path: str | os.PathLike[str]) -> Result:
+    """Read a whole result.
+
+    Raises:
+        ResultError: no such file, not HDF5, of other software or another version, incomplete or damaged.
+    """
+    path = Path(path)
+    with open_hdf5(path) as file:
+        check_format(file)
+        meta = read_meta(file)
+        rows = count_rows(file, meta)
+        columns = {
+            name: file.array(name, column.dtype, (rows, *column.shape), column.most)
+            for name, column in columns_of(meta).items()
+        }
+        _check_frames(file, columns["frames"])
+        return Result(
+            path=path,
+            meta=meta,
+            frames=columns["frames"],
+            time=columns["time"],
+            pose=columns["pose"],
+            joints=columns["joints/position"],
+            waist=columns.get("waist"),
+            status=columns["status"],
+            objective=columns["objective"],
+            iterations=columns["iterations"],
+            timing={stage: columns[f"timing/{stage}"] for stage in meta.timing_stages},
+            ankles=columns.get("ankles"),
+            sigma=columns.get("joints/sigma"),
+            fit_error=columns.get("fit_error"),
+            segments_rotation=columns.get("segments/rotation"),
+            feet=columns.get("feet/position"),
+            angles={angles.joint: columns[f"angles/{angles.joint}"] for angles in meta.angles},
+            cameras=_read_cameras(file),
+            smoothed=_read_smoothed(file, meta, rows),
+            model=read_values(file, "model"),
+            hull=_read_hull(file, rows),
+            state=read_values(file, "resume/state"),
+            software=file.text("", "software", ""),
+            created=file.text("", "created", ""),
+            notes=file.names("", "notes") if file.attribute("", "notes") is not None else (),
+        )
+
+
+def read_joints(path: str | os.PathLike[str]) -> JointTrack:
+    """Read `/frames` and `/joints/position` of a result or a truth, the joints in the contract's order.
+
+    Raises:
+        ResultError: as :func:`read_result`, or a joint is missing, a frame is there twice, or the unit is not metres.
+    """
+    path = Path(path)
+    with open_hdf5(path) as file:
+        if file.attribute("", "format") is not None:
+            check_format(file)
+        units = file.text("", "units", "m")
+        if units != "m":
+            file.fail(f"units = {units}; joint positions must be in metres (m)")
+        for name in ("frames", "joints/position"):
+            if name not in file.shapes:
+                file.fail(f"has no /{name}; it is neither a tk result nor a capture's truth")
+        frames = file.array("frames", "int64", (None,), LAST_FRAME)
+        _check_frames(file, frames)
+        names = file.names("joints/position", "names")
+        missing = [joint for joint in JOINTS if joint not in names]
+        if missing:
+            file.fail(f"/joints/position has no joint {missing[0]} in its attribute names")
+        order = [names.index(joint) for joint in JOINTS]
+        rows, joints = len(frames), len(names)
+        positions = file.array("joints/position", "float64", (rows, joints, 3), FAR_M)[:, order]
+        positions[~np.isfinite(positions)] = np.nan
+        status = file.array("status", "uint8", (rows,), LAST_STATUS) if "status" in file else None
+        sigma = file.array("joints/sigma", "float64", (rows, joints), FAR_M) if "joints/sigma" in file else None
+        if sigma is not None and (sigma < 0).any():
+            file.fail("/joints/sigma holds negative numbers; the file is damaged")
+        stages = [name for name in file.below("timing") if "/" not in name]
+        timing = {stage: file.array(f"timing/{stage}", "float64", (rows,), LARGE) for stage in stages}
+    seconds: Float | None = None
+    if timing:
+        seconds = timing["total"] if "total" in timing else np.sum(list(timing.values()), axis=0)
+    return JointTrack(path, frames, positions, status, seconds, None if sigma is None else sigma[:, order])
+
+
+@contextlib.contextmanager
+def blamed_on(path: Path, what: str) -> Iterator[None]:
+    """Whatever goes wrong inside is the fault of ``what`` in a result: of a body or a state that no tracker wrote.
+
+    Raises:
+        ResultError: in the place of the exceptions that values of a wrong kind, shape or size cause.
+    """
+    try:
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            yield
+    except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, AssertionError) as error:
+        detail = " ".join(str(error).split())[:100]
+        raise ResultError(f"{path}: {what} cannot be used; the file is damaged ({detail})") from error
+
+
+# --- shared with the writer -------------------------------------------------------------------------------------------
+
+
+def check_format(file: Hdf5Reader) -> None:
+    """Raise ResultError unless the file says that it is a result of a format version that is known here."""
+    if not file.is_format(FORMAT):
+        file.fail(f"an HDF5 file of other software, not a {FORMAT}; name another file")
+    found = file.attribute("", "format_version")
+    if np.ndim(found) or found not in READABLE_VERSIONS:
+        known = ", ".join(map(str, READABLE_VERSIONS))
+        file.fail(f"format_version is {found}, this version of tk knows {known}; use a newer tk")
+
+
+def read_meta(file: Hdf5Reader) -> ResultMeta:
+    """The metadata of an open result."""
+    for name in ("pose", "iterations", "timing", "joints/position", "frames"):
+        if name not in file:
+            file.fail(f"has no /{name}; the file is damaged")
+    try:
+        return ResultMeta(
+            pose_names=file.names("pose", "names"),
+            pose_units=file.names("pose", "units"),
+            stages=file.names("iterations", "stages"),
+            timing_stages=file.names("timing", "stages"),
+            fps=file.number("", "fps"),
+            up=file.text("", "up"),
+            capture=file.text("", "capture"),
+            method=file.text("", "method"),
+            seed=int(file.number("", "seed")),
+            config_toml=file.text("", "config"),
+            joint_names=file.names("joints/position", "names"),
+            waist_names=file.names("waist", "names") if "waist" in file else (),
+            ankle_names=file.names("ankles", "names") if "ankles" in file else (),
+            sigma="joints/sigma" in file,
+            fit_cameras=file.names("fit_error", "cameras") if "fit_error" in file else (),
+            segment_names=file.names("segments/rotation", "names") if "segments/rotation" in file else (),
+            feet="feet/position" in file,
+            angles=_read_angles(file),
+            objective_kind=file.text("objective", "kind", "") if "objective" in file else "",
+        )
+    except ValueError as error:
+        file.fail(f"{error}; the file is damaged")
+
+
+def count_rows(file: Hdf5Reader, meta: ResultMeta) -> int:
+    """The number of frames. Every dataset with a row a frame has as many, of the shape that ``meta`` says.
+
+    Raises:
+        ResultError: one is missing or has another shape.
+    """
+    if len(file.shapes.get("frames", ())) != 1:
+        file.fail("has no /frames with a number a frame; the file is damaged")
+    rows = file.shapes["frames"][0]
+    for name, column in columns_of(meta).items():
+        if file.shapes.get(name) != (rows, *column.shape):
+            found = f"has shape {file.shapes[name]}" if name in file.shapes else "is missing"
+            file.fail(f"/{name} {found}; {(rows, *column.shape)} is expected for {rows} frames")
+    return rows
+
+
+def check_hull(file: Hdf5Reader, rows: int) -> NDArray[np.int64] | None:
+    """`/hull/offsets`, which divide the voxels into frames; None if there is no hull.
+
+    Raises:
+        ResultError: they do not, or colours or positions are missing.
+    """
+    if "hull" not in file:
+        return None
+    offsets = file.array("hull/offsets", "int64", (rows + 1,))
+    shapes = [file.shapes.get(name) for name in ("hull/positions", "hull/colors")]
+    if offsets[0] != 0 or (np.diff(offsets) < 0).any() or shapes != [(offsets[-1], 3)] * 2:
+        file.fail("/hull/offsets does not divide /hull/positions and /hull/colors into frames; the file is damaged")
+    return offsets
+
+
+def read_values(file: Hdf5Reader, group: str) -> dict[str, Value]:
+    """All datasets below a group as a flat mapping; {} if there is no such group.
+
+    Raises:
+        ResultError: one holds something else than numbers or text, or a number that is out of all range.
+    """
+    found: dict[str, Value] = {name: file.value(f"{group}/{name}") for name in file.below(group)}
+    for name, value in found.items():
+        numbers = np.asarray(value)
+        if numbers.dtype.kind == "f" and (np.abs(numbers[np.isfinite(numbers)]) > LARGE).any():
+            file.fail(f"/{group}/{name} holds a number out of all range; the file is damaged")
+    return found
+
+
+def _read_angles(file: Hdf5Reader) -> tuple[JointAngles, ...]:
+    if "angles" not in file:
+        return ()
+    return tuple(
+        JointAngles(joint, file.names(f"angles/{joint}", "names"), file.text(f"angles/{joint}", "convention"))
+        for joint in file.names("angles", "joints")
+    )
+
+
+def _check_frames(file: Hdf5Reader, frames: NDArray[np.int64]) -> None:
+    values, counts = np.unique(frames, return_counts=True)
+    if (values < 0).any():
+        file.fail(f"/frames holds {values[0]}; frames count from 0")
+    if (counts > 1).any():
+        file.fail(f"frame {values[counts > 1][0]} is there twice; each frame must be listed once")
+
+
+def _read_cameras(file: Hdf5Reader) -> UsedCameras | None:
+    if "cameras" not in file:
+        return None
+    names = file.names("cameras", "names")
+    count = len(names)
+    shapes: dict[str, tuple[int, ...]] = {
+        "matrix": (count, 3, 3), "distortions": (count, 5), "rotation": (count, 3), "translation": (count, 3),
+        "size": (count, 2), "fisheye": (count,), "time_offset": (count,),
+    }  # fmt: skip
+    found = {name: file.array(f"cameras/{name}", "float64", shape, LARGE) for name, shape in shapes.items()}
+    if not all(np.isfinite(values).all() for values in found.values()) or (found["size"] < 1).any():
+        file.fail("/cameras describes no cameras; the file is damaged")
+    cameras = [
+        Camera(
+            name=name,
+            width=int(found["size"][c, 0]),
+            height=int(found["size"][c, 1]),
+            matrix=found["matrix"][c],
+            distortions=found["distortions"][c, : 4 if found["fisheye"][c] else 5],
+            rotation=np.asarray(cv2.Rodrigues(found["rotation"][c])[0], dtype=np.float64),
+            translation=found["translation"][c],
+            fisheye=bool(found["fisheye"][c]),
+        )
+        for c, name in enumerate(names)
+    ]
+    return UsedCameras(Rig(tuple(cameras)), found["time_offset"])
+
+
+def _read_smoothed(file: Hdf5Reader, meta: ResultMeta, rows: int) -> dict[str, NDArray[Any]] | None:
+    if "smoothed" not in file:
+        return None
+    found = {
+        name: file.array(f"smoothed/{name}", column.dtype, (rows, *column.shape), column.most)
+        for name, column in columns_of(meta).items()
+        if can_be_smoothed(name) and f"smoothed/{name}" in file
+    }
+    return {**found, "bridged": file.array("smoothed/bridged", "bool", (rows,))}
+
+
+def _read_hull(file: Hdf5Reader, rows: int) -> Hull | None:
+    offsets = check_hull(file, rows)
+    if offsets is None:
+        return None
+    shape = (int(offsets[-1]), 3)
+    return Hull(
+        file.array("hull/positions", "float32", shape, FAR_M), file.array("hull/colors", "uint8", shape), offsets
+    )

@@ -1,0 +1,129 @@
+"""A result as a pandas table or an xarray dataset, where these are installed; they are imported only then."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ExportError
+from tk.io.results.data import FOOT_POINTS, STATUS_MEANING
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+    from tk.io.results.data import Result
+
+_AXES = ("x", "y", "z")
+
+
+def to_pandas(result: Result) -> pandas.DataFrame:
+    """One row a frame, indexed by the frame's number.
+
+    Columns: ``time`` (seconds), ``status`` (a word), ``objective``; ``<joint>_x``, ``_y``, ``_z`` and ``<joint>_sigma``
+    (metres), the feet likewise; the pose, the waist and the ankles by their names (radians and metres);
+    ``<joint>_<angle>_deg``; ``fit_error_<camera>``.
+
+    Raises:
+        ExportError: pandas is not installed.
+    """
+    pd = _load("pandas")
+    columns: dict[str, Any] = {
+        "time": result.time,
+        "status": np.array(STATUS_MEANING)[np.minimum(result.status, len(STATUS_MEANING) - 1)],
+        "objective": result.objective,
+    }
+    for values, names in _points(result):
+        columns |= {f"{name}_{axis}": values[:, i, k] for i, name in enumerate(names) for k, axis in enumerate(_AXES)}
+    if result.sigma is not None:
+        columns |= {f"{name}_sigma": result.sigma[:, i] for i, name in enumerate(result.meta.joint_names)}
+    columns |= dict(_pose(result))
+    columns |= {
+        f"{angles.joint}_{name}_deg": result.angles[angles.joint][:, i]
+        for angles in result.meta.angles
+        if angles.joint in result.angles
+        for i, name in enumerate(angles.names)
+    }
+    if result.fit_error is not None:
+        columns |= {f"fit_error_{name}": result.fit_error[:, i] for i, name in enumerate(result.meta.fit_cameras)}
+    return pd.DataFrame(columns, index=pd.Index(result.frames, name="frame"))
+
+
+def to_xarray(result: Result) -> xarray.Dataset:
+    """Arrays whose dimensions have names: ``frame``, ``joint``, ``axis``, ``dof``, ``foot``, ``camera``, ``segment`` …
+
+    The frames' ``time`` is a coordinate beside their numbers. The attribute ``units`` tells a variable's unit.
+
+    Raises:
+        ExportError: xarray is not installed.
+    """
+    xr = _load("xarray")
+    meta = result.meta
+    pose = dict(_pose(result))
+    units = dict(zip(meta.pose_names, meta.pose_units, strict=True))
+    variables: dict[str, Any] = {
+        "joints": (("frame", "joint", "axis"), result.joints, {"units": "m"}),
+        "pose": (("frame", "dof"), np.stack(list(pose.values()), axis=1)),
+        "status": (("frame",), result.status, {"meaning": ", ".join(STATUS_MEANING)}),
+        "objective": (("frame",), result.objective, {"kind": meta.objective_kind}),
+    }
+    coords: dict[str, Any] = {
+        "frame": result.frames,
+        "time": ("frame", result.time, {"units": "s"}),
+        "joint": list(meta.joint_names),
+        "axis": list(_AXES),
+        "dof": list(pose),
+        "dof_unit": ("dof", [units.get(name, "rad") for name in pose]),
+    }
+    if result.sigma is not None:
+        variables["sigma"] = (("frame", "joint"), result.sigma, {"units": "m"})
+    if result.feet is not None:
+        variables["feet"] = (("frame", "foot", "axis"), result.feet, {"units": "m"})
+        coords["foot"] = list(FOOT_POINTS)
+    if result.fit_error is not None:
+        variables["fit_error"] = (("frame", "camera"), result.fit_error)
+        coords["camera"] = list(meta.fit_cameras)
+    if result.segments_rotation is not None:
+        variables["rotation"] = (("frame", "segment", "quaternion"), result.segments_rotation)
+        coords |= {"segment": list(meta.segment_names), "quaternion": list("wxyz")}
+    angles = {
+        f"{told.joint} {name}": result.angles[told.joint][:, i]
+        for told in meta.angles
+        if told.joint in result.angles
+        for i, name in enumerate(told.names)
+    }
+    if angles:
+        variables["angles"] = (("frame", "angle"), np.stack(list(angles.values()), axis=1), {"units": "degrees"})
+        coords["angle"] = list(angles)
+    attributes = {"fps": meta.fps, "up": meta.up, "capture": meta.capture, "method": meta.method}
+    return xr.Dataset(variables, coords, attributes)
+
+
+def _points(result: Result) -> Iterator[tuple[NDArray[np.float64], tuple[str, ...]]]:
+    yield result.joints, result.meta.joint_names
+    if result.feet is not None:
+        yield result.feet, FOOT_POINTS
+
+
+def _pose(result: Result) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """The configuration vector, the waist's and the ankles' angles, each (F,), by name."""
+    meta = result.meta
+    parts: Mapping[tuple[str, ...], NDArray[np.float64] | None] = {
+        meta.pose_names: result.pose,
+        meta.waist_names: result.waist,
+        meta.ankle_names: result.ankles,
+    }
+    for names, values in parts.items():
+        if values is not None:
+            yield from ((name, values[:, i]) for i, name in enumerate(names))
+
+
+def _load(package: str) -> Any:
+    try:
+        return import_module(package)
+    except ImportError:
+        raise ExportError(f"this needs {package}, which is not installed: pip install {package}") from None

@@ -1,0 +1,1 @@
+"""The person: skeleton, body, dimensions, angles."""

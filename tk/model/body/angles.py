@@ -1,0 +1,197 @@
+"""Joint angles as a clinician reads them, from the rotations of the segments.
+
+A segment's axes are x forward, y to the left, z up along its length, all when the body stands upright with hanging arms
+(thumbs forward, elbows straight): all segments then have the same rotation. Angles follow the International Society of
+Biomechanics where it has a rule: Wu et al., J. Biomech. 35 (2002) 543-548 for hip, ankle and spine; Wu et al., J.
+Biomech. 38 (2005) 981-992 for shoulder and elbow. Their axes are X forward, Y up, Z to the right. They lie in bony
+landmarks, which no camera sees; ours lie in the model, so an angle may differ by a constant of some degrees. The knee
+follows Grood & Suntay, J. Biomech. Eng. 105 (1983) 136-144, the pelvis Baker, Gait & Posture 13 (2001) 1-6.
+
+A left limb is mirrored first: the same movement has the same sign on both sides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.model.body.rotations import compose, decompose, to_quaternions
+from tk.model.body.skeleton import SEGMENTS, Skeleton
+
+Float = NDArray[np.float64]
+
+# ISB's axes (forward, up, right) as columns in ours (forward, left, up).
+_ISB = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+# What mirrors a left limb's rotation in ISB's axes: M R M.
+_MIRROR = np.diag([1.0, 1.0, -1.0])
+
+# The axes of the left arm in the zero configuration, body frame: up along the arm, and forward, where the forearm goes
+# when the elbow bends (see tk.model.body.skeleton).
+_ARM_UP_AXIS = -np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
+_ARM_FORWARD = np.array([0.5, -0.5, np.sqrt(0.5)])
+_ARM_AXES = np.column_stack([_ARM_FORWARD, np.cross(_ARM_UP_AXIS, _ARM_FORWARD), _ARM_UP_AXIS])
+
+
+@dataclass(frozen=True)
+class AngleSet:
+    """The angles of one joint.
+
+    Attributes:
+        joint: its name, that of the dataset `/angles/<joint>`.
+        parent, child: the segments; the parent None is the world.
+        sequence: the turns that take the parent's axes (ISB's) to the child's, about moving axes.
+        columns: for each angle its name, which turn of the sequence it is, and its sign.
+        convention: zero, signs and source, in words.
+    """
+
+    joint: str
+    parent: str | None
+    child: str
+    sequence: str
+    columns: tuple[tuple[str, int, float], ...]
+    convention: str
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The angles' names, in the order of the columns."""
+        return tuple(name for name, _, _ in self.columns)
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether it is of the left side."""
+        return self.joint.endswith("_l")
+
+
+def _sets() -> tuple[AngleSet, ...]:
+    spine = (("flexion", 0, -1.0), ("lateral_bending", 1, 1.0), ("rotation", 2, 1.0))
+    trunk_words = (
+        "flexion forward, lateral bending to the right, rotation to the left are positive; turns Z-X-Y "
+        "(Wu et al. 2002, there with the opposite sign of flexion)"
+    )
+    found = [
+        AngleSet(
+            "pelvis",
+            None,
+            "pelvis",
+            "yxz",
+            (("tilt", 2, -1.0), ("obliquity", 1, 1.0), ("rotation", 0, 1.0)),
+            "against the world: anterior tilt, left side up, turned to the left are positive; turns rotation, "
+            "obliquity, tilt (Baker 2001)",
+        ),
+        AngleSet("lumbar", "pelvis", "torso", "zxy", spine, f"trunk against pelvis: {trunk_words}"),
+        AngleSet("neck", "torso", "head", "zxy", spine, f"head against trunk: {trunk_words}"),
+    ]
+    for side in ("l", "r"):
+        found += [
+            AngleSet(
+                f"shoulder_{side}",
+                "torso",
+                f"upper_arm_{side}",
+                "yxy",
+                (("plane", 0, 1.0), ("elevation", 1, -1.0), ("rotation", 2, 1.0)),
+                "upper arm against trunk, turns Y-X-Y (Wu et al. 2005, there with negative elevation): the plane of "
+                "elevation is 0 for abduction, 90 for forward flexion; elevation is 0 for the hanging arm; internal "
+                "rotation is positive; with the arm hanging only the sum of plane and rotation is determined",
+            ),
+            AngleSet(
+                f"elbow_{side}",
+                f"upper_arm_{side}",
+                f"forearm_{side}",
+                "zxy",
+                (("flexion", 0, 1.0),),
+                "0 is straight, flexion is positive (Wu et al. 2005)",
+            ),
+            AngleSet(
+                f"hip_{side}",
+                "pelvis",
+                f"thigh_{side}",
+                "zxy",
+                (("flexion", 0, 1.0), ("adduction", 1, 1.0), ("rotation", 2, 1.0)),
+                "thigh against pelvis, turns Z-X-Y (Wu et al. 2002): flexion, adduction, internal rotation positive",
+            ),
+            AngleSet(
+                f"knee_{side}",
+                f"thigh_{side}",
+                f"calf_{side}",
+                "zxy",
+                (("flexion", 0, -1.0),),
+                "0 is straight, flexion is positive (Grood & Suntay 1983)",
+            ),
+            AngleSet(
+                f"ankle_{side}",
+                f"calf_{side}",
+                f"foot_{side}",
+                "zxy",
+                (("dorsiflexion", 0, 1.0), ("inversion", 1, 1.0)),
+                "foot against shin, turns Z-X-Y (Wu et al. 2002): 0 is a right angle, dorsiflexion and inversion are "
+                "positive; all 0 where the skeleton's feet ride on the shins",
+            ),
+        ]
+    return tuple(found)
+
+
+ANGLES: tuple[AngleSet, ...] = _sets()
+
+
+def segment_rotations(skeleton: Skeleton, poses: Float) -> Float:
+    """(F, S, 3, 3) rotations of the segments' axes (see the module's docstring) to the world, from poses (F, D)."""
+    return standing_rotations(skeleton, skeleton.segment_transforms(poses))
+
+
+def standing_rotations(skeleton: Skeleton, transforms: Float) -> Float:
+    """(F, S, 3, 3) the same from :meth:`Skeleton.segment_transforms`."""
+    return transforms[..., :3, :3] @ skeleton.T_world_body @ standing_axes()
+
+
+def segment_quaternions(skeleton: Skeleton, poses: Float) -> Float:
+    """(F, S, 4) the same as quaternions (w, x, y, z), w not negative: what `/segments/rotation` holds."""
+    return to_quaternions(segment_rotations(skeleton, poses))
+
+
+def standing_axes() -> Float:
+    """(S, 3, 3) the segments' axes in the zero configuration, body frame: not unity for the arms, which are level."""
+    mirror = np.diag([1.0, -1.0, 1.0])
+    arms = {"_l": _ARM_AXES, "_r": mirror @ _ARM_AXES @ mirror}
+    return np.array([arms[name[-2:]] if "arm" in name else np.eye(3) for name in SEGMENTS])
+
+
+def joint_angles(rotations: Float, T_world_body: Float, segments: Sequence[str] = SEGMENTS) -> dict[str, Float]:
+    """Degrees by joint, each (..., k) with the columns of :data:`ANGLES`.
+
+    Args:
+        rotations: (..., S, 3, 3) of :func:`segment_rotations`.
+        T_world_body: (3, 3) the world's forward, left and up axes as columns; see :class:`Skeleton`.
+        segments: the S segments' names.
+    """
+    result = {}
+    for angles in ANGLES:
+        if angles.child not in segments:  # a foot that rides on the shin
+            result[angles.joint] = np.zeros((*rotations.shape[:-3], len(angles.columns)))
+            continue
+        parent = T_world_body if angles.parent is None else rotations[..., segments.index(angles.parent), :, :]
+        child = rotations[..., segments.index(angles.child), :, :]
+        turns = decompose(angles.sequence, _in_isb(np.swapaxes(parent, -1, -2) @ child, angles.mirrored))
+        result[angles.joint] = np.degrees(np.stack([sign * turns[..., k] for _, k, sign in angles.columns], axis=-1))
+    return result
+
+
+def joint_rotation(angles: AngleSet, degrees: Float) -> Float:
+    """(..., 3, 3) the child's axes in the parent's from degrees (..., k): the inverse of :func:`joint_angles`.
+
+    A turn that is no column, such as a knee's rotation, is none.
+    """
+    turns = np.zeros((*np.shape(degrees)[:-1], 3))
+    for column, (_, k, sign) in enumerate(angles.columns):
+        turns[..., k] = sign * np.radians(degrees[..., column])
+    R = compose(angles.sequence, turns)
+    R = _MIRROR @ R @ _MIRROR if angles.mirrored else R
+    return _ISB @ R @ _ISB.T
+
+
+def _in_isb(R: Float, mirrored: bool) -> Float:
+    """A rotation (..., 3, 3) between two segments in ISB's axes, mirrored if it is of the left side."""
+    R = _ISB.T @ R @ _ISB
+    return _MIRROR @ R @ _MIRROR if mirrored else R

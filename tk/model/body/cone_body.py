@@ -1,0 +1,468 @@
+"""The body of elliptical cone frusta and an ellipsoid head, on the skeleton (silhouette paper, section 3).
+
+The paper prints no sizes; :func:`build_cone_body` lays the parts out from
+:class:`~tk.model.body.anthropometry.BodyDimensions`, as the superellipsoid body is laid out. Hands and feet ride on
+forearm
+and calf: the skeleton has no joints for them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ConfigError
+from tk.kernels.cone_arrays import MOST_PARTS, ConeArrays
+from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A, SIDE_B
+from tk.model.body.anthropometry import (
+    ANKLE_OUTWARD,
+    CROTCH_DROP,
+    ELBOW_FRONT,
+    HAIR,
+    HEAD_LENGTH,
+    HIP_HALF_WIDTH,
+    KNEE_BACK,
+    PELVIS_FORWARD,
+    BodyDimensions,
+)
+from tk.model.body.skeleton import SEGMENTS, Skeleton, build_skeleton, up_rotation
+
+Float = NDArray[np.float64]
+
+# How much of a body is modelled: all fourteen components; without hands and feet; the paper's six-part walker.
+PRESETS = ("full", "limbs", "walker")
+
+# The calf at its thickest against a straight line from knee to ankle.
+CALF_BELLY = 1.1
+
+# How far the head's longest axis, from the chin to the back of the crown, leans back; an estimate, degrees.
+SKULL_TILT_DEG = 15.0
+
+# Of the left arm in the zero configuration.
+_BENT = np.array([0.5, -0.5, np.sqrt(0.5)])  # where the elbow's crook faces
+ELBOW_AXIS = np.cross(np.array([1.0, 1.0, 0.0]) / np.sqrt(2), _BENT)
+
+_FORWARD = np.array([1.0, 0.0, 0.0])
+
+# What :meth:`ConeBody.reshaped` changes of a part: logarithms of a, b, m and h; offsets of either end along x and y.
+SHAPE_NUMBERS = 8
+
+# Edges of different limbs can be mistaken for one another (section 4.4).
+_LIMBS = {
+    "torso": 0,
+    "head": 1,
+    "upper_arm_l": 2,
+    "forearm_l": 2,
+    "upper_arm_r": 3,
+    "forearm_r": 3,
+    "thigh_l": 4,
+    "calf_l": 4,
+    "thigh_r": 5,
+    "calf_r": 5,
+    "pelvis": 0,
+    "foot_l": 4,
+    "foot_r": 5,
+}
+
+# The seven degrees of freedom of the paper's experiments (section 6): translation, hips and knees.
+_WALKER_DOFS = (
+    "torso_x",
+    "torso_y",
+    "torso_z",
+    "hip_l_pitch",
+    "knee_l_flexion",
+    "hip_r_pitch",
+    "knee_r_flexion",
+)
+
+
+@dataclass(frozen=True)
+class ConePart:
+    """A frustum of an elliptical cone, or an ellipsoid.
+
+    Attributes:
+        name: what it is.
+        segment: the skeleton's segment that carries it.
+        kind: :data:`~tk.kernels.cones.CONE` or :data:`~tk.kernels.cones.ELLIPSOID`.
+        shape: cone: semi-axes a, b of the section at z = 0, height h, magnification m of the section at z = h;
+            ellipsoid: semi-axes along x, y, z, and 1. Metres.
+        T_body_part: (4, 4) the part's frame in the zero configuration: a cone's axis runs from the origin along z, an
+            ellipsoid is centred on the origin.
+        ends: whether the rims at z = 0 and z = h are tracked, too.
+    """
+
+    name: str
+    segment: str
+    kind: int
+    shape: tuple[float, float, float, float]
+    T_body_part: Float
+    ends: tuple[bool, bool] = (False, False)
+
+    @property
+    def component(self) -> str:
+        """The rigid component that it is a part of: its segment, or its own name if it is a hand or a foot."""
+        name = self.name.replace("instep_", "foot_")
+        return name if name.startswith(("hand_", "foot_")) else self.segment
+
+    def __post_init__(self) -> None:
+        if not all(0 < value < 3 for value in self.shape):
+            raise ConfigError(f"part {self.name}: sizes {self.shape} must lie between 0 and 3")
+
+    def surface(self, unscaled: Float) -> Float:
+        """Points (N, 3) of the surface in the part's frame from coordinates (x / a r, y / b r, z / h)."""
+        a, b, h, m = self.shape
+        z = unscaled[:, 2]
+        r = 1 + (m - 1) * z if self.kind == CONE else np.ones_like(z)
+        return np.column_stack([a * r * unscaled[:, 0], b * r * unscaled[:, 1], h * z])
+
+
+@dataclass(frozen=True)
+class ConeBody:
+    """One person's body, fixed during tracking.
+
+    Attributes:
+        dimensions: lengths and radii, metres.
+        skeleton: the kinematic tree.
+        parts: the cones and the ellipsoid.
+        preset: one of :data:`PRESETS`.
+    """
+
+    dimensions: BodyDimensions
+    skeleton: Skeleton
+    parts: tuple[ConePart, ...]
+    preset: str = "full"
+
+    def standing(self, up: str) -> ConeBody:
+        """The same body in a world in which ``up`` (see :func:`tk.model.cameras.up.up_vector`) points up."""
+        if np.array_equal(self.skeleton.T_world_body, up_rotation(up)):
+            return self
+        return replace(self, skeleton=_skeleton(self.dimensions, up, self.preset))
+
+    @cached_property
+    def free(self) -> NDArray[np.bool_]:
+        """(D,) the degrees of freedom that are tracked: those that move a part, or the walker's seven."""
+        names = self.skeleton.names
+        if self.preset == "walker":
+            return np.array([name in _WALKER_DOFS for name in names])
+        carried = [SEGMENTS.index(part.segment) for part in self.parts]
+        return np.asarray(self.skeleton.ancestors()[carried].any(axis=0))
+
+    @cached_property
+    def arrays(self) -> ConeArrays:
+        """The body for the kernels, float32."""
+        return self.pack(np.float32)
+
+    def pack(self, dtype: type[np.floating]) -> ConeArrays:
+        """The body for the kernels in this precision.
+
+        Raises:
+            ConfigError: it has more parts than the kernels can tell apart.
+        """
+        if len(self.parts) > MOST_PARTS:
+            raise ConfigError(f"a body of {len(self.parts)} parts; {MOST_PARTS} are the most")
+        s = self.skeleton
+        segments, inside = self._frames
+        curves: list[tuple[int, int]] = []
+        for p, part in enumerate(self.parts):
+            if part.kind == ELLIPSOID:
+                curves.append((p, OUTLINE))
+                continue
+            curves += [(p, SIDE_A), (p, SIDE_B)]
+            curves += [(p, kind) for kind, tracked in zip((END_NEAR, END_FAR), part.ends, strict=True) if tracked]
+        return ConeArrays(
+            axis=np.ascontiguousarray(s.axis, dtype),
+            point=np.ascontiguousarray(s.anchor, dtype),
+            prismatic=s.prismatic.astype(np.int32),
+            parent=s.parent.astype(np.int32),
+            part_kind=np.array([part.kind for part in self.parts], np.int32),
+            part_shape=np.array([part.shape for part in self.parts], dtype),
+            part_frame=inside[:, :3].reshape(len(inside), 12).astype(dtype),
+            part_dof=s.segment_dof[segments].astype(np.int32),
+            part_limb=np.array([_LIMBS[part.segment] for part in self.parts], np.int32),
+            curve_part=np.array([p for p, _ in curves], np.int32),
+            curve_kind=np.array([kind for _, kind in curves], np.int32),
+        )
+
+    @property
+    def shape_groups(self) -> tuple[str, ...]:
+        """Parts that are shaped alike: a name for each, "thigh_" for the left and right thigh."""
+        return tuple(dict.fromkeys(group_of(part.name) for part in self.parts))
+
+    def reshaped(self, change: Float) -> ConeBody:
+        """A body whose parts have other sizes and lie elsewhere about their bones; the skeleton is the same.
+
+        Args:
+            change: (G, 8) for each of :attr:`shape_groups` what the logarithms of a, b, m and h grow by (of an
+                ellipsoid: of the three semi-axes), and how far the axis moves along the part's x and y, metres: two
+                numbers where it begins (a cone's z = 0, an ellipsoid's lower pole), two where it ends. The right
+                side's is the left's in a mirror.
+        """
+        rows = dict(zip(self.shape_groups, change, strict=True))
+        return replace(
+            self,
+            parts=tuple(_reshape(part, rows[group_of(part.name)], part.name.endswith("_r")) for part in self.parts),
+        )
+
+    def place(
+        self, pose: Float, part: NDArray[np.integer], unscaled: Float, T_world_segment: Float | None = None
+    ) -> Float:
+        """World points (N, 3) on the surface of parts (N,), from coordinates as :meth:`ConePart.surface`
+        takes them.
+
+        ``T_world_segment`` is what the skeleton says of the segments at this pose, if at hand.
+        """
+        if T_world_segment is None:
+            T_world_segment = self.skeleton.segment_transforms(pose)
+        T = self.part_transforms(T_world_segment)[part]
+        return self.placed(T, part, unscaled)
+
+    def placed(self, T_world_part: Float, part: NDArray[np.integer], unscaled: Float) -> Float:
+        """The same from each point's part's transform (N, 4, 4)."""
+        local = self.local(part, unscaled)[2]
+        return np.asarray((T_world_part[:, :3, :3] @ local[:, :, None])[:, :, 0] + T_world_part[:, :3, 3])
+
+    def part_transforms(self, T_world_segment: Float) -> Float:
+        """(..., P, 4, 4) from each part to the world, from the segments' (..., S, 4, 4)."""
+        segments, inside = self._frames
+        return np.asarray(T_world_segment[..., segments, :, :] @ inside)
+
+    def local(self, part: NDArray[np.integer], unscaled: Float) -> tuple[Float, Float, Float]:
+        """Shape (N, 4) and radius factor (N,) of the parts, points (N, 3) in their frames."""
+        shape = np.array([p.shape for p in self.parts])[part]
+        cone = np.array([p.kind == CONE for p in self.parts])[part]
+        r = np.where(cone, 1 + (shape[:, 3] - 1) * unscaled[:, 2], 1.0)
+        return shape, r, unscaled * np.column_stack([shape[:, 0] * r, shape[:, 1] * r, shape[:, 2]])
+
+    @cached_property
+    def _frames(self) -> tuple[NDArray[np.int64], Float]:
+        """(P,) each part's segment, and (P, 4, 4) from the part to it."""
+        B = np.eye(4)
+        B[:3, :3] = self.skeleton.T_world_body
+        segments = np.array([SEGMENTS.index(part.segment) for part in self.parts])
+        return segments, B @ np.array([part.T_body_part for part in self.parts])
+
+
+def _reshape(part: ConePart, row: Float, right: bool) -> ConePart:
+    """What :meth:`ConeBody.reshaped` makes of a part."""
+    by_a, by_b, by_m, by_h = np.exp(row[:4]).tolist()
+    a, b, h, m = part.shape
+    side = -1.0 if right else 1.0
+    T = part.T_body_part
+    low = 0.0 if part.kind == CONE else -h
+    begin = T[:3, :3] @ [row[4], side * row[5], low] + T[:3, 3]
+    end = T[:3, :3] @ [row[6], side * row[7], h] + T[:3, 3]
+    axis = (end - begin) / np.linalg.norm(end - begin)
+    front = T[:3, 0] - (T[:3, 0] @ axis) * axis
+    return replace(
+        part,
+        shape=(a * by_a, b * by_b, h * by_h, m * by_m if part.kind == CONE else m),
+        T_body_part=_frame(begin if part.kind == CONE else 0.5 * (begin + end), axis, front / np.linalg.norm(front)),
+    )
+
+
+def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "full") -> ConeBody:
+    """The cone body with these dimensions.
+
+    Args:
+        dimensions: lengths and radii, metres.
+        up: the world axis that points up.
+        preset: "full" (14 rigid components: torso, head, upper and lower arms, hands, thighs, calves, feet), "limbs"
+            (10, without hands and feet), or "walker" (6: torso, head, thighs, calves; seven degrees of freedom are
+            free). In the full body the torso consists of four frusta, the calf of two, the head has a neck and the foot
+            an instep ("variable resolution", section 3); in the others every component is one solid.
+
+    Raises:
+        ConfigError: an unknown preset.
+    """
+    if preset not in PRESETS:
+        raise ConfigError(f'cone body "{preset}": choose one of {", ".join(PRESETS)}')
+    d = dimensions
+    x, y, z = np.eye(3)
+    parts = _trunk_and_head(d) if preset == "full" else [_torso(d), _head(d)]
+    for side, sign in (("l", 1.0), ("r", -1.0)):
+        M = np.diag([1.0, sign, 1.0])
+        if preset != "walker":
+            u = M @ np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
+            shoulder = M @ np.array([0.0, d.shoulder_half_width, d.trunk - d.shoulder_drop])
+            elbow = shoulder + d.upper_arm * u
+            wrist = elbow + d.forearm * u
+            # the flesh lies on the side that the elbow bends to
+            crook = elbow + ELBOW_FRONT * d.stature * (M @ _BENT) if preset == "full" else elbow
+            for segment, begin, end, r0, r1 in (
+                ("upper_arm", shoulder, crook, d.upper_arm_radius, d.elbow_radius),
+                ("forearm", crook, wrist, d.elbow_radius, d.wrist_radius),
+            ):
+                parts.append(_between(f"{segment}_{side}", f"{segment}_{side}", begin, end, r0, r1, z))
+        if preset == "full":
+            # half open: a little shorter than the stretched hand, wider than the wrist across the palm; the thumb's
+            # side is that to which the elbow bends
+            shape = (0.9 * d.wrist_radius, 1.4 * d.wrist_radius, 0.95 * d.hand, 0.6)
+            thin = M @ ELBOW_AXIS
+            parts.append(
+                ConePart(f"hand_{side}", f"forearm_{side}", CONE, shape, _frame(wrist, u, thin), ends=(False, True))
+            )
+        hip = M @ np.array([0.0, d.hip_half_width, 0.0])
+        knee = hip - d.thigh * z
+        ankle = knee - d.calf * z
+        if preset == "full":
+            # the flesh lies before the hip, behind the knee and outside of the ankle
+            top = hip + PELVIS_FORWARD * d.stature * x
+            hollow = knee - KNEE_BACK * d.stature * x
+            low = ankle + ANKLE_OUTWARD * d.stature * (M @ y)
+            parts.append(_between(f"thigh_{side}", f"thigh_{side}", top, hollow, d.thigh_radius, d.knee_radius))
+            parts += _calf(side, hollow, low, d) + _foot(side, ankle, d)
+        else:  # without a foot the calf reaches the ground
+            parts.append(_limb(f"thigh_{side}", hip, -z, d.thigh, d.thigh_radius, d.knee_radius, x))
+            reach = d.calf + d.ankle_height
+            parts.append(_limb(f"calf_{side}", knee, -z, reach, d.knee_radius, d.ankle_radius, x, (False, True)))
+    return ConeBody(d, _skeleton(d, up, preset), tuple(parts), preset)
+
+
+def _skeleton(dimensions: BodyDimensions, up: str, preset: str) -> Skeleton:
+    full = preset == "full"
+    return build_skeleton(dimensions, up, waist=full, ankles=full)
+
+
+def _calf(side: str, knee: Float, ankle: Float, d: BodyDimensions) -> list[ConePart]:
+    """Two frusta that meet where the muscle is thickest."""
+    share = 0.35
+    belly = knee + share * (ankle - knee)
+    radius = CALF_BELLY * (d.knee_radius + share * (d.ankle_radius - d.knee_radius))
+    segment = f"calf_{side}"
+    return [
+        _between(segment, segment, knee, belly, d.knee_radius, radius),
+        _between(f"shin_{side}", segment, belly, ankle, radius, d.ankle_radius),
+    ]
+
+
+def _between(
+    name: str, segment: str, begin: Float, end: Float, r0: float, r1: float, toward: Float = _FORWARD
+) -> ConePart:
+    """A frustum whose x axis faces ``toward`` a direction, as near as may be."""
+    length = float(np.linalg.norm(end - begin))
+    axis = (end - begin) / length
+    front = toward - (toward @ axis) * axis
+    return ConePart(name, segment, CONE, (r0, r0, length, r1 / r0), _frame(begin, axis, front / np.linalg.norm(front)))
+
+
+def _foot(side: str, ankle: Float, d: BodyDimensions) -> list[ConePart]:
+    """A flat sole from heel to toes and the instep from the ankle down to the ball."""
+    x, y, z = np.eye(3)
+    ground = ankle - d.ankle_height * z
+    thick, thin = 0.45 * d.ankle_height, 0.3 * d.ankle_height
+
+    def between(name: str, start: Float, end: Float, sizes: tuple[float, float], m: float, far: bool) -> ConePart:
+        length = float(np.linalg.norm(end - start))
+        axis = (end - start) / length
+        frame = _frame(start, axis, np.cross(axis, y))
+        return ConePart(f"{name}_{side}", f"foot_{side}", CONE, (*sizes, length, m), frame, ends=(far, far))
+
+    heel, toes = ground + thick * z - 0.2 * d.foot * x, ground + thin * z + 0.8 * d.foot * x
+    ball = ground + thick * z + 0.45 * d.foot * x
+    return [
+        between("foot", heel, toes, (thick, 0.17 * d.foot), 0.8, True),
+        between("instep", ankle, ball, (d.ankle_radius, d.ankle_radius), 0.6, False),
+    ]
+
+
+def _torso(d: BodyDimensions) -> ConePart:
+    """From the crotch to the root of the neck; one magnification for width and depth, as the paper has it."""
+    x, _, z = np.eye(3)
+    bottom = -0.9 * CROTCH_DROP / HIP_HALF_WIDTH * d.hip_half_width
+    top = 0.94 * d.trunk
+    m = d.chest_half_width / d.hips_half_width
+    depth = 0.5 * (d.hips_half_depth + d.chest_half_depth / m)
+    shape = (depth, d.hips_half_width, top - bottom, m)
+    return ConePart("torso", "torso", CONE, shape, _frame(bottom * z, z, x), ends=(False, True))
+
+
+def _trunk_and_head(d: BodyDimensions) -> list[ConePart]:
+    """Torso and head in more detail: abdomen, belly, chest, shoulders; skull, neck.
+
+    At the hips the trunk lies before the line of the joints, at the shoulders about it; hair stands on the crown.
+    """
+    x, _, z = np.eye(3)
+    bottom = -0.9 * CROTCH_DROP / HIP_HALF_WIDTH * d.hip_half_width
+    waist, shoulders = 0.42 * d.trunk, d.trunk - 0.7 * d.shoulder_drop
+    breast = 0.5 * (waist + shoulders)
+    taper = 0.93
+    hips = (d.hips_half_depth, d.hips_half_width)
+    chest = (d.chest_half_depth, d.chest_half_width)
+
+    def slice_of(name: str, low: float, high: float, sizes: tuple[float, float], m: float) -> ConePart:
+        # as far forward as the pelvis up to the waist, on the line at the shoulders
+        begin, end = (
+            h * z + PELVIS_FORWARD * d.stature * np.clip((shoulders - h) / (shoulders - waist), 0, 1) * x
+            for h in (low, high)
+        )
+        part = _between(name, "pelvis" if low < 0 else "torso", begin, end, 1.0, m)
+        return replace(part, shape=(*sizes, part.shape[2], m))
+
+    skull = 0.46 * d.head
+    forward = 0.1 * d.head
+    # its long axis goes from the chin to the back of the crown
+    lean = float(np.radians(SKULL_TILT_DEG))
+    vertex, face = np.cos(lean) * z - np.sin(lean) * x, np.cos(lean) * x + np.sin(lean) * z
+    crown = d.trunk + (1 + HAIR / HEAD_LENGTH) * d.head
+    return [
+        slice_of("abdomen", bottom, waist, hips, taper),
+        slice_of("belly", waist, breast, (taper * chest[0], taper * chest[1]), 1 / taper),
+        slice_of("chest", breast, shoulders, chest, 0.95),
+        slice_of("shoulders", shoulders, d.trunk, (0.85 * chest[0], chest[1]), 0.5),
+        ConePart(
+            "head",
+            "head",
+            ELLIPSOID,
+            (1.12 * d.head_radius, d.head_radius, skull, 1.0),
+            _frame((crown - skull) * z + forward * x, vertex, face),
+        ),
+        ConePart(
+            "neck",
+            "head",
+            CONE,
+            (d.neck_radius, d.neck_radius, 0.5 * d.head, 0.95),
+            _frame((d.trunk - 0.15 * d.head) * z + 0.5 * forward * x, z, x),
+        ),
+    ]
+
+
+def _head(d: BodyDimensions) -> ConePart:
+    """An ellipsoid that reaches from the crown into the torso: it stands for the neck, too.
+
+    C7 lies at the back of the neck and the crown behind the middle of the head: its centre is before their line.
+    """
+    x, _, z = np.eye(3)
+    half = 0.58 * d.head
+    shape = (1.12 * d.head_radius, d.head_radius, half, 1.0)
+    center = (d.trunk + d.head - half) * z + 0.1 * d.head * x
+    return ConePart("head", "head", ELLIPSOID, shape, _frame(center, z, x))
+
+
+def group_of(name: str) -> str:
+    """A part's name without its side; it ends with an underscore if there are two."""
+    return name[:-1] if name.endswith(("_l", "_r")) else name
+
+
+def _limb(
+    segment: str,
+    origin: Float,
+    axis: Float,
+    length: float,
+    r0: float,
+    r1: float,
+    front: Float,
+    ends: tuple[bool, bool] = (False, False),
+) -> ConePart:
+    return ConePart(segment, segment, CONE, (r0, r0, length, r1 / r0), _frame(origin, axis, front), ends)
+
+
+def _frame(origin: Float, axis: Float, front: Float) -> Float:
+    """(4, 4) frame at ``origin`` with z along ``axis`` and x along ``front`` (perpendicular to it)."""
+    (a, b, c), (x, y, z) = axis, front
+    T = np.eye(4)
+    T[:3, 0], T[:3, 2], T[:3, 3] = front, axis, origin
+    T[:3, 1] = b * z - c * y, c * x - a * z, a * y - b * x  # np.cross takes ten times as long
+    return T

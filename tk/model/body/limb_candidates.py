@@ -1,0 +1,163 @@
+"""Where a limb may be: candidates for a search that looks at all of its places, not only at those near the last one.
+
+An arm's candidates are directions spread evenly over the sphere, each with the elbow stretched or bent to one of
+several sides; a leg's are hip and knee angles on a grid. Both are relative to the trunk and within the limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.kernels.cone_arrays import ConeArrays
+from tk.model.body.cone_body import ConeBody
+from tk.model.body.skeleton import CHAINS, JOINTS, Skeleton, shoulder_angles
+
+Float = NDArray[np.float64]
+
+LIMBS = ("arm_l", "arm_r", "leg_l", "leg_r")
+# Of the two places of a limb: joints that lie farther apart than this make them different, metres.
+DISTINCT_M = 0.12
+
+# Directions of the upper arm on the sphere, some 20° apart; those through the back or far across are left out.
+_DIRECTIONS = 84
+_ELBOWS_DEG = (60.0, 115.0)
+_ARM_ROLLS_DEG = (-80.0, -30.0, 20.0, 70.0)
+_HIPS_DEG = (-20.0, 10.0, 40.0, 70.0, 100.0)
+_SPREADS_DEG = (-10.0, 10.0, 35.0)
+_LEG_ROLLS_DEG = (-25.0, 25.0)
+_KNEES_DEG = (5.0, 45.0, 85.0, 130.0)
+# How far a candidate near the present place is turned in each angle, one standard deviation.
+_NEAR_DEG = 25.0
+
+
+@dataclass(frozen=True, eq=False)
+class Limb:
+    """A limb of a body.
+
+    Attributes:
+        name: of :data:`LIMBS`.
+        dofs: (L,) its degrees of freedom.
+        free: (D,) bool, where those are.
+        parts: (K,) int32 its parts.
+        arrays: the body for the kernels, with the contours of these parts only.
+        joints: elbow and wrist, or knee and ankle, as indices into the skeleton's joints.
+        places: (N, L) candidates.
+        lower, upper: (L,) limits.
+    """
+
+    name: str
+    dofs: NDArray[np.int64]
+    free: NDArray[np.bool_]
+    parts: NDArray[np.int32]
+    arrays: ConeArrays
+    joints: tuple[int, int]
+    places: Float
+    lower: Float
+    upper: Float
+
+    def candidates(self, pose: Float, near: int, rng: np.random.Generator) -> Float:
+        """(B, D) copies of a pose with the limb everywhere, and at ``near`` random places about its own."""
+        turned = pose[self.dofs] + rng.normal(scale=np.radians(_NEAR_DEG), size=(near, len(self.dofs)))
+        places = np.concatenate([self.places, np.clip(turned, self.lower, self.upper)])
+        result = np.repeat(pose[None], len(places), axis=0)
+        result[:, self.dofs] = places
+        return result
+
+    def combined(self, poses: Float, places: Float) -> Float:
+        """(B·N, D) each of the poses (B, D) with the limb as in each of others (N, D)."""
+        result = np.repeat(poses, len(places), axis=0)
+        result[:, self.dofs] = np.tile(places[:, self.dofs], (len(poses), 1))
+        return result
+
+    def distinct(self, skeleton: Skeleton, poses: Float, cost: Float, count: int) -> Float:
+        """(C, D) the cheapest of the poses whose limbs lie apart by more than :data:`DISTINCT_M`, at most ``count``."""
+        best = np.argsort(cost, kind="stable")
+        best = best[np.isfinite(cost[best])]
+        chosen: list[int] = []
+        for many in (5 * count, 20 * count):  # beyond these only neighbours of the first follow
+            if len(chosen) < count:
+                chosen = distinct(skeleton.joints(poses[best[:many]])[:, list(self.joints)], count)
+        return np.asarray(poses[best[chosen]])
+
+
+def distinct(places: Float, count: int, present: Float | None = None) -> list[int]:
+    """The first of the places (N, J, 3) that lie apart from each other and from the present one (J, 3)."""
+
+    def apart(place: Float) -> NDArray[np.bool_]:
+        return np.asarray(np.linalg.norm(places - place, axis=-1).max(axis=-1) > DISTINCT_M)
+
+    free = np.ones(len(places), np.bool_) if present is None else apart(present)
+    chosen: list[int] = []
+    while len(chosen) < count and free.any():
+        chosen.append(int(np.argmax(free)))
+        free &= apart(places[chosen[-1]])
+    return chosen
+
+
+def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
+    """The limbs that a body has parts of."""
+    skeleton = body.skeleton
+    result = []
+    for name in LIMBS:
+        side = name[-1]
+        parts = np.array([p.segment in CHAINS[name] for p in body.parts])
+        if not parts.any():
+            continue
+        chain = np.flatnonzero(skeleton.chain_dofs(name))
+        dofs = chain[body.free[chain]]
+        lower, upper = skeleton.lower[dofs], skeleton.upper[dofs]
+        arm = name.startswith("arm")
+        places = _arm_places() if arm else _leg_places(len(chain))
+        if len(dofs) < len(chain):  # the walker's hips turn about one axis only
+            places = np.unique(places[:, body.free[chain]], axis=0)
+        own = parts[body.arrays.curve_part]
+        free = np.zeros(len(skeleton.names), bool)
+        free[dofs] = True
+        ends = ("elbow", "wrist") if arm else ("knee", "ankle")
+        result.append(
+            Limb(
+                name=name,
+                dofs=dofs,
+                free=free,
+                parts=np.flatnonzero(parts).astype(np.int32),
+                arrays=body.arrays._replace(
+                    curve_part=body.arrays.curve_part[own], curve_kind=body.arrays.curve_kind[own]
+                ),
+                joints=(JOINTS.index(f"{ends[0]}_{side}"), JOINTS.index(f"{ends[1]}_{side}")),
+                places=np.clip(places, lower, upper),
+                lower=lower,
+                upper=upper,
+            )
+        )
+    return tuple(result)
+
+
+def pairs(limbs: Sequence[Limb]) -> list[tuple[Limb, ...]]:
+    """Both arms, and both legs."""
+    kinds = [[limb for limb in limbs if limb.name.startswith(kind)] for kind in ("arm", "leg")]
+    return [tuple(pair) for pair in kinds if len(pair) == 2]
+
+
+def _arm_places() -> Float:
+    """(N, 4) shoulder's yaw, pitch and roll, elbow."""
+    # the golden spiral: evenly spread over the sphere (forward, outward, up)
+    k = np.arange(_DIRECTIONS) + 0.5
+    polar, turn = np.arccos(1 - 2 * k / _DIRECTIONS), np.pi * (1 + np.sqrt(5)) * k
+    spread = np.column_stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)])
+    rows = []
+    for direction in spread[(spread[:, 0] > -0.75) & (spread[:, 1] > -0.8)]:
+        yaw, pitch = shoulder_angles(direction)
+        rows.append((yaw, pitch, 0.0, np.radians(10.0)))
+        rows += [(yaw, pitch, roll, elbow) for elbow in np.radians(_ELBOWS_DEG) for roll in np.radians(_ARM_ROLLS_DEG)]
+    return np.array(rows)
+
+
+def _leg_places(dofs: int) -> Float:
+    """(N, dofs) hip's pitch, yaw and roll, knee, and a foot at right angles."""
+    grid = np.meshgrid(-np.radians(_HIPS_DEG), *map(np.radians, (_SPREADS_DEG, _LEG_ROLLS_DEG, _KNEES_DEG)))
+    rows = np.stack([axis.ravel() for axis in grid], axis=1)
+    return np.hstack([rows, np.zeros((len(rows), dofs - 4))])

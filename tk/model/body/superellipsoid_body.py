@@ -1,0 +1,180 @@
+"""The skin of superellipsoids on a body, and its sampled surface (Kehl 2006, section 5).
+
+The paper shows its model in figure 5 and prints no sizes. Here every part of a
+:class:`~tk.model.body.cone_body.ConeBody` gets a superellipsoid of the same ends, so one fit of the body serves both
+skins.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.kernels.cones import CONE
+from tk.model.body.cone_body import ConeBody, ConePart, group_of
+from tk.model.body.gait_poses import neutral_pose
+from tk.model.body.skeleton import SEGMENTS, Skeleton, build_skeleton
+from tk.model.body.superellipsoid import Superellipsoid
+
+Float = NDArray[np.float64]
+
+# ε₁ and ε₂ of the parts that are no ellipsoids, by their group: trunks are flatter than ellipses, and hands and feet,
+# which end a limb, are closed boxes with round edges.
+EXPONENTS: dict[str, tuple[float, float]] = {
+    "abdomen": (1.0, 0.8),
+    "belly": (1.0, 0.8),
+    "chest": (1.0, 0.8),
+    "shoulders": (1.0, 0.8),
+    "hand_": (0.6, 1.0),
+    "foot_": (0.6, 0.9),
+}
+# A tapered piece is cut from an ellipsoid so many times as long: nearly straight from end to end, as a cone is.
+SLENDER = 4.0
+# Between neighbouring surface samples, metres.
+SPACING_M = 0.03
+
+
+@dataclass(frozen=True)
+class BodySettings:
+    """Settings of the body.
+
+    Attributes:
+        waist: whether the pelvis turns against the trunk, by three angles beyond the paper's 24 degrees of freedom. A
+            dancer's hips stay level while the trunk leans; a rigid trunk takes them along.
+    """
+
+    waist: bool = True
+
+
+@dataclass(frozen=True)
+class SuperellipsoidBody:
+    """One person's surface: pieces and samples (N points) on a skeleton, all fixed during tracking.
+
+    Attributes:
+        skeleton: the kinematic tree.
+        pieces: the superellipsoids.
+        points: (N, 3) surface samples in the zero configuration, world frame, metres.
+        segment: (N,) index of each sample's segment.
+        piece: (N,) index of each sample's piece.
+        diameter: (N,) the limb diameter σ at each sample, metres (eq. 10).
+        patch: (N,) index of each sample's colour patch.
+        patch_names: (P,) what the patches are.
+    """
+
+    skeleton: Skeleton
+    pieces: tuple[Superellipsoid, ...]
+    points: Float
+    segment: NDArray[np.int32]
+    piece: NDArray[np.int32]
+    diameter: Float
+    patch: NDArray[np.int32]
+    patch_names: tuple[str, ...]
+
+    def place(self, pose: Float) -> Float:
+        """Surface samples (N, 3) at a pose, world frame. Float64 reference for the kernels."""
+        T = self.skeleton.segment_transforms(pose)[self.segment]
+        return np.asarray(np.einsum("nab,nb->na", T[:, :3, :3], self.points) + T[:, :3, 3])
+
+
+def build_superellipsoid_body(
+    body: ConeBody, up: str = "z", waist: bool = False, spacing_m: float = SPACING_M
+) -> SuperellipsoidBody:
+    """The skin of a body.
+
+    Args:
+        body: dimensions, and where its parts lie and how thick they are.
+        up: the world axis that points up.
+        waist: whether the pelvis turns against the trunk, by three degrees of freedom beyond the paper's 24. The feet
+            are the calves', as in the paper.
+        spacing_m: distance between neighbouring surface samples.
+    """
+    skeleton = build_skeleton(body.dimensions, up, waist)
+    pieces = tuple(piece_of(part) for part in body.parts)
+    points, normals = [], []
+    for piece in pieces:
+        eta, omega = piece.samples(spacing_m)
+        T = piece.T_body_piece
+        points.append(piece.point(eta, omega) @ T[:3, :3].T + T[:3, 3])
+        normals.append(piece.normal(eta, omega) @ T[:3, :3].T)
+    p_zero, n_zero = np.concatenate(points), np.concatenate(normals)
+    owner = np.repeat(np.arange(len(pieces), dtype=np.int32), [len(p) for p in points])
+    segment = np.array([SEGMENTS.index(p.segment) for p in pieces], dtype=np.int32)[owner]
+    B = skeleton.T_world_body
+    keep = ~_buried(skeleton, pieces, p_zero @ B.T, segment, owner)
+    # the crotch: silhouettes cannot carve between the thighs, so the hull is always too low there
+    keep &= ~((segment == SEGMENTS.index("pelvis")) & (n_zero[:, 2] < -0.3))
+    patch, patch_names = _patches(p_zero, n_zero, segment)
+    used, patch_of = np.unique(patch[keep], return_inverse=True)
+    return SuperellipsoidBody(
+        skeleton=skeleton,
+        pieces=pieces,
+        points=(p_zero @ B.T)[keep],
+        segment=segment[keep],
+        piece=owner[keep],
+        diameter=np.array([p.diameter_m for p in pieces])[owner][keep],
+        patch=patch_of.astype(np.int32),
+        patch_names=tuple(patch_names[i] for i in used),
+    )
+
+
+def piece_of(part: ConePart) -> Superellipsoid:
+    """The superellipsoid that stands for a part: of an ellipsoid itself; of a frustum one with its two ends, cut there
+    or, where the limb ends, closed."""
+    e1, e2 = EXPONENTS.get(group_of(part.name), (1.0, 1.0))
+    a, b, h, m = part.shape
+    if part.kind != CONE:
+        return Superellipsoid(part.segment, part.T_body_part, (a, b, h), e1, e2, -h, h, 2 * b)
+    T = part.T_body_part.copy()
+    mean = 0.5 * (1 + m)
+    if e1 != 1.0:
+        T[:3, 3] += 0.5 * h * T[:3, 2]
+        radii = (a * mean, b * mean, 0.5 * h)
+        return Superellipsoid(part.segment, T, radii, e1, e2, -0.5 * h, 0.5 * h, mean * (a + b))
+    # r(z) = R √(1 − (u + w z/h)²) with r(0) = 1 and r(h) = m
+    w, q = 1 / SLENDER, 1 - m**2
+    u = (q - w**2) / (w + np.sqrt(w**2 + q**2 - q * w**2))
+    R, begin = 1 / np.sqrt(1 - u**2), u * SLENDER * h
+    T[:3, 3] -= begin * T[:3, 2]
+    radii = (a * R, b * R, SLENDER * h)
+    return Superellipsoid(part.segment, T, radii, e1, e2, begin, begin + h, mean * (a + b))
+
+
+def _buried(
+    skeleton: Skeleton,
+    pieces: tuple[Superellipsoid, ...],
+    points: Float,
+    segment: NDArray[np.int32],
+    piece: NDArray[np.int32],
+) -> NDArray[np.bool_]:
+    """(N,) True for samples inside another piece in the Da Vinci pose: armpits, the crotch, the inside of joints."""
+    T = skeleton.segment_transforms(neutral_pose(skeleton))
+    B = np.eye(4)
+    B[:3, :3] = skeleton.T_world_body
+    p_world = np.einsum("nab,nb->na", T[segment][:, :3, :3], points) + T[segment][:, :3, 3]
+    buried = np.zeros(len(points), dtype=bool)
+    for index, other in enumerate(pieces):
+        T_piece_world = np.linalg.inv(T[SEGMENTS.index(other.segment)] @ B @ other.T_body_piece)
+        p_piece = p_world @ T_piece_world[:3, :3].T + T_piece_world[:3, 3]
+        buried |= other.contains(p_piece) & (piece != index)
+    return buried
+
+
+def _patches(points: Float, normals: Float, segment: NDArray[np.int32]) -> tuple[NDArray[np.int32], list[str]]:
+    """Colour patches: each segment cut along its length, the trunk and head also into front and back."""
+    names: list[str] = []
+    patch = np.zeros(len(points), dtype=np.int32)
+    for s, name in enumerate(SEGMENTS):
+        here = segment == s
+        axis = np.array([1.0, np.sign(points[here][0, 1]), 0.0]) if "arm" in name else np.array([0.0, 0.0, 1.0])
+        along = points[here] @ axis
+        low, high = along.min(), along.max()
+        rows = {"torso": 2, "pelvis": 2, "head": 2, "foot_l": 1, "foot_r": 1}.get(name, 3)
+        level = np.clip(((along - low) / (high - low + 1e-9) * rows).astype(int), 0, rows - 1)
+        sides = 2 if name in ("torso", "pelvis", "head") else 1
+        face = (normals[here][:, 0] < 0).astype(int) if sides == 2 else np.zeros(here.sum(), dtype=int)
+        patch[here] = len(names) + level * sides + face
+        suffixes = ("_front", "_back") if sides == 2 else ("",)
+        names += [f"{name}_{row}{suffix}" for row in range(rows) for suffix in suffixes]
+    return patch, names

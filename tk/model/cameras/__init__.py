@@ -1,0 +1,1 @@
+"""Cameras, the working volume, the up direction, refinement."""

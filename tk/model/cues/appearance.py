@@ -1,0 +1,124 @@
+"""The colours of the body's patches (Kehl 2006, section 6.1.3).
+
+Each patch is one Gaussian a YUV channel. The paper learns the model on the initialised body, segments the surface
+voxels by it once a frame and updates the means by eq. 16. In its section 7.2 wrong assignments destroy the models; the
+guards here are ours, since the paper has none: only samples that sit on a voxel that a camera sees teach a colour, a
+patch with too few of them learns nothing, a mean never leaves the neighbourhood of the initial one, and a patch that
+hardly any voxel fits constrains nothing in that frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ConfigError
+from tk.kernels.appearance import segment
+
+Float = NDArray[np.float64]
+
+# ITU-R BT.601 luma and colour differences, from B, G, R.
+_YUV_FROM_BGR = np.array([[0.114, 0.587, 0.299], [0.436, -0.289, -0.147], [-0.100, -0.515, 0.615]])
+
+
+# Least standard deviations of Y, U, V, levels of 255: shading moves Y more than U and V.
+FLOOR_YUV = (16.0, 6.0, 6.0)
+# Greatest distance of a mean from its first value, levels.
+MOST_DRIFT = 30.0
+# Greatest distance between a sample and the voxel whose colour it learns, metres.
+LEARNING_M = 0.05
+# A patch that fewer than this share of the voxels fit constrains nothing.
+LEAST_SHARE = 0.01
+
+
+@dataclass(frozen=True)
+class AppearanceSettings:
+    """Settings of the colour models.
+
+    Attributes:
+        enabled: whether colour confines the nearest-neighbour search.
+        rate: α of eq. 16 (paper: 0.3).
+        width: a voxel fits when every channel lies within this many standard deviations of the mean. The paper does
+            not say what fits.
+    """
+
+    enabled: bool = True
+    rate: float = 0.3
+    width: float = 2.5
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.rate <= 1 or not self.width > 0:
+            raise ConfigError(f"appearance: rate = {self.rate} must lie in [0, 1], width = {self.width} be positive")
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """Colour models of P patches, YUV levels 0…255.
+
+    Attributes:
+        mean: (P, 3); initial: (P, 3) the means as first learned; deviation: (P, 3) standard deviations.
+        known: (P,) False for patches that never had a voxel; they fit everything.
+    """
+
+    mean: Float
+    initial: Float
+    deviation: Float
+    known: NDArray[np.bool_]
+
+    @staticmethod
+    def learn(patches: int, patch: NDArray[np.integer], colors_bgr: NDArray[np.floating]) -> Appearance:
+        """Models from the voxels under the initialised body.
+
+        Args:
+            patches: P.
+            patch: (N,) patch of each sample; colors_bgr: (N, 3) the colour of its nearest voxel.
+        """
+        yuv = to_yuv(colors_bgr)
+        mean = np.zeros((patches, 3))
+        deviation = np.zeros((patches, 3))
+        known = np.zeros(patches, bool)
+        for p in range(patches):
+            mine = yuv[patch == p]
+            if len(mine) >= 3:
+                mean[p] = np.median(mine, axis=0)
+                deviation[p] = 1.4826 * np.median(np.abs(mine - mean[p]), axis=0)
+                known[p] = True
+        return Appearance(mean, mean.copy(), np.maximum(deviation, FLOOR_YUV), known)
+
+    def segment(
+        self, colors_bgr: NDArray[np.floating], seen: NDArray[np.integer], config: AppearanceSettings
+    ) -> NDArray[np.int64]:
+        """(V,) bit masks of the patches that each voxel fits."""
+        if not config.enabled:
+            return np.full(len(colors_bgr), -1, np.int64)
+        bound = np.where(self.known[:, None], config.width * self.deviation, 1e9)
+        fits = segment(self.mean, bound, to_yuv(colors_bgr), seen)
+        bits = np.arange(len(self.mean))
+        counts = np.bincount(
+            np.concatenate([np.full(int(np.count_nonzero((fits >> b) & 1)), b) for b in bits]), minlength=len(bits)
+        )
+        for b in bits[counts < LEAST_SHARE * len(fits)]:
+            fits |= np.int64(1) << np.int64(b)
+        return fits
+
+    def updated(
+        self, patch: NDArray[np.integer], colors_bgr: NDArray[np.floating], config: AppearanceSettings
+    ) -> Appearance:
+        """Eq. 16 with the colours (N, 3) that this frame's trusted samples of patches (N,) sit on."""
+        if not config.enabled or not len(patch):
+            return self
+        P = len(self.mean)
+        count = np.bincount(patch, minlength=P)
+        yuv = to_yuv(colors_bgr)
+        incoming = np.stack([np.bincount(patch, weights=yuv[:, a], minlength=P) for a in range(3)], axis=1)
+        learns = self.known & (count >= 3)
+        incoming = np.where(learns[:, None], incoming / np.maximum(count, 1)[:, None], self.mean)
+        mean = (1 - config.rate) * self.mean + config.rate * incoming
+        return replace(self, mean=np.clip(mean, self.initial - MOST_DRIFT, self.initial + MOST_DRIFT))
+
+
+def to_yuv(colors_bgr: NDArray[np.floating]) -> Float:
+    """Colours (N, 3) BGR 0…255 as YUV; U and V lie around 0."""
+    return np.asarray(colors_bgr, np.float64) @ _YUV_FROM_BGR.T

@@ -1,0 +1,549 @@
+"""A body's objective in one frame: which samples and voxels are drawn, and what the kernel makes of them.
+
+The optimisers see callables of poses (:meth:`FrameObjective.full`, :meth:`FrameObjective.chains`); what they are made
+of, voxels, colours, samples, stays here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ConfigError
+from tk.kernels.linearisation import Linearisation
+from tk.kernels.nearest import SurfaceIndex
+from tk.kernels.objective import Held, ObjectiveKernel, ObjectiveParameters
+from tk.model.body.skeleton import CHAINS, SEGMENTS, WAIST_STIFFNESS
+from tk.model.body.superellipsoid_body import SuperellipsoidBody
+from tk.model.cues.edge_term import RENEW, ContourTerm
+
+Float = NDArray[np.float64]
+Ints = NDArray[np.int32]
+
+CHAIN_NAMES = tuple(CHAINS)
+# the chain of each segment, -1 for the torso
+CHAIN_OF_SEGMENT = np.array(
+    [next((c for c, chain in enumerate(CHAINS.values()) if name in chain), -1) for name in SEGMENTS]
+)
+
+
+def _barred() -> Ints:
+    """(S,) bit masks of the parts (0 the torso, 1 + c chain c) that a segment's surface may not enter."""
+    bits = {name: 1 << 1 + c for c, name in enumerate(CHAIN_NAMES)}
+    trunk = 1 | bits["head"]
+    enters_not = {
+        "arm_l": trunk | bits["arm_r"],
+        "arm_r": trunk | bits["arm_l"],
+        "leg_l": bits["leg_r"],
+        "leg_r": bits["leg_l"],
+    }
+    return np.array([enters_not.get(CHAIN_NAMES[c], 0) if c >= 0 else 0 for c in CHAIN_OF_SEGMENT], np.int32)
+
+
+BARRED = _barred()
+
+
+# How far a sample looks for a voxel, and a voxel for the body, metres.
+REACH_M, COVERAGE_REACH_M = 0.3, 0.5
+# Leclerc's ν of the coverage term beside the surface term's: a voxel of a limb that has left the body is far from it.
+COVERAGE_SOFTNESS = 2.0
+# Least weight of a pair in the Hessian: a limb that has moved away from its data keeps some curvature.
+OUTLIERS = 0.1
+# Leclerc's ν of eq. 9, in units of ½ (d/σ)²; the paper prints none.
+SURFACE_NU = 0.35
+
+
+@dataclass(frozen=True)
+class ObjectiveSettings:
+    """Settings of the objective (section 6.1).
+
+    Attributes:
+        coverage_weight: w_c of the coverage term, from data to model; 0 leaves it out, as the paper does.
+        surface_weight: w_s of eq. 8; 0 leaves the surface term out.
+    """
+
+    coverage_weight: float = 0.7
+    surface_weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("coverage_weight", "surface_weight"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"objective.{name} = {getattr(self, name)} must not be negative")
+
+    @property
+    def settings(self) -> ObjectiveParameters:
+        """What the kernel takes."""
+        return ObjectiveParameters(
+            nu=SURFACE_NU,
+            reach_m=REACH_M,
+            coverage_weight=self.coverage_weight,
+            coverage_nu=COVERAGE_SOFTNESS * SURFACE_NU,
+            coverage_reach_m=COVERAGE_REACH_M,
+            surface_weight=self.surface_weight,
+        )
+
+
+@dataclass(frozen=True)
+class SamplingSettings:
+    """How many points an evaluation uses (section 6.4: 60 on the torso, 20 on each limb and the head).
+
+    Attributes:
+        torso, chain: surface samples on the torso, and on the head and each limb.
+        voxels: voxels of the coverage term in the optimisation of all degrees of freedom.
+        chain_voxels: the same for one chain.
+        sigma_m: σ of eq. 10 for every sample, metres; 0 takes the limb's diameter, as the paper does. Distances are
+            as uncertain on the trunk as on an arm: both come from the same voxels. In units of the diameter the trunk,
+            five times as thick, weighs a twenty-fifth and follows the arms.
+        scale: so many times as many of all points, contour points included, in the optimisation (section 7.3).
+    """
+
+    torso: int = 60
+    chain: int = 20
+    voxels: int = 150
+    chain_voxels: int = 30
+    sigma_m: float = 0.1
+    scale: int = 1
+
+    def __post_init__(self) -> None:
+        if min(self.torso, self.chain, self.voxels, self.chain_voxels, self.scale) < 1 or self.sigma_m < 0:
+            raise ConfigError("sampling: numbers of points and scale must be at least 1, sigma_m at least 0")
+
+
+class BodyObjective:
+    """The objective of one body, ready for any frame.
+
+    Args:
+        body: the person.
+        settings: constants of the objective.
+        sampling: numbers of points.
+        contours: the contour cues, if any.
+        dtype: precision of the kernel.
+        waist_stiffness: see :data:`tk.trackers.volumetric.WAIST_STIFFNESS`.
+    """
+
+    def __init__(
+        self,
+        body: SuperellipsoidBody,
+        settings: ObjectiveParameters,
+        sampling: SamplingSettings,
+        contours: ContourTerm | None = None,
+        dtype: type = np.float32,
+        waist_stiffness: float = 0.0,
+    ) -> None:
+        self.body = body
+        self.stiffness = np.zeros(len(body.skeleton.names))
+        self.stiffness[body.skeleton.is_waist] = (
+            waist_stiffness * np.array(WAIST_STIFFNESS)[: body.skeleton.is_waist.sum()]
+        )
+        self.settings = settings
+        self.sampling = sampling
+        self.contours = contours
+        skeleton, pieces = body.skeleton, body.pieces
+        T_world_body = np.eye(4)
+        T_world_body[:3, :3] = skeleton.T_world_body
+        fixed = sampling.sigma_m
+        self.piece_segment = np.array([SEGMENTS.index(p.segment) for p in pieces])
+        self.kernel = ObjectiveKernel(
+            axis=skeleton.axis,
+            point=skeleton.anchor,
+            prismatic=skeleton.prismatic,
+            parent=skeleton.parent,
+            local=body.points,
+            last_dof=skeleton.segment_dof[body.segment],
+            sigma=np.full(len(body.points), fixed) if fixed else body.diameter,
+            patch=body.patch,
+            piece_dof=skeleton.segment_dof[self.piece_segment],
+            piece_frame=np.array([(T_world_body @ p.T_body_piece)[:3] for p in pieces]),
+            piece_shape=np.array([[*p.radii, p.e1, p.e2, p.z_lower, p.z_upper] for p in pieces]),
+            piece_sigma=np.array([fixed or p.diameter_m for p in pieces]),
+            piece_patches=piece_patches(body),
+            barred=BARRED[body.segment],
+            piece_part=CHAIN_OF_SEGMENT[self.piece_segment] + 1,
+            cameras=None if contours is None else contours.cameras,
+            dtype=dtype,
+        )
+        chain = CHAIN_OF_SEGMENT[body.segment]
+        self.torso_samples = np.flatnonzero(chain < 0).astype(np.int32)
+        self.chain_samples = [np.flatnonzero(chain == c).astype(np.int32) for c in range(len(CHAINS))]
+        self.chain_free = np.array([skeleton.chain_dofs(c) for c in CHAIN_NAMES])
+
+    def draw(self, rng: np.random.Generator, scale: int = 1) -> Ints:
+        """(M,) fresh surface samples, in the proportions of section 6.4, ``scale`` times as many."""
+        parts = [pick(rng, self.torso_samples, scale * self.sampling.torso)]
+        parts += [pick(rng, samples, scale * self.sampling.chain) for samples in self.chain_samples]
+        return np.concatenate(parts)
+
+    def spread(self, scale: int = 2) -> Ints:
+        """(M,) surface samples evenly over the body, the same at every call."""
+        parts = [even(self.torso_samples, scale * self.sampling.torso)]
+        parts += [even(samples, scale * self.sampling.chain) for samples in self.chain_samples]
+        return np.concatenate(parts)
+
+    def damping(self, lever_m: float) -> Float:
+        """(D,) curvature of f along each degree of freedom, were all points ``lever_m`` from its axis."""
+        s = self.settings
+        sigma = self.sampling.sigma_m or float(np.median(self.body.diameter))
+        unit = (1 / s.nu + s.coverage_weight / s.coverage_nu) / sigma**2
+        return unit * np.where(self.body.skeleton.prismatic, 1.0, lever_m**2)
+
+    def with_stiffness(
+        self, poses: Float, directions: Float | None, value: Float, gradient: Float, product: Float
+    ) -> Evaluation:
+        """An evaluation at poses (B, D), with the waist's stiffness added."""
+        k = self.stiffness
+        if not k.any():
+            return Evaluation(value, gradient, product)
+        return Evaluation(
+            value + 0.5 * np.square(poses) @ k,
+            gradient + k * poses,
+            product if directions is None else product + k * directions,
+        )
+
+
+def piece_patches(body: SuperellipsoidBody) -> NDArray[np.int64]:
+    """(P,) bit masks of the colour patches on each piece; a piece without samples has those of its segment."""
+    masks = np.zeros(len(body.pieces), np.int64)
+    for index, piece in enumerate(body.pieces):
+        mine = body.piece == index
+        if not mine.any():
+            mine = body.segment == SEGMENTS.index(piece.segment)
+        masks[index] = np.bitwise_or.reduce(np.int64(1) << np.unique(body.patch[mine]).astype(np.int64))
+    return masks
+
+
+def pick(rng: np.random.Generator, samples: Ints, count: int) -> Ints:
+    """``count`` of the samples at random, all of them where there are no more."""
+    if count >= len(samples):
+        return samples
+    # a random start in a random order would do as well; partial shuffles cost more than they give at these sizes
+    return samples[rng.permutation(len(samples))[:count]]
+
+
+def even(samples: Ints, count: int) -> Ints:
+    """``count`` of the samples at equal steps, all of them where there are no more."""
+    if count >= len(samples):
+        return samples
+    return samples[(np.arange(count) * len(samples)) // count]
+
+
+class Evaluation(NamedTuple):
+    """An objective at B poses: value (B,), gradient (B, D), Hessian-vector product (B, D)."""
+
+    value: Float
+    gradient: Float
+    hessian_vector: Float
+
+
+# A voxel farther from the body than this is not explained by it, metres.
+UNEXPLAINED_M = 0.1
+# A voxel this far from the nearest piece may belong to another: voxels lie 2 to 3 cm off the piece they belong to.
+UNCLAIMED_M = 0.05
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well a pose explains a frame.
+
+    Attributes:
+        value: the objective over evenly spread samples and voxels.
+        linear: the linearisation at the pose (M + Q pairs); held: its assignments.
+        samples: (M,) the samples used; voxels: (Q,) the voxels used.
+        entries: (1, E, 16) of the contour cues, if any.
+    """
+
+    value: float
+    linear: Linearisation
+    held: Held
+    samples: Ints
+    voxels: Ints
+    entries: NDArray[np.floating] | None = None
+
+    @property
+    def unmatched(self) -> NDArray[np.bool_]:
+        """(M,) True for samples with no voxel within σ."""
+        M = len(self.samples)
+        distance2 = np.sum(self.linear.residual[:M] ** 2, axis=1)
+        return (self.linear.partner[:M] < 0) | (distance2 * self.linear.inv_sigma2[:M] > 1)
+
+    @property
+    def unexplained(self) -> NDArray[np.bool_]:
+        """(Q,) True for voxels that the body does not explain."""
+        M = len(self.samples)
+        if len(self.linear.residual) == M:
+            return np.zeros(len(self.voxels), bool)
+        return (self.linear.partner[M:] < 0) | (np.linalg.norm(self.linear.residual[M:], axis=1) > UNEXPLAINED_M)
+
+    @property
+    def unexplained_share(self) -> float:
+        """Share of the voxels that the body does not explain."""
+        unexplained = self.unexplained
+        return float(unexplained.mean()) if len(unexplained) else 0.0
+
+
+class _Look(NamedTuple):
+    """A pose's value on the even samples, and the assignments that it rests on."""
+
+    value: float
+    held: Held
+    entries: NDArray[np.floating] | None
+
+
+class FrameObjective:
+    """The objective of one body in one frame; what :class:`tk.optim.schedule.Problem` asks for.
+
+    Args:
+        objective: the body's.
+        index: the frame's surface voxels.
+        rng: where samples are drawn from.
+        images: (C, H, W, 3) the pictures of the edge term; without them, or without that term, the hull alone counts.
+    """
+
+    def __init__(
+        self,
+        objective: BodyObjective,
+        index: SurfaceIndex,
+        rng: np.random.Generator,
+        images: NDArray[np.uint8] | None = None,
+    ) -> None:
+        self.objective = objective
+        self.index = index
+        self.rng = rng
+        self.contours = None if images is None else objective.contours
+        self.images = images
+        self.voxel_count = len(index.positions)
+        self.free = objective.chain_free
+        self.angular = ~objective.body.skeleton.prismatic
+        self._even_samples = objective.spread()
+        self._even_voxels = np.arange(0, self.voxel_count, max(self.voxel_count // 600, 1), dtype=np.int32)
+        self._looks: dict[bytes, _Look] = {}
+        self._fits: dict[bytes, Fit] = {}
+        self._pools: list[Ints] = []
+
+    def constrain(self, poses: Float) -> Float:
+        """Poses (B, D) mapped into the joints' limits (eq. 22)."""
+        return self.objective.body.skeleton.clip(poses)
+
+    def damping(self, lever_m: float) -> Float:
+        """See :meth:`BodyObjective.damping`."""
+        return self.objective.damping(lever_m)
+
+    def full(self) -> Callable[[Float, Float, int], Evaluation]:
+        """All degrees of freedom: new samples for every iteration number, the same in all rows."""
+        draws = _Draws(self._draw_full)
+        renewed = self._renewing(lambda B: np.repeat(self._term.draw(self.rng)[None], B, 0))
+
+        def evaluate(poses: Float, directions: Float, iteration: int) -> Evaluation:
+            samples, voxels = draws(iteration)
+            B = len(poses)
+            rows = np.repeat(samples[None], B, 0), np.repeat(voxels[None], B, 0)
+            return self._evaluate(*rows, poses, directions, renewed(poses, iteration))
+
+        return evaluate
+
+    def chains(self, owner: NDArray[np.intp], pose: Float) -> Callable[[Float, Float, int], Evaluation]:
+        """Row b is chain ``owner[b]`` with its own samples, and voxels that are its own or nobody's at ``pose``."""
+        self._pools = self._chain_pools(self.fit(pose))
+        draws = _Draws(lambda: self._draw_chains(owner))
+        renewed = self._renewing(lambda _: self._term.draw_chains(self.rng)[owner])
+
+        def evaluate(poses: Float, directions: Float, iteration: int) -> Evaluation:
+            return self._evaluate(*draws(iteration), poses, directions, renewed(poses, iteration))
+
+        return evaluate
+
+    def fixed(self) -> FixedObjective:
+        """All degrees of freedom on one draw of points that stays: what Levenberg-Marquardt minimises (section 7.3)."""
+        strips = None if self.contours is None else self._term.draw(self.rng)
+        return FixedObjective(self, *self._draw_full(), strips)
+
+    def fixed_chain(self, chain: int, pose: Float) -> FixedObjective:
+        """The same for one chain, the rest of the body being at ``pose``; points as in :meth:`chains`."""
+        self._pools = self._chain_pools(self.fit(pose))
+        strips = None if self.contours is None else self._term.draw_chains(self.rng)[chain]
+        return FixedObjective(self, *self._draw_chain(chain), strips)
+
+    def value(self, pose: Float) -> float:
+        """The objective at ``pose`` (D,) on even samples and evenly spread voxels."""
+        return float(self.values(pose[None])[0])
+
+    def values(self, poses: Float) -> Float:
+        """(B,) the same of poses (B, D), in one go."""
+        unknown = [pose for pose in poses if pose.tobytes() not in self._looks]
+        if unknown:
+            self._look(np.array(unknown))
+        return np.array([self._looks[pose.tobytes()].value for pose in poses])
+
+    def curvature(self, pose: Float) -> Float:
+        """(D, D) Gauss-Newton Hessian at ``pose`` (D,), outliers weighing at least :data:`OUTLIERS`."""
+        return self._linearise(pose).hessian + np.diag(self.objective.stiffness)
+
+    def fit(self, pose: Float) -> Fit:
+        """How well ``pose`` (D,) explains the frame, on samples that do not change from call to call."""
+        key = pose.tobytes()
+        if key not in self._fits:
+            linear = self._linearise(pose)
+            look = self._looks[key]
+            self._fits[key] = Fit(look.value, linear, look.held, self._even_samples, self._even_voxels, look.entries)
+        return self._fits[key]
+
+    def _look(self, poses: Float) -> None:
+        """Evaluate poses (B, D) on the even samples and keep what was found."""
+        B = len(poses)
+        entries = None
+        if self.contours:
+            entries = self._entries(poses, np.repeat(self._term.draw(None)[None], B, 0))
+        value, gradient, product, held = self.objective.kernel.evaluate(
+            self.index,
+            np.repeat(self._even_samples[None], B, 0),
+            np.repeat(self._even_voxels[None], B, 0),
+            poses,
+            None,
+            self.objective.settings,
+            entries=entries,
+        )
+        value = self.objective.with_stiffness(poses, None, value, gradient, product).value
+        for b, pose in enumerate(poses):
+            own = Held(held.assigned[b : b + 1], held.covering[b : b + 1])
+            self._looks[pose.tobytes()] = _Look(float(value[b]), own, None if entries is None else entries[b : b + 1])
+
+    def _linearise(self, pose: Float) -> Linearisation:
+        self.values(pose[None])
+        look = self._looks[pose.tobytes()]
+        return self.objective.kernel.linearise(
+            self.index,
+            self._even_samples,
+            self._even_voxels,
+            pose,
+            look.held,
+            self.objective.settings,
+            OUTLIERS,
+            entries=look.entries,
+        )
+
+    def _chain_pools(self, fit: Fit) -> list[Ints]:
+        """For each chain the voxels it may have to cover: those nearest to it, and those that nothing covers."""
+        if self.objective.settings.coverage_weight <= 0:
+            return [np.zeros(1, np.int32)] * len(CHAINS)
+        piece = fit.held.covering[0, : len(fit.voxels), 0].astype(np.int64)
+        nearest = np.where(piece >= 0, CHAIN_OF_SEGMENT[self.objective.piece_segment[piece]], -1)
+        M = len(fit.samples)
+        unclaimed = np.linalg.norm(fit.linear.residual[M:], axis=1) > UNCLAIMED_M
+        pools = [fit.voxels[(nearest == c) | fit.unexplained | unclaimed] for c in range(len(CHAINS))]
+        return [pool if len(pool) else fit.voxels for pool in pools]
+
+    def _draw_full(self) -> tuple[Ints, Ints]:
+        s = self.objective.sampling
+        voxels = self.rng.integers(self.voxel_count, size=s.scale * s.voxels).astype(np.int32)
+        return self.objective.draw(self.rng, s.scale), voxels
+
+    def _draw_chain(self, chain: int) -> tuple[Ints, Ints]:
+        s = self.objective.sampling
+        # a chain with fewer samples than asked for gives some of them twice: rows are of one length
+        count = s.scale * s.chain
+        samples = np.resize(pick(self.rng, self.objective.chain_samples[chain], count), count)
+        pool = self._pools[chain]
+        return samples, pool[self.rng.integers(len(pool), size=s.scale * s.chain_voxels)]
+
+    def _draw_chains(self, owner: NDArray[np.intp]) -> tuple[Ints, Ints]:
+        samples, voxels = zip(*(self._draw_chain(c) for c in range(len(CHAINS))), strict=True)
+        return np.stack(samples)[owner], np.stack(voxels)[owner]
+
+    @property
+    def _term(self) -> ContourTerm:
+        assert self.contours is not None
+        return self.contours
+
+    def _entries(self, poses: Float, chosen: Ints) -> NDArray[np.floating]:
+        assert self.images is not None
+        return self._term.assign(self.images, poses, chosen)
+
+    def _renewing(self, draw: Callable[[int], Ints]) -> Callable[[Float, int], NDArray[np.floating] | None]:
+        """The contour cues' entries at an iteration: held for some, then made anew at the poses as they are."""
+        drawn: tuple[int, Ints] | None = None
+        last: NDArray[np.floating] | None = None
+        calls = 0
+
+        def entries(poses: Float, iteration: int) -> NDArray[np.floating] | None:
+            nonlocal drawn, last, calls
+            if self.contours is None:
+                return None
+            # calls are counted, as the iteration's number stands still where points are not shuffled
+            if last is None or calls % RENEW == 0:
+                if drawn is None or drawn[0] != iteration:
+                    drawn = iteration, draw(len(poses))
+                last = self._entries(poses, drawn[1])
+            calls += 1
+            return last
+
+        return entries
+
+    def _evaluate(
+        self,
+        samples: Ints,
+        voxels: Ints,
+        poses: Float,
+        directions: Float | None,
+        entries: NDArray[np.floating] | None = None,
+    ) -> Evaluation:
+        value, gradient, product, _ = self.objective.kernel.evaluate(
+            self.index, samples, voxels, poses, directions, self.objective.settings, entries=entries
+        )
+        return self.objective.with_stiffness(poses, directions, value, gradient, product)
+
+
+class FixedObjective:
+    """The objective of a frame on points that stay the same; their voxels and edges are found anew at every pose.
+
+    Args:
+        frame: the frame.
+        samples: (M,); voxels: (Q,); strips: (K,) of the contour cues, if they count.
+    """
+
+    def __init__(self, frame: FrameObjective, samples: Ints, voxels: Ints, strips: Ints | None) -> None:
+        self._frame = frame
+        self._points = samples, voxels
+        self._strips = strips
+
+    def value(self, pose: Float) -> float:
+        """The objective at ``pose`` (D,)."""
+        return float(self._evaluate(pose)[0][0][0])
+
+    def model(self, pose: Float) -> tuple[float, Float, Float]:
+        """Value, gradient (D,) and Gauss-Newton Hessian (D, D) at ``pose`` (D,), outliers weighing as for SMD's."""
+        (value, gradient, _, held), entries = self._evaluate(pose)
+        linear = self._frame.objective.kernel.linearise(
+            self._frame.index,
+            *self._points,
+            pose,
+            held,
+            self._frame.objective.settings,
+            OUTLIERS,
+            entries=entries,
+        )
+        return float(value[0]), gradient[0], linear.hessian + np.diag(self._frame.objective.stiffness)
+
+    def _evaluate(self, pose: Float) -> tuple[tuple[Float, Float, Float, Held], NDArray[np.floating] | None]:
+        frame, (samples, voxels) = self._frame, self._points
+        entries = None if self._strips is None else frame._entries(pose[None], self._strips[None])
+        value, gradient, product, held = frame.objective.kernel.evaluate(
+            frame.index, samples[None], voxels[None], pose[None], None, frame.objective.settings, entries=entries
+        )
+        return (*frame.objective.with_stiffness(pose[None], None, value, gradient, product), held), entries
+
+
+class _Draws:
+    """The samples of each iteration number; the same number gives the same samples."""
+
+    def __init__(self, draw: Callable[[], tuple[Ints, Ints]]) -> None:
+        self._draw = draw
+        self._iteration: int | None = None
+        self._last: tuple[Ints, Ints] | None = None
+
+    def __call__(self, iteration: int) -> tuple[Ints, Ints]:
+        if self._last is None or iteration != self._iteration:
+            self._last, self._iteration = self._draw(), iteration
+        return self._last

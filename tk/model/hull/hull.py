@@ -1,0 +1,170 @@
+"""The visual hull of a person in a voxel grid, followed from frame to frame (Kehl & Van Gool 2006, section 4.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.kernels import hull as kernels
+from tk.model.cameras.camera import Rig
+from tk.model.cameras.volume import VoxelGrid
+from tk.model.hull.boundary import hull_boundary
+from tk.model.hull.tables import HullTables, load_or_build, mask_words
+
+__all__ = ["HullSurface", "VisualHull"]
+
+
+@dataclass(frozen=True)
+class HullSurface:
+    """The surface voxels of a hull, ascending by flat index (the same order in every run).
+
+    Attributes:
+        voxels: (N,) int32 flat indices into the grid.
+        positions: (N, 3) float32 voxel centres, world frame, metres.
+        normals: (N, 3) float32 outward unit normals; zero where undefined (a voxel amid symmetric neighbours).
+        colors: (N, 3) float32, 0..255 in the images' channel order (BGR); zero where ``seen`` is 0.
+        seen: (N,) int32, bit c set where camera c truly sees the voxel: frontal, and nothing of the hull in between.
+        boundary: (N, 3) float32 metres where asked for: each voxel moved along its normal to the hull's own boundary.
+    """
+
+    voxels: NDArray[np.int32]
+    positions: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    colors: NDArray[np.float32]
+    seen: NDArray[np.int32]
+    boundary: NDArray[np.float32] | None = None
+
+    def __len__(self) -> int:
+        return len(self.voxels)
+
+
+class VisualHull:
+    """Carves a grid by silhouettes; keeps its state, so that the next frame costs only what changed.
+
+    A voxel is active if its centre falls on foreground in every camera whose picture holds it, and at least two
+    pictures hold it. (The paper does not say what happens outside a picture: its cameras all see the whole volume.)
+
+    Args:
+        rig: up to 31 cameras.
+        grid: the voxels.
+        cache_dir: where the look-up tables are kept between runs; by default the platform's cache folder. A cache that
+            cannot be read or written is left aside silently.
+        use_cache: False builds the tables anew and writes nothing.
+
+    Raises:
+        VolumeError: no voxel is seen by two cameras.
+        ConfigError: too many cameras or voxels for 32-bit look-up tables.
+    """
+
+    def __init__(self, rig: Rig, grid: VoxelGrid, cache_dir: Path | None = None, use_cache: bool = True) -> None:
+        self.rig = rig
+        self.grid = grid
+        self._tables: HullTables = load_or_build(rig, grid, cache_dir, use_cache)
+        self._mask_shape = (len(rig), *rig.frame_shape)
+        self._pixel_count = int(np.prod(rig.frame_shape))
+        self._eyes = ((rig.centers - np.asarray(grid.origin)) / grid.voxel_m).astype(np.float32)
+        self._spacing = _sample_spacing(rig, grid)
+        self._planes = self._tables.empty_planes.copy()
+        self._occupied = np.zeros(self._planes.shape[1], dtype=np.uint32)
+        self._previous = np.zeros((len(rig), mask_words(rig)), dtype=np.int64)
+        self._found = np.empty(grid.count, dtype=np.int32)
+        self._clean = True
+
+    def reset(self) -> None:
+        """Forget the previous frame: nothing is active."""
+        if not self._clean:
+            self._planes[:] = self._tables.empty_planes
+            self._occupied.fill(0)
+            self._previous.fill(0)
+            self._clean = True
+
+    def carve(self, masks: NDArray[np.uint8]) -> None:
+        """Carve from scratch. ``masks`` (C, H, W) uint8, foreground where not 0."""
+        self.reset()
+        self.update(masks)
+
+    def update(self, masks: NDArray[np.uint8]) -> None:
+        """Carve by what changed since the previous masks; the result is that of :meth:`carve`, voxel for voxel.
+
+        Args:
+            masks: (C, H, W) uint8 with (H, W) = ``rig.frame_shape``, foreground where not 0.
+        """
+        words = self._as_words(masks)
+        tables = self._tables
+        self._clean = False
+        kernels.carve(
+            tables.row_offsets,
+            tables.entries,
+            tables.enough,
+            words,
+            self._previous,
+            self._planes,
+            self._occupied,
+        )
+
+    @property
+    def occupancy(self) -> NDArray[np.bool_]:
+        """(nx, ny, nz) bool, the active voxels; a copy."""
+        return kernels.unpack(self._occupied, self.grid.shape)
+
+    @property
+    def camera_bits(self) -> NDArray[np.int32]:
+        """(nx, ny, nz) int32, the paper's bit masks: bit c is set where camera c does not carve the voxel; a copy."""
+        bits = np.zeros(self.grid.shape, dtype=np.int32)
+        for row, plane in enumerate(self._planes):
+            bits |= kernels.unpack(plane, self.grid.shape).astype(np.int32) << (row // kernels.SHARES)
+        return bits
+
+    def surface(self, images: NDArray[np.uint8] | None = None, boundary: bool = False) -> HullSurface:
+        """The surface voxels of the current hull.
+
+        Args:
+            images: (C, H, W, 3) uint8 BGR of the same frame as the masks; None for no colours.
+            boundary: also find where the hull ends between voxels; costs a few milliseconds.
+        """
+        channels = (*self._mask_shape, 3)
+        if images is not None and (images.shape != channels or images.dtype != np.uint8):
+            raise ValueError(f"images are {images.dtype} {images.shape}, expected uint8 {channels}")
+        voxels, box = kernels.surface_voxels(self._occupied, self.grid.shape, self._found)
+        masks = self._previous.view(np.uint8)
+        normals, colors, seen = kernels.shade_surface(
+            self._occupied,
+            self.grid.shape,
+            self._tables.pixels,
+            self._eyes,
+            self._spacing,
+            None if images is None else np.ascontiguousarray(images),
+            masks,
+            voxels,
+            box,
+        )
+        positions = self.grid.centers(voxels).astype(np.float32)
+        ends = None
+        if boundary:
+            pictures = masks[:, : self._pixel_count].reshape(self._mask_shape)
+            ends = hull_boundary(self.rig, pictures, positions, normals, self.grid.voxel_m)
+        return HullSurface(voxels, positions, normals, colors, seen, ends)
+
+    def _as_words(self, masks: NDArray[np.uint8]) -> NDArray[np.int64]:
+        """(C, M) the masks as int64 words: a view where memory allows it, a zero-padded copy otherwise."""
+        if masks.shape != self._mask_shape or masks.dtype != np.uint8:
+            raise ValueError(f"masks are {masks.dtype} {masks.shape}, expected uint8 {self._mask_shape}")
+        flat = np.ascontiguousarray(masks).reshape(len(masks), self._pixel_count)
+        if self._pixel_count % 8 == 0:
+            words = flat.view(np.int64)
+            if words.flags.aligned:
+                return words
+        words = np.zeros_like(self._previous)
+        words.view(np.uint8)[:, : self._pixel_count] = flat
+        return words
+
+
+def _sample_spacing(rig: Rig, grid: VoxelGrid) -> NDArray[np.int32]:
+    """(C,) a third of a voxel's size in each picture, at the volume's centre, in whole pixels, at least 1."""
+    middle = np.asarray(grid.origin) + grid.voxel_m * (np.asarray(grid.shape) - 1) / 2
+    distance = np.maximum(np.linalg.norm(rig.centers - middle, axis=1), grid.voxel_m)
+    focal = np.array([camera.matrix[0, 0] for camera in rig])
+    return np.maximum(np.rint(focal * grid.voxel_m / distance / 3), 1).astype(np.int32)

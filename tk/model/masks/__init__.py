@@ -1,0 +1,1 @@
+"""Masks: background model, cleaning, consistency between cameras."""

@@ -1,0 +1,180 @@
+"""Silhouettes of one instant in several views: cleaning, scales, and how well a cone body covers them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.errors import ConfigError
+from tk.kernels import silhouette as kernels
+from tk.kernels.cone_arrays import ConeArrays
+from tk.kernels.line_search import Regions, SearchSettings
+from tk.kernels.projection import pack_camera
+from tk.kernels.raycast import cast
+from tk.kernels.silhouette import Edgels, NormalEquations
+from tk.model.body.cone_body import ConeBody
+from tk.model.cameras.camera import Rig
+from tk.model.masks.regions import clean_by_area
+
+Float = NDArray[np.float64]
+Masks = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class CleaningSettings:
+    """What is mended in a mask before contours are pulled to it. The paper takes its masks as they are.
+
+    Attributes:
+        speck_share: connected parts smaller than this share of the largest one are no part of the person.
+        hole_share: holes smaller than this share of it are filled; gaps between limbs are larger.
+    """
+
+    speck_share: float = 0.05
+    hole_share: float = 0.004
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.speck_share <= 1 or not 0 <= self.hole_share <= 1:
+            raise ConfigError(
+                f"silhouette cleaning: speck_share = {self.speck_share} and hole_share = {self.hole_share} "
+                "must lie in [0, 1]"
+            )
+
+
+def clean(mask: Masks, config: CleaningSettings) -> Masks:
+    """A mask (H, W) without specks and small holes, 0 or 255."""
+    box = cv2.boundingRect(mask)
+    if box[2] == 0:
+        return mask
+    x, y, width, height = box
+    part = mask[y : y + height, x : x + width] >= 128
+    contours, _ = cv2.findContours(part.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not contours:
+        return np.zeros_like(mask)
+    largest = max(cv2.contourArea(contour) + len(contour) / 2 + 1 for contour in contours)
+    result = np.zeros_like(mask)
+    result[y : y + height, x : x + width] = clean_by_area(
+        part, config.speck_share * largest, config.hole_share * largest
+    )
+    return result
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """Masks at several scales, a factor of two apart.
+
+    Attributes:
+        masks: for each scale (V, H, W) uint8; scale 0 is the full picture. Of F frames (F V, H, W).
+        sizes: for each scale (V, 2) width and height of each camera's part.
+    """
+
+    masks: tuple[Masks, ...]
+    sizes: tuple[NDArray[np.int32], ...]
+
+    @staticmethod
+    def of_all(frames: Sequence[Pyramid]) -> Pyramid:
+        """Those of several frames as one."""
+        return Pyramid(tuple(map(np.concatenate, zip(*(f.masks for f in frames), strict=True))), frames[0].sizes)
+
+
+class Views:
+    """The cameras of a rig as the kernels want them.
+
+    Args:
+        rig: the cameras.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self.cameras = pack_rig(rig)
+        self._cameras32 = self.cameras.astype(np.float32)
+        self.sizes = np.array([(c.width, c.height) for c in rig], np.int32)
+
+    def pyramid(self, masks: Masks, scales: int, cleaning: CleaningSettings | None) -> Pyramid:
+        """The scales of masks (V, H, W), cleaned unless ``cleaning`` is None."""
+        if cleaning is not None:
+            masks = np.stack([clean(mask, cleaning) for mask in masks])
+        levels, sizes = [masks], [self.sizes]
+        for _ in range(scales - 1):
+            last = levels[-1]
+            height, width = (last.shape[1] + 1) // 2, (last.shape[2] + 1) // 2
+            even = list(last)
+            if last.shape[1] % 2 or last.shape[2] % 2:
+                rest = last.shape[1] % 2, last.shape[2] % 2
+                even = [cv2.copyMakeBorder(m, 0, rest[0], 0, rest[1], cv2.BORDER_CONSTANT) for m in last]
+            half = np.empty((len(last), height, width), np.uint8)
+            for m, out in zip(even, half, strict=True):
+                cv2.resize(m, (width, height), dst=out, interpolation=cv2.INTER_AREA)
+            levels.append(half)
+            sizes.append((sizes[-1] + 1) // 2)
+        return Pyramid(tuple(levels), tuple(sizes))
+
+    def equations(
+        self,
+        body: ConeArrays,
+        pyramid: Pyramid,
+        poses: Float,
+        scale: int,
+        settings: SearchSettings,
+        regions: Regions | None = None,
+    ) -> NormalEquations:
+        """Normal equations of poses (B, D) at a scale's index, all in one frame or each in its own of B."""
+        return kernels.normal_equations(
+            body,
+            self._cameras32,
+            pyramid.sizes[scale],
+            pyramid.masks[scale],
+            2.0**scale,
+            poses,
+            settings,
+            regions,
+        )
+
+    def edgels(self, body: ConeBody, pyramid: Pyramid, pose: Float, scale: int, settings: SearchSettings) -> Edgels:
+        """The edgels that a pose (D,) finds at a scale's index."""
+        return kernels.find_edgels(
+            body.arrays, self._cameras32, pyramid.sizes[scale], pyramid.masks[scale], 2.0**scale, pose, settings
+        )
+
+
+def pack_rig(rig: Rig) -> Float:
+    """(V, 22) the cameras as the kernels take them."""
+    return np.array([pack_camera(c.matrix, c.distortions, c.rotation, c.translation, c.fisheye) for c in rig])
+
+
+def pixel_rays(rig: Rig, step: int = 1) -> NDArray[np.float32]:
+    """(V, H, W, 3) viewing directions of every ``step``-th pixel, world frame; zero outside smaller pictures."""
+    height, width = rig.frame_shape
+    offset = step // 2
+    ys, xs = np.arange(offset, height, step), np.arange(offset, width, step)
+    grid = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2).astype(np.float64)
+    rays = np.zeros((len(rig), len(ys) * len(xs), 3), np.float32)
+    for out, camera in zip(rays, rig, strict=True):
+        inside = (grid[:, 0] < camera.width) & (grid[:, 1] < camera.height)
+        out[inside] = camera.rays(grid[inside])
+    return rays.reshape(len(rig), len(ys), len(xs), 3)
+
+
+def share_wrong(drawn: Masks, seen: Masks) -> Float:
+    """(V,) E_S (eq. 12) of silhouettes (V, H, W) against masks (V, H, W), S_T; inf where the mask is empty."""
+    wrong = np.count_nonzero((drawn >= 128) != (seen >= 128), axis=(1, 2))
+    total = np.count_nonzero(seen >= 128, axis=(1, 2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(total > 0, wrong / total, np.inf)
+
+
+def draw_silhouettes(body: ConeBody, rig: Rig, poses: Float) -> NDArray[np.uint8]:
+    """(B, V, H, W) silhouettes of the body at poses (B, D), 0 or 255."""
+    rays = pixel_rays(rig)
+    group = np.zeros(len(body.parts), np.int32)
+    cost = np.zeros((*rays.shape[:3], 2), np.float32)
+    cameras = pack_rig(rig).astype(np.float32)
+    pictures = []
+    for pose in poses:  # one at a time: depths of all pixels of many poses are large
+        _, met = cast(body.arrays, group, cameras, 1, rays, cost, pose[None], export=True)
+        assert met is not None
+        pictures.append(np.where(met.label[0] > 0, np.uint8(255), np.uint8(0)))
+    return np.array(pictures)

@@ -1,0 +1,48 @@
+"""What follows from poses: joints, segments, feet and angles, as the result file keeps them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.model.body.angles import joint_angles, standing_rotations
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.rotations import to_quaternions
+from tk.model.body.skeleton import Skeleton
+from tk.model.motion.segments import foot_points, joint_positions
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Derived:
+    """What F poses mean.
+
+    Attributes:
+        joints: (F, 15, 3) metres, world frame: `/joints/position`.
+        rotations: (F, S, 4) quaternions (w, x, y, z), segment to world: `/segments/rotation`, the segments being
+            :data:`tk.model.body.skeleton.SEGMENTS` with the axes of :mod:`tk.model.body.angles`.
+        feet: (F, 4, 3) metres, world frame: `/feet/position`, in the order of
+        :data:`tk.model.motion.segments.FOOT_POINTS`.
+        angles: degrees by joint, each (F, k): `/angles/<joint>`; names and conventions in
+            :data:`tk.model.body.angles.ANGLES`.
+    """
+
+    joints: Float
+    rotations: Float
+    feet: Float
+    angles: dict[str, Float]
+
+
+def derive(skeleton: Skeleton, dimensions: BodyDimensions, poses: Float) -> Derived:
+    """What the poses (F, D) mean; they must be finite."""
+    T = skeleton.segment_transforms(poses)
+    R = standing_rotations(skeleton, T)
+    return Derived(
+        joints=joint_positions(skeleton, T),
+        rotations=to_quaternions(R),
+        feet=foot_points(skeleton, dimensions, T),
+        angles=joint_angles(R, skeleton.T_world_body),
+    )

@@ -1,0 +1,129 @@
+"""Masks of a whole recording in a folder: `tk masks`."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from tk.errors import CaptureError, ConfigError
+from tk.io.captures.capture import MASKS_RECORD, Capture
+from tk.io.toml import load_toml
+from tk.run.plan import choose_frames
+from tk.run.segmentation import NO_SEGMENTER
+from tk.run.session import Reporter
+from tk.segmenters import load, names
+from tk.segmenters.subject_masks import SubjectMasks
+from tk.threads import one_thread
+
+
+@dataclass(frozen=True)
+class Written:
+    """What :func:`write_masks` has done.
+
+    Attributes:
+        frames: in the folder now, of those that were asked for.
+        now: of these, how many this run has made.
+        empty: by camera, frames of this run in which nobody was found.
+    """
+
+    frames: int
+    now: int
+    empty: dict[str, int]
+
+
+@one_thread()
+def write_masks(
+    capture: Capture,
+    folder: Path,
+    reporter: Reporter,
+    segmenter: str | None = None,
+    frames: tuple[int, int | None] = (0, None),
+) -> Written:
+    """Write ``folder/<camera>/000000.png`` …: 8 bits, 255 where the segmenter sees the subject, else 0.
+
+    Frames that are there already are left as they are, so the same command goes on where an earlier run stopped.
+
+    Args:
+        capture: whose pictures; masks of its own and its empty scene are not asked.
+        folder: made where it is missing.
+        reporter: who hears of the progress.
+        segmenter: its name; the first of :func:`tk.segmenters.names` if None.
+        frames: first frame and the one to stop before (None: the last).
+
+    Raises:
+        ConfigError: no such segmenter, or the folder holds something else.
+        CaptureError: no segmenter is installed, or a frame cannot be read or written; what was finished stays.
+    """
+    for warning in capture.warnings:
+        reporter.note(warning)
+    capture = capture.as_recorded()  # masks are numbered as the pictures are: both shift by a time offset later
+    start, stop = choose_frames(capture, frames, reporter.note)
+    if segmenter is None:
+        installed = names()
+        if not installed:
+            raise CaptureError(f"{capture.path}: {NO_SEGMENTER}")
+        segmenter = installed[0]
+    made = SubjectMasks(load(segmenter), segmenter, capture.rig, capture.volume)
+    _claim(folder, {"capture": capture.name, "segmenter": segmenter, "cameras": list(capture.rig.names)})
+    missing = [k for k in range(start, stop) if not all(_file(folder, n, k).exists() for n in capture.rig.names)]
+    reporter.begin(stop - start, stop - start - len(missing))
+    empty = dict.fromkeys(capture.rig.names, 0)
+    if missing:
+        wanted = set(missing)
+        with capture.frames(missing[0], missing[-1] + 1) as reader:
+            for frame in reader:
+                if frame.index not in wanted:
+                    continue
+                for camera, mask in zip(capture.rig, made.segment(frame.images), strict=True):
+                    _write(_file(folder, camera.name, frame.index), mask[: camera.height, : camera.width])
+                    empty[camera.name] += not mask.any()
+                reporter.advance(frame.index, None)
+    for name, count in empty.items():
+        if count:
+            reporter.note(f"{folder / name}: nobody in {count} of {len(missing)} frames")
+    if start > 0 and not all(_file(folder, name, 0).exists() for name in capture.rig.names):
+        reporter.note(f"{folder}: frames before {start} are missing; tk track takes a folder of masks from frame 0 on")
+    return Written(stop - start, len(missing), empty)
+
+
+def _file(folder: Path, camera: str, index: int) -> Path:
+    return folder / camera / f"{index:06d}.png"
+
+
+def _claim(folder: Path, origin: dict[str, str | list[str]]) -> None:
+    """Note in the folder where its masks come from, so that another command does not go on with them."""
+    record = folder / MASKS_RECORD
+    if record.is_file():
+        found = load_toml(record, ConfigError)
+        for name, value in origin.items():
+            if found.get(name) != value:
+                raise ConfigError(
+                    f"{record}: these masks were made differently: {name}: {found.get(name)}, not {value}; "
+                    "delete the folder, or choose another one"
+                )
+        return
+    try:
+        if folder.exists() and any(folder.iterdir()):
+            raise ConfigError(f"{folder}: holds files that tk masks has not made; choose another folder")
+        folder.mkdir(parents=True, exist_ok=True)
+        record.write_text(tomli_w.dumps(origin), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be written: {error.strerror}") from None
+
+
+def _write(path: Path, mask: NDArray[np.uint8]) -> None:
+    """All of a file or none of it."""
+    _, coded = cv2.imencode(".png", mask)
+    part = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(exist_ok=True)
+        part.write_bytes(coded.tobytes())
+        os.replace(part, path)
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be written: {error.strerror}") from None

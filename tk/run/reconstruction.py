@@ -1,0 +1,77 @@
+"""Visual hulls of a whole capture: `tk reconstruct`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from tk.errors import ConfigError, ResultError
+from tk.io.captures.capture import Capture
+from tk.io.mesh import hull_mesh, write_mesh
+from tk.io.point_cloud import check_hull_path, ply_path, write_hulls, write_ply
+from tk.io.results.writer import HullPoints
+from tk.model.cameras.volume import VoxelGrid
+from tk.model.hull.hull import VisualHull
+from tk.run.plan import choose_frames
+from tk.run.segmentation import make_segmenter
+from tk.run.session import Reporter, points_of
+from tk.settings import Settings
+
+
+def reconstruct(
+    capture: Capture,
+    output: Path,
+    config: Settings,
+    reporter: Reporter,
+    frames: tuple[int, int | None] = (0, None),
+    ply: Path | None = None,
+    mesh: Path | None = None,
+    force: bool = False,
+) -> int:
+    """Write the coloured surface voxels of every frame.
+
+    Args:
+        capture: what to reconstruct.
+        output: HDF5 file with `/frames`, `/time` and `/hull` as in a result.
+        config: settings of the segmentation and the resolution.
+        reporter: who hears of the progress.
+        frames: first frame and the one to stop before (None: the last).
+        ply: folder for a point cloud a frame, PLY; needs Open3D.
+        mesh: folder for a closed mesh of the hull's surface a frame, PLY; needs Open3D.
+        force: replace files that exist.
+
+    Returns:
+        Frames written.
+
+    Raises:
+        TkError: bad input; every frame finished before it is in the file.
+    """
+    check_hull_path(output, force)
+    for warning in capture.warnings:
+        reporter.note(warning)
+    start, stop = choose_frames(capture, frames, reporter.note)
+    if ply is not None and mesh is not None and ply.resolve() == mesh.resolve():
+        raise ConfigError(f"--ply {ply}, --mesh {mesh}: give each a folder of its own")
+    files = [ply_path(folder, frame) for folder in (ply, mesh) if folder is not None for frame in range(start, stop)]
+    taken = None if force else next((file for file in files if file.exists()), None)
+    if taken is not None:
+        raise ResultError(f"{taken}: exists; replace it by --force, or choose another folder")
+    segment = make_segmenter(capture, config, reporter.note)
+    hull = VisualHull(capture.rig, VoxelGrid.cover(capture.volume, config.voxels))
+    reporter.begin(stop - start, 0)
+
+    def hulls() -> Iterator[tuple[int, HullPoints]]:
+        with capture.frames(start, stop) as reader:
+            for frame in reader:
+                hull.update(segment(frame))
+                points: HullPoints = points_of(hull.surface(frame.images))
+                if ply is not None:
+                    write_ply(ply_path(ply, frame.index), np.asarray(points.positions), points.colors)
+                if mesh is not None:
+                    write_mesh(ply_path(mesh, frame.index), hull_mesh(hull.occupancy, hull.grid, points))
+                yield frame.index, points
+                reporter.advance(frame.index, None)
+
+    return write_hulls(output, capture, hull.grid, hulls())
