@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from tk.errors import ConfigError, VolumeError
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.volume import Volume, VoxelGrid
-from tk.model.hull.hull import VisualHull
 from tk.model.hull import tables as hull_tables
+from tk.model.hull.hull import VisualHull
 
 VOLUME = Volume((0.0, 0.0, 1.0), (1.0, 0.8, 1.2))
 few = settings(max_examples=15, deadline=None)
