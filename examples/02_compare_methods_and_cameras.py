@@ -42,6 +42,6 @@ for label, (method, chosen) in runs.items():
     found = np.array([estimate.joints for estimate in estimates])
     distance = 100 * np.linalg.norm(found - truth.positions[rows], axis=2)  # (F, 15)
     lost = sum(estimate.status == "lost" for estimate in estimates)
-    told = [estimate.fit_error for estimate in estimates if estimate.fit_error is not None]
-    error = " ".join(f"{value:.2f}" for value in np.nanmean(told, axis=0)) if told else "not told"
+    errors = [estimate.residual.sum(axis=1) for estimate in estimates if estimate.residual is not None]  # (F, C)
+    error = " ".join(f"{value:.2f}" for value in np.nanmean(errors, axis=0)) if errors else "not measured"
     print(f"{label:28}  {distance.mean():9.2f}  {distance[:, LIMBS].mean():10.2f}  {lost:4}  {error}")

@@ -57,7 +57,7 @@ def test_track_writes_what_the_contract_says(tk: Tk, quick: Path, tiny: Path, tm
         "ankles": ((6, 4), "float64"),
         "joints/position": ((6, 15, 3), "float64"),
         "joints/sigma": ((6, 15), "float64"),
-        "fit_error": ((6, 4), "float64"),
+        "residual": ((6, 4, 2), "float64"),
         "status": ((6,), "uint8"),
         "objective": ((6,), "float64"),
     }

@@ -25,7 +25,7 @@ META = ResultMeta(
     config_toml='method = "volumetric"\n[smd]\nmu = 0.1\n',
     ankle_names=("ankle_pitch_l", "ankle_roll_l", "ankle_pitch_r", "ankle_roll_r"),
     sigma=True,
-    fit_cameras=("cam1", "cam2", "cam3"),
+    residual_cameras=("cam1", "cam2", "cam3"),
     segment_names=("torso", "head"),
     feet=True,
     angles=(
@@ -53,7 +53,7 @@ def make_frame(index: int) -> FrameResult:
         hull=hull,
         ankles=np.arange(4) / 10 + index,
         sigma=None if index % 4 == 3 else np.full(15, 0.01 * index),  # nothing known in some frames
-        fit_error=np.array([0.1, 0.2, index]),
+        residual=np.array([[0.1, 0.0], [0.1, 0.1], [0.0, index]]),
         segments_rotation=np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),
         feet=np.arange(12.0).reshape(4, 3) - index,
         angles={"knee_l": np.array([5.0 * index]), "hip_l": np.array([1.0, 2.0, index])},

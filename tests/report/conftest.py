@@ -36,7 +36,7 @@ def complete_result(path: Path, capture_path: Path, count: int = FRAMES) -> Path
         pose_names=tuple(paper), pose_units=tuple(units), stages=("all",),
         timing_stages=("decode", "optimise", "total"),
         fps=capture.fps, up=capture.up, capture="made <up>", method="region", seed=0, config_toml=Settings().to_toml(),
-        waist_names=WAIST, ankle_names=ANKLES, sigma=True, fit_cameras=capture.rig.names, segment_names=SEGMENTS,
+        waist_names=WAIST, ankle_names=ANKLES, sigma=True, residual_cameras=capture.rig.names, segment_names=SEGMENTS,
         feet=True, angles=tuple(JointAngles(a.joint, a.names, a.convention) for a in ANGLES), objective_kind="E_S",
     )  # fmt: skip
     rng = np.random.default_rng(1)
@@ -57,7 +57,7 @@ def complete_result(path: Path, capture_path: Path, count: int = FRAMES) -> Path
                 FrameResult(
                     f, f / capture.fps, main, derived.joints[f], status, 0.1 + 0.01 * f, np.array([9]),
                     {"decode": 0.01, "optimise": 0.12, "total": 0.15}, waist=waist, ankles=ankles, sigma=sigma,
-                    fit_error=np.full(len(capture.rig), 0.1 + (0.2 if f == 11 else 0.001 * f)),
+                    residual=np.full((len(capture.rig), 2), 0.05 + (0.1 if f == 11 else 0.0005 * f)),
                     segments_rotation=derived.rotations[f], feet=derived.feet[f],
                     angles={joint: values[f] for joint, values in derived.angles.items()},
                 )

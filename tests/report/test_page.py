@@ -94,7 +94,7 @@ def longer(result: Result, count: int) -> Result:
     rows = np.arange(count) % len(result)
     columns = {
         name: getattr(result, name)[rows]
-        for name in ("pose", "waist", "ankles", "joints", "sigma", "fit_error", "feet", "segments_rotation", "status",
+        for name in ("pose", "waist", "ankles", "joints", "sigma", "residual", "feet", "segments_rotation", "status",
                      "objective", "iterations")
     }  # fmt: skip
     angles = {joint: values[rows] for joint, values in result.angles.items()}

@@ -105,8 +105,8 @@ def test_pictures_out_of_step_are_tracked_again(tiny: Path, tmp_path: Path, monk
     assert result.cameras is not None
     np.testing.assert_allclose(result.cameras.time_offset_s * open_capture(tiny).fps, [0, 0, 1, -1])
     # a camera that is late or early has no mask at an end
-    assert result.fit_error is not None
-    assert np.isnan(result.fit_error[[0, -1], [2, 3]]).all() and np.isfinite(result.fit_error[1:-1]).all()
+    assert result.residual is not None
+    assert np.isnan(result.residual[[0, -1], [2, 3]]).all() and np.isfinite(result.residual[1:-1]).all()
 
 
 def test_what_does_not_belong_together_is_refused(tiny: Path, tracked: Path, tk: Tk, tmp_path: Path) -> None:

@@ -121,7 +121,7 @@ def test_a_camera_that_looks_aside_is_left_out_and_comes_back(scene: Scene) -> N
     (line,) = watch.report()
     assert "camera cam2 disagrees with the others" in line and "frames 5 to 10" in line
     # its fit is told as unknown where it was not used
-    assert estimates[6].fit_error is not None and np.isnan(estimates[6].fit_error[1])
+    assert estimates[6].residual is not None and np.isnan(estimates[6].residual[1]).all()
 
 
 def test_a_frozen_and_a_black_camera_are_named(scene: Scene) -> None:

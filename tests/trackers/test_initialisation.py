@@ -125,7 +125,7 @@ def test_poses_that_one_frame_cannot_tell_apart_are_all_followed(monkeypatch) ->
     monkeypatch.setattr("tk.trackers.initialisation._searched", lambda _, __, ___, pose: pose)
     explained = {False: 0.21, True: 0.22}
     monkeypatch.setattr(
-        tracker, "fit_error", lambda _, poses, __: np.array([explained[np.allclose(p, right)] for p in poses])
+        tracker, "mean_residual", lambda _, poses, __: np.array([explained[np.allclose(p, right)] for p in poses])
     )
     monkeypatch.setattr(tracker, "improved", lambda _, __, pose: pose)
     ways = find_person(tracker, frames, [tracker.pyramid(frame) for frame in frames])
@@ -171,7 +171,7 @@ def test_who_is_found_again_faces_as_before_where_silhouettes_leave_that_open(mo
         return lambda _, poses: 0.2 - better_if_turned * (np.cos(poses[:, facing] - yaw) < -0.9)
 
     for gain, turned in ((0.0, False), (0.03, False), (0.1, True)):
-        monkeypatch.setattr(tracker, "fit_error", explained(gain))
+        monkeypatch.setattr(tracker, "mean_residual", explained(gain))
         pose, error = tracker.relocate(pyramid, before, 1.0)
         assert (np.cos(pose[facing] - yaw) < 0) == turned
         assert error == pytest.approx(0.2 - gain * turned)

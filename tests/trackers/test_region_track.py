@@ -30,7 +30,7 @@ from tk.trackers.protocol import Estimate, Observation
 from tk.trackers.region import RegionTracker
 
 CONFIG = Settings.from_toml(QUICK)
-COLUMNS = ("frames", "time", "pose", "waist", "ankles", "joints", "sigma", "fit_error", "status", "objective")
+COLUMNS = ("frames", "time", "pose", "waist", "ankles", "joints", "sigma", "residual", "status", "objective")
 
 
 def run(capture: Path, output: Path, reporter: Silent | None = None, **options: Any) -> Summary:
@@ -78,8 +78,8 @@ def test_the_second_pass_replaces_poses(tiny: Path, causal: Path, refined: Path)
     assert REFINED not in first.model and second.model[REFINED] == 1
     for name in ("frames", "time", "status"):
         np.testing.assert_array_equal(getattr(second, name), getattr(first, name), err_msg=name)
-    assert first.fit_error is not None and second.fit_error is not None
-    assert second.fit_error.mean() < 1.03 * first.fit_error.mean()
+    assert first.residual is not None and second.residual is not None
+    assert second.residual.mean() < 1.03 * first.residual.mean()
     assert np.abs(second.pose - first.pose).max() > 1e-3
     # the initialisation pose has shown the body
     np.testing.assert_array_equal(second.model["parts/shape"], first.model["parts/shape"])
@@ -223,9 +223,9 @@ def test_lost_frames_stay_as_they_are_in_the_second_pass(copy: Path, tmp_path: P
     assert (summary.frames, summary.lost) == (8, 2)
     result = read_result(tmp_path / "r.h5")
     assert result.status.tolist() == [1, 0, 0, Status.LOST, Status.LOST, Status.RECOVERED, 0, 0]
-    assert result.sigma is not None and result.fit_error is not None
+    assert result.sigma is not None and result.residual is not None
     np.testing.assert_array_equal(np.isnan(result.sigma).all(axis=1), result.status == Status.LOST)
-    np.testing.assert_array_equal(np.isnan(result.fit_error).all(axis=1), result.status == Status.LOST)
+    np.testing.assert_array_equal(np.isnan(result.residual).all(axis=(1, 2)), result.status == Status.LOST)
     assert np.isfinite(result.joints).all()
     assert "fewer than two cameras see anybody: lost, frames 3 to 4" in result.notes
 

@@ -71,7 +71,7 @@ class Outcome:
         seconds: that the last attempt took.
         error_cm, limbs_cm: mean joint distance as it is, and of the limbs with constant offsets taken off, where the
             capture has a truth.
-        fit_error: mean E_S of the frames that are not lost.
+        silhouette_error: mean E_S of the frames that are not lost.
         sigma_cm: median σ of the joints.
         said: notes while it ran.
         failure: why it failed, in one line.
@@ -85,7 +85,7 @@ class Outcome:
     seconds: float = 0.0
     error_cm: float | None = None
     limbs_cm: float | None = None
-    fit_error: float | None = None
+    silhouette_error: float | None = None
     sigma_cm: float | None = None
     said: tuple[str, ...] = ()
     failure: str = ""

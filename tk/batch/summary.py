@@ -15,7 +15,7 @@ from tk.batch.jobs import BEGUN, DONE, FAILED, WAITING, Job, Outcome
 from tk.errors import ResultError
 
 COLUMNS = (
-    "name", "capture", "state", "frames", "lost", "lost_percent", "error_cm", "limbs_cm", "fit_error",
+    "name", "capture", "state", "frames", "lost", "lost_percent", "error_cm", "limbs_cm", "silhouette_error",
     "sigma_median_cm", "frames_per_second", "seconds", "said",
 )  # fmt: skip
 
@@ -75,7 +75,7 @@ def _row(job: Job, outcome: Outcome) -> dict[str, object]:
         "lost_percent": _lost_percent(outcome),
         "error_cm": outcome.error_cm,
         "limbs_cm": outcome.limbs_cm,
-        "fit_error": outcome.fit_error,
+        "silhouette_error": outcome.silhouette_error,
         "sigma_median_cm": outcome.sigma_cm,
         "frames_per_second": outcome.frames_per_second,
         "seconds": outcome.seconds if outcome.state in (DONE, FAILED) else None,
@@ -146,7 +146,7 @@ def _line(job: Job, outcome: Outcome, has_truth: bool) -> str:
         title = f'<a href="{quote(shown.name)}">{title}</a>'
     look = "lost" if outcome.mostly_lost else outcome.state
     percent = _lost_percent(outcome)
-    fit = None if outcome.fit_error is None else 100 * outcome.fit_error
+    fit = None if outcome.silhouette_error is None else 100 * outcome.silhouette_error
     cells = [
         f'<td class="text" title="{html.escape(str(job.capture))}">{title}</td>',
         f'<td class="text"><span class="state {look}">{_state(outcome)}</span></td>',

@@ -80,7 +80,7 @@ def _track(job: Job, reporter: _Reporter) -> Outcome:
         tracked_now=summary.tracked_now,
         error_cm=error_cm,
         limbs_cm=limbs_cm,
-        fit_error=_typical(np.mean, result.fit_error, known),
+        silhouette_error=_typical(np.mean, result.silhouette_error, known),
         sigma_cm=_typical(np.median, result.sigma, known, 100),
     )
 

@@ -183,7 +183,7 @@ class Overlay:
     def _name(self, tile: Image, row: int, camera: Camera) -> None:
         """The camera's name and E_S in a corner."""
         text = camera.name
-        names, errors = self.result.meta.fit_cameras, self.result.fit_error
+        names, errors = self.result.meta.residual_cameras, self.result.silhouette_error
         if errors is not None and camera.name in names:
             error = float(errors[row, names.index(camera.name)])
             text += f"  E_S {100 * error:.0f} %" if np.isfinite(error) else ""

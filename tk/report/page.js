@@ -7,7 +7,7 @@
   const count = data.frames.length;
   const lost = data.status.map((status) => status === data.lostStatus);
   const lostCount = lost.filter(Boolean).length;
-  const fitError = data.fitError && unpack(data.fitError);
+  const silhouetteError = data.silhouetteError && unpack(data.silhouetteError);
   const sigma = data.sigma && unpack(data.sigma);
   const objective = unpack(data.objective);
   const C = data.cameras.length, J = data.joints.length;
@@ -44,8 +44,8 @@
     get("figures").append(box);
   };
   tell("lost frames", String(lostCount), `of ${count}`, lostCount > 0);
-  const meanError = fitError && Array.from({ length: count }, (_, row) => {
-    const told = Array.from(fitError.subarray(row * C, row * C + C)).filter(isFinite);
+  const meanError = silhouetteError && Array.from({ length: count }, (_, row) => {
+    const told = Array.from(silhouetteError.subarray(row * C, row * C + C)).filter(isFinite);
     return told.length ? told.reduce((a, b) => a + b) / told.length : NaN;
   });
   if (meanError) tell("E_S, median frame", short(100 * quantile(good(meanError), 0.5)), "%");
@@ -73,10 +73,10 @@
     get(holder).append(box);
     return made;
   };
-  const errorBars = fitError ? bars("now-cameras", "E_S of each camera", data.cameras, "%") : [];
+  const errorBars = silhouetteError ? bars("now-cameras", "E_S of each camera", data.cameras, "%") : [];
   const sigmaBars = sigma ? bars("now-joints", "σ of each joint", data.joints.map(joint), "mm") : [];
-  if (!fitError && !sigma) get("now-joints").append(make("p", "This result tells neither E_S nor σ.", "muted"));
-  const mostError = fitError ? Math.max(quantile(fitError, 0.99) * 100, 1) : 1;
+  if (!silhouetteError && !sigma) get("now-joints").append(make("p", "This result tells neither E_S nor σ.", "muted"));
+  const mostError = silhouetteError ? Math.max(quantile(silhouetteError, 0.99) * 100, 1) : 1;
 
   function show(wanted) {
     const next = Math.min(Math.max(wanted, 0), count - 1);
@@ -90,7 +90,7 @@
     get("status").dataset.status = data.status[row];
     get("badge").hidden = !lost[row];
     document.querySelector(".stage").classList.toggle("lost", lost[row]);
-    errorBars.forEach((set, k) => set(100 * fitError[row * C + k], mostError));
+    errorBars.forEach((set, k) => set(100 * silhouetteError[row * C + k], mostError));
     sigmaBars.forEach((set, k) => {
       const value = sigma[row * J + k];
       set(1000 * value, 1000 * data.colors.sigmaMost, isFinite(value) ? sigmaColor(data.colors, value) : "");
@@ -166,7 +166,7 @@
     get("quality-text").textContent = "E_S is the share of pixels that the body explains wrongly. Red: lost frames. A click on a curve goes to its frame.";
     charts.push(new Chart(get("quality-charts"), {
       ...common, title: "E_S of each camera", unit: " %", width: wide, height: 190, zero: true, digits: 1,
-      lines: data.cameras.map((name, k) => ({ name, color: hues[k % hues.length], values: column(fitError, C, k).map((v) => 100 * v) })),
+      lines: data.cameras.map((name, k) => ({ name, color: hues[k % hues.length], values: column(silhouetteError, C, k).map((v) => 100 * v) })),
     }));
   } else {
     get("quality-text").textContent = "This result does not tell E_S. Red: lost frames. A click on a curve goes to its frame.";

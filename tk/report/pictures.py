@@ -32,9 +32,10 @@ def choose_rows(result: Result) -> list[Choice]:
     count = len(result)
     lost = result.status == Status.LOST
     error = np.full(count, np.nan)
-    if result.fit_error is not None and result.fit_error.size:
-        told = np.isfinite(result.fit_error).any(axis=1)
-        error[told] = np.nanmean(result.fit_error[told], axis=1)
+    by_view = result.silhouette_error
+    if by_view is not None and by_view.size:
+        known = np.isfinite(by_view).any(axis=1)
+        error[known] = np.nanmean(by_view[known], axis=1)
     chosen: dict[int, str] = {}
     apart = max(2, count // 20)
 

@@ -59,7 +59,7 @@ def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[st
         _LOG.info("second pass")
         # the initialisation pose shows all of the body; what else a recording may begin with does not
         shown = plan.init is None and plan.capture.init_pose != "any"
-        assert result.fit_error is not None
+        assert result.residual is not None
         missing = [int(f) for f in result.frames if int(f) not in masks]
         if missing:  # what an earlier run has tracked
             with open_source(plan.capture, plan.config, lambda _: None) as source:
@@ -78,11 +78,11 @@ def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[st
                     poses[rows] = [join_pose(skeleton, e.pose, e.waist, e.ankles) for e in told_again]
                     lost[rows] = [e.status == "lost" for e in told_again]
                     columns |= _replaced(result, rows, told_again)
-        poses, columns["fit_error"], sigma = tracker.second_pass(
+        poses, columns["residual"], sigma = tracker.second_pass(
             masks.sequence(result.frames),
             poses,
             lost,
-            columns.get("fit_error", result.fit_error),
+            columns.get("residual", result.residual),
             plan.capture.subject_height_m,
             keep_body=plan.body is not None or shown,
         )
@@ -134,15 +134,15 @@ def _track_again(
 
 def _replaced(result: Result, rows: NDArray[np.int64], estimates: Sequence[Estimate]) -> dict[str, NDArray[Any]]:
     """What a result's first pass told of these rows, told by other estimates."""
-    assert result.sigma is not None and result.fit_error is not None
+    assert result.sigma is not None and result.residual is not None
     columns = {
         "joints/sigma": result.sigma.copy(),
-        "fit_error": result.fit_error.copy(),
+        "residual": result.residual.copy(),
         "objective": result.objective.copy(),
         "status": result.status.copy(),
     }
     for row, e in zip(rows, estimates, strict=True):
-        columns["joints/sigma"][row], columns["fit_error"][row] = e.sigma, e.fit_error
+        columns["joints/sigma"][row], columns["residual"][row] = e.sigma, e.residual
         columns["objective"][row] = e.objective
         if result.status[row] != Status.INITIALISED:
             columns["status"][row] = Status[e.status.upper()]

@@ -104,7 +104,7 @@ class Plan:
             waist_names=tracker.waist_names,
             ankle_names=tracker.ankle_names,
             sigma=tracker.method == RegionTracker.method,
-            fit_cameras=capture.rig.names if tracker.method == RegionTracker.method else (),
+            residual_cameras=capture.rig.names if tracker.method == RegionTracker.method else (),
             segment_names=SEGMENTS if contours else (),
             feet=contours,
             angles=tuple(JointAngles(a.joint, a.names, a.convention) for a in ANGLES) if contours else (),

@@ -401,7 +401,7 @@ def _row(estimate: Estimate, store_hull: bool) -> FrameResult:
         ankles=estimate.ankles if len(estimate.ankles) else None,
         joints=estimate.joints,
         sigma=estimate.sigma,
-        fit_error=estimate.fit_error,
+        residual=estimate.residual,
         status=int(Status[estimate.status.upper()]),
         objective=estimate.objective,
         iterations=estimate.iterations,

@@ -135,7 +135,7 @@ class CameraMonitor:
         before = self.tracker.state() if watched else {}
         estimate = self.tracker.step(used)
         aside = None
-        if watched and used.masks.any() and estimate.fit_error is not None:
+        if watched and used.masks.any() and estimate.residual is not None:
             estimate, used, aside = self._weigh(frame, used, bad, before, estimate)
         for camera, reason in enumerate(sick):
             if reason is not None and bad[camera]:
@@ -158,8 +158,8 @@ class CameraMonitor:
         Returns:
             the estimate, what it was made from, and (C,) by how much each used camera's mask lies beside the body.
         """
-        assert first.fit_error is not None
-        error = aside = first.fit_error  # no mask can lie farther beside the body
+        assert first.residual is not None
+        error = aside = first.residual.sum(axis=1)  # no mask can lie farther beside the body
         if self._distrusted.any() or np.nanmax(error, initial=0.0) > _SUSPECT:
             lacking, surplus = self._errors(frame, first)
             error, aside = lacking + surplus, _aside(lacking, surplus)

@@ -237,7 +237,7 @@ class ContourTracker:
 
     def _misfit(self, frame: Observation, pyramid: Pyramid, pose: Float) -> float:
         """E_S where a pose (D,) settles, masks in doubt counted half."""
-        return float(self.fit_error(pyramid, self.settle(pyramid, pose[None]).states, frame.uncertain)[0])
+        return float(self.mean_residual(pyramid, self.settle(pyramid, pose[None]).states, frame.uncertain)[0])
 
     def fit(
         self,
@@ -329,7 +329,7 @@ class ContourTracker:
         """What the frame shows on a grid."""
         return Evidence.of(grid, pyramid.masks[0], frame.uncertain, frame.images, self.colors)
 
-    def fit_error(self, pyramid: Pyramid, poses: Float, uncertain: NDArray[np.bool_] | None = None) -> Float:
+    def mean_residual(self, pyramid: Pyramid, poses: Float, uncertain: NDArray[np.bool_] | None = None) -> Float:
         """(B,) E_S averaged over the views that see anybody, inf where none does; what is met where the masks are
         ``uncertain`` counts half."""
         evidence = Evidence.of(self.screen, pyramid.masks[0], uncertain)
@@ -437,13 +437,13 @@ class ContourTracker:
             return np.asarray(FACING * (1 - np.cos(states[:, yaw] - pose[yaw])) / 2)
 
         coarse = self.settle(pyramid, starts, levels[:1]).states
-        rough = self.fit_error(pyramid, coarse)
+        rough = self.mean_residual(pyramid, coarse)
         order = np.argsort(rough + turned(coarse), kind="stable")[: len(starts) // RELOCATED]
         order = order[rough[order] < HALVED * error]
         if not len(order):
             return pose, error
         settled = self.settle(pyramid, coarse[order], levels[1:]).states
-        errors = self.fit_error(pyramid, settled)
+        errors = self.mean_residual(pyramid, settled)
         i = int(np.argmin(errors + turned(settled)))
         return (settled[i], float(errors[i])) if errors[i] < error else (pose, error)
 

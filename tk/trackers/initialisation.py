@@ -128,11 +128,11 @@ def _find(tracker: ContourTracker, frame: Observation, pyramid: Pyramid) -> tupl
     skeleton = tracker.body.skeleton
     p_centroid = centroid(tracker.views.rig, pyramid, frame.index)
     settled = tracker.settle(pyramid, gait.hypotheses(skeleton, HEADINGS, PHASES, p_centroid)).states
-    order = settled[np.argsort(tracker.fit_error(pyramid, settled, frame.uncertain), kind="stable")]
+    order = settled[np.argsort(tracker.mean_residual(pyramid, settled, frame.uncertain), kind="stable")]
     turned = _turned(skeleton, order, order[0])
     finalists = np.array(_distinct(skeleton, order, FINALISTS) + _distinct(skeleton, order[turned], OPPOSITE))
     poses = np.array([_searched(tracker, frame, pyramid, pose) for pose in np.unique(finalists, axis=0)])
-    error = tracker.fit_error(pyramid, poses, frame.uncertain)
+    error = tracker.mean_residual(pyramid, poses, frame.uncertain)
     best = int(np.argmin(error))
     others = np.flatnonzero(_turned(skeleton, poses, poses[best]) & (error < NEARLY * error[best]))
     opposite = others[np.argsort(error[others], kind="stable")[:1]]
@@ -151,7 +151,7 @@ def _follow(
     errors = np.full(F, np.nan)
 
     def told(i: int, pose: Float) -> float:
-        return float(tracker.fit_error(pyramids[i], pose[None], frames[i].uncertain)[0])
+        return float(tracker.mean_residual(pyramids[i], pose[None], frames[i].uncertain)[0])
 
     errors[anchor] = told(anchor, pose)
     every = tracker.contours.search_every

@@ -51,7 +51,8 @@ class Estimate:
         surface: the hull's surface, if the tracker made one.
         sigma: (15,) one standard deviation of each joint's position along an axis, metres; None where the tracker does
             not say.
-        fit_error: (C,) E_S of each camera; None where the tracker does not say.
+        residual: (C, 2) missing area (body outside the mask) and surplus area (mask outside the body) by camera, shares
+            of the person's pixels, NaN for a camera that was not used; their sum is E_S. None if not measured.
         masks: (C, H, W) uint8, what the tracker took for the person, cleaned; None where that is the observation's, and
             in what :func:`tk.track` hands out. drawn: (C, h, w) bool, where the body is on the tracker's grid of rays,
             cameras left out included; None likewise.
@@ -68,7 +69,7 @@ class Estimate:
     waist: Float = field(default_factory=lambda: np.zeros(0))
     ankles: Float = field(default_factory=lambda: np.zeros(0))
     sigma: Float | None = None
-    fit_error: Float | None = None
+    residual: Float | None = None
     masks: NDArray[np.uint8] | None = None
     drawn: NDArray[np.bool_] | None = None
     frame: int = -1

@@ -183,7 +183,8 @@ class RegionTracker(ContourTracker):
         self._rank()
         i = int(np.argmin([np.abs(pose - self._best.pose).max() for pose in poses]))
         label, curvature = met.label[i], hessian[i]
-        error = evidence.fit_error(label)
+        residual = evidence.residual(label)
+        error = residual.sum(axis=1)
         watch.lap("check")
         misplaced = self.misplaced(evidence, label)
         searched = self._needs_search(frame, self._worse(error), misplaced)
@@ -192,7 +193,8 @@ class RegionTracker(ContourTracker):
             in_pairs, settled = self._in_vain, self._best.pose
             self._propose(frame, pyramid, evidence, images, misplaced, in_pairs)
             if self._best.pose is not settled:
-                label, curvature, error = self._look(evidence, pyramid, images)
+                label, curvature, residual = self._look(evidence, pyramid, images)
+                error = residual.sum(axis=1)
                 misplaced = self.misplaced(evidence, label)
             self._in_vain = not in_pairs and self._worse(error)
         else:
@@ -201,7 +203,8 @@ class RegionTracker(ContourTracker):
         followed = self._best.pose
         lost = self._follow(pyramid, error)
         if self._best.pose is not followed:
-            label, curvature, error = self._look(evidence, pyramid, images)
+            label, curvature, residual = self._look(evidence, pyramid, images)
+            error = residual.sum(axis=1)
         self._learn(evidence, label, error, lost)
         status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
         self._lost_for = self._lost_for + 1 if lost else 0
@@ -220,7 +223,7 @@ class RegionTracker(ContourTracker):
             iterations=np.array([iterations.sum(), int(searched)], np.int32),
             timing=watch.laps,
             sigma=sigma,
-            fit_error=error,
+            residual=residual,
             masks=pyramid.masks[0],
             drawn=label > 0,
         )
@@ -362,13 +365,13 @@ class RegionTracker(ContourTracker):
     def _look(
         self, evidence: Evidence, pyramid: Pyramid, images: NDArray[np.uint8] | None
     ) -> tuple[NDArray[np.uint8], Float, Float]:
-        """The best pose's labels on the screen (V, h, w), JᵀWJ (D, D), and E_S (V,)."""
+        """The best pose's labels on the screen (V, h, w), JᵀWJ (D, D), and residual (V, 2)."""
         best = self._best.pose[None]
         _, met = evidence.cast(self.body, self.colors.group, best, export=True)
         assert met is not None
         regions = None if images is None else self.colors.regions(images)
         here = self.views.equations(self.body.arrays, pyramid, best, 0, self.contours.search, regions)
-        return met.label[0], here.hessian[0], evidence.fit_error(met.label[0])
+        return met.label[0], here.hessian[0], evidence.residual(met.label[0])
 
     def _sigma(self, pose: Float, curvature: Float) -> Float:
         """(15,) one standard deviation of each joint's position along an axis, metres: of the contours' noise, the
@@ -389,7 +392,7 @@ class RegionTracker(ContourTracker):
         masks: Sequence[NDArray[np.uint8]],
         poses: Float,
         lost: NDArray[np.bool_],
-        error: Float,
+        residual: Float,
         height_m: float | None,
         keep_body: bool = False,
     ) -> tuple[Float, Float, Float]:
@@ -405,35 +408,37 @@ class RegionTracker(ContourTracker):
             masks: (C, H, W) of F frames, as :meth:`step` told them: cleaned.
             poses: (F, D) of the first pass, in the capture's world.
             lost: (F,) bool; such frames neither teach nor change.
-            error: (F, C) E_S of the first pass; NaN where a camera was left out, and is again.
+            residual: (F, C, 2) of the first pass; a camera whose residual is NaN in a frame is not used in it.
             height_m: the subject's height, if known.
             keep_body: leave the body as it is.
 
         Returns:
-            Poses (F, D) in the capture's world, E_S (F, C), and one standard deviation (F, 15) of the joints' positions
-            along an axis, metres, 0 in lost frames. The tracker has the new body.
+            Poses (F, D) in the capture's world, residuals (F, C, 2), and one standard deviation (F, 15) of the joints'
+            positions along an axis, metres, 0 in lost frames. The tracker has the new body.
         """
         given, poses = poses, self.world.poses_in(poses)
         tracked = np.flatnonzero(~lost)
         variance = np.zeros((len(poses), len(JOINTS)))
         if not len(tracked):
-            return given, error, variance
+            return given, residual, variance
 
         def believed(i: int) -> NDArray[np.uint8]:
-            shown, out = masks[i], np.isnan(error[i])
+            shown, out = masks[i], np.isnan(residual[i, :, 0])
             return np.where(out[:, None, None], np.uint8(0), shown) if out.any() else shown
 
         if not keep_body and self.contours.adapt:
             opening = tracked[: self.contours.init_frames : 3]
-            spread = _spread(tracked, np.nanmean(error[tracked], axis=1), SECOND_FIT.frames - len(opening))
+            spread = _spread(
+                tracked, np.nanmean(residual[tracked].sum(axis=2), axis=1), SECOND_FIT.frames - len(opening)
+            )
             chosen = np.union1d(opening, spread)
             seen = [self.views.pyramid(believed(int(i)), 1, None) for i in chosen]
             stature = height_m or self.body.dimensions.stature
             fit = SECOND_FIT if height_m else replace(SECOND_FIT, stature_deviation=0.03)
             body, _ = self.fit(seen, poses[chosen], np.arange(len(chosen)), stature, fit)
             self.take_body(body)
-        result, errors = poses.copy(), np.array(error)
-        body, group = self.body, self.colors.group
+        result, residuals = poses.copy(), np.array(residual)
+        body = self.body
         for chunk in np.array_split(tracked, -(-len(tracked) // AT_ONCE)):
             seen = [self.views.pyramid(believed(int(i)), 1, None) for i in chunk]
             prior = self._prior(poses[chunk], SECOND_ANGLE_DEG)
@@ -442,7 +447,7 @@ class RegionTracker(ContourTracker):
             precision = INFORMATION * (settled.hessian + np.diag(prior.precision))
             variance[chunk] = contour_variance(body.skeleton, result[chunk], precision, body.free)
             for i, pyramid in zip(chunk, seen, strict=True):
-                errors[i] = Evidence.of(self.screen, pyramid.masks[0]).cast(body, group, result[i][None])[0][0]
+                residuals[i] = self._costs(pyramid, result[i][None])[1][0]
         jumps = _jumps(body.skeleton, poses)
         later: Hypothesis | None = None
         for i in tracked[::-1]:
@@ -456,18 +461,25 @@ class RegionTracker(ContourTracker):
             prior = self._prior(later.pose[None], SECOND_ANGLE_DEG)
             settled = self.settle(pyramid, later.pose[None], (0,), prior=prior)
             both = np.stack([result[i], settled.states[0]])
-            by_view = Evidence.of(self.screen, pyramid.masks[0]).cast(body, group, both)[0]
-            later = self._backwards(later, both, mean_of_views(by_view))
+            costs, of_both = self._costs(pyramid, both)
+            later = self._backwards(later, both, costs)
             if later is None:
                 continue
             if later.cost < -GAIN:
-                result[i], errors[i] = both[1], by_view[1]
+                result[i], residuals[i] = both[1], of_both[1]
                 precision = INFORMATION * (settled.hessian[0] + np.diag(prior.precision))
                 variance[i] = contour_variance(body.skeleton, result[i], precision, body.free)
             variance[i] += _disagreement(body.skeleton, both, np.array([0.0, later.cost]))
         usual = np.median(directions(self.body.skeleton, result[tracked]), axis=0)
         variance[tracked] += posture_variance(self.body.skeleton, result[tracked], usual)
-        return np.where(lost[:, None], given, self.world.poses_out(result)), errors, np.sqrt(variance)
+        return np.where(lost[:, None], given, self.world.poses_out(result)), residuals, np.sqrt(variance)
+
+    def _costs(self, pyramid: Pyramid, poses: Float) -> tuple[Float, Float]:
+        """Return the costs (B,) of poses (B, D) by masks alone, mean over the views, and their residuals (B, V, 2)."""
+        evidence = Evidence.of(self.screen, pyramid.masks[0])
+        by_view, met = evidence.cast(self.body, self.colors.group, poses, export=True)
+        assert met is not None
+        return mean_of_views(by_view), np.array([evidence.residual(label) for label in met.label])
 
     def _backwards(self, later: Hypothesis, poses: Float, cost: Float) -> Hypothesis | None:
         """The hypothesis that comes from the frame after, by what it costs more than that frame's own pose; both are at
@@ -494,7 +506,7 @@ class RegionTracker(ContourTracker):
             iterations=np.zeros(len(self.stages), np.int32),
             timing=watch.laps,
             sigma=np.full(len(JOINTS), np.nan),
-            fit_error=np.full(len(frame.masks), np.nan),
+            residual=np.full((len(frame.masks), 2), np.nan),
         )
 
     def state(self) -> Mapping[str, Any]:

@@ -64,7 +64,7 @@ class SilhouetteTracker(ContourTracker):
         watch.lap("optimise")
         if config.search_every and frame.index % config.search_every == 0:
             pose = self.improved(Observation(frame.index, frame.images[:0], frame.masks), pyramid, pose)
-        error = float(self.fit_error(pyramid, pose[None])[0])
+        error = float(self.mean_residual(pyramid, pose[None])[0])
         # after a loss the last pose is no evidence, however well the pose near it fits
         due = self._lost_for > 0 if error <= config.lost_error else self._lost_for % RELOCATE_EVERY == 0
         if due and np.isfinite(error):

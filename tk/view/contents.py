@@ -93,8 +93,9 @@ class Contents:
         """What there is to say of a frame."""
         result = self.result
         parts = [f"frame {result.frames[row]}", f"{result.time[row]:.2f} s", STATUS_MEANING[result.status[row]]]
-        if result.fit_error is not None and np.isfinite(result.fit_error[row]).any():
-            parts.append(f"E_S {100 * np.nanmean(result.fit_error[row]):.1f} %")
+        error = result.silhouette_error
+        if error is not None and np.isfinite(error[row]).any():
+            parts.append(f"E_S {100 * np.nanmean(error[row]):.1f} %")
         if result.sigma is not None and np.isfinite(result.sigma[row]).any():
             parts.append(f"median sigma {100 * np.nanmedian(result.sigma[row]):.1f} cm")
         return "    ".join(parts)

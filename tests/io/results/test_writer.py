@@ -59,7 +59,7 @@ def test_layout_is_the_contract(tmp_path: Path) -> None:
             ("timing/optimise", (2,), "float64"),
             ("ankles", (2, 4), "float64"),
             ("joints/sigma", (2, 15), "float64"),
-            ("fit_error", (2, 3), "float64"),
+            ("residual", (2, 3, 2), "float64"),
             ("segments/rotation", (2, 2, 4), "float64"),
             ("feet/position", (2, 4, 3), "float64"),
             ("angles/knee_l", (2, 1), "float64"),
@@ -74,7 +74,8 @@ def test_layout_is_the_contract(tmp_path: Path) -> None:
         assert tuple(file["ankles"].attrs["names"]) == META.ankle_names
         assert tuple(file["ankles"].attrs["units"]) == ("rad",) * 4
         assert tuple(file["joints/sigma"].attrs["names"]) == JOINTS
-        assert tuple(file["fit_error"].attrs["cameras"]) == META.fit_cameras
+        assert tuple(file["residual"].attrs["cameras"]) == META.residual_cameras
+        assert tuple(file["residual"].attrs["areas"]) == ("missing", "surplus")
         assert tuple(file["segments/rotation"].attrs["names"]) == META.segment_names
         assert tuple(file["feet/position"].attrs["names"]) == ("heel_l", "toe_l", "heel_r", "toe_r")
         assert tuple(file["angles/hip_l"].attrs["names"]) == ("flexion", "abduction", "rotation")
@@ -196,7 +197,7 @@ def test_result_without_pose_or_joints(tmp_path: Path) -> None:
         {"status": 4},
         {"timing": {"nonsense": 1.0}},
         {"sigma": np.zeros(14)},
-        {"fit_error": np.zeros(2)},
+        {"residual": np.zeros(3)},
         {"angles": {"elbow_l": np.zeros(1)}},
         {"angles": {"knee_l": np.zeros(2)}},
     ],
@@ -214,13 +215,13 @@ def test_a_frame_of_the_wrong_shape_is_refused_and_the_rest_kept(tmp_path: Path,
 # --- what a tracker may have or not -----------------------------------------------------------------------------------
 
 PLAIN = replace(
-    META, ankle_names=(), sigma=False, fit_cameras=(), segment_names=(), feet=False, angles=(), objective_kind=""
+    META, ankle_names=(), sigma=False, residual_cameras=(), segment_names=(), feet=False, angles=(), objective_kind=""
 )
 
 
 def plain_frame(index: int) -> FrameResult:
     return replace(
-        make_frame(index), ankles=None, sigma=None, fit_error=None, segments_rotation=None, feet=None, angles={}
+        make_frame(index), ankles=None, sigma=None, residual=None, segments_rotation=None, feet=None, angles={}
     )
 
 
@@ -238,11 +239,17 @@ def test_what_is_optional_is_read_back(tmp_path: Path) -> None:
     write(path, 5)
     result = read_result(path)
     assert result.meta == META
-    assert result.ankles is not None and result.sigma is not None and result.fit_error is not None
+    assert (
+        result.ankles is not None
+        and result.sigma is not None
+        and result.residual is not None
+        and result.silhouette_error is not None
+    )
     assert result.segments_rotation is not None and result.feet is not None
     assert result.sigma.shape == (5, 15) and np.isnan(result.sigma).all(axis=1).tolist() == [False] * 3 + [True, False]
     np.testing.assert_array_equal(result.ankles[2], make_frame(2).ankles)
-    np.testing.assert_array_equal(result.fit_error[:, 2], range(5))
+    np.testing.assert_array_equal(result.residual[:, 2, 1], range(5))
+    np.testing.assert_array_equal(result.silhouette_error[:, 2], range(5))
     np.testing.assert_array_equal(result.segments_rotation[4], make_frame(4).segments_rotation)
     np.testing.assert_array_equal(result.feet[1], make_frame(1).feet)
     assert list(result.angles) == ["knee_l", "hip_l"]

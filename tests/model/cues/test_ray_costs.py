@@ -46,7 +46,11 @@ def test_without_colors_the_cost_is_the_papers_error():
     expected = np.array([share_wrong(drawn, MASKS) for drawn in DRAWN])
     np.testing.assert_allclose(total, expected, atol=1e-6)
     assert (total[1] > 0.1).all() and (total[0] < 1e-6).all()
-    np.testing.assert_allclose(Evidence.of(FINE, MASKS).fit_error(met.label[1]), expected[1], atol=1e-12)
+    residual = Evidence.of(FINE, MASKS).residual(met.label[1])
+    np.testing.assert_allclose(residual.sum(axis=1), expected[1], atol=1e-12)
+    outside = (DRAWN[1] > 0) & (MASKS == 0)
+    missing = np.count_nonzero(outside, axis=(1, 2)) / np.count_nonzero(MASKS, axis=(1, 2))
+    np.testing.assert_allclose(residual[:, 0], missing, atol=1e-12)
     np.testing.assert_allclose(mean_of_views(total), expected.mean(axis=1), atol=1e-6)
 
 
@@ -61,7 +65,7 @@ def test_a_view_that_sees_nobody_does_not_count():
     evidence = Evidence.of(FINE, masks)
     total, met = cast(evidence, export=True)
     assert np.isnan(total[:, 1]).all() and np.isfinite(total[:, [0, 2]]).all()
-    assert met is not None and np.isnan(evidence.fit_error(met.label[0])).tolist() == [False, True, False]
+    assert met is not None and np.isnan(evidence.residual(met.label[0])[:, 0]).tolist() == [False, True, False]
     np.testing.assert_allclose(mean_of_views(total), total[:, [0, 2]].mean(axis=1))
     nobody, _ = cast(Evidence.of(FINE, 0 * masks))
     assert np.isnan(nobody).all() and np.isinf(mean_of_views(nobody)).all()

@@ -68,8 +68,9 @@ def columns_of(meta: ResultMeta) -> dict[str, Column]:
             columns[name] = Column((len(names),), "f8", {"names": names, "units": ("rad",) * len(names)})
     if meta.sigma:
         columns["joints/sigma"] = Column((len(joints),), "f8", {"names": joints}, FAR_M)
-    if meta.fit_cameras:
-        columns["fit_error"] = Column((len(meta.fit_cameras),), "f8", {"cameras": meta.fit_cameras})
+    if meta.residual_cameras:
+        attributes = {"cameras": meta.residual_cameras, "areas": ("missing", "surplus")}
+        columns["residual"] = Column((len(meta.residual_cameras), 2), "f8", attributes)
     if meta.segment_names:
         columns["segments/rotation"] = Column((len(meta.segment_names), 4), "f8", {"names": meta.segment_names})
     if meta.feet:
@@ -92,7 +93,7 @@ def row_of(frame: FrameResult, meta: ResultMeta) -> dict[str, NDArray[Any]]:
     optional = {
         "ankles": frame.ankles,
         "joints/sigma": frame.sigma,
-        "fit_error": frame.fit_error,
+        "residual": frame.residual,
         "segments/rotation": frame.segments_rotation,
         "feet/position": frame.feet,
         **{f"angles/{joint}": values for joint, values in frame.angles.items()},

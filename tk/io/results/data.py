@@ -43,7 +43,7 @@ class Status(IntEnum):
 #: fields of ResultMeta that hold names
 _LISTS = (
     "pose_names", "pose_units", "stages", "timing_stages", "joint_names",
-    "waist_names", "ankle_names", "fit_cameras", "segment_names",
+    "waist_names", "ankle_names", "residual_cameras", "segment_names",
 )  # fmt: skip
 
 STATUS_MEANING = ("tracked", "initialised", "recovered after loss", "lost")
@@ -88,7 +88,7 @@ class ResultMeta:
         waist_names: names of the angles between trunk and pelvis, radians.
         ankle_names: names of the angles of the feet against the shins, radians.
         sigma: whether there is a standard deviation of each joint's position.
-        fit_cameras: names of the C cameras whose fit is told, for `/fit_error`.
+        residual_cameras: names of the C cameras of `/residual`.
         segment_names: names of the segments whose rotation is told.
         feet: whether there are the positions of :data:`FOOT_POINTS`.
         angles: the joints' angles as a clinician reads them.
@@ -109,7 +109,7 @@ class ResultMeta:
     waist_names: tuple[str, ...] = ()
     ankle_names: tuple[str, ...] = ()
     sigma: bool = False
-    fit_cameras: tuple[str, ...] = ()
+    residual_cameras: tuple[str, ...] = ()
     segment_names: tuple[str, ...] = ()
     feet: bool = False
     angles: tuple[JointAngles, ...] = ()
@@ -189,7 +189,7 @@ class FrameResult:
 
         ankles: (A,) angles of the feet against the shins, radians.
         sigma: (J,) one standard deviation of each joint's position, metres; NaN where a joint has no evidence.
-        fit_error: (C,) the share of wrongly classified pixels of each camera (E_S).
+        residual: (C, 2) missing and surplus area by camera, shares of the person's pixels; their sum is E_S.
         segments_rotation: (S, 4) quaternions (w, x, y, z), segment to world.
         feet: (4, 3) the :data:`FOOT_POINTS`, metres, world frame.
         angles: degrees by joint; a joint that is not mentioned is NaN.
@@ -207,7 +207,7 @@ class FrameResult:
     waist: Float = field(default_factory=lambda: np.zeros(0))
     ankles: Float | None = None
     sigma: Float | None = None
-    fit_error: Float | None = None
+    residual: Float | None = None
     segments_rotation: Float | None = None
     feet: Float | None = None
     angles: Mapping[str, Float] = field(default_factory=dict)
@@ -271,7 +271,7 @@ class Result:
     created: str
     ankles: Float | None = None  # (F, A) radians
     sigma: Float | None = None  # (F, J) metres, NaN where a joint has no evidence
-    fit_error: Float | None = None  # (F, C)
+    residual: Float | None = None  # (F, C, 2) missing and surplus area, shares of the person's pixels
     segments_rotation: Float | None = None  # (F, S, 4) w, x, y, z; segment to world
     feet: Float | None = None  # (F, 4, 3) metres
     angles: Mapping[str, Float] = field(default_factory=dict)  # by joint, each (F, k) degrees
@@ -281,6 +281,11 @@ class Result:
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    @property
+    def silhouette_error(self) -> Float | None:
+        """(F, C) E_S by camera: the sum of missing and surplus area; None if the result has no residual."""
+        return None if self.residual is None else np.asarray(self.residual.sum(axis=2))
 
     def to_pandas(self) -> pandas.DataFrame:
         """A table, one row a frame; see :func:`tk.io.results.tables.to_pandas`."""

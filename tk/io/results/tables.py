@@ -26,7 +26,7 @@ def to_pandas(result: Result) -> pandas.DataFrame:
 
     Columns: ``time`` (seconds), ``status`` (a word), ``objective``; ``<joint>_x``, ``_y``, ``_z`` and ``<joint>_sigma``
     (metres), the feet likewise; the pose, the waist and the ankles by their names (radians and metres);
-    ``<joint>_<angle>_deg``; ``fit_error_<camera>``.
+    ``<joint>_<angle>_deg``; ``<camera>_missing`` and ``<camera>_surplus``, the residual.
 
     Raises:
         ExportError: pandas is not installed.
@@ -48,8 +48,12 @@ def to_pandas(result: Result) -> pandas.DataFrame:
         if angles.joint in result.angles
         for i, name in enumerate(angles.names)
     }
-    if result.fit_error is not None:
-        columns |= {f"fit_error_{name}": result.fit_error[:, i] for i, name in enumerate(result.meta.fit_cameras)}
+    if result.residual is not None:
+        columns |= {
+            f"{name}_{area}": result.residual[:, i, k]
+            for i, name in enumerate(result.meta.residual_cameras)
+            for k, area in enumerate(("missing", "surplus"))
+        }
     return pd.DataFrame(columns, index=pd.Index(result.frames, name="frame"))
 
 
@@ -84,9 +88,10 @@ def to_xarray(result: Result) -> xarray.Dataset:
     if result.feet is not None:
         variables["feet"] = (("frame", "foot", "axis"), result.feet, {"units": "m"})
         coords["foot"] = list(FOOT_POINTS)
-    if result.fit_error is not None:
-        variables["fit_error"] = (("frame", "camera"), result.fit_error)
-        coords["camera"] = list(meta.fit_cameras)
+    if result.residual is not None:
+        variables["residual"] = (("frame", "camera", "area"), result.residual)
+        coords["area"] = ["missing", "surplus"]
+        coords["camera"] = list(meta.residual_cameras)
     if result.segments_rotation is not None:
         variables["rotation"] = (("frame", "segment", "quaternion"), result.segments_rotation)
         coords |= {"segment": list(meta.segment_names), "quaternion": list("wxyz")}

@@ -114,11 +114,9 @@ class Evidence:
         seen = np.count_nonzero(self.person, axis=(1, 2))
         return np.where(seen > 0, total / np.maximum(seen, 1), np.nan), met
 
-    def fit_error(self, label: NDArray[np.uint8]) -> Float:
-        """(V,) E_S of what the rays meet, labels (V, h, w); NaN where a view sees nobody."""
-        wrong = np.count_nonzero((label > 0) != self.person, axis=(1, 2))
-        seen = np.count_nonzero(self.person, axis=(1, 2))
-        return np.where(seen > 0, wrong / np.maximum(seen, 1), np.nan)
+    def residual(self, label: NDArray[np.uint8]) -> Float:
+        """Return (V, 2) missing and surplus area of a rendered body, labels (V, h, w), see :func:`residual_of`."""
+        return residual_of(label > 0, self.person)
 
     def cost_of_parts(self, group: NDArray[np.int32], label: NDArray[np.uint8]) -> tuple[Float, NDArray[np.int64]]:
         """What the rays that meet each part cost in all, (P,), and how many they are, (P,); labels (V, h, w).
@@ -136,6 +134,19 @@ class Evidence:
         missed = np.count_nonzero(self.person & (label == 0), axis=(1, 2))
         seen = np.count_nonzero(self.person, axis=(1, 2))
         return float(mean_of_views(np.where(seen > 0, missed / np.maximum(seen, 1), np.nan)[None])[0])
+
+
+def residual_of(body: NDArray[np.bool_], person: NDArray[np.bool_]) -> Float:
+    """Return (V, 2) missing area (body outside the mask) and surplus area (mask outside the body), as shares of the
+    person's pixels in each view; their sum is E_S.
+
+    Args:
+        body: (V, h, w) pixels that the body covers.
+        person: (V, h, w) pixels of the mask. A view without any has a residual of NaN.
+    """
+    areas = np.stack([np.count_nonzero(area, axis=(1, 2)) for area in (body & ~person, person & ~body)], axis=1)
+    seen = np.count_nonzero(person, axis=(1, 2))[:, None]
+    return np.where(seen > 0, areas / np.maximum(seen, 1), np.nan)
 
 
 def mean_of_views(cost: Float) -> Float:
