@@ -87,7 +87,7 @@ def track(
     Args:
         capture: of :func:`open_capture`.
         output: a result file to write; without one the estimates are handed out frame by frame.
-        method: "region", "silhouette", "volumetric" or "lm".
+        method: "region", "silhouette" or "volumetric".
         frames: the first frame to tell and the one to stop before (None: the last).
         config: all settings; the defaults if None.
         seed: of the random generator, in the place of the configuration's.

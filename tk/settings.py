@@ -68,7 +68,7 @@ class Settings:
             1, takes the paper's numbers of iterations and points (6.4). Less than 1 is a share of the iterations; more
             is so many times as many points: "thorough", which is 5, is what its section 7.3 compares.
         foreground: masks made against the empty scene, with segmentation = "collinearity".
-        appearance: colour models, of --method volumetric and lm, as all up to [tracking].
+        appearance: colour models, of --method volumetric, as all up to [tracking].
         body: the body.
         objective: the objective (section 6.1).
         contours: the edge term of the objective (section 6.1.2).

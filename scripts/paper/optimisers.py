@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
 
 from scripts.paper.common import Options, over_seeds, plt, save, spread, table
+from scripts.paper.levenberg_marquardt import instead_of_smd
 from tk.settings import Settings
 
 VARIANTS = (
-    ("SMD, 1× points", "volumetric", 1),
-    ("SMD, 5× points", "volumetric", 5),
-    ("LM, 1× points", "lm", 1),
-    ("LM, 5× points", "lm", 5),
+    ("SMD, 1× points", nullcontext, 1),
+    ("SMD, 5× points", nullcontext, 5),
+    ("LM, 1× points", instead_of_smd, 1),
+    ("LM, 5× points", instead_of_smd, 5),
 )
 
 
@@ -22,9 +24,10 @@ def run(options: Options) -> str:
     figure, (above, below) = plt.subplots(2, 1, figsize=(9, 6), sharex=True)
     rows = []
     base = Settings()
-    for name, method, scale in VARIANTS:
+    for name, optimiser, scale in VARIANTS:
         config = replace(base, effort=float(scale))
-        tracks = over_seeds(options, config, method)
+        with optimiser():
+            tracks = over_seeds(options, config)
         rows.append(
             {
                 "optimiser": name,

@@ -12,10 +12,12 @@ import pytest
 from scripts.experiments import EXPERIMENTS, main
 from scripts.paper import common, cues, sampling, views
 from scripts.paper.common import Options, Track, spread, table
+from scripts.paper.levenberg_marquardt import instead_of_smd
 from scripts.paper.motion import turned_deg
 from tests.conftest import QUICK
 from tk.model.body.skeleton import JOINTS
 from tk.settings import Settings
+from tk.trackers.volumetric import VolumetricTracker
 
 DEMO = Path(__file__).resolve().parents[2] / "tk" / "data" / "demo"
 
@@ -41,7 +43,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     def track(
         capture: Path, config: Settings, frames: int | None, method: str = "volumetric", cameras: Any = None
     ) -> Track:
-        calls.append((config, frames, method, cameras))
+        calls.append((config, frames, VolumetricTracker.optimise, cameras))
         return made_up()
 
     monkeypatch.setattr(common, "track", track)
@@ -61,10 +63,13 @@ def test_every_experiment_writes_a_figure_and_a_table(
     assert {config.seed for config, *_ in asked} == {0, 1}
 
 
-def test_optimisers_differ_in_method_and_points_alone(asked: list[tuple[Any, ...]], tmp_path: Path) -> None:
+def test_optimisers_differ_only_in_the_optimiser_and_the_number_of_points(
+    asked: list[tuple[Any, ...]], tmp_path: Path
+) -> None:
     main(["optimisers", str(DEMO), "--seeds", "1", "--out", str(tmp_path)])
-    assert [(method, config.effort) for config, _, method, _ in asked] == [
-        ("volumetric", 1), ("volumetric", 5), ("lm", 1), ("lm", 5),
+    smd = VolumetricTracker.optimise
+    assert [(optimise is smd, config.effort) for config, _, optimise, _ in asked] == [
+        (True, 1), (True, 5), (False, 1), (False, 5),
     ]  # fmt: skip
     same = {replace(config, effort="normal") for config, *_ in asked}
     assert same == {Settings()}
@@ -96,6 +101,15 @@ def test_a_table_is_markdown() -> None:
         "| a | b |", "| --- | --- |", "| 1 | 2 |", "| 3 | 4 |",
     ]  # fmt: skip
     assert spread([1.0]) == "1.00" and spread([1.0, 3.0], 1) == "2.0 (1.0-3.0)"
+
+
+def test_a_capture_is_tracked_by_levenberg_marquardt() -> None:
+    config = replace(Settings.from_toml(QUICK), voxels=48)
+    with instead_of_smd():
+        track = common.track(DEMO, config, 3)
+    smd = common.track(DEMO, config, 3)
+    assert 0.5 < track.mean_cm < 15 and track.mean_cm != smd.mean_cm
+    assert (track.iterations > 0).all() and track.iterations.shape == smd.iterations.shape
 
 
 def test_a_track_is_of_the_capture() -> None:

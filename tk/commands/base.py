@@ -86,8 +86,8 @@ method_option = click.option(
     "--method",
     default="region",
     show_default=True,
-    type=click.Choice(["region", "silhouette", "volumetric", "lm"]),
-    help="The tracker: region; silhouette and volumetric, the two papers' own; lm, by Levenberg-Marquardt.",
+    type=click.Choice(["region", "silhouette", "volumetric"]),
+    help="The tracker: region; silhouette and volumetric, the two papers' own.",
 )
 seed_option = click.option("--seed", type=int, help="Of the random generator.  [default: 0]")
 body_option = click.option(

@@ -26,11 +26,11 @@ from tk.trackers.contour_tracker import ContourTracker
 from tk.trackers.protocol import Tracker
 from tk.trackers.region import RegionTracker
 from tk.trackers.silhouette import SilhouetteTracker
-from tk.trackers.volumetric import LevenbergMarquardtTracker, VolumetricTracker
+from tk.trackers.volumetric import VolumetricTracker
 
 _LOG = logging.getLogger(__name__)
 
-METHODS = ("region", "silhouette", "volumetric", "lm")
+METHODS = ("region", "silhouette", "volumetric")
 
 
 def make_tracker(method: str, capture: Capture, config: Settings) -> Tracker:
@@ -44,9 +44,8 @@ def make_tracker(method: str, capture: Capture, config: Settings) -> Tracker:
         return RegionTracker(rig, up, config.silhouette, config.region)
     if method == SilhouetteTracker.method:
         return SilhouetteTracker(rig, up, config.silhouette)
-    for tracker in (VolumetricTracker, LevenbergMarquardtTracker):
-        if method == tracker.method:
-            return tracker(rig, capture.volume, up, config)
+    if method == VolumetricTracker.method:
+        return VolumetricTracker(rig, capture.volume, up, config)
     raise ConfigError(f"--method {method}: choose one of {', '.join(METHODS)}")
 
 

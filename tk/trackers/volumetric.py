@@ -34,8 +34,7 @@ from tk.model.cues.appearance import LEARNING_M, Appearance
 from tk.model.cues.edge_term import ContourTerm
 from tk.model.cues.objective import CHAIN_OF_SEGMENT, BodyObjective, Fit, FrameObjective, SamplingSettings
 from tk.model.hull.hull import HullSurface, VisualHull
-from tk.optim import lm_schedule, schedule
-from tk.optim.levenberg_marquardt import LmSettings
+from tk.optim import schedule
 from tk.optim.smd import SmdSettings
 from tk.settings import Settings
 from tk.trackers.contour_tracker import ContourTracker, restore_body
@@ -61,7 +60,6 @@ WAIST_STIFFNESS = 0.1
 SCHEDULE = schedule.ScheduleSettings()
 SAMPLING = SamplingSettings()
 SMD = SmdSettings()
-LM = LmSettings()
 # where a body has none
 NO_ANGLES = np.zeros(0)
 
@@ -72,7 +70,6 @@ class Effort:
 
     sampling: SamplingSettings
     smd: SmdSettings
-    lm: LmSettings
 
     @staticmethod
     def of(factor: float) -> Effort:
@@ -84,7 +81,6 @@ class Effort:
         return Effort(
             replace(SAMPLING, scale=max(round(factor), 1) * SAMPLING.scale),
             replace(SMD, max_iterations=share(SMD.max_iterations)),
-            replace(LM, max_iterations=share(LM.max_iterations)),
         )
 
 
@@ -196,7 +192,7 @@ class VolumetricTracker:
         rng = np.random.default_rng([config.seed, frame.index])
         problem = FrameObjective(self._objective, index, rng, images=frame.images)
         # (2) all degrees of freedom at ε₁, (3) five chains at ε₂ (section 6.4)
-        result = self._search(problem, self._starts(surface))
+        result = self.optimise(problem, self._starts(surface))
         every = config.silhouette.search_every
         if every and frame.index % every == 0:
             result = self._elsewhere(frame, problem, result)
@@ -226,8 +222,8 @@ class VolumetricTracker:
             surface=surface,
         )
 
-    def _search(self, problem: FrameObjective, starts: Float) -> schedule.ScheduleResult:
-        """The pose that explains a frame best, from the starts (S, D)."""
+    def optimise(self, problem: FrameObjective, starts: Float) -> schedule.ScheduleResult:
+        """Minimise a frame's objective, beginning at the best of the starts (S, D)."""
         return schedule.optimise(problem, starts, SCHEDULE, self.effort.smd)
 
     def _elsewhere(
@@ -247,7 +243,7 @@ class VolumetricTracker:
         best, here = int(np.argmin(values)), problem.value(found.pose)
         if values[best] >= here:
             return found
-        again = self._search(problem, starts[best : best + 1])
+        again = self.optimise(problem, starts[best : best + 1])
         return again if problem.value(again.pose) < here else found
 
     def _from_contours(self, pose: Float) -> Float:
@@ -372,12 +368,3 @@ class VolumetricTracker:
         self._usual = np.array(state["usual"], np.float64)
         self._lost_for = int(state["lost_for"])
         self._fresh = False
-
-
-class LevenbergMarquardtTracker(VolumetricTracker):
-    """The same tracker with Levenberg-Marquardt in the place of SMD: the comparison of section 7.3."""
-
-    method = "lm"
-
-    def _search(self, problem: FrameObjective, starts: Float) -> schedule.ScheduleResult:
-        return lm_schedule.optimise(problem, starts, SCHEDULE, self.effort.lm)

@@ -333,7 +333,7 @@ class FrameObjective:
 
     def full(self) -> Callable[[Float, Float, int], Evaluation]:
         """All degrees of freedom: new samples for every iteration number, the same in all rows."""
-        draws = _Draws(self._draw_full)
+        draws = _Draws(self.draw_all)
         renewed = self._renewing(lambda B: np.repeat(self._term.draw(self.rng)[None], B, 0))
 
         def evaluate(poses: Float, directions: Float, iteration: int) -> Evaluation:
@@ -346,7 +346,7 @@ class FrameObjective:
 
     def chains(self, owner: NDArray[np.intp], pose: Float) -> Callable[[Float, Float, int], Evaluation]:
         """Row b is chain ``owner[b]`` with its own samples, and voxels that are its own or nobody's at ``pose``."""
-        self._pools = self._chain_pools(self.fit(pose))
+        self.assign_voxels(pose)
         draws = _Draws(lambda: self._draw_chains(owner))
         renewed = self._renewing(lambda _: self._term.draw_chains(self.rng)[owner])
 
@@ -354,17 +354,6 @@ class FrameObjective:
             return self._evaluate(*draws(iteration), poses, directions, renewed(poses, iteration))
 
         return evaluate
-
-    def fixed(self) -> FixedObjective:
-        """All degrees of freedom on one draw of points that stays: what Levenberg-Marquardt minimises (section 7.3)."""
-        strips = None if self.contours is None else self._term.draw(self.rng)
-        return FixedObjective(self, *self._draw_full(), strips)
-
-    def fixed_chain(self, chain: int, pose: Float) -> FixedObjective:
-        """The same for one chain, the rest of the body being at ``pose``; points as in :meth:`chains`."""
-        self._pools = self._chain_pools(self.fit(pose))
-        strips = None if self.contours is None else self._term.draw_chains(self.rng)[chain]
-        return FixedObjective(self, *self._draw_chain(chain), strips)
 
     def value(self, pose: Float) -> float:
         """The objective at ``pose`` (D,) on even samples and evenly spread voxels."""
@@ -395,7 +384,7 @@ class FrameObjective:
         B = len(poses)
         entries = None
         if self.contours:
-            entries = self._entries(poses, np.repeat(self._term.draw(None)[None], B, 0))
+            entries = self.edge_entries(poses, np.repeat(self._term.draw(None)[None], B, 0))
         value, gradient, product, held = self.objective.kernel.evaluate(
             self.index,
             np.repeat(self._even_samples[None], B, 0),
@@ -424,23 +413,27 @@ class FrameObjective:
             entries=look.entries,
         )
 
-    def _chain_pools(self, fit: Fit) -> list[Ints]:
-        """For each chain the voxels it may have to cover: those nearest to it, and those that nothing covers."""
+    def assign_voxels(self, pose: Float) -> None:
+        """Give each chain the voxels that it may have to cover at ``pose``: the voxels nearest to it or to no piece."""
+        fit = self.fit(pose)
         if self.objective.settings.coverage_weight <= 0:
-            return [np.zeros(1, np.int32)] * len(CHAINS)
+            self._pools = [np.zeros(1, np.int32)] * len(CHAINS)
+            return
         piece = fit.held.covering[0, : len(fit.voxels), 0].astype(np.int64)
         nearest = np.where(piece >= 0, CHAIN_OF_SEGMENT[self.objective.piece_segment[piece]], -1)
         M = len(fit.samples)
         unclaimed = np.linalg.norm(fit.linear.residual[M:], axis=1) > UNCLAIMED_M
         pools = [fit.voxels[(nearest == c) | fit.unexplained | unclaimed] for c in range(len(CHAINS))]
-        return [pool if len(pool) else fit.voxels for pool in pools]
+        self._pools = [pool if len(pool) else fit.voxels for pool in pools]
 
-    def _draw_full(self) -> tuple[Ints, Ints]:
+    def draw_all(self) -> tuple[Ints, Ints]:
+        """Draw samples (M,) on the whole body and voxels (Q,)."""
         s = self.objective.sampling
         voxels = self.rng.integers(self.voxel_count, size=s.scale * s.voxels).astype(np.int32)
         return self.objective.draw(self.rng, s.scale), voxels
 
-    def _draw_chain(self, chain: int) -> tuple[Ints, Ints]:
+    def draw_chain(self, chain: int) -> tuple[Ints, Ints]:
+        """Draw samples (M,) of a chain and voxels (Q,) that it may have to cover, see :meth:`assign_voxels`."""
         s = self.objective.sampling
         # a chain with fewer samples than asked for gives some of them twice: rows are of one length
         count = s.scale * s.chain
@@ -449,7 +442,7 @@ class FrameObjective:
         return samples, pool[self.rng.integers(len(pool), size=s.scale * s.chain_voxels)]
 
     def _draw_chains(self, owner: NDArray[np.intp]) -> tuple[Ints, Ints]:
-        samples, voxels = zip(*(self._draw_chain(c) for c in range(len(CHAINS))), strict=True)
+        samples, voxels = zip(*(self.draw_chain(c) for c in range(len(CHAINS))), strict=True)
         return np.stack(samples)[owner], np.stack(voxels)[owner]
 
     @property
@@ -457,7 +450,8 @@ class FrameObjective:
         assert self.contours is not None
         return self.contours
 
-    def _entries(self, poses: Float, chosen: Ints) -> NDArray[np.floating]:
+    def edge_entries(self, poses: Float, chosen: Ints) -> NDArray[np.floating]:
+        """Return the entries (B, E, 16) of the edge term at poses (B, D) for the chosen strips (B, K)."""
         assert self.images is not None
         return self._term.assign(self.images, poses, chosen)
 
@@ -475,7 +469,7 @@ class FrameObjective:
             if last is None or calls % RENEW == 0:
                 if drawn is None or drawn[0] != iteration:
                     drawn = iteration, draw(len(poses))
-                last = self._entries(poses, drawn[1])
+                last = self.edge_entries(poses, drawn[1])
             calls += 1
             return last
 
@@ -493,46 +487,6 @@ class FrameObjective:
             self.index, samples, voxels, poses, directions, self.objective.settings, entries=entries
         )
         return self.objective.with_stiffness(poses, directions, value, gradient, product)
-
-
-class FixedObjective:
-    """The objective of a frame on points that stay the same; their voxels and edges are found anew at every pose.
-
-    Args:
-        frame: the frame.
-        samples: (M,); voxels: (Q,); strips: (K,) of the contour cues, if they count.
-    """
-
-    def __init__(self, frame: FrameObjective, samples: Ints, voxels: Ints, strips: Ints | None) -> None:
-        self._frame = frame
-        self._points = samples, voxels
-        self._strips = strips
-
-    def value(self, pose: Float) -> float:
-        """The objective at ``pose`` (D,)."""
-        return float(self._evaluate(pose)[0][0][0])
-
-    def model(self, pose: Float) -> tuple[float, Float, Float]:
-        """Value, gradient (D,) and Gauss-Newton Hessian (D, D) at ``pose`` (D,), outliers weighing as for SMD's."""
-        (value, gradient, _, held), entries = self._evaluate(pose)
-        linear = self._frame.objective.kernel.linearise(
-            self._frame.index,
-            *self._points,
-            pose,
-            held,
-            self._frame.objective.settings,
-            OUTLIERS,
-            entries=entries,
-        )
-        return float(value[0]), gradient[0], linear.hessian + np.diag(self._frame.objective.stiffness)
-
-    def _evaluate(self, pose: Float) -> tuple[tuple[Float, Float, Float, Held], NDArray[np.floating] | None]:
-        frame, (samples, voxels) = self._frame, self._points
-        entries = None if self._strips is None else frame._entries(pose[None], self._strips[None])
-        value, gradient, product, held = frame.objective.kernel.evaluate(
-            frame.index, samples[None], voxels[None], pose[None], None, frame.objective.settings, entries=entries
-        )
-        return (*frame.objective.with_stiffness(pose[None], None, value, gradient, product), held), entries
 
 
 class _Draws:
