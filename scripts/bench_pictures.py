@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tk.io.captures.capture import open_capture
-from tk.report.after import leave_pictures
+from tk.report.after import write_video_and_report
 from tk.run import session
 from tk.settings import Settings
 
@@ -43,7 +43,7 @@ def run_once(capture_path: Path, masks: str, frames: int | None, output: Path) -
     summary = session.track(capture, output, Settings(), session.Silent(), frames=(0, frames))
     tracked = _clocks()
     warnings: list[str] = []
-    leave_pictures(capture, output, warnings.append)
+    write_video_and_report(capture, output, warnings.append)
     if warnings:
         raise SystemExit(warnings[0])
     done = _clocks()

@@ -71,16 +71,16 @@ def test_a_frame_is_drawn(display: str, tracked: Path, tiny: Path, tmp_path: Pat
 @pytest.mark.skipif(sys.platform != "linux", reason="displays of X are Linux's")
 def test_without_a_display_one_line_says_so(tk: Tk, tracked: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
-    tk("view", tracked).complaint("DISPLAY is not set", "tk render")
+    tk("view", tracked).complaint("DISPLAY is not set", "tk report RESULT.h5")
     monkeypatch.setenv("DISPLAY", ":4711")
-    tk("view", tracked).complaint("the display :4711 cannot be opened", "tk render")
+    tk("view", tracked).complaint("the display :4711 cannot be opened", "tk report RESULT.h5")
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
         (["--frame", "99"], "--frame 99: the result has frames 0 to 13"),
-        (["--screenshot", "a.jpg"], "a picture is a .png"),
+        (["--screenshot", "a.jpg"], "an image must end in .png"),
         (["--screenshot", "nowhere/a.png"], "the folder nowhere does not exist"),
     ],
 )

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from tk.commands.console import Report
+from tk.commands.console import ConsoleReporter
 
 
 def terminal() -> Console:
@@ -27,14 +27,14 @@ def shown(console: Console) -> str:
 
 def test_the_bar_with_all_that_may_stand_in_it_fits_80_columns() -> None:
     console = terminal()
-    with Report(console=console) as report:
-        report.begin(12000, 9000)
+    with ConsoleReporter(console=console) as reporter:
+        reporter.begin(12000, 9000)
         for frame in range(9000, 10500):
-            report.advance(frame, SimpleNamespace(status="lost"))
-        assert report._live is not None
-        task = report._live.tasks[0]
+            reporter.advance(frame, SimpleNamespace(status="lost"))
+        assert reporter._live is not None
+        task = reporter._live.tasks[0]
         task.fields["rate"] = "123.4 frames/s"
-        report._live.refresh()
+        reporter._live.refresh()
     last = next(line for line in reversed(re.split(r"[\r\n]+", shown(console))) if line.strip())
     assert len(last) <= 80
     assert "10500/12000" in last and "1500 lost" in last
@@ -44,32 +44,32 @@ def test_the_bar_with_all_that_may_stand_in_it_fits_80_columns() -> None:
 
 def test_a_terminal_shows_what_is_being_done_before_the_first_frame() -> None:
     console = terminal()
-    with Report(console=console) as report:
-        report.stage("finding the person")
-        assert report._live is not None and report._live.tasks[0].description == "finding the person"
-        report.begin(2, 0)
+    with ConsoleReporter(console=console) as reporter:
+        reporter.stage("finding the person")
+        assert reporter._live is not None and reporter._live.tasks[0].description == "finding the person"
+        reporter.begin(2, 0)
         logging.getLogger("tk.run.session").info("fitting the body")
-        assert report._live.tasks[0].description == "fitting the body"
-        report.advance(0, None)
-        assert (report._live.tasks[0].completed, report._live.tasks[0].total) == (1, 2)
-        report.advance(1, None)
+        assert reporter._live.tasks[0].description == "fitting the body"
+        reporter.advance(0, None)
+        assert (reporter._live.tasks[0].completed, reporter._live.tasks[0].total) == (1, 2)
+        reporter.advance(1, None)
         logging.getLogger("tk.run.session").info("second pass")
-        assert report._live.tasks[0].description == "second pass"
+        assert reporter._live.tasks[0].description == "second pass"
     assert "finding the person" in shown(console) and "2/2" in shown(console)
-    assert report._live is None
+    assert reporter._live is None
 
 
 def test_the_packages_log_is_told(capfd: pytest.CaptureFixture[str]) -> None:
     log = logging.getLogger("tk.run.session")
     before = logging.getLogger("tk").level, list(logging.getLogger("tk").handlers)
-    with Report():
+    with ConsoleReporter():
         log.info("finding the person")
         log.warning("a camera is dark")
-    with Report(quiet=True):
-        log.info("not told")
-        log.warning("told")
+    with ConsoleReporter(quiet=True):
+        log.info("hidden")
+        log.warning("shown")
     log.info("nobody listens")
     lines = capfd.readouterr().err.splitlines()
     assert lines[0].startswith("[") and lines[0].endswith(" s] finding the person")
-    assert lines[1:] == ["note: a camera is dark", "note: told"]
+    assert lines[1:] == ["note: a camera is dark", "note: shown"]
     assert (logging.getLogger("tk").level, list(logging.getLogger("tk").handlers)) == before

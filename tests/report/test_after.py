@@ -11,14 +11,14 @@ from tk.errors import ExportError
 from tk.io.captures.capture import open_capture
 from tk.render.video import made_here as is_our_video
 from tk.report import after
-from tk.report.after import leave_pictures
+from tk.report.after import write_video_and_report
 from tk.report.page import made_here as is_our_page
 
 
 def test_track_leaves_a_video_and_a_report(tk: Tk, tiny: Path, quick: Path, tmp_path: Path) -> None:
     ran = tk("track", tiny, "-o", tmp_path / "r.h5", "--config", quick, "--frames", "1:3", "--causal", pictures=True)
     assert ran.code == 0
-    assert f"to look at: {tmp_path / 'r.mp4'}, {tmp_path / 'r.html'}" in ran.err.splitlines()
+    assert f"wrote {tmp_path / 'r.mp4'}, {tmp_path / 'r.html'}" in ran.err.splitlines()
     assert {path.name for path in tmp_path.iterdir()} == {"r.h5", "r.mp4", "r.html"}
     assert is_our_video(tmp_path / "r.mp4") and is_our_page(tmp_path / "r.html")
 
@@ -30,16 +30,18 @@ def test_nobody_elses_file_is_replaced(complete: Path, tiny: Path, tmp_path: Pat
     warnings: list[str] = []
     for name in ("walk.mp4", "walk.html"):
         (tmp_path / name).write_bytes(b"a recording of mine")
-        assert leave_pictures(capture, result, warnings.append) == []
+        assert write_video_and_report(capture, result, warnings.append) == []
         warning = warnings[-1]
         assert f"{name} was not made by tk" in warning and "\n" not in warning
         assert (tmp_path / name).read_bytes() == b"a recording of mine"
         (tmp_path / name).unlink()
         assert [path.name for path in tmp_path.iterdir()] == ["walk.h5"]
-    files = leave_pictures(capture, result, warnings.append)
+    files = write_video_and_report(capture, result, warnings.append)
     assert [file.name for file in files] == ["walk.mp4", "walk.html"]
     files[1].write_text(files[1].read_text(encoding="utf-8") + "<!-- -->", encoding="utf-8")
-    assert leave_pictures(capture, result, warnings.append) == files and len(warnings) == 2, "its own are replaced"
+    assert write_video_and_report(capture, result, warnings.append) == files and len(warnings) == 2, (
+        "its own are replaced"
+    )
     assert "<!-- -->" not in files[1].read_text(encoding="utf-8")
 
 
@@ -60,8 +62,8 @@ def test_what_fails_is_told_in_a_line(
         with monkeypatch.context() as patched:
             patched.setattr(after, name, fail)
             warnings: list[str] = []
-            leave_pictures(open_capture(tiny), result, warnings.append)
+            write_video_and_report(open_capture(tiny), result, warnings.append)
         (warning,) = warnings
-        assert "are left out: " in warning and "\n" not in warning
+        assert "no overlay video and report: " in warning and "\n" not in warning
         assert result.read_bytes() == before
         assert {path.name for path in tmp_path.iterdir()} <= {"walk.h5", "walk.mp4"}

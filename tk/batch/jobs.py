@@ -92,6 +92,11 @@ class Outcome:
     trace: str = ""
 
     @property
+    def failed(self) -> bool:
+        """Whether tracking ended with an error."""
+        return self.state == FAILED
+
+    @property
     def mostly_lost(self) -> bool:
         """Whether more than half of the frames are lost."""
         return self.state == DONE and 2 * self.lost > self.frames

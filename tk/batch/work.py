@@ -50,7 +50,7 @@ def work(job: Job) -> Outcome:
 def _track(job: Job, reporter: _Reporter) -> Outcome:
     from tk.io.captures.capture import open_capture
     from tk.io.results.writer import Status, read_result
-    from tk.report.after import leave_pictures
+    from tk.report.after import write_video_and_report
     from tk.run import session  # the driver needs none of it
 
     options = job.options
@@ -69,7 +69,7 @@ def _track(job: Job, reporter: _Reporter) -> Outcome:
                 raise
             time.sleep(_ASK_EVERY_S)
     if job.pictures:
-        leave_pictures(capture, job.output, reporter.note)
+        write_video_and_report(capture, job.output, reporter.note)
     result = read_result(job.output)
     known = result.status != Status.LOST
     error_cm, limbs_cm = _errors(job, reporter.note)

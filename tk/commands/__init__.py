@@ -1,1 +1,1 @@
-"""The commands of `tk`: one module each."""
+"""The commands of `tk`, one module each. They import heavy modules when they run, so that `tk --help` stays fast."""

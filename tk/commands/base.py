@@ -1,16 +1,19 @@
-"""What the commands of :mod:`tk.cli` share: mistakes told in a line, options that several take, and what they mean."""
+"""What several commands share: options, settings, and error messages in one line."""
 
 from __future__ import annotations
 
+import functools
+import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from tk.commands.console import Report
+from tk.commands.console import ConsoleReporter
 from tk.errors import ConfigError, TkError
 
 if TYPE_CHECKING:
@@ -18,15 +21,15 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def one_line() -> Iterator[None]:
-    """A user's mistake, in the input or in the command, becomes one line and exit code 2."""
+def errors_in_one_line() -> Iterator[None]:
+    """Print a user's mistake, in the input or in the command, as one line, and exit with 2."""
     try:
         yield
     except TkError as error:
         click.echo(f"tk: {' '.join(str(error).split())}", err=True)
         raise click.exceptions.Exit(2) from None
     except click.UsageError as error:
-        if type(error).__name__ == "NoArgsIsHelpError":  # `tk` alone: the help
+        if type(error).__name__ == "NoArgsIsHelpError":  # `tk` alone prints the help
             raise
         command = error.ctx.command_path if error.ctx else "tk"
         click.echo(f"tk: {' '.join(error.format_message().split())} See {command} --help", err=True)
@@ -34,83 +37,129 @@ def one_line() -> Iterator[None]:
 
 
 @contextmanager
-def working(on: str) -> Iterator[None]:
-    """On a terminal, that something is done which has no frames to count."""
-    with Report(quiet=not sys.stderr.isatty()) as report:
-        report.stage(on)
+def working(stage: str) -> Iterator[None]:
+    """Show on a terminal that work without countable frames goes on."""
+    with ConsoleReporter(quiet=not sys.stderr.isatty()) as reporter:
+        reporter.stage(stage)
         yield
 
 
 class Commands(click.Group):
-    """Reports mistakes as :func:`one_line` does."""
+    """A group of commands that reports mistakes as :func:`errors_in_one_line` does."""
 
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
-        with one_line():
+        with errors_in_one_line():
             return super().make_context(*args, **kwargs)
 
     def invoke(self, ctx: click.Context) -> object:
-        with one_line():
+        with errors_in_one_line():
             return super().invoke(ctx)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Each command with the whole first sentence of its help; click's own cuts it off."""
+        """List each command with the whole first sentence of its help; click itself would cut it off."""
         rows = [(name, command.get_short_help_str(limit=1000)) for name, command in sorted(self.commands.items())]
         with formatter.section("Commands"):
             formatter.write_dl(rows)
 
 
 def example(*lines: str) -> str:
-    """What a command's help ends with."""
+    """Return the epilogue of a command's help."""
     return "\b\n" + "\n".join(["Example:" if len(lines) == 1 else "Examples:", *(f"  {line}" for line in lines)])
 
 
-capture_argument = click.argument("capture", type=click.Path(path_type=Path))
+PATH = click.Path(path_type=Path)
+
+capture_argument = click.argument("capture", type=PATH)
+optional_capture_argument = click.argument("capture", type=PATH, required=False)
+result_argument = click.argument("result", type=PATH, metavar="RESULT.h5")
 cameras_option = click.option("--cameras", metavar="A,B,…", help="Use these cameras only.")
-frames_option = click.option("--frames", metavar="A:B", help="Frames A to B-1; either may be left out.")
+frames_option = click.option("--frames", metavar="A:B", help="Frames A to B-1; A or B may be omitted.")
 masks_option = click.option(
     "--masks", default="auto", show_default=True, metavar="auto|none|median|DIR",
-    help="auto: the capture's masks, else its empty scene, else an installed segmenter; none: not its masks; "
-    "median: over the recording, for the empty scene; DIR: a folder of masks.",
+    help="auto: the capture's masks, else its empty scene, else an installed segmenter; none: ignore the capture's "
+    "masks; median: segment against the median image of the recording; DIR: a folder of masks.",
 )  # fmt: skip
-voxels_option = click.option(
-    "--voxels", type=int, help="Voxels along the working volume's longest side.  [default: 64]"
-)
-no_report_option = click.option("--no-report", is_flag=True, help="Leave out the overlay video and the report.")
-config_option = click.option("--config", "config_file", type=click.Path(path_type=Path), help="Settings, TOML.")
-preset_option = click.option("--preset", metavar="NAME", help="Settings to begin with: kehl2006, the paper's own.")
-resume_option = click.option("--resume", is_flag=True, help="Go on where an earlier run of the same command stopped.")
-force_option = click.option("--force", is_flag=True, help="Replace what exists under the output's name.")
-quiet_option = click.option("-q", "--quiet", is_flag=True, help="No progress: only notes and errors.")
-json_option = click.option("--json", "as_json", is_flag=True, help="Print a summary for scripts on stdout.")
-method_option = click.option(
-    "--method",
-    default="region",
-    show_default=True,
-    type=click.Choice(["region", "silhouette", "volumetric"]),
-    help="The tracker: region; silhouette and volumetric, the two papers' own.",
-)
-seed_option = click.option("--seed", type=int, help="Of the random generator.  [default: 0]")
-body_option = click.option(
-    "--body", type=click.Path(path_type=Path), metavar="FILE", help="The body of a result, or of a TOML file."
-)
-causal_option = click.option(
-    "--causal", is_flag=True, help="Leave it at the first pass: no frame knows of those after it."
-)
-store_hull_option = click.option("--store-hull", is_flag=True, help="Keep the hull's coloured surface in the result.")
+voxels_option = click.option("--voxels", type=int, help="Voxels along the longest side of the volume.  [default: 64]")
+no_report_option = click.option("--no-report", is_flag=True, help="Write no overlay video and no report.")
+config_option = click.option("--config", "config_file", type=PATH, help="Settings file (TOML).")
+preset_option = click.option("--preset", metavar="NAME", help="Settings to start from: kehl2006, the first paper's.")
+resume_option = click.option("--resume", is_flag=True, help="Continue an interrupted run of the same command.")
+force_option = click.option("--force", is_flag=True, help="Replace existing output.")
+quiet_option = click.option("-q", "--quiet", is_flag=True, help="Show no progress, only notes and errors.")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print the results as JSON on stdout.")
+
+
+@dataclass(frozen=True)
+class TrackingOptions:
+    """The options that `tk track` and `tk batch` share, as given on the command line."""
+
+    method: str
+    voxels: int | None
+    cameras: str | None
+    frames: str | None
+    seed: int | None
+    masks: str
+    body: Path | None
+    causal: bool
+    store_hull: bool
+    preset: str | None
+    config_file: Path | None
+
+    def settings(self) -> Settings:
+        """Return the settings that the options describe."""
+        return load_settings(self.config_file, self.preset, voxels=self.voxels, seed=self.seed)
+
+
+_TRACKING_OPTIONS = (
+    click.option(
+        "--method", default="region", show_default=True,
+        type=click.Choice(["region", "silhouette", "volumetric"]),
+        help="Tracker: region; silhouette and volumetric are those of the two papers.",
+    ),
+    voxels_option,
+    cameras_option,
+    frames_option,
+    click.option("--seed", type=int, help="Seed of the random generator.  [default: 0]"),
+    masks_option,
+    click.option("--body", type=PATH, metavar="FILE", help="Use the body of a result (.h5) or of a TOML file."),
+    click.option("--causal", is_flag=True, help="Run the first pass only: no frame depends on later frames."),
+    click.option("--store-hull", is_flag=True, help="Store the coloured surface of the visual hull in the result."),
+    preset_option,
+    config_option,
+)  # fmt: skip
+
+
+def tracking_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options of :class:`TrackingOptions` to a command, which receives them as ``options``."""
+    names = [field.name for field in fields(TrackingOptions)]
+
+    @functools.wraps(command)
+    def grouped(**given: Any) -> None:
+        command(options=TrackingOptions(**{name: given.pop(name) for name in names}), **given)
+
+    for option in reversed(_TRACKING_OPTIONS):
+        grouped = option(grouped)
+    return grouped
 
 
 def print_json(**values: object) -> None:
-    import json
-
+    """Print values as a JSON object on stdout."""
     click.echo(json.dumps(values, indent=2, allow_nan=False))
 
 
-def listed(cameras: str | None) -> tuple[str, ...] | None:
-    return tuple(name.strip() for name in cameras.split(",") if name.strip()) if cameras else None
+def print_notes(notes: tuple[str, ...] | list[str]) -> None:
+    """Print each note as a line on stderr."""
+    for note in notes:
+        click.echo(f"note: {note}", err=True)
 
 
-def frame_span(frames: str | None) -> tuple[int, int | None]:
-    """``A:B`` as (A, B)."""
+def split_names(names: str | None) -> tuple[str, ...] | None:
+    """Return the names in ``A,B,…``; None without any text."""
+    return tuple(name.strip() for name in names.split(",") if name.strip()) if names else None
+
+
+def parse_frames(frames: str | None) -> tuple[int, int | None]:
+    """Return (A, B) from ``A:B``; (0, None), all frames, from None."""
     if frames is None:
         return 0, None
     first, colon, last = frames.partition(":")
@@ -123,11 +172,10 @@ def frame_span(frames: str | None) -> tuple[int, int | None]:
     return start, stop
 
 
-def configuration(file: Path | None, preset: str | None = None, **overrides: Any) -> Settings:
-    from dataclasses import replace
-
+def load_settings(file: Path | None, preset: str | None = None, **overrides: Any) -> Settings:
+    """Return the settings of a preset, changed by a file, changed by options that are not None."""
     from tk.settings import Settings
 
     base = Settings.preset(preset) if preset else Settings()
-    config = Settings.read(file, base) if file else base
-    return replace(config, **{name: value for name, value in overrides.items() if value is not None})
+    settings = Settings.read(file, base) if file else base
+    return replace(settings, **{name: value for name, value in overrides.items() if value is not None})

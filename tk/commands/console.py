@@ -1,7 +1,7 @@
-"""What a command tells a person on stderr while it works: what it is doing, how far it is, and what is worth knowing.
+"""What commands print on stderr while they work: the current stage, the progress, and notes.
 
-On a terminal a line that moves; elsewhere plain lines. The package says what it is doing through the logger "tk", as
-any library does; :class:`Report` shows it.
+On a terminal a moving line shows the progress; otherwise plain lines do. The package reports stages and warnings
+through the logger "tk", and :class:`ConsoleReporter` prints them.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console
@@ -22,54 +23,65 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+if TYPE_CHECKING:
+    from tk.batch import Outcome
+
 _LOG = logging.getLogger("tk")
 
+#: seconds between two lines of progress, of one capture and of a batch, if stderr is no terminal. The values only
+#: decide how many lines a log file gets.
+_PERIOD_S, _BATCH_PERIOD_S = 2.0, 5.0
+#: captures named in a batch's line of progress; more would not fit on a line
+_NAMED_CAPTURES = 4
 
-class Report(logging.Handler):
+
+class _Notes:
+    """Prints notes on stderr."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        self._console = console or Console(stderr=True, highlight=False, soft_wrap=True)
+
+    def note(self, text: str) -> None:
+        """Print a line that the user should read."""
+        self._console.print(f"note: {text}", style="yellow", markup=False)
+
+
+class ConsoleReporter(_Notes):
     """The reporter of a command, see :class:`tk.run.session.Reporter`; a context manager.
 
     Args:
-        quiet: only notes and errors are told, no progress.
-        console: where to; stderr by default.
+        quiet: print notes only, no progress.
+        console: where to print; stderr by default.
     """
 
-    #: off a terminal, seconds between two lines of progress
-    every_s = 2.0
-
     def __init__(self, quiet: bool = False, console: Console | None = None) -> None:
-        super().__init__(logging.INFO)
+        super().__init__(console)
         self._quiet = quiet
-        self._console = console or Console(stderr=True, highlight=False, soft_wrap=True)
+        self._handler = logging.Handler(logging.INFO)
+        self._handler.emit = self._log  # type: ignore[method-assign]
         self._live: Progress | None = None
         self._lost = self._count = self._done = self._total = 0
         self._begun = self._started = self._last = time.perf_counter()
 
-    def __enter__(self) -> Report:
+    def __enter__(self) -> ConsoleReporter:
         self._level_before = _LOG.level
-        _LOG.addHandler(self)
+        _LOG.addHandler(self._handler)
         _LOG.setLevel(logging.INFO)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        _LOG.removeHandler(self)
+        _LOG.removeHandler(self._handler)
         _LOG.setLevel(self._level_before)
         self._stop()
 
-    def emit(self, record: logging.LogRecord) -> None:
-        """A line of the package's log: warnings are notes, what is below them says what is being done."""
-        if record.levelno >= logging.WARNING:
-            self.note(record.getMessage())
-        else:
-            self.stage(record.getMessage())
-
-    def note(self, text: str) -> None:
-        """A line worth reading."""
-        self._console.print(f"note: {text}", style="yellow", markup=False)
+    def _log(self, record: logging.LogRecord) -> None:
+        """Print a record of the package's log: warnings as notes, everything else as the current stage."""
+        (self.note if record.levelno >= logging.WARNING else self.stage)(record.getMessage())
 
     def stage(self, text: str) -> None:
-        """What is being done from now on."""
+        """Show what is being done from now on."""
         if self._quiet:
             return
         if not self._console.is_terminal:
@@ -84,14 +96,14 @@ class Report(logging.Handler):
         self._live.start()
 
     def begin(self, total: int, done: int) -> None:
-        """``total`` frames are to be made, ``done`` of which are there."""
+        """Start counting: ``done`` of ``total`` frames are finished already."""
         self._total, self._done = total, done
         if done:
-            self.note(f"{done} of {total} frames are there already")
+            self.note(f"{done} of {total} frames are finished already")
         self._started = self._last = time.perf_counter()
 
     def advance(self, frame: int, estimate: object) -> None:
-        """A frame is finished. The first one is waited for: kernels are compiled, the person is found."""
+        """Count a finished frame. The first one is not part of the rate: kernels are compiled before it."""
         self._count += 1
         self._lost += getattr(estimate, "status", "") == "lost"
         if self._quiet:
@@ -111,14 +123,14 @@ class Report(logging.Handler):
                 self._start_bar()
             assert self._live is not None
             self._live.update(self._live.task_ids[0], completed=made, rate=rate, lost=lost)
-        elif self._count == 1 or now - self._last > self.every_s or made == self._total:
+        elif self._count == 1 or now - self._last > _PERIOD_S or made == self._total:
             self._last = now
-            told = ", ".join(part for part in (rate, left, lost) if part)
-            click.echo(f"frame {frame}: {made}/{self._total}, {told}", err=True)
+            progress = ", ".join(part for part in (rate, left, lost) if part)
+            click.echo(f"frame {frame}: {made}/{self._total}, {progress}", err=True)
 
     def _start_bar(self) -> None:
         self._stop()
-        # narrow enough for 80 columns with all that may stand in it
+        # fits into 80 columns with the longest texts
         columns = (
             TextColumn("frames"), BarColumn(20), MofNCompleteColumn(),
             TextColumn("{task.fields[rate]}"), TimeRemainingColumn(), TextColumn("{task.fields[lost]}"),
@@ -131,3 +143,66 @@ class Report(logging.Handler):
         if self._live is not None:
             self._live.stop()
             self._live = None
+
+
+class BatchConsoleReporter(_Notes):
+    """The reporter of a batch, see :class:`tk.batch.BatchReporter`; a context manager.
+
+    Args:
+        quiet: print only notes and captures that failed or are mostly lost.
+    """
+
+    def __init__(self, quiet: bool = False) -> None:
+        super().__init__()
+        self._quiet = quiet
+        self._running: dict[str, tuple[int, int]] = {}
+        self._last = time.monotonic()
+        columns = (
+            TextColumn("captures"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+            TextColumn("{task.description}"),
+        )  # fmt: skip
+        self._bar = Progress(*columns, console=self._console) if self._console.is_terminal and not quiet else None
+        self._task = self._bar.add_task("", total=None) if self._bar else None
+
+    def __enter__(self) -> BatchConsoleReporter:
+        if self._bar:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar:
+            self._bar.stop()
+
+    def progress(self, name: str, done: int, total: int) -> None:
+        """Show how many frames of a capture are finished."""
+        self._running[name] = (done, total)
+        if self._bar and self._task is not None:
+            self._bar.update(self._task, description=self._running_captures())
+        elif not self._quiet and time.monotonic() - self._last > _BATCH_PERIOD_S:
+            self._last = time.monotonic()
+            self._console.print(self._running_captures(), markup=False)
+
+    def finished(self, name: str, outcome: Outcome, done: int, total: int) -> None:
+        """Print how a capture ended, a line each."""
+        self._running.pop(name, None)
+        if not self._quiet or outcome.failed or outcome.mostly_lost:
+            self._console.print(f"{done}/{total} {name}: {_summary_of(outcome)}", markup=False)
+        if self._bar and self._task is not None:
+            self._bar.update(self._task, completed=done, total=total, description=self._running_captures())
+
+    def _running_captures(self) -> str:
+        """Return the progress of the captures that are being tracked."""
+        shown = [f"{name} {done}/{total}" for name, (done, total) in list(self._running.items())[:_NAMED_CAPTURES]]
+        more = len(self._running) - len(shown)
+        return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
+
+
+def _summary_of(outcome: Outcome) -> str:
+    if outcome.failed:
+        return f"failed: {outcome.failure}"
+    parts = [f"{outcome.frames} frames", f"{outcome.lost} lost"]
+    if outcome.error_cm is not None:
+        parts.append(f"error {outcome.error_cm:.2f} cm")
+    if outcome.frames_per_second is not None:
+        parts.append(f"{outcome.frames_per_second:.1f} frames/s")
+    return ", ".join(parts)

@@ -28,10 +28,13 @@ _FIELD_OF_VIEW_DEG = 38.0
 _ELEVATION_DEG = 14.0
 _TURN_S = 16.0  # seconds of a whole turn
 _SQUARE_M, _SQUARES = 0.5, 6  # of the floor, and how many lie on each side of its middle
-_PYRAMID_M = 0.25  # how long a camera is drawn
+_PYRAMID_M = 0.25  # height of a camera's pyramid
 _BACKGROUND, _FLOOR, _WIRE = (34, 30, 28), (78, 70, 66), (190, 170, 150)
 _SUBPIXEL = 4
-_NEAREST_M = 0.05
+_NEAREST_M = 0.05  # near clipping plane
+
+#: lines between the points of :func:`camera_pyramid`
+PYRAMID_EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,31 @@ class Stage:
         floor = float(np.percentile(heights, 10)) if len(heights) else float((points @ up).min())
         radius = float(np.linalg.norm(points - middle, axis=1).max()) + 0.15
         return Stage(np.column_stack([east, np.cross(up, east), up]), middle, radius, floor)
+
+    @property
+    def origin(self) -> Float:
+        """(3,) point of the floor below or above :attr:`middle`, metres."""
+        up = self.axes[:, 2]
+        return np.asarray(self.middle + (self.floor - self.middle @ up) * up)
+
+    def floor_lines(self) -> Float:
+        """Return the ends (N, 2, 3) of the lines of the floor's squares, metres."""
+        east, north, _ = self.axes.T
+        reach = _SQUARE_M * _SQUARES
+        return np.array(
+            [
+                [self.origin + k * across - reach * along, self.origin + k * across + reach * along]
+                for k in np.linspace(-reach, reach, 2 * _SQUARES + 1)
+                for along, across in ((east, north), (north, east))
+            ]
+        )
+
+
+def camera_pyramid(camera: Camera) -> Float:
+    """Return the centre of a camera and the corners of its image plane, (5, 3) metres, world frame."""
+    w, h = camera.width, camera.height
+    rays = np.column_stack([camera.undistort([[0, 0], [w, 0], [w, h], [0, h]]), np.ones(4)]) @ camera.rotation
+    return np.vstack([camera.center, camera.center + _PYRAMID_M * rays])
 
 
 class Scene:
@@ -147,21 +175,14 @@ class Scene:
         return Camera("view", WIDTH, HEIGHT, matrix, np.zeros(5), R, -R @ center)
 
     def _draw_floor(self, tile: Image, eye: Camera) -> None:
-        east, north, up = self.stage.axes.T
-        middle = self.stage.middle + (self.stage.floor - self.stage.middle @ up) * up
-        reach = _SQUARE_M * _SQUARES
-        for k in np.linspace(-reach, reach, 2 * _SQUARES + 1):
-            for along, across in ((east, north), (north, east)):
-                _line(tile, eye, middle + k * across - reach * along, middle + k * across + reach * along, _FLOOR)
+        for a, b in self.stage.floor_lines():
+            _line(tile, eye, a, b, _FLOOR)
 
     def _draw_cameras(self, tile: Image, eye: Camera) -> None:
         for camera in self.rig or ():
-            corners = np.array([[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], float)
-            rays = (np.column_stack([camera.undistort(corners), np.ones(4)])) @ camera.rotation
-            ends = camera.center + _PYRAMID_M * rays
-            for k in range(4):
-                _line(tile, eye, camera.center, ends[k], _WIRE)
-                _line(tile, eye, ends[k], ends[(k + 1) % 4], _WIRE)
+            points = camera_pyramid(camera)
+            for a, b in PYRAMID_EDGES:
+                _line(tile, eye, points[a], points[b], _WIRE)
             xy, depth = eye.project(camera.center)
             if depth[0] > _NEAREST_M and np.isfinite(xy).all() and (np.abs(xy[0]) < 4 * WIDTH).all():
                 write(tile, camera.name, int(xy[0, 0]) + 8, int(xy[0, 1]) - 8, _WIRE)

@@ -1,4 +1,4 @@
-"""What `tk track` leaves beside a result: the overlay video and the report, made in one pass over the pictures."""
+"""The overlay video and the report that `tk track` writes next to a result, in one pass over the videos."""
 
 from __future__ import annotations
 
@@ -16,43 +16,43 @@ from tk.report.page import made_here as is_our_page
 from tk.report.pictures import choose_rows, embedded, shot
 from tk.threads import one_thread
 
-# Of the video. Every run pays for it: `tk render` makes a larger one for who wants to look closely.
+# Width of the video, pixels. Every run pays the time for it; `tk render` makes a larger one.
 _WIDEST = 960
 
 
-def leave_pictures(
+def write_video_and_report(
     capture: Capture,
     result_path: Path,
     warn: Callable[[str], None],
 ) -> list[Path]:
-    """Write RESULT.mp4 and RESULT.html; the files that are there now.
+    """Write RESULT.mp4 and RESULT.html, and return the paths of the files written.
 
-    The result is finished, and nothing that goes wrong here may cost it: ``warn`` hears of it in one line.
+    The result is finished, so an error here must not fail the run: ``warn`` is called with one line.
     """
     try:
         return _write(capture, result_path)
     except KeyboardInterrupt:
-        warn("the overlay video and the report are left out: interrupted; the result is complete")
+        warn("no overlay video and report: interrupted; the result is complete")
     except TkError as error:
-        warn(f"the overlay video and the report are left out: {error}")
-    except Exception as error:  # a defect of ours; the run itself is done and right
-        warn(f"the overlay video and the report are left out: {type(error).__name__}: {' '.join(str(error).split())}")
+        warn(f"no overlay video and report: {error}")
+    except Exception as error:  # a defect of tk; the result itself is complete
+        warn(f"no overlay video and report: {type(error).__name__}: {' '.join(str(error).split())}")
     return []
 
 
 @one_thread()
 def _write(capture: Capture, result_path: Path) -> list[Path]:
     video, page = result_path.with_suffix(".mp4"), result_path.with_suffix(".html")
-    # a folder of recordings may hold a video of the result's name
+    # in a folder of recordings a video may have the result's name
     for path, ours in ((video, is_our_video), (page, is_our_page)):
         if path.exists() and not ours(path):
-            raise ExportError(f"{path} was not made by tk and is not replaced; name the result otherwise")
+            raise ExportError(f"{path} was not made by tk and is not replaced; choose another name for the result")
     result = read_result(result_path)
     overlay = Overlay(capture, result, _WIDEST)
     choices = choose_rows(result)
     wanted = {choice.row for choice in choices}
     pictures = overlay.pictures(overlay.chosen(count=len(result)))
-    check_encoder()  # takes its time, and decoding has begun
+    check_encoder()  # slow; decoding has already begun in the background
     shots: dict[int, bytes] = {}
     with video_writer(video, capture.fps) as add:
         for frame, images in pictures:

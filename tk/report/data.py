@@ -15,13 +15,12 @@ from tk.model.body.skeleton import JOINTS, SEGMENTS
 from tk.model.cameras.camera import Rig
 from tk.render.figure import AROUND, BONES, Figure, figure_of
 from tk.render.palette import BONE, LOST, LOST_BODY, SEGMENT_COLORS, SIGMA_MOST_M, hexadecimal, sigma_colors
-from tk.render.scene import Stage
+from tk.render.scene import Stage, camera_pyramid
 
 Float = NDArray[np.float64]
 
 #: how many stops of the scale of σ's colours are handed over
 _SIGMA_STOPS = 9
-_PYRAMID_M = 0.25  # how long a camera is drawn
 #: flexion at the middle joint of three
 _HINGES = {"elbow": ("shoulder", "elbow", "wrist"), "knee": ("hip", "knee", "ankle")}
 
@@ -82,11 +81,9 @@ def packed(values: ArrayLike) -> dict[str, Any]:
 def _scene(result: Result, figure: Figure, rig: Rig | None) -> dict[str, Any]:
     """Joints, body and cameras in the frame of the floor: x, y along it, z up, the motion's middle above the origin."""
     stage = Stage.of(result, figure)
-    up = stage.axes[:, 2]
-    origin = stage.middle + (stage.floor - stage.middle @ up) * up
     T = np.eye(4)
     T[:3, :3] = stage.axes.T
-    T[:3, 3] = -stage.axes.T @ origin
+    T[:3, 3] = -stage.axes.T @ stage.origin
     cameras = result.cameras.rig if result.cameras else rig
     carrying = sorted({solid.segment for solid in figure.solids})
     return {
@@ -99,19 +96,12 @@ def _scene(result: Result, figure: Figure, rig: Rig | None) -> dict[str, Any]:
             {"segment": carrying.index(solid.segment), "rings": packed(solid.divided.rings)} for solid in figure.solids
         ],
         "cameras": [
-            {"name": camera.name, "points": packed(_pyramid(camera) @ T[:3, :3].T + T[:3, 3])}
+            {"name": camera.name, "points": packed(camera_pyramid(camera) @ T[:3, :3].T + T[:3, 3])}
             for camera in cameras or ()
         ],
         "radius": stage.radius,
-        "height": float((stage.middle - origin) @ up),
+        "height": float((stage.middle - stage.origin) @ stage.axes[:, 2]),
     }
-
-
-def _pyramid(camera: Any) -> Float:
-    """(5, 3) a camera's centre and the corners of its picture held before it, metres, world frame."""
-    w, h = camera.width, camera.height
-    rays = np.column_stack([camera.undistort([[0, 0], [w, 0], [w, h], [0, h]]), np.ones(4)]) @ camera.rotation
-    return np.vstack([camera.center, camera.center + _PYRAMID_M * rays])
 
 
 def _angles(result: Result, figure: Figure) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""What a window shows of a result, whichever way it is drawn."""
+"""What the window shows of a result."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ from tk.view import shapes
 
 Float = NDArray[np.float64]
 
-SIZE = (1280, 860)
+# Appearance only; no measurement depends on these values.
+SIZE = (1280, 860)  # pixels
 BACKGROUND = (0.11, 0.12, 0.135)
-WIRE = (0.62, 0.68, 0.78)
-_FLOOR, _BONE = (0.32, 0.34, 0.37), (0.95, 0.95, 0.95)
+_WIRE, _FLOOR, _BONE = (0.62, 0.68, 0.78), (0.32, 0.34, 0.37), (0.95, 0.95, 0.95)
 FIELD_OF_VIEW_DEG = 40.0
 _ELEVATION_DEG = 14.0
+_AZIMUTH = 0.6  # radians
 
 
 @dataclass(frozen=True)
 class Contents:
-    """A result, its cameras where they are known, and the true joints (F, 15, 3) where there are some."""
+    """A result, its cameras if they are known, and the ground truth (F, 15, 3) if there is one."""
 
     result: Result
     rig: Rig | None
@@ -45,7 +46,7 @@ class Contents:
 
     @property
     def names(self) -> list[str]:
-        """What can be shown and hidden."""
+        """Parts that can be shown and hidden."""
         there = {
             "body": bool(self.figure.solids),
             "joints": True,
@@ -56,41 +57,37 @@ class Contents:
         }
         return [name for name, is_there in there.items() if is_there]
 
-    def geometry(self, name: str, row: int) -> dict[str, Any]:
-        """Open3D's geometries of what goes by one of :attr:`names`, in a frame, in their colours; none is empty."""
-        figure, found = self.figure, dict[str, Any]()
+    def geometry(self, name: str, row: int) -> list[Any]:
+        """Return Open3D's coloured geometries of one of :attr:`names` in a frame, without empty ones."""
+        figure, found = self.figure, list[Any]()
         if name == "body":
-            found["body"] = shapes.body_mesh(figure, row)
+            found.append(shapes.body_mesh(figure, row))
         elif name == "joints":
             joints = figure.joints[row]
-            found["bones"] = shapes.skeleton_lines(joints).paint_uniform_color(_BONE)
-            found["joints"] = shapes.joint_spheres(joints, None if figure.sigma is None else figure.sigma[row])
+            found.append(shapes.skeleton_lines(joints).paint_uniform_color(_BONE))
+            found.append(shapes.joint_spheres(joints, None if figure.sigma is None else figure.sigma[row]))
         elif name == "hull" and self.result.hull is not None:
-            found["hull"] = shapes.hull_cloud(self.result.hull[row])
+            found.append(shapes.hull_cloud(self.result.hull[row]))
         elif name == "truth" and self.truth is not None:
-            found["truth"] = shapes.truth_spheres(self.truth[row])
+            found.append(shapes.truth_spheres(self.truth[row]))
         elif name == "cameras" and self.rig is not None:
-            found["cameras"] = shapes.camera_lines(self.rig).paint_uniform_color(WIRE)
+            found.append(shapes.camera_lines(self.rig).paint_uniform_color(_WIRE))
         elif name == "floor":
-            found["floor"] = shapes.floor_lines(self.stage).paint_uniform_color(_FLOOR)
-        return {name: geometry for name, geometry in found.items() if not geometry.is_empty()}
+            found.append(shapes.floor_lines(self.stage).paint_uniform_color(_FLOOR))
+        return [geometry for geometry in found if not geometry.is_empty()]
 
     @property
     def eye(self) -> Float:
-        """(3,) a place aside and a little above, all that moves and some of the room in sight; metres."""
+        """(3,) position of the camera, metres, world frame: beside and above the motion, all of it in view."""
         stage = self.stage
         elevation = np.radians(_ELEVATION_DEG)
         distance = 1.25 * stage.radius / np.sin(np.radians(FIELD_OF_VIEW_DEG / 2))
-        aside = np.cos(elevation) * self.level + np.sin(elevation) * stage.axes[:, 2]
-        return np.asarray(stage.middle + distance * aside)
-
-    @property
-    def level(self) -> Float:
-        """(3,) the horizontal direction from the middle to :attr:`eye`."""
-        return np.asarray(self.stage.axes @ np.array([np.cos(0.6), np.sin(0.6), 0.0]))
+        horizontal = stage.axes @ np.array([np.cos(_AZIMUTH), np.sin(_AZIMUTH), 0.0])
+        direction = np.cos(elevation) * horizontal + np.sin(elevation) * stage.axes[:, 2]
+        return np.asarray(stage.middle + distance * direction)
 
     def line(self, row: int) -> str:
-        """What there is to say of a frame."""
+        """Return a line about a frame: time, status, residual, uncertainty."""
         result = self.result
         parts = [f"frame {result.frames[row]}", f"{result.time[row]:.2f} s", STATUS_MEANING[result.status[row]]]
         error = result.silhouette_error
@@ -102,7 +99,7 @@ class Contents:
 
 
 def truth_of(result: Result, path: Path) -> Float | None:
-    """(F, 15, 3) the true joints of a file in the result's frames; NaN where it has none, None without the file."""
+    """Return the ground-truth joints (F, 15, 3) in the result's frames, NaN if missing; None without the file."""
     if not path.exists():
         return None
     truth = read_joints(path)

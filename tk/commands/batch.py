@@ -1,0 +1,68 @@
+"""`tk batch`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from tk.commands.base import (
+    PATH,
+    TrackingOptions,
+    example,
+    no_report_option,
+    parse_frames,
+    quiet_option,
+    split_names,
+    tracking_options,
+)
+from tk.commands.console import BatchConsoleReporter
+from tk.errors import WorkerError
+
+
+@click.command(epilog=example("tk batch recordings/* -o results --workers 4"))
+@click.argument("captures", nargs=-1, required=True, type=PATH, metavar="CAPTURE...")
+@click.option("-o", "--output", required=True, type=PATH, metavar="FOLDER")
+@click.option(
+    "--workers", type=int, metavar="N",
+    help="Captures to track at the same time on this machine.  [default: half the cores]",
+)  # fmt: skip
+@click.option("--scheduler", metavar="ADDRESS", help="Use the workers of this Dask scheduler: tcp://host:8786.")
+@tracking_options
+@no_report_option
+@quiet_option
+def batch(
+    captures: tuple[Path, ...],
+    output: Path,
+    workers: int | None,
+    scheduler: str | None,
+    options: TrackingOptions,
+    no_report: bool,
+    quiet: bool,
+) -> None:
+    """Track many captures into FOLDER and write a summary; after an interruption, the same command continues."""
+    from tk.batch import TrackOptions, exit_code, run_batch
+
+    track_options = TrackOptions(
+        options.method,
+        parse_frames(options.frames),
+        split_names(options.cameras),
+        options.masks,
+        options.body and options.body.resolve(),
+        options.causal,
+        options.store_hull,
+        options.settings(),
+    )
+    with BatchConsoleReporter(quiet) as reporter:
+        try:
+            outcomes = run_batch(captures, output, track_options, reporter, workers, scheduler, not no_report)
+        except KeyboardInterrupt:
+            click.echo("tk: interrupted; the same command continues", err=True)
+            sys.exit(1)
+        except WorkerError as error:
+            click.echo(f"tk: {error}", err=True)
+            sys.exit(1)
+    if not quiet:
+        click.echo(f"the summary is in {output / 'summary.html'}", err=True)
+    sys.exit(exit_code(outcomes))

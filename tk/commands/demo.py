@@ -1,0 +1,52 @@
+"""`tk demo`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from tk.commands.base import (
+    PATH,
+    example,
+    force_option,
+    load_settings,
+    no_report_option,
+    quiet_option,
+    resume_option,
+    voxels_option,
+)
+from tk.commands.console import ConsoleReporter
+from tk.commands.track import draw_video_and_report, end
+
+
+@click.command(epilog=example("tk demo"))
+@click.option("-o", "--output", default="demo.h5", show_default=True, type=PATH)
+@voxels_option
+@resume_option
+@force_option
+@no_report_option
+@quiet_option
+def demo(output: Path, voxels: int | None, resume: bool, force: bool, no_report: bool, quiet: bool) -> None:
+    """Track the capture that ships with tk and compare the result with its ground truth."""
+    from importlib.resources import as_file, files
+
+    with as_file(files("tk") / "data" / "demo") as folder:
+        with ConsoleReporter(quiet) as reporter:
+            reporter.stage("loading")
+            from tk.evaluation.joints import evaluate_files
+            from tk.io.captures.capture import open_capture
+            from tk.io.results.files import check_output
+            from tk.run import session
+
+            check_output(output, force, resume)
+            reporter.stage(f"opening the capture that ships with tk, {folder}")
+            settings = load_settings(None, voxels=voxels)
+            capture = open_capture(folder)
+            summary = session.track(capture, output, settings, reporter, resume=resume, force=force)
+            if not no_report:
+                draw_video_and_report(capture, output, summary, reporter, quiet)
+        if not summary.interrupted:
+            click.echo(evaluate_files(output, folder / "truth.h5").format_table())
+            click.echo(f"The result is in {output}. Try your own recording: tk track CAPTURE -o RESULT.h5")
+        end(output, summary, quiet, as_json=False)

@@ -1,0 +1,74 @@
+"""`tk refine`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from tk.commands.base import (
+    PATH,
+    cameras_option,
+    capture_argument,
+    config_option,
+    example,
+    force_option,
+    load_settings,
+    masks_option,
+    quiet_option,
+    result_argument,
+    split_names,
+)
+from tk.commands.console import ConsoleReporter
+from tk.errors import ConfigError
+
+
+@click.command(epilog=example("tk refine CAPTURE result.h5 -o refined.toml"))
+@capture_argument
+@result_argument
+@click.option("-o", "--output", required=True, type=PATH, metavar="CALIBRATION.toml")
+@click.option("--focal", is_flag=True, help="Also refine the focal lengths.")
+@click.option("--offsets/--no-offsets", default=True, show_default=True, help="Estimate the videos' time offsets.")
+@click.option(
+    "--trust", type=float, default=1.0, show_default=True,
+    help="Expected error of the calibration; 1 means about 0.3° and 12 mm.",
+)  # fmt: skip
+@cameras_option
+@masks_option
+@config_option
+@force_option
+@quiet_option
+def refine(
+    capture: Path,
+    result: Path,
+    output: Path,
+    focal: bool,
+    offsets: bool,
+    trust: float,
+    cameras: str | None,
+    masks: str,
+    config_file: Path | None,
+    force: bool,
+    quiet: bool,
+) -> None:
+    """Refine the calibration and the time offsets of CAPTURE with RESULT.h5, a result tracked from CAPTURE."""
+    with ConsoleReporter(quiet) as reporter:
+        reporter.stage("loading")
+        from tk.io.captures.capture import open_capture
+        from tk.model.cameras.refinement import RefinementSettings
+        from tk.run.refinement import refine_capture
+
+        if output.exists() and not force:
+            raise ConfigError(f"{output}: exists; choose another name, or replace it with --force")
+        refinement = RefinementSettings(focal=focal, offsets=offsets, trust=trust)
+        settings = load_settings(config_file)
+        reporter.stage(f"opening {capture}")
+        opened = open_capture(capture, split_names(cameras), masks)
+        for warning in opened.warnings:
+            reporter.note(warning)
+        reporter.stage("refining the cameras")
+        done = refine_capture(opened, result, output, settings, reporter.note, refinement)
+        for warning in done.warnings:
+            reporter.note(warning)
+    click.echo(done.format_table())
+    click.echo(f"{done.frames} frames used; the new calibration is in {output}", err=True)

@@ -1,0 +1,128 @@
+"""`tk track`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from tk.commands.base import (
+    PATH,
+    TrackingOptions,
+    capture_argument,
+    example,
+    force_option,
+    json_option,
+    no_report_option,
+    parse_frames,
+    print_json,
+    quiet_option,
+    resume_option,
+    split_names,
+    tracking_options,
+)
+from tk.commands.console import ConsoleReporter
+
+if TYPE_CHECKING:
+    from tk.io.captures.capture import Capture
+    from tk.run.session import Summary
+
+#: exit code when more than half of the frames are lost
+EXIT_LOST = 3
+
+
+@click.command(
+    epilog=example(
+        "tk track CAPTURE -o result.h5",
+        "tk track CAPTURE -o part.h5 --frames 0:100 --cameras cam1,cam2,cam4",
+    )
+)
+@capture_argument
+@click.option("-o", "--output", required=True, type=PATH, metavar="RESULT.h5")
+@tracking_options
+@click.option(
+    "--init-pose", type=PATH, metavar="FILE",
+    help="Start from the approximate pose in this TOML file, or from this folder of 2D keypoints.",
+)  # fmt: skip
+@resume_option
+@force_option
+@no_report_option
+@quiet_option
+@json_option
+def track(
+    capture: Path,
+    output: Path,
+    options: TrackingOptions,
+    init_pose: Path | None,
+    resume: bool,
+    force: bool,
+    no_report: bool,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Track the person in CAPTURE and write the pose of every frame to RESULT.h5.
+
+    An overlay video (RESULT.mp4) and a report (RESULT.html) are written next to it.
+    """
+    span = parse_frames(options.frames)
+    with ConsoleReporter(quiet) as reporter:
+        reporter.stage("loading")
+        from tk.io.captures.capture import open_capture
+        from tk.io.results.files import check_output
+        from tk.run import session
+
+        settings = options.settings()
+        check_output(output, force, resume)
+        reporter.stage(f"opening {capture}")
+        opened = open_capture(capture, split_names(options.cameras), options.masks)
+        summary = session.track(
+            opened, output, settings, reporter, options.method, span, init_pose, resume, options.store_hull,
+            options.body, options.causal, force,
+        )  # fmt: skip
+        if not no_report:
+            draw_video_and_report(opened, output, summary, reporter, quiet)
+    end(output, summary, quiet, as_json)
+
+
+def draw_video_and_report(
+    capture: Capture, result: Path, summary: Summary, reporter: ConsoleReporter, quiet: bool
+) -> None:
+    """Write the overlay video and the report of a run that was not interrupted."""
+    if summary.interrupted or not summary.frames:
+        return
+    from tk.report.after import write_video_and_report
+
+    reporter.stage("drawing the overlay video and the report")
+    files = write_video_and_report(capture, result, lambda text: click.echo(f"warning: {text}", err=True))
+    if files and not quiet:
+        click.echo(f"wrote {', '.join(str(file) for file in files)}", err=True)
+
+
+def end(output: Path, summary: Summary, quiet: bool, as_json: bool) -> None:
+    """Print how a run ended, and exit: with 1 after an interruption, with 3 if most frames are lost."""
+    rate = summary.tracked_now / summary.seconds if summary.seconds > 0 else 0.0
+    if as_json:
+        print_json(
+            result=str(output),
+            frames=summary.frames,
+            lost=summary.lost,
+            tracked_now=summary.tracked_now,
+            seconds=round(summary.seconds, 3),
+            frames_per_second=round(rate, 3),
+            interrupted=summary.interrupted,
+        )
+    if summary.frames and not quiet:
+        click.echo(f"{summary.frames} frames in {output}, {summary.lost} lost, {rate:.1f} frames/s", err=True)
+    if summary.interrupted:
+        next_step = "continue with the same command and --resume" if summary.frames else "no frame was finished"
+        click.echo(f"tk: interrupted; {next_step}", err=True)
+        sys.exit(1)
+    if summary.mostly_lost:
+        click.echo(
+            f"tk: {output}: {summary.lost} of {summary.frames} frames are lost; do not use the result: check masks, "
+            "calibration and working volume with tk inspect",
+            err=True,
+        )
+        sys.exit(EXIT_LOST)

@@ -1,0 +1,48 @@
+"""`tk view`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from tk.commands.base import PATH, example, optional_capture_argument, result_argument
+from tk.errors import ConfigError, ExportError, ResultError
+
+
+@click.command(epilog=example("tk view walk.h5 --frame 40"))
+@result_argument
+@optional_capture_argument
+@click.option("--frame", type=int, metavar="N", help="Frame to show first.  [default: the first]")
+@click.option("--screenshot", type=PATH, metavar="FILE.png", help="Write an image of the frame, and close.")
+def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path | None) -> None:
+    """Show RESULT.h5 in a window: body, joints, hull, cameras. Keys move through time and switch parts on and off.
+
+    CAPTURE adds its cameras, if the result has none, and its ground truth, if it has one.
+    """
+    from tk.io.captures.capture import open_capture
+    from tk.io.results.writer import read_result
+    from tk.view.contents import Contents, truth_of
+    from tk.view.window import Window, require_display
+
+    loaded = read_result(result)
+    if not len(loaded):
+        raise ResultError(f"{result}: has no frames")
+    known = loaded.frames.tolist()
+    if frame is not None and frame not in known:
+        raise ConfigError(f"--frame {frame}: the result has frames {min(known)} to {max(known)}")
+    if screenshot is not None and screenshot.suffix.lower() != ".png":
+        raise ConfigError(f"--screenshot {screenshot}: an image must end in .png")
+    if screenshot is not None and not screenshot.parent.is_dir():
+        raise ExportError(f"{screenshot}: the folder {screenshot.parent} does not exist; make it first")
+    rig = loaded.cameras.rig if loaded.cameras else None
+    truth = None
+    if capture is not None:
+        rig = rig or open_capture(capture, masks="none").rig
+        truth = truth_of(loaded, capture / "truth.h5")
+    require_display()
+    window, row = Window(Contents(loaded, rig, truth)), 0 if frame is None else known.index(frame)
+    if screenshot is not None:
+        window.save(row, screenshot)
+    else:
+        window.run(row)
