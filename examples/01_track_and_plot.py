@@ -25,7 +25,7 @@ options = parser.parse_args()
 options.out.mkdir(parents=True, exist_ok=True)
 
 capture = tk.open_capture(options.capture)
-config = tk.Settings.read(options.config) if options.config else tk.Settings()
+config = tk.read_settings(options.config) if options.config else tk.Settings()
 result = tk.track(capture, options.out / "result.h5", frames=(0, options.frames), config=config, force=True)
 lost = result.status == 3
 print(f"{len(result)} frames, {lost.sum()} lost")

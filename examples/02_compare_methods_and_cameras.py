@@ -22,7 +22,7 @@ parser.add_argument("capture", nargs="?", type=Path, default=DEMO)
 parser.add_argument("--frames", type=int, default=45, help="how many, at most")
 parser.add_argument("--config", type=Path, help="settings, TOML")
 options = parser.parse_args()
-config = tk.Settings.read(options.config) if options.config else tk.Settings()
+config = tk.read_settings(options.config) if options.config else tk.Settings()
 
 truth = read_joints(options.capture / "truth.h5")  # positions (F, 15, 3) metres
 cameras = tk.open_capture(options.capture).rig.names

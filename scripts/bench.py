@@ -59,7 +59,7 @@ from tk.model.body.skeleton import CHAINS, join_pose
 from tk.model.body.superellipsoid_body import build_superellipsoid_body
 from tk.model.cameras.volume import VoxelGrid
 from tk.model.cues.appearance import Appearance
-from tk.model.cues.objective import BodyObjective
+from tk.model.cues.objective import BodyObjective, objective_parameters
 from tk.model.hull.hull import VisualHull
 from tk.run import session
 from tk.run.segmentation import make_segmenter
@@ -246,7 +246,7 @@ def stages_alone(options: Options, result: Result) -> tuple[list[Stage], bench_h
     decoding = Stage("decode", _decode_ms(capture, first, stop, options.repeat), {})
     masking = Stage("masks", statistics.median(median_ms(partial(segment, frame), 1) for frame in frames), {})
     if options.method == SilhouetteTracker.method:
-        return [decoding, masking, *silhouette_stages(capture, config, frames, masks, result)], None
+        return [decoding, masking, *silhouette_stages(capture, frames, masks, result)], None
     masked = bench_hull.MaskedCapture(capture.name, capture.rig, capture.volume, np.stack(masks))
     hull_times = bench_hull.measure(masked, options.voxels, options.repeat)
     theirs = {"Open3D carve_silhouette": hull_times.open3d, "NumPy projection": hull_times.numpy}
@@ -301,7 +301,7 @@ def _search_stages(
     yield Stage("colour segmentation", median_ms(segmented), {})
 
     # the peer knows no colours, so this comparison leaves them out of ours as well
-    objective = BodyObjective(skin, config.objective.settings, SAMPLING)
+    objective = BodyObjective(skin, objective_parameters(config.objective), SAMPLING)
     rng = np.random.default_rng(0)
     samples = objective.draw(rng)
     points = skin.place(pose)[samples].astype(np.float32)
@@ -342,7 +342,13 @@ def _search_stages(
         voxels = rng.integers(len(surface), size=(B, Q)).astype(np.int32)
         poses = np.repeat(pose[None], B, axis=0)
         call = partial(
-            objective.kernel.evaluate, index, chosen, voxels, poses, np.ones_like(poses), config.objective.settings
+            objective.kernel.evaluate,
+            index,
+            chosen,
+            voxels,
+            poses,
+            np.ones_like(poses),
+            objective_parameters(config.objective),
         )
         yield Stage(name, median_ms(call), {})
     yield from contour_stages(objective, capture, config, frame, pose, index)

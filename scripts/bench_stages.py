@@ -18,14 +18,14 @@ from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.raycast import Cast
 from tk.model.body.limb_candidates import limbs_of
 from tk.model.cues.edge_term import ContourTerm
-from tk.model.cues.objective import BodyObjective
+from tk.model.cues.objective import BodyObjective, objective_parameters
 from tk.model.cues.part_colors import PartColors
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Pyramid, Views
 from tk.optim import gauss_newton
 from tk.settings import Settings
 from tk.trackers.bodies import body_and_poses
-from tk.trackers.contour_tracker import NEARBY, SCREEN_ROWS
+from tk.trackers.contour_tracker import LINE_SEARCH, NEARBY, SCREEN_ROWS, SOLVER
 from tk.trackers.volumetric import SAMPLING
 
 Float = np.ndarray
@@ -85,7 +85,7 @@ def contour_stages(
     rng = np.random.default_rng(0)
     samples, voxels = objective.draw(rng), rng.integers(len(index.positions), size=SAMPLING.voxels)
     rows = samples[None].astype(np.int32), voxels[None].astype(np.int32)
-    settings = config.objective.settings
+    settings = objective_parameters(config.objective)
     for text, given in (("without entries", None), (f"and {entries.shape[1]} alignment entries", entries)):
         *_, held = objective.kernel.evaluate(index, *rows, poses, poses, settings, entries=given)
         evaluate = partial(objective.kernel.evaluate, index, *rows, poses, poses, settings, entries=given)
@@ -98,19 +98,18 @@ def contour_stages(
 
 
 def silhouette_stages(
-    capture: Capture, config: Settings, frames: Sequence[FrameSet], masks: Sequence[np.ndarray], result: Result
+    capture: Capture, frames: Sequence[FrameSet], masks: Sequence[np.ndarray], result: Result
 ) -> list[Stage]:
     """The silhouette tracker's work on consecutive frames with masks (V, H, W) each, two frames at least.
 
     Every frame but the first starts where the tracker would: at the pose before it.
     """
-    settings = config.silhouette
     found_body = body_and_poses(result)
     assert found_body is not None
     body, tracked = found_body
     views = Views(capture.rig)
-    scales = settings.solver.scales
-    pyramids = [views.pyramid(frame, scales, settings.cleaning) for frame in masks[1:]]
+    scales = SOLVER.scales
+    pyramids = [views.pyramid(frame, scales, True) for frame in masks[1:]]
     row_of = {int(index): row for row, index in enumerate(result.frames)}
     poses = tracked[[row_of[frame.index] for frame in frames[:-1]]]
     last, pose = pyramids[-1], poses[-1][None]
@@ -123,22 +122,22 @@ def silhouette_stages(
     )
     assert rest is not None
     others = Cast(rest.label[0], rest.depth[0])
-    here = views.equations(body.arrays, last, pose, 0, settings.search)
+    here = views.equations(body.arrays, last, pose, 0, LINE_SEARCH)
     limits = body.free, body.skeleton.lower, body.skeleton.upper
 
     def fit(start: Float, pyramid: Pyramid) -> Float:
         return gauss_newton.minimise(
-            lambda states, scale: views.equations(body.arrays, pyramid, states, scale, settings.search),
-            start[None], *limits, settings.solver,
+            lambda states, scale: views.equations(body.arrays, pyramid, states, scale, LINE_SEARCH),
+            start[None], *limits, SOLVER,
         )  # fmt: skip
 
     def equations(scale: int, window_px: float) -> float:
-        search = replace(settings.search, window_px=window_px)
+        search = replace(LINE_SEARCH, window_px=window_px)
         return median_ms(lambda: views.equations(body.arrays, last, pose, scale, search))
 
-    window = settings.search.window_px
-    one_step = replace(settings.solver, scales=1, iterations=1)
-    found = [Stage("masks cleaned, scales", median_ms(lambda: views.pyramid(masks[-1], scales, settings.cleaning)), {})]
+    window = LINE_SEARCH.window_px
+    one_step = replace(SOLVER, scales=1, iterations=1)
+    found = [Stage("masks cleaned, scales", median_ms(lambda: views.pyramid(masks[-1], scales, True)), {})]
     found += [
         Stage(f"contours, search, equations: 1/{2**scale} scale, one launch", equations(scale, window), {})
         for scale in reversed(range(scales))
@@ -151,7 +150,7 @@ def silhouette_stages(
             {},
         ),
         Stage(
-            f"fit: {scales} scales of {settings.solver.iterations} iterations",
+            f"fit: {scales} scales of {SOLVER.iterations} iterations",
             statistics.median(median_ms(partial(fit, *frame), 3) for frame in zip(poses, pyramids, strict=True)),
             {},
         ),

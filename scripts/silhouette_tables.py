@@ -26,7 +26,8 @@ from tk.model.body.skeleton import JOINTS, join_pose
 from tk.model.cameras.camera import Rig
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.optim.gauss_newton import GaussNewtonSettings
-from tk.trackers.contour_tracker import SilhouetteSettings
+from tk.settings import SilhouetteSettings
+from tk.trackers.contour_tracker import LINE_SEARCH, SOLVER
 from tk.trackers.protocol import Observation
 from tk.trackers.silhouette import SilhouetteTracker
 
@@ -36,11 +37,21 @@ Float = NDArray[np.float64]
 CAMERAS = ("cam3", "cam6", "cam1", "cam4")
 ANKLES = [JOINTS.index("ankle_l"), JOINTS.index("ankle_r")]
 
-PAPER = SilhouetteSettings(
-    prediction=0.0,
-    search_every=0,
-    search=SearchSettings(interior=True, ambiguous_px=8.0, tangential=1.0, spacing_px=1.0, robust_px=0.0),
-    solver=GaussNewtonSettings(scales=2),
+
+@dataclass(frozen=True)
+class Variant:
+    """Settings of a tracker, its line search and its solver."""
+
+    settings: SilhouetteSettings
+    line_search: SearchSettings
+    solver: GaussNewtonSettings
+
+
+OURS = Variant(SilhouetteSettings(), LINE_SEARCH, SOLVER)
+PAPER = Variant(
+    SilhouetteSettings(prediction=0.0, search_every=0),
+    SearchSettings(interior=True, ambiguous_px=8.0, tangential=1.0, spacing_px=1.0, robust_px=0.0),
+    GaussNewtonSettings(scales=2),
 )
 
 
@@ -83,15 +94,14 @@ def load(folder: Path, cameras: Sequence[str], frames: int, every: int = 1) -> S
     return Sequence3D(rig, capture.up, masks, truth.positions[:frames:every], capture.subject_height_m)
 
 
-def variants() -> list[tuple[str, int, SilhouetteSettings]]:
+def variants() -> list[tuple[str, int, Variant]]:
     """Names, views and settings of table 1, then ours."""
 
-    def iterations(n: int) -> SilhouetteSettings:
+    def iterations(n: int) -> Variant:
         return replace(PAPER, solver=replace(PAPER.solver, iterations=n))
 
-    blind = replace(PAPER, search=replace(PAPER.search, ambiguous_px=0.0))
+    blind = replace(PAPER, line_search=replace(PAPER.line_search, ambiguous_px=0.0))
     single = replace(PAPER, solver=replace(PAPER.solver, scales=1, iterations=6))
-    ours = SilhouetteSettings()
     return [
         ("paper, no ambiguity weights", 2, blind),
         ("paper", 2, PAPER),
@@ -101,19 +111,19 @@ def variants() -> list[tuple[str, int, SilhouetteSettings]]:
         ("paper", 4, iterations(5)),
         ("paper, no ambiguity weights", 4, blind),
         ("paper, single scale", 4, single),
-        ("tk", 2, ours),
-        ("tk", 3, ours),
-        ("tk", 4, ours),
+        ("tk", 2, OURS),
+        ("tk", 3, OURS),
+        ("tk", 4, OURS),
     ]
 
 
-def track(data: Sequence3D, name: str, views: int, config: SilhouetteSettings) -> tuple[Row, Float]:
+def track(data: Sequence3D, name: str, views: int, config: Variant) -> tuple[Row, Float]:
     """Track with the first views; a row of the tables and the joints (F, 15, 3)."""
     rig = Rig(data.rig.cameras[:views])
     empty = np.zeros(0, np.uint8)
     frames = [Observation(i, empty, np.ascontiguousarray(m[:views])) for i, m in enumerate(data.masks)]
-    tracker = SilhouetteTracker(rig, data.up, config)
-    tracker.start(frames[: config.init_frames], data.height_m, None)
+    tracker = SilhouetteTracker(rig, data.up, config.settings, config.line_search, config.solver)
+    tracker.start(frames[: config.settings.init_frames], data.height_m, None)
     estimates = [tracker.step(frame) for frame in frames]
     joints = np.array([e.joints for e in estimates])
     every = max(1, len(frames) // 68)

@@ -18,6 +18,7 @@ import hypothesis
 import pytest
 
 from scripts.synthetic.capture import Options, plan_capture, write_capture
+from tk.io import settings_file
 
 # every run draws the same examples; `pytest --hypothesis-profile default` draws new ones
 hypothesis.settings.register_profile("same", derandomize=True)
@@ -131,10 +132,9 @@ def tracked(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The result of an unbroken run of the volumetric tracker over the tiny capture. Not to be changed."""
     from tk.io.captures.capture import open_capture
     from tk.run.session import track
-    from tk.settings import Settings
 
     def make(path: Path) -> None:
-        track(open_capture(tiny), path, Settings.from_toml(QUICK), Silent(), method="volumetric", store_hull=True)
+        track(open_capture(tiny), path, settings_file.from_toml(QUICK), Silent(), method="volumetric", store_hull=True)
 
     return made_once(tmp_path_factory, "unbroken.h5", make)
 

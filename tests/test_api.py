@@ -12,6 +12,7 @@ import tk
 from tests.conftest import QUICK
 from tests.io.conftest import picture, write_video
 from tk.errors import CaptureError
+from tk.io import settings_file
 
 
 def test_importing_changes_nothing_in_the_process():
@@ -39,7 +40,7 @@ def test_a_missing_capture_is_one_line(tmp_path):
 
 def test_what_is_worth_knowing_is_logged(copy, tmp_path, caplog):
     write_video(copy / "videos" / "cam2.mp4", [picture(1, k, (160, 120)) for k in range(3)])
-    config = tk.Settings.from_toml(QUICK)
+    config = settings_file.from_toml(QUICK)
     list(tk.track(tk.open_capture(copy), config=config))
     (said,) = [r.getMessage() for r in caplog.records if r.name.startswith("tk") and r.levelname == "WARNING"]
     assert "only the first 3 are used" in said
@@ -47,7 +48,7 @@ def test_what_is_worth_knowing_is_logged(copy, tmp_path, caplog):
 
 def test_estimates_one_by_one_are_those_of_the_file(tiny, tmp_path):
     """The iterator's first pass is the file's, bit for bit."""
-    config = tk.Settings.from_toml("ahead = 0\n[silhouette]\ninit_frames = 3\n")
+    config = settings_file.from_toml("ahead = 0\n[silhouette]\ninit_frames = 3\n")
     opened = tk.open_capture(tiny)
     told = list(tk.track(opened, config=config, frames=(0, 4)))
     assert [e.frame for e in told] == [0, 1, 2, 3]

@@ -22,13 +22,13 @@ from tk.batch import Job, Outcome, TrackOptions, exit_code
 from tk.batch.jobs import DONE, FAILED, make_jobs
 from tk.batch.summary import write_summary
 from tk.errors import ConfigError, ResultBusyError, ResultError
+from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.files import Workshop
 from tk.run.session import track
-from tk.settings import Settings
 
 ROOT = Path(__file__).parents[1]
-CONFIG = Settings.from_toml(QUICK)
+CONFIG = settings_file.from_toml(QUICK)
 
 
 def folders(*paths: Path) -> list[Path]:

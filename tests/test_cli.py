@@ -18,8 +18,8 @@ import tomli_w
 from tests.conftest import FRAMES, QUICK, Tk
 from tests.io.conftest import picture, write_picture, write_video
 from tk import __version__
+from tk.io import settings_file
 from tk.model.body.skeleton import JOINTS
-from tk.settings import Settings
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -88,7 +88,7 @@ def test_track_writes_what_the_contract_says(tk: Tk, quick: Path, tiny: Path, tm
     }  # fmt: skip
     assert (attributes["method"], attributes["seed"]) == ("region", 5)
     assert __version__ in attributes["software"] and attributes["created"].startswith("20")
-    config = Settings.from_toml(attributes["config"])
+    config = settings_file.from_toml(attributes["config"])
     assert (config.voxels, config.seed) == (32, 5)
 
 
@@ -133,7 +133,7 @@ def test_settings_from_a_file_and_options_over_them(tk: Tk, quick: Path, tiny: P
     ran = tk("track", tiny, "-o", result, "--config", settings, "--voxels", "32", "--frames", ":1")
     assert ran.code == 0, ran.err
     with h5py.File(result, "r") as file:
-        config = Settings.from_toml(file.attrs["config"])
+        config = settings_file.from_toml(file.attrs["config"])
     assert (config.voxels, config.seed, config.tracking.prediction) == (32, 3, 0.0)
 
 
@@ -149,7 +149,7 @@ def test_demo_tracks_and_says_how_well(tk: Tk, tiny: Path, tmp_path: Path, monke
     package = tmp_path / "package"
     shutil.copytree(tiny, package / "data" / "demo")
     monkeypatch.setattr("importlib.resources.files", lambda name: package)
-    monkeypatch.setattr("tk.commands.demo.load_settings", lambda file, voxels: Settings.from_toml(QUICK))
+    monkeypatch.setattr("tk.commands.demo.load_settings", lambda file, voxels: settings_file.from_toml(QUICK))
     ran = tk("demo", "-o", tmp_path / "demo.h5")
     assert ran.code == 0, ran.err
     assert f"{FRAMES} frames judged: 0 lost" in ran.out

@@ -17,6 +17,7 @@ import tk as package
 from tests.conftest import FRAMES, QUICK, Tk
 from tk.cli import main
 from tk.errors import ConfigError, ResultError
+from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 
 
@@ -58,7 +59,7 @@ def test_a_hull_and_its_point_clouds_are_not_replaced_unasked(tk: Tk, tiny: Path
 
 def test_python_follows_the_same_rule(tiny: Path, tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
-    config = package.Settings.from_toml(QUICK)
+    config = settings_file.from_toml(QUICK)
     capture = open_capture(tiny)
     first = package.track(capture, path, config=config, frames=(0, 1), causal=True)
     with pytest.raises(ResultError, match="exists"):

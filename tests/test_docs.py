@@ -13,6 +13,7 @@ import pytest
 
 from tests.conftest import Tk
 from tk.cli import main
+from tk.io import settings_file
 from tk.io.captures.calibration import read_calibration
 from tk.io.captures.capture_toml import read_settings
 from tk.io.captures.init_pose import read_init_pose
@@ -123,13 +124,13 @@ def test_python_examples_compile(page: Path) -> None:
 
 
 def test_settings_example_is_accepted() -> None:
-    config = Settings.from_toml(toml_block("segmentation ="))
+    config = settings_file.from_toml(toml_block("segmentation ="))
     assert config != Settings() and config.voxels == 128 and not config.appearance.enabled
 
 
 @pytest.mark.parametrize("page", [HOW_TO, ROOT / "docs" / "method.md"], ids=lambda page: page.name)
 def test_named_settings_exist(page: Path) -> None:
-    tree = tomllib.loads(Settings().to_toml())
+    tree = tomllib.loads(settings_file.to_toml(Settings()))
     tables = {name for name, value in tree.items() if isinstance(value, dict)}
     named = re.findall(r"`(\w+)\.(\w+)(?: = [^`]*)?`", page.read_text(encoding="utf-8"))
     named = [(table, name) for table, name in named if table in tables]

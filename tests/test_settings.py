@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 
 from tk.commands.config_text import annotated_toml, meanings
 from tk.errors import ConfigError
-from tk.settings import PRESETS, Settings
+from tk.io import settings_file
+from tk.io.settings_file import PRESETS
+from tk.settings import Settings
 from tk.trackers.volumetric import SAMPLING, SCHEDULE, SMD, Effort
 
 
@@ -36,8 +38,8 @@ def toml(name: str, value: str) -> str:
 
 
 def test_defaults_round_trip() -> None:
-    assert Settings.from_toml(Settings().to_toml()) == Settings()
-    assert Settings.from_toml("") == Settings()
+    assert settings_file.from_toml(settings_file.to_toml(Settings())) == Settings()
+    assert settings_file.from_toml("") == Settings()
 
 
 @settings(deadline=None)
@@ -58,11 +60,11 @@ def test_values_round_trip(
         tracking=dataclasses.replace(config.tracking, prediction=prediction),
         appearance=dataclasses.replace(config.appearance, enabled=enabled),
     )
-    assert Settings.from_toml(config.to_toml()) == config
+    assert settings_file.from_toml(settings_file.to_toml(config)) == config
 
 
 def test_what_a_file_leaves_out_keeps_its_default() -> None:
-    config = Settings.from_toml("voxels = 128\n[tracking]\nprediction = 1\n")
+    config = settings_file.from_toml("voxels = 128\n[tracking]\nprediction = 1\n")
     assert config.voxels == 128 and config.tracking.prediction == 1.0
     assert isinstance(config.tracking.prediction, float)
     changed = {name for name, value in leaves(config) if value != DEFAULTS[name]}
@@ -96,6 +98,10 @@ def test_what_a_file_leaves_out_keeps_its_default() -> None:
         ("voxels = ", ["invalid TOML"]),
         ("tracking = " + 3000 * "[", ["invalid TOML"]),
         ("[silhouette]\ninit_frames = 1000000000\n", ["silhouette.init_frames = 1000000000 is too large"]),
+        ("[foreground]\nshadow_min = 1.5", ["foreground.shadow_min = 1.5"]),
+        ("[silhouette]\nbody = 'robot'\n", ["silhouette.body", "robot", "full, limbs, walker"]),
+        ("[objective]\nsurface_weight = -1.0\n", ["objective.surface_weight = -1"]),
+        ("[contours]\nviews = 0\n", ["contours.views = 0"]),
         ("[contours]\nthreshold = 1e300\n", ["contours.threshold = 1e+300 is too large"]),
         (f"[contours]\nthreshold = 1{400 * '0'}\n", ["contours.threshold = 1000", "is too large"]),
         (f"voxels = 1{5000 * '0'}\n", ["invalid TOML"]),
@@ -106,7 +112,7 @@ def test_mistakes_are_one_line_that_names_file_and_setting(tmp_path: Path, text:
     path = tmp_path / "settings.toml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
-        Settings.read(path)
+        settings_file.read(path)
     message = str(caught.value)
     assert message.startswith(f"{path}: ") and "\n" not in message
     for part in parts:
@@ -117,7 +123,7 @@ def test_mistakes_are_one_line_that_names_file_and_setting(tmp_path: Path, text:
 @pytest.mark.parametrize("name", NUMBERS)
 def test_no_setting_takes_what_is_not_finite(name: str, value: str) -> None:
     with pytest.raises(ConfigError, match=name.rpartition(".")[2]):
-        Settings.from_toml(toml(name, value))
+        settings_file.from_toml(toml(name, value))
 
 
 @pytest.mark.parametrize("name", [name for name in DEFAULTS if not isinstance(DEFAULTS[name], str)])
@@ -126,7 +132,7 @@ def test_extreme_values_are_taken_or_refused_as_the_users_mistake(name: str, val
     default = DEFAULTS[name]
     text = str(bool(value)).lower() if isinstance(default, bool) else str(value)
     try:
-        config = Settings.from_toml(toml(name, text))
+        config = settings_file.from_toml(toml(name, text))
     except ConfigError as error:
         table, _, key = name.rpartition(".")
         assert key in str(error) or f"{table}: " in str(error)  # it names the setting, or at least its table
@@ -136,28 +142,28 @@ def test_extreme_values_are_taken_or_refused_as_the_users_mistake(name: str, val
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"nowhere\.toml: cannot be read"):
-        Settings.read(tmp_path / "nowhere.toml")
+        settings_file.read(tmp_path / "nowhere.toml")
     with pytest.raises(ConfigError, match="cannot be read"):
-        Settings.read(tmp_path)
+        settings_file.read(tmp_path)
     (tmp_path / "latin.toml").write_bytes(b'segmentation = "\xe4"')
     with pytest.raises(ConfigError, match=r"latin\.toml: is not UTF-8"):
-        Settings.read(tmp_path / "latin.toml")
+        settings_file.read(tmp_path / "latin.toml")
 
 
 def test_every_default_is_finite() -> None:
-    assert len(NUMBERS) > 20
+    assert len(NUMBERS) > 10
     assert all(math.isfinite(DEFAULTS[name]) for name in NUMBERS)
 
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_are_valid_and_unlike_the_defaults(name: str) -> None:
-    config = Settings.preset(name)
+    config = settings_file.preset(name)
     assert config != Settings()
-    assert Settings.from_toml(config.to_toml()) == config
+    assert settings_file.from_toml(settings_file.to_toml(config)) == config
 
 
 def test_the_papers_preset_has_the_papers_numbers() -> None:
-    c = Settings.preset("kehl2006")
+    c = settings_file.preset("kehl2006")
     effort = Effort.of(c.effort_factor)
     assert (c.contours.views, c.contours.pairs, c.contours.hidden) == (3, 5, 1)
     assert (c.voxels, c.body.waist, c.appearance.rate) == (64, False, 0.3)
@@ -175,14 +181,14 @@ def test_effort_is_iterations_below_one_and_points_above() -> None:
     assert Effort.of(0.05).smd.max_iterations >= 1
 
 
-def test_there_are_no_more_settings_than_one_can_look_through() -> None:
-    assert len(DEFAULTS) <= 60
+def test_there_are_at_most_35_settings() -> None:
+    assert len(DEFAULTS) <= 35
 
 
-@pytest.mark.parametrize("config", [Settings(), Settings.preset("kehl2006")], ids=["defaults", "kehl2006"])
+@pytest.mark.parametrize("config", [Settings(), settings_file.preset("kehl2006")], ids=["defaults", "kehl2006"])
 def test_the_annotated_settings_are_the_settings(config: Settings) -> None:
     text = annotated_toml(config)
-    assert Settings.from_toml(text) == config
+    assert settings_file.from_toml(text) == config
     lines = text.splitlines()
     for number, line in enumerate(lines):
         name, equals, _ = line.partition(" = ")
@@ -207,7 +213,7 @@ def test_each_setting_is_explained() -> None:
 
 
 def test_the_papers_preset_is_the_default_but_for_the_waist_and_the_search() -> None:
-    c = Settings.preset("kehl2006")
+    c = settings_file.preset("kehl2006")
     assert not c.body.waist and c.silhouette.search_every == 0
     silhouette = dataclasses.replace(c.silhouette, search_every=Settings().silhouette.search_every)
     assert dataclasses.replace(c, body=Settings().body, silhouette=silhouette) == Settings()
@@ -216,10 +222,10 @@ def test_the_papers_preset_is_the_default_but_for_the_waist_and_the_search() -> 
 def test_a_file_wins_over_a_preset(tmp_path: Path) -> None:
     file = tmp_path / "own.toml"
     file.write_text("voxels = 128\n[contours]\nviews = 2\n")
-    config = Settings.read(file, Settings.preset("kehl2006"))
+    config = settings_file.read(file, settings_file.preset("kehl2006"))
     assert (config.voxels, config.contours.views, config.body.waist) == (128, 2, False)
 
 
 def test_an_unknown_preset_is_named() -> None:
     with pytest.raises(ConfigError, match="--preset mine: choose one of kehl2006"):
-        Settings.preset("mine")
+        settings_file.preset("mine")

@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scripts.silhouette_tables import CAMERAS, load, track
+from scripts.silhouette_tables import CAMERAS, OURS, load, track
 from tests.conftest import Silent
 from tk.io.captures.capture import open_capture
 from tk.io.results.writer import read_joints
 from tk.run.session import track as track_capture
 from tk.settings import Settings
-from tk.trackers.contour_tracker import SilhouetteSettings
 
 CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "captures"
 TREADMILL = CAPTURES / "treadmill-slow"
@@ -24,7 +23,7 @@ pytestmark = pytest.mark.slow
 @pytest.mark.skipif(not TREADMILL.is_dir(), reason=f"no {TREADMILL.name} among the shared captures")
 def test_treadmill_with_four_views() -> None:
     data = load(TREADMILL, CAMERAS, 340)
-    row, _ = track(data, "tk", 4, SilhouetteSettings())
+    row, _ = track(data, "tk", 4, OURS)
     assert row.ankle_share <= 2.0 and row.joints_cm <= 4.0 and row.swaps == 0
     assert row.error_share <= 12.0
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from tk.api import open_capture, track
     from tk.io.results.writer import Result, read_result
+    from tk.io.settings_file import read as read_settings
     from tk.model.body.cone_body import ConeBody as Body
     from tk.model.hull.hull import VisualHull
     from tk.settings import Settings
@@ -33,6 +34,7 @@ __all__ = [
     "__version__",
     "open_capture",
     "read_result",
+    "read_settings",
     "track",
 ]
 
@@ -44,6 +46,7 @@ _HOMES = {
     "VisualHull": ("tk.model.hull.hull", "VisualHull"),
     "open_capture": ("tk.api", "open_capture"),
     "read_result": ("tk.io.results.writer", "read_result"),
+    "read_settings": ("tk.io.settings_file", "read"),
     "track": ("tk.api", "track"),
 }
 

@@ -1,82 +1,231 @@
-"""Every setting of the program, as one tree of frozen dataclasses; TOML in, TOML out.
+"""All settings of the program, as frozen dataclasses. Each part goes to the tracker or the segmentation that needs it.
 
-Each default stands with its unit and source in the dataclass of the part that it belongs to.
+Files of settings are read and written by :mod:`tk.io.settings_file`. Parameters of an algorithm that no user sets are
+constants beside the algorithm.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from dataclasses import dataclass, field
-from importlib import resources
-from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
-
-import tomli_w
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 from tk.errors import ConfigError
-from tk.io.toml import LARGE, parse_toml, read_text, shown
-from tk.model.body.superellipsoid_body import BodySettings
-from tk.model.cues.appearance import AppearanceSettings
-from tk.model.cues.edge_term import ContourSettings
-from tk.model.cues.objective import ObjectiveSettings
-from tk.model.masks.foreground import ForegroundSettings
-from tk.trackers.contour_tracker import SilhouetteSettings
-from tk.trackers.region import RegionSettings
-
-T = TypeVar("T")
 
 SEGMENTATIONS = ("collinearity", "mog2")
-PRESETS = ("kehl2006",)
+BODIES = ("full", "limbs", "walker")
 EFFORTS = {"fast": 0.5, "normal": 1.0, "thorough": 5.0}
 
-#: of whatever a configuration counts: frames, points, rounds
+#: largest count in a settings file: frames, points, iterations
 MOST_COUNT = 100_000
+
+
+def _check(table: str, values: Any, **ranges: tuple[float, float]) -> None:
+    """Raise ConfigError for a value of a settings table that is outside its closed range, or NaN."""
+    for name, (low, high) in ranges.items():
+        value = getattr(values, name)
+        if not low <= value <= high:
+            expected = f"in [{low:g}, {high:g}]" if math.isfinite(high) else f"at {low:g} or above"
+            raise ConfigError(f"{table}.{name} = {value} must lie {expected}")
+
+
+@dataclass(frozen=True)
+class ForegroundSettings:
+    """Masks made against the empty scene, with segmentation = "collinearity".
+
+    Attributes:
+        threshold: least difference between a person's pixel and the scene, in noise variances; pure noise gives 0.5. A
+            lower value finds more of the person and more false pixels. Measured on rendered captures with exact masks.
+        shadow_min: brightness of the darkest shadow, as a share of the lit scene; 1 if there are no shadows. A darker
+            pixel is taken for the person; other cameras can correct that, but a hole in one mask cuts through the
+            visual hull. Measured under two lamps: 0.76.
+    """
+
+    threshold: float = 3.0
+    shadow_min: float = 0.7
+
+    def __post_init__(self) -> None:
+        for name in (f.name for f in fields(self)):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise ConfigError(f"foreground.{name} = {getattr(self, name)} must be finite and positive")
+        if self.shadow_min > 1:
+            raise ConfigError(f"foreground.shadow_min = {self.shadow_min} must be at most 1, which means no shadows")
+
+
+@dataclass(frozen=True)
+class AppearanceSettings:
+    """Colour models, of --method volumetric, as all up to [tracking].
+
+    Attributes:
+        enabled: whether colour confines the nearest-neighbour search.
+        rate: α of eq. 16 (paper: 0.3).
+    """
+
+    enabled: bool = True
+    rate: float = 0.3
+
+    def __post_init__(self) -> None:
+        _check("appearance", self, rate=(0, 1))
+
+
+@dataclass(frozen=True)
+class BodySettings:
+    """The body of the volumetric tracker.
+
+    Attributes:
+        waist: whether the pelvis turns against the trunk, by three angles beyond the paper's 24 degrees of freedom. A
+            dancer's hips stay level while the trunk leans; a rigid trunk would tilt them.
+    """
+
+    waist: bool = True
+
+
+@dataclass(frozen=True)
+class ObjectiveSettings:
+    """The objective (section 6.1).
+
+    Attributes:
+        coverage_weight: w_c of the coverage term, from data to model; 0 leaves it out, as the paper does.
+        surface_weight: w_s of eq. 8; 0 leaves the surface term out.
+    """
+
+    coverage_weight: float = 0.7
+    surface_weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check("objective", self, coverage_weight=(0, math.inf), surface_weight=(0, math.inf))
+
+
+@dataclass(frozen=True)
+class ContourSettings:
+    """The edge term of the objective (section 6.1.2).
+
+    Attributes:
+        edge_weight: w_e (eq. 8) beside the surface term's w_s; 0 leaves the term out. The paper prints neither.
+        views: number of views in which edges are searched: those with the fewest hidden contour points (paper: 3).
+        pairs: circles of latitude on each limb; the paper takes 10 contour points a limb and view, which are 5 pairs.
+        threshold: least colour gradient of an edge, 0…1; the paper tuned its own by hand for each camera.
+        hidden: ρ of a hidden contour point (paper: 1).
+    """
+
+    edge_weight: float = 0.1
+    views: int = 3
+    pairs: int = 5
+    threshold: float = 0.12
+    hidden: float = 1.0
+
+    def __post_init__(self) -> None:
+        positive, at_least_one = (0, math.inf), (1, math.inf)
+        _check("contours", self, edge_weight=positive, threshold=positive, hidden=positive)
+        _check("contours", self, views=at_least_one, pairs=at_least_one)
 
 
 @dataclass(frozen=True)
 class TrackingSettings:
-    """Following a person from frame to frame.
+    """Tracking from frame to frame.
 
     Attributes:
-        prediction: share of the last frame's motion that the next is expected to repeat. The paper does not say how it
+        prediction: share of the last frame's motion that is predicted for the next one. The paper does not say how it
             predicts; at 15 Hz an arm turns by up to 31° between frames (its section 7.4).
-        lost_ratio: a frame is lost whose objective exceeds that of the usual frame by this factor.
+        lost_ratio: a frame is lost if its objective exceeds the running mean by this factor.
     """
 
     prediction: float = 0.9
     lost_ratio: float = 3.0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.prediction <= 1.5:
-            raise ConfigError(f"tracking.prediction = {self.prediction} must lie in [0, 1.5]")
-        if not self.lost_ratio >= 1:
-            raise ConfigError(f"tracking.lost_ratio = {self.lost_ratio} must be at least 1")
+        _check("tracking", self, prediction=(0, 1.5), lost_ratio=(1, math.inf))
+
+
+@dataclass(frozen=True)
+class BodyFitSettings:
+    """The fit of the body to the silhouettes.
+
+    Attributes:
+        frames: most frames that are used, evenly spaced.
+        rounds: Gauss-Newton iterations.
+    """
+
+    frames: int = 8
+    rounds: int = 6
+
+    def __post_init__(self) -> None:
+        _check("silhouette.fit", self, frames=(1, 200), rounds=(0, 50))
+
+
+@dataclass(frozen=True)
+class SilhouetteSettings:
+    """How contours are tracked, by --method region and silhouette; for every method, the body fit and how often limbs
+    are searched.
+
+    Attributes:
+        body: "full" (14 segments, 31 degrees of freedom), "limbs" (10 segments, the paper's 24) or "walker" (the
+            silhouette paper's 6 segments and 7 degrees of freedom).
+        prediction: share of the last frame's motion that is predicted for the next one (the silhouette paper: 0, which
+            it found as good; half of the motion helps when arms and legs swing).
+        adapt: whether the body is fitted to the silhouettes.
+        init_frames: frames that the initialisation looks at; a stride is about one second.
+        search_every: frames between two limb searches; 0: never.
+        lost_error: a frame is lost if its E_S, averaged over the views, exceeds this.
+    """
+
+    body: str = "full"
+    prediction: float = 0.5
+    adapt: bool = True
+    init_frames: int = 24
+    search_every: int = 10
+    lost_error: float = 0.6
+    fit: BodyFitSettings = field(default_factory=BodyFitSettings)
+
+    def __post_init__(self) -> None:
+        if self.body not in BODIES:
+            raise ConfigError(f'silhouette.body = "{self.body}": choose one of {", ".join(BODIES)}')
+        _check("silhouette", self, init_frames=(1, 1000), search_every=(0, 1e6), prediction=(0, 1.5))
+        if not 0 < self.lost_error <= 10:
+            raise ConfigError(f"silhouette.lost_error = {self.lost_error} must lie in (0, 10]")
+
+
+@dataclass(frozen=True)
+class RegionSettings:
+    """How --method region searches.
+
+    Attributes:
+        hypotheses: most poses that are tracked at the same time.
+        search_excess: a frame triggers a limb search when its residual, averaged over the views, exceeds the running
+            mean by more than this value. One view counts for at most 0.15, so a value above 0.15 switches this off.
+        colors: whether the colours of the segments are learned and used.
+    """
+
+    hypotheses: int = 3
+    search_excess: float = 0.065
+    colors: bool = True
+
+    def __post_init__(self) -> None:
+        _check("region", self, hypotheses=(1, 20), search_excess=(0, 1))
 
 
 @dataclass(frozen=True)
 class Settings:
-    """All settings of a run. Those within tables are told in the tables' classes.
+    """All settings of a run.
 
     Attributes:
         voxels: voxels along the working volume's longest side (the paper: 64 and 128).
-        seed: of the one random generator.
+        seed: seed of the one random generator.
         segmentation: "collinearity" (the paper's) or "mog2".
-        ahead: frames that a process of its own decodes and segments ahead of the tracker; 0: no such process, each
-            frame when the tracker asks for it. The result is the same.
-        effort: how much the volumetric tracker computes: "fast", "normal", "thorough", or a number. "normal", which is
-            1, takes the paper's numbers of iterations and points (6.4). Less than 1 is a share of the iterations; more
-            is so many times as many points: "thorough", which is 5, is what its section 7.3 compares.
-        foreground: masks made against the empty scene, with segmentation = "collinearity".
-        appearance: colour models, of --method volumetric, as all up to [tracking].
-        body: the body.
-        objective: the objective (section 6.1).
-        contours: the edge term of the objective (section 6.1.2).
-        tracking: following a person from frame to frame.
-        silhouette: how contours are followed, by --method region and silhouette; and, for every method, how the body is
-            fitted and how often other places of the limbs are tried.
-        region: how --method region searches.
-        refine: whether cameras that disagree about the person are refined before the second pass.
+        ahead: frames that a separate process decodes and segments ahead of the tracker; 0: no such process, each frame
+            is prepared when the tracker asks for it. The result is the same.
+        effort: how much the volumetric tracker computes: "fast", "normal", "thorough", or a number. "normal" is 1, the
+            paper's numbers of iterations and points (6.4). A number below 1 is the share of the iterations, a number
+            above 1 multiplies the points: "thorough" is 5, which the paper compares in its section 7.3.
+        refine: whether inconsistent cameras are refined before the second pass.
+        foreground: see :class:`ForegroundSettings`.
+        appearance: see :class:`AppearanceSettings`.
+        body: see :class:`BodySettings`.
+        objective: see :class:`ObjectiveSettings`.
+        contours: see :class:`ContourSettings`.
+        tracking: see :class:`TrackingSettings`.
+        silhouette: see :class:`SilhouetteSettings`.
+        region: see :class:`RegionSettings`.
     """
 
     voxels: int = 64
@@ -97,7 +246,7 @@ class Settings:
     def __post_init__(self) -> None:
         if not 8 <= self.voxels <= 512:
             raise ConfigError(f"--voxels {self.voxels}: choose from 8 to 512")
-        if not 0 <= self.seed < 2**63:  # the result file keeps it as an int64
+        if not 0 <= self.seed < 2**63:  # the result file stores it as an int64
             raise ConfigError(f"--seed {self.seed}: choose from 0 to {2**63 - 1}")
         if self.segmentation not in SEGMENTATIONS:
             raise ConfigError(f'segmentation = "{self.segmentation}": choose one of {", ".join(SEGMENTATIONS)}')
@@ -112,67 +261,3 @@ class Settings:
     def effort_factor(self) -> float:
         """``effort`` as a number."""
         return EFFORTS[self.effort] if isinstance(self.effort, str) else self.effort
-
-    def to_toml(self) -> str:
-        """The whole configuration as TOML text."""
-        return tomli_w.dumps(dataclasses.asdict(self))
-
-    @staticmethod
-    def from_toml(text: str, where: str = "configuration", base: Settings | None = None) -> Settings:
-        """A configuration from TOML text; what it leaves out is as in ``base``, the defaults if None.
-
-        Raises:
-            ConfigError: unknown names, wrong types, values out of range; ``where`` names the source.
-        """
-        return _build(base or Settings(), parse_toml(text, where, ConfigError), where)
-
-    @staticmethod
-    def preset(name: str) -> Settings:
-        """One of the :data:`PRESETS`: the settings of ``tk/data/presets/``.
-
-        Raises:
-            ConfigError: there is none of this name.
-        """
-        if name not in PRESETS:
-            raise ConfigError(f"--preset {name}: choose one of {', '.join(PRESETS)}")
-        text = (resources.files("tk") / "data" / "presets" / f"{name}.toml").read_text(encoding="utf-8")
-        return Settings.from_toml(text, f"preset {name}")
-
-    @staticmethod
-    def read(path: Path, base: Settings | None = None) -> Settings:
-        """A configuration file; what it leaves out is as in ``base``, the defaults if None."""
-        return Settings.from_toml(read_text(path, ConfigError), str(path), base)
-
-
-def _build(default: T, values: dict[str, Any], where: str, path: str = "") -> T:
-    """``default`` with the values of a table put in, recursively."""
-    known = {f.name: getattr(default, f.name) for f in dataclasses.fields(default)}  # type: ignore[arg-type]
-    hints = get_type_hints(type(default))
-    changes: dict[str, Any] = {}
-    for key, value in values.items():
-        name = f"{path}{key}"
-        if key not in known:
-            raise ConfigError(f"{where}: unknown setting {name}; known here: {', '.join(known)}")
-        old = known[key]
-        if isinstance(value, int) and name != "seed" and abs(value) > MOST_COUNT:
-            raise ConfigError(f"{where}: {name} = {shown(value)} is too large; give {MOST_COUNT} at most")
-        if isinstance(value, float) and math.isfinite(value) and abs(value) > LARGE:
-            raise ConfigError(f"{where}: {name} = {value:g} is too large; give {LARGE:g} at most")
-        if dataclasses.is_dataclass(old):
-            if not isinstance(value, dict):
-                raise ConfigError(f"{where}: {name} must be a table")
-            changes[key] = _build(old, value, where, f"{name}.")
-            continue
-        kinds = get_args(hints[key]) or (hints[key],)
-        if float in kinds and type(value) is int:
-            changes[key] = float(value)
-        elif type(value) not in kinds:
-            raise ConfigError(f"{where}: {name} = {shown(value)} must be of type {type(old).__name__}, as {old!r} is")
-        elif isinstance(value, float) and not math.isfinite(value):
-            raise ConfigError(f"{where}: {name} = {value} must be a finite number")
-        else:
-            changes[key] = value
-    try:
-        return dataclasses.replace(default, **changes)  # type: ignore[type-var]
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None

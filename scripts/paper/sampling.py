@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scripts.paper.common import Float, Options, plt, save, table
+from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.kernels.nearest import SurfaceIndex
 from tk.model.body.skeleton import join_pose
 from tk.model.cues.edge_term import ContourTerm
-from tk.model.cues.objective import CHAIN_NAMES, BodyObjective, FrameObjective
+from tk.model.cues.objective import CHAIN_NAMES, BodyObjective, FrameObjective, objective_parameters
 from tk.optim import smd
 from tk.optim.schedule import CHAIN_LEVER_M, descent_basis, max_step
 from tk.run.segmentation import make_segmenter
@@ -75,7 +76,7 @@ def look(options: Options, paper: Settings) -> Scene:
     every = np.full(len(surface), -1, np.int64)
     index = SurfaceIndex.build(surface.positions, every, CELL_VOXELS * tracker.hull.grid.voxel_m)
     term = ContourTerm(skin, capture.rig, paper.contours)
-    objective = BodyObjective(skin, paper.objective.settings, replace(SAMPLING, chain=ARM_POINTS), term)
+    objective = BodyObjective(skin, objective_parameters(paper.objective), replace(SAMPLING, chain=ARM_POINTS), term)
     frame = FrameObjective(objective, index, np.random.default_rng(0), images=observation.images)
     two = np.array([skin.skeleton.index(name) for name in ANGLES])
     return Scene(frame, join_pose(skin.skeleton, estimate.pose, estimate.waist, estimate.ankles), two)
@@ -121,7 +122,7 @@ def descend(scene: Scene, start: Float, seed: int, shuffle: bool) -> tuple[Float
 
 def run(options: Options) -> str:
     """Write the figure and give the table."""
-    paper = Settings.preset("kehl2006")
+    paper = settings_file.preset("kehl2006")
     scene = look(options, paper)
     axis = np.arange(-WIDTH_DEG, WIDTH_DEG + 0.1, STEP_DEG)
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)

@@ -12,12 +12,12 @@ import pytest
 
 from tests.conftest import Silent, Tk
 from tk.evaluation.views import capture_of, evaluate_views
+from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.writer import read_joints, read_result
 from tk.model.body.skeleton import JOINTS
 from tk.model.masks.silhouettes import draw_silhouettes
 from tk.run.session import track
-from tk.settings import Settings
 from tk.trackers.bodies import body_and_poses
 
 SETTINGS = """
@@ -34,7 +34,7 @@ rounds = 2
 def three_views(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("views") / "r.h5"
     capture = open_capture(tiny, open_capture(tiny).rig.names[:3])
-    track(capture, path, Settings.from_toml(SETTINGS), Silent(), method="silhouette", frames=(0, 3))
+    track(capture, path, settings_file.from_toml(SETTINGS), Silent(), method="silhouette", frames=(0, 3))
     return path
 
 

@@ -9,8 +9,9 @@ from tests.kernels.test_contour import BODY, RIG, some_poses
 from tk.kernels import alignment as a
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective import ObjectiveParameters
-from tk.model.cues.edge_term import ContourSettings, ContourTerm
+from tk.model.cues.edge_term import ContourTerm
 from tk.model.cues.objective import BodyObjective, SamplingSettings
+from tk.settings import ContourSettings
 
 SKELETON = BODY.skeleton
 D = len(SKELETON.names)

@@ -12,6 +12,7 @@ import pytest
 
 from tests.conftest import QUICK, Silent, Tk
 from tk.errors import ResultError
+from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.writer import (
     FrameResult,
@@ -62,7 +63,16 @@ def result(tmp_path: Path) -> Path:
     skeleton, truth = SKELETON, read_joints(DEMO / "truth.h5")
     pose = neutral_pose(skeleton)
     meta = ResultMeta(
-        skeleton.names, skeleton.units, ("all",), ("total",), 15.0, "z", "demo", "made", 0, Settings().to_toml()
+        skeleton.names,
+        skeleton.units,
+        ("all",),
+        ("total",),
+        15.0,
+        "z",
+        "demo",
+        "made",
+        0,
+        settings_file.to_toml(Settings()),
     )
     with ResultWriter.create(path, meta) as writer:
         writer.write_model({f"dimensions/{name}": value for name, value in asdict(BODY.dimensions).items()})
@@ -105,7 +115,7 @@ def test_outlines_of_cones_are_their_silhouette() -> None:
 
 def test_results_of_the_region_tracker_are_drawn(tiny: Path, tmp_path: Path) -> None:
     path = tmp_path / "region.h5"
-    track(open_capture(tiny), path, Settings.from_toml(QUICK), Silent(), frames=(0, 2))
+    track(open_capture(tiny), path, settings_file.from_toml(QUICK), Silent(), frames=(0, 2))
     capture = open_capture(tiny, masks="none")
     (sheet,) = write_sheets(Overlay(capture, read_result(path)), tmp_path, [1], full=True)
     picture = cv2.imread(str(sheet))

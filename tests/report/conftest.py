@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import FRAMES
+from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.writer import FrameResult, JointAngles, ResultMeta, ResultWriter, Status, read_joints, revise_result
 from tk.model.body.angles import ANGLES
@@ -35,7 +36,8 @@ def complete_result(path: Path, capture_path: Path, count: int = FRAMES) -> Path
     meta = ResultMeta(
         pose_names=tuple(paper), pose_units=tuple(units), stages=("all",),
         timing_stages=("decode", "optimise", "total"),
-        fps=capture.fps, up=capture.up, capture="made <up>", method="region", seed=0, config_toml=Settings().to_toml(),
+        fps=capture.fps, up=capture.up, capture="made <up>", method="region", seed=0,
+        config_toml=settings_file.to_toml(Settings()),
         waist_names=WAIST, ankle_names=ANKLES, sigma=True, residual_cameras=capture.rig.names, segment_names=SEGMENTS,
         feet=True, angles=tuple(JointAngles(a.joint, a.names, a.convention) for a in ANGLES), objective_kind="E_S",
     )  # fmt: skip

@@ -21,13 +21,14 @@ from tests.conftest import FRAMES, QUICK, Silent
 from tests.people import write_people
 from tests.run.test_session import assert_same, send
 from tk.errors import ConfigError, VideoError, WorkerError
+from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.writer import read_result
 from tk.run import session
 from tk.run.prefetch import Ahead, Serial, Source, open_source
 from tk.settings import Settings
 
-AHEAD = Settings.from_toml(QUICK.replace("ahead = 0", "ahead = 2"))
+AHEAD = settings_file.from_toml(QUICK.replace("ahead = 0", "ahead = 2"))
 ROOT = Path(__file__).parents[2]
 track = partial(session.track, method="volumetric")
 

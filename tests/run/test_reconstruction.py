@@ -9,12 +9,12 @@ import pytest
 
 from tests.conftest import FRAMES, QUICK, Silent, Tk
 from tests.io.conftest import write_picture
+from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.writer import read_result
 from tk.run.reconstruction import reconstruct
-from tk.settings import Settings
 
-CONFIG = Settings.from_toml(QUICK)
+CONFIG = settings_file.from_toml(QUICK)
 
 
 def test_the_hull_is_the_trackers(tk: Tk, tiny: Path, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import pytest
 import tomli_w
 
 from tests.conftest import FRAMES, QUICK, Silent, Tk
+from tk.io import settings_file
 from tk.io.captures.calibration import read_calibration
 from tk.io.captures.capture import open_capture
 from tk.io.captures.mask_store import MaskStore
@@ -25,7 +26,6 @@ from tk.run import plan
 from tk.run.prefetch import open_source
 from tk.run.refinement import retimed
 from tk.run.session import track
-from tk.settings import Settings
 
 TURNED = 1.0  # degrees, of cam2: a camera that is further off is left out instead
 
@@ -48,7 +48,7 @@ def astray(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(astray: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Silent]:
     """A result, and what was said."""
     path, reporter = tmp_path_factory.mktemp("results") / "result.h5", Silent()
-    assert track(open_capture(astray), path, Settings.from_toml(QUICK), reporter).lost == 0
+    assert track(open_capture(astray), path, settings_file.from_toml(QUICK), reporter).lost == 0
     return path, reporter
 
 
@@ -97,7 +97,7 @@ def test_pictures_out_of_step_are_tracked_again(tiny: Path, tmp_path: Path, monk
     for module in (plan, finish):
         monkeypatch.setattr(module, "open_source", remember)
     path, reporter = tmp_path / "again.h5", Silent()
-    assert track(open_capture(tiny), path, Settings.from_toml(QUICK), reporter, frames=(2, None)).lost == 0
+    assert track(open_capture(tiny), path, settings_file.from_toml(QUICK), reporter, frames=(2, None)).lost == 0
     assert [late.tolist() for late in asked] == [[0, 0, 0, 0], [0, 0, 1, -1]]
     assert any("tracking again" in note for note in reporter.notes)
     result = read_result(path)

@@ -13,6 +13,7 @@ import pytest
 from tests.conftest import QUICK, Silent, Tk
 from tests.people import RIG, install, person_mask, truth, write_people
 from tk.errors import CaptureError, ConfigError
+from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.run.mask_folder import write_masks
 from tk.run.prefetch import Ahead
@@ -149,7 +150,7 @@ def test_a_process_ahead_makes_the_same_masks(walk: Path, tmp_path: Path, monkey
     segment = make_segmenter(capture, Settings(), lambda _: None)
     with capture.frames(3, 6) as frames:
         here = {frame.index: segment(frame) for frame in frames}
-    config = Settings.from_toml(QUICK.replace("ahead = 0", "ahead = 2"))
+    config = settings_file.from_toml(QUICK.replace("ahead = 0", "ahead = 2"))
     with Ahead(capture, config, lambda _: None) as source:
         for observation, _ in source.frames(4, 6):
             np.testing.assert_array_equal(observation.masks, here[observation.index], strict=True)

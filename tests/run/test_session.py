@@ -21,16 +21,16 @@ import tomli_w
 from tests.conftest import FRAMES, QUICK, Silent, Tk
 from tests.io.conftest import write_picture
 from tk.errors import ConfigError
+from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.writer import Status, read_joints, read_result
 from tk.model.body.skeleton import JOINTS
 from tk.run import session
 from tk.run.plan import choose_frames, make_tracker
 from tk.run.session import Summary
-from tk.settings import Settings
 
 ROOT = Path(__file__).parents[2]
-CONFIG = Settings.from_toml(QUICK)
+CONFIG = settings_file.from_toml(QUICK)
 track = partial(session.track, method="volumetric")
 
 # `tk` that sends itself a signal once a frame is finished
@@ -106,7 +106,7 @@ def test_the_same_seed_gives_the_same_result(tiny: Path, tracked: Path, tmp_path
 
 
 def test_another_seed_gives_another_result(tiny: Path, tracked: Path, tmp_path: Path) -> None:
-    run(tiny, tmp_path / "other.h5", config=Settings.from_toml(f"seed = 1\n{QUICK}"), frames=(0, 4))
+    run(tiny, tmp_path / "other.h5", config=settings_file.from_toml(f"seed = 1\n{QUICK}"), frames=(0, 4))
     assert np.abs(read_result(tmp_path / "other.h5").pose - read_result(tracked).pose[:4]).max() > 1e-6
 
 
@@ -316,7 +316,7 @@ def test_frames_that_are_asked_for(tiny: Path) -> None:
 
 
 def test_mog2_is_a_further_choice(tiny: Path, tmp_path: Path) -> None:
-    config = Settings.from_toml(f'segmentation = "mog2"\n{QUICK}')
+    config = settings_file.from_toml(f'segmentation = "mog2"\n{QUICK}')
     assert track(open_capture(tiny, masks="none"), tmp_path / "r.h5", config, Silent(), frames=(0, 4)).lost == 0
 
 

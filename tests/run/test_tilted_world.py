@@ -15,13 +15,13 @@ from scipy.spatial.transform import Rotation
 
 from tests.conftest import QUICK, Silent
 from tests.trackers.test_silhouette_track import QUICK as QUICK_SILHOUETTE
+from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.writer import read_joints, read_result
 from tk.model.cameras.tracker_frame import seen_from
 from tk.model.cameras.up import up_text
 from tk.model.cameras.volume import Volume
 from tk.run.session import track
-from tk.settings import Settings
 
 TURN = Rotation.from_euler("xyz", [-1.2, 0.3, 0.5]).as_matrix()
 
@@ -57,7 +57,7 @@ def tilted(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_the_person_is_tracked(tiny: Path, tilted: Path, tmp_path: Path, method: str, quick: str) -> None:
     path = tmp_path / "r.h5"
-    track(open_capture(tilted), path, Settings.from_toml(quick), Silent(), method, (0, 6))
+    track(open_capture(tilted), path, settings_file.from_toml(quick), Silent(), method, (0, 6))
     with h5py.File(path) as file:
         up = file.attrs["up"]
     np.testing.assert_allclose(open_capture(tilted).up_axis, TURN[:, 2], atol=1e-12)
@@ -81,7 +81,7 @@ def test_a_turned_world_makes_no_difference(tiny: Path, tmp_path: Path, method: 
     )
     results = []
     for name, one in (("as it is", capture), ("turned", turned)):
-        track(one, tmp_path / name, Settings.from_toml(QUICK_SILHOUETTE), Silent(), method, (0, 6))
+        track(one, tmp_path / name, settings_file.from_toml(QUICK_SILHOUETTE), Silent(), method, (0, 6))
         results.append(read_result(tmp_path / name))
     expected, found = results
     assert found.smoothed is not None and expected.smoothed is not None

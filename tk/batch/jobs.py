@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from tk.errors import ConfigError, ResultError
+from tk.io.settings_file import to_toml
 from tk.settings import Settings
 
 #: of the batch's folder: one record a capture
@@ -56,7 +57,7 @@ class TrackOptions:
             "body": "none" if self.body is None else _hash(_content(self.body)),
             "causal": "yes" if self.causal else "no",
             "stored hull": "yes" if self.store_hull else "no",
-            "settings": _hash(self.config.to_toml().encode()),
+            "settings": _hash(to_toml(self.config).encode()),
         }
 
 

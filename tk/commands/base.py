@@ -174,8 +174,9 @@ def parse_frames(frames: str | None) -> tuple[int, int | None]:
 
 def load_settings(file: Path | None, preset: str | None = None, **overrides: Any) -> Settings:
     """Return the settings of a preset, changed by a file, changed by options that are not None."""
+    from tk.io import settings_file
     from tk.settings import Settings
 
-    base = Settings.preset(preset) if preset else Settings()
-    settings = Settings.read(file, base) if file else base
+    base = settings_file.preset(preset) if preset else Settings()
+    settings = settings_file.read(file, base) if file else base
     return replace(settings, **{name: value for name, value in overrides.items() if value is not None})

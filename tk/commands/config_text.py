@@ -14,7 +14,8 @@ from typing import Any
 import tomli_w
 
 from tk.errors import ConfigError
-from tk.settings import PRESETS, Settings
+from tk.io.settings_file import PRESETS
+from tk.settings import Settings
 
 _WIDTH = 110
 _HEAD = f"""\

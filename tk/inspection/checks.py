@@ -24,7 +24,7 @@ from tk.model.cameras.up import up_vector
 from tk.model.masks.image_health import ImageHealth
 from tk.model.masks.mask_agreement import DISAGREE, Agreement, MaskAgreement, Place
 from tk.model.masks.regions import clean_by_area
-from tk.model.masks.silhouettes import CleaningSettings
+from tk.model.masks.silhouettes import HOLE_SHARE
 from tk.run.segmentation import make_labeller
 from tk.settings import Settings
 from tk.threads import one_thread
@@ -278,7 +278,7 @@ def _camera(
         count, _, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
         areas = np.sort(stats[1:count, cv2.CC_STAT_AREA])
         specks.append(1.0 - areas[-1] / areas.sum())
-        mended = clean_by_area(mask, 0.0, CleaningSettings().hole_share * areas[-1])
+        mended = clean_by_area(mask, 0.0, HOLE_SHARE * areas[-1])
         holes.append(float(np.count_nonzero(mended)) / mask.sum() - 1.0)
         cut += bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
     verdict = ""

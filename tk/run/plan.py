@@ -15,6 +15,7 @@ from tk.io.captures.capture import Capture
 from tk.io.captures.init_pose import InitPose
 from tk.io.captures.keypoints import first_pose
 from tk.io.results.writer import JointAngles, ResultMeta
+from tk.io.settings_file import to_toml
 from tk.model.body.angles import ANGLES
 from tk.model.body.cone_body import ConeBody
 from tk.model.body.skeleton import SEGMENTS
@@ -99,7 +100,7 @@ class Plan:
             capture=capture.name,
             method=tracker.method,
             seed=self.config.seed,
-            config_toml=self.config.to_toml(),
+            config_toml=to_toml(self.config),
             waist_names=tracker.waist_names,
             ankle_names=tracker.ankle_names,
             sigma=tracker.method == RegionTracker.method,

@@ -36,8 +36,8 @@ from numpy.typing import NDArray
 
 from tk.errors import TkError, WorkerError
 from tk.io.captures.capture import Capture
-from tk.model.masks.foreground import ForegroundSettings
 from tk.run.segmentation import Labeller, make_labeller, mask_source
+from tk.settings import ForegroundSettings
 from tk.trackers.protocol import Observation, Stopwatch
 
 if TYPE_CHECKING:

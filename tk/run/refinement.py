@@ -15,6 +15,7 @@ from tk.io.captures.calibration import write_calibration
 from tk.io.captures.capture import Capture
 from tk.io.captures.mask_store import MaskStore
 from tk.io.results.writer import Status, read_result
+from tk.kernels.line_search import SearchSettings
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.agreement import LATE_FRAMES, camera_agreement
 from tk.model.cameras.bundle import gather
@@ -26,7 +27,6 @@ from tk.run.prefetch import open_source
 from tk.settings import Settings
 from tk.threads import one_thread
 from tk.trackers.bodies import body_and_poses
-from tk.trackers.contour_tracker import SilhouetteSettings
 from tk.trackers.region import RegionTracker
 
 Float = NDArray[np.float64]
@@ -122,7 +122,7 @@ def refine_capture(
             store.put(observation.index, observation.masks)
     body, poses = tracked[0].standing("z"), world.poses_in(tracked[1])
     usable = found.status != Status.LOST
-    done = refine_rig(body, world.rig, store, found.frames, poses, usable, config.silhouette, how)
+    done = refine_rig(body, world.rig, store, found.frames, poses, usable, how)
     if done is None:
         raise CaptureError(
             f"{result}: has too few tracked frames in a row to refine {capture.path} by; {FEWEST} are needed"
@@ -140,7 +140,6 @@ def refine_rig(
     frames: NDArray[np.int64],
     poses: Float,
     usable: NDArray[np.bool_],
-    contours: SilhouetteSettings,
     how: RefinementSettings | None = None,
 ) -> Refinement | None:
     """Refine cameras by poses (F, D) of frames (F,) whose masks are in the store; None where too few are usable.
@@ -156,13 +155,13 @@ def refine_rig(
     for _ in range(_SHIFTS):
         moments = gather(
             lambda frame, camera: masks(frame)[camera],
-            Views(rig), frames, poses, usable, FRAMES, how.scales, contours.cleaning, late,
+            Views(rig), frames, poses, usable, FRAMES, how.scales, True, late,
         )  # fmt: skip
         if len(moments) < FEWEST:
             break
         count = len(moments)
         before = None if done is None else done.before_px
-        done = refine_cameras(body, rig, moments, contours.search, how)
+        done = refine_cameras(body, rig, moments, SearchSettings(), how)
         done = replace(
             done,
             offset_frames=done.offset_frames + late,
@@ -195,7 +194,7 @@ def refine_if_astray(
         A tracker with the refined cameras and the same body, the masks that belong together, and by how many frames
         each camera is late (C,).
     """
-    world, contours = tracker.world, tracker.contours
+    world = tracker.world
     poses = world.poses_in(poses)
     masks = lru_cache(16)(store.get)
     moments = gather(
@@ -206,14 +205,14 @@ def refine_if_astray(
         usable,
         LOOKED_AT,
         1,
-        None,
+        False,
     )
     if len(moments) < FEWEST:
         return None
-    agreement = camera_agreement(tracker.body, world.rig, moments, contours.search)
+    agreement = camera_agreement(tracker.body, world.rig, moments)
     if not (agreement.astray.any() or agreement.late.any()):
         return None
-    done = refine_rig(tracker.body, world.rig, store, frames, poses, usable, contours)
+    done = refine_rig(tracker.body, world.rig, store, frames, poses, usable)
     if done is None:
         return None
     refined = done.refined
@@ -228,7 +227,7 @@ def refine_if_astray(
         f"{after:.2f}; {', '.join([f'{names[worst]} is turned most, by {refined.turn_deg[worst]:.2f}°', *told])} "
         "(refine = false leaves them)"
     )
-    fresh = RegionTracker(world.rig_out(refined.rig), tracker.up, contours, tracker.config)
+    fresh = RegionTracker(world.rig_out(refined.rig), tracker.up, tracker.contours, tracker.config)
     fresh.take_body(tracker.body)
     fresh.colors.restore(tracker.colors.state())
     return fresh, retimed(store, frames, np.round(refined.offset_frames).astype(np.int64)), refined.offset_frames

@@ -12,9 +12,10 @@ from tk.errors import CaptureError
 from tk.io.captures.capture import Capture
 from tk.io.captures.frames import FrameSet
 from tk.model.masks.background import median_plate
-from tk.model.masks.foreground import CollinearityForeground, Foreground, ForegroundSettings
+from tk.model.masks.foreground import CollinearityForeground, Foreground
 from tk.model.masks.mog2 import Mog2Foreground
 from tk.segmenters import INSTALL, load, names
+from tk.settings import ForegroundSettings
 from tk.threads import one_thread
 
 Segmenter = Callable[[FrameSet], NDArray[np.uint8]]

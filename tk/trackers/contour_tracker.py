@@ -7,20 +7,20 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import CaptureError, ConfigError
+from tk.errors import CaptureError
 from tk.io.captures.init_pose import InitPose
 from tk.kernels.line_search import SearchSettings
 from tk.kernels.raycast import Cast
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.body_fit import BodyFitSettings, fit_body
-from tk.model.body.cone_body import PRESETS, ConeBody, ConePart, build_cone_body
+from tk.model.body.body_fit import STATURE_DEVIATION, fit_body
+from tk.model.body.cone_body import ConeBody, ConePart, build_cone_body
 from tk.model.body.initial_pose import rough_pose
 from tk.model.body.limb_candidates import Limb, distinct, limbs_of, pairs
 from tk.model.body.skeleton import ANKLES, WAIST, build_skeleton, join_pose, split_pose
@@ -28,9 +28,10 @@ from tk.model.cameras.camera import Rig
 from tk.model.cameras.tracker_frame import TrackerFrame
 from tk.model.cues.part_colors import PartColors
 from tk.model.cues.ray_costs import Evidence, RayGrid, mean_of_views
-from tk.model.masks.silhouettes import CleaningSettings, Pyramid, Views
+from tk.model.masks.silhouettes import Pyramid, Views
 from tk.optim import gauss_newton
 from tk.optim.gauss_newton import Descent, GaussNewtonSettings, Prior
+from tk.settings import BodyFitSettings, SilhouetteSettings
 from tk.trackers.initialisation import HEADINGS, PHASES, Way, centroid, find_person, stature_of
 from tk.trackers.protocol import Observation
 
@@ -64,50 +65,10 @@ FACING = 0.04
 # Rays a picture's height: to screen many places of a limb, and to choose among few poses.
 SCREEN_ROWS, CHOICE_ROWS = 54, 96
 
+LINE_SEARCH = SearchSettings()
 # A tolerance of half as much, or of none, leaves the mean of the joints' errors as it is on eight captures, to 0.02 cm;
 # twice as much makes fast arms worse by 0.1.
-_SOLVER = GaussNewtonSettings(scales=3, relaxation=1.6, tolerance=0.012)
-
-
-@dataclass(frozen=True)
-class SilhouetteSettings:
-    """How contours are followed; both trackers of contours have these.
-
-    Attributes:
-        body: "full" (14 parts, 31 degrees of freedom), "limbs" (10 parts, the paper's 24) or "walker" (the silhouette
-            paper's 6 parts and 7 degrees of freedom).
-        prediction: share of the last frame's motion that the next is expected to repeat (the silhouette paper: 0, for
-            it found none useful; half of it pays when arms and legs swing).
-        adapt: whether the body is fitted to the silhouettes.
-        init_frames: frames that the initialisation looks at; a stride is about one second.
-        search_every: every how many frames other places are tried for the limbs; 0: never.
-        lost_error: a frame whose E_S, averaged over the views, is above this is lost.
-    """
-
-    body: str = "full"
-    prediction: float = 0.5
-    adapt: bool = True
-    init_frames: int = 24
-    search_every: int = 10
-    lost_error: float = 0.6
-    search: SearchSettings = field(default_factory=SearchSettings)
-    solver: GaussNewtonSettings = _SOLVER
-    cleaning: CleaningSettings = field(default_factory=CleaningSettings)
-    fit: BodyFitSettings = field(default_factory=lambda: BodyFitSettings(frames=8, rounds=6))
-
-    def __post_init__(self) -> None:
-        if self.body not in PRESETS:
-            raise ConfigError(f'silhouette: body = "{self.body}": choose one of {", ".join(PRESETS)}')
-        if not 1 <= self.init_frames <= 1000 or not 0 <= self.search_every <= 1_000_000:
-            raise ConfigError(
-                f"silhouette: init_frames = {self.init_frames} must lie in [1, 1000], search_every = "
-                f"{self.search_every} in [0, 1000000]"
-            )
-        if not 0 <= self.prediction <= 1.5 or not 0 < self.lost_error <= 10:
-            raise ConfigError(
-                f"silhouette: prediction = {self.prediction} must lie in [0, 1.5], lost_error = {self.lost_error} "
-                "in (0, 10]"
-            )
+SOLVER = GaussNewtonSettings(scales=3, relaxation=1.6, tolerance=0.012)
 
 
 class ContourTracker:
@@ -119,11 +80,20 @@ class ContourTracker:
     Args:
         rig: the cameras.
         up: what points up in their world, see :func:`tk.model.cameras.up.up_vector`.
-        config: see :class:`SilhouetteSettings`.
+        config: see :class:`~tk.settings.SilhouetteSettings`.
+        line_search: how edges are searched along the contours' normals.
+        solver: scales and iterations of Gauss-Newton.
     """
 
-    def __init__(self, rig: Rig, up: str, config: SilhouetteSettings) -> None:
-        self.contours = config
+    def __init__(
+        self,
+        rig: Rig,
+        up: str,
+        config: SilhouetteSettings,
+        line_search: SearchSettings = LINE_SEARCH,
+        solver: GaussNewtonSettings = SOLVER,
+    ) -> None:
+        self.contours, self.line_search, self.solver = config, line_search, solver
         self.rig, self.up = rig, up
         self.world = TrackerFrame.of(rig, up)
         self.views = Views(self.world.rig)
@@ -165,10 +135,10 @@ class ContourTracker:
         """Have the kernels compiled while there is nothing else to do. Without it that is done where one is needed."""
         body = build_cone_body(BodyDimensions.from_stature(1.7), preset=self.contours.body)
         empty = np.zeros((len(self.views.rig), *self.views.rig.frame_shape), np.uint8)
-        seen = self.views.pyramid(empty, 1, None)
+        seen = self.views.pyramid(empty, 1, False)
         for poses in (1, 2):  # one pose, and several at once
             pose = np.zeros((poses, len(body.skeleton.names)))
-            self.views.equations(body.arrays, seen, pose, 0, self.contours.search)
+            self.views.equations(body.arrays, seen, pose, 0, self.line_search)
             Evidence.of(self.screen, empty).cast(body, np.zeros(len(body.parts), np.int32), pose)
 
     # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
@@ -221,10 +191,10 @@ class ContourTracker:
         """
         count = min(self.contours.fit.frames, len(pyramids))
         chosen = np.unique(np.linspace(0, len(pyramids) - 1, count).round().astype(int))
-        config = self.contours.fit if known else replace(self.contours.fit, stature_deviation=MEASURED)
+        deviation = STATURE_DEVIATION if known else MEASURED
         found: list[tuple[float, ConeBody, Float]] = []
         for way in ways:
-            body, fitted = self.fit(pyramids, way.poses, chosen, stature, config)
+            body, fitted = self.fit(pyramids, way.poses, chosen, stature, self.contours.fit, deviation)
             error = way.error * way.handicap
             if len(ways) > 1:
                 self.take_body(body)
@@ -246,11 +216,13 @@ class ContourTracker:
         chosen: NDArray[np.int64],
         stature: float,
         config: BodyFitSettings,
+        stature_deviation: float = STATURE_DEVIATION,
     ) -> tuple[ConeBody, Float]:
         """The body that suits the chosen ones of several frames, and their poses."""
         seen = [pyramids[i] for i in chosen]
-        contours = self.contours
-        return fit_body(contours.body, self.views, seen, poses[chosen], contours.search, stature, config)
+        return fit_body(
+            self.contours.body, self.views, seen, poses[chosen], self.line_search, stature, config, stature_deviation
+        )
 
     def start(
         self,
@@ -291,11 +263,11 @@ class ContourTracker:
 
     def pyramid(self, frame: Observation) -> Pyramid:
         """The frame's silhouettes, cleaned, at all scales."""
-        return self.views.pyramid(frame.masks, self.contours.solver.scales, self.contours.cleaning)
+        return self.views.pyramid(frame.masks, self.solver.scales, True)
 
     def cleaned(self, masks: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Masks (V, H, W) as contours are looked for in them."""
-        return self.views.pyramid(masks, 1, self.contours.cleaning).masks[0]
+        return self.views.pyramid(masks, 1, True).masks[0]
 
     def settle(
         self,
@@ -311,16 +283,16 @@ class ContourTracker:
 
         With ``images``, colours pull at contours inside the silhouette, too. With ``limb`` all else stays where it is.
         """
-        body, contours = self.body, self.contours
+        body = self.body
         arrays, free = (limb.arrays, limb.free) if limb else (body.arrays, body.free)
         regions = None if images is None else self.colors.regions(images)
         return gauss_newton.minimise(
-            lambda states, scale: self.views.equations(arrays, pyramid, states, scale, contours.search, regions),
+            lambda states, scale: self.views.equations(arrays, pyramid, states, scale, self.line_search, regions),
             poses,
             free,
             body.skeleton.lower,
             body.skeleton.upper,
-            contours.solver,
+            self.solver,
             prior,
             levels,
         )
@@ -360,7 +332,7 @@ class ContourTracker:
         assert met is not None
         own, unmet = mean_of_views(by_view)[0], evidence.unmet(met.label[0])
         joints = skeleton.joints(pose)
-        level = (min(1, self.contours.solver.scales - 1),)
+        level = (min(1, self.solver.scales - 1),)
         found: list[tuple[NDArray[np.int64], Float]] = []
         told_by, rays = evidence.cost_of_parts(group, met.label[0])
         for limbs in pairs(self.limbs) if in_pairs else [(limb,) for limb in self.limbs]:
@@ -430,7 +402,7 @@ class ContourTracker:
         skeleton = self.body.skeleton
         moved, yaw = pose.copy(), skeleton.index("torso_yaw")
         moved[skeleton.prismatic] = p_centroid
-        levels = range(self.contours.solver.scales - 1, -1, -1)
+        levels = range(self.solver.scales - 1, -1, -1)
         starts = np.concatenate([moved[None], gait.hypotheses(skeleton, HEADINGS, PHASES, p_centroid, pose[yaw])])
 
         def turned(states: Float) -> Float:

@@ -25,9 +25,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import ConfigError
 from tk.io.captures.init_pose import InitPose
-from tk.model.body.body_fit import BodyFitSettings
+from tk.model.body.body_fit import STATURE_DEVIATION
 from tk.model.body.cone_body import ConeBody
 from tk.model.body.joint_sigma import contour_variance, directions, posture_variance
 from tk.model.body.limb_candidates import Limb
@@ -37,7 +36,8 @@ from tk.model.cues.part_colors import color_bins
 from tk.model.cues.ray_costs import Evidence, mean_of_views
 from tk.model.masks.silhouettes import Pyramid
 from tk.optim.gauss_newton import Prior
-from tk.trackers.contour_tracker import APART_M, GAIN, RELOCATE_EVERY, ContourTracker, SilhouetteSettings
+from tk.settings import BodyFitSettings, RegionSettings, SilhouetteSettings
+from tk.trackers.contour_tracker import APART_M, GAIN, RELOCATE_EVERY, ContourTracker
 from tk.trackers.protocol import Estimate, Observation, Stopwatch, drift
 
 Float = NDArray[np.float64]
@@ -70,35 +70,14 @@ MISPLACED = 0.25
 # The second pass: what the body is fitted to, and how near a frame stays to its pose of the first pass.
 SECOND_FIT = BodyFitSettings(frames=24, rounds=4)
 SECOND_ANGLE_DEG = 15.0
+# One standard deviation of the logarithm of the stature about that of the first fit, where no height was given.
+SECOND_STATURE_DEVIATION = 0.03
 # Frames that the second pass settles in one launch.
 AT_ONCE = 8
 # A step of a joint that is longer than its neighbours by this is a jump, metres: twice what makes two poses of one.
 JUMP_M = 2 * APART_M
 # Over so many frames the usual posture of the first pass is a plain mean, then one that forgets.
 USUAL_FRAMES = 200
-
-
-@dataclass(frozen=True)
-class RegionSettings:
-    """How the region tracker searches.
-
-    Attributes:
-        hypotheses: most poses that are followed at once.
-        search_excess: a frame that leaves more of the person's pixels unexplained, or covers more beside them, than is
-            usual is searched, if this share more by the mean over the views; who stays so, searched or not, is looked
-            for as if lost. No view counts for more than 0.15, so from there on nothing is searched for this reason.
-        colors: whether the colours of the parts are learned and used.
-    """
-
-    hypotheses: int = 3
-    search_excess: float = 0.065
-    colors: bool = True
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.hypotheses <= 20:
-            raise ConfigError(f"region: hypotheses = {self.hypotheses} must lie in [1, 20]")
-        if not 0 <= self.search_excess <= 1:
-            raise ConfigError(f"region: search_excess = {self.search_excess} must lie in [0, 1]")
 
 
 @dataclass(frozen=True)
@@ -263,12 +242,12 @@ class RegionTracker(ContourTracker):
         far as the prediction leaves to go of what a joint went in the frame before; the coarsest, after a jump and for
         who is lost or stranded."""
         contours, skeleton = self.contours, self.body.skeleton
-        first = contours.solver.scales - 1
+        first = self.solver.scales - 1
         if not (self._lost_for or self._stranded or any(h.jumped for h in self._alive)):
             went_m = max(skeleton.apart(h.pose, skeleton.joints(h.previous)) for h in self._alive)
             left_m = abs(1 - contours.prediction) * went_m
             left_px = left_m * self.views.rig.pixels_per_metre(skeleton.joints(self._best.pose)[0])
-            while first > FEWEST - 1 and contours.search.window_px * 2 ** (first - 1) >= left_px:
+            while first > FEWEST - 1 and self.line_search.window_px * 2 ** (first - 1) >= left_px:
                 first -= 1
         return list(range(first, -1, -1))
 
@@ -370,7 +349,7 @@ class RegionTracker(ContourTracker):
         _, met = evidence.cast(self.body, self.colors.group, best, export=True)
         assert met is not None
         regions = None if images is None else self.colors.regions(images)
-        here = self.views.equations(self.body.arrays, pyramid, best, 0, self.contours.search, regions)
+        here = self.views.equations(self.body.arrays, pyramid, best, 0, self.line_search, regions)
         return met.label[0], here.hessian[0], evidence.residual(met.label[0])
 
     def _sigma(self, pose: Float, curvature: Float) -> Float:
@@ -432,15 +411,15 @@ class RegionTracker(ContourTracker):
                 tracked, np.nanmean(residual[tracked].sum(axis=2), axis=1), SECOND_FIT.frames - len(opening)
             )
             chosen = np.union1d(opening, spread)
-            seen = [self.views.pyramid(believed(int(i)), 1, None) for i in chosen]
+            seen = [self.views.pyramid(believed(int(i)), 1, False) for i in chosen]
             stature = height_m or self.body.dimensions.stature
-            fit = SECOND_FIT if height_m else replace(SECOND_FIT, stature_deviation=0.03)
-            body, _ = self.fit(seen, poses[chosen], np.arange(len(chosen)), stature, fit)
+            deviation = STATURE_DEVIATION if height_m else SECOND_STATURE_DEVIATION
+            body, _ = self.fit(seen, poses[chosen], np.arange(len(chosen)), stature, SECOND_FIT, deviation)
             self.take_body(body)
         result, residuals = poses.copy(), np.array(residual)
         body = self.body
         for chunk in np.array_split(tracked, -(-len(tracked) // AT_ONCE)):
-            seen = [self.views.pyramid(believed(int(i)), 1, None) for i in chunk]
+            seen = [self.views.pyramid(believed(int(i)), 1, False) for i in chunk]
             prior = self._prior(poses[chunk], SECOND_ANGLE_DEG)
             settled = self.settle(Pyramid.of_all(seen), poses[chunk], (0,), prior=prior)
             result[chunk] = settled.states
@@ -457,7 +436,7 @@ class RegionTracker(ContourTracker):
                 later = Hypothesis(result[i + 1], result[i + 1], 0.0)
             if later is None:
                 continue
-            pyramid = self.views.pyramid(believed(int(i)), 1, None)
+            pyramid = self.views.pyramid(believed(int(i)), 1, False)
             prior = self._prior(later.pose[None], SECOND_ANGLE_DEG)
             settled = self.settle(pyramid, later.pose[None], (0,), prior=prior)
             both = np.stack([result[i], settled.states[0]])

@@ -17,9 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.captures.init_pose import InitPose
+from tk.kernels.line_search import SearchSettings
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.camera import Rig
-from tk.trackers.contour_tracker import RELOCATE_EVERY, ContourTracker, SilhouetteSettings
+from tk.optim.gauss_newton import GaussNewtonSettings
+from tk.settings import SilhouetteSettings
+from tk.trackers.contour_tracker import LINE_SEARCH, RELOCATE_EVERY, SOLVER, ContourTracker
 from tk.trackers.protocol import Estimate, Observation, Stopwatch
 
 Float = NDArray[np.float64]
@@ -31,9 +34,16 @@ class SilhouetteTracker(ContourTracker):
     method = "silhouette"
     timing_stages: tuple[str, ...] = ("masks_clean", "optimise", "check")
 
-    def __init__(self, rig: Rig, up: str, config: SilhouetteSettings | None = None) -> None:
-        super().__init__(rig, up, config or SilhouetteSettings())
-        self.stages = tuple(f"scale_{i}" for i in reversed(range(self.contours.solver.scales)))
+    def __init__(
+        self,
+        rig: Rig,
+        up: str,
+        config: SilhouetteSettings | None = None,
+        line_search: SearchSettings = LINE_SEARCH,
+        solver: GaussNewtonSettings = SOLVER,
+    ) -> None:
+        super().__init__(rig, up, config or SilhouetteSettings(), line_search, solver)
+        self.stages = tuple(f"scale_{i}" for i in reversed(range(solver.scales)))
         self._pose = self._previous = np.zeros(len(self.pose_names))
         self._lost_for = 0
         self._fresh = True

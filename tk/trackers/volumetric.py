@@ -32,7 +32,14 @@ from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume, VoxelGrid
 from tk.model.cues.appearance import LEARNING_M, Appearance
 from tk.model.cues.edge_term import ContourTerm
-from tk.model.cues.objective import CHAIN_OF_SEGMENT, BodyObjective, Fit, FrameObjective, SamplingSettings
+from tk.model.cues.objective import (
+    CHAIN_OF_SEGMENT,
+    BodyObjective,
+    Fit,
+    FrameObjective,
+    SamplingSettings,
+    objective_parameters,
+)
 from tk.model.hull.hull import HullSurface, VisualHull
 from tk.optim import schedule
 from tk.optim.smd import SmdSettings
@@ -166,7 +173,7 @@ class VolumetricTracker:
         edges, scale = self.config.contours, self.effort.sampling.scale
         self._objective = BodyObjective(
             self.skin,
-            self.config.objective.settings,
+            objective_parameters(self.config.objective),
             self.effort.sampling,
             ContourTerm(self.skin, self.rig, edges, scale) if edges.edge_weight > 0 else None,
             waist_stiffness=WAIST_STIFFNESS,

@@ -21,7 +21,6 @@ from tk.io.captures.keypoints import LAYOUTS, keypoint_pose, read_people
 from tk.io.results.writer import read_joints, read_result
 from tk.model.body.skeleton import JOINTS
 from tk.run.session import track
-from tk.settings import Settings
 
 FRAME = 4
 
@@ -84,7 +83,7 @@ def test_tracking_begins_with_them(detected: Path, tiny: Path, tmp_path: Path, t
     assert opened.init_keypoints == folder / "pose"
     for name, init in (("settings", None), ("option", detected)):
         capture = opened if init is None else replace(opened, init_keypoints=None)
-        config = Settings.from_toml(QUICK)
+        config = settings_file.from_toml(QUICK)
         track(capture, tmp_path / f"{name}.h5", config, Silent(), frames=(FRAME, 8), init_pose=init, causal=True)
         results.append(read_result(tmp_path / f"{name}.h5"))
     np.testing.assert_array_equal(results[0].pose, results[1].pose)

@@ -11,13 +11,14 @@ import pytest
 import tk
 from tests.conftest import QUICK
 from tk.errors import ExportError
+from tk.io import settings_file
 from tk.io.results.writer import FOOT_POINTS, Result, read_result
 
 
 @pytest.fixture(scope="module")
 def result(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Result:
     path = tmp_path_factory.mktemp("tables") / "r.h5"
-    return tk.track(tk.open_capture(tiny), path, config=tk.Settings.from_toml(QUICK), frames=(2, 5), causal=True)
+    return tk.track(tk.open_capture(tiny), path, config=settings_file.from_toml(QUICK), frames=(2, 5), causal=True)
 
 
 def test_a_table_has_a_row_a_frame_and_all_that_the_file_tells(result: Result) -> None:

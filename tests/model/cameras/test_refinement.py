@@ -28,14 +28,13 @@ from tk.model.cameras.refinement import (
     turn_between,
     world_motions,
 )
-from tk.model.masks.silhouettes import CleaningSettings, Views, draw_silhouettes
+from tk.model.masks.silhouettes import Views, draw_silhouettes
 from tk.run.refinement import refine_rig
-from tk.trackers.contour_tracker import SilhouetteSettings
 
 RIG = ring_of_cameras(4, width=320, height=400)
 BODY = build_cone_body(BodyDimensions.from_stature(1.75))
 FRAMES = 12
-SEARCH, CLEANING = SearchSettings(), CleaningSettings()
+SEARCH = SearchSettings()
 QUICK = RefinementSettings(rounds=4, scales=1)
 
 
@@ -78,7 +77,7 @@ def moments(store: MaskStore, rig: Rig):
         np.ones(FRAMES, bool),
         FRAMES,
         1,
-        CLEANING,
+        True,
     )
 
 
@@ -226,7 +225,7 @@ def test_focal_lengths_are_found():
 @pytest.mark.parametrize("late", [(0, 0, 1, 0), (0, 0.4, 0, 0)])
 def test_late_videos_are_found(late):
     store = drawn(late)
-    done = refine_rig(BODY, RIG, store, np.arange(FRAMES), motion(), np.ones(FRAMES, bool), SilhouetteSettings(), QUICK)
+    done = refine_rig(BODY, RIG, store, np.arange(FRAMES), motion(), np.ones(FRAMES, bool), QUICK)
     assert done is not None
     np.testing.assert_allclose(done.refined.offset_frames, late, atol=0.12)
     assert (done.refined.offset_sigma_frames < 0.2).all()
@@ -235,7 +234,7 @@ def test_late_videos_are_found(late):
 def test_too_few_frames_are_said():
     usable = np.zeros(FRAMES, bool)
     usable[3:8] = True
-    args = (np.arange(FRAMES), motion(), usable, SilhouetteSettings(), QUICK)
+    args = (np.arange(FRAMES), motion(), usable, QUICK)
     assert refine_rig(BODY, RIG, in_time(), *args) is None
 
 

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tk.model.cues.appearance import FLOOR_YUV, MOST_DRIFT, Appearance, AppearanceSettings, to_yuv
+from tk.model.cues.appearance import FLOOR_YUV, MOST_DRIFT, Appearance, to_yuv
+from tk.settings import AppearanceSettings
 
 CONFIG = AppearanceSettings()
 RED, GREEN, BLUE = np.array([30.0, 30, 200]), np.array([30.0, 200, 30]), np.array([200.0, 30, 30])

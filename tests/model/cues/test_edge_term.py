@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from tests.kernels.test_contour import BODY, RIG, piece_transforms, some_poses
-from tk.errors import ConfigError
 from tk.kernels import alignment as a
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective import ObjectiveParameters
 from tk.model.body.skeleton import CHAINS, SEGMENTS
 from tk.model.body.strips import LIMBS
 from tk.model.cameras.camera import Camera, Rig
-from tk.model.cues.edge_term import ContourSettings, ContourTerm
+from tk.model.cues.edge_term import ContourTerm
 from tk.model.cues.objective import BodyObjective, FrameObjective, SamplingSettings
+from tk.settings import ContourSettings
 
 EDGES = ContourSettings(edge_weight=1.0)
 TRUTH = some_poses(1, seed=21)[0]
@@ -186,9 +186,3 @@ def test_a_body_that_nobody_sees_has_no_entries():
     term = term_of(EDGES, Rig((turned,)))
     entries = term.assign(pictures()[:1], TRUTH[None], term.draw(None)[None])
     assert not (entries[..., a.STATE] != a.ABSENT).any()
-
-
-@pytest.mark.parametrize("bad", [{"edge_weight": -1.0}, {"views": 0}, {"pairs": 0}, {"reach_m": 0.0}, {"hidden": -1.0}])
-def test_bad_settings_are_refused(bad):
-    with pytest.raises(ConfigError, match=f"contours.{next(iter(bad))}"):
-        ContourSettings(**bad)

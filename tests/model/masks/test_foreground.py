@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tk.errors import CaptureError, ConfigError
+from tk.errors import CaptureError
 from tk.model.masks.background import median_plate
-from tk.model.masks.foreground import CollinearityForeground, ForegroundSettings
+from tk.model.masks.foreground import CollinearityForeground
 from tk.model.masks.mog2 import Mog2Foreground
 from tk.model.masks.regions import clean_by_area
 
@@ -159,13 +159,14 @@ def test_nothing_outside_a_smaller_picture(learned):
     assert not masks[1, 100:].any() and not masks[1, :, 140:].any()
 
 
-def test_specks_go_and_small_holes_close(learned):
+def test_specks_go_and_small_holes_close(learned, monkeypatch):
     scene, clips, _ = learned
     image, truth = with_person(scene, (40, 40, 200))
     image[0, 10, 10] = 0  # the window makes nine pixels of it
     image[0, 50:52, 70:72] = scene[0, 50:52, 70:72]
-    config = ForegroundSettings(speck_area=12 / 19200, hole_area=12 / 19200)
-    masks = CollinearityForeground.learn(clips, SHAPE, SIZES, config).segment(expose(image, np.random.default_rng(8)))
+    monkeypatch.setattr("tk.model.masks.foreground.SPECK_AREA", 12 / 19200)
+    monkeypatch.setattr("tk.model.masks.foreground.HOLE_AREA", 12 / 19200)
+    masks = CollinearityForeground.learn(clips, SHAPE, SIZES).segment(expose(image, np.random.default_rng(8)))
     assert not masks[0, :20, :20].any()
     assert masks[0, 48:54, 68:74].all()
     assert iou(masks[0], truth[0]) > 0.93
@@ -234,15 +235,6 @@ def test_wrong_clips_are_refused(learned):
         Mog2Foreground.learn([clips[0][:0], clips[1]], SHAPE, SIZES)
     with pytest.raises(CaptureError, match="empty"):
         median_plate([], SIZES)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"threshold": -1.0}, {"threshold": float("nan")}, {"shadow_min": 1.5}, {"shadow_min": 0.0}, {"rim": 1.5}],
-)
-def test_wrong_configuration_is_refused(change):
-    with pytest.raises(ConfigError, match=next(iter(change))):
-        ForegroundSettings(**change)
 
 
 @pytest.mark.parametrize("name", ["walk", "dance"])

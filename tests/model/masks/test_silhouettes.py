@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from tests.model.ring import ring_of_cameras
-from tk.errors import ConfigError
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.body.gait_poses import hip_and_knee, hypotheses, walking_pose
-from tk.model.masks.silhouettes import CleaningSettings, Views, clean, draw_silhouettes, pixel_rays, share_wrong
+from tk.model.masks.silhouettes import Views, clean, draw_silhouettes, pixel_rays, share_wrong
 
 RIG = ring_of_cameras(2, width=101, height=133)
 BODY = build_cone_body(BodyDimensions.from_stature(1.7))
@@ -23,21 +22,21 @@ def test_cleaning_removes_specks_and_holes_and_leaves_the_rest():
     dirty[2:4, 2:5] = 255
     y, x = (int(np.median(v)) for v in np.nonzero(mask[:50]))
     dirty[y : y + 2, x : x + 1] = 0
-    np.testing.assert_array_equal(clean(dirty, CleaningSettings()), mask)
-    np.testing.assert_array_equal(clean(mask, CleaningSettings()), mask)
+    np.testing.assert_array_equal(clean(dirty), mask)
+    np.testing.assert_array_equal(clean(mask), mask)
     nothing = np.zeros_like(mask)
-    np.testing.assert_array_equal(clean(nothing, CleaningSettings()), nothing)
+    np.testing.assert_array_equal(clean(nothing), nothing)
 
 
 def test_gaps_between_limbs_stay_open():
     mask = np.zeros((100, 80), np.uint8)
     mask[10:90, 20:60] = 255
     mask[40:60, 35:45] = 0
-    np.testing.assert_array_equal(clean(mask, CleaningSettings()), mask)
+    np.testing.assert_array_equal(clean(mask), mask)
 
 
 def test_scales_halve_pictures_of_any_size():
-    pyramid = Views(RIG).pyramid(MASKS, 3, None)
+    pyramid = Views(RIG).pyramid(MASKS, 3, False)
     assert [m.shape for m in pyramid.masks] == [(2, 133, 101), (2, 67, 51), (2, 34, 26)]
     assert pyramid.sizes[2].tolist() == [[26, 34]] * 2
     fine = MASKS[:, :132, :100].astype(float).reshape(2, 66, 2, 50, 2).mean(axis=(2, 4))
@@ -74,8 +73,3 @@ def test_a_stride_is_periodic_and_bends_knees_backwards():
         assert hip_and_knee(phase) == pytest.approx(hip_and_knee(phase + 1))
         assert hip_and_knee(phase)[1] > 0
     assert hip_and_knee(0.0)[0] > hip_and_knee(0.5)[0]
-
-
-def test_settings_out_of_range_are_told():
-    with pytest.raises(ConfigError, match="hole_share = 2"):
-        CleaningSettings(hole_share=2.0)

@@ -11,12 +11,11 @@ only the dimensions may give way. (The silhouette paper leaves the adaptation of
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import ConfigError
 from tk.kernels.cones import CONE
 from tk.kernels.line_search import SearchSettings
 from tk.kernels.silhouette import Edgels
@@ -24,6 +23,7 @@ from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import SHAPE_NUMBERS, ConeBody, build_cone_body, group_of
 from tk.model.body.skeleton import SEGMENTS
 from tk.model.masks.silhouettes import Pyramid, Views
+from tk.settings import BodyFitSettings
 
 Float = NDArray[np.float64]
 
@@ -75,27 +75,8 @@ _STRAIGHT_DEVIATION = 0.3
 _DIMENSIONS = tuple(field.name for field in fields(BodyDimensions))
 
 
-@dataclass(frozen=True)
-class BodyFitSettings:
-    """Settings of the body's fit.
-
-    Attributes:
-        frames: most frames that are used, evenly spaced.
-        rounds: Gauss-Newton iterations.
-        stature_deviation: of the logarithm of the stature about the given one.
-    """
-
-    frames: int = 16
-    rounds: int = 4
-    stature_deviation: float = 0.01
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.frames <= 200 or not 0 <= self.rounds <= 50:
-            raise ConfigError(
-                f"body fit: frames = {self.frames} must lie in [1, 200], rounds = {self.rounds} in [0, 50]"
-            )
-        if not 0 < self.stature_deviation <= 1:
-            raise ConfigError(f"body fit: stature_deviation = {self.stature_deviation} must lie in (0, 1]")
+# One standard deviation of the logarithm of the stature about a given height: 1 %, of shoes, posture and measurement.
+STATURE_DEVIATION = 0.01
 
 
 def fit_body(
@@ -105,7 +86,8 @@ def fit_body(
     poses: Float,
     settings: SearchSettings,
     stature_m: float,
-    config: BodyFitSettings | None = None,
+    config: BodyFitSettings,
+    stature_deviation: float = STATURE_DEVIATION,
 ) -> tuple[ConeBody, Float]:
     """The body that suits several frames, with their poses.
 
@@ -117,13 +99,13 @@ def fit_body(
         settings: of the search.
         stature_m: the subject's height without shoes, given or measured.
         config: see :class:`BodyFitSettings`.
+        stature_deviation: one standard deviation of the logarithm of the stature about ``stature_m``.
 
     Returns:
         The body, and poses (F, D).
     """
-    config = config or BodyFitSettings()
     settings = replace(settings, spacing_px=_SPACING_PX)
-    problem = BodyProblem(preset, BodyDimensions.from_stature(stature_m), config.stature_deviation)
+    problem = BodyProblem(preset, BodyDimensions.from_stature(stature_m), stature_deviation)
     shared = problem.mean.copy()
     poses, start = np.array(poses), np.array(poses)
     K = len(shared)

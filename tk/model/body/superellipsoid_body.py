@@ -37,18 +37,6 @@ SPACING_M = 0.03
 
 
 @dataclass(frozen=True)
-class BodySettings:
-    """Settings of the body.
-
-    Attributes:
-        waist: whether the pelvis turns against the trunk, by three angles beyond the paper's 24 degrees of freedom. A
-            dancer's hips stay level while the trunk leans; a rigid trunk takes them along.
-    """
-
-    waist: bool = True
-
-
-@dataclass(frozen=True)
 class SuperellipsoidBody:
     """One person's surface: pieces and samples (N points) on a skeleton, all fixed during tracking.
 

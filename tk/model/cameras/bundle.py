@@ -23,7 +23,7 @@ from tk.model.body.body_fit import pose_rows
 from tk.model.body.cone_body import ConeBody
 from tk.model.body.skeleton import SEGMENTS
 from tk.model.cameras.camera import Camera, Rig
-from tk.model.masks.silhouettes import CleaningSettings, Pyramid, Views
+from tk.model.masks.silhouettes import Pyramid, Views
 
 Float = NDArray[np.float64]
 
@@ -219,7 +219,7 @@ def gather(
     usable: NDArray[np.bool_],
     count: int,
     scales: int,
-    cleaning: CleaningSettings | None,
+    cleaning: bool,
     late: NDArray[np.int64] | None = None,
 ) -> list[Moment]:
     """Frames that are spread evenly over a recording, whose neighbours are usable, too: they tell the velocity.
@@ -232,7 +232,7 @@ def gather(
         usable: (F,) bool, rows whose pose is to be trusted.
         count: most frames that are taken.
         scales: of the pyramids.
-        cleaning: of the masks; None: they are clean.
+        cleaning: whether the masks are cleaned first.
         late: (C,) whole frames by which a camera's pictures are late; its frame k - late is shown beside frame k of
             the others. None: by none.
     """

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import ConfigError
 from tk.kernels.appearance import segment
+from tk.settings import AppearanceSettings
 
 Float = NDArray[np.float64]
 
@@ -29,28 +29,11 @@ FLOOR_YUV = (16.0, 6.0, 6.0)
 MOST_DRIFT = 30.0
 # Greatest distance between a sample and the voxel whose colour it learns, metres.
 LEARNING_M = 0.05
+# A voxel fits a patch if every channel lies within this many standard deviations of the mean. The paper does not say
+# what fits; sensitivity not measured.
+WIDTH = 2.5
 # A patch that fewer than this share of the voxels fit constrains nothing.
 LEAST_SHARE = 0.01
-
-
-@dataclass(frozen=True)
-class AppearanceSettings:
-    """Settings of the colour models.
-
-    Attributes:
-        enabled: whether colour confines the nearest-neighbour search.
-        rate: α of eq. 16 (paper: 0.3).
-        width: a voxel fits when every channel lies within this many standard deviations of the mean. The paper does
-            not say what fits.
-    """
-
-    enabled: bool = True
-    rate: float = 0.3
-    width: float = 2.5
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.rate <= 1 or not self.width > 0:
-            raise ConfigError(f"appearance: rate = {self.rate} must lie in [0, 1], width = {self.width} be positive")
 
 
 @dataclass(frozen=True)
@@ -93,7 +76,7 @@ class Appearance:
         """(V,) bit masks of the patches that each voxel fits."""
         if not config.enabled:
             return np.full(len(colors_bgr), -1, np.int64)
-        bound = np.where(self.known[:, None], config.width * self.deviation, 1e9)
+        bound = np.where(self.known[:, None], WIDTH * self.deviation, 1e9)
         fits = segment(self.mean, bound, to_yuv(colors_bgr), seen)
         bits = np.arange(len(self.mean))
         counts = np.bincount(

@@ -8,12 +8,9 @@ that hold until they are assigned anew.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import ConfigError
 from tk.kernels import alignment
 from tk.kernels.contour import ContourPoints
 from tk.kernels.edge_search import LINE_NUMBERS, PAIR, SINGLE, search_edges
@@ -23,6 +20,7 @@ from tk.model.body.skeleton import CHAINS
 from tk.model.body.strips import LIMBS, Strips, build_strips, contour_kernel
 from tk.model.body.superellipsoid_body import SuperellipsoidBody
 from tk.model.cameras.camera import Rig
+from tk.settings import ContourSettings
 
 Float = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -38,33 +36,9 @@ SIGMA_M = 0.1
 EDGE_NU = 0.1
 
 
-@dataclass(frozen=True)
-class ContourSettings:
-    """Settings of the edge term.
-
-    Attributes:
-        edge_weight: w_e (eq. 8) beside the surface term's w_s; 0 leaves the term out. The paper prints neither.
-        views: how many views edges are looked for in: those with the fewest hidden contour points (paper: 3).
-        pairs: circles of latitude on each limb; the paper takes 10 contour points a limb and view, which are 5 pairs.
-        reach_m: how far from the contour edges are looked for, metres at the limb.
-        threshold: least colour gradient of an edge, 0…1; the paper tuned its own by hand for each camera.
-        hidden: ρ of a hidden contour point (paper: 1).
-    """
-
-    edge_weight: float = 0.1
-    views: int = 3
-    pairs: int = 5
-    reach_m: float = 0.08
-    threshold: float = 0.12
-    hidden: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name in ("edge_weight", "threshold", "hidden"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"contours.{name} = {getattr(self, name)} must not be negative")
-        for name in ("views", "pairs", "reach_m"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"contours.{name} = {getattr(self, name)} must be positive")
+# How far from the contour edges are searched, metres at the limb. Chosen on rendered captures; sensitivity not
+# measured.
+REACH_M = 0.08
 
 
 class ContourTerm:
@@ -138,7 +112,7 @@ class ContourTerm:
         second = np.where(both, 1, first)
         entries, lines, pixels_a_metre = self._rows(points, b, v, k, first, second)
         lines[:, 0] = np.where(both, PAIR, SINGLE)
-        lines[:, 10] = c.reach_m * pixels_a_metre
+        lines[:, 10] = REACH_M * pixels_a_metre
         diameter = np.where(
             both, np.hypot(*(lines[:, 2:4] - lines[:, 4:6]).T), self._diameter[points.strip[b, k]] * pixels_a_metre
         )

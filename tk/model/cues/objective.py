@@ -20,6 +20,7 @@ from tk.kernels.objective import Held, ObjectiveKernel, ObjectiveParameters
 from tk.model.body.skeleton import CHAINS, SEGMENTS, WAIST_STIFFNESS
 from tk.model.body.superellipsoid_body import SuperellipsoidBody
 from tk.model.cues.edge_term import RENEW, ContourTerm
+from tk.settings import ObjectiveSettings
 
 Float = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -57,34 +58,16 @@ OUTLIERS = 0.1
 SURFACE_NU = 0.35
 
 
-@dataclass(frozen=True)
-class ObjectiveSettings:
-    """Settings of the objective (section 6.1).
-
-    Attributes:
-        coverage_weight: w_c of the coverage term, from data to model; 0 leaves it out, as the paper does.
-        surface_weight: w_s of eq. 8; 0 leaves the surface term out.
-    """
-
-    coverage_weight: float = 0.7
-    surface_weight: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name in ("coverage_weight", "surface_weight"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"objective.{name} = {getattr(self, name)} must not be negative")
-
-    @property
-    def settings(self) -> ObjectiveParameters:
-        """What the kernel takes."""
-        return ObjectiveParameters(
-            nu=SURFACE_NU,
-            reach_m=REACH_M,
-            coverage_weight=self.coverage_weight,
-            coverage_nu=COVERAGE_SOFTNESS * SURFACE_NU,
-            coverage_reach_m=COVERAGE_REACH_M,
-            surface_weight=self.surface_weight,
-        )
+def objective_parameters(settings: ObjectiveSettings) -> ObjectiveParameters:
+    """Return what the kernel takes."""
+    return ObjectiveParameters(
+        nu=SURFACE_NU,
+        reach_m=REACH_M,
+        coverage_weight=settings.coverage_weight,
+        coverage_nu=COVERAGE_SOFTNESS * SURFACE_NU,
+        coverage_reach_m=COVERAGE_REACH_M,
+        surface_weight=settings.surface_weight,
+    )
 
 
 @dataclass(frozen=True)

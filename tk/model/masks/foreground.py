@@ -30,14 +30,12 @@ five things, which are settled here as follows.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
 from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tk.errors import ConfigError
 from tk.kernels.background import BRIGHT, DARK, GREY, Statistic
 from tk.model.masks.background import (
     Images,
@@ -61,6 +59,7 @@ from tk.model.masks.regions import (
     trim_rim,
     without_penumbrae,
 )
+from tk.settings import ForegroundSettings
 
 # "Measured" means: on rendered captures with exact masks and on one real one.
 
@@ -117,43 +116,15 @@ _GAP = 0.08
 _LIMB = 0.025
 
 _RIM_LAYERS = 4  # how deep the rim is searched, pixels: two reduced ones for the window
-
-
-@dataclass(frozen=True)
-class ForegroundSettings:
-    """What can be said about the segmentation.
-
-    Attributes:
-        threshold: how unlike the scene the person is, in noise variances; pure noise gives 0.5. Lower finds more, and
-            more that is nobody. Measured on rendered captures with exact masks, as all of these.
-        shadow_min: the darkest shadow, as a share of the lit scene; 1 if there are none. What is darker is taken for
-            the person, which the other cameras put right, while a hole in one mask cuts through the visual hull. 0.76
-            was measured under two lamps.
-        shadow_max: the faintest shadow, as a share of the lit scene. What is fainter is the edge of a darker one.
-        rim: a pixel of the outline stays if it has this share of the largest contrast nearby; 0.5 would be unbiased at
-            a sharp outline, less is cautious: a pixel too many swells the hull a little, one too few cuts through it.
-        speck_area: smaller pieces of foreground go, share of the picture's area (61 pixels of 640×480).
-        hole_area: smaller holes are filled, share of the picture's area (123 pixels of 640×480).
-    """
-
-    threshold: float = 3.0
-    shadow_min: float = 0.7
-    shadow_max: float = 0.95
-    rim: float = 0.3
-    speck_area: float = 2e-4
-    hole_area: float = 4e-4
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (np.isfinite(value) and value >= 0):
-                raise ConfigError(f"foreground.{field.name} = {value}: must be a finite number, 0 or more")
-            if field.name != "threshold" and value > 1:
-                raise ConfigError(f"foreground.{field.name} = {value}: a share, at most 1")
-        if self.threshold == 0:
-            raise ConfigError("foreground.threshold = 0: must be positive")
-        if self.shadow_min == 0:
-            raise ConfigError("foreground.shadow_min = 0: must be positive (1 switches the tolerance of shadows off)")
+# The faintest shadow, as a share of the lit scene: a fainter one is the edge of a darker one. As the next three, chosen
+# on rendered captures with exact masks; sensitivity not measured.
+_SHADOW_MAX = 0.95
+# A pixel of the rim stays if it has this share of the largest contrast nearby. 0.5 would be unbiased at a sharp
+# outline; less is cautious: a pixel too many swells the hull a little, one too few cuts through it.
+_RIM = 0.3
+# Smaller connected parts are removed, and smaller holes filled, shares of the image's area (61 and 123 pixels of
+# 640×480).
+SPECK_AREA, HOLE_AREA = 2e-4, 4e-4
 
 
 class Foreground(Protocol):
@@ -201,8 +172,7 @@ class CollinearityForeground:
         self._height = int(np.median(sizes[:, 1])) // _REDUCTION
         self._look = PersonBoxes(self._small_plates, config.shadow_min, self._height)
         self._speck, self._hole = (
-            share * float(np.median(np.prod(sizes, axis=1))) / _REDUCTION**2
-            for share in (config.speck_area, config.hole_area)
+            share * float(np.median(np.prod(sizes, axis=1))) / _REDUCTION**2 for share in (SPECK_AREA, HOLE_AREA)
         )
         self._bridge = 2 * round(_BRIDGE * self._height / 2) + 1
         self._penumbra = 2 * round(_PENUMBRA_REACH * self._height) + 1
@@ -275,7 +245,7 @@ class CollinearityForeground:
             mosaic.shape,
             darkness_offset=_DARKNESS_OFFSET,
             shadow_min=self.config.shadow_min,
-            shadow_max=self.config.shadow_max,
+            shadow_max=_SHADOW_MAX,
             difference_min=_DIFFERENCE_MIN,
             threshold=self.config.threshold,
             octaves_per_neighbour=_NEIGHBOUR_OCTAVES,
@@ -341,7 +311,7 @@ class CollinearityForeground:
                 scene = cv2.transform(full.crop(self.plates[c], c), np.diag(gain))
                 blue, green, red = cv2.split(cv2.absdiff(full.crop(images[c], c), scene, dst=scene))
                 cv2.max(cv2.max(blue, green, dst=blue), red, dst=full.part(contrast, c))
-        person = trim_rim(doubled(small), contrast, self.config.rim, _RIM_LAYERS)
+        person = trim_rim(doubled(small), contrast, _RIM, _RIM_LAYERS)
         clean = clean_by_area(person, self._speck * _REDUCTION**2, self._hole * _REDUCTION**2)
         for c in range(len(images)):
             full.crop(masks[c], c)[...] = full.part(clean, c)

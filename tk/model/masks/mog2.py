@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tk.model.masks.background import Images, check_clips
-from tk.model.masks.foreground import ForegroundSettings
+from tk.model.masks.foreground import HOLE_AREA, SPECK_AREA
 from tk.model.masks.regions import clean_by_area
+from tk.settings import ForegroundSettings
 
 
 class Mog2Foreground:
@@ -57,9 +58,7 @@ class Mog2Foreground:
         for c, (model, (width, height)) in enumerate(zip(self._models, self.sizes, strict=True)):
             labels = model.apply(np.ascontiguousarray(images[c, :height, :width]), learningRate=0)
             area = width * height
-            masks[c, :height, :width] = clean_by_area(
-                labels == 255, self.config.speck_area * area, self.config.hole_area * area
-            )
+            masks[c, :height, :width] = clean_by_area(labels == 255, SPECK_AREA * area, HOLE_AREA * area)
             shadow = labels == model.getShadowValue()
             uncertain[c, :height, :width] = shadow & (masks[c, :height, :width] == 0)
         return masks, uncertain
