@@ -15,7 +15,6 @@ from tests.io.importers.test_other_formats import write_easymocap, write_panopti
 from tests.io.importers.test_xml_formats import write_qca, write_xcp
 from tk.errors import CaptureError
 from tk.io.importers import read_project
-from tk.io.importers.project import Request
 from tk.model.cameras.mounting import infer_up
 
 NAMES = ["26578", "26579", "26580", "26581"]
@@ -42,14 +41,14 @@ def damaged(data: bytes, rng: random.Random) -> bytes:
     """Cut off, a stretch lost, twice there, or a few bytes changed."""
     a, b = sorted(rng.randrange(len(data) + 1) for _ in range(2))
     b = min(b, a + rng.choice([1, 8, 200]))
-    way = rng.randrange(5)
-    if way == 0:
+    kind = rng.randrange(5)
+    if kind == 0:
         return data[:a]
-    if way == 1:
+    if kind == 1:
         return data[:a] + data[b:]
-    if way == 2:
+    if kind == 2:
         return data[:b] + data[a:]
-    if way == 3:
+    if kind == 3:
         return data[:a] + bytes(rng.choices(b"0123456789.-e[]{}<>\"'=,: \n\x00\xff", k=b - a)) + data[b:]
     return data[:a] + rng.choice([b"nan", b"9" * 400, b"-", b"null", b"true", b"[", b'"', b"1e999"]) + data[b:]
 
@@ -69,9 +68,9 @@ def test_damage_is_one_line(name: str, folder: Path, capfd: pytest.CaptureFixtur
         path = rng.choice(files)
         path.write_bytes(damaged(intact[path], rng))
         try:
-            project = read_project(Request(folder))
+            project = read_project(folder)
             infer_up(project.rig)
-            if len(project.rig) < len(NAMES):  # a damaged matrix is no matrix; whatever is missing is told
+            if len(project.rig) < len(NAMES):  # a damaged matrix is no matrix; missing cameras are noted
                 assert any("left out" in note for note in project.notes)
                 refused += 1
         except CaptureError as reason:

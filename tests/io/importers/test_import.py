@@ -33,10 +33,7 @@ def test_the_command(folder: Path, tmp_path: Path, tk: Tk) -> None:
     assert ran.code == 0 and ran.out == ""
     notes = [line for line in ran.err.splitlines() if line.startswith("note: ")]
     assert len([note for note in notes if "lengths are taken for mm" in note]) == 1
-    assert (
-        ran.err.splitlines()[-1]
-        == f"4 cameras in {tmp_path / 'capture'}; have a look at {tmp_path}/capture/capture.toml"
-    )
+    assert ran.err.splitlines()[-1] == f"4 cameras in {tmp_path / 'capture'}; check {tmp_path}/capture/capture.toml"
     tk("import", folder, "-o", tmp_path / "capture").complaint(str(tmp_path / "capture"), "exists already")
     tk("import", folder, "-o", tmp_path / "c", "--units", "inch").complaint("inch")
     tk("import", folder, "-o", tmp_path / "c", "--trial", "x").complaint("holds no videos of the trial 'x'")
@@ -52,8 +49,8 @@ def test_nothing_matches(folder: Path, check: Import) -> None:
     (folder / "readme.md").write_text("# Nothing")
     with pytest.raises(CaptureError) as caught:
         import_project(folder, check.output)
-    for importer in FORMATS:
-        assert f"{importer.TOOL}: {importer.LOOKS_FOR}" in str(caught.value)
+    for form in FORMATS:
+        assert f"{form.tool}: {form.files}" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

@@ -25,7 +25,7 @@ from tests.io.importers.conftest import (
 )
 from tk.errors import CalibrationError, CaptureError
 from tk.io.importers import import_project
-from tk.io.importers.projections import take_apart
+from tk.io.importers.projections import factorise
 from tk.model.cameras.camera import Rig
 
 MANUAL = Path(__file__).resolve().parents[3] / "docs" / "import.md"
@@ -119,10 +119,10 @@ def test_easymocap_camera_without_a_pose(folder: Path, check: Import) -> None:
         ("intri.yml", "K_cam2:", "L_cam2:", "has no K_cam2"),
         ("intri.yml", "names:", "cams:", "has no list `names`"),
         ("intri.yml", "data: [", "data: [ x{", "intri.yml: K_cam1 must be a matrix of 9 finite numbers"),
-        ("intri.yml", '"cam2"', '"cam1"', "names must be different"),
+        ("intri.yml", '"cam2"', '"cam1"', "names must be distinct"),
         ("intri.yml", "W_cam3: 320", "W_cam3: wide", "W_cam3 = 'wide' must be a number of pixels"),
         ("extri.yml", "data: [", "data: [ .Nan, ", "extri.yml: R_cam1 must be a matrix of 3 finite numbers"),
-        ("extri.yml", ":", ";", "is no YAML as OpenCV writes it"),
+        ("extri.yml", ":", ";", "is not YAML as OpenCV writes it"),
         ("intri.yml", None, "", "intri.yml: cannot be read (No such file or directory)"),
     ],
 )
@@ -196,8 +196,8 @@ def test_panoptic(folder: Path, check: Import) -> None:
     write_clips(folder / "hdVideos", [f"hd_{name}" for name in names])
     checked = check(folder, rig, world=Y_DOWN)
     assert checked.capture.up == "-y" and checked.capture.rig.names == tuple(names)
-    checked.note('up = "-y": as always with CMU Panoptic')
-    checked.note("lengths are in cm, as always in this format")
+    checked.note('up = "-y": as CMU Panoptic defines it')
+    checked.note("lengths are in cm, as the format says")
     checked.note("48 of its 52 cameras have no video here: left out")
 
 
@@ -245,13 +245,13 @@ def test_a_text_that_is_no_matrix_is_told(folder: Path, check: Import) -> None:
     check(folder, rig).note("notes.txt: holds no 3×4 matrix: left out")
 
 
-def test_take_apart_says_what_is_no_camera() -> None:
+def test_factorise_says_what_is_no_camera() -> None:
     with pytest.raises(CalibrationError, match="left 3×3 part is singular"):
-        take_apart(np.ones((3, 4)), "P.txt")
+        factorise(np.ones((3, 4)), "P.txt")
     skewed = make_rig(distorted=False)[0]
     K = skewed.matrix + np.array([[0, 3.0, 0], [0, 0, 0], [0, 0, 0]])
     P = K @ np.column_stack([skewed.rotation, skewed.translation])
-    found, rotation, translation = take_apart(P, "P.txt")
+    found, rotation, translation = factorise(P, "P.txt")
     np.testing.assert_allclose(found, K, atol=1e-9)
     np.testing.assert_allclose(rotation, skewed.rotation, atol=1e-12)
     np.testing.assert_allclose(translation, skewed.translation, atol=1e-9)

@@ -111,7 +111,9 @@ def test_freemocap_without_a_board_on_the_floor(folder: Path, check: Import) -> 
     check.output = check.output.with_name("again")
     p_camera = points() @ first.rotation.T + first.translation
     checked = import_project(folder, check.output)
-    assert imported.notes[0] == checked.notes[0] and "lengths are in mm, as mm is usual there" in imported.notes[0]
+    assert (
+        imported.notes[0] == checked.notes[0] and "lengths are in mm, the default of this format" in imported.notes[0]
+    )
     capture = open_capture(check.output)
     for camera, true in zip(capture.rig, own, strict=True):
         np.testing.assert_allclose(camera.project(p_camera)[0], true.project(p_camera)[0], atol=0.01)
@@ -147,8 +149,8 @@ def test_caliscope_old_layout(folder: Path, check: Import) -> None:
     write_clips(folder / "calibration" / "extrinsic", [f"port_{k}" for k in range(6)])
     checked = check(folder, rig)
     checked.note("'cam_4' has no rotation and no translation: left out")
-    checked.note("'cam_5' is switched off there: left out")
-    checked.note("belongs to no camera: port_4, port_5")
+    checked.note("'cam_5' is switched off (ignore = true): left out")
+    checked.note("no camera matches port_4, port_5")
 
 
 def test_caliscope_new_layout(folder: Path, check: Import) -> None:
@@ -211,7 +213,7 @@ def test_masks_and_background_come_along(folder: Path, check: Import) -> None:
     checked = check(folder, rig)
     assert not checked.capture.has_masks and checked.capture.background() is None
     checked.note("background: has nothing of cam3: all of it is left out")
-    checked.note("masks: cannot tell which video belongs to which camera", "masks/ is left out")
+    checked.note("masks: cannot match videos and cameras by name", "masks/ is left out")
 
 
 @pytest.mark.parametrize(

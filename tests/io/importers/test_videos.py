@@ -4,11 +4,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tk.io.importers.videos import Wanted, match_clips, natural
+from tk.io.importers.videos import CameraNames, match_clips, natural
 
 
-def wanted(*names: str) -> list[Wanted]:
-    return [Wanted(name, name) for name in names]
+def named(*names: str) -> list[CameraNames]:
+    return [CameraNames(name, name) for name in names]
 
 
 @pytest.mark.parametrize(
@@ -28,7 +28,7 @@ def wanted(*names: str) -> list[Wanted]:
     ],
 )
 def test_each_finds_its_own(cameras: list[str], stems: list[str]) -> None:
-    order = match_clips(wanted(*cameras), stems[::-1], in_order=False)
+    order = match_clips(named(*cameras), stems[::-1], in_order=False)
     assert order is not None and list(order.stems) == stems
 
 
@@ -44,19 +44,19 @@ def test_each_finds_its_own(cameras: list[str], stems: list[str]) -> None:
     ],
 )
 def test_what_cannot_be_told_is_not_guessed(cameras: list[str], stems: list[str]) -> None:
-    assert match_clips(wanted(*cameras), stems, in_order=False) is None
+    assert match_clips(named(*cameras), stems, in_order=False) is None
 
 
 def test_some_are_missing() -> None:
-    order = match_clips(wanted("cam1", "cam2", "cam3", "cam4"), ["x_cam4", "x_cam2", "x_cam1"], in_order=False)
+    order = match_clips(named("cam1", "cam2", "cam3", "cam4"), ["x_cam4", "x_cam2", "x_cam1"], in_order=False)
     assert order is not None and order.stems == ("x_cam1", "x_cam2", None, "x_cam4")
 
 
 def test_in_order_sorts_numbers_by_value() -> None:
-    order = match_clips(wanted("north", "east", "west"), ["clip 10", "clip 2", "clip 1"], in_order=True)
+    order = match_clips(named("north", "east", "west"), ["clip 10", "clip 2", "clip 1"], in_order=True)
     assert order is not None and order.by == "order"
     assert order.stems == ("clip 2", "clip 1", "clip 10")  # east, north, west
-    assert match_clips(wanted("north", "east"), ["a", "b", "c"], in_order=True) is None
+    assert match_clips(named("north", "east"), ["a", "b", "c"], in_order=True) is None
     assert sorted(["cam10", "cam2", "cam"], key=natural) == ["cam", "cam2", "cam10"]
 
 
@@ -65,7 +65,7 @@ names = st.lists(st.text("abcz019_-", min_size=1, max_size=6), min_size=2, max_s
 
 @given(cameras=names, stems=names, in_order=st.booleans())
 def test_no_video_belongs_to_two_cameras(cameras: list[str], stems: list[str], in_order: bool) -> None:
-    order = match_clips(wanted(*cameras), stems, in_order)
+    order = match_clips(named(*cameras), stems, in_order)
     if order is not None:
         taken = [stem for stem in order.stems if stem is not None]
         assert len(order.stems) == len(cameras) and len(taken) == len(set(taken)) >= 2
@@ -74,7 +74,7 @@ def test_no_video_belongs_to_two_cameras(cameras: list[str], stems: list[str], i
 
 @given(cameras=names)
 def test_equal_names_always_match(cameras: list[str]) -> None:
-    order = match_clips(wanted(*cameras), cameras[::-1], in_order=False)
+    order = match_clips(named(*cameras), cameras[::-1], in_order=False)
     bare = {"".join(c for c in name if c.isalnum()) for name in cameras}
     if len(bare) == len(cameras):
         assert order is not None and list(order.stems) == cameras

@@ -65,16 +65,16 @@ def test_qualisys(folder: Path, check: Import) -> None:
     write_qca(folder / "session.qca.txt", rig)
     write_clips(folder, [f"walk_Miqus_{k}_{serial}" for k, serial in enumerate(SERIALS, 3)], suffix=".avi")
     checked = check(folder, rig)
-    checked.note("lengths are in mm, as always in this format")
+    checked.note("lengths are in mm, as the format says")
     assert checked.capture.up == "z"
 
 
-def test_qualisys_marker_cameras_make_no_videos(folder: Path, check: Import) -> None:
+def test_qualisys_marker_cameras_record_no_videos(folder: Path, check: Import) -> None:
     rig = renamed(make_rig(), *SERIALS)
     write_qca(folder / "session.qca.txt", rig, ("Miqus Video", "Oqus 300+", "Miqus Video", "Miqus Video"))
     write_clips(folder, [SERIALS[0], SERIALS[2], SERIALS[3]])
     checked = check(folder, Rig((rig[0], rig[2], rig[3])))
-    checked.note("1 of its 4 cameras make no videos: left out")
+    checked.note("1 of its 4 cameras record no videos: left out")
 
 
 @pytest.mark.parametrize(
@@ -106,8 +106,8 @@ def test_vicon(folder: Path, check: Import) -> None:
     write_xcp(folder / "session.xcp", rig)
     write_clips(folder, [f"Walk01.{serial}.20190301120000" for serial in SERIALS], suffix=".avi")
     checked = check(folder, rig)
-    checked.note("1 of its 5 cameras make no videos: left out")
-    checked.note("lengths are in mm, as always in this format")
+    checked.note("1 of its 5 cameras record no videos: left out")
+    checked.note("lengths are in mm, as the format says")
 
 
 def test_vicon_distortion_undoes_opencvs(folder: Path, check: Import) -> None:
@@ -134,7 +134,7 @@ def test_vicon_with_several_trials_in_one_folder(folder: Path, check: Import) ->
     write_xcp(folder / "session.xcp", rig)
     for trial in ("Walk01", "Walk02"):
         write_clips(folder, [f"{trial}.{serial}" for serial in SERIALS], suffix=".avi")
-    with pytest.raises(VideoError, match=r"cannot tell which video belongs .* choose a recording with --trial NAME"):
+    with pytest.raises(VideoError, match=r"cannot match videos and cameras .* choose a recording with --trial NAME"):
         import_project(folder, check.output)
     check(folder, rig, trial="Walk02")
 
@@ -147,7 +147,7 @@ def test_vicon_with_several_trials_in_one_folder(folder: Path, check: Import) ->
         ('SENSOR_SIZE="320 240"', 'SENSOR_SIZE="320"', "camera '26578': SENSOR_SIZE = '320' must be 2 finite numbers"),
         ('FOCAL_LENGTH="', 'FOCAL_LENGTH="-', "must be positive"),
         ("KeyFrames>", "Frames>", "0 calibrated video camera; a capture needs at least 2"),
-        ("ViconRadial2 ", "ViconRadial2 0 0 -1 0 0 ", "the distortion folds back within the picture"),
+        ("ViconRadial2 ", "ViconRadial2 0 0 -1 0 0 ", "the distortion is not monotonic within the image"),
     ],
 )
 def test_damaged_vicon(folder: Path, check: Import, old: str, new: str, complaint: str) -> None:

@@ -2,15 +2,16 @@
 
     names: ["1", "2"]
     K_1, dist_1                intrinsic matrix; k1 k2 p1 p2 k3
-    H_1, W_1                   rows and columns, not always there: then the videos' own
+    H_1, W_1                   rows and columns; if missing, the videos' size is used
     R_1 or Rot_1, T_1          Rodrigues vector or matrix, world to camera; metres
 
-The videos are in `videos/1.mp4`, or pictures in `images/1/000000.jpg`.
+The videos are in `videos/1.mp4`, or images in `images/1/000000.jpg`.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -19,36 +20,21 @@ from numpy.typing import NDArray
 
 from tk.errors import CalibrationError
 from tk.io.importers.files import read_text
-from tk.io.importers.project import Cameras, Project, Request, assemble, check_camera, in_metres
-from tk.io.importers.videos import Places
+from tk.io.importers.project import Cameras, Format, check_camera
 from tk.model.cameras.camera import Camera, Rig
 
-TOOL = "EasyMocap"
-LOOKS_FOR = "intri.yml and extri.yml"
-NESTS = False
 
-PLACES = Places(("videos", "images", "."))
-
-
-def detect(root: Path) -> bool:
-    return _folder(root) is not None
-
-
-def read(root: Path, request: Request) -> Project:
-    folder = _folder(root)
-    assert folder is not None  # detected
-    return assemble(TOOL, in_metres(_read_cameras(folder), request, "m"), request, PLACES)
-
-
-def _folder(root: Path) -> Path | None:
+def _find(root: Path) -> list[Path]:
     for folder in (root, root / "calibration", root / "cameras"):
-        if any((folder / name).exists() for name in ("intri.yml", "extri.yml")):
-            return folder
-    return None
+        files = [folder / "intri.yml", folder / "extri.yml"]
+        if any(path.exists() for path in files):
+            return files
+    return []
 
 
-def _read_cameras(folder: Path) -> Cameras:
-    intrinsic, extrinsic = _Storage(folder / "intri.yml"), _Storage(folder / "extri.yml")
+def _read(files: Sequence[Path]) -> Cameras:
+    folder = files[0].parent
+    intrinsic, extrinsic = (_OpenCvYaml(path) for path in files)
     cameras: list[Camera] = []
     notes: list[str] = []
     for name in intrinsic.names():
@@ -82,10 +68,10 @@ def _read_cameras(folder: Path) -> Cameras:
     return Cameras(folder / "intri.yml", Rig(tuple(cameras)), tuple(camera.name for camera in cameras), tuple(notes))
 
 
-class _Storage:
-    """The little of YAML that OpenCV writes: at the top level matrices, numbers and a list of names.
+class _OpenCvYaml:
+    """A YAML file as OpenCV writes it: at the top level matrices, numbers and a list of names.
 
-    Read here and not by OpenCV, which a damaged file can bring down with the whole process.
+    OpenCV's own reader is not used: a damaged file can crash the process.
     """
 
     def __init__(self, path: Path) -> None:
@@ -93,10 +79,10 @@ class _Storage:
         blocks = re.findall(r"^([^\s:#%-][^:\n]*):(.*?)(?=^[^\s-]|\Z)", f"{read_text(path)}\n", re.M | re.S)
         self._blocks = {key.strip(): block.strip() for key, block in blocks}
         if not self._blocks:
-            raise CalibrationError(f"{path}: is no YAML as OpenCV writes it: it has no keys")
+            raise CalibrationError(f"{path}: is not YAML as OpenCV writes it: it has no keys")
 
     def names(self) -> list[str]:
-        """The list `names`: a line each, or within brackets."""
+        """Return the list `names`, which has one name per line or is in brackets."""
         block = self._blocks.get("names")
         if block is None:
             raise CalibrationError(f"{self.path}: has no list `names` of its cameras")
@@ -104,11 +90,11 @@ class _Storage:
         items = inside.group(1).split(",") if inside else re.findall(r"^\s*-(.*)$", block, re.M)
         found = [item.strip().strip("\"'").strip() for item in items]
         if not all(found) or len(set(found)) < len(found):
-            raise CalibrationError(f"{self.path}: names must be different and not empty, and are {found}")
+            raise CalibrationError(f"{self.path}: names must be distinct and not empty, but are {found}")
         return found
 
     def matrix(self, key: str, *counts: int) -> NDArray[np.float64] | None:
-        """The numbers of a matrix, flat, as many as one of ``counts``; None when there is no such key."""
+        """Return the numbers of a matrix, flat, as many as one of ``counts``; None without such a key."""
         block = self._blocks.get(key)
         if block is None:
             return None
@@ -122,7 +108,7 @@ class _Storage:
         return np.array(values)
 
     def pixels(self, key: str) -> int:
-        """A whole number from 1 on, 0 when there is no such key."""
+        """Return a whole number from 1; 0 without such a key."""
         block = self._blocks.get(key)
         if block is None:
             return 0
@@ -133,3 +119,8 @@ class _Storage:
         if not 1 <= value < 1e6:
             raise CalibrationError(f"{self.path}: {key} = {block[:40]!r} must be a number of pixels")
         return round(value)
+
+
+FORMAT = Format(
+    tool="EasyMocap", files="intri.yml and extri.yml", find=_find, read=_read, videos=("videos", "images", ".")
+)

@@ -3,42 +3,30 @@
     SEQUENCE/calibration_171204_pose1.json       name "00_12", type "hd", resolution, K, distCoef, R, t
     SEQUENCE/hdVideos/hd_00_12.mp4               or hdImgs/00_12/00_12_00000000.jpg, vgaVideos/, kinectVideos/
 
-Lengths are centimetres, R and t lead from the world to the camera, and the world's y axis points down.
+Lengths are centimetres; R and t map world to camera; the world's y axis points down.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from tk.errors import CalibrationError
 from tk.io.importers.files import matching, only, read_text
-from tk.io.importers.project import Cameras, Project, Request, assemble, check_camera, in_metres
-from tk.io.importers.videos import Places
+from tk.io.importers.project import Cameras, Format, check_camera
 from tk.io.toml import Table
 from tk.model.cameras.camera import Camera, Rig
 
-TOOL = "CMU Panoptic"
-LOOKS_FOR = "calibration_*.json"
-NESTS = False
 
-PLACES = Places(("hdVideos", "hdImgs", "kinectVideos", "kinectImgs", "vgaVideos", "vgaImgs", "videos", "."))
+def _find(root: Path) -> list[Path]:
+    return matching(root, "calibration_*.json")
 
 
-def detect(root: Path) -> bool:
-    return bool(matching(root, "calibration_*.json"))
-
-
-def read(root: Path, request: Request) -> Project:
-    path = only(matching(root, "calibration_*.json"), "calibrations")
-    cameras = in_metres(_read_cameras(path), request, "cm", always=True)
-    return assemble(TOOL, cameras, request, PLACES, up="-y", all_expected=False)
-
-
-def _read_cameras(path: Path) -> Cameras:
+def _read(files: Sequence[Path]) -> Cameras:
+    path = only(files)
     try:
         document = json.loads(read_text(path))
     except (json.JSONDecodeError, RecursionError) as reason:
@@ -48,7 +36,7 @@ def _read_cameras(path: Path) -> Cameras:
         raise CalibrationError(f"{path}: has no list of `cameras`")
     cameras = [_camera(item, index, path) for index, item in enumerate(listed)]
     keys = tuple(f"{item.get('type', '')}_{item.get('name', '')}" for item in listed)
-    return Cameras(path, Rig(tuple(cameras)), keys)
+    return Cameras(path, Rig(tuple(cameras)), keys, unit="cm", unit_from="the format")
 
 
 def _camera(values: Mapping[str, object], index: int, path: Path) -> Camera:
@@ -66,3 +54,14 @@ def _camera(values: Mapping[str, object], index: int, path: Path) -> Camera:
         translation=np.ravel(table.array("t", (3, 1), (3,), (1, 3))),
     )
     return check_camera(camera, where)
+
+
+FORMAT = Format(
+    tool="CMU Panoptic",
+    files="calibration_*.json",
+    find=_find,
+    read=_read,
+    videos=("hdVideos", "hdImgs", "kinectVideos", "kinectImgs", "vgaVideos", "vgaImgs", "videos", "."),
+    up="-y",
+    videos_of_all=False,
+)

@@ -9,33 +9,32 @@ in the order of their names.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
-from tk.io.importers import qualisys
-from tk.io.importers.files import matching, only
-from tk.io.importers.project import Project, Request, assemble
-from tk.io.importers.toml_cameras import read_cameras
-from tk.io.importers.videos import Places
-
-TOOL = "Pose2Sim"
-LOOKS_FOR = "calibration/Calib*.toml or calibration/*.qca.txt"
-NESTS = True
+from tk.io.importers import qualisys, toml_cameras
+from tk.io.importers.files import matching
+from tk.io.importers.project import Cameras, Format
 
 _RAW = ("videos", "raw", "raw-2d", "raw_videos", "videos_raw")
-PLACES = Places((*_RAW, *(f"*/{name}" for name in _RAW), "."))
 
 
-def detect(root: Path) -> bool:
-    return bool(_calibrations(root))
-
-
-def read(root: Path, request: Request) -> Project:
-    path = only(_calibrations(root), "calibrations")
-    cameras = qualisys.read_cameras(path, request) if path.suffix == ".txt" else read_cameras(path, request, "m")
-    return assemble(TOOL, cameras, request, PLACES, in_order=True)
-
-
-def _calibrations(root: Path) -> list[Path]:
-    """The TOML files; else those of Qualisys, which Pose2Sim makes the TOML files from."""
+def _find(root: Path) -> list[Path]:
+    """Return the TOML files; without any, the files of Qualisys from which Pose2Sim makes them."""
     folder = root / "calibration"
     return matching(folder, "Calib*.toml") or matching(folder, "*.qca.txt")
+
+
+def _read(files: Sequence[Path]) -> Cameras:
+    return (qualisys if files[0].suffix == ".txt" else toml_cameras).read_cameras(files)
+
+
+FORMAT = Format(
+    tool="Pose2Sim",
+    files="calibration/Calib*.toml or calibration/*.qca.txt",
+    find=_find,
+    read=_read,
+    videos=(*_RAW, *(f"*/{name}" for name in _RAW), "."),
+    nests=True,
+    in_order=True,
+)

@@ -1,11 +1,10 @@
-"""What every importer hands on: the cameras and videos of a project, in metres and matched."""
+"""What all formats share: a format's description, and a project in metres with a video for every camera."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -13,22 +12,22 @@ import numpy as np
 from tk.errors import CalibrationError, VideoError
 from tk.io.captures.calibration import scale_world
 from tk.io.captures.units import LEAST_APART_M, MOST_APART_M, FoundUnit, apart, infer_unit
-from tk.io.importers.videos import Places, Wanted, find_clips
+from tk.io.importers.videos import CameraNames, find_clips
 from tk.model.cameras.camera import Camera, Rig
 
 
 @dataclass(frozen=True)
 class Project:
-    """A project of another tool, read.
+    """A project of another tool.
 
     Attributes:
-        tool: whose it is, for messages.
-        source: the calibration file (or folder) that was read.
-        rig: the cameras that have a video, metres. A width and height of 0 are unknown: the video's are taken.
-        clips: the video file or folder of pictures of each of them.
-        masks, backgrounds: the same for masks and pictures of the empty scene; empty where there are none.
-        up: the world's upward direction where the format fixes it ("-y"), else None.
-        notes: what was inferred or left out, a line each, for the user to read.
+        tool: name of the tool.
+        source: calibration file or folder.
+        rig: cameras with a video, metres. A width and height of 0 are unknown: the video's size is used.
+        clips: video file or folder of images of each camera.
+        masks, backgrounds: the same for masks and images of the empty scene; empty without any.
+        up: the world's up direction if the format fixes it ("-y"), else None.
+        notes: lines for the user about what was inferred or left out.
     """
 
     tool: str
@@ -42,100 +41,107 @@ class Project:
 
 
 @dataclass(frozen=True)
-class Request:
-    """What the user asked for.
-
-    Attributes:
-        folder: the folder to import; videos are looked for in it.
-        unit: of the calibration's lengths, None to infer it.
-        trial: a part of the path of the videos that are meant, None where there is no choice.
-    """
-
-    folder: Path
-    unit: str | None = None
-    trial: str | None = None
-
-
-class Importer(Protocol):
-    """One format; a module of this package is one.
-
-    Attributes:
-        TOOL: the tool's name.
-        LOOKS_FOR: what :func:`detect` looks for, for the message when nothing matches.
-        NESTS: a recording's folder lies below the one with the calibration.
-    """
-
-    TOOL: str
-    LOOKS_FOR: str
-    NESTS: bool
-
-    def detect(self, root: Path) -> bool:
-        """Whether this folder holds the format's calibration. Opens as little as possible."""
-        ...
-
-    def read(self, root: Path, request: Request) -> Project:
-        """Read the calibration in ``root`` and find the videos in ``request.folder``.
-
-        Raises:
-            CalibrationError: the calibration cannot be used.
-            VideoError: the videos cannot be found, or not be told apart.
-        """
-        ...
-
-
-@dataclass(frozen=True)
 class Cameras:
-    """A calibration file's cameras, lengths in the file's unit.
+    """The cameras of a calibration.
 
     Attributes:
-        source: the file.
-        rig: its cameras.
-        keys: a second name of each, by which its video may be called.
+        source: calibration file or folder.
+        rig: cameras, lengths in the file's unit.
+        keys: a second name of each camera, which its video may have.
         notes: as in :class:`Project`.
+        unit: unit of lengths, None if unknown; unit_from: what specifies it.
     """
 
     source: Path
     rig: Rig
     keys: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    unit: str | None = None
+    unit_from: str = "the file"
 
 
-def in_metres(
-    cameras: Cameras, request: Request, default: str, said: str | None = None, always: bool = False
-) -> Cameras:
-    """The cameras with lengths in metres, and a note that says how the unit was found.
+@dataclass(frozen=True)
+class Format:
+    """A calibration format: the constant ``FORMAT`` of a module of this package.
 
-    Args:
-        cameras: as read.
-        request: its ``unit`` comes before everything else.
-        default: the unit that the tool writes as a rule.
-        said: the unit that the file itself gives.
-        always: the format has no other unit than ``default``.
+    Attributes:
+        tool: name of the tool.
+        files: calibration files that ``find`` searches for, for messages.
+        find: returns the calibration files in a folder, [] without any; it opens as few files as possible.
+        read: reads the cameras from these files; raises CalibrationError.
+        videos: folders that hold videos, as patterns relative to the project; the first that matches is used.
+        unit: unit of lengths in this format, if the file does not say and the distances of the cameras allow it.
+        nests: recordings lie in folders below the calibration.
+        up: the world's up direction if the format fixes it.
+        in_order: the tool matches cameras and videos in the order of their names.
+        videos_of_all: a camera without a video is worth a note by name.
     """
-    if request.unit:
-        found, how = FoundUnit(request.unit), "as --units says"
-    elif said:
-        found, how = FoundUnit(said), "as the file says"
-    elif always:
-        found, how = FoundUnit(default), "as always in this format"
+
+    tool: str
+    files: str
+    find: Callable[[Path], list[Path]]
+    read: Callable[[Sequence[Path]], Cameras]
+    videos: tuple[str, ...]
+    unit: str = "m"
+    nests: bool = False
+    up: str | None = None
+    in_order: bool = False
+    videos_of_all: bool = True
+
+
+def read_format(form: Format, files: Sequence[Path], folder: Path, unit: str | None, trial: str | None) -> Project:
+    """Read the calibration ``files``, and find a video in ``folder`` for every camera.
+
+    Raises:
+        CalibrationError: the calibration cannot be used.
+        VideoError: see :func:`tk.io.importers.videos.find_clips`.
+    """
+    cameras = _in_metres(form.read(files), unit, form.unit)
+    names = [CameraNames(camera.name, key) for camera, key in zip(cameras.rig, cameras.keys, strict=True)]
+    found = find_clips(folder, form.videos, names, trial, form.in_order)
+    chosen = [index for index, clip in enumerate(found.clips) if clip is not None]
+    notes = [*cameras.notes, *found.notes]
+    missing = [names[index].name for index, clip in enumerate(found.clips) if clip is None]
+    if missing and form.videos_of_all:
+        notes.append(f"{found.folder}: no video of {', '.join(missing)}: left out")
+    elif missing:
+        notes.append(f"{cameras.source}: {len(missing)} of its {len(names)} cameras have no video here: left out")
+    chosen_names = [names[index] for index in chosen]
+    return Project(
+        tool=form.tool,
+        source=cameras.source,
+        rig=Rig(tuple(cameras.rig[index] for index in chosen)),
+        clips=tuple(clip for clip in found.clips if clip is not None),
+        masks=_beside(folder, found.folder, ("masks", "mask"), chosen_names, notes),
+        backgrounds=_beside(folder, found.folder, ("background", "backgrounds"), chosen_names, notes),
+        up=form.up,
+        notes=tuple(notes),
+    )
+
+
+def _in_metres(cameras: Cameras, requested: str | None, default: str) -> Cameras:
+    """Return the cameras with lengths in metres, and a note about the unit: requested, specified, or inferred."""
+    if requested:
+        found, reason = FoundUnit(requested), "as --units says"
+    elif cameras.unit:
+        found, reason = FoundUnit(cameras.unit), f"as {cameras.unit_from} says"
     else:
-        found = infer_unit(cameras.rig.centers, default)
-        how = f"as {default} is usual there"
+        found, reason = infer_unit(cameras.rig.centers, default), "the default of this format"
     rig = scale_world(cameras.rig, found.metres)
     if found.note:
         note = f"{found.note}; --units m, cm or mm overrides it"
     else:
-        note = f"lengths are in {found.name}, {how}"
+        note = f"lengths are in {found.name}, {reason}"
         if not LEAST_APART_M <= apart(rig.centers) <= MOST_APART_M:
-            note += f": the cameras are then up to {apart(rig.centers):.3g} m apart, which is unusual"
+            note += f": the cameras are then up to {apart(rig.centers):.3g} m apart, which is unlikely"
     return replace(cameras, rig=rig, notes=(*cameras.notes, f"{cameras.source}: {note}"))
 
 
 def check_camera(camera: Camera, where: str) -> Camera:
-    """The camera, made sure of: finite, positive focal lengths, the rotation made orthonormal.
+    """Return the camera with an exactly orthonormal rotation, if it is valid.
 
     Raises:
-        CalibrationError: with ``where`` at the beginning.
+        CalibrationError: a number is not finite, a focal length not positive, or the rotation not orthonormal.
     """
     numbers = (camera.matrix, camera.distortions, camera.rotation, camera.translation)
     if not all(np.isfinite(values).all() for values in numbers):
@@ -144,75 +150,29 @@ def check_camera(camera: Camera, where: str) -> Camera:
         raise CalibrationError(
             f"{where}: focal lengths {camera.matrix[0, 0]:g}, {camera.matrix[1, 1]:g} must be positive"
         )
-    off = float(np.abs(camera.rotation @ camera.rotation.T - np.eye(3)).max())
-    if off > 1e-3 or np.linalg.det(camera.rotation) < 0:
-        raise CalibrationError(f"{where}: the rotation is no rotation matrix (R Rᵀ is off the identity by {off:.2g})")
+    error = float(np.abs(camera.rotation @ camera.rotation.T - np.eye(3)).max())
+    if error > 1e-3 or np.linalg.det(camera.rotation) < 0:
+        raise CalibrationError(
+            f"{where}: the rotation is no rotation matrix (R Rᵀ differs from the identity by {error:.2g})"
+        )
     nearest = cv2.Rodrigues(cv2.Rodrigues(camera.rotation)[0])[0]
     return replace(camera, rotation=np.asarray(nearest, dtype=np.float64))
 
 
-def assemble(
-    tool: str,
-    cameras: Cameras,
-    request: Request,
-    places: Places,
-    *,
-    up: str | None = None,
-    in_order: bool = False,
-    all_expected: bool = True,
-) -> Project:
-    """The project of these cameras (metres) and the videos that are found for them.
-
-    Args:
-        tool: its name.
-        cameras: in metres.
-        request: where to look, and for which trial.
-        places: the folders, relative to the request's, that the tool keeps videos in.
-        up: the world's upward direction, None to leave it open.
-        in_order: the tool itself matches cameras and videos in the order of their names.
-        all_expected: a camera without a video is worth a note.
-
-    Raises:
-        VideoError: see :func:`tk.io.importers.videos.find_clips`.
-    """
-    names = [Wanted(camera.name, key) for camera, key in zip(cameras.rig, cameras.keys, strict=True)]
-    found = find_clips(request.folder, places, names, request.trial, in_order)
-    chosen = [index for index, clip in enumerate(found.clips) if clip is not None]
-    notes = [*cameras.notes, *found.notes]
-    without = [names[index].name for index, clip in enumerate(found.clips) if clip is None]
-    if without and all_expected:
-        notes.append(f"{found.folder}: no video of {', '.join(without)}: left out")
-    elif without:
-        notes.append(f"{cameras.source}: {len(without)} of its {len(names)} cameras have no video here: left out")
-    wanted = [names[index] for index in chosen]
-    masks = _beside(request.folder, found.folder, ("masks", "mask"), wanted, notes)
-    backgrounds = _beside(request.folder, found.folder, ("background", "backgrounds"), wanted, notes)
-    return Project(
-        tool=tool,
-        source=cameras.source,
-        rig=Rig(tuple(cameras.rig[index] for index in chosen)),
-        clips=tuple(clip for clip in found.clips if clip is not None),
-        masks=masks,
-        backgrounds=backgrounds,
-        up=up,
-        notes=tuple(notes),
-    )
-
-
 def _beside(
-    root: Path, videos: Path, folders: Sequence[str], wanted: Sequence[Wanted], notes: list[str]
+    root: Path, videos: Path, folders: Sequence[str], cameras: Sequence[CameraNames], notes: list[str]
 ) -> tuple[Path, ...]:
-    """Masks or backgrounds of these cameras, from the first of these folders there is; () and a note if not of all."""
+    """Return masks or backgrounds from the first existing folder; () and a note if they are not complete."""
     for parent in dict.fromkeys((videos.parent, root)):
         for name in folders:
             if not (parent / name).is_dir():
                 continue
             try:
-                found = find_clips(parent, Places((name,), pictures=True), wanted, None, False)
+                found = find_clips(parent, (name,), cameras, None, False, images=True)
             except VideoError as reason:
                 notes.append(f"{reason}: {name}/ is left out")
                 return ()
-            missing = [camera.name for camera, clip in zip(wanted, found.clips, strict=True) if clip is None]
+            missing = [camera.name for camera, clip in zip(cameras, found.clips, strict=True) if clip is None]
             if missing:
                 notes.append(f"{found.folder}: has nothing of {', '.join(missing)}: all of it is left out")
                 return ()

@@ -1,13 +1,14 @@
-"""Plain 3×4 projection matrices, one file a camera: `cam1.txt` (twelve numbers, rows first) or `cam1.npy`.
+"""Plain 3×4 projection matrices, one file per camera: `cam1.txt` (twelve numbers, rows first) or `cam1.npy`.
 
-A matrix P maps a world point to homogeneous pixels; it is taken apart into K [R | t] (Hartley and Zisserman, *Multiple
-View Geometry*, 2nd ed., section 6.2.4). There is no lens distortion in it, and no size of pictures: the videos' are
-taken. Text files may begin with a line CONTOUR, and have comments after #.
+A matrix P maps a world point to homogeneous pixels; it is factorised into K [R | t] (Hartley and Zisserman, *Multiple
+View Geometry*, 2nd ed., section 6.2.4). It has no lens distortion and no image size: the videos' size
+is used. Text files may begin with a line CONTOUR, and have comments after #.
 """
 
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,30 +17,17 @@ from scipy.linalg import rq
 
 from tk.errors import CalibrationError
 from tk.io.importers.files import check_file, matching
-from tk.io.importers.project import Cameras, Project, Request, assemble, check_camera, in_metres
-from tk.io.importers.videos import Places
+from tk.io.importers.project import Cameras, Format, check_camera
 from tk.model.cameras.camera import Camera, Rig
 
-TOOL = "projection matrices"
-LOOKS_FOR = "a .txt or .npy file a camera with a 3×4 projection matrix, in the folder, calibration/ or cameras/"
-NESTS = False
-
-PLACES = Places(("videos", "images", "."))
-
-#: bytes: twelve numbers take a kilobyte
+#: largest file, bytes; twelve numbers take 1 kB
 _LARGEST = 2**16
 
-#: skew above this share of the focal length is told; below it is rounding
+#: a larger skew, as a share of the focal length, is reported; a smaller one is rounding of the file's numbers
 _SKEW = 1e-6
 
 
-def detect(root: Path) -> bool:
-    return _files(root) is not None
-
-
-def read(root: Path, request: Request) -> Project:
-    files = _files(root)
-    assert files is not None  # detected
+def _read(files: Sequence[Path]) -> Cameras:
     cameras: list[Camera] = []
     notes: list[str] = []
     for path in files:
@@ -47,29 +35,27 @@ def read(root: Path, request: Request) -> Project:
         if P is None:
             notes.append(f"{path}: holds no 3×4 matrix: left out")
             continue
-        K, rotation, translation = take_apart(P, str(path))
+        K, rotation, translation = factorise(P, str(path))
         if abs(K[0, 1]) > _SKEW * K[0, 0]:
             notes.append(
-                f"{path}: has a skew of {K[0, 1]:.3g} px, which is left out: the sides of the picture move by about "
+                f"{path}: has a skew of {K[0, 1]:.3g} px, which is left out: the sides of the image move by about "
                 f"{abs(K[0, 1]) * K[1, 2] / K[1, 1]:.2g} px"
             )
             K[0, 1] = 0.0
         cameras.append(check_camera(Camera(path.stem, 0, 0, K, np.zeros(5), rotation, translation), str(path)))
-    source = files[0].parent
-    found = Cameras(source, Rig(tuple(cameras)), tuple(camera.name for camera in cameras), tuple(notes))
-    return assemble(TOOL, in_metres(found, request, "m"), request, PLACES)
+    return Cameras(files[0].parent, Rig(tuple(cameras)), tuple(camera.name for camera in cameras), tuple(notes))
 
 
-def take_apart(P: NDArray[np.float64], where: str) -> tuple[NDArray[np.float64], ...]:
-    """K (3, 3) with positive focal lengths, R (3, 3) and t (3,) with P ~ K [R | t].
+def factorise(P: NDArray[np.float64], where: str) -> tuple[NDArray[np.float64], ...]:
+    """Return K (3, 3) with positive focal lengths, R (3, 3) and t (3,) with P ~ K [R | t].
 
     Raises:
-        CalibrationError: P is no finite camera: its left 3×3 part is singular.
+        CalibrationError: P is not the matrix of a finite camera: its left 3×3 part is singular.
     """
     left = P[:, :3]
     scale = np.abs(left).max()
     if not scale > 0 or abs(np.linalg.det(left / scale)) < 1e-12:
-        raise CalibrationError(f"{where}: the left 3×3 part is singular: this is no projection of a camera")
+        raise CalibrationError(f"{where}: the left 3×3 part is singular: this is not the projection of a camera")
     P = P * np.sign(np.linalg.det(left / scale)) / scale
     K, R = rq(P[:, :3])
     signs = np.diag(np.where(np.diag(K) < 0, -1.0, 1.0))
@@ -77,27 +63,36 @@ def take_apart(P: NDArray[np.float64], where: str) -> tuple[NDArray[np.float64],
     return K / K[2, 2], R, np.linalg.solve(K, P[:, 3])
 
 
-def _files(root: Path) -> list[Path] | None:
-    """The .txt and .npy files of the first folder in which two of them hold a matrix."""
+def _find(root: Path) -> list[Path]:
+    """Return the .txt and .npy files of the first folder in which two of them hold a matrix."""
     for folder in (root, root / "calibration", root / "calib", root / "cameras", root / "projections"):
         files = matching(folder, "*.txt", "*.npy")
         if sum(_matrix(path) is not None for path in files) >= 2:
             return files
-    return None
+    return []
 
 
 def _matrix(path: Path) -> NDArray[np.float64] | None:
-    """(3, 4) what the file holds, None when it holds something else."""
+    """Return the matrix (3, 4) of a file; None if the file holds something else."""
     try:
         check_file(path, _LARGEST)
-        coded = path.read_bytes()
+        content = path.read_bytes()
         if path.suffix == ".npy":
-            values = np.load(io.BytesIO(coded), allow_pickle=False)
+            values = np.load(io.BytesIO(content), allow_pickle=False)
         else:
-            lines = [line.split("#")[0] for line in coded.decode("utf-8-sig").splitlines()]
+            lines = [line.split("#")[0] for line in content.decode("utf-8-sig").splitlines()]
             words = " ".join(line for line in lines if line.strip() != "CONTOUR").replace(",", " ").split()
             values = np.array([float(word) for word in words])
         P = np.asarray(values, dtype=np.float64)
     except (CalibrationError, OSError, ValueError, EOFError):
         return None
     return P.reshape(3, 4) if P.size == 12 and np.isfinite(P).all() else None
+
+
+FORMAT = Format(
+    tool="projection matrices",
+    files="one .txt or .npy file per camera with a 3×4 projection matrix, in the folder, calibration/ or cameras/",
+    find=_find,
+    read=_read,
+    videos=("videos", "images", "."),
+)

@@ -1,4 +1,4 @@
-"""A calibration made at one picture size, a video of another: what can be explained is put right."""
+"""Adapt a camera calibrated at one image size to a video of another size."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import numpy as np
 from tk.errors import CalibrationError
 from tk.model.cameras.camera import Camera
 
-#: codecs pad pictures to blocks of 16 pixels: a difference below this is padding that has been cut off, or left on
+#: codecs pad images to blocks of 16 pixels: a smaller difference in size is padding, removed or kept
 _BLOCK = 16
 
 
 def fit_size(camera: Camera, width: int, height: int, clip: Path) -> tuple[Camera, str | None]:
-    """The camera of a video of ``width`` × ``height`` pixels, and a line that says what was done to it.
+    """Return the camera of a video of ``width`` × ``height`` pixels, and a note about the change.
 
-    - The calibration does not say a size (0 × 0): the video's is taken.
-    - A few pixels of difference (1088 rows against 1080) are a codec's padding at the right and the bottom. Pixels keep
-      their places, so the matrix stays and the size becomes the video's.
-    - One exact ratio in both directions is a scaled picture: the matrix is scaled. Pixel centres lie at integer
-      coordinates, so a pixel x goes to s (x + ½) - ½.
+    - A calibration without a size (0 × 0) takes the video's size.
+    - A difference of a few pixels (1088 rows against 1080) is a codec's padding at the right and the bottom: the matrix
+      stays the same.
+    - One exact ratio in both directions is a scaled image: the matrix is scaled. Pixel centres are integers, so a pixel
+      x maps to s (x + ½) - ½.
 
     Raises:
-        CalibrationError: the sizes agree in none of these ways.
+        CalibrationError: none of these rules applies.
     """
     calibrated = (camera.width, camera.height)
     if calibrated in ((width, height), (0, 0)):

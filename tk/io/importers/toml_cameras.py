@@ -1,25 +1,26 @@
-"""Camera tables in TOML, as Anipose began them and others took them over, each a little differently."""
+"""Camera tables in TOML: Anipose's format and the variants of other tools."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from tk.errors import CalibrationError
 from tk.io.captures.calibration import calibration_of, camera_tables, given_unit
-from tk.io.importers.files import read_toml
-from tk.io.importers.project import Cameras, Request, in_metres
+from tk.io.importers.files import only, read_toml
+from tk.io.importers.project import Cameras
 
-#: how the tools write "not known yet" in a language without null
+#: values by which the tools mark an unknown entry; TOML has no null
 _NOTHING: tuple[object, ...] = (None, "", "null", "None", [])
 
 
-def read_cameras(path: Path, request: Request, default_unit: str) -> Cameras:
-    """The cameras of a TOML file, metres. Tables that are no camera, are switched off or have no pose are left out.
+def read_cameras(files: Sequence[Path]) -> Cameras:
+    """Read the cameras of the one TOML file. Tables without a camera, a pose, or with ``ignore`` are left out.
 
     Raises:
-        CalibrationError: with the file, the camera and the key that is wrong; or fewer than two cameras are left.
+        CalibrationError: there are several files, an entry is wrong, or fewer than two cameras have a pose.
     """
+    path = only(files)
     document = read_toml(path)
     tables: dict[str, Mapping[str, object]] = {}
     notes: list[str] = []
@@ -28,7 +29,7 @@ def read_cameras(path: Path, request: Request, default_unit: str) -> Cameras:
             continue  # settings of the tool
         missing = [name for name in ("matrix", "rotation", "translation") if table.get(name) in _NOTHING]
         if table.get("ignore") is True:
-            notes.append(f"{path}: camera {key!r} is switched off there: left out")
+            notes.append(f"{path}: camera {key!r} is switched off (ignore = true): left out")
         elif missing:
             notes.append(f"{path}: camera {key!r} has no {' and no '.join(missing)}: left out")
         else:
@@ -39,12 +40,11 @@ def read_cameras(path: Path, request: Request, default_unit: str) -> Cameras:
             f"{path}: {len(tables)} camera with a pose, and a capture needs at least 2{skipped}; finish the calibration"
         )
     calibration = calibration_of(path, tables, "m")
-    cameras = Cameras(path, calibration.rig, calibration.keys, tuple(notes))
-    return in_metres(cameras, request, default_unit, said=given_unit(document, path))
+    return Cameras(path, calibration.rig, calibration.keys, tuple(notes), given_unit(document, path))
 
 
 def has_camera_tables(path: Path) -> bool:
-    """Whether a TOML file has a table with a camera matrix; False for one that cannot be read."""
+    """Return whether a TOML file has a table with a camera matrix; False if the file cannot be read."""
     try:
         document = read_toml(path)
         return any("matrix" in table for table in camera_tables(document, path).values())

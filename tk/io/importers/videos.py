@@ -1,4 +1,4 @@
-"""The videos of a project: which folder holds them, and which camera made which."""
+"""Find the videos of a project, and match them with the cameras by their names."""
 
 from __future__ import annotations
 
@@ -11,35 +11,23 @@ from tk.errors import CaptureError, VideoError
 from tk.io.captures.calibration import match_camera
 from tk.io.captures.video import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 
-#: video files that tk does not read; they are named when nothing else is found
+#: suffixes of videos that tk does not read; a message names such files if there are no others
 _OTHER_VIDEOS = (".m4v", ".mts", ".m2ts", ".webm", ".wmv", ".mpg", ".mpeg", ".flv", ".3gp", ".ts")
 
-#: words in the names of cameras and files that tell nothing about which camera it is
+#: words in names of cameras and files that do not identify a camera
 _COMMON_WORDS = frozenset({"int", "ext", "img", "calib", "video", "synchronized", "sync", "camera", "cam", "port"})
 
-#: a name of numbers alone that is shorter than this ("1", "02") may be within another by chance
-_TELLING = 4
+#: shortest name of digits alone that identifies a camera as a part of another name: "1" or "02" may be chance, serial
+#: numbers have more digits
+_LEAST_DIGITS = 4
 
-#: files of a folder that are looked at before it is taken to hold no pictures
-_GLANCE = 200
-
-
-@dataclass(frozen=True)
-class Places:
-    """Where a tool keeps its videos.
-
-    Attributes:
-        folders: patterns relative to the project's folder, "." being the folder itself; the first that matches counts.
-        pictures: single pictures count, too.
-    """
-
-    folders: tuple[str, ...]
-    pictures: bool = False
+#: files of a folder that are checked for images; a folder of images has them among its first files
+_CHECKED_FILES = 200
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """A camera whose video is looked for: its ``name``, and a second name, its ``key`` in the calibration."""
+class CameraNames:
+    """A camera's name, and its key in the calibration; its video may have either name."""
 
     name: str
     key: str
@@ -50,9 +38,9 @@ class Found:
     """The videos of a recording.
 
     Attributes:
-        folder: that holds them.
-        clips: of each camera, None where there is none.
-        notes: how they were matched, where that is not plain, and what was left over.
+        folder: the folder with the videos.
+        clips: video file or folder of images of each camera, None without one.
+        notes: lines about a match that is not obvious, and about videos without a camera.
     """
 
     folder: Path
@@ -62,30 +50,32 @@ class Found:
 
 def find_clips(
     root: Path,
-    places: Places,
-    cameras: Sequence[Wanted],
+    patterns: Sequence[str],
+    cameras: Sequence[CameraNames],
     trial: str | None,
     in_order: bool,
+    images: bool = False,
 ) -> Found:
-    """The video of each camera in the project's folder.
+    """Find the video of each camera in the project's folder.
 
     Args:
         root: the project's folder.
-        places: where in it to look.
-        cameras: whose videos.
-        trial: a part of the path of the videos that are meant.
-        in_order: where names tell nothing, the first camera belongs to the first video, and so on.
+        patterns: folders in it, "." being the folder itself; the first pattern with videos is used.
+        cameras: their names.
+        trial: a part of the path of the videos, None to accept any.
+        in_order: if names do not match, the first camera belongs to the first video, and so on.
+        images: accept single images as clips.
 
     Raises:
-        VideoError: there are no videos, several recordings, or names that cannot be matched; it says what there is.
+        VideoError: there are no videos, several recordings, or names that cannot be matched.
     """
-    folder, clips = _one_set(root, places, trial)
+    folder, clips = _one_recording(root, patterns, trial, images)
     order = match_clips(cameras, list(clips), in_order)
     if order is None:
         names = ", ".join(camera.name for camera in cameras[:12]) + (", …" if len(cameras) > 12 else "")
         hint = "rename the videos to the cameras' names"
         raise VideoError(
-            f"{folder}: cannot tell which video belongs to which camera: the cameras are {names}, the videos "
+            f"{folder}: cannot match videos and cameras by name: the cameras are {names}, the videos "
             f"{_some(clips)}; {hint if trial else f'choose a recording with --trial NAME, or {hint}'}"
         )
     notes = []
@@ -94,23 +84,23 @@ def find_clips(
         pairs = ", ".join(
             f"{camera.name} ↔ {stem.name}" for camera, stem in zip(cameras, stems, strict=True) if stem is not None
         )
-        notes.append(f"{folder}: the names do not tell, so cameras and videos are matched in their order: {pairs}")
+        notes.append(f"{folder}: names do not match, so cameras and videos are matched in their order: {pairs}")
     left = sorted(set(clips) - {stem for stem in order.stems if stem is not None})
     if left:
-        notes.append(f"{folder}: belongs to no camera: {_some(left)}")
+        notes.append(f"{folder}: no camera matches {_some(left)}")
     return Found(folder, tuple(stems), tuple(notes))
 
 
-def clips_in(folder: Path, pictures: bool = False) -> dict[str, Path]:
-    """The clips that a folder holds, by name: video files; else folders of pictures, or of one video each.
+def _clips_in(folder: Path, images: bool) -> dict[str, Path]:
+    """Return the clips in a folder by name: video files; without any, folders of images or of one video each.
 
     Symbolic links are followed; pipes and devices are not clips.
 
     Raises:
-        VideoError: two files have one name, but for the suffix.
+        VideoError: two files differ in the suffix only.
     """
     files = _regular(folder)
-    suffixes = VIDEO_SUFFIXES + (PICTURE_SUFFIXES if pictures else ())
+    suffixes = VIDEO_SUFFIXES + (PICTURE_SUFFIXES if images else ())
     clips: dict[str, Path] = {}
     for path in files:
         if path.suffix.lower() in suffixes:
@@ -124,7 +114,7 @@ def clips_in(folder: Path, pictures: bool = False) -> dict[str, Path]:
         videos = [path for path in inside if path.suffix.lower() in VIDEO_SUFFIXES]
         numbered = [
             path
-            for path in inside[:_GLANCE]
+            for path in inside[:_CHECKED_FILES]
             if path.suffix.lower() in PICTURE_SUFFIXES and re.search(r"[0-9]$", path.stem)
         ]
         if len(videos) == 1:
@@ -135,50 +125,49 @@ def clips_in(folder: Path, pictures: bool = False) -> dict[str, Path]:
 
 
 @dataclass(frozen=True)
-class _Order:
-    """The stem of each camera's clip, and ``by`` what they were matched."""
+class Match:
+    """The name of each camera's clip, and ``by`` which rule they match."""
 
     stems: tuple[str | None, ...]
     by: str
 
 
-def match_clips(cameras: Sequence[Wanted], stems: Sequence[str], in_order: bool) -> _Order | None:
-    """The clip's name of each camera; None when it cannot be told for two cameras at least.
+def match_clips(cameras: Sequence[CameraNames], stems: Sequence[str], in_order: bool) -> Match | None:
+    """Match clips with cameras by name; None if fewer than two cameras match.
 
-    Tried in this order, the one that matches most cameras counts, and none may match two cameras with one clip: equal
-    names; one name within the other ("cam01" in "int_cam01_img"); the number in which the names differ ("cam_0",
-    "port_0"); what is left of the names without their common beginning and end ("A", "trial1-camA"); and, where
-    ``in_order``, the order of the names.
+    The first rule that matches most cameras counts, and no rule may match two cameras with one clip: equal names; one
+    name within the other ("cam01" in "int_cam01_img"); the number in which the names differ ("cam_0", "port_0"); the
+    names without their common beginning and end ("A", "trial1-camA"); and, with ``in_order``, the order of the names.
     """
-    ways: list[tuple[str, Callable[[], list[str | None]]]] = [
+    rules: list[tuple[str, Callable[[], list[str | None]]]] = [
         ("name", lambda: [_equal(camera, stems) for camera in cameras]),
         ("part", lambda: [_within(camera, stems) for camera in cameras]),
         ("number", lambda: _by_difference(cameras, stems, _distinct_numbers)),
         ("difference", lambda: _by_difference(cameras, stems, _differences)),
     ]
-    best: _Order | None = None
-    for by, way in ways:
-        found = way()
+    best: Match | None = None
+    for by, rule in rules:
+        found = rule()
         taken = [stem for stem in found if stem is not None]
         if len(taken) < 2 or len(set(taken)) < len(taken):
             continue
         if best is None or len(taken) > len(best.stems) - best.stems.count(None):
-            best = _Order(tuple(found), by)
+            best = Match(tuple(found), by)
     if best is None and in_order and len(stems) == len(cameras) >= 2:
         by_name = sorted(range(len(cameras)), key=lambda index: natural(cameras[index].name))
         ordered: list[str | None] = [None] * len(cameras)
         for index, stem in zip(by_name, sorted(stems, key=natural), strict=True):
             ordered[index] = stem
-        best = _Order(tuple(ordered), "order")
+        best = Match(tuple(ordered), "order")
     return best
 
 
 def natural(text: str) -> list[tuple[int, str]]:
-    """A key that sorts numbers in names by value: cam2 before cam10."""
+    """Return a key that sorts numbers in names by value: cam2 before cam10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", text) if part]
 
 
-def _equal(camera: Wanted, stems: Sequence[str]) -> str | None:
+def _equal(camera: CameraNames, stems: Sequence[str]) -> str | None:
     try:
         return match_camera(camera.name, camera.key, stems)
     except CaptureError:  # ambiguous
@@ -186,26 +175,26 @@ def _equal(camera: Wanted, stems: Sequence[str]) -> str | None:
 
 
 def _words(text: str) -> tuple[str, ...]:
-    """The words and numbers of a name, without leading zeros: "Cam_01" is ("cam", "1")."""
+    """Return the words and numbers of a name, without leading zeros: ("cam", "1") for "Cam_01"."""
     found = re.findall(r"[a-z]+|[0-9]+", text.lower())
     return tuple(word.lstrip("0") or "0" if word.isdigit() else word for word in found)
 
 
-def _within(camera: Wanted, stems: Sequence[str]) -> str | None:
-    """The one stem that contains a name of the camera, or is contained in it, word by word."""
+def _within(camera: CameraNames, stems: Sequence[str]) -> str | None:
+    """Return the one stem that contains a name of the camera, or is contained in it, word by word."""
     for name in dict.fromkeys((camera.name, camera.key)):
-        inner = [stem for stem in stems if _tells(name) and _contains(_words(stem), _words(name))]
-        outer = [stem for stem in stems if _tells(stem) and _contains(_words(name), _words(stem))]
+        inner = [stem for stem in stems if _identifies(name) and _contains(_words(stem), _words(name))]
+        outer = [stem for stem in stems if _identifies(stem) and _contains(_words(name), _words(stem))]
         for found in (inner, outer):
             if len(found) == 1:
                 return found[0]
     return None
 
 
-def _tells(name: str) -> bool:
-    """Whether a name, found within another, can be no chance."""
+def _identifies(name: str) -> bool:
+    """Return whether a name as a part of another name identifies a camera."""
     words = _words(name)
-    return not set(words) <= _COMMON_WORDS and (len(name) >= _TELLING or not all(word.isdigit() for word in words))
+    return not set(words) <= _COMMON_WORDS and (len(name) >= _LEAST_DIGITS or not all(word.isdigit() for word in words))
 
 
 def _contains(words: tuple[str, ...], part: tuple[str, ...]) -> bool:
@@ -214,11 +203,11 @@ def _contains(words: tuple[str, ...], part: tuple[str, ...]) -> bool:
 
 
 def _by_difference(
-    cameras: Sequence[Wanted], stems: Sequence[str], differences: Callable[[Sequence[str]], list[str]]
+    cameras: Sequence[CameraNames], stems: Sequence[str], differences: Callable[[Sequence[str]], list[str]]
 ) -> list[str | None]:
-    """By that in which the names differ; all there is of the cameras must be there of the stems, or vice versa.
+    """Match by the part in which the names differ; the cameras' parts must all occur in the stems, or vice versa.
 
-    "cam1" to "cam4" and "0" to "3" are thus not matched: which is which would be a guess.
+    "cam1" to "cam4" and "0" to "3" are thus not matched, because that would be a guess.
     """
     theirs = differences(stems)
     for names in ([camera.name for camera in cameras], [camera.key for camera in cameras]):
@@ -229,7 +218,7 @@ def _by_difference(
 
 
 def _distinct_numbers(names: Sequence[str]) -> list[str]:
-    """A number of each name, at the same place in all, in which no two agree; [] if there is none or several."""
+    """Return the number in each name, at the same place in all, that is distinct; [] if there is none or several."""
     rows = [_words(name) for name in names]
     if len({len(row) for row in rows}) != 1:
         return []
@@ -242,7 +231,7 @@ def _distinct_numbers(names: Sequence[str]) -> list[str]:
 
 
 def _differences(names: Sequence[str]) -> list[str]:
-    """Each name without the beginning and the end that all have in common; [] if nothing is left of one."""
+    """Return each name without the common beginning and end of all names; [] if nothing is left of one."""
     if not names:
         return []
     start = _shared(names)
@@ -253,20 +242,22 @@ def _differences(names: Sequence[str]) -> list[str]:
 
 
 def _shared(names: Sequence[str]) -> int:
-    """How many characters all names begin with in common."""
+    """Return the length of the beginning that all names have in common."""
     first, last = min(names), max(names)
     same = (index for index, (a, b) in enumerate(zip(first, last, strict=False)) if a != b)
     return next(same, min(len(first), len(last)))
 
 
-def _one_set(root: Path, places: Places, trial: str | None) -> tuple[Path, Mapping[str, Path]]:
-    """The folder of the one recording that is meant, and its clips."""
-    looked: list[str] = []
-    for pattern in places.folders:
+def _one_recording(
+    root: Path, patterns: Sequence[str], trial: str | None, images: bool
+) -> tuple[Path, Mapping[str, Path]]:
+    """Return the folder of the one recording that matches, and its clips."""
+    searched: list[str] = []
+    for pattern in patterns:
         found: dict[Path, dict[str, Path]] = {}
         for folder in [root] if pattern == "." else sorted(root.glob(pattern)):
             if folder.is_dir():
-                clips = clips_in(folder, places.pictures)
+                clips = _clips_in(folder, images)
                 if trial is not None and trial not in str(folder.relative_to(root)):
                     clips = {stem: path for stem, path in clips.items() if trial in str(path.relative_to(folder))}
                 if len(clips) >= 2:
@@ -279,14 +270,14 @@ def _one_set(root: Path, places: Places, trial: str | None) -> tuple[Path, Mappi
                 f"{root}: holds videos of several recordings, in {names}; choose one with --trial NAME"
                 + (f", {trial!r} is in the path of all of them" if trial else "")
             )
-        looked.append("the folder itself" if pattern == "." else pattern)
+        searched.append("the folder itself" if pattern == "." else pattern)
     others = sorted(path.name for path in _regular(root) if path.suffix.lower() in _OTHER_VIDEOS)
-    because = f" of the trial {trial!r}" if trial else ""
+    of_trial = f" of the trial {trial!r}" if trial else ""
     if others:
         raise VideoError(
             f"{root}: {_some(others)}: tk reads {', '.join(VIDEO_SUFFIXES)}; convert them, e.g. with ffmpeg"
         )
-    raise VideoError(f"{root}: holds no videos{because} of two cameras; looked in {', '.join(looked)}")
+    raise VideoError(f"{root}: holds no videos{of_trial} of two cameras; searched in {', '.join(searched)}")
 
 
 def _regular(folder: Path) -> list[Path]:

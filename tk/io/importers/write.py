@@ -1,4 +1,4 @@
-"""Write an imported project as a capture folder."""
+"""Write an imported project as a capture."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from tk.model.cameras.volume import Volume
 
 @dataclass(frozen=True)
 class Imported:
-    """What has been written.
+    """A capture that was written.
 
     Attributes:
-        path: the capture.
-        cameras: how many it has.
-        notes: what was inferred, changed or left out, a line each.
+        path: its folder.
+        cameras: number of cameras.
+        notes: lines for the user about what was inferred, changed or left out.
     """
 
     path: Path
@@ -43,10 +43,10 @@ class Imported:
 
 
 def write_capture(project: Project, output: Path) -> Imported:
-    """Write the capture: whole or not at all.
+    """Write the capture completely or not at all.
 
-    Videos and pictures become hard links to the originals, which take no room and stay when the original is deleted;
-    on another file system they are copied.
+    Videos and images become hard links, which take no space and stay when the originals are deleted; on another file
+    system they are copied.
 
     Raises:
         CaptureError: the output exists already or cannot be written, a video cannot be read or does not fit.
@@ -54,10 +54,10 @@ def write_capture(project: Project, output: Path) -> Imported:
     if len(project.rig) < 2:
         raise CaptureError(f"{project.source}: {len(project.rig)} camera with a video; a capture needs at least 2")
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise CaptureError(f"{output}: exists already; remove it, or give another name")
+        raise CaptureError(f"{output}: exists already; remove it, or choose another name")
     notes = list(project.notes)
     rig = _fitted(_renamed(project.rig, notes), project.clips, notes)
-    found = FoundUp(project.up, f"as always with {project.tool}") if project.up else infer_up(rig)
+    found = FoundUp(project.up, f"as {project.tool} defines it") if project.up else infer_up(rig)
     volume, where = find_volume(rig)
     notes.append(f"up = {_up_toml(found.up)}: {found.how}")
     if volume is None:
@@ -89,7 +89,7 @@ def write_capture(project: Project, output: Path) -> Imported:
         draft.rename(output)
     except OSError as reason:
         raise CaptureError(f"{output}: cannot be written ({reason.strerror or reason})") from None
-    except CaptureError as reason:  # of the draft, which nobody knows
+    except CaptureError as reason:  # name the output, not the draft
         raise type(reason)(str(reason).replace(str(draft), str(output))) from None
     finally:
         shutil.rmtree(draft, ignore_errors=True)
@@ -99,7 +99,7 @@ def write_capture(project: Project, output: Path) -> Imported:
 
 
 def calibration_toml(rig: Rig, project: Project) -> str:
-    """`calibration.toml` of the rig, metres."""
+    """Return the text of `calibration.toml`, metres."""
     document: dict[str, object] = {
         camera.name: {
             "name": camera.name,
@@ -117,7 +117,7 @@ def calibration_toml(rig: Rig, project: Project) -> str:
 
 
 def capture_toml(name: str, project: Project, up: FoundUp, volume: Volume | None, where: str) -> str:
-    """`capture.toml`: what was inferred, each with a comment that says how."""
+    """Return the text of `capture.toml`: each inferred value with a comment on how it was inferred."""
     lines = [
         f"# imported from {project.tool}, {project.source.name}",
         tomli_w.dumps({"name": name}).strip(),
@@ -130,7 +130,7 @@ def capture_toml(name: str, project: Project, up: FoundUp, volume: Volume | None
     else:
         lines += [
             f"# {where}; metres",
-            "# make it as small as the motion allows: voxels then are smaller",
+            "# make it as small as the motion allows: then the voxels are smaller",
             "[volume]",
             f"center = {list(volume.center)}",
             f"size = {list(volume.size)}",
@@ -141,20 +141,20 @@ def capture_toml(name: str, project: Project, up: FoundUp, volume: Volume | None
         "# height = 1.75    # metres, without shoes",
         "",
         "# [init]",
-        '# pose = "any"     # where nobody stands with arms and legs spread to begin with',
+        '# pose = "any"     # if the person does not start with arms and legs spread',
     ]
     return "\n".join(lines) + "\n"
 
 
 def _up_toml(up: str) -> str:
-    """An axis as a TOML string, a vector as an array of five decimals."""
+    """Return an axis as a TOML string, a vector as an array of five decimals."""
     if not up.startswith("["):
         return f'"{up}"'
     return json.dumps([round(value, 5) for value in json.loads(up_text(up))])
 
 
 def _renamed(rig: Rig, notes: list[str]) -> Rig:
-    """The cameras with names that files can have."""
+    """Return the cameras with names that are valid file names and distinct."""
     cameras: list[Camera] = []
     for camera in rig:
         name = re.sub(r"[^\w.+-]+", "_", camera.name).strip(".") or "camera"
@@ -178,11 +178,11 @@ def _fitted(rig: Rig, clips: Sequence[Path], notes: list[str]) -> Rig:
 
 
 def _place(clips: Sequence[Path], names: Sequence[str], draft: Path, folder: str) -> bool:
-    """Put the clips into a folder of the capture, named by their cameras; True when something had to be copied."""
-    pictures = folder == "videos" and any(clip.is_dir() for clip in clips)
+    """Link or copy the clips into a folder, named by their cameras; return whether one was copied."""
+    images = folder == "videos" and any(clip.is_dir() for clip in clips)
     copied = False
     for clip, name in zip(clips, names, strict=True):
-        target = draft / ("images" if pictures else folder)
+        target = draft / ("images" if images else folder)
         target.mkdir(exist_ok=True)
         if not clip.is_dir():
             copied |= _link(clip, target / f"{name}{clip.suffix.lower()}")
@@ -195,7 +195,7 @@ def _place(clips: Sequence[Path], names: Sequence[str], draft: Path, folder: str
 
 
 def _link(original: Path, target: Path) -> bool:
-    """A hard link where the file system allows it, else a copy and True."""
+    """Make a hard link, or a copy if the file system refuses; return whether it is a copy."""
     original = original.resolve()
     try:
         os.link(original, target)

@@ -1,4 +1,4 @@
-"""Attributes of XML elements as numbers, with errors that say where."""
+"""Attributes of XML elements as numbers; errors name the element."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from tk.errors import CalibrationError
 
 @dataclass(frozen=True)
 class Attributes:
-    """An element's attributes; ``where`` begins every complaint."""
+    """An element's attributes; ``where`` is the beginning of every error message."""
 
     element: Element
     where: str
 
     @staticmethod
     def child(parent: Element, path: str, where: str) -> Attributes:
-        """The first child at ``path``. Raises CalibrationError when there is none."""
+        """Return the first child at ``path``. Raises CalibrationError if there is none."""
         found = parent.find(path)
         if found is None:
             raise CalibrationError(f"{where}: has no <{path.rpartition('/')[2]}>")
         return Attributes(found, f"{where}: <{found.tag}>")
 
     def numbers(self, key: str, count: int, default: list[float] | None = None, skip: int = 0) -> list[float]:
-        """The finite numbers of an attribute after ``skip`` words, ``count`` or more; ``default`` where it is missing.
+        """Return the finite numbers of an attribute after ``skip`` words: ``count`` or more; ``default`` if missing.
 
         Raises:
-            CalibrationError: it is missing without a default, or holds something else.
+            CalibrationError: it is missing without a default, or does not hold such numbers.
         """
         text = self.element.get(key)
         if text is None:
@@ -45,5 +45,5 @@ class Attributes:
         return values
 
     def number(self, key: str, default: float | None = None) -> float:
-        """The one finite number of an attribute. Raises as :meth:`numbers` does."""
+        """Return the one finite number of an attribute. Raises as :meth:`numbers` does."""
         return self.numbers(key, 1, None if default is None else [default])[0]
