@@ -1,4 +1,4 @@
-"""Who is looked for without any hint, on silhouettes of the tracker's own body, drawn by ray casting."""
+"""Initialisation without a known pose, on silhouettes rendered from the tracker's own body."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tk.model.body.skeleton import JOINTS, shoulder_angles
 from tk.model.masks.silhouettes import draw_silhouettes
 from tk.optim.gauss_newton import Descent
 from tk.settings import SilhouetteSettings
-from tk.trackers.initialisation import Way, find_person, stature_of
+from tk.trackers.initialisation import TrajectoryHypothesis, find_person, stature_of
 from tk.trackers.protocol import Observation
 from tk.trackers.silhouette import SilhouetteTracker
 
@@ -51,7 +51,7 @@ def tracker_of(stature: float = STATURE) -> SilhouetteTracker:
 
 
 def found(poses: np.ndarray) -> np.ndarray:
-    """(F, 15, 3) joints that are found in silhouettes of poses (F, D)."""
+    """Return (F, 15, 3) joints of the person found in silhouettes of poses (F, D)."""
     tracker = tracker_of()
     frames = [Observation(i, np.zeros(0, np.uint8), m) for i, m in enumerate(draw_silhouettes(BODY, RIG, poses))]
     poses = find_person(tracker, frames, [tracker.pyramid(frame) for frame in frames])[0].poses
@@ -64,8 +64,8 @@ def error(joints: np.ndarray, poses: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("yaw", [0.3, 2.0, 4.4])
-def test_front_and_back_of_a_t_pose(yaw: float) -> None:
-    """Arms level and straight, legs straight, standing still: only the feet tell."""
+def test_heading_of_a_t_pose_is_found_from_the_feet(yaw: float) -> None:
+    """Arms level and straight, legs straight, standing still: only the feet differ."""
     t_pose = arms(standing_pose(SKELETON), (0, 1, 0), (0, 1, 0))
     poses = np.array([placed(t_pose, yaw)] * 2)
     joints = found(poses)
@@ -76,7 +76,7 @@ def test_front_and_back_of_a_t_pose(yaw: float) -> None:
 
 
 @pytest.mark.parametrize("name", ["arms at 45°", "crouching", "one arm up, one forwards"])
-def test_other_poses(name: str) -> None:
+def test_person_is_found_in_pose(name: str) -> None:
     standing = standing_pose(SKELETON)
     bent = {"hip_l_pitch": -85.0, "hip_r_pitch": -85.0, "knee_l_flexion": 110.0, "knee_r_flexion": 110.0}
     pose = {
@@ -88,7 +88,7 @@ def test_other_poses(name: str) -> None:
     assert error(found(poses), poses).max() < 0.04
 
 
-def test_a_first_frame_that_is_hard_is_reached_from_an_easy_one() -> None:
+def test_difficult_first_frame_is_reached_by_tracking_back_from_an_easy_one() -> None:
     """Bent over with an arm up and a leg lifted; then the person straightens up and walks."""
     lifted = {"torso_pitch": 50.0, "hip_l_pitch": -100.0, "knee_l_flexion": 70.0, "hip_r_pitch": -40.0}
     hard = placed(arms(standing_pose(SKELETON), (1, 0.4, 0.8), (-0.4, 0.6, 0.6)), 0.8, **lifted)
@@ -98,22 +98,24 @@ def test_a_first_frame_that_is_hard_is_reached_from_an_easy_one() -> None:
     assert errors[0] < 0.06 and errors[-1] < 0.04, errors
 
 
-def test_of_two_ways_to_explain_the_opening_the_one_whose_own_body_explains_it_better_is_believed(monkeypatch) -> None:
-    """The arms change places: the wrong way comes first, as if the average body told little."""
+def test_hypothesis_whose_fitted_body_has_the_lower_residual_is_chosen(monkeypatch) -> None:
+    """The arms change places; with the average body the wrong hypothesis comes first."""
     right = placed(arms(standing_pose(SKELETON), (1, 0.6, 0.3), (0.2, 1, -0.6)), 0.6)
     wrong = placed(arms(standing_pose(SKELETON), (0.2, 1, -0.6), (1, 0.6, 0.3)), 0.6)
     masks = draw_silhouettes(BODY, RIG, np.array([right] * 4))
     frames = [Observation(i, np.zeros(0, np.uint8), m) for i, m in enumerate(masks)]
-    ways = [Way(np.array([pose] * 4), error) for pose, error in ((wrong, 0.10), (right, 0.105))]
-    monkeypatch.setattr("tk.trackers.contour_tracker.find_person", lambda *_: ways)
     tracker = tracker_of()
-    ways = [way._replace(poses=tracker.world.poses_in(way.poses)) for way in ways]
+    hypotheses = [
+        TrajectoryHypothesis(tracker.world.poses_in(np.array([pose] * 4)), residual)
+        for pose, residual in ((wrong, 0.10), (right, 0.105))
+    ]
+    monkeypatch.setattr("tk.trackers.contour_tracker.find_person", lambda *_: hypotheses)
     pose = tracker.world.poses_out(tracker.find(frames, STATURE, None))
     assert error(SKELETON.joints(pose)[None], right[None])[0] < 0.02
 
 
-def test_poses_that_one_frame_cannot_tell_apart_are_all_followed(monkeypatch) -> None:
-    """The first frame says that the arms are elsewhere, and only nearly as well where they are."""
+def test_poses_with_similar_residuals_in_one_frame_all_become_hypotheses(monkeypatch) -> None:
+    """In the first frame the wrong pose has the lower residual, by little."""
     right = placed(arms(standing_pose(SKELETON), (1, 0.6, 0.3), (0.2, 1, -0.6)), 0.6)
     wrong = placed(arms(standing_pose(SKELETON), (0.2, 0.3, 1), (-0.3, 1, 0.6)), 0.6)
     masks = draw_silhouettes(BODY, RIG, np.array([right] * 4))
@@ -124,19 +126,19 @@ def test_poses_that_one_frame_cannot_tell_apart_are_all_followed(monkeypatch) ->
     )
     monkeypatch.setattr("tk.trackers.initialisation.gait.hypotheses", lambda *_: np.array([wrong, right]))
     monkeypatch.setattr("tk.trackers.initialisation._searched", lambda _, __, ___, pose: pose)
-    explained = {False: 0.21, True: 0.22}
+    residuals = {False: 0.21, True: 0.22}
     monkeypatch.setattr(
-        tracker, "mean_residual", lambda _, poses, __: np.array([explained[np.allclose(p, right)] for p in poses])
+        tracker, "mean_residual", lambda _, poses, __: np.array([residuals[np.allclose(p, right)] for p in poses])
     )
     monkeypatch.setattr(tracker, "improved", lambda _, __, pose: pose)
-    ways = find_person(tracker, frames, [tracker.pyramid(frame) for frame in frames])
-    assert [way.error for way in ways] == pytest.approx([0.21, 0.22])
-    assert ways[0].handicap == 1.0 < ways[1].handicap
-    assert error(SKELETON.joints(ways[1].poses[0])[None], right[None])[0] < 1e-6
+    hypotheses = find_person(tracker, frames, [tracker.pyramid(frame) for frame in frames])
+    assert [hypothesis.residual for hypothesis in hypotheses] == pytest.approx([0.21, 0.22])
+    assert hypotheses[0].handicap == 1.0 < hypotheses[1].handicap
+    assert error(SKELETON.joints(hypotheses[1].poses[0])[None], right[None])[0] < 1e-6
 
 
 @pytest.mark.parametrize("stature", [1.2, 1.6, 1.95])
-def test_the_stature_hardly_depends_on_the_pose(stature: float) -> None:
+def test_estimated_stature_hardly_depends_on_the_pose(stature: float) -> None:
     body = build_cone_body(BodyDimensions.from_stature(stature))
     standing = standing_pose(SKELETON)
     bowing = placed(standing, 1.0, hip_l_pitch=-45.0, hip_r_pitch=-45.0, torso_pitch=45.0)
@@ -150,7 +152,7 @@ def test_the_stature_hardly_depends_on_the_pose(stature: float) -> None:
     np.testing.assert_allclose(statures, stature, rtol=0.09)
 
 
-def test_nobody_in_the_first_frame_is_told() -> None:
+def test_empty_first_frame_is_refused() -> None:
     tracker = tracker_of()
     empty = Observation(7, np.zeros(0, np.uint8), np.zeros((3, 250, 200), np.uint8))
     with pytest.raises(CaptureError, match="0 of 3 masks of frame 7 show anybody, two are needed"):
@@ -158,7 +160,7 @@ def test_nobody_in_the_first_frame_is_told() -> None:
 
 
 @pytest.mark.parametrize("yaw", [0.4, 0.4 + np.pi])
-def test_who_is_found_again_faces_as_before_where_silhouettes_leave_that_open(monkeypatch, yaw):
+def test_recovered_person_keeps_the_heading_where_silhouettes_are_ambiguous(monkeypatch, yaw):
     tracker = tracker_of()
     before, there = (placed(standing_pose(SKELETON), yaw) for _ in range(2))
     before[0] += 1.0
@@ -168,12 +170,12 @@ def test_who_is_found_again_faces_as_before_where_silhouettes_leave_that_open(mo
         tracker, "settle", lambda _, starts, levels: Descent(starts, np.zeros(0), np.zeros(len(levels), np.int32))
     )
 
-    def explained(better_if_turned):
+    def residual_function(better_if_turned):
         return lambda _, poses: 0.2 - better_if_turned * (np.cos(poses[:, facing] - yaw) < -0.9)
 
     for gain, turned in ((0.0, False), (0.03, False), (0.1, True)):
-        monkeypatch.setattr(tracker, "mean_residual", explained(gain))
-        pose, error = tracker.relocate(pyramid, before, 1.0)
+        monkeypatch.setattr(tracker, "mean_residual", residual_function(gain))
+        pose, error = tracker.recover(pyramid, before, 1.0)
         assert (np.cos(pose[facing] - yaw) < 0) == turned
         assert error == pytest.approx(0.2 - gain * turned)
-    np.testing.assert_array_equal(tracker.relocate(pyramid, before, 0.05)[0], before)
+    np.testing.assert_array_equal(tracker.recover(pyramid, before, 0.05)[0], before)

@@ -1,4 +1,4 @@
-"""What the trackers that follow contours share: finding the person, fitting the body, and a search for lost limbs.
+"""What the trackers that follow contours share: initialisation, body fit, limb search and recovery.
 
 masks → cleaned, scales → {contours → edgels along their normals → normal equations → step} × iterations × scales
 """
@@ -32,54 +32,57 @@ from tk.model.masks.silhouettes import Pyramid, Views
 from tk.optim import gauss_newton
 from tk.optim.gauss_newton import Descent, GaussNewtonSettings, Prior
 from tk.settings import BodyFitSettings, SilhouetteSettings
-from tk.trackers.initialisation import HEADINGS, PHASES, Way, centroid, find_person, stature_of
+from tk.trackers.initialisation import HEADINGS, PHASES, TrajectoryHypothesis, centroid, find_person, stature_of
 from tk.trackers.protocol import Observation
 
 Float = NDArray[np.float64]
 
-# Standard deviation of the logarithm of a stature that was measured in the pictures and not given.
-MEASURED = 0.05
-# A lost frame is searched for the person from the silhouettes' centroid; of several lost ones every so many.
-RELOCATE_EVERY = 3
-# One in so many places of a lost person goes on to the finer scales.
-RELOCATED = 4
-# No finer scale halves what a place leaves unexplained.
-HALVED = 2.0
-# The fall of the cost, as a share of the person's pixels, that makes another place of a limb the pose.
+# Standard deviation of the logarithm of a stature that was estimated from the silhouettes: their areas err by 6 %.
+ESTIMATED_STATURE_DEVIATION = 0.05
+# A person who is lost in consecutive frames is searched for, from the centroid of the silhouettes, in every so many.
+RECOVER_EVERY = 3
+# Of the poses from which a lost person is searched for at the coarsest scale, one in RECOVERY_KEPT goes on to the finer
+# ones, if its residual is below HALVED times the current one: no finer scale halves a residual.
+RECOVERY_KEPT, HALVED = 4, 2.0
+# Decrease of the cost, as a share of the person's pixels, at which another pose of a limb replaces the current one.
+# Chosen on the development captures; sensitivity not measured.
 GAIN = 0.004
-# Places of a limb that are descended from, more of one that is known to be misplaced, and random ones about its own
-# place that are looked at beside the grid. With 3 and 8, half as many again of the limbs that are elsewhere stay there
+# Candidates of a limb that are refined; of a limb that is known to be misplaced; random candidates near its pose that
+# are screened beside the grid. With 3 and 8 refined candidates half as many more of the misplaced limbs stay misplaced
 # (scripts/search_recall.py).
-PLACES, MORE_PLACES, NEARBY = 8, 16, 80
-# Places of a limb are not looked at where that much of it is outside the silhouettes.
+CANDIDATES, MORE_CANDIDATES, NEARBY = 8, 16, 80
+# Screening stops at a candidate of which this share lies outside the silhouettes. Chosen on the development captures;
+# sensitivity not measured.
 OUTSIDE = 0.4
-# A limb's place is not descended from where the body costs more than now by this factor; and is given up if, once the
-# limb alone has settled there, it costs more by this share of the person's pixels.
+# A candidate is not refined if the whole body's cost exceeds the current one by this factor; after the limb alone has
+# converged, it is dropped if it costs this share of the person's pixels more. Chosen on the development captures;
+# sensitivity not measured.
 PROPOSED, PROMISING = 1.5, 0.01
-# Poses that a search descends from with all limbs, beside the present one; and for each pair of limbs.
+# Poses that a search refines with all limbs, beside the current one; and for each pair of limbs.
 FINISHED, FINISHED_PAIRS = 2, 4
-# Poses whose joints lie farther apart than this are different ones, metres.
-APART_M = 0.05
-# What a person who is found again may explain worse, as E_S, for facing as before and not the other way.
+# Poses that differ by more than this, mean over the joints, metres, are different.
+SAME_POSE_M = 0.05
+# A recovered person who faces the other way than before must have a residual (E_S) lower by this at a half turn.
+# Chosen on the development captures; sensitivity not measured.
 FACING = 0.04
-# Rays a picture's height: to screen many places of a limb, and to choose among few poses.
+# Rows of the grid of rays: to screen many candidates of a limb, and to choose among few poses.
 SCREEN_ROWS, CHOICE_ROWS = 54, 96
 
 LINE_SEARCH = SearchSettings()
-# A tolerance of half as much, or of none, leaves the mean of the joints' errors as it is on eight captures, to 0.02 cm;
-# twice as much makes fast arms worse by 0.1.
+# Half this tolerance, or none, leaves the mean joint error on eight captures unchanged to 0.02 cm; twice as much makes
+# fast arms worse by 0.1 cm.
 SOLVER = GaussNewtonSettings(scales=3, relaxation=1.6, tolerance=0.012)
 
 
 class ContourTracker:
-    """The person, the body and the descent; what a frame's way is, a subclass says.
+    """Base class of the region and the silhouette tracker: initialisation, body fit, limb search, recovery.
 
-    It counts in a world of its own: there stands :attr:`body`, and there are all poses but those that the protocol of
-    :class:`~tk.trackers.protocol.Tracker` hands in and out, which are the capture's.
+    The tracker has its own world frame, derived from the cameras. :attr:`body` and all poses are in it, except those
+    that go in or out by the protocol (:class:`~tk.trackers.protocol.Tracker`), which are in the capture's world.
 
     Args:
         rig: the cameras.
-        up: what points up in their world, see :func:`tk.model.cameras.up.up_vector`.
+        up: the upward direction of their world, see :func:`tk.model.cameras.up.up_vector`.
         config: see :class:`~tk.settings.SilhouetteSettings`.
         line_search: how edges are searched along the contours' normals.
         solver: scales and iterations of Gauss-Newton.
@@ -112,19 +115,18 @@ class ContourTracker:
 
     @property
     def opening_frames(self) -> int:
-        """Frames that the person is found in."""
+        """Number of frames used by the initialisation."""
         return self.contours.init_frames
 
     @property
     def body(self) -> ConeBody:
-        """The body, as it stands in the tracker's own world; only after :meth:`start` or :meth:`restore`."""
+        """The body, in the tracker's own world; known after :meth:`start` or :meth:`restore`."""
         if self._body is None:
             raise RuntimeError("the tracker has no body yet: call start() or restore() first")
         return self._body
 
     def take_body(self, body: ConeBody) -> None:
-        """Track this body from now on, whichever world it stands in; the colours of its parts are kept where there are
-        any."""
+        """Track this body from now on; the learned colours are kept."""
         known = self.colors.state() if self._body is not None else {}
         self._body = body = body.standing("z")
         self.colors = PartColors(body)
@@ -132,7 +134,7 @@ class ContourTracker:
         self.limbs = limbs_of(body)
 
     def prepare(self) -> None:
-        """Have the kernels compiled while there is nothing else to do. Without it that is done where one is needed."""
+        """Compile the kernels; otherwise each is compiled when it is first called."""
         body = build_cone_body(BodyDimensions.from_stature(1.7), preset=self.contours.body)
         empty = np.zeros((len(self.views.rig), *self.views.rig.frame_shape), np.uint8)
         seen = self.views.pyramid(empty, 1, False)
@@ -146,12 +148,12 @@ class ContourTracker:
     def find(
         self, frames: Sequence[Observation], height_m: float | None, init: InitPose | None, body: ConeBody | None = None
     ) -> Float:
-        """(D,) the pose in the first of the frames; the body is fitted to all of them.
+        """Return the pose (D,) in the first of the frames; the body is fitted to all of them.
 
         Args:
-            frames: consecutive observations from the initial one on, at least one; better a whole stride.
+            frames: consecutive observations, at least one; a whole stride is better.
             height_m: the subject's height, if known.
-            init: a rough pose given by a person, in the capture's world; None tries walking phases, standing and the Da
+            init: a rough pose given by the user, in the capture's world; None tries walking phases, standing and the Da
                 Vinci pose.
             body: the body, if known; it is not fitted then.
 
@@ -163,7 +165,7 @@ class ContourTracker:
         rough: Float | None = None
         stature = (init and init.height_m) or height_m
         if init is None:
-            centroid(self.views.rig, pyramids[0], frames[0].index)  # or nobody is there, and no body is taken
+            centroid(self.views.rig, pyramids[0], frames[0].index)  # raises if nobody is there, before a body is taken
             average = BodyDimensions.from_stature(stature or stature_of(self, pyramids))
         else:
             average, angles = rough_pose(init.joints, init.angles, stature, self.world)
@@ -171,42 +173,47 @@ class ContourTracker:
         if init is not None:
             unknown = np.zeros(len(self.waist_names)), np.zeros(len(self.ankle_names))
             rough = self.settle(pyramids[0], join_pose(self.body.skeleton, angles, *unknown)[None]).states[0]
-        ways = find_person(self, frames, pyramids, rough)
+        hypotheses = find_person(self, frames, pyramids, rough)
         if not self.contours.adapt or body is not None:
-            return np.asarray(ways[0].poses[0])
-        return self._adapt(frames, pyramids, ways, average.stature, stature is not None)
+            return np.asarray(hypotheses[0].poses[0])
+        return self._adapt(frames, pyramids, hypotheses, average.stature, stature is not None)
 
     def _adapt(
         self,
         frames: Sequence[Observation],
         pyramids: Sequence[Pyramid],
-        ways: Sequence[Way],
+        hypotheses: Sequence[TrajectoryHypothesis],
         stature: float,
         known: bool,
     ) -> Float:
-        """Fit the body to the opening, and (D,) the pose in its first frame; whether the stature is ``known``.
+        """Fit the body to the opening and return the pose (D,) in its first frame.
 
-        Of several ways to explain the opening that is believed which both the average body, as its mean E_S
-        tells, and its own explain best: a body that is fitted to a wrong way makes up for some of it.
+        Of several hypotheses the one is chosen that has the lowest product of two residuals: that of the average body
+        and that of the body fitted to it, because a fitted body compensates a part of a wrong trajectory.
+
+        Args:
+            frames, pyramids: the F frames of the opening, and their silhouettes.
+            hypotheses: trajectories over these frames.
+            stature, known: stature, metres, and whether it was given rather than estimated.
         """
         count = min(self.contours.fit.frames, len(pyramids))
         chosen = np.unique(np.linspace(0, len(pyramids) - 1, count).round().astype(int))
-        deviation = STATURE_DEVIATION if known else MEASURED
+        deviation = STATURE_DEVIATION if known else ESTIMATED_STATURE_DEVIATION
         found: list[tuple[float, ConeBody, Float]] = []
-        for way in ways:
-            body, fitted = self.fit(pyramids, way.poses, chosen, stature, self.contours.fit, deviation)
-            error = way.error * way.handicap
-            if len(ways) > 1:
+        for hypothesis in hypotheses:
+            body, fitted = self.fit(pyramids, hypothesis.poses, chosen, stature, self.contours.fit, deviation)
+            cost = hypothesis.cost
+            if len(hypotheses) > 1:
                 self.take_body(body)
-                told = np.array(list(map(self._misfit, frames, pyramids, way.poses)))
-                error *= float(told[np.isfinite(told)].mean())  # in the others nobody is in sight
-            found.append((error, body, fitted[0]))
+                residuals = np.array(list(map(self._converged_residual, frames, pyramids, hypothesis.poses)))
+                cost *= float(residuals[np.isfinite(residuals)].mean())  # infinite in frames without a person
+            found.append((cost, body, fitted[0]))
         _, body, pose = min(found, key=lambda one: one[0])
         self.take_body(body)
         return np.asarray(pose)
 
-    def _misfit(self, frame: Observation, pyramid: Pyramid, pose: Float) -> float:
-        """E_S where a pose (D,) settles, masks in doubt counted half."""
+    def _converged_residual(self, frame: Observation, pyramid: Pyramid, pose: Float) -> float:
+        """Return E_S of the pose that a pose (D,) converges to; uncertain pixels count half."""
         return float(self.mean_residual(pyramid, self.settle(pyramid, pose[None]).states, frame.uncertain)[0])
 
     def fit(
@@ -218,7 +225,7 @@ class ContourTracker:
         config: BodyFitSettings,
         stature_deviation: float = STATURE_DEVIATION,
     ) -> tuple[ConeBody, Float]:
-        """The body that suits the chosen ones of several frames, and their poses."""
+        """Fit the body to the chosen ones of several frames; return it, and its poses in them."""
         seen = [pyramids[i] for i in chosen]
         return fit_body(
             self.contours.body, self.views, seen, poses[chosen], self.line_search, stature, config, stature_deviation
@@ -231,42 +238,37 @@ class ContourTracker:
         init: InitPose | None,
         body: ConeBody | None = None,
     ) -> None:
-        """Find the subject in the first frame; what is kept of it, a subclass says."""
+        """Find the subject in the first frame, see :meth:`find`."""
         self.find(frames, height_m, init, body)
 
     def state(self) -> Mapping[str, Any]:
-        """What :meth:`restore` needs beside the model to go on from the last frame.
+        """Return what :meth:`restore` needs, beside the model, to continue after the last frame.
 
-        Its poses are those of the tracker's own world, for turned out and in again they would not be the same bit for
-        bit; ``world`` (3, 4) is the way from there to the capture's.
+        Poses are stored in tracker coordinates, so that a resumed run has the same bits; ``world`` (3, 4) transforms
+        them to the capture's world.
         """
         return {"world": np.column_stack([self.world.rotation, self.world.origin])}
 
     def rewind(self, state: Mapping[str, Any]) -> None:
-        """Go back to a state; what of it there is, a subclass says."""
+        """Go back to a state."""
 
     def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
-        """Take up where a run with this model and state stopped."""
+        """Continue a run from its model and state."""
         self.take_body(restore_body(model))
         self.rewind(state)
 
-    def poses_of(self, state: Mapping[str, Any], name: str) -> Float:
-        """Poses that a state tells; results of before told those of the capture's world."""
-        poses = np.asarray(state[name])
-        return poses if "world" in state else self.world.poses_in(poses)
-
     def lose(self) -> None:
-        """The last frame's pose is not believed: the person is looked for in the next one."""
+        """Take the last frame for lost: the person is searched for in the next one."""
         self._lost_for = max(self._lost_for, 1)
 
     # --- one frame ----------------------------------------------------------------------------------------------
 
     def pyramid(self, frame: Observation) -> Pyramid:
-        """The frame's silhouettes, cleaned, at all scales."""
+        """Return the frame's silhouettes, cleaned, at all scales."""
         return self.views.pyramid(frame.masks, self.solver.scales, True)
 
     def cleaned(self, masks: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Masks (V, H, W) as contours are looked for in them."""
+        """Return masks (V, H, W) after cleaning."""
         return self.views.pyramid(masks, 1, True).masks[0]
 
     def settle(
@@ -278,10 +280,15 @@ class ContourTracker:
         prior: Prior | None = None,
         limb: Limb | None = None,
     ) -> Descent:
-        """Gauss-Newton from poses (B, D), through all scales or those of ``levels``, 0 the finest; all in one frame, or
-        each in its own of B.
+        """Minimise by Gauss-Newton from poses (B, D), all in one frame or each in its own.
 
-        With ``images``, colours pull at contours inside the silhouette, too. With ``limb`` all else stays where it is.
+        Args:
+            pyramid: silhouettes of one frame, or of B.
+            poses: (B, D).
+            levels: scales, 0 the finest; None: all.
+            images: with images, colour differences attract contours inside the silhouette, too.
+            prior: see :class:`~tk.optim.gauss_newton.Prior`.
+            limb: only this limb moves.
         """
         body = self.body
         arrays, free = (limb.arrays, limb.free) if limb else (body.arrays, body.free)
@@ -298,12 +305,12 @@ class ContourTracker:
         )
 
     def evidence(self, grid: RayGrid, frame: Observation, pyramid: Pyramid) -> Evidence:
-        """What the frame shows on a grid."""
+        """Return the costs of a frame on a grid of rays."""
         return Evidence.of(grid, pyramid.masks[0], frame.uncertain, frame.images, self.colors)
 
     def mean_residual(self, pyramid: Pyramid, poses: Float, uncertain: NDArray[np.bool_] | None = None) -> Float:
-        """(B,) E_S averaged over the views that see anybody, inf where none does; what is met where the masks are
-        ``uncertain`` counts half."""
+        """Return (B,) E_S, mean over the views that see anybody, inf if none does. A body on ``uncertain`` pixels
+        counts half."""
         evidence = Evidence.of(self.screen, pyramid.masks[0], uncertain)
         return mean_of_views(evidence.cast(self.body, self.colors.group, poses)[0])
 
@@ -317,63 +324,67 @@ class ContourTracker:
         misplaced: Sequence[Limb] = (),
         in_pairs: bool = False,
     ) -> tuple[Float, Float]:
-        """Other places of the limbs: all of a limb's are screened in one launch, the best ones descended from, first by
-        the limb alone, then, where that promises something, by the whole body.
+        """Search for better poses of the limbs: screen all candidates of a limb in one launch, refine the best ones by
+        the limb alone, then the most promising by the whole body.
 
-        With ``in_pairs`` both arms, and both legs, are taken away at once: where one of them is in the other's place,
-        neither finds its own while the other stays. ``evidence`` is the frame's on the screen's grid.
+        Args:
+            frame, pyramid, evidence: the frame, its silhouettes, its costs on the grid :attr:`screen`.
+            pose: (D,) current pose.
+            images: as in :meth:`settle`.
+            misplaced: limbs that are known to be misplaced.
+            in_pairs: move both arms, or both legs, at once. Where one of a pair has taken the other's place, neither is
+                found as long as the other stays.
 
         Returns:
-            Poses (B, D), that which was given first, and their costs (B,).
+            Poses (B, D), the current one first, and their costs (B,).
         """
         skeleton, group = self.body.skeleton, self.colors.group
         rng = np.random.default_rng([7, frame.index])
         by_view, met = evidence.cast(self.body, group, pose[None], export=True)
         assert met is not None
-        own, unmet = mean_of_views(by_view)[0], evidence.unmet(met.label[0])
+        own, surplus = mean_of_views(by_view)[0], evidence.surplus(met.label[0])
         joints = skeleton.joints(pose)
         level = (min(1, self.solver.scales - 1),)
         found: list[tuple[NDArray[np.int64], Float]] = []
-        told_by, rays = evidence.cost_of_parts(group, met.label[0])
+        part_cost, rays = evidence.cost_of_parts(group, met.label[0])
         for limbs in pairs(self.limbs) if in_pairs else [(limb,) for limb in self.limbs]:
             moved = np.concatenate([limb.parts for limb in limbs])
-            if in_pairs and told_by[moved].sum() * rays.sum() <= told_by.sum() * rays[moved].sum():
-                continue  # where they are they explain more than the rest of the body does
+            if in_pairs and part_cost[moved].sum() * rays.sum() <= part_cost.sum() * rays[moved].sum():
+                continue  # their rays cost less than those of the rest of the body
             others = np.setdiff1d(np.arange(len(group), dtype=np.int32), moved)
             without, rest = evidence.cast(self.body, group, pose[None], others, export=True)
             assert rest is not None
-            if not in_pairs and limbs[0] not in misplaced and mean_of_views(without)[0] - own > unmet:
-                continue  # it explains more where it is than there is to explain elsewhere
+            if not in_pairs and limbs[0] not in misplaced and mean_of_views(without)[0] - own > surplus:
+                continue  # the limb covers more than the surplus area that it could cover elsewhere
             before = Cast(rest.label[0].copy(), rest.depth[0].copy())
             settled = pose[None]
             for limb in limbs:
                 tried = limb.candidates(pose, NEARBY, rng)
-                cost, _ = evidence.cast(self.body, group, tried, limb.parts, before, most_outside=OUTSIDE)
-                told = mean_of_views(cost)
+                by_view, _ = evidence.cast(self.body, group, tried, limb.parts, before, most_outside=OUTSIDE)
+                cost = mean_of_views(by_view)
                 if not in_pairs:
-                    told[told > PROPOSED * own] = np.inf
-                count = MORE_PLACES if in_pairs or limb in misplaced else PLACES
-                places = limb.distinct(skeleton, tried, told, count)
-                if len(places):
-                    places = self.settle(pyramid, places, level, images, limb=limb).states
-                settled = limb.combined(settled, np.concatenate([pose[None], places]))
-            cost, _ = evidence.cast(self.body, group, settled, moved, before)
-            told = mean_of_views(cost)
-            order = np.argsort(told, kind="stable")
-            settled, told = settled[order], told[order]
-            if in_pairs:  # the trunk has gone with the limbs as they are: only the whole body tells what a pair costs
+                    cost[cost > PROPOSED * own] = np.inf
+                count = MORE_CANDIDATES if in_pairs or limb in misplaced else CANDIDATES
+                chosen = limb.distinct(skeleton, tried, cost, count)
+                if len(chosen):
+                    chosen = self.settle(pyramid, chosen, level, images, limb=limb).states
+                settled = limb.combined(settled, np.concatenate([pose[None], chosen]))
+            cost = mean_of_views(evidence.cast(self.body, group, settled, moved, before)[0])
+            order = np.argsort(cost, kind="stable")
+            settled, cost = settled[order], cost[order]
+            if in_pairs:  # the trunk has followed the limbs as they are: only the whole body's cost can rank a pair
                 better = settled[distinct(skeleton.joints(settled), FINISHED_PAIRS, joints)]
             else:
-                better = settled[(told < own + PROMISING) & (skeleton.apart(settled, joints) > APART_M)][:2]
+                better = settled[(cost < own + PROMISING) & (skeleton.apart(settled, joints) > SAME_POSE_M)][:2]
             if len(better):
                 found.append((np.concatenate([limb.dofs for limb in limbs]), better))
         if not found:
             return pose[None], np.array([own])
-        # limbs elsewhere, and those of two groups
-        poses = [place for _, places in found for place in places]
-        for i, (_, places) in enumerate(found):
+        # the best poses of each group, and combinations of two groups
+        poses = [one for _, better in found for one in better]
+        for i, (_, better) in enumerate(found):
             for dofs, others in found[i + 1 :]:
-                both = places[0].copy()
+                both = better[0].copy()
                 both[dofs] = others[0][dofs]
                 poses.append(both)
         cost = mean_of_views(evidence.cast(self.body, group, np.array(poses))[0])
@@ -384,21 +395,21 @@ class ContourTracker:
         return settled, mean_of_views(fine.cast(self.body, group, settled)[0])
 
     def improved(self, frame: Observation, pyramid: Pyramid, pose: Float) -> Float:
-        """(D,) the pose, or what a search finds that costs :data:`GAIN` less."""
+        """Return the pose (D,), or the best one of a limb search if that costs :data:`GAIN` less."""
         poses, cost = self.search(frame, pyramid, self.evidence(self.screen, frame, pyramid), pose)
         best = int(np.argmin(cost))
         return np.asarray(poses[best if cost[best] < cost[0] - GAIN else 0])
 
-    def relocate(self, pyramid: Pyramid, pose: Float, error: float) -> tuple[Float, float]:
-        """The pose or, if that explains the silhouettes better, one found as at the start; and its E_S.
+    def recover(self, pyramid: Pyramid, pose: Float, residual: float) -> tuple[Float, float]:
+        """Search for a lost person as at the start; return the pose with the lowest residual (E_S), and that residual.
 
-        The pose as it was, moved to where the person is now, is tried, too. Seen from one instant a person may face
-        either way: who faces as before is preferred by :data:`FACING`.
+        The given pose, moved to the silhouettes' centroid, is a candidate, too. In one frame a person may face either
+        way: the heading as before is preferred, see :data:`FACING`.
         """
         try:
             p_centroid = centroid(self.views.rig, pyramid, 0)
         except CaptureError:
-            return pose, error
+            return pose, residual
         skeleton = self.body.skeleton
         moved, yaw = pose.copy(), skeleton.index("torso_yaw")
         moved[skeleton.prismatic] = p_centroid
@@ -410,17 +421,17 @@ class ContourTracker:
 
         coarse = self.settle(pyramid, starts, levels[:1]).states
         rough = self.mean_residual(pyramid, coarse)
-        order = np.argsort(rough + turned(coarse), kind="stable")[: len(starts) // RELOCATED]
-        order = order[rough[order] < HALVED * error]
+        order = np.argsort(rough + turned(coarse), kind="stable")[: len(starts) // RECOVERY_KEPT]
+        order = order[rough[order] < HALVED * residual]
         if not len(order):
-            return pose, error
+            return pose, residual
         settled = self.settle(pyramid, coarse[order], levels[1:]).states
-        errors = self.mean_residual(pyramid, settled)
-        i = int(np.argmin(errors + turned(settled)))
-        return (settled[i], float(errors[i])) if errors[i] < error else (pose, error)
+        found = self.mean_residual(pyramid, settled)
+        i = int(np.argmin(found + turned(settled)))
+        return (settled[i], float(found[i])) if found[i] < residual else (pose, residual)
 
-    def told(self, pose: Float) -> dict[str, Any]:
-        """A pose (D,) as an :class:`~tk.trackers.protocol.Estimate` tells it, in the capture's world."""
+    def pose_fields(self, pose: Float) -> dict[str, Any]:
+        """Return the fields of an :class:`~tk.trackers.protocol.Estimate` that follow from a pose (D,)."""
         skeleton, world = self.body.skeleton, self.world
         paper, waist, ankles = split_pose(skeleton, world.poses_out(pose))
         return {"pose": paper, "waist": waist, "ankles": ankles, "joints": world.points_out(skeleton.joints(pose))}
@@ -428,7 +439,7 @@ class ContourTracker:
     # --- what a result file keeps -------------------------------------------------------------------------------
 
     def model(self) -> Mapping[str, Any]:
-        """The body for `/model`."""
+        """Return the body as stored in `/model`."""
         body = self.body
         return {
             **{f"dimensions/{name}": value for name, value in asdict(body.dimensions).items()},
@@ -442,15 +453,15 @@ class ContourTracker:
 
 
 def restore_dimensions(model: Mapping[str, Any]) -> BodyDimensions:
-    """The dimensions that :meth:`ContourTracker.model` wrote down."""
+    """Return the dimensions that :meth:`ContourTracker.model` stored."""
     prefix = "dimensions/"
     return BodyDimensions(**{k[len(prefix) :]: float(v) for k, v in model.items() if k.startswith(prefix)})
 
 
 def restore_body(model: Mapping[str, Any], up: str = "z") -> ConeBody:
-    """The body that :meth:`ContourTracker.model` wrote down."""
+    """Return the body that :meth:`ContourTracker.model` stored."""
     body = build_cone_body(restore_dimensions(model), up, str(model["body"]))
-    # parts as they were written down: other versions of this program may lay the body out in other ones
+    # the stored parts, because another version of the program may divide the body differently
     ends = {part.name: part.ends for part in body.parts}
     parts = []
     for name, segment, kind, shape, T in zip(

@@ -1,9 +1,9 @@
-"""Finds a person of whom nothing is known but silhouettes: any pose, any heading, any stature (silhouette paper,
-section 4.6: "multiple different poses can be hypothesized and tested").
+"""Find a person in the opening frames from silhouettes alone: any pose, heading and stature (silhouette paper, section
+4.6: "multiple different poses can be hypothesized and tested").
 
-No frame of the opening is better than another, so the person is looked for in some of them, and followed from each to
-both ends, until one is explained well or two tell the same. Whether he or she faces this way or the opposite one, all
-of the opening decides: feet, knees and elbows bend one way, and people walk forwards.
+The person is searched for in several frames of the opening, and each pose found is tracked to both ends of the opening,
+until one trajectory has a low residual or two frames give the same trajectory. The whole opening decides which way the
+person faces: feet, knees and elbows bend one way, and people walk forwards.
 """
 
 from __future__ import annotations
@@ -29,102 +29,106 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-# Headings and walking phases that are tried.
+# Headings, and walking phases of each, from which the person is searched for.
 HEADINGS, PHASES = 8, 8
-# Of what they settle to, so many different poses are finished by a search for the limbs: of the best heading, and of
-# those that face the other way; with joints that far apart on an average, metres.
-FINALISTS, OPPOSITE, APART_M = 4, 2, 0.15
-# Frames of the opening in which the person is looked for, one after the other. A pose is believed at once that leaves
-# no more than this unexplained (E_S): in the development captures an average body of the right stature leaves 0.15 to
-# 0.31 in the right pose, and in a wrong one never less than 0.25.
+# Poses that differ by more than this, mean over the joints, metres, are different hypotheses. Coarser than the
+# tracker's own SAME_POSE_M: an average body that is not fitted yet reaches the same pose only to about 10 cm.
+SAME_START_M = 0.15
+# Poses of the best heading, and of those that face the other way, that are refined by a limb search.
+FINALISTS, OPPOSITE = 4, 2
+# Frames of the opening in which the person is searched for, in turn. The search ends at a residual (E_S) of CLEAR: on
+# the development captures an average body of the right stature has 0.15 to 0.31 in the right pose and never less than
+# 0.25 in a wrong one.
 ANCHORS, CLEAR = 4, 0.2
-# Over the opening, what is explained worse than the best by more than this factor is wrong.
-AMBIGUOUS = 1.1
-# Of those that face alike the best in its frame is believed unless another way is better by this factor: legs that
-# change places explain a walk as well, but for noise.
-HANDICAP = 1.1
-# Whoever faces the other way is followed, too, where that explains the frame nearly as well, by this factor.
-NEARLY = 1.4
-# A frame explained worse than the anchor by this factor is searched for lost limbs.
-WORSE = 1.2
-# The stature that the first guess renders.
+# How far a residual must exceed another one, as a factor, to be certainly worse. Over the whole opening: hypotheses
+# within AMBIGUOUS are all kept. A hypothesis that faces the same way as the best one in its frame must be better by
+# HANDICAP, because legs that change places explain a walk equally well but for noise. In a single frame the opposite
+# heading is kept within NEARLY, and a frame above WORSE times the anchor's residual triggers a limb search. Chosen on
+# the development captures; sensitivity not measured.
+AMBIGUOUS, HANDICAP, NEARLY, WORSE = 1.1, 1.1, 1.4, 1.2
+# Stature of the body that the first estimate of the stature renders, metres.
 _AVERAGE_M = 1.7
-# A search that finds a better pose is repeated, at most so often.
+# A search that finds a better pose is repeated, at most this often.
 _SEARCHES = 2
 
 
-class Way(NamedTuple):
-    """How the opening can be explained.
+class TrajectoryHypothesis(NamedTuple):
+    """Poses that may explain the opening.
 
     Attributes:
         poses: (F, D).
-        error: their mean E_S.
-        handicap: by which that counts more.
+        residual: their mean E_S.
+        handicap: factor on the residual when hypotheses are compared.
     """
 
     poses: Float
-    error: float
+    residual: float
     handicap: float = 1.0
+
+    @property
+    def cost(self) -> float:
+        """The residual times the handicap."""
+        return self.residual * self.handicap
 
 
 def find_person(
     tracker: ContourTracker, frames: Sequence[Observation], pyramids: Sequence[Pyramid], pose: Float | None = None
-) -> list[Way]:
-    """Poses in F consecutive frames, the best explained ones first, and others that are explained nearly as well: only
-    a body fitted to each tells then. The tracker has an average body already.
+) -> list[TrajectoryHypothesis]:
+    """Return trajectory hypotheses over F consecutive frames, best first. Those after the first are within AMBIGUOUS of
+    it; the caller fits a body to each of them to decide. The tracker already has an average body.
 
     Args:
         tracker: see :class:`ContourTracker`.
         frames: F observations, at least one.
         pyramids: their silhouettes.
-        pose: (D,) that in the first frame, where it is known; it is followed then.
+        pose: (D,) pose in the first frame, if known; there is one hypothesis then.
 
     Raises:
-        CaptureError: nobody is seen in the first frame by two cameras.
+        CaptureError: fewer than two cameras see anybody in the first frame.
     """
     if pose is not None:
         return [_follow(tracker, frames, pyramids, _searched(tracker, frames[0], pyramids[0], pose), 0)]
     skeleton = tracker.body.skeleton
-    ways: list[Way] = []
-    others: list[tuple[int, Float, float]] = []
+    hypotheses: list[TrajectoryHypothesis] = []
+    alternatives: list[tuple[int, Float, float]] = []
     for anchor in np.unique(np.linspace(0, len(frames) - 1, ANCHORS).astype(int)):
         try:
-            error, poses = _find(tracker, frames[anchor], pyramids[anchor])
+            residual, poses = _find(tracker, frames[anchor], pyramids[anchor])
         except CaptureError:
             if anchor == 0:
                 raise
             continue
         for pose in poses[1:]:
             turned = _turned(skeleton, pose[None], poses[0])[0]
-            others.append((int(anchor), pose, 1.0 if turned else HANDICAP))
-        if _is_on(skeleton, ways, anchor, poses[0]):
-            break  # found twice
-        ways.append(_follow(tracker, frames, pyramids, poses[0], anchor))
-        if error < CLEAR:
+            alternatives.append((int(anchor), pose, 1.0 if turned else HANDICAP))
+        if _contains(skeleton, hypotheses, anchor, poses[0]):
+            break  # found from two frames
+        hypotheses.append(_follow(tracker, frames, pyramids, poses[0], anchor))
+        if residual < CLEAR:
             break
-    for anchor, pose, handicap in others:
-        if not _is_on(skeleton, ways, anchor, pose):
-            ways.append(_follow(tracker, frames, pyramids, pose, anchor)._replace(handicap=handicap))
-    ways.sort(key=lambda way: way.error * way.handicap)
-    least = min(way.error for way in ways)
-    kept: list[Way] = []
-    for way in ways:
-        joints = skeleton.joints(way.poses)
+    for anchor, pose, handicap in alternatives:
+        if not _contains(skeleton, hypotheses, anchor, pose):
+            hypotheses.append(_follow(tracker, frames, pyramids, pose, anchor)._replace(handicap=handicap))
+    hypotheses.sort(key=lambda hypothesis: hypothesis.cost)
+    least = min(hypothesis.residual for hypothesis in hypotheses)
+    kept: list[TrajectoryHypothesis] = []
+    for hypothesis in hypotheses:
+        joints = skeleton.joints(hypothesis.poses)
         apart = [np.max(skeleton.apart(other.poses, joints)) for other in kept]
-        if way.error <= AMBIGUOUS * least and all(distance > APART_M for distance in apart):
-            kept.append(way)
+        if hypothesis.residual <= AMBIGUOUS * least and all(distance > SAME_START_M for distance in apart):
+            kept.append(hypothesis)
     return kept
 
 
-def _is_on(skeleton: Skeleton, ways: Sequence[Way], frame: int, pose: Float) -> bool:
-    """Whether one of the ways passes by a pose (D,) in a frame."""
+def _contains(skeleton: Skeleton, hypotheses: Sequence[TrajectoryHypothesis], frame: int, pose: Float) -> bool:
+    """Return whether one of the hypotheses has the pose (D,) in a frame."""
     joints = skeleton.joints(pose)
-    return any(skeleton.apart(way.poses[frame], joints) < APART_M for way in ways)
+    return any(skeleton.apart(hypothesis.poses[frame], joints) < SAME_START_M for hypothesis in hypotheses)
 
 
 def _find(tracker: ContourTracker, frame: Observation, pyramid: Pyramid) -> tuple[float, list[Float]]:
-    """E_S of the pose (D,) that explains a frame best; the pose, and others that are nearly as good: one that faces the
-    other way, and those that few cameras cannot tell from it."""
+    """Return the lowest residual (E_S) in a frame, and poses (D,): the one that has it, then one that faces the other
+    way and those that few cameras cannot distinguish from it."""
     skeleton = tracker.body.skeleton
     p_centroid = centroid(tracker.views.rig, pyramid, frame.index)
     settled = tracker.settle(pyramid, gait.hypotheses(skeleton, HEADINGS, PHASES, p_centroid)).states
@@ -132,47 +136,47 @@ def _find(tracker: ContourTracker, frame: Observation, pyramid: Pyramid) -> tupl
     turned = _turned(skeleton, order, order[0])
     finalists = np.array(_distinct(skeleton, order, FINALISTS) + _distinct(skeleton, order[turned], OPPOSITE))
     poses = np.array([_searched(tracker, frame, pyramid, pose) for pose in np.unique(finalists, axis=0)])
-    error = tracker.mean_residual(pyramid, poses, frame.uncertain)
-    best = int(np.argmin(error))
-    others = np.flatnonzero(_turned(skeleton, poses, poses[best]) & (error < NEARLY * error[best]))
-    opposite = others[np.argsort(error[others], kind="stable")[:1]]
-    alike = np.flatnonzero(error < AMBIGUOUS * error[best])
-    rest = np.union1d(opposite, alike)
-    rest = rest[np.argsort(error[rest], kind="stable")]
-    return float(error[best]), _distinct(skeleton, poses[np.concatenate([[best], rest])], len(poses))
+    residual = tracker.mean_residual(pyramid, poses, frame.uncertain)
+    best = int(np.argmin(residual))
+    others = np.flatnonzero(_turned(skeleton, poses, poses[best]) & (residual < NEARLY * residual[best]))
+    opposite = others[np.argsort(residual[others], kind="stable")[:1]]
+    similar = np.flatnonzero(residual < AMBIGUOUS * residual[best])
+    rest = np.union1d(opposite, similar)
+    rest = rest[np.argsort(residual[rest], kind="stable")]
+    return float(residual[best]), _distinct(skeleton, poses[np.concatenate([[best], rest])], len(poses))
 
 
 def _follow(
     tracker: ContourTracker, frames: Sequence[Observation], pyramids: Sequence[Pyramid], pose: Float, anchor: int
-) -> Way:
-    """Poses from that of frame ``anchor`` to both ends."""
+) -> TrajectoryHypothesis:
+    """Return the trajectory that follows from a pose (D,) in frame ``anchor``, tracked to both ends of the frames."""
     F = len(frames)
     poses = np.tile(pose, (F, 1))
-    errors = np.full(F, np.nan)
+    residuals = np.full(F, np.nan)
 
-    def told(i: int, pose: Float) -> float:
+    def residual_of(i: int, pose: Float) -> float:
         return float(tracker.mean_residual(pyramids[i], pose[None], frames[i].uncertain)[0])
 
-    errors[anchor] = told(anchor, pose)
+    residuals[anchor] = residual_of(anchor, pose)
     every = tracker.contours.search_every
     for step, end in ((1, F), (-1, -1)):
         for i in range(anchor + step, end, step):
             before = poses[i - 2 * step] if abs(i - anchor) > 1 else poses[anchor]
             expected = poses[i - step] + tracker.contours.prediction * (poses[i - step] - before)
             now = tracker.settle(pyramids[i], expected[None]).states[0]
-            error = told(i, now)
-            if not np.isfinite(error):  # nobody is in sight
+            residual = residual_of(i, now)
+            if not np.isfinite(residual):  # no camera sees anybody
                 poses[i] = poses[i - step]
                 continue
-            if every and (error > WORSE * errors[anchor] or abs(i - anchor) % every == 0):
+            if every and (residual > WORSE * residuals[anchor] or abs(i - anchor) % every == 0):
                 now = tracker.improved(frames[i], pyramids[i], now)
-                error = told(i, now)
-            poses[i], errors[i] = now, error
-    return Way(poses, float(np.nanmean(errors)))
+                residual = residual_of(i, now)
+            poses[i], residuals[i] = now, residual
+    return TrajectoryHypothesis(poses, float(np.nanmean(residuals)))
 
 
 def _searched(tracker: ContourTracker, frame: Observation, pyramid: Pyramid, pose: Float) -> Float:
-    """The pose (D,) with limbs searched for until none is found elsewhere."""
+    """Return the pose (D,) after limb searches, repeated as long as a search finds a better pose."""
     for _ in range(_SEARCHES):
         found = tracker.improved(frame, pyramid, pose)
         if np.array_equal(found, pose):
@@ -182,26 +186,26 @@ def _searched(tracker: ContourTracker, frame: Observation, pyramid: Pyramid, pos
 
 
 def _distinct(skeleton: Skeleton, poses: Float, count: int) -> list[Float]:
-    """The first poses of (B, D), at most ``count``, whose joints lie apart from each other's."""
+    """Return the first poses of (B, D), at most ``count``, that differ from each other by SAME_START_M."""
     chosen: list[Float] = []
-    places: list[Float] = []
+    joints: list[Float] = []
     for pose in poses:
         if len(chosen) == count:
             break
-        if all(skeleton.apart(pose, other) > APART_M for other in places):
+        if all(skeleton.apart(pose, other) > SAME_START_M for other in joints):
             chosen.append(pose)
-            places.append(skeleton.joints(pose))
+            joints.append(skeleton.joints(pose))
     return chosen
 
 
 def _turned(skeleton: Skeleton, poses: Float, pose: Float) -> NDArray[np.bool_]:
-    """(B,) whether poses (B, D) face away from where ``pose`` (D,) does, by more than a right angle."""
+    """Return (B,) whether poses (B, D) are turned by more than 90° from ``pose`` (D,)."""
     yaw = skeleton.index("torso_yaw")
     return np.asarray(np.cos(poses[:, yaw] - pose[yaw]) < 0)
 
 
 def centroid(rig: Rig, pyramid: Pyramid, index: int) -> Float:
-    """(3,) the point nearest to the rays through the silhouettes' centroids, metres; ``index`` is the frame's number.
+    """Return (3,) the point nearest to the rays through the silhouettes' centroids, metres; ``index``: the frame's.
 
     Raises:
         CaptureError: fewer than two cameras see anybody.
@@ -225,10 +229,10 @@ def centroid(rig: Rig, pyramid: Pyramid, index: int) -> Float:
 
 
 def stature_of(tracker: ContourTracker, pyramids: Sequence[Pyramid]) -> float:
-    """The stature whose average body covers as much of the pictures as the silhouettes do, metres.
+    """Return the stature, metres, at which an average body covers as many pixels as the silhouettes do.
 
-    Areas hardly change when somebody bends or raises the arms, as the silhouette's height does; girth and clothes make
-    it err by 6 %. The median over the views of all frames, against the mean area of hanging and of spread arms.
+    The area hardly changes when a person bends or raises the arms; the silhouette's height does. Girth and clothes
+    cause an error of about 6 %. Median over the views of all frames, against the mean area of hanging and spread arms.
     """
     body: ConeBody = build_cone_body(BodyDimensions.from_stature(_AVERAGE_M), preset=tracker.contours.body)
     group = np.zeros(len(body.parts), np.int32)

@@ -37,7 +37,7 @@ from tk.model.cues.ray_costs import Evidence, mean_of_views
 from tk.model.masks.silhouettes import Pyramid
 from tk.optim.gauss_newton import Prior
 from tk.settings import BodyFitSettings, RegionSettings, SilhouetteSettings
-from tk.trackers.contour_tracker import APART_M, GAIN, RELOCATE_EVERY, ContourTracker
+from tk.trackers.contour_tracker import GAIN, RECOVER_EVERY, SAME_POSE_M, ContourTracker
 from tk.trackers.protocol import Estimate, Observation, Stopwatch, drift
 
 Float = NDArray[np.float64]
@@ -56,7 +56,7 @@ MARGIN = 0.02
 # worse than usual.
 MOST_A_VIEW = 0.15
 # Who stays worse explained for so many frames has been looked for twice in vain: where the joints are is not known.
-UNKNOWN_AFTER = 2 * RELOCATE_EVERY
+UNKNOWN_AFTER = 2 * RECOVER_EVERY
 # Colours are learned only in frames that are explained about as well as is usual, and what is worse than that counts as
 # this much worse: a wrong pose that lasts does not become usual.
 LEARN_RATIO = 1.15
@@ -75,7 +75,7 @@ SECOND_STATURE_DEVIATION = 0.03
 # Frames that the second pass settles in one launch.
 AT_ONCE = 8
 # A step of a joint that is longer than its neighbours by this is a jump, metres: twice what makes two poses of one.
-JUMP_M = 2 * APART_M
+JUMP_M = 2 * SAME_POSE_M
 # Over so many frames the usual posture of the first pass is a plain mean, then one that forgets.
 USUAL_FRAMES = 200
 
@@ -196,7 +196,7 @@ class RegionTracker(ContourTracker):
             sigma[:] = np.nan
         watch.lap("check")
         return Estimate(
-            **self.told(pose),
+            **self.pose_fields(pose),
             status=status,
             objective=float(self._best.cost),
             iterations=np.array([iterations.sum(), int(searched)], np.int32),
@@ -271,7 +271,7 @@ class RegionTracker(ContourTracker):
         for h in sorted(self._alive, key=lambda h: h.cost):
             if kept and (h.cost > kept[0].cost + MARGIN or h.age > PATIENCE):
                 continue
-            if all(skeleton.apart(h.pose, other) > APART_M for other in places):
+            if all(skeleton.apart(h.pose, other) > SAME_POSE_M for other in places):
                 kept.append(h)
                 places.append(skeleton.joints(h.pose))
         self._alive = [replace(kept[0], age=1), *kept[1 : self.config.hypotheses]]
@@ -322,12 +322,12 @@ class RegionTracker(ContourTracker):
         vain, again after twice as long."""
         error, limit = float(np.nanmean(by_view)), self.contours.lost_error
         self._stranded = self._stranded + 1 if self._worse(by_view) else 0
-        due = self._lost_for > 0 if error <= limit else self._lost_for % RELOCATE_EVERY == 0
-        waits, rest = divmod(self._stranded, RELOCATE_EVERY)
+        due = self._lost_for > 0 if error <= limit else self._lost_for % RECOVER_EVERY == 0
+        waits, rest = divmod(self._stranded, RECOVER_EVERY)
         stranded = not due and rest == 0 and waits.bit_count() == 1
         if not (due or stranded):
             return error > limit
-        pose, found = self.relocate(pyramid, self._best.pose, error)
+        pose, found = self.recover(pyramid, self._best.pose, error)
         if found < (error - self.config.search_excess if stranded else error):
             self._alive = [Hypothesis(pose, pose, self._best.cost)]
         return found > limit
@@ -467,7 +467,7 @@ class RegionTracker(ContourTracker):
         if later.age:
             more = later.cost + RENEWAL * (more - later.cost)
         skeleton = self.body.skeleton
-        if more > MARGIN or skeleton.apart(poses[1], skeleton.joints(poses[0])) <= APART_M:
+        if more > MARGIN or skeleton.apart(poses[1], skeleton.joints(poses[0])) <= SAME_POSE_M:
             return None
         return Hypothesis(poses[1], later.pose, more, later.age + 1)
 
@@ -479,7 +479,7 @@ class RegionTracker(ContourTracker):
         for stage in self.timing_stages:
             watch.lap(stage)
         return Estimate(
-            **self.told(pose),
+            **self.pose_fields(pose),
             status="lost",
             objective=np.inf,
             iterations=np.zeros(len(self.stages), np.int32),
@@ -508,7 +508,7 @@ class RegionTracker(ContourTracker):
 
     def rewind(self, state: Mapping[str, Any]) -> None:
         """Go back to a state."""
-        poses, previous = (self.poses_of(state, name) for name in ("poses", "previous"))
+        poses, previous = (np.array(state[name]) for name in ("poses", "previous"))
         jumped = state.get("jumped", np.zeros(len(poses), np.bool_))  # results of before have none
         rows = zip(poses, previous, state["costs"], state["ages"], jumped, strict=True)
         self._alive = [Hypothesis(p, q, float(c), int(a), bool(j)) for p, q, c, a, j in rows]

@@ -1,11 +1,11 @@
 """The silhouette tracker: cone body, occluding contours, damped Gauss-Newton (the paper on silhouettes and twists).
 
-No voxels and no colour: two or three cameras and their masks are enough. A frame's way, top to bottom:
+It uses neither voxels nor colours, so two or three cameras and their masks are enough. One frame:
 
     masks → cleaned, scales → {contours → edgels along their normals → normal equations → step} × iterations × scales
 
-Beyond the paper: from time to time other places are tried for the limbs (:meth:`ContourTracker.search`), for a
-silhouette hides an arm before or behind the trunk, and where it comes out again no contour may be near.
+Beyond the paper, a limb search runs at intervals (:meth:`ContourTracker.search`): a silhouette hides an arm in front of
+or behind the trunk, and when the arm reappears, no contour may be near it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.camera import Rig
 from tk.optim.gauss_newton import GaussNewtonSettings
 from tk.settings import SilhouetteSettings
-from tk.trackers.contour_tracker import LINE_SEARCH, RELOCATE_EVERY, SOLVER, ContourTracker
+from tk.trackers.contour_tracker import LINE_SEARCH, RECOVER_EVERY, SOLVER, ContourTracker
 from tk.trackers.protocol import Estimate, Observation, Stopwatch
 
 Float = NDArray[np.float64]
@@ -56,14 +56,14 @@ class SilhouetteTracker(ContourTracker):
         body: ConeBody | None = None,
     ) -> None:
         """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourTracker.find`."""
-        # colours are none of this tracker's cues
+        # this tracker does not use colours
         blind = [Observation(f.index, f.images[:0], f.masks) for f in frames]
         self._pose = self._previous = self.find(blind, height_m, init, body)
         self._lost_for = 0
         self._fresh = True
 
     def step(self, frame: Observation) -> Estimate:
-        """The pose in the next frame."""
+        """Return the estimate for the next frame."""
         watch = Stopwatch()
         config = self.contours
         pyramid = self.pyramid(frame)
@@ -75,21 +75,21 @@ class SilhouetteTracker(ContourTracker):
         if config.search_every and frame.index % config.search_every == 0:
             pose = self.improved(Observation(frame.index, frame.images[:0], frame.masks), pyramid, pose)
         error = float(self.mean_residual(pyramid, pose[None])[0])
-        # after a loss the last pose is no evidence, however well the pose near it fits
-        due = self._lost_for > 0 if error <= config.lost_error else self._lost_for % RELOCATE_EVERY == 0
+        # after a loss a pose near the last one may fit by chance
+        due = self._lost_for > 0 if error <= config.lost_error else self._lost_for % RECOVER_EVERY == 0
         if due and np.isfinite(error):
-            pose, error = self.relocate(pyramid, pose, error)
+            pose, error = self.recover(pyramid, pose, error)
         lost = not error <= config.lost_error
         status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
-        # nobody is in sight: the last pose stands
+        # nobody is visible: the last pose is kept
         pose = pose if np.isfinite(error) else self._pose
-        # whoever was lost has jumped, not moved
+        # after a loss the displacement is no motion
         self._previous, self._pose = pose if self._lost_for else self._pose, pose
         self._lost_for = self._lost_for + 1 if lost else 0
         self._fresh = False
         watch.lap("check")
         return Estimate(
-            **self.told(pose),
+            **self.pose_fields(pose),
             status=status,
             objective=error,
             iterations=settled.iterations,
@@ -97,11 +97,11 @@ class SilhouetteTracker(ContourTracker):
         )
 
     def state(self) -> Mapping[str, Any]:
-        """What :meth:`restore` needs beside the model to go on from the last frame."""
+        """Return what :meth:`restore` needs, beside the model, to continue after the last frame."""
         return {**super().state(), "pose": self._pose, "previous": self._previous, "lost_for": self._lost_for}
 
     def rewind(self, state: Mapping[str, Any]) -> None:
         """Go back to a state."""
-        self._pose, self._previous = (self.poses_of(state, name) for name in ("pose", "previous"))
+        self._pose, self._previous = (np.array(state[name]) for name in ("pose", "previous"))
         self._lost_for = int(state["lost_for"])
         self._fresh = False

@@ -11,7 +11,7 @@ from tk.model.body.cone_body import build_cone_body
 from tk.model.body.gait_poses import walking_pose
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import PartColors
-from tk.model.cues.ray_costs import COLOR_COST, DOUBT_COST, Evidence, RayGrid, mean_of_views
+from tk.model.cues.ray_costs import COLOR_COST, UNCERTAIN_COST, Evidence, RayGrid, mean_of_views
 from tk.model.masks.silhouettes import draw_silhouettes, share_wrong
 
 RIG = ring_of_cameras(3, width=120, height=160)
@@ -76,7 +76,7 @@ def test_doubt_halves_what_a_part_costs_outside_the_mask():
     whole, _ = cast(Evidence.of(FINE, MASKS))
     doubted, _ = cast(Evidence.of(FINE, MASKS, MASKS == 0))
     outside = ((DRAWN[1] > 0) & (MASKS == 0)).sum(axis=(1, 2)) / (MASKS > 0).sum(axis=(1, 2))
-    np.testing.assert_allclose(whole[1] - doubted[1], (1 - DOUBT_COST) * outside, atol=1e-6)
+    np.testing.assert_allclose(whole[1] - doubted[1], (1 - UNCERTAIN_COST) * outside, atol=1e-6)
     np.testing.assert_allclose(cast(Evidence.of(FINE, MASKS, MASKS == 255))[0], whole, atol=1e-6)
 
 

@@ -1,9 +1,9 @@
-"""What a frame shows along a grid of rays, as the cost of every part that a ray could meet.
+"""Costs of a frame on a grid of rays, for every part of the body that a ray could hit.
 
-A ray through the person that meets no part costs 1, and so does one that meets a part outside the mask; half of that
-where the mask is in doubt. A ray through the person that meets a part costs what its colour tells against that part.
-Costs are told as a share of the person's rays, averaged over the views: without colours this is E_S of the silhouette
-paper (eq. 12).
+A ray through the mask that hits no part costs 1, and so does a ray that hits a part outside the mask; half of that
+where the mask is uncertain. A ray through the mask that hits a part costs the mismatch of its colour with that part.
+Costs are shares of the person's rays, averaged over the views: without colours the cost is E_S of the silhouette paper
+(eq. 12).
 """
 
 from __future__ import annotations
@@ -21,18 +21,20 @@ from tk.model.masks.silhouettes import pack_rig, pixel_rays
 
 Float = NDArray[np.float64]
 
-# What a colour that surely belongs to another part costs, beside a ray that meets nothing: colours err more than masks.
+# Cost of a colour that certainly belongs to another part; below 1, because colours are wrong more often than masks.
+# Chosen on the development captures; sensitivity not measured.
 COLOR_COST = 0.4
-# What a part costs where the mask is 0 but in doubt (a shadow, or cloth of the scene's colour).
-DOUBT_COST = 0.5
+# Cost of a part on a pixel outside the mask that is uncertain (a shadow, or clothes of the background's colour): both
+# values are equally likely.
+UNCERTAIN_COST = 0.5
 
 
 class RayGrid:
-    """Every ``step``-th pixel of a rig's pictures.
+    """Every ``step``-th pixel of a rig's images.
 
     Args:
         rig: the cameras.
-        rows: about so many rays to a picture's height.
+        rows: number of rays along an image's height, approximately.
     """
 
     def __init__(self, rig: Rig, rows: int) -> None:
@@ -40,21 +42,21 @@ class RayGrid:
         self.rays = pixel_rays(rig, self.step)
         self.cameras = pack_rig(rig).astype(np.float32)
 
-    def sample(self, pictures: NDArray) -> NDArray:
-        """The grid's pixels (V, h, w, ...) of pictures (V, H, W, ...)."""
+    def sample(self, images: NDArray) -> NDArray:
+        """Return the grid's pixels (V, h, w, ...) of images (V, H, W, ...)."""
         offset = self.step // 2
-        return pictures[:, offset :: self.step, offset :: self.step]
+        return images[:, offset :: self.step, offset :: self.step]
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """One frame on one grid.
+    """Costs of one frame on one grid.
 
     Attributes:
-        grid: where it was looked at.
-        person: (V, h, w) bool.
+        grid: rays of the V views.
+        person: (V, h, w) bool, the mask.
         cost: (V, h, w, G + 1) float32, see :mod:`tk.kernels.raycast`.
-        bins: (V, h, w) the colours' bins; None without colours.
+        bins: (V, h, w) bin of each ray's colour; None without colours.
     """
 
     grid: RayGrid
@@ -70,11 +72,11 @@ class Evidence:
         images: NDArray[np.uint8] | None = None,
         colors: PartColors | None = None,
     ) -> Evidence:
-        """From masks (V, H, W), where they are in doubt, and the images with what is known of the parts' colours."""
+        """Return the costs from masks (V, H, W), uncertain pixels, images and the learned colours of the parts."""
         person = grid.sample(masks) >= 128
         outside = np.ones(person.shape, np.float32)
         if uncertain is not None:
-            outside[grid.sample(uncertain)] = DOUBT_COST
+            outside[grid.sample(uncertain)] = UNCERTAIN_COST
         cost = np.empty((*person.shape, len(GROUPS) + 1), np.float32)
         cost[..., 0] = person
         cost[..., 1:] = np.where(person, 0.0, outside)[..., None]
@@ -93,9 +95,10 @@ class Evidence:
         export: bool = False,
         most_outside: float = np.inf,
     ) -> tuple[Float, Cast | None]:
-        """(B, V) cost of poses (B, D) by view, NaN where a view sees nobody; and with ``export`` what the rays meet.
+        """Return (B, V) the cost of poses (B, D) by view, NaN where a view sees nobody; with ``export`` also the parts
+        that the rays hit.
 
-        ``drawn``, ``before`` and ``most_outside`` as :func:`tk.kernels.raycast.cast` has them.
+        ``drawn``, ``before`` and ``most_outside`` as in :func:`tk.kernels.raycast.cast`.
         """
         grid = self.grid
         total, met = cast(
@@ -119,7 +122,7 @@ class Evidence:
         return residual_of(label > 0, self.person)
 
     def cost_of_parts(self, group: NDArray[np.int32], label: NDArray[np.uint8]) -> tuple[Float, NDArray[np.int64]]:
-        """What the rays that meet each part cost in all, (P,), and how many they are, (P,); labels (V, h, w).
+        """Return the summed cost (P,) and the number (P,) of the rays that hit each part, labels (V, h, w).
 
         Views that see nobody do not count.
         """
@@ -129,11 +132,9 @@ class Evidence:
         total, count = np.bincount(part, cost, len(group)), np.bincount(part, minlength=len(group))
         return total.astype(np.float64), count.astype(np.int64)
 
-    def unmet(self, label: NDArray[np.uint8]) -> float:
-        """The share of the person's rays that meet no part, averaged over the views; labels (V, h, w)."""
-        missed = np.count_nonzero(self.person & (label == 0), axis=(1, 2))
-        seen = np.count_nonzero(self.person, axis=(1, 2))
-        return float(mean_of_views(np.where(seen > 0, missed / np.maximum(seen, 1), np.nan)[None])[0])
+    def surplus(self, label: NDArray[np.uint8]) -> float:
+        """Return the surplus area, mean over the views; labels (V, h, w)."""
+        return float(mean_of_views(self.residual(label)[None, :, 1])[0])
 
 
 def residual_of(body: NDArray[np.bool_], person: NDArray[np.bool_]) -> Float:
@@ -150,7 +151,7 @@ def residual_of(body: NDArray[np.bool_], person: NDArray[np.bool_]) -> Float:
 
 
 def mean_of_views(cost: Float) -> Float:
-    """(B,) the mean over the views (B, V) that see somebody; inf where none does."""
+    """Return (B,) the mean over the views (B, V) that see anybody; inf if none does."""
     seen = np.isfinite(cost)
     total = np.where(seen, cost, 0.0).sum(axis=1)
     return np.where(seen.any(axis=1), total / np.maximum(seen.sum(axis=1), 1), np.inf)
