@@ -93,7 +93,7 @@ def test_pictures_out_of_step_are_tracked_again(tiny: Path, tmp_path: Path, monk
         asked.append(np.array(capture.late_frames))
         return open_source(capture, *more, **options)
 
-    monkeypatch.setattr(finish, "refine_if_astray", made_up)
+    monkeypatch.setattr(finish, "refine_if_inconsistent", made_up)
     for module in (plan, finish):
         monkeypatch.setattr(module, "open_source", remember)
     path, reporter = tmp_path / "again.h5", Silent()
@@ -115,7 +115,7 @@ def test_what_does_not_belong_together_is_refused(tiny: Path, tracked: Path, tk:
     shutil.copy(tracked, bare)
     with h5py.File(bare, "r+") as file:
         del file["model"]
-    tk("refine", tiny, bare, "-o", output).complaint(str(bare), "no body")
+    tk("refine", tiny, bare, "-o", output).complaint(str(bare), "no body with contours")
     tk("refine", tiny, tracked, "-o", output, "--trust", "0").complaint("trust = 0")
     assert not output.exists()
 

@@ -20,7 +20,7 @@ from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
 from tk.run.plan import Plan
 from tk.run.prefetch import open_source
-from tk.run.refinement import refine_if_astray
+from tk.run.refinement import refine_if_inconsistent
 from tk.trackers.contour_tracker import ContourTracker
 from tk.trackers.protocol import Estimate
 from tk.trackers.region import RegionTracker
@@ -66,7 +66,7 @@ def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[st
                 for observation, _ in source.frames(min(missing), max(missing) + 1):
                     masks.put(observation.index, tracker.cleaned(tracker.without_foreign(observation).masks))
         if plan.config.refine:
-            refined = refine_if_astray(tracker, masks, result.frames, poses, ~lost, note)
+            refined = refine_if_inconsistent(tracker, masks, result.frames, poses, ~lost, note)
             if refined is not None:
                 tracker, masks, offsets = refined
                 cameras = UsedCameras(tracker.rig, cameras.time_offset_s + offsets / plan.capture.fps)

@@ -1,4 +1,4 @@
-"""`tk refine`: cameras and time offsets from a tracked recording of a person."""
+"""`tk refine`: refines cameras and time offsets by a tracked recording of a person."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from tk.io.captures.calibration import write_calibration
 from tk.io.captures.capture import Capture
 from tk.io.captures.mask_store import MaskStore
 from tk.io.results.writer import Status, read_result
-from tk.kernels.line_search import SearchSettings
+from tk.model.block_least_squares import Stop
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.agreement import LATE_FRAMES, camera_agreement
-from tk.model.cameras.bundle import gather
+from tk.model.cameras.bundle import choose_frames
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import Refined, RefinementSettings, refine_cameras
 from tk.model.cameras.tracker_frame import TrackerFrame
@@ -32,26 +32,26 @@ from tk.trackers.region import RegionTracker
 Float = NDArray[np.float64]
 Note = Callable[[str], None]
 
-#: frames that take part, and the fewest that do
+# Frames of a refinement, at most and at least, and of a check of the cameras' agreement. Chosen on the development
+# captures, sensitivity not measured: more frames take longer, and fewer than eight show too little motion.
 FRAMES, FEWEST = 40, 8
-#: frames in which the agreement of the cameras is looked at
-LOOKED_AT = 24
-# A refinement that leaves more than this share of the contours' distance is not worth a change.
-_WORTH = 0.95
-# A video is read by whole frames; what is left of a delay is below one half. So often this is looked at again.
+AGREEMENT_FRAMES = 24
+# Refined cameras are used if they reduce the contours' distance to less than this share.
+_WORTHWHILE = 0.95
+# Largest number of refinements while the whole frames of the videos' delays still change.
 _SHIFTS = 3
-# A delay with a larger standard deviation, in frames, is not told by this motion.
-_TELLING_FRAMES = 0.25
+# A delay counts as unknown if its standard deviation exceeds this, frames.
+_UNKNOWN_FRAMES = 0.25
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """Refined cameras, and what a person wants to know of them.
+    """Refined cameras with a report.
 
     Attributes:
-        refined: the cameras, in their own world; its ``offset_frames`` hold the whole delay, whole frames included.
+        refined: the cameras in the tracker's frame; ``offset_frames`` includes the whole frames of a delay.
         names: of the cameras.
-        frames: that took part.
+        frames: number of frames used.
     """
 
     refined: Refined
@@ -60,23 +60,23 @@ class Refinement:
 
     @property
     def warnings(self) -> list[str]:
-        """What is not to be relied on, a line each."""
+        """Warnings about unreliable numbers, one line each."""
         r = self.refined
         lines = []
-        if not r.settled:
+        if r.stop is not Stop.CONVERGED:
             lines.append("the cameras still moved in the last round; refine again with the new calibration")
-        vague = [name for name, told in zip(self.names, r.told, strict=True) if not told]
+        vague = [name for name, observed in zip(self.names, r.observed, strict=True) if not observed]
         if vague:
             lines.append(
-                f"{', '.join(vague)}: the recording tells little of these cameras' places, which stay near the "
-                "calibration; a person who walks about and turns tells more"
+                f"{', '.join(vague)}: the recording does not determine where these cameras are, so they stay near the "
+                "calibration; record a person who walks about and turns"
             )
-        if (r.offset_sigma_frames > _TELLING_FRAMES).any():
-            lines.append("the person moves too little to tell the time offsets; use --no-offsets, or faster motion")
+        if (r.offset_sigma_frames > _UNKNOWN_FRAMES).any():
+            lines.append("the person moves too little to estimate the time offsets; use --no-offsets, or faster motion")
         return lines
 
     def format_table(self) -> str:
-        """A line a camera."""
+        """A table with one line a camera."""
         r = self.refined
         width = max(6, *(len(name) for name in self.names))
         lines = [f"{'camera':<{width}}  turned [deg]      moved [mm]     focal [%]      late [frames]  contours [px]"]
@@ -99,22 +99,22 @@ def refine_capture(
     note: Note,
     how: RefinementSettings | None = None,
 ) -> Refinement:
-    """Refine a capture's cameras by a result of tracking it, and write its calibration file anew.
+    """Refine a capture's cameras by a result of tracking it, and write a new calibration file.
 
     Raises:
-        ConfigError: the result holds no body of contours.
-        CaptureError, ResultError: capture and result do not belong together, or too few frames are tracked.
+        ConfigError: the result has no cone body.
+        CaptureError, ResultError: capture and result do not match, or too few frames are tracked.
         CalibrationError: the new file cannot be written.
     """
     found = read_result(result)
     tracked = body_and_poses(found)
     if tracked is None:
-        raise ConfigError(f"{result}: holds no body of contours; track with --method region")
+        raise ConfigError(f"{result}: has no body with contours; track with --method region")
     if not len(found.frames) or found.frames.max() >= capture.frame_count or found.meta.up != capture.up:
-        raise ResultError(f"{result}: is no result of {capture.path}")
+        raise ResultError(f"{result}: is not a result of {capture.path}")
     if found.cameras is not None and found.cameras.rig.names != capture.rig.names:
         raise ResultError(
-            f"{result}: was tracked with the cameras {', '.join(found.cameras.rig.names)}; give them with --cameras"
+            f"{result}: was tracked with the cameras {', '.join(found.cameras.rig.names)}; name them with --cameras"
         )
     world, store = TrackerFrame.of(capture.rig, capture.up), MaskStore()
     with open_source(capture, config, note, keep_images=False) as source:
@@ -125,7 +125,7 @@ def refine_capture(
     done = refine_rig(body, world.rig, store, found.frames, poses, usable, how)
     if done is None:
         raise CaptureError(
-            f"{result}: has too few tracked frames in a row to refine {capture.path} by; {FEWEST} are needed"
+            f"{result}: has too few consecutive tracked frames to refine {capture.path}; {FEWEST} are needed"
         )
     read = np.array(capture.late_frames) / capture.fps
     late = read + done.refined.offset_frames / capture.fps
@@ -142,10 +142,10 @@ def refine_rig(
     usable: NDArray[np.bool_],
     how: RefinementSettings | None = None,
 ) -> Refinement | None:
-    """Refine cameras by poses (F, D) of frames (F,) whose masks are in the store; None where too few are usable.
+    """Refine cameras by poses (F, D) of frames (F,) whose masks are in the store; None if too few are usable.
 
-    Body, cameras and poses, and the cameras that are returned, are those of a world in which z is up.
-    A video that is late by whole frames is shown by its other frames, until less than one half is left.
+    Body, cameras and poses, and the returned cameras, are in a world in which z is up. If a video is late by whole
+    frames, the refinement is repeated with its other frames until less than half a frame of delay remains.
     """
     how = how or RefinementSettings()
     masks = lru_cache(16)(store.get)
@@ -153,15 +153,15 @@ def refine_rig(
     done: Refined | None = None
     count = 0
     for _ in range(_SHIFTS):
-        moments = gather(
+        chosen = choose_frames(
             lambda frame, camera: masks(frame)[camera],
             Views(rig), frames, poses, usable, FRAMES, how.scales, True, late,
         )  # fmt: skip
-        if len(moments) < FEWEST:
+        if len(chosen) < FEWEST:
             break
-        count = len(moments)
+        count = len(chosen)
         before = None if done is None else done.before_px
-        done = refine_cameras(body, rig, moments, SearchSettings(), how)
+        done = refine_cameras(body, rig, chosen, how)
         done = replace(
             done,
             offset_frames=done.offset_frames + late,
@@ -174,7 +174,7 @@ def refine_rig(
     return None if done is None else Refinement(done, rig.names, count)
 
 
-def refine_if_astray(
+def refine_if_inconsistent(
     tracker: RegionTracker,
     store: MaskStore,
     frames: NDArray[np.int64],
@@ -182,50 +182,50 @@ def refine_if_astray(
     usable: NDArray[np.bool_],
     note: Note,
 ) -> tuple[RegionTracker, MaskStore, Float] | None:
-    """The cameras refined, where they disagree about what was tracked; None where they do not, or it does not help.
+    """Refine the cameras if they disagree about the tracked person; None if they agree, or refinement does not help.
 
     Args:
-        tracker: that has gone over the frames.
+        tracker: after the first pass over the frames.
         store: the frames' masks.
-        frames, poses, usable: (F,), (F, D), (F,) of :func:`refine_rig`, the poses in the capture's world.
-        note: who hears what was found.
+        frames, poses, usable: (F,), (F, D), (F,) of :func:`refine_rig`; the poses are in the capture's world.
+        note: receives a message about the refined cameras.
 
     Returns:
-        A tracker with the refined cameras and the same body, the masks that belong together, and by how many frames
-        each camera is late (C,).
+        A tracker with the refined cameras and the same body, the synchronised masks, and the delay of each camera (C,),
+        frames.
     """
     world = tracker.world
     poses = world.poses_in(poses)
     masks = lru_cache(16)(store.get)
-    moments = gather(
+    chosen = choose_frames(
         lambda frame, camera: masks(frame)[camera],
         tracker.views,
         frames,
         poses,
         usable,
-        LOOKED_AT,
+        AGREEMENT_FRAMES,
         1,
         False,
     )
-    if len(moments) < FEWEST:
+    if len(chosen) < FEWEST:
         return None
-    agreement = camera_agreement(tracker.body, world.rig, moments)
-    if not (agreement.astray.any() or agreement.late.any()):
+    agreement = camera_agreement(tracker.body, world.rig, chosen)
+    if not (agreement.inconsistent.any() or agreement.late.any()):
         return None
     done = refine_rig(tracker.body, world.rig, store, frames, poses, usable)
     if done is None:
         return None
     refined = done.refined
     before, after = float(np.mean(refined.before_px)), float(np.mean(refined.after_px))
-    if not after < _WORTH * before:
+    if not after < _WORTHWHILE * before:
         return None
     names, worst = world.rig.names, int(np.argmax(refined.turn_deg))
-    told = [f"{name} is {n:+.2f} frames late" for name, n in zip(names, refined.offset_frames, strict=True)
+    late = [f"{name} is {n:+.2f} frames late" for name, n in zip(names, refined.offset_frames, strict=True)
             if abs(n) > LATE_FRAMES]  # fmt: skip
     note(
         f"the cameras disagreed and are refined from {done.frames} frames: contours {before:.2f} px off, now "
-        f"{after:.2f}; {', '.join([f'{names[worst]} is turned most, by {refined.turn_deg[worst]:.2f}°', *told])} "
-        "(refine = false leaves them)"
+        f"{after:.2f}; {', '.join([f'{names[worst]} is turned most, by {refined.turn_deg[worst]:.2f}°', *late])} "
+        "(refine = false keeps them)"
     )
     fresh = RegionTracker(world.rig_out(refined.rig), tracker.up, tracker.contours, tracker.config)
     fresh.take_body(tracker.body)
@@ -234,7 +234,7 @@ def refine_if_astray(
 
 
 def retimed(store: MaskStore, frames: NDArray[np.int64], late: NDArray[np.int64]) -> MaskStore:
-    """The masks of frames (F,) of cameras that are late by whole frames (C,); nobody where a camera has no picture."""
+    """Return the masks of frames (F,) of cameras that are late by whole frames (C,); empty if a camera has no image."""
     if not late.any():
         return store
     result = MaskStore()

@@ -11,11 +11,8 @@ from tk.kernels.line_search import SearchSettings
 from tk.kernels.silhouette import Edgels
 from tk.model.body import body_fit
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.body_fit import (
-    fit_body,
-    pose_rows,
-    shape_rows,
-)
+from tk.model.body.body_fit import fit_body
+from tk.model.body.body_parameters import BodyFamily, pose_rows, shape_rows
 from tk.model.body.cone_body import PRESETS, SHAPE_NUMBERS, build_cone_body
 from tk.model.body.gait_poses import walking_pose
 from tk.model.body.skeleton import SEGMENTS
@@ -101,7 +98,7 @@ def test_no_edgels_have_no_rows():
 
 
 def test_rows_by_dimensions_are_differences():
-    problem = body_fit.BodyProblem("full", AVERAGE.dimensions, 0.01)
+    problem = BodyFamily("full", AVERAGE.dimensions, 0.01)
     shared = problem.mean + np.random.default_rng(2).normal(0, 0.02, len(problem.mean)) * (problem.deviation > 1e-5)
     (rows,) = problem.dimension_rows(shared, POSE[None], [EDGELS])
     assert rows.shape == (len(EDGELS.part), len(DIMENSIONS))
@@ -116,7 +113,7 @@ def test_rows_by_dimensions_are_differences():
 
 
 def test_frames_are_told_apart_in_rows_by_dimensions():
-    problem = body_fit.BodyProblem("full", AVERAGE.dimensions, 0.01)
+    problem = BodyFamily("full", AVERAGE.dimensions, 0.01)
     poses = walk(AVERAGE, 2)
     both = problem.dimension_rows(problem.mean, poses, [EDGELS, EDGELS])
     for pose, rows in zip(poses, both, strict=True):
@@ -140,7 +137,7 @@ def test_transforms_of_many_poses_are_the_skeletons(up):
 
 def test_lengths_of_a_known_body_are_found(monkeypatch):
     """Silhouettes without noise: an edgel errs by what a pixel hides, not by ragged masks."""
-    monkeypatch.setattr(body_fit, "_EDGE_NOISE_PX", 0.5)
+    monkeypatch.setattr(body_fit, "INFORMATION", 1.0 / (0.5**2 * 10.0))
     # where a forearm ends and a hand begins hardly shows: only both together are told
     true = AVERAGE.dimensions.scaled(thigh=0.95, calf=1.05, upper_arm=1.05, thigh_radius=1.1)
     body = build_cone_body(true)

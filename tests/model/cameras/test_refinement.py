@@ -12,12 +12,11 @@ from tests.model.ring import ring_of_cameras
 from tk.errors import ConfigError
 from tk.io.captures.mask_store import MaskStore
 from tk.kernels.cones import CONE
-from tk.kernels.line_search import SearchSettings
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.body_parameters import Family, shapes_of
+from tk.model.body.body_parameters import BodyFamily, shapes_of
 from tk.model.body.cone_body import SHAPE_NUMBERS, build_cone_body, group_of
 from tk.model.cameras.agreement import camera_agreement
-from tk.model.cameras.bundle import camera_rows, gather
+from tk.model.cameras.bundle import camera_rows, choose_frames
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.refinement import (
     MOVE_M,
@@ -34,7 +33,6 @@ from tk.run.refinement import refine_rig
 RIG = ring_of_cameras(4, width=320, height=400)
 BODY = build_cone_body(BodyDimensions.from_stature(1.75))
 FRAMES = 12
-SEARCH = SearchSettings()
 QUICK = RefinementSettings(rounds=4, scales=1)
 
 
@@ -68,8 +66,8 @@ def in_time() -> MaskStore:
     return drawn()
 
 
-def moments(store: MaskStore, rig: Rig):
-    return gather(
+def frames(store: MaskStore, rig: Rig):
+    return choose_frames(
         lambda k, c: store.get(k)[c],
         Views(rig),
         np.arange(FRAMES),
@@ -107,8 +105,8 @@ def test_a_camera_that_shows_nothing_tells_nothing():
         masks = in_time().get(k).copy()
         masks[2] = 0
         store.put(k, masks)
-    agreement = camera_agreement(BODY, RIG, moments(store, RIG), SEARCH)
-    assert np.isfinite(agreement.shift_px).all() and not agreement.astray.any()
+    agreement = camera_agreement(BODY, RIG, frames(store, RIG))
+    assert np.isfinite(agreement.shift_px).all() and not agreement.inconsistent.any()
 
 
 @pytest.mark.parametrize("kind", ["turn", "move", "focal", "shift"])
@@ -174,7 +172,7 @@ def test_the_family_begins_at_the_body():
     ellipsoid = [group_of(p.name) for p in BODY.parts if p.kind != CONE]
     change[[BODY.shape_groups.index(name) for name in ellipsoid], 2] = 0.0  # nothing tapers there
     np.testing.assert_allclose(shapes_of(body), change, atol=2e-4)
-    family = Family(body)
+    family = BodyFamily.around(body, 0.03)
     again = family.build(family.start)
     for one, other in zip(again.parts, body.parts, strict=True):
         np.testing.assert_allclose(one.shape, other.shape, rtol=2e-3)
@@ -187,16 +185,16 @@ def test_the_family_begins_at_the_body():
 def test_perturbed_cameras_are_found_again():
     # what is drawn exactly is to be trusted more than a prior
     how = replace(QUICK, rounds=6, trust=5.0, offsets=False)
-    found = refine_cameras(BODY, PERTURBED, moments(in_time(), PERTURBED), SEARCH, how)
+    found = refine_cameras(BODY, PERTURBED, frames(in_time(), PERTURBED), how)
     (was_turned, was_moved), (turned, moved) = errors(PERTURBED), errors(found.rig)
     assert turned < 0.08 and turned < was_turned / 2.5, (was_turned, turned)
     assert moved < 0.006 and moved < was_moved, (was_moved, moved)
     assert (found.after_px < found.before_px).all()
-    assert found.told.all()
+    assert found.observed.all()
 
 
 def test_true_cameras_stay():
-    found = refine_cameras(BODY, RIG, moments(in_time(), RIG), SEARCH, QUICK)
+    found = refine_cameras(BODY, RIG, frames(in_time(), RIG), QUICK)
     assert found.turn_deg.max() < 0.05 and found.move_m.max() < 0.004
     # the gauge: as a whole the cameras have neither moved nor grown
     weight = np.tile(np.repeat([1 / np.radians(TURN_DEG), 1 / MOVE_M], 3), len(RIG))
@@ -218,7 +216,7 @@ def test_focal_lengths_are_found():
             for c in RIG
         )
     )
-    found = refine_cameras(BODY, wide, moments(in_time(), wide), SEARCH, replace(QUICK, focal=True))
+    found = refine_cameras(BODY, wide, frames(in_time(), wide), replace(QUICK, focal=True))
     assert found.focal[2] < 0.997 and np.abs(np.delete(found.focal, 2) - 1).max() < 0.004, found.focal
 
 
@@ -239,12 +237,12 @@ def test_too_few_frames_are_said():
 
 
 def test_the_agreement_names_the_camera_that_is_off():
-    fine = camera_agreement(BODY, RIG, moments(in_time(), RIG), SEARCH)
-    assert not fine.astray.any() and not fine.late.any()
+    fine = camera_agreement(BODY, RIG, frames(in_time(), RIG))
+    assert not fine.inconsistent.any() and not fine.late.any()
     one = Rig(tuple(astray(c, np.random.default_rng(5), 0.5, 0.0) if c.name == "c1" else c for c in RIG))
-    found = camera_agreement(BODY, one, moments(in_time(), one), SEARCH)
-    assert found.astray[1] and np.linalg.norm(found.shift_px, axis=1).argmax() == 1
-    late = camera_agreement(BODY, RIG, moments(drawn((0, 0, 0, 1)), RIG), SEARCH)
+    found = camera_agreement(BODY, one, frames(in_time(), one))
+    assert found.inconsistent[1] and np.linalg.norm(found.shift_px, axis=1).argmax() == 1
+    late = camera_agreement(BODY, RIG, frames(drawn((0, 0, 0, 1)), RIG))
     assert late.late.tolist() == [False, False, False, True]
 
 

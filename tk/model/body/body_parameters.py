@@ -1,54 +1,195 @@
-"""The bodies about a given one: dimensions and shapes as in :mod:`tk.model.body.body_fit`, as unknowns beside
-cameras."""
+"""Parameters of a cone body, their prior, and the derivatives of its contours by them and by the pose.
+
+The parameters are the logarithms of the dimensions and, for each group of parts, what
+:meth:`~tk.model.body.cone_body.ConeBody.reshaped` changes. A contour point's row is n·Jπ·∂x/∂δ at the material point x:
+along an occluding contour the surface slides in the image's tangent only.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.cones import CONE
-from tk.model.body.body_fit import BodyProblem as Problem
-from tk.model.body.body_fit import shape_rows
+from tk.kernels.silhouette import Edgels
+from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import SHAPE_NUMBERS, ConeBody, ConePart, build_cone_body, group_of
-from tk.model.cameras.bundle import Seen
+from tk.model.body.skeleton import SEGMENTS
 
 Float = NDArray[np.float64]
 
-# Of the logarithm of the stature about that of the given body: the cameras know the scale better.
-STATURE_DEVIATION = 0.03
+# Prior standard deviation of a dimension's logarithm about the proportions of the stature. Lengths between joints vary
+# by 4 to 5 % at a given stature (Drillis & Contini 1966). Radii vary with girth and clothes; so do the ends of the body
+# and the shoulder's drop, which both sources define loosely: chosen on the development captures, sensitivity not
+# measured.
+_LENGTHS = {
+    "trunk": 0.05,
+    "head": 0.05,
+    "upper_arm": 0.05,
+    "forearm": 0.05,
+    "thigh": 0.05,
+    "calf": 0.05,
+    "foot": 0.06,
+    "hand": 0.1,
+    "shoulder_drop": 0.25,
+    "shoulder_half_width": 0.06,
+    "hip_half_width": 0.06,
+    "ankle_height": 0.1,
+}
+_RADII = 0.2
+_STATURE = ("head", "trunk", "thigh", "calf", "ankle_height")  # dimensions that add up to the stature
+
+# Prior standard deviation of a part's shape: logarithms of a, b, m and h about the values that follow from the
+# dimensions, and metres off the bone along x and y at the beginning and at the end of the axis. Parts between joints
+# keep their lengths. Hands, feet and head end a chain, so their lengths and directions are free. Parts in the median
+# plane are symmetric. Chosen on the development captures, sensitivity not measured.
+_FIXED = 1e-6
+_LIMB = (0.15, 0.15, 0.15, _FIXED, 0.005, 0.005, 0.005, 0.005)
+_TRUNK = (0.15, 0.15, 0.15, _FIXED, 0.01, _FIXED, 0.01, _FIXED)
+_END = (0.15, 0.15, 0.15, 0.1, 0.005, 0.005, 0.02, 0.01)
+_HEAD = (0.15, 0.15, 0.15, 0.1, 0.005, _FIXED, 0.02, _FIXED)
+_SHAPES = {"hand_": _END, "foot_": _END, "head": _HEAD}
+
+# Difference of a dimension's logarithm for its derivative: curvature then changes the derivative by 1e-6, float64's
+# rounding by less.
+_STEP = 1e-6
+_DIMENSIONS = tuple(field.name for field in fields(BodyDimensions))
 
 
-class Family:
-    """The bodies about a given one: its dimensions and shapes may change, as in :mod:`tk.model.body.body_fit`."""
+class BodyFamily:
+    """The bodies of a preset: K = 24 logarithms of dimensions, then 8 numbers for each of G groups of parts.
 
-    def __init__(self, body: ConeBody) -> None:
-        self._problem = Problem(body.preset, body.dimensions, STATURE_DEVIATION)
-        self.start: Float = self._problem.mean.copy()
-        self.start[-SHAPE_NUMBERS * len(self._problem.groups) :] = shapes_of(body).ravel()
+    Attributes:
+        preset: of :data:`~tk.model.body.cone_body.PRESETS`.
+        average: dimensions at the prior's mean.
+        stature_deviation: prior standard deviation of the stature's logarithm.
+        groups: (G,) names of the groups of parts.
+        mean, deviation: (K,) mean and standard deviation of the prior.
+        start: (K,) parameters to begin with.
+    """
+
+    def __init__(self, preset: str, average: BodyDimensions, stature_deviation: float) -> None:
+        self.preset, self.average = preset, average
+        self.stature_deviation = stature_deviation
+        self.groups = build_cone_body(average, preset=preset).shape_groups
+        shapes = [_SHAPES.get(name, _LIMB if name.endswith("_") else _TRUNK) for name in self.groups]
+        logs = np.log([getattr(average, name) for name in _DIMENSIONS])
+        self.mean = np.concatenate([logs, np.zeros(SHAPE_NUMBERS * len(self.groups))])
+        self.deviation = np.concatenate([[_LENGTHS.get(name, _RADII) for name in _DIMENSIONS], np.ravel(shapes)])
+        self.start = self.mean.copy()
+
+    @staticmethod
+    def around(body: ConeBody, stature_deviation: float) -> BodyFamily:
+        """The family whose prior is about a body's dimensions and which begins at the body."""
+        family = BodyFamily(body.preset, body.dimensions, stature_deviation)
+        family.start[len(_DIMENSIONS) :] = shapes_of(body).ravel()
+        return family
 
     def build(self, shared: Float) -> ConeBody:
-        return self._problem.build(shared)
+        """The body with parameters (K,)."""
+        values = np.exp(shared[: len(_DIMENSIONS)])
+        dimensions = BodyDimensions(**dict(zip(_DIMENSIONS, values.tolist(), strict=True)))
+        change = shared[len(_DIMENSIONS) :].reshape(len(self.groups), SHAPE_NUMBERS)
+        return build_cone_body(dimensions, preset=self.preset).reshaped(change)
 
-    def add_prior(self, shared: Float, H: Float, g: Float) -> None:
-        self._problem.add_prior(shared, H, g)
-
-    def rows(self, shared: Float, seen: Sequence[Seen]) -> list[Float]:
-        """For each of ``seen`` (N, K) the contours' derivatives along their normals by the body's numbers."""
+    def rows(self, shared: Float, poses: Float, seen: Sequence[Edgels]) -> list[Float]:
+        """(N, K) derivatives of contours along their normals by the parameters, for each pose (M, D) and its edgels."""
         body = self.build(shared)
-        poses = np.array([view.pose for view in seen])
-        by_dimension = self._problem.dimension_rows(shared, poses, [view.edgels for view in seen])
         transforms = body.skeleton.segment_transforms(poses)
         return [
-            np.hstack([rows, shape_rows(body, T, view.edgels)])
-            for rows, T, view in zip(by_dimension, transforms, seen, strict=True)
+            np.hstack([rows, shape_rows(body, T, edgels)])
+            for rows, T, edgels in zip(self.dimension_rows(shared, poses, seen), transforms, seen, strict=True)
         ]
+
+    def dimension_rows(self, shared: Float, poses: Float, seen: Sequence[Edgels]) -> list[Float]:
+        """(N, 24) derivatives by the dimensions, by differences of surface points, for each pose and its edgels."""
+        counts = [len(edgels.part) for edgels in seen]
+        part = np.concatenate([edgels.part for edgels in seen])
+        unscaled = np.concatenate([edgels.unscaled for edgels in seen])
+        row = np.concatenate([edgels.row for edgels in seen])
+        rows = np.zeros((len(part), len(_DIMENSIONS)))
+        # cameras of a frame may share its pose
+        different, which = np.unique(poses, axis=0, return_inverse=True)
+        frame = np.repeat(which.ravel(), counts)
+
+        def points(values: Float) -> Float:
+            body = self.build(values)
+            placed = body.part_transforms(body.skeleton.segment_transforms(different))
+            return body.placed(placed[frame, part], part, unscaled)
+
+        here = points(shared)
+        for k in range(len(_DIMENSIONS)):
+            step = np.zeros(len(shared))
+            step[k] = _STEP
+            rows[:, k] = np.einsum("na,na->n", row, points(shared + step) - here) / _STEP
+        return np.split(rows, np.cumsum(counts)[:-1])
+
+    def add_prior(self, shared: Float, H: Float, g: Float) -> None:
+        """Add the prior at parameters (K,) to their normal equations (K, K), (K,)."""
+        H += np.diag(self.deviation**-2)
+        g += (self.mean - shared) / self.deviation**2
+        lengths = dict(zip(_DIMENSIONS, np.exp(shared[: len(_DIMENSIONS)]), strict=True))
+        stature = sum(lengths[name] for name in _STATURE)
+        row = np.zeros(len(shared))
+        for name in _STATURE:
+            row[_DIMENSIONS.index(name)] = lengths[name] / stature / self.stature_deviation
+        H += np.outer(row, row)
+        g += row * np.log(self.average.stature / stature) / self.stature_deviation
+
+
+def pose_rows(body: ConeBody, pose: Float, edgels: Edgels, x_world: Float | None = None) -> Float:
+    """Return (N, D) derivatives of the contour's position along its normal by the pose, pixels.
+
+    ``x_world`` (N, 3) are the edgels' points on the surface; None: they are computed.
+    """
+    s = body.skeleton
+    w, v = s.twists(pose)
+    x = body.place(pose, edgels.part, edgels.unscaled) if x_world is None else x_world
+    moves = s.ancestors()[[SEGMENTS.index(part.segment) for part in body.parts]][edgels.part]
+    # n · (ω × x + v) = ω · (x × n) + v · n
+    return np.where(moves, np.cross(x, edgels.row) @ w.T + edgels.row @ v.T, 0.0)
+
+
+def shape_rows(body: ConeBody, T_world_segment: Float, edgels: Edgels) -> Float:
+    """Return (N, 8 G) derivatives by the changes of :meth:`ConeBody.reshaped` at no change, to first order.
+
+    An axis whose ends move apart tilts, and the cross-sections tilt with it.
+    """
+    groups = body.shape_groups
+    part = edgels.part
+    T = body.part_transforms(T_world_segment)[part]
+    n = np.einsum("nab,na->nb", T[:, :3, :3], edgels.row)  # the row in the part's frame
+    shape, _, local = body.local(part, edgels.unscaled)
+    cone = np.array([p.kind == CONE for p in body.parts])[part]
+    mirror = np.array([-1.0 if p.name.endswith("_r") else 1.0 for p in body.parts])[part]
+    u = edgels.unscaled
+    along = np.where(cone, u[:, 2], 0.5 * (u[:, 2] + 1))  # 0 at the beginning of the axis, 1 at its end
+    length = np.where(cone, shape[:, 2], 2 * shape[:, 2])
+    grown = np.where(cone, shape[:, 3] * u[:, 2], 0.0)  # derivative of the radius factor by log m
+    rows = np.zeros((len(part), SHAPE_NUMBERS))
+    rows[:, 0] = n[:, 0] * local[:, 0]
+    rows[:, 1] = n[:, 1] * local[:, 1]
+    rows[:, 2] = grown * (n[:, 0] * shape[:, 0] * u[:, 0] + n[:, 1] * shape[:, 1] * u[:, 1])
+    rows[:, 3] = n[:, 2] * local[:, 2]
+    for axis in range(2):
+        side = mirror if axis == 1 else 1.0
+        tilt = n[:, 2] * local[:, axis] / length
+        rows[:, 4 + axis] = side * ((1 - along) * n[:, axis] + tilt)
+        rows[:, 6 + axis] = side * (along * n[:, axis] - tilt)
+    result = np.zeros((len(part), len(groups), SHAPE_NUMBERS))
+    column = np.array([groups.index(group_of(p.name)) for p in body.parts])[part]
+    result[np.arange(len(part)), column] = rows
+    return result.reshape(len(part), SHAPE_NUMBERS * len(groups))
 
 
 def shapes_of(body: ConeBody) -> Float:
-    """(G, 8) what :meth:`ConeBody.reshaped` did to the body that its dimensions describe; zero where that is laid out
-    in other parts."""
+    """Return the change (G, 8) by which :meth:`ConeBody.reshaped` makes a body from its dimensions.
+
+    A group is zero if the body of these dimensions has no such part.
+    """
     average = {part.name: part for part in build_cone_body(body.dimensions, preset=body.preset).parts}
     result = np.zeros((len(body.shape_groups), SHAPE_NUMBERS))
     for g, group in enumerate(body.shape_groups):

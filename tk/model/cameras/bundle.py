@@ -1,56 +1,65 @@
-"""Normal equations of cameras, poses and a body on the contours' residuals: bundle adjustment without points.
+"""Normal equations of cameras, poses and a body from the residuals of contours: bundle adjustment without points.
 
-An edgel says that the contour of frame f in camera c should move by d pixels along its normal n. To first order it
+An edgel means that the contour of frame f in camera c should move by d pixels along its normal n. To first order it
 moves by n·Jπ·∂x/∂δ, where x is the material point of the contour: the surface slides along its contour in the image's
-tangent only. That holds for the pose and the body (:mod:`tk.model.body.body_fit`) and for whatever moves the camera. A
-camera's frame k is taken ``offset`` frames later than k, so the body is drawn for it at θ_k + offset · dθ/dk.
+tangent only. This holds for the pose, for the body (:mod:`tk.model.body.body_parameters`) and for a moving camera. A
+camera's frame k is taken ``offset`` frames later than k, so the body is rendered for it at θ_k + offset · dθ/dk.
 
-Poses are eliminated frame by frame (the Schur complement; Triggs et al. 2000, *Bundle adjustment: a modern synthesis*,
-section 6), so the equations that are left have the size of what the frames share.
+The poses are the blocks of :mod:`tk.model.block_least_squares`; cameras and body are the unknowns that frames share.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.line_search import SearchSettings
 from tk.kernels.silhouette import Edgels
-from tk.model.body.body_fit import pose_rows
-from tk.model.body.cone_body import ConeBody
+from tk.model.block_least_squares import Equations
+from tk.model.body.body_parameters import BodyFamily, pose_rows
 from tk.model.body.skeleton import SEGMENTS
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.masks.silhouettes import Pyramid, Views
 
 Float = NDArray[np.float64]
 
-# Information of one pixel of contour, 1/px²: edgels err by 3 px, and together along 10 px of a contour, as in the
-# body's fit.
-INFORMATION = 1.0 / (3.0**2 * 10.0)
-# Standard deviation of a degree of freedom about the pose that was given, radians or metres; of waist and ankles about
-# straight ones.
+# Standard deviation of an edgel's distance, pixels: ragged masks, and shapes that no cone has. Chosen on the
+# development captures, sensitivity not measured.
+EDGE_NOISE_PX = 3.0
+# Edgels within this length of a contour err together, pixels. Chosen like EDGE_NOISE_PX.
+CORRELATION_PX = 10.0
+# Information of one pixel of contour, 1/px².
+INFORMATION = 1.0 / (EDGE_NOISE_PX**2 * CORRELATION_PX)
+# Between samples of a contour, pixels: no more than these are independent, by CORRELATION_PX.
+SPACING_PX = 6.0
+# Standard deviation of a degree of freedom about the given pose, radians or metres; of waist and ankles about zero,
+# because a bent waist and another trunk look alike.
 POSE_DEVIATION = 0.3
-# One standard deviation, metres, of a segment along an axis in one frame about where skeleton and pose put it: no
-# joint of a person is a hinge, and clothes stand off by 1 to 3 cm. Without this freedom the cameras bend to suit the
+# Standard deviation, metres, of a segment's position along an axis in one frame about that of skeleton and pose: no
+# human joint is a hinge, and clothes stand off by 1 to 3 cm. Without this freedom the cameras bend to suit the
 # skeleton.
 SEGMENT_M = 0.02
-# Added to the diagonal for a joint beyond its limit.
+# Precision that pulls a joint back from beyond its limit: 0.03 rad.
 _LIMIT = 1e3
+# Largest change in one iteration of a pose's entry (radians or metres) and of a body parameter: the linearisation holds
+# for about these.
+LONGEST_STEP = (0.3, 0.1)
 
-#: what a camera may change by, and how many numbers that is
-KINDS = {"shift": 2, "turn": 3, "move": 3, "focal": 1, "offset": 1}
+#: parameters of a camera that may change, and how many numbers each has
+CAMERA_PARAMETERS = {"shift": 2, "turn": 3, "move": 3, "focal": 1, "offset": 1}
 
 
 @dataclass(frozen=True)
-class Moment:
-    """A frame that takes part.
+class BundleFrame:
+    """One frame of a bundle.
 
     Attributes:
         pyramid: its silhouettes.
-        pose: (D,) the pose that was found.
+        pose: (D,) the given pose.
         velocity: (D,) its change from frame to frame.
     """
 
@@ -60,13 +69,13 @@ class Moment:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What one camera shows of one frame.
+class Contours:
+    """The edgels of one frame in one camera, or in all cameras if these are known.
 
     Attributes:
-        frame, camera: which.
-        pose: (D,) that the body was drawn at: where this camera's clock says that it is.
-        edgels: of this camera alone.
+        frame, camera: indices; camera 0 stands for all.
+        pose: (D,) at which the body was rendered: the pose at the camera's own time.
+        edgels: of these cameras.
     """
 
     frame: int
@@ -76,142 +85,193 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Equations:
-    """What is left once the poses are eliminated, S unknowns that the frames share.
+class BundleState:
+    """Estimate of a bundle.
 
     Attributes:
-        hessian, gradient: (S, S), (S,) the step solves ``hessian @ step = gradient``. No prior on the unknowns is in.
-        by_frame: (F, S) what each frame adds to the gradient.
-        steps: of each frame (D,) and (D, S): its pose moves by ``a - B @ step``.
+        rig: the C cameras.
+        change: (C, k) sum of the cameras' steps so far; the cameras' prior is about zero.
+        poses: (F, D).
+        body: (K,) parameters of the body.
     """
 
-    hessian: Float
-    gradient: Float
-    by_frame: Float
-    steps: list[tuple[Float, Float]]
+    rig: Rig
+    change: Float
+    poses: Float
+    body: Float
 
 
-def look(
-    body: ConeBody,
-    rig: Rig,
-    offsets: Float,
-    moments: Sequence[Moment],
-    poses: Float,
-    scale: int,
-    settings: SearchSettings,
-) -> list[Seen]:
-    """The edgels of F frames in C cameras at poses (F, D), the cameras ``offsets`` (C,) frames late; frame by frame."""
-    views = [Views(Rig((camera,))) for camera in rig]
-    found = []
-    for f, (moment, pose) in enumerate(zip(moments, poses, strict=True)):
-        for c, view in enumerate(views):
-            here = pose + offsets[c] * moment.velocity
-            masks = Pyramid(
-                tuple(level[c : c + 1] for level in moment.pyramid.masks),
-                tuple(size[c : c + 1] for size in moment.pyramid.sizes),
-            )
-            found.append(Seen(f, c, here, view.edgels(body, masks, here, scale, settings)))
-    return found
+class ContourBundle:
+    """Least-squares problem of F frames' contours: poses, camera parameters and body parameters.
+
+    Attributes:
+        family: of the body.
+        rig: the C cameras as given.
+        frames: the frames.
+        parameters: names of :data:`CAMERA_PARAMETERS`, in the order of a camera's k unknowns; "offset" comes last.
+        sigma: (k,) standard deviation of each about the given camera.
+        cameras: where the cameras' C k unknowns stand among the shared ones; the body's K follow.
+    """
+
+    def __init__(
+        self,
+        family: BodyFamily,
+        rig: Rig,
+        frames: Sequence[BundleFrame],
+        settings: SearchSettings,
+        sigmas: Mapping[str, float],
+        information: float = INFORMATION,
+        segment_m: float | None = SEGMENT_M,
+    ) -> None:
+        """See the attributes.
+
+        Args:
+            family, rig, frames: as above.
+            settings: of the edge search.
+            sigmas: standard deviation of each camera parameter that may change; empty if the cameras are known.
+            information: of one pixel of contour, 1/px².
+            segment_m: standard deviation of a segment's position about the skeleton's, metres; None: it is fixed.
+        """
+        self.family, self.rig, self.frames = family, rig, frames
+        self.parameters = tuple(sigmas)
+        self.sigma = np.concatenate(
+            [np.zeros(0), *(np.full(CAMERA_PARAMETERS[name], value) for name, value in sigmas.items())]
+        )
+        self.cameras = slice(0, len(rig) * len(self.sigma))
+        self._settings, self._information, self._segment_m = settings, information, segment_m
+
+    @property
+    def start(self) -> BundleState:
+        """The given cameras and poses, and the family's first body."""
+        poses = np.array([frame.pose for frame in self.frames])
+        return BundleState(self.rig, np.zeros((len(self.rig), len(self.sigma))), poses, self.family.start)
+
+    def offsets(self, state: BundleState) -> Float:
+        """(C,) time offset of each camera, frames."""
+        return state.change[:, -1] if "offset" in self.parameters else np.zeros(len(self.rig))
+
+    def contours(self, state: BundleState, scale: int) -> list[Contours]:
+        """Find the edgels at an estimate and a scale's index, frame by frame."""
+        body, offsets = self.family.build(state.body), self.offsets(state)
+        views = [Views(Rig((camera,))) for camera in state.rig] if self.parameters else [Views(state.rig)]
+        found = []
+        for f, (frame, pose) in enumerate(zip(self.frames, state.poses, strict=True)):
+            for c, view in enumerate(views):
+                own = slice(c, c + 1) if self.parameters else slice(None)
+                pyramid = Pyramid(
+                    tuple(level[own] for level in frame.pyramid.masks), tuple(s[own] for s in frame.pyramid.sizes)
+                )
+                here = pose + offsets[c] * frame.velocity
+                found.append(Contours(f, c, here, view.edgels(body, pyramid, here, scale, self._settings)))
+        return found
+
+    def linearise(self, state: BundleState, scale: int) -> Equations:
+        """The equations at an estimate and a scale's index, priors included."""
+        return self.equations(state, self.contours(state, scale))
+
+    def equations(self, state: BundleState, contours: Sequence[Contours]) -> Equations:
+        """The equations of contours at an estimate, priors included.
+
+        A block holds a frame's pose and, unless segments are fixed, the displacement (3,) of every segment.
+        """
+        body = self.family.build(state.body)
+        s = body.skeleton
+        segment = np.array([SEGMENTS.index(part.segment) for part in body.parts])
+        P, L, k, K = len(s.names), 3 * len(SEGMENTS), len(self.sigma), len(state.body)
+        if self._segment_m is None:
+            L = 0
+        D, S = P + L, self.cameras.stop + K
+        found = Equations(len(self.frames), np.concatenate([body.free, np.ones(L, bool)]), S)
+        poses = np.array([view.pose for view in contours])
+        by_body = self.family.rows(state.body, poses, [view.edgels for view in contours])
+        transforms = s.segment_transforms(poses)
+        for view, body_rows, T in zip(contours, by_body, transforms, strict=True):
+            edgels = view.edgels
+            x = body.place(view.pose, edgels.part, edgels.unscaled, T)
+            by_pose = pose_rows(body, view.pose, edgels, x)
+            by_camera = [
+                (by_pose @ self.frames[view.frame].velocity)[:, None]
+                if name == "offset"
+                else camera_rows(state.rig[view.camera], x, edgels, name)
+                for name in self.parameters
+            ]
+            by_segment = np.zeros((len(x), L // 3, 3))
+            if L:
+                by_segment[np.arange(len(x)), segment[edgels.part]] = edgels.row
+            rows = np.hstack([by_pose, by_segment.reshape(len(x), L), *by_camera, body_rows])
+            first = D + view.camera * k
+            columns = [slice(0, D), slice(first, first + k), slice(D + S - K, D + S)]
+            found.add(view.frame, columns, rows, self._information * edgels.weight, edgels.distance)
+        straight = s.is_waist | s.is_ankle
+        precision = np.full(D, POSE_DEVIATION**-2.0)
+        precision[P:] = (self._segment_m or 1.0) ** -2.0
+        for f, (frame, pose) in enumerate(zip(self.frames, state.poses, strict=True)):
+            difference, excess = np.zeros(D), np.zeros(D)
+            difference[:P] = np.where(straight, 0.0, frame.pose) - pose
+            excess[:P] = s.clip(pose) - pose
+            found.add_block_prior(f, precision, difference)
+            found.add_block_prior(f, np.where(excess != 0, _LIMIT, 0.0), excess)
+        H, g, cameras = found.prior_hessian, found.prior_gradient, self.cameras
+        camera_precision = np.tile(self.sigma**-2.0, len(self.rig))
+        H[cameras, cameras] += np.diag(camera_precision)
+        g[cameras] -= camera_precision * state.change.ravel()
+        self.family.add_prior(state.body, H[cameras.stop :, cameras.stop :], g[cameras.stop :])
+        return found
+
+    def move(self, state: BundleState, poses: Float, shared: Float) -> BundleState:
+        """The estimate after steps of the blocks (F, D, of which the poses come first) and of the shared unknowns."""
+        step = shared[self.cameras].reshape(state.change.shape)
+        moved = (_moved(camera, self.parameters, row) for camera, row in zip(state.rig, step, strict=True))
+        return BundleState(
+            rig=Rig(tuple(moved)) if self.parameters else state.rig,
+            change=state.change + step,
+            poses=state.poses + poses[:, : state.poses.shape[1]],
+            body=state.body + shared[self.cameras.stop :],
+        )
 
 
-def camera_rows(camera: Camera, x_world: Float, edgels: Edgels, kind: str) -> Float:
-    """(N, k) derivative of the contour's position along its normal by what may change a camera, pixels.
+def camera_rows(camera: Camera, x_world: Float, edgels: Edgels, name: str) -> Float:
+    """Return (N, k) derivatives of the contour's position along its normal by a camera parameter, pixels.
 
     Args:
-        camera: whose edgels these are.
-        x_world: (N, 3) their points on the surface, metres.
+        camera: of the edgels.
+        x_world: (N, 3) the edgels' points on the surface, metres.
         edgels: N of them.
-        kind: "shift", of the picture (pixels); "turn" and "move", the twist (ω, v) by which a point of the camera frame
+        name: "shift", of the image (pixels); "turn" and "move", the twist (ω, v) by which a point of the camera frame
             moves, p + ω × p + v (radians, metres); "focal", the logarithm of the focal lengths.
     """
     row = edgels.row @ camera.rotation.T  # n·Jπ in the camera frame
-    if kind == "move":
+    if name == "move":
         return row
-    if kind == "turn":
+    if name == "turn":
         return np.cross(camera.to_camera(x_world), row)
-    if kind == "shift":
+    if name == "shift":
         return edgels.normal
     return np.einsum("ni,ni->n", edgels.normal, edgels.pixel - camera.matrix[:2, 2])[:, None]
 
 
-def equations(
-    body: ConeBody,
-    rig: Rig,
-    moments: Sequence[Moment],
-    poses: Float,
-    seen: Sequence[Seen],
-    kinds: Sequence[str],
-    shared_rows: Sequence[Float] | None = None,
-) -> Equations:
-    """The equations of the cameras and, behind them, of what else the frames share.
-
-    Args:
-        body: that was drawn.
-        rig: C cameras.
-        moments: F frames.
-        poses: (F, D) now.
-        seen: of :func:`look`.
-        kinds: of :data:`KINDS`, each camera's unknowns in this order.
-        shared_rows: rows (N, K) by K further unknowns, for each of ``seen``; None: there are none.
-    """
-    s = body.skeleton
-    segment = np.array([SEGMENTS.index(part.segment) for part in body.parts])
-    P, D, per_camera = len(s.names), len(s.names) + 3 * len(SEGMENTS), sum(KINDS[kind] for kind in kinds)
-    further = shared_rows or [np.zeros((len(view.edgels.part), 0)) for view in seen]
-    K = further[0].shape[1]
-    S = per_camera * len(rig) + K
-    free = np.concatenate([np.flatnonzero(body.free), np.arange(P, D)])
-    straight = s.is_waist | s.is_ankle
-    precision = np.concatenate([np.full(P, POSE_DEVIATION**-2.0), np.full(D - P, SEGMENT_M**-2.0)])
-    blocks = [(np.zeros((D + S, D + S)), np.zeros(D + S)) for _ in moments]
-    transforms = s.segment_transforms(np.array([view.pose for view in seen]))
-    for view, rows_behind, T in zip(seen, further, transforms, strict=True):
-        edgels = view.edgels
-        x = body.place(view.pose, edgels.part, edgels.unscaled, T)
-        by_pose = pose_rows(body, view.pose, edgels, x)
-        columns = [
-            (by_pose @ moments[view.frame].velocity)[:, None]
-            if kind == "offset"
-            else camera_rows(rig[view.camera], x, edgels, kind)
-            for kind in kinds
-        ]
-        loose = np.zeros((len(x), len(SEGMENTS), 3))
-        loose[np.arange(len(x)), segment[edgels.part]] = edgels.row
-        rows = np.hstack([by_pose, loose.reshape(len(x), 3 * len(SEGMENTS)), *columns, rows_behind])
-        weighted = rows * (edgels.weight * INFORMATION)[:, None]
-        A, y = weighted.T @ rows, weighted.T @ edgels.distance
-        H, g = blocks[view.frame]
-        start, k = D + view.camera * per_camera, per_camera
-        pairs = [
-            (slice(0, D), slice(0, D)),
-            (slice(start, start + k), slice(D, D + k)),
-            (slice(D + S - K, D + S), slice(D + k, None)),
-        ]
-        for whole, own in pairs:
-            g[whole] += y[own]
-            for other_whole, other_own in pairs:
-                H[whole, other_whole] += A[own, other_own]
-    hessian, by_frame = np.zeros((S, S)), np.zeros((len(moments), S))
-    steps = []
-    for f, (H, g) in enumerate(blocks):
-        excess = np.zeros(D)
-        excess[:P] = s.clip(poses[f]) - poses[f]
-        limit = np.where(excess != 0, _LIMIT, 0.0)
-        away = np.zeros(D)
-        away[:P] = np.where(straight, 0.0, moments[f].pose) - poses[f]
-        pose_block = (H[:D, :D] + np.diag(precision + limit))[np.ix_(free, free)]
-        pose_gradient = (g[:D] + precision * away + limit * excess)[free]
-        across = H[free, D:]
-        solved = np.linalg.solve(pose_block, np.column_stack([pose_gradient, across]))
-        hessian += H[D:, D:] - across.T @ solved[:, 1:]
-        by_frame[f] = g[D:] - across.T @ solved[:, 0]
-        a, B = np.zeros(D), np.zeros((D, S))
-        a[free], B[free] = solved[:, 0], solved[:, 1:]
-        steps.append((a[:P], B[:P]))
-    return Equations(hessian, by_frame.sum(axis=0), by_frame, steps)
+def _moved(camera: Camera, parameters: Sequence[str], row: Float) -> Camera:
+    """The camera after a step (k,) of "turn", "move" and, if it is a parameter, "focal"."""
+    turn = np.asarray(cv2.Rodrigues(row[:3])[0])
+    moved = replace(camera, rotation=turn @ camera.rotation, translation=turn @ camera.translation + row[3:6])
+    if "focal" in parameters:
+        matrix = camera.matrix.copy()
+        matrix[[0, 1], [0, 1]] *= np.exp(row[6])
+        moved = replace(moved, matrix=matrix)
+    return moved
 
 
-def gather(
+def residual_px(contours: Sequence[Contours], count: int) -> Float:
+    """Return (C,) the weighted root mean square distance of contours from edges in ``count`` cameras, pixels; NaN
+    without edgels."""
+    sums = np.zeros((count, 2))
+    for view in contours:
+        weight = view.edgels.weight
+        sums[view.camera] += [(weight * view.edgels.distance**2).sum(), weight.sum()]
+    return np.sqrt(sums[:, 0] / np.where(sums[:, 1] > 0, sums[:, 1], np.nan))
+
+
+def choose_frames(
     masks: Callable[[int, int], NDArray[np.uint8]],
     views: Views,
     frames: NDArray[np.int64],
@@ -221,20 +281,20 @@ def gather(
     scales: int,
     cleaning: bool,
     late: NDArray[np.int64] | None = None,
-) -> list[Moment]:
-    """Frames that are spread evenly over a recording, whose neighbours are usable, too: they tell the velocity.
+) -> list[BundleFrame]:
+    """Choose frames spread evenly over a recording, whose neighbours are usable, too: velocities need them.
 
     Args:
         masks: (H, W) of a frame and a camera.
         views: the C cameras.
         frames: (F,) source frame of each row.
         poses: (F, D).
-        usable: (F,) bool, rows whose pose is to be trusted.
-        count: most frames that are taken.
+        usable: (F,) bool, rows with a reliable pose.
+        count: largest number of frames.
         scales: of the pyramids.
         cleaning: whether the masks are cleaned first.
-        late: (C,) whole frames by which a camera's pictures are late; its frame k - late is shown beside frame k of
-            the others. None: by none.
+        late: (C,) whole frames by which a camera's video is late: its frame k - late goes with frame k of the other
+            cameras. None: by none.
     """
     C = len(views.rig)
     late = np.zeros(C, np.int64) if late is None else late
@@ -244,9 +304,9 @@ def gather(
     inner &= [all(int(frame) - int(n) in known for n in late) for frame in frames]
     rows = np.flatnonzero(inner)
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(int))]
-    moments = []
+    chosen = []
     for i in rows:
-        shown = np.stack([masks(int(frames[i] - late[c]), c) for c in range(C)])
+        frame_set = np.stack([masks(int(frames[i] - late[c]), c) for c in range(C)])
         velocity = 0.5 * (poses[i + 1] - poses[i - 1])
-        moments.append(Moment(views.pyramid(shown, scales, cleaning), poses[i], velocity))
-    return moments
+        chosen.append(BundleFrame(views.pyramid(frame_set, scales, cleaning), poses[i], velocity))
+    return chosen

@@ -1,11 +1,10 @@
-"""Cameras, their clocks, the body and its poses, all adjusted at once to the contours of some frames.
+"""Refines cameras, their clocks, the body and its poses together on the contours of several frames.
 
-Gauss-Newton on the equations of :mod:`tk.model.cameras.bundle`. What no picture tells is held: a rigid motion of the
-world and
-its scale by aligning the cameras with those that were given, the common delay of all cameras by calling one camera's
-clock right. A prior about the given calibration decides what the pictures tell badly: a camera that is turned and moved
-such that the person stays where he or she is in the picture shows it only by the person's depth. The body's dimensions
-and shapes take part: a body too thin for its clothes would otherwise push every camera back.
+Gauss-Newton on the equations of :mod:`tk.model.cameras.bundle`. Three gauges cannot be observed: a rigid motion of the
+world and its scale, fixed by aligning the cameras with the given ones, and the common delay of all cameras, fixed by
+calling one camera's clock right. A prior about the given calibration decides what is badly observed: a camera that is
+turned and moved such that the person keeps the place in the image shows it only by the person's depth. The body's
+dimensions and shapes are unknowns, too: a body too thin for its clothes would otherwise push every camera back.
 """
 
 from __future__ import annotations
@@ -18,35 +17,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
-from tk.kernels.line_search import SearchSettings
-from tk.model.body.body_parameters import Family
+from tk.model.block_least_squares import Stop, gauge_projection, minimise
+from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.cone_body import ConeBody
-from tk.model.cameras.agreement import ROBUST_PX, SPACING_PX, residual_px
-from tk.model.cameras.bundle import KINDS, Moment, equations, look
+from tk.model.cameras.agreement import CAMERA_SEARCH, SCALE_DEVIATION
+from tk.model.cameras.bundle import CAMERA_PARAMETERS, LONGEST_STEP, BundleFrame, ContourBundle, residual_px
 from tk.model.cameras.camera import Camera, Rig
 
 Float = NDArray[np.float64]
 
-# One standard deviation of a calibration about the truth: of a turn about an axis, of a centre along one, of the
-# logarithm of a focal length; of a video's delay in frames.
+# Prior standard deviations of a calibration: of a turn about an axis, of a centre's place along one, of the logarithm
+# of a focal length; of a video's delay in frames. For calibrations with errors of about 0.25° and 10 mm; `trust` scales
+# the first two. Sensitivity not measured.
 TURN_DEG, MOVE_M, FOCAL, OFFSET_FRAMES = 0.18, 0.007, 0.01, 2.0
-# A step is small when it is below this share of those.
+# The iteration has converged when all steps are below this share of the prior standard deviations: a change of 0.007°.
 _SMALL = 0.04
-# Where a standard deviation is more than this share of the one beforehand, the pictures tell little.
-_TELLING = 0.7
+# A camera's placement counts as observed if its standard deviation is below this share of the prior one.
+_OBSERVED = 0.7
+# Iterations at each coarser scale.
+_COARSE_ROUNDS = 2
 
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """How it is done.
+    """Settings of the camera refinement.
 
     Attributes:
         focal: whether focal lengths change, too.
-        offsets: whether the videos' delays are sought.
-        rounds: most iterations at the finest scale.
-        scales: of the search; the coarsest comes first, two iterations each.
-        trust: standard deviations of the calibration beforehand, as multiples of :data:`TURN_DEG` and :data:`MOVE_M`;
-            more for cameras that are far off.
+        offsets: whether the videos' delays are estimated.
+        rounds: largest number of iterations at the finest scale.
+        scales: of the edge search; the coarsest comes first.
+        trust: factor of the prior standard deviations :data:`TURN_DEG` and :data:`MOVE_M`; larger for cameras with
+            larger errors.
     """
 
     focal: bool = False
@@ -65,20 +67,20 @@ class RefinementSettings:
 
 @dataclass(frozen=True)
 class Refined:
-    """What came out.
+    """Result of :func:`refine_cameras`.
 
     Attributes:
         rig: the C cameras.
-        offset_frames: (C,) by how many frames a camera's pictures are taken later than the reference camera's, the
-            middle one's.
-        turn_deg, move_m, focal: (C,) how far each camera was turned, its centre moved, and by which factor its focal
-            lengths were multiplied.
+        offset_frames: (C,) frames by which a camera's images are taken later than those of the reference camera, the
+            median one.
+        turn_deg, move_m, focal: (C,) degrees, metres and a factor: the change of each camera's orientation, centre and
+            focal lengths.
         turn_sigma_deg, move_sigma_m, focal_sigma, offset_sigma_frames: (C,) one standard deviation; of turn and move
-            the length of the vector's.
-        told: (C,) bool, whether the pictures tell a camera's place better than the prior.
-        before_px, after_px: (C,) root of the mean squared distance of contours from the mask's edges.
-        rounds: iterations that were made.
-        settled: whether the last step was small.
+            the vector's length.
+        observed: (C,) bool, whether the recording determines a camera's placement better than the prior.
+        before_px, after_px: (C,) pixels, root mean square distance of contours from the mask's edges.
+        rounds: number of iterations.
+        stop: why the iteration ended.
     """
 
     rig: Rig
@@ -90,117 +92,86 @@ class Refined:
     move_sigma_m: Float
     focal_sigma: Float
     offset_sigma_frames: Float
-    told: NDArray[np.bool_]
+    observed: NDArray[np.bool_]
     before_px: Float
     after_px: Float
     rounds: int
-    settled: bool
+    stop: Stop
 
 
 def refine_cameras(
     body: ConeBody,
     rig: Rig,
-    moments: Sequence[Moment],
-    settings: SearchSettings,
+    frames: Sequence[BundleFrame],
     config: RefinementSettings | None = None,
 ) -> Refined:
     """Adjust C cameras to F frames; see the module.
 
     Args:
-        body: that was tracked, in a world in which z is up.
+        body: the tracked body, in a world in which z is up.
         rig: the cameras as calibrated.
-        moments: the frames, with pyramids of at least ``config.scales`` scales.
-        settings: of the search.
+        frames: with pyramids of at least ``config.scales`` scales.
         config: see :class:`RefinementSettings`.
     """
     config = config or RefinementSettings()
-    settings = replace(settings, spacing_px=SPACING_PX, robust_px=ROBUST_PX)
-    kinds = ("turn", "move", *(("focal",) if config.focal else ()), *(("offset",) if config.offsets else ()))
     sigmas = {"turn": np.radians(TURN_DEG) * config.trust, "move": MOVE_M * config.trust}
-    sigmas |= {"focal": FOCAL, "offset": OFFSET_FRAMES}
-    sigma = np.concatenate([np.full(KINDS[kind], sigmas[kind]) for kind in kinds])
-    C, k = len(rig), len(sigma)
-    cameras = slice(0, C * k)
-    family = Family(body)
-    shared = family.start
-    # what the cameras have changed by, to first order: the prior looks at it
-    change, offsets = np.zeros((C, k)), np.zeros(C)
-    poses = np.array([moment.pose for moment in moments])
-    precision = np.tile(sigma**-2.0, C)
-    before = residual_px(look(body, rig, offsets, moments, poses, 0, settings), C)
-    now, settled, count = rig, False, 0
-    H = np.eye(C * k)
-    schedule = [scale for scale in range(config.scales - 1, 0, -1) for _ in range(2)] + [0] * config.rounds
-    for scale in schedule:
-        count += 1
-        here = family.build(shared)
-        seen = look(here, now, offsets, moments, poses, scale, settings)
-        rows = family.rows(shared, seen)
-        found = equations(here, now, moments, poses, seen, kinds, rows)
-        H, g = found.hessian, found.gradient
-        H[cameras, cameras] += np.diag(precision)
-        g[cameras] -= precision * change.ravel()
-        family.add_prior(shared, H[C * k :, C * k :], g[C * k :])
-        step = np.linalg.solve(H, g)
-        for f, (a, B) in enumerate(found.steps):
-            poses[f] += np.clip(a - B @ step, -0.3, 0.3)
-        shared = shared + np.clip(step[C * k :], -0.1, 0.1)
-        by_camera = step[cameras].reshape(C, k)
-        change += by_camera
-        now = Rig(
-            tuple(
-                _moved(camera, kinds, np.asarray(row, np.float64)) for camera, row in zip(now, by_camera, strict=True)
-            )
-        )
-        if config.offsets:
-            offsets = change[:, -1].copy()
-        settled = scale == 0 and bool((np.abs(by_camera) < _SMALL * sigma).all())
-        if settled:
-            break
-    after = residual_px(look(family.build(shared), now, offsets, moments, poses, 0, settings), C)
-    now = aligned(now, rig, sigmas["turn"], sigmas["move"])
-    covariance = np.asarray(np.linalg.inv(H)[cameras, cameras], np.float64)
-    told, held = _relative(covariance, rig, kinds, sigmas), _relative(np.diag(1 / precision), rig, kinds, sigmas)
+    sigmas |= ({"focal": FOCAL} if config.focal else {}) | ({"offset": OFFSET_FRAMES} if config.offsets else {})
+    family = BodyFamily.around(body, SCALE_DEVIATION)
+    bundle = ContourBundle(family, rig, frames, CAMERA_SEARCH, sigmas)
+    C, sigma, others = len(rig), np.tile(bundle.sigma, len(rig)), np.full(len(family.start), np.inf)
+    solution = minimise(
+        bundle.start,
+        bundle.linearise,
+        bundle.move,
+        [s for s in range(config.scales - 1, 0, -1) for _ in range(_COARSE_ROUNDS)] + [0] * config.rounds,
+        (LONGEST_STEP[0], np.concatenate([np.full(len(sigma), np.inf), np.full(len(others), LONGEST_STEP[1])])),
+        np.concatenate([_SMALL * sigma, others]),
+    )
+    assert solution.reduced is not None
+    final, offsets = solution.state, bundle.offsets(solution.state)
+    now = aligned(final.rig, rig, sigmas["turn"], sigmas["move"])
+    covariance = np.asarray(np.linalg.inv(solution.reduced.hessian), np.float64)[bundle.cameras, bundle.cameras]
+    posterior, prior = _deviations(covariance, bundle), _deviations(np.diag(sigma**2), bundle)
     reference = np.argsort(offsets, kind="stable")[(C - 1) // 2]
-    nothing = np.zeros(C)
     return Refined(
         rig=now,
         offset_frames=offsets - offsets[reference],
         turn_deg=np.array([turn_between(n, o) for n, o in zip(now, rig, strict=True)]),
         move_m=np.linalg.norm(now.centers - rig.centers, axis=1),
         focal=np.array([n.matrix[0, 0] / o.matrix[0, 0] for n, o in zip(now, rig, strict=True)]),
-        turn_sigma_deg=np.degrees(told["turn"]),
-        move_sigma_m=told["move"],
-        focal_sigma=told.get("focal", nothing),
-        offset_sigma_frames=told.get("offset", nothing),
-        told=(told["turn"] < _TELLING * held["turn"]) & (told["move"] < _TELLING * held["move"]),
-        before_px=before,
-        after_px=after,
-        rounds=count,
-        settled=settled,
+        turn_sigma_deg=np.degrees(posterior["turn"]),
+        move_sigma_m=posterior["move"],
+        focal_sigma=posterior.get("focal", np.zeros(C)),
+        offset_sigma_frames=posterior.get("offset", np.zeros(C)),
+        observed=(posterior["turn"] < _OBSERVED * prior["turn"]) & (posterior["move"] < _OBSERVED * prior["move"]),
+        before_px=residual_px(bundle.contours(bundle.start, 0), C),
+        after_px=residual_px(bundle.contours(final, 0), C),
+        rounds=solution.iterations,
+        stop=solution.reason,
     )
 
 
 def turn_between(one: Camera, other: Camera) -> float:
-    """Angle between the orientations of two cameras, degrees."""
+    """Return the angle between the orientations of two cameras, degrees."""
     return float(np.degrees(np.linalg.norm(cv2.Rodrigues(one.rotation @ other.rotation.T)[0])))
 
 
 def aligned(rig: Rig, target: Rig, turn: float, move: float, scaling: bool = True) -> Rig:
-    """The rig after the motion of the world, and its scaling unless that is held, that brings it closest to the target.
+    """Return the rig after the motion of the world, and its scaling unless ``scaling`` is False, that brings it closest
+    to the target.
 
     Args:
         rig, target: the same C cameras.
-        turn, move: standard deviations, radians and metres, that turns and places of cameras are weighed by.
-        scaling: whether the world may grow, too.
+        turn, move: standard deviations, radians and metres, that weight the cameras' turns and places.
+        scaling: whether the world's scale is free.
     """
     free = 7 if scaling else 6
     weight = np.tile(np.repeat([1 / turn, 1 / move], 3), len(rig))
     for _ in range(5):
-        away = np.concatenate([_twist(c, t) for c, t in zip(rig, target, strict=True)])
+        difference = np.concatenate([_twist(c, t) for c, t in zip(rig, target, strict=True)])
         modes = world_motions(rig)[:, :free]
         s = np.zeros(7)
-        s[:free] = np.linalg.lstsq(modes * weight[:, None], -away * weight, rcond=None)[0]
+        s[:free] = np.linalg.lstsq(modes * weight[:, None], -difference * weight, rcond=None)[0]
         Q, scale = np.asarray(cv2.Rodrigues(s[:3])[0]), float(np.exp(s[6]))
         cameras = []
         for c in rig:
@@ -212,13 +183,13 @@ def aligned(rig: Rig, target: Rig, turn: float, move: float, scaling: bool = Tru
 
 
 def _twist(camera: Camera, other: Camera) -> Float:
-    """(6,) the turn and the move of the centre, both in the camera frame, from another camera to this one."""
+    """(6,) turn, radians, and move of the centre, metres, from another camera to this one, in the camera frame."""
     turn = np.asarray(cv2.Rodrigues(camera.rotation @ other.rotation.T)[0]).ravel()
     return np.concatenate([turn, -camera.rotation @ (camera.center - other.center)])
 
 
 def world_motions(rig: Rig) -> Float:
-    """(6 C, 7) by what turns, moves and a growth of the world change the cameras' twists (ω, v).
+    """Return (6 C, 7) derivatives of the cameras' twists (ω, v) by turns, moves and a scaling of the world.
 
     A twist turns a camera about its centre and moves the centre by -v in the camera frame.
     """
@@ -237,31 +208,17 @@ def _cross(a: Float) -> Float:
     return np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
 
 
-def _relative(covariance: Float, rig: Rig, kinds: Sequence[str], sigmas: dict[str, float]) -> dict[str, Float]:
-    """(C,) standard deviations of each kind, the world's motion and growth and the common delay taken off."""
-    C = len(rig)
-    k = sum(KINDS[kind] for kind in kinds)
-    modes = np.zeros((C * k, 7 + ("offset" in kinds)))
-    modes.reshape(C, k, -1)[:, :6, :7] = world_motions(rig).reshape(C, 6, 7)
-    if "offset" in kinds:
-        modes.reshape(C, k, -1)[:, -1, 7] = 1.0
-    W = np.tile(np.concatenate([np.full(KINDS[kind], sigmas[kind] ** -2.0) for kind in kinds]), C)
-    weighted = modes.T * W
-    project = np.eye(C * k) - modes @ np.linalg.solve(weighted @ modes, weighted)
+def _deviations(covariance: Float, bundle: ContourBundle) -> dict[str, Float]:
+    """(C,) standard deviations of each camera parameter, after the gauges are projected out."""
+    C, k, timed = len(bundle.rig), len(bundle.sigma), "offset" in bundle.parameters
+    modes = np.zeros((C, k, 7 + timed))
+    modes[:, :6, :7] = world_motions(bundle.rig).reshape(C, 6, 7)
+    if timed:
+        modes[:, -1, 7] = 1.0
+    project = gauge_projection(modes.reshape(C * k, -1), np.tile(bundle.sigma**-2.0, C))
     variance = np.diag(project @ covariance @ project.T).reshape(C, k)
-    result, at = {}, 0
-    for kind in kinds:
-        result[kind] = np.sqrt(np.maximum(variance[:, at : at + KINDS[kind]].sum(axis=1), 0.0))
-        at += KINDS[kind]
-    return result
-
-
-def _moved(camera: Camera, kinds: Sequence[str], row: Float) -> Camera:
-    """The camera after a step (k,): points of its frame move by the twist."""
-    turn = np.asarray(cv2.Rodrigues(row[:3])[0])
-    moved = replace(camera, rotation=turn @ camera.rotation, translation=turn @ camera.translation + row[3:6])
-    if "focal" in kinds:
-        matrix = camera.matrix.copy()
-        matrix[[0, 1], [0, 1]] *= np.exp(row[6])
-        moved = replace(moved, matrix=matrix)
-    return moved
+    ends = np.cumsum([CAMERA_PARAMETERS[name] for name in bundle.parameters])
+    parts = np.split(variance, ends[:-1], axis=1)
+    return {
+        name: np.sqrt(np.maximum(part.sum(axis=1), 0.0)) for name, part in zip(bundle.parameters, parts, strict=True)
+    }

@@ -1,0 +1,111 @@
+"""The block solver against dense solutions by numpy."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tk.model.block_least_squares import Equations, Stop, gauge_projection, minimise
+
+BLOCKS, OWN, SHARED, ROWS = 3, 4, 5, 7
+
+
+class Linear:
+    """Residuals y - own_b @ p_b - across_b @ s with weights and priors, and the dense equations of the same."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.rows = rng.normal(size=(BLOCKS, ROWS, OWN + SHARED))
+        self.target, self.weight = rng.normal(size=(BLOCKS, ROWS)), rng.uniform(0.1, 2.0, (BLOCKS, ROWS))
+        self.own_precision, self.shared_precision = rng.uniform(0.5, 2.0, OWN), rng.uniform(0.5, 2.0, SHARED)
+        self.free = rng.random(OWN) < 0.7
+        self.start = rng.normal(size=(BLOCKS, OWN)), rng.normal(size=SHARED)
+
+    def linearise(self, state, level=0):
+        p, s = state
+        equations = Equations(BLOCKS, self.free, SHARED)
+        for b, rows in enumerate(self.rows):
+            residual = self.target[b] - rows @ np.concatenate([p[b], s])
+            equations.add(b, [slice(0, OWN), slice(OWN, OWN + SHARED)], rows, self.weight[b], residual)
+            equations.add_block_prior(b, self.own_precision, -p[b])
+        equations.prior_hessian += np.diag(self.shared_precision)
+        equations.prior_gradient -= self.shared_precision * s
+        return equations
+
+    def dense(self):
+        """Hessian and gradient of all free unknowns at the start: blocks first, then the shared unknowns."""
+        p, s = self.start
+
+        H = np.diag(np.concatenate([np.tile(self.own_precision, BLOCKS), self.shared_precision]))
+        g = -np.diag(H) * np.concatenate([p.ravel(), s])
+        for b, rows in enumerate(self.rows):
+            J = np.zeros((ROWS, len(g)))
+            J[:, b * OWN : (b + 1) * OWN], J[:, BLOCKS * OWN :] = rows[:, :OWN], rows[:, OWN:]
+            H += J.T @ (self.weight[b][:, None] * J)
+            g += J.T @ (self.weight[b] * (self.target[b] - rows @ np.concatenate([p[b], s])))
+        kept = np.concatenate([np.tile(self.free, BLOCKS), np.ones(SHARED, bool)])
+        return H[np.ix_(kept, kept)], g[kept], kept
+
+
+def move(state, own, shared):
+    return state[0] + own, state[1] + shared
+
+
+@given(st.integers(0, 10**6), st.sampled_from([0.0, 0.3]))
+@settings(max_examples=30, deadline=None)
+def test_step_and_covariance_equal_the_dense_solution(seed, damping):
+    problem = Linear(seed)
+    H, g, kept = problem.dense()
+    H[np.diag_indices_from(H)] *= 1 + damping
+    expected = np.zeros(len(kept))
+    expected[kept] = np.linalg.solve(H, g)
+    reduced = problem.linearise(problem.start).reduced(damping)
+    own, shared = reduced.step()
+    np.testing.assert_allclose(np.concatenate([own.ravel(), shared]), expected, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.inv(reduced.hessian), np.linalg.inv(H)[-SHARED:, -SHARED:], atol=1e-9)
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=10, deadline=None)
+def test_linear_problem_converges_in_two_iterations(seed):
+    problem = Linear(seed)
+    found = minimise(problem.start, problem.linearise, move, [0] * 5, (100.0, 100.0), tolerance=1e-8)
+    assert found.reason is Stop.CONVERGED and found.iterations == 2
+    np.testing.assert_allclose(problem.linearise(found.state).gradient[:, :OWN][:, problem.free], 0, atol=1e-8)
+
+
+def test_steps_are_limited_and_all_iterations_are_made():
+    problem = Linear(1)
+    found = minimise(problem.start, problem.linearise, move, [1, 0], (0.01, 0.02), tolerance=1e-8)
+    assert found.reason is Stop.ITERATIONS and found.iterations == 2
+    for now, before, limit in zip(found.state, problem.start, (0.02, 0.04), strict=True):
+        assert np.abs(now - before).max() == pytest.approx(limit)
+
+
+def test_coarse_levels_do_not_end_the_iteration():
+    problem = Linear(2)
+    assert minimise(problem.start, problem.linearise, move, [1, 1, 0], (9.0, 9.0), tolerance=np.inf).iterations == 3
+
+
+def test_without_iterations_the_start_is_returned():
+    found = minimise(3.0, lambda *_: pytest.fail("linearised"), lambda *_: 0.0, [], (1.0, 1.0))
+    assert (found.state, found.reduced, found.iterations) == (3.0, None, 0)
+
+
+def test_damped_iterations_reach_the_same_minimum():
+    problem = Linear(3)
+    plain = minimise(problem.start, problem.linearise, move, [0], (100.0, 100.0)).state
+    damped = minimise(problem.start, problem.linearise, move, [0] * 40, (100.0, 100.0), damping=0.3).state
+    for one, other in zip(plain, damped, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-8)
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=10, deadline=None)
+def test_gauge_projection_removes_modes_and_keeps_what_is_orthogonal(seed):
+    rng = np.random.default_rng(seed)
+    modes, precision, step = rng.normal(size=(8, 3)), rng.uniform(0.5, 2.0, 8), rng.normal(size=8)
+    project = gauge_projection(modes, precision)
+    np.testing.assert_allclose(project @ modes, 0, atol=1e-9)
+    np.testing.assert_allclose((modes.T * precision) @ (project @ step), 0, atol=1e-9)
+    np.testing.assert_allclose(project @ (project @ step), project @ step, atol=1e-9)
