@@ -31,7 +31,7 @@ _STEP_M = 1e-4
 # standard deviations (three: one false alarm in 370). Captures with exact cameras (walk, dance) show 0.02° and 0.01
 # frames; lower limits refine cameras that are right.
 INCONSISTENT_DEG, LATE_FRAMES, SIGNIFICANT = 0.06, 0.2, 3.0
-# An edge's weight falls to a quarter at robust_px: at less than in the tracker's search, because a camera can do without
+# An edge's weight falls to a quarter at robust_px: less than in the tracker's search, because a camera can do without
 # the edges of folds, shadows and hands.
 CAMERA_SEARCH = SearchSettings(spacing_px=SPACING_PX, robust_px=3.0)
 # Prior standard deviation of the logarithm of the stature about that of the given body: the cameras determine the scale
