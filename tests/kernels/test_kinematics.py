@@ -141,25 +141,14 @@ def test_rodrigues_is_a_rotation_about_the_axis(seed, scale):
 
 
 @ti.kernel
-def _velocities(
-    axis: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (D, 3)
-    point: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (D, 3)
-    prismatic: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
-    parent: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
-    chain: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (D,)
+def _twists(
+    tree: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (D, 11)
+    chain: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,)
     pose: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (1, D)
-    x: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (N, 3) world points
-    frames: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (1, D, 12) scratch
-    twists: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (1, D, 6) scratch
-    velocities: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (N, D, 3) out
+    joints: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (1, D, 18) out
 ):
     for _ in range(1):
-        kinematics.forward(axis, point, prismatic, parent, chain, pose, 0, 0, frames, twists)
-        for n in range(x.shape[0]):
-            for k in range(axis.shape[0]):
-                v = kinematics.point_velocity(prismatic, twists, 0, k, kinematics.load_vector3(x, n))
-                for a in ti.static(range(3)):
-                    velocities[n, k, a] = v[a]
+        kinematics.forward_chain(tree, chain, pose, 0, 0, joints)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -169,22 +158,19 @@ def test_velocity_of_a_point_is_the_derivative_of_its_place(seed):
     rng = np.random.default_rng(seed)
     pose, (local, segment) = poses_of(rng, 1)[0], points_of(rng, 12)
     s = SKELETON
-    velocities = np.empty((len(local), D, 3))
-    _velocities(
-        s.axis,
-        s.anchor,
-        s.prismatic.astype(np.int32),
-        s.parent,
-        np.arange(D, dtype=np.int32),
-        pose[None],
-        place(local, segment, pose[None])[0],
-        np.empty((1, D, 12)),
-        np.empty((1, D, 6)),
-        velocities,
-    )
+    joints = np.empty((1, D, kinematics.JOINT_NUMBERS))
+    tree = kinematics.pack_tree(s.axis, s.anchor, s.prismatic, s.parent)
+    _twists(tree, np.arange(D, dtype=np.int32), pose[None], joints)
+    w, v = np.split(joints[0, :, kinematics.TWIST :], 2, axis=1)
+    velocities = np.cross(w, place(local, segment, pose[None])[0][:, None]) + v
     h = 1e-6
     steps = h * np.eye(D)
     numeric = (place(local, segment, pose + steps) - place(local, segment, pose - steps)) / (2 * h)
     above = s.ancestors()[segment]
     np.testing.assert_allclose(velocities[above], numeric.transpose(1, 0, 2)[above], rtol=0, atol=1e-8)
     np.testing.assert_array_equal(numeric.transpose(1, 0, 2)[~above], 0)
+    chain = np.flatnonzero(s.ancestors()[segment[0]]).astype(np.int32)
+    some = np.full_like(joints, np.nan)
+    _twists(tree, chain, pose[None], some)
+    np.testing.assert_array_equal(some[:, chain], joints[:, chain])
+    assert np.isnan(np.delete(some, chain, axis=1)).all(), "the others are not touched"

@@ -94,7 +94,7 @@ def test_body_is_built_anew_from_the_model(result: Path) -> None:
     assert restored is not None
     body, poses = restored
     assert poses.shape == (3, len(BODY.skeleton.names)) and body.dimensions == BODY.dimensions
-    np.testing.assert_array_equal(body.arrays.part_shape, BODY.arrays.part_shape)
+    np.testing.assert_array_equal(body.arrays.parts, BODY.arrays.parts)
 
 
 def test_outlines_of_cones_are_their_silhouette() -> None:

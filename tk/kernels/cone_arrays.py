@@ -1,4 +1,4 @@
-"""A cone body as arrays, and its parts placed in the world: what the kernels of contours and of overlap share."""
+"""A cone body as arrays, and its parts placed in the world: shared by the kernels of contours and of rays."""
 
 from typing import NamedTuple
 
@@ -9,55 +9,74 @@ from tk.kernels.kinematics import load_rotation, load_translation
 from tk.kernels.runtime import ti
 from tk.kernels.vectors import product, times
 
-# Nearer than this to a camera nothing is projected, metres.
+# Points nearer to a camera than this are not projected, metres. Chosen; sensitivity not measured: bodies stay farther
+# away. At 0 a projection divides by zero; beyond the least distance of a body, parts have no contour.
 NEAREST_M = 0.1
-# Which parts may hide another is told by the bits of a number.
+# The parts that may hide a part are the bits of an int64.
 MOST_PARTS = 64
+# Columns of ``parts``: a, b, h, m of the shape (from 0), the 3×4 frame, CONE or ELLIPSOID, the last degree of freedom
+# above the part, its limb.
+PART_FRAME, PART_KIND, PART_DOF, PART_LIMB, PART_NUMBERS = 4, 16, 17, 18, 19
 
 
 class ConeArrays(NamedTuple):
-    """A cone body as plain arrays (D degrees of freedom, P parts, Q curves), all of one real type.
+    """A cone body as plain arrays (D degrees of freedom, P parts, Q curves), the first two of one real type.
 
     Attributes:
-        axis, point: (D, 3) twists in the zero configuration.
-        prismatic, parent: (D,) int32.
-        part_kind: (P,) int32, CONE or ELLIPSOID.
-        part_shape: (P, 4) a, b, h, m.
-        part_frame: (P, 12) 3×4 transform from the part to the zero configuration.
-        part_dof: (P,) int32 the last degree of freedom above each part.
-        part_limb: (P,) int32 parts of one limb never make each other's edges ambiguous.
-        curve_part, curve_kind: (Q,) int32.
+        tree: (D, 11) of :func:`tk.kernels.kinematics.pack_tree`.
+        parts: (P, 19) of :func:`pack_parts`.
+        curves: (Q, 2) int32 part and kind of each curve, see :mod:`tk.kernels.cones`.
     """
 
-    axis: NDArray
-    point: NDArray
-    prismatic: NDArray[np.int32]
-    parent: NDArray[np.int32]
-    part_kind: NDArray[np.int32]
-    part_shape: NDArray
-    part_frame: NDArray
-    part_dof: NDArray[np.int32]
-    part_limb: NDArray[np.int32]
-    curve_part: NDArray[np.int32]
-    curve_kind: NDArray[np.int32]
+    tree: NDArray
+    parts: NDArray
+    curves: NDArray[np.int32]
+
+
+def pack_parts(shape: np.ndarray, frame: np.ndarray, kind: np.ndarray, dof: np.ndarray, limb: np.ndarray) -> NDArray:
+    """Pack the parts of a body into one array (P, 19), float64.
+
+    Args:
+        shape: (P, 4) a, b, h, m.
+        frame: (P, 3, 4) transform from the part to the zero configuration.
+        kind: (P,) CONE or ELLIPSOID.
+        dof: (P,) the last degree of freedom above each part.
+        limb: (P,) number of the limb; parts of one limb never make each other's edges ambiguous.
+    """
+    return np.column_stack([shape, np.reshape(frame, (-1, 12)), kind, dof, limb]).astype(np.float64)
 
 
 @ti.func
-def shape_of(part_shape: ti.template(), p: int):
-    return ti.Vector([part_shape[p, i] for i in ti.static(range(4))])
+def shape_of(parts: ti.template(), p: int):
+    """Return (a, b, h, m) of part p."""
+    return ti.Vector([parts[p, i] for i in ti.static(range(4))])
 
 
 @ti.func
-def place_part(frames: ti.template(), part_dof: ti.template(), part_frame: ti.template(), b: int, p: int):
-    """Rotation and translation from part p to the world at pose b."""
-    R0 = ti.Matrix([[part_frame[p, 4 * i + j] for j in ti.static(range(3))] for i in ti.static(range(3))])
-    t0 = ti.Vector([part_frame[p, 4 * i + 3] for i in ti.static(range(3))])
-    R = load_rotation(frames, b, part_dof[p])
-    return product(R, R0), times(R, t0) + load_translation(frames, b, part_dof[p])
+def kind_of(parts: ti.template(), p: int):
+    """Return CONE or ELLIPSOID."""
+    return ti.cast(parts[p, PART_KIND], ti.i32)
 
 
 @ti.func
-def keep(placed: ti.template(), b: int, p: int, R, t):
+def limb_of(parts: ti.template(), p: int):
+    """Return the number of the limb of part p."""
+    return ti.cast(parts[p, PART_LIMB], ti.i32)
+
+
+@ti.func
+def place_part(joints: ti.template(), parts: ti.template(), b: int, p: int):
+    """Return rotation and translation from part p to the world at pose b."""
+    R0 = ti.Matrix([[parts[p, PART_FRAME + 4 * i + j] for j in ti.static(range(3))] for i in ti.static(range(3))])
+    t0 = ti.Vector([parts[p, PART_FRAME + 4 * i + 3] for i in ti.static(range(3))])
+    k = ti.cast(parts[p, PART_DOF], ti.i32)
+    R = load_rotation(joints, b, k)
+    return product(R, R0), times(R, t0) + load_translation(joints, b, k)
+
+
+@ti.func
+def store_frame(placed: ti.template(), b: int, p: int, R, t):
+    """Store a 3×4 transform in the first 12 columns of a row."""
     for i in ti.static(range(3)):
         for j in ti.static(range(3)):
             placed[b, p, 4 * i + j] = R[i, j]

@@ -1,12 +1,12 @@
 """Forward kinematics of a tree of twists, as Taichi functions for the kernels that need it.
 
-Layout: ``frames (C, D, 12)`` holds the 3×4 transform after each degree of freedom, row by row; ``twists (C, D, 6)`` its
-world twist (ω, v): a point x below it moves at ω × x + v; ``joints (C, D, 18)`` both. C are scratch rows, one a
-parallel task, so that no task waits for another.
+A tree is one array ``(D, 11)``, see :func:`pack_tree`. ``joints (C, D, 18 or more)`` receives for each degree of
+freedom the 3×4 transform after it, row by row, and its world twist (ω, v): a point x below moves at ω × x + v. C are
+scratch rows, one a parallel task, so that no task waits for another.
 
 The shoulder girdle has no degree of freedom of its own, but the shoulder rises as the arm does. So the first degree of
 freedom of a shoulder may carry a translation ``rise · u`` before its rotation, with u the sine of the arm's elevation
-over the horizontal in the trunk's frame, which its own angle and the next one make (:data:`ARM_UP`).
+over the horizontal in the trunk's frame, which follows from its own angle and the next one (:data:`ARM_UP`).
 """
 
 import numpy as np
@@ -17,20 +17,20 @@ from tk.kernels.vectors import cross, norm_sqr, product, times
 # The arm's elevation u from a shoulder's first two angles, the arm being level in the zero configuration:
 # u = ARM_UP[0] cos(second) sin(first) + ARM_UP[1] sin(second).
 ARM_UP = (-np.sqrt(2 / 3), np.sqrt(1 / 3))
-# Columns of ``point``: the point, and the rise where there is one.
-RISE = 3
-# Columns of a tree in one array: axis, point, rise, 1 where prismatic, parent. A launch pays 6 µs for each array.
+# Columns of a tree: axis (from 0), point, rise, 1 where prismatic, parent. A launch pays up to 6 µs for each array.
 TREE_POINT, TREE_RISE, TREE_PRISMATIC, TREE_PARENT, TREE_NUMBERS = 3, 6, 9, 10, 11
-# Columns of its scratch: frame and twist.
+# Columns of ``joints``: frame (from 0) and twist.
 TWIST, JOINT_NUMBERS = 12, 18
 
 
 def pack_tree(axis: np.ndarray, point: np.ndarray, prismatic: np.ndarray, parent: np.ndarray) -> np.ndarray:
-    """(D, 11) float64, a tree in one array.
+    """Pack a tree into one array (D, 11), float64.
 
     Args:
-        axis: (D, 3), point: (D, 3) or (D, 6) with the rise, twists in the zero configuration.
-        prismatic, parent: (D,).
+        axis: (D, 3) of the twists in the zero configuration.
+        point: (D, 3) on the axes, metres; or (D, 6), point and rise.
+        prismatic: (D,) 1 for a translation along the axis.
+        parent: (D,) index of the degree of freedom above, -1 at the root.
     """
     tree = np.zeros((len(axis), TREE_NUMBERS))
     tree[:, :TREE_POINT] = axis
@@ -84,38 +84,40 @@ def rodrigues(w, angle):
 
 
 @ti.func
-def _move(
-    w,  # the degree of freedom's axis and point, zero configuration
-    q,
-    slides: int,  # 1 for a translation along the axis
-    up: int,  # its parent, or -1
-    rise,  # of the shoulder that it belongs to, or zero
-    first: int,  # that shoulder's first degree of freedom
-    above: int,  # the parent of that one
+def _place_joint(
+    tree: ti.template(),  # (D, 11)
     pose: ti.template(),  # (B, D)
     b: int,
     c: int,
     k: int,
-    frames: ti.template(),  # (C, D, 12 or more) out
-    twists: ti.template(),  # (C, D, from + 6) out
-    start: ti.template(),  # the twist's first column
+    joints: ti.template(),  # (C, D, 18 or more) out
 ):
     """Place degree of freedom k at pose b, in row c of the scratch."""
+    up = parent_of(tree, k)
+    # the rise of the shoulder that k belongs to, and that shoulder's first degree of freedom
+    first = k
+    rise = _load_columns(tree, k, TREE_RISE)
+    if up >= 0:
+        rise_above = _load_columns(tree, up, TREE_RISE)
+        if norm_sqr(rise_above) > 0.0:
+            first, rise = up, rise_above
     zero = pose[b, k] * 0.0
     R = ti.Matrix([[1.0 + zero, zero, zero], [zero, 1.0 + zero, zero], [zero, zero, 1.0 + zero]])
     t = ti.Vector([zero, zero, zero])
     if up >= 0:
-        R = load_rotation(frames, c, up)
-        t = load_translation(frames, c, up)
+        R = load_rotation(joints, c, up)
+        t = load_translation(joints, c, up)
+    w, q = _load_columns(tree, k, 0), _load_columns(tree, k, TREE_POINT)
     w_world = times(R, w)
     q_world = times(R, q) + t
     rate = q_world * zero
     if rise[0] != 0.0 or rise[1] != 0.0 or rise[2] != 0.0:
         second = ti.select(first == k, k + 1, k)
         lifted = times(R, rise)
+        above = parent_of(tree, first)
         if first != k and above >= 0:
-            lifted = times(load_rotation(frames, c, above), rise)
-        # of the pose's precision, which a literal need not have
+            lifted = times(load_rotation(joints, c, above), rise)
+        # ARM_UP in the pose's precision, which a literal need not have
         a, d = -ti.sqrt((zero + 2.0) / 3.0), ti.sqrt((zero + 1.0) / 3.0)
         s1, c1 = ti.sin(pose[b, first]), ti.cos(pose[b, first])
         s2, c2 = ti.sin(pose[b, second]), ti.cos(pose[b, second])
@@ -125,7 +127,7 @@ def _move(
         else:
             rate = (d * c2 - a * s2 * s1) * lifted
     v_world = w_world
-    if slides == 1:
+    if ti.cast(tree[k, TREE_PRISMATIC], ti.i32) == 1:
         t += w_world * pose[b, k]
         w_world = w_world * 0.0
     else:
@@ -134,68 +136,28 @@ def _move(
         v_world = cross(q_world, w_world) + rate
     for i in ti.static(range(3)):
         for j in ti.static(range(3)):
-            frames[c, k, 4 * i + j] = R[i, j]
-        frames[c, k, 4 * i + 3] = t[i]
-        twists[c, k, start + i] = w_world[i]
-        twists[c, k, start + 3 + i] = v_world[i]
+            joints[c, k, 4 * i + j] = R[i, j]
+        joints[c, k, 4 * i + 3] = t[i]
+        joints[c, k, TWIST + i] = w_world[i]
+        joints[c, k, TWIST + 3 + i] = v_world[i]
 
 
 @ti.func
-def forward_tree(
-    tree: ti.template(),  # (D, 11) of pack_tree
-    pose: ti.template(),  # (B, D)
-    b: int,
-    c: int,
-    joints: ti.template(),  # (C, D, 18) out: frames and twists
-):
-    """Fill row c of the scratch with the tree at pose b. Parents come before children."""
+def forward_tree(tree: ti.template(), pose: ti.template(), b: int, c: int, joints: ti.template()):
+    """Place all degrees of freedom at pose b, in row c of ``joints``. Parents come before children."""
     for k in range(tree.shape[0]):
-        up = parent_of(tree, k)
-        first = k
-        rise = _load_columns(tree, k, TREE_RISE)
-        if up >= 0:
-            its = _load_columns(tree, up, TREE_RISE)
-            if norm_sqr(its) > 0.0:
-                first, rise = up, its
-        _move(
-            _load_columns(tree, k, 0), _load_columns(tree, k, TREE_POINT), ti.cast(tree[k, TREE_PRISMATIC], ti.i32),
-            up, rise, first, parent_of(tree, first), pose, b, c, k, joints, joints, TWIST,
-        )  # fmt: skip
+        _place_joint(tree, pose, b, c, k, joints)
 
 
 @ti.func
-def forward(
-    axis: ti.template(),  # (D, 3)
-    point: ti.template(),  # (D, 3), or (D, 6) with the rise
-    prismatic: ti.template(),  # (D,) 0 or 1
-    parent: ti.template(),  # (D,)
-    chain: ti.template(),  # (N,) the degrees of freedom that are wanted, ascending, with all above them
-    pose: ti.template(),  # (B, D)
+def forward_chain(
+    tree: ti.template(),
+    chain: ti.template(),  # (N,) degrees of freedom, ascending, with all their ancestors
+    pose: ti.template(),
     b: int,
     c: int,
-    frames: ti.template(),  # (C, D, 12) out
-    twists: ti.template(),  # (C, D, 6) out
+    joints: ti.template(),
 ):
-    """The same from a tree in four arrays, into two; of some degrees of freedom only."""
+    """Place some degrees of freedom only, see :func:`forward_tree`."""
     for n in range(chain.shape[0]):
-        k = chain[n]
-        up = parent[k]
-        first = k
-        rise = load_vector3(axis, k) * 0.0
-        if point.shape[1] > 3:
-            rise = _load_columns(point, k, RISE)
-            if up >= 0:
-                its = _load_columns(point, up, RISE)
-                if norm_sqr(its) > 0.0:
-                    first, rise = up, its
-        _move(
-            load_vector3(axis, k), load_vector3(point, k), prismatic[k],
-            up, rise, first, parent[first], pose, b, c, k, frames, twists, 0,
-        )  # fmt: skip
-
-
-@ti.func
-def point_velocity(prismatic: ti.template(), twists: ti.template(), c: int, k: int, x):
-    """∂x/∂p_k of a point x below degree of freedom k (silhouette paper, eq. 6)."""
-    w = ti.Vector([twists[c, k, 0], twists[c, k, 1], twists[c, k, 2]])
-    return cross(w, x) + ti.Vector([twists[c, k, 3], twists[c, k, 4], twists[c, k, 5]])
+        _place_joint(tree, pose, b, c, chain[n], joints)

@@ -178,7 +178,7 @@ def _linearise_kernel(real):
         assigned: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M,)
         covering: ti.types.ndarray(dtype=real, ndim=2),  # (Q, 4)
         residual: ti.types.ndarray(dtype=real, ndim=2),  # (M + Q, 4) out, metres, and the voxel or -1
-        hessian: ti.types.ndarray(dtype=real, ndim=3),  # (C, D, D) out, zeroed by the caller; the lower triangle
+        hessian: ti.types.ndarray(dtype=real, ndim=3),  # (C, D, D) out, zeroed by the caller
     ):
         for turn in range(spread * hessian.shape[0]):
             if turn % spread != 0:
@@ -448,12 +448,11 @@ class ObjectiveKernel:
             hessian,
         )
         self.launches += 1
-        lower = hessian.sum(axis=0, dtype=np.float64)
         weight, piece_weight = self._weights
         partner = found[:, 3].astype(np.int32)
         return Linearisation(
             residual=found[:, :3].astype(np.float64),
-            hessian=lower + np.tril(lower, -1).T,
+            hessian=hessian.sum(axis=0, dtype=np.float64),
             partner=partner,
             inv_sigma2=np.concatenate([weight[chosen], piece_weight[held.covering[0, :Q, 0].astype(np.int64)]]),
         )

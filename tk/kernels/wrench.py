@@ -27,6 +27,8 @@ MOTION, WRENCH = JOINT_NUMBERS, JOINT_NUMBERS + 6
 INERTIA = JOINT_NUMBERS
 INERTIA_NUMBERS = 21
 SCRATCH_NUMBERS = INERTIA + INERTIA_NUMBERS
+# After the inertia, in the scratch of a kernel that needs both: a wrench about the origin of the inertias.
+PULL, PULL_NUMBERS = SCRATCH_NUMBERS, 6
 
 
 @ti.func
@@ -118,7 +120,7 @@ def _twist_about(scratch: ti.template(), c: int, k: int, origin):
 
 @ti.func
 def collect_inertias(tree: ti.template(), c: int, scratch: ti.template(), origin, hessian: ti.template()):
-    """The Hessian's lower triangle into row c; what no two degrees of freedom share is left as it is."""
+    """Write the Hessian into row c. Entries of two degrees of freedom on different branches are left as they are."""
     D = tree.shape[0]
     for back in range(D):
         k = D - 1 - back
@@ -130,9 +132,30 @@ def collect_inertias(tree: ti.template(), c: int, scratch: ti.template(), origin
                 force[i] += scratch[c, k, INERTIA + high * (high + 1) // 2 + low] * s[j]
         j = k
         while j >= 0:
-            hessian[c, k, j] = force.dot(_twist_about(scratch, c, j, origin))
+            shared = force.dot(_twist_about(scratch, c, j, origin))
+            hessian[c, k, j] = shared
+            hessian[c, j, k] = shared
             j = parent_of(tree, j)
         up = parent_of(tree, k)
         if up >= 0:
             for a in range(INERTIA_NUMBERS):
                 scratch[c, up, INERTIA + a] = scratch[c, up, INERTIA + a] + scratch[c, k, INERTIA + a]
+
+
+@ti.func
+def collect_pulls(
+    tree: ti.template(), c: int, scratch: ti.template(), origin, sums: ti.template(), first: ti.template()
+):
+    """Write the gradient (D,) into row c of the sums from column ``first`` on."""
+    D = tree.shape[0]
+    for back in range(D):
+        k = D - 1 - back
+        s = _twist_about(scratch, c, k, origin)
+        gradient = 0.0 * s[0]
+        for i in ti.static(range(PULL_NUMBERS)):
+            gradient += s[i] * scratch[c, k, PULL + i]
+        sums[c, first + k] = gradient
+        up = parent_of(tree, k)
+        if up >= 0:
+            for a in range(PULL_NUMBERS):
+                scratch[c, up, PULL + a] = scratch[c, up, PULL + a] + scratch[c, k, PULL + a]

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
-from tk.kernels.cone_arrays import MOST_PARTS, ConeArrays
+from tk.kernels.cone_arrays import MOST_PARTS, ConeArrays, pack_parts
 from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A, SIDE_B
+from tk.kernels.kinematics import pack_tree
 from tk.model.body.anthropometry import (
     ANKLE_OUTWARD,
     CROTCH_DROP,
@@ -172,19 +173,15 @@ class ConeBody:
                 continue
             curves += [(p, SIDE_A), (p, SIDE_B)]
             curves += [(p, kind) for kind, tracked in zip((END_NEAR, END_FAR), part.ends, strict=True) if tracked]
-        return ConeArrays(
-            axis=np.ascontiguousarray(s.axis, dtype),
-            point=np.ascontiguousarray(s.anchor, dtype),
-            prismatic=s.prismatic.astype(np.int32),
-            parent=s.parent.astype(np.int32),
-            part_kind=np.array([part.kind for part in self.parts], np.int32),
-            part_shape=np.array([part.shape for part in self.parts], dtype),
-            part_frame=inside[:, :3].reshape(len(inside), 12).astype(dtype),
-            part_dof=s.segment_dof[segments].astype(np.int32),
-            part_limb=np.array([_LIMBS[part.segment] for part in self.parts], np.int32),
-            curve_part=np.array([p for p, _ in curves], np.int32),
-            curve_kind=np.array([kind for _, kind in curves], np.int32),
+        parts = pack_parts(
+            shape=np.array([part.shape for part in self.parts]),
+            frame=inside[:, :3],
+            kind=np.array([part.kind for part in self.parts]),
+            dof=s.segment_dof[segments],
+            limb=np.array([_LIMBS[part.segment] for part in self.parts]),
         )
+        tree = pack_tree(s.axis, s.anchor, s.prismatic, s.parent)
+        return ConeArrays(tree.astype(dtype), parts.astype(dtype), np.array(curves, np.int32))
 
     @property
     def shape_groups(self) -> tuple[str, ...]:

@@ -114,7 +114,7 @@ def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
         places = _arm_places() if arm else _leg_places(len(chain))
         if len(dofs) < len(chain):  # the walker's hips turn about one axis only
             places = np.unique(places[:, body.free[chain]], axis=0)
-        own = parts[body.arrays.curve_part]
+        own = parts[body.arrays.curves[:, 0]]
         free = np.zeros(len(skeleton.names), bool)
         free[dofs] = True
         ends = ("elbow", "wrist") if arm else ("knee", "ankle")
@@ -124,9 +124,7 @@ def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
                 dofs=dofs,
                 free=free,
                 parts=np.flatnonzero(parts).astype(np.int32),
-                arrays=body.arrays._replace(
-                    curve_part=body.arrays.curve_part[own], curve_kind=body.arrays.curve_kind[own]
-                ),
+                arrays=body.arrays._replace(curves=body.arrays.curves[own]),
                 joints=(JOINTS.index(f"{ends[0]}_{side}"), JOINTS.index(f"{ends[1]}_{side}")),
                 places=np.clip(places, lower, upper),
                 lower=lower,
