@@ -1,8 +1,8 @@
-"""Make the pictures of the documentation from the result of `tk demo`: docs/demo.png and docs/report.png.
+"""Make the images of the documentation from the result of `tk demo`: docs/demo.png and docs/report.png.
 
     tk demo -o demo.h5 && python -m scripts.screenshots demo.h5
 
-The second needs Chromium.
+docs/report.png needs Chromium.
 """
 
 from __future__ import annotations
@@ -25,37 +25,37 @@ DEMO = ROOT / "tk" / "data" / "demo"
 FRAMES = (40, 52)
 CAMERAS = ("cam1", "cam2", "cam4", "cam5")
 REPORT_FRAME = 40
-# enough for a web page, and a third of the bytes
+# colours of the PNG: a third of the bytes without a visible difference
 COLOURS = 256
 
 
 def draw_demo(result: Path, path: Path) -> None:
-    """Two frames in four of the cameras."""
+    """Draw two frames in four of the cameras."""
     overlay = Overlay(open_capture(DEMO, CAMERAS, masks="none"), read_result(result))
-    rows = [overlay.sheet_row(frame, images, 330) for frame, images in overlay.pictures(overlay.chosen(FRAMES))]
+    rows = [overlay.sheet_row(frame, images, 330) for frame, images in overlay.pictures(FRAMES)]
     picture = Image.fromarray(joined(rows, axis=0)[..., ::-1])
     picture.quantize(COLOURS, kmeans=5).save(path, optimize=True)
 
 
 def draw_report(result: Path, path: Path) -> None:
-    """The head of the report, as a window of 1280×800 shows it."""
+    """Draw the top of the report as a window of 1280×800 shows it."""
     with tempfile.TemporaryDirectory() as folder, browser_page() as page:
         page.open(report(result, DEMO, Path(folder) / "demo.html"))
         page.run(f"report.show({REPORT_FRAME})")
-        # two frames of animation: drawn, and on the screen
+        # wait for two animation frames: one draws, the next shows
         page.run("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
         page.screenshot(path)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("result", type=Path, help="of tk demo")
+    parser.add_argument("result", type=Path, help="result of tk demo")
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs", metavar="DIR")
     options = parser.parse_args(arguments)
     draw_demo(options.result, options.output / "demo.png")
     print(options.output / "demo.png")
     if find_browser() is None:
-        raise SystemExit("report.png is left out: no Chromium is installed")
+        raise SystemExit("no report.png: Chromium is not installed")
     draw_report(options.result, options.output / "report.png")
     print(options.output / "report.png")
 

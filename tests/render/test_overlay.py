@@ -260,10 +260,10 @@ def test_cameras_and_time_offsets_are_those_of_the_run(result: Path) -> None:
 
 def test_a_frame_that_is_not_there_is_named(result: Path, tmp_path: Path, tk: Tk) -> None:
     said = tk("render", result, DEMO, "--png", tmp_path, "--frames", "1,7")
-    said.complaint("frame 7 is not there; it has frames 0 to 2")
+    said.complaint("frame 7 is not in it; it has frames 0 to 2")
     tk("render", tmp_path / "nothing.h5", DEMO).complaint("nothing.h5: no such file")
     tk("render", result, DEMO, "--png", tmp_path, "--frames", "one").complaint("--frames one: give A:B")
-    tk("render", result, "--view", "overlay").complaint("needs the pictures, too")
+    tk("render", result, "--view", "overlay").complaint("needs the images")
     tk("render", result, "--view", "hull").complaint("holds no hull")
 
 

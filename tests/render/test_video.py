@@ -101,4 +101,4 @@ def test_render_writes_what_is_asked_for(tracked: Path, tiny: Path, tmp_path: Pa
     assert (tmp_path / "3d.mp4").read_bytes() == before
     assert tk("render", tracked, "-o", tmp_path / "3d.mp4", "--frames", "1", "--force").code == 0
     assert (tmp_path / "3d.mp4").read_bytes() != before
-    tk("render", tracked, "-o", tmp_path / "3d.avi").complaint("a video is an .mp4")
+    tk("render", tracked, "-o", tmp_path / "3d.avi").complaint("a video must end in .mp4")

@@ -264,7 +264,7 @@ def test_older_and_poorer_results(kind: str, tracked: Path, page: Page, tk: Tk, 
     page.press(" ")
     wait_for(page, "report.row > 2")
     text = page.run("document.body.innerText")
-    for missing in ("does not tell E_S", "No pictures", "does not tell the joints' angles", "does not tell σ"):
+    for missing in ("has no E_S", "No images", "has no joint angles", "has no σ"):
         assert missing in text
     assert page.said == []
 

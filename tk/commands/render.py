@@ -71,7 +71,7 @@ def _render(
     from tk.io.captures.capture import open_capture
     from tk.io.results.writer import read_result
     from tk.render.files import check_target
-    from tk.render.overlay import Overlay, write_sheets
+    from tk.render.overlay import Overlay, choose_frames, write_sheets
     from tk.render.scene import Scene
     from tk.render.video import check_encoder, video_writer
 
@@ -100,9 +100,9 @@ def _render(
         raise ConfigError(f"--view overlay: needs the images: tk render {result_path} CAPTURE")
     else:
         overlay = Overlay(capture, result, full=full)
-        overlaid = overlay.chosen(chosen, len(result))
+        shown = choose_frames(result, chosen, len(result))
         with video_writer(output, capture.fps) as add:
-            for frame, images in overlay.pictures(overlaid):
+            for frame, images in overlay.pictures(shown):
                 add(overlay.mosaic(frame, images))
     return [output]
 

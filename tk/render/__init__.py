@@ -1,4 +1,4 @@
-"""Pictures of a result: the body over the videos, a turning view in three dimensions, the hull; as PNG and as H.264.
+"""Images of a result, as PNG or H.264: the body over the videos, a turning 3D view, the hull.
 
-Everything is drawn by OpenCV on the CPU: no display and no GPU are needed.
+OpenCV draws everything on the CPU: no display and no GPU are needed.
 """

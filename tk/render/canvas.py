@@ -1,4 +1,4 @@
-"""Drawing on a tile, a part of a camera's picture at some scale: body, joints, truth, text."""
+"""Draw on a tile, a scaled part of a camera's image: body, joints, ground truth, text."""
 
 from __future__ import annotations
 
@@ -17,17 +17,25 @@ from tk.render.palette import BONE, INK, LOST_BODY, SEGMENT_COLORS, TEXT, Color,
 Float = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-_FILL = 0.35  # opacity
+# Appearance only; no measurement depends on these values.
+_FILL = 0.35  # opacity of the body
 _SQUARE = np.ones((3, 3), np.uint8)  # makes contours two pixels wide
-_BEYOND: Color = (24, 24, 24)  # where there is no picture
-_SUBPIXEL = 4  # bits of a fraction of a pixel that OpenCV draws with
+_BEYOND: Color = (24, 24, 24)  # outside the image
+#: fractional bits of OpenCV's drawing coordinates
+SUBPIXEL_BITS = 4
 _BONES = np.array([(JOINTS.index(a), JOINTS.index(b)) for a, b in BONES])
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 @dataclass(frozen=True)
 class View:
-    """A tile: what part of a picture it shows, ``origin`` (2,) being its upper left corner, pixels, and its scale."""
+    """The part of an image that a tile shows.
+
+    Attributes:
+        origin: (2,) upper left corner in the image, pixels.
+        scale: tile pixels per image pixel.
+        width, height: size of the tile, pixels.
+    """
 
     origin: Float
     scale: float
@@ -36,12 +44,12 @@ class View:
 
     @staticmethod
     def around(xy: Float, camera: Camera, width: int, height: int) -> View:
-        """A tile of this size that holds the points (N, 2), within the picture, or around all of it."""
+        """Return the view of a tile of this size that contains the points (N, 2), inside the image if possible."""
         xy = xy[np.isfinite(xy).all(axis=1)]
         if not len(xy):
             return View.whole(camera, height)
         low, high = xy.min(axis=0), xy.max(axis=0)
-        span = np.maximum(high - low, 1.0) * 1.2  # room for what the body misses
+        span = np.maximum(high - low, 1.0) * 1.2  # margin, because the body may be smaller than the person
         scale = float(min(width / span[0], height / span[1], 4.0))
         size = np.array([width, height]) / scale
         most = np.array([camera.width, camera.height]) - size
@@ -50,15 +58,15 @@ class View:
 
     @staticmethod
     def whole(camera: Camera, height: int) -> View:
-        """The whole picture at this height."""
+        """Return the view of the whole image at this height."""
         return View(np.zeros(2), height / camera.height, round(camera.width * height / camera.height), height)
 
     def cut(self, picture: Image, tile: Image) -> None:
-        """Fill ``tile`` (height, width, 3) with its part of a picture."""
+        """Fill ``tile`` (height, width, 3) with its part of an image."""
         reach = self.origin + np.array([self.width, self.height]) / self.scale
         if self.scale <= 1 and (self.origin > -0.5).all() and (reach < np.array(picture.shape[1::-1]) + 0.5).all():
             (left, top), (right, bottom) = self.origin.round().astype(int), reach.round().astype(int)
-            # down to half the size linear interpolation skips no pixel, and takes a tenth of the time
+            # down to half the size, linear interpolation uses every pixel, and takes a tenth of the time
             method = cv2.INTER_LINEAR if self.scale >= 0.5 else cv2.INTER_AREA
             cv2.resize(picture[top:bottom, left:right], (self.width, self.height), tile, interpolation=method)
             return
@@ -67,12 +75,12 @@ class View:
         cv2.warpAffine(picture, M, (self.width, self.height), tile, cv2.INTER_LINEAR, borderValue=_BEYOND)
 
     def place(self, xy: Float) -> Float:
-        """(N, 2) pixels of the picture as pixels of the tile."""
+        """Convert pixels of the image (N, 2) to pixels of the tile."""
         return np.asarray((xy + 0.5 - self.origin) * self.scale - 0.5)
 
 
 def draw_body(tile: Image, view: View, outlines: Sequence[Outline], lost: bool = False) -> None:
-    """Fill the segments, translucent, and draw their contours, near ones over far ones; grey if ``lost``."""
+    """Draw the segments, translucent, with their contours, near ones over far ones; grey if ``lost``."""
     solids = [points for outline in outlines for points in outline.points]
     if not solids:
         return
@@ -80,15 +88,15 @@ def draw_body(tile: Image, view: View, outlines: Sequence[Outline], lost: bool =
     x, y, width, height = _box(placed, tile)
     if width <= 0 or height <= 0:
         return
-    placed -= np.array([x, y], np.int32) << _SUBPIXEL
-    # which segment is seen: its rank, near ones higher
+    placed -= np.array([x, y], np.int32) << SUBPIXEL_BITS
+    # rank of the visible segment in each pixel; near segments have higher ranks
     layer, end = np.zeros((height, width), np.uint8), 0
     colors = np.zeros((256, 1, 3), np.uint8)
     for rank, outline in enumerate(outlines, 1):
         colors[rank] = LOST_BODY if lost else SEGMENT_COLORS[outline.segment]
         for points in outline.points:
             begin, end = end, end + len(points)
-            cv2.fillConvexPoly(layer, cv2.convexHull(placed[begin:end]), (rank,), cv2.LINE_8, _SUBPIXEL)
+            cv2.fillConvexPoly(layer, cv2.convexHull(placed[begin:end]), (rank,), cv2.LINE_8, SUBPIXEL_BITS)
     near = cv2.dilate(layer, _SQUARE)
     contour = near != cv2.erode(layer, _SQUARE)
     over, under = cv2.applyColorMap(near, colors), tile[y : y + height, x : x + width]
@@ -97,59 +105,61 @@ def draw_body(tile: Image, view: View, outlines: Sequence[Outline], lost: bool =
 
 
 def dots(sigma_m: Float | None, lost: bool = False) -> Sequence[Color | None]:
-    """How the joints (15,) are drawn: in a colour that tells the standard deviation, metres, plain without one; None,
-    a ring, for a joint without evidence (NaN)."""
+    """Return the colours of the joints by their standard deviation (15,) metres, or plain without one.
+
+    None stands for a ring: the standard deviation is unknown (NaN).
+    """
     plain = LOST_BODY if lost else BONE
     if sigma_m is None:
         return [plain] * len(JOINTS)
-    told: list[Color] = [plain] * len(JOINTS) if lost else sigma_colors(np.nan_to_num(sigma_m)).tolist()
-    return [color if known else None for color, known in zip(told, np.isfinite(sigma_m).tolist(), strict=True)]
+    colors: list[Color] = [plain] * len(JOINTS) if lost else sigma_colors(np.nan_to_num(sigma_m)).tolist()
+    return [color if known else None for color, known in zip(colors, np.isfinite(sigma_m).tolist(), strict=True)]
 
 
 def draw_joints(tile: Image, xy: Float, colors: Sequence[Color | None], lost: bool = False) -> None:
-    """Bones as lines, joints in the colours of :func:`dots`; ``xy`` (15, 2) tile pixels."""
+    """Draw bones as lines and joints in the colours of :func:`dots`; ``xy`` (15, 2) tile pixels."""
     points = fixed(np.nan_to_num(xy))
     seen = np.asarray(np.isfinite(xy).all(axis=1))
     plain = LOST_BODY if lost else BONE
     bones = list(points[_BONES[seen[_BONES].all(axis=1)]])
-    # what lies below is not smoothed: a quarter of the time
-    cv2.polylines(tile, bones, False, INK, 3, cv2.LINE_8, _SUBPIXEL)
-    cv2.polylines(tile, bones, False, plain, 1, cv2.LINE_AA, _SUBPIXEL)
+    # the dark outline is drawn without antialiasing, in a quarter of the time
+    cv2.polylines(tile, bones, False, INK, 3, cv2.LINE_8, SUBPIXEL_BITS)
+    cv2.polylines(tile, bones, False, plain, 1, cv2.LINE_AA, SUBPIXEL_BITS)
     for k in np.flatnonzero(seen):
         dot = colors[int(k)]
-        cv2.circle(tile, points[k], 4 << _SUBPIXEL, INK, cv2.FILLED, cv2.LINE_8, _SUBPIXEL)
+        cv2.circle(tile, points[k], 4 << SUBPIXEL_BITS, INK, cv2.FILLED, cv2.LINE_8, SUBPIXEL_BITS)
         color, width = (plain, 1) if dot is None else (dot, cv2.FILLED)
-        cv2.circle(tile, points[k], 3 << _SUBPIXEL, color, width, cv2.LINE_AA, _SUBPIXEL)
+        cv2.circle(tile, points[k], 3 << SUBPIXEL_BITS, color, width, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def draw_truth(tile: Image, xy: Float) -> None:
-    """Small crosses at the true joints, ``xy`` (15, 2) tile pixels."""
+    """Draw small crosses at the ground-truth joints, ``xy`` (15, 2) tile pixels."""
     for x, y in xy[np.isfinite(xy).all(axis=1)]:
         for color, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
             for dx, dy in ((3.5, 3.5), (3.5, -3.5)):
                 a, b = fixed(np.array([[x - dx, y - dy], [x + dx, y + dy]]))
-                cv2.line(tile, a, b, color, width, cv2.LINE_AA, _SUBPIXEL)
+                cv2.line(tile, a, b, color, width, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def fixed(xy: Float) -> NDArray[np.int32]:
-    """Pixels as OpenCV takes them with a fraction."""
-    return np.rint(np.clip(xy, -30000, 30000) * (1 << _SUBPIXEL)).astype(np.int32)
+    """Convert pixels to OpenCV's fixed-point coordinates."""
+    return np.rint(np.clip(xy, -30000, 30000) * (1 << SUBPIXEL_BITS)).astype(np.int32)
 
 
 def write(tile: Image, text: str, left: int, baseline: int, color: Color = TEXT, size: float = 0.42) -> int:
-    """A line of text (ASCII); returns where it ends, pixels."""
+    """Write a line of text (ASCII); return its right end, pixels."""
     cv2.putText(tile, text, (left, baseline), _FONT, size, color, 1, cv2.LINE_AA)
     return left + text_width(text, size)
 
 
 def text_width(text: str, size: float = 0.42) -> int:
-    """Pixels that a line of text takes."""
+    """Return the width of a line of text, pixels."""
     return int(cv2.getTextSize(text, _FONT, size, 1)[0][0])
 
 
 def _box(points: NDArray[np.int32], picture: Image) -> tuple[int, int, int, int]:
-    """x, y, width, height of the part of a picture that holds points (N, 2) of :func:`fixed` and a margin."""
-    x, y, width, height = cv2.boundingRect(points >> _SUBPIXEL)
+    """Return x, y, width, height of the box around points (N, 2) of :func:`fixed` with a margin, in the image."""
+    x, y, width, height = cv2.boundingRect(points >> SUBPIXEL_BITS)
     left, top = max(x - 2, 0), max(y - 2, 0)
     right, bottom = min(x + width + 3, picture.shape[1]), min(y + height + 3, picture.shape[0])
     return left, top, right - left, bottom - top

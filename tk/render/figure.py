@@ -1,4 +1,4 @@
-"""What there is to draw of a person in every frame: skeleton, and the body's solids as meshes in their segments."""
+"""The geometry of a person in every frame: joints, and the body's solids as meshes in their segments."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ BONES = (
     ("pelvis", "hip_r"), ("hip_r", "knee_r"), ("knee_r", "ankle_r"),
 )  # fmt: skip
 
-#: points around a solid
+#: points around a solid, appearance only
 AROUND = 24
-# circles along an ellipsoid; a frustum is the convex hull of two
+# circles along an ellipsoid, appearance only; a frustum has two
 _ALONG = 9
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A convex solid that rides on a segment.
+    """A convex solid that moves with a segment.
 
     Attributes:
         segment: its index in :data:`~tk.model.body.skeleton.SEGMENTS`.
@@ -46,7 +46,7 @@ class Solid:
 
     @cached_property
     def divided(self) -> Solid:
-        """The same with five circles at least: faces that are short enough to be sorted by their depth."""
+        """The same solid with at least five circles: its faces are short enough to be sorted by depth."""
         if len(self.rings) > 2:
             return self
         share = np.linspace(0, 1, 5)[:, None, None]
@@ -54,10 +54,9 @@ class Solid:
 
     @cached_property
     def faces(self) -> NDArray[np.int64]:
-        """(N, 4) corners of the faces as indices of the points of all circles; both ends are closed.
+        """(N, 4) corners of the faces, indices into the points of all circles; both ends are closed.
 
-        Seen from outside they run the same way round everywhere: a face's normal, the product of its diagonals, points
-        outwards.
+        The normal of a face, the cross product of its diagonals, points outwards.
         """
         R = len(self.rings)
         index = np.arange(R * AROUND).reshape(R, AROUND)
@@ -68,17 +67,17 @@ class Solid:
 
     @cached_property
     def triangles(self) -> NDArray[np.int64]:
-        """(M, 3) the faces halved, turned outwards as they are."""
+        """(M, 3) the faces split into triangles, with normals outwards."""
         return np.concatenate([self.faces[:, [0, 1, 2]], self.faces[:, [0, 2, 3]]])
 
 
 @dataclass(frozen=True)
 class Outline:
-    """What a camera sees of a segment.
+    """A segment in the image of a camera.
 
     Attributes:
-        segment: its name; depth: metres.
-        points: (N, 2) pixels of each of its solids, whose convex hull is the solid's outline.
+        segment: name of the segment; depth: metres.
+        points: (N, 2) pixels for each of its solids; their convex hull is the outline of the solid.
     """
 
     segment: str
@@ -95,8 +94,8 @@ class Figure:
         joints: (F, 15, 3) metres, world frame.
         sigma: (F, 15) standard deviations of the joints, metres, or None.
         status: (F,) as in the result.
-        solids: the body; none where the result has no body.
-        transforms: (F, S, 4, 4) the segments, zero configuration to world.
+        solids: the body; empty if the result has no body.
+        transforms: (F, S, 4, 4) of the segments, zero configuration to world.
     """
 
     frames: NDArray[np.int64]
@@ -108,12 +107,12 @@ class Figure:
     _placed: dict[int, Float] = field(default_factory=dict, repr=False, compare=False)
 
     def lost(self, row: int) -> bool:
-        """Whether the frame is lost."""
+        """Return whether the frame is lost."""
         return bool(self.status[row] == Status.LOST)
 
     def placed(self, row: int) -> Float:
-        """(N, 3) the points of all solids' circles in a frame, solid by solid; metres, world frame."""
-        if row not in self._placed:  # every camera asks for the same
+        """Return the points (N, 3) of all circles in a frame, solid by solid; metres, world frame."""
+        if row not in self._placed:  # the same for all cameras
             self._placed.clear()
             T = self.transforms[row]
             self._placed[row] = np.concatenate(
@@ -123,14 +122,14 @@ class Figure:
 
     @cached_property
     def starts(self) -> NDArray[np.int64]:
-        """(S + 1,) where each solid's points begin among those of all, and their number."""
+        """(S + 1,) index of the first point of each solid in :meth:`placed`, and the number of points."""
         return np.cumsum([0, *(solid.rings.size // 3 for solid in self.solids)])
 
     def seen(self, row: int, camera: Camera) -> tuple[list[Outline], Float]:
-        """What a camera sees of the body, farthest segment first, and of the joints, pixels (15, 2).
+        """Return the segments in the image of a camera, farthest first, and the joints (15, 2) pixels.
 
         Solids are convex, so each outline is the convex hull of the projected circles (lens distortion bends it by
-        less than a pixel over a limb). What is behind the camera, even in part, is left out; such a joint is NaN.
+        less than a pixel over a limb). Solids that are partly behind the camera are left out; such joints are NaN.
         """
         joints = self.joints[row]
         if not self.solids:
@@ -156,11 +155,13 @@ class Figure:
 
 
 def figure_of(result: Result) -> Figure:
-    """The person of a result; its joints in the order of :data:`~tk.model.body.skeleton.JOINTS`.
+    """Return the person of a result, joints in the order of :data:`~tk.model.body.skeleton.JOINTS`.
 
     Raises:
-        ResultError: the body and the poses do not belong together, or a joint is missing.
+        ResultError: there are no frames, the body does not fit the poses, or a joint is missing.
     """
+    if not len(result):
+        raise ResultError(f"{result.path}: has no frames")
     names = result.meta.joint_names
     missing = [name for name in JOINTS if name not in names]
     if missing:
@@ -177,7 +178,7 @@ def figure_of(result: Result) -> Figure:
 
 
 def solids_of(body: ConeBody) -> tuple[Solid, ...]:
-    """The body's solids in their segments' frames."""
+    """Return the solids of a body in the frames of their segments."""
     T_body = np.eye(4)
     T_body[:3, :3] = body.skeleton.T_world_body
     found = [(part.segment, T_body @ part.T_body_part, _part_rings(part)) for part in body.parts]
@@ -185,7 +186,7 @@ def solids_of(body: ConeBody) -> tuple[Solid, ...]:
 
 
 def _part_rings(part: ConePart) -> Float:
-    """(R, AROUND, 3) circles of a frustum or an ellipsoid, its own frame."""
+    """Return the circles (R, AROUND, 3) of a frustum or an ellipsoid in its own frame."""
     around = np.linspace(-np.pi, np.pi, AROUND, endpoint=False)
     angle, z = np.meshgrid(around, np.linspace(0, 1, _ALONG if part.kind == ELLIPSOID else 2))
     radius = np.ones_like(z)

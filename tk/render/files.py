@@ -1,4 +1,4 @@
-"""Files that are made from a result: whole or not there, and nobody else's file is replaced."""
+"""Write files completely or not at all, and replace none without permission."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from tk.errors import ExportError
 
 
 def check_target(path: Path, force: bool = False) -> Path:
-    """The path, if a file may be written there.
+    """Return the path, if a file may be written there.
 
     Raises:
-        ExportError: it is a folder or lies in none, or it exists and ``force`` is not set.
+        ExportError: it is a folder, its folder does not exist, or it exists and ``force`` is not set.
     """
     if path.is_dir():
         raise ExportError(f"{path}: is a folder; name a file in it")
@@ -27,10 +27,10 @@ def check_target(path: Path, force: bool = False) -> Path:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary name beside ``path``, which takes its name when the block ends without an error.
+    """Yield a temporary path, which is renamed to ``path`` when the block ends without an error.
 
     Raises:
-        ExportError: the system refuses.
+        ExportError: the file cannot be written.
     """
     part = path.with_name(f".{path.stem}.part{path.suffix}")
     try:

@@ -1,8 +1,8 @@
-"""The tracked body over the pictures of all cameras: the way to see whether a result is right.
+"""Draw the tracked body over the images of all cameras, to check a result by eye.
 
-Filled outlines are the fitted body (left limbs warm, right limbs cool, trunk and head green), lines and dots its
-joints, a dot's colour the joint's standard deviation. A result without a body shows joints only. Lost frames are grey
-with a red frame. On contact sheets white crosses are the capture's truth, where it has one.
+Filled outlines show the fitted body (left limbs warm, right limbs cool, trunk and head green), lines and dots its
+joints; a dot's colour shows the joint's standard deviation. A result without a body shows joints only. Lost frames are
+grey with a red border. On contact sheets, white crosses show the ground truth, if the capture has it.
 """
 
 from __future__ import annotations
@@ -22,42 +22,33 @@ from tk.io.results.writer import Result, Status, read_joints
 from tk.model.cameras.camera import Camera, Rig
 from tk.render.canvas import Image, View, dots, draw_body, draw_joints, draw_truth, text_width, write
 from tk.render.figure import Figure, figure_of
-from tk.render.palette import INK, LOST, SEGMENT_COLORS, SIGMA_MOST_M, TEXT, Color, sigma_colors
+from tk.render.legend import LEGEND_HEIGHT, Legend
+from tk.render.palette import LOST, TEXT, Color
 
 Float = NDArray[np.float64]
 
+# Layout only; no measurement depends on these values.
 _GAP = 6  # pixels between the tiles of a sheet
-_STRIP, _BAR = 30, 6  # heights of a video's legend and of its bar of time
-# widths of what the legend tells, of a lost frame or another, and of the colours' key with a margin
-_TOLD, _KEY = {False: 280, True: 360}, 330
-#: pixels that a video is wide at most, and at least if that means to enlarge
+#: largest width of a video, pixels; smaller images are enlarged up to the second width
 WIDEST, _NARROWEST = 1280, 640
-_ASPECT = 9 / 16  # of the tiles together, at most
-_STATUS_COLORS: dict[int, Color] = {
-    Status.TRACKED: (120, 150, 90),
-    Status.INITIALISED: (190, 170, 110),
-    Status.RECOVERED: (60, 190, 240),
-    Status.LOST: LOST,
-}
+_ASPECT = 9 / 16  # largest height of all tiles together, as a share of the largest width
 
 
 class Overlay:
-    """A result over the pictures of its capture.
+    """Draws a result over the images of its capture.
 
     Args:
-        capture: the pictures, of the cameras that are to be shown.
-        result: what was tracked. The cameras and which picture belongs to a frame are as the run used them, where it
-            says so.
-        widest: pixels that a video is wide at most.
-        full: whole pictures in a video, not the part of each in which the person moves.
+        capture: the images, of the cameras to show.
+        result: the result. Its cameras and time offsets, if it has them, replace those of the capture.
+        widest: largest width of a video, pixels.
+        full: show whole images in a video, not the part in which the person moves.
 
     Raises:
         ResultError: the result has no frames, frames that the capture does not have, or a body that cannot be used.
     """
 
     def __init__(self, capture: Capture, result: Result, widest: int = WIDEST, full: bool = False) -> None:
-        if not len(result):
-            raise ResultError(f"{result.path}: has no frames")
+        self.figure: Figure = figure_of(result)
         last = int(result.frames.max())
         if last >= capture.frame_count:
             raise ResultError(
@@ -65,12 +56,10 @@ class Overlay:
                 "name the capture that was tracked"
             )
         self.capture, self.result = as_tracked(capture, result), result
-        self.figure: Figure = figure_of(result)
         self.rig = self.capture.rig
         self.grid = Grid.of(self.rig, widest)
-        self._canvas = np.full((self.grid.height + _STRIP + _BAR, self.grid.width, 3), 24, np.uint8)
-        self._timeline = timeline(self.figure.status, self.grid.width)
-        self._keys: dict[bool, Image] = {}
+        self._canvas = np.full((self.grid.height + LEGEND_HEIGHT, self.grid.width, 3), 24, np.uint8)
+        self._legend = Legend(result, self.figure, self.grid.width)
         self._colors: dict[int, Sequence[Color | None]] = {}
         self._views = [self._steady_view(camera, full) for camera in self.rig]
         self.row_of = {int(frame): row for row, frame in enumerate(result.frames)}
@@ -79,7 +68,7 @@ class Overlay:
         self._truth = {} if truth is None else dict(zip(truth.frames.tolist(), truth.positions, strict=True))
 
     def pictures(self, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """The chosen frames, ascending, and their pictures (C, H, W, 3); decoding begins at once."""
+        """Yield these frames, ascending, and their images (C, H, W, 3); decoding starts immediately."""
         wanted = set(frames)
         reader = self.capture.frames(min(wanted), max(wanted) + 1)
 
@@ -91,14 +80,6 @@ class Overlay:
 
         return taken()
 
-    def chosen(self, frames: Sequence[int] = (), count: int = 8) -> list[int]:
-        """These frames, ascending; without any, ``count`` spread over the result.
-
-        Raises:
-            ResultError: one is not in the result.
-        """
-        return choose_frames(self.result, frames, count)
-
     def sheet_row(
         self,
         frame: int,
@@ -107,7 +88,7 @@ class Overlay:
         full: bool = False,
         truth: bool = True,
     ) -> Image:
-        """A row of tiles, one a camera, of a frame; the person cut out, or the ``full`` pictures."""
+        """Return a row of tiles of a frame, one per camera: the part with the person, or the ``full`` images."""
         row, tiles = self.row_of[frame], []
         for camera, image in zip(self.rig, images, strict=True):
             view = View.whole(camera, tile_height)
@@ -133,7 +114,7 @@ class Overlay:
         return joined(tiles, axis=1)
 
     def _draw(self, tile: Image, row: int, camera: Camera, image: Image, view: View) -> None:
-        """Fill a tile with a camera's picture, body and joints drawn over it."""
+        """Fill a tile with a camera's image, and draw body and joints over it."""
         lost = self.figure.lost(row)
         view.cut(image[: camera.height, : camera.width], tile)
         outlines, joints = self.figure.seen(row, camera)
@@ -143,7 +124,7 @@ class Overlay:
             cv2.rectangle(tile, (0, 0), (view.width - 1, view.height - 1), LOST, 5)
 
     def _dots(self, row: int) -> Sequence[Color | None]:
-        if row not in self._colors:  # every camera asks for the same
+        if row not in self._colors:  # the same for all cameras
             sigma = None if self.figure.sigma is None else self.figure.sigma[row]
             self._colors = {row: dots(sigma, self.figure.lost(row))}
         return self._colors[row]
@@ -151,12 +132,10 @@ class Overlay:
     def _true(self, frame: int, camera: Camera) -> list[Float]:
         return [camera.project(self._truth[frame])[0]] if frame in self._truth else []
 
-    # --- a picture of a video ---------------------------------------------------------------------------------------
-
     def mosaic(self, frame: int, images: NDArray[np.uint8]) -> Image:
-        """All cameras' pictures in a grid, below them what is to be known: (H, W, 3), H and W even.
+        """Return the images of all cameras in a grid with the legend below, (H, W, 3), H and W even.
 
-        The next call draws over it.
+        The next call overwrites the image.
         """
         grid, row, canvas = self.grid, self.row_of[frame], self._canvas
         for c, (camera, image) in enumerate(zip(self.rig, images, strict=True)):
@@ -165,12 +144,11 @@ class Overlay:
             tile = canvas[y : y + view.height, x : x + view.width]
             self._draw(tile, row, camera, image, view)
             self._name(tile, row, camera)
-        self._legend(canvas[grid.height : grid.height + _STRIP], row)
-        draw_timeline(canvas[grid.height + _STRIP :], self._timeline, (row + 0.5) / len(self.result))
+        self._legend.draw(canvas[grid.height :], row)
         return canvas
 
     def _steady_view(self, camera: Camera, full: bool) -> View:
-        """A tile of the grid that holds the person in all frames, those aside that are lost."""
+        """Return the view of a tile that contains the person in all frames that are not lost."""
         width, height = (max(int(size * self.grid.scale), 1) for size in (camera.width, camera.height))
         whole = View(np.zeros(2), self.grid.scale, width, height)
         good = self.figure.status != Status.LOST
@@ -181,7 +159,7 @@ class Overlay:
         return near if near.scale > self.grid.scale else whole
 
     def _name(self, tile: Image, row: int, camera: Camera) -> None:
-        """The camera's name and E_S in a corner."""
+        """Write the camera's name and E_S into a corner."""
         text = camera.name
         names, errors = self.result.meta.residual_cameras, self.result.silhouette_error
         if errors is not None and camera.name in names:
@@ -191,22 +169,10 @@ class Overlay:
         label[...] = label // 3
         write(tile, text, 6, 13)
 
-    def _legend(self, strip: Image, row: int) -> None:
-        """Frame, time and status on the left; what the colours mean on the right, as far as there is room."""
-        lost = self.figure.lost(row)
-        if lost not in self._keys:
-            key = self._keys[lost] = np.full_like(strip, LOST if lost else 24)
-            if strip.shape[1] > _TOLD[lost] + _KEY:
-                draw_key(key, strip.shape[1] - _KEY + 20, self.figure.sigma is not None)
-        strip[...] = self._keys[lost]
-        state = "LOST: do not use this pose" if lost else STATUS_MEANING[self.figure.status[row]]
-        text = f"frame {self.figure.frames[row]}   {self.result.time[row]:.2f} s   {state}"
-        write(strip, text, 10, 20, TEXT, 0.5)
-
 
 @dataclass(frozen=True)
 class Grid:
-    """How the pictures of several cameras are laid out; even numbers of pixels, as H.264 wants them."""
+    """Layout of the images of several cameras; width and height are even, as H.264 requires."""
 
     columns: int
     scale: float
@@ -216,7 +182,7 @@ class Grid:
 
     @staticmethod
     def of(rig: Rig, widest: int = WIDEST) -> Grid:
-        """The grid that shows the cameras' pictures largest."""
+        """Return the grid that shows the images largest."""
         rows, across = rig.frame_shape
         count = len(rig)
 
@@ -230,7 +196,7 @@ class Grid:
         return Grid(columns, scale(columns), cell, width + width % 2, height + height % 2)
 
     def corner(self, index: int, shape: tuple[int, int]) -> tuple[int, int]:
-        """Where a tile of this shape (height, width) begins (y, x): in the middle of its cell."""
+        """Return the upper left corner (y, x) of a tile of this shape (height, width) in the middle of its cell."""
         row, column = divmod(index, self.columns)
         return (
             row * self.cell[0] + max(self.cell[0] - shape[0], 0) // 2,
@@ -238,69 +204,37 @@ class Grid:
         )
 
 
-def draw_key(strip: Image, left: int, sigma: bool) -> None:
-    """What the colours mean, from ``left`` on: 300 pixels."""
-    for name, segment in (("left", "forearm_l"), ("right", "upper_arm_r")):
-        cv2.rectangle(strip, (left, 10), (left + 10, 20), SEGMENT_COLORS[segment], cv2.FILLED)
-        left = write(strip, name, left + 15, 20) + 14
-    if not sigma:
-        return
-    left = write(strip, "joint sigma  0", left + 6, 20) + 6
-    ramp = sigma_colors(np.linspace(0, SIGMA_MOST_M, 60))
-    strip[10:21, left : left + 60] = ramp[None]
-    cv2.rectangle(strip, (left - 1, 9), (left + 60, 21), INK, 1)
-    write(strip, f"{100 * SIGMA_MOST_M:.0f} cm", left + 68, 20)
-
-
-def timeline(status: NDArray[np.uint8], width: int) -> Image:
-    """(1, width, 3) the status of all frames along a bar, lost ones red."""
-    of_status = np.zeros((max(_STATUS_COLORS) + 1, 3), np.uint8)
-    for value, color in _STATUS_COLORS.items():
-        of_status[value] = color
-    line = of_status[status[np.arange(width) * len(status) // width]]
-    # a single lost frame of a long recording takes less than a pixel, and must not vanish
-    line[np.flatnonzero(status == Status.LOST) * width // len(status)] = LOST
-    return line[None]
-
-
-def draw_timeline(bar: Image, line: Image, share: float) -> None:
-    """Draw a :func:`timeline`, and where this frame is, a share of all."""
-    bar[...] = line
-    at = round(share * bar.shape[1])
-    bar[:, max(at - 2, 0) : at + 2] = (255, 255, 255)
-
-
 def choose_frames(result: Result, frames: Sequence[int], count: int) -> list[int]:
-    """These frames of a result, ascending; without any, ``count`` spread over it.
+    """Return these frames of a result, ascending; without any, ``count`` frames spread over the result.
 
     Raises:
-        ResultError: one is not in the result.
+        ResultError: a frame is not in the result.
     """
     known = result.frames.tolist()
     missing = sorted(set(frames) - set(known))
     if missing:
-        raise ResultError(f"{result.path}: frame {missing[0]} is not there; it has frames {min(known)} to {max(known)}")
+        raise ResultError(f"{result.path}: frame {missing[0]} is not in it; it has frames {min(known)} to {max(known)}")
     spread = [known[i] for i in np.unique(np.linspace(0, len(known) - 1, count).astype(int))]
     return sorted(set(frames)) or sorted(spread)
 
 
 def as_tracked(capture: Capture, result: Result) -> Capture:
-    """The capture with the cameras and time offsets that the run used, where the result tells of them."""
+    """Return the capture with the cameras and time offsets of the run, if the result has them."""
     if result.cameras is None:
         return capture
-    told = {
+    of_run = {
         (camera.name, camera.width, camera.height): (camera, float(late))
         for camera, late in zip(result.cameras.rig, result.cameras.time_offset_s, strict=True)
     }
     used = [
-        told.get((camera.name, camera.width, camera.height), (camera, late))
+        of_run.get((camera.name, camera.width, camera.height), (camera, late))
         for camera, late in zip(capture.rig, capture.time_offset_s, strict=True)
     ]
     return replace(capture, rig=Rig(tuple(camera for camera, _ in used)), time_offset_s=tuple(late for _, late in used))
 
 
 def joined(tiles: Sequence[Image], axis: int) -> Image:
-    """Tiles beside (axis 1) or below (axis 0) each other, on white."""
+    """Join tiles horizontally (axis 1) or vertically (axis 0) on white."""
     across = max(tile.shape[1 - axis] for tile in tiles)
     parts: list[Image] = []
     for tile in tiles:
@@ -320,17 +254,17 @@ def write_sheets(
     tile_height: int = 360,
     full: bool = False,
 ) -> list[Path]:
-    """Write contact sheets of ``rows`` frames each as PNG, a column a camera; eight frames by default.
+    """Write contact sheets of ``rows`` frames each as PNG, one column per camera; eight frames by default.
 
     Raises:
         ResultError: a frame is not in the result.
         ExportError: a sheet cannot be written.
     """
-    chosen = overlay.chosen(frames)
+    chosen = choose_frames(overlay.result, frames, count=8)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ExportError(f"{folder}: cannot be made: {error.strerror or error}") from None
+        raise ExportError(f"{folder}: cannot be created: {error.strerror or error}") from None
     written: list[Path] = []
     sheet: list[tuple[int, Image]] = []
     for frame, images in overlay.pictures(chosen):

@@ -1,6 +1,6 @@
 """The colours of overlays, 3D views and reports: left limbs warm, right limbs cool, trunk and head green.
 
-A joint's colour tells its standard deviation. Colours are BGR, as OpenCV takes them.
+A joint's colour shows its standard deviation. Colours are BGR, as in OpenCV.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ SEGMENT_COLORS: dict[str, Color] = {
     "foot_l": (90, 100, 235),
     "foot_r": (215, 95, 175),
 }
-#: a frame that is lost, and a body that is not to be believed
+#: border of a lost frame, and the body in it
 LOST: Color = (50, 50, 225)
 LOST_BODY: Color = (150, 150, 150)
 TEXT: Color = (240, 240, 240)
 BONE: Color = (245, 245, 245)
 INK: Color = (20, 20, 20)
 
-#: standard deviations from here on share the last colour, metres
+#: standard deviation of the last colour, metres; larger ones have the same. Appearance only.
 SIGMA_MOST_M = 0.05
 #: certain to uncertain: pale yellow, orange, red, dark violet; lightness falls steadily, so it reads without colours
 _SIGMA_STOPS = np.array([[255, 246, 170], [254, 190, 75], [240, 90, 50], [190, 25, 95], [70, 15, 95]], float)
 
 
 def sigma_colors(sigma_m: ArrayLike) -> NDArray[np.uint8]:
-    """(N, 3) the colours of joints with these N standard deviations along an axis, metres; none may be NaN."""
+    """Return the colours (N, 3) of N standard deviations along one axis, metres, none of them NaN."""
     place = np.clip(np.asarray(sigma_m, float) / SIGMA_MOST_M, 0, 1) * (len(_SIGMA_STOPS) - 1)
     stops = np.arange(len(_SIGMA_STOPS))
     rgb = np.stack([np.interp(place, stops, channel) for channel in _SIGMA_STOPS.T], axis=-1)
@@ -47,6 +47,6 @@ def sigma_colors(sigma_m: ArrayLike) -> NDArray[np.uint8]:
 
 
 def hexadecimal(color: Color) -> str:
-    """A colour as a web page writes it."""
+    """Return a colour in HTML notation."""
     b, g, r = color
     return f"#{r:02x}{g:02x}{b:02x}"

@@ -1,4 +1,4 @@
-"""A view from a camera of its own that turns about the person: body or hull, skeleton, cameras, floor."""
+"""Draw a result in 3D from a camera that turns around the person: body or hull, skeleton, cameras, floor."""
 
 from __future__ import annotations
 
@@ -10,27 +10,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ResultError
-from tk.io.results.data import STATUS_MEANING
 from tk.io.results.writer import Result
 from tk.model.body.skeleton import SEGMENTS
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.up import up_vector
-from tk.render.canvas import Image, dots, draw_joints, fixed, write
+from tk.render.canvas import SUBPIXEL_BITS, Image, dots, draw_joints, fixed, write
 from tk.render.figure import Figure, figure_of
-from tk.render.overlay import choose_frames, draw_key, draw_timeline, timeline
-from tk.render.palette import LOST, LOST_BODY, SEGMENT_COLORS, TEXT
+from tk.render.legend import LEGEND_HEIGHT, Legend
+from tk.render.overlay import choose_frames
+from tk.render.palette import LOST, LOST_BODY, SEGMENT_COLORS
 
 Float = NDArray[np.float64]
 
-WIDTH, HEIGHT = 960, 720
-_STRIP, _BAR = 30, 6
+# Appearance only; no measurement depends on these values.
+WIDTH, HEIGHT = 960, 720  # pixels
 _FIELD_OF_VIEW_DEG = 38.0
 _ELEVATION_DEG = 14.0
-_TURN_S = 16.0  # seconds of a whole turn
-_SQUARE_M, _SQUARES = 0.5, 6  # of the floor, and how many lie on each side of its middle
+_TURN_S = 16.0  # duration of a whole turn
+_SQUARE_M, _SQUARES = 0.5, 6  # side of the floor's squares, and their number on each side of the middle
 _PYRAMID_M = 0.25  # height of a camera's pyramid
 _BACKGROUND, _FLOOR, _WIRE = (34, 30, 28), (78, 70, 66), (190, 170, 150)
-_SUBPIXEL = 4
 _NEAREST_M = 0.05  # near clipping plane
 
 #: lines between the points of :func:`camera_pyramid`
@@ -42,9 +41,9 @@ class Stage:
     """Where the person moves.
 
     Attributes:
-        axes: (3, 3) two directions along the floor and up, as columns; right-handed.
-        middle: (3,) of the motion, metres.
-        radius: of a ball around it that holds the motion, metres.
+        axes: (3, 3) two horizontal directions and up, as columns; right-handed.
+        middle: (3,) centre of the motion, metres.
+        radius: radius of a ball around ``middle`` that contains the motion, metres.
         floor: height of the floor along up, metres.
     """
 
@@ -55,7 +54,7 @@ class Stage:
 
     @staticmethod
     def of(result: Result, figure: Figure) -> Stage:
-        """From the frames that are not lost (all, if all are). The floor is where the lowest feet stand."""
+        """Return the stage of the frames that are not lost (all, if all are). The lowest feet stand on the floor."""
         up = up_vector(result.meta.up)
         good = [row for row in range(len(result)) if not figure.lost(row)] or list(range(len(result)))
         points = figure.joints[good].reshape(-1, 3)
@@ -70,7 +69,7 @@ class Stage:
         feet = figure.joints[good] if result.feet is None else result.feet[good]
         heights = (feet @ up).min(axis=1)
         heights = heights[np.isfinite(heights)]
-        # single frames may step through it
+        # the 10th percentile, because feet may be below the floor in single frames
         floor = float(np.percentile(heights, 10)) if len(heights) else float((points @ up).min())
         radius = float(np.linalg.norm(points - middle, axis=1).max()) + 0.15
         return Stage(np.column_stack([east, np.cross(up, east), up]), middle, radius, floor)
@@ -102,45 +101,43 @@ def camera_pyramid(camera: Camera) -> Float:
 
 
 class Scene:
-    """A result in three dimensions.
+    """Draws a result in 3D.
 
     Args:
-        result: what was tracked.
-        rig: the cameras; those of the result by default, none where it tells of none.
-        hull: draw the stored hull, and not the body.
+        result: the result.
+        rig: the cameras; those of the result by default, if it has them.
+        hull: draw the stored hull instead of the body.
 
     Raises:
-        ResultError: no frames, no hull although it is asked for, or a body that cannot be used.
+        ResultError: the result has no frames, no hull although ``hull`` is set, or a body that cannot be used.
     """
 
     def __init__(self, result: Result, rig: Rig | None = None, hull: bool = False) -> None:
-        if not len(result):
-            raise ResultError(f"{result.path}: has no frames")
         if hull and result.hull is None:
             raise ResultError(f"{result.path}: holds no hull; track with --method volumetric --store-hull")
         self.result, self.hull = result, result.hull if hull else None
         figure = figure_of(result)
         self.figure = replace(figure, solids=tuple(solid.divided for solid in figure.solids), _placed={})
-        self._timeline = timeline(self.figure.status, WIDTH)
+        self._legend = Legend(result, self.figure, WIDTH)
         self.stage = Stage.of(result, self.figure)
         self.rig = rig or (result.cameras.rig if result.cameras else None)
         away = [] if self.rig is None else np.linalg.norm(self.rig.centers - self.stage.middle, axis=1)
         fitting = self.stage.radius / np.sin(np.radians(_FIELD_OF_VIEW_DEG / 2))
-        # beyond the recording's own cameras, so that they are seen, too; not so far that the person gets small
+        # beyond the recording's cameras, so that they are visible; but near enough to show the person large
         self._distance = float(np.clip(1.15 * np.median(away), fitting, 2.2 * fitting)) if len(away) else fitting
 
     def rows(self, frames: Sequence[int] = ()) -> list[int]:
-        """The rows of these frames, of all by default.
+        """Return the rows of these frames; all rows by default.
 
         Raises:
-            ResultError: one is not in the result.
+            ResultError: a frame is not in the result.
         """
         wanted = choose_frames(self.result, frames, len(self.result))
         return np.flatnonzero(np.isin(self.result.frames, wanted)).tolist()
 
     def picture(self, row: int) -> Image:
-        """A frame: (HEIGHT + strips, WIDTH, 3). The camera goes round once in 16 seconds of the recording."""
-        canvas = np.full((HEIGHT + _STRIP + _BAR, WIDTH, 3), _BACKGROUND, np.uint8)
+        """Return an image (HEIGHT + LEGEND_HEIGHT, WIDTH, 3). The camera turns once in 16 s of the recording."""
+        canvas = np.full((HEIGHT + LEGEND_HEIGHT, WIDTH, 3), _BACKGROUND, np.uint8)
         tile = canvas[:HEIGHT]
         turn = 2 * np.pi * (self.result.time[row] - self.result.time[0]) / _TURN_S
         eye = self._camera(float(turn))
@@ -156,12 +153,11 @@ class Scene:
         draw_joints(tile, eye.project(self.figure.joints[row])[0], dots(sigma, lost), lost)
         if lost:
             cv2.rectangle(tile, (0, 0), (WIDTH - 1, HEIGHT - 1), LOST, 5)
-        self._draw_legend(canvas[HEIGHT : HEIGHT + _STRIP], row, lost)
-        draw_timeline(canvas[HEIGHT + _STRIP :], self._timeline, (row + 0.5) / len(self.result))
+        self._legend.draw(canvas[HEIGHT:], row)
         return canvas
 
     def _camera(self, turn: float) -> Camera:
-        """Looks at the middle from this angle about the vertical, radians."""
+        """Return the camera at this angle about the vertical, radians; it looks at the middle."""
         up = self.stage.axes[:, 2]
         elevation = np.radians(_ELEVATION_DEG)
         level = self.stage.axes @ np.array([np.cos(turn), np.sin(turn), 0.0])
@@ -188,7 +184,7 @@ class Scene:
                 write(tile, camera.name, int(xy[0, 0]) + 8, int(xy[0, 1]) - 8, _WIRE)
 
     def _draw_body(self, tile: Image, eye: Camera, row: int, lost: bool) -> None:
-        """The solids' faces, far ones first, each lit from where the viewer is."""
+        """Draw the faces of the solids, far ones first, lit from the viewer."""
         if not self.figure.solids or not np.isfinite(self.figure.transforms[row]).all():
             return
         polygons, depths, colors = [], [], []
@@ -211,17 +207,11 @@ class Scene:
         homogeneous, shades = np.concatenate(polygons), np.concatenate(colors).round().astype(int)
         corners2 = fixed(homogeneous[..., :2] / homogeneous[..., 2:])
         for k in np.argsort(-np.concatenate(depths)):
-            cv2.fillConvexPoly(tile, corners2[k], shades[k].tolist(), cv2.LINE_8, _SUBPIXEL)
-
-    def _draw_legend(self, strip: Image, row: int, lost: bool) -> None:
-        strip[...] = LOST if lost else 24
-        state = "LOST: do not use this pose" if lost else STATUS_MEANING[self.figure.status[row]]
-        write(strip, f"frame {self.figure.frames[row]}   {self.result.time[row]:.2f} s   {state}", 10, 20, TEXT, 0.5)
-        draw_key(strip, WIDTH - 310, self.figure.sigma is not None)
+            cv2.fillConvexPoly(tile, corners2[k], shades[k].tolist(), cv2.LINE_8, SUBPIXEL_BITS)
 
 
 def _line(tile: Image, eye: Camera, a: Float, b: Float, color: tuple[int, int, int]) -> None:
-    """A line between two points of the world, cut off before the eye."""
+    """Draw a line between two points of the world, clipped in front of the camera."""
     ends = eye.to_camera(np.stack([a, b]))
     behind = ends[:, 2] < _NEAREST_M
     if behind.all():
@@ -231,11 +221,11 @@ def _line(tile: Image, eye: Camera, a: Float, b: Float, color: tuple[int, int, i
         ends[int(np.flatnonzero(behind)[0])] = ends[0] + share * (ends[1] - ends[0])
     pixels = ends @ eye.matrix.T
     start, stop = fixed(pixels[:, :2] / pixels[:, 2:])
-    cv2.line(tile, start, stop, color, 1, cv2.LINE_AA, _SUBPIXEL)
+    cv2.line(tile, start, stop, color, 1, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def _splat(tile: Image, eye: Camera, points: Float, colors: NDArray[np.uint8]) -> None:
-    """Points as squares of the size of a voxel, near ones over far ones."""
+    """Draw points as squares of the size of a voxel, near ones over far ones."""
     if not len(points):
         return
     xy, depth = eye.project(points)
@@ -251,7 +241,7 @@ def _splat(tile: Image, eye: Camera, points: Float, colors: NDArray[np.uint8]) -
 
 
 def _spacing(points: Float) -> float:
-    """How far apart the voxels of a grid are, metres."""
+    """Return the spacing of the voxels of a grid, metres."""
     steps = np.concatenate([np.diff(np.unique(points[:, axis].round(5))) for axis in range(3)])
     steps = steps[steps > 1e-4]
     return float(np.median(steps)) if len(steps) else 0.02

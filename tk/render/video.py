@@ -1,4 +1,4 @@
-"""H.264 in MP4 that every browser plays, through PyAV; encoded in a thread of its own."""
+"""Write H.264 in MP4, which every browser plays, with PyAV in a separate thread."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from tk.render.files import replacing
 
 Image = NDArray[np.uint8]
 
-# Constant rate factor: 0 is lossless, 51 the worst; text and thin lines still read well at 28. Macroblock trees would
-# make files a fifth smaller and 0.7 dB worse, and take a sixth longer.
+# Constant rate factor: 0 is lossless, 51 the worst; text and thin lines are readable at 28. Macroblock trees would make
+# files a fifth smaller and 0.7 dB worse, and take a sixth longer.
 _X264 = {"preset": "ultrafast", "crf": "28", "x264-params": "threads=1:mbtree=0:rc-lookahead=0:deblock=0,0"}
-# pictures that wait for the encoder at most
+# images that may wait for the encoder; more would only need memory
 _WAITING = 8
-#: in the file's metadata
+#: marks tk's files in their metadata
 _COMMENT = "made by tk"
 
 
 @contextmanager
 def video_writer(path: Path, fps: float) -> Iterator[Callable[[Image], None]]:
-    """Write a video: a context that gives a function to add pictures (H, W, 3) BGR with, H and W even, all of one size.
+    """Open a video for writing; yield a function that adds images (H, W, 3) BGR, H and W even, all of one size.
 
-    PyAV releases the interpreter while it encodes, so drawing the next picture goes on beside. The file takes its name
-    when the block ends without an error.
+    PyAV releases the interpreter lock while it encodes, so the next image is drawn at the same time. The file gets its
+    name when the block ends without an error.
 
     Args:
         path: the MP4 file. One that exists is replaced.
-        fps: pictures a second.
+        fps: images per second.
 
     Raises:
         ExportError: it cannot be written there.
@@ -52,7 +52,7 @@ def video_writer(path: Path, fps: float) -> Iterator[Callable[[Image], None]]:
 
 
 class _Encoder:
-    """The thread, and the queue to it."""
+    """The encoding thread and its queue."""
 
     def __init__(self, path: Path, fps: float) -> None:
         self._path = path
@@ -64,7 +64,7 @@ class _Encoder:
 
     def add(self, picture: Image) -> None:
         self.check()
-        # a fifth of the time that PyAV takes for it
+        # five times as fast as PyAV's conversion
         self._waiting.put(np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420), np.uint8))
 
     def finish(self) -> None:
@@ -72,23 +72,23 @@ class _Encoder:
         self._thread.join()
 
     def check(self) -> None:
-        """Raise what the thread has met."""
+        """Raise the exception of the thread, if there was one."""
         if self._failure is not None:
             raise self._failure
 
     def _run(self) -> None:
         try:
             self._encode()
-        except Exception as error:  # handed on to whoever adds the next picture
+        except Exception as error:  # raised when the next image is added
             self._failure = error
-            while self._waiting.get() is not None:  # so that nobody waits for this thread
+            while self._waiting.get() is not None:  # empty the queue, so that ``add`` never blocks
                 pass
 
     def _encode(self) -> None:
         picture = self._waiting.get()
         if picture is None:
             return
-        import av  # only where a video is written
+        import av  # slow to import, and only needed here
 
         with av.open(str(self._path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
             container.metadata["comment"] = _COMMENT
@@ -102,18 +102,18 @@ class _Encoder:
 
 
 def made_here(path: Path) -> bool:
-    """Whether a video was written by :func:`video_writer`."""
+    """Return whether a video was written by :func:`video_writer`."""
     import av
 
     try:
         with av.open(str(path)) as container:
             return container.metadata.get("comment") == _COMMENT
-    except (OSError, ValueError):  # what PyAV raises is one of these
+    except (OSError, ValueError):  # base classes of PyAV's errors
         return False
 
 
 def check_encoder() -> None:
-    """Raise ExportError where PyAV is missing or cannot encode H.264."""
+    """Raise ExportError if PyAV is missing or cannot encode H.264."""
     try:
         import av.codec
 

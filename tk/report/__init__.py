@@ -1,1 +1,1 @@
-"""A result as one self-contained HTML page: nothing is loaded from anywhere else."""
+"""A result as one self-contained HTML page that loads nothing from the network."""

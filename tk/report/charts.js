@@ -87,7 +87,7 @@ class Chart {
   draw() {
     this.range();
     const { svg } = this;
-    // lost frames first: they lie behind everything
+    // lost frames first, so that they lie behind the curves
     const half = (this.span[1] - this.span[0]) / Math.max(this.time.length - 1, 1) / 2;
     this.lost.forEach((flag, row) => {
       if (!flag) return;

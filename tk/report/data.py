@@ -1,4 +1,4 @@
-"""What a report tells of a result, as plain values for JSON. Arrays go as base64 of little-endian float32."""
+"""The data of a report as plain values for JSON. Arrays are base64 of little-endian float32."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from tk.render.scene import Stage, camera_pyramid
 
 Float = NDArray[np.float64]
 
-#: how many stops of the scale of σ's colours are handed over
+#: stops of the colour scale of σ; the page interpolates between them
 _SIGMA_STOPS = 9
-#: flexion at the middle joint of three
+#: joints whose flexion angle is at the middle one of three
 _HINGES = {"elbow": ("shoulder", "elbow", "wrist"), "knee": ("hip", "knee", "ankle")}
 
 
 def describe(result: Result, rig: Rig | None = None) -> dict[str, Any]:
-    """Everything but the pictures.
+    """Return all data of the report except the images.
 
     Args:
-        result: with one frame at least.
-        rig: the cameras, where the result does not tell them.
+        result: the result, with at least one frame.
+        rig: the cameras, if the result does not have them.
 
     Raises:
-        ResultError: the body cannot be used, or there is nothing to draw.
+        ResultError: there are no frames or joints, or the body cannot be used.
     """
     meta = result.meta
     figure = figure_of(result)
@@ -72,14 +72,14 @@ def describe(result: Result, rig: Rig | None = None) -> dict[str, Any]:
 
 
 def packed(values: ArrayLike) -> dict[str, Any]:
-    """An array as its shape and base64 of float32; what is not finite is NaN."""
+    """Return an array as its shape and base64 of float32; infinities become NaN."""
     array = np.asarray(values, dtype="<f4")
     array = np.where(np.isfinite(array), array, np.float32(np.nan))
     return {"shape": list(array.shape), "data": base64.b64encode(array.tobytes()).decode("ascii")}
 
 
 def _scene(result: Result, figure: Figure, rig: Rig | None) -> dict[str, Any]:
-    """Joints, body and cameras in the frame of the floor: x, y along it, z up, the motion's middle above the origin."""
+    """Return joints, body and cameras in a frame on the floor: z up, the middle of the motion above the origin."""
     stage = Stage.of(result, figure)
     T = np.eye(4)
     T[:3, :3] = stage.axes.T
@@ -105,7 +105,7 @@ def _scene(result: Result, figure: Figure, rig: Rig | None) -> dict[str, Any]:
 
 
 def _angles(result: Result, figure: Figure) -> list[dict[str, Any]]:
-    """A panel an angle; both sides of a pair share one. Flexion of elbows and knees has a standard deviation."""
+    """Return a panel per angle, with both sides in one. Flexion of elbows and knees has a standard deviation."""
     panels: dict[str, dict[str, Any]] = {}
     for joint in result.meta.angles:
         side = joint.joint[-2:] if joint.joint.endswith(("_l", "_r")) else ""
@@ -124,9 +124,9 @@ def _angles(result: Result, figure: Figure) -> list[dict[str, Any]]:
 
 
 def hinge_sigma_deg(figure: Figure, joints: Sequence[str]) -> Float:
-    """(F,) standard deviation of the angle at the middle one of three joints, degrees.
+    """Return the standard deviation (F,) of the angle at the middle one of three joints, degrees.
 
-    To first order, the three positions' errors taken as independent and alike along all axes.
+    First-order propagation of independent, isotropic errors of the three positions.
     """
     index = [JOINTS.index(name) for name in joints]
     A, B, C = np.moveaxis(figure.joints[:, index], 1, 0)
@@ -136,12 +136,12 @@ def hinge_sigma_deg(figure: Figure, joints: Sequence[str]) -> Float:
     p, q = np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         cosine = (u * v).sum(axis=1) / (p * q)
-        # moved alike, the ends turn the limb and the middle stays; moved against each other they bend it
+        # sensitivity to the middle joint: it moves relative to both ends at the same time
         middle = 1 / p**2 + 1 / q**2 - 2 * cosine / (p * q)
         return np.asarray(np.degrees(np.sqrt((a / p) ** 2 + (c / q) ** 2 + b**2 * middle)))
 
 
 def _timing(result: Result) -> list[dict[str, Any]]:
-    """Milliseconds a frame of every stage, means."""
+    """Return the mean time of every stage, milliseconds per frame."""
     means = {stage: 1e3 * float(np.nanmean(values)) if len(values) else 0.0 for stage, values in result.timing.items()}
     return [{"stage": stage, "ms": ms} for stage, ms in means.items() if np.isfinite(ms)]

@@ -1,5 +1,5 @@
 "use strict";
-// Fills the page from the data, and keeps everything at the same frame.
+// Fills the page from the data, and shows the same frame in all its parts.
 
 (function () {
   const data = JSON.parse(document.getElementById("data").textContent);
@@ -32,28 +32,28 @@
   const good = (values) => values.filter((_, row) => !lost[row]);
   const joint = (name) => name.replace(/^(.*)_([lr])$/, (_, part, side) => `${side === "l" ? "left" : "right"} ${part}`).replace("_", " ");
 
-  // --- head
+  // --- header
   get("title").textContent = data.capture;
   const when = data.created.slice(0, 16).replace("T", " ");
   get("subtitle").textContent = `${data.file} · ${count} frames at ${short(data.fps)} Hz · method ${data.method} · ${data.software}${when ? ` · ${when} UTC` : ""}`;
-  const tell = (name, value, unit = "", bad = false) => {
+  const addFigure = (name, value, unit = "", bad = false) => {
     const box = make("div", "", bad ? "bad" : "");
     const number = make("dd", value);
     if (unit) number.append(" ", make("small", unit));
     box.append(make("dt", name), number);
     get("figures").append(box);
   };
-  tell("lost frames", String(lostCount), `of ${count}`, lostCount > 0);
+  addFigure("lost frames", String(lostCount), `of ${count}`, lostCount > 0);
   const meanError = silhouetteError && Array.from({ length: count }, (_, row) => {
-    const told = Array.from(silhouetteError.subarray(row * C, row * C + C)).filter(isFinite);
-    return told.length ? told.reduce((a, b) => a + b) / told.length : NaN;
+    const known = Array.from(silhouetteError.subarray(row * C, row * C + C)).filter(isFinite);
+    return known.length ? known.reduce((a, b) => a + b) / known.length : NaN;
   });
-  if (meanError) tell("E_S, median frame", short(100 * quantile(good(meanError), 0.5)), "%");
-  if (sigma) tell("σ of a joint, median", short(1000 * quantile(sigma, 0.5)), "mm");
+  if (meanError) addFigure("E_S, median frame", short(100 * quantile(good(meanError), 0.5)), "%");
+  if (sigma) addFigure("σ of a joint, median", short(1000 * quantile(sigma, 0.5)), "mm");
   const total = data.timing.find(({ stage }) => stage === "total");
-  if (total) tell("time a frame, mean", short(total.ms), "ms");
+  if (total) addFigure("time per frame, mean", short(total.ms), "ms");
 
-  // --- the frame that is shown
+  // --- current frame
   const viewer = new Viewer(get("view"), data);
   const charts = [];
   let row = -1, playing = false, clock = 0, startedAt = 0, startedTime = 0;
@@ -75,7 +75,7 @@
   };
   const errorBars = silhouetteError ? bars("now-cameras", "E_S of each camera", data.cameras, "%") : [];
   const sigmaBars = sigma ? bars("now-joints", "σ of each joint", data.joints.map(joint), "mm") : [];
-  if (!silhouetteError && !sigma) get("now-joints").append(make("p", "This result tells neither E_S nor σ.", "muted"));
+  if (!silhouetteError && !sigma) get("now-joints").append(make("p", "This result has neither E_S nor σ.", "muted"));
   const mostError = silhouetteError ? Math.max(quantile(silhouetteError, 0.99) * 100, 1) : 1;
 
   function show(wanted) {
@@ -133,7 +133,7 @@
     else return;
     event.preventDefault();
   });
-  // a button takes the space bar for itself when it is let go
+  // the button would react to the space bar a second time when the key is released
   document.addEventListener("keyup", (event) => {
     if (event.key === " " && event.target === get("play")) event.preventDefault();
   });
@@ -147,7 +147,7 @@
     const strip = get("strip"), width = strip.width = strip.clientWidth, pen = strip.getContext("2d");
     const style = getComputedStyle(document.documentElement);
     const colors = ["--ok", "--initialised", "--recovered", "--lost"].map((name) => style.getPropertyValue(name).trim());
-    // lost frames last and a pixel wide at least: one of ten thousand must not vanish
+    // lost frames last and at least a pixel wide: one in ten thousand must stay visible
     for (const wanted of [false, true]) {
       data.status.forEach((status, k) => {
         if (lost[k] !== wanted) return;
@@ -160,16 +160,16 @@
 
   // --- curves
   const common = { time: data.time, lost, seek };
-  const wide = innerWidth > 560 ? 1240 : 400; // of what goes over the whole page: its text keeps its size
+  const wide = innerWidth > 560 ? 1240 : 400; // of charts over the whole page, so that their text has the same size as elsewhere
   const hues = Array.from({ length: 9 }, (_, k) => `var(--hue-${k})`);
   if (meanError) {
-    get("quality-text").textContent = "E_S is the share of pixels that the body explains wrongly. Red: lost frames. A click on a curve goes to its frame.";
+    get("quality-text").textContent = "E_S is the share of wrong pixels: body outside the mask, or mask outside the body. Lower is better. Red: lost frames. Click a curve to go to a frame.";
     charts.push(new Chart(get("quality-charts"), {
       ...common, title: "E_S of each camera", unit: " %", width: wide, height: 190, zero: true, digits: 1,
       lines: data.cameras.map((name, k) => ({ name, color: hues[k % hues.length], values: column(silhouetteError, C, k).map((v) => 100 * v) })),
     }));
   } else {
-    get("quality-text").textContent = "This result does not tell E_S. Red: lost frames. A click on a curve goes to its frame.";
+    get("quality-text").textContent = "This result has no E_S. Red: lost frames. Click a curve to go to a frame.";
   }
   const kind = data.objectiveKind ? ` (${data.objectiveKind})` : "";
   charts.push(new Chart(get("quality-charts"), {
@@ -179,8 +179,8 @@
   const tints = { left: "var(--left)", right: "var(--right)", middle: "var(--middle)" };
   if (data.angles.length) {
     const banded = data.angles.some(({ lines }) => lines.some((line) => line.sigma));
-    get("angles-text").textContent = "Degrees. Left warm, right cool; conventions on the titles, after the ISB where it has them. "
-      + (banded ? "Bands: ± one σ, from the positions of the three joints taken as independent; the other angles' σ is not known." : "No σ is known.");
+    get("angles-text").textContent = "Degrees. Left warm, right cool. Point at a title to read its convention (ISB where it defines one). "
+      + (banded ? "Bands: ± one σ, computed from independent positions of the three joints; other angles have no σ." : "No σ is available.");
     for (const panel of data.angles) {
       charts.push(new Chart(get("angle-charts"), {
         ...common, title: panel.title, unit: "°", hint: panel.convention, wraps: true, least: 20, digits: 1,
@@ -191,13 +191,13 @@
       }));
     }
   } else {
-    get("angles-text").textContent = "This result does not tell the joints' angles.";
+    get("angles-text").textContent = "This result has no joint angles.";
   }
 
   // --- pictures
   get("pictures-text").textContent = data.pictures.length
-    ? "The tracked body over the pictures: left limbs warm, right limbs cool. Dots are joints, from pale yellow (sure) to dark violet (σ of 5 cm and more). A click goes to the frame."
-    : "No pictures: the report was made without the capture. tk report RESULT.h5 CAPTURE adds them.";
+    ? "The tracked body over the images: left limbs warm, right limbs cool. Dots are joints, from pale yellow (small σ) to dark violet (σ of 5 cm or more). Click an image to go to its frame."
+    : "No images: the report was made without the capture. tk report RESULT.h5 CAPTURE adds them.";
   for (const picture of data.pictures) {
     const figure = make("figure"), caption = make("figcaption"), button = make("button"), image = make("img");
     const at = `frame ${data.frames[picture.row]}, ${data.time[picture.row].toFixed(2)} s`;
@@ -223,16 +223,16 @@
     return made;
   };
   if (sigma) {
-    get("sigma-text").textContent = "One standard deviation of a position along an axis, millimetres, frames that are not lost.";
+    get("sigma-text").textContent = "One standard deviation of a joint position along one axis, mm; frames that are not lost.";
     get("sigma-table").append(line(["joint", "median", "90 %", "largest"], "th"));
     data.joints.forEach((name, k) => {
       const values = good(column(sigma, J, k));
       get("sigma-table").append(line([joint(name), ...[0.5, 0.9, 1].map((share) => listed(1000 * quantile(values, share)))]));
     });
   } else {
-    get("sigma-text").textContent = "This result does not tell σ.";
+    get("sigma-text").textContent = "This result has no σ.";
   }
-  get("times-text").textContent = "Milliseconds, means. Decoding and masks run ahead in a process of their own and are no part of the total.";
+  get("times-text").textContent = "Mean, ms. Decoding and segmentation run in a separate process and are not part of the total.";
   get("times-table").append(line(["stage", "", "ms"], "th"));
   const longest = Math.max(...data.timing.map(({ ms }) => ms), 1e-9);
   for (const { stage, ms } of data.timing) {
@@ -242,10 +242,10 @@
     get("times-table").append(line([stage.replace("_", " "), track, listed(ms)]));
   }
 
-  // --- words
-  for (const note of data.notes.length ? data.notes : ["Nothing."]) get("notes").append(make("li", note));
+  // --- notes and settings
+  for (const note of data.notes.length ? data.notes : ["None."]) get("notes").append(make("li", note));
   get("settings").textContent = data.settings;
-  get("foot").textContent = `Made by ${data.software} from ${data.file}; seed ${data.seed}. The page is complete by itself.`;
+  get("foot").textContent = `Made by ${data.software} from ${data.file}; seed ${data.seed}. The page needs no network.`;
 
   show(0);
   window.report = { show, play, get row() { return row; }, get playing() { return playing; }, count };

@@ -1,4 +1,4 @@
-"""The page: template, style, scripts and data in one text."""
+"""The page: template, style, scripts and data in one file."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tk.errors import ResultError
 from tk.io.captures.capture import open_capture
 from tk.io.results.writer import Result, read_result
 from tk.model.cameras.camera import Rig
@@ -21,20 +20,18 @@ _GENERATOR = '<meta name="generator" content="tk">'
 
 
 def build_page(result: Result, pictures: list[dict[str, Any]], rig: Rig | None = None) -> str:
-    """The page of a result.
+    """Return the page of a result.
 
     Args:
-        result: with one frame at least.
-        pictures: of :func:`tk.report.pictures.embedded`.
-        rig: the cameras, where the result does not tell them.
+        result: the result, with at least one frame.
+        pictures: images, from :func:`tk.report.pictures.embedded`.
+        rig: the cameras, if the result does not have them.
 
     Raises:
         ResultError: the result cannot be drawn.
     """
-    if not len(result):
-        raise ResultError(f"{result.path}: has no frames")
     data = describe(result, rig) | {"file": result.path.name, "pictures": pictures}
-    # "<" could end the script element
+    # "<" could close the script element
     text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     page = _read("page.html")
     for mark, content in (
@@ -48,17 +45,17 @@ def build_page(result: Result, pictures: list[dict[str, Any]], rig: Rig | None =
 
 
 def write_page(path: Path, page: str) -> None:
-    """Write it under a temporary name first.
+    """Write the page, under a temporary name first.
 
     Raises:
-        ExportError: it cannot be written.
+        ExportError: the file cannot be written.
     """
     with replacing(path) as part:
         part.write_text(page, encoding="utf-8")
 
 
 def made_here(path: Path) -> bool:
-    """Whether a file is a report of tk."""
+    """Return whether a file is a report of tk."""
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
             return _GENERATOR in file.read(4096)
@@ -67,14 +64,12 @@ def made_here(path: Path) -> bool:
 
 
 def report(result_path: Path, capture_path: Path | None, output: Path | None, force: bool = False) -> Path:
-    """What `tk report` does; the file that was written.
+    """Write the report of a result, and return its path.
 
     Raises:
-        TkError: result or capture cannot be used, or the page cannot be written.
+        TkError: the result or the capture cannot be used, or the page cannot be written.
     """
     result = read_result(result_path)
-    if not len(result):
-        raise ResultError(f"{result_path}: has no frames")
     target = check_target(output or result_path.with_suffix(".html"), force)
     shown: list[dict[str, Any]] = []
     rig = None

@@ -1,4 +1,4 @@
-"""The frames that a report shows pictures of, and why these."""
+"""Choose the frames that a report shows images of, and make the images."""
 
 from __future__ import annotations
 
@@ -14,21 +14,23 @@ from numpy.typing import NDArray
 from tk.io.results.writer import Result, Status
 from tk.render.overlay import Overlay
 
+# Frames with the largest and with a typical E_S; width of an image with all cameras, pixels; JPEG quality. Appearance
+# and size of the page only: five images have about 0.5 MB.
 _WORST, _TYPICAL = 3, 2
-_WIDTH = 1400  # of a picture with all cameras side by side, pixels
-_QUALITY = 80  # of JPEG
+_WIDTH = 1400
+_QUALITY = 80
 
 
 @dataclass(frozen=True)
 class Choice:
-    """A row of the result and why it is shown."""
+    """A row of the result, and the reason to show it."""
 
     row: int
     why: str
 
 
 def choose_rows(result: Result) -> list[Choice]:
-    """The first lost frame, the worst, and typical ones; frames spread over the result where no E_S is told."""
+    """Return the first lost frame, the worst and typical frames; without E_S, frames spread over the result."""
     count = len(result)
     lost = result.status == Status.LOST
     error = np.full(count, np.nan)
@@ -37,13 +39,13 @@ def choose_rows(result: Result) -> list[Choice]:
         known = np.isfinite(by_view).any(axis=1)
         error[known] = np.nanmean(by_view[known], axis=1)
     chosen: dict[int, str] = {}
-    apart = max(2, count // 20)
+    spacing = max(2, count // 20)
 
     def take(order: NDArray[np.int64], why: str, most: int) -> None:
         for row in order.tolist():
             if most == 0:
                 return
-            if np.isfinite(error[row]) and all(abs(row - other) >= apart for other in chosen):
+            if np.isfinite(error[row]) and all(abs(row - other) >= spacing for other in chosen):
                 chosen[row] = f"{why}: mean E_S {100 * error[row]:.0f} %"
                 most -= 1
 
@@ -61,7 +63,7 @@ def choose_rows(result: Result) -> list[Choice]:
 
 
 def shot(overlay: Overlay, frame: int, images: NDArray[np.uint8]) -> bytes:
-    """A JPEG of a frame: the person in all cameras."""
+    """Return a JPEG of a frame with the person in all cameras."""
     height = int(np.clip(_WIDTH / (0.75 * len(overlay.rig)), 160, 300))
     _, data = cv2.imencode(
         ".jpg", overlay.sheet_row(frame, images, height, truth=False), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
@@ -70,7 +72,7 @@ def shot(overlay: Overlay, frame: int, images: NDArray[np.uint8]) -> bytes:
 
 
 def embedded(choices: list[Choice], shots: Mapping[int, bytes]) -> list[dict[str, Any]]:
-    """The pictures for the page, in the order of the choices; ``shots`` by row."""
+    """Return the images for the page in the order of the choices; ``shots`` are JPEGs by row."""
     return [
         {"row": choice.row, "why": choice.why, "jpeg": base64.b64encode(shots[choice.row]).decode("ascii")}
         for choice in choices

@@ -1,5 +1,5 @@
 "use strict";
-// The person in three dimensions on a 2D canvas: faces sorted by depth, no GPU. Metres; z is up, the floor at z = 0.
+// Draws the person in 3D on a 2D canvas: faces sorted by depth, no GPU. Metres; z is up, the floor is at z = 0.
 
 /** The numbers of an array that Python packed: a Float32Array with its shape. */
 function unpack(packed) {
@@ -127,7 +127,7 @@ class Viewer {
     const reach = Math.max(2, Math.ceil(this.scene.radius * 1.5)), step = 0.5;
     this.pen.beginPath();
     for (let k = -reach; k <= reach + 1e-9; k += step) {
-      for (let j = -reach; j < reach - 1e-9; j += step) { // in pieces: one end may be behind the eye
+      for (let j = -reach; j < reach - 1e-9; j += step) { // in pieces, because one end may be behind the camera
         this.line([k, j, 0], [k, j + step, 0]);
         this.line([j, k, 0], [j + step, k, 0]);
       }
@@ -174,11 +174,11 @@ class Viewer {
       for (const face of solid.faces) {
         const [a, b, c, d] = face.map((i) => seen[i]);
         const area = (c[0] - a[0]) * (d[1] - b[1]) - (c[1] - a[1]) * (d[0] - b[0]);
-        if (area >= 0) continue; // seen from behind: the screen's y runs down
+        if (area >= 0) continue; // a back face: the screen's y axis points down
         const [i, j, k, l] = face.map((n) => 3 * n);
         const u = [0, 1, 2].map((r) => world[k + r] - world[i + r]), v = [0, 1, 2].map((r) => world[l + r] - world[j + r]);
         const n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
-        // the light comes over the viewer's shoulder
+        // the light comes from behind the viewer
         const along = (n[0] * (0.35 * this.eye.cos + 0.4 * this.eye.sin) + n[1] * (0.35 * this.eye.sin - 0.4 * this.eye.cos)
           + n[2] * 0.85) * light / Math.max(Math.hypot(...n), 1e-12);
         faces.push({ depth: a[2] + b[2] + c[2] + d[2], corners: [a, b, c, d], base, shade: 0.76 + 0.32 * along });
@@ -193,7 +193,7 @@ class Viewer {
       corners.forEach((p, k) => (k ? pen.lineTo(p[0], p[1]) : pen.moveTo(p[0], p[1])));
       pen.closePath();
       pen.fill();
-      pen.stroke(); // no gaps between neighbours
+      pen.stroke(); // closes gaps between neighbouring faces
     }
   }
 
