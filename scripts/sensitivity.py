@@ -1,0 +1,257 @@
+"""Within which range of a constant or a setting the accuracy of tracking hardly changes.
+
+    python -m scripts.sensitivity NAME… --captures CAPTURE… [--factors 0.5 0.7 1.4 2] [--frames A:B] [--masks none]
+                                  [--method region] [--config FILE] [--limit 0.1]
+
+NAME is a constant, ``tk.model.cameras.bundle:SEGMENT_M``, or a setting, ``silhouette.fit.rounds``. A dot after a
+constant's name selects a field, a key or an index: ``tk.trackers.contour_tracker:LINE_SEARCH.robust_px``. Numbers of a
+whole table are multiplied together; integers are rounded.
+
+Each capture, which needs a ``truth.h5``, is tracked by ``tk track`` in a process of its own: once unchanged, then with
+each number multiplied by each factor. A constant is multiplied where its module defines it, so all numbers derived from
+it change, too. A line a value: mean errors of limbs (constant offsets removed) and of all joints (raw) by capture, cm.
+Then the range of values around the present one in which the means of both over the captures change by less than
+``--limit`` cm.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import dataclasses
+import importlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from importlib.abc import MetaPathFinder, SourceLoader
+from importlib.machinery import ModuleSpec, PathFinder
+from pathlib import Path
+from types import ModuleType
+from typing import Any, cast
+
+import numpy as np
+
+FACTORS = (0.5, 0.7, 1.4, 2.0)
+# Environment variable of a process that tracks with a changed constant: JSON of name and factor.
+_VARIABLE = "TK_SENSITIVITY"
+
+
+@dataclass(frozen=True)
+class Run:
+    """One way to track the captures.
+
+    Attributes:
+        name: what is multiplied; None: nothing is.
+        factor: by which.
+    """
+
+    name: str | None = None
+    factor: float = 1.0
+
+
+def scaled(value: Any, factor: float, path: Sequence[str] = ()) -> Any:
+    """Return a value with its numbers multiplied, or only those of the field, key or index that ``path`` names."""
+    if path:
+        head, *rest = path
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            return dataclasses.replace(value, **{head: scaled(getattr(value, head), factor, rest)})
+        if isinstance(value, dict):
+            return {**value, head: scaled(value[head], factor, rest)}
+        return tuple(scaled(v, factor, rest) if i == int(head) else v for i, v in enumerate(value))
+    if isinstance(value, bool) or value is None or isinstance(value, str):
+        raise ValueError(f"{value!r} is no number")
+    if isinstance(value, int):
+        return round(value * factor)
+    if isinstance(value, float | np.ndarray | np.floating):
+        return value * factor
+    if isinstance(value, dict):
+        return {key: scaled(v, factor) for key, v in value.items()}
+    if isinstance(value, tuple | list):
+        return type(value)(scaled(v, factor) for v in value)
+    raise ValueError(f"{value!r} is no number, nor a table of numbers")
+
+
+def select(value: Any, path: Iterable[str]) -> Any:
+    """Return the field, key or index of a value."""
+    for part in path:
+        value = getattr(value, part) if dataclasses.is_dataclass(value) else value[_key(value, part)]
+    return value
+
+
+def _key(value: Any, part: str) -> Any:
+    return part if isinstance(value, dict) else int(part)
+
+
+# --- in the process that tracks ---------------------------------------------------------------------------------------
+
+
+class _Scaling(MetaPathFinder):
+    """Imports one module with a constant multiplied right after its definition."""
+
+    def __init__(self, name: str, factor: float) -> None:
+        self.module, _, constant = name.partition(":")
+        self.constant, *self.path = constant.split(".")
+        self.factor = factor
+
+    def find_spec(self, name: str, path: Any, target: ModuleType | None = None) -> ModuleSpec | None:
+        if name != self.module:
+            return None
+        spec = PathFinder.find_spec(name, path, target)
+        if spec is not None:
+            assert isinstance(spec.loader, SourceLoader)
+            cast(Any, spec.loader).get_code = lambda _: self._code(cast(str, spec.origin))
+        return spec
+
+    def _code(self, file: str) -> Any:
+        tree = ast.parse(Path(file).read_text(encoding="utf-8"), file)
+        for position, node in enumerate(tree.body):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target] if _annotated(node) else []
+            if any(isinstance(n, ast.Name) and n.id == self.constant for t in targets for n in ast.walk(t)):
+                change = f"from scripts.sensitivity import scaled as _scaled\n{self.constant} = _scaled("
+                change += f"{self.constant}, {self.factor!r}, {self.path!r})"
+                tree.body[position + 1 : position + 1] = ast.parse(change).body
+                return compile(ast.fix_missing_locations(tree), file, "exec")
+        raise ImportError(f"{self.module} defines no {self.constant}")
+
+
+def _annotated(node: ast.stmt) -> bool:
+    return isinstance(node, ast.AnnAssign)
+
+
+if _VARIABLE in os.environ:  # here, and not in a function: processes that tk starts import this file again
+    sys.meta_path.insert(0, _Scaling(*json.loads(os.environ[_VARIABLE])))
+
+
+# --- in the process that compares -------------------------------------------------------------------------------------
+
+
+def track_errors(run: Run, capture: Path, args: argparse.Namespace) -> tuple[float, float]:
+    """Track a capture and return the mean errors of limbs (offsets removed) and of all joints, cm; NaN if it failed."""
+    from tk.evaluation.joints import evaluate_files
+    from tk.io import settings_file
+    from tk.settings import Settings
+
+    settings = settings_file.read(args.config) if args.config else Settings()
+    environment = {name: value for name, value in os.environ.items() if name != _VARIABLE}
+    if run.name is not None and ":" in run.name:
+        environment[_VARIABLE] = json.dumps([run.name, run.factor])
+    elif run.name is not None:
+        settings = scaled(settings, run.factor, run.name.split("."))
+    with tempfile.TemporaryDirectory() as folder:
+        result, config = Path(folder) / "result.h5", Path(folder) / "settings.toml"
+        config.write_text(settings_file.to_toml(settings), encoding="utf-8")
+        command = ["track", str(capture), "-o", str(result), "--config", str(config), "--no-report", "-q"]
+        command += ["--masks", args.masks, "--method", args.method]
+        command += ["--frames", args.frames] if args.frames else []
+        done = subprocess.run(
+            [sys.executable, "-m", "scripts.sensitivity", "--track", *command],
+            env=environment, capture_output=True, text=True,
+        )  # fmt: skip
+        if done.returncode not in (0, 3):
+            sys.stderr.write(done.stderr)
+            return np.nan, np.nan
+        found = evaluate_files(result, capture / "truth.h5")
+    return found.corrected.limbs.mean_cm, found.raw.all.mean_cm
+
+
+def value_of(name: str, config: Path | None = None) -> Any:
+    """Return the present value of a constant or a setting."""
+    module, colon, constant = name.partition(":")
+    if colon:
+        head, *path = constant.split(".")
+        return select(getattr(importlib.import_module(module), head), path)
+    from tk.io import settings_file
+    from tk.settings import Settings
+
+    return select(settings_file.read(config) if config else Settings(), name.split("."))
+
+
+def tolerated(values: Sequence[tuple[float, bool]]) -> tuple[float, float]:
+    """Return the smallest and the largest factor, around 1, between which every tried one is good.
+
+    Args:
+        values: factors in any order, and whether the accuracy hardly changed with each.
+    """
+    low = high = 1.0
+    for factor, good in sorted((v for v in values if v[0] < 1), reverse=True):
+        if not good:
+            break
+        low = factor
+    for factor, good in sorted(v for v in values if v[0] > 1):
+        if not good:
+            break
+        high = factor
+    return low, high
+
+
+def shown(value: Any) -> str:
+    """Return a value as short text."""
+    if isinstance(value, float | np.floating):
+        return f"{value:.4g}"
+    if isinstance(value, tuple | list):
+        return f"({', '.join(map(shown, value))})"
+    return f"{value}"
+
+
+def measure(
+    name: str, factors: Sequence[float], errors: Callable[[Run], np.ndarray], limit: float, config: Path | None = None
+) -> Iterable[str]:
+    """Yield a table's lines for one constant or setting; ``errors`` returns (captures, 2) of a run, cm."""
+    present = value_of(name, config)
+    base, judged = errors(Run()), []
+    yield f"{name} = {shown(present)}"
+    yield _line("unchanged", present, base)
+    for factor in factors:
+        value = scaled(present, factor)
+        if shown(value) == shown(present):  # an integer that rounds to itself
+            continue
+        found = errors(Run(name, factor))
+        change = np.abs(found.mean(axis=0) - base.mean(axis=0)).max()
+        judged.append((factor, bool(change < limit)))
+        yield _line(f"× {factor:g}", value, found) + f"   change {change:.2f}"
+    low, high = tolerated(judged)
+    ends = f"{shown(scaled(present, low))} to {shown(scaled(present, high))}"
+    yield f"changes by less than {limit:g} cm: {ends}"
+
+
+def _line(label: str, value: Any, errors: np.ndarray) -> str:
+    text = "   ".join(f"{limbs:5.2f} {raw:5.2f}" for limbs, raw in errors)
+    return f"  {label:10} {shown(value):>12}   {text}   mean {errors[:, 0].mean():5.2f} {errors[:, 1].mean():5.2f}"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments[:1] == ["--track"]:
+        from tk.cli import main as tk
+
+        tk(list(arguments[1:]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="+", metavar="NAME")
+    parser.add_argument("--captures", nargs="+", type=Path, required=True, metavar="CAPTURE")
+    parser.add_argument("--factors", nargs="+", type=float, default=FACTORS)
+    parser.add_argument("--frames", help="as for tk track")
+    parser.add_argument("--masks", default="none", help="as for tk track")
+    parser.add_argument("--method", default="region", help="as for tk track")
+    parser.add_argument("--config", type=Path, help="settings to begin with")
+    parser.add_argument("--limit", type=float, default=0.1, help="smallest change that counts, cm")
+    args = parser.parse_args(arguments)
+    known: dict[Run, np.ndarray] = {}
+
+    def errors(run: Run) -> np.ndarray:
+        if run not in known:
+            known[run] = np.array([track_errors(run, capture, args) for capture in args.captures])
+        return known[run]
+
+    sys.stdout.write(f"limbs and raw errors, cm: {', '.join(capture.name for capture in args.captures)}\n")
+    for name in args.names:
+        for line in measure(name, args.factors, errors, args.limit, args.config):
+            sys.stdout.write(line + "\n")
+            sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
