@@ -60,7 +60,7 @@ class Recorded:
 
     def __init__(self, path: Path) -> None:
         self.capture: Capture = open_capture(path, None, "none")
-        label = make_labeller(self.capture, Settings(), lambda _: None)
+        label = make_labeller(self.capture.setup(), self.capture, Settings(), lambda _: None)
         with self.capture.frames() as frames:
             self.frames = [
                 Observation(frame.index, np.array(frame.images), *(np.array(layer) for layer in label(frame)))

@@ -241,7 +241,7 @@ def stages_alone(options: Options, result: Result) -> tuple[list[Stage], bench_h
     first = max(stop - WINDOW, int(result.frames[0]))
     with capture.frames(first, stop) as reader:
         frames = list(reader)
-    segment = make_segmenter(capture, config, lambda _: None)
+    segment = make_segmenter(capture.setup(), capture, config, lambda _: None)
     masks = [segment(frame) for frame in frames]
     decoding = Stage("decode", _decode_ms(capture, first, stop, options.repeat), {})
     masking = Stage("masks", statistics.median(median_ms(partial(segment, frame), 1) for frame in frames), {})

@@ -49,7 +49,7 @@ def truth_of(folder: Path, capture: Capture, index: int) -> np.ndarray:
 def measure(path: Path, frames: int | None) -> str:
     """The line of one capture."""
     capture = open_capture(path, masks="none")
-    label = make_labeller(capture, Settings(), print)
+    label = make_labeller(capture.setup(), capture, Settings(), print)
     label(next(capture.frames(0, 1)))  # compiles
     stop = min(frames or capture.frame_count, capture.frame_count)
     with capture.frames(0, stop) as reader:

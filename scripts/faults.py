@@ -175,7 +175,7 @@ def exposure(spoiled: Spoiled) -> None:
 def bystander(spoiled: Spoiled) -> None:
     """Somebody beside the person in two of the views, cut out of the same recording at another time."""
     original = spoiled.original
-    label = make_labeller(original, Settings(), lambda _: None)
+    label = make_labeller(original.setup(), original, Settings(), lambda _: None)
     with original.frames() as frames:
         masks = [label(frame)[0].copy() for frame in frames]
     for camera in (spoiled.camera, (spoiled.camera + 2) % len(original.rig)):

@@ -19,6 +19,8 @@ import pytest
 
 from scripts.synthetic.capture import Options, plan_capture, write_capture
 from tk.io import settings_file
+from tk.io.captures.capture import Capture
+from tk.model.setup import Setup
 
 # every run draws the same examples; `pytest --hypothesis-profile default` draws new ones
 hypothesis.settings.register_profile("same", derandomize=True)
@@ -41,6 +43,11 @@ init_frames = 3
 frames = 2
 rounds = 2
 """
+
+
+def setup_and_source(capture: Capture) -> tuple[Setup, Capture]:
+    """Return the two things that a recording gives."""
+    return capture.setup(), capture
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a script calls: :func:`tk.open_capture`, :func:`tk.track`, :func:`tk.read_result`."""
+"""The public functions :func:`tk.open_capture` and :func:`tk.track`."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from tk.io.captures.capture import Capture
 from tk.io.captures.capture import open_capture as _open_capture
 from tk.io.results.writer import Result, read_result
 from tk.run import session
+from tk.run.plan import recording_setup
+from tk.run.reporter import Silent
 from tk.settings import Settings
 from tk.trackers.protocol import Estimate
 
@@ -24,21 +26,21 @@ _LOG = logging.getLogger(__name__)
 PathLike = str | os.PathLike[str]
 
 
-class _Logged(session.Silent):
-    """The reporter of scripts: notes are warnings of the logger "tk", progress goes nowhere."""
+class _Logged(Silent):
+    """The reporter of scripts: notes become warnings of the logger "tk", progress is ignored."""
 
     def note(self, text: str) -> None:
         _LOG.warning("%s", text)
 
 
 def open_capture(path: PathLike, cameras: Sequence[str] | None = None, masks: str = "auto") -> Capture:
-    """A capture folder.
+    """Open a capture folder.
 
     Args:
-        path: the folder: `calibration.toml`, `videos/` and what else there is.
+        path: the folder with `calibration.toml` and `videos/`.
         cameras: names of the cameras to use; all if None.
-        masks: "auto" (the capture's own where it has some), "none" (segment the videos), "median" (against the
-            recording's median), or a folder of masks.
+        masks: "auto" (those of the capture, if there are any), "none" (segment the videos), "median" (segment against
+            the recording's median), or a folder of masks.
 
     Raises:
         tk.errors.CaptureError: what is wrong with the folder, in one line that names the file.
@@ -47,7 +49,7 @@ def open_capture(path: PathLike, cameras: Sequence[str] | None = None, masks: st
 
 
 class _Options(TypedDict, total=False):
-    """What :func:`track` takes beside capture and output."""
+    """Options of :func:`track`, except capture and output."""
 
     method: str
     frames: tuple[int, int | None]
@@ -86,26 +88,25 @@ def track(
 
     Args:
         capture: of :func:`open_capture`.
-        output: a result file to write; without one the estimates are handed out frame by frame.
+        output: a result file to write; without one the estimates are returned frame by frame.
         method: "region", "silhouette" or "volumetric".
-        frames: the first frame to tell and the one to stop before (None: the last).
+        frames: range of frames to return, end exclusive (None: to the last frame).
         config: all settings; the defaults if None.
-        seed: of the random generator, in the place of the configuration's.
+        seed: seed of the random generator, instead of the one in ``config``.
         init_pose: a file with a rough initial pose, or a folder of 2D keypoints.
         body: a result or a TOML file whose body is taken.
-        causal: leave it at the first pass. Without ``output`` there is no other.
-        resume: go on where an earlier run with the same ``output`` stopped.
-        force: replace a result that exists under ``output``; without it that is an error.
+        causal: stop after the first pass. Without ``output`` there is no second one.
+        resume: continue where an earlier run with the same ``output`` stopped.
+        force: replace an existing ``output``; without it an existing file is an error.
 
     Returns:
         Without ``output`` an iterator of :class:`~tk.trackers.protocol.Estimate`: ``frame``, ``time`` (seconds),
-        ``pose``
-        (24,), ``joints`` (15, 3) metres, ``sigma`` (15,) metres, ``status`` … With it the finished
+        ``pose`` (D,), ``joints`` (15, 3) metres, ``sigma`` (15,) metres, ``status`` … With it the finished
         :class:`~tk.io.results.writer.Result`.
 
     Raises:
-        tk.errors.TkError: bad input, in one line; what was finished before it is in the file.
-        KeyboardInterrupt: somebody stopped it; with ``output`` the finished frames are in the file.
+        tk.errors.TkError: bad input, in one line; every frame finished before it is in the file.
+        KeyboardInterrupt: the user stopped the run; with ``output`` the finished frames are in the file.
     """
     chosen = config or Settings()
     if seed is not None:
@@ -114,7 +115,10 @@ def track(
     body_file = Path(body) if body is not None else None
     reporter = _Logged()
     if output is None:
-        return session.estimates(capture, chosen, reporter.note, method, frames, pose_file, body_file)
+        for warning in capture.warnings:
+            reporter.note(warning)
+        setup = recording_setup(capture, pose_file, body_file, frames[0])
+        return session.estimates(setup, capture, chosen, reporter.note, method, frames)
     summary = session.track(
         capture,
         Path(output),

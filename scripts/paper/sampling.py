@@ -60,7 +60,7 @@ def look(options: Options, paper: Settings) -> Scene:
     """Track to the last of the frames with the defaults, and set up ``paper``'s objective there."""
     capture = open_capture(options.capture)
     config = Settings()
-    segment = make_segmenter(capture, config, lambda _: None)
+    segment = make_segmenter(capture.setup(), capture, config, lambda _: None)
     tracker = VolumetricTracker(capture.rig, capture.volume, capture.up, config)
     opening = tracker.opening_frames
     with capture.frames(0, options.frames) as frames:

@@ -17,7 +17,7 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.conftest import FRAMES, QUICK, Silent
+from tests.conftest import FRAMES, QUICK, Silent, setup_and_source
 from tests.people import write_people
 from tests.run.test_session import assert_same, send
 from tk.errors import ConfigError, VideoError, WorkerError
@@ -25,7 +25,7 @@ from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.writer import read_result
 from tk.run import session
-from tk.run.prefetch import Ahead, Serial, Source, open_source
+from tk.run.prefetch import Ahead, Observations, Serial, open_observations
 from tk.settings import Settings
 
 AHEAD = settings_file.from_toml(QUICK.replace("ahead = 0", "ahead = 2"))
@@ -33,7 +33,7 @@ ROOT = Path(__file__).parents[2]
 track = partial(session.track, method="volumetric")
 
 
-def arrays(source: Source, start: int, stop: int) -> list[tuple[int, np.ndarray, np.ndarray, np.ndarray | None]]:
+def arrays(source: Observations, start: int, stop: int) -> list[tuple[int, np.ndarray, np.ndarray, np.ndarray | None]]:
     """Index, images, masks, and what is uncertain."""
     with source:
         return [
@@ -52,8 +52,8 @@ def nobody(text: str) -> None:
 def test_frames_are_the_same(tiny: Path, masks: str, keep_images: bool, doubts: bool) -> None:
     """Given masks are not in doubt; without pictures nobody asks for what is."""
     capture = open_capture(tiny, masks=masks)
-    theirs = arrays(Ahead(capture, AHEAD, nobody, keep_images), 2, FRAMES)
-    ours = arrays(Serial(capture, AHEAD, nobody, keep_images), 2, FRAMES)
+    theirs = arrays(Ahead(capture.setup(), capture, AHEAD, nobody, keep_images), 2, FRAMES)
+    ours = arrays(Serial(capture.setup(), capture, AHEAD, nobody, keep_images), 2, FRAMES)
     assert [frame[0] for frame in theirs] == list(range(2, FRAMES))
     assert ours[0][2].any() and (ours[0][1].size > 0) == keep_images
     for a, b in zip(theirs, ours, strict=True):
@@ -68,8 +68,8 @@ def test_frames_are_the_same(tiny: Path, masks: str, keep_images: bool, doubts: 
 def test_frames_stay_as_they_are_while_they_are_held(tiny: Path) -> None:
     """More of them than the ring has slots, some dropped in between, and views after their frame."""
     capture = open_capture(tiny)
-    expected = arrays(Serial(capture, AHEAD, nobody), 0, FRAMES)
-    with Ahead(capture, AHEAD, nobody) as source:
+    expected = arrays(Serial(capture.setup(), capture, AHEAD, nobody), 0, FRAMES)
+    with Ahead(capture.setup(), capture, AHEAD, nobody) as source:
         held = {o.index: o.masks[1:, ::2] for o, _ in source.frames(0, FRAMES) if o.index % 4 != 2}
     assert len(held) > FRAMES // 2
     for index, masks in held.items():
@@ -90,7 +90,7 @@ def test_a_result_is_the_same(tiny: Path, tracked: Path, tmp_path: Path) -> None
 def test_notes_are_handed_on(tmp_path: Path) -> None:
     folder = write_people(tmp_path / "walk", [lambda k: (0.85 * np.cos(k / 2), 0.85 * np.sin(k / 2))], 12)
     notes: list[str] = []
-    assert len(arrays(Ahead(open_capture(folder, masks="median"), AHEAD, notes.append), 0, 1)) == 1
+    assert len(arrays(Ahead(*setup_and_source(open_capture(folder, masks="median")), AHEAD, notes.append), 0, 1)) == 1
     assert "the median of 12 frames is taken for the empty scene" in notes[0]
 
 
@@ -106,14 +106,17 @@ def test_an_error_comes_at_its_frame(copy: Path, tmp_path: Path) -> None:
 def test_an_error_in_learning(copy: Path) -> None:
     capture = open_capture(copy, masks="none")
     next((copy / "background").iterdir()).unlink()
-    with Ahead(capture, AHEAD, nobody) as source, pytest.raises(VideoError, match="has no background"):
+    with Ahead(capture.setup(), capture, AHEAD, nobody) as source, pytest.raises(VideoError, match="has no background"):
         next(source.frames(0, 3))
 
 
 def test_a_defect_keeps_its_traceback(tiny: Path) -> None:
     no_number: Any = "3"
-    with Ahead(open_capture(tiny), AHEAD, nobody) as source, pytest.raises(RuntimeError, match="TypeError") as raised:
-        next(source.frames(0, no_number))
+    with (
+        Ahead(*setup_and_source(open_capture(tiny)), AHEAD, nobody) as observations,
+        pytest.raises(RuntimeError, match="TypeError") as raised,
+    ):
+        next(observations.frames(0, no_number))
     assert "in _serve" in str(raised.value)
 
 
@@ -128,9 +131,7 @@ def test_a_killed_process_is_told_in_one_line(tiny: Path, tmp_path: Path, monkey
                 source._process.kill()
 
     killer = Killer()
-    with pytest.raises(
-        WorkerError, match=r"tiny: the process .* was ended by SIGKILL \(out of memory\?\); set ahead = 0"
-    ):
+    with pytest.raises(WorkerError, match=r"tiny: the process .* was ended by SIGKILL \(out of memory\?\); ahead = 0"):
         track(open_capture(tiny), tmp_path / "r.h5", AHEAD, killer)
     done = len(killer.frames)
     assert 5 <= done < FRAMES  # those that lay ready are tracked
@@ -145,13 +146,13 @@ def test_nothing_is_left_behind(tiny: Path) -> None:
 
     capture = open_capture(tiny)
     before = open_files()
-    with Ahead(capture, AHEAD, nobody) as source:
+    with Ahead(capture.setup(), capture, AHEAD, nobody) as source:
         frames: Iterator[object] = source.frames(0, FRAMES)
         next(frames)
         assert open_files() > before
     assert source._process.returncode == 0  # it ended by itself
     source.close()
-    with Ahead(capture, AHEAD, nobody) as unused:
+    with Ahead(capture.setup(), capture, AHEAD, nobody) as unused:
         pass
     assert unused._process.returncode is not None
     del source, frames, unused
@@ -163,7 +164,8 @@ def test_it_ends_with_the_tracker(tiny: Path) -> None:
     """Killed, the tracker cannot tell it to."""
     script = (
         "import os, signal, sys, tk.run.prefetch, tk.settings, tk.io.captures.capture as c\n"
-        "source = tk.run.prefetch.Ahead(c.open_capture(sys.argv[1]), tk.settings.Settings(ahead=1), print)\n"
+        "capture = c.open_capture(sys.argv[1])\n"
+        "source = tk.run.prefetch.Ahead(capture.setup(), capture, tk.settings.Settings(ahead=1), print)\n"
         "frames = source.frames(0, 14); next(frames)\n"
         "print(source._process.pid, flush=True)\n"
         "os.kill(os.getpid(), signal.SIGKILL)\n"
@@ -192,7 +194,7 @@ def test_ctrl_c_of_the_command_line(tiny: Path, tmp_path: Path) -> None:
     stopped = send(signal.SIGINT, 3, "track", tiny, "-o", result, "--config", settings)
     assert stopped.returncode == 1, stopped.stderr
     assert stopped.stdout == "" and "Traceback" not in stopped.stderr
-    assert stopped.stderr.splitlines()[-1] == "tk: interrupted; go on with the same command and --resume"
+    assert stopped.stderr.splitlines()[-1] == "tk: interrupted; continue with the same command and --resume"
     # the masks are for the second pass of the run that goes on
     assert {path.name for path in tmp_path.iterdir()} == {"r.h5", ".r.h5.masks", "s.toml"}
     with h5py.File(result, "r") as file:
@@ -201,11 +203,11 @@ def test_ctrl_c_of_the_command_line(tiny: Path, tmp_path: Path) -> None:
 
 def test_one_core_needs_no_further_process(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = open_capture(tiny)
-    assert isinstance(open_source(capture, Settings(ahead=0), nobody), Serial)
+    assert isinstance(open_observations(capture.setup(), capture, Settings(ahead=0), nobody), Serial)
     monkeypatch.setattr("tk.run.prefetch._cores", lambda: 1)
-    assert isinstance(open_source(capture, Settings(), nobody), Serial)
+    assert isinstance(open_observations(capture.setup(), capture, Settings(), nobody), Serial)
     monkeypatch.setattr("tk.run.prefetch._cores", lambda: 2)
-    with open_source(capture, Settings(), nobody) as source:
+    with open_observations(capture.setup(), capture, Settings(), nobody) as source:
         assert isinstance(source, Ahead)
 
 

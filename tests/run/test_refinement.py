@@ -23,7 +23,7 @@ from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import turn_between
 from tk.run import offline as finish
 from tk.run import plan
-from tk.run.prefetch import open_source
+from tk.run.prefetch import open_observations
 from tk.run.refinement import retimed
 from tk.run.session import track
 
@@ -89,13 +89,13 @@ def test_pictures_out_of_step_are_tracked_again(tiny: Path, tmp_path: Path, monk
         late = np.array([0, 0, 1, -1])
         return tracker, retimed(store, frames, late), late.astype(float)
 
-    def remember(capture: Any, *more: Any, **options: Any) -> Any:
+    def remember(setup: Any, capture: Any, *more: Any, **options: Any) -> Any:
         asked.append(np.array(capture.late_frames))
-        return open_source(capture, *more, **options)
+        return open_observations(setup, capture, *more, **options)
 
     monkeypatch.setattr(finish, "refine_if_inconsistent", made_up)
     for module in (plan, finish):
-        monkeypatch.setattr(module, "open_source", remember)
+        monkeypatch.setattr(module, "open_observations", remember)
     path, reporter = tmp_path / "again.h5", Silent()
     assert track(open_capture(tiny), path, settings_file.from_toml(QUICK), reporter, frames=(2, None)).lost == 0
     assert [late.tolist() for late in asked] == [[0, 0, 0, 0], [0, 0, 1, -1]]

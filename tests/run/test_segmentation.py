@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.conftest import QUICK, Silent, Tk
+from tests.conftest import QUICK, Silent, Tk, setup_and_source
 from tests.people import RIG, install, person_mask, truth, write_people
 from tk.errors import CaptureError, ConfigError
 from tk.io import settings_file
@@ -98,7 +98,7 @@ def test_a_segmenter_that_is_not_there(walk: Path, tmp_path: Path, monkeypatch: 
 def test_a_median_where_the_person_moves(walk: Path) -> None:
     notes: list[str] = []
     capture = open_capture(walk, masks="median")
-    segment = make_segmenter(capture, Settings(), notes.append)
+    segment = make_segmenter(capture.setup(), capture, Settings(), notes.append)
     assert notes == [f"{walk}: the median of 20 frames is taken for the empty scene"]
     with capture.frames(10, 11) as frames:
         found = wrong(segment(next(frames)), truth(walk, 10))
@@ -110,14 +110,14 @@ def test_a_median_where_the_person_moves(walk: Path) -> None:
 def test_a_median_where_nobody_moves_is_refused(tmp_path: Path, masks: str) -> None:
     folder = write_people(tmp_path / "still", [standing], 12)
     with pytest.raises(CaptureError, match="hardly moves" if masks == "median" else "nothing tells") as caught:
-        make_segmenter(open_capture(folder, masks=masks), Settings(), lambda _: None)
+        make_segmenter(*setup_and_source(open_capture(folder, masks=masks)), Settings(), lambda _: None)
     assert "--masks DIR" in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_a_median_that_holds_parts_of_the_person_says_so(tmp_path: Path) -> None:
     folder = write_people(tmp_path / "slow", [lambda k: (-0.75, 0.0) if k < 9 else (-0.75 + 0.13 * (k - 8), 0.0)], 20)
     notes: list[str] = []
-    make_segmenter(open_capture(folder, masks="median"), Settings(), notes.append)
+    make_segmenter(*setup_and_source(open_capture(folder, masks="median")), Settings(), notes.append)
     assert len(notes) == 2 and "the median shows parts" in notes[1] and "c1, c2" in notes[1]
 
 
@@ -133,7 +133,7 @@ def test_the_subject_is_who_stands_in_the_volume(
     install(tmp_path / "site", monkeypatch, red=segmenter)
     capture = open_capture(walk)
     notes: list[str] = []
-    segment = make_segmenter(capture, Settings(), notes.append)
+    segment = make_segmenter(capture.setup(), capture, Settings(), notes.append)
     assert len(notes) == 1 and "the segmenter red makes the masks" in notes[0]
     with capture.frames() as frames:
         for frame in frames:
@@ -147,11 +147,11 @@ def test_a_process_ahead_makes_the_same_masks(walk: Path, tmp_path: Path, monkey
     """From another frame on, too: nothing is carried over."""
     install(tmp_path / "site", monkeypatch, red="Finding")
     capture = open_capture(walk)
-    segment = make_segmenter(capture, Settings(), lambda _: None)
+    segment = make_segmenter(capture.setup(), capture, Settings(), lambda _: None)
     with capture.frames(3, 6) as frames:
         here = {frame.index: segment(frame) for frame in frames}
     config = settings_file.from_toml(QUICK.replace("ahead = 0", "ahead = 2"))
-    with Ahead(capture, config, lambda _: None) as source:
+    with Ahead(capture.setup(), capture, config, lambda _: None) as source:
         for observation, _ in source.frames(4, 6):
             np.testing.assert_array_equal(observation.masks, here[observation.index], strict=True)
 
@@ -161,7 +161,7 @@ def test_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_people(tmp_path / "left", [lambda k: None], 2)
     capture = open_capture(folder)
     with capture.frames() as frames:
-        assert not make_segmenter(capture, Settings(), lambda _: None)(next(frames)).any()
+        assert not make_segmenter(capture.setup(), capture, Settings(), lambda _: None)(next(frames)).any()
 
 
 # --------------------------------------------------------------------------------------------------------- tk masks

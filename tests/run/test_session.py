@@ -26,8 +26,9 @@ from tk.io.captures.capture import open_capture
 from tk.io.results.writer import Status, read_joints, read_result
 from tk.model.body.skeleton import JOINTS
 from tk.run import session
-from tk.run.plan import choose_frames, make_tracker
+from tk.run.plan import choose_frames
 from tk.run.session import Summary
+from tk.trackers.registry import tracker_class
 
 ROOT = Path(__file__).parents[2]
 CONFIG = settings_file.from_toml(QUICK)
@@ -41,14 +42,14 @@ from tk.run import session
 from tk import cli
 
 session.WRITE_EVERY_S = float(os.environ["TEST_WRITE_EVERY_S"])
-tell = console.Report.advance
+tell = console.ConsoleReporter.advance
 
 def advance(self, frame, estimate):
     tell(self, frame, estimate)
     if frame == int(os.environ["TEST_FRAME"]):
         os.kill(os.getpid(), int(os.environ["TEST_SIGNAL"]))
 
-console.Report.advance = advance
+console.ConsoleReporter.advance = advance
 cli.main(prog_name="tk")
 """
 
@@ -192,7 +193,7 @@ def test_only_the_same_command_is_taken_up_again(
 ) -> None:
     before = begun.read_bytes()
     ran = tk("track", tiny, "--method", "volumetric", "-o", begun, "--config", quick, "--resume", *options)
-    ran.complaint(str(begun), difference, "--force in the place of --resume")
+    ran.complaint(str(begun), difference, "--force instead of --resume")
     assert begun.read_bytes() == before
 
 
@@ -320,6 +321,6 @@ def test_mog2_is_a_further_choice(tiny: Path, tmp_path: Path) -> None:
     assert track(open_capture(tiny, masks="none"), tmp_path / "r.h5", config, Silent(), frames=(0, 4)).lost == 0
 
 
-def test_unknown_method(tiny: Path) -> None:
+def test_unknown_method() -> None:
     with pytest.raises(ConfigError, match=r"--method neural: choose one of .*volumetric"):
-        make_tracker("neural", open_capture(tiny), CONFIG)
+        tracker_class("neural")

@@ -15,6 +15,7 @@ from tk.errors import CaptureError
 from tk.io import settings_file
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.results.writer import read_joints
+from tk.model.setup import Subject
 from tk.trackers.camera_monitor import CameraMonitor
 from tk.trackers.protocol import Estimate, Observation
 from tk.trackers.region import RegionTracker
@@ -28,6 +29,7 @@ class Scene:
 
     def __init__(self, folder: Path) -> None:
         self.capture: Capture = open_capture(folder)
+        self.setup = self.capture.setup()
         with self.capture.frames() as frames:
             self.frames = [Observation(f.index, f.images.copy(), np.array(f.masks)) for f in frames]
         self.truth = read_joints(folder / "truth.h5").positions
@@ -41,7 +43,7 @@ class Scene:
     def watch(self) -> CameraMonitor:
         tracker = self._tracker()
         tracker.restore(self.model, self.state)
-        return CameraMonitor(tracker, self.capture)
+        return CameraMonitor(tracker, self.setup, self.setup.subjects[0])
 
     def follow(self, spoil: Spoil) -> tuple[CameraMonitor, list[Estimate], list[np.ndarray]]:
         """All frames, spoilt; the estimates, and which cameras were used in each."""
@@ -190,7 +192,7 @@ def test_the_opening_goes_without_a_camera_that_disagrees(scene: Scene) -> None:
 
 
 def test_a_person_of_another_size_than_told_is_refused(scene: Scene) -> None:
-    watch = CameraMonitor(scene.watch().tracker, replace(scene.capture, subject_height_m=0.95))
+    watch = CameraMonitor(scene.watch().tracker, scene.setup, Subject(height_m=0.95))
     with pytest.raises(CaptureError, match=r"measures 1\.\d+ m in the pictures, but .* says 0.95 m"):
         watch.start(scene.frames[:3])
 
@@ -209,7 +211,7 @@ class Jumping:
 
 def test_an_estimate_that_cannot_be_true_is_lost(scene: Scene) -> None:
     tracker: Any = Jumping(scene.truth[0], 3)
-    watch = CameraMonitor(tracker, scene.capture)
+    watch = CameraMonitor(tracker, scene.setup, scene.setup.subjects[0])
     estimates = [watch.step(frame)[0] for frame in scene.frames[:6]]
     assert [e.status for e in estimates] == ["tracked"] * 3 + ["lost"] + ["tracked"] * 2
     assert estimates[3].sigma is not None and np.isnan(estimates[3].sigma).all()

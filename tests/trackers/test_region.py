@@ -11,7 +11,6 @@ import pytest
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, EMPTY, NAMES, STATURE, errors, find_again_elsewhere, observe, walk
 from tk.errors import CaptureError
-from tk.io.captures.init_pose import InitPose
 from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.gait_poses import standing_pose, walking_pose
 from tk.model.body.skeleton import JOINTS, join_pose, shoulder_angles, split_pose
@@ -19,6 +18,7 @@ from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import GROUPS, PartColors
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import draw_silhouettes
+from tk.model.setup import InitPose
 from tk.settings import RegionSettings, SilhouetteSettings
 from tk.trackers.region import MOST_A_VIEW, UNKNOWN_AFTER, RegionTracker
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from tests.conftest import FRAMES, QUICK, Silent, Tk
+from tests.conftest import FRAMES, QUICK, Silent, Tk, setup_and_source
 from tests.io.conftest import write_picture
 from tests.run.test_session import send
 from tk.errors import ResultError
@@ -110,7 +110,7 @@ def test_runs_repeat_and_the_seed_does_not_matter(tiny: Path, causal: Path, tmp_
 
 
 def test_estimates_are_those_of_the_first_pass(tiny: Path, causal: Path) -> None:
-    found = list(estimates(open_capture(tiny), CONFIG, frames=(0, 4)))
+    found = list(estimates(*setup_and_source(open_capture(tiny)), CONFIG, frames=(0, 4)))
     expected = read_result(causal)
     assert [e.frame for e in found] == [0, 1, 2, 3]
     np.testing.assert_array_equal([e.joints for e in found], expected.joints[:4])
@@ -119,7 +119,7 @@ def test_estimates_are_those_of_the_first_pass(tiny: Path, causal: Path) -> None
 
 def test_estimates_keep_no_pictures_alive(tiny: Path) -> None:
     """Whoever collects them holds some kilobytes a frame."""
-    found = list(estimates(open_capture(tiny), CONFIG, frames=(0, 4)))
+    found = list(estimates(*setup_and_source(open_capture(tiny)), CONFIG, frames=(0, 4)))
     assert len(found) == 4
     for estimate in found:
         arrays = [value for value in vars(estimate).values() if isinstance(value, np.ndarray)]
@@ -249,7 +249,7 @@ def test_frames_of_which_nothing_is_known_are_told(
     (line,) = (note for note in result.notes if "σ is unknown" in note)
     assert line.endswith("σ is unknown, frames 2 to 3") and line in reporter.notes
     notes: list[str] = []
-    assert len(list(estimates(open_capture(tiny), CONFIG, notes.append, frames=(0, 5)))) == 5
+    assert len(list(estimates(*setup_and_source(open_capture(tiny)), CONFIG, notes.append, frames=(0, 5)))) == 5
     assert line in notes
 
 

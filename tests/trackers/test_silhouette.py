@@ -6,10 +6,10 @@ import pytest
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, NAMES, STATURE, errors, find_again_elsewhere, observe, walk
 from tk.errors import CaptureError
-from tk.io.captures.init_pose import InitPose
 from tk.model.body.cone_body import build_cone_body
 from tk.model.body.skeleton import JOINTS
 from tk.model.masks.silhouettes import draw_silhouettes
+from tk.model.setup import InitPose
 from tk.settings import BodyFitSettings, SilhouetteSettings
 from tk.trackers.silhouette import SilhouetteTracker
 

@@ -15,8 +15,8 @@ from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.writer import Status, read_joints, read_result
 from tk.model.body.skeleton import JOINTS
-from tk.run.plan import METHODS
 from tk.run.session import Summary, track
+from tk.trackers.registry import METHODS
 
 # no process ahead, and few frames to fit the body to
 QUICK = """

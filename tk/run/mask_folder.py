@@ -15,8 +15,8 @@ from tk.errors import CaptureError, ConfigError
 from tk.io.captures.capture import MASKS_RECORD, Capture
 from tk.io.toml import load_toml
 from tk.run.plan import choose_frames
+from tk.run.reporter import Reporter
 from tk.run.segmentation import NO_SEGMENTER
-from tk.run.session import Reporter
 from tk.segmenters import load, names
 from tk.segmenters.subject_masks import SubjectMasks
 from tk.threads import one_thread

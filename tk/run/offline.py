@@ -1,4 +1,4 @@
-"""What needs all frames of a result: the second pass, cameras that disagree refined for it; angles; a smoothed copy."""
+"""What needs all frames of a result: camera refinement and the second pass, angles, and a smoothed copy."""
 
 from __future__ import annotations
 
@@ -19,121 +19,121 @@ from tk.model.masks.image_health import described
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
 from tk.run.plan import Plan
-from tk.run.prefetch import open_source
+from tk.run.prefetch import open_observations
 from tk.run.refinement import refine_if_inconsistent
-from tk.trackers.contour_tracker import ContourTracker
-from tk.trackers.protocol import Estimate
-from tk.trackers.region import RegionTracker
+from tk.trackers.protocol import Estimate, TwoPassTracker, two_pass
 
 _LOG = logging.getLogger(__name__)
 Float = NDArray[np.float64]
 
-#: in `/model` of a result that a second pass has gone over
+#: entry in `/model` of a result after the second pass
 REFINED = "refined"
-# A joint whose σ is larger than the second pass's by this factor keeps that of the first.
+# A joint keeps its sigma of the first pass where that exceeds the sigma of the second pass by this factor. Sensitivity
+# not measured.
 _LESS_SURE = 2.0
 
 
 def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[str], None]) -> None:
-    """What needs all frames: the second pass; segments, feet and angles; the smoothed copy; cameras.
+    """Write what needs all frames: the second pass; segments, feet and angles; the smoothed copy; cameras.
 
-    The second pass, which ``masks`` are for (None: there is none), settles every frame anew, with the body fitted to
-    frames of the whole recording where that did not begin with the initialisation pose; by refined cameras where they
-    disagree, unless ``config.refine`` is False. The result is replaced in one step; if this does not end, the first
-    pass's stays.
+    The second pass uses ``masks``; None: no second pass. It optimises every frame again, with the body fitted to frames
+    of the whole recording unless that began with the initialisation pose, and with refined cameras if they disagree and
+    ``settings.refine`` is True. The result is replaced in one step; if this function is interrupted, the result of the
+    first pass stays.
     """
-    tracker = plan.tracker
-    if not isinstance(tracker, ContourTracker):
+    tracker, subject, fps = plan.trackers[0], plan.setup.subjects[0], plan.setup.fps
+    if not tracker.has_segments:
         return
     result = read_result(output)
     none = np.zeros((len(result.frames), 0))
     waist = none if result.waist is None else result.waist
     ankles = none if result.ankles is None else result.ankles
     skeleton = tracker.body.skeleton
-    poses = np.array([join_pose(skeleton, *row) for row in zip(result.pose, waist, ankles, strict=True)])
+    poses: Float = np.array([join_pose(skeleton, *row) for row in zip(result.pose, waist, ankles, strict=True)])
     lost = result.status == Status.LOST
     columns: dict[str, NDArray[Any]] = {}
     model: Mapping[str, Value] | None = None
-    cameras = UsedCameras(plan.capture.rig, np.array(plan.capture.time_offset_s))
-    if isinstance(tracker, RegionTracker) and masks is not None:
+    cameras = UsedCameras(plan.setup.rig, np.array(plan.source.time_offset_s))
+    again = two_pass(tracker)
+    if again is not None and masks is not None:
         _LOG.info("second pass")
-        # the initialisation pose shows all of the body; what else a recording may begin with does not
-        shown = plan.init is None and plan.capture.init_pose != "any"
         assert result.residual is not None
         missing = [int(f) for f in result.frames if int(f) not in masks]
-        if missing:  # what an earlier run has tracked
-            with open_source(plan.capture, plan.config, lambda _: None) as source:
-                for observation, _ in source.frames(min(missing), max(missing) + 1):
-                    masks.put(observation.index, tracker.cleaned(tracker.without_foreign(observation).masks))
-        if plan.config.refine:
-            refined = refine_if_inconsistent(tracker, masks, result.frames, poses, ~lost, note)
+        if missing:  # frames that an earlier run has tracked
+            with open_observations(plan.setup, plan.source, plan.settings, lambda _: None) as observations:
+                for observation, _ in observations.frames(min(missing), max(missing) + 1):
+                    masks.put(observation.index, again.cleaned(again.without_foreign(observation).masks))
+        if plan.settings.refine:
+            refined = refine_if_inconsistent(again, masks, result.frames, poses, ~lost, note)
             if refined is not None:
-                tracker, masks, offsets = refined
-                cameras = UsedCameras(tracker.rig, cameras.time_offset_s + offsets / plan.capture.fps)
+                again, masks, offsets = refined
+                cameras = UsedCameras(again.rig, cameras.time_offset_s + offsets / fps)
                 if np.round(offsets).any():
-                    note("tracking again: the first pass had the pictures out of step")
-                    again = _track_again(plan, tracker, cameras, result.frames, poses)
-                    rows = np.flatnonzero(np.isin(result.frames, list(again)))
-                    told_again = [again[int(frame)] for frame in result.frames[rows]]
-                    poses[rows] = [join_pose(skeleton, e.pose, e.waist, e.ankles) for e in told_again]
-                    lost[rows] = [e.status == "lost" for e in told_again]
-                    columns |= _replaced(result, rows, told_again)
-        poses, columns["residual"], sigma = tracker.second_pass(
+                    note("tracking again: the images of the first pass were not synchronised")
+                    found = _track_again(plan, again, cameras, result.frames, poses)
+                    rows = np.flatnonzero(np.isin(result.frames, list(found)))
+                    estimates = [found[int(frame)] for frame in result.frames[rows]]
+                    poses[rows] = [join_pose(skeleton, e.pose, e.waist, e.ankles) for e in estimates]
+                    lost[rows] = [e.status == "lost" for e in estimates]
+                    columns |= _replaced(result, rows, estimates)
+        poses, columns["residual"], precise = again.second_pass(
             masks.sequence(result.frames),
             poses,
             lost,
             columns.get("residual", result.residual),
-            plan.capture.subject_height_m,
-            keep_body=plan.body is not None or shown,
+            subject.height_m,
+            # in the initialisation pose every limb is visible; other first poses may hide limbs
+            keep_body=subject.body is not None or (subject.init is None and subject.in_init_pose),
         )
-        # where the first pass was much less sure, or NaN, it followed several poses, or none was found for a limb
+        # a much larger sigma of the first pass, or NaN: it tracked several poses, or did not find a limb
         assert result.sigma is not None
         before = columns.get("joints/sigma", result.sigma)
-        columns["joints/sigma"] = np.where(before <= _LESS_SURE * sigma, sigma, before)
+        columns["joints/sigma"] = np.where(before <= _LESS_SURE * precise, precise, before)
+        tracker = again
         model = {**tracker.model(), REFINED: 1}
     sigma = columns.get("joints/sigma", result.sigma)
     if sigma is not None:
-        tell_unknown(result.frames[np.isnan(sigma).all(axis=1) & ~lost], note)
+        report_unknown(result.frames[np.isnan(sigma).all(axis=1) & ~lost], note)
     _LOG.info("angles, feet, and the smoothed copy")
-    # the first pass's poses stand as they are
-    told = ("pose", "waist", "ankles", "joints/position") if model is None else ()
-    body = tracker.body.standing(plan.capture.up)
-    columns |= {name: values for name, values in _columns(body, poses).items() if name not in told}
-    filtered = smooth(body.skeleton, poses, ~lost, plan.capture.fps)
+    # poses of the first pass stay as they are
+    kept = ("pose", "waist", "ankles", "joints/position") if model is None else ()
+    body = tracker.body.standing(plan.setup.up)
+    columns |= {name: values for name, values in _columns(body, poses).items() if name not in kept}
+    filtered = smooth(body.skeleton, poses, ~lost, fps)
     smoothed = {**_columns(body, filtered.poses), "bridged": filtered.bridged}
     revise_result(output, columns, smoothed=smoothed, model=model, cameras=cameras)
 
 
-def tell_unknown(frames: Sequence[int] | NDArray[np.int64], note: Callable[[str], None]) -> None:
-    """Tell of frames (F,) that are not lost and of which no joint has a σ."""
+def report_unknown(frames: Sequence[int] | NDArray[np.int64], note: Callable[[str], None]) -> None:
+    """Report frames (F,) that are not lost, but without a sigma of any joint."""
     if len(frames):
         which = described(int(frames[0]), int(frames[-1]), len(frames))
-        note(f"the person is explained far worse than usual, and not found elsewhere: σ is unknown, {which}")
+        note(f"the residual is high, and no better pose was found: sigma is unknown, {which}")
 
 
 def _track_again(
-    plan: Plan, tracker: RegionTracker, cameras: UsedCameras, frames: NDArray[np.int64], poses: Float
+    plan: Plan, tracker: TwoPassTracker, cameras: UsedCameras, frames: NDArray[np.int64], poses: Float
 ) -> dict[int, Estimate]:
-    """The estimates of those of the frames (F,) of which all cameras have a picture once they are in step, by frame.
+    """Return estimates, by frame, of the frames (F,) of which every synchronised camera has an image; none if the
+    source cannot be read again.
 
-    It begins at the pose that the first pass found there.
+    Tracking begins at the first pass's pose.
     """
-    capture = replace(plan.capture, rig=cameras.rig, time_offset_s=tuple(cameras.time_offset_s.tolist()))
-    begin = max(capture.first_frame, int(frames[0]))
-    ends = [clip.frame_count + late for clip, late in zip(capture.clips, capture.late_frames, strict=True)]
-    stop = min(*ends, int(frames[-1]) + 1)
+    source = plan.source.shifted(cameras.time_offset_s.tolist())
+    if source is None or source.frame_count is None:
+        return {}
+    begin = max(source.first_frame, int(frames[0]))
+    stop = min(source.frame_count, int(frames[-1]) + 1)
     if begin >= stop:
         return {}
-    start = tracker.world.poses_in(poses[np.searchsorted(frames, begin)][None])
-    once = {"poses": start, "previous": start, "costs": np.zeros(1), "ages": np.ones(1, int)}
-    nothing = {"usual": np.inf, "lost_for": 0, "stranded": 0, "in_vain": False}
-    tracker.rewind({**tracker.state(), **once, **nothing, "jumped": np.zeros(1, bool)})
-    with open_source(capture, plan.config, lambda _: None) as source:
-        return {observation.index: tracker.step(observation) for observation, _ in source.frames(begin, stop)}
+    tracker.start_at(poses[np.searchsorted(frames, begin)])
+    setup = replace(plan.setup, rig=cameras.rig)
+    with open_observations(setup, source, plan.settings, lambda _: None) as observations:
+        return {observation.index: tracker.step(observation) for observation, _ in observations.frames(begin, stop)}
 
 
 def _replaced(result: Result, rows: NDArray[np.int64], estimates: Sequence[Estimate]) -> dict[str, NDArray[Any]]:
-    """What a result's first pass told of these rows, told by other estimates."""
+    """Return the columns of a result with these rows replaced by other estimates."""
     assert result.sigma is not None and result.residual is not None
     columns = {
         "joints/sigma": result.sigma.copy(),
@@ -150,7 +150,7 @@ def _replaced(result: Result, rows: NDArray[np.int64], estimates: Sequence[Estim
 
 
 def _columns(body: ConeBody, poses: NDArray[np.float64]) -> dict[str, NDArray[np.floating]]:
-    """The datasets that tell poses (F, D) of a body and what follows from them."""
+    """Return the datasets of poses (F, D) of a body and of what is derived from them."""
     skeleton = body.skeleton
     paper, waist, ankles = (np.array(part) for part in zip(*(split_pose(skeleton, p) for p in poses), strict=True))
     derived = derive(skeleton, body.dimensions, poses)

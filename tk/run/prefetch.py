@@ -1,10 +1,10 @@
-"""Frames decoded and segmented ahead of the tracker, in a process of their own.
+"""Observations: frames decoded and segmented, ahead of the tracker in a separate process where there is a second core.
 
-A thread would not do: Taichi's launches hold the interpreter, so what a thread segments the tracker waits for. The
+A thread would not do: Taichi's launches hold the interpreter, so the tracker would wait while a thread segments. The
 process is a fresh interpreter (a fork would hang in Taichi, and multiprocessing's spawn imports the user's script
-again) that gets its task through a socket and hands frames over in a ring of memory that both processes map. That
-memory has no name, and the system frees it with the last of the two, however they end. When the tracker ends, the
-socket closes, and the process ends, too.
+again). It receives its task through a socket and passes frames in a ring of memory that both processes map. That memory
+has no name, and the system frees it when both processes have ended, however they end. When the tracker ends, the socket
+closes, and the process ends, too.
 
 The frames are the same, bit for bit, as those that :func:`observe` makes in the tracker's own process.
 """
@@ -28,32 +28,31 @@ from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from types import TracebackType
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import TkError, WorkerError
-from tk.io.captures.capture import Capture
+from tk.io.captures.source import Source
+from tk.model.cameras.camera import Rig
+from tk.model.setup import Setup
 from tk.run.segmentation import Labeller, make_labeller, mask_source
-from tk.settings import ForegroundSettings
+from tk.settings import Settings
 from tk.trackers.protocol import Observation, Stopwatch
 
-if TYPE_CHECKING:
-    from tk.settings import Settings
-
 Note = Callable[[str], None]
-#: a frame, and what it took: seconds in "decode", "masks", and how long the tracker had to "wait" for it
+#: a frame, and seconds spent in "decode" and "masks", and in which the tracker had to "wait" for it
 Observed = tuple[Observation, Mapping[str, float]]
 
 TIMING_STAGES = ("decode", "masks", "wait")
 
-#: frames that the tracker may hold without a copy: the one at hand, and the one before while it asks for the next
+#: frames that the tracker may hold without a copy: the current one, and the one before while it asks for the next
 _HELD = 2
-#: bytes that the ring may take
+#: most bytes of the ring: a few frames of eight full-HD cameras. Fewer would make the process wait.
 _RING_BYTES = 384 * 2**20
-#: seconds that the process has to end by itself
+#: seconds in which the process may end by itself. A shorter time would lose kernels that it has compiled.
 _PATIENCE_S = 5.0
 
 _START = (
@@ -62,40 +61,43 @@ _START = (
 )
 
 
-class Source(Protocol):
-    """Where a tracker's observations come from. A context manager."""
+class Observations(Protocol):
+    """The observations of a source. A context manager."""
 
-    def frames(self, start: int, stop: int) -> Iterator[Observed]:
-        """The frames ``start`` … ``stop - 1``; to be asked for once.
+    def frames(self, start: int, stop: int | None) -> Iterator[Observed]:
+        """Return the frames from ``start`` on, up to ``stop``, exclusive, or to the end; to be called once.
 
         Raises:
-            TkError: a frame cannot be read; all before it have been handed out.
+            TkError: a frame cannot be read; all frames before it have been returned.
         """
         ...
 
-    def __enter__(self) -> Source: ...
+    def __enter__(self) -> Observations: ...
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None: ...
 
 
-def open_source(capture: Capture, config: Settings, note: Note, keep_images: bool = True) -> Source:
-    """The observations of a capture: ahead of the tracker where there is a second core and ``config.ahead`` is not 0.
+def open_observations(
+    setup: Setup, source: Source, settings: Settings, note: Note, keep_images: bool = True
+) -> Observations:
+    """Return the observations of a source, made ahead if there is a second core and ``settings.ahead`` is not 0.
 
     Args:
-        capture: whose frames.
-        config: how they are segmented, and how many frames ahead.
-        note: who hears what is worth knowing.
-        keep_images: False leaves the images empty, (C, 0, 0, 3), for a tracker that looks at masks alone.
+        setup: the cameras and the working volume.
+        source: the images.
+        settings: how frames are segmented, and how many frames ahead.
+        note: called with each line that the user should read.
+        keep_images: False leaves the images empty, (C, 0, 0, 3), for a tracker that needs masks alone.
 
     Raises:
-        CaptureError: nothing to make masks from.
+        CaptureError: there is nothing to make masks from.
     """
-    mask_source(capture)  # before anything is started
-    if config.ahead == 0 or _cores() < 2 or not sys.executable:
-        return Serial(capture, config, note, keep_images)
-    return Ahead(capture, config, note, keep_images)
+    mask_source(source)  # before a process is started
+    if settings.ahead == 0 or _cores() < 2 or not sys.executable:
+        return Serial(setup, source, settings, note, keep_images)
+    return Ahead(setup, source, settings, note, keep_images)
 
 
 def _cores() -> int:
@@ -103,17 +105,17 @@ def _cores() -> int:
 
 
 def _threads() -> str:
-    """For the process's kernels: half the cores, for the tracker is what should not wait. Fewer if the user says so."""
+    """Threads of the process's kernels: half the cores, because the tracker should not wait; at most TK_THREADS."""
     asked = os.environ.get("TK_THREADS")
     half = max(_cores() // 2, 1)
     return str(min(half, int(asked)) if asked else half)
 
 
 def observe(
-    capture: Capture, label: Labeller, span: tuple[int, int], keep_images: bool
+    source: Source, label: Labeller, span: tuple[int, int | None], keep_images: bool
 ) -> Iterator[tuple[Observation, Stopwatch]]:
-    """Decode and segment here and now; ``span``: the first frame and the one to stop before."""
-    with capture.frames(*span) as frames:
+    """Decode and segment frames in this process; ``span``: first frame, and the end, exclusive."""
+    with source.frames(*span) as frames:
         while True:
             watch = Stopwatch()
             frame = next(frames, None)
@@ -123,21 +125,22 @@ def observe(
             masks, uncertain = label(frame)
             images = frame.images if keep_images else np.empty((len(masks), 0, 0, 3), np.uint8)
             watch.lap("masks")
-            yield Observation(frame.index, images, masks, uncertain if keep_images else None), watch
+            yield Observation(frame.index, images, masks, uncertain if keep_images else None, time=frame.time), watch
 
 
 @dataclass(frozen=True)
 class Serial:
-    """The source that makes each frame when the tracker asks for it."""
+    """Observations that are made when the tracker asks for them."""
 
-    capture: Capture
-    config: Settings
+    setup: Setup
+    source: Source
+    settings: Settings
     note: Note
     keep_images: bool = True
 
-    def frames(self, start: int, stop: int) -> Iterator[Observed]:
-        label = make_labeller(self.capture, self.config, self.note)
-        for observation, watch in observe(self.capture, label, (start, stop), self.keep_images):
+    def frames(self, start: int, stop: int | None) -> Iterator[Observed]:
+        label = make_labeller(self.setup, self.source, self.settings, self.note)
+        for observation, watch in observe(self.source, label, (start, stop), self.keep_images):
             yield observation, {**watch.laps, "wait": sum(watch.laps.values())}
 
     def __enter__(self) -> Serial:
@@ -152,40 +155,40 @@ class Serial:
 
 @dataclass(frozen=True)
 class _Task:
-    """What the process needs to begin with; the span of frames follows. It has the settings that
-    :class:`tk.run.segmentation.MaskSettings` names."""
+    """What the process needs first; the span of frames follows."""
 
-    capture: Capture
-    segmentation: str
-    foreground: ForegroundSettings
+    setup: Setup
+    source: Source
+    settings: Settings
     keep_images: bool
     slots: int
 
 
 @dataclass(frozen=True)
 class _Ready:
-    """A frame lies in a slot. ``uncertain``: there is such a layer."""
+    """A frame lies in a slot. ``uncertain``: whether the observation has uncertain pixels."""
 
     slot: int
     index: int
+    time: float
     uncertain: bool
     laps: Mapping[str, float]
 
 
 @dataclass(frozen=True)
 class _Failed:
-    """What ended the process: a user's mistake, or a defect of ours and its traceback."""
+    """What ended the process: a user's mistake, or a defect of the program and its traceback."""
 
     error: TkError | None
     trace: str
 
 
 class _Layout:
-    """Where a slot's layers are: images, masks, uncertain."""
+    """Position of a slot's layers: images, masks, uncertain."""
 
-    def __init__(self, capture: Capture, keep_images: bool) -> None:
-        self.masks = (len(capture.rig), *capture.rig.frame_shape)
-        self.images = (*self.masks, 3) if keep_images else (len(capture.rig), 0, 0, 3)
+    def __init__(self, rig: Rig, keep_images: bool) -> None:
+        self.masks = (len(rig), *rig.frame_shape)
+        self.images = (*self.masks, 3) if keep_images else (len(rig), 0, 0, 3)
         self.bytes = math.prod(self.images) + 2 * math.prod(self.masks)
 
     def layers(self, slot: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.bool_]]:
@@ -197,7 +200,7 @@ class _Layout:
 
 
 def _nameless_file(size: int) -> int:
-    """A descriptor of ``size`` bytes that go with their last user: nothing to be cleaned up, whoever is killed."""
+    """A descriptor of ``size`` bytes of memory that the system frees with their last user, even a killed one."""
     if hasattr(os, "memfd_create"):  # Linux
         handle = os.memfd_create("tk-ahead", os.MFD_CLOEXEC)
     else:
@@ -211,15 +214,15 @@ def _nameless_file(size: int) -> int:
 
 
 class Ahead:
-    """The source that makes frames in a process of its own, which starts at once and learns the background.
+    """Observations that a separate process makes. It starts at once and learns the background.
 
-    An array stays as it is as long as somebody holds it: its slot is used again once it is dropped.
+    An array does not change while a reference to it exists; then its slot of the ring is used again.
     """
 
-    def __init__(self, capture: Capture, config: Settings, note: Note, keep_images: bool = True) -> None:
-        self._path, self._note = capture.path, note
-        self._layout = _Layout(capture, keep_images)
-        slots = max(min(config.ahead, _RING_BYTES // self._layout.bytes), 1) + _HELD
+    def __init__(self, setup: Setup, source: Source, settings: Settings, note: Note, keep_images: bool = True) -> None:
+        self._where, self._note = source.where, note
+        self._layout = _Layout(setup.rig, keep_images)
+        slots = max(min(settings.ahead, _RING_BYTES // self._layout.bytes), 1) + _HELD
         handle = _nameless_file(slots * self._layout.bytes)
         self._memory = mmap.mmap(handle, slots * self._layout.bytes)
         self._held = 0
@@ -238,9 +241,9 @@ class Ahead:
         finally:
             theirs.close()
             os.close(handle)
-        self._send(_Task(capture, config.segmentation, config.foreground, keep_images, slots))
+        self._send(_Task(setup, source, settings, keep_images, slots))
 
-    def frames(self, start: int, stop: int) -> Iterator[Observed]:
+    def frames(self, start: int, stop: int | None) -> Iterator[Observed]:
         self._begun = True
         self._send((start, stop))  # now, not when the first is asked for
         return self._arriving()
@@ -267,7 +270,7 @@ class Ahead:
             slot = slot.copy()
             self._send([ready.slot])
         images, masks, uncertain = self._layout.layers(slot)
-        return Observation(ready.index, images, masks, uncertain if ready.uncertain else None)
+        return Observation(ready.index, images, masks, uncertain if ready.uncertain else None, time=ready.time)
 
     def _give_back(self) -> None:
         slots = [self._returned.popleft() for _ in range(len(self._returned))]
@@ -276,7 +279,7 @@ class Ahead:
             self._send(slots)
 
     def _send(self, message: object) -> None:
-        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # what it had to say is still to be read
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # its last messages are still to be read
             self._connection.send(message)
 
     def _receive(self) -> _Ready | None:
@@ -284,14 +287,14 @@ class Ahead:
 
         Raises:
             TkError: what the process raised.
-            WorkerError: it is no more.
-            RuntimeError: a defect of ours in it.
+            WorkerError: the process has been killed.
+            RuntimeError: a defect of the program in it.
         """
         while True:
             try:
                 message = self._connection.recv()
             except (EOFError, ConnectionResetError):
-                raise WorkerError(f"{self._path}: {self._last_words()}; set ahead = 0 to do without it") from None
+                raise WorkerError(f"{self._where}: {self._last_words()}; ahead = 0 avoids this process") from None
             if isinstance(message, str):
                 self._note(message)
             elif isinstance(message, _Failed):
@@ -316,7 +319,7 @@ class Ahead:
     def close(self) -> None:
         """End the process. Closing twice is fine."""
         self._connection.close()
-        if self._begun:  # it leaves by itself, and keeps the kernels that it has compiled
+        if self._begun:  # it ends by itself, and stores the kernels that it has compiled
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(_PATIENCE_S)
         self._process.kill()
@@ -332,7 +335,7 @@ class _Ring:
     def __init__(self, tracker: Connection, memory: mmap.mmap, task: _Task) -> None:
         self._tracker = tracker
         self._memory = memory
-        self._layout = _Layout(task.capture, task.keep_images)
+        self._layout = _Layout(task.setup.rig, task.keep_images)
         self._free = list(range(task.slots))
 
     def put(self, observation: Observation, watch: Stopwatch) -> None:
@@ -345,19 +348,21 @@ class _Ring:
         masks[...] = observation.masks
         if observation.uncertain is not None:
             uncertain[...] = observation.uncertain
-        self._tracker.send(_Ready(number, observation.index, observation.uncertain is not None, watch.laps))
+        self._tracker.send(
+            _Ready(number, observation.index, observation.time, observation.uncertain is not None, watch.laps)
+        )
 
 
 def serve(socket: int, handle: int) -> None:
-    """The process: take a task, hand over frames until there are no more, or nobody to take them.
+    """Run the process: take a task, pass frames until the last one, or until the tracker has ended.
 
     Args:
         socket, handle: descriptors of the socket to the tracker and of the memory that both share.
     """
-    cv2.setNumThreads(1)  # the cameras are segmented side by side already
+    cv2.setNumThreads(1)  # the cameras are segmented in parallel already
     with Connection(socket) as tracker, mmap.mmap(handle, 0) as memory:
         os.close(handle)
-        # the other end closed: the tracker has ended, or has stopped asking
+        # the tracker closed its end of the socket
         with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
             try:
                 _serve(tracker, memory)
@@ -371,9 +376,9 @@ def serve(socket: int, handle: int) -> None:
 
 def _serve(tracker: Connection, memory: mmap.mmap) -> None:
     task: _Task = tracker.recv()
-    label = make_labeller(task.capture, task, tracker.send)
+    label = make_labeller(task.setup, task.source, task.settings, tracker.send)
     ring = _Ring(tracker, memory, task)
-    span: tuple[int, int] = tracker.recv()
-    for observation, watch in observe(task.capture, label, span, task.keep_images):
+    span: tuple[int, int | None] = tracker.recv()
+    for observation, watch in observe(task.source, label, span, task.keep_images):
         ring.put(observation, watch)
     tracker.send(None)

@@ -15,8 +15,9 @@ from tk.io.results.writer import HullPoints
 from tk.model.cameras.volume import VoxelGrid
 from tk.model.hull.hull import VisualHull
 from tk.run.plan import choose_frames
+from tk.run.reporter import Reporter
 from tk.run.segmentation import make_segmenter
-from tk.run.session import Reporter, points_of
+from tk.run.session import points_of
 from tk.settings import Settings
 
 
@@ -58,7 +59,7 @@ def reconstruct(
     taken = None if force else next((file for file in files if file.exists()), None)
     if taken is not None:
         raise ResultError(f"{taken}: exists; replace it by --force, or choose another folder")
-    segment = make_segmenter(capture, config, reporter.note)
+    segment = make_segmenter(capture.setup(), capture, config, reporter.note)
     hull = VisualHull(capture.rig, VoxelGrid.cover(capture.volume, config.voxels))
     reporter.begin(stop - start, 0)
 

@@ -23,11 +23,11 @@ from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import Refined, RefinementSettings, refine_cameras
 from tk.model.cameras.tracker_frame import TrackerFrame
 from tk.model.masks.silhouettes import Views
-from tk.run.prefetch import open_source
+from tk.run.prefetch import open_observations
 from tk.settings import Settings
 from tk.threads import one_thread
 from tk.trackers.bodies import body_and_poses
-from tk.trackers.region import RegionTracker
+from tk.trackers.protocol import TwoPassTracker
 
 Float = NDArray[np.float64]
 Note = Callable[[str], None]
@@ -117,8 +117,8 @@ def refine_capture(
             f"{result}: was tracked with the cameras {', '.join(found.cameras.rig.names)}; name them with --cameras"
         )
     world, store = TrackerFrame.of(capture.rig, capture.up), MaskStore()
-    with open_source(capture, config, note, keep_images=False) as source:
-        for observation, _ in source.frames(int(found.frames.min()), int(found.frames.max()) + 1):
+    with open_observations(capture.setup(), capture, config, note, keep_images=False) as observations:
+        for observation, _ in observations.frames(int(found.frames.min()), int(found.frames.max()) + 1):
             store.put(observation.index, observation.masks)
     body, poses = tracked[0].standing("z"), world.poses_in(tracked[1])
     usable = found.status != Status.LOST
@@ -175,13 +175,13 @@ def refine_rig(
 
 
 def refine_if_inconsistent(
-    tracker: RegionTracker,
+    tracker: TwoPassTracker,
     store: MaskStore,
     frames: NDArray[np.int64],
     poses: Float,
     usable: NDArray[np.bool_],
     note: Note,
-) -> tuple[RegionTracker, MaskStore, Float] | None:
+) -> tuple[TwoPassTracker, MaskStore, Float] | None:
     """Refine the cameras if they disagree about the tracked person; None if they agree, or refinement does not help.
 
     Args:
@@ -227,9 +227,7 @@ def refine_if_inconsistent(
         f"{after:.2f}; {', '.join([f'{names[worst]} is turned most, by {refined.turn_deg[worst]:.2f}°', *late])} "
         "(refine = false keeps them)"
     )
-    fresh = RegionTracker(world.rig_out(refined.rig), tracker.up, tracker.contours, tracker.config)
-    fresh.take_body(tracker.body)
-    fresh.colors.restore(tracker.colors.state())
+    fresh = tracker.with_cameras(world.rig_out(refined.rig))
     return fresh, retimed(store, frames, np.round(refined.offset_frames).astype(np.int64)), refined.offset_frames
 
 

@@ -1,4 +1,4 @@
-"""The loop: step a tracker through a capture, write the result, tell how it goes, resume."""
+"""The loop of a run: step the trackers through a source, write the result, report progress, resume."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError, ResultError, TkError
 from tk.io.captures.capture import Capture
 from tk.io.captures.mask_store import MaskStore
+from tk.io.captures.source import Source
 from tk.io.results.files import check_output
 from tk.io.results.writer import (
     FrameResult,
@@ -28,58 +28,29 @@ from tk.io.results.writer import (
     revise_result,
 )
 from tk.model.hull.hull import HullSurface
-from tk.run.offline import REFINED, finish, tell_unknown
-from tk.run.plan import Plan, open_plan
+from tk.model.setup import Setup, Subject
+from tk.run.offline import REFINED, finish, report_unknown
+from tk.run.plan import Plan, open_plan, recording_setup
 from tk.run.prefetch import Observed
+from tk.run.reporter import Reporter
 from tk.settings import Settings
 from tk.threads import one_thread
 from tk.trackers.camera_monitor import CameraMonitor
-from tk.trackers.contour_tracker import ContourTracker
-from tk.trackers.protocol import Estimate, Observation
-from tk.trackers.region import RegionTracker
+from tk.trackers.protocol import Estimate, Observation, Tracker, share, silhouette, two_pass
 
 _LOG = logging.getLogger(__name__)
 
 
-class Reporter(Protocol):
-    """Who wants to know how it goes."""
-
-    def note(self, text: str) -> None:
-        """A line worth reading."""
-        ...
-
-    def begin(self, total: int, done: int) -> None:
-        """``total`` frames are to be tracked, ``done`` of which an earlier run has finished."""
-        ...
-
-    def advance(self, frame: int, estimate: Estimate | None) -> None:
-        """A frame is finished; ``estimate`` is None where no pose is sought."""
-        ...
-
-
-class Silent:
-    """A reporter that wants to know nothing; whoever wants some of it derives from it."""
-
-    def note(self, text: str) -> None:
-        pass
-
-    def begin(self, total: int, done: int) -> None:
-        pass
-
-    def advance(self, frame: int, estimate: Estimate | None) -> None:
-        pass
-
-
 @dataclass(frozen=True)
 class Summary:
-    """What a run did.
+    """Outcome of a run.
 
     Attributes:
-        frames: in the result, those of earlier runs included.
-        lost: frames among them that are lost.
-        seconds: that this run took.
-        tracked_now: frames that this run added.
-        interrupted: somebody stopped it with Ctrl-C.
+        frames: number of frames in the result, including those of earlier runs.
+        lost: number of lost frames among them.
+        seconds: duration of this run.
+        tracked_now: number of frames that this run added.
+        interrupted: whether Ctrl-C stopped it.
     """
 
     frames: int
@@ -97,7 +68,7 @@ class Summary:
 def track(
     capture: Capture,
     output: Path,
-    config: Settings,
+    settings: Settings,
     reporter: Reporter,
     method: str = "region",
     frames: tuple[int, int | None] = (0, None),
@@ -108,29 +79,58 @@ def track(
     causal: bool = False,
     force: bool = False,
 ) -> Summary:
-    """Track a capture and write the result, frame by frame.
-
-    The subject is found in the capture's initial frame and followed from there; what lies before ``frames`` is tracked
-    but not written. Ctrl-C ends the run with all finished frames in the file, closed and ready for ``resume``.
+    """Track a recording, see :func:`track_source`.
 
     Args:
-        capture: what to track.
-        output: the result file.
-        config: all settings.
-        reporter: who hears of the progress.
-        method: the tracker's name.
-        frames: first frame to write and the one to stop before (None: the last).
-        init_pose: a file with a rough initial pose, see :mod:`tk.io.captures.init_pose`, or a folder of 2D
-            keypoints, see
-            :mod:`tk.io.captures.keypoints`.
-        resume: go on where an earlier run of the same command stopped.
-        store_hull: keep the hull's surface in the result, too.
-        body: a result or a TOML file whose body is taken; None fits one to the opening frames.
-        causal: leave it at the first pass, in which a frame knows nothing of those after it.
-        force: replace a result that exists.
+        capture: the recording; other arguments as of :func:`track_source`.
+        init_pose, body: files, see :func:`tk.run.plan.recording_setup`.
 
     Raises:
-        TkError: bad input; everything finished before it is in the file.
+        TkError: bad input; every frame finished before it is in the file.
+    """
+    check_output(output, force, resume)
+    setup = recording_setup(capture, init_pose, body, frames[0])
+    notes = capture.warnings
+    return track_source(
+        setup, capture, output, settings, reporter, method, frames, resume, store_hull, causal, force, notes
+    )
+
+
+def track_source(
+    setup: Setup,
+    source: Source,
+    output: Path,
+    settings: Settings,
+    reporter: Reporter,
+    method: str = "region",
+    frames: tuple[int, int | None] = (0, None),
+    resume: bool = False,
+    store_hull: bool = False,
+    causal: bool = False,
+    force: bool = False,
+    notes: tuple[str, ...] = (),
+) -> Summary:
+    """Track the subjects of a setup and write the result of the first one, frame by frame.
+
+    A subject is found in its frame of initialisation and tracked forwards; frames before ``frames`` are tracked but not
+    written. Ctrl-C ends the run with all finished frames in the file, closed and ready for ``resume``.
+
+    Args:
+        setup: the scene.
+        source: the images.
+        output: the result file.
+        settings: all settings.
+        reporter: receives notes and progress.
+        method: name of the tracker.
+        frames: range of frames to write, end exclusive (None: to the end of the source).
+        resume: continue where an earlier run of the same command stopped.
+        store_hull: store the hull's surface in the result, too.
+        causal: stop after the first pass, in which no frame depends on later ones.
+        force: replace an existing result.
+        notes: notes about the input, for reporter and result.
+
+    Raises:
+        TkError: bad input; every frame finished before it is in the file.
     """
     check_output(output, force, resume)
     said: list[str] = []
@@ -139,26 +139,28 @@ def track(
         said.append(text)
         reporter.note(text)
 
-    for warning in capture.warnings:
-        note(warning)
-    with open_plan(capture, config, note, method, frames, init_pose, body) as plan:
+    for text in notes:
+        note(text)
+    with open_plan(setup, source, settings, note, method, frames) as plan:
         meta = plan.meta()
         writer, done = ResultWriter.resume(output, meta) if resume else (ResultWriter.create(output, meta), 0)
-        again = not causal and isinstance(plan.tracker, RegionTracker)  # the second pass asks for the masks
+        if done and len(setup.subjects) > 1:
+            raise ResultError(f"{output}: --resume works with one subject, not {len(setup.subjects)}")
+        again = not causal and plan.trackers[0].has_second_pass  # the second pass needs the masks
         kept = output.with_name(f".{output.name}.masks")
         masks = MaskStore(kept, resume=bool(done)) if again else None
         if not (done or again):
-            kept.unlink(missing_ok=True)  # of a stopped run; a second pass's replace them at the first frame
+            kept.unlink(missing_ok=True)  # of a stopped run; with a second pass, the first frame replaces it
         run = _Run(plan, _Output(writer, done, plan.origin(store_hull), store_hull), masks)
         started = time.perf_counter()
         interrupted = False
         try:
             with writer:
-                reporter.begin(plan.stop - plan.begin, min(done, plan.stop - plan.begin))
+                reporter.begin(plan.total, min(done, plan.total) if plan.total else done)
                 for estimate in run.estimates():
                     reporter.advance(estimate.frame, estimate)
             if run.tracked or run.restore_unfinished(output, causal):
-                for line in run.watch.report():
+                for line in run.people[0].monitor.report():
                     note(line)
                 with one_thread():
                     finish(output, plan, masks, note)
@@ -166,39 +168,38 @@ def track(
                     revise_result(output, notes=said)
             kept.unlink(missing_ok=True)
         except KeyboardInterrupt:
-            # caught outside the writer, which then leaves an older result alone if nothing is done
+            # caught outside the writer, which then keeps an older result if no frame is finished
             interrupted = True
         return Summary(done + run.tracked, run.lost, time.perf_counter() - started, run.tracked, interrupted)
 
 
 def estimates(
-    capture: Capture,
-    config: Settings,
+    setup: Setup,
+    source: Source,
+    settings: Settings,
     note: Callable[[str], None] = lambda _: None,
     method: str = "region",
     frames: tuple[int, int | None] = (0, None),
-    init_pose: Path | None = None,
-    body: Path | None = None,
 ) -> Iterator[Estimate]:
-    """Track a capture and hand out the frames' estimates one by one, as the first pass finds them; no file is written.
+    """Track the subjects of a setup and yield the estimates of the first one, as the first pass finds them. No file is
+    written.
 
-    Arguments and errors are those of :func:`track`.
+    Arguments and errors are those of :func:`track_source`.
     """
-    for warning in capture.warnings:
-        note(warning)
-    with open_plan(capture, config, note, method, frames, init_pose, body) as plan:
+    with open_plan(setup, source, settings, note, method, frames) as plan:
         run = _Run(plan, None)
         unknown: list[int] = []
         for estimate in run.estimates():
             if estimate.status != "lost" and estimate.sigma is not None and np.isnan(estimate.sigma).all():
                 unknown.append(estimate.frame)
             yield estimate
-        for line in run.watch.report():
+        for line in run.people[0].monitor.report():
             note(line)
-        tell_unknown(unknown, note)
+        report_unknown(unknown, note)
 
 
-# Frames go to the file together that are finished within this time, seconds, and are told of then.
+# Seconds between two writes to the file; frames finished within this time are written and reported together. A shorter
+# time costs more writes; a longer one loses more frames when the process is killed.
 WRITE_EVERY_S = 0.5
 
 _ORIGIN, _LOST, _WATCH = "run/", "lost frames", "watch/"
@@ -206,11 +207,11 @@ _ORIGIN, _LOST, _WATCH = "run/", "lost frames", "watch/"
 
 @dataclass
 class _Output:
-    """Where a run writes, and what an earlier one has written.
+    """The result file of a run.
 
     Attributes:
-        done: frames that an earlier run has finished.
-        origin: what must agree with it.
+        done: number of frames that an earlier run has finished.
+        origin: what must agree with the earlier run.
     """
 
     writer: ResultWriter
@@ -219,70 +220,90 @@ class _Output:
     store_hull: bool
 
     def check(self) -> None:
-        """Raise ResultError where the earlier run was another one."""
+        """Raise ResultError if the earlier run was another one."""
         for name, value in self.origin.items():
             found = self.writer.state.get(_ORIGIN + name)
             if found != value:
                 raise ResultError(
                     f"{self.writer.path}: was made differently: {name}: {found}, not {value}; "
-                    "start afresh with --force in the place of --resume"
+                    "start again with --force instead of --resume"
                 )
         if REFINED in self.writer.model:
             raise ResultError(
-                f"{self.writer.path}: a second pass has gone over its frames, so no more can be added; start afresh "
-                "with --force in the place of --resume; with --causal the result can be prolonged"
+                f"{self.writer.path}: a second pass has gone over its frames, so no more can be added; start again "
+                "with --force instead of --resume; a result of --causal can be continued"
             )
 
 
+@dataclass
+class _Person:
+    """A subject during a run.
+
+    Attributes:
+        silhouette: (C, H, W) bool, pixels that the body covers in the last frame; None if unknown.
+    """
+
+    subject: Subject
+    tracker: Tracker
+    monitor: CameraMonitor
+    silhouette: NDArray[np.bool_] | None = None
+
+
 class _Run:
-    """One run of a tracker through a capture; how far it got stands in ``tracked`` and ``lost`` whatever ends it."""
+    """One run of trackers through a source. ``tracked`` and ``lost`` count frames, even if the run is interrupted."""
 
     def __init__(self, plan: Plan, output: _Output | None, masks: MaskStore | None = None) -> None:
         self.plan, self.output = plan, output
         self.tracked = 0
         self.lost = 0
         self.masks = masks
-        self.watch = CameraMonitor(plan.tracker, plan.capture)
+        self.people = [
+            _Person(subject, tracker, CameraMonitor(tracker, plan.setup, subject))
+            for subject, tracker in zip(plan.setup.subjects, plan.trackers, strict=True)
+        ]
 
     def estimates(self) -> Iterator[Estimate]:
-        """Start or restore the tracker, and step it to the end; what is handed out is in the file already."""
+        """Start or restore the trackers, and step them to the end; yielded estimates are in the file already."""
         plan, output = self.plan, self.output
         done = output.done if output else 0
         if output and done:
             with blamed_on(output.writer.path, "the state of the run"):
                 self.lost = int(np.asarray(output.writer.state[_ORIGIN + _LOST]))
-        if plan.begin + done >= plan.stop:
+        if plan.stop is not None and plan.begin + done >= plan.stop:
             return
         if output and done:
             output.check()
             self._restore(output)
-            yield from self._step_through(plan.source.frames(plan.begin + done, plan.stop))
+            yield from self._step_through(plan.observations.frames(plan.begin + done, plan.stop))
             return
-        # The body is fitted to the same frames however few are asked for, so that a run may be prolonged by --resume.
-        count = plan.tracker.opening_frames
-        observations = plan.source.frames(plan.first, max(plan.stop, plan.first + count))
+        # The body is fitted to the same frames however few are asked for, so that --resume may extend a run.
+        count = max(person.tracker.opening_frames for person in self.people)
+        stop = None if plan.stop is None else max(plan.stop, plan.first + count)
+        observations = plan.observations.frames(plan.first, stop)
         _LOG.info("reading the first frames and learning what the scene looks like")
-        plan.tracker.prepare()
+        for person in self.people:
+            person.tracker.prepare()
         opening, broken = _take(observations, count)
         _LOG.info("finding the person in frame %d and fitting the body to %d frames", plan.first, len(opening))
         try:
             with one_thread():
-                seen = self.watch.start([o for o, _ in opening])
-                plan.tracker.start(seen, plan.capture.subject_height_m, plan.init, plan.body)
-                self.watch.check_body()
+                for person in self.people:
+                    seen, subject = person.monitor.start([o for o, _ in opening]), person.subject
+                    person.tracker.start(seen, subject.height_m, subject.init, subject.body)
+                    person.monitor.check_body()
+                    del seen
         except CaptureError as error:
-            raise CaptureError(f"{plan.capture.path}: {error}") from None
-        del seen
+            raise CaptureError(f"{plan.source.where}: {error}") from None
         if output:
-            output.writer.write_model(plan.tracker.model())
+            output.writer.write_model(self.people[0].tracker.model())
         yield from self._step_through(chain(_emptied(opening), broken or observations))
 
     def restore_unfinished(self, path: Path, causal: bool) -> bool:
-        """Restore the tracker if an earlier run got to the last frame and no further; whether it is so."""
-        output, tracker = self.output, self.plan.tracker
-        if output is None or not output.done or not isinstance(tracker, ContourTracker):
+        """Restore the tracker if an earlier run wrote the last frame, but did not finish the result; whether it did."""
+        output, tracker = self.output, self.people[0].tracker
+        if output is None or not output.done or not tracker.has_segments:
             return False
-        refined = causal or not isinstance(tracker, RegionTracker) or REFINED in output.writer.model
+        refined = causal or not tracker.has_second_pass or REFINED in output.writer.model
         if refined and read_result(path).smoothed is not None:
             return False
         output.check()
@@ -290,18 +311,19 @@ class _Run:
         return True
 
     def _restore(self, output: _Output) -> None:
+        person = self.people[0]
         with blamed_on(output.writer.path, "the state of the run"):
-            self.plan.tracker.restore(output.writer.model, output.writer.state)
-            self.watch.restore(_below(_WATCH, output.writer.state))
+            person.tracker.restore(output.writer.model, output.writer.state)
+            person.monitor.restore(_below(_WATCH, output.writer.state))
 
     def _step_through(self, observations: Iterator[Observed]) -> Iterator[Estimate]:
-        """Step the tracker to the end; frames are handed out when they are in the file."""
-        output = self.output
+        """Step the trackers to the end; an estimate is yielded when it is in the file."""
+        output, stop = self.output, self.plan.stop
         finished: list[Estimate] = []
-        written, writing = -np.inf, 0.0  # the first frame is told of at once
+        written, writing = -np.inf, 0.0  # the first frame is written at once
         try:
             for observation, laps in observations:
-                if observation.index >= self.plan.stop:
+                if stop is not None and observation.index >= stop:
                     break
                 started = time.perf_counter()
                 estimate = self._step(observation)
@@ -320,29 +342,33 @@ class _Run:
                     written = stepped + writing
                     yield from finished
                     finished.clear()
-        except TkError:  # what could be read counts
+        except TkError:  # frames before the broken one count
             yield from self._written(finished)
             raise
         yield from self._written(finished)
 
     def _step(self, observation: Observation) -> Estimate | None:
-        """The estimate in a frame, its masks kept for the second pass; None before the first frame to be written."""
-        plan, index = self.plan, observation.index
+        """Step all trackers; return the first one's estimate, None before the first frame to be written."""
+        people = self.people
+        shared = share(observation, [person.silhouette for person in people])
         with one_thread():
-            estimate, used = self.watch.step(observation)
-        if index < plan.begin:
+            found = [person.monitor.step(own) for person, own in zip(people, shared, strict=True)]
+        if len(people) > 1:
+            for person, (estimate, _) in zip(people, found, strict=True):
+                person.silhouette = silhouette(estimate, observation.masks.shape)
+        if observation.index < self.plan.begin:
             return None
+        estimate, used = found[0]
         if self.masks is not None:
-            self.masks.put(index, self._kept(observation, used, estimate))
+            self.masks.put(observation.index, self._kept(shared[0], used, estimate))
         self.lost += estimate.status == "lost"
-        # masks are large, and a view of the ring of frames at that: nobody who keeps the estimate keeps them
-        return replace(estimate, frame=index, time=index / plan.capture.fps, masks=None, drawn=None)
+        # masks are large, and a view into the ring of frames: an estimate must not keep them
+        return replace(estimate, frame=observation.index, time=observation.time, masks=None, drawn=None)
 
     def _kept(self, observation: Observation, used: Observation, estimate: Estimate) -> NDArray[np.uint8]:
-        """The masks (C, H, W) of a frame, cleaned, as the tracker took them; those of cameras that were left out, too,
-        for these may be refined."""
-        tracker = self.plan.tracker
-        assert isinstance(tracker, ContourTracker)
+        """Return the cleaned masks (C, H, W) of a frame, including those of excluded cameras, which may be refined."""
+        tracker = two_pass(self.people[0].tracker)
+        assert tracker is not None
         taken = tracker.cleaned(used.masks) if estimate.masks is None else estimate.masks
         out = np.asarray(observation.masks.any(axis=(1, 2)) & ~used.masks.any(axis=(1, 2)))
         if out.any():
@@ -356,9 +382,10 @@ class _Run:
         yield from finished
 
     def _state(self, output: _Output) -> Mapping[str, Value]:
+        person = self.people[0]
         origin = {_ORIGIN + name: value for name, value in output.origin.items()}
-        watched = {_WATCH + name: value for name, value in self.watch.state().items()}
-        return {**self.plan.tracker.state(), **watched, **origin, _ORIGIN + _LOST: self.lost}
+        monitor = {_WATCH + name: value for name, value in person.monitor.state().items()}
+        return {**person.tracker.state(), **monitor, **origin, _ORIGIN + _LOST: self.lost}
 
 
 def _below(prefix: str, state: Mapping[str, Value]) -> dict[str, Value]:
@@ -366,7 +393,8 @@ def _below(prefix: str, state: Mapping[str, Value]) -> dict[str, Value]:
 
 
 def _take(observations: Iterator[Observed], count: int) -> tuple[list[Observed], Iterator[Observed] | None]:
-    """The first ``count`` observations; if one after the first cannot be read, those before it and what raises then."""
+    """Return the first ``count`` observations; if one after the first cannot be read, those before it, and an iterator
+    that raises the error."""
     taken: list[Observed] = []
     try:
         for observation in observations:
@@ -381,7 +409,7 @@ def _take(observations: Iterator[Observed], count: int) -> tuple[list[Observed],
 
 
 def _emptied(opening: list[Observed]) -> Iterator[Observed]:
-    """Hands the opening out and keeps none of it, for pictures are large."""
+    """Yield the opening and keep none of it, because images are large."""
     opening.reverse()
     while opening:
         yield opening.pop()
@@ -411,5 +439,5 @@ def _row(estimate: Estimate, store_hull: bool) -> FrameResult:
 
 
 def points_of(surface: HullSurface) -> HullPoints:
-    """A hull's surface as the result file keeps it: colours RGB, uint8."""
+    """Return a hull's surface as a result stores it: colours RGB, uint8."""
     return HullPoints(surface.positions, surface.colors[:, ::-1].round().clip(0, 255).astype(np.uint8))

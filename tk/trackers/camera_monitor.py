@@ -27,11 +27,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.captures.capture import Capture
 from tk.model.body.plausibility import Plausibility, check_extent, check_stature
 from tk.model.body.skeleton import JOINTS
 from tk.model.masks.image_health import ImageHealth, described
 from tk.model.masks.mask_agreement import MaskAgreement
+from tk.model.setup import Setup, Subject
 from tk.trackers.contour_tracker import ContourTracker
 from tk.trackers.protocol import Estimate, Observation, Tracker
 
@@ -75,14 +75,15 @@ class CameraMonitor:
 
     Args:
         tracker: started by :meth:`start`, or restored by whoever resumes.
-        capture: what it tracks.
+        setup: the scene.
+        subject: what is known of the person.
     """
 
-    def __init__(self, tracker: Tracker, capture: Capture) -> None:
-        self.tracker, self._capture = tracker, capture
-        self._names = capture.rig.names
+    def __init__(self, tracker: Tracker, setup: Setup, subject: Subject) -> None:
+        self.tracker, self._setup, self._subject = tracker, setup, subject
+        self._names = setup.rig.names
         self._health = ImageHealth()
-        self._plausibility = Plausibility(capture.up, capture.fps)
+        self._plausibility = Plausibility(setup.up, setup.fps)
         C = len(self._names)
         self._usual = np.full(C, _FIRST_USUAL)
         self._distrusted = np.zeros(C, bool)
@@ -105,13 +106,13 @@ class CameraMonitor:
         bad = np.array([self._bad(health.look(f.images, f.masks)) for f in frames])
         shown = [_without(f, b) for f, b in zip(frames, bad, strict=True)]
         chosen = np.unique(np.linspace(0, len(shown) - 1, _OPENING).round().astype(int))
-        agreement = MaskAgreement(self._capture.rig, self._capture.volume).compare([shown[i].masks for i in chosen])
+        agreement = MaskAgreement(self._setup.rig, self._setup.volume).compare([shown[i].masks for i in chosen])
         for camera in agreement.apart if isinstance(self.tracker, ContourTracker) else ():
             if len(self._names) - self._distrusted.sum() > 2:
                 self._distrusted[camera] = True
                 self._why_apart[camera] = agreement.why(camera)
-        if self._capture.subject_height_m is not None:
-            check_extent(agreement.extent_m, self._capture.subject_height_m)
+        if self._subject.height_m is not None:
+            check_extent(agreement.extent_m, self._subject.height_m)
         return [_without(f, self._distrusted) for f in shown]
 
     def check_body(self) -> None:
@@ -120,7 +121,7 @@ class CameraMonitor:
         Raises:
             CaptureError: of the person's size.
         """
-        if self._capture.subject_height_m is None:
+        if self._subject.height_m is None:
             check_stature(self.tracker.body.dimensions.stature)
 
     def step(self, frame: Observation) -> tuple[Estimate, Observation]:

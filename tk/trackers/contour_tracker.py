@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
-from tk.io.captures.init_pose import InitPose
 from tk.kernels.line_search import SearchSettings
 from tk.kernels.raycast import Cast
 from tk.model.body import gait_poses as gait
@@ -29,6 +28,7 @@ from tk.model.cameras.tracker_frame import TrackerFrame
 from tk.model.cues.part_colors import PartColors
 from tk.model.cues.ray_costs import Evidence, RayGrid, mean_of_views
 from tk.model.masks.silhouettes import Pyramid, Views
+from tk.model.setup import InitPose
 from tk.optim import gauss_newton
 from tk.optim.gauss_newton import Descent, GaussNewtonSettings, Prior
 from tk.settings import BodyFitSettings, SilhouetteSettings
@@ -87,6 +87,13 @@ class ContourTracker:
         line_search: how edges are searched along the contours' normals.
         solver: scales and iterations of Gauss-Newton.
     """
+
+    objective_kind = "E_S"
+    needs_images = False
+    can_exclude_cameras = True
+    reports_sigma = False
+    has_segments = True
+    has_second_pass = False
 
     def __init__(
         self,
@@ -306,7 +313,7 @@ class ContourTracker:
 
     def evidence(self, grid: RayGrid, frame: Observation, pyramid: Pyramid) -> Evidence:
         """Return the costs of a frame on a grid of rays."""
-        return Evidence.of(grid, pyramid.masks[0], frame.uncertain, frame.images, self.colors)
+        return Evidence.of(grid, pyramid.masks[0], frame.uncertain, frame.images, self.colors, frame.others)
 
     def mean_residual(self, pyramid: Pyramid, poses: Float, uncertain: NDArray[np.bool_] | None = None) -> Float:
         """Return (B,) E_S, mean over the views that see anybody, inf if none does. A body on ``uncertain`` pixels

@@ -1,39 +1,48 @@
-"""What a tracker is: the protocol that :mod:`tk.trackers` share."""
+"""The protocol of the trackers, and what goes in and out of them."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:  # who decodes and segments needs no tracker's parts
-    from tk.io.captures.init_pose import InitPose
+if TYPE_CHECKING:  # the process that decodes and segments needs no parts of a tracker
     from tk.model.body.cone_body import ConeBody
+    from tk.model.cameras.camera import Rig
+    from tk.model.cameras.tracker_frame import TrackerFrame
     from tk.model.hull.hull import HullSurface
+    from tk.model.masks.silhouettes import Views
+    from tk.model.setup import InitPose, Setup
+    from tk.settings import Settings
 
 Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What the cameras saw at one instant.
+    """Images and masks of all cameras at one time, for one subject.
 
     Attributes:
-        index: the frame's number.
+        index: number of the frame in its source.
         images: (C, H, W, 3) uint8 BGR.
-        masks: (C, H, W) uint8, 0 or 255.
-        uncertain: (C, H, W) bool, where a mask is 0 and what is seen may be the person all the same, or a shadow; None
-            where nobody says.
+        masks: (C, H, W) uint8, 255 where the subject is, else 0.
+        uncertain: (C, H, W) bool, pixels whose mask is 0 although they may show the subject: a shadow, or clothes of
+            the scene's colour. A body part there costs half. None if unknown.
+        others: (C, H, W) bool, pixels that show another subject, which may hide this one: their mask is 0, and a body
+            part there costs nothing. None if there is no other subject.
+        time: time stamp of the source, seconds.
     """
 
     index: int
     images: NDArray[np.uint8]
     masks: NDArray[np.uint8]
     uncertain: NDArray[np.bool_] | None = None
+    others: NDArray[np.bool_] | None = None
+    time: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -49,8 +58,8 @@ class Estimate:
         iterations: (S,) optimiser iterations a stage.
         timing: seconds a stage.
         surface: the hull's surface, if the tracker made one.
-        sigma: (15,) one standard deviation of each joint's position along an axis, metres; None where the tracker does
-            not say.
+        sigma: (15,) m, standard deviation of each joint position along one axis; NaN if unknown, None if the tracker
+            does not report it.
         residual: (C, 2) missing area (body outside the mask) and surplus area (mask outside the body) by camera, shares
             of the person's pixels, NaN for a camera that was not used; their sum is E_S. None if not measured.
         masks: (C, H, W) uint8, what the tracker took for the person, cleaned; None where that is the observation's, and
@@ -77,7 +86,20 @@ class Estimate:
 
 
 class Tracker(Protocol):
-    """Follows one person from frame to frame. Poses are those of the capture's world, but for the state's."""
+    """Tracks one subject from frame to frame. Poses are those of the setup's world, except in :meth:`state`.
+
+    Attributes:
+        method: name in :data:`tk.trackers.registry.METHODS`.
+        stages, timing_stages: names of the entries of ``Estimate.iterations``, and of ``Estimate.timing``.
+        pose_names, pose_units: (D,) names and units of the entries of the pose vector.
+        waist_names, ankle_names: names of the angles beyond it.
+        objective_kind: meaning of ``Estimate.objective``.
+        needs_images: whether it looks at images, or at masks alone.
+        can_exclude_cameras: whether an empty mask excludes its camera. In a visual hull it would remove the subject.
+        reports_sigma: whether estimates have sigma and residual.
+        has_segments: whether segments, feet, joint angles and a smoothed copy are derived from its poses.
+        has_second_pass: whether it is a :class:`TwoPassTracker`.
+    """
 
     method: str
     stages: tuple[str, ...]
@@ -86,19 +108,30 @@ class Tracker(Protocol):
     pose_units: tuple[str, ...]
     waist_names: tuple[str, ...]
     ankle_names: tuple[str, ...]
+    objective_kind: str
+    needs_images: bool
+    can_exclude_cameras: bool
+    reports_sigma: bool
+    has_segments: bool
+    has_second_pass: bool
+
+    @classmethod
+    def of(cls, setup: Setup, settings: Settings) -> Tracker:
+        """Return a new tracker with the settings of this method."""
+        ...
 
     @property
     def opening_frames(self) -> int:
-        """Frames that :meth:`start` wants to look at."""
+        """Number of frames for :meth:`start`."""
         ...
 
     @property
     def body(self) -> ConeBody:
-        """The person's body, once it is known."""
+        """The subject's body; only after :meth:`start` or :meth:`restore`."""
         ...
 
     def prepare(self) -> None:
-        """Have kernels compiled while there is nothing else to do."""
+        """Compile kernels while there is nothing else to do."""
         ...
 
     def start(
@@ -108,7 +141,7 @@ class Tracker(Protocol):
         init: InitPose | None,
         body: ConeBody | None = None,
     ) -> None:
-        """Find the subject in the first of the frames; nothing is returned, :meth:`step` begins with that frame.
+        """Find the subject in the first of the frames. :meth:`step` begins with that frame again.
 
         Args:
             frames: consecutive observations.
@@ -119,20 +152,105 @@ class Tracker(Protocol):
         ...
 
     def step(self, frame: Observation) -> Estimate:
-        """The pose in the next frame."""
+        """Estimate the pose in the next frame."""
         ...
 
     def model(self) -> Mapping[str, Any]:
-        """The fitted body, for `/model` of the result."""
+        """Return the fitted body, for `/model` of the result."""
         ...
 
     def state(self) -> Mapping[str, Any]:
-        """All that changes from frame to frame."""
+        """Return everything that changes from frame to frame."""
         ...
 
     def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
-        """Take up where a run stopped."""
+        """Continue where a run with this model and state stopped."""
         ...
+
+
+class TwoPassTracker(Tracker, Protocol):
+    """A tracker that goes over the frames a second time when all of them are known."""
+
+    rig: Rig
+    world: TrackerFrame
+    views: Views
+
+    def cleaned(self, masks: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return masks (C, H, W) without specks and small holes, as :meth:`second_pass` takes them."""
+        ...
+
+    def without_foreign(self, frame: Observation) -> Observation:
+        """Return the frame without things in its masks that are not the person."""
+        ...
+
+    def with_cameras(self, rig: Rig) -> TwoPassTracker:
+        """Return a tracker of the same body with other cameras."""
+        ...
+
+    def start_at(self, pose: Float) -> None:
+        """Continue at a pose (D,) with no memory of the frames before it."""
+        ...
+
+    def second_pass(
+        self,
+        masks: Sequence[NDArray[np.uint8]],
+        poses: Float,
+        lost: NDArray[np.bool_],
+        residual: Float,
+        height_m: float | None,
+        keep_body: bool = False,
+    ) -> tuple[Float, Float, Float]:
+        """Optimise every frame again with a body fitted to all of them.
+
+        Args:
+            masks: (C, H, W) of F frames, cleaned.
+            poses: (F, D) of the first pass.
+            lost: (F,) bool; such frames neither teach nor change.
+            residual: (F, C, 2) of the first pass; NaN where a camera was excluded.
+            height_m: the subject's height, if known.
+            keep_body: leave the body as it is.
+
+        Returns:
+            Poses (F, D), residuals (F, C, 2), and sigma (F, 15) in metres, 0 in lost frames.
+        """
+        ...
+
+
+def two_pass(tracker: Tracker) -> TwoPassTracker | None:
+    """Return the tracker if it has a second pass, else None."""
+    return cast(TwoPassTracker, tracker) if tracker.has_second_pass else None
+
+
+def share(frame: Observation, silhouettes: Sequence[NDArray[np.bool_] | None]) -> list[Observation]:
+    """Return the observation of each subject: pixels that other subjects covered in the last frame are ``others``.
+
+    Args:
+        frame: images, and masks of all subjects together.
+        silhouettes: (C, H, W) pixels that each subject covered in the last frame; None if unknown.
+    """
+    if len(silhouettes) == 1:
+        return [frame]
+    shared = []
+    for own in silhouettes:
+        others = np.zeros(frame.masks.shape, np.bool_)
+        for other in silhouettes:
+            if other is not None and other is not own:
+                others |= other
+        if own is not None:
+            others &= ~own
+        shared.append(replace(frame, masks=np.where(others, np.uint8(0), frame.masks), others=others))
+    return shared
+
+
+def silhouette(estimate: Estimate, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+    """Return the pixels that the body covers, as an array of this shape (C, H, W); None if the tracker renders none."""
+    if estimate.drawn is None:
+        return None
+    step = max(1, round(shape[1] / estimate.drawn.shape[1]))
+    full = np.zeros(shape, np.bool_)
+    covered = estimate.drawn.repeat(step, axis=1).repeat(step, axis=2)[:, : shape[1], : shape[2]]
+    full[:, : covered.shape[1], : covered.shape[2]] = covered
+    return full
 
 
 class Stopwatch:

@@ -25,7 +25,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.captures.init_pose import InitPose
 from tk.model.body.body_fit import STATURE_DEVIATION
 from tk.model.body.cone_body import ConeBody
 from tk.model.body.joint_sigma import contour_variance, directions, posture_variance
@@ -35,8 +34,9 @@ from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import color_bins
 from tk.model.cues.ray_costs import Evidence, mean_of_views
 from tk.model.masks.silhouettes import Pyramid
+from tk.model.setup import InitPose, Setup
 from tk.optim.gauss_newton import Prior
-from tk.settings import BodyFitSettings, RegionSettings, SilhouetteSettings
+from tk.settings import BodyFitSettings, RegionSettings, Settings, SilhouetteSettings
 from tk.trackers.contour_tracker import GAIN, RECOVER_EVERY, SAME_POSE_M, ContourTracker
 from tk.trackers.protocol import Estimate, Observation, Stopwatch, drift
 
@@ -105,6 +105,14 @@ class RegionTracker(ContourTracker):
     method = "region"
     stages: tuple[str, ...] = ("contours", "search")
     timing_stages: tuple[str, ...] = ("masks_clean", "optimise", "check", "search")
+    needs_images = True
+    reports_sigma = True
+    has_second_pass = True
+
+    @classmethod
+    def of(cls, setup: Setup, settings: Settings) -> RegionTracker:
+        """Return a new tracker with the settings of this method."""
+        return cls(setup.rig, setup.up, settings.silhouette, settings.region)
 
     def __init__(
         self, rig: Rig, up: str, contours: SilhouetteSettings | None = None, config: RegionSettings | None = None
@@ -520,6 +528,20 @@ class RegionTracker(ContourTracker):
         self._in_vain = bool(state.get("in_vain", False))  # results of before have none
         self.colors.restore(state)
         self._fresh = False
+
+    def with_cameras(self, rig: Rig) -> RegionTracker:
+        """Return a tracker of the same body and colours with other cameras."""
+        fresh = RegionTracker(rig, self.up, self.contours, self.config)
+        fresh.take_body(self.body)
+        fresh.colors.restore(self.colors.state())
+        return fresh
+
+    def start_at(self, pose: Float) -> None:
+        """Continue at a pose (D,) of the setup's world, with no memory of the frames before it."""
+        start = self.world.poses_in(pose[None])
+        once = {"poses": start, "previous": start, "costs": np.zeros(1), "ages": np.ones(1, int)}
+        nothing = {"usual": np.inf, "lost_for": 0, "stranded": 0, "in_vain": False}
+        self.rewind({**self.state(), **once, **nothing, "jumped": np.zeros(1, bool)})
 
 
 def _disagreement(skeleton: Skeleton, poses: Float, cost: Float) -> Float:

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.captures.init_pose import InitPose
 from tk.kernels.line_search import SearchSettings
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.camera import Rig
+from tk.model.setup import InitPose, Setup
 from tk.optim.gauss_newton import GaussNewtonSettings
-from tk.settings import SilhouetteSettings
+from tk.settings import Settings, SilhouetteSettings
 from tk.trackers.contour_tracker import LINE_SEARCH, RECOVER_EVERY, SOLVER, ContourTracker
 from tk.trackers.protocol import Estimate, Observation, Stopwatch
 
@@ -33,6 +33,11 @@ class SilhouetteTracker(ContourTracker):
 
     method = "silhouette"
     timing_stages: tuple[str, ...] = ("masks_clean", "optimise", "check")
+
+    @classmethod
+    def of(cls, setup: Setup, settings: Settings) -> SilhouetteTracker:
+        """Return a new tracker with the settings of this method."""
+        return cls(setup.rig, setup.up, settings.silhouette)
 
     def __init__(
         self,
@@ -73,7 +78,9 @@ class SilhouetteTracker(ContourTracker):
         pose = settled.states[0]
         watch.lap("optimise")
         if config.search_every and frame.index % config.search_every == 0:
-            pose = self.improved(Observation(frame.index, frame.images[:0], frame.masks), pyramid, pose)
+            pose = self.improved(
+                Observation(frame.index, frame.images[:0], frame.masks, others=frame.others), pyramid, pose
+            )
         error = float(self.mean_residual(pyramid, pose[None])[0])
         # after a loss a pose near the last one may fit by chance
         due = self._lost_for > 0 if error <= config.lost_error else self._lost_for % RECOVER_EVERY == 0

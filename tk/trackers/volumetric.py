@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ConfigError
-from tk.io.captures.init_pose import InitPose
 from tk.kernels.nearest import SurfaceIndex
 from tk.model.body.cone_body import ConeBody
 from tk.model.body.skeleton import CHAINS, JOINTS, WAIST, join_pose, split_pose
@@ -41,6 +40,7 @@ from tk.model.cues.objective import (
     objective_parameters,
 )
 from tk.model.hull.hull import HullSurface, VisualHull
+from tk.model.setup import InitPose, Setup
 from tk.optim import schedule
 from tk.optim.smd import SmdSettings
 from tk.settings import Settings
@@ -108,6 +108,17 @@ class VolumetricTracker:
     method = "volumetric"
     stages: tuple[str, ...] = ("all", *CHAINS)
     timing_stages: tuple[str, ...] = ("hull", "surface", "colour", "optimise", "update")
+    objective_kind = "robust distance of surface points"
+    needs_images = True
+    can_exclude_cameras = False
+    reports_sigma = False
+    has_segments = False
+    has_second_pass = False
+
+    @classmethod
+    def of(cls, setup: Setup, settings: Settings) -> VolumetricTracker:
+        """Return a new tracker with the settings of this method."""
+        return cls(setup.rig, setup.volume, setup.up, settings)
 
     def __init__(self, rig: Rig, volume: Volume, up: str, config: Settings, cache_dir: Path | None = None) -> None:
         self.config = config

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -22,6 +23,7 @@ from tk.model.cameras.common_view import infer_volume, sample_box, views_of
 from tk.model.cameras.mounting import infer_up
 from tk.model.cameras.up import up_vector
 from tk.model.cameras.volume import Volume
+from tk.model.setup import Setup, Subject
 
 __all__ = ["Capture", "FrameReader", "FrameSet", "open_capture"]
 
@@ -106,7 +108,33 @@ class Capture:
 
     @property
     def has_masks(self) -> bool:
+        """Whether masks are given."""
         return self.mask_clips is not None
+
+    @property
+    def where(self) -> str:
+        """The folder, as messages name it."""
+        return str(self.path)
+
+    @property
+    def masks_from(self) -> str:
+        """Where masks come from, see :attr:`tk.io.captures.source.Source.masks_from`."""
+        if self.mask_clips is not None:
+            return os.path.relpath(self.mask_clips[0].path.parent, self.path)
+        if self.masks == "median":
+            return "median"
+        return "none" if (self.path / "background").is_dir() else ""
+
+    def setup(self) -> Setup:
+        """Return what `calibration.toml` and `capture.toml` say about the scene."""
+        subject = Subject(self.subject_height_m, self.init_frame, in_init_pose=self.init_pose != "any")
+        return Setup(self.rig, self.volume, self.up, self.fps, (subject,))
+
+    def shifted(self, time_offset_s: Sequence[float]) -> Capture:
+        """Return the capture with other time offsets (C,); it ends with the first video."""
+        moved = replace(self, time_offset_s=tuple(time_offset_s))
+        ends = [clip.frame_count + late for clip, late in zip(self.clips, moved.late_frames, strict=True)]
+        return replace(moved, frame_count=min(self.frame_count, *ends))
 
     @property
     def up_axis(self) -> NDArray[np.float64]:
@@ -126,7 +154,7 @@ class Capture:
             raise CaptureError(
                 f"{self.path}: no frames from {start} to {stop}; it has frames 0 to {self.frame_count - 1}"
             )
-        return FrameReader(self.clips, self.mask_clips, self.rig.frame_shape, start, stop, self.late_frames)
+        return FrameReader(self.clips, self.mask_clips, self.rig.frame_shape, start, stop, self.late_frames, self.fps)
 
     def background(self) -> tuple[NDArray[np.uint8], ...] | None:
         """The empty scene: an array (T, h, w, 3) uint8 BGR a camera, None without a `background/` folder.

@@ -23,15 +23,17 @@ _AHEAD_BYTES = 128 * 2**20
 
 @dataclass(frozen=True)
 class FrameSet:
-    """What all cameras saw at one instant.
+    """Images of all cameras at one time.
 
     Attributes:
-        index: source frame.
-        images: (C, H, W, 3) uint8 BGR; a smaller camera's picture is padded with zeros at the right and bottom.
-        masks: (C, H, W) uint8 with 0 or 255 (the person), or None.
+        index: number of the frame in its source.
+        time: time stamp, seconds.
+        images: (C, H, W, 3) uint8 BGR; the image of a smaller camera is padded with zeros at the right and bottom.
+        masks: (C, H, W) uint8, 255 where the person is, else 0; None without given masks.
     """
 
     index: int
+    time: float
     images: NDArray[np.uint8]
     masks: NDArray[np.uint8] | None
 
@@ -53,9 +55,10 @@ class FrameReader(Iterator[FrameSet]):
         start: int,
         stop: int,
         late: Sequence[int] = (),
+        fps: float = 1.0,
     ) -> None:
-        """``late``: for each clip, by how many frames its pictures are later than their number says; picture
-        k - late is handed out in frame k. Before a clip's first picture and after its last these stand in.
+        """``late``: delay of each clip in frames; frame k holds image k - late. The first image is repeated before the
+        clip's start, the last one after its end. ``fps``: frame rate, for the time stamps.
         """
         late = tuple(late) or (0,) * len(clips)
         self.start = start
@@ -69,7 +72,7 @@ class FrameReader(Iterator[FrameSet]):
         masks = _Stacks((count, *frame_shape), ahead) if mask_clips else None
 
         def blank(index: int) -> FrameSet:
-            return FrameSet(index, images.take(), masks.take() if masks else None)
+            return FrameSet(index, index / fps, images.take(), masks.take() if masks else None)
 
         window = _Window(blank, count, start, ahead)
         self._window = window

@@ -21,7 +21,6 @@ or angles by the names of `/pose`, in degrees, with the place of the pelvis; wha
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -30,36 +29,15 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError
 from tk.io.toml import Table, load_toml
 from tk.model.body.skeleton import JOINTS
+from tk.model.setup import TRANSLATIONS, InitPose
 
 LEAST_JOINTS = 6
 
 # across the line that fits the joints best, root of the sum of squares
 LEAST_SPREAD_M = 0.05
 
-TRANSLATIONS = ("torso_x", "torso_y", "torso_z")
-
 # metres; the same for a height in capture.toml
 HEIGHT_RANGE_M = (0.3, 3.0)
-
-
-@dataclass(frozen=True)
-class InitPose:
-    """A rough pose: ``joints`` name → (3,) metres, or ``angles`` name → metres or radians; the other is empty.
-
-    ``frame`` and ``height_m`` are None where the file does not give them.
-    """
-
-    joints: dict[str, NDArray[np.float64]]
-    angles: dict[str, float]
-    frame: int | None = None
-    height_m: float | None = None
-
-    @property
-    def center(self) -> NDArray[np.float64]:
-        """(3,) where the body roughly is: the mean of the joints, or the pelvis."""
-        if self.joints:
-            return np.mean(list(self.joints.values()), axis=0)
-        return np.array([self.angles[name] for name in TRANSLATIONS])
 
 
 def spread_m(joints: Mapping[str, NDArray[np.float64]]) -> float:

@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError
 from tk.io.captures.calibration import match_camera
 from tk.io.captures.capture import Capture
-from tk.io.captures.init_pose import LEAST_JOINTS, LEAST_SPREAD_M, InitPose, read_init_pose, spread_m
+from tk.io.captures.init_pose import LEAST_JOINTS, LEAST_SPREAD_M, read_init_pose, spread_m
 from tk.io.toml import LARGE, read_text, shown
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.triangulation import same_person, triangulate_joints
+from tk.model.setup import InitPose
 
 Float = NDArray[np.float64]
 

@@ -71,12 +71,16 @@ class Evidence:
         uncertain: NDArray[np.bool_] | None = None,
         images: NDArray[np.uint8] | None = None,
         colors: PartColors | None = None,
+        others: NDArray[np.bool_] | None = None,
     ) -> Evidence:
-        """Return the costs from masks (V, H, W), uncertain pixels, images and the learned colours of the parts."""
+        """Return the costs from masks (V, H, W), uncertain pixels, images, the learned colours of the parts,
+        and the pixels of other subjects, where a body costs nothing."""
         person = grid.sample(masks) >= 128
         outside = np.ones(person.shape, np.float32)
         if uncertain is not None:
             outside[grid.sample(uncertain)] = UNCERTAIN_COST
+        if others is not None:
+            outside[grid.sample(others)] = 0.0
         cost = np.empty((*person.shape, len(GROUPS) + 1), np.float32)
         cost[..., 0] = person
         cost[..., 1:] = np.where(person, 0.0, outside)[..., None]

@@ -1,0 +1,84 @@
+"""What is known before the first frame: the cameras, the working volume, and the subjects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:  # the process that decodes and segments needs no body
+    from tk.model.body.cone_body import ConeBody
+    from tk.model.cameras.camera import Rig
+    from tk.model.cameras.volume import Volume
+
+#: entries of the pose vector that place the pelvis, metres
+TRANSLATIONS = ("torso_x", "torso_y", "torso_z")
+
+
+@dataclass(frozen=True)
+class InitPose:
+    """A rough pose given by a person, in the setup's world. Either ``joints`` or ``angles`` is empty.
+
+    Attributes:
+        joints: name → (3,) metres.
+        angles: name → metres or radians.
+        frame: frame of the pose; None if not given.
+        height_m: height of the subject, metres; None if not given.
+    """
+
+    joints: dict[str, NDArray[np.float64]]
+    angles: dict[str, float]
+    frame: int | None = None
+    height_m: float | None = None
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """(3,) metres, rough position of the body: the mean of the joints, or the pelvis."""
+        if self.joints:
+            return np.mean(list(self.joints.values()), axis=0)
+        return np.array([self.angles[name] for name in TRANSLATIONS])
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is known of a person before tracking.
+
+    Attributes:
+        height_m: height without shoes, metres; None if unknown.
+        init_frame: frame of the initialisation.
+        init: rough pose in that frame; None if the tracker finds the person by itself.
+        body: the body, from an earlier recording; None if it is to be fitted.
+        in_init_pose: whether the subject stands in the initialisation pose in that frame, so that every limb is
+            visible. If not, any frame may serve, and the body is fitted again at the end.
+    """
+
+    height_m: float | None = None
+    init_frame: int = 0
+    init: InitPose | None = None
+    body: ConeBody | None = None
+    in_init_pose: bool = True
+
+
+@dataclass(frozen=True)
+class Setup:
+    """The scene of a run. It says nothing about where the images come from.
+
+    Attributes:
+        rig: the cameras.
+        volume: the working volume, metres.
+        up: axis that points up in the world, see :func:`tk.model.cameras.up.up_vector`.
+        fps: frame rate, 1/s.
+        subjects: the persons to be tracked, at least one.
+    """
+
+    rig: Rig
+    volume: Volume
+    up: str
+    fps: float
+    subjects: tuple[Subject, ...] = (Subject(),)
+
+    def __post_init__(self) -> None:
+        if not self.subjects:
+            raise ValueError("a setup has at least one subject")
