@@ -1,4 +1,4 @@
-"""`tk inspect` and `tk level` on the tiny capture, and on spoilt ones."""
+"""`tk inspect` and `tk level` on the tiny capture, and on damaged copies."""
 
 from __future__ import annotations
 
@@ -37,27 +37,27 @@ def turned(folder: Path, camera: int, degrees: float) -> None:
     write_calibration(Rig(tuple(cameras)), folder / "calibration.toml")
 
 
-def test_a_good_capture_is_told_so_with_pictures(tk: Tk, tiny: Path, tmp_path: Path) -> None:
-    ran = tk("inspect", tiny, "-o", tmp_path / "looks")
+def test_good_capture_has_no_findings_and_gets_a_sheet(tk: Tk, tiny: Path, tmp_path: Path) -> None:
+    ran = tk("inspect", tiny, "-o", tmp_path / "sheets")
     assert ran.code == 0, ran.err
-    assert "Nothing is the matter." in ran.out and all(f"cam{c}" in ran.out for c in range(1, 5))
-    sheet = cv2.imread(str(tmp_path / "looks" / "inspect.png"))
+    assert "No problems found." in ran.out and all(f"cam{c}" in ran.out for c in range(1, 5))
+    sheet = cv2.imread(str(tmp_path / "sheets" / "inspect.png"))
     # a row of four cameras for each of three frames, below the text
     assert sheet.shape[0] > 900 and sheet.shape[1] > 1600
 
 
-def test_the_odd_camera_is_named(tk: Tk, copy: Path) -> None:
+def test_turned_camera_is_named(tk: Tk, copy: Path) -> None:
     turned(copy, 1, 6.0)
     ran = tk("inspect", copy, "--json")
     assert ran.code == 0, ran.err
     found = json.loads(ran.out)
     assert [bool(c["verdict"]) for c in found["cameras"]] == [False, True, False, False]
-    assert found["findings"][0].startswith("camera cam2 disagrees with the others: off by ")
+    assert found["findings"][0].startswith("camera cam2 is inconsistent with the others: off by ")
     assert found["cameras"][1]["shift_px"] > 5 and found["cameras"][1]["outside"] > 0.1
 
 
-def test_a_video_that_starts_late_is_told_by_frames(tk: Tk, tmp_path: Path) -> None:
-    """Drawn masks of a walker; the masks of one camera are those of three frames later."""
+def test_delay_of_a_video_is_found_in_frames(tk: Tk, tmp_path: Path) -> None:
+    """The masks are rendered; those of one camera are three frames ahead."""
     rig, count, late = ring_of_cameras(4, 160, 120), 24, 3
     body = build_cone_body(BodyDimensions.from_stature(1.75), "z", "full")
     poses = []
@@ -79,26 +79,26 @@ def test_a_video_that_starts_late_is_told_by_frames(tk: Tk, tmp_path: Path) -> N
     assert [c["late_frames"] for c in json.loads(ran.out)["cameras"]] == [0, 0, late, 0]
 
 
-def test_empty_masks_and_a_volume_elsewhere_are_told(tk: Tk, copy: Path) -> None:
+def test_empty_masks_are_reported(tk: Tk, copy: Path) -> None:
     for path in (copy / "masks").rglob("*.png"):
         cv2.imwrite(str(path), np.zeros((120, 160), np.uint8))
     ran = tk("inspect", copy)
     assert ran.code == 0, ran.err
-    assert "no hull in common" in ran.out and "shows nobody in 100% of the frames" in ran.out
+    assert "no visual hull in common" in ran.out and "shows nobody in 100% of the frames" in ran.out
 
 
 # --- up ---------------------------------------------------------------------------------------------------------------
 
 
 def standing(count: int = 8) -> list[np.ndarray]:
-    """Points of somebody who stands here and there."""
+    """Return points of a person who stands at random places."""
     rng = np.random.default_rng(0)
     body = rng.uniform([-0.25, -0.15, 0.0], [0.25, 0.15, 1.75], (2000, 3))
     return [body + np.array([x, y, 0.0]) for x, y in rng.uniform(-0.8, 0.8, (count, 2))]
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_up_is_found_in_a_world_that_nobody_has_laid(seed: int) -> None:
+def test_up_is_estimated_in_a_rotated_world(seed: int) -> None:
     R = Rotation.random(random_state=seed).as_matrix()
     rig = Rig(tuple(replace(c, rotation=c.rotation @ R.T) for c in ring_of_cameras(4, 160, 120)))
     found = find_up(rig, "z", [hull @ R.T for hull in standing()])
@@ -106,7 +106,7 @@ def test_up_is_found_in_a_world_that_nobody_has_laid(seed: int) -> None:
     assert abs(found.floor_m) < 0.1
 
 
-def test_cameras_mounted_sideways_are_overruled_by_a_standing_person() -> None:
+def test_standing_person_overrules_cameras_mounted_sideways() -> None:
     quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()
     cameras = []
     for c in ring_of_cameras(4, 160, 120):
@@ -115,7 +115,7 @@ def test_cameras_mounted_sideways_are_overruled_by_a_standing_person() -> None:
     assert up_vector(found.up)[2] > np.cos(np.radians(3.0))
 
 
-def test_up_is_written_down_and_all_else_stays(tk: Tk, copy: Path) -> None:
+def test_level_writes_up_and_keeps_the_rest(tk: Tk, copy: Path) -> None:
     R = Rotation.from_euler("xyz", [-1.2, 0.3, 0.5]).as_matrix()
     original = open_capture(copy)
     write_calibration(
@@ -149,7 +149,7 @@ def test_up_is_written_down_and_all_else_stays(tk: Tk, copy: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("up", ["z", "[0.6, 0.0, 0.8]"])
-def test_up_is_put_where_toml_wants_it(tmp_path: Path, text: str, up: str) -> None:
+def test_up_is_written_before_the_first_table(tmp_path: Path, text: str, up: str) -> None:
     from tk.io.toml import load_toml
 
     path = tmp_path / "capture.toml"
@@ -162,7 +162,7 @@ def test_up_is_put_where_toml_wants_it(tmp_path: Path, text: str, up: str) -> No
     assert after == before
 
 
-def test_a_broken_file_is_left_alone(tmp_path: Path) -> None:
+def test_broken_capture_toml_is_not_changed(tmp_path: Path) -> None:
     (tmp_path / "capture.toml").write_text("up = \n")
     with pytest.raises(CaptureError, match=r"capture.toml: invalid TOML"):
         write_up(tmp_path, Leveling("z", "how", 0.0, ""))

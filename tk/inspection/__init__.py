@@ -1,1 +1,1 @@
-"""What can be checked before a capture is tracked."""
+"""Checks of a capture before tracking."""

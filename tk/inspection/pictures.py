@@ -1,4 +1,4 @@
-"""The pictures of `tk inspect`: masks against the hull of the other cameras, the working volume, and what points up."""
+"""The sheet of `tk inspect`: masks and the hull of the other cameras, the working volume, the up direction."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
-from tk.inspection.checks import Inspection, Seen
+from tk.inspection.checks import Inspection, Sample
 from tk.io.captures.capture import Capture
 from tk.model.cameras.camera import Camera
 from tk.model.cameras.up import up_vector
@@ -19,7 +19,7 @@ from tk.model.cameras.up import up_vector
 Image = NDArray[np.uint8]
 Float = NDArray[np.float64]
 
-#: pixels: a tile's height, what lies between tiles, a line of text
+#: layout, pixels: height of a tile, gap between tiles, height of a line of text
 _TILE, _GAP, _LINE = 300, 6, 20
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _PAPER, _INK, _BAD = (255, 255, 255), (40, 40, 40), (40, 40, 200)
@@ -28,20 +28,20 @@ _MASK, _HULL, _OUTSIDE, _BOX, _UP = (80, 220, 80), (230, 120, 230), (40, 40, 255
 _LEGEND = (
     ("mask", _MASK),
     ("hull of the others", _HULL),
-    ("mask outside of it", _OUTSIDE),
+    ("mask outside the hull", _OUTSIDE),
     ("volume", _BOX),
     ("up", _UP),
 )
 
 
-def write_sheet(path: Path, capture: Capture, inspection: Inspection, seen: Sequence[Seen]) -> None:
-    """Write the sheet as a PNG: a row a frame, a column a camera, the findings above.
+def write_sheet(path: Path, capture: Capture, inspection: Inspection, samples: Sequence[Sample]) -> None:
+    """Write the sheet as a PNG: one row per frame, one column per camera, the findings above.
 
     Raises:
-        CaptureError: it cannot be written.
+        CaptureError: the file cannot be written.
     """
     tiles = []
-    for frame in seen:
+    for frame in samples:
         cameras = [_tile(capture, inspection, frame, c) for c in range(len(capture.rig))]
         tiles.append(np.hstack([part for tile in cameras for part in (tile, _blank(_TILE, _GAP))]))
     width = max([row.shape[1] for row in tiles], default=900)
@@ -51,7 +51,7 @@ def write_sheet(path: Path, capture: Capture, inspection: Inspection, seen: Sequ
     ok, coded = cv2.imencode(".png", np.vstack(rows))
     try:
         if not ok:
-            raise OSError("the picture is too large")
+            raise OSError("the image is too large")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(coded.tobytes())
     except OSError as reason:
@@ -64,7 +64,7 @@ def _blank(height: int, width: int) -> Image:
 
 def _text(inspection: Inspection, width: int) -> Image:
     lines = [(line, _INK) for line in inspection.format_table().split("\n")[: -max(len(inspection.findings), 1)]]
-    lines += [(line, _BAD) for line in inspection.findings] or [("Nothing is the matter.", (60, 140, 60))]
+    lines += [(line, _BAD) for line in inspection.findings] or [("No problems found.", (60, 140, 60))]
     wrapped = [(part, color) for line, color in lines for part in _wrapped(line, (width - 20) // 8)]
     image = _blank((len(wrapped) + 2) * _LINE, width)
     for i, (line, color) in enumerate(wrapped):
@@ -88,14 +88,14 @@ def _wrapped(line: str, most: int) -> list[str]:
 
 
 def _columns(image: Image, line: str, y: int, color: tuple[int, int, int]) -> None:
-    """A line with every character in its place, as a terminal sets it: OpenCV's letters differ in width."""
+    """Write a line in columns of equal width, as on a terminal: OpenCV's letters differ in width."""
     for i, character in enumerate(line):
         if character != " ":
             shown = {"°": "o", "±": "+"}.get(character, character)
             cv2.putText(image, shown, (10 + 8 * i, y), _FONT, 0.45, color, 1, cv2.LINE_AA)
 
 
-def _tile(capture: Capture, inspection: Inspection, frame: Seen, c: int) -> Image:
+def _tile(capture: Capture, inspection: Inspection, frame: Sample, c: int) -> Image:
     camera = capture.rig[c]
     picture = frame.images[c, : camera.height, : camera.width].copy()
     mask = (frame.masks[c, : camera.height, : camera.width] >= 128).astype(np.uint8)
@@ -139,7 +139,7 @@ def _outline(picture: Image, mask: Image, color: tuple[int, int, int], thick: in
 def _segment(
     picture: Image, camera: Camera, a: Float, b: Float, color: tuple[int, int, int], thick: int, steps: int = 24
 ) -> None:
-    """A line in the world, drawn where the camera sees it: lenses bend it."""
+    """Draw a line of the world as the camera sees it; the lens may bend it."""
     pixels, _ = camera.project(a + np.linspace(0, 1, steps)[:, None] * (b - a))
     for p, q in pairwise(pixels):
         if np.isfinite(p).all() and np.isfinite(q).all() and max(np.abs(p).max(), np.abs(q).max()) < 1e5:
