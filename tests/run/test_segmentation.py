@@ -88,7 +88,7 @@ def test_a_segmenter_that_is_not_there(walk: Path, tmp_path: Path, monkeypatch: 
         load("blue")
     with pytest.raises(ConfigError, match="segmenter lost: redsegmenter:Missing cannot be loaded"):
         load("lost")
-    with pytest.raises(ConfigError, match="segmenter wrong: gave values outside 0 to 1"):
+    with pytest.raises(ConfigError, match="segmenter wrong: returned values outside 0 to 1"):
         write_masks(open_capture(walk), tmp_path / "masks", Silent(), "wrong")
 
 
