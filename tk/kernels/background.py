@@ -1,6 +1,6 @@
-"""How unlike the empty scene each pixel is: the clamped collinearity statistic, for all cameras in one launch.
+"""Measure how each pixel differs from the empty scene: the clamped collinearity statistic, all cameras in one launch.
 
-The colour values of a 3×3 window of the picture and of the (gain-corrected) plate are stacked into two vectors **a**,
+The colour values of a 3×3 window of the image and of the (gain-corrected) plate are stacked into two vectors **a**,
 **b** of 27 components; a constant component, the darkness offset, is added to both (Mester et al. 2001; Griesser et al.
 2005). The smaller eigenvalue of their Gram matrix is ``min over s of |a - s b|² / (1 + s²)``: the distance from being
 collinear, whatever the factor ``s``. A cast shadow can only darken, and only so far, thus here ``s`` is confined to
@@ -8,8 +8,8 @@ collinear, whatever the factor ``s``. A cast shadow can only darken, and only so
 expression is ``|a - b|² / 2``, an upper bound, so that the costlier statistic is needed only where this plain
 difference is significant.
 
-Only a box of each camera's picture is looked at. Sums are integers and the results are levels on a logarithmic scale in
-one byte, so they repeat bit for bit. What lies outside the picture adds nothing to a sum.
+Only a box of each camera's image is measured. Sums are integers and the results are levels on a logarithmic scale in
+one byte, so they repeat bit for bit. Pixels outside the image add nothing to a sum.
 """
 
 import numpy as np
@@ -26,6 +26,10 @@ GREY = (29, 150, 77)
 
 BRIGHT, DARK = 1, 2
 """Shades: brighter than the scene; darker than the scene is under the faintest shadow."""
+
+# The results' planes; labels after an even and after an odd number of iterations.
+DIFFERENCE, COLLINEARITY, SHADES, LABELS, SPARE = range(5)
+PLANES = 5
 
 _MANTISSA_SHIFT = 20  # 23 bits of float32 mantissa less log2(STEPS_PER_OCTAVE)
 _LEVEL_ONE = 128  # the level of 1.0
@@ -71,34 +75,74 @@ def _column(images: ti.template(), plates: ti.template(), pixel: ti.i32, width: 
 
 
 @ti.func
-def _relaxed(labels: ti.template(), i: ti.i32, stride: ti.i32, level: ti.i32, per_neighbour: ti.i32, threshold: ti.i32):
-    """The label of pixel ``i`` under those of its eight neighbours, 0 or 1."""
-    above = labels[i - stride - 1] + labels[i - stride] + labels[i - stride + 1]
-    below = labels[i + stride - 1] + labels[i + stride] + labels[i + stride + 1]
-    count = ti.cast(above + below + labels[i - 1] + labels[i + 1], ti.i32)
+def _relaxed(planes: ti.template(), i: ti.i32, stride: ti.i32, level: ti.i32, per_neighbour: ti.i32, threshold: ti.i32):
+    """The label of a pixel given the labels of its eight neighbours around place ``i``, 0 or 1."""
+    above = planes[i - stride - 1] + planes[i - stride] + planes[i - stride + 1]
+    below = planes[i + stride - 1] + planes[i + stride] + planes[i + stride + 1]
+    count = ti.cast(above + below + planes[i - 1] + planes[i + 1], ti.i32)
     return ti.cast(level + per_neighbour * (count - 4) >= threshold, ti.u8)
+
+
+@ti.func
+def _clamped(dd: ti.f32, db: ti.f32, bb: ti.f32, shadow_min: ti.f32) -> ti.f32:
+    """The least ``|a - s b|² / (1 + s²)`` for s in [shadow_min, 1], from d·d, d·b and b·b with d = a - b."""
+    # every product follows from these without cancellation
+    excess = dd + 2.0 * db  # a·a - b·b
+    cross = bb + db  # a·b, positive thanks to the offset
+    s = (excess + ti.sqrt(excess * excess + 4.0 * cross * cross)) / (2.0 * cross)
+    s = ti.min(ti.max(s, shadow_min), 1.0)
+    t = 1.0 - s
+    return (dd + 2.0 * t * db + t * t * bb) / (1.0 + s * s)
+
+
+@ti.func
+def _shade(plates: ti.template(), i: ti.i32, brighter: ti.f32, bright: ti.f32, dark: ti.f32, shadow_max: ti.f32):
+    """BRIGHT, DARK or 0 of a pixel whose window differs by ``brighter`` from the plate; ``i``: its first channel."""
+    scene = 0
+    for k in ti.static(range(3)):
+        scene += GREY[k] * ti.cast(plates[i + k], ti.i32)
+    shade = 0
+    if brighter > bright:
+        shade = BRIGHT
+    elif brighter < dark + (shadow_max - 1.0) * 9.0 * scene:
+        shade = DARK
+    return ti.cast(shade, ti.u8)
+
+
+@ti.func
+def _relabel(
+    planes: ti.template(), open_pixels: ti.template(), begin: int, end: int, stride: int, per_neighbour: int,
+    threshold: int, iterations: int,
+):  # fmt: skip
+    """Update the labels of the open pixels from ``begin`` to ``end``, all at once, a number of times."""
+    plane = planes.shape[0] // PLANES
+    for iteration in range(iterations):
+        before, after = LABELS + iteration % 2, SPARE - iteration % 2
+        for k in range(begin, end):
+            i = open_pixels[k]
+            level = ti.cast(planes[COLLINEARITY * plane + i], ti.i32)
+            planes[after * plane + i] = _relaxed(planes, before * plane + i, stride, level, per_neighbour, threshold)
 
 
 @ti.kernel
 def _label_kernel(
-    images: ti.types.ndarray(dtype=ti.u8, ndim=1),  # [C * H * W * 3]
-    plates: ti.types.ndarray(dtype=ti.u8, ndim=1),  # [C * H * W * 3]
-    weights: ti.types.ndarray(dtype=ti.f32, ndim=1),  # [C * H * W] 1 / relative noise variance
-    squares: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [C * 3 * (W + 2)] scratch: |a - b|² of three rows
-    difference: ti.types.ndarray(dtype=ti.u8, ndim=1),  # [mosaic] out, and so are the others; zero before
-    collinearity: ti.types.ndarray(dtype=ti.u8, ndim=1),
-    shades: ti.types.ndarray(dtype=ti.u8, ndim=1),
-    labels: ti.types.ndarray(dtype=ti.u8, ndim=1),  # after an even number of iterations
-    spare: ti.types.ndarray(dtype=ti.u8, ndim=1),  # after an odd one
-    open_pixels: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [mosaic] scratch: those whose labels neighbours can change
+    # constants: images and plates [C * H * W * 3], 1 / relative noise variance [C * H * W]
+    images: ti.types.ndarray(dtype=ti.u8, ndim=1),
+    plates: ti.types.ndarray(dtype=ti.u8, ndim=1),
+    weights: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    # scratch
+    squares: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [C * 3 * (W + 2)] |a - b|² of three rows
+    planes: ti.types.ndarray(dtype=ti.u8, ndim=1),  # [PLANES * mosaic] out, from DIFFERENCE to SPARE; zero before
+    open_pixels: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [mosaic] pixels whose labels their neighbours can change
+    # the frame
     precision: ti.types.ndarray(dtype=ti.f32, ndim=1),  # [C] 1 / noise variance
     brightness: ti.types.ndarray(dtype=ti.f32, ndim=2),  # [C, 2] least of what is bright, and of the scene
-    boxes: ti.types.ndarray(dtype=ti.i32, ndim=2),  # [C, 4] left, top, width, height
-    corners: ti.types.ndarray(dtype=ti.i32, ndim=2),  # [C, 2] left, top in the mosaic
+    boxes: ti.types.ndarray(dtype=ti.i32, ndim=2),  # [C, 6] left, top, width, height; left, top in the mosaic
     stride: ti.i32,  # of the mosaic
     height: ti.i32,
     width: ti.i32,
     spread: ti.i32,
+    # settings
     offset_squared: ti.i32,
     shadow_min: ti.f32,
     shadow_max: ti.f32,
@@ -111,19 +155,17 @@ def _label_kernel(
         if turn % spread != 0:
             continue
         c = turn // spread
-        left = boxes[c, 0]
-        top = boxes[c, 1]
-        w = boxes[c, 2]
-        h = boxes[c, 3]
+        left, top, w, h = boxes[c, 0], boxes[c, 1], boxes[c, 2], boxes[c, 3]
         if w * h == 0:
             continue
+        plane = planes.shape[0] // PLANES
         first = c * height * width  # of the camera's pixels
-        corner = corners[c, 1] * stride + corners[c, 0]
-        line = w + 2  # of a row of squares: a pixel more on either side
+        corner = boxes[c, 5] * stride + boxes[c, 4]
+        line = w + 2  # of a row of squares: one more pixel on either side
         row_0 = c * 3 * (width + 2)
         smallest = difference_min / precision[c]
         swing = 4 * per_neighbour
-        begin = corners[c, 0] * (labels.shape[0] // stride)  # of its open pixels
+        begin = boxes[c, 4] * (plane // stride)  # of its open pixels
         end = begin
         for y in range(-1, h + 1):  # the statistic is a row behind the squares
             row = row_0 + (y + 1) % 3 * line
@@ -134,7 +176,7 @@ def _label_kernel(
                     square = _square(images, plates, 3 * (first + (top + y) * width + left + x))
                 squares[row + x + 1] = square
             if y >= 1:
-                v = top + y - 1  # in the picture
+                v = top + y - 1  # in the image
                 up = -1 if v > 0 else 0
                 down = 1 if v < height - 1 else 0
                 to = corner + (y - 1) * stride
@@ -167,49 +209,28 @@ def _label_kernel(
                             column_2 = _column(images, plates, pixel + 1, width, up, down)
                         slid = x
                         sums = column_0 + column_1 + column_2
-                        # a = b + d: every product follows from d·d, d·b and b·b without cancellation
-                        db = ti.cast(sums[0], ti.f32)
-                        bb = ti.cast(sums[1] + offset_squared, ti.f32)
-                        excess = dd + 2.0 * db  # a·a - b·b
-                        cross = bb + db  # a·b, positive thanks to the offset
-                        s = (excess + ti.sqrt(excess * excess + 4.0 * cross * cross)) / (2.0 * cross)
-                        s = ti.min(ti.max(s, shadow_min), 1.0)
-                        t = 1.0 - s
-                        residual = (dd + 2.0 * t * db + t * t * bb) / (1.0 + s * s)
-                        difference[to + x] = _level(plain * (precision[c] / 54.0))
+                        db, bb = ti.cast(sums[0], ti.f32), ti.cast(sums[1] + offset_squared, ti.f32)
+                        residual = _clamped(dd, db, bb, shadow_min)
+                        i = to + x
+                        planes[DIFFERENCE * plane + i] = _level(plain * (precision[c] / 54.0))
                         level = ti.cast(_level(residual * weights[pixel] * (precision[c] / 27.0)), ti.i32)
-                        collinearity[to + x] = ti.cast(level, ti.u8)
+                        planes[COLLINEARITY * plane + i] = ti.cast(level, ti.u8)
                         label = ti.cast(level >= threshold, ti.u8)
-                        labels[to + x] = label
-                        spare[to + x] = label
+                        planes[LABELS * plane + i] = label
+                        planes[SPARE * plane + i] = label
                         if level > 0 and threshold - swing <= level < threshold + swing:
-                            open_pixels[end] = to + x
+                            open_pixels[end] = i
                             end += 1
-                        scene = 0
-                        for k in ti.static(range(3)):
-                            scene += GREY[k] * ti.cast(plates[3 * pixel + k], ti.i32)
-                        brighter = ti.cast(sums[2], ti.f32)
-                        shade = 0
-                        if brighter > brightness[c, 0]:
-                            shade = BRIGHT
-                        elif brighter < brightness[c, 1] + (shadow_max - 1.0) * 9.0 * scene:
-                            shade = DARK
-                        shades[to + x] = ti.cast(shade, ti.u8)
-        for turn_of_labels in range(iterations):
-            for k in range(begin, end):
-                i = open_pixels[k]
-                level = ti.cast(collinearity[i], ti.i32)
-                if turn_of_labels % 2 == 0:
-                    spare[i] = _relaxed(labels, i, stride, level, per_neighbour, threshold)
-                else:
-                    labels[i] = _relaxed(spare, i, stride, level, per_neighbour, threshold)
+                        brighter, bright, dark = ti.cast(sums[2], ti.f32), brightness[c, 0], brightness[c, 1]
+                        planes[SHADES * plane + i] = _shade(plates, 3 * pixel, brighter, bright, dark, shadow_max)
+        _relabel(planes, open_pixels, begin, end, stride, per_neighbour, threshold, iterations)
 
 
 class Statistic:
-    """The test of one rig's pictures against its plates, with its buffers, made once.
+    """The test of one rig's images against its plates, with its buffers, made once.
 
-    Pictures and plates are read where they lie whenever :meth:`measure` is called. What it finds lies in mosaics of the
-    boxes that it is given, as arrays that the next call writes over.
+    :meth:`measure` reads images and plates where they lie. Its results are mosaics of the boxes that it is given, in
+    arrays that the next call overwrites.
 
     Attributes:
         difference: level of ``|a - b|² / 2`` over 27 noise variances, 0 where it is below the least.
@@ -219,12 +240,12 @@ class Statistic:
     """
 
     def __init__(self, images: NDArray[np.uint8], plates: NDArray[np.uint8], weights: NDArray[np.float32]) -> None:
-        """Pictures (C, H, W, 3); plates likewise, under each frame's gain; (C, H, W) 1 / relative noise variance."""
+        """Take images (C, H, W, 3), gain-corrected plates alike, and 1 / relative noise variance (C, H, W)."""
         cameras, self._height, self._width = images.shape[:3]
         self._spread = 0
         self._inputs = (images.reshape(-1), plates.reshape(-1), weights.reshape(-1))
         self._squares = np.zeros(cameras * 3 * (self._width + 2), np.int32)
-        self._planes = np.zeros((5, 0), np.uint8)
+        self._planes = np.zeros((PLANES, 0), np.uint8)
         self._launch: Launcher | None = None
         self.difference, self.collinearity, self.shades, self.labels = (np.zeros((0, 0), np.uint8) for _ in range(4))
 
@@ -254,7 +275,7 @@ class Statistic:
             precision: (C,) 1 / noise variance, grey levels⁻².
             brightness: (C, 2) sums over a window of the difference in brightness (weights :data:`GREY`): that of the
                 least bright thing that the scene is not, and of the scene itself.
-            boxes: (C, 4) left, top, width, height of what is looked at, within the picture; nothing else is labelled.
+            boxes: (C, 4) left, top, width, height of what is measured, within the image; nothing else is labelled.
             corners: (C, 2) left, top of each box in the mosaic, a pixel or more from each other and the edge.
             shape: (height, width) of the mosaic.
             darkness_offset: the constant component, grey levels, > 0.
@@ -264,16 +285,15 @@ class Statistic:
         ensure_runtime()
         size = shape[0] * shape[1]
         if self._launch is None or size > self._planes.shape[1]:
-            self._planes = np.zeros((5, size + size // 2), np.uint8)
+            self._planes = np.zeros((PLANES, size + size // 2), np.uint8)
             pixels = np.zeros(self._planes.shape[1], np.int32)
-            self._launch = Launcher(_label_kernel, *self._inputs, self._squares, *self._planes, pixels)
+            self._launch = Launcher(_label_kernel, *self._inputs, self._squares, self._planes.reshape(-1), pixels)
             self._spread = spread_of(len(precision))
         self._planes[:, :size] = 0
         self._launch(
             precision,
             brightness,
-            boxes,
-            corners,
+            np.concatenate([boxes, corners], axis=1),
             shape[1],
             self._height,
             self._width,
@@ -286,6 +306,6 @@ class Statistic:
             round(octaves_per_neighbour * STEPS_PER_OCTAVE),
             iterations,
         )
-        planes = self._planes[:, :size].reshape(5, *shape)
-        self.difference, self.collinearity, self.shades = planes[:3]
-        self.labels = planes[3 + iterations % 2]
+        planes = self._planes[:, :size].reshape(PLANES, *shape)
+        self.difference, self.collinearity, self.shades = planes[:LABELS]
+        self.labels = planes[LABELS + iterations % 2]

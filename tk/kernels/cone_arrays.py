@@ -59,12 +59,6 @@ def kind_of(parts: ti.template(), p: int):
 
 
 @ti.func
-def limb_of(parts: ti.template(), p: int):
-    """Return the number of the limb of part p."""
-    return ti.cast(parts[p, PART_LIMB], ti.i32)
-
-
-@ti.func
 def place_part(joints: ti.template(), parts: ti.template(), b: int, p: int):
     """Return rotation and translation from part p to the world at pose b."""
     R0 = ti.Matrix([[parts[p, PART_FRAME + 4 * i + j] for j in ti.static(range(3))] for i in ti.static(range(3))])

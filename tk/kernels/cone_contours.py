@@ -11,12 +11,12 @@ Scratch of B poses, V cameras, P parts and Q curves:
     of its image in pixels, the sign that turns its image's normal outwards, and the corners of a polyline in pixels.
 """
 
-from tk.kernels.cone_arrays import NEAREST_M, kind_of, limb_of, place_part, shape_of, store_frame
+from tk.kernels.cone_arrays import NEAREST_M, PART_LIMB, kind_of, place_part, shape_of, store_frame
 from tk.kernels.cones import SIDE_B, curve_of, enclosing_radius, enter, interior_point, point_on
 from tk.kernels.kinematics import load_rotation, load_translation
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ti
-from tk.kernels.vectors import cross, dot, norm_sqr, times, transposed_times
+from tk.kernels.vectors import cross, dot, norm2, norm_sqr, times, transposed_times
 
 # Chords that approximate a curve when its length is measured and when edgels are compared with it: 30° each of a
 # circle, at most 3.4 % of its radius off. Straight curves have one.
@@ -37,10 +37,11 @@ def place_parts(joints: ti.template(), parts: ti.template(), b: int, placed: ti.
     for p in range(parts.shape[0]):
         R, t = place_part(joints, parts, b, p)
         store_frame(placed, b, p, R, t)
-        middle = times(R, interior_point(kind_of(parts, p), shape_of(parts, p))) + t
+        kind, shape = kind_of(parts, p), shape_of(parts, p)
+        middle = times(R, interior_point(kind, shape)) + t
         for a in ti.static(range(3)):
             placed[b, p, BALL + a] = middle[a]
-        placed[b, p, BALL_SQUARE] = enclosing_radius(kind_of(parts, p), shape_of(parts, p)) ** 2
+        placed[b, p, BALL_SQUARE] = enclosing_radius(kind, shape) ** 2
 
 
 @ti.func
@@ -111,15 +112,6 @@ def find_hider(parts: ti.template(), placed: ti.template(), b: int, candidates: 
 
 
 @ti.func
-def chords_of(kind: int):
-    """Return the number of chords of a curve."""
-    chords = CHORDS
-    if kind <= SIDE_B:
-        chords = 1
-    return chords
-
-
-@ti.func
 def load_corner(outlines: ti.template(), c: int, i: int):
     """Return the pixel (2,) of corner i of a curve."""
     return ti.Vector([outlines[c, CORNERS + 2 * i], outlines[c, CORNERS + 2 * i + 1]])
@@ -142,7 +134,7 @@ def trace_curve(
     R, t = load_rotation(placed, b, p), load_translation(placed, b, p)
     center = transposed_times(R, camera_center(cameras, v) - t)
     visible, params = curve_of(kind, shape, center)
-    chords = chords_of(kind)
+    chords = ti.select(kind <= SIDE_B, 1, CHORDS)
     length = 0.0 * shape[0]
     sign = 0.0 * shape[0]
     last = ti.Vector([0.0 * length, 0.0 * length])
@@ -153,7 +145,7 @@ def trace_curve(
             if z < NEAREST_M:
                 visible = 0
             if i > 0:
-                length += (pixel - last).norm()
+                length += norm2(pixel - last)
             if i == 0:
                 # the plane of viewing ray and tangent, turned away from the part's inside
                 n = cross(tangent, x - center)
@@ -198,8 +190,8 @@ def nearest_rival(
     near, nearest = False, reach_sqr
     for q in range(curves.shape[0]):
         c = first + q
-        if limb_of(parts, curves[q, 0]) != limb_of(parts, p) and outlines[c, VISIBLE] > 0.0:
-            for s in range(chords_of(curves[q, 1])):
+        if parts[curves[q, 0], PART_LIMB] != parts[p, PART_LIMB] and outlines[c, VISIBLE] > 0.0:
+            for s in range(ti.select(curves[q, 1] <= SIDE_B, 1, CHORDS)):
                 e0, e1 = load_corner(outlines, c, s), load_corner(outlines, c, s + 1)
                 facing = ti.Vector([e1[1] - e0[1], e0[0] - e1[0]]).dot(n) * outlines[c, SIGN]
                 if facing > 0.0:

@@ -23,30 +23,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from tk.kernels.alignment import ENTRY_NUMBERS, add_alignment, add_curvature
-from tk.kernels.kinematics import (
-    forward_tree,
-    load_rotation,
-    load_translation,
-    load_vector3,
-    pack_tree,
-)
+from tk.kernels.kinematics import forward_tree, load_rotation, load_translation, pack_tree
 from tk.kernels.launch import Launcher
 from tk.kernels.linearisation import Linearisation
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective_pairs import (
-    COVERAGE_NU,
-    COVERAGE_REACH,
-    COVERAGE_SCALE,
-    NU,
     PATCH_BITS,
-    PIECE_DOF,
-    PIECE_WEIGHT,
-    SAMPLE_DOF,
-    SAMPLE_WEIGHT,
-    SCALE,
     add_residual,
-    nearest_piece,
-    pair_sample,
+    assign,
+    load_pair,
+    load_voxel,
     place_pieces,
 )
 from tk.kernels.projection import CAMERA_NUMBERS
@@ -108,45 +94,19 @@ def _objective_kernel(real):
             for e in range(E * part // tasks, E * (part + 1) // tasks):
                 add_alignment(scratch, cameras, entries, sums, b, c, e)
             for m in range((M + Q) * part // tasks, (M + Q) * (part + 1) // tasks):
-                v = -1
-                k = 0
-                x0 = ti.Vector([settings[0] * 0.0, settings[0] * 0.0, settings[0] * 0.0])
-                inv_sigma2, nu, scale = x0[0], settings[NU], settings[SCALE]
-                if m < M:
-                    n = chosen[b, m]
-                    if hold == 0:
-                        v = pair_sample(samples, pieces, voxels, fits, starts, settings, scratch, c, D, n)
-                        assigned[b, m] = v
-                    else:
-                        v = assigned[b, m]
-                    k = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
-                    x0 = load_vector3(samples, n)
-                    inv_sigma2 = samples[n, SAMPLE_WEIGHT]
-                else:
-                    scale, nu = settings[COVERAGE_SCALE], settings[COVERAGE_NU]
-                    q = m - M
-                    v = chosen[b, m]
-                    i = -1
-                    if hold == 0:
-                        y = ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
-                        i, x0 = nearest_piece(scratch, c, D, pieces, fits[v], y, settings[COVERAGE_REACH])
-                        covering[b, q, 0] = ti.cast(i, real)
-                        for a in ti.static(range(3)):
-                            covering[b, q, 1 + a] = x0[a]
-                    else:
-                        i = ti.cast(covering[b, q, 0], ti.i32)
-                        x0 = ti.Vector([covering[b, q, 1 + a] for a in ti.static(range(3))])
-                    if i < 0:
-                        v = -1
-                    else:
-                        k = ti.cast(pieces[i, PIECE_DOF], ti.i32)
-                        inv_sigma2 = pieces[i, PIECE_WEIGHT]
+                if hold == 0:
+                    assign(
+                        samples, pieces, voxels, fits, starts, settings, chosen, scratch, b, c, D, m, M,
+                        assigned, covering,
+                    )  # fmt: skip
+                v, k, x0, inv_sigma2, nu, scale = load_pair(
+                    samples, pieces, settings, chosen, assigned, covering, b, m, M
+                )
                 if v < 0:
                     sums[c, 0] = sums[c, 0] + scale
                 else:
-                    y = ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
                     x = times(load_rotation(scratch, c, k), x0) + load_translation(scratch, c, k)
-                    add_residual(scratch, sums, c, k, x, x - y, inv_sigma2, nu, scale)
+                    add_residual(scratch, sums, c, k, x, x - load_voxel(voxels, v, nu), inv_sigma2, nu, scale)
             collect_wrenches(tree, c, scratch, sums)
 
     return objective
@@ -171,12 +131,12 @@ def _linearise_kernel(real):
         M: ti.i32,
         Q: ti.i32,
         E: ti.i32,
-        chosen: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M + Q,)
+        chosen: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (1, M + Q)
         entries: ti.types.ndarray(dtype=real, ndim=3),  # (1, E, 16)
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (1, D)
         scratch: ti.types.ndarray(dtype=real, ndim=3),  # (C, D or more, 39)
-        assigned: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (M,)
-        covering: ti.types.ndarray(dtype=real, ndim=2),  # (Q, 4)
+        assigned: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (1, M)
+        covering: ti.types.ndarray(dtype=real, ndim=3),  # (1, Q, 4)
         residual: ti.types.ndarray(dtype=real, ndim=2),  # (M + Q, 4) out, metres, and the voxel or -1
         hessian: ti.types.ndarray(dtype=real, ndim=3),  # (C, D, D) out, zeroed by the caller
     ):
@@ -192,34 +152,19 @@ def _linearise_kernel(real):
             for e in range(E * c // tasks, E * (c + 1) // tasks):
                 add_curvature(scratch, cameras, entries, c, e, floor, origin)
             for m in range((M + Q) * c // tasks, (M + Q) * (c + 1) // tasks):
-                k_last = 0
-                v = -1
-                x0 = ti.Vector([pose[0, 0] * 0.0, pose[0, 0] * 0.0, pose[0, 0] * 0.0])
-                inv_sigma2, nu, scale = x0[0], settings[NU], settings[SCALE]
-                if m < M:
-                    n = chosen[m]
-                    k_last = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
-                    x0 = load_vector3(samples, n)
-                    v = assigned[m]
-                    inv_sigma2 = samples[n, SAMPLE_WEIGHT]
-                else:
-                    i = ti.cast(covering[m - M, 0], ti.i32)
-                    if i >= 0:
-                        k_last = ti.cast(pieces[i, PIECE_DOF], ti.i32)
-                        v = chosen[m]
-                        x0 = ti.Vector([covering[m - M, 1 + a] for a in ti.static(range(3))])
-                        nu, scale = settings[COVERAGE_NU], settings[COVERAGE_SCALE]
-                        inv_sigma2 = pieces[i, PIECE_WEIGHT]
-                residual[m, 3] = ti.cast(v, real)
-                x = times(load_rotation(scratch, c, k_last), x0) + load_translation(scratch, c, k_last)
+                v, k, x0, inv_sigma2, nu, scale = load_pair(
+                    samples, pieces, settings, chosen, assigned, covering, 0, m, M
+                )
+                residual[m, 3] = v
                 for a in ti.static(range(3)):
                     residual[m, a] = 0.0
                 if v >= 0:
-                    r = x - ti.Vector([ti.cast(voxels[v, a], real) for a in ti.static(range(3))])
+                    x = times(load_rotation(scratch, c, k), x0) + load_translation(scratch, c, k)
+                    r = x - load_voxel(voxels, v, nu)
                     for a in ti.static(range(3)):
                         residual[m, a] = r[a]
                     decay = ti.exp(-0.5 * norm_sqr(r) * inv_sigma2 / nu)
-                    add_inertia(scratch, c, k_last, x - origin, scale * inv_sigma2 / nu * ti.max(decay, floor))
+                    add_inertia(scratch, c, k, x - origin, scale * inv_sigma2 / nu * ti.max(decay, floor))
             collect_inertias(tree, c, scratch, origin, hessian)
 
     return linearise
@@ -438,12 +383,12 @@ class ObjectiveKernel:
             M,
             Q,
             E,
-            np.ascontiguousarray(np.concatenate([chosen, voxels[:Q]]), np.int32),
+            np.ascontiguousarray(np.concatenate([chosen, voxels[:Q]])[None], np.int32),
             self._entries(entries),
             np.ascontiguousarray(pose[None], self.dtype),
             self._scratch_of(tasks),
-            np.ascontiguousarray(held.assigned[0], np.int32),
-            np.ascontiguousarray(held.covering[0], self.dtype),
+            np.ascontiguousarray(held.assigned, np.int32),
+            np.ascontiguousarray(held.covering, self.dtype),
             found,
             hessian,
         )

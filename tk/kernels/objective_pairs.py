@@ -202,3 +202,75 @@ def pair_sample(
             ti.cast(settings[REACH], ti.f32),
         )
     return v
+
+
+@ti.func
+def assign(
+    samples: ti.template(),
+    pieces: ti.template(),
+    voxels: ti.template(),
+    fits: ti.template(),
+    starts: ti.template(),
+    settings: ti.template(),
+    chosen: ti.template(),
+    scratch: ti.template(),
+    b: int,
+    c: int,
+    D: int,
+    m: int,
+    M: int,
+    assigned: ti.template(),
+    covering: ti.template(),
+):
+    """Assign a voxel to sample m of pose b, or a piece and its nearest point to voxel m - M of the coverage term."""
+    if m < M:
+        n = chosen[b, m]
+        assigned[b, m] = pair_sample(samples, pieces, voxels, fits, starts, settings, scratch, c, D, n)
+    else:
+        v = chosen[b, m]
+        y = load_voxel(voxels, v, settings[0])
+        i, x0 = nearest_piece(scratch, c, D, pieces, fits[v], y, settings[COVERAGE_REACH])
+        covering[b, m - M, 0] = i
+        for a in ti.static(range(3)):
+            covering[b, m - M, 1 + a] = x0[a]
+
+
+@ti.func
+def load_voxel(voxels: ti.template(), v: int, like):
+    """Return voxel v (3,) in the precision of ``like``."""
+    zero = like * 0.0
+    return ti.Vector([zero + voxels[v, a] for a in ti.static(range(3))])
+
+
+@ti.func
+def load_pair(
+    samples: ti.template(),
+    pieces: ti.template(),
+    settings: ti.template(),
+    chosen: ti.template(),
+    assigned: ti.template(),
+    covering: ti.template(),
+    b: int,
+    m: int,
+    M: int,
+):
+    """Return pair m of pose b as assigned: the voxel or -1, the last degree of freedom above the point, the point in
+    the zero configuration, 1/σ², ν and the pair's share of f."""
+    v, k = -1, 0
+    x0 = ti.Vector([settings[0] * 0.0, settings[0] * 0.0, settings[0] * 0.0])
+    inv_sigma2, nu, scale = x0[0], settings[NU], settings[SCALE]
+    if m < M:
+        n = chosen[b, m]
+        v = assigned[b, m]
+        k = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
+        x0 = load_vector3(samples, n)
+        inv_sigma2 = samples[n, SAMPLE_WEIGHT]
+    else:
+        nu, scale = settings[COVERAGE_NU], settings[COVERAGE_SCALE]
+        i = ti.cast(covering[b, m - M, 0], ti.i32)
+        if i >= 0:
+            v = chosen[b, m]
+            k = ti.cast(pieces[i, PIECE_DOF], ti.i32)
+            x0 = ti.Vector([covering[b, m - M, 1 + a] for a in ti.static(range(3))])
+            inv_sigma2 = pieces[i, PIECE_WEIGHT]
+    return v, k, x0, inv_sigma2, nu, scale

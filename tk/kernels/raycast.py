@@ -20,7 +20,7 @@ from tk.kernels.kinematics import JOINT_NUMBERS, TREE_PARENT, forward_chain, loa
 from tk.kernels.launch import Launcher
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
-from tk.kernels.vectors import norm_sqr, times
+from tk.kernels.vectors import norm2, norm_sqr, times
 
 # Safety factors of the capsule that encloses a part in an image, beyond first order: of its radius, and of the distance
 # between a distorted axis and its chord, measured at the middle. Too small, and rays miss parts near the border of
@@ -107,10 +107,10 @@ def enclose_part(
     outline: ti.template(),  # (B, V, P, _COLUMNS) out
 ):
     """Store the capsule, in pixels, that encloses a part in each image, and the camera in the unit part's frame."""
-    shape = shape_of(parts, p)
-    size = extent(kind_of(parts, p), shape, 1.0)
+    kind, shape = kind_of(parts, p), shape_of(parts, p)
+    size = extent(kind, shape, 1.0)
     M, t = load_rotation(placed, b, p), load_translation(placed, b, p)
-    z0, z1, reach = capsule(kind_of(parts, p), shape)
+    z0, z1, reach = capsule(kind, shape)
     along_part = ti.Vector([M[2, i] * size[2] for i in ti.static(range(3))])
     for v in range(cameras.shape[0]):
         begin, J0, depth0 = project(cameras, v, t + z0 * along_part)
@@ -123,7 +123,7 @@ def enclose_part(
             chord = end - begin
             x = outline[b, v, p, _MIDDLE] - begin[0]
             y = outline[b, v, p, _MIDDLE + 1] - begin[1]
-            offset = ti.abs(chord[0] * y - chord[1] * x) / ti.max(chord.norm(), 1e-6)
+            offset = ti.abs(chord[0] * y - chord[1] * x) / ti.max(norm2(chord), 1e-6)
             radius = MARGIN * growth * reach + BEND * offset
         elif farthest > -reach:
             # the camera is close to the part or inside: all pixels
@@ -131,7 +131,7 @@ def enclose_part(
             begin *= 0.0
             end = begin
         along = end - begin
-        across = radius / ti.max(along.norm(), 1e-6)
+        across = radius / ti.max(norm2(along), 1e-6)
         origin = times(M, camera_center(cameras, v) - t)
         outline[b, v, p, _RADIUS] = radius
         outline[b, v, p, _ACROSS], outline[b, v, p, _ACROSS + 1] = across * along[1], -across * along[0]
@@ -244,10 +244,11 @@ def _cast_kernel(real, alone):
             for k in range(K):
                 p = drawn[k]
                 R, t = place_part(joints, parts, b, p)
-                size = extent(kind_of(parts, p), shape_of(parts, p), 1.0)
+                kind, shape = kind_of(parts, p), shape_of(parts, p)
+                size = extent(kind, shape, 1.0)
                 M = ti.Matrix([[R[j, i] / size[i] for j in ti.static(range(3))] for i in ti.static(range(3))])
                 store_frame(placed, b, p, M, t)
-                middle = times(R, interior_point(kind_of(parts, p), shape_of(parts, p))) + t
+                middle = times(R, interior_point(kind, shape)) + t
                 for v in range(V):
                     more, one = middle_cost(middle, cameras, cost, outline, b, v, p, group[p], step)
                     out += ti.cast(more, real)

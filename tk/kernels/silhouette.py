@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.cone_arrays import PART_DOF, ConeArrays, limb_of, shape_of
+from tk.kernels.cone_arrays import PART_DOF, PART_LIMB, ConeArrays, shape_of
 from tk.kernels.cone_contours import (
     LENGTH,
     OUTLINE_NUMBERS,
@@ -33,7 +33,7 @@ from tk.kernels.launch import Launcher
 from tk.kernels.line_search import COLOR_BINS, Regions, SearchSettings, in_picture, search_colors, search_mask
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
-from tk.kernels.vectors import cross, pulled, times, transposed_times
+from tk.kernels.vectors import cross, norm2, pulled, times, transposed_times
 from tk.kernels.wrench import (
     INERTIA,
     INERTIA_NUMBERS,
@@ -100,7 +100,7 @@ def sample_curve(cameras: ti.template(), v: int, kind: int, shape, center, param
     x = times(R, x_part) + t
     pixel, J, _ = project(cameras, v, x)
     along = times(J, times(R, tangent))
-    norm = along.norm()
+    norm = norm2(along)
     n = ti.Vector([along[1], -along[0]]) * (sign / ti.max(norm, 1e-9))
     return x_part, x, pixel, J, n, norm > 1e-6
 
@@ -235,7 +235,7 @@ def _equations_kernel(real, alone):
                             # in front of another part no edge of the silhouette is expected, but a border of colours
                             if (
                                 numbers[COLORS] > 0.0
-                                and limb_of(parts, behind) != limb_of(parts, p)
+                                and parts[behind, PART_LIMB] != parts[p, PART_LIMB]
                                 and group[behind] != group[p]
                             ):
                                 certainty, place = search_colors(

@@ -1,8 +1,8 @@
 """Products of small vectors and matrices, written out.
 
-Taichi's own operators for them (``@``, ``.dot``, ``.cross``, ``.norm_sqr``, ``.transpose``) are Taichi functions that
-handle every shape. A kernel takes each of their calls in anew, which is half of the time that its Python transformation
-takes at each start. Those below are a line each, for three dimensions, and do the same sums in the same order.
+Taichi's own operators (``@``, ``.dot``, ``.cross``, ``.norm``, ``.transpose``) are Taichi functions for every shape.
+Taichi transforms each of their calls again, which is half of the time of a kernel's Python transformation at each
+start. The functions below are one line each, for three dimensions, and do the same sums in the same order.
 """
 
 from tk.kernels.runtime import ti
@@ -53,3 +53,9 @@ def cross(a, b):
 def norm_sqr(a):
     """|a|², for a vector (3,)."""
     return a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
+
+
+@ti.func
+def norm2(a):
+    """|a|, for a vector (2,)."""
+    return ti.sqrt(a[0] * a[0] + a[1] * a[1])
