@@ -34,17 +34,11 @@ NUMERIC = 1e-7
 
 def kernel_of(dtype=np.float64):
     return ObjectiveKernel(
-        axis=SKELETON.axis,
-        point=SKELETON.anchor,
-        prismatic=SKELETON.prismatic,
-        parent=SKELETON.parent,
+        BODY.arrays,
         local=BODY.points,
         last_dof=SAMPLE_DOF,
         sigma=BODY.diameter,
         patch=BODY.patch,
-        piece_dof=PIECE_DOF,
-        piece_frame=np.array([p.T_body_piece[:3] for p in BODY.pieces]),
-        piece_shape=np.array([[*p.radii, p.e1, p.e2, p.z_lower, p.z_upper] for p in BODY.pieces]),
         piece_sigma=PIECE_SIGMA,
         dtype=dtype,
     )

@@ -25,8 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tk.kernels.kinematics import JOINT_NUMBERS, forward_tree, pack_tree
-from tk.kernels.objective_pairs import PIECE_SHAPE
+from tk.kernels.kinematics import JOINT_NUMBERS, forward_tree
 from tk.kernels.occlusion import (
     PLACED_CAMERA,
     PLACED_NUMBERS,
@@ -37,6 +36,7 @@ from tk.kernels.occlusion import (
     pieces_beside,
     place_pieces,
 )
+from tk.kernels.piece_arrays import PIECE_SHAPE, PieceArrays
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.superellipsoid import power
@@ -249,10 +249,7 @@ class ContourKernel:
     """The contours of one body in a rig's cameras: constants and scratch are laid out once.
 
     Args:
-        axis, point: (D, 3) twists; prismatic, parent: (D,).
-        piece_dof: (P,) last degree of freedom above each superellipsoid.
-        piece_frame: (P, 3, 4) from its frame to the zero configuration.
-        piece_shape: (P, 7) a1 a2 a3 ε1 ε2 z_lower z_upper.
+        body: the body.
         strip_angles: (S, N, 2) η and ω along each strip, radians; a circle's last sample is its first.
         strip_normals: (S, N, 3) n_d of eq. 2 there, in the piece's frame, 1/m.
         strip_piece: (S,) the piece of each strip; strip_segment: (S,) its segment.
@@ -266,14 +263,8 @@ class ContourKernel:
 
     def __init__(
         self,
+        body: PieceArrays,
         *,
-        axis: np.ndarray,
-        point: np.ndarray,
-        prismatic: np.ndarray,
-        parent: np.ndarray,
-        piece_dof: np.ndarray,
-        piece_frame: np.ndarray,
-        piece_shape: np.ndarray,
         strip_angles: np.ndarray,
         strip_normals: np.ndarray,
         strip_piece: np.ndarray,
@@ -292,8 +283,8 @@ class ContourKernel:
         def whole(array: np.ndarray) -> np.ndarray:
             return np.ascontiguousarray(array, np.int32)
 
-        self.tree = real(pack_tree(axis, point, prismatic, parent))
-        self.pieces = real(np.column_stack([np.reshape(piece_frame, (-1, 12)), piece_shape, piece_dof]))
+        self.tree = real(body.tree)
+        self.pieces = real(body.pieces)
         samples = np.concatenate([strip_angles, strip_normals], axis=2)
         self.strips = real(np.concatenate([samples, np.zeros_like(samples[:, :1])], axis=1))
         self.strips[:, -1, 0] = strip_piece

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tk.kernels.alignment import ENTRY_NUMBERS, add_alignment, add_curvature
-from tk.kernels.kinematics import forward_tree, load_rotation, load_translation, pack_tree
+from tk.kernels.kinematics import forward_tree, load_rotation, load_translation
 from tk.kernels.launch import Launcher
 from tk.kernels.linearisation import Linearisation
 from tk.kernels.nearest import SurfaceIndex
@@ -35,6 +35,7 @@ from tk.kernels.objective_pairs import (
     load_voxel,
     place_pieces,
 )
+from tk.kernels.piece_arrays import PieceArrays
 from tk.kernels.projection import CAMERA_NUMBERS
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.vectors import norm_sqr, times
@@ -202,12 +203,9 @@ class ObjectiveKernel:
     """The objective of one body: constants and scratch are laid out once, a frame's voxels are handed in.
 
     Args:
-        axis, point: (D, 3) twists; prismatic, parent: (D,).
+        body: the body.
         local: (N, 3) surface samples in the zero configuration; last_dof, patch: (N,).
         sigma: (N,) σ of eq. 10 at the samples, metres.
-        piece_dof: (P,) last degree of freedom above each superellipsoid.
-        piece_frame: (P, 3, 4) from its frame to the zero configuration.
-        piece_shape: (P, 7) a1 a2 a3 ε1 ε2 z_lower z_upper.
         piece_sigma: (P,) σ of voxels that the piece covers, metres.
         piece_patches: (P,) int64 bit masks of the colour patches on each piece: a voxel that fits none of them is not
             covered by the piece. All patches by default.
@@ -220,18 +218,12 @@ class ObjectiveKernel:
 
     def __init__(
         self,
+        body: PieceArrays,
         *,
-        axis: np.ndarray,
-        point: np.ndarray,
-        prismatic: np.ndarray,
-        parent: np.ndarray,
         local: np.ndarray,
         last_dof: np.ndarray,
         sigma: np.ndarray,
         patch: np.ndarray,
-        piece_dof: np.ndarray,
-        piece_frame: np.ndarray,
-        piece_shape: np.ndarray,
         piece_sigma: np.ndarray,
         piece_patches: np.ndarray | None = None,
         barred: np.ndarray | None = None,
@@ -241,26 +233,25 @@ class ObjectiveKernel:
     ) -> None:
         ensure_runtime()
         self.dtype = dtype
-        self.degrees = len(axis)
+        self.degrees = len(body.tree)
         self.launches = 0
 
         def real(array: np.ndarray) -> np.ndarray:
             return np.ascontiguousarray(array, dtype)
 
-        tree = real(pack_tree(axis, point, prismatic, parent))
+        tree = real(body.tree)
         weight = 1.0 / np.asarray(sigma, np.float64) ** 2
         piece_weight = 1.0 / np.asarray(piece_sigma, np.float64) ** 2
         self._weights = weight, piece_weight
         if barred is None:
             barred = np.zeros(len(local), np.int32)
         if piece_part is None:
-            piece_part = np.zeros(len(piece_dof), np.int32)
+            piece_part = np.zeros(len(body.pieces), np.int32)
         if piece_patches is None:
-            piece_patches = np.full(len(piece_dof), 2**63 - 1, np.int64)
+            piece_patches = np.full(len(body.pieces), 2**63 - 1, np.int64)
         patches = [piece_patches >> PATCH_BITS * part & (1 << PATCH_BITS) - 1 for part in range(3)]
         samples = real(np.column_stack([local, last_dof, patch, weight, barred]))
-        frame = np.reshape(piece_frame, (-1, 12))
-        self._pieces = real(np.column_stack([frame, piece_shape, piece_dof, piece_weight, piece_part, *patches]))
+        self._pieces = real(np.column_stack([body.pieces, piece_weight, piece_part, *patches]))
         packed_cameras = real(np.zeros((1, CAMERA_NUMBERS)) if cameras is None else cameras)
         precision = ti.f64 if dtype == np.float64 else ti.f32
         constants = tree, samples, self._pieces, packed_cameras

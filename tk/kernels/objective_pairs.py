@@ -5,6 +5,7 @@ Part of :mod:`tk.kernels.objective`, which says what the terms are.
 
 from tk.kernels.kinematics import load_rotation, load_translation, load_vector3
 from tk.kernels.nearest import nearest_voxel
+from tk.kernels.piece_arrays import PIECE_DOF, PIECE_NUMBERS, PIECE_SHAPE
 from tk.kernels.runtime import ti
 from tk.kernels.superellipsoid import implicit, project
 from tk.kernels.vectors import cross, norm_sqr, product, times, transposed_times
@@ -13,9 +14,9 @@ from tk.kernels.wrench import MOTION, WRENCH, add_wrench, load_wrench
 # Columns of the packed arrays. Every array that a launch is handed costs about 6 µs, so the body comes in few.
 # Of a sample, after its position; the weight is 1/σ²:
 SAMPLE_DOF, SAMPLE_PATCH, SAMPLE_WEIGHT, SAMPLE_BARRED = range(3, 7)
-# Of a piece, after the 3×4 frame: a1 a2 a3 ε1 ε2 z_lower z_upper, and so on. Its colour patches, a bit mask of 63, are
-# in three numbers of 21 bits, which a float32 holds.
-PIECE_SHAPE, PIECE_DOF, PIECE_WEIGHT, PIECE_PART, PIECE_PATCHES, PIECE_NUMBERS = 12, 19, 20, 21, 22, 25
+# Of a piece, after those of PieceArrays. Its colour patches, a bit mask of 63, are in three numbers of 21 bits, which a
+# float32 represents exactly.
+PIECE_WEIGHT, PIECE_PART, PIECE_PATCHES = PIECE_NUMBERS, PIECE_NUMBERS + 1, PIECE_NUMBERS + 2
 PATCH_BITS = 21
 # Of the scratch's rows after the joints, one a piece: after the 3×4 frame in the world the bounding sphere.
 SPHERE, SPHERE_RADIUS = 12, 15

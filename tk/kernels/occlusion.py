@@ -14,7 +14,7 @@ not hide each other, or every seam of the model would flicker.
 """
 
 from tk.kernels.kinematics import load_rotation, load_translation
-from tk.kernels.objective_pairs import PIECE_DOF, PIECE_SHAPE
+from tk.kernels.piece_arrays import PIECE_DOF, PIECE_SHAPE
 from tk.kernels.runtime import ti
 from tk.kernels.superellipsoid import implicit, inside_outside, is_quadric, power
 from tk.kernels.vectors import dot, norm_sqr, product, times, transposed_times

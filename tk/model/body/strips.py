@@ -119,17 +119,8 @@ def build_strips(body: SuperellipsoidBody, circles: int = 20, meridians: int = 1
 
 def contour_kernel(body: SuperellipsoidBody, strips: Strips, rig: Rig, dtype: type = np.float32) -> ContourKernel:
     """The kernel that finds this body's contour points in these cameras."""
-    skeleton = body.skeleton
-    T_world_body = np.eye(4)
-    T_world_body[:3, :3] = skeleton.T_world_body
     return ContourKernel(
-        axis=skeleton.axis,
-        point=skeleton.anchor,
-        prismatic=skeleton.prismatic,
-        parent=skeleton.parent,
-        piece_dof=skeleton.segment_dof[[SEGMENTS.index(p.segment) for p in body.pieces]],
-        piece_frame=np.array([(T_world_body @ p.T_body_piece)[:3] for p in body.pieces]),
-        piece_shape=np.array([[*p.radii, p.e1, p.e2, p.z_lower, p.z_upper] for p in body.pieces]),
+        body.arrays,
         strip_angles=strips.angles,
         strip_normals=strips.normals,
         strip_piece=strips.piece,

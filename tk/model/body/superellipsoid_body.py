@@ -8,11 +8,14 @@ skins.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.cones import CONE
+from tk.kernels.kinematics import pack_tree
+from tk.kernels.piece_arrays import PieceArrays, pack_pieces
 from tk.model.body.cone_body import ConeBody, ConePart, group_of
 from tk.model.body.gait_poses import neutral_pose
 from tk.model.body.skeleton import SEGMENTS, Skeleton, build_skeleton
@@ -59,6 +62,20 @@ class SuperellipsoidBody:
     diameter: Float
     patch: NDArray[np.int32]
     patch_names: tuple[str, ...]
+
+    @cached_property
+    def arrays(self) -> PieceArrays:
+        """The body for the kernels."""
+        skeleton = self.skeleton
+        T_world_body = np.eye(4)
+        T_world_body[:3, :3] = skeleton.T_world_body
+        pieces = pack_pieces(
+            frame=np.array([(T_world_body @ p.T_body_piece)[:3] for p in self.pieces]),
+            shape=np.array([[*p.radii, p.e1, p.e2, p.z_lower, p.z_upper] for p in self.pieces]),
+            dof=skeleton.segment_dof[[SEGMENTS.index(p.segment) for p in self.pieces]],
+        )
+        tree = pack_tree(skeleton.axis, skeleton.anchor, skeleton.prismatic, skeleton.parent)
+        return PieceArrays(tree, pieces)
 
     def place(self, pose: Float) -> Float:
         """Surface samples (N, 3) at a pose, world frame. Float64 reference for the kernels."""

@@ -126,22 +126,14 @@ class BodyObjective:
         self.sampling = sampling
         self.contours = contours
         skeleton, pieces = body.skeleton, body.pieces
-        T_world_body = np.eye(4)
-        T_world_body[:3, :3] = skeleton.T_world_body
         fixed = sampling.sigma_m
         self.piece_segment = np.array([SEGMENTS.index(p.segment) for p in pieces])
         self.kernel = ObjectiveKernel(
-            axis=skeleton.axis,
-            point=skeleton.anchor,
-            prismatic=skeleton.prismatic,
-            parent=skeleton.parent,
+            body.arrays,
             local=body.points,
             last_dof=skeleton.segment_dof[body.segment],
             sigma=np.full(len(body.points), fixed) if fixed else body.diameter,
             patch=body.patch,
-            piece_dof=skeleton.segment_dof[self.piece_segment],
-            piece_frame=np.array([(T_world_body @ p.T_body_piece)[:3] for p in pieces]),
-            piece_shape=np.array([[*p.radii, p.e1, p.e2, p.z_lower, p.z_upper] for p in pieces]),
             piece_sigma=np.array([fixed or p.diameter_m for p in pieces]),
             piece_patches=piece_patches(body),
             barred=BARRED[body.segment],
