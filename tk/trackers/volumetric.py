@@ -1,6 +1,6 @@
 """The volumetric tracker: visual hull, colour, superellipsoid body, Stochastic Meta Descent (Kehl & Van Gool 2006).
 
-A frame's way, top to bottom, as :meth:`VolumetricTracker.step` has it: figure 8 of the paper, with what goes before.
+The steps of a frame in :meth:`VolumetricTracker.step`, with their sections; figure 8 of the paper starts at (1).
 
     masks → visual hull, coloured surface      4.1
     (1) colour segmentation                    6.1.3
@@ -8,7 +8,7 @@ A frame's way, top to bottom, as :meth:`VolumetricTracker.step` has it: figure 8
     (3) five chains at ε₂, the torso held      6.4
     (4) colour models updated                  eq. 16
 
-Where it departs from the paper is told in docs/method.md.
+docs/method.md lists the departures from the paper.
 """
 
 from __future__ import annotations
@@ -49,38 +49,39 @@ from tk.trackers.protocol import Estimate, Observation, Stopwatch, drift
 
 Float = NDArray[np.float64]
 
-# Cells of the nearest-neighbour search, in voxels: some twenty surface voxels a cell.
+# Edge of a cell of the nearest-neighbour search, voxels: about twenty surface voxels a cell. Affects speed only.
 CELL_VOXELS = 4.0
-# Fewer surface voxels than this are no person.
+# Minimum number of surface voxels of a person: a person has about 1,300 in a grid of 64³. Smaller hulls are noise.
 LEAST_VOXELS = 60
-# A frame is lost, too, when more than this share of the samples of a limb, the head or the torso has no voxel near it,
+# Status "lost": more than this share of the samples of a limb, the head or the torso has no voxel near. Chosen on the
+# development captures; sensitivity not measured.
 LOST_LIMB = 0.6
-# or when this much more of the hull's surface than usual is farther than 10 cm from the body: the body is somewhere,
-# but the person is elsewhere.
+# Status "lost": the share of the hull's surface farther than 10 cm from the body exceeds its baseline by this: the body
+# has converged to a place where the person is not. Chosen on the development captures; sensitivity not measured.
 LOST_UNEXPLAINED = 0.25
-# What a waist bent to the side by θ radians costs: half of this times θ², in units of the objective; bending forward
-# costs three times as much, twisting five times. The lumbar spine bends where the picture asks for it, and not where
-# nothing does.
-WAIST_STIFFNESS = 0.1
+# Cost of a waist bent to the side by θ radians: half of this times θ², in units of the objective; bending forward costs
+# three times as much, twisting five times. Chosen on the development captures; sensitivity not measured. At 0 the waist
+# follows noise, far above it stays straight.
+WAIST_COST = 0.1
 
-# The paper's schedule (6.2, 6.4), and what stands in for numbers that it does not print: see docs/method.md.
+# The paper's schedule (6.2, 6.4), and values for the numbers that it does not print: see docs/method.md.
 SCHEDULE = schedule.ScheduleSettings()
 SAMPLING = SamplingSettings()
 SMD = SmdSettings()
-# where a body has none
+# angles of a waist or of ankles that a body does not have
 NO_ANGLES = np.zeros(0)
 
 
 @dataclass(frozen=True)
 class Effort:
-    """What ``effort`` makes of the paper's numbers of iterations and points."""
+    """The paper's numbers of iterations and points, scaled by the setting ``effort``."""
 
     sampling: SamplingSettings
     smd: SmdSettings
 
     @staticmethod
     def of(factor: float) -> Effort:
-        """See :class:`tk.settings.Settings`."""
+        """Scale points from a factor of 1 upwards, iterations below, see :class:`tk.settings.Settings`."""
 
         def share(count: int) -> int:
             return max(round(min(factor, 1.0) * count), 1)
@@ -134,14 +135,14 @@ class VolumetricTracker:
         self._objective: BodyObjective
         self._appearance: Appearance
         self._pose = self._previous = NO_ANGLES
-        self._usual: Float = np.array([np.inf, 1.0])  # objective, unexplained share
+        self._baseline: Float = np.array([np.inf, 1.0])  # objective, unexplained share
         self._lost_for = 0
         self._fresh = True
 
     # --- initialisation (section 6.3) ---------------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """Have the kernels of the initialisation compiled while there is nothing else to do."""
+        """Compile the kernels of the initialisation ahead of its first frame."""
         self._finder.prepare()
 
     def start(
@@ -151,15 +152,15 @@ class VolumetricTracker:
         init: InitPose | None,
         body: ConeBody | None = None,
     ) -> None:
-        """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourTracker.find`.
+        """Find the subject in the first frame and fit the body to all frames, see :meth:`ContourTracker.find`.
 
         Raises:
-            CaptureError: there is nobody.
-            ConfigError: a body that is given has not all parts.
+            CaptureError: the volume is empty.
+            ConfigError: ``body`` has no hands or feet.
         """
         if body is not None and body.preset != "full":
             raise ConfigError(f'the body given is "{body.preset}": --method {self.method} needs a full one')
-        # the colours of the contours' search are none of this method's cues
+        # without images: colours inside the silhouettes are a cue of the region tracker only
         blind = [Observation(f.index, f.images[:0], f.masks) for f in frames]
         pose = self._finder.find(blind, height_m, init, body)
         first = frames[0]
@@ -174,7 +175,7 @@ class VolumetricTracker:
         self._pose = self._previous = self._from_contours(pose)
         index = self._index(surface, np.full(len(surface), -1, np.int64))
         fit = FrameObjective(self._objective, index, np.random.default_rng(0), images=first.images).fit(self._pose)
-        self._usual = np.array([fit.value, fit.unexplained_share])
+        self._baseline = np.array([fit.value, fit.unexplained_share])
         patch, colors = self._correspondences(surface, index, fit)
         self._appearance = Appearance.learn(len(self.skin.patch_names), patch, colors)
         self.hull.reset()
@@ -187,13 +188,13 @@ class VolumetricTracker:
             objective_parameters(self.config.objective),
             self.effort.sampling,
             ContourTerm(self.skin, self.rig, edges, scale) if edges.edge_weight > 0 else None,
-            waist_stiffness=WAIST_STIFFNESS,
+            waist_stiffness=WAIST_COST,
         )
 
     # --- tracking (section 6.4) ---------------------------------------------------------------------------------
 
     def step(self, frame: Observation) -> Estimate:
-        """The pose in the next frame."""
+        """Track the next frame."""
         watch = Stopwatch()
         config = self.config
         # the visual hull and its coloured surface (section 4.1)
@@ -206,21 +207,21 @@ class VolumetricTracker:
         # (1) colour segmentation (section 6.1.3)
         index = self._index(surface, self._appearance.segment(surface.colors, surface.seen, config.appearance))
         watch.lap("colour")
-        # a generator of its own for every frame: a resumed run draws what an unbroken one would have drawn
+        # one generator per frame: a resumed run draws the same samples as an uninterrupted run
         rng = np.random.default_rng([config.seed, frame.index])
         problem = FrameObjective(self._objective, index, rng, images=frame.images)
         # (2) all degrees of freedom at ε₁, (3) five chains at ε₂ (section 6.4)
         result = self.optimise(problem, self._starts(surface))
         every = config.silhouette.search_every
         if every and frame.index % every == 0:
-            result = self._elsewhere(frame, problem, result)
+            result = self._search_limbs(frame, problem, result)
         fit = problem.fit(result.pose)
         watch.lap("optimise")
         lost = self._is_lost(fit)
         status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
         if not lost:
             # (4) the colour models follow (eq. 16)
-            self._usual = drift(self._usual, np.array([fit.value, fit.unexplained_share]))
+            self._baseline = drift(self._baseline, np.array([fit.value, fit.unexplained_share]))
             patch, colors = self._correspondences(surface, index, fit)
             self._appearance = self._appearance.updated(patch, colors, config.appearance)
         self._previous = result.pose if lost or self._lost_for else self._pose
@@ -244,19 +245,20 @@ class VolumetricTracker:
         """Minimise a frame's objective, beginning at the best of the starts (S, D)."""
         return schedule.optimise(problem, starts, SCHEDULE, self.effort.smd)
 
-    def _elsewhere(
+    def _search_limbs(
         self, frame: Observation, problem: FrameObjective, found: schedule.ScheduleResult
     ) -> schedule.ScheduleResult:
-        """The result or, if this method's objective is lower there, one that begins where the contours' search has
-        found another place of a limb. Not in the paper: a limb that was left behind finds other voxels, and stays.
+        """Search other poses of the limbs by contours; return the result from there if its objective is lower.
+
+        Not in the paper: a limb that was left behind finds other voxels near it and stays.
         """
         finder = self._finder
-        # the colours of the contours' search are none of this method's cues
+        # without images: colours inside the silhouettes are a cue of the region tracker only
         blind = Observation(frame.index, frame.images[:0], frame.masks, frame.uncertain)
         pyramid = finder.pyramid(blind)
-        settled = finder.settle(pyramid, self._to_contours(found.pose)[None]).states[0]
-        places, _ = finder.search(blind, pyramid, finder.evidence(finder.screen, blind, pyramid), settled)
-        starts = problem.constrain(np.array([self._from_contours(place) for place in places]))
+        converged = finder.settle(pyramid, self._to_contours(found.pose)[None]).states[0]
+        candidates, _ = finder.search(blind, pyramid, finder.evidence(finder.screen, blind, pyramid), converged)
+        starts = problem.constrain(np.array([self._from_contours(candidate) for candidate in candidates]))
         values = problem.values(starts)
         best, here = int(np.argmin(values)), problem.value(found.pose)
         if values[best] >= here:
@@ -265,12 +267,12 @@ class VolumetricTracker:
         return again if problem.value(again.pose) < here else found
 
     def _from_contours(self, pose: Float) -> Float:
-        """A pose of the contours' body, in their own world, as one of the skin; its feet are rigid."""
+        """Convert a pose of the cone body, tracker coordinates, to the superellipsoid body, which has rigid feet."""
         paper, waist, _ = split_pose(self.body.skeleton, self._finder.world.poses_out(pose))
         return join_pose(self.skin.skeleton, paper, waist[: len(self.waist_names)], NO_ANGLES)
 
     def _to_contours(self, pose: Float) -> Float:
-        """The way back."""
+        """Convert a pose of the superellipsoid body to the cone body, tracker coordinates."""
         finder = self._finder
         paper, bent, _ = split_pose(self.skin.skeleton, pose)
         waist = np.pad(bent, (0, len(finder.waist_names) - len(bent)))
@@ -279,7 +281,7 @@ class VolumetricTracker:
 
     @property
     def opening_frames(self) -> int:
-        """Frames that the body is fitted to."""
+        """Number of frames that the body is fitted to."""
         return self._finder.opening_frames
 
     @property
@@ -288,13 +290,13 @@ class VolumetricTracker:
         return self._finder.body.standing(self.up)
 
     def _starts(self, surface: HullSurface) -> Float:
-        """(S, D) where the search may begin."""
+        """Return the poses (S, D) from which the optimisation may start."""
         skeleton = self.skin.skeleton
-        # limbs swing on, or stop and turn: the objective tells which
+        # a limb moves on, stops or turns: the objective decides
         motion = self.config.tracking.prediction * (self._pose - self._previous)
         starts = [self._pose + motion, self._pose + motion / 2, self._pose]
         if self._lost_for:
-            # the last pose, carried to where the person now is
+            # the last pose, moved to the centre of the hull
             moved = self._pose.copy()
             moved[:3] += surface.positions.mean(axis=0) - skeleton.joints(self._pose)[list(JOINTS).index("pelvis")]
             turned = [moved.copy() for _ in range(4)]
@@ -306,18 +308,18 @@ class VolumetricTracker:
         return np.array(starts)
 
     def _is_lost(self, fit: Fit) -> bool:
-        """Whether the person, or one of the limbs, is elsewhere."""
+        """Return whether the body, or one of its limbs, has left the hull."""
         chain = CHAIN_OF_SEGMENT[self.skin.segment[fit.samples]]
         unmatched = np.bincount(chain[fit.unmatched] + 1, minlength=len(CHAINS) + 1)
         everywhere = np.bincount(chain + 1, minlength=len(CHAINS) + 1)
         return (
-            fit.value > self.config.tracking.lost_ratio * self._usual[0]
-            or fit.unexplained_share > self._usual[1] + LOST_UNEXPLAINED
+            fit.value > self.config.tracking.lost_ratio * self._baseline[0]
+            or fit.unexplained_share > self._baseline[1] + LOST_UNEXPLAINED
             or bool((unmatched > LOST_LIMB * everywhere).any())
         )
 
     def _nothing_seen(self, frame: Observation, surface: HullSurface, watch: Stopwatch) -> Estimate:
-        """Nobody is in the volume: the last pose stands, as lost."""
+        """Return the last pose with status "lost": the volume is empty."""
         self._previous = self._pose
         self._lost_for += 1
         for stage in ("colour", "optimise", "update"):
@@ -340,17 +342,17 @@ class VolumetricTracker:
     def _correspondences(
         self, surface: HullSurface, index: SurfaceIndex, fit: Fit
     ) -> tuple[NDArray[np.integer], NDArray[np.floating]]:
-        """Patches (N,) and colours (N, 3) of the samples that sit on a voxel which a camera sees."""
+        """Return patches (N,) and colours (N, 3) of the samples that lie on a voxel which a camera sees."""
         M = len(fit.samples)
         near = np.linalg.norm(fit.linear.residual[:M], axis=1) < LEARNING_M
         partner = index.order[fit.linear.partner[:M]]
         sure = (fit.linear.partner[:M] >= 0) & near & (surface.seen[partner] > 0)
         return self.skin.patch[fit.samples[sure]], surface.colors[partner[sure]]
 
-    # --- what a result file keeps -------------------------------------------------------------------------------
+    # --- stored in the result file -------------------------------------------------------------------------------
 
     def model(self) -> Mapping[str, Any]:
-        """The fitted body for `/model`."""
+        """Return the fitted body for `/model`."""
         return {
             **self._finder.model(),
             "patches/names": json.dumps(self.skin.patch_names),
@@ -360,17 +362,17 @@ class VolumetricTracker:
         }
 
     def state(self) -> Mapping[str, Any]:
-        """What :meth:`restore` needs beside the model to go on from the last frame."""
+        """Return the values that :meth:`restore` needs, beside the model, to continue after the last frame."""
         return {
             "pose": self._pose,
             "previous": self._previous,
-            "usual": self._usual.copy(),
+            "baseline": self._baseline.copy(),
             "lost_for": self._lost_for,
             "mean_yuv": self._appearance.mean,
         }
 
     def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
-        """Take up where a run with this model and state stopped."""
+        """Continue a run that stopped with this model and state."""
         self._finder.take_body(restore_body(model))
         self._build()
         initial = np.asarray(model["patches/mean_yuv"])
@@ -383,6 +385,6 @@ class VolumetricTracker:
         self._appearance = replace(learned, mean=np.asarray(state["mean_yuv"]))
         self._pose = np.asarray(state["pose"])
         self._previous = np.asarray(state["previous"])
-        self._usual = np.array(state["usual"], np.float64)
+        self._baseline = np.array(state["baseline"], np.float64)
         self._lost_for = int(state["lost_for"])
         self._fresh = False

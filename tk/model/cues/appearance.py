@@ -1,10 +1,13 @@
 """The colours of the body's patches (Kehl 2006, section 6.1.3).
 
-Each patch is one Gaussian a YUV channel. The paper learns the model on the initialised body, segments the surface
-voxels by it once a frame and updates the means by eq. 16. In its section 7.2 wrong assignments destroy the models; the
-guards here are ours, since the paper has none: only samples that sit on a voxel that a camera sees teach a colour, a
-patch with too few of them learns nothing, a mean never leaves the neighbourhood of the initial one, and a patch that
-hardly any voxel fits constrains nothing in that frame.
+Each patch has one Gaussian per YUV channel. The paper learns the model on the initialised body, segments the surface
+voxels by it once a frame and updates the means by eq. 16. In its section 7.2 wrong assignments destroy the models. The
+paper has no guard against this; the guards here are:
+
+- a colour is learned only from samples near a voxel that a camera sees;
+- a patch with fewer than three such samples is not updated;
+- a mean stays near its initial value;
+- a patch that hardly any voxel fits does not constrain that frame.
 """
 
 from __future__ import annotations
@@ -23,16 +26,18 @@ Float = NDArray[np.float64]
 _YUV_FROM_BGR = np.array([[0.114, 0.587, 0.299], [0.436, -0.289, -0.147], [-0.100, -0.515, 0.615]])
 
 
-# Least standard deviations of Y, U, V, levels of 255: shading moves Y more than U and V.
+# Minimum standard deviations of Y, U, V, levels of 255: shading changes Y more than U and V. Chosen; sensitivity not
+# measured. Far below, noise rejects voxels of the right colour.
 FLOOR_YUV = (16.0, 6.0, 6.0)
-# Greatest distance of a mean from its first value, levels.
+# Maximum distance of a mean from its initial value, levels. Chosen; sensitivity not measured.
 MOST_DRIFT = 30.0
-# Greatest distance between a sample and the voxel whose colour it learns, metres.
+# Maximum distance between a sample and the voxel whose colour it learns, metres: voxels lie 2 to 3 cm from the piece
+# that they belong to.
 LEARNING_M = 0.05
 # A voxel fits a patch if every channel lies within this many standard deviations of the mean. The paper does not say
 # what fits; sensitivity not measured.
 WIDTH = 2.5
-# A patch that fewer than this share of the voxels fit constrains nothing.
+# A patch that fits a smaller share of the voxels does not constrain the frame. Chosen; sensitivity not measured.
 LEAST_SHARE = 0.01
 
 
@@ -41,8 +46,10 @@ class Appearance:
     """Colour models of P patches, YUV levels 0…255.
 
     Attributes:
-        mean: (P, 3); initial: (P, 3) the means as first learned; deviation: (P, 3) standard deviations.
-        known: (P,) False for patches that never had a voxel; they fit everything.
+        mean: (P, 3).
+        initial: (P, 3) means of the initialised body.
+        deviation: (P, 3) standard deviations.
+        known: (P,) bool; False for patches without voxels at the start, which fit every voxel.
     """
 
     mean: Float
@@ -52,11 +59,12 @@ class Appearance:
 
     @staticmethod
     def learn(patches: int, patch: NDArray[np.integer], colors_bgr: NDArray[np.floating]) -> Appearance:
-        """Models from the voxels under the initialised body.
+        """Learn the models from the voxels near the initialised body.
 
         Args:
             patches: P.
-            patch: (N,) patch of each sample; colors_bgr: (N, 3) the colour of its nearest voxel.
+            patch: (N,) patch of each sample.
+            colors_bgr: (N, 3) colour of its nearest voxel.
         """
         yuv = to_yuv(colors_bgr)
         mean = np.zeros((patches, 3))
@@ -73,7 +81,7 @@ class Appearance:
     def segment(
         self, colors_bgr: NDArray[np.floating], seen: NDArray[np.integer], config: AppearanceSettings
     ) -> NDArray[np.int64]:
-        """(V,) bit masks of the patches that each voxel fits."""
+        """Return bit masks (V,) of the patches that each voxel fits."""
         if not config.enabled:
             return np.full(len(colors_bgr), -1, np.int64)
         bound = np.where(self.known[:, None], WIDTH * self.deviation, 1e9)
@@ -89,7 +97,7 @@ class Appearance:
     def updated(
         self, patch: NDArray[np.integer], colors_bgr: NDArray[np.floating], config: AppearanceSettings
     ) -> Appearance:
-        """Eq. 16 with the colours (N, 3) that this frame's trusted samples of patches (N,) sit on."""
+        """Return the models after eq. 16, from the colours (N, 3) of this frame's samples on patches (N,)."""
         if not config.enabled or not len(patch):
             return self
         P = len(self.mean)
@@ -103,5 +111,5 @@ class Appearance:
 
 
 def to_yuv(colors_bgr: NDArray[np.floating]) -> Float:
-    """Colours (N, 3) BGR 0…255 as YUV; U and V lie around 0."""
+    """Convert colours (N, 3) from BGR 0…255 to YUV; U and V lie around 0."""
     return np.asarray(colors_bgr, np.float64) @ _YUV_FROM_BGR.T

@@ -1,9 +1,8 @@
-"""The model's contours against the pictures' colour edges: which points are used, and what edges they get
-(Kehl 2006, section 6.1.2).
+"""The edge term: the model's contours against the images' colour edges (Kehl 2006, section 6.1.2).
 
-The limbs' contour points (:mod:`tk.kernels.contour`), in the three views with the fewest hidden ones, look for edges
-along lines (:mod:`tk.kernels.edge_search`). What comes out are entries of the objective (:mod:`tk.kernels.alignment`)
-that hold until they are assigned anew.
+The limbs' contour points (:mod:`tk.kernels.contour`), in the three views with the fewest hidden points, search edges
+along lines (:mod:`tk.kernels.edge_search`). The results are entries of the objective (:mod:`tk.kernels.alignment`),
+valid until they are assigned again.
 """
 
 from __future__ import annotations
@@ -27,15 +26,13 @@ Ints = NDArray[np.int32]
 Entries = NDArray[np.float32]
 
 
-# Iterations for which assigned edges are held. The paper assigns them at every iteration.
+# Iterations for which assigned edges are kept. The paper assigns edges at every iteration, which takes longer.
 RENEW = 5
-
-# σ of eqs. 13 and 15, metres at the limb; 0 would take the limb's diameter, as the paper does.
+# σ of eqs. 13 and 15, metres at the limb: as SamplingSettings.sigma_m; the paper takes the limb's diameter.
 SIGMA_M = 0.1
-# Leclerc's ν of eq. 9, in units of ½ (d/σ)²; the paper prints none.
+# Leclerc's ν of eq. 9, in units of ½ (d/σ)². The paper prints none; chosen on rendered captures, sensitivity not
+# measured.
 EDGE_NU = 0.1
-
-
 # How far from the contour edges are searched, metres at the limb. Chosen on rendered captures; sensitivity not
 # measured.
 REACH_M = 0.08
@@ -48,7 +45,7 @@ class ContourTerm:
         body: the person.
         rig: the cameras.
         config: settings.
-        scale: so many times as many contour points (section 7.3).
+        scale: factor of the number of contour points (section 7.3).
         dtype: precision of the contours.
     """
 
@@ -74,11 +71,11 @@ class ContourTerm:
         self._circles = {segment: piece * per_piece + within for segment, piece in pieces.items()}
 
     def draw(self, rng: np.random.Generator | None) -> Ints:
-        """(K,) strips of all limbs: at random, or evenly spread without a generator."""
+        """Draw strips (K,) of all limbs: at random, or evenly spread without a generator."""
         return np.concatenate([_some(self._circles[s], self._pairs_a_limb, rng) for s in LIMBS])
 
     def draw_chains(self, rng: np.random.Generator | None) -> Ints:
-        """(chains, K) strips of each chain. The head's find no edges (6.4); rows are of one length."""
+        """Draw strips (chains, K) of each chain. The head's strips find no edges (6.4); all rows have one length."""
         chains = [[s for s in chain if s in self._circles] for chain in CHAINS.values()]
         return np.stack(
             [
@@ -88,7 +85,7 @@ class ContourTerm:
         )
 
     def assign(self, images: NDArray[np.uint8], poses: Float, chosen: Ints) -> Entries:
-        """(B, E, 16) entries at poses (B, D) from strips (B, K) and the pictures (C, H, W, 3)."""
+        """Return entries (B, E, 16) at poses (B, D) from strips (B, K) and images (C, H, W, 3)."""
         (pose_of, entries), lines = self._pairs(self.kernel(poses, chosen))
         found = search_edges(images, self.sizes, lines, self.config.threshold, self.gradient)
         wanted = entries[:, alignment.STATE] == alignment.ASSIGNED
@@ -97,7 +94,7 @@ class ContourTerm:
         return _by_pose(pose_of, entries, len(poses))
 
     def _pairs(self, points: ContourPoints) -> tuple[tuple[Ints, NDArray[np.float32]], NDArray[np.float32]]:
-        """Entries and search lines of the colour edges."""
+        """Return the pose and the entry of each contour point or pair, and the search lines."""
         c = self.config
         B, C = points.visible.shape[:2]
         limb = self._is_limb[points.strip]
@@ -120,8 +117,7 @@ class ContourTerm:
         entries[:, alignment.INV_SIGMA2] = 1 / sigma**2
         entries[:, alignment.STATE] = np.where(any_seen, alignment.ASSIGNED, alignment.UNASSIGNABLE)
         entries[:, alignment.NU] = EDGE_NU
-        # every contour point counts the same, whether it stands for itself or in a pair;
-        # the hidden half of a half-hidden pair has an entry of its own
+        # every contour point has the same weight, alone or in a pair; the hidden half of a pair has its own entry
         found = points.found[b, v, k].sum(axis=1)
         total = np.bincount(b, found, minlength=B)
         share = c.edge_weight / total[b]
@@ -144,7 +140,7 @@ class ContourTerm:
         first: NDArray[np.intp],
         second: NDArray[np.intp],
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Entries with points, camera and normal, the lines of the same points, and pixels a metre there."""
+        """Return entries with points, camera and normal, their search lines, and the pixels a metre there."""
         entries = np.zeros((len(b), alignment.ENTRY_NUMBERS), np.float32)
         lines = np.zeros((len(b), LINE_NUMBERS), np.float32)
         a = alignment
@@ -162,17 +158,17 @@ class ContourTerm:
 
 
 def _some(row: NDArray[np.integer], count: int, rng: np.random.Generator | None) -> Ints:
-    """``count`` of the strips, at random or evenly spread."""
+    """Return ``count`` of the strips, at random or evenly spread."""
     if rng is None:
         picked = ((np.arange(count) + 0.5) * len(row) / count).astype(np.int64)
     else:
-        # some strips twice where there are fewer than asked for: rows are of one length
+        # repeats strips if there are fewer: all rows have one length
         picked = np.sort(np.resize(rng.permutation(len(row)), count))
     return row[picked].astype(np.int32)
 
 
 def _by_pose(pose_of: Ints, entries: NDArray[np.float32], poses: int) -> NDArray[np.float32]:
-    """(B, E, 16): each pose's entries in a row, padded with absent ones."""
+    """Return entries (B, E, 16), one row a pose, padded with absent entries."""
     if poses == 1:
         return entries[None]
     counts = np.bincount(pose_of, minlength=poses)

@@ -1,7 +1,7 @@
-"""A body's objective in one frame: which samples and voxels are drawn, and what the kernel makes of them.
+"""A body's objective in one frame (Kehl 2006, section 6.1): draw samples and voxels, evaluate them by the kernel.
 
-The optimisers see callables of poses (:meth:`FrameObjective.full`, :meth:`FrameObjective.chains`); what they are made
-of, voxels, colours, samples, stays here.
+The optimisers see only callables of poses (:meth:`FrameObjective.full`, :meth:`FrameObjective.chains`), no voxels,
+colours or samples.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ Float = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 CHAIN_NAMES = tuple(CHAINS)
-# the chain of each segment, -1 for the torso
+# index of the chain of each segment, -1 for the torso
 CHAIN_OF_SEGMENT = np.array(
     [next((c for c, chain in enumerate(CHAINS.values()) if name in chain), -1) for name in SEGMENTS]
 )
 
 
 def _barred() -> Ints:
-    """(S,) bit masks of the parts (0 the torso, 1 + c chain c) that a segment's surface may not enter."""
+    """Return bit masks (S,) of the parts (0 the torso, 1 + c chain c) that a segment's surface may not enter."""
     bits = {name: 1 << 1 + c for c, name in enumerate(CHAIN_NAMES)}
     trunk = 1 | bits["head"]
     enters_not = {
@@ -48,13 +48,17 @@ def _barred() -> Ints:
 BARRED = _barred()
 
 
-# How far a sample looks for a voxel, and a voxel for the body, metres.
+# Search radius of a sample for its voxel, and of a voxel for the body, metres. At 0.3 m and σ = 0.1 m a pair's weight
+# is e^-13, so a larger radius costs time only; a smaller one ignores pairs that still pull.
 REACH_M, COVERAGE_REACH_M = 0.3, 0.5
-# Leclerc's ν of the coverage term beside the surface term's: a voxel of a limb that has left the body is far from it.
+# Leclerc's ν of the coverage term, as a multiple of the surface term's: voxels of a limb that the body has left are far
+# away. Chosen on the development captures; sensitivity not measured.
 COVERAGE_SOFTNESS = 2.0
-# Least weight of a pair in the Hessian: a limb that has moved away from its data keeps some curvature.
+# Minimum weight of a pair in the Hessian, so that a limb far from its data keeps some curvature; at 0 its steps grow
+# without bound. Chosen on the development captures; sensitivity not measured.
 OUTLIERS = 0.1
-# Leclerc's ν of eq. 9, in units of ½ (d/σ)²; the paper prints none.
+# Leclerc's ν of eq. 9, in units of ½ (d/σ)². The paper prints none; chosen on the development captures, sensitivity not
+# measured.
 SURFACE_NU = 0.35
 
 
@@ -75,13 +79,14 @@ class SamplingSettings:
     """How many points an evaluation uses (section 6.4: 60 on the torso, 20 on each limb and the head).
 
     Attributes:
-        torso, chain: surface samples on the torso, and on the head and each limb.
+        torso: surface samples on the torso.
+        chain: surface samples on the head and on each limb.
         voxels: voxels of the coverage term in the optimisation of all degrees of freedom.
-        chain_voxels: the same for one chain.
-        sigma_m: σ of eq. 10 for every sample, metres; 0 takes the limb's diameter, as the paper does. Distances are
-            as uncertain on the trunk as on an arm: both come from the same voxels. In units of the diameter the trunk,
-            five times as thick, weighs a twenty-fifth and follows the arms.
-        scale: so many times as many of all points, contour points included, in the optimisation (section 7.3).
+        chain_voxels: voxels of the coverage term in the optimisation of one chain.
+        sigma_m: σ of eq. 10 for every sample, metres; 0 takes the limb's diameter, as the paper does. Distances on the
+            trunk and on an arm are equally uncertain: both come from the same voxels. In units of the diameter the
+            trunk, five times as thick, weighs a twenty-fifth and follows the arms.
+        scale: factor of all numbers of points in the optimisation, contour points included (section 7.3).
     """
 
     torso: int = 60
@@ -97,15 +102,15 @@ class SamplingSettings:
 
 
 class BodyObjective:
-    """The objective of one body, ready for any frame.
+    """The objective of one body, for any frame.
 
     Args:
         body: the person.
-        settings: constants of the objective.
+        settings: constants of the objective's kernel.
         sampling: numbers of points.
-        contours: the contour cues, if any.
+        contours: the edge term, if it counts.
         dtype: precision of the kernel.
-        waist_stiffness: see :data:`tk.trackers.volumetric.WAIST_STIFFNESS`.
+        waist_stiffness: see :data:`tk.trackers.volumetric.WAIST_COST`.
     """
 
     def __init__(
@@ -147,19 +152,19 @@ class BodyObjective:
         self.chain_free = np.array([skeleton.chain_dofs(c) for c in CHAIN_NAMES])
 
     def draw(self, rng: np.random.Generator, scale: int = 1) -> Ints:
-        """(M,) fresh surface samples, in the proportions of section 6.4, ``scale`` times as many."""
+        """Draw surface samples (M,) at random in the proportions of section 6.4, ``scale`` times as many."""
         parts = [pick(rng, self.torso_samples, scale * self.sampling.torso)]
         parts += [pick(rng, samples, scale * self.sampling.chain) for samples in self.chain_samples]
         return np.concatenate(parts)
 
     def spread(self, scale: int = 2) -> Ints:
-        """(M,) surface samples evenly over the body, the same at every call."""
+        """Return surface samples (M,) evenly over the body, the same at every call."""
         parts = [even(self.torso_samples, scale * self.sampling.torso)]
         parts += [even(samples, scale * self.sampling.chain) for samples in self.chain_samples]
         return np.concatenate(parts)
 
     def damping(self, lever_m: float) -> Float:
-        """(D,) curvature of f along each degree of freedom, were all points ``lever_m`` from its axis."""
+        """Return the curvature (D,) of f along each parameter if all points lay ``lever_m`` from its axis."""
         s = self.settings
         sigma = self.sampling.sigma_m or float(np.median(self.body.diameter))
         unit = (1 / s.nu + s.coverage_weight / s.coverage_nu) / sigma**2
@@ -168,7 +173,7 @@ class BodyObjective:
     def with_stiffness(
         self, poses: Float, directions: Float | None, value: Float, gradient: Float, product: Float
     ) -> Evaluation:
-        """An evaluation at poses (B, D), with the waist's stiffness added."""
+        """Return an evaluation at poses (B, D) with the cost of the waist's angles added."""
         k = self.stiffness
         if not k.any():
             return Evaluation(value, gradient, product)
@@ -180,7 +185,7 @@ class BodyObjective:
 
 
 def piece_patches(body: SuperellipsoidBody) -> NDArray[np.int64]:
-    """(P,) bit masks of the colour patches on each piece; a piece without samples has those of its segment."""
+    """Return bit masks (P,) of the colour patches on each piece; a piece without samples has its segment's patches."""
     masks = np.zeros(len(body.pieces), np.int64)
     for index, piece in enumerate(body.pieces):
         mine = body.piece == index
@@ -191,15 +196,14 @@ def piece_patches(body: SuperellipsoidBody) -> NDArray[np.int64]:
 
 
 def pick(rng: np.random.Generator, samples: Ints, count: int) -> Ints:
-    """``count`` of the samples at random, all of them where there are no more."""
+    """Draw ``count`` of the samples at random, all of them if there are no more."""
     if count >= len(samples):
         return samples
-    # a random start in a random order would do as well; partial shuffles cost more than they give at these sizes
     return samples[rng.permutation(len(samples))[:count]]
 
 
 def even(samples: Ints, count: int) -> Ints:
-    """``count`` of the samples at equal steps, all of them where there are no more."""
+    """Return ``count`` of the samples at equal steps, all of them if there are no more."""
     if count >= len(samples):
         return samples
     return samples[(np.arange(count) * len(samples)) // count]
@@ -213,21 +217,24 @@ class Evaluation(NamedTuple):
     hessian_vector: Float
 
 
-# A voxel farther from the body than this is not explained by it, metres.
+# Distance from the body above which a voxel is unexplained, metres: the σ of a sample (SamplingSettings.sigma_m).
 UNEXPLAINED_M = 0.1
-# A voxel this far from the nearest piece may belong to another: voxels lie 2 to 3 cm off the piece they belong to.
+# Distance from the nearest piece above which a voxel may belong to another piece, metres: voxels lie 2 to 3 cm from the
+# piece that they belong to.
 UNCLAIMED_M = 0.05
 
 
 @dataclass(frozen=True)
 class Fit:
-    """How well a pose explains a frame.
+    """The pairs and the objective of a frame at one pose.
 
     Attributes:
         value: the objective over evenly spread samples and voxels.
-        linear: the linearisation at the pose (M + Q pairs); held: its assignments.
-        samples: (M,) the samples used; voxels: (Q,) the voxels used.
-        entries: (1, E, 16) of the contour cues, if any.
+        linear: the linearisation at the pose (M + Q pairs).
+        held: its assignments.
+        samples: (M,) the samples used.
+        voxels: (Q,) the voxels used.
+        entries: (1, E, 16) of the edge term, if it counts.
     """
 
     value: float
@@ -239,14 +246,14 @@ class Fit:
 
     @property
     def unmatched(self) -> NDArray[np.bool_]:
-        """(M,) True for samples with no voxel within σ."""
+        """(M,) bool, samples without a voxel within σ."""
         M = len(self.samples)
         distance2 = np.sum(self.linear.residual[:M] ** 2, axis=1)
         return (self.linear.partner[:M] < 0) | (distance2 * self.linear.inv_sigma2[:M] > 1)
 
     @property
     def unexplained(self) -> NDArray[np.bool_]:
-        """(Q,) True for voxels that the body does not explain."""
+        """(Q,) bool, voxels farther than :data:`UNEXPLAINED_M` from the body."""
         M = len(self.samples)
         if len(self.linear.residual) == M:
             return np.zeros(len(self.voxels), bool)
@@ -254,13 +261,13 @@ class Fit:
 
     @property
     def unexplained_share(self) -> float:
-        """Share of the voxels that the body does not explain."""
+        """Share of the voxels that are unexplained."""
         unexplained = self.unexplained
         return float(unexplained.mean()) if len(unexplained) else 0.0
 
 
 class _Look(NamedTuple):
-    """A pose's value on the even samples, and the assignments that it rests on."""
+    """A pose's value on the evenly spread samples, with its assignments."""
 
     value: float
     held: Held
@@ -268,13 +275,13 @@ class _Look(NamedTuple):
 
 
 class FrameObjective:
-    """The objective of one body in one frame; what :class:`tk.optim.schedule.Problem` asks for.
+    """The objective of one body in one frame: a :class:`tk.optim.schedule.Problem`.
 
     Args:
-        objective: the body's.
+        objective: the body's objective.
         index: the frame's surface voxels.
-        rng: where samples are drawn from.
-        images: (C, H, W, 3) the pictures of the edge term; without them, or without that term, the hull alone counts.
+        rng: random generator of the samples.
+        images: (C, H, W, 3) for the edge term; None without that term.
     """
 
     def __init__(
@@ -299,7 +306,7 @@ class FrameObjective:
         self._pools: list[Ints] = []
 
     def constrain(self, poses: Float) -> Float:
-        """Poses (B, D) mapped into the joints' limits (eq. 22)."""
+        """Map poses (B, D) into the joints' limits (eq. 22)."""
         return self.objective.body.skeleton.clip(poses)
 
     def damping(self, lever_m: float) -> Float:
@@ -307,7 +314,7 @@ class FrameObjective:
         return self.objective.damping(lever_m)
 
     def full(self) -> Callable[[Float, Float, int], Evaluation]:
-        """All degrees of freedom: new samples for every iteration number, the same in all rows."""
+        """Return the objective of all degrees of freedom; new samples, alike in all rows, each iteration number."""
         draws = _Draws(self.draw_all)
         renewed = self._renewing(lambda B: np.repeat(self._term.draw(self.rng)[None], B, 0))
 
@@ -320,7 +327,7 @@ class FrameObjective:
         return evaluate
 
     def chains(self, owner: NDArray[np.intp], pose: Float) -> Callable[[Float, Float, int], Evaluation]:
-        """Row b is chain ``owner[b]`` with its own samples, and voxels that are its own or nobody's at ``pose``."""
+        """Return an objective whose row b is chain ``owner[b]``, with voxels as :meth:`assign_voxels` gives them."""
         self.assign_voxels(pose)
         draws = _Draws(lambda: self._draw_chains(owner))
         renewed = self._renewing(lambda _: self._term.draw_chains(self.rng)[owner])
@@ -331,22 +338,22 @@ class FrameObjective:
         return evaluate
 
     def value(self, pose: Float) -> float:
-        """The objective at ``pose`` (D,) on even samples and evenly spread voxels."""
+        """Return the objective at ``pose`` (D,) on evenly spread samples and voxels."""
         return float(self.values(pose[None])[0])
 
     def values(self, poses: Float) -> Float:
-        """(B,) the same of poses (B, D), in one go."""
+        """Return the objective (B,) at poses (B, D) on evenly spread samples and voxels."""
         unknown = [pose for pose in poses if pose.tobytes() not in self._looks]
         if unknown:
             self._look(np.array(unknown))
         return np.array([self._looks[pose.tobytes()].value for pose in poses])
 
     def curvature(self, pose: Float) -> Float:
-        """(D, D) Gauss-Newton Hessian at ``pose`` (D,), outliers weighing at least :data:`OUTLIERS`."""
+        """Return the Gauss-Newton Hessian (D, D) at ``pose`` (D,), outliers weighing at least :data:`OUTLIERS`."""
         return self._linearise(pose).hessian + np.diag(self.objective.stiffness)
 
     def fit(self, pose: Float) -> Fit:
-        """How well ``pose`` (D,) explains the frame, on samples that do not change from call to call."""
+        """Return the fit of ``pose`` (D,) on samples that do not change from call to call."""
         key = pose.tobytes()
         if key not in self._fits:
             linear = self._linearise(pose)
@@ -355,7 +362,7 @@ class FrameObjective:
         return self._fits[key]
 
     def _look(self, poses: Float) -> None:
-        """Evaluate poses (B, D) on the even samples and keep what was found."""
+        """Evaluate poses (B, D) on the evenly spread samples and store the results."""
         B = len(poses)
         entries = None
         if self.contours:
@@ -410,7 +417,7 @@ class FrameObjective:
     def draw_chain(self, chain: int) -> tuple[Ints, Ints]:
         """Draw samples (M,) of a chain and voxels (Q,) that it may have to cover, see :meth:`assign_voxels`."""
         s = self.objective.sampling
-        # a chain with fewer samples than asked for gives some of them twice: rows are of one length
+        # a chain with fewer samples repeats some: all rows have one length
         count = s.scale * s.chain
         samples = np.resize(pick(self.rng, self.objective.chain_samples[chain], count), count)
         pool = self._pools[chain]
@@ -431,7 +438,7 @@ class FrameObjective:
         return self._term.assign(self.images, poses, chosen)
 
     def _renewing(self, draw: Callable[[int], Ints]) -> Callable[[Float, int], NDArray[np.floating] | None]:
-        """The contour cues' entries at an iteration: held for some, then made anew at the poses as they are."""
+        """Return the edge term's entries as a function of poses and iteration; assigned again every RENEW calls."""
         drawn: tuple[int, Ints] | None = None
         last: NDArray[np.floating] | None = None
         calls = 0
@@ -440,7 +447,7 @@ class FrameObjective:
             nonlocal drawn, last, calls
             if self.contours is None:
                 return None
-            # calls are counted, as the iteration's number stands still where points are not shuffled
+            # calls are counted: without shuffling the iteration number does not change
             if last is None or calls % RENEW == 0:
                 if drawn is None or drawn[0] != iteration:
                     drawn = iteration, draw(len(poses))
@@ -465,7 +472,7 @@ class FrameObjective:
 
 
 class _Draws:
-    """The samples of each iteration number; the same number gives the same samples."""
+    """The samples of an iteration number; the same number gives the same samples."""
 
     def __init__(self, draw: Callable[[], tuple[Ints, Ints]]) -> None:
         self._draw = draw

@@ -1,4 +1,4 @@
-"""The visual hull of a person in a voxel grid, followed from frame to frame (Kehl & Van Gool 2006, section 4.1)."""
+"""The visual hull of a person in a voxel grid, updated from frame to frame (Kehl & Van Gool 2006, section 4.1)."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class HullSurface:
     Attributes:
         voxels: (N,) int32 flat indices into the grid.
         positions: (N, 3) float32 voxel centres, world frame, metres.
-        normals: (N, 3) float32 outward unit normals; zero where undefined (a voxel amid symmetric neighbours).
+        normals: (N, 3) float32 outward unit normals; zero where undefined (symmetric neighbours).
         colors: (N, 3) float32, 0..255 in the images' channel order (BGR); zero where ``seen`` is 0.
-        seen: (N,) int32, bit c set where camera c truly sees the voxel: frontal, and nothing of the hull in between.
-        boundary: (N, 3) float32 metres where asked for: each voxel moved along its normal to the hull's own boundary.
+        seen: (N,) int32, bit c set where camera c sees the voxel frontally and nothing of the hull hides it.
+        boundary: (N, 3) float32 metres, each voxel moved along its normal to the hull's boundary, if requested.
     """
 
     voxels: NDArray[np.int32]
@@ -42,17 +42,17 @@ class HullSurface:
 
 
 class VisualHull:
-    """Carves a grid by silhouettes; keeps its state, so that the next frame costs only what changed.
+    """A voxel grid carved by silhouettes. It keeps its state: a frame costs only the pixels that changed.
 
-    A voxel is active if its centre falls on foreground in every camera whose picture holds it, and at least two
-    pictures hold it. (The paper does not say what happens outside a picture: its cameras all see the whole volume.)
+    A voxel is active if its centre projects into at least two images, and to foreground in each of them. (The paper is
+    silent about voxels outside an image: its cameras all see the whole volume.)
 
     Args:
         rig: up to 31 cameras.
         grid: the voxels.
-        cache_dir: where the look-up tables are kept between runs; by default the platform's cache folder. A cache that
-            cannot be read or written is left aside silently.
-        use_cache: False builds the tables anew and writes nothing.
+        cache_dir: folder of the look-up tables between runs; by default the platform's cache folder. A cache that
+            cannot be read or written is ignored.
+        use_cache: False builds the tables again and writes nothing.
 
     Raises:
         VolumeError: no voxel is seen by two cameras.
@@ -87,7 +87,7 @@ class VisualHull:
         self.update(masks)
 
     def update(self, masks: NDArray[np.uint8]) -> None:
-        """Carve by what changed since the previous masks; the result is that of :meth:`carve`, voxel for voxel.
+        """Carve by the changes since the previous masks; the result equals :meth:`carve`, voxel for voxel.
 
         Args:
             masks: (C, H, W) uint8 with (H, W) = ``rig.frame_shape``, foreground where not 0.
@@ -119,11 +119,11 @@ class VisualHull:
         return bits
 
     def surface(self, images: NDArray[np.uint8] | None = None, boundary: bool = False) -> HullSurface:
-        """The surface voxels of the current hull.
+        """Return the surface voxels of the current hull.
 
         Args:
             images: (C, H, W, 3) uint8 BGR of the same frame as the masks; None for no colours.
-            boundary: also find where the hull ends between voxels; costs a few milliseconds.
+            boundary: also compute :attr:`HullSurface.boundary`; takes a few milliseconds.
         """
         channels = (*self._mask_shape, 3)
         if images is not None and (images.shape != channels or images.dtype != np.uint8):
@@ -149,7 +149,7 @@ class VisualHull:
         return HullSurface(voxels, positions, normals, colors, seen, ends)
 
     def _as_words(self, masks: NDArray[np.uint8]) -> NDArray[np.int64]:
-        """(C, M) the masks as int64 words: a view where memory allows it, a zero-padded copy otherwise."""
+        """Return the masks as int64 words (C, M): a view if aligned, else a zero-padded copy."""
         if masks.shape != self._mask_shape or masks.dtype != np.uint8:
             raise ValueError(f"masks are {masks.dtype} {masks.shape}, expected uint8 {self._mask_shape}")
         flat = np.ascontiguousarray(masks).reshape(len(masks), self._pixel_count)
@@ -163,7 +163,7 @@ class VisualHull:
 
 
 def _sample_spacing(rig: Rig, grid: VoxelGrid) -> NDArray[np.int32]:
-    """(C,) a third of a voxel's size in each picture, at the volume's centre, in whole pixels, at least 1."""
+    """Return a third of a voxel's size in each image (C,), at the volume's centre, in whole pixels, at least 1."""
     middle = np.asarray(grid.origin) + grid.voxel_m * (np.asarray(grid.shape) - 1) / 2
     distance = np.maximum(np.linalg.norm(rig.centers - middle, axis=1), grid.voxel_m)
     focal = np.array([camera.matrix[0, 0] for camera in rig])

@@ -1,4 +1,4 @@
-"""Look-up tables of the visual hull: which voxels each pixel holds. Built once a rig and grid, cached on disk."""
+"""Look-up tables of the visual hull: the voxels of each pixel. Built once for a rig and grid, cached on disk."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from tk.model.cameras.volume import VoxelGrid
 
 __all__ = ["MAX_CAMERAS", "HullTables", "default_cache_dir", "load_or_build", "mask_words", "table_key"]
 
-MAX_CAMERAS = 31  # a bit each in an int32 that stays positive
+MAX_CAMERAS = 31  # one bit each in a positive int32
 _FORMAT = 1  # part of the key: raise it when the tables' meaning changes
-_CACHE_BYTES = 1 << 30  # the oldest tables go when the folder holds more
+_CACHE_BYTES = 1 << 30  # maximum size of the folder; the oldest tables are deleted
 _BLOCK = 1 << 15  # voxels projected at a time: the intermediate arrays stay in the processor's cache
 
 
@@ -50,7 +50,7 @@ class HullTables:
 
     @cached_property
     def pixels(self) -> NDArray[np.int32]:
-        """(V, C) int32, the lists turned back: each voxel's pixel in each camera, -1 outside the picture."""
+        """(V, C) int32, each voxel's pixel in each camera, -1 outside the image."""
         nz = self.shape[2]
         depth = np.int32(32 * kernels.words_per_column(nz))
         pixels = np.full((self.shape[0] * self.shape[1], nz, self.camera_count), -1, dtype=np.int32)
@@ -65,7 +65,7 @@ class HullTables:
 
     @cached_property
     def empty_planes(self) -> NDArray[np.uint32]:
-        """(2C, W) uint32, the cameras' planes before any foreground: a camera does not carve what it does not hold."""
+        """(2C, W) uint32, the cameras' planes without foreground: voxels outside a camera's image are not carved."""
         planes = np.zeros((kernels.SHARES * self.camera_count, len(self.enough)), dtype=np.uint32)
         for camera, row in enumerate(self.pixels.T):
             planes[kernels.SHARES * camera] = kernels.pack((row < 0).reshape(self.shape))
@@ -73,12 +73,12 @@ class HullTables:
 
     @cached_property
     def enough(self) -> NDArray[np.uint32]:
-        """(W,) uint32, the voxels that at least two pictures hold."""
+        """(W,) uint32, the voxels in at least two images."""
         return kernels.pack(_holders(self.pixels.T).reshape(self.shape) >= 2)
 
 
 def load_or_build(rig: Rig, grid: VoxelGrid, cache_dir: Path | None = None, use_cache: bool = True) -> HullTables:
-    """The tables of this rig and grid, from the cache where it has them, else built and cached.
+    """Return the tables of this rig and grid from the cache, or build and cache them.
 
     Raises:
         VolumeError: no voxel is seen by two cameras.
@@ -102,13 +102,13 @@ def load_or_build(rig: Rig, grid: VoxelGrid, cache_dir: Path | None = None, use_
 
 
 def mask_words(rig: Rig) -> int:
-    """Words of eight pixels that hold one picture of the packed stack."""
+    """Return the number of eight-pixel words of one image."""
     height, width = rig.frame_shape
     return (height * width + 7) // 8
 
 
 def default_cache_dir() -> Path:
-    """The platform's folder for this program's cached files; it need not exist."""
+    """Return the platform's folder for this program's cached files; it need not exist."""
     if sys.platform == "win32":
         base = os.environ.get("LOCALAPPDATA", "")
     elif sys.platform == "darwin":
@@ -119,7 +119,7 @@ def default_cache_dir() -> Path:
 
 
 def table_key(rig: Rig, grid: VoxelGrid) -> str:
-    """A hash of all that the tables depend on: format, the cameras' numbers (not their names), and the grid."""
+    """Return a hash of the format, the cameras (without their names) and the grid."""
     digest = hashlib.sha256(f"tk-hull {_FORMAT} {sys.byteorder}".encode())
     for camera in rig:
         digest.update(f"{camera.width} {camera.height} {camera.fisheye} {len(camera.distortions)}".encode())
@@ -152,7 +152,7 @@ def _build(rig: Rig, grid: VoxelGrid) -> HullTables:
 
 
 def _holders(pixels: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """(V,) how many pictures hold each voxel."""
+    """Return the number of images that contain each voxel (V,)."""
     holders = np.zeros(pixels.shape[1], dtype=np.uint8)
     for row in pixels:
         holders += row >= 0
@@ -160,7 +160,7 @@ def _holders(pixels: NDArray[np.int32]) -> NDArray[np.uint8]:
 
 
 def _pixel_index(camera: Camera, p_world: NDArray[np.float64], stride: int) -> NDArray[np.int32]:
-    """(N,) index ``y * stride + x`` of the pixel each point falls on, -1 outside the camera's picture."""
+    """Return the index ``y * stride + x`` (N,) of each point's pixel, -1 outside the camera's image."""
     xy, _ = camera.project(p_world)
     limit = np.array([camera.width - 0.5, camera.height - 0.5])
     inside = np.logical_and((xy >= -0.5).all(axis=1), (xy < limit).all(axis=1))  # NaN is not
@@ -169,9 +169,9 @@ def _pixel_index(camera: Camera, p_world: NDArray[np.float64], stride: int) -> N
 
 
 def _load(path: Path, rig: Rig, grid: VoxelGrid) -> HullTables | None:
-    """The tables in this file; None unless they are whole and fit (zip checksums are verified on reading)."""
+    """Return the tables in this file; None if they are damaged or do not fit (reading verifies zip checksums)."""
     try:
-        # a stream of our own: numpy leaves the one that it opens to the collector when the archive is broken
+        # our own stream: numpy does not close the stream that it opens if the archive is damaged
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             row_offsets, entries = stored["row_offsets"], stored["entries"]
         os.utime(path)
@@ -193,7 +193,7 @@ def _load(path: Path, rig: Rig, grid: VoxelGrid) -> HullTables | None:
 
 
 def _save(path: Path, tables: HullTables) -> None:
-    """Write under a temporary name and rename, so that no reader ever finds half a file; failure is no matter."""
+    """Write to a temporary name and rename: no reader finds an incomplete file. Failures are ignored."""
     temporary: str | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -211,7 +211,7 @@ def _save(path: Path, tables: HullTables) -> None:
 
 
 def _prune(folder: Path) -> None:
-    """Delete the tables used longest ago until the rest keep within the cache's size."""
+    """Delete the least recently used tables until the rest fit into the cache's size."""
     total = 0
     for stat, path in sorted(((p.stat(), p) for p in folder.glob("hull-*.npz")), key=lambda e: -e[0].st_mtime):
         total += stat.st_size

@@ -1,4 +1,4 @@
-"""Silhouettes of one instant in several views: cleaning, scales, and how well a cone body covers them."""
+"""Silhouettes of one frame in several views: cleaning, scales, and their agreement with a cone body."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SPECK_SHARE, HOLE_SHARE = 0.05, 0.004
 
 
 def clean(mask: Masks) -> Masks:
-    """A mask (H, W) without specks and small holes, 0 or 255."""
+    """Return a mask (H, W) without specks and small holes, 0 or 255."""
     box = cv2.boundingRect(mask)
     if box[2] == 0:
         return mask
@@ -50,8 +50,8 @@ class Pyramid:
     """Masks at several scales, a factor of two apart.
 
     Attributes:
-        masks: for each scale (V, H, W) uint8; scale 0 is the full picture. Of F frames (F V, H, W).
-        sizes: for each scale (V, 2) width and height of each camera's part.
+        masks: (V, H, W) uint8 for each scale, or (F V, H, W) of F frames; scale 0 is the full image.
+        sizes: (V, 2) for each scale, width and height of each camera's image.
     """
 
     masks: tuple[Masks, ...]
@@ -59,12 +59,12 @@ class Pyramid:
 
     @staticmethod
     def of_all(frames: Sequence[Pyramid]) -> Pyramid:
-        """Those of several frames as one."""
+        """Join the pyramids of several frames."""
         return Pyramid(tuple(map(np.concatenate, zip(*(f.masks for f in frames), strict=True))), frames[0].sizes)
 
 
 class Views:
-    """The cameras of a rig as the kernels want them.
+    """The cameras of a rig, packed for the kernels.
 
     Args:
         rig: the cameras.
@@ -104,7 +104,7 @@ class Views:
         settings: SearchSettings,
         regions: Regions | None = None,
     ) -> NormalEquations:
-        """Normal equations of poses (B, D) at a scale's index, all in one frame or each in its own of B."""
+        """Return normal equations of poses (B, D) at a scale's index, all in one frame or one frame each."""
         return kernels.normal_equations(
             body,
             self._cameras32,
@@ -117,19 +117,19 @@ class Views:
         )
 
     def edgels(self, body: ConeBody, pyramid: Pyramid, pose: Float, scale: int, settings: SearchSettings) -> Edgels:
-        """The edgels that a pose (D,) finds at a scale's index."""
+        """Return the edgels that a pose (D,) finds at a scale's index."""
         return kernels.find_edgels(
             body.arrays, self._cameras32, pyramid.sizes[scale], pyramid.masks[scale], 2.0**scale, pose, settings
         )
 
 
 def pack_rig(rig: Rig) -> Float:
-    """(V, 22) the cameras as the kernels take them."""
+    """Pack the cameras for the kernels (V, 22)."""
     return np.array([pack_camera(c.matrix, c.distortions, c.rotation, c.translation, c.fisheye) for c in rig])
 
 
 def pixel_rays(rig: Rig, step: int = 1) -> NDArray[np.float32]:
-    """(V, H, W, 3) viewing directions of every ``step``-th pixel, world frame; zero outside smaller pictures."""
+    """Return viewing directions (V, H, W, 3) of every ``step``-th pixel, world frame; zero outside smaller images."""
     height, width = rig.frame_shape
     offset = step // 2
     ys, xs = np.arange(offset, height, step), np.arange(offset, width, step)
@@ -142,7 +142,7 @@ def pixel_rays(rig: Rig, step: int = 1) -> NDArray[np.float32]:
 
 
 def share_wrong(drawn: Masks, seen: Masks) -> Float:
-    """(V,) E_S (eq. 12) of silhouettes (V, H, W) against masks (V, H, W), S_T; inf where the mask is empty."""
+    """Return E_S (V,) (eq. 12) of silhouettes (V, H, W) against masks (V, H, W), S_T; inf where the mask is empty."""
     wrong = np.count_nonzero((drawn >= 128) != (seen >= 128), axis=(1, 2))
     total = np.count_nonzero(seen >= 128, axis=(1, 2))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -150,13 +150,13 @@ def share_wrong(drawn: Masks, seen: Masks) -> Float:
 
 
 def draw_silhouettes(body: ConeBody, rig: Rig, poses: Float) -> NDArray[np.uint8]:
-    """(B, V, H, W) silhouettes of the body at poses (B, D), 0 or 255."""
+    """Render silhouettes (B, V, H, W) of the body at poses (B, D), 0 or 255."""
     rays = pixel_rays(rig)
     group = np.zeros(len(body.parts), np.int32)
     cost = np.zeros((*rays.shape[:3], 2), np.float32)
     cameras = pack_rig(rig).astype(np.float32)
     pictures = []
-    for pose in poses:  # one at a time: depths of all pixels of many poses are large
+    for pose in poses:  # one at a time: depths of all pixels of many poses need much memory
         _, met = cast(body.arrays, group, cameras, 1, rays, cost, pose[None], export=True)
         assert met is not None
         pictures.append(np.where(met.label[0] > 0, np.uint8(255), np.uint8(0)))
