@@ -87,6 +87,23 @@ def test_coarse_levels_do_not_end_the_iteration():
     assert minimise(problem.start, problem.linearise, move, [1, 1, 0], (9.0, 9.0), tolerance=np.inf).iterations == 3
 
 
+def test_blocks_without_shared_unknowns_are_solved_each_on_its_own():
+    rng = np.random.default_rng(4)
+    rows, target = rng.normal(size=(BLOCKS, ROWS, OWN)), rng.normal(size=(BLOCKS, ROWS))
+
+    def linearise(p, _):
+        equations = Equations(BLOCKS, np.ones(OWN, bool), 0)
+        for b in range(BLOCKS):
+            equations.add(b, [slice(0, OWN)], rows[b], np.ones(ROWS), target[b] - rows[b] @ p[b])
+        return equations
+
+    levels = [0] * 60
+    found = minimise(np.zeros((BLOCKS, OWN)), linearise, lambda p, own, _: p + own, levels, (9.0, 9.0), damping=0.2)
+    assert found.iterations == 60
+    for b in range(BLOCKS):
+        np.testing.assert_allclose(found.state[b], np.linalg.lstsq(rows[b], target[b], rcond=None)[0], atol=1e-6)
+
+
 def test_without_iterations_the_start_is_returned():
     found = minimise(3.0, lambda *_: pytest.fail("linearised"), lambda *_: 0.0, [], (1.0, 1.0))
     assert (found.state, found.reduced, found.iterations) == (3.0, None, 0)

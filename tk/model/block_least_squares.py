@@ -133,7 +133,7 @@ def minimise(
     move: Callable[[T, Float, Float], T],
     levels: Sequence[int],
     longest: tuple[float, Float | float],
-    tolerance: Float | float = 0.0,
+    tolerance: Float | float | None = None,
     damping: float = 0.0,
 ) -> Solution[T]:
     """Iterate from an estimate.
@@ -144,7 +144,8 @@ def minimise(
         move: the estimate after steps (B, D) of the blocks and (S,) of the shared unknowns.
         levels: the level of each iteration; 0 is the finest.
         longest: largest change of a number of a block, and of the shared unknowns (S,), in one iteration.
-        tolerance: (S,) the iteration ends at level 0 once every shared unknown changes by less than this.
+        tolerance: (S,) the iteration ends at level 0 once every shared unknown changes by less than this; None: all
+            iterations are made.
         damping: share of each diagonal element that is added to it.
     """
     state, reduced = start, None
@@ -152,7 +153,7 @@ def minimise(
         reduced = linearise(state, level).reduced(damping)
         blocks, shared = reduced.step()
         state = move(state, np.clip(blocks, -longest[0], longest[0]), np.clip(shared, -longest[1], longest[1]))
-        if level == 0 and (np.abs(shared) < tolerance).all():
+        if tolerance is not None and level == 0 and (np.abs(shared) < tolerance).all():
             return Solution(state, reduced, count, Stop.CONVERGED)
     return Solution(state, reduced, len(levels), Stop.ITERATIONS)
 

@@ -5,25 +5,24 @@ from dataclasses import fields
 import pytest
 
 from tk.errors import ConfigError
-from tk.model.body import anthropometry
-from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.anthropometry import FRACTIONS, BodyDimensions
 
 NAMES = [f.name for f in fields(BodyDimensions)]
 
 
 @pytest.mark.parametrize("stature", [1.1, 1.5, 1.75, 2.1])
-def test_the_average_body_is_as_tall_as_asked(stature):
+def test_average_body_has_the_given_stature(stature):
     """The segments of a standing person add up, to the rounding of the table and a shoe's sole."""
     assert -0.005 < BodyDimensions.from_stature(stature).stature / stature - 1 < 0.02
 
 
-def test_every_dimension_grows_with_the_stature():
+def test_every_dimension_is_proportional_to_the_stature():
     small, large = BodyDimensions.from_stature(1.0), BodyDimensions.from_stature(2.0)
     for name in NAMES:
         assert getattr(large, name) == pytest.approx(2 * getattr(small, name)), name
 
 
-def test_limbs_taper_and_fit_each_other():
+def test_limbs_taper_and_thighs_hardly_overlap():
     d = BodyDimensions.from_stature(1.75)
     assert d.upper_arm_radius > d.elbow_radius > d.wrist_radius
     assert d.thigh_radius > d.knee_radius > d.ankle_radius
@@ -34,15 +33,14 @@ def test_limbs_taper_and_fit_each_other():
 
 def test_table_agrees_with_drillis_and_contini():
     """In Winter's figure 4.1, fractions of the stature, where joint centres are given."""
-    winter = {"UPPER_ARM_LENGTH": 0.186, "FOREARM_LENGTH": 0.146, "HAND_LENGTH": 0.108, "THIGH_LENGTH": 0.245}
-    winter |= {"CALF_LENGTH": 0.246, "ANKLE_HEIGHT": 0.039, "FOOT_LENGTH": 0.152}
-    del winter["UPPER_ARM_LENGTH"]  # there from the acromion, which is not the joint's centre
+    # not the upper arm, which is there from the acromion instead of the joint's centre
+    winter = {"forearm": 0.146, "hand": 0.108, "thigh": 0.245, "calf": 0.246, "ankle_height": 0.039, "foot": 0.152}
     for name, value in winter.items():
-        shoe = 0.013 if name == "ANKLE_HEIGHT" else 0.0
-        assert value - 0.01 < getattr(anthropometry, name) < value + 0.01 + shoe, name
+        shoe = 0.013 if name == "ankle_height" else 0.0
+        assert value - 0.01 < FRACTIONS[name] < value + 0.01 + shoe, name
 
 
-def test_scaled_changes_what_is_named():
+def test_scaled_changes_only_the_named_dimensions():
     d = BodyDimensions.from_stature(1.75)
     e = d.scaled(thigh=1.1, wrist_radius=0.5)
     assert e.thigh == pytest.approx(1.1 * d.thigh) and e.wrist_radius == pytest.approx(0.5 * d.wrist_radius)
@@ -50,6 +48,6 @@ def test_scaled_changes_what_is_named():
 
 
 @pytest.mark.parametrize("factor", [0.0, -1.0, 100.0, float("nan"), float("inf")])
-def test_impossible_dimensions_are_named(factor):
+def test_impossible_dimensions_are_refused_by_name(factor):
     with pytest.raises(ConfigError, match=r"body dimension calf = .* must lie between 0 and 3 m"):
         BodyDimensions.from_stature(1.75).scaled(calf=factor)

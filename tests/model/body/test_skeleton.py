@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from tk.errors import ConfigError
-from tk.model.body.anthropometry import RAISED_SHOULDERS, TRUNK_LENGTH, BodyDimensions
+from tk.model.body.anthropometry import FRACTIONS, RAISED_SHOULDERS, BodyDimensions
 from tk.model.body.gait_poses import neutral_pose
 from tk.model.body.skeleton import (
     ANKLES,
@@ -312,7 +312,7 @@ def test_shoulders_rise_with_the_arms():
         local = np.array([direction @ FORWARD, direction @ LEFT, direction @ UP])
         pose[SKELETON.index("shoulder_l_yaw")], pose[SKELETON.index("shoulder_l_pitch")] = shoulder_angles(local)
         heights[name] = joints(pose)["shoulder_l"] @ UP
-    lift = RAISED_SHOULDERS * DIMENSIONS.trunk / TRUNK_LENGTH
+    lift = RAISED_SHOULDERS * DIMENSIONS.trunk / FRACTIONS["trunk"]
     level = DIMENSIONS.trunk - DIMENSIONS.shoulder_drop
     np.testing.assert_allclose(list(heights.values()), [level - lift, level, level, level + lift], atol=1e-12)
 

@@ -1,10 +1,10 @@
-"""Body proportions: what the length of a limb is when only the stature is known.
+"""Body proportions: dimensions of the average body of a given stature.
 
 The paper (section 6.3) takes its ratios from Dreyfuss, *The Measure of Man* (1959-67), and prints none of them. The
-book is not at hand either, so the table stands on two sources that give distances between joint centres as fractions of
-the stature: Drillis & Contini (1966; in Winter, *Biomechanics and Motor Control of Human Movement*, fig. 4.1), de Leva
-(J. Biomech. 29, 1996, table 4: men and women averaged). They measure the shoulder, the hip and the neck at different
-points; where they disagree the value lies between them. The fit to the hull then moves each length within its scatter.
+table here stands on two sources of distances between joint centres as fractions of the stature: Drillis & Contini
+(1966; in Winter, *Biomechanics and Motor Control of Human Movement*, fig. 4.1) and de Leva (J. Biomech. 29, 1996, table
+4; men and women averaged). They measure shoulder, hip and neck at different points; where they disagree, the value lies
+between them. The body fit then changes each length within its scatter (:mod:`tk.model.body.body_parameters`).
 """
 
 from __future__ import annotations
@@ -13,60 +13,53 @@ from dataclasses import dataclass, fields, replace
 
 from tk.errors import ConfigError
 
-# Fractions of the stature.
-PELVIS_HEIGHT = 0.525  # floor to the hip centres
-TRUNK_LENGTH = 0.328  # hip centres to C7/T1
-HEAD_LENGTH = 0.142  # C7/T1 to the crown
-SHOULDER_DROP = 0.044  # shoulder centres below C7/T1, the arms level
-SHOULDER_HALF_WIDTH = 0.106  # glenohumeral centre to the median plane
-HIP_HALF_WIDTH = 0.060  # hip centre to the median plane
-UPPER_ARM_LENGTH = 0.149
-FOREARM_LENGTH = 0.149
-HAND_LENGTH = 0.108  # wrist to the tip of the middle finger
-THIGH_LENGTH = 0.245
-CALF_LENGTH = 0.246
-ANKLE_HEIGHT = 0.049  # ankle centre above the sole of a shoe; 0.039 barefoot
-FOOT_LENGTH = 0.150
-# How far an arm raised from hanging to level lifts its shoulder: the collar bone points up by 5 to 10° more (Ludewig et
-# al., J. Bone Joint Surg. Am. 91, 2009, 378-389), which is 2 to 3 cm at its end. SHOULDER_DROP is that of level arms.
+#: each of the :class:`BodyDimensions` as a fraction of the stature; radii and half widths are over light clothes
+FRACTIONS = {
+    "trunk": 0.328,  # hip centres to C7/T1
+    "head": 0.142,  # C7/T1 to the crown
+    "shoulder_drop": 0.044,  # shoulder centres below C7/T1, the arms level
+    "shoulder_half_width": 0.106,  # glenohumeral centre to the median plane
+    "hip_half_width": 0.060,  # hip centre to the median plane
+    "upper_arm": 0.149,
+    "forearm": 0.149,
+    "hand": 0.108,  # wrist to the tip of the middle finger
+    "thigh": 0.245,
+    "calf": 0.246,
+    "ankle_height": 0.049,  # ankle centre above the sole of a shoe; 0.039 barefoot
+    "foot": 0.150,
+    "chest_half_width": 0.098,
+    "chest_half_depth": 0.070,
+    "hips_half_width": 0.100,
+    "hips_half_depth": 0.072,
+    "head_radius": 0.049,
+    "neck_radius": 0.036,
+    "upper_arm_radius": 0.032,
+    "elbow_radius": 0.026,
+    "wrist_radius": 0.019,
+    "thigh_radius": 0.050,
+    "knee_radius": 0.036,
+    "ankle_radius": 0.025,
+}
+
+# Rise of a shoulder when its arm goes from hanging to level, as a fraction of the stature: the collar bone then points
+# up by 5 to 10° more (Ludewig et al., J. Bone Joint Surg. Am. 91, 2009, 378-389), 2 to 3 cm at its end.
 RAISED_SHOULDERS = 0.016
+
+# Where the surface lies off the lines between joint centres, as fractions of the stature. Neither source gives these:
+# estimates, chosen with the joints of the rendered development captures in view; sensitivity not measured.
 CROTCH_DROP = 0.070  # lowest point of the trunk below the hip centres, in trousers
-
-# The trunk's surface lies forward of the line from the hip centres to C7/T1, which runs nearer to the back: how far the
-# middle of the chest and of the pelvis lies ahead of that line. Estimates: neither source gives them; chosen with the
-# joints of the rendered development captures in view.
-CHEST_FORWARD = 0.014
-PELVIS_FORWARD = 0.016
-# The same for other parts, and with the same reservation: the spine meets the skull behind its middle; the knee's
-# hollow, the calf's muscle and the heel's tendon lie behind the line from knee to ankle; the arm's flexors lie before
-# the elbow's axis; hair stands on the crown.
-SKULL_FORWARD = 0.007
-KNEE_BACK = 0.007
-ELBOW_FRONT = 0.003
-ANKLE_BACK = 0.013
+PELVIS_FORWARD = 0.016  # middle of the pelvis in front of the line from the hip centres to C7/T1
+KNEE_BACK = 0.007  # middle of the knee behind the line from hip to ankle: its hollow and the calf's muscle
+ELBOW_FRONT = 0.003  # middle of the elbow on the side of its flexors
 ANKLE_OUTWARD = 0.006
-HAIR = 0.008
-
-# Half widths and girths as radii, fractions of the stature, over light clothes.
-CHEST_HALF_WIDTH = 0.098
-CHEST_HALF_DEPTH = 0.070
-HIPS_HALF_WIDTH = 0.100
-HIPS_HALF_DEPTH = 0.072
-HEAD_RADIUS = 0.049
-NECK_RADIUS = 0.036
-UPPER_ARM_RADIUS = 0.032
-ELBOW_RADIUS = 0.026
-WRIST_RADIUS = 0.019
-THIGH_RADIUS = 0.050
-KNEE_RADIUS = 0.036
-ANKLE_RADIUS = 0.025
+HAIR = 0.008  # above the crown
 
 
 @dataclass(frozen=True)
 class BodyDimensions:
     """Lengths and radii of one person's body, metres. Left and right are alike.
 
-    Lengths join joint centres; radii are those of the clothed surface about the limb's axis.
+    Lengths are between joint centres; radii are those of the clothed surface about a segment's axis.
     """
 
     trunk: float
@@ -102,37 +95,11 @@ class BodyDimensions:
 
     @staticmethod
     def from_stature(stature_m: float) -> BodyDimensions:
-        """The average body of this stature (crown to sole, metres)."""
-        h = stature_m
-        return BodyDimensions(
-            trunk=TRUNK_LENGTH * h,
-            head=HEAD_LENGTH * h,
-            shoulder_drop=SHOULDER_DROP * h,
-            shoulder_half_width=SHOULDER_HALF_WIDTH * h,
-            hip_half_width=HIP_HALF_WIDTH * h,
-            upper_arm=UPPER_ARM_LENGTH * h,
-            forearm=FOREARM_LENGTH * h,
-            hand=HAND_LENGTH * h,
-            thigh=THIGH_LENGTH * h,
-            calf=CALF_LENGTH * h,
-            ankle_height=ANKLE_HEIGHT * h,
-            foot=FOOT_LENGTH * h,
-            chest_half_width=CHEST_HALF_WIDTH * h,
-            chest_half_depth=CHEST_HALF_DEPTH * h,
-            hips_half_width=HIPS_HALF_WIDTH * h,
-            hips_half_depth=HIPS_HALF_DEPTH * h,
-            head_radius=HEAD_RADIUS * h,
-            neck_radius=NECK_RADIUS * h,
-            upper_arm_radius=UPPER_ARM_RADIUS * h,
-            elbow_radius=ELBOW_RADIUS * h,
-            wrist_radius=WRIST_RADIUS * h,
-            thigh_radius=THIGH_RADIUS * h,
-            knee_radius=KNEE_RADIUS * h,
-            ankle_radius=ANKLE_RADIUS * h,
-        )
+        """Return the dimensions of the average body of a stature (crown to sole), metres."""
+        return BodyDimensions(**{name: fraction * stature_m for name, fraction in FRACTIONS.items()})
 
     def scaled(self, **factors: float) -> BodyDimensions:
-        """A copy with the named dimensions multiplied by these factors."""
+        """Return a copy with the named dimensions multiplied by factors."""
         return replace(self, **{name: getattr(self, name) * factor for name, factor in factors.items()})
 
     @property

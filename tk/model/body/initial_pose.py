@@ -1,93 +1,107 @@
-"""A rough pose that somebody wrote down, as a body of average proportions in that pose."""
+"""Converts an initial pose that a person wrote down, as joint positions or angles, to a pose of the average body."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.body.anthropometry import (
-    CALF_LENGTH,
-    FOREARM_LENGTH,
-    HEAD_LENGTH,
-    SHOULDER_HALF_WIDTH,
-    THIGH_LENGTH,
-    TRUNK_LENGTH,
-    UPPER_ARM_LENGTH,
-    BodyDimensions,
-)
+from tk.model.block_least_squares import Equations, minimise
+from tk.model.body.anthropometry import FRACTIONS, BodyDimensions
 from tk.model.body.gait_poses import neutral_pose
-from tk.model.body.skeleton import JOINTS, build_skeleton, shoulder_angles
+from tk.model.body.skeleton import JOINTS, Skeleton, build_skeleton, shoulder_angles
 from tk.model.cameras.tracker_frame import TrackerFrame
 
 Float = NDArray[np.float64]
 
-# A person is between these two tall, standing on the feet (metres).
+# Statures of people, metres; no number written for a joint makes the body taller or shorter.
 LEAST_STATURE, GREATEST_STATURE = 0.8, 2.4
+# Stature without any evidence, metres: the mean of adults.
+_STATURE_M = 1.72
+# Standard deviation of a written joint, metres.
+_JOINT_M = 0.02
+# Standard deviation of an angle about that of standing, radians: wide, for what the joints leave open.
+_ANGLE = 5.0
+# Precision that holds an angle at its limit: 0.003 rad, small against a joint's noise over a limb's length.
+_LIMIT = 1e5
+# Headings to begin from, and iterations for each with steps of at most this size, radians: enough to turn any joint
+# from one limit to the other.
+_HEADINGS, _ITERATIONS, _LONGEST_STEP = 8, 30, 0.4
 
 
 def rough_pose(
     joints: dict[str, Float], angles: dict[str, float], height_m: float | None, world: TrackerFrame
 ) -> tuple[BodyDimensions, Float]:
-    """Average body, and its pose in the cameras' own world, from what a person wrote down in the capture's.
+    """Return the average body, and its pose in the tracker's frame, from numbers in the capture's world.
 
     Args:
         joints: name → (3,) metres of some joints; or empty.
-        angles: name → value of some entries of the configuration vector (radians, metres); or empty.
-        height_m: the subject's height; without it, the joints' distances tell, else 1.72 m.
-        world: the cameras'.
+        angles: name → value of some entries of the pose vector (radians, metres); or empty.
+        height_m: the subject's height; None: estimated from the joints' distances, or 1.72 m.
+        world: the tracker's frame.
 
     Returns:
         Dimensions and pose (D,).
     """
-    stature = height_m or _stature_of(joints) or 1.72
-    dimensions = BodyDimensions.from_stature(stature)
+    dimensions = BodyDimensions.from_stature(height_m or _stature_of(joints) or _STATURE_M)
     skeleton = build_skeleton(dimensions)
-    pose = np.zeros(len(skeleton.names))
     if angles:
         pose = neutral_pose(skeleton)
         for name, value in angles.items():
             pose[skeleton.index(name)] = value
         return dimensions, world.poses_in(skeleton.clip(pose))
-    rows = [JOINTS.index(name) for name in joints]
-    targets = world.points_in(list(joints.values()))
+    rows = np.array([JOINTS.index(name) for name in joints])
+    return dimensions, _fitted(skeleton, rows, world.points_in(list(joints.values())))
 
-    def residual(p: Float) -> Float:
-        # a little weight on plain angles settles what the joints leave open
-        return np.concatenate([((skeleton.joints(p)[rows] - targets) / 0.02).ravel(), 0.2 * (p[3:] - rest[3:])])
 
-    from scipy.optimize import least_squares  # takes half a second to import
+def _fitted(skeleton: Skeleton, rows: NDArray[np.int64], targets: Float) -> Float:
+    """(D,) pose within the limits whose joints ``rows`` (N,) are closest to targets (N, 3); the best of several
+    headings."""
+    rest = neutral_pose(skeleton)
+    hanging = shoulder_angles(np.array([0.0, 0.2, -0.98]))
+    for side in ("l", "r"):  # arms down, legs together
+        rest[skeleton.index(f"shoulder_{side}_yaw")], rest[skeleton.index(f"shoulder_{side}_pitch")] = hanging
+        rest[skeleton.index(f"hip_{side}_yaw")] = 0.0
+    start = np.repeat(rest[None], _HEADINGS, 0)
+    start[:, skeleton.index("torso_yaw")] = np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS
+    for pose in start:
+        pose[:3] = targets.mean(axis=0) - skeleton.joints(rest)[rows].mean(axis=0)
+    free = np.ones(len(rest), bool)
+    moves = skeleton.ancestors()[skeleton.joint_segment][rows]
+    precision = np.where(skeleton.prismatic, 0.0, _ANGLE**-2.0)
+    weight = np.full(3 * len(rows), _JOINT_M**-2.0)
 
-    lower, upper = skeleton.lower - 1e-9, skeleton.upper + 1e-9
-    best = None
-    for yaw in np.arange(8) * np.pi / 4:
-        rest = neutral_pose(skeleton)
-        for side in ("l", "r"):  # arms down, legs together
-            hanging = shoulder_angles(np.array([0.0, 0.2, -0.98]))
-            rest[skeleton.index(f"shoulder_{side}_yaw")], rest[skeleton.index(f"shoulder_{side}_pitch")] = hanging
-            rest[skeleton.index(f"hip_{side}_yaw")] = 0.0
-        rest[:3] = targets.mean(axis=0) - skeleton.joints(rest)[rows].mean(axis=0)
-        rest[skeleton.index("torso_yaw")] = yaw
-        fit = least_squares(residual, rest, bounds=(lower, upper), max_nfev=60)
-        if best is None or fit.cost < best.cost:
-            best = fit
-    assert best is not None
-    return dimensions, skeleton.clip(best.x)
+    def linearise(poses: Float, _: int) -> Equations:
+        found = Equations(len(poses), free, 0)
+        for b, pose in enumerate(poses):
+            w, v = skeleton.twists(pose)
+            x = skeleton.joints(pose)[rows]
+            J = np.where(moves[:, :, None], np.cross(w[None], x[:, None]) + v, 0.0).swapaxes(1, 2)
+            found.add(b, [slice(0, len(rest))], J.reshape(-1, len(rest)), weight, (targets - x).ravel())
+            found.add_block_prior(b, precision, start[b] - pose)
+            excess = skeleton.clip(pose) - pose
+            found.add_block_prior(b, np.where(excess != 0, _LIMIT, 0.0), excess)
+        return found
+
+    levels = [0] * _ITERATIONS
+    poses = minimise(start, linearise, lambda q, step, _: q + step, levels, (_LONGEST_STEP, 0.0), damping=0.01).state
+    poses = skeleton.clip(poses)
+    distance = np.linalg.norm(skeleton.joints(poses)[:, rows] - targets, axis=2)
+    cost = ((distance / _JOINT_M) ** 2).sum(axis=1) + (precision * (start - poses) ** 2).sum(axis=1)
+    return np.asarray(poses[np.argmin(cost)])
 
 
 def _stature_of(joints: dict[str, Float]) -> float | None:
-    """Median stature that the distances of neighbouring joints stand for; None where there are too few."""
+    """Median stature by the distances of neighbouring joints; None if there are fewer than three."""
     table = {
-        ("pelvis", "neck"): TRUNK_LENGTH,
-        ("neck", "head_top"): HEAD_LENGTH,
-        ("shoulder_l", "shoulder_r"): 2 * SHOULDER_HALF_WIDTH,
+        ("pelvis", "neck"): FRACTIONS["trunk"],
+        ("neck", "head_top"): FRACTIONS["head"],
+        ("shoulder_l", "shoulder_r"): 2 * FRACTIONS["shoulder_half_width"],
     }
     for side in ("l", "r"):
-        table |= {
-            (f"shoulder_{side}", f"elbow_{side}"): UPPER_ARM_LENGTH,
-            (f"elbow_{side}", f"wrist_{side}"): FOREARM_LENGTH,
-            (f"hip_{side}", f"knee_{side}"): THIGH_LENGTH,
-            (f"knee_{side}", f"ankle_{side}"): CALF_LENGTH,
-        }
+        chain = ("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")
+        for names, dimensions in zip(chain, (("upper_arm", "forearm"), ("thigh", "calf")), strict=True):
+            for a, b, dimension in zip(names[:-1], names[1:], dimensions, strict=True):
+                table[f"{a}_{side}", f"{b}_{side}"] = FRACTIONS[dimension]
     known = [(a, b, ratio) for (a, b), ratio in table.items() if a in joints and b in joints]
     found = [np.linalg.norm(joints[a] - joints[b]) / ratio for a, b, ratio in known]
     return float(np.clip(np.median(found), LEAST_STATURE, GREATEST_STATURE)) if len(found) >= 3 else None

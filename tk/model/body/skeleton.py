@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tk.kernels.kinematics import ARM_UP
-from tk.model.body.anthropometry import RAISED_SHOULDERS, TRUNK_LENGTH, BodyDimensions
+from tk.model.body.anthropometry import FRACTIONS, RAISED_SHOULDERS, BodyDimensions
 from tk.model.cameras.up import up_vector
 
 Float = NDArray[np.float64]
@@ -465,7 +465,7 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z", waist: bool = Fals
         joints[f"ankle_{side}"] = (f"calf_{side}", ankle)
 
     names = tuple(row[0] for row in rows)
-    lift = RAISED_SHOULDERS / TRUNK_LENGTH * d.trunk * z
+    lift = RAISED_SHOULDERS / FRACTIONS["trunk"] * d.trunk * z
     rise = np.array([lift * (n.startswith("shoulder") and n.endswith("yaw")) for n in names])
     prismatic = np.array([name in ("torso_x", "torso_y", "torso_z") for name in names])
     limits = np.array([_limits(name) for name in names])
