@@ -1,12 +1,12 @@
 """Damped Gauss-Newton over a batch of states, coarse to fine, with quadratic penalties beyond limits.
 
-The silhouette paper's solver (eqs. 9-11 and section 4.5): a fixed number of iterations a scale, no line search, for the
-correspondences are found anew at every iteration. Not in the paper: a scale is left once its steps are short. Damping
-is not in the paper; without it a limb that is hidden in every view makes its equation singular. Nor is over-relaxation.
-Correspondences that are found anew give way less than their equations tell: an edgel that is far off weighs little, the
-next edge along a normal may be another limb's, and a border between colours is told by the few pixels about it. So a
-full step leaves a share of the way, the same again in the next one; longer steps leave less, and a plain one at the end
-takes back what they overshot where equations are exact.
+The silhouette paper's solver (eqs. 9-11 and section 4.5): a fixed number of iterations at each scale and no line
+search, because the correspondences are found anew in every iteration. Not in the paper: a scale ends once its steps are
+short; damping, without which a limb hidden in every view makes its equations singular; and over-relaxation.
+Correspondences found anew move less than their equations predict: an edgel far off has little weight, the next edge
+along a normal may belong to another limb, and a border between colours is determined by the few pixels about it. A full
+step therefore leaves a share of the error, and the next step the same share again. Longer steps leave less; a plain one
+at the end corrects their overshoot where equations are exact.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Float = NDArray[np.float64]
 
 
 class Equations(Protocol):
-    """What a state's residuals add up to: ``hessian (B, D, D)`` is JᵀWJ, ``gradient (B, D)`` is JᵀWd."""
+    """Normal equations of B states: ``hessian (B, D, D)`` is JᵀWJ, ``gradient (B, D)`` is JᵀWd."""
 
     @property
     def hessian(self) -> Float: ...
@@ -34,7 +34,7 @@ class Equations(Protocol):
 
     @property
     def cost(self) -> Float:
-        """(B,) by which states are compared."""
+        """(B,) cost of each state."""
         ...
 
 
@@ -45,16 +45,16 @@ class GaussNewtonSettings:
     Attributes:
         scales: scales of the search, a factor of two apart; the coarsest comes first (the paper: 2).
         iterations: at each scale (the paper: 3).
-        relaxation: by how much steps are longer than the equations tell; beyond 1 (the paper) one plain step more
+        relaxation: length of the steps as a multiple of the equations' solution; above 1 (the paper) one plain step
             follows at the finest scale.
-        damping: share of the diagonal that is added to it.
-        stiffness: what is added to the diagonal at least, as a share of its mean over the free parameters that the
-            data sees; it keeps the others where they are.
-        limit_weight: weight of the squared excess over a limit, as a share of the same mean (4.5, which gives no
-            number).
+        damping: share of each diagonal element that is added to it.
+        stiffness: least number added to the diagonal, as a share of its mean over the free parameters with evidence; it
+            keeps parameters without evidence in place.
+        limit_weight: weight of the squared excess over a limit, as a share of the same mean (section 4.5, which gives
+            no number).
         longest_step: largest change of a parameter in one iteration; steps are shortened to it as a whole.
-        tolerance: a state is done with a scale once no parameter changes by more, radians or metres; 0 (the paper): all
-            iterations are made.
+        tolerance: a state's iteration at a scale ends once no parameter changes by more, radians or metres; 0 (the
+            paper): all iterations are made.
     """
 
     scales: int = 2
@@ -82,7 +82,7 @@ class GaussNewtonSettings:
             )
 
     def steps(self, scale: int) -> list[float]:
-        """How long each step at a scale is, as a share of what the equations tell."""
+        """Return the length of each step at a scale as a multiple of the equations' solution."""
         plain = [1.0] if scale == 0 and self.relaxation > 1 else []
         return [self.relaxation] * self.iterations + plain
 
@@ -93,7 +93,7 @@ class Prior:
 
     Attributes:
         mean: (D,) or (B, D).
-        precision: (D,) zero where there is none.
+        precision: (D,) zero without a prior.
     """
 
     mean: Float
@@ -101,12 +101,12 @@ class Prior:
 
 
 class Descent(NamedTuple):
-    """Where B descents ended.
+    """Result of :func:`minimise` for B states.
 
     Attributes:
         states: (B, D) after the last iteration.
-        hessian: (B, D, D) JᵀWJ where the last step was taken from.
-        iterations: (L,) made at each of the scales, in the order in which they were gone through.
+        hessian: (B, D, D) JᵀWJ before the last step.
+        iterations: (L,) number at each scale, in order.
     """
 
     states: Float
@@ -124,29 +124,29 @@ def minimise(
     prior: Prior | None = None,
     levels: Sequence[int] | None = None,
 ) -> Descent:
-    """Descend from B states at once.
+    """Iterate from B states at once; each state's result is independent of the others.
 
     Args:
         equations: the normal equations at states (B, D) and a scale's index, 0 the finest.
         start: (B, D).
         free: (D,) parameters that may change.
-        lower, upper: (D,) limits; infinite where there is none.
+        lower, upper: (D,) limits; infinite without a limit.
         config: see :class:`GaussNewtonSettings`.
-        prior: what is known beside the equations.
-        levels: the scales to go through; all from the coarsest to the finest if None.
+        prior: of the states.
+        levels: the scales in order; None: all from the coarsest to the finest.
     """
     config = config or GaussNewtonSettings()
     state = np.array(start, np.float64)
     hessian = np.zeros((*state.shape, state.shape[1]))
-    room = _Room(np.flatnonzero(free), lower, upper, config, prior)
+    parameters = _FreeParameters(np.flatnonzero(free), lower, upper, config, prior)
     scales = range(config.scales - 1, -1, -1) if levels is None else levels
     iterations = np.zeros(len(scales), np.int32)
     for i, scale in enumerate(scales):
-        moving = np.ones(len(state), np.bool_)  # what a state comes to does not depend on those beside it
+        moving = np.ones(len(state), np.bool_)  # states do not depend on each other
         for share in config.steps(scale):
             here = equations(state, scale)
-            step = share * room.step(here.hessian, here.gradient, state)
-            state[:, room.index] += np.where(moving[:, None], step, 0.0)
+            step = share * parameters.step(here.hessian, here.gradient, state)
+            state[:, parameters.index] += np.where(moving[:, None], step, 0.0)
             hessian[moving] = here.hessian[moving]
             iterations[i] += 1
             moving &= np.abs(step).max(axis=1, initial=0.0) > config.tolerance
@@ -155,8 +155,8 @@ def minimise(
     return Descent(state, hessian, iterations)
 
 
-class _Room:
-    """Where the states may go: the free parameters ``index`` (n,), their limits, and what is known of them."""
+class _FreeParameters:
+    """The free parameters ``index`` (n,), with their limits and prior."""
 
     def __init__(
         self, index: NDArray[np.intp], lower: Float, upper: Float, config: GaussNewtonSettings, prior: Prior | None
@@ -168,7 +168,7 @@ class _Room:
         self._known = None if prior is None else (prior.mean[..., index], prior.precision[index])
 
     def step(self, hessian: Float, gradient: Float, state: Float) -> Float:
-        """One damped step (B, n) of each state (B, D), the limits' pull included."""
+        """Return one damped step (B, n) of each state (B, D), limits included."""
         config = self._config
         H = hessian[:, self._rows, self.index]
         g = gradient[:, self.index]

@@ -1,9 +1,8 @@
-"""The body of elliptical cone frusta and an ellipsoid head, on the skeleton (silhouette paper, section 3).
+"""The cone body: elliptical cone frusta and an ellipsoid head on the skeleton (silhouette paper, section 3).
 
-The paper prints no sizes; :func:`build_cone_body` lays the parts out from
-:class:`~tk.model.body.anthropometry.BodyDimensions`, as the superellipsoid body is laid out. Hands and feet ride on
-forearm
-and calf: the skeleton has no joints for them.
+The paper prints no sizes; :func:`build_cone_body` places the parts by
+:class:`~tk.model.body.anthropometry.BodyDimensions`. A hand belongs to the forearm's segment, because the skeleton has
+no wrists that turn; a foot is a segment of its own, which turns at the ankle if the skeleton has ankles.
 """
 
 from __future__ import annotations
@@ -22,9 +21,8 @@ from tk.model.body.anthropometry import (
     ANKLE_OUTWARD,
     CROTCH_DROP,
     ELBOW_FRONT,
+    FRACTIONS,
     HAIR,
-    HEAD_LENGTH,
-    HIP_HALF_WIDTH,
     KNEE_BACK,
     PELVIS_FORWARD,
     BodyDimensions,
@@ -33,25 +31,26 @@ from tk.model.body.skeleton import SEGMENTS, Skeleton, build_skeleton, up_rotati
 
 Float = NDArray[np.float64]
 
-# How much of a body is modelled: all fourteen components; without hands and feet; the paper's six-part walker.
+# All fourteen rigid components; without hands and feet; the paper's six-part walker.
 PRESETS = ("full", "limbs", "walker")
 
-# The calf at its thickest against a straight line from knee to ankle.
+# Radius of the calf at its thickest, as a factor of the straight line from knee to ankle. An estimate; the body fit
+# changes it.
 CALF_BELLY = 1.1
 
-# How far the head's longest axis, from the chin to the back of the crown, leans back; an estimate, degrees.
+# Angle, degrees, by which the head's longest axis, from the chin to the back of the crown, leans back. An estimate.
 SKULL_TILT_DEG = 15.0
 
-# Of the left arm in the zero configuration.
-_BENT = np.array([0.5, -0.5, np.sqrt(0.5)])  # where the elbow's crook faces
+# Direction that the crook of the left elbow faces in the zero configuration: perpendicular to the arm, half up.
+_BENT = np.array([0.5, -0.5, np.sqrt(0.5)])
 ELBOW_AXIS = np.cross(np.array([1.0, 1.0, 0.0]) / np.sqrt(2), _BENT)
 
 _FORWARD = np.array([1.0, 0.0, 0.0])
 
-# What :meth:`ConeBody.reshaped` changes of a part: logarithms of a, b, m and h; offsets of either end along x and y.
+# Numbers of a part that :meth:`ConeBody.reshaped` changes: logarithms of a, b, m and h; x and y of either end.
 SHAPE_NUMBERS = 8
 
-# Edges of different limbs can be mistaken for one another (section 4.4).
+# Limb of each segment: an edge of one limb can be mistaken for that of another (section 4.4).
 _LIMBS = {
     "torso": 0,
     "head": 1,
@@ -85,14 +84,14 @@ class ConePart:
     """A frustum of an elliptical cone, or an ellipsoid.
 
     Attributes:
-        name: what it is.
-        segment: the skeleton's segment that carries it.
+        name: of the part.
+        segment: of the skeleton, to which the part is fixed.
         kind: :data:`~tk.kernels.cones.CONE` or :data:`~tk.kernels.cones.ELLIPSOID`.
         shape: cone: semi-axes a, b of the section at z = 0, height h, magnification m of the section at z = h;
             ellipsoid: semi-axes along x, y, z, and 1. Metres.
-        T_body_part: (4, 4) the part's frame in the zero configuration: a cone's axis runs from the origin along z, an
+        T_body_part: (4, 4) the part's frame in the zero configuration: a cone's axis goes from the origin along z, an
             ellipsoid is centred on the origin.
-        ends: whether the rims at z = 0 and z = h are tracked, too.
+        ends: whether the rims at z = 0 and z = h are contours, too.
     """
 
     name: str
@@ -104,7 +103,7 @@ class ConePart:
 
     @property
     def component(self) -> str:
-        """The rigid component that it is a part of: its segment, or its own name if it is a hand or a foot."""
+        """Rigid component of the part: its segment, or its own name if it is a hand or a foot."""
         name = self.name.replace("instep_", "foot_")
         return name if name.startswith(("hand_", "foot_")) else self.segment
 
@@ -113,7 +112,7 @@ class ConePart:
             raise ConfigError(f"part {self.name}: sizes {self.shape} must lie between 0 and 3")
 
     def surface(self, unscaled: Float) -> Float:
-        """Points (N, 3) of the surface in the part's frame from coordinates (x / a r, y / b r, z / h)."""
+        """Return surface points (N, 3) in the part's frame from coordinates (x / a r, y / b r, z / h)."""
         a, b, h, m = self.shape
         z = unscaled[:, 2]
         r = 1 + (m - 1) * z if self.kind == CONE else np.ones_like(z)
@@ -137,14 +136,14 @@ class ConeBody:
     preset: str = "full"
 
     def standing(self, up: str) -> ConeBody:
-        """The same body in a world in which ``up`` (see :func:`tk.model.cameras.up.up_vector`) points up."""
+        """Return the same body in a world in which ``up`` (see :func:`tk.model.cameras.up.up_vector`) points up."""
         if np.array_equal(self.skeleton.T_world_body, up_rotation(up)):
             return self
         return replace(self, skeleton=_skeleton(self.dimensions, up, self.preset))
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
-        """(D,) the degrees of freedom that are tracked: those that move a part, or the walker's seven."""
+        """(D,) bool, tracked degrees of freedom: those that move a part, or the walker's seven."""
         names = self.skeleton.names
         if self.preset == "walker":
             return np.array([name in _WALKER_DOFS for name in names])
@@ -153,17 +152,17 @@ class ConeBody:
 
     @cached_property
     def arrays(self) -> ConeArrays:
-        """The body for the kernels, float32."""
+        """Arrays for the kernels, float32."""
         return self.pack(np.float32)
 
     def pack(self, dtype: type[np.floating]) -> ConeArrays:
-        """The body for the kernels in this precision.
+        """Return arrays for the kernels in a precision.
 
         Raises:
-            ConfigError: it has more parts than the kernels can tell apart.
+            ConfigError: the body has more parts than the kernels can number.
         """
         if len(self.parts) > MOST_PARTS:
-            raise ConfigError(f"a body of {len(self.parts)} parts; {MOST_PARTS} are the most")
+            raise ConfigError(f"a body has {len(self.parts)} parts; {MOST_PARTS} are the most")
         s = self.skeleton
         segments, inside = self._frames
         curves: list[tuple[int, int]] = []
@@ -185,17 +184,17 @@ class ConeBody:
 
     @property
     def shape_groups(self) -> tuple[str, ...]:
-        """Parts that are shaped alike: a name for each, "thigh_" for the left and right thigh."""
+        """(G,) names of the groups of parts with one shape: "thigh_" for the left and right thigh."""
         return tuple(dict.fromkeys(group_of(part.name) for part in self.parts))
 
     def reshaped(self, change: Float) -> ConeBody:
-        """A body whose parts have other sizes and lie elsewhere about their bones; the skeleton is the same.
+        """Return a body whose parts have other sizes and lie elsewhere about their bones; the skeleton stays.
 
         Args:
-            change: (G, 8) for each of :attr:`shape_groups` what the logarithms of a, b, m and h grow by (of an
-                ellipsoid: of the three semi-axes), and how far the axis moves along the part's x and y, metres: two
-                numbers where it begins (a cone's z = 0, an ellipsoid's lower pole), two where it ends. The right
-                side's is the left's in a mirror.
+            change: (G, 8) for each of :attr:`shape_groups` the growth of the logarithms of a, b, m and h (of an
+                ellipsoid: of the three semi-axes), and the displacement of the axis along the part's x and y, metres:
+                two numbers at its beginning (a cone's z = 0, an ellipsoid's lower pole), two at its end. The right
+                side is the left's mirror image.
         """
         rows = dict(zip(self.shape_groups, change, strict=True))
         return replace(
@@ -206,10 +205,9 @@ class ConeBody:
     def place(
         self, pose: Float, part: NDArray[np.integer], unscaled: Float, T_world_segment: Float | None = None
     ) -> Float:
-        """World points (N, 3) on the surface of parts (N,), from coordinates as :meth:`ConePart.surface`
-        takes them.
+        """Return world points (N, 3) on the surface of parts (N,) from coordinates of :meth:`ConePart.surface`.
 
-        ``T_world_segment`` is what the skeleton says of the segments at this pose, if at hand.
+        ``T_world_segment`` are the segments' transforms at the pose; None: they are computed.
         """
         if T_world_segment is None:
             T_world_segment = self.skeleton.segment_transforms(pose)
@@ -217,17 +215,17 @@ class ConeBody:
         return self.placed(T, part, unscaled)
 
     def placed(self, T_world_part: Float, part: NDArray[np.integer], unscaled: Float) -> Float:
-        """The same from each point's part's transform (N, 4, 4)."""
+        """Return the same from the transform (N, 4, 4) of each point's part."""
         local = self.local(part, unscaled)[2]
         return np.asarray((T_world_part[:, :3, :3] @ local[:, :, None])[:, :, 0] + T_world_part[:, :3, 3])
 
     def part_transforms(self, T_world_segment: Float) -> Float:
-        """(..., P, 4, 4) from each part to the world, from the segments' (..., S, 4, 4)."""
+        """Return (..., P, 4, 4) from each part to the world, from the segments' (..., S, 4, 4)."""
         segments, inside = self._frames
         return np.asarray(T_world_segment[..., segments, :, :] @ inside)
 
     def local(self, part: NDArray[np.integer], unscaled: Float) -> tuple[Float, Float, Float]:
-        """Shape (N, 4) and radius factor (N,) of the parts, points (N, 3) in their frames."""
+        """Return shape (N, 4) and radius factor (N,) of the parts, and points (N, 3) in their frames."""
         shape = np.array([p.shape for p in self.parts])[part]
         cone = np.array([p.kind == CONE for p in self.parts])[part]
         r = np.where(cone, 1 + (shape[:, 3] - 1) * unscaled[:, 2], 1.0)
@@ -235,7 +233,7 @@ class ConeBody:
 
     @cached_property
     def _frames(self) -> tuple[NDArray[np.int64], Float]:
-        """(P,) each part's segment, and (P, 4, 4) from the part to it."""
+        """(P,) segment of each part, and (P, 4, 4) from the part to its segment."""
         B = np.eye(4)
         B[:3, :3] = self.skeleton.T_world_body
         segments = np.array([SEGMENTS.index(part.segment) for part in self.parts])
@@ -243,7 +241,7 @@ class ConeBody:
 
 
 def _reshape(part: ConePart, row: Float, right: bool) -> ConePart:
-    """What :meth:`ConeBody.reshaped` makes of a part."""
+    """Change a part by a row (8,) of :meth:`ConeBody.reshaped`."""
     by_a, by_b, by_m, by_h = np.exp(row[:4]).tolist()
     a, b, h, m = part.shape
     side = -1.0 if right else 1.0
@@ -261,7 +259,7 @@ def _reshape(part: ConePart, row: Float, right: bool) -> ConePart:
 
 
 def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "full") -> ConeBody:
-    """The cone body with these dimensions.
+    """Build the cone body of these dimensions.
 
     Args:
         dimensions: lengths and radii, metres.
@@ -286,7 +284,7 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
             shoulder = M @ np.array([0.0, d.shoulder_half_width, d.trunk - d.shoulder_drop])
             elbow = shoulder + d.upper_arm * u
             wrist = elbow + d.forearm * u
-            # the flesh lies on the side that the elbow bends to
+            # the muscles lie on the side to which the elbow bends
             crook = elbow + ELBOW_FRONT * d.stature * (M @ _BENT) if preset == "full" else elbow
             for segment, begin, end, r0, r1 in (
                 ("upper_arm", shoulder, crook, d.upper_arm_radius, d.elbow_radius),
@@ -338,7 +336,7 @@ def _calf(side: str, knee: Float, ankle: Float, d: BodyDimensions) -> list[ConeP
 def _between(
     name: str, segment: str, begin: Float, end: Float, r0: float, r1: float, toward: Float = _FORWARD
 ) -> ConePart:
-    """A frustum whose x axis faces ``toward`` a direction, as near as may be."""
+    """A frustum whose x axis is as close as possible to the direction ``toward``."""
     length = float(np.linalg.norm(end - begin))
     axis = (end - begin) / length
     front = toward - (toward @ axis) * axis
@@ -366,9 +364,9 @@ def _foot(side: str, ankle: Float, d: BodyDimensions) -> list[ConePart]:
 
 
 def _torso(d: BodyDimensions) -> ConePart:
-    """From the crotch to the root of the neck; one magnification for width and depth, as the paper has it."""
+    """From the crotch to the root of the neck; one magnification for width and depth, as in the paper."""
     x, _, z = np.eye(3)
-    bottom = -0.9 * CROTCH_DROP / HIP_HALF_WIDTH * d.hip_half_width
+    bottom = -0.9 * CROTCH_DROP / FRACTIONS["hip_half_width"] * d.hip_half_width
     top = 0.94 * d.trunk
     m = d.chest_half_width / d.hips_half_width
     depth = 0.5 * (d.hips_half_depth + d.chest_half_depth / m)
@@ -379,10 +377,10 @@ def _torso(d: BodyDimensions) -> ConePart:
 def _trunk_and_head(d: BodyDimensions) -> list[ConePart]:
     """Torso and head in more detail: abdomen, belly, chest, shoulders; skull, neck.
 
-    At the hips the trunk lies before the line of the joints, at the shoulders about it; hair stands on the crown.
+    At the hips the trunk lies in front of the line of the joints, at the shoulders on it; hair stands on the crown.
     """
     x, _, z = np.eye(3)
-    bottom = -0.9 * CROTCH_DROP / HIP_HALF_WIDTH * d.hip_half_width
+    bottom = -0.9 * CROTCH_DROP / FRACTIONS["hip_half_width"] * d.hip_half_width
     waist, shoulders = 0.42 * d.trunk, d.trunk - 0.7 * d.shoulder_drop
     breast = 0.5 * (waist + shoulders)
     taper = 0.93
@@ -403,7 +401,7 @@ def _trunk_and_head(d: BodyDimensions) -> list[ConePart]:
     # its long axis goes from the chin to the back of the crown
     lean = float(np.radians(SKULL_TILT_DEG))
     vertex, face = np.cos(lean) * z - np.sin(lean) * x, np.cos(lean) * x + np.sin(lean) * z
-    crown = d.trunk + (1 + HAIR / HEAD_LENGTH) * d.head
+    crown = d.trunk + (1 + HAIR / FRACTIONS["head"]) * d.head
     return [
         slice_of("abdomen", bottom, waist, hips, taper),
         slice_of("belly", waist, breast, (taper * chest[0], taper * chest[1]), 1 / taper),
@@ -427,9 +425,9 @@ def _trunk_and_head(d: BodyDimensions) -> list[ConePart]:
 
 
 def _head(d: BodyDimensions) -> ConePart:
-    """An ellipsoid that reaches from the crown into the torso: it stands for the neck, too.
+    """An ellipsoid that reaches from the crown into the torso: it represents the neck, too.
 
-    C7 lies at the back of the neck and the crown behind the middle of the head: its centre is before their line.
+    C7 lies at the back of the neck and the crown behind the middle of the head: its centre is in front of their line.
     """
     x, _, z = np.eye(3)
     half = 0.58 * d.head
@@ -439,7 +437,7 @@ def _head(d: BodyDimensions) -> ConePart:
 
 
 def group_of(name: str) -> str:
-    """A part's name without its side; it ends with an underscore if there are two."""
+    """Return a part's name without its side; it ends with an underscore if there are two sides."""
     return name[:-1] if name.endswith(("_l", "_r")) else name
 
 

@@ -1,7 +1,7 @@
-"""Rough poses of a walking person: what the initialisation tries out ("multiple different poses can be hypothesized
-and tested", silhouette paper, section 4.6).
+"""Rough poses of a walking person: hypotheses of the initialisation ("multiple different poses can be hypothesized and
+tested", silhouette paper, section 4.6).
 
-The curves are the textbook's sagittal joint angles of level walking (Perry, *Gait Analysis*, 1992, chapters 5 and 6) in
+The curves are textbook sagittal joint angles of level walking (Perry, *Gait Analysis*, 1992, chapters 5 and 6) in
 their simplest form: the hip swings between 30° of flexion at heel strike and 10° of extension; the knee yields by 15°
 in early stance and bends by 60° in swing.
 """
@@ -17,7 +17,7 @@ Float = NDArray[np.float64]
 
 
 def hip_and_knee(phase: float) -> tuple[float, float]:
-    """Hip flexion and knee flexion, radians, at a phase in [0, 1) of the leg's cycle; 0 is heel strike."""
+    """Return hip and knee flexion, radians, at a phase in [0, 1) of the leg's cycle; 0 is heel strike."""
     phase %= 1.0
     hip = 10.0 + 20.0 * np.cos(2 * np.pi * phase)
     swing = (phase - 0.72) / 0.13
@@ -27,12 +27,12 @@ def hip_and_knee(phase: float) -> tuple[float, float]:
 
 
 def standing_pose(skeleton: Skeleton) -> Float:
-    """(D,) upright at the origin, arms hanging, legs together."""
+    """Return the pose (D,): upright at the origin, arms hanging, legs together."""
     return walking_pose(skeleton, None)
 
 
 def walking_pose(skeleton: Skeleton, phase: float | None) -> Float:
-    """(D,) at a phase of the left leg's cycle, upright at the origin, facing forward; None: standing."""
+    """Return the pose (D,) at a phase of the left leg's cycle, at the origin, facing forward; None: standing."""
     pose = np.zeros(len(skeleton.names))
     for side, lag in (("l", 0.0), ("r", 0.5)):
         hip, knee = hip_and_knee(phase + lag) if phase is not None else (0.0, np.radians(3.0))
@@ -49,7 +49,7 @@ def walking_pose(skeleton: Skeleton, phase: float | None) -> Float:
 
 
 def neutral_pose(skeleton: Skeleton) -> Float:
-    """(D,) the Da Vinci pose: upright, arms level and sideways, legs 15° apart (Kehl 2006, section 6.3)."""
+    """Return the Da Vinci pose (D,): upright, arms level and sideways, legs 15° apart (Kehl 2006, section 6.3)."""
     pose = np.zeros(len(skeleton.names))
     for side in ("l", "r"):
         pose[skeleton.index(f"shoulder_{side}_yaw")] = np.radians(30.0)
@@ -59,7 +59,7 @@ def neutral_pose(skeleton: Skeleton) -> Float:
 
 
 def hypotheses(skeleton: Skeleton, headings: int, phases: int, p_pelvis: Float, first: float = 0.0) -> Float:
-    """(B, D) walking phases, standing and Da Vinci pose at every heading, with the pelvis at ``p_pelvis`` (3,).
+    """Return poses (B, D) with the pelvis at ``p_pelvis`` (3,): walking phases, standing and Da Vinci pose at headings.
 
     Headings are evenly spaced, beginning with ``first``, radians.
     """

@@ -1,10 +1,10 @@
 """Strips of surface points along the circles of latitude and the meridians of a body's pieces (Kehl 2006, 5.2, fig. 6).
 
-Laid out once a body. Strips are equal distances apart on the surface. Along a strip the samples are at equal steps of
-the angle: there the paper's interpolation (eq. 5) works, and flat sides, where the normal hardly turns, need few.
+Computed once for a body. Strips are equal distances apart on the surface. Along a strip the samples are at equal steps
+of the angle: there the paper's interpolation (eq. 5) works, and flat sides, where the normal hardly turns, need few.
 
-Contour points are taken on the limbs only (6.1.2): on the upper arms, forearms, thighs and calves, there on the tapered
-piece. Its caps lie inside joints, and hands and feet turn about joints that the model does not have.
+Contour points lie on the limbs only (6.1.2): on the tapered pieces of upper arms, forearms, thighs and calves. Their
+caps lie inside joints; hands and feet have no wrist and no ankle in the paper's model.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from tk.errors import ConfigError
 from tk.kernels.contour import ContourKernel
 from tk.kernels.projection import pack_camera
 from tk.model.body.skeleton import SEGMENTS
-from tk.model.body.superellipsoid import Superellipsoid, signed_power
+from tk.model.body.superellipsoid import Superellipsoid
 from tk.model.body.superellipsoid_body import SuperellipsoidBody
 from tk.model.cameras.camera import Rig
 
 Float = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
-# feet are pieces of the calves
+# segments with contour points
 LIMBS = tuple(s for s in SEGMENTS if s not in ("torso", "pelvis", "head", "foot_l", "foot_r"))
 
 
 @dataclass(frozen=True)
 class Strips:
-    """Strips of N samples on every piece: first a piece's circles of latitude, then its meridians; S in all.
+    """Strips of N samples on every piece, S in all: first a piece's circles of latitude, then its meridians.
 
     Attributes:
         circles, meridians: number of strips of each kind on each piece.
@@ -53,7 +53,7 @@ class Strips:
     limb_piece: Ints
 
     def even(self, pairs: int = 5, singles: int = 0) -> Ints:
-        """(K,) strips on the limbs, evenly spread, the same at every call: K = L (pairs + singles).
+        """Return (K,) strips on the limbs, evenly spread, the same at every call: K = L (pairs + singles).
 
         Args:
             pairs: circles of latitude on each limb. The paper takes 10 contour points a limb and view: 5 pairs.
@@ -65,7 +65,7 @@ class Strips:
         return self._on_limbs(np.tile(np.concatenate([circle, meridian]), (1, len(self.limb_piece), 1)))[0]
 
     def draw(self, rng: np.random.Generator, batch: int = 1, pairs: int = 5, singles: int = 0) -> Ints:
-        """(batch, K) strips on the limbs, drawn for each pose without repetition; arguments as in :meth:`even`."""
+        """Draw (batch, K) strips on the limbs for each pose without repetition; arguments as in :meth:`even`."""
         self._check(pairs, singles)
         parts = [
             first + np.sort(np.argsort(rng.random((batch, len(self.limb_piece), count)), axis=2)[..., :wanted], axis=2)
@@ -74,21 +74,21 @@ class Strips:
         return self._on_limbs(np.concatenate(parts, axis=2))
 
     def _on_limbs(self, within: NDArray[np.integer]) -> Ints:
-        """(B, L · n) strips from their numbers (B, L, n) within each limb's piece."""
+        """(B, L · n) strips from their indices (B, L, n) within each limb's piece."""
         first = self.limb_piece[:, None] * (self.circles + self.meridians)
         return (first + within).reshape(len(within), -1).astype(np.int32)
 
     def _check(self, pairs: int, singles: int) -> None:
         for name, wanted, count in (("pairs", pairs, self.circles), ("single points", singles, self.meridians)):
             if not 0 <= wanted <= count:
-                raise ConfigError(f"{wanted} contour {name} a limb: choose 0 to {count}, or lay out more strips")
+                raise ConfigError(f"{wanted} contour {name} a limb: choose 0 to {count}, or build more strips")
 
 
 def build_strips(body: SuperellipsoidBody, circles: int = 20, meridians: int = 16, samples: int = 32) -> Strips:
-    """The strips of a body.
+    """Build the strips of a body.
 
     Args:
-        body: its pieces are used, the surface samples are not.
+        body: only its pieces are used.
         circles, meridians: strips of each kind on each piece.
         samples: steps along each strip; with 32, eq. 5 is within 0.5 mm of the rim on a limb's circles.
     """
@@ -102,7 +102,7 @@ def build_strips(body: SuperellipsoidBody, circles: int = 20, meridians: int = 1
         eta = np.concatenate([np.repeat(heights[:, None], samples + 1, 1), np.tile(along, (meridians, 1))])
         omega = np.concatenate([np.tile(around, (circles, 1)), np.repeat(turns[:, None], samples + 1, 1)])
         angles.append(np.stack([eta, omega], -1))
-        normals.append(_normal_direction(piece, eta, omega))
+        normals.append(piece.normal_direction(eta, omega))
     per_piece = circles + meridians
     segment = np.array([SEGMENTS.index(p.segment) for p in body.pieces], np.int32)
     return Strips(
@@ -118,7 +118,7 @@ def build_strips(body: SuperellipsoidBody, circles: int = 20, meridians: int = 1
 
 
 def contour_kernel(body: SuperellipsoidBody, strips: Strips, rig: Rig, dtype: type = np.float32) -> ContourKernel:
-    """The kernel that finds this body's contour points in these cameras."""
+    """Return the kernel that finds a body's contour points in cameras."""
     return ContourKernel(
         body.arrays,
         strip_angles=strips.angles,
@@ -128,20 +128,6 @@ def contour_kernel(body: SuperellipsoidBody, strips: Strips, rig: Rig, dtype: ty
         strip_paired=strips.paired,
         cameras=np.array([pack_camera(c.matrix, c.distortions, c.rotation, c.translation, c.fisheye) for c in rig]),
         dtype=dtype,
-    )
-
-
-def _normal_direction(piece: Superellipsoid, eta: Float, omega: Float) -> Float:
-    """(…, 3) n_d of eq. 2 in its own length: with it, n_d · r(η, ω) = 1."""
-    a1, a2, a3 = piece.radii
-    ring = signed_power(np.cos(eta), 2 - piece.e1)
-    return np.stack(
-        [
-            ring * signed_power(np.cos(omega), 2 - piece.e2) / a1,
-            ring * signed_power(np.sin(omega), 2 - piece.e2) / a2,
-            signed_power(np.sin(eta), 2 - piece.e1) / a3,
-        ],
-        axis=-1,
     )
 
 

@@ -1,7 +1,7 @@
 """Truncated superellipsoids (Kehl 2006, sections 5.1 and 5.2).
 
-A piece has its main axis along local z. Its surface is eq. 1 for the part between two planes z = const. A limb is a
-truncated piece and a cap; a cap is a piece of its own, with ε₁ = 1 and cut at its equator.
+A piece has its main axis along local z. Its surface is eq. 1 between two planes z = const. A limb is a truncated piece
+and a cap; a cap is a piece of its own, with ε₁ = 1 and cut at its equator.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Superellipsoid:
     """One piece of the body's surface.
 
     Attributes:
-        segment: the body segment that carries it.
+        segment: the body segment to which the piece is fixed.
         T_body_piece: (4, 4) from the piece's frame to the body frame in the zero configuration.
         radii: a₁, a₂, a₃, metres.
         e1, e2: ε₁ (along the meridians) and ε₂ (along the circles of latitude), each in (0, 2).
@@ -52,7 +52,7 @@ class Superellipsoid:
         return _eta(self.z_lower / self.radii[2], self.e1), _eta(self.z_upper / self.radii[2], self.e1)
 
     def point(self, eta: Float, omega: Float) -> Float:
-        """(…, 3) r(η, ω), metres (eq. 1)."""
+        """Return (…, 3) r(η, ω), metres (eq. 1)."""
         a1, a2, a3 = self.radii
         ring = signed_power(np.cos(eta), self.e1)
         return np.stack(
@@ -65,10 +65,15 @@ class Superellipsoid:
         )
 
     def normal(self, eta: Float, omega: Float) -> Float:
-        """(…, 3) unit outward normals (eq. 2)."""
+        """Return (…, 3) unit outward normals (eq. 2)."""
+        n = self.normal_direction(eta, omega)
+        return n / np.linalg.norm(n, axis=-1, keepdims=True)
+
+    def normal_direction(self, eta: Float, omega: Float) -> Float:
+        """Return (…, 3) n_d of eq. 2 in its own length, 1/m: with it, n_d · r(η, ω) = 1."""
         a1, a2, a3 = self.radii
         ring = signed_power(np.cos(eta), 2 - self.e1)
-        n = np.stack(
+        return np.stack(
             [
                 ring * signed_power(np.cos(omega), 2 - self.e2) / a1,
                 ring * signed_power(np.sin(omega), 2 - self.e2) / a2,
@@ -76,10 +81,9 @@ class Superellipsoid:
             ],
             axis=-1,
         )
-        return n / np.linalg.norm(n, axis=-1, keepdims=True)
 
     def inside_outside(self, p_piece: Float) -> Float:
-        """F(x, y, z) of section 5.3 at points (…, 3): below 1 inside, 1 on the surface, above 1 outside.
+        """Return F(x, y, z) of section 5.3 at points (…, 3): below 1 inside, 1 on the surface, above 1 outside.
 
         The paper does not print F; this is Barr's. It ignores the truncation: see :meth:`contains`.
         """
@@ -87,12 +91,12 @@ class Superellipsoid:
         return (x ** (2 / self.e2) + y ** (2 / self.e2)) ** (self.e2 / self.e1) + z ** (2 / self.e1)
 
     def contains(self, p_piece: Float) -> NDArray[np.bool_]:
-        """(…) True for points inside the truncated piece."""
+        """Return (…) True for points inside the truncated piece."""
         z = np.asarray(p_piece)[..., 2]
         return (self.inside_outside(p_piece) < 1) & (z >= self.z_lower) & (z <= self.z_upper)
 
     def samples(self, spacing_m: float) -> tuple[Float, Float]:
-        """Angles (N,) η and (N,) ω of surface points about ``spacing_m`` apart, uniform in area.
+        """Return angles η (N,) and ω (N,) of surface points about ``spacing_m`` apart, uniform in area.
 
         Circles of latitude are laid at equal arc lengths along the meridian, and points at equal arc lengths along each
         circle, every other circle shifted by half a step (equal steps of η and ω would crowd the curved regions).
@@ -120,7 +124,7 @@ class Superellipsoid:
 
 
 def signed_power(base: Float, exponent: float) -> Float:
-    """sign(b)·|b|^e, the power that superquadrics are written in."""
+    """Return sign(b)·|b|^e, the power in the equations of superquadrics."""
     return np.sign(base) * np.abs(base) ** exponent
 
 

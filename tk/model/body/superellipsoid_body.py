@@ -1,8 +1,8 @@
-"""The skin of superellipsoids on a body, and its sampled surface (Kehl 2006, section 5).
+"""The superellipsoid body and its sampled surface (Kehl 2006, section 5).
 
 The paper shows its model in figure 5 and prints no sizes. Here every part of a
-:class:`~tk.model.body.cone_body.ConeBody` gets a superellipsoid of the same ends, so one fit of the body serves both
-skins.
+:class:`~tk.model.body.cone_body.ConeBody` becomes a superellipsoid with the same ends, so one body fit serves both
+surface models.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from tk.model.body.superellipsoid import Superellipsoid
 
 Float = NDArray[np.float64]
 
-# ε₁ and ε₂ of the parts that are no ellipsoids, by their group: trunks are flatter than ellipses, and hands and feet,
-# which end a limb, are closed boxes with round edges.
+# ε₁ and ε₂ by group of parts, (1, 1) for the others: trunks are flatter than ellipses; hands and feet, at the end of a
+# limb, are closed boxes with round edges. Estimates: the paper gives no numbers.
 EXPONENTS: dict[str, tuple[float, float]] = {
     "abdomen": (1.0, 0.8),
     "belly": (1.0, 0.8),
@@ -33,9 +33,10 @@ EXPONENTS: dict[str, tuple[float, float]] = {
     "hand_": (0.6, 1.0),
     "foot_": (0.6, 0.9),
 }
-# A tapered piece is cut from an ellipsoid so many times as long: nearly straight from end to end, as a cone is.
+# Length of the ellipsoid from which a tapered piece is cut, as a factor of the piece's: its sides are then nearly
+# straight, as a cone's.
 SLENDER = 4.0
-# Between neighbouring surface samples, metres.
+# Distance between neighbouring surface samples, metres: less than a voxel of the hull (37 mm at 64 along 2.4 m).
 SPACING_M = 0.03
 
 
@@ -45,13 +46,13 @@ class SuperellipsoidBody:
 
     Attributes:
         skeleton: the kinematic tree.
-        pieces: the superellipsoids.
+        pieces: of the surface.
         points: (N, 3) surface samples in the zero configuration, world frame, metres.
         segment: (N,) index of each sample's segment.
         piece: (N,) index of each sample's piece.
         diameter: (N,) the limb diameter σ at each sample, metres (eq. 10).
         patch: (N,) index of each sample's colour patch.
-        patch_names: (P,) what the patches are.
+        patch_names: (P,) of the colour patches.
     """
 
     skeleton: Skeleton
@@ -78,7 +79,7 @@ class SuperellipsoidBody:
         return PieceArrays(tree, pieces)
 
     def place(self, pose: Float) -> Float:
-        """Surface samples (N, 3) at a pose, world frame. Float64 reference for the kernels."""
+        """Return surface samples (N, 3) at a pose, world frame, metres. Float64 reference for the kernels."""
         T = self.skeleton.segment_transforms(pose)[self.segment]
         return np.asarray(np.einsum("nab,nb->na", T[:, :3, :3], self.points) + T[:, :3, 3])
 
@@ -86,13 +87,13 @@ class SuperellipsoidBody:
 def build_superellipsoid_body(
     body: ConeBody, up: str = "z", waist: bool = False, spacing_m: float = SPACING_M
 ) -> SuperellipsoidBody:
-    """The skin of a body.
+    """Build the superellipsoid body of a cone body.
 
     Args:
-        body: dimensions, and where its parts lie and how thick they are.
+        body: its dimensions and parts.
         up: the world axis that points up.
-        waist: whether the pelvis turns against the trunk, by three degrees of freedom beyond the paper's 24. The feet
-            are the calves', as in the paper.
+        waist: whether the pelvis turns against the trunk, by three degrees of freedom beyond the paper's 24. There are
+            no ankles, as in the paper: a foot moves with its calf.
         spacing_m: distance between neighbouring surface samples.
     """
     skeleton = build_skeleton(body.dimensions, up, waist)
@@ -108,7 +109,7 @@ def build_superellipsoid_body(
     segment = np.array([SEGMENTS.index(p.segment) for p in pieces], dtype=np.int32)[owner]
     B = skeleton.T_world_body
     keep = ~_buried(skeleton, pieces, p_zero @ B.T, segment, owner)
-    # the crotch: silhouettes cannot carve between the thighs, so the hull is always too low there
+    # no samples at the crotch: the hull is too low there, because silhouettes cannot carve between the thighs
     keep &= ~((segment == SEGMENTS.index("pelvis")) & (n_zero[:, 2] < -0.3))
     patch, patch_names = _patches(p_zero, n_zero, segment)
     used, patch_of = np.unique(patch[keep], return_inverse=True)
@@ -125,8 +126,8 @@ def build_superellipsoid_body(
 
 
 def piece_of(part: ConePart) -> Superellipsoid:
-    """The superellipsoid that stands for a part: of an ellipsoid itself; of a frustum one with its two ends, cut there
-    or, where the limb ends, closed."""
+    """Return the superellipsoid of a part: an ellipsoid is one; a frustum's has the same two ends, cut there or, at the
+    end of a limb, closed."""
     e1, e2 = EXPONENTS.get(group_of(part.name), (1.0, 1.0))
     a, b, h, m = part.shape
     if part.kind != CONE:
@@ -153,7 +154,7 @@ def _buried(
     segment: NDArray[np.int32],
     piece: NDArray[np.int32],
 ) -> NDArray[np.bool_]:
-    """(N,) True for samples inside another piece in the Da Vinci pose: armpits, the crotch, the inside of joints."""
+    """(N,) bool, samples inside another piece in the Da Vinci pose: armpits, the crotch, the inside of joints."""
     T = skeleton.segment_transforms(neutral_pose(skeleton))
     B = np.eye(4)
     B[:3, :3] = skeleton.T_world_body

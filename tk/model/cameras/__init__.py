@@ -1,1 +1,1 @@
-"""Cameras, the working volume, the up direction, refinement."""
+"""Cameras, working volume, up direction, triangulation, agreement and refinement of cameras."""

@@ -12,13 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 
 Float = NDArray[np.float64]
 
-# OpenCV's default of five rounds leaves up to 0.07 px under a usual barrel distortion.
+# Termination of OpenCV's undistortion: its default of five rounds leaves up to 0.07 px under common barrel distortion;
+# 1e-12 is rounding.
 _CONVERGED = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 
 def _undistort(points: Float, matrix: Float, distortions: Float, criteria: tuple[int, int, float]) -> Float:
-    """Pixels (N, 1, 2) to normalised coordinates (N, 1, 2), iterated until ``criteria`` are met."""
-    if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4: a function of its own
+    """Normalised coordinates (N, 1, 2) of pixels (N, 1, 2), iterated until ``criteria`` hold."""
+    if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4 has a separate function
         result = cv2.undistortPointsIter(points, matrix, distortions, None, None, criteria)
     else:
         result = cv2.undistortPoints(points, matrix, distortions, criteria=criteria)
@@ -52,7 +53,7 @@ class Camera:
 
     @property
     def center(self) -> Float:
-        """(3,) the centre of projection in the world frame, metres."""
+        """(3,) centre of projection in the world frame, metres."""
         return -self.rotation.T @ self.translation
 
     @property
@@ -62,7 +63,7 @@ class Camera:
         return projection
 
     def to_camera(self, p_world: ArrayLike) -> Float:
-        """World points (N, 3) in the camera frame, metres."""
+        """Return world points (N, 3) in the camera frame, metres."""
         return np.asarray(p_world, dtype=np.float64).reshape(-1, 3) @ self.rotation.T + self.translation
 
     def project(self, p_world: ArrayLike) -> tuple[Float, Float]:
@@ -84,20 +85,20 @@ class Camera:
         return pixels, depth
 
     def _pixels(self, p_camera: Float) -> Float:
-        """(N, 2) pixels of points (N, 3) before the camera, NaN past the fold of the distortion."""
+        """(N, 2) pixels of points (N, 3) in front of the camera, NaN beyond the fold of the distortion."""
         xy = p_camera[:, :2] / p_camera[:, 2:]
         squared = np.einsum("na,na->n", xy, xy)
         if self.fisheye:
             bent = np.arctan(np.sqrt(squared)) ** 2
-            if len(p_camera):  # OpenCV refuses none
+            if len(p_camera):  # OpenCV refuses an empty array
                 distorted = cv2.fisheye.distortPoints(xy[:, None], np.eye(3), self.distortions[:4])
                 xy = np.asarray(distorted, np.float64)[:, 0]
         else:
-            # written out, for OpenCV's takes several times as long
+            # not OpenCV's function, which takes several times as long
             k1, k2, p1, p2, k3 = (*self.distortions, 0.0)[:5]
             bent = squared
             radial = 1 + squared * (k1 + squared * (k2 + squared * k3))
-            tangential = 2 * (xy @ np.array([p2, p1]))  # along the point's own direction, as the radial part is
+            tangential = 2 * (xy @ np.array([p2, p1]))  # along the point's direction, like the radial part
             xy = xy * (radial + tangential)[:, None] + squared[:, None] * np.array([p2, p1])
         pixels = xy * self.matrix.diagonal()[:2] + self.matrix[:2, 2]
         pixels[bent > self._fold] = np.nan
@@ -105,20 +106,20 @@ class Camera:
 
     @cached_property
     def _fold(self) -> float:
-        """Up to which squared radius (fisheye: angle from the axis) the distortion grows with it; infinite if always.
+        """Squared radius (fisheye: angle from the axis) up to which the distorted radius grows; infinite if always.
 
-        Far outside the picture its polynomial folds back: such a point is not seen at all.
+        Far outside the image the distortion's polynomial folds back: such a point is not visible.
         """
         k = self.distortions[:4] if self.fisheye else np.delete(self.distortions, [2, 3])
-        # where 1 + 3 k1 s + 5 k2 s² + … first gets zero; solved for 1 / s, whose highest coefficient is 1
+        # the first zero of 1 + 3 k1 s + 5 k2 s² + …, solved for 1 / s, whose highest coefficient is 1
         roots = np.roots([1.0, *(np.arange(3, 2 * len(k) + 2, 2) * k)])
         found = roots.real[np.isreal(roots) & (roots.real > 0)]
         return float(1 / found.max()) if len(found) else np.inf
 
     def undistort(self, pixels: ArrayLike) -> Float:
-        """Pixels (N, 2) to normalised image coordinates (N, 2): x/z and y/z in the camera frame."""
+        """Return normalised image coordinates (N, 2), x/z and y/z in the camera frame, of pixels (N, 2)."""
         points = np.ascontiguousarray(np.asarray(pixels, dtype=np.float64).reshape(-1, 1, 2))
-        if len(points) == 0:  # OpenCV makes a single zero of nothing
+        if len(points) == 0:  # OpenCV returns a single zero for an empty array
             return np.zeros((0, 2))
         if self.fisheye:
             result = cv2.fisheye.undistortPoints(points, self.matrix, self.distortions[:4])
@@ -127,13 +128,13 @@ class Camera:
         return np.asarray(result, dtype=np.float64).reshape(-1, 2)
 
     def rays(self, pixels: ArrayLike) -> Float:
-        """Unit viewing directions (N, 3) in the world frame through pixels (N, 2)."""
+        """Return unit viewing directions (N, 3) in the world frame through pixels (N, 2)."""
         xy = self.undistort(pixels)
         directions = np.column_stack([xy, np.ones(len(xy))]) @ self.rotation
         return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
     def sees(self, p_world: ArrayLike) -> NDArray[np.bool_]:
-        """(N,) True for points whose projection rounds to a pixel of the picture."""
+        """Return (N,) True for points whose projection rounds to a pixel of the image."""
         pixels, _ = self.project(p_world)
         with np.errstate(invalid="ignore"):
             return (
@@ -165,7 +166,7 @@ class Rig:
 
     @property
     def frame_shape(self) -> tuple[int, int]:
-        """(height, width) that holds every camera's picture: the shape of packed image stacks."""
+        """(height, width) of packed image stacks: the largest of all cameras."""
         return max(c.height for c in self.cameras), max(c.width for c in self.cameras)
 
     @property
@@ -174,6 +175,6 @@ class Rig:
         return np.array([c.center for c in self.cameras])
 
     def pixels_per_metre(self, point: ArrayLike) -> float:
-        """How long a metre across the view is in a picture where the world point (3,) is; the median of the cameras."""
+        """Return the length in pixels of a metre across the view at a world point (3,); the median of the cameras."""
         focal = np.array([c.matrix[0, 0] for c in self.cameras])
         return float(np.median(focal / np.linalg.norm(self.centers - np.asarray(point), axis=1)))

@@ -1,4 +1,4 @@
-"""Where the cameras of a rig look together: a working volume when nobody has given one."""
+"""Infers the working volume: the region that the cameras of a rig have in common."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from tk.model.cameras.volume import Volume
 
 Float = NDArray[np.float64]
 
-#: samples along each side of a box whose visibility is asked for
+#: samples along each side of a box for a test of visibility: 10 cm apart in a box of 2.4 m
 _SAMPLES = 24
 
 
 def views_of(rig: Rig, p_world: Float) -> NDArray[np.int64]:
-    """(N,) the number of cameras that have each of the points (N, 3) in their picture."""
+    """Return (N,) the number of cameras that see each of the points (N, 3)."""
     return np.sum([camera.sees(p_world) for camera in rig], axis=0)
 
 
 def sample_box(volume: Volume, samples: int = _SAMPLES) -> Float:
-    """(samples³, 3) points on a regular grid over the box, its faces included, metres."""
+    """Return (samples³, 3) points on a regular grid over the box and its faces, metres."""
     axes = [np.linspace(low, high, samples) for low, high in zip(volume.lower, volume.upper, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def closest_to_axes(rig: Rig) -> Float:
-    """(3,) the point with the least sum of squared distances to the cameras' optical axes, metres.
+    """Return the point (3,) with the least sum of squared distances to the cameras' optical axes, metres.
 
     Raises:
-        VolumeError: the axes are parallel, so that there is no such point.
+        VolumeError: the axes are parallel.
     """
     point = closest_to_lines(rig.centers, np.array([camera.rotation[2] for camera in rig]))
     if point is None:
@@ -41,28 +41,28 @@ def closest_to_axes(rig: Rig) -> Float:
 
 
 def closest_to_lines(origins: Float, directions: Float) -> Float | None:
-    """(3,) the point with the least sum of squared distances to lines; None where they are parallel.
+    """Return the point (3,) with the least sum of squared distances to lines; None if they are parallel.
 
     Args:
-        origins: (N, 3) a point of each.
+        origins: (N, 3) a point of each line.
         directions: (N, 3) unit vectors.
     """
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]  # projects onto the plane across each line
     normal = across.sum(axis=0)
-    if np.linalg.cond(normal) > 1e6:  # within about a milliradian of one another
+    if np.linalg.cond(normal) > 1e6:  # parallel within about a milliradian
         return None
     return np.linalg.solve(normal, np.einsum("cij,cj->i", across, origins))
 
 
 def infer_volume(rig: Rig) -> Volume:
-    """A working volume for a rig: the box around what all cameras see in common.
+    """Infer a working volume for a rig: the box around the region that all cameras see.
 
-    The rule: start at the point closest to all optical axes. Around it, out to 0.6 of the distance to the nearest
-    camera, take the points that are in every camera's picture. The volume is their axis-aligned bounding box: rather
-    too large than a head cut off. The paper (section 4.1) takes the volume as given.
+    Start at the point closest to all optical axes. Within 0.6 of its distance to the nearest camera, take the points
+    that every camera sees. The volume is their axis-aligned bounding box: a volume that is too large costs time,
+    one that is too small cuts the person. The paper (section 4.1) takes the volume as given.
 
     Raises:
-        VolumeError: the axes do not meet, or no region is seen by all cameras.
+        VolumeError: the axes are parallel, or no region is seen by all cameras.
     """
     for views, volume in common_boxes(rig):
         if views == len(rig):
@@ -71,15 +71,15 @@ def infer_volume(rig: Rig) -> Volume:
 
 
 def common_boxes(rig: Rig) -> Iterator[tuple[int, Volume]]:
-    """What all cameras see in common, then what all but one of them do, and so on down to two.
+    """Yield the box that all cameras see, then the box that all but one see, and so on down to two cameras.
 
     The rule is that of :func:`infer_volume`.
 
     Yields:
-        the number of cameras and the box, the larger the fewer cameras; numbers without a region are left out.
+        The number of cameras and the box; numbers without a region are skipped.
 
     Raises:
-        VolumeError: the axes do not meet, or a camera stands where they do.
+        VolumeError: the axes are parallel, or a camera stands where the axes meet.
     """
     middle = closest_to_axes(rig)
     reach_m = 0.6 * float(np.linalg.norm(rig.centers - middle, axis=1).min())

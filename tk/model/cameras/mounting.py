@@ -1,4 +1,4 @@
-"""Which way is up in a calibration's world, told from how its cameras are mounted."""
+"""Infers the up direction of a calibration's world from the mounting of its cameras."""
 
 from __future__ import annotations
 
@@ -9,24 +9,27 @@ import numpy as np
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.up import UP_AXES, up_text, up_vector
 
-#: a direction this close to an axis is meant to be the axis
+#: an inferred direction this close to an axis is taken to be the axis, degrees: cameras that look down tilt it by less
 SNAP_DEG = 10.0
 
-#: the mean of the cameras' upward directions is shorter than this when they are mounted every way
+#: the cameras are mounted in different ways if the mean of their upward directions is shorter than this
 _AGREE = 0.4
 
-#: cameras whose rightward directions are off the horizontal by more than this, root mean square, are rolled
+#: cameras are rolled if their rightward directions are off the horizontal by more than this, root mean square, degrees
 _ROLLED_DEG = 4.0
 
-#: the two greater eigenvalues of the rightward directions, as a ratio, below which these do not span the horizontal
+#: least ratio of the two largest eigenvalues of the rightward directions at which these span the horizontal plane
 _SPAN = 0.05
 
 
 @dataclass(frozen=True)
 class FoundUp:
-    """The world's upward direction: ``up`` as :func:`tk.model.cameras.up.up_text` tells it, and ``how`` it was found.
+    """The world's up direction.
 
-    ``level``: whether it comes from cameras that are not rolled, which are right to some 2°.
+    Attributes:
+        up: text as of :func:`tk.model.cameras.up.up_text`.
+        how: how it was inferred, for messages.
+        level: whether it comes from cameras that are not rolled; it is then right to about 2°.
     """
 
     up: str
@@ -35,32 +38,32 @@ class FoundUp:
 
 
 def infer_up(rig: Rig) -> FoundUp:
-    """The upward direction, from cameras that are mounted upright.
+    """Infer the up direction from cameras that are mounted upright.
 
-    A first estimate is the mean of the directions that point up in the pictures. Cameras that look down tilt it, those
-    on one side of a room all alike. A camera that is not rolled has a horizontal rightward direction however it looks
-    down: so, where these directions span a plane, a second estimate is across it, to the side of the first. It counts
-    where the cameras agree with it to 4° (root mean square); otherwise they are rolled, and the first counts.
+    The first estimate is the mean of the directions that point up in the images. Cameras that look down tilt it, and
+    those on one side of a room tilt it alike. A camera that is not rolled has a horizontal rightward direction however
+    far it looks down. If these directions span a plane, the second estimate is its normal, on the side of the first. It
+    counts if the cameras agree with it to 4° (root mean square); otherwise they are rolled, and the first counts.
 
-    An estimate within 10° of an axis is that axis, since people lay the world's axes along the floor; where the cameras
-    are rolled either estimate may be. Not so where the world is one of the cameras' own frame, which nobody has laid.
+    An estimate within 10° of an axis is that axis, because people align the world's axes with the floor; for rolled
+    cameras either estimate may be. No axis is preferred if the world is the frame of one of the cameras.
     """
     mean = -np.mean([camera.rotation[1] for camera in rig], axis=0)
     agreement = float(np.linalg.norm(mean))
     if agreement < 1e-6:
-        return FoundUp("z", "the cameras say nothing: they are mounted every way; z is a guess")
+        return FoundUp("z", "the cameras are mounted in opposite directions; z is a guess")
     mean /= agreement
     level = False
-    estimates = [(mean, "the mean of the directions that point up in the pictures")]
+    estimates = [(mean, "the mean of the directions that point up in the images")]
     right = np.array([camera.rotation[0] for camera in rig])
     values, vectors = np.linalg.eigh(right.T @ right)  # ascending
     across = vectors[:, 0] * np.sign(vectors[:, 0] @ mean)
     if values[1] > _SPAN * values[2] and across @ mean > np.cos(np.pi / 4):
-        second = (across, "the direction across those that point right in the pictures")
+        second = (across, "the direction perpendicular to those that point right in the images")
         roll_deg = float(np.degrees(np.sqrt(max(values[0], 0.0) / len(rig))))
         level = roll_deg <= _ROLLED_DEG
         estimates = [second] if level else [*estimates, second]
-    unsure = "; the cameras are mounted every way, so make sure of it" if agreement < _AGREE else ""
+    unsure = "; the cameras are mounted in different ways, so make sure of it" if agreement < _AGREE else ""
 
     own = next((camera.name for camera in rig if _is_world(camera)), None)
     if own is not None:

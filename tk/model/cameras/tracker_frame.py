@@ -1,9 +1,9 @@
-"""A world that the cameras make, wherever the capture's own lies: z is up, the origin is the cameras' middle, and x
-points where the first camera's pictures have their right.
+"""The tracker's frame: a world defined by the cameras. z is up, the origin is the mean of the camera centres, and x is
+the first camera's rightward direction.
 
-Kernels count in single precision, and rounding differs from world to world. Where two poses explain the pictures alike,
-that decides between them. So trackers of contours count in this world, which goes with the cameras, and whose cameras
-are rounded: however the capture's world is turned and moved, this one is the same bit for bit.
+Kernels compute in single precision, so rounding depends on the world's origin and axes, and it decides between two
+poses that explain the images equally well. The contour trackers therefore compute in this frame, which moves with the
+cameras, and whose cameras are rounded: it is the same bit for bit however the capture's world is turned and moved.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from tk.model.cameras.up import up_vector
 
 Float = NDArray[np.float64]
 
-# Decimals of the cameras' places, metres, and quaternions: a sixth of a float32's step at one metre, and a million
-# times what turning a world by some metres changes in float64, so that this hardly ever rounds the other way.
+# Decimals of the cameras' centres, metres, and quaternions: a sixth of float32's step at one metre, and a million times
+# float64's rounding when a world is turned, so two worlds almost never round differently.
 _DECIMALS = 8
-# A camera lies on its side where its rightward direction has this sine with the horizontal; it then looks along x.
+# A camera lies on its side if the sine of its rightward direction's angle with the horizontal exceeds this; its viewing
+# direction then gives x. Any value between 0.1 and 0.99 leaves x well defined.
 _ON_ITS_SIDE = 0.8
 
 
 @dataclass(frozen=True)
 class TrackerFrame:
-    """The cameras' own world, and the way between it and the capture's.
+    """The tracker's frame and its transform to the capture's world.
 
-    Poses are those of :mod:`tk.model.body.skeleton`, whose first four entries are the pelvis's place and the trunk's
-    yaw;
-    nothing else of a pose tells how the world lies.
+    Poses are those of :mod:`tk.model.body.skeleton`: only the first four entries, the pelvis's position and the trunk's
+    yaw, depend on the world.
 
     Attributes:
-        rig: the cameras in it.
-        rotation: (3, 3) from it to the capture's world.
-        origin: (3,) its origin in the capture's world, metres.
-        yaw: what a trunk's yaw in the capture's world is beyond that in this one, radians.
+        rig: the cameras in this frame.
+        rotation: (3, 3) from this frame to the capture's world.
+        origin: (3,) m, of this frame in the capture's world.
+        yaw: radians, the trunk's yaw in the capture's world minus that in this frame.
     """
 
     rig: Rig
@@ -49,8 +49,8 @@ class TrackerFrame:
 
     @staticmethod
     def of(rig: Rig, up: str) -> TrackerFrame:
-        """The world of the cameras of a capture in which ``up`` (see :func:`tk.model.cameras.up.up_vector`) points
-        up."""
+        """Return the frame of the cameras of a capture whose up direction is ``up`` (see
+        :func:`tk.model.cameras.up.up_vector`)."""
         z = up_vector(up)
         right, _, ahead = rig[0].rotation
         x = right if abs(right @ z) < _ON_ITS_SIDE else ahead
@@ -63,30 +63,30 @@ class TrackerFrame:
         return TrackerFrame(own, rotation, origin, float(np.arctan2(facing[1], facing[0])))
 
     def points_in(self, points: ArrayLike) -> Float:
-        """Points (..., 3) of the capture's world in this one, metres."""
+        """Transform points (..., 3) from the capture's world to this frame, metres."""
         return np.asarray((np.asarray(points) - self.origin) @ self.rotation)
 
     def points_out(self, points: ArrayLike) -> Float:
-        """Points (..., 3) of this world in the capture's, metres."""
+        """Transform points (..., 3) from this frame to the capture's world, metres."""
         return np.asarray(np.asarray(points) @ self.rotation.T + self.origin)
 
     def poses_in(self, poses: Float) -> Float:
-        """Poses (..., D) of a body that stands in the capture's world, as those of one that stands in this one."""
+        """Transform poses (..., D) from the capture's world to this frame."""
         place, yaw, angles = np.split(poses, [3, 4], axis=-1)
         return np.concatenate([self.points_in(place), yaw - self.yaw, angles], axis=-1)
 
     def poses_out(self, poses: Float) -> Float:
-        """The inverse of :meth:`poses_in`."""
+        """Transform poses (..., D) from this frame to the capture's world."""
         place, yaw, angles = np.split(poses, [3, 4], axis=-1)
         return np.concatenate([self.points_out(place), yaw + self.yaw, angles], axis=-1)
 
     def rig_out(self, rig: Rig) -> Rig:
-        """Cameras of this world in the capture's."""
+        """Transform cameras from this frame to the capture's world."""
         return seen_from(rig, self.rotation.T, -self.rotation.T @ self.origin)
 
 
 def seen_from(rig: Rig, rotation: Float, origin: Float) -> Rig:
-    """The cameras in a world that is turned by ``rotation`` (3, 3) and lies at ``origin`` (3,), metres, in theirs."""
+    """Return the cameras in a world with orientation ``rotation`` (3, 3) and origin (3,), metres, in their world."""
     return Rig(
         tuple(
             replace(

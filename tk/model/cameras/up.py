@@ -1,7 +1,7 @@
-"""Which way is up in the world: an axis, or any other direction.
+"""The world's up direction: an axis, or any other direction.
 
-In memory and in a result's attribute `up` it is a text: the name of an axis ("z", "-y"), or a unit vector as TOML and
-JSON write it ("[0.02, -0.9998, 0.01]").
+In memory and in a result's attribute `up` it is a text: the name of an axis ("z", "-y"), or a unit vector in the syntax
+of TOML and JSON ("[0.02, -0.9998, 0.01]").
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from tk.errors import ConfigError
 
 Float = NDArray[np.float64]
 
-#: world axes that may point up
+#: names of axes
 UP_AXES = ("x", "y", "z", "-x", "-y", "-z")
 
-#: what ``up`` may be, for messages
+#: valid values of ``up``, for messages
 UP_FORMS = f"one of {', '.join(UP_AXES)} or three numbers, a direction in the world frame"
 
-#: a direction shorter than this has been mistyped: nobody can tell where it points
+#: a shorter vector is refused: it is mistyped, and its direction is mostly rounding
 _SHORT = 1e-3
 
 
 def up_vector(up: str) -> Float:
-    """(3,) the unit vector that points up, world frame.
+    """Return the unit vector (3,) that points up, world frame.
 
     Raises:
         ConfigError: ``up`` is neither an axis nor three numbers.
@@ -47,10 +47,10 @@ def up_vector(up: str) -> Float:
 
 
 def up_text(up: str | Sequence[float] | Float) -> str:
-    """The text for a direction: the axis's name where it is one, else the normalised vector.
+    """Return the text of a direction: the axis's name if it is one, else the normalised vector.
 
     Raises:
-        ConfigError: it is no direction.
+        ConfigError: ``up`` is not a direction.
     """
     vector = up_vector(up) if isinstance(up, str) else _unit(up)
     for name in UP_AXES:
@@ -69,6 +69,6 @@ def _unit(values: ArrayLike) -> Float:
     length = float(np.linalg.norm(vector))
     if length < _SHORT:
         raise ConfigError(f"up = {vector.tolist()} has no direction: its length is {length:g}")
-    if abs(length - 1.0) < 1e-12:  # the text of a unit vector stays what it is
+    if abs(length - 1.0) < 1e-12:  # the text of a unit vector does not change
         return vector
     return vector / length

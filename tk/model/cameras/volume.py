@@ -47,7 +47,7 @@ class VoxelGrid:
 
     @staticmethod
     def cover(volume: Volume, voxels: int) -> VoxelGrid:
-        """The grid with ``voxels`` along the volume's longest side, centred on the volume."""
+        """Return the grid with ``voxels`` along the volume's longest side, centred on the volume."""
         if voxels < 2:
             raise VolumeError(f"--voxels {voxels}: at least 2 along the longest side")
         size = np.array(volume.size)
@@ -65,7 +65,7 @@ class VoxelGrid:
         return int(np.prod(self.shape))
 
     def centers(self, flat: NDArray[np.integer] | None = None) -> NDArray[np.float64]:
-        """(N, 3) centres of the voxels with these flat indices (all of them by default), metres."""
+        """Return (N, 3) centres of the voxels with flat indices (all of them by default), metres."""
         index = np.arange(self.count) if flat is None else np.asarray(flat)
         ijk = np.stack(np.unravel_index(index, self.shape), axis=-1)
         return np.asarray(self.origin) + self.voxel_m * ijk
