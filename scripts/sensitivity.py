@@ -189,12 +189,10 @@ def tolerated(values: Sequence[tuple[float, bool]]) -> tuple[float, float]:
 
 
 def shown(value: Any) -> str:
-    """Return a value as short text."""
-    if isinstance(value, float | np.floating):
-        return f"{value:.4g}"
-    if isinstance(value, tuple | list):
-        return f"({', '.join(map(shown, value))})"
-    return f"{value}"
+    """Return a number as short text; a table as "table"."""
+    return (
+        f"{value:.4g}" if isinstance(value, float | np.floating) else str(value) if isinstance(value, int) else "table"
+    )
 
 
 def measure(
@@ -207,14 +205,17 @@ def measure(
     yield _line("unchanged", present, base)
     for factor in factors:
         value = scaled(present, factor)
-        if shown(value) == shown(present):  # an integer that rounds to itself
+        if isinstance(value, int) and value == present:  # it rounds to itself
             continue
         found = errors(Run(name, factor))
         change = np.abs(found.mean(axis=0) - base.mean(axis=0)).max()
         judged.append((factor, bool(change < limit)))
         yield _line(f"× {factor:g}", value, found) + f"   change {change:.2f}"
     low, high = tolerated(judged)
-    ends = f"{shown(scaled(present, low))} to {shown(scaled(present, high))}"
+    if isinstance(present, float | int):
+        ends = f"{shown(scaled(present, low))} to {shown(scaled(present, high))}"
+    else:
+        ends = f"factors {low:g} to {high:g}"
     yield f"changes by less than {limit:g} cm: {ends}"
 
 

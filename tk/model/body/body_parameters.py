@@ -23,8 +23,8 @@ Float = NDArray[np.float64]
 
 # Prior standard deviation of a dimension's logarithm about the proportions of the stature. Lengths between joints vary
 # by 4 to 5 % at a given stature (Drillis & Contini 1966). Radii vary with girth and clothes; so do the ends of the body
-# and the shoulder's drop, which both sources define loosely: chosen on the development captures, sensitivity not
-# measured.
+# and the shoulder's drop, which both sources define loosely. Half and twice the radii's value change the mean errors of
+# walk and dance (60 frames) by less than 0.1 cm.
 _LENGTHS = {
     "trunk": 0.05,
     "head": 0.05,
