@@ -30,7 +30,7 @@ Float = NDArray[np.float64]
 # Ranges below: the mean errors of walk and dance (60 frames) change by less than 0.1 cm, by `scripts.sensitivity`.
 # Standard deviation of an edgel's distance, pixels: ragged masks, and shapes that no cone has. Range 1.5 to 6.
 EDGE_NOISE_PX = 3.0
-# Edgels within this length of a contour err together, pixels. Only its product with EDGE_NOISE_PX² counts: range 2.5 to 40.
+# Edgels within this length of a contour err together, pixels. Only its product with EDGE_NOISE_PX² counts: 2.5 to 40.
 CORRELATION_PX = 10.0
 # Information of one pixel of contour, 1/px².
 INFORMATION = 1.0 / (EDGE_NOISE_PX**2 * CORRELATION_PX)
