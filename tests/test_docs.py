@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import re
 import shlex
 import sys
@@ -186,33 +185,3 @@ def test_lines_of_documentation_are_short() -> None:
             continue
         for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1):
             assert len(line) <= 100 or line.startswith("|"), f"{page.name}:{number}"
-
-
-# --- the house --------------------------------------------------------------------------------------------------------
-
-
-def imported_by(file: Path) -> set[str]:
-    """The members of `tk` that a module imports, wherever in it, but for types."""
-    found = set()
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
-            node.body.clear()
-        elif isinstance(node, ast.ImportFrom) and node.module == "tk":
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module is not None and node.module.startswith("tk."):
-            found.add(node.module.split(".")[1])
-    return found
-
-
-def test_imports_run_one_way() -> None:
-    text = (ROOT / "docs/architecture.md").read_text("utf-8")
-    (line,) = re.findall(r"^Imports run one way:\s+`([^`]*)`", text, re.M)
-    line = " ".join(line.split())
-    layers = [layer.split(", ") for layer in line.split(" → ")]
-    level = {name: k for k, layer in enumerate(layers) for name in layer}
-    for name, k in level.items():
-        package = ROOT / "tk" / name
-        files = sorted(package.rglob("*.py")) if package.is_dir() else [package.with_suffix(".py")]
-        for file in files:
-            above = {other for other in imported_by(file) & level.keys() if level[other] < k}
-            assert not above, f"{file.relative_to(ROOT)} imports from {above}"

@@ -1,0 +1,78 @@
+"""The direction of imports within tk, as docs/architecture.md states it."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+FILES = {
+    ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): file
+    for file in sorted((ROOT / "tk").rglob("*.py"))
+}
+
+
+def imports(node: ast.AST) -> Iterator[str]:
+    """Yield the modules of tk that a syntax tree imports, inside functions too, except for type annotations."""
+    if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+        return
+    if isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names if alias.name in FILES)
+    elif isinstance(node, ast.ImportFrom) and node.module is not None:
+        for alias in node.names:
+            whole = f"{node.module}.{alias.name}"
+            yield from (name for name in (whole if whole in FILES else node.module,) if name in FILES)
+    for child in ast.iter_child_nodes(node):
+        yield from imports(child)
+
+
+# Result.to_pandas and its module of tables import each other; the import in the method is deferred.
+DEFERRED = {("tk.io.results.data", "tk.io.results.tables")}
+IMPORTS = {name: set(imports(ast.parse(file.read_text(encoding="utf-8")))) - {name} for name, file in FILES.items()}
+
+
+def member(module: str) -> str:
+    """Return the package or top module of tk that a module belongs to; "tk" for the package itself."""
+    return module.split(".")[1] if "." in module else module
+
+
+def levels() -> dict[str, int]:
+    """Return the level of each package and top module, 0 the highest, from the line in docs/architecture.md."""
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    (line,) = re.findall(r"^Imports run one way[^`]*`([^`]*)`", text, re.M)
+    rows = [row.split(", ") for row in " ".join(line.split()).split(" → ")]
+    return {name: k for k, row in enumerate(rows) for name in row}
+
+
+def test_every_package_has_a_level() -> None:
+    assert {member(name) for name in FILES} - {"tk", "__main__"} == set(levels())
+
+
+def test_imports_go_to_lower_levels_only() -> None:
+    level = levels()
+    wrong = [
+        f"{name} imports {other}"
+        for name, found in IMPORTS.items()
+        for other in sorted(found)
+        if member(name) in level
+        and member(other) in level
+        and member(name) != member(other)
+        and level[member(other)] <= level[member(name)]
+    ]
+    assert not wrong
+
+
+def test_no_module_imports_itself_through_others() -> None:
+    done: set[str] = set()
+
+    def visit(name: str, path: tuple[str, ...]) -> None:
+        assert name not in path, " → ".join((*path[path.index(name) :], name))
+        if name not in done:
+            for other in sorted(o for o in IMPORTS[name] if (name, o) not in DEFERRED):
+                visit(other, (*path, name))
+            done.add(name)
+
+    for name in IMPORTS:
+        visit(name, ())
