@@ -193,7 +193,7 @@ def test_only_the_same_command_is_taken_up_again(
 ) -> None:
     before = begun.read_bytes()
     ran = tk("track", tiny, "--method", "volumetric", "-o", begun, "--config", quick, "--resume", *options)
-    ran.complaint(str(begun), difference, "--force instead of --resume")
+    ran.complaint(str(begun), difference, "--force in")
     assert begun.read_bytes() == before
 
 

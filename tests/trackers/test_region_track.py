@@ -198,12 +198,12 @@ def test_a_refined_result_is_not_prolonged(tk: Tk, tiny: Path, quick: Path, tmp_
     result = tmp_path / "r.h5"
     run(tiny, result, frames=(0, 4))
     before = result.read_bytes()
-    with pytest.raises(ResultError, match=r"a second pass has gone over .* --force .* with --causal"):
+    with pytest.raises(ResultError, match=r"a second pass has gone over .* --force .* --causal"):
         run(tiny, result, frames=(0, 6), resume=True)
     assert result.read_bytes() == before
     # nothing to be done is no mistake, and changes nothing
     ran = tk("track", tiny, "-o", result, "--config", quick, "--frames", ":4", "--resume")
-    assert ran.code == 0 and "4 of 4 frames are there already" in ran.err
+    assert ran.code == 0 and "4 of 4 frames are finished already" in ran.err
     assert result.read_bytes() == before
 
 

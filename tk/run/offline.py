@@ -108,7 +108,7 @@ def report_unknown(frames: Sequence[int] | NDArray[np.int64], note: Callable[[st
     """Report frames (F,) that are not lost, but without a sigma of any joint."""
     if len(frames):
         which = described(int(frames[0]), int(frames[-1]), len(frames))
-        note(f"the residual is high, and no better pose was found: sigma is unknown, {which}")
+        note(f"the residual is high, and no better pose was found: σ is unknown, {which}")
 
 
 def _track_again(
