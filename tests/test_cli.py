@@ -149,7 +149,7 @@ def test_demo_tracks_and_says_how_well(tk: Tk, tiny: Path, tmp_path: Path, monke
     package = tmp_path / "package"
     shutil.copytree(tiny, package / "data" / "demo")
     monkeypatch.setattr("importlib.resources.files", lambda name: package)
-    monkeypatch.setattr("tk.commands.demo.load_settings", lambda file, voxels: settings_file.from_toml(QUICK))
+    monkeypatch.setattr("tk.commands.base.load_settings", lambda file, voxels: settings_file.from_toml(QUICK))
     ran = tk("demo", "-o", tmp_path / "demo.h5")
     assert ran.code == 0, ran.err
     assert f"{FRAMES} frames judged: 0 lost" in ran.out

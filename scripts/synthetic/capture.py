@@ -23,6 +23,7 @@ from scripts.synthetic.rig import make_rig
 from scripts.synthetic.scene import Lamps, RoomView, make_lamps, view_room
 from scripts.synthetic.sensor import Sensor
 from scripts.synthetic.skeleton import JOINTS, Pose, Skeleton, joint_positions, make_skeleton
+from tk.io.captures.calibration import camera_table
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.volume import Volume
 
@@ -207,19 +208,8 @@ def write_capture(
 
 
 def write_calibration(rig: Rig, path: Path) -> None:
-    """The rig as `calibration.toml` of the contract."""
-    tables = {
-        camera.name: {
-            "name": camera.name,
-            "size": [camera.width, camera.height],
-            "matrix": camera.matrix.tolist(),
-            "distortions": camera.distortions.tolist(),
-            "rotation": cv2.Rodrigues(camera.rotation)[0].ravel().tolist(),
-            "translation": camera.translation.tolist(),
-            "fisheye": False,
-        }
-        for camera in rig
-    }
+    """Write the rig as `calibration.toml`."""
+    tables = {camera.name: camera_table(camera) for camera in rig}
     path.write_text(tomli_w.dumps({**tables, "metadata": {"adjusted": False, "error": 0.0}}), encoding="utf-8")
 
 

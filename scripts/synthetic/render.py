@@ -180,12 +180,19 @@ def _trace(origin, ray, near, far, frame, begin, end, primitives: ti.template(),
 
 
 @ti.func
-def _visibility(p, light: ti.template(), axes: ti.template(), shadow: ti.template(), lamp, bias):
-    """Share of a lamp's light that reaches p: a bilinear, percentage-closer look-up in its shadow map."""
+def _in_lamp(p, light: ti.template(), axes: ti.template(), lamp):
+    """The vector from a lamp to p in the world, and its x, y, z in the lamp's frame."""
     d = p - vec3(light[lamp, 0], light[lamp, 1], light[lamp, 2])
     z = axes[lamp, 2, 0] * d[0] + axes[lamp, 2, 1] * d[1] + axes[lamp, 2, 2] * d[2]
     x = axes[lamp, 0, 0] * d[0] + axes[lamp, 0, 1] * d[1] + axes[lamp, 0, 2] * d[2]
     y = axes[lamp, 1, 0] * d[0] + axes[lamp, 1, 1] * d[1] + axes[lamp, 1, 2] * d[2]
+    return d, x, y, z
+
+
+@ti.func
+def _visibility(p, light: ti.template(), axes: ti.template(), shadow: ti.template(), lamp, bias):
+    """Share of a lamp's light that reaches p: a bilinear, percentage-closer look-up in its shadow map."""
+    d, x, y, z = _in_lamp(p, light, axes, lamp)
     size = shadow.shape[1]
     visible = 1.0
     if z > 0.1:
@@ -209,10 +216,7 @@ def _visibility(p, light: ti.template(), axes: ti.template(), shadow: ti.templat
 @ti.func
 def _shade(p, light: ti.template(), axes: ti.template(), veil: ti.template(), lamp):
     """Share of a lamp's light that reaches a point of the room: a bilinear look-up of the blurred silhouette."""
-    d = p - vec3(light[lamp, 0], light[lamp, 1], light[lamp, 2])
-    z = axes[lamp, 2, 0] * d[0] + axes[lamp, 2, 1] * d[1] + axes[lamp, 2, 2] * d[2]
-    x = axes[lamp, 0, 0] * d[0] + axes[lamp, 0, 1] * d[1] + axes[lamp, 0, 2] * d[2]
-    y = axes[lamp, 1, 0] * d[0] + axes[lamp, 1, 1] * d[1] + axes[lamp, 1, 2] * d[2]
+    _, x, y, z = _in_lamp(p, light, axes, lamp)
     size = veil.shape[1]
     lit = 1.0
     if z > 0.1:

@@ -6,7 +6,6 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import h5py
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from tests.conftest import QUICK, Silent
 from tests.trackers.test_silhouette_track import QUICK as QUICK_SILHOUETTE
 from tk.io import settings_file
+from tk.io.captures.calibration import camera_table
 from tk.io.captures.capture import open_capture
 from tk.io.results.writer import read_joints, read_result
 from tk.model.cameras.tracker_frame import seen_from
@@ -35,13 +35,7 @@ def tilted(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     tables: dict[str, object] = {}
     for camera in original.rig:
         turned = replace(camera, rotation=camera.rotation @ TURN.T)
-        tables[camera.name] = {
-            "size": [camera.width, camera.height],
-            "matrix": camera.matrix.tolist(),
-            "distortions": camera.distortions.tolist(),
-            "rotation": cv2.Rodrigues(turned.rotation)[0].ravel().tolist(),
-            "translation": camera.translation.tolist(),
-        }
+        tables[camera.name] = camera_table(turned)
     (folder / "calibration.toml").write_text(tomli_w.dumps(tables))
     side = 1.15 * max(original.volume.size)
     settings = {

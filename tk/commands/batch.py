@@ -7,37 +7,28 @@ from pathlib import Path
 
 import click
 
-from tk.commands.base import (
-    PATH,
-    TrackingOptions,
-    example,
-    no_report_option,
-    parse_frames,
-    quiet_option,
-    split_names,
-    tracking_options,
-)
+from tk.commands import base
 from tk.commands.console import BatchConsoleReporter
 from tk.errors import WorkerError
 
 
-@click.command(epilog=example("tk batch recordings/* -o results --workers 4"))
-@click.argument("captures", nargs=-1, required=True, type=PATH, metavar="CAPTURE...")
-@click.option("-o", "--output", required=True, type=PATH, metavar="FOLDER")
+@click.command(epilog=base.example("tk batch recordings/* -o results --workers 4"))
+@click.argument("captures", nargs=-1, required=True, type=base.PATH, metavar="CAPTURE...")
+@click.option("-o", "--output", required=True, type=base.PATH, metavar="FOLDER")
 @click.option(
     "--workers", type=int, metavar="N",
     help="Captures to track at the same time on this machine.  [default: half the cores]",
 )  # fmt: skip
 @click.option("--scheduler", metavar="ADDRESS", help="Use the workers of this Dask scheduler: tcp://host:8786.")
-@tracking_options
-@no_report_option
-@quiet_option
+@base.tracking_options
+@base.no_report_option
+@base.quiet_option
 def batch(
     captures: tuple[Path, ...],
     output: Path,
     workers: int | None,
     scheduler: str | None,
-    options: TrackingOptions,
+    options: base.TrackingOptions,
     no_report: bool,
     quiet: bool,
 ) -> None:
@@ -46,8 +37,8 @@ def batch(
 
     track_options = TrackOptions(
         options.method,
-        parse_frames(options.frames),
-        split_names(options.cameras),
+        base.parse_frames(options.frames),
+        base.split_names(options.cameras),
         options.masks,
         options.body and options.body.resolve(),
         options.causal,

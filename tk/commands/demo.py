@@ -6,27 +6,18 @@ from pathlib import Path
 
 import click
 
-from tk.commands.base import (
-    PATH,
-    example,
-    force_option,
-    load_settings,
-    no_report_option,
-    quiet_option,
-    resume_option,
-    voxels_option,
-)
+from tk.commands import base
 from tk.commands.console import ConsoleReporter
 from tk.commands.track import draw_video_and_report, end
 
 
-@click.command(epilog=example("tk demo"))
-@click.option("-o", "--output", default="demo.h5", show_default=True, type=PATH)
-@voxels_option
-@resume_option
-@force_option
-@no_report_option
-@quiet_option
+@click.command(epilog=base.example("tk demo"))
+@click.option("-o", "--output", default="demo.h5", show_default=True, type=base.PATH)
+@base.voxels_option
+@base.resume_option
+@base.force_option
+@base.no_report_option
+@base.quiet_option
 def demo(output: Path, voxels: int | None, resume: bool, force: bool, no_report: bool, quiet: bool) -> None:
     """Track the capture that ships with tk and compare the result with its ground truth."""
     from importlib.resources import as_file, files
@@ -41,7 +32,7 @@ def demo(output: Path, voxels: int | None, resume: bool, force: bool, no_report:
 
             check_output(output, force, resume)
             reporter.stage(f"opening the capture that ships with tk, {folder}")
-            settings = load_settings(None, voxels=voxels)
+            settings = base.load_settings(None, voxels=voxels)
             capture = open_capture(folder)
             summary = session.track(capture, output, settings, reporter, resume=resume, force=force)
             if not no_report:

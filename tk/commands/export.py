@@ -6,24 +6,24 @@ from pathlib import Path
 
 import click
 
-from tk.commands.base import PATH, example, force_option, print_notes, result_argument, split_names, working
+from tk.commands import base
 
 
-@click.command(epilog=example("tk export walk.h5 --to trc,mot,bvh"))
-@result_argument
+@click.command(epilog=base.example("tk export walk.h5 --to trc,mot,bvh"))
+@base.result_argument
 @click.option(
     "--to", "formats", required=True, metavar="A,B,…",
     help="Formats: trc, mot (OpenSim), c3d, bvh, csv, gltf (.glb), ply (a folder).",
 )  # fmt: skip
-@click.option("-o", "--output", type=PATH, metavar="DIR", help="Folder.  [default: the folder of RESULT.h5]")
+@click.option("-o", "--output", type=base.PATH, metavar="DIR", help="Folder.  [default: the folder of RESULT.h5]")
 @click.option("--smoothed", is_flag=True, help="Export the smoothed motion, with short losses bridged.")
-@force_option
+@base.force_option
 def export(result: Path, formats: str, output: Path | None, smoothed: bool, force: bool) -> None:
     """Write RESULT.h5 in the formats of other programs: OpenSim, Blender, spreadsheets."""
-    with working(f"exporting {result}"):
+    with base.working(f"exporting {result}"):
         from tk.export import export as write
 
-        written = write(result, split_names(formats) or (), output, smoothed, force)
-    print_notes(written.notes)
+        written = write(result, base.split_names(formats) or (), output, smoothed, force)
+    base.print_notes(written.notes)
     for file in written.files:
         click.echo(f"wrote {file}", err=True)

@@ -6,21 +6,21 @@ from pathlib import Path
 
 import click
 
-from tk.commands.base import PATH, example, print_notes, working
+from tk.commands import base
 
 
-@click.command("import", epilog=example("tk import my_session -o my_capture"))
-@click.argument("folder", type=PATH)
-@click.option("-o", "--output", required=True, type=PATH, metavar="CAPTURE")
+@click.command("import", epilog=base.example("tk import my_session -o my_capture"))
+@click.argument("folder", type=base.PATH)
+@click.option("-o", "--output", required=True, type=base.PATH, metavar="CAPTURE")
 @click.option(
     "--units", type=click.Choice(["m", "cm", "mm"]), help="Unit of lengths in the calibration.  [default: inferred]"
 )
 @click.option("--trial", metavar="NAME", help="Use the videos whose path contains NAME, if there are several trials.")
 def import_(folder: Path, output: Path, units: str | None, trial: str | None) -> None:
     """Convert another tool's project to a capture: Pose2Sim, FreeMoCap, Caliscope, Anipose, EasyMocap and others."""
-    with working(f"importing {folder}"):
+    with base.working(f"importing {folder}"):
         from tk.io.importers import import_project
 
         done = import_project(folder, output, units, trial)
-    print_notes(done.notes)
+    base.print_notes(done.notes)
     click.echo(f"{done.cameras} cameras in {output}; check {output / 'capture.toml'}", err=True)

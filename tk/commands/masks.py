@@ -6,26 +6,17 @@ from pathlib import Path
 
 import click
 
-from tk.commands.base import (
-    PATH,
-    cameras_option,
-    capture_argument,
-    example,
-    frames_option,
-    parse_frames,
-    quiet_option,
-    split_names,
-)
+from tk.commands import base
 from tk.commands.console import ConsoleReporter
 
 
-@click.command(epilog=example("tk masks CAPTURE -o masks; tk track CAPTURE -o result.h5 --masks masks"))
-@capture_argument
-@click.option("-o", "--output", required=True, type=PATH, metavar="DIR")
+@click.command(epilog=base.example("tk masks CAPTURE -o masks; tk track CAPTURE -o result.h5 --masks masks"))
+@base.capture_argument
+@click.option("-o", "--output", required=True, type=base.PATH, metavar="DIR")
 @click.option("--segmenter", metavar="NAME", help="Segmenter to use, if several are installed.")
-@cameras_option
-@frames_option
-@quiet_option
+@base.cameras_option
+@base.frames_option
+@base.quiet_option
 def masks(
     capture: Path, output: Path, segmenter: str | None, cameras: str | None, frames: str | None, quiet: bool
 ) -> None:
@@ -33,13 +24,13 @@ def masks(
 
     The person is white. After an interruption, the same command continues.
     """
-    span = parse_frames(frames)
+    span = base.parse_frames(frames)
     with ConsoleReporter(quiet) as reporter:
         reporter.stage("loading")
         from tk.io.captures.capture import open_capture
         from tk.run import mask_folder
 
-        opened = open_capture(capture, split_names(cameras), "none")
+        opened = open_capture(capture, base.split_names(cameras), "none")
         written = mask_folder.write_masks(opened, output, reporter, segmenter, span)
     if not quiet:
         click.echo(f"masks of {written.frames} frames in {output}, {written.now} of them new", err=True)

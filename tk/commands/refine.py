@@ -6,38 +6,26 @@ from pathlib import Path
 
 import click
 
-from tk.commands.base import (
-    PATH,
-    cameras_option,
-    capture_argument,
-    config_option,
-    example,
-    force_option,
-    load_settings,
-    masks_option,
-    quiet_option,
-    result_argument,
-    split_names,
-)
+from tk.commands import base
 from tk.commands.console import ConsoleReporter
 from tk.errors import ConfigError
 
 
-@click.command(epilog=example("tk refine CAPTURE result.h5 -o refined.toml"))
-@capture_argument
-@result_argument
-@click.option("-o", "--output", required=True, type=PATH, metavar="CALIBRATION.toml")
+@click.command(epilog=base.example("tk refine CAPTURE result.h5 -o refined.toml"))
+@base.capture_argument
+@base.result_argument
+@click.option("-o", "--output", required=True, type=base.PATH, metavar="CALIBRATION.toml")
 @click.option("--focal", is_flag=True, help="Also refine the focal lengths.")
 @click.option("--offsets/--no-offsets", default=True, show_default=True, help="Estimate the videos' time offsets.")
 @click.option(
     "--trust", type=float, default=1.0, show_default=True,
     help="Expected error of the calibration; 1 means about 0.3° and 12 mm.",
 )  # fmt: skip
-@cameras_option
-@masks_option
-@config_option
-@force_option
-@quiet_option
+@base.cameras_option
+@base.masks_option
+@base.config_option
+@base.force_option
+@base.quiet_option
 def refine(
     capture: Path,
     result: Path,
@@ -61,9 +49,9 @@ def refine(
         if output.exists() and not force:
             raise ConfigError(f"{output}: exists; choose another name, or replace it with --force")
         refinement = RefinementSettings(focal=focal, offsets=offsets, trust=trust)
-        settings = load_settings(config_file)
+        settings = base.load_settings(config_file)
         reporter.stage(f"opening {capture}")
-        opened = open_capture(capture, split_names(cameras), masks)
+        opened = open_capture(capture, base.split_names(cameras), masks)
         for warning in opened.warnings:
             reporter.note(warning)
         reporter.stage("refining the cameras")

@@ -8,33 +8,24 @@ from pathlib import Path
 
 import click
 
-from tk.commands.base import (
-    PATH,
-    cameras_option,
-    example,
-    force_option,
-    optional_capture_argument,
-    result_argument,
-    split_names,
-    working,
-)
+from tk.commands import base
 from tk.errors import ConfigError, ResultError
 
 
-@click.command(epilog=example("tk render result.h5 CAPTURE", "tk render result.h5 --view 3d -o turning.mp4"))
-@result_argument
-@optional_capture_argument
-@click.option("-o", "--output", type=PATH, metavar="OUT.mp4", help="Video.  [default: next to RESULT.h5]")
+@click.command(epilog=base.example("tk render result.h5 CAPTURE", "tk render result.h5 --view 3d -o turning.mp4"))
+@base.result_argument
+@base.optional_capture_argument
+@click.option("-o", "--output", type=base.PATH, metavar="OUT.mp4", help="Video.  [default: next to RESULT.h5]")
 @click.option(
     "--view", type=click.Choice(["overlay", "3d", "hull"]),
     help="overlay: over the images; 3d: from a virtual camera that turns around the person; hull: 3d with the stored "
     "hull.  [default: overlay with CAPTURE, else 3d]",
 )  # fmt: skip
-@cameras_option
+@base.cameras_option
 @click.option("--frames", metavar="A:B|A,B,…", help="Frames A to B-1, or single frames.")
-@click.option("--png", type=PATH, metavar="DIR", help="Write contact sheets instead of a video.")
+@click.option("--png", type=base.PATH, metavar="DIR", help="Write contact sheets instead of a video.")
 @click.option("--full", is_flag=True, help="Show whole images, not only the part with the person.")
-@force_option
+@base.force_option
 def render(
     result: Path,
     capture: Path | None,
@@ -47,11 +38,11 @@ def render(
     force: bool,
 ) -> None:
     """Draw RESULT.h5 as a video: over the images of CAPTURE, or in 3D."""
-    with working("drawing"):
+    with base.working("drawing"):
         from tk.threads import one_thread
 
         with one_thread():
-            files = _render(result, capture, output, view, split_names(cameras), frames, png, full, force)
+            files = _render(result, capture, output, view, base.split_names(cameras), frames, png, full, force)
     for file in files:
         click.echo(f"wrote {file}", err=True)
 

@@ -8,21 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tk.commands.base import (
-    PATH,
-    TrackingOptions,
-    capture_argument,
-    example,
-    force_option,
-    json_option,
-    no_report_option,
-    parse_frames,
-    print_json,
-    quiet_option,
-    resume_option,
-    split_names,
-    tracking_options,
-)
+from tk.commands import base
 from tk.commands.console import ConsoleReporter
 
 if TYPE_CHECKING:
@@ -34,27 +20,27 @@ EXIT_LOST = 3
 
 
 @click.command(
-    epilog=example(
+    epilog=base.example(
         "tk track CAPTURE -o result.h5",
         "tk track CAPTURE -o part.h5 --frames 0:100 --cameras cam1,cam2,cam4",
     )
 )
-@capture_argument
-@click.option("-o", "--output", required=True, type=PATH, metavar="RESULT.h5")
-@tracking_options
+@base.capture_argument
+@click.option("-o", "--output", required=True, type=base.PATH, metavar="RESULT.h5")
+@base.tracking_options
 @click.option(
-    "--init-pose", type=PATH, metavar="FILE",
+    "--init-pose", type=base.PATH, metavar="FILE",
     help="Start from the approximate pose in this TOML file, or from this folder of 2D keypoints.",
 )  # fmt: skip
-@resume_option
-@force_option
-@no_report_option
-@quiet_option
-@json_option
+@base.resume_option
+@base.force_option
+@base.no_report_option
+@base.quiet_option
+@base.json_option
 def track(
     capture: Path,
     output: Path,
-    options: TrackingOptions,
+    options: base.TrackingOptions,
     init_pose: Path | None,
     resume: bool,
     force: bool,
@@ -66,7 +52,7 @@ def track(
 
     An overlay video (RESULT.mp4) and a report (RESULT.html) are written next to it.
     """
-    span = parse_frames(options.frames)
+    span = base.parse_frames(options.frames)
     with ConsoleReporter(quiet) as reporter:
         reporter.stage("loading")
         from tk.io.captures.capture import open_capture
@@ -76,7 +62,7 @@ def track(
         settings = options.settings()
         check_output(output, force, resume)
         reporter.stage(f"opening {capture}")
-        opened = open_capture(capture, split_names(options.cameras), options.masks)
+        opened = open_capture(capture, base.split_names(options.cameras), options.masks)
         summary = session.track(
             opened, output, settings, reporter, options.method, span, init_pose, resume, options.store_hull,
             options.body, options.causal, force,
@@ -104,7 +90,7 @@ def end(output: Path, summary: Summary, quiet: bool, as_json: bool) -> None:
     """Print how a run ended, and exit: with 1 after an interruption, with 3 if most frames are lost."""
     rate = summary.tracked_now / summary.seconds if summary.seconds > 0 else 0.0
     if as_json:
-        print_json(
+        base.print_json(
             result=str(output),
             frames=summary.frames,
             lost=summary.lost,

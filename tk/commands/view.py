@@ -6,15 +6,15 @@ from pathlib import Path
 
 import click
 
-from tk.commands.base import PATH, example, optional_capture_argument, result_argument
+from tk.commands import base
 from tk.errors import ConfigError, ExportError, ResultError
 
 
-@click.command(epilog=example("tk view walk.h5 --frame 40"))
-@result_argument
-@optional_capture_argument
+@click.command(epilog=base.example("tk view walk.h5 --frame 40"))
+@base.result_argument
+@base.optional_capture_argument
 @click.option("--frame", type=int, metavar="N", help="Frame to show first.  [default: the first]")
-@click.option("--screenshot", type=PATH, metavar="FILE.png", help="Write an image of the frame, and close.")
+@click.option("--screenshot", type=base.PATH, metavar="FILE.png", help="Write an image of the frame, and close.")
 def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path | None) -> None:
     """Show RESULT.h5 in a window: body, joints, hull, cameras. Keys move through time and switch parts on and off.
 

@@ -15,12 +15,13 @@ from tk.inspection.checks import Inspection, Sample
 from tk.io.captures.capture import Capture
 from tk.model.cameras.camera import Camera
 from tk.model.cameras.up import up_vector
+from tk.render.overlay import joined
 
 Image = NDArray[np.uint8]
 Float = NDArray[np.float64]
 
-#: layout, pixels: height of a tile, gap between tiles, height of a line of text
-_TILE, _GAP, _LINE = 300, 6, 20
+#: layout, pixels: height of a tile, height of a line of text
+_TILE, _LINE = 300, 20
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _PAPER, _INK, _BAD = (255, 255, 255), (40, 40, 40), (40, 40, 200)
 #: BGR
@@ -40,15 +41,10 @@ def write_sheet(path: Path, capture: Capture, inspection: Inspection, samples: S
     Raises:
         CaptureError: the file cannot be written.
     """
-    tiles = []
-    for frame in samples:
-        cameras = [_tile(capture, inspection, frame, c) for c in range(len(capture.rig))]
-        tiles.append(np.hstack([part for tile in cameras for part in (tile, _blank(_TILE, _GAP))]))
-    width = max([row.shape[1] for row in tiles], default=900)
-    rows = [_text(inspection, width)]
-    for row in tiles:
-        rows += [np.hstack([row, _blank(_TILE, width - row.shape[1])]), _blank(_GAP, width)]
-    ok, coded = cv2.imencode(".png", np.vstack(rows))
+    cameras = range(len(capture.rig))
+    rows = [joined([_tile(capture, inspection, frame, c) for c in cameras], axis=1) for frame in samples]
+    width = max([row.shape[1] for row in rows], default=900)
+    ok, coded = cv2.imencode(".png", joined([_text(inspection, width), *rows], axis=0))
     try:
         if not ok:
             raise OSError("the image is too large")
@@ -58,15 +54,11 @@ def write_sheet(path: Path, capture: Capture, inspection: Inspection, samples: S
         raise CaptureError(f"{path}: cannot be written ({reason.strerror or reason})") from None
 
 
-def _blank(height: int, width: int) -> Image:
-    return np.full((height, max(width, 0), 3), 255, np.uint8)
-
-
 def _text(inspection: Inspection, width: int) -> Image:
     lines = [(line, _INK) for line in inspection.format_table().split("\n")[: -max(len(inspection.findings), 1)]]
     lines += [(line, _BAD) for line in inspection.findings] or [("No problems found.", (60, 140, 60))]
     wrapped = [(part, color) for line, color in lines for part in _wrapped(line, (width - 20) // 8)]
-    image = _blank((len(wrapped) + 2) * _LINE, width)
+    image = np.full(((len(wrapped) + 2) * _LINE, width, 3), 255, np.uint8)
     for i, (line, color) in enumerate(wrapped):
         _columns(image, line, (i + 1) * _LINE, color)
     x = 10

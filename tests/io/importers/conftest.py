@@ -1,4 +1,4 @@
-"""A rig whose projection is known, written as each tool writes it, beside tiny videos that tell their camera."""
+"""A rig with known projections in the format of each tool, and tiny videos whose images encode their camera."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.io.conftest import CENTER, look_at, picture, read_tag, write_video
+from tk.io.captures.calibration import camera_table
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.importers import Imported, import_project
 from tk.model.cameras.camera import Camera, Rig
@@ -23,7 +24,7 @@ Y_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def make_rig(distorted: bool = True, world: np.ndarray | None = None) -> Rig:
-    """Four cameras 2.5 to 3.7 m from (0, 0, 1), all unlike one another; ``world`` (3, 3) turns the world."""
+    """Return four different cameras 2.5 to 3.7 m from (0, 0, 1); ``world`` (3, 3) rotates the world."""
     turn = np.eye(3) if world is None else world
     cameras = []
     for index in range(4):
@@ -40,13 +41,13 @@ def make_rig(distorted: bool = True, world: np.ndarray | None = None) -> Rig:
 
 
 def points(world: np.ndarray | None = None) -> np.ndarray:
-    """(40, 3) where the person is, metres."""
+    """Return points (40, 3) near the person, metres."""
     around = CENTER + np.random.default_rng(5).uniform(-0.6, 0.6, (40, 3))
     return around if world is None else around @ world.T
 
 
 def write_clips(folder: Path, names: list[str], size: tuple[int, int] = (WIDTH, HEIGHT), suffix: str = ".mp4") -> None:
-    """A video of three frames for each name; its pictures tell the place in the list."""
+    """Write a video of three frames for each name; its images encode the index of the name."""
     for index, name in enumerate(names):
         write_video(folder / f"{name}{suffix}", [picture(index, k, size) for k in range(FRAMES)])
 
@@ -56,35 +57,27 @@ def rodrigues(camera: Camera) -> list[float]:
 
 
 def tables(rig: Rig, unit_m: float = 1.0) -> dict[str, dict[str, Any]]:
-    """The tables of a TOML calibration, as Anipose writes them, by the cameras' names."""
+    """Return the tables of a TOML calibration by the cameras' names."""
     return {
-        camera.name: {
-            "name": camera.name,
-            "size": [camera.width, camera.height],
-            "matrix": camera.matrix.tolist(),
-            "distortions": camera.distortions.tolist(),
-            "rotation": rodrigues(camera),
-            "translation": (camera.translation / unit_m).tolist(),
-        }
-        for camera in rig
+        camera.name: camera_table(camera) | {"translation": (camera.translation / unit_m).tolist()} for camera in rig
     }
 
 
 @dataclass(frozen=True)
 class Checked:
-    """An import that went well."""
+    """A successful import."""
 
     imported: Imported
     capture: Capture
 
     def note(self, *parts: str) -> str:
-        """The one note that holds all these parts."""
+        """Return the one note that contains all these parts."""
         (found,) = [note for note in self.imported.notes if all(part in note for part in parts)]
         return found
 
 
 class Import:
-    """Imports a folder and holds the capture against the truth."""
+    """Imports a folder and compares the capture with the true rig."""
 
     def __init__(self, output: Path) -> None:
         self.output = output
@@ -98,7 +91,7 @@ class Import:
         trial: str | None = None,
         order: list[int] | None = None,
     ) -> Checked:
-        """Every camera of ``rig`` is there, projects within 0.01 px, and has its own video (``order`` in the list)."""
+        """Check that every camera of ``rig`` exists, projects within 0.01 px, and has its own video (``order``)."""
         imported = import_project(folder, self.output, unit, trial)
         capture = open_capture(imported.path)
         assert imported.cameras == len(capture.rig) == len(rig)
@@ -125,7 +118,7 @@ def check(tmp_path: Path) -> Import:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """The project's folder, empty."""
+    """Return an empty project folder."""
     made = tmp_path / "project"
     made.mkdir()
     return made

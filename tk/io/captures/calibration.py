@@ -143,6 +143,19 @@ def calibration_of(path: Path, tables: Mapping[str, Mapping[str, object]], unit:
     return Calibration(path, rig, tuple(tables), notes, tuple(late), found.metres)
 
 
+def camera_table(camera: Camera) -> dict[str, object]:
+    """Return the table of a camera in `calibration.toml`, metres."""
+    return {
+        "name": camera.name,
+        "size": [camera.width, camera.height],
+        "matrix": camera.matrix.tolist(),
+        "distortions": camera.distortions.tolist(),
+        "rotation": np.asarray(cv2.Rodrigues(camera.rotation)[0]).ravel().tolist(),
+        "translation": camera.translation.tolist(),
+        "fisheye": camera.fisheye,
+    }
+
+
 def write_calibration(path: Path, source: Calibration, rig: Rig, time_offset_s: Sequence[float]) -> None:
     """Write the file that ``source`` was read from with other cameras: all that is not said here stays as it is.
 

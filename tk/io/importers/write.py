@@ -11,11 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
-import numpy as np
 import tomli_w
 
 from tk.errors import CaptureError
+from tk.io.captures.calibration import camera_table
 from tk.io.captures.capture import open_capture
 from tk.io.captures.video import PICTURE_SUFFIXES, probe
 from tk.io.importers.project import Project
@@ -100,20 +99,8 @@ def write_capture(project: Project, output: Path) -> Imported:
 
 def calibration_toml(rig: Rig, project: Project) -> str:
     """Return the text of `calibration.toml`, metres."""
-    document: dict[str, object] = {
-        camera.name: {
-            "name": camera.name,
-            "size": [camera.width, camera.height],
-            "matrix": camera.matrix.tolist(),
-            "distortions": camera.distortions.tolist(),
-            "rotation": np.asarray(cv2.Rodrigues(camera.rotation)[0], dtype=np.float64).ravel().tolist(),
-            "translation": camera.translation.tolist(),
-            "fisheye": camera.fisheye,
-        }
-        for camera in rig
-    }
-    document["metadata"] = {"units": "m", "imported_from": f"{project.tool}, {project.source.name}"}
-    return tomli_w.dumps(document)
+    metadata = {"units": "m", "imported_from": f"{project.tool}, {project.source.name}"}
+    return tomli_w.dumps({camera.name: camera_table(camera) for camera in rig} | {"metadata": metadata})
 
 
 def capture_toml(name: str, project: Project, up: FoundUp, volume: Volume | None, where: str) -> str:
