@@ -55,7 +55,7 @@ from tk.io.results.writer import Result, read_result
 from tk.kernels.launch import Launcher
 from tk.kernels.nearest import SurfaceIndex, nearest
 from tk.kernels.runtime import ti
-from tk.model.body.skeleton import CHAINS, join_pose
+from tk.model.body.skeleton import CHAINS, convert_poses
 from tk.model.body.superellipsoid_body import build_superellipsoid_body
 from tk.model.cameras.volume import VoxelGrid
 from tk.model.cues.appearance import Appearance
@@ -282,8 +282,7 @@ def _search_stages(
         raise SystemExit(f"{result.path}: has no body in /model")
     skin = build_superellipsoid_body(restored[0], capture.up, config.body.waist)
     row = np.flatnonzero(result.frames == frame.index)[0]
-    waist = np.zeros((0,)) if result.waist is None else result.waist[row]
-    pose = join_pose(skin.skeleton, result.pose[row], waist, np.zeros(0))
+    pose = convert_poses(restored[1][row], restored[0].skeleton, skin.skeleton)
     hull = VisualHull(capture.rig, VoxelGrid.cover(capture.volume, config.voxels))
     hull.carve(masks)
     surface = hull.surface(frame.images)

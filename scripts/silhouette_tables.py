@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from tk.io.captures.capture import open_capture
 from tk.io.results.writer import read_joints
 from tk.kernels.line_search import SearchSettings
-from tk.model.body.skeleton import JOINTS, join_pose
+from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.optim.gauss_newton import GaussNewtonSettings
@@ -131,7 +131,7 @@ def track(data: Sequence3D, name: str, views: int, config: Variant) -> tuple[Row
     body = tracker.body.standing(data.up)
     error = []
     for i in range(0, len(frames), every):
-        pose = join_pose(body.skeleton, estimates[i].pose, estimates[i].waist, estimates[i].ankles)
+        pose = estimates[i].pose
         shares, _ = Evidence.of(grid, data.masks[i]).cast(body, tracker.colors.group, pose[None])
         error.append(np.nanmean(shares))
     found, true = joints[:, ANKLES], data.truth[:, ANKLES]

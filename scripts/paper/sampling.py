@@ -17,7 +17,6 @@ from scripts.paper.common import Float, Options, plt, save, table
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.kernels.nearest import SurfaceIndex
-from tk.model.body.skeleton import join_pose
 from tk.model.cues.edge_term import ContourTerm
 from tk.model.cues.objective import CHAIN_NAMES, BodyObjective, FrameObjective, objective_parameters
 from tk.optim import smd
@@ -79,7 +78,7 @@ def look(options: Options, paper: Settings) -> Scene:
     objective = BodyObjective(skin, objective_parameters(paper.objective), replace(SAMPLING, chain=ARM_POINTS), term)
     frame = FrameObjective(objective, index, np.random.default_rng(0), images=observation.images)
     two = np.array([skin.skeleton.index(name) for name in ANGLES])
-    return Scene(frame, join_pose(skin.skeleton, estimate.pose, estimate.waist, estimate.ankles), two)
+    return Scene(frame, estimate.pose, two)
 
 
 def landscape(scene: Scene, seed: int, poses: Float, iteration: int = 0) -> Float:

@@ -7,13 +7,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 
 from tk.io.results.writer import FrameResult, ResultMeta, ResultWriter, Status
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.skeleton import WAIST, Skeleton, build_skeleton, split_pose
+from tk.model.body.skeleton import Skeleton, build_skeleton
 
 BODY = BodyDimensions.from_stature(1.75)
 SKELETON = build_skeleton(BODY, waist=True)
@@ -45,7 +44,7 @@ def status() -> np.ndarray:
 
 @pytest.fixture
 def write(tmp_path: Path) -> Write:
-    """``write(name)``: a result file of version 1's content; ``meta`` and ``rows`` add what version 2 may hold."""
+    """``write(name)``: a result with what every result has; ``meta`` and ``rows`` add optional datasets."""
 
     def run(
         name: str = "walk.h5",
@@ -53,16 +52,13 @@ def write(tmp_path: Path) -> Write:
         up: str = "z",
         meta: dict[str, Any] | None = None,
         rows: Callable[[int], dict[str, Any]] = lambda f: {},
-        version: int | None = 1,
         lost: np.ndarray | None = None,
         frames: np.ndarray | None = None,
     ) -> Path:
-        has_waist = bool(skeleton.is_waist.any())
         states = status() if lost is None else lost
-        names = tuple(name for name in skeleton.names if name not in WAIST)
         fixed = ResultMeta(
-            pose_names=names,
-            pose_units=tuple("m" if name in ("torso_x", "torso_y", "torso_z") else "rad" for name in names),
+            pose_names=skeleton.names,
+            pose_units=skeleton.units,
             stages=("all",),
             timing_stages=("total",),
             fps=FPS,
@@ -71,32 +67,26 @@ def write(tmp_path: Path) -> Write:
             method="volumetric",
             seed=0,
             config_toml="",
-            waist_names=WAIST if has_waist else (),
             **(meta or {}),
         )
         path = tmp_path / name
         with ResultWriter.create(path, fixed) as writer:
             writer.write_model({f"dimensions/{key}": value for key, value in asdict(BODY).items()})
             for f, pose in enumerate(poses(skeleton)):
-                short, waist, _ = split_pose(skeleton, pose)
                 index = FIRST + f if frames is None else int(frames[f])
                 writer.append(
                     FrameResult(
                         frame=index,
                         time=index / FPS,
-                        pose=short,
+                        pose=pose,
                         joints=skeleton.joints(pose),
                         status=int(states[f]),
                         objective=0.0,
                         iterations=np.zeros(1, int),
                         timing={},
-                        waist=waist,
                         **rows(f),
                     )
                 )
-        if version is not None:
-            with h5py.File(path, "r+") as file:
-                file.attrs["format_version"] = version
         return path
 
     return run

@@ -27,7 +27,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 def test_csv_of_points(write: Write) -> None:
     sigma = np.full(15, 0.02)
-    points, _ = export(write(meta={"sigma": True}, rows=lambda f: {"sigma": sigma}, version=None), ["csv"]).files
+    points, _ = export(write(meta={"sigma": True}, rows=lambda f: {"sigma": sigma}), ["csv"]).files
     rows = rows_of(points)
     assert list(rows[0]) == ["frame", "time", "status", "point", "x", "y", "z", "sigma"]
     assert len(rows) == FRAMES * (len(JOINTS) + 4)
@@ -62,7 +62,7 @@ def test_without_a_waist(write: Write) -> None:
 
 
 def test_what_the_result_holds_goes_before_what_is_computed(write: Write) -> None:
-    """Version 2: rotations and feet are the file's, in the order of its names."""
+    """Rotations and feet are the file's, in the order of its names."""
     q = segment_quaternions(SKELETON, poses())[:, ::-1]
     feet = np.arange(12.0).reshape(4, 3)
     meta = {"segment_names": SEGMENTS[::-1], "feet": True}
@@ -72,7 +72,7 @@ def test_what_the_result_holds_goes_before_what_is_computed(write: Write) -> Non
     def rows(f: int) -> dict[str, np.ndarray]:
         return {} if f in LOST else {"segments_rotation": q[f], "feet": feet}
 
-    motion, _ = read_motion(write("new.h5", meta=meta, rows=rows, version=None))
+    motion, _ = read_motion(write("new.h5", meta=meta, rows=rows))
     old, _ = read_motion(write("old.h5"))
     assert motion.segments == SEGMENTS[::-1]
     both = motion.known & old.known
@@ -84,7 +84,7 @@ def test_what_the_result_holds_goes_before_what_is_computed(write: Write) -> Non
 
 def test_smoothed_copy_of_the_result(write: Write) -> None:
     """`/smoothed` where there is one; what it bridged counts as known."""
-    path = write(version=None)
+    path = write()
     joints = np.array([SKELETON.joints(pose) for pose in poses()]) + 0.01
     with h5py.File(path, "r+") as file:
         file["smoothed/joints/position"] = joints

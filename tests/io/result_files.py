@@ -31,7 +31,7 @@ def assert_complete(path: Path, at_least: int) -> int:
             np.testing.assert_array_equal(dataset[()], [getattr(frame, name) for frame in expected])
         np.testing.assert_array_equal(file["joints/position"][()], [frame.joints for frame in expected])
         np.testing.assert_array_equal(file["timing/total"][()], [frame.timing["total"] for frame in expected])
-        for name, field in (("ankles", "ankles"), ("residual", "residual"), ("feet/position", "feet")):
+        for name, field in (("residual", "residual"), ("feet/position", "feet")):
             np.testing.assert_array_equal(file[name][()], [getattr(frame, field) for frame in expected])
         sigma = [np.full(15, np.nan) if frame.sigma is None else frame.sigma for frame in expected]
         np.testing.assert_array_equal(file["joints/sigma"][()], np.reshape(sigma, (count, 15)))

@@ -23,7 +23,6 @@ META = ResultMeta(
     method="volumetric",
     seed=7,
     config_toml='method = "volumetric"\n[smd]\nmu = 0.1\n',
-    ankle_names=("ankle_pitch_l", "ankle_roll_l", "ankle_pitch_r", "ankle_roll_r"),
     sigma=True,
     residual_cameras=("cam1", "cam2", "cam3"),
     segment_names=("torso", "head"),
@@ -51,7 +50,6 @@ def make_frame(index: int) -> FrameResult:
         iterations=np.array([index, index + 1]),
         timing={"hull": 0.01, "total": 0.05 + index},
         hull=hull,
-        ankles=np.arange(4) / 10 + index,
         sigma=None if index % 4 == 3 else np.full(15, 0.01 * index),  # nothing known in some frames
         residual=np.array([[0.1, 0.0], [0.1, 0.1], [0.0, index]]),
         segments_rotation=np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),

@@ -16,7 +16,7 @@ from tk.io.results.writer import FrameResult, JointAngles, ResultMeta, ResultWri
 from tk.model.body.angles import ANGLES
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
-from tk.model.body.skeleton import ANKLES, SEGMENTS, WAIST, split_pose
+from tk.model.body.skeleton import SEGMENTS
 from tk.model.motion.derived import derive
 from tk.settings import Settings
 from tk.trackers.contour_tracker import ContourTracker
@@ -31,14 +31,12 @@ def complete_result(path: Path, capture_path: Path, count: int = FRAMES) -> Path
     body = build_cone_body(BodyDimensions.from_stature(1.7), capture.up)
     skeleton = body.skeleton
     truth = read_joints(capture_path / "truth.h5").positions
-    paper = [name for name, own in zip(skeleton.names, skeleton.is_paper, strict=True) if own]
-    units = [unit for unit, own in zip(skeleton.units, skeleton.is_paper, strict=True) if own]
     meta = ResultMeta(
-        pose_names=tuple(paper), pose_units=tuple(units), stages=("all",),
+        pose_names=skeleton.names, pose_units=skeleton.units, stages=("all",),
         timing_stages=("decode", "optimise", "total"),
         fps=capture.fps, up=capture.up, capture="made <up>", method="region", seed=0,
         config_toml=settings_file.to_toml(Settings()),
-        waist_names=WAIST, ankle_names=ANKLES, sigma=True, residual_cameras=capture.rig.names, segment_names=SEGMENTS,
+        sigma=True, residual_cameras=capture.rig.names, segment_names=SEGMENTS,
         feet=True, angles=tuple(JointAngles(a.joint, a.names, a.convention) for a in ANGLES), objective_kind="E_S",
     )  # fmt: skip
     rng = np.random.default_rng(1)
@@ -51,14 +49,13 @@ def complete_result(path: Path, capture_path: Path, count: int = FRAMES) -> Path
     with ResultWriter.create(path, meta) as writer:
         writer.write_model(ContourTracker.model(cast(Any, SimpleNamespace(body=body))))
         for f in range(count):
-            main, waist, ankles = split_pose(skeleton, poses[f])
             sigma = rng.uniform(0.005, 0.03, 15)
             sigma[8] = np.nan if f == 3 else sigma[8]
             status = Status.LOST if f in LOST else Status.INITIALISED if f == 0 else Status.TRACKED
             writer.append(
                 FrameResult(
-                    f, f / capture.fps, main, derived.joints[f], status, 0.1 + 0.01 * f, np.array([9]),
-                    {"decode": 0.01, "optimise": 0.12, "total": 0.15}, waist=waist, ankles=ankles, sigma=sigma,
+                    f, f / capture.fps, poses[f], derived.joints[f], status, 0.1 + 0.01 * f, np.array([9]),
+                    {"decode": 0.01, "optimise": 0.12, "total": 0.15}, sigma=sigma,
                     residual=np.full((len(capture.rig), 2), 0.05 + (0.1 if f == 11 else 0.0005 * f)),
                     segments_rotation=derived.rotations[f], feet=derived.feet[f],
                     angles={joint: values[f] for joint, values in derived.angles.items()},

@@ -13,7 +13,7 @@ from tests.trackers.walker import BODY, EMPTY, NAMES, STATURE, errors, find_agai
 from tk.errors import CaptureError
 from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.gait_poses import standing_pose, walking_pose
-from tk.model.body.skeleton import JOINTS, join_pose, shoulder_angles, split_pose
+from tk.model.body.skeleton import JOINTS, shoulder_angles
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import GROUPS, PartColors
 from tk.model.cues.ray_costs import Evidence, RayGrid
@@ -45,8 +45,7 @@ MASKS = draw_silhouettes(BODY, RIG, POSES)
 
 
 def init_of(pose: np.ndarray) -> InitPose:
-    paper, _, _ = split_pose(SKELETON, pose)
-    return InitPose({}, dict(zip(np.array(NAMES)[SKELETON.is_paper].tolist(), paper, strict=True)), None, STATURE)
+    return InitPose({}, dict(zip(NAMES, pose, strict=True)), None, STATURE)
 
 
 def tracker_at(
@@ -77,7 +76,7 @@ def test_a_walk_is_followed_and_can_be_taken_up_again() -> None:
     second.restore(model, state)
     for i in range(3, 6):
         again = second.step(observe(MASKS[i], i))
-        for name in ("pose", "waist", "ankles", "joints", "sigma", "residual", "objective", "status"):
+        for name in ("pose", "joints", "sigma", "residual", "objective", "status"):
             np.testing.assert_array_equal(getattr(again, name), getattr(estimates[i], name), err_msg=name)
 
 
@@ -85,10 +84,8 @@ def test_an_estimate_says_all_that_the_contract_has() -> None:
     tracker = tracker_at(POSES[0])
     tracker.step(observe(MASKS[0]))
     estimate = tracker.step(observe(MASKS[1], 1))
-    assert (len(estimate.pose), len(estimate.waist), len(estimate.ankles)) == (24, 3, 4)
-    assert len(tracker.pose_names) == len(tracker.pose_units) == 24
-    joined = join_pose(SKELETON, estimate.pose, estimate.waist, estimate.ankles)
-    np.testing.assert_allclose(SKELETON.joints(joined), estimate.joints, atol=1e-9)
+    assert tracker.pose_names == SKELETON.names and len(tracker.pose_units) == len(estimate.pose) == 31
+    np.testing.assert_allclose(SKELETON.joints(estimate.pose), estimate.joints, atol=1e-9)
     assert set(estimate.timing) == set(tracker.timing_stages) and len(estimate.iterations) == len(tracker.stages)
     assert estimate.residual is not None and estimate.residual.shape == (3, 2)
     assert (estimate.residual >= 0).all() and (estimate.residual < 0.15).all()
@@ -341,7 +338,7 @@ def test_the_second_pass_mends_a_wrong_body() -> None:
     tracker = RegionTracker(RIG, "z", replace(SETTINGS, adapt=True))
     tracker.start([observe(MASKS[0])], STATURE, init_of(POSES[0]), thin)
     first = [tracker.step(observe(m, i)) for i, m in enumerate(MASKS)]
-    poses = np.array([join_pose(SKELETON, e.pose, e.waist, e.ankles) for e in first])
+    poses = np.array([e.pose for e in first])
     error = np.array([e.residual for e in first])
     before = error_of(thin, poses, MASKS)
     lost = np.array([False] * 5 + [True])

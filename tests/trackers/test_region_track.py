@@ -30,7 +30,7 @@ from tk.trackers.protocol import Estimate, Observation
 from tk.trackers.region import RegionTracker
 
 CONFIG = settings_file.from_toml(QUICK)
-COLUMNS = ("frames", "time", "pose", "waist", "ankles", "joints", "sigma", "residual", "status", "objective")
+COLUMNS = ("frames", "time", "pose", "joints", "sigma", "residual", "status", "objective")
 
 
 def run(capture: Path, output: Path, reporter: Silent | None = None, **options: Any) -> Summary:

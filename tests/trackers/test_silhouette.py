@@ -23,8 +23,7 @@ MASKS = draw_silhouettes(BODY, RIG, POSES)
 
 
 def init_of(pose) -> InitPose:
-    paper = BODY.skeleton.is_paper
-    return InitPose({}, {n: v for n, v, known in zip(NAMES, pose, paper, strict=True) if known}, None, STATURE)
+    return InitPose({}, dict(zip(NAMES, pose, strict=True)), None, STATURE)
 
 
 def tracker_at(pose, **settings) -> SilhouetteTracker:

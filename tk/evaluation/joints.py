@@ -42,7 +42,7 @@ from tk.evaluation.details import (
     longest_run,
     sigma_shares,
 )
-from tk.io.results.writer import JointTrack, Status, read_joints
+from tk.io.results.writer import JointTrack, has_pose, read_joints
 from tk.model.body.skeleton import JOINTS
 
 Float = NDArray[np.float64]
@@ -208,7 +208,7 @@ def evaluate(result: JointTrack, truth: JointTrack) -> Evaluation:
     p_result[found] = result.positions[rows[found]]
     lost = np.zeros(len(frames), dtype=bool)
     if result.status is not None:
-        lost[found] = result.status[rows[found]] == Status.LOST
+        lost[found] = ~has_pose(result.status[rows[found]])
 
     known = np.isfinite(p_truth).all(axis=2)
     failed = ~np.isfinite(p_result).all(axis=2)

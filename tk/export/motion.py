@@ -13,14 +13,14 @@ from tk.io.results.writer import Result, Status, read_result
 from tk.model.body.angles import segment_rotations
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.rotations import to_matrices
-from tk.model.body.skeleton import JOINTS, SEGMENTS, Skeleton, build_skeleton, join_pose, split_pose
+from tk.model.body.skeleton import JOINTS, SEGMENTS, Skeleton, skeleton_of_names
 from tk.model.motion.derived import derive
 from tk.model.motion.segments import FOOT_POINTS, sole_offset
 from tk.model.motion.smoothing import smooth
 
 Float = NDArray[np.float64]
 
-STATUS_WORDS = ("tracked", "initialised", "recovered", "lost")
+STATUS_WORDS = tuple(status.name.lower() for status in Status)
 
 # Axes of other programs as rows, in the body's (forward, left, up) when it stands as the skeleton does in its zero
 # configuration: that is (x, y, z) of a world whose z axis is up.
@@ -109,8 +109,8 @@ def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[M
         raise ResultError(f"{path}: /segments/rotation has no segment {missing[0]}; track the capture again")
     skeleton = _skeleton(result, dimensions)
     # (F, …) what the segments' rotations are made of
-    source = _poses(result, skeleton) if result.segments_rotation is None else result.segments_rotation
-    known = bridged | (result.status != Status.LOST)
+    source = result.pose if result.segments_rotation is None else result.segments_rotation
+    known = bridged | result.has_pose
     for numbers in (result.joints, source):
         known &= np.isfinite(numbers).reshape(len(known), -1).all(axis=1)
     if result.segments_rotation is not None:
@@ -159,8 +159,6 @@ def _in_order(result: Result) -> Result:
     missing = [name for name in JOINTS if name not in names]
     if missing:
         raise ResultError(f"{result.path}: /joints/position has no joint {missing[0]}; the file is damaged")
-    if (result.status > Status.LOST).any():
-        raise ResultError(f"{result.path}: /status holds {result.status.max()}, which has no meaning")
     order = [names.index(name) for name in JOINTS]
     sigma = None if result.sigma is None else result.sigma[:, order]
     return replace(result, joints=result.joints[:, order], sigma=sigma)
@@ -190,43 +188,27 @@ def _dimensions(result: Result) -> BodyDimensions:
 
 
 def _skeleton(result: Result, dimensions: BodyDimensions) -> Skeleton:
-    return build_skeleton(dimensions, result.meta.up, waist=result.waist is not None, ankles=result.ankles is not None)
-
-
-def _poses(result: Result, skeleton: Skeleton) -> Float:
-    """(F, D) the angles of waist and ankles in their place. Frames without numbers stay so."""
-    size = int(skeleton.is_paper.sum())
-    if result.pose.shape[1] != size:
-        raise ResultError(f"{result.path}: /pose has {result.pose.shape[1]} columns; {size} are expected")
-    none = np.zeros((len(result), 0))
-    waist = none if result.waist is None else result.waist
-    ankles = none if result.ankles is None else result.ankles
-    if waist.shape[1] != skeleton.is_waist.sum() or ankles.shape[1] != skeleton.is_ankle.sum():
-        raise ResultError(f"{result.path}: /waist or /ankles has not as many columns as the body has; track it again")
-    return np.array([join_pose(skeleton, *row) for row in zip(result.pose, waist, ankles, strict=True)])
+    try:
+        return skeleton_of_names(result.meta.pose_names, dimensions, result.meta.up)
+    except ValueError as error:
+        raise ResultError(f"{result.path}: /pose: {error}; track the capture again") from error
 
 
 def _smooth(result: Result, dimensions: BodyDimensions) -> tuple[Result, NDArray[np.bool_]]:
     """The result with smoothed poses and what follows from them, and (F,) the frames that were bridged."""
     skeleton = _skeleton(result, dimensions)
-    poses = _poses(result, skeleton)
-    known = (result.status != Status.LOST) & np.isfinite(poses).all(axis=1)
-    found = smooth(skeleton, poses, known, result.meta.fps)
+    known = result.has_pose & np.isfinite(result.pose).all(axis=1)
+    found = smooth(skeleton, result.pose, known, result.meta.fps)
     changed = known | found.bridged
     joints = result.joints.copy()
     derived = derive(skeleton, dimensions, found.poses[changed])
     joints[changed] = derived.joints
     rotation = np.full((len(result), len(SEGMENTS), 4), np.nan)
     rotation[changed] = derived.rotations
-    paper, waist, ankles = (
-        np.array(part) for part in zip(*(split_pose(skeleton, p) for p in found.poses), strict=True)
-    )
     result = replace(
         result,
         meta=replace(result.meta, segment_names=SEGMENTS),
-        pose=paper,
-        waist=None if result.waist is None else waist,
-        ankles=None if result.ankles is None else ankles,
+        pose=found.poses,
         joints=joints,
         segments_rotation=rotation,
         feet=None,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ResultError
-from tk.io.results.writer import Result, Status
+from tk.io.results.writer import Result, has_pose
 from tk.kernels.cones import ELLIPSOID
 from tk.model.body.cone_body import ConeBody, ConePart
 from tk.model.body.skeleton import JOINTS, SEGMENTS
@@ -107,8 +107,8 @@ class Figure:
     _placed: dict[int, Float] = field(default_factory=dict, repr=False, compare=False)
 
     def lost(self, row: int) -> bool:
-        """Return whether the frame is lost."""
-        return bool(self.status[row] == Status.LOST)
+        """Return whether the frame has no pose: the person is lost or absent."""
+        return not has_pose(self.status[row])
 
     def placed(self, row: int) -> Float:
         """Return the points (N, 3) of all circles in a frame, solid by solid; metres, world frame."""

@@ -23,6 +23,8 @@ _STATUS_COLORS: dict[int, Color] = {
     Status.INITIALISED: (190, 170, 110),
     Status.RECOVERED: (60, 190, 240),
     Status.LOST: LOST,
+    Status.SUSPECT: (0, 140, 255),
+    Status.ABSENT: (60, 60, 60),
 }
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tk.errors import ExportError, ResultError
 from tk.io.captures.capture import Capture
 from tk.io.results.data import STATUS_MEANING
-from tk.io.results.writer import Result, Status, read_joints
+from tk.io.results.writer import Result, has_pose, read_joints
 from tk.model.cameras.camera import Camera, Rig
 from tk.render.canvas import Image, View, dots, draw_body, draw_joints, draw_truth, text_width, write
 from tk.render.figure import Figure, figure_of
@@ -151,7 +151,7 @@ class Overlay:
         """Return the view of a tile that contains the person in all frames that are not lost."""
         width, height = (max(int(size * self.grid.scale), 1) for size in (camera.width, camera.height))
         whole = View(np.zeros(2), self.grid.scale, width, height)
-        good = self.figure.status != Status.LOST
+        good = has_pose(self.figure.status)
         points, _ = camera.project(self.figure.joints[good].reshape(-1, 3))
         if full or not camera.sees(self.figure.joints[good].reshape(-1, 3)).any():
             return whole

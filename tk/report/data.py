@@ -50,7 +50,7 @@ def describe(result: Result, rig: Rig | None = None) -> dict[str, Any]:
         "time": result.time.round(4).tolist(),
         "status": result.status.tolist(),
         "statusWords": list(STATUS_MEANING),
-        "lostStatus": int(Status.LOST),
+        "withoutPose": [int(Status.LOST), int(Status.ABSENT)],
         "scene": _scene(result, figure, rig),
         "joints": list(JOINTS),
         "sigma": None if figure.sigma is None else packed(figure.sigma),

@@ -5,7 +5,7 @@
   const data = JSON.parse(document.getElementById("data").textContent);
   const get = (id) => document.getElementById(id);
   const count = data.frames.length;
-  const lost = data.status.map((status) => status === data.lostStatus);
+  const lost = data.status.map((status) => data.withoutPose.includes(status));
   const lostCount = lost.filter(Boolean).length;
   const silhouetteError = data.silhouetteError && unpack(data.silhouetteError);
   const sigma = data.sigma && unpack(data.sigma);
@@ -146,7 +146,7 @@
   function drawStrip() {
     const strip = get("strip"), width = strip.width = strip.clientWidth, pen = strip.getContext("2d");
     const style = getComputedStyle(document.documentElement);
-    const colors = ["--ok", "--initialised", "--recovered", "--lost"].map((name) => style.getPropertyValue(name).trim());
+    const colors = ["--ok", "--initialised", "--recovered", "--lost", "--suspect", "--wire"].map((name) => style.getPropertyValue(name).trim());
     // lost frames last and at least a pixel wide: one in ten thousand must stay visible
     for (const wanted of [false, true]) {
       data.status.forEach((status, k) => {

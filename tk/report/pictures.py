@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.results.writer import Result, Status
+from tk.io.results.writer import Result
 from tk.render.overlay import Overlay
 
 # Frames with the largest and with a typical E_S; width of an image with all cameras, pixels; JPEG quality. Appearance
@@ -32,7 +32,7 @@ class Choice:
 def choose_rows(result: Result) -> list[Choice]:
     """Return the first lost frame, the worst and typical frames; without E_S, frames spread over the result."""
     count = len(result)
-    lost = result.status == Status.LOST
+    lost = ~result.has_pose
     error = np.full(count, np.nan)
     by_view = result.silhouette_error
     if by_view is not None and by_view.size:

@@ -21,7 +21,7 @@ class Viewer {
     this.colors = data.colors;
     this.names = data.joints;
     this.status = data.status;
-    this.lostStatus = data.lostStatus;
+    this.withoutPose = data.withoutPose;
     this.joints = unpack(data.scene.joints);
     this.transforms = unpack(data.scene.transforms);
     this.sigma = data.sigma && unpack(data.sigma);
@@ -109,7 +109,7 @@ class Viewer {
       cos: Math.cos(this.turn), sin: Math.sin(this.turn), cosLift: Math.cos(this.lift), sinLift: Math.sin(this.lift),
       focal: 1.25 * height, x: width / 2, y: height / 2,
     };
-    const lost = this.status[this.frame] === this.lostStatus;
+    const lost = this.withoutPose.includes(this.status[this.frame]);
     this.drawFloor(color("--floor"));
     if (this.shown.cameras) this.drawCameras(color("--wire"));
     if (this.shown.body) this.drawBody(lost);

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from tk.io.captures.mask_store import MaskStore
 from tk.io.results.writer import Result, Status, UsedCameras, Value, read_result, revise_result
 from tk.model.body.cone_body import ConeBody
-from tk.model.body.skeleton import join_pose, split_pose
 from tk.model.masks.image_health import described
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
@@ -45,12 +44,8 @@ def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[st
     if not tracker.has_segments:
         return
     result = read_result(output)
-    none = np.zeros((len(result.frames), 0))
-    waist = none if result.waist is None else result.waist
-    ankles = none if result.ankles is None else result.ankles
-    skeleton = tracker.body.skeleton
-    poses: Float = np.array([join_pose(skeleton, *row) for row in zip(result.pose, waist, ankles, strict=True)])
-    lost = result.status == Status.LOST
+    poses = result.pose.copy()
+    lost = ~result.has_pose
     columns: dict[str, NDArray[Any]] = {}
     model: Mapping[str, Value] | None = None
     cameras = UsedCameras(plan.setup.rig, np.array(plan.source.time_offset_s))
@@ -73,7 +68,7 @@ def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[st
                     found = _track_again(plan, again, cameras, result.frames, poses)
                     rows = np.flatnonzero(np.isin(result.frames, list(found)))
                     estimates = [found[int(frame)] for frame in result.frames[rows]]
-                    poses[rows] = [join_pose(skeleton, e.pose, e.waist, e.ankles) for e in estimates]
+                    poses[rows] = [e.pose for e in estimates]
                     lost[rows] = [e.status == "lost" for e in estimates]
                     columns |= _replaced(result, rows, estimates)
         poses, columns["residual"], precise = again.second_pass(
@@ -96,7 +91,7 @@ def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[st
         report_unknown(result.frames[np.isnan(sigma).all(axis=1) & ~lost], note)
     _LOG.info("angles, feet, and the smoothed copy")
     # poses of the first pass stay as they are
-    kept = ("pose", "waist", "ankles", "joints/position") if model is None else ()
+    kept = ("pose", "joints/position") if model is None else ()
     body = tracker.body.standing(plan.setup.up)
     columns |= {name: values for name, values in _columns(body, poses).items() if name not in kept}
     filtered = smooth(body.skeleton, poses, ~lost, fps)
@@ -151,14 +146,9 @@ def _replaced(result: Result, rows: NDArray[np.int64], estimates: Sequence[Estim
 
 def _columns(body: ConeBody, poses: NDArray[np.float64]) -> dict[str, NDArray[np.floating]]:
     """Return the datasets of poses (F, D) of a body and of what is derived from them."""
-    skeleton = body.skeleton
-    paper, waist, ankles = (np.array(part) for part in zip(*(split_pose(skeleton, p) for p in poses), strict=True))
-    derived = derive(skeleton, body.dimensions, poses)
-    columns = {"pose": paper, "joints/position": derived.joints, "segments/rotation": derived.rotations}
+    derived = derive(body.skeleton, body.dimensions, poses)
+    columns: dict[str, NDArray[np.floating]] = {"pose": poses, "joints/position": derived.joints}
+    columns["segments/rotation"] = derived.rotations
     columns["feet/position"] = derived.feet
     columns |= {f"angles/{joint}": values for joint, values in derived.angles.items()}
-    if skeleton.is_waist.any():
-        columns["waist"] = waist
-    if skeleton.is_ankle.any():
-        columns["ankles"] = ankles
     return columns

@@ -117,8 +117,6 @@ class Plan:
             method=tracker.method,
             seed=self.settings.seed,
             config_toml=to_toml(self.settings),
-            waist_names=tracker.waist_names,
-            ankle_names=tracker.ankle_names,
             sigma=tracker.reports_sigma,
             residual_cameras=setup.rig.names if tracker.reports_sigma else (),
             segment_names=SEGMENTS if tracker.has_segments else (),

@@ -14,7 +14,7 @@ from tk.errors import CaptureError, ConfigError, ResultError
 from tk.io.captures.calibration import write_calibration
 from tk.io.captures.capture import Capture
 from tk.io.captures.mask_store import MaskStore
-from tk.io.results.writer import Status, read_result
+from tk.io.results.writer import read_result
 from tk.model.block_least_squares import Stop
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.agreement import LATE_FRAMES, camera_agreement
@@ -121,7 +121,7 @@ def refine_capture(
         for observation, _ in observations.frames(int(found.frames.min()), int(found.frames.max()) + 1):
             store.put(observation.index, observation.masks)
     body, poses = tracked[0].standing("z"), world.poses_in(tracked[1])
-    usable = found.status != Status.LOST
+    usable = found.has_pose
     done = refine_rig(body, world.rig, store, found.frames, poses, usable, how)
     if done is None:
         raise CaptureError(

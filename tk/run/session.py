@@ -425,8 +425,6 @@ def _row(estimate: Estimate, store_hull: bool) -> FrameResult:
         frame=estimate.frame,
         time=estimate.time,
         pose=estimate.pose,
-        waist=estimate.waist,
-        ankles=estimate.ankles if len(estimate.ankles) else None,
         joints=estimate.joints,
         sigma=estimate.sigma,
         residual=estimate.residual,

@@ -13,7 +13,7 @@ from tk.io.results.writer import Result, blamed_on, read_result
 from tk.io.toml import parse_toml, read_text
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import ConeBody, build_cone_body
-from tk.model.body.skeleton import DEGREES_OF_FREEDOM, join_pose
+from tk.model.body.skeleton import convert_poses, skeleton_of_names
 from tk.trackers.contour_tracker import restore_body, restore_dimensions
 
 
@@ -50,11 +50,10 @@ def read_body(path: Path, up: str) -> ConeBody:
 def body_and_poses(result: Result) -> tuple[ConeBody, NDArray[np.float64]] | None:
     """The body that a result was tracked with, and its poses (F, D); None where it holds none.
 
-    Angles that the result does not tell, as the volumetric tracker's do not tell the ankles', are 0. Of the volumetric
-    tracker's results of 0.x only the dimensions are taken: their shapes were of another kind.
+    Angles that the result does not have are 0: the volumetric tracker has no ankles.
 
     Raises:
-        ResultError: the poses are not of this body.
+        ResultError: the pose vector is not one of this body.
     """
     if "parts/shape" in result.model and "body" in result.model:
         body = restore_body(result.model, result.meta.up)
@@ -62,20 +61,8 @@ def body_and_poses(result: Result) -> tuple[ConeBody, NDArray[np.float64]] | Non
         body = build_cone_body(restore_dimensions(result.model), result.meta.up)
     else:
         return None
-    skeleton = body.skeleton
-    F = len(result.frames)
-    columns = []
-    for name, values, count in (
-        ("pose", result.pose, DEGREES_OF_FREEDOM),
-        ("waist", result.waist, int(skeleton.is_waist.sum())),
-        ("ankles", result.ankles, int(skeleton.is_ankle.sum())),
-    ):
-        column = np.zeros((F, count)) if values is None else values
-        if column.shape[1:] != (count,):
-            raise ResultError(
-                f"{result.path}: /{name} has {column.shape[1]} entries a frame, its body {count} such degrees of "
-                "freedom; track anew"
-            )
-        columns.append(column)
-    poses = [join_pose(skeleton, pose, waist, ankles) for pose, waist, ankles in zip(*columns, strict=True)]
-    return body, np.array(poses).reshape(F, len(skeleton.names))
+    try:
+        own = skeleton_of_names(result.meta.pose_names, body.dimensions, result.meta.up)
+    except ValueError as error:
+        raise ResultError(f"{result.path}: /pose: {error}; track the capture again") from error
+    return body, convert_poses(result.pose, own, body.skeleton)

@@ -22,7 +22,7 @@ from tk.model.body.body_fit import STATURE_DEVIATION, fit_body
 from tk.model.body.cone_body import ConeBody, ConePart, build_cone_body
 from tk.model.body.initial_pose import rough_pose
 from tk.model.body.limb_candidates import Limb, distinct, limbs_of, pairs
-from tk.model.body.skeleton import ANKLES, WAIST, build_skeleton, join_pose, split_pose
+from tk.model.body.skeleton import build_skeleton, convert_poses
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.tracker_frame import TrackerFrame
 from tk.model.cues.part_colors import PartColors
@@ -110,11 +110,7 @@ class ContourTracker:
         self.screen, self.choice = (RayGrid(self.world.rig, rows) for rows in (SCREEN_ROWS, CHOICE_ROWS))
         full = config.body == "full"
         skeleton = build_skeleton(BodyDimensions.from_stature(1.7), waist=full, ankles=full)
-        paper = np.flatnonzero(skeleton.is_paper)
-        self.pose_names = tuple(skeleton.names[k] for k in paper)
-        self.pose_units = tuple(skeleton.units[k] for k in paper)
-        self.waist_names: tuple[str, ...] = WAIST if full else ()
-        self.ankle_names: tuple[str, ...] = ANKLES if full else ()
+        self.pose_names, self.pose_units = skeleton.names, skeleton.units
         self._body: ConeBody | None = None
         self._lost_for = 0
         self.colors: PartColors
@@ -175,11 +171,10 @@ class ContourTracker:
             centroid(self.views.rig, pyramids[0], frames[0].index)  # raises if nobody is there, before a body is taken
             average = BodyDimensions.from_stature(stature or stature_of(self, pyramids))
         else:
-            average, angles = rough_pose(init.joints, init.angles, stature, self.world)
+            average, given, angles = rough_pose(init.joints, init.angles, stature, self.world)
         self.take_body(body or build_cone_body(average, preset=preset))
         if init is not None:
-            unknown = np.zeros(len(self.waist_names)), np.zeros(len(self.ankle_names))
-            rough = self.settle(pyramids[0], join_pose(self.body.skeleton, angles, *unknown)[None]).states[0]
+            rough = self.settle(pyramids[0], convert_poses(angles, given, self.body.skeleton)[None]).states[0]
         hypotheses = find_person(self, frames, pyramids, rough)
         if not self.contours.adapt or body is not None:
             return np.asarray(hypotheses[0].poses[0])
@@ -440,8 +435,7 @@ class ContourTracker:
     def pose_fields(self, pose: Float) -> dict[str, Any]:
         """Return the fields of an :class:`~tk.trackers.protocol.Estimate` that follow from a pose (D,)."""
         skeleton, world = self.body.skeleton, self.world
-        paper, waist, ankles = split_pose(skeleton, world.poses_out(pose))
-        return {"pose": paper, "waist": waist, "ankles": ankles, "joints": world.points_out(skeleton.joints(pose))}
+        return {"pose": world.poses_out(pose), "joints": world.points_out(skeleton.joints(pose))}
 
     # --- what a result file keeps -------------------------------------------------------------------------------
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
@@ -50,8 +50,7 @@ class Estimate:
     """A tracker's answer for one frame.
 
     Attributes:
-        pose: (D,) configuration vector; waist: (W,), ankles: (A,) angles beyond it, in the order of the tracker's
-            names.
+        pose: (D,) pose vector, radians and metres, in the order of the tracker's ``pose_names``.
         joints: (15, 3) joint centres, metres.
         status: "tracked", "initialised", "recovered" or "lost".
         objective: the objective's final value.
@@ -75,8 +74,6 @@ class Estimate:
     iterations: NDArray[np.int32]
     timing: Mapping[str, float]
     surface: HullSurface | None = None
-    waist: Float = field(default_factory=lambda: np.zeros(0))
-    ankles: Float = field(default_factory=lambda: np.zeros(0))
     sigma: Float | None = None
     residual: Float | None = None
     masks: NDArray[np.uint8] | None = None
@@ -92,7 +89,6 @@ class Tracker(Protocol):
         method: name in :data:`tk.trackers.registry.METHODS`.
         stages, timing_stages: names of the entries of ``Estimate.iterations``, and of ``Estimate.timing``.
         pose_names, pose_units: (D,) names and units of the entries of the pose vector.
-        waist_names, ankle_names: names of the angles beyond it.
         objective_kind: meaning of ``Estimate.objective``.
         needs_images: whether it looks at images, or at masks alone.
         can_exclude_cameras: whether an empty mask excludes its camera. In a visual hull it would remove the subject.
@@ -106,8 +102,6 @@ class Tracker(Protocol):
     timing_stages: tuple[str, ...]
     pose_names: tuple[str, ...]
     pose_units: tuple[str, ...]
-    waist_names: tuple[str, ...]
-    ankle_names: tuple[str, ...]
     objective_kind: str
     needs_images: bool
     can_exclude_cameras: bool

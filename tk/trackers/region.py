@@ -516,16 +516,14 @@ class RegionTracker(ContourTracker):
 
     def rewind(self, state: Mapping[str, Any]) -> None:
         """Go back to a state."""
-        poses, previous = (np.array(state[name]) for name in ("poses", "previous"))
-        jumped = state.get("jumped", np.zeros(len(poses), np.bool_))  # results of before have none
-        rows = zip(poses, previous, state["costs"], state["ages"], jumped, strict=True)
+        rows = zip(*(np.array(state[name]) for name in ("poses", "previous", "costs", "ages", "jumped")), strict=True)
         self._alive = [Hypothesis(p, q, float(c), int(a), bool(j)) for p, q, c, a, j in rows]
         self._usual = np.full(len(self.views.rig), state["usual"], np.float64)
         self._usual_posture = np.array(state["usual_posture"], np.float64)
         self._postures = int(state["postures"])
         self._lost_for = int(state["lost_for"])
-        self._stranded = int(state.get("stranded", 0))  # results of before have none
-        self._in_vain = bool(state.get("in_vain", False))  # results of before have none
+        self._stranded = int(state["stranded"])
+        self._in_vain = bool(state["in_vain"])
         self.colors.restore(state)
         self._fresh = False
 

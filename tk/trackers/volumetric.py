@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ConfigError
 from tk.kernels.nearest import SurfaceIndex
+from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import ConeBody
-from tk.model.body.skeleton import CHAINS, JOINTS, WAIST, join_pose, split_pose
+from tk.model.body.skeleton import CHAINS, JOINTS, build_skeleton, convert_poses
 from tk.model.body.superellipsoid_body import SuperellipsoidBody, build_superellipsoid_body
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume, VoxelGrid
@@ -128,9 +129,8 @@ class VolumetricTracker:
         self.rig = rig
         self.hull = VisualHull(rig, VoxelGrid.cover(volume, config.voxels), cache_dir)
         self._finder = ContourTracker(rig, up, replace(config.silhouette, body="full"))
-        self.pose_names, self.pose_units = self._finder.pose_names, self._finder.pose_units
-        self.waist_names: tuple[str, ...] = WAIST if config.body.waist else ()
-        self.ankle_names: tuple[str, ...] = ()
+        skeleton = build_skeleton(BodyDimensions.from_stature(1.7), up, config.body.waist)
+        self.pose_names, self.pose_units = skeleton.names, skeleton.units
         self.skin: SuperellipsoidBody
         self._objective: BodyObjective
         self._appearance: Appearance
@@ -229,10 +229,8 @@ class VolumetricTracker:
         self._lost_for = self._lost_for + 1 if lost else 0
         self._fresh = False
         watch.lap("update")
-        pose, waist, _ = split_pose(self.skin.skeleton, result.pose)
         return Estimate(
-            pose=pose,
-            waist=waist,
+            pose=result.pose,
             joints=self.skin.skeleton.joints(result.pose),
             status=status,
             objective=fit.value,
@@ -268,16 +266,11 @@ class VolumetricTracker:
 
     def _from_contours(self, pose: Float) -> Float:
         """Convert a pose of the cone body, tracker coordinates, to the superellipsoid body, which has rigid feet."""
-        paper, waist, _ = split_pose(self.body.skeleton, self._finder.world.poses_out(pose))
-        return join_pose(self.skin.skeleton, paper, waist[: len(self.waist_names)], NO_ANGLES)
+        return convert_poses(self._finder.world.poses_out(pose), self.body.skeleton, self.skin.skeleton)
 
     def _to_contours(self, pose: Float) -> Float:
         """Convert a pose of the superellipsoid body to the cone body, tracker coordinates."""
-        finder = self._finder
-        paper, bent, _ = split_pose(self.skin.skeleton, pose)
-        waist = np.pad(bent, (0, len(finder.waist_names) - len(bent)))
-        whole = join_pose(self.body.skeleton, paper, waist, np.zeros(len(finder.ankle_names)))
-        return finder.world.poses_in(whole)
+        return self._finder.world.poses_in(convert_poses(pose, self.skin.skeleton, self.body.skeleton))
 
     @property
     def opening_frames(self) -> int:
@@ -324,10 +317,8 @@ class VolumetricTracker:
         self._lost_for += 1
         for stage in ("colour", "optimise", "update"):
             watch.lap(stage)
-        pose, waist, _ = split_pose(self.skin.skeleton, self._pose)
         return Estimate(
-            pose=pose,
-            waist=waist,
+            pose=self._pose,
             joints=self.skin.skeleton.joints(self._pose),
             status="lost",
             objective=1.0 + self.config.objective.coverage_weight,

@@ -7,6 +7,7 @@ import shutil
 import stat
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -30,10 +31,13 @@ def not_hdf5(path: Path) -> None:
     path.write_text("frame,x,y,z\n")
 
 
-def newer_version(path: Path) -> None:
-    write(path, 1)
-    with h5py.File(path, "r+") as file:
-        file.attrs["format_version"] = 3
+def of_version(version: int) -> Callable[[Path], None]:
+    def make(path: Path) -> None:
+        write(path, 1)
+        with h5py.File(path, "r+") as file:
+            file.attrs["format_version"] = version
+
+    return make
 
 
 def truncated(path: Path) -> None:
@@ -56,7 +60,8 @@ def missing(path: Path) -> None:
     [
         (other_software, "other software|neither"),
         (not_hdf5, "not an HDF5 file"),
-        (newer_version, "format_version is 3"),
+        (of_version(4), "format_version is 4.*use a newer tk"),
+        (of_version(2), "format_version is 2.*version 3: track the capture again"),
         (truncated, "damaged"),
         (incomplete, "no /frames"),
         (missing, "no such file"),
@@ -71,6 +76,16 @@ def test_unusable_files_are_named(tmp_path: Path, make, message: str, read) -> N
         read(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_older_results_are_not_resumed(tmp_path: Path) -> None:
+    path = tmp_path / "some.h5"
+    of_version(2)(path)
+    before = path.read_bytes()
+    with pytest.raises(ResultError, match=r"some\.h5: format_version is 2.*track the capture again"):
+        ResultWriter.resume(path, META)
+    assert path.read_bytes() == before
+    write(path, 1)  # but they may be replaced
 
 
 @pytest.mark.parametrize("make", [other_software, not_hdf5])

@@ -125,7 +125,7 @@ def test_frames_after_the_last_state_are_done_again(tmp_path: Path) -> None:
         ({"fps": 30.0}, "fps is 15.0, not 30.0"),
         ({"pose_names": ("x",), "pose_units": ("m",)}, "the pose has 24 entries, not 1"),
         ({"stages": ("all",)}, "stages are all, chains; not all"),
-        ({"ankle_names": ()}, "ankle_names are ankle_pitch_l, .*; not none"),
+        ({"residual_cameras": ()}, "residual_cameras are cam1, .*; not none"),
         ({"sigma": False}, "sigma is True, not False"),
         ({"objective_kind": ""}, "objective_kind is negative log-likelihood, not none"),
         ({"angles": ()}, "angles are knee_l, hip_l; not none"),

@@ -80,7 +80,7 @@ def test_what_was_smoothed_does_not_outlive_what_it_was_made_of(tmp_path: Path) 
     "change",
     [
         {"columns": {"pose": np.zeros((3, 24))}},
-        {"columns": {"waist": np.zeros((4, 3))}},
+        {"columns": {"nonsense": np.zeros((4, 3))}},
         {"smoothed": {"pose": np.zeros((4, 24))}},
         {"smoothed": {"pose": np.zeros((5, 24)), "bridged": np.zeros(4)}},
         {"smoothed": {"status": np.zeros(4), "bridged": np.zeros(4)}},

@@ -32,14 +32,14 @@ def test_a_table_has_a_row_a_frame_and_all_that_the_file_tells(result: Result) -
     np.testing.assert_array_equal(table[list(result.meta.pose_names)], result.pose)
     np.testing.assert_array_equal(table["knee_l_flexion_deg"], result.angles["knee_l"][:, 0])
     assert set(table["status"]) == {"tracked"}
-    expected = 3 + 15 * 3 + 15 + 4 * 3 + 24 + 3 + 4 + sum(len(a.names) for a in result.meta.angles)
+    expected = 3 + 15 * 3 + 15 + 4 * 3 + 31 + sum(len(a.names) for a in result.meta.angles)
     assert len(table.columns) == expected + 2 * len(result.meta.residual_cameras)
 
 
 def test_a_dataset_names_its_dimensions(result: Result) -> None:
     pytest.importorskip("xarray")
     data = result.to_xarray()
-    assert data.sizes["frame"] == 3 and data.sizes["dof"] == 24 + 3 + 4
+    assert data.sizes["frame"] == 3 and data.sizes["dof"] == 31
     np.testing.assert_array_equal(
         data["joints"].sel(joint="knee_r", axis="z"),
         result.joints[:, result.meta.joint_names.index("knee_r"), 2],

@@ -20,8 +20,18 @@ from tests.io.result_files import (
 )
 from tests.io.result_victim import META, make_frame, make_state
 from tk.errors import ResultError
-from tk.io.results.writer import FrameResult, JointAngles, ResultWriter, UsedCameras, Value, read_joints, read_result
-from tk.model.body.skeleton import JOINTS
+from tk.io.results.writer import (
+    FrameResult,
+    JointAngles,
+    ResultWriter,
+    Status,
+    UsedCameras,
+    Value,
+    read_joints,
+    read_result,
+)
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.skeleton import JOINTS, build_skeleton, paper_poses
 
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
@@ -57,7 +67,6 @@ def test_layout_is_the_contract(tmp_path: Path) -> None:
             ("objective", (2,), "float64"),
             ("iterations", (2, 2), "int32"),
             ("timing/optimise", (2,), "float64"),
-            ("ankles", (2, 4), "float64"),
             ("joints/sigma", (2, 15), "float64"),
             ("residual", (2, 3, 2), "float64"),
             ("segments/rotation", (2, 2, 4), "float64"),
@@ -70,9 +79,9 @@ def test_layout_is_the_contract(tmp_path: Path) -> None:
         assert tuple(file["pose"].attrs["names"]) == META.pose_names
         assert tuple(file["pose"].attrs["units"]) == META.pose_units
         assert tuple(file["iterations"].attrs["stages"]) == META.stages
-        assert file["status"].attrs["meaning"][3] == "3: lost"
-        assert tuple(file["ankles"].attrs["names"]) == META.ankle_names
-        assert tuple(file["ankles"].attrs["units"]) == ("rad",) * 4
+        assert list(file["status"].attrs["meaning"]) == [
+            "0: tracked", "1: initialised", "2: recovered after loss", "3: lost", "4: suspect", "5: absent"
+        ]  # fmt: skip
         assert tuple(file["joints/sigma"].attrs["names"]) == JOINTS
         assert tuple(file["residual"].attrs["cameras"]) == META.residual_cameras
         assert tuple(file["residual"].attrs["areas"]) == ("missing", "surplus")
@@ -86,7 +95,7 @@ def test_layout_is_the_contract(tmp_path: Path) -> None:
     assert attributes.pop("created").endswith("+00:00")
     assert attributes == {
         "format": "tk-result",
-        "format_version": 2,
+        "format_version": 3,
         "fps": 15.0,
         "units": "m",
         "up": "z",
@@ -194,7 +203,7 @@ def test_result_without_pose_or_joints(tmp_path: Path) -> None:
         {"pose": np.zeros(23)},
         {"joints": np.zeros((14, 3))},
         {"iterations": np.zeros(3, dtype=np.int32)},
-        {"status": 4},
+        {"status": 6},
         {"timing": {"nonsense": 1.0}},
         {"sigma": np.zeros(14)},
         {"residual": np.zeros(3)},
@@ -214,24 +223,11 @@ def test_a_frame_of_the_wrong_shape_is_refused_and_the_rest_kept(tmp_path: Path,
 
 # --- what a tracker may have or not -----------------------------------------------------------------------------------
 
-PLAIN = replace(
-    META, ankle_names=(), sigma=False, residual_cameras=(), segment_names=(), feet=False, angles=(), objective_kind=""
-)
+PLAIN = replace(META, sigma=False, residual_cameras=(), segment_names=(), feet=False, angles=(), objective_kind="")
 
 
 def plain_frame(index: int) -> FrameResult:
-    return replace(
-        make_frame(index), ankles=None, sigma=None, residual=None, segments_rotation=None, feet=None, angles={}
-    )
-
-
-def write_version_1(path: Path, count: int) -> None:
-    """As tk 0.1 wrote it: none of what is new, and the old number."""
-    with ResultWriter.create(path, PLAIN) as writer:
-        for index in range(count):
-            writer.append(plain_frame(index), make_state(index))
-    with h5py.File(path, "r+") as file:
-        file.attrs["format_version"] = 1
+    return replace(make_frame(index), sigma=None, residual=None, segments_rotation=None, feet=None, angles={})
 
 
 def test_what_is_optional_is_read_back(tmp_path: Path) -> None:
@@ -239,15 +235,9 @@ def test_what_is_optional_is_read_back(tmp_path: Path) -> None:
     write(path, 5)
     result = read_result(path)
     assert result.meta == META
-    assert (
-        result.ankles is not None
-        and result.sigma is not None
-        and result.residual is not None
-        and result.silhouette_error is not None
-    )
+    assert result.sigma is not None and result.residual is not None and result.silhouette_error is not None
     assert result.segments_rotation is not None and result.feet is not None
     assert result.sigma.shape == (5, 15) and np.isnan(result.sigma).all(axis=1).tolist() == [False] * 3 + [True, False]
-    np.testing.assert_array_equal(result.ankles[2], make_frame(2).ankles)
     np.testing.assert_array_equal(result.residual[:, 2, 1], range(5))
     np.testing.assert_array_equal(result.silhouette_error[:, 2], range(5))
     np.testing.assert_array_equal(result.segments_rotation[4], make_frame(4).segments_rotation)
@@ -259,19 +249,33 @@ def test_what_is_optional_is_read_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(track.sigma, result.sigma)
 
 
-def test_version_1_is_read_and_resumed(tmp_path: Path) -> None:
+def test_what_a_tracker_does_not_have_is_absent(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
-    write_version_1(path, 4)
+    with ResultWriter.create(path, PLAIN) as writer:
+        writer.append(plain_frame(0), make_state(0))
     result = read_result(path)
-    assert result.meta == PLAIN and len(result) == 4
-    assert result.ankles is None and result.sigma is None and result.feet is None and result.angles == {}
+    assert result.meta == PLAIN and result.sigma is None and result.feet is None and result.angles == {}
     assert read_joints(path).sigma is None
-    writer, done = ResultWriter.resume(path, PLAIN)
-    with writer:
-        assert done == 4
-        writer.append(plain_frame(4), make_state(4))
-    with h5py.File(path) as file:
-        assert (file.attrs["format_version"], len(file["frames"])) == (2, 5)
+
+
+def test_suspect_frames_have_a_pose_and_absent_frames_have_none(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    with ResultWriter.create(path, META) as writer:
+        for status in Status:
+            writer.append(replace(make_frame(int(status)), status=status))
+    assert read_result(path).has_pose.tolist() == [True, True, True, False, True, False]
+
+
+def test_paper_pose_is_derived_from_the_names_of_the_pose(tmp_path: Path) -> None:
+    skeleton = build_skeleton(BodyDimensions.from_stature(1.7), waist=True, ankles=True)
+    path = tmp_path / "result.h5"
+    pose = skeleton.clip(np.linspace(-0.3, 0.3, 31))
+    with ResultWriter.create(path, replace(META, pose_names=skeleton.names, pose_units=skeleton.units)) as writer:
+        writer.append(replace(make_frame(0), pose=pose))
+    np.testing.assert_array_equal(read_result(path).paper_pose(), [paper_poses(skeleton, pose)])
+    write(path, 1)
+    with pytest.raises(ResultError, match="/pose"):
+        read_result(path).paper_pose()
 
 
 def test_the_same_angles_twice_are_refused() -> None:

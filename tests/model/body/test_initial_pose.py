@@ -31,7 +31,7 @@ def test_rough_pose_meets_the_joints(seed):
     pose = skeleton.clip(rest + rng.normal(0, 0.12, len(rest)) * ~skeleton.prismatic)
     pose[:4] = [*rng.uniform(-1, 1, 3), rng.uniform(-np.pi, np.pi)]
     joints = dict(zip(JOINTS, skeleton.joints(pose), strict=True))
-    dimensions, found = rough_pose(joints, {}, 1.8, WORLD)
+    dimensions, _, found = rough_pose(joints, {}, 1.8, WORLD)
     error = np.linalg.norm(build_skeleton(dimensions).joints(WORLD.poses_out(found)) - skeleton.joints(pose), axis=1)
     assert error.max() < 0.04 and error.mean() < 0.02
 
@@ -40,15 +40,15 @@ def test_rough_pose_takes_the_stature_from_the_joints():
     skeleton = build_skeleton(BodyDimensions.from_stature(1.62))
     joints = dict(zip(JOINTS, skeleton.joints(neutral_pose(skeleton)), strict=True))
     limbs = {name: x for name, x in joints.items() if name not in ("head_top", "pelvis")}
-    dimensions, _ = rough_pose(limbs, {}, None, WORLD)
+    dimensions, _, _ = rough_pose(limbs, {}, None, WORLD)
     assert dimensions.thigh == pytest.approx(BodyDimensions.from_stature(1.62).thigh, rel=0.01)
 
 
 def test_rough_pose_from_angles_is_clipped_and_otherwise_taken_as_written():
     angles = {"torso_x": 0.4, "torso_yaw": 1.0, "knee_l_flexion": 9.0}
     world = TrackerFrame.of(ring_of_cameras(2, width=160, height=200), "-y")
-    dimensions, pose = rough_pose({}, angles, 1.7, world)
-    skeleton, written = build_skeleton(dimensions), world.poses_out(pose)
+    dimensions, skeleton, pose = rough_pose({}, angles, 1.7, world)
+    written = world.poses_out(pose)
     np.testing.assert_allclose(
         written[[skeleton.index("torso_x"), skeleton.index("torso_yaw")]], [0.4, 1.0], atol=1e-12
     )

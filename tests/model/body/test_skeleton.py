@@ -1,4 +1,4 @@
-"""The tree of twists: group axioms, anatomy, limits, mirror symmetry, directions of up."""
+"""The tree of twists: anatomy, limits, mirror symmetry, directions of up."""
 
 import numpy as np
 import pytest
@@ -12,30 +12,25 @@ from tk.model.body.gait_poses import neutral_pose
 from tk.model.body.skeleton import (
     ANKLES,
     CHAINS,
-    DEGREES_OF_FREEDOM,
     JOINTS,
     SEGMENTS,
     WAIST,
     arm_elevation,
     build_skeleton,
-    join_pose,
+    convert_poses,
+    paper_poses,
     shoulder_angles,
-    split_pose,
-    twist_exp,
+    skeleton_of_names,
     up_rotation,
 )
 
 DIMENSIONS = BodyDimensions.from_stature(1.75)
 SKELETON = build_skeleton(DIMENSIONS)
-D = DEGREES_OF_FREEDOM
+D = len(SKELETON.names)
 EXACT = 1e-12
 UPS = ("x", "y", "z", "-x", "-y", "-z")
 FORWARD, LEFT, UP = np.eye(3)
 
-angles = st.one_of(st.floats(-7, 7), st.floats(-1e-7, 1e-7))
-coordinates = st.floats(-2, 2)
-points = st.tuples(coordinates, coordinates, coordinates).map(np.array)
-axes = points.filter(lambda v: np.linalg.norm(v) > 1e-2).map(lambda v: v / np.linalg.norm(v))
 seeds = st.integers(0, 2**32 - 1)
 many = settings(max_examples=60, deadline=None)
 
@@ -65,40 +60,6 @@ def mirrored(pose):
         sign = -1 if name in ("torso_y", "torso_yaw", "torso_roll", "neck_yaw") else 1
         result[SKELETON.index(partner)] = sign * pose[k]
     return result
-
-
-# Twists
-
-
-@given(axes, points, angles)
-@many
-def test_twist_exp_equals_the_matrix_exponential(w, q, angle):
-    xi = np.zeros((4, 4))
-    xi[:3, :3] = np.cross(np.eye(3), w)
-    xi[:3, 3] = -np.cross(w, q)
-    np.testing.assert_allclose(twist_exp(w, q, angle), expm(xi * angle), rtol=0, atol=1e-11)
-
-
-@given(axes, points, angles, angles)
-@many
-def test_twists_about_one_axis_form_a_group(w, q, a, b):
-    product = twist_exp(w, q, a) @ twist_exp(w, q, b)
-    np.testing.assert_allclose(product, twist_exp(w, q, a + b), rtol=0, atol=EXACT)
-    np.testing.assert_allclose(product, twist_exp(w, q, b) @ twist_exp(w, q, a), rtol=0, atol=EXACT)
-    np.testing.assert_allclose(twist_exp(w, q, a) @ twist_exp(w, q, -a), np.eye(4), rtol=0, atol=EXACT)
-    np.testing.assert_allclose(np.linalg.inv(twist_exp(w, q, a)), twist_exp(w, q, -a), rtol=0, atol=EXACT)
-    np.testing.assert_array_equal(twist_exp(w, q, 0.0), np.eye(4))
-
-
-@given(axes, points, angles, st.floats(-3, 3))
-@many
-def test_twist_is_rigid_and_keeps_its_axis(w, q, angle, along):
-    T = twist_exp(w, q, angle)
-    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), rtol=0, atol=EXACT)
-    assert np.linalg.det(T[:3, :3]) == pytest.approx(1, abs=1e-12)
-    np.testing.assert_allclose(T[:3, :3] @ (q + along * w) + T[:3, 3], q + along * w, rtol=0, atol=EXACT)
-    # only the foot of the axis counts, not which point of it is named
-    np.testing.assert_allclose(twist_exp(w, q + along * w, angle), T, rtol=0, atol=EXACT)
 
 
 # The tree
@@ -158,22 +119,6 @@ def test_a_straight_waist_changes_nothing():
         np.testing.assert_allclose(WAISTED.joints(pose), SKELETON.joints(pose[~WAISTED.is_waist]), atol=EXACT)
 
 
-@pytest.mark.parametrize("up", ["z", "-y"])
-def test_without_a_waist_all_limbs_keep_their_directions(up):
-    skeleton, poses = waisted_poses(up=up)
-    plain = build_skeleton(DIMENSIONS, up)
-    for pose in poses:
-        told, waist, none = split_pose(skeleton, pose)
-        np.testing.assert_array_equal(waist, pose[skeleton.is_waist])
-        R, R_told = (s.segment_transforms(p)[:, :3, :3] for s, p in ((skeleton, pose), (plain, told)))
-        limbs = [SEGMENTS.index(s) for s in SEGMENTS if s != "pelvis"]
-        np.testing.assert_allclose(R_told[limbs], R[limbs], atol=1e-9)
-        # the sockets are moved by less than the waist's angle times their distance from it
-        away = np.linalg.norm(plain.joints(told) - skeleton.joints(pose), axis=1).max()
-        assert away < 0.25 * np.linalg.norm(waist) + 1e-9
-        np.testing.assert_allclose(join_pose(skeleton, told, waist, none), pose, atol=1e-9)
-
-
 # The whole skeleton, with waist and ankles
 
 
@@ -219,29 +164,34 @@ def test_signs_of_the_ankles_are_anatomical(side):
 @pytest.mark.parametrize("up", ["z", "-y"])
 @given(seed=seeds)
 @settings(max_examples=20, deadline=None)
-def test_poses_are_split_and_joined(up, seed):
-    """A round trip; in between, what is told has the same limbs, and the legs hang elsewhere by the waist only."""
+def test_paper_pose_keeps_the_orientation_of_trunk_head_and_limbs(up, seed):
     skeleton = whole(up)
-    pose = skeleton.clip(np.random.default_rng(seed).normal(0, 0.5, 31))
-    paper, waist, ankles = split_pose(skeleton, pose)
-    assert (len(paper), len(waist), len(ankles)) == (24, 3, 4)
-    np.testing.assert_array_equal(waist, pose[skeleton.is_waist])
-    np.testing.assert_array_equal(ankles, pose[skeleton.is_ankle])
-    joined = join_pose(skeleton, paper, waist, ankles)
-    np.testing.assert_allclose(joined, pose, atol=1e-9)
-    np.testing.assert_allclose(skeleton.joints(joined), skeleton.joints(pose), atol=1e-9)
+    poses = skeleton.clip(np.random.default_rng(seed).normal(0, 0.5, (2, 31)))
     plain = build_skeleton(DIMENSIONS, up)
-    R, R_told = (s.segment_transforms(p)[:, :3, :3] for s, p in ((skeleton, pose), (plain, paper)))
+    paper = paper_poses(skeleton, poses)
+    assert paper.shape == (2, 24)
+    np.testing.assert_array_equal(paper[1], paper_poses(skeleton, poses[1]))
+    R, R_paper = (s.segment_transforms(p)[..., :3, :3] for s, p in ((skeleton, poses), (plain, paper)))
     limbs = [SEGMENTS.index(s) for s in SEGMENTS if s != "pelvis" and not s.startswith("foot")]
-    np.testing.assert_allclose(R_told[limbs], R[limbs], atol=1e-9)
+    np.testing.assert_allclose(R_paper[:, limbs], R[:, limbs], atol=1e-9)
+    # the waist moves the hip centres by less than its angle times their distance from it
+    away = np.linalg.norm(plain.joints(paper) - skeleton.joints(poses), axis=-1).max(axis=1)
+    assert (away < 0.25 * np.linalg.norm(poses[:, skeleton.is_waist], axis=1) + 1e-9).all()
 
 
-def test_bodies_without_waist_or_ankles_are_split_into_nothing_more():
-    pose = random_pose(3)
-    paper, waist, ankles = split_pose(SKELETON, SKELETON.clip(pose))
-    np.testing.assert_allclose(paper, SKELETON.clip(pose), atol=1e-12)
-    assert waist.shape == ankles.shape == (0,)
-    np.testing.assert_allclose(join_pose(SKELETON, paper, waist, ankles), SKELETON.clip(pose), atol=1e-12)
+def test_poses_of_another_skeleton_are_taken_by_name():
+    pose = SKELETON.clip(random_pose(3))
+    full = convert_poses(pose, SKELETON, whole())
+    assert not full[whole().is_waist | whole().is_ankle].any()
+    np.testing.assert_array_equal(full[np.isin(whole().names, SKELETON.names)], pose)
+    np.testing.assert_allclose(convert_poses(full, whole(), SKELETON), pose, atol=1e-12)
+
+
+def test_skeleton_is_found_by_the_names_of_its_pose_vector():
+    for skeleton in (SKELETON, WAISTED, whole()):
+        assert skeleton_of_names(skeleton.names, DIMENSIONS, "z").names == skeleton.names
+    with pytest.raises(ValueError, match="waist_pitch"):
+        skeleton_of_names([name for name in whole().names if name != "waist_pitch"], DIMENSIONS, "z")
 
 
 @pytest.mark.parametrize("up", ["z", "-y"])
@@ -257,7 +207,10 @@ def test_transforms_are_the_products_of_exponentials(up, seed):
         if skeleton.prismatic[k]:
             step[:3, 3] = skeleton.axis[k] * pose[k]
         else:
-            step = twist_exp(skeleton.axis[k], skeleton.point[k], pose[k])
+            w, q = skeleton.axis[k], skeleton.point[k]
+            xi = np.zeros((4, 4))
+            xi[:3] = np.column_stack([np.cross(np.eye(3), w), -np.cross(w, q)])
+            step = expm(xi * pose[k])
         if skeleton.rise[k].any():
             step[:3, 3] += skeleton.rise[k] * arm_elevation(pose[k], pose[k + 1])
         expected.append(step if parent < 0 else expected[parent] @ step)

@@ -63,9 +63,6 @@ def columns_of(meta: ResultMeta) -> dict[str, Column]:
         "iterations": Column((len(meta.stages),), "i4", {"stages": meta.stages}),
         **{f"timing/{stage}": Column((), "f8") for stage in meta.timing_stages},
     }
-    for name, names in (("waist", meta.waist_names), ("ankles", meta.ankle_names)):
-        if names:
-            columns[name] = Column((len(names),), "f8", {"names": names, "units": ("rad",) * len(names)})
     if meta.sigma:
         columns["joints/sigma"] = Column((len(joints),), "f8", {"names": joints}, FAR_M)
     if meta.residual_cameras:
@@ -91,7 +88,6 @@ def row_of(frame: FrameResult, meta: ResultMeta) -> dict[str, NDArray[Any]]:
     if int(frame.status) not in range(len(STATUS_MEANING)):
         raise ValueError(f"status {frame.status} has no meaning")
     optional = {
-        "ankles": frame.ankles,
         "joints/sigma": frame.sigma,
         "residual": frame.residual,
         "segments/rotation": frame.segments_rotation,
@@ -107,7 +103,6 @@ def row_of(frame: FrameResult, meta: ResultMeta) -> dict[str, NDArray[Any]]:
         "frames": frame.frame,
         "time": frame.time,
         "pose": frame.pose,
-        "waist": frame.waist,
         "joints/position": frame.joints,
         "status": int(frame.status),
         "objective": frame.objective,

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from tk.errors import ResultError
 from tk.io.toml import parse_toml
-from tk.model.body.skeleton import JOINTS
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.skeleton import JOINTS, paper_poses, skeleton_of_names
 from tk.model.cameras.camera import Rig
 
 if TYPE_CHECKING:
@@ -21,8 +22,7 @@ if TYPE_CHECKING:
     import xarray
 
 FORMAT = "tk-result"
-FORMAT_VERSION = 2
-READABLE_VERSIONS = (1, 2)
+FORMAT_VERSION = 3
 
 #: the points of the feet, in the order of `/feet/position`
 FOOT_POINTS = ("heel_l", "toe_l", "heel_r", "toe_r")
@@ -38,15 +38,22 @@ class Status(IntEnum):
     INITIALISED = 1
     RECOVERED = 2
     LOST = 3
+    SUSPECT = 4
+    ABSENT = 5
 
 
 #: fields of ResultMeta that hold names
 _LISTS = (
     "pose_names", "pose_units", "stages", "timing_stages", "joint_names",
-    "waist_names", "ankle_names", "residual_cameras", "segment_names",
+    "residual_cameras", "segment_names",
 )  # fmt: skip
 
-STATUS_MEANING = ("tracked", "initialised", "recovered after loss", "lost")
+STATUS_MEANING = ("tracked", "initialised", "recovered after loss", "lost", "suspect", "absent")
+
+
+def has_pose(status: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Whether frames of this status (...) hold a pose: True unless the person is lost or absent."""
+    return ~np.isin(status, (Status.LOST, Status.ABSENT))
 
 
 @dataclass(frozen=True)
@@ -72,7 +79,7 @@ class JointAngles:
 class ResultMeta:
     """What is fixed for a whole run. A run is resumed only with an equal one.
 
-    The fields from ``waist_names`` on declare what a tracker may have or not: what is declared here is in the file, and
+    The fields from ``sigma`` on declare what a tracker may have or not: what is declared here is in the file, and
     each frame should bring it.
 
     Attributes:
@@ -85,8 +92,6 @@ class ResultMeta:
         seed: of the random generator.
         config_toml: the full configuration as TOML text.
         joint_names: J names, in the order of `/joints/position`.
-        waist_names: names of the angles between trunk and pelvis, radians.
-        ankle_names: names of the angles of the feet against the shins, radians.
         sigma: whether there is a standard deviation of each joint's position.
         residual_cameras: names of the C cameras of `/residual`.
         segment_names: names of the segments whose rotation is told.
@@ -106,8 +111,6 @@ class ResultMeta:
     seed: int
     config_toml: str
     joint_names: tuple[str, ...] = JOINTS
-    waist_names: tuple[str, ...] = ()
-    ankle_names: tuple[str, ...] = ()
     sigma: bool = False
     residual_cameras: tuple[str, ...] = ()
     segment_names: tuple[str, ...] = ()
@@ -146,8 +149,6 @@ class ResultMeta:
 #: fields of Result by the name of their dataset, for those that can be smoothed; `/angles` have a field for all
 _SMOOTHED_FIELDS = {
     "pose": "pose",
-    "waist": "waist",
-    "ankles": "ankles",
     "joints/position": "joints",
     "joints/sigma": "sigma",
     "segments/rotation": "segments_rotation",
@@ -182,12 +183,10 @@ class FrameResult:
         iterations: (S,) optimiser iterations a stage.
         timing: seconds a stage; a stage that is not mentioned took none.
         hull: the surface voxels, if they are to be stored.
-        waist: (W,) angles beyond the pose's, radians; none by default.
 
     What follows may be None: nothing is known in this frame, which the file tells by NaN. It is refused where
     :class:`ResultMeta` does not declare it.
 
-        ankles: (A,) angles of the feet against the shins, radians.
         sigma: (J,) one standard deviation of each joint's position, metres; NaN where a joint has no evidence.
         residual: (C, 2) missing and surplus area by camera, shares of the person's pixels; their sum is E_S.
         segments_rotation: (S, 4) quaternions (w, x, y, z), segment to world.
@@ -204,8 +203,6 @@ class FrameResult:
     iterations: NDArray[np.integer]
     timing: Mapping[str, float]
     hull: HullPoints | None = None
-    waist: Float = field(default_factory=lambda: np.zeros(0))
-    ankles: Float | None = None
     sigma: Float | None = None
     residual: Float | None = None
     segments_rotation: Float | None = None
@@ -258,7 +255,6 @@ class Result:
     frames: NDArray[np.int64]  # (F,)
     time: Float  # (F,) seconds
     pose: Float  # (F, D)
-    waist: Float | None  # (F, W) radians
     joints: Float  # (F, J, 3) metres
     status: NDArray[np.uint8]  # (F,)
     objective: Float  # (F,)
@@ -269,7 +265,6 @@ class Result:
     state: Mapping[str, Value]  # what the tracker needs to go on after the last frame
     software: str
     created: str
-    ankles: Float | None = None  # (F, A) radians
     sigma: Float | None = None  # (F, J) metres, NaN where a joint has no evidence
     residual: Float | None = None  # (F, C, 2) missing and surplus area, shares of the person's pixels
     segments_rotation: Float | None = None  # (F, S, 4) w, x, y, z; segment to world
@@ -286,6 +281,23 @@ class Result:
     def silhouette_error(self) -> Float | None:
         """(F, C) E_S by camera: the sum of missing and surplus area; None if the result has no residual."""
         return None if self.residual is None else np.asarray(self.residual.sum(axis=2))
+
+    @property
+    def has_pose(self) -> NDArray[np.bool_]:
+        """(F,) True where the person is present and found; the rows of other frames hold no usable pose."""
+        return has_pose(self.status)
+
+    def paper_pose(self) -> Float:
+        """(F, 24) the pose vectors of Kehl & Van Gool's body: no waist, hips as angles against the trunk.
+
+        Raises:
+            ResultError: `/pose` is not a pose vector of this program's body.
+        """
+        try:
+            skeleton = skeleton_of_names(self.meta.pose_names, BodyDimensions.from_stature(1.75), self.meta.up)
+        except ValueError as error:
+            raise ResultError(f"{self.path}: /pose: {error}") from error
+        return paper_poses(skeleton, self.pose)
 
     def to_pandas(self) -> pandas.DataFrame:
         """A table, one row a frame; see :func:`tk.io.results.tables.to_pandas`."""

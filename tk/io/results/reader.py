@@ -17,7 +17,7 @@ from tk.io.hdf5 import Hdf5Reader, open_hdf5
 from tk.io.results.columns import FAR_M, LARGE, LAST_FRAME, LAST_STATUS, columns_of
 from tk.io.results.data import (
     FORMAT,
-    READABLE_VERSIONS,
+    FORMAT_VERSION,
     Float,
     Hull,
     JointAngles,
@@ -55,12 +55,10 @@ def read_result(path: str | os.PathLike[str]) -> Result:
             time=columns["time"],
             pose=columns["pose"],
             joints=columns["joints/position"],
-            waist=columns.get("waist"),
             status=columns["status"],
             objective=columns["objective"],
             iterations=columns["iterations"],
             timing={stage: columns[f"timing/{stage}"] for stage in meta.timing_stages},
-            ankles=columns.get("ankles"),
             sigma=columns.get("joints/sigma"),
             residual=columns.get("residual"),
             segments_rotation=columns.get("segments/rotation"),
@@ -134,13 +132,14 @@ def blamed_on(path: Path, what: str) -> Iterator[None]:
 
 
 def check_format(file: Hdf5Reader) -> None:
-    """Raise ResultError unless the file says that it is a result of a format version that is known here."""
+    """Raise ResultError unless the file is a result of the format that this version of tk writes."""
     if not file.is_format(FORMAT):
         file.fail(f"an HDF5 file of other software, not a {FORMAT}; name another file")
     found = file.attribute("", "format_version")
-    if np.ndim(found) or found not in READABLE_VERSIONS:
-        known = ", ".join(map(str, READABLE_VERSIONS))
-        file.fail(f"format_version is {found}, this version of tk knows {known}; use a newer tk")
+    if np.ndim(found) or found != FORMAT_VERSION:
+        newer = isinstance(found, int | np.integer) and found > FORMAT_VERSION
+        remedy = "use a newer tk" if newer else "track the capture again (--force replaces the file)"
+        file.fail(f"format_version is {found}; this version of tk reads and resumes version {FORMAT_VERSION}: {remedy}")
 
 
 def read_meta(file: Hdf5Reader) -> ResultMeta:
@@ -161,8 +160,6 @@ def read_meta(file: Hdf5Reader) -> ResultMeta:
             seed=int(file.number("", "seed")),
             config_toml=file.text("", "config"),
             joint_names=file.names("joints/position", "names"),
-            waist_names=file.names("waist", "names") if "waist" in file else (),
-            ankle_names=file.names("ankles", "names") if "ankles" in file else (),
             sigma="joints/sigma" in file,
             residual_cameras=file.names("residual", "cameras") if "residual" in file else (),
             segment_names=file.names("segments/rotation", "names") if "segments/rotation" in file else (),

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from tk.io.hdf5 import open_hdf5
 from tk.io.results.columns import Column, columns_of, put_attributes, strings
-from tk.io.results.data import FORMAT_VERSION, ResultMeta, UsedCameras, Value, can_be_smoothed
+from tk.io.results.data import ResultMeta, UsedCameras, Value, can_be_smoothed
 from tk.io.results.files import WRITE_ERRORS, Workshop, as_result_error, move_to_memory, open_for_writing, writable
 from tk.io.results.layout import put_cameras, put_model
 from tk.io.results.reader import check_format, count_rows, read_meta
@@ -65,7 +65,6 @@ def revise_result(
         shutil.copyfile(target, revised)
         with open_for_writing(revised, "r+") as copy:
             try:
-                copy.attrs["format_version"] = FORMAT_VERSION
                 for name, values in changed.items():
                     copy[name][...] = values
                 if (changed or filtered is not None) and "smoothed" in copy:

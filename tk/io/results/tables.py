@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +25,7 @@ def to_pandas(result: Result) -> pandas.DataFrame:
     """One row a frame, indexed by the frame's number.
 
     Columns: ``time`` (seconds), ``status`` (a word), ``objective``; ``<joint>_x``, ``_y``, ``_z`` and ``<joint>_sigma``
-    (metres), the feet likewise; the pose, the waist and the ankles by their names (radians and metres);
+    (metres), the feet likewise; the pose by its names (radians and metres);
     ``<joint>_<angle>_deg``; ``<camera>_missing`` and ``<camera>_surplus``, the residual.
 
     Raises:
@@ -41,7 +41,7 @@ def to_pandas(result: Result) -> pandas.DataFrame:
         columns |= {f"{name}_{axis}": values[:, i, k] for i, name in enumerate(names) for k, axis in enumerate(_AXES)}
     if result.sigma is not None:
         columns |= {f"{name}_sigma": result.sigma[:, i] for i, name in enumerate(result.meta.joint_names)}
-    columns |= dict(_pose(result))
+    columns |= {name: result.pose[:, i] for i, name in enumerate(result.meta.pose_names)}
     columns |= {
         f"{angles.joint}_{name}_deg": result.angles[angles.joint][:, i]
         for angles in result.meta.angles
@@ -67,11 +67,9 @@ def to_xarray(result: Result) -> xarray.Dataset:
     """
     xr = _load("xarray")
     meta = result.meta
-    pose = dict(_pose(result))
-    units = dict(zip(meta.pose_names, meta.pose_units, strict=True))
     variables: dict[str, Any] = {
         "joints": (("frame", "joint", "axis"), result.joints, {"units": "m"}),
-        "pose": (("frame", "dof"), np.stack(list(pose.values()), axis=1)),
+        "pose": (("frame", "dof"), result.pose),
         "status": (("frame",), result.status, {"meaning": ", ".join(STATUS_MEANING)}),
         "objective": (("frame",), result.objective, {"kind": meta.objective_kind}),
     }
@@ -80,8 +78,8 @@ def to_xarray(result: Result) -> xarray.Dataset:
         "time": ("frame", result.time, {"units": "s"}),
         "joint": list(meta.joint_names),
         "axis": list(_AXES),
-        "dof": list(pose),
-        "dof_unit": ("dof", [units.get(name, "rad") for name in pose]),
+        "dof": list(meta.pose_names),
+        "dof_unit": ("dof", list(meta.pose_units)),
     }
     if result.sigma is not None:
         variables["sigma"] = (("frame", "joint"), result.sigma, {"units": "m"})
@@ -112,19 +110,6 @@ def _points(result: Result) -> Iterator[tuple[NDArray[np.float64], tuple[str, ..
     yield result.joints, result.meta.joint_names
     if result.feet is not None:
         yield result.feet, FOOT_POINTS
-
-
-def _pose(result: Result) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """The configuration vector, the waist's and the ankles' angles, each (F,), by name."""
-    meta = result.meta
-    parts: Mapping[tuple[str, ...], NDArray[np.float64] | None] = {
-        meta.pose_names: result.pose,
-        meta.waist_names: result.waist,
-        meta.ankle_names: result.ankles,
-    }
-    for names, values in parts.items():
-        if values is not None:
-            yield from ((name, values[:, i]) for i, name in enumerate(names))
 
 
 def _load(package: str) -> Any:

@@ -24,7 +24,6 @@ from tk.io.hdf5 import open_hdf5
 from tk.io.results.data import (
     FOOT_POINTS,
     FORMAT,
-    FORMAT_VERSION,
     FrameResult,
     Hull,
     HullPoints,
@@ -35,6 +34,7 @@ from tk.io.results.data import (
     Status,
     UsedCameras,
     Value,
+    has_pose,
 )
 from tk.io.results.files import (
     WRITE_ERRORS,
@@ -61,7 +61,6 @@ from tk.io.results.revision import revise_result
 __all__ = [
     "FOOT_POINTS",
     "FORMAT",
-    "FORMAT_VERSION",
     "FrameResult",
     "Hull",
     "HullPoints",
@@ -74,6 +73,7 @@ __all__ = [
     "UsedCameras",
     "Value",
     "blamed_on",
+    "has_pose",
     "read_joints",
     "read_result",
     "revise_result",
@@ -158,7 +158,6 @@ class ResultWriter:
                 shutil.copyfile(target, twin_path)
                 file = undo.enter_context(open_for_writing(twin_path, "r+"))
                 twins.append(Twin(twin_path, file))
-                file.attrs["format_version"] = FORMAT_VERSION
                 twins[-1].drop_rows_without_state(meta)
             undo.pop_all()
         writer = cls(target, meta, workshop, twins)

@@ -30,7 +30,7 @@ _HEADINGS, _ITERATIONS, _LONGEST_STEP = 8, 30, 0.4
 
 def rough_pose(
     joints: dict[str, Float], angles: dict[str, float], height_m: float | None, world: TrackerFrame
-) -> tuple[BodyDimensions, Float]:
+) -> tuple[BodyDimensions, Skeleton, Float]:
     """Return the average body, and its pose in the tracker's frame, from numbers in the capture's world.
 
     Args:
@@ -40,17 +40,18 @@ def rough_pose(
         world: the tracker's frame.
 
     Returns:
-        Dimensions and pose (D,).
+        Dimensions, a skeleton of these, and its pose (D,).
     """
     dimensions = BodyDimensions.from_stature(height_m or _stature_of(joints) or _STATURE_M)
-    skeleton = build_skeleton(dimensions)
     if angles:
+        skeleton = build_skeleton(dimensions, waist=True, ankles=True)
         pose = neutral_pose(skeleton)
         for name, value in angles.items():
             pose[skeleton.index(name)] = value
-        return dimensions, world.poses_in(skeleton.clip(pose))
+        return dimensions, skeleton, world.poses_in(skeleton.clip(pose))
+    skeleton = build_skeleton(dimensions)
     rows = np.array([JOINTS.index(name) for name in joints])
-    return dimensions, _fitted(skeleton, rows, world.points_in(list(joints.values())))
+    return dimensions, skeleton, _fitted(skeleton, rows, world.points_in(list(joints.values())))
 
 
 def _fitted(skeleton: Skeleton, rows: NDArray[np.int64], targets: Float) -> Float:

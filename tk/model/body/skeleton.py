@@ -16,12 +16,12 @@ back-out-up / forward-in-down, which is at least 54° away from hanging, raised,
 
 Beyond the paper: a waist, three rotations between trunk and pelvis about the lumbar spine. A dancer's hips stay level
 while the trunk leans; the paper's torso takes them along.
-:func:`split_pose` tells the same pose in the paper's 24
-degrees of freedom.
+:func:`paper_poses` gives a pose in the paper's 24 degrees of freedom.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -115,7 +115,6 @@ _LIMITS_DEG: dict[str, tuple[float, float]] = {
     "ankle_inversion": (-30.0, 40.0),
 }
 
-DEGREES_OF_FREEDOM = 24  # of the paper's body
 WAIST = ("waist_roll", "waist_pitch", "waist_yaw")
 # How stiff each is beside the first: nothing outlines the pelvis from the front, and a hip can turn as well as it.
 WAIST_STIFFNESS = (1.0, 3.0, 5.0)
@@ -265,6 +264,15 @@ class Skeleton:
                 v[..., k + by, :] += lift * arm_elevation(pose[..., k], pose[..., k + 1], by=by)[..., None]
         return np.where(self.prismatic[:, None], 0.0, axis), v
 
+    def rotation(self, dofs: Iterable[int], poses: Float) -> Float:
+        """(..., 3, 3) the product of successive rotations about these axes of the zero configuration."""
+        K, squares = self._generators
+        R = np.eye(3)
+        for k in dofs:
+            angle = poses[..., k, None, None]
+            R = R @ (np.eye(3) + np.sin(angle) * K[k] + (1 - np.cos(angle)) * squares[k])
+        return R
+
     def segment_transforms(self, pose: Float) -> Float:
         """(..., S, 4, 4) transforms of the segments."""
         return self.transforms(pose)[..., self.segment_dof, :, :]
@@ -326,57 +334,37 @@ def arm_elevation(first: ArrayLike, second: ArrayLike, by: int | None = None) ->
     return np.asarray(a * np.cos(second) * np.sin(first) + b * np.sin(second))
 
 
-def twist_exp(axis: Float, point: Float, angle: float) -> Float:
-    """(4, 4) exp of a revolute twist: the rotation by ``angle`` about ``axis`` (unit) through ``point``."""
-    x, y, z = axis
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    R = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
-    T = np.eye(4)
-    T[:3, :3] = R
-    T[:3, 3] = point - R @ point
-    return T
+def convert_poses(poses: Float, source: Skeleton, target: Skeleton) -> Float:
+    """(..., D') poses (..., D) of one skeleton as poses of another: angles by name, 0 where the source has none.
 
-
-def split_pose(skeleton: Skeleton, pose: Float) -> tuple[Float, Float, Float]:
-    """A pose (D,) as the paper's (24,), the waist's angles (3,) and the ankles' (4,); empty where there are none.
-
-    The hips' angles become those between thigh and trunk: all limbs, trunk and head keep their orientation; the legs
-    are moved by what the waist moves their sockets.
+    If only the source has a waist, the hips take over its rotation: trunk, head and all limbs keep their orientation,
+    and the legs move with their sockets.
     """
-    turned = _turn_hips(skeleton, pose, _waist_rotation(skeleton, pose))
-    return turned[skeleton.is_paper], pose[skeleton.is_waist], pose[skeleton.is_ankle]
+    if source.is_waist.any() and not target.is_waist.any():
+        poses = _with_waist_in_hips(source, poses)
+    result = np.zeros((*np.shape(poses)[:-1], len(target.names)))
+    for k, name in enumerate(target.names):
+        if name in source.names:
+            result[..., k] = poses[..., source.index(name)]
+    return result
 
 
-def join_pose(skeleton: Skeleton, pose: Float, waist: Float, ankles: Float) -> Float:
-    """(D,) the inverse of :func:`split_pose`."""
-    whole = np.empty(len(skeleton.names))
-    whole[skeleton.is_paper], whole[skeleton.is_waist], whole[skeleton.is_ankle] = pose, waist, ankles
-    return _turn_hips(skeleton, whole, _waist_rotation(skeleton, whole).T)
+def paper_poses(skeleton: Skeleton, poses: Float) -> Float:
+    """(..., 24) poses (..., D) in the degrees of freedom of the paper's body; the hips are angles against the trunk."""
+    return convert_poses(poses, skeleton, build_skeleton(BodyDimensions.from_stature(1.75)))
 
 
-def _waist_rotation(skeleton: Skeleton, pose: Float) -> Float:
-    R = np.eye(3)
-    for k in np.flatnonzero(skeleton.is_waist):
-        R = R @ twist_exp(skeleton.axis[k], np.zeros(3), pose[k])[:3, :3]
-    return R
-
-
-def _turn_hips(skeleton: Skeleton, pose: Float, R: Float) -> Float:
-    """The pose whose hips' rotations have R (3, 3) before them."""
-    result = pose.copy()
+def _with_waist_in_hips(skeleton: Skeleton, poses: Float) -> Float:
+    """The poses (..., D) with hip angles against the trunk instead of the pelvis."""
+    result = np.array(poses, dtype=np.float64)
     B = skeleton.T_world_body
+    waist = skeleton.rotation(np.flatnonzero(skeleton.is_waist), result)
     for side, spin in (("l", 1.0), ("r", -1.0)):
         dofs = [skeleton.index(f"hip_{side}_{name}") for name in ("pitch", "yaw", "roll")]
-        hip = R
-        for k in dofs:
-            hip = hip @ twist_exp(skeleton.axis[k], np.zeros(3), pose[k])[:3, :3]
-        M = B.T @ hip @ B  # rotations about y, then spin x, then -spin z
-        angles = (
-            np.arctan2(M[0, 2], M[2, 2]),
-            -spin * np.arcsin(np.clip(M[1, 2], -1.0, 1.0)),
-            -spin * np.arctan2(M[1, 0], M[1, 1]),
-        )
-        result[dofs] = angles
+        M = B.T @ waist @ skeleton.rotation(dofs, result) @ B  # rotations about y, then spin x, then -spin z
+        result[..., dofs[0]] = np.arctan2(M[..., 0, 2], M[..., 2, 2])
+        result[..., dofs[1]] = -spin * np.arcsin(np.clip(M[..., 1, 2], -1.0, 1.0))
+        result[..., dofs[2]] = -spin * np.arctan2(M[..., 1, 0], M[..., 1, 1])
     return result
 
 
@@ -494,3 +482,18 @@ def _limits(name: str) -> tuple[float, float]:
     key = name.replace("_l_", "_").replace("_r_", "_")
     lower, upper = _LIMITS_DEG[key]
     return float(np.radians(lower)), float(np.radians(upper))
+
+
+def skeleton_of_names(names: Sequence[str], dimensions: BodyDimensions, up: str) -> Skeleton:
+    """The skeleton whose pose vector has entries of these names, in this order.
+
+    Raises:
+        ValueError: no skeleton has them.
+    """
+    skeleton = build_skeleton(
+        dimensions, up, waist=not {*WAIST}.isdisjoint(names), ankles=not {*ANKLES}.isdisjoint(names)
+    )
+    if skeleton.names != tuple(names):
+        different = sorted({*skeleton.names} ^ {*names}) or ["other order"]
+        raise ValueError(f"the pose vector is not one of this body ({different[0]})")
+    return skeleton
