@@ -20,8 +20,9 @@ from tk.io.captures.capture import Capture
 from tk.model.body.plausibility import fits_height
 from tk.model.cameras.common_view import sample_box, views_of
 from tk.model.cameras.up import up_vector
+from tk.model.hull.coarse import Hull
 from tk.model.masks.image_health import ImageHealth
-from tk.model.masks.mask_agreement import DISAGREE, Agreement, MaskAgreement, Place
+from tk.model.masks.mask_agreement import INCONSISTENT, Agreement, MaskAgreement
 from tk.model.masks.regions import clean_by_area
 from tk.model.masks.silhouettes import HOLE_SHARE
 from tk.run.segmentation import make_labeller
@@ -186,11 +187,11 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
     chosen = [masks[int(i)] for i in frames]
     agreement = compare.compare(chosen)
     late = _delays(compare, masks, centers, agreement)
-    places = compare.places([compare.small(m) for m in chosen])
-    good = [c for c in range(len(capture.rig)) if c not in agreement.apart]
-    hulls = [place.hull(good) for place in places if place is not None]
-    leveling = find_up(capture.rig, capture.up, hulls)
-    p = np.concatenate(hulls) if hulls else np.zeros((0, 3))
+    hulls = compare.hulls([compare.small(m) for m in chosen])
+    good = [c for c in range(len(capture.rig)) if c not in agreement.inconsistent]
+    points = [hull.points(good) for hull in hulls if hull is not None]
+    leveling = find_up(capture.rig, capture.up, points)
+    p = np.concatenate(points) if points else np.zeros((0, 3))
     edge = max(capture.volume.size) / 50
     at_border = ((p < capture.volume.lower + edge) | (p > capture.volume.upper - edge)).any(axis=1)
     views = views_of(capture.rig, sample_box(capture.volume))
@@ -208,7 +209,7 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
         findings=(),
     )
     seen = [
-        Sample(int(i), images[int(i)], masks[int(i)], _silhouettes(places[list(frames).index(i)], good), compare.step)
+        Sample(int(i), images[int(i)], masks[int(i)], _silhouettes(hulls[list(frames).index(i)], good), compare.step)
         for i in kept
     ]
     return replace(inspection, findings=(*_findings(inspection, capture, agreement), *notes)), seen
@@ -220,13 +221,13 @@ def _delays(
     """Return the delay of each camera (C,) frames: the shift with which its masks lie in the hull of the others."""
     C = len(compare.rig)
     small = {index: compare.small(m) for index, m in masks.items()}
-    places = compare.places([small[i] for i in centers])
+    hulls = compare.hulls([small[i] for i in centers])
     shifts = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 1)
     late = np.zeros(C, np.int64)
     out = np.zeros((C, len(shifts)))
     for c in range(C):
         others = [k for k in range(C) if k != c and (k != agreement.odd)]
-        out[c] = _outside_by_shift(small, centers, places, others, c, shifts)
+        out[c] = _outside_by_shift(small, centers, hulls, others, c, shifts)
     best = shifts[np.nanargmin(np.where(np.isfinite(out), out, np.inf), axis=1)]
     now = out[:, _LARGEST_DELAY]
     least = np.nanmin(np.where(np.isfinite(out), out, np.inf), axis=1)
@@ -241,18 +242,18 @@ def _delays(
 def _outside_by_shift(
     small: dict[int, NDArray[np.bool_]],
     centers: Sequence[int],
-    places: Sequence[Place | None],
+    hulls: Sequence[Hull | None],
     others: Sequence[int],
     camera: int,
     shifts: NDArray[np.int64],
 ) -> NDArray[np.float64]:
     """Return the share (S,) of a camera's masks outside the others' hull, for masks taken so many frames later."""
     area, out = np.zeros(len(shifts)), np.zeros(len(shifts))
-    for center, place in zip(centers, places, strict=True):
+    for center, hull in zip(centers, hulls, strict=True):
         # all shifts or none, so that they are compared over the same frames
-        if place is None or any(center + int(s) not in small for s in shifts):
+        if hull is None or any(center + int(s) not in small for s in shifts):
             continue
-        silhouette = place.silhouette(place.carve(others), camera)
+        silhouette = hull.silhouette(hull.carve(others), camera)
         for i, s in enumerate(shifts):
             mask = small[center + int(s)][camera]
             area[i] += mask.sum()
@@ -260,13 +261,13 @@ def _outside_by_shift(
     return np.where(area > 0, out / np.maximum(area, 1), np.nan)
 
 
-def _silhouettes(place: Place | None, good: Sequence[int]) -> NDArray[np.bool_] | None:
-    if place is None:
+def _silhouettes(hull: Hull | None, good: Sequence[int]) -> NDArray[np.bool_] | None:
+    if hull is None:
         return None
     pictures = []
-    for c in range(len(place.sees)):
+    for c in range(len(hull.inside)):
         others = [k for k in good if k != c]
-        pictures.append(place.silhouette(place.common(others or [c]), c))
+        pictures.append(hull.silhouette(hull.common(others or [c]), c))
     return np.array(pictures)
 
 
@@ -292,8 +293,8 @@ def _camera(
             f"its video seems to start {abs(late)} frame(s) {'late' if late > 0 else 'early'}: its frame k shows what "
             f"frame k {late:+d} of the others shows"
         )
-    elif c in agreement.apart:
-        verdict = agreement.why(c)
+    elif c in agreement.inconsistent:
+        verdict = agreement.reason(c)
     return CameraReport(
         name=camera.name,
         area=float(np.mean([m.mean() for m in own])),
@@ -311,7 +312,7 @@ def _camera(
 
 def _findings(found: Inspection, capture: Capture, agreement: Agreement) -> list[str]:
     lines = [f"camera {c.name} is inconsistent with the others: {c.verdict}" for c in found.cameras if c.verdict]
-    if not lines and agreement.disagreement > DISAGREE:
+    if not lines and agreement.disagreement > INCONSISTENT:
         lines.append(
             f"the cameras are inconsistent, none more than the others: {agreement.disagreement:.0%} of the masks lie "
             "outside the hulls of the others; check the calibration, and whether masks miss parts of the person"

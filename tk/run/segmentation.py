@@ -117,7 +117,7 @@ def _learn_median(setup: Setup, source: Source, settings: Settings, note: Callab
         samples = [frame.images.copy() for frame in frames if frame.index % step == 0]
     foreground = _learn(setup, settings, median_plate(samples, [(c.width, c.height) for c in setup.rig]))
     masks = np.array([foreground.segment(images) for images in samples]) > 0  # (K, C, H, W)
-    from tk.model.masks.subject import CoarseHull  # SciPy
+    from tk.model.hull.coarse import CoarseHull  # SciPy
 
     hull = CoarseHull(setup.rig, setup.volume)
     litres = float(np.median([hull.litres(hull.subject(each.view(np.uint8))) for each in masks]))

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume
-from tk.model.masks.subject import CoarseHull, Patch, Sighting, locate, volume_patch
+from tk.model.hull.coarse import CoarseHull
+from tk.model.masks.subject import Patch, Sighting, locate, volume_patch
 from tk.segmenters import Finder, Segmenter, probabilities
 
 Images = NDArray[np.uint8]

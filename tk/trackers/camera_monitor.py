@@ -107,10 +107,10 @@ class CameraMonitor:
         shown = [_without(f, b) for f, b in zip(frames, bad, strict=True)]
         chosen = np.unique(np.linspace(0, len(shown) - 1, _OPENING).round().astype(int))
         agreement = MaskAgreement(self._setup.rig, self._setup.volume).compare([shown[i].masks for i in chosen])
-        for camera in agreement.apart if isinstance(self.tracker, ContourTracker) else ():
+        for camera in agreement.inconsistent if isinstance(self.tracker, ContourTracker) else ():
             if len(self._names) - self._distrusted.sum() > 2:
                 self._distrusted[camera] = True
-                self._why_apart[camera] = agreement.why(camera)
+                self._why_apart[camera] = agreement.reason(camera)
         if self._subject.height_m is not None:
             check_extent(agreement.extent_m, self._subject.height_m)
         return [_without(f, self._distrusted) for f in shown]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.joint_sigma import BENT_M, IN_THE_FLESH_M, contour_variance, directions, posture_variance
+from tk.model.body.joint_sigma import BENT_M, OFFSET_M, contour_variance, directions, posture_variance
 from tk.model.body.skeleton import JOINTS, build_skeleton
 
 SKELETON = build_skeleton(BodyDimensions.from_stature(1.75), waist=True, ankles=True)
@@ -67,7 +67,7 @@ def test_the_usual_posture_adds_nothing_and_an_arm_that_is_turned_over_all_there
     arm = [JOINTS.index(f"{joint}_l") for joint in ("shoulder", "elbow")]
     over[arm] *= -3.0  # a mean is shorter than one, its length says nothing
     found = posture_variance(SKELETON, straight, over)
-    np.testing.assert_allclose(found[arm], (2 * IN_THE_FLESH_M) ** 2)
+    np.testing.assert_allclose(found[arm], (2 * OFFSET_M) ** 2)
     assert np.delete(found, arm).max() < 1e-12
 
 

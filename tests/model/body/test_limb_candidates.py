@@ -24,7 +24,7 @@ def test_limbs_have_the_parts_and_angles_that_the_body_has(preset):
     limbs = limbs_of(body)
     assert [limb.name for limb in limbs] == list(LIMBS[2:] if preset == "walker" else LIMBS)
     for limb in limbs:
-        assert limb.places.shape[1] == len(limb.dofs) and len(np.unique(limb.places, axis=0)) == len(limb.places)
+        assert limb.grid.shape[1] == len(limb.dofs) and len(np.unique(limb.grid, axis=0)) == len(limb.grid)
         assert body.free[limb.dofs].all() and body.skeleton.chain_dofs(limb.name)[limb.dofs].all()
         assert {body.parts[p].segment[-1] for p in limb.parts} == {limb.name[-1]}
     assert [tuple(limb.name for limb in pair) for pair in pairs(limbs)] == [
@@ -39,7 +39,7 @@ def test_candidates_stay_within_the_limits_and_change_the_limb_only(name, seed):
     limb, rng = LIMB[name], np.random.default_rng(seed)
     pose = SKELETON.clip(rng.normal(0, 0.6, len(POSE)))
     found = limb.candidates(pose, 40, rng)
-    assert found.shape == (len(limb.places) + 40, len(pose))
+    assert found.shape == (len(limb.grid) + 40, len(pose))
     np.testing.assert_array_equal(SKELETON.clip(found), found)
     others = np.delete(np.arange(len(pose)), limb.dofs)
     np.testing.assert_array_equal(found[:, others], np.repeat(pose[None, others], len(found), axis=0))
@@ -69,7 +69,7 @@ def test_arms_are_looked_for_in_all_directions(name):
 @pytest.mark.parametrize("name", ["arm_l", "arm_r"])
 def test_elbows_are_stretched_and_bent_to_all_sides(name):
     elbow = list(LIMB[name].dofs).index(SKELETON.index(f"elbow_{name[-1]}_flexion"))
-    bends = np.degrees(LIMB[name].places[:, elbow])
+    bends = np.degrees(LIMB[name].grid[:, elbow])
     assert bends.min() < 20 and bends.max() > 110 and len(np.unique(bends.round())) >= 3
 
 
@@ -78,9 +78,9 @@ def test_legs_are_looked_for_from_behind_to_a_high_kick(name):
     found = directions(name, ("hip", "knee"))
     forward = np.degrees(np.arctan2(found @ FORWARD, -found @ UP))
     assert forward.min() < -15 and forward.max() > 90
-    knees = np.degrees(LIMB[name].places[:, 3])
+    knees = np.degrees(LIMB[name].grid[:, 3])
     assert knees.min() < 10 and knees.max() > 120
-    assert not LIMB[name].places[:, 4:].any()
+    assert not LIMB[name].grid[:, 4:].any()
 
 
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 6))

@@ -15,7 +15,7 @@ from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume
-from tk.model.masks.mask_agreement import DISAGREE, MaskAgreement
+from tk.model.masks.mask_agreement import INCONSISTENT, MaskAgreement
 from tk.model.masks.silhouettes import draw_silhouettes
 
 RIG = ring_of_cameras(5, 240, 240)
@@ -40,7 +40,7 @@ def compare(masks: np.ndarray, rig: Rig = RIG):
 
 def test_exact_masks_agree(masks: np.ndarray) -> None:
     found = compare(masks)
-    assert found.odd is None and found.apart == () and found.closes.all()
+    assert found.odd is None and found.inconsistent == () and found.closes.all()
     assert found.disagreement < 0.01
     np.testing.assert_array_equal(found.shift_px, 0.0)
     assert 1.6 < found.extent_m < 2.1
@@ -51,12 +51,12 @@ def test_a_turned_camera_is_named_with_its_pixels(masks: np.ndarray) -> None:
     cameras = list(RIG)
     cameras[3] = replace(cameras[3], rotation=turn @ cameras[3].rotation, translation=turn @ cameras[3].translation)
     found = compare(masks, Rig(tuple(cameras)))
-    assert found.odd == 3 and found.apart == (3,)
+    assert found.odd == 3 and found.inconsistent == (3,)
     off = RIG[3].matrix[0, 0] * np.tan(np.radians(3.0))
     # the hull of the others has room for some of it
     assert 0.5 * off < np.hypot(*found.shift_px[3]) <= off + 3
-    assert "turned" in found.why(3)
-    assert np.delete(found.own, 3).max() < DISAGREE / 2
+    assert "turned" in found.reason(3)
+    assert np.delete(found.own, 3).max() < INCONSISTENT / 2
 
 
 @pytest.mark.parametrize(
@@ -73,8 +73,8 @@ def test_what_a_mask_shows_too_much_or_too_little_is_told(
     spoilt = masks.copy()
     spoilt[:, 2] = spoil(masks[:, 2])
     found = compare(spoilt)
-    assert found.apart == (2,)
-    assert reason in found.why(2)
+    assert found.inconsistent == (2,)
+    assert reason in found.reason(2)
 
 
 def test_nobody_is_no_hull(masks: np.ndarray) -> None:

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from tests.model.ring import ring_of_cameras
 from tk.model.cameras.volume import Volume
-from tk.model.masks.subject import CoarseHull, Patch, Sighting, locate, volume_patch
+from tk.model.hull.coarse import CoarseHull
+from tk.model.masks.subject import Patch, Sighting, locate, volume_patch
 
 RIG = ring_of_cameras(4, 160, 200)
 VOLUME = Volume((0.0, 0.0, 1.0), (2.4, 2.4, 2.2))

@@ -1,10 +1,10 @@
-"""How sure a joint's place is: from the contours' noise, and from how far the person is from the usual posture.
+"""Standard deviation of each joint's position: from the contours' noise, and from the posture.
 
-Two things make a joint's error. Contours err by some pixels, and the curvature at the optimum says what that does to a
-joint. And no joint of a person is a hinge at a point: where the model's lies in the flesh differs from where an
-anatomist puts it by about a centimetre. As long as a limb keeps its direction in the trunk that is a constant, which no
-motion shows and `tk evaluate` takes off; when the limb turns the difference turns with it. In the same way a spine
-bends along its length, the model's in one place.
+Two things cause a joint's error. First, contours err by some pixels; the curvature at the optimum gives the effect on a
+joint. Second, no joint of a person is a hinge at a point: the model's joint differs from the anatomical one by about a
+centimetre. As long as a limb keeps its direction relative to the trunk, this difference is a constant offset, which
+`tk evaluate` removes; when the limb turns, the offset turns with it. In the same way a spine bends along its length,
+but the model's bends at one point.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from tk.model.body.skeleton import JOINTS, SEGMENTS, Skeleton
 
 Float = NDArray[np.float64]
 
-# A joint's place in the flesh, metres along an axis, and what a bend of the waist by one radian adds to all joints.
-# Chosen on walk, dance, fold, cube and treadmill such that as many errors are within 1 and 2 σ as are of a normal's.
-# The first is about what the joints' constant offsets are on these.
-IN_THE_FLESH_M, BENT_M = 0.0067, 0.0145
+# Offset of a joint from the anatomical one, metres along an axis, and the error of all joints when the waist bends by
+# one radian. Fitted on walk, dance, fold, cube and treadmill-slow, so that as many errors lie within 1 and 2 σ as for a
+# normal distribution. The joints' constant offsets on these captures are about as large as the first.
+OFFSET_M, BENT_M = 0.0067, 0.0145
 
-# The bone whose direction tells how a joint is turned, by the joints at its ends; the trunk's own joints have none.
+# The bone that each joint turns with, by the joints at its ends; the trunk's own joints have none.
 _BONES = {
     "head_top": ("neck", "head_top"),
     **{f"{joint}_{side}": (f"shoulder_{side}", f"elbow_{side}") for side in "lr" for joint in ("shoulder", "elbow")},
@@ -36,13 +36,13 @@ _TRUNK = SEGMENTS.index("torso")
 
 
 def contour_variance(skeleton: Skeleton, pose: Float, precision: Float, free: NDArray[np.bool_]) -> Float:
-    """(..., 15) variance of the joints' places along an axis, metres², that the contours' noise makes.
+    """Return (..., 15) variance of the joints' positions along an axis, metres², from the contours' noise.
 
     Args:
         skeleton: of D degrees of freedom.
         pose: (..., D).
-        precision: (..., D, D) the information about the pose that contours and priors give.
-        free: (D,) what was free to change.
+        precision: (..., D, D) information of contours and priors about the pose.
+        free: (D,) bool, degrees of freedom that were optimised.
     """
     index = np.flatnonzero(free)
     covariance = np.linalg.inv(precision[..., index[:, None], index])
@@ -55,8 +55,8 @@ def contour_variance(skeleton: Skeleton, pose: Float, precision: Float, free: ND
 
 
 def directions(skeleton: Skeleton, poses: Float) -> Float:
-    """(..., 15, 3) the direction, in the trunk, of the bone that each joint turns with, at poses (..., D); zero for the
-    trunk's own joints."""
+    """Return (..., 15, 3) the direction, relative to the trunk, of the bone that each joint turns with, at poses
+    (..., D); zero for the trunk's own joints."""
     x = skeleton.joints(poses)
     bones = (x[..., _TO, :] - x[..., _FROM, :]) @ skeleton.segment_transforms(poses)[..., _TRUNK, :3, :3]
     result = np.zeros(x.shape)
@@ -64,13 +64,13 @@ def directions(skeleton: Skeleton, poses: Float) -> Float:
     return result
 
 
-def posture_variance(skeleton: Skeleton, poses: Float, usual: Float) -> Float:
-    """(..., 15) variance along an axis, metres², of what is no constant of where the joints of poses (..., D) lie.
+def posture_variance(skeleton: Skeleton, poses: Float, mean: Float) -> Float:
+    """Return (..., 15) variance of the joints' offsets along an axis, metres², at poses (..., D).
 
     Args:
-        usual: (15, 3) mean or median of :func:`directions` over the recording.
+        mean: (15, 3) mean or median of :func:`directions` over the recording.
     """
-    length = np.linalg.norm(usual, axis=-1, keepdims=True)
-    turned = directions(skeleton, poses) - usual / np.where(length > 0, length, 1.0)
+    length = np.linalg.norm(mean, axis=-1, keepdims=True)
+    turned = directions(skeleton, poses) - mean / np.where(length > 0, length, 1.0)
     bent = (np.asarray(poses)[..., skeleton.is_waist] ** 2).sum(axis=-1, keepdims=True)
-    return np.asarray(IN_THE_FLESH_M**2 * (turned**2).sum(axis=-1) + BENT_M**2 * bent)
+    return np.asarray(OFFSET_M**2 * (turned**2).sum(axis=-1) + BENT_M**2 * bent)

@@ -1,7 +1,7 @@
-"""Where a limb may be: candidates for a search that looks at all of its places, not only at those near the last one.
+"""Candidate poses of a limb over its whole range of motion, for the limb search.
 
-An arm's candidates are directions spread evenly over the sphere, each with the elbow stretched or bent to one of
-several sides; a leg's are hip and knee angles on a grid. Both are relative to the trunk and within the limits.
+An arm's candidates are directions spread evenly over the sphere, each with the elbow straight or bent to one of several
+sides; a leg's are hip and knee angles on a grid. Both are relative to the trunk and within the limits.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from tk.model.body.skeleton import CHAINS, JOINTS, Skeleton, shoulder_angles
 Float = NDArray[np.float64]
 
 LIMBS = ("arm_l", "arm_r", "leg_l", "leg_r")
-# Of the two places of a limb: joints that lie farther apart than this make them different, metres.
+# Two poses of a limb are different if a joint's positions differ by more than this, metres: about an arm's width.
 DISTINCT_M = 0.12
 
-# Directions of the upper arm on the sphere, some 20° apart; those through the back or far across are left out.
+# Grids of angles. The upper arm has directions on the sphere about 20° apart, without those through the back or far
+# across. Chosen on the development captures; sensitivity not measured.
 _DIRECTIONS = 84
 _ELBOWS_DEG = (60.0, 115.0)
 _ARM_ROLLS_DEG = (-80.0, -30.0, 20.0, 70.0)
@@ -30,7 +31,7 @@ _HIPS_DEG = (-20.0, 10.0, 40.0, 70.0, 100.0)
 _SPREADS_DEG = (-10.0, 10.0, 35.0)
 _LEG_ROLLS_DEG = (-25.0, 25.0)
 _KNEES_DEG = (5.0, 45.0, 85.0, 130.0)
-# How far a candidate near the present place is turned in each angle, one standard deviation.
+# Standard deviation of the angles of candidates near the current pose.
 _NEAR_DEG = 25.0
 
 
@@ -41,11 +42,11 @@ class Limb:
     Attributes:
         name: of :data:`LIMBS`.
         dofs: (L,) its degrees of freedom.
-        free: (D,) bool, where those are.
+        free: (D,) bool, those degrees of freedom.
         parts: (K,) int32 its parts.
         arrays: the body for the kernels, with the contours of these parts only.
         joints: elbow and wrist, or knee and ankle, as indices into the skeleton's joints.
-        places: (N, L) candidates.
+        grid: (N, L) candidates.
         lower, upper: (L,) limits.
     """
 
@@ -55,51 +56,51 @@ class Limb:
     parts: NDArray[np.int32]
     arrays: ConeArrays
     joints: tuple[int, int]
-    places: Float
+    grid: Float
     lower: Float
     upper: Float
 
     def candidates(self, pose: Float, near: int, rng: np.random.Generator) -> Float:
-        """(B, D) copies of a pose with the limb everywhere, and at ``near`` random places about its own."""
+        """Return (B, D) copies of a pose with the limb in all candidates of the grid, and in ``near`` random ones."""
         turned = pose[self.dofs] + rng.normal(scale=np.radians(_NEAR_DEG), size=(near, len(self.dofs)))
-        places = np.concatenate([self.places, np.clip(turned, self.lower, self.upper)])
-        result = np.repeat(pose[None], len(places), axis=0)
-        result[:, self.dofs] = places
+        angles = np.concatenate([self.grid, np.clip(turned, self.lower, self.upper)])
+        result = np.repeat(pose[None], len(angles), axis=0)
+        result[:, self.dofs] = angles
         return result
 
-    def combined(self, poses: Float, places: Float) -> Float:
-        """(B·N, D) each of the poses (B, D) with the limb as in each of others (N, D)."""
-        result = np.repeat(poses, len(places), axis=0)
-        result[:, self.dofs] = np.tile(places[:, self.dofs], (len(poses), 1))
+    def combined(self, poses: Float, others: Float) -> Float:
+        """Return (B·N, D) each of the poses (B, D) with the limb as in each of the others (N, D)."""
+        result = np.repeat(poses, len(others), axis=0)
+        result[:, self.dofs] = np.tile(others[:, self.dofs], (len(poses), 1))
         return result
 
     def distinct(self, skeleton: Skeleton, poses: Float, cost: Float, count: int) -> Float:
-        """(C, D) the cheapest of the poses whose limbs lie apart by more than :data:`DISTINCT_M`, at most ``count``."""
+        """Return (C, D) the cheapest different poses of the limb (:data:`DISTINCT_M`), at most ``count``."""
         best = np.argsort(cost, kind="stable")
         best = best[np.isfinite(cost[best])]
         chosen: list[int] = []
-        for many in (5 * count, 20 * count):  # beyond these only neighbours of the first follow
+        for many in (5 * count, 20 * count):  # the cheapest are mostly neighbours of each other
             if len(chosen) < count:
                 chosen = distinct(skeleton.joints(poses[best[:many]])[:, list(self.joints)], count)
         return np.asarray(poses[best[chosen]])
 
 
-def distinct(places: Float, count: int, present: Float | None = None) -> list[int]:
-    """The first of the places (N, J, 3) that lie apart from each other and from the present one (J, 3)."""
+def distinct(joints: Float, count: int, current: Float | None = None) -> list[int]:
+    """Return the indices of the first positions (N, J, 3) that differ from each other and the current one (J, 3)."""
 
-    def apart(place: Float) -> NDArray[np.bool_]:
-        return np.asarray(np.linalg.norm(places - place, axis=-1).max(axis=-1) > DISTINCT_M)
+    def differs(other: Float) -> NDArray[np.bool_]:
+        return np.asarray(np.linalg.norm(joints - other, axis=-1).max(axis=-1) > DISTINCT_M)
 
-    free = np.ones(len(places), np.bool_) if present is None else apart(present)
+    free = np.ones(len(joints), np.bool_) if current is None else differs(current)
     chosen: list[int] = []
     while len(chosen) < count and free.any():
         chosen.append(int(np.argmax(free)))
-        free &= apart(places[chosen[-1]])
+        free &= differs(joints[chosen[-1]])
     return chosen
 
 
 def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
-    """The limbs that a body has parts of."""
+    """Return the limbs of a body."""
     skeleton = body.skeleton
     result = []
     for name in LIMBS:
@@ -111,9 +112,9 @@ def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
         dofs = chain[body.free[chain]]
         lower, upper = skeleton.lower[dofs], skeleton.upper[dofs]
         arm = name.startswith("arm")
-        places = _arm_places() if arm else _leg_places(len(chain))
+        grid = _arm_grid() if arm else _leg_grid(len(chain))
         if len(dofs) < len(chain):  # the walker's hips turn about one axis only
-            places = np.unique(places[:, body.free[chain]], axis=0)
+            grid = np.unique(grid[:, body.free[chain]], axis=0)
         own = parts[body.arrays.curves[:, 0]]
         free = np.zeros(len(skeleton.names), bool)
         free[dofs] = True
@@ -126,7 +127,7 @@ def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
                 parts=np.flatnonzero(parts).astype(np.int32),
                 arrays=body.arrays._replace(curves=body.arrays.curves[own]),
                 joints=(JOINTS.index(f"{ends[0]}_{side}"), JOINTS.index(f"{ends[1]}_{side}")),
-                places=np.clip(places, lower, upper),
+                grid=np.clip(grid, lower, upper),
                 lower=lower,
                 upper=upper,
             )
@@ -135,14 +136,14 @@ def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
 
 
 def pairs(limbs: Sequence[Limb]) -> list[tuple[Limb, ...]]:
-    """Both arms, and both legs."""
+    """Return the pairs of arms and of legs."""
     kinds = [[limb for limb in limbs if limb.name.startswith(kind)] for kind in ("arm", "leg")]
     return [tuple(pair) for pair in kinds if len(pair) == 2]
 
 
-def _arm_places() -> Float:
-    """(N, 4) shoulder's yaw, pitch and roll, elbow."""
-    # the golden spiral: evenly spread over the sphere (forward, outward, up)
+def _arm_grid() -> Float:
+    """Return (N, 4) shoulder's yaw, pitch and roll, elbow, radians."""
+    # golden spiral: evenly spread over the sphere (forward, outward, up)
     k = np.arange(_DIRECTIONS) + 0.5
     polar, turn = np.arccos(1 - 2 * k / _DIRECTIONS), np.pi * (1 + np.sqrt(5)) * k
     spread = np.column_stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)])
@@ -154,8 +155,8 @@ def _arm_places() -> Float:
     return np.array(rows)
 
 
-def _leg_places(dofs: int) -> Float:
-    """(N, dofs) hip's pitch, yaw and roll, knee, and a foot at right angles."""
-    grid = np.meshgrid(-np.radians(_HIPS_DEG), *map(np.radians, (_SPREADS_DEG, _LEG_ROLLS_DEG, _KNEES_DEG)))
-    rows = np.stack([axis.ravel() for axis in grid], axis=1)
+def _leg_grid(dofs: int) -> Float:
+    """Return (N, dofs) hip's pitch, yaw and roll, knee, radians, and a foot at right angles."""
+    angles = np.meshgrid(-np.radians(_HIPS_DEG), *map(np.radians, (_SPREADS_DEG, _LEG_ROLLS_DEG, _KNEES_DEG)))
+    rows = np.stack([axis.ravel() for axis in angles], axis=1)
     return np.hstack([rows, np.zeros((len(rows), dofs - 4))])

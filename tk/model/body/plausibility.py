@@ -1,8 +1,8 @@
-"""What cannot be true of a person, whatever the pictures say.
+"""Poses and sizes that are impossible for a person.
 
-Limits are wide: what lies outside is not unusual but impossible, or so nearly that a wrong calibration, wrong masks
-or a tracker gone astray are likelier. Statures: adults measure 1.3 to 2.2 m, children of six 1 m and more (WHO growth
-reference 2007: three standard deviations below the median). Who is smaller is named in `capture.toml`.
+The limits are wide: a value outside is impossible, or so unlikely that a wrong calibration, wrong masks or a wrong pose
+are likelier. Statures: adults measure 1.3 to 2.2 m, children of six 1 m and more (WHO growth reference 2007: three
+standard deviations below the median). The height of a smaller person is given in `capture.toml`.
 """
 
 from __future__ import annotations
@@ -18,18 +18,20 @@ from tk.model.body.skeleton import JOINTS, up_rotation
 
 Float = NDArray[np.float64]
 
-#: statures that are believed without being told, metres
+# Statures that are accepted if the height is not given, metres: see above.
 STATURE_M = (1.0, 2.3)
-#: the greatest extent of a person, beside the height: crouched with bent arms, or upright with raised ones
+# Greatest extent of a person, in heights: crouched with bent arms (0.55), upright with raised arms (1.5).
 EXTENT = (0.55, 1.5)
-#: a sprinter makes 12 m/s; and so much may the estimate of a trunk jump by itself, metres
-FASTEST_M_S, JUMP_M = 12.0, 0.2
-#: a pirouette makes three turns a second; a turn in a frame aside this and 90° is left taken for right
+# Highest speed of the trunk, m/s: a sprinter reaches 12; and an error of its position between frames, metres.
+FASTEST_M_S, TRUNK_ERROR_M = 12.0, 0.2
+# Fastest turn, degrees a second: a pirouette has three turns a second (1080); turns below 90° between frames are
+# always accepted.
 FASTEST_TURN_DEG_S = 1500.0
-#: how far the lower ankle may be above where it stood lowest, metres: the best jump less than a metre
+# How far the lower ankle may rise above its lowest position, metres: the best jumps are below one metre.
 HIGHEST_M = 1.2
-#: by so much of the person a view's mask lies beside the body if it shows something else
-UNEXPLAINED = 0.5
+# Offset of a view's mask from the body, as a share of the person, above which the mask shows something else: half
+# of the body is outside the mask.
+MOST_OFFSET = 0.5
 
 _CAUSES = "the unit or the scale of calibration.toml is wrong, or the masks show more or less than the person"
 _PELVIS, _NECK = JOINTS.index("pelvis"), JOINTS.index("neck")
@@ -39,16 +41,16 @@ _ANKLES = JOINTS.index("ankle_l"), JOINTS.index("ankle_r")
 
 
 def fits_height(extent_m: float, height_m: float) -> bool:
-    """Whether a person of this height may be this long in some direction; an unknown extent, NaN, may be anything."""
+    """Return whether a person of this height may have this greatest extent; True for an unknown one (NaN)."""
     return not (extent_m < EXTENT[0] * height_m or extent_m > EXTENT[1] * height_m)
 
 
 def check_extent(extent_m: float, height_m: float) -> None:
-    """Refuse a hull in which a person of this height has no room, or far too much.
+    """Refuse a hull that is too small or too large for a person of this height.
 
     Args:
-        extent_m: the hull's greatest extent; NaN where there is none, which is not refused here.
-        height_m: as `capture.toml` tells it.
+        extent_m: the hull's greatest extent; NaN without a hull, which is accepted.
+        height_m: the height in `capture.toml`.
 
     Raises:
         CaptureError: with the likely causes.
@@ -61,7 +63,7 @@ def check_extent(extent_m: float, height_m: float) -> None:
 
 
 def check_stature(stature_m: float) -> None:
-    """Refuse a stature that nobody has, measured in silhouettes where `capture.toml` does not tell it.
+    """Refuse an impossible stature, estimated from silhouettes because `capture.toml` has no height.
 
     Raises:
         CaptureError: with the likely causes.
@@ -74,39 +76,39 @@ def check_stature(stature_m: float) -> None:
 
 
 class Plausibility:
-    """Judges one frame after the other.
+    """Checks the poses of consecutive frames.
 
     Args:
-        up: what points up in the world.
-        fps: frames a second.
+        up: upward direction of the world.
+        fps: frames per second.
     """
 
     def __init__(self, up: str, fps: float) -> None:
         self._up = up_rotation(up)[:, 2]
         self._fps = fps
-        self._joints: Float | None = None  # of the last frame that was believed
+        self._joints: Float | None = None  # of the last accepted frame
         self._index = -1
         self._lowest = np.inf
 
-    def judge(self, index: int, joints: Float, aside: Float | None) -> str | None:
-        """Why the joints (15, 3) of a frame cannot be right; None where they can.
+    def judge(self, index: int, joints: Float, offset: Float | None) -> str | None:
+        """Return why a pose is impossible; None if it is possible.
 
         Args:
-            index: the frame's number.
+            index: frame index.
             joints: (15, 3) metres.
-            aside: (C,) by how much the masks of the cameras that were used lie beside the body: body outside the mask
-                and as much mask outside the body, as a share of it. NaN for other cameras; None where nobody tells.
+            offset: (C,) the smaller of missing and surplus area of each used camera, as a share of the person; NaN for
+                other cameras. None if not measured.
         """
-        reason = self._reason(index, joints, aside)
+        reason = self._reason(index, joints, offset)
         if reason is None:
             self._joints, self._index = joints, index
             self._lowest = min(self._lowest, self._height(joints))
         return reason
 
-    def _reason(self, index: int, joints: Float, aside: Float | None) -> str | None:
+    def _reason(self, index: int, joints: Float, offset: Float | None) -> str | None:
         if not np.isfinite(joints).all():
             return "it has joints that are no numbers"
-        if aside is not None and np.nanmax(aside, initial=0.0) > UNEXPLAINED:
+        if offset is not None and np.nanmax(offset, initial=0.0) > MOST_OFFSET:
             return "one view shows something else than the body"
         if self._height(joints) - self._lowest > HIGHEST_M:
             return "it hovers above where it stood"
@@ -115,7 +117,7 @@ class Plausibility:
         dt = max(index - self._index, 1) / self._fps
         middle = (_PELVIS, _NECK)
         moved = float(np.linalg.norm(joints[middle, :] - self._joints[middle, :], axis=1).min())
-        if moved > FASTEST_M_S * dt + JUMP_M:
+        if moved > FASTEST_M_S * dt + TRUNK_ERROR_M:
             return "it jumps"
         turned = self._turned_deg(joints)
         if turned > max(FASTEST_TURN_DEG_S * dt, 90.0):
@@ -126,7 +128,7 @@ class Plausibility:
         return float((joints[_ANKLES, :] @ self._up).min())
 
     def _turned_deg(self, joints: Float) -> float:
-        """The smaller of the angles by which hips and shoulders have turned, both across."""
+        """Return the smaller of the angles by which the lines through the hips and the shoulders have turned."""
         assert self._joints is not None
         angles = []
         for left, right in (_HIPS, _SHOULDERS):
@@ -136,16 +138,16 @@ class Plausibility:
         return min(angles)
 
     def forget(self) -> None:
-        """The person was lost: where he or she was before says nothing any more."""
+        """Forget the last pose, after a loss."""
         self._joints = None
 
     def state(self) -> Mapping[str, Any]:
-        """What :meth:`restore` needs."""
+        """Return what :meth:`restore` needs."""
         known = {} if self._joints is None else {"joints": self._joints, "index": self._index}
         return {**known, "lowest": self._lowest}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Take up what :meth:`state` gave."""
+        """Continue from a state."""
         self._joints = np.asarray(state["joints"], np.float64) if "joints" in state else None
         self._index = int(state.get("index", -1))
         self._lowest = float(state["lowest"])

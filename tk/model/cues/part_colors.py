@@ -1,10 +1,10 @@
-"""Colours of a body's parts, learned as the person moves: which part does a pixel show?
+"""Colours of a body's parts, learned while the person moves: how likely is a pixel's colour on each part?
 
-Left and right share a model, as clothes do. A model is a histogram over 16 levels of blue, green and red; it holds what
-a shirt with stripes, or an arm half in a sleeve, has of colours, which no single Gaussian does.
+Left and right parts share a model, because clothes are symmetric. A model is a histogram over 16 levels of blue, green
+and red: unlike a single Gaussian it represents a shirt with stripes, or an arm half in a sleeve.
 
-What the person carries is in the mask, too. Its colours are seen beside the body more than on it, or were never seen on
-it before: such a colour is foreign.
+Carried objects are in the mask, too. A colour is foreign if it is seen outside the body more often than on it, or was
+never seen on it.
 """
 
 from __future__ import annotations
@@ -21,16 +21,17 @@ from tk.model.body.cone_body import ConeBody
 Float = NDArray[np.float64]
 
 GROUPS = ("torso", "pelvis", "head", "upper_arm", "forearm", "hand", "thigh", "calf", "foot")
-# Standard deviation of the smoothing over bins, in bins: gain and white balance differ a little from camera to camera.
+# Standard deviation of the smoothing over bins, in bins: gain and white balance differ a little between cameras. Chosen
+# on the development captures, as the following constants; sensitivity not measured.
 _SMOOTHING = 0.7
 _SMOOTH = gaussian_filter1d(np.eye(16, dtype=np.float32), _SMOOTHING, axis=0, mode="nearest").T
-# Share of a part's pixels that may have any colour: outlines, shadows, what the person carries.
+# Share of a part's pixels that may have any colour: outlines, shadows, carried objects.
 _ANYTHING = 0.02
-# How much of the models a frame's colours replace.
+# Share of the histograms that a frame replaces: they follow a change of light within about 20 frames.
 _RATE = 0.05
-# A pixel's colour says at most this about the parts, as a ratio of likelihoods: e⁵.
+# Logarithm of the largest likelihood ratio that one pixel may give.
 _MOST_LOG_RATIO = 5.0
-# Weight of a contour between two parts of different colours, beside that of a silhouette's edge.
+# Weight of a contour between two parts of different colours, relative to a silhouette's edge.
 _CONTOUR_WEIGHT = 0.5
 
 
@@ -38,75 +39,75 @@ class PartColors:
     """The colour models of one person.
 
     Args:
-        body: whose parts they are.
+        body: the body with the parts.
 
     Attributes:
         group: (P,) the group of each part.
-        log_likelihood: (G, COLOR_BINS) log p(colour | group); None before any colours are known.
+        log_likelihood: (G, COLOR_BINS) log p(colour | group); None before any colours are learned.
         foreign: (COLOR_BINS,) bool, colours that are not the person's.
-        mismatch: (COLOR_BINS, G) in [0, 1]: how much less likely a colour is on a part than on the part that it suits
-            best.
+        mismatch: (COLOR_BINS, G) in [0, 1], how much less likely a colour is in a group than in its likeliest group.
     """
 
     def __init__(self, body: ConeBody) -> None:
         self.group = np.array([GROUPS.index(_group(part.component)) for part in body.parts], np.int32)
         self._counts: Float = np.zeros((len(GROUPS), COLOR_BINS))
-        self._beside: Float = np.zeros(COLOR_BINS)
+        self._outside: Float = np.zeros(COLOR_BINS)
         self.foreign = np.zeros(COLOR_BINS, np.bool_)
         self.log_likelihood: NDArray[np.float32] | None = None
         self.mismatch = np.zeros((COLOR_BINS, len(GROUPS)), np.float32)
 
     @property
     def known(self) -> bool:
-        """Whether any colours have been learned."""
+        """Return whether any colours have been learned."""
         return self.log_likelihood is not None
 
     def learn(self, bins: NDArray[np.int32], label: NDArray[np.uint8]) -> None:
-        """Take up the colours (N,) of the person's pixels, which show the parts ``label - 1`` (N,), or none: 0."""
+        """Learn the colours (N,) of the mask's pixels; they show the parts ``label - 1`` (N,), or none: 0."""
         shown = label > 0
         flat = self.group[label[shown].astype(np.int64) - 1] * COLOR_BINS + bins[shown]
         seen = np.bincount(flat, minlength=self._counts.size).reshape(self._counts.shape)
-        beside = np.bincount(bins[~shown], minlength=COLOR_BINS)
+        outside = np.bincount(bins[~shown], minlength=COLOR_BINS)
         rate = _RATE if self.known else 1.0
         self._counts = (1 - rate) * self._counts + rate * seen
-        self._beside = (1 - rate) * self._beside + rate * beside
+        self._outside = (1 - rate) * self._outside + rate * outside
         self._update()
 
     def _update(self) -> None:
-        *rows, beside = _smooth(np.concatenate([self._counts, self._beside[None]]))
+        *rows, outside = _smooth(np.concatenate([self._counts, self._outside[None]]))
         total = np.sum(rows, axis=1, keepdims=True)
         share = rows / np.maximum(total, 1e-9)
-        told = np.log(((1 - _ANYTHING) * share + _ANYTHING / COLOR_BINS).astype(np.float32))
-        self.log_likelihood = told
-        self.mismatch = np.ascontiguousarray(np.minimum((told.max(axis=0) - told) / _MOST_LOG_RATIO, 1.0).T)
-        self.foreign = beside + _ANYTHING * total.sum() / COLOR_BINS > np.sum(rows, axis=0)
+        log_likelihood = np.log(((1 - _ANYTHING) * share + _ANYTHING / COLOR_BINS).astype(np.float32))
+        self.log_likelihood = log_likelihood
+        deficit = (log_likelihood.max(axis=0) - log_likelihood) / _MOST_LOG_RATIO
+        self.mismatch = np.ascontiguousarray(np.minimum(deficit, 1.0).T)
+        self.foreign = outside + _ANYTHING * total.sum() / COLOR_BINS > np.sum(rows, axis=0)
 
     def regions(self, images: NDArray[np.uint8]) -> Regions | None:
-        """What the contours' search needs to use the colours of images (V, H, W, 3); None before any are known."""
+        """Return the colour cue of images (V, H, W, 3) for the contours; None before any colours are learned."""
         if self.log_likelihood is None:
             return None
         return Regions(np.ascontiguousarray(images), self.log_likelihood, self.group, _CONTOUR_WEIGHT)
 
     def state(self) -> dict[str, Any]:
-        """What :meth:`restore` needs."""
-        return {"colors": self._counts, "colors_beside": self._beside} if self.known else {}
+        """Return what :meth:`restore` needs."""
+        return {"colors": self._counts, "colors_outside": self._outside} if self.known else {}
 
     def restore(self, state: Any) -> None:
-        """Take up what :meth:`state` gave."""
+        """Continue from a state."""
         if "colors" in state:
             self._counts = np.asarray(state["colors"], np.float64)
-            self._beside = np.asarray(state["colors_beside"], np.float64)
+            self._outside = np.asarray(state["colors_outside"], np.float64)
             self._update()
 
 
 def color_bins(images: NDArray[np.uint8]) -> NDArray[np.int32]:
-    """(...) the bin of each pixel (..., 3) BGR, as the kernels number them."""
+    """Return (...) the bin of each pixel (..., 3) BGR, numbered as in the kernels."""
     blue, green, red = (images[..., i] >> 4 for i in range(3))
     return np.asarray((blue.astype(np.int32) << 8) | (green << 4 | red))
 
 
 def _smooth(counts: Float) -> NDArray[np.float32]:
-    """Histograms (N, COLOR_BINS), each smoothed over its neighbouring bins."""
+    """Return histograms (N, COLOR_BINS), each smoothed over neighbouring bins."""
     cubes = counts.reshape(-1, 16, 16, 16).astype(np.float32)
     for _ in range(3):  # along the last axis, which then becomes the first of the three
         cubes = np.moveaxis(cubes @ _SMOOTH, 3, 1)

@@ -1,4 +1,4 @@
-"""Pictures that show nothing of what happens: a camera that is black, or stands still while the others see movement."""
+"""Cameras whose image is blank, or frozen while the other cameras see movement."""
 
 from __future__ import annotations
 
@@ -8,86 +8,87 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: about so many rows of a picture are looked at
+# Rows of an image that are compared, approximately.
 _ROWS = 64
-#: a picture of grey levels that differ by less than this (one standard deviation) shows nothing
+# An image is blank if the standard deviation of its grey levels is below this: sensor noise has 1 to 3 levels.
 _BLANK_LEVELS = 3.0
-#: levels that the coding of a still picture may change, and the share of pixels that it may change by more
+# Two images are the same if at most this share of the pixels differs by more than this many levels, which covers what
+# the coding of a still video changes. Chosen on the development captures; sensitivity not measured.
 _SAME_LEVELS, _SAME_SHARE = 6, 0.001
-#: a camera's picture is frozen when the masks of the others have changed by this share meanwhile
+# Change of another camera's mask, as a share of its area, that shows movement: noise of segmented masks is below 10 %.
 _MOVED = 0.15
 
 BLANK, FROZEN = "shows nothing", "stands still"
 
 
 class ImageHealth:
-    """Looks at one frame after the other.
+    """Checks the images of consecutive frames.
 
-    A picture that is as it was is no fault as long as nobody moves. So each camera keeps the last picture that was
-    another one, with the masks of all cameras at that moment: where its picture is still that one and at least half of
-    the other cameras have gone on, and most of these show that the person has moved, it is frozen.
+    An unchanged image is normal while nobody moves. So each camera keeps a reference: its last image that differed from
+    the one before, with the masks of all cameras in that frame. The camera is frozen if its image still equals the
+    reference, at least half of the other images have changed since, and most of these show that the person has moved.
     """
 
     def __init__(self) -> None:
-        self._pictures: NDArray[np.uint8] | None = None  # (C, h, w) grey, of the reference frame of each camera
+        self._references: NDArray[np.uint8] | None = None  # (C, h, w) grey, of the reference frame of each camera
         self._masks: NDArray[np.bool_] | None = None  # (C, C, h, w): at camera c's reference frame those of all
 
     def look(self, images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> list[str | None]:
-        """What is the matter with each camera in the next frame: :data:`BLANK`, :data:`FROZEN` or None.
+        """Return for each camera :data:`BLANK`, :data:`FROZEN` or None.
 
         Args:
-            images: (C, H, W, 3) BGR, or without pixels; the masks stand for them then.
+            images: (C, H, W, 3) BGR, or without pixels: then the masks are compared.
             masks: (C, H, W), 128 and more where the person is.
         """
         C = len(masks)
         step = max(1, masks.shape[1] // _ROWS)
         small = masks[:, step // 2 :: step, step // 2 :: step] >= 128
         given = images.size > 0
-        # green alone tells as much, and is at hand
+        # the green channel suffices
         shown = images[:, step // 2 :: step, step // 2 :: step, 1] if given else small * np.uint8(255)
         found: list[str | None] = [None] * C
         if given:
             for c in range(C):
                 if shown[c].std() < _BLANK_LEVELS:
                     found[c] = BLANK
-        if self._pictures is None or self._masks is None or self._pictures.shape != shown.shape:
-            self._pictures, self._masks = shown.copy(), np.repeat(small[None], C, axis=0)
+        if self._references is None or self._masks is None or self._references.shape != shown.shape:
+            self._references, self._masks = shown.copy(), np.repeat(small[None], C, axis=0)
             return found
-        differs = np.abs(shown.astype(np.int16) - self._pictures) > _SAME_LEVELS
+        differs = np.abs(shown.astype(np.int16) - self._references) > _SAME_LEVELS
         still = differs.reshape(C, -1).mean(axis=1) <= _SAME_SHARE
         for c in range(C):
             if not still[c]:
-                self._pictures[c], self._masks[c] = shown[c], small
-            elif found[c] is None and small[c].any():  # where it shows nobody there is nothing that could move
+                self._references[c], self._masks[c] = shown[c], small
+            elif found[c] is None and small[c].any():  # a mask without anybody cannot move
                 others = [_changed(self._masks[c][k], small[k]) > _MOVED for k in range(C) if k != c and not still[k]]
                 if 2 * len(others) >= C - 1 and np.mean(others) > 0.5:
                     found[c] = FROZEN
         return found
 
     def state(self) -> Mapping[str, Any]:
-        """What :meth:`restore` needs."""
-        if self._pictures is None or self._masks is None:
+        """Return what :meth:`restore` needs."""
+        if self._references is None or self._masks is None:
             return {}
-        return {"pictures": self._pictures, "masks": np.packbits(self._masks)}
+        return {"references": self._references, "masks": np.packbits(self._masks)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Take up what :meth:`state` gave."""
-        if "pictures" not in state:
-            self._pictures = self._masks = None
+        """Continue from a state."""
+        if "references" not in state:
+            self._references = self._masks = None
             return
-        self._pictures = np.array(state["pictures"], np.uint8)
-        C, h, w = self._pictures.shape
+        self._references = np.array(state["references"], np.uint8)
+        C, h, w = self._references.shape
         bits = np.unpackbits(np.asarray(state["masks"], np.uint8), count=C * C * h * w)
         self._masks = bits.reshape(C, C, h, w).astype(bool)
 
 
 def _changed(before: NDArray[np.bool_], now: NDArray[np.bool_]) -> float:
-    """The share of a mask that is another one now."""
+    """Return the share of a mask that has changed."""
     return float(np.count_nonzero(before != now)) / max(int(before.sum()), int(now.sum()), 1)
 
 
 def described(first: int, last: int, count: int) -> str:
-    """So many frames for people to read: "frame 12", "frames 30 to 74", "12 of the frames 30 to 74"."""
+    """Return a text like "frame 12", "frames 30 to 74", "12 of the frames 30 to 74"."""
     if count == 1:
         return f"frame {first}"
     if last - first + 1 == count:

@@ -1,0 +1,209 @@
+"""A coarse visual hull, for decisions about masks: which voxels each camera's mask contains.
+
+A point of the person lies in the masks of all cameras that see it (Laurentini, 1994). The hull of any choice of cameras
+is therefore computed from one table of voxels by cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from tk.model.cameras.camera import Rig
+from tk.model.cameras.volume import Volume, VoxelGrid
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+# Voxels along the volume's longest side for the person's hull: 5 cm of 2.4 m, which a thigh fills.
+_VOXELS = 48
+# Volume of a hull that may be a person's, litres, at least.
+_LEAST_LITRES = 10.0
+# A region of a mask belongs to the person within this many voxels of the hull: thin limbs contain no voxel's centre.
+_NEAR_VOXELS = 2.5
+# With this many cameras that see a voxel, one of them may be wrong, if the hull would otherwise shrink to this share.
+# Chosen on the development captures; sensitivity not measured.
+_ENOUGH, _MUCH_SMALLER = 4, 0.4
+# Half the diagonal of a voxel, in edges.
+_HALF_DIAGONAL = np.sqrt(3.0) / 2
+# Directions in which an extent is measured: to the faces, edges and corners of a cube.
+_DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d > (1, 1, 1)], np.float64) - 1.0
+_DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True)
+
+
+@dataclass(frozen=True)
+class Voxels:
+    """Voxels projected into every ``step``-th pixel of a rig's images.
+
+    Attributes:
+        centers: (N, 3) metres.
+        sees: (C, N) whether a camera's image contains the voxel's centre.
+        pixels: (C, N) flat index of its pixel.
+        pixels_per_voxel: (C,) edge of a voxel in the image at the voxels' median depth; 0 if the camera sees none.
+        shape: (h, w) of the images.
+    """
+
+    centers: Float
+    sees: Bool
+    pixels: NDArray[np.int32]
+    pixels_per_voxel: Float
+    shape: tuple[int, int]
+
+    @staticmethod
+    def of(rig: Rig, centers: Float, voxel_m: float, step: int = 1) -> Voxels:
+        """Project voxels with centres (N, 3)."""
+        offset = step // 2
+        height, width = (len(range(offset, side, step)) for side in rig.frame_shape)
+        sees, pixels = np.zeros((len(rig), len(centers)), bool), np.zeros((len(rig), len(centers)), np.int32)
+        scale = np.zeros(len(rig))
+        for c, camera in enumerate(rig):
+            projected, depth = camera.project(centers)
+            with np.errstate(invalid="ignore"):
+                x, y = ((projected - offset) / step).round().T
+                inside = (x >= 0) & (x * step + offset < camera.width) & (y >= 0) & (y * step + offset < camera.height)
+            inside &= depth > 0
+            sees[c] = inside
+            pixels[c, inside] = (y[inside] * width + x[inside]).astype(np.int32)
+            if inside.any():
+                scale[c] = voxel_m * camera.matrix[0, 0] / float(np.median(depth[inside])) / step
+        return Voxels(centers, sees, pixels, scale, (height, width))
+
+    def inside(self, masks: NDArray) -> Bool:
+        """Return (C, N) whether a voxel's centre is in the camera's mask, of (C, h, w), or outside its image."""
+        return ~self.sees | np.stack([mask.ravel()[p] > 0 for mask, p in zip(masks, self.pixels, strict=True)])
+
+    def xy(self, camera: int, chosen: Bool) -> NDArray[np.int64]:
+        """Return (M, 2) pixels of the chosen voxels (N,) that a camera sees."""
+        return np.stack(np.divmod(self.pixels[camera, chosen & self.sees[camera]], self.shape[1])[::-1], axis=1)
+
+    @cached_property
+    def reach(self) -> NDArray[np.int64]:
+        """(C,) half a voxel's diagonal, pixels, at least 1."""
+        return np.maximum(np.ceil(_HALF_DIAGONAL * self.pixels_per_voxel), 1).astype(np.int64)
+
+    def near(self, inside: Bool, missing: int) -> NDArray[np.int64]:
+        """Return the indices of voxels that all but ``missing`` masks (C, N) contain, at least two of them visibly."""
+        least = max(2, len(inside) - missing)
+        return np.flatnonzero((inside.sum(axis=0) >= least) & ((inside & self.sees).sum(axis=0) >= 2))
+
+    def hull(self, inside: Bool, chosen: NDArray[np.int64]) -> Hull:
+        """Return the hulls of the chosen voxels."""
+        sees, pixels = self.sees[:, chosen], self.pixels[:, chosen]
+        voxels = Voxels(self.centers[chosen], sees, pixels, self.pixels_per_voxel, self.shape)
+        return Hull(voxels, inside[:, chosen])
+
+
+@dataclass(frozen=True)
+class Hull:
+    """The visual hulls of one frame, of any choice of cameras.
+
+    Attributes:
+        voxels: N voxels near the person.
+        inside: (C, N) whether a camera's mask contains the voxel, see :meth:`Voxels.inside`.
+    """
+
+    voxels: Voxels
+    inside: Bool
+
+    def carve(self, cameras: Sequence[int]) -> Bool:
+        """Return (N,) the hull of these cameras; voxels that none of them sees are not in it."""
+        chosen = list(cameras)
+        return np.asarray(self.inside[chosen].all(axis=0) & self.voxels.sees[chosen].any(axis=0))
+
+    def common(self, cameras: Sequence[int]) -> Bool:
+        """Return (N,) the part of these cameras' hull that most cameras see: elsewhere little is carved away."""
+        carved = self.carve(cameras)
+        views = self.voxels.sees.sum(axis=0)
+        return carved & (views >= np.percentile(views[carved], 95)) if carved.any() else carved
+
+    def points(self, cameras: Sequence[int]) -> Float:
+        """Return (M, 3) the centres of :meth:`common`, metres."""
+        return self.voxels.centers[self.common(cameras)]
+
+    def extent(self, cameras: Sequence[int]) -> float:
+        """Return the greatest extent of these cameras' hull, metres, without specks; 0 if it is empty."""
+        points = self.points(cameras)
+        if not len(points):
+            return 0.0
+        low, high = np.percentile(points @ _DIRECTIONS.T, [1, 99], axis=0)
+        return float((high - low).max())
+
+    def silhouette(self, hull: Bool, camera: int) -> Bool:
+        """Return (h, w) the silhouette of voxels (N,) in a camera, rather too large than too small."""
+        image = np.zeros(self.voxels.shape, np.uint8)
+        image.ravel()[self.voxels.pixels[camera, hull & self.voxels.sees[camera]]] = 1
+        return dilated(image, int(self.voxels.reach[camera]))
+
+
+class CoarseHull:
+    """The person's hull in large voxels, from masks of which one may be wrong."""
+
+    def __init__(self, rig: Rig, volume: Volume) -> None:
+        self._grid = VoxelGrid.cover(volume, _VOXELS)
+        self._litre = 1000 * self._grid.voxel_m**3
+        self._voxels = Voxels.of(rig, self._grid.centers(), self._grid.voxel_m)
+
+    def subject(self, masks: NDArray[np.uint8], but: int | None = None) -> Bool:
+        """Return (N,) the voxels of the largest object in most masks (C, H, W), 0 or more.
+
+        One of four or more cameras may be wrong, if the hull would be much smaller otherwise. Camera ``but`` is
+        ignored.
+        """
+        strict, lenient = (self._agreed(masks, but, wrong) for wrong in (0, 1))
+        return strict if np.count_nonzero(strict) >= _MUCH_SMALLER * np.count_nonzero(lenient) else lenient
+
+    def _agreed(self, masks: NDArray[np.uint8], but: int | None, wrong: int) -> Bool:
+        sees = self._voxels.sees.copy()
+        if but is not None:
+            sees[but] = False
+        seeing = sees.sum(axis=0)
+        agreeing = (self._voxels.inside(masks) & sees).sum(axis=0)
+        hull = (seeing >= 2) & (agreeing >= np.where(seeing >= _ENOUGH, seeing - wrong, seeing))
+        objects, count = ndimage.label(hull.reshape(self._grid.shape), np.ones((3, 3, 3)))
+        if count == 0:
+            return hull
+        label = objects.reshape(-1)
+        # a region that only two cameras see may be larger than the person, whom more of them see
+        sizes = np.array(
+            [np.bincount(label[hull & (agreeing >= n)], minlength=count + 1) for n in range(2, len(masks) + 1)]
+        )
+        large = sizes * self._litre >= _LEAST_LITRES
+        level = int(np.flatnonzero(large.any(axis=1))[-1]) if large.any() else 0
+        return np.asarray(label == sizes[level].argmax(), np.bool_) & hull
+
+    def litres(self, voxels: Bool) -> float:
+        """Return the volume of voxels (N,)."""
+        return self._litre * np.count_nonzero(voxels)
+
+    def points(self, voxels: Bool, c: int) -> Float:
+        """Return (M, 2) the pixels of voxels (N,) in a camera's image."""
+        return self._voxels.xy(c, voxels).astype(np.float64)
+
+    def share(self, voxels: Bool, c: int, mask: NDArray[np.uint8]) -> float:
+        """Return the share of the voxels (N,) in a camera's image that its mask (h, w) contains; 1 if it shows none."""
+        x, y = self._voxels.xy(c, voxels).T
+        return float(np.mean(mask[y, x] > 0)) if len(x) else 1.0
+
+    def only(self, voxels: Bool, c: int, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the regions of a mask (h, w) that are near voxels (N,); all of it if the image shows none of them."""
+        x, y = self._voxels.xy(c, voxels).T
+        if len(x) == 0:
+            return mask
+        regions = cv2.connectedComponents(mask, connectivity=8)[1]
+        away = np.ones(mask.shape, np.uint8)
+        inside = (x < mask.shape[1]) & (y < mask.shape[0])
+        away[y[inside], x[inside]] = 0
+        distance = cv2.distanceTransform(away, cv2.DIST_L2, 3)
+        kept = np.unique(regions[distance <= _NEAR_VOXELS * self._voxels.pixels_per_voxel[c]])
+        return np.where(np.isin(regions, kept), mask, 0).astype(np.uint8)
+
+
+def dilated(mask: NDArray, by: int) -> Bool:
+    """Return a mask (h, w) grown by so many pixels on all sides."""
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * by + 1, 2 * by + 1), np.uint8)).astype(bool)
