@@ -1,12 +1,12 @@
-"""How near refined cameras come to the true ones, and what that is worth.
+"""Measures how close refined cameras come to the true ones, and the effect on the joints' errors.
 
     python -m scripts.refined_cameras CAPTURE… [--seeds 3] [--late] [--masks none] [--work DIR]
 
-Every camera of a capture with exact calibration is turned by 0.25° and its place moved by 10 mm, each in a random
-direction (another for each seed); with ``--late`` the first picture of the second camera's video is left out, too. A
-capture that has a ``calibration_true.toml`` beside its own is taken as it is. It is tracked with ``refine = false`` and
-by default. A line a run: errors of both, and how far the cameras that the result tells are from the true ones, after
-the rigid motion that brings them closest; scale is held, as a recording of one person does not tell it.
+Every camera of a capture with exact calibration is turned by 0.25° and its centre moved by 10 mm, each in a random
+direction (another for each seed); with ``--late`` the first frame of the second camera's video is removed, too. A
+capture with a ``calibration_true.toml`` is used unchanged. It is tracked with ``refine = false`` and by default. A line
+a run: mean joint errors of both, and errors of the given and of the refined cameras after the rigid motion that brings
+them closest to the true ones; the scale is fixed, because a recording of one person does not determine it.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from tk.run.session import track
 from tk.settings import Settings
 
 TURN_DEG, MOVE_M = 0.25, 0.010
-# Turns and places are weighed by these, degrees and metres, when the rigid motion is taken off: the goal.
+# Weights of turns and centres in the alignment, degrees and metres: the goal of a refinement.
 GOAL_DEG, GOAL_M = 0.1, 0.005
 
 
 def disturbed(camera: Camera, rng: np.random.Generator) -> Camera:
-    """The camera turned by 0.25° and moved by 10 mm in random directions."""
-    axis, way = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+    """Return the camera turned by 0.25° and moved by 10 mm in random directions."""
+    axis, direction = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     turn = np.asarray(cv2.Rodrigues(np.radians(TURN_DEG) * axis)[0])
-    center = camera.center + MOVE_M * way
+    center = camera.center + MOVE_M * direction
     return replace(camera, rotation=turn @ camera.rotation, translation=-turn @ camera.rotation @ center)
 
 
-def off(rig: Rig, true: Rig) -> str:
-    """How far the cameras are from the true ones: by the mean, and the worst."""
+def camera_errors(rig: Rig, true: Rig) -> str:
+    """Return the mean and the largest errors of cameras as text."""
     near = aligned(rig, true, np.radians(GOAL_DEG), GOAL_M, scaling=False)
     deg = [turn_between(one, other) for one, other in zip(near, true, strict=True)]
     mm = 1000 * np.linalg.norm(near.centers - true.centers, axis=1)
@@ -55,7 +55,7 @@ def off(rig: Rig, true: Rig) -> str:
 
 
 def compare(capture: Path, seeds: int, late: bool, masks: str, work: Path) -> Iterator[str]:
-    """A line a seed."""
+    """Yield one line for each seed."""
     known = capture / "calibration_true.toml"
     true = read_calibration(known if known.exists() else capture / "calibration.toml").rig
     truth = read_joints(capture / "truth.h5")
@@ -68,19 +68,19 @@ def compare(capture: Path, seeds: int, late: bool, masks: str, work: Path) -> It
             write_calibration(Rig(tuple(disturbed(camera, rng) for camera in true)), folder / "calibration.toml")
         if late:
             spoiled.change(lambda video: video[1:])
-        opened, told = open_capture(folder, masks=masks), []
+        opened, errors = open_capture(folder, masks=masks), []
         for refine in (False, True):
             output = work / f"{folder.name}-{refine}.h5"
             track(opened, output, Settings(refine=refine), Quiet(), force=True)
             result = read_result(output)
-            judged = evaluate(read_joints(output), truth)
-            told.append(f"{judged.raw.all.mean_cm:.2f} {judged.corrected.limbs.mean_cm:.2f}")
+            found = evaluate(read_joints(output), truth)
+            errors.append(f"{found.raw.all.mean_cm:.2f} {found.corrected.limbs.mean_cm:.2f}")
         used = result.cameras
         rig = opened.rig if used is None else used.rig
         delays = np.zeros(len(rig)) if used is None else opened.fps * used.time_offset_s
         yield (
-            f"{capture.name:8} seed {seed}{', late' if late else ''}: raw, limbs [cm] {told[0]} → {told[1]}; "
-            f"cameras {off(opened.rig, true)} → {off(rig, true)}; "
+            f"{capture.name:8} seed {seed}{', late' if late else ''}: raw, limbs [cm] {errors[0]} → {errors[1]}; "
+            f"cameras {camera_errors(opened.rig, true)} → {camera_errors(rig, true)}; "
             f"frames late {' '.join(f'{x:+.2f}' for x in delays)}"
         )
 
@@ -89,7 +89,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", nargs="+", type=Path, metavar="CAPTURE")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--late", action="store_true", help="the second camera's first picture is left out")
+    parser.add_argument("--late", action="store_true", help="remove the first frame of the second camera")
     parser.add_argument("--masks", default="none", help="as for tk track")
     parser.add_argument("--work", type=Path, help="where copies and results go; a temporary folder otherwise")
     args = parser.parse_args()

@@ -1,4 +1,4 @@
-"""Damped Gauss-Newton on small problems with known answers; it is shown no body."""
+"""Damped Gauss-Newton on small problems with known answers."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -46,14 +46,14 @@ def problem(seed, rows=9):
 
 @given(st.integers(0, 10**6))
 @settings(max_examples=30, deadline=None)
-def test_a_linear_problem_is_solved_in_one_step(seed):
+def test_linear_problem_is_solved_in_one_step(seed):
     A, y, start = problem(seed)
     expected = np.linalg.lstsq(A, y, rcond=None)[0]
     found = minimise(linear(A, y), start, ALL, *NONE, UNDAMPED)
     np.testing.assert_allclose(found, np.repeat(expected[None], 3, 0), rtol=1e-4, atol=1e-5)
 
 
-def test_damping_shortens_and_iterations_make_up_for_it():
+def test_damped_iterations_converge():
     A, y, start = problem(1)
     expected = np.linalg.lstsq(A, y, rcond=None)[0]
     errors = [
@@ -72,15 +72,15 @@ def test_damping_shortens_and_iterations_make_up_for_it():
     assert errors[0] > errors[1] > errors[2] and errors[2] < 1e-4
 
 
-def test_longer_steps_reach_where_equations_tell_half_of_the_way_and_do_no_harm_where_they_tell_all():
+def test_over_relaxation_converges_faster_if_equations_predict_half_the_step():
     A, y, start = problem(2)
     expected = np.linalg.lstsq(A, y, rcond=None)[0]
-    told = np.array([0.4, 0.5, 1.0, 1.0])  # of the way along each parameter
+    share = np.array([0.4, 0.5, 1.0, 1.0])  # of the error of each parameter that the equations predict
 
     def equations(states, scale):
-        way = (expected - states) * told
+        step = (expected - states) * share
         H = np.repeat(np.eye(4)[None], len(states), 0)
-        return Sums(H, way, (way**2).sum(axis=1))
+        return Sums(H, step, (step**2).sum(axis=1))
 
     def error(relaxation, iterations):
         config = GaussNewtonSettings(1, iterations, relaxation, damping=0.0, stiffness=0.0, longest_step=100.0)
@@ -91,7 +91,7 @@ def test_longer_steps_reach_where_equations_tell_half_of_the_way_and_do_no_harm_
     assert (relaxed[2:] < 1e-6).all() and (error(1.6, 1)[2:] < 1e-6).all()  # the last step is a plain one
 
 
-def test_parameters_that_are_not_free_stay():
+def test_fixed_parameters_stay():
     A, y, start = problem(2)
     free = np.array([True, False, True, False])
     found = minimise(linear(A, y), start, free, *NONE, UNDAMPED)
@@ -100,7 +100,7 @@ def test_parameters_that_are_not_free_stay():
     np.testing.assert_allclose(found[0, free], expected, rtol=1e-4, atol=1e-5)
 
 
-def test_unseen_parameters_stay_where_they_are():
+def test_parameters_without_evidence_stay():
     A, y, start = problem(3)
     A[:, 2] = 0.0
     found = minimise(linear(A, y), start, ALL, *NONE, GaussNewtonSettings(scales=1, iterations=4))
@@ -109,7 +109,7 @@ def test_unseen_parameters_stay_where_they_are():
     np.testing.assert_array_equal(nothing, start)
 
 
-def test_a_limit_pulls_back_in_proportion_and_only_beyond_it():
+def test_limit_is_a_quadratic_penalty_beyond_it():
     """The minimum of ‖p − 1‖² + w (p − 0.5)₊²: between limit and data."""
     A, y = np.eye(4), np.ones(4)
     upper = np.array([0.5, np.inf, 2.0, np.inf])
@@ -147,9 +147,9 @@ def test_scales_run_from_coarse_to_fine():
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 0.05])
-def test_a_batch_is_as_good_as_one_at_a_time(tolerance):
+def test_states_of_a_batch_are_independent(tolerance):
     A, y, start = problem(5)
-    start[0] = np.linalg.lstsq(A, y)[0]  # is done at once
+    start[0] = np.linalg.lstsq(A, y)[0]  # converged from the beginning
     config = GaussNewtonSettings(iterations=6, damping=0.5, tolerance=tolerance)
     together = minimise(linear(A, y), start, ALL, *NONE, config)
     for i in range(len(start)):
@@ -160,7 +160,7 @@ def test_a_batch_is_as_good_as_one_at_a_time(tolerance):
 
 @given(st.integers(0, 10**6))
 @settings(max_examples=30, deadline=None)
-def test_a_scale_is_left_when_nothing_moves_by_more_than_the_tolerance(seed):
+def test_scale_ends_once_no_parameter_moves_by_more_than_the_tolerance(seed):
     A, y, start = problem(seed)
     made = []
 
@@ -180,7 +180,7 @@ def test_a_scale_is_left_when_nothing_moves_by_more_than_the_tolerance(seed):
 
 @given(seed=st.integers(0, 10**6), each=st.booleans())
 @settings(max_examples=30, deadline=None)
-def test_a_prior_is_a_further_measurement(seed, each):
+def test_prior_is_a_further_measurement(seed, each):
     """The minimum of ‖A p − y‖² + Σ w (p − m)², the mean shared or each state's own."""
     A, y, start = problem(seed)
     rng = np.random.default_rng(seed + 1)
@@ -191,7 +191,7 @@ def test_a_prior_is_a_further_measurement(seed, each):
         np.testing.assert_allclose(state, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_a_precise_prior_holds_the_state_and_none_leaves_it_alone():
+def test_precise_prior_holds_the_state_and_zero_precision_has_no_effect():
     A, y, start = problem(6)
     config = GaussNewtonSettings(scales=1, iterations=5)
     held = Prior(start, np.array([1e9, 0.0, 1e9, 0.0]))
@@ -203,7 +203,7 @@ def test_a_precise_prior_holds_the_state_and_none_leaves_it_alone():
     np.testing.assert_array_equal(weak, without)
 
 
-def test_a_prior_places_what_the_data_does_not_see():
+def test_prior_determines_parameters_without_evidence():
     A, y, start = problem(7)
     A[:, 2] = 0.0
     prior = Prior(np.array([0, 0, 0.3, 0]), np.array([0, 0, 1e3, 0.0]))
@@ -222,6 +222,6 @@ def test_a_prior_places_what_the_data_does_not_see():
         ({"relaxation": 2.0}, "relaxation = 2"),
     ],
 )
-def test_settings_out_of_range_are_told(values, message):
+def test_settings_out_of_range_are_refused(values, message):
     with pytest.raises(ConfigError, match=message):
         GaussNewtonSettings(**values)

@@ -1,4 +1,4 @@
-"""The body's fit: rows against finite differences, a known body found again from its own drawn silhouettes."""
+"""The body fit: rows against finite differences, and a known body recovered from its rendered silhouettes."""
 
 from dataclasses import fields
 
@@ -29,7 +29,7 @@ DIMENSIONS = [field.name for field in fields(BodyDimensions)]
 
 
 def walk(body, count):
-    """(count, D) a stride, arms out and elbows bent more than walking people have them: every joint shows itself."""
+    """(count, D) a stride with arms out and bent elbows, so that every joint is visible."""
     skeleton = body.skeleton
     poses = np.array([walking_pose(skeleton, 0.05 + i / count) for i in range(count)])
     poses[:, 2] = 0.93
@@ -46,7 +46,7 @@ def pyramids_of(body, poses):
 
 
 def edgels_all_over(body, count=400):
-    """Edgels that hold to random places of all parts, with random rows: what the rows are of need not be contours."""
+    """Edgels at random places of all parts with random rows: derivatives hold for any surface point."""
     rng = np.random.default_rng(8)
     part = rng.integers(len(body.parts), size=count)
     angle, z = rng.uniform(0, 2 * np.pi, count), rng.uniform(-1, 1, count)
@@ -65,18 +65,18 @@ POSE = walk(AVERAGE, 3)[1] + np.random.default_rng(1).normal(0, 0.1, len(AVERAGE
 
 
 def along_rows(body, pose):
-    """(N,) the edgels' places along their rows, pixels."""
+    """(N,) positions of the edgels along their rows, pixels."""
     return np.einsum("na,na->n", EDGELS.row, body.place(pose, EDGELS.part, EDGELS.unscaled))
 
 
-def test_rows_by_the_pose_are_differences():
+def test_pose_rows_equal_finite_differences():
     rows = pose_rows(AVERAGE, POSE, EDGELS)
     for k, step in enumerate(1e-6 * np.eye(len(POSE))):
         expected = (along_rows(AVERAGE, POSE + step) - along_rows(AVERAGE, POSE - step)) / 2e-6
         np.testing.assert_allclose(rows[:, k], expected, atol=1e-7, err_msg=AVERAGE.skeleton.names[k])
 
 
-def test_rows_by_shapes_are_differences():
+def test_shape_rows_equal_finite_differences():
     groups = AVERAGE.shape_groups
     rows = shape_rows(AVERAGE, AVERAGE.skeleton.segment_transforms(POSE), EDGELS)
     for k in range(len(groups) * SHAPE_NUMBERS):
@@ -87,17 +87,16 @@ def test_rows_by_shapes_are_differences():
         name = f"{groups[k // SHAPE_NUMBERS]} {k % SHAPE_NUMBERS}"
         np.testing.assert_allclose(rows[:, k], expected, atol=1e-6, err_msg=name)
         if k % SHAPE_NUMBERS < 2:
-            assert np.abs(expected).max() > 0.01, f"{name}: no edgel tells"
+            assert np.abs(expected).max() > 0.01, f"{name}: no edgel moves"
 
 
-def test_no_edgels_have_no_rows():
-    """A camera that shows nothing in any frame."""
+def test_camera_without_edgels_has_no_rows():
     none = Edgels(*(values[:0] for values in EDGELS))
     rows = shape_rows(AVERAGE, AVERAGE.skeleton.segment_transforms(POSE), none)
     assert rows.shape == (0, SHAPE_NUMBERS * len(AVERAGE.shape_groups))
 
 
-def test_rows_by_dimensions_are_differences():
+def test_dimension_rows_equal_finite_differences():
     problem = BodyFamily("full", AVERAGE.dimensions, 0.01)
     shared = problem.mean + np.random.default_rng(2).normal(0, 0.02, len(problem.mean)) * (problem.deviation > 1e-5)
     (rows,) = problem.dimension_rows(shared, POSE[None], [EDGELS])
@@ -112,7 +111,7 @@ def test_rows_by_dimensions_are_differences():
         np.testing.assert_allclose(rows[:, k], (pair[0] - pair[1]) / 2e-5, atol=1e-6, err_msg=name)
 
 
-def test_frames_are_told_apart_in_rows_by_dimensions():
+def test_dimension_rows_use_the_pose_of_their_frame():
     problem = BodyFamily("full", AVERAGE.dimensions, 0.01)
     poses = walk(AVERAGE, 2)
     both = problem.dimension_rows(problem.mean, poses, [EDGELS, EDGELS])
@@ -122,7 +121,7 @@ def test_frames_are_told_apart_in_rows_by_dimensions():
 
 
 @pytest.mark.parametrize("up", ["z", "x"])
-def test_transforms_of_many_poses_are_the_skeletons(up):
+def test_part_transforms_of_many_poses_follow_the_skeleton(up):
     body = build_cone_body(AVERAGE.dimensions, up)
     poses = np.random.default_rng(0).uniform(-1, 1, (4, len(body.skeleton.names)))
     T = body.skeleton.segment_transforms(poses)
@@ -135,10 +134,10 @@ def test_transforms_of_many_poses_are_the_skeletons(up):
         np.testing.assert_allclose(body.part_transforms(T)[:, p], expected, atol=1e-12)
 
 
-def test_lengths_of_a_known_body_are_found(monkeypatch):
-    """Silhouettes without noise: an edgel errs by what a pixel hides, not by ragged masks."""
+def test_lengths_of_a_known_body_are_recovered(monkeypatch):
+    """Silhouettes without noise: an edgel's error is below a pixel."""
     monkeypatch.setattr(body_fit, "INFORMATION", 1.0 / (0.5**2 * 10.0))
-    # where a forearm ends and a hand begins hardly shows: only both together are told
+    # the wrist hardly shows, so forearm and hand keep their lengths
     true = AVERAGE.dimensions.scaled(thigh=0.95, calf=1.05, upper_arm=1.05, thigh_radius=1.1)
     body = build_cone_body(true)
     poses = walk(body, 4)
@@ -156,8 +155,8 @@ def test_lengths_of_a_known_body_are_found(monkeypatch):
     assert found.dimensions.stature == pytest.approx(true.stature, rel=0.01)
 
 
-def test_shapes_are_found_and_left_and_right_are_mirror_images():
-    """Feet that are longer and point elsewhere: no dimension explains both."""
+def test_shapes_are_recovered_as_mirror_images():
+    """Longer feet that point in another direction: no dimension explains both."""
     groups = AVERAGE.shape_groups
     change = np.zeros((len(groups), SHAPE_NUMBERS))
     change[groups.index("foot_"), [3, 6]] = [0.15, 0.03]
@@ -182,7 +181,7 @@ def test_shapes_are_found_and_left_and_right_are_mirror_images():
     assert parts["thigh_l"].shape[0] > 1.08 * start["thigh_l"].shape[0]
 
 
-def test_without_rounds_the_average_body_is_told():
+def test_without_rounds_the_average_body_is_returned():
     poses = walk(AVERAGE, 1)
     found, fitted = fit_body(
         "limbs",
@@ -214,7 +213,7 @@ def test_every_preset_is_fitted(preset):
     assert np.linalg.norm(fitted[0][:3] - pose[:3]) < np.linalg.norm(start[:3] - pose[:3])
 
 
-def test_either_end_moves_alone_and_mirrored():
+def test_ends_of_a_part_move_separately_and_mirrored():
     change = np.zeros((len(AVERAGE.shape_groups), SHAPE_NUMBERS))
     change[AVERAGE.shape_groups.index("upper_arm_"), 4:] = [0.01, 0.02, 0.0, 0.0]
     change[AVERAGE.shape_groups.index("head"), 4:] = [0.03, 0.0, 0.0, 0.0]
@@ -230,7 +229,7 @@ def test_either_end_moves_alone_and_mirrored():
     begin, end = ends(body, "upper_arm_l")
     begin_before, end_before = ends(AVERAGE, "upper_arm_l")
     assert np.linalg.norm(begin - begin_before) == pytest.approx(np.hypot(0.01, 0.02), abs=1e-9)
-    assert np.linalg.norm(end - end_before) < 2e-3  # a limb keeps its length: its far end swings a little nearer
+    assert np.linalg.norm(end - end_before) < 2e-3  # a limb keeps its length, so its far end moves a little
     chin, crown = (np.subtract(a, b) for a, b in zip(ends(body, "head"), ends(AVERAGE, "head"), strict=True))
     assert np.linalg.norm(chin) == pytest.approx(0.03, rel=0.1) and np.linalg.norm(crown) < 3e-3
     same = AVERAGE.reshaped(np.zeros_like(change))

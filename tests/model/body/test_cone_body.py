@@ -33,13 +33,13 @@ def points_of(body, pose):
 
 @pytest.mark.parametrize(("preset", "components"), [("full", 15), ("limbs", 10), ("walker", 6)])
 def test_presets_have_the_papers_components(preset, components):
-    """The full body has one more: a pelvis apart from the trunk."""
+    """The full body has one more: the pelvis."""
     body = build_cone_body(DIMENSIONS, preset=preset)
     assert len({part.component for part in body.parts}) == components
     assert [part.component for part in body.parts if part.kind == ELLIPSOID] == ["head"]
 
 
-def test_the_walker_has_the_papers_seven_degrees_of_freedom():
+def test_walker_has_the_papers_seven_degrees_of_freedom():
     body = build_cone_body(DIMENSIONS, preset="walker")
     free = {name for name, is_free in zip(body.skeleton.names, body.free, strict=True) if is_free}
     legs = {f"{joint}_{side}_{axis}" for joint, axis in (("hip", "pitch"), ("knee", "flexion")) for side in "lr"}
@@ -48,7 +48,7 @@ def test_the_walker_has_the_papers_seven_degrees_of_freedom():
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_a_standing_body_is_as_tall_as_its_dimensions_say(preset):
+def test_standing_body_has_the_stature_of_its_dimensions(preset):
     body = build_cone_body(DIMENSIONS, preset=preset)
     pose = standing_pose(body.skeleton)
     for name in ("knee_l_flexion", "knee_r_flexion"):
@@ -75,12 +75,12 @@ def test_left_and_right_are_mirror_images():
         twin = names.index(name.replace("_l", "_?").replace("_r", "_l").replace("_?", "_r"))
         a = points[owner == p] * [1, -1, 1]
         b = other[owner == twin]
-        # mirrored rings run the other way round
+        # mirrored rings have the opposite order
         nearest = np.linalg.norm(a[:, None] - b[None], axis=2).min(axis=1)
         assert nearest.max() < 1e-9
 
 
-def test_limbs_run_from_joint_to_joint():
+def test_axes_of_limbs_end_near_joints():
     body = build_cone_body(DIMENSIONS)
     pose = walking_pose(body.skeleton, 0.6)
     joints = dict(zip(JOINTS, body.skeleton.joints(pose), strict=True))
@@ -90,12 +90,12 @@ def test_limbs_run_from_joint_to_joint():
         if limb in ends:
             axis = body.place(pose, np.array([p, p]), np.array([[0, 0, 0.0], [0, 0, 1.0]]))
             expected = [joints[f"{joint}_{side}"] for joint in ends[limb]]
-            # a thigh's flesh lies before the hip and behind the knee, an arm's in the elbow's crook
-            aside = (0.02 if limb == "thigh" else 0.003) * DIMENSIONS.stature
-            np.testing.assert_allclose(axis, expected, atol=aside)
+            # a thigh's surface lies in front of the hip and behind the knee, an arm's in the elbow's crook
+            offset = (0.02 if limb == "thigh" else 0.003) * DIMENSIONS.stature
+            np.testing.assert_allclose(axis, expected, atol=offset)
 
 
-def test_the_world_may_lie_on_its_side():
+def test_body_turns_with_the_up_direction():
     upright, lying = build_cone_body(DIMENSIONS), build_cone_body(DIMENSIONS, up="y")
     pose = np.zeros(len(upright.skeleton.names))
     _, a = points_of(upright, pose)
@@ -103,7 +103,7 @@ def test_the_world_may_lie_on_its_side():
     np.testing.assert_allclose(a @ up_rotation("y").T, b, atol=1e-12)
 
 
-def test_packed_frames_place_parts_as_the_body_does():
+def test_packed_frames_place_parts_like_the_body():
     body = build_cone_body(DIMENSIONS)
     packed = body.pack(np.float64)
     pose = walking_pose(body.skeleton, 0.1)
@@ -116,14 +116,14 @@ def test_packed_frames_place_parts_as_the_body_does():
         np.testing.assert_allclose(local @ frame[:3, :3].T + frame[:3, 3], expected, atol=1e-12)
 
 
-def test_wrong_input_is_told():
+def test_unknown_preset_and_impossible_size_are_refused():
     with pytest.raises(ConfigError, match="choose one of full, limbs, walker"):
         build_cone_body(DIMENSIONS, preset="stick")
     with pytest.raises(ConfigError, match="part spike"):
         ConePart("spike", "torso", CONE, (0.1, 0.1, -1.0, 1.0), np.eye(4))
 
 
-def test_a_body_of_more_parts_than_the_kernels_tell_apart_is_refused():
+def test_body_with_too_many_parts_for_the_kernels_is_refused():
     body = build_cone_body(DIMENSIONS)
     parts = body.parts * (MOST_PARTS // len(body.parts) + 1)
     with pytest.raises(ConfigError, match=f"{len(parts)} parts"):

@@ -1,4 +1,4 @@
-"""Poses written down by hand."""
+"""Initial poses written by a person."""
 
 import numpy as np
 import pytest
@@ -18,8 +18,8 @@ seeds = st.integers(0, 2**32 - 1)
 
 @given(seeds)
 @settings(max_examples=3, deadline=None)
-def test_rough_pose_meets_the_joints(seed):
-    """Of a body of average proportions in an everyday pose: all but the ends of the joints' ranges."""
+def test_joints_of_the_rough_pose_are_near_the_written_ones(seed):
+    """A body of average proportions in an everyday pose."""
     rng = np.random.default_rng(seed)
     skeleton = build_skeleton(BodyDimensions.from_stature(1.8))
     rest = neutral_pose(skeleton)
@@ -36,7 +36,7 @@ def test_rough_pose_meets_the_joints(seed):
     assert error.max() < 0.04 and error.mean() < 0.02
 
 
-def test_rough_pose_takes_the_stature_from_the_joints():
+def test_stature_is_estimated_from_the_joints():
     skeleton = build_skeleton(BodyDimensions.from_stature(1.62))
     joints = dict(zip(JOINTS, skeleton.joints(neutral_pose(skeleton)), strict=True))
     limbs = {name: x for name, x in joints.items() if name not in ("head_top", "pelvis")}
@@ -44,7 +44,7 @@ def test_rough_pose_takes_the_stature_from_the_joints():
     assert dimensions.thigh == pytest.approx(BodyDimensions.from_stature(1.62).thigh, rel=0.01)
 
 
-def test_rough_pose_from_angles_is_clipped_and_otherwise_taken_as_written():
+def test_written_angles_are_clipped_to_the_limits():
     angles = {"torso_x": 0.4, "torso_yaw": 1.0, "knee_l_flexion": 9.0}
     world = TrackerFrame.of(ring_of_cameras(2, width=160, height=200), "-y")
     dimensions, skeleton, pose = rough_pose({}, angles, 1.7, world)

@@ -1,4 +1,4 @@
-"""Strips: where they lie on the pieces, and which of them are chosen."""
+"""Strips: their places on the pieces, and the choice of some."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_every_piece_has_its_circles_and_meridians():
         np.testing.assert_allclose(z[meridians][:, [0, -1]], [[piece.z_lower, piece.z_upper]] * 8, atol=1e-9)
 
 
-def test_normals_have_the_length_that_makes_their_product_with_the_point_one():
+def test_product_of_normal_and_point_is_one():
     for index, piece in enumerate(BODY.pieces):
         mine = STRIPS.piece == index
         eta, omega = np.moveaxis(STRIPS.angles[mine], -1, 0)
@@ -80,10 +80,10 @@ def test_random_choice_follows_the_seed_and_repeats_no_strip():
         limbs = STRIPS.segment[row].reshape(len(LIMBS), 7)
         assert (limbs == np.array([SEGMENTS.index(name) for name in LIMBS])[:, None]).all()
         assert (STRIPS.paired[row].reshape(len(LIMBS), 7).sum(axis=1) == 5).all()
-    assert len(np.unique(chosen)) == len(LIMBS) * PER_PIECE, "every strip gets its turn"
+    assert len(np.unique(chosen)) == len(LIMBS) * PER_PIECE, "every strip is drawn"
 
 
-def test_more_strips_than_there_are_is_a_user_error():
+def test_more_strips_than_exist_are_refused():
     with pytest.raises(ConfigError, match="13 contour pairs a limb: choose 0 to 12"):
         STRIPS.even(13)
     with pytest.raises(ConfigError, match="contour single points"):

@@ -59,7 +59,7 @@ def test_normals_are_perpendicular_to_the_surface(seed, e1, e2):
 
 @given(seeds, exponents, exponents)
 @many
-def test_normals_are_where_inside_outside_grows(seed, e1, e2):
+def test_normals_are_the_gradient_of_inside_outside(seed, e1, e2):
     rng = np.random.default_rng(seed)
     piece = piece_of(rng, e1, e2)
     eta, omega = angles_of(rng)
@@ -70,7 +70,7 @@ def test_normals_are_where_inside_outside_grows(seed, e1, e2):
     np.testing.assert_allclose(piece.normal(eta, omega), gradient, atol=1e-4)
 
 
-def test_ellipsoid_is_the_case_of_exponents_one():
+def test_exponents_of_one_give_an_ellipsoid():
     piece = Superellipsoid("head", np.eye(4), (0.1, 0.2, 0.3), 1.0, 1.0, -0.3, 0.3, 0.2)
     eta, omega = angles_of(np.random.default_rng(0))
     x, y, z = piece.point(eta, omega).T
@@ -80,7 +80,7 @@ def test_ellipsoid_is_the_case_of_exponents_one():
 
 @given(seeds, exponents, exponents)
 @many
-def test_contains_is_inside_between_the_planes(seed, e1, e2):
+def test_contained_points_are_inside_and_between_the_planes(seed, e1, e2):
     rng = np.random.default_rng(seed)
     piece = piece_of(rng, e1, e2)
     q = rng.uniform(-1.2, 1.2, (200, 3)) * piece.radii
@@ -106,7 +106,7 @@ def test_degenerate_exponents_stay_finite(e1, e2):
 
 
 def area_per_sample(piece, spacing):
-    """Area of the surface nearest to each sample, in units of the spacing squared; a fine mesh shared out."""
+    """Area of the surface nearest to each sample, by a fine mesh, in units of the spacing squared."""
     samples = piece.point(*piece.samples(spacing))
     mesh = piece.point(*np.meshgrid(np.linspace(*piece.eta_range, 500), np.linspace(-np.pi, np.pi, 501), indexing="ij"))
     across, down = mesh[1:, 1:] - mesh[:-1, :-1], mesh[1:, :-1] - mesh[:-1, 1:]
@@ -175,7 +175,7 @@ GOOD = {"radii": (0.1, 0.1, 0.3), "e1": 1.0, "e2": 1.0, "z_lower": -0.1, "z_uppe
         ({"z_lower": -0.31}, "cut"),
     ],
 )
-def test_impossible_shapes_are_named(change, message):
+def test_impossible_shapes_are_refused_by_name(change, message):
     Superellipsoid("thigh_l", np.eye(4), **GOOD, diameter_m=0.2)
     with pytest.raises(ConfigError, match=f"superellipsoid of thigh_l: {message}"):
         Superellipsoid("thigh_l", np.eye(4), **(GOOD | change), diameter_m=0.2)

@@ -1,4 +1,4 @@
-"""The skin of superellipsoids: its pieces beside the parts, surface, what is buried, patches, mirror symmetry."""
+"""The superellipsoid body: pieces against the cone body's parts, samples, patches, mirror symmetry."""
 
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ def profile(piece, z):
 
 
 @pytest.mark.parametrize("m", [0.5, 0.8, 1.0, 1.3])
-def test_a_limb_has_the_two_ends_of_its_cone_and_is_nearly_straight_between(m):
+def test_limb_has_the_ends_of_its_cone_and_nearly_straight_sides(m):
     part = replace(CONES.parts[[p.name for p in CONES.parts].index("thigh_l")], shape=(0.1, 0.08, 0.4, m))
     piece = piece_of(part)
     for at, factor in ((0.0, 1.0), (0.5, 0.5 * (1 + m)), (1.0, m)):
@@ -51,7 +51,7 @@ def test_a_limb_has_the_two_ends_of_its_cone_and_is_nearly_straight_between(m):
     assert piece.z_upper - piece.z_lower == pytest.approx(0.4)
 
 
-def test_every_part_has_a_piece_in_its_place():
+def test_every_part_has_a_piece_at_its_place():
     assert [piece.segment for piece in BODY.pieces] == [part.segment for part in CONES.parts]
     for part, piece in zip(CONES.parts, BODY.pieces, strict=True):
         h = part.shape[2]
@@ -63,7 +63,7 @@ def test_every_part_has_a_piece_in_its_place():
             assert (piece.z_lower, piece.z_upper) == (-piece.radii[2], piece.radii[2])
 
 
-def test_every_segment_has_samples_of_its_own_pieces():
+def test_samples_have_the_segment_of_their_piece():
     np.testing.assert_array_equal(PIECE_SEGMENT[BODY.piece], BODY.segment)
     assert set(BODY.segment) == set(range(len(SEGMENTS)))
     np.testing.assert_array_equal(BODY.diameter, np.array([p.diameter_m for p in BODY.pieces])[BODY.piece])
@@ -81,8 +81,8 @@ def test_samples_lie_on_their_pieces_at_any_pose(seed):
         assert q[:, 2].min() > piece.z_lower - 1e-9 and q[:, 2].max() < piece.z_upper + 1e-9
 
 
-def test_buried_samples_and_the_crotch_are_left_out_and_no_others():
-    """In the neutral pose no sample is inside another piece; all that are inside none are there."""
+def test_only_buried_samples_and_the_crotch_are_removed():
+    """In the neutral pose the samples are all those outside other pieces."""
     pose = neutral_pose(BODY.skeleton)
     T = BODY.skeleton.segment_transforms(pose)
     points = BODY.place(pose)
@@ -117,7 +117,7 @@ def test_patches_do_not_depend_on_the_stature(stature):
 
 
 def mirror_pieces():
-    """The piece of the other side for every piece: the same in the order of its segment's."""
+    """Index of each piece's mirror image: the same rank in the mirrored segment."""
     swap = {name: name.replace("_l", "_#").replace("_r", "_l").replace("_#", "_r") for name in SEGMENTS}
     ranks = [sum(q.segment == p.segment for q in BODY.pieces[:i]) for i, p in enumerate(BODY.pieces)]
     places = {(p.segment, rank): i for i, (p, rank) in enumerate(zip(BODY.pieces, ranks, strict=True))}
@@ -138,7 +138,7 @@ def test_mirrored_pose_gives_the_mirrored_surface(seed):
 
 
 @pytest.mark.parametrize("up", UPS)
-def test_another_up_gives_the_rotated_body(up):
+def test_another_up_direction_gives_the_rotated_body(up):
     body, B = skin_of(DIMENSIONS, up), up_rotation(up)
     np.testing.assert_allclose(body.points, BODY.points @ B.T, atol=1e-12)
     np.testing.assert_array_equal(body.patch, BODY.patch)
@@ -146,7 +146,7 @@ def test_another_up_gives_the_rotated_body(up):
     np.testing.assert_allclose(body.place(pose), BODY.place(pose) @ B.T, atol=1e-12)
 
 
-def test_neutral_pose_is_da_vincis():
+def test_neutral_pose_is_the_da_vinci_pose():
     """Upright, arms level and sideways, legs 15° apart from the vertical, toes forward."""
     pose = neutral_pose(BODY.skeleton)
     j = dict(zip(JOINTS, BODY.skeleton.joints(pose), strict=True))
@@ -159,12 +159,12 @@ def test_neutral_pose_is_da_vincis():
     np.testing.assert_allclose(j["head_top"] - j["pelvis"], [0, 0, DIMENSIONS.trunk + DIMENSIONS.head], atol=1e-9)
 
 
-def test_the_surface_reaches_from_the_sole_to_the_crown():
+def test_surface_reaches_from_the_sole_to_the_crown():
     z = BODY.place(np.zeros(len(BODY.skeleton.names)))[:, 2]
     assert z.max() - z.min() == pytest.approx(DIMENSIONS.stature, abs=0.02)
 
 
-def test_spacing_sets_the_number_of_samples():
+def test_number_of_samples_follows_the_spacing():
     counts = [len(skin_of(DIMENSIONS, spacing_m=s).points) for s in (0.02, 0.04)]
     assert counts[0] / counts[1] == pytest.approx(4, rel=0.15)
 

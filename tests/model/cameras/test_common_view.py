@@ -14,7 +14,7 @@ TARGET = np.array([0.4, -0.3, 1.1])
 
 
 def ring(count: int, radius_m: float = 3.0, height_m: float = 0.6, focal_px: float = 60.0) -> Rig:
-    """Cameras of 64×48 pixels around :data:`TARGET`, which all of them look at."""
+    """Cameras of 64×48 pixels around :data:`TARGET`, pointing at it."""
     cameras = []
     for angle in 2 * np.pi * np.arange(count) / count:
         center = TARGET + np.array([radius_m * np.cos(angle), radius_m * np.sin(angle), height_m])
@@ -32,38 +32,38 @@ def test_axes_meet_at_the_target(count: int) -> None:
     np.testing.assert_allclose(closest_to_axes(ring(count)), TARGET, atol=1e-9)
 
 
-def test_the_inferred_volume_bounds_the_common_view() -> None:
+def test_inferred_volume_bounds_the_common_view() -> None:
     rig = ring(5)
     volume = infer_volume(rig)
     assert (volume.lower < TARGET).all() and (volume.upper > TARGET).all()
-    # what all cameras see near the target is inside, up to the spacing of the samples
+    # the points that all cameras see near the target are inside, up to the spacing of the samples
     around = sample_box(Volume(tuple(TARGET), (3.0, 3.0, 3.0)))
     common = around[(views_of(rig, around) == 5) & (np.linalg.norm(around - TARGET, axis=1) < 1.5)]
     spacing_m = 0.08
     assert len(common) > 100
     assert (common > volume.lower - spacing_m).all() and (common < volume.upper + spacing_m).all()
-    # and it is tight: each face touches a point that all cameras see
+    # the box is tight: each face touches a point that all cameras see
     inside = sample_box(volume, 40)
     seen = inside[views_of(rig, inside) == 5]
     np.testing.assert_allclose(seen.min(axis=0), volume.lower, atol=spacing_m)
     np.testing.assert_allclose(seen.max(axis=0), volume.upper, atol=spacing_m)
 
 
-def test_longer_lenses_see_less() -> None:
+def test_longer_focal_length_gives_a_smaller_volume() -> None:
     assert np.prod(infer_volume(ring(4, focal_px=120.0)).size) < np.prod(infer_volume(ring(4)).size)
 
 
-def test_views_are_counted() -> None:
+def test_cameras_that_see_a_point_are_counted() -> None:
     rig = ring(4)
     assert views_of(rig, np.array([TARGET, TARGET + np.array([0, 0, 50]), rig.centers[0]])).tolist() == [4, 0, 1]
 
 
-def test_no_volume_without_a_common_view() -> None:
+def test_rig_without_a_common_view_is_refused() -> None:
     rig = ring(2)
     twin = dataclasses.replace(rig[0], name="twin", translation=rig[0].translation + np.array([0.5, 0.0, 0.0]))
     with pytest.raises(VolumeError, match="parallel"):
         infer_volume(Rig((rig[0], twin)))
-    # each looks the other way: the axes meet behind both
+    # cameras turned round: the axes meet behind them
     turned = [
         dataclasses.replace(c, rotation=c.rotation * [[-1], [1], [-1]], translation=c.translation * [-1, 1, -1])
         for c in ring(3)

@@ -1,4 +1,4 @@
-"""Cameras and clocks found again from a person who is drawn exactly; rows against finite differences."""
+"""Refinement of cameras and clocks by a rendered person; rows against finite differences."""
 
 from dataclasses import replace
 from functools import cache
@@ -47,8 +47,8 @@ def motion() -> np.ndarray:
     return poses
 
 
-def drawn(late: tuple[float, ...] = (0, 0, 0, 0)) -> MaskStore:
-    """Masks of the motion; picture k of a camera shows the pose of frame k + late."""
+def rendered(late: tuple[float, ...] = (0, 0, 0, 0)) -> MaskStore:
+    """Masks of the motion; image k of a camera shows the pose of frame k + late."""
     frame = np.arange(FRAMES)
     layers = []
     for camera, delay in zip(RIG, late, strict=True):
@@ -63,7 +63,7 @@ def drawn(late: tuple[float, ...] = (0, 0, 0, 0)) -> MaskStore:
 
 @cache
 def in_time() -> MaskStore:
-    return drawn()
+    return rendered()
 
 
 def frames(store: MaskStore, rig: Rig):
@@ -79,18 +79,18 @@ def frames(store: MaskStore, rig: Rig):
     )
 
 
-def astray(camera: Camera, rng: np.random.Generator, deg: float = 0.25, metres: float = 0.01) -> Camera:
-    axis, way = rng.normal(size=(2, 3))
+def disturbed(camera: Camera, rng: np.random.Generator, deg: float = 0.25, metres: float = 0.01) -> Camera:
+    axis, direction = rng.normal(size=(2, 3))
     turn = np.asarray(cv2.Rodrigues(np.radians(deg) * axis / np.linalg.norm(axis))[0])
-    center = camera.center + metres * way / np.linalg.norm(way)
+    center = camera.center + metres * direction / np.linalg.norm(direction)
     return replace(camera, rotation=turn @ camera.rotation, translation=-turn @ camera.rotation @ center)
 
 
-PERTURBED = Rig(tuple(astray(camera, np.random.default_rng(20 + i)) for i, camera in enumerate(RIG)))
+PERTURBED = Rig(tuple(disturbed(camera, np.random.default_rng(20 + i)) for i, camera in enumerate(RIG)))
 
 
 def errors(rig: Rig) -> tuple[float, float]:
-    """Largest turn (degrees) and distance of the centres (metres) from the truth, the world's motion taken off."""
+    """Largest errors of orientation (degrees) and centre (metres) after alignment with the true cameras."""
     rig = aligned(rig, RIG, np.radians(0.1), 0.005)
     turns = [turn_between(one, other) for one, other in zip(rig, RIG, strict=True)]
     return max(turns), float(np.linalg.norm(rig.centers - RIG.centers, axis=1).max())
@@ -99,7 +99,7 @@ def errors(rig: Rig) -> tuple[float, float]:
 # --- derivatives and gauge --------------------------------------------------------------------------------------------
 
 
-def test_a_camera_that_shows_nothing_tells_nothing():
+def test_camera_with_empty_masks_is_consistent():
     store = MaskStore()
     for k in range(FRAMES):
         masks = in_time().get(k).copy()
@@ -110,15 +110,14 @@ def test_a_camera_that_shows_nothing_tells_nothing():
 
 
 @pytest.mark.parametrize("kind", ["turn", "move", "focal", "shift"])
-def test_rows_by_a_camera_are_differences(kind):
+def test_camera_rows_equal_finite_differences(kind):
     camera = replace(RIG[1], distortions=np.array([-0.08, 0.01, 0.001, -0.002, 0.0]))
     rng = np.random.default_rng(3)
     edgels = edgels_all_over(BODY, 60)
     x = BODY.place(motion()[3], edgels.part, edgels.unscaled)
     pixel, _ = camera.project(x)
     normal = rng.normal(size=(len(x), 2))
-    step = 1e-6 * np.eye(3)
-    J = np.stack([(camera.project(x + s)[0] - camera.project(x - s)[0]) / 2e-6 for s in step], axis=2)
+    J = np.stack([(camera.project(x + s)[0] - camera.project(x - s)[0]) / 2e-6 for s in 1e-6 * np.eye(3)], axis=2)
     edgels = edgels._replace(pixel=pixel, normal=normal, row=np.einsum("ni,nij->nj", normal, J))
     rows = camera_rows(camera, x, edgels, kind)
 
@@ -135,12 +134,12 @@ def test_rows_by_a_camera_are_differences(kind):
             K[:2, 2] += row
         return replace(camera, matrix=K)
 
-    for k, way in enumerate(1e-5 * np.eye(rows.shape[1])):
-        moved = (changed(way).project(x)[0] - changed(-way).project(x)[0]) / 2e-5
+    for k, step in enumerate(1e-5 * np.eye(rows.shape[1])):
+        moved = (changed(step).project(x)[0] - changed(-step).project(x)[0]) / 2e-5
         np.testing.assert_allclose(rows[:, k], np.einsum("ni,ni->n", normal, moved), rtol=1e-4, atol=1e-3)
 
 
-def test_the_worlds_motions_change_no_picture():
+def test_motions_of_the_world_change_no_image():
     modes = world_motions(RIG).reshape(len(RIG), 6, 7)
     x = np.random.default_rng(1).uniform([-0.5, -0.5, 0], [0.5, 0.5, 1.8], (30, 3))
     for k in range(7):
@@ -154,7 +153,7 @@ def test_the_worlds_motions_change_no_picture():
             np.testing.assert_allclose(moved.project(world)[0], camera.project(x)[0], atol=1e-6)
 
 
-def test_a_world_that_was_moved_and_grew_is_brought_back():
+def test_alignment_undoes_a_motion_and_a_scaling_of_the_world():
     Q, t = np.asarray(cv2.Rodrigues(np.array([0.02, -0.05, 0.1]))[0]), np.array([0.1, -0.2, 0.05])
     moved = []
     for camera in RIG:
@@ -165,9 +164,8 @@ def test_a_world_that_was_moved_and_grew_is_brought_back():
     assert max(turn_between(one, other) for one, other in zip(back, RIG, strict=True)) < 1e-3
 
 
-def test_the_family_begins_at_the_body():
+def test_body_family_begins_at_the_body():
     change = np.random.default_rng(4).normal(0, 0.01, (len(BODY.shape_groups), SHAPE_NUMBERS))
-    # what ends a part may move; the lengths of parts between joints stay
     body = BODY.reshaped(change)
     ellipsoid = [group_of(p.name) for p in BODY.parts if p.kind != CONE]
     change[[BODY.shape_groups.index(name) for name in ellipsoid], 2] = 0.0  # nothing tapers there
@@ -179,11 +177,11 @@ def test_the_family_begins_at_the_body():
         np.testing.assert_allclose(one.T_body_part, other.T_body_part, atol=3e-4)
 
 
-# --- what is found ----------------------------------------------------------------------------------------------------
+# --- refinement ----------------------------------------------------------------------------------------------------
 
 
-def test_perturbed_cameras_are_found_again():
-    # what is drawn exactly is to be trusted more than a prior
+def test_refinement_corrects_perturbed_cameras():
+    # rendered contours are exact, so the prior is wide
     how = replace(QUICK, rounds=6, trust=5.0, offsets=False)
     found = refine_cameras(BODY, PERTURBED, frames(in_time(), PERTURBED), how)
     (was_turned, was_moved), (turned, moved) = errors(PERTURBED), errors(found.rig)
@@ -193,10 +191,10 @@ def test_perturbed_cameras_are_found_again():
     assert found.observed.all()
 
 
-def test_true_cameras_stay():
+def test_true_cameras_hardly_move():
     found = refine_cameras(BODY, RIG, frames(in_time(), RIG), QUICK)
     assert found.turn_deg.max() < 0.05 and found.move_m.max() < 0.004
-    # the gauge: as a whole the cameras have neither moved nor grown
+    # the gauge: the cameras have no common motion or scaling
     weight = np.tile(np.repeat([1 / np.radians(TURN_DEG), 1 / MOVE_M], 3), len(RIG))
     change = np.concatenate(
         [
@@ -208,7 +206,7 @@ def test_true_cameras_stay():
     assert np.abs(common).max() < 1e-2 * np.abs(change * weight).max() * weight.max()
 
 
-def test_focal_lengths_are_found():
+def test_focal_lengths_are_refined():
     longer = np.diag([1.01, 1.01, 1.0])
     wide = Rig(
         tuple(
@@ -221,31 +219,31 @@ def test_focal_lengths_are_found():
 
 
 @pytest.mark.parametrize("late", [(0, 0, 1, 0), (0, 0.4, 0, 0)])
-def test_late_videos_are_found(late):
-    store = drawn(late)
+def test_delays_of_videos_are_estimated(late):
+    store = rendered(late)
     done = refine_rig(BODY, RIG, store, np.arange(FRAMES), motion(), np.ones(FRAMES, bool), QUICK)
     assert done is not None
     np.testing.assert_allclose(done.refined.offset_frames, late, atol=0.12)
     assert (done.refined.offset_sigma_frames < 0.2).all()
 
 
-def test_too_few_frames_are_said():
+def test_too_few_usable_frames_give_none():
     usable = np.zeros(FRAMES, bool)
     usable[3:8] = True
     args = (np.arange(FRAMES), motion(), usable, QUICK)
     assert refine_rig(BODY, RIG, in_time(), *args) is None
 
 
-def test_the_agreement_names_the_camera_that_is_off():
+def test_agreement_names_the_inconsistent_and_the_late_camera():
     fine = camera_agreement(BODY, RIG, frames(in_time(), RIG))
     assert not fine.inconsistent.any() and not fine.late.any()
-    one = Rig(tuple(astray(c, np.random.default_rng(5), 0.5, 0.0) if c.name == "c1" else c for c in RIG))
+    one = Rig(tuple(disturbed(c, np.random.default_rng(5), 0.5, 0.0) if c.name == "c1" else c for c in RIG))
     found = camera_agreement(BODY, one, frames(in_time(), one))
     assert found.inconsistent[1] and np.linalg.norm(found.shift_px, axis=1).argmax() == 1
-    late = camera_agreement(BODY, RIG, frames(drawn((0, 0, 0, 1)), RIG))
+    late = camera_agreement(BODY, RIG, frames(rendered((0, 0, 0, 1)), RIG))
     assert late.late.tolist() == [False, False, False, True]
 
 
-def test_settings_out_of_range():
+def test_settings_out_of_range_are_refused():
     with pytest.raises(ConfigError, match="trust = 0"):
         RefinementSettings(trust=0.0)

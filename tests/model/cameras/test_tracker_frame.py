@@ -1,4 +1,4 @@
-"""The cameras' own world, whatever the capture's."""
+"""The tracker's frame in worlds with any orientation and origin."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def random_rig(rng: np.random.Generator) -> Rig:
-    """One to six cameras somewhere within some metres, mounted every way."""
+    """One to six cameras within some metres, with any orientation."""
     cameras = []
     for i in range(rng.integers(1, 7)):
         rotation = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
@@ -47,7 +47,7 @@ def bits(rig: Rig) -> list[bytes]:
 
 @given(seeds)
 @settings(deadline=None)
-def test_points_poses_and_cameras_come_back(seed: int) -> None:
+def test_points_poses_and_cameras_survive_a_round_trip(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rig, up = random_rig(rng), random_up(rng)
     world = TrackerFrame.of(rig, up)
@@ -64,7 +64,7 @@ def test_points_poses_and_cameras_come_back(seed: int) -> None:
 
 @given(seeds)
 @settings(deadline=None)
-def test_z_is_up_and_a_pose_is_the_same_body_in_either_world(seed: int) -> None:
+def test_z_is_up_and_a_pose_places_the_same_body_in_both_worlds(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rig, up = random_rig(rng), random_up(rng)
     world = TrackerFrame.of(rig, up)
@@ -73,14 +73,14 @@ def test_z_is_up_and_a_pose_is_the_same_body_in_either_world(seed: int) -> None:
     poses = rng.uniform(-1, 1, (4, len(BODY.skeleton.names)))
     outside = BODY.standing(up).skeleton.joints(world.poses_out(poses))
     np.testing.assert_allclose(outside, world.points_out(BODY.skeleton.joints(poses)), atol=1e-12)
-    # and the cameras see it where they saw it
+    # the cameras see the joints at the same places
     for own, camera in zip(world.rig, rig, strict=True):
         np.testing.assert_allclose(own.to_camera(world.points_in(outside[0])), camera.to_camera(outside[0]), atol=1e-6)
 
 
 @given(seeds)
 @settings(deadline=None)
-def test_its_cameras_are_the_same_bit_for_bit_however_the_capture_lies(seed: int) -> None:
+def test_cameras_are_bit_identical_in_any_world(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rig, up = random_rig(rng), random_up(rng)
     expected = bits(TrackerFrame.of(rig, up).rig)
@@ -92,8 +92,8 @@ def test_its_cameras_are_the_same_bit_for_bit_however_the_capture_lies(seed: int
 
 @pytest.mark.parametrize("roll_deg", [0.0, 90.0, -90.0, 180.0])
 @pytest.mark.parametrize("pitch_deg", [0.0, 30.0, 90.0])
-def test_cameras_that_are_mounted_straight_make_no_difference_either(roll_deg: float, pitch_deg: float) -> None:
-    """Level, on their side, upside down, on the ceiling: turns by exactly 90° and 180° round the same way, too."""
+def test_cameras_mounted_at_right_angles_are_bit_identical_in_any_world(roll_deg: float, pitch_deg: float) -> None:
+    """Level, on their side, upside down, on the ceiling: turns by exactly 90° and 180° round alike, too."""
     ring = ring_of_cameras(4, width=160, height=200)
     mounted = Rotation.from_euler("xz", [pitch_deg, roll_deg], degrees=True).as_matrix()
     rig = Rig(tuple(replace(c, rotation=mounted @ c.rotation, translation=mounted @ c.translation) for c in ring))
@@ -104,9 +104,9 @@ def test_cameras_that_are_mounted_straight_make_no_difference_either(roll_deg: f
         assert bits(TrackerFrame.of(seen_from(rig, turn.T, -turn.T @ shift), up_text(turn[:, 2])).rig) == expected
 
 
-def test_x_is_the_right_of_the_first_cameras_pictures() -> None:
+def test_x_is_the_first_cameras_rightward_direction() -> None:
     rig = ring_of_cameras(3, width=160, height=200)
     np.testing.assert_allclose(TrackerFrame.of(rig, "z").rig[0].rotation, [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-7)
-    # whose camera lies on its side: where that looks
+    # of a camera on its side: the viewing direction
     on_side = replace(rig[0], rotation=Rotation.from_euler("z", 90, degrees=True).as_matrix() @ rig[0].rotation)
     np.testing.assert_allclose(TrackerFrame.of(Rig((on_side,)), "z").rig[0].rotation[2], [1, 0, 0], atol=1e-7)

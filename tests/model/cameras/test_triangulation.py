@@ -1,4 +1,4 @@
-"""Triangulation of joints that cameras see wrongly, and the choice of one person."""
+"""Triangulation of joints with outliers, and the choice of one person."""
 
 import numpy as np
 import pytest
@@ -30,8 +30,8 @@ def seen(joints: np.ndarray) -> np.ndarray:
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**16))
-def test_wrong_views_are_left_out(seed: int) -> None:
-    """Of five views of each joint two are anywhere; what the three others say is met."""
+def test_outliers_are_excluded(seed: int) -> None:
+    """Two of five views of each joint are anywhere; the result agrees with the other three."""
     rng = np.random.default_rng(seed)
     joints, pixels = person(), seen(person())
     wrong = np.argsort(rng.random((5, 15)), axis=0)[:2]
@@ -47,7 +47,7 @@ def test_wrong_views_are_left_out(seed: int) -> None:
     np.testing.assert_array_equal(agreeing, good)
 
 
-def test_noise_is_averaged_and_confidence_weighs() -> None:
+def test_noise_is_averaged_with_confidence_as_weight() -> None:
     rng = np.random.default_rng(1)
     pixels = seen(person())
     pixels[:, :, :2] += rng.normal(0, 5, (5, 15, 2))
@@ -61,18 +61,18 @@ def test_noise_is_averaged_and_confidence_weighs() -> None:
     assert surer.mean() < 0.7 * error.mean()
 
 
-def test_what_no_two_views_tell_is_nan() -> None:
+def test_joints_without_two_views_are_nan() -> None:
     pixels = seen(person())
     pixels[1:, 3] = np.nan  # one view is left
-    pixels[:, 5, 2] = 0.1  # nobody is sure
+    pixels[:, 5, 2] = 0.1  # too little confidence
     found, agreeing = triangulate_joints(RIG, pixels)
     assert np.isnan(found[[3, 5]]).all() and not agreeing[:, [3, 5]].any()
     assert np.isfinite(np.delete(found, [3, 5], axis=0)).all()
 
 
 @pytest.mark.parametrize("order", [0, 1])
-def test_one_of_several_people_is_chosen_in_all_views(order: int) -> None:
-    """Who stands in the box, although the other one is seen as well, and in another order in each view."""
+def test_person_inside_the_box_is_chosen_in_all_views(order: int) -> None:
+    """Another person is visible as well, and the order of the people differs between views."""
     ours, other = seen(person()), seen(person(2.0, 1.0, 2.0))
     people = [np.stack([a, b] if (c + order) % 2 else [b, a]) for c, (a, b) in enumerate(zip(ours, other, strict=True))]
     people[3] = people[3][:0]  # a camera that finds nobody
@@ -81,7 +81,7 @@ def test_one_of_several_people_is_chosen_in_all_views(order: int) -> None:
     np.testing.assert_array_equal(np.delete(chosen, 3, axis=0), np.delete(ours, 3, axis=0))
 
 
-def test_nobody_is_nobody() -> None:
+def test_without_people_in_two_views_the_result_is_nan() -> None:
     people = [np.zeros((0, 15, 3)) for _ in RIG]
     assert np.isnan(same_person(RIG, people, BOX)).all()
     alone = [seen(person())[:1], *people[1:]]

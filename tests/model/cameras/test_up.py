@@ -23,22 +23,22 @@ def random_up(seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", UP_AXES)
-def test_an_axis_keeps_its_name(name: str) -> None:
+def test_axis_keeps_its_name(name: str) -> None:
     assert up_text(name) == up_text(up_vector(name)) == up_text(3.0 * up_vector(name)) == name
     assert up_text(f" {name.upper()} ") == name
     assert np.count_nonzero(up_vector(name)) == 1
 
 
 @given(seed=seeds)
-def test_the_text_of_a_direction_is_that_direction(seed: int) -> None:
+def test_text_of_a_direction_converts_back(seed: int) -> None:
     vector = random_up(seed)
     text = up_text(7.5 * vector)
     np.testing.assert_allclose(up_vector(text), vector, rtol=0, atol=1e-15)
-    assert up_text(text) == text  # what a result says is what a resumed run says
+    assert up_text(text) == text  # a resumed run writes the same text
 
 
 @given(seed=seeds)
-def test_any_direction_lifts_the_body(seed: int) -> None:
+def test_rotation_turns_z_to_any_direction(seed: int) -> None:
     vector = random_up(seed)
     B = up_rotation(up_text(vector))
     np.testing.assert_allclose(B.T @ B, np.eye(3), atol=1e-12)
@@ -47,13 +47,13 @@ def test_any_direction_lifts_the_body(seed: int) -> None:
 
 
 @given(seed=seeds)
-def test_a_direction_near_an_axis_is_nearly_that_axis(seed: int) -> None:
+def test_rotation_is_continuous_near_an_axis(seed: int) -> None:
     near = up_vector(UP_AXES[seed % 6]) + 1e-4 * np.random.default_rng(seed).uniform(-1, 1, 3)
     np.testing.assert_allclose(up_rotation(up_text(near)), up_rotation(UP_AXES[seed % 6]), atol=1e-3)
 
 
 @given(seed=seeds)
-def test_the_skeleton_turns_with_up(seed: int) -> None:
+def test_skeleton_turns_with_up(seed: int) -> None:
     text = up_text(random_up(seed))
     skeleton, B = build_skeleton(DIMENSIONS, text), up_rotation(text)
     pose = random_pose(seed)
@@ -63,6 +63,6 @@ def test_the_skeleton_turns_with_up(seed: int) -> None:
 
 
 @pytest.mark.parametrize("up", ["north", "[1, 2]", "[0, 0, 0]", '["a", 1, 2]', "[NaN, 0, 1]", "[[1, 0, 0]]", "{}", "3"])
-def test_no_direction(up: str) -> None:
+def test_invalid_direction_is_refused(up: str) -> None:
     with pytest.raises(ConfigError, match=r"^up = "):
         up_vector(up)

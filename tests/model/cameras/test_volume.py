@@ -25,13 +25,13 @@ def test_empty_volume_is_refused(size):
         Volume((0.0, 0.0, 0.0), size)
 
 
-def test_a_grid_needs_two_voxels():
+def test_grid_of_one_voxel_is_refused():
     with pytest.raises(VolumeError, match="--voxels 1"):
         VoxelGrid.cover(Volume((0, 0, 0), (1, 1, 1)), 1)
 
 
 @given(points, sizes, st.integers(2, 40))
-def test_a_grid_covers_its_volume_and_little_more(center, size, voxels):
+def test_grid_covers_its_volume_with_less_than_a_voxel_to_spare(center, size, voxels):
     volume = Volume(center, size)
     grid = VoxelGrid.cover(volume, voxels)
     lower = np.array(grid.origin) - grid.voxel_m / 2

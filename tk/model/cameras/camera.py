@@ -56,12 +56,6 @@ class Camera:
         """(3,) centre of projection in the world frame, metres."""
         return -self.rotation.T @ self.translation
 
-    @property
-    def projection(self) -> Float:
-        """(3, 4) K [R | t], without lens distortion."""
-        projection: Float = self.matrix @ np.column_stack([self.rotation, self.translation])
-        return projection
-
     def to_camera(self, p_world: ArrayLike) -> Float:
         """Return world points (N, 3) in the camera frame, metres."""
         return np.asarray(p_world, dtype=np.float64).reshape(-1, 3) @ self.rotation.T + self.translation
