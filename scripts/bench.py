@@ -52,9 +52,9 @@ from tk.errors import TkError
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.captures.frames import FrameSet
 from tk.io.results.writer import Result, read_result
-from tk.kernels.launch import Launcher
 from tk.kernels.nearest import SurfaceIndex, nearest
 from tk.kernels.runtime import ti
+from tk.kernels.taichi_internals import Launcher
 from tk.model.body.skeleton import CHAINS, convert_poses
 from tk.model.body.superellipsoid_body import build_superellipsoid_body
 from tk.model.cameras.volume import VoxelGrid

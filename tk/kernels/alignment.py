@@ -1,16 +1,16 @@
 """Model contour against picture, once edges have been assigned: ρ(e) of one entry (Kehl 2006, eqs. 10, 13, 15).
 
-An entry is two contour points a and b of one limb (a pair symmetric about its axis, or twice the same point), which are
-held as material points, and the picture point that their images' midpoint should meet:
+An entry has two contour points a and b of one limb (a pair symmetric about its axis, or twice the same point), fixed as
+material points, and the target in the image for the midpoint of their projections:
 
     e = ½ (n · (½ (x^a + x^b) − x̄) / σ)²,    ρ(e) = 1 − exp(−e / ν)
 
-with n the contour's normal in the picture: the distance across the contour counts, where the paper takes the whole one,
-for a held edge does not tell how far along a limb its point is. A contour slides over the limb as it turns; as the
-limb's normal there is perpendicular to the viewing ray, the sliding moves the image along the contour only, to first
-order, so the derivative by the pose needs no term for it.
+with n the contour's normal in the image. Only the distance across the contour counts, because an assigned edge does not
+determine the position along a limb; the paper takes the whole distance. A contour slides over the limb as the limb
+turns. The limb's normal there is perpendicular to the viewing ray, so to first order the sliding moves the image along
+the contour only, and the derivative by the pose needs no term for it.
 
-A hidden contour point, or one without an edge, is an entry that costs ρ = 1 and pulls nowhere (6.1.2).
+A hidden contour point, or a point without an edge, is an entry with ρ = 1 and no gradient (6.1.2).
 """
 
 from tk.kernels.kinematics import load_rotation, load_translation
@@ -19,9 +19,9 @@ from tk.kernels.runtime import ti
 from tk.kernels.vectors import cross, dot, norm_sqr, pulled, times
 from tk.kernels.wrench import MOTION, WRENCH, add_direction, add_wrench, load_wrench
 
-# Columns of an entry. Points a and b are in the zero configuration (metres), target and unit normal in the picture.
+# Columns of an entry. Points a and b are in the zero configuration, metres; target and unit normal in the image.
 POINT_A, POINT_B, LAST_DOF, CAMERA, TARGET, NORMAL = 0, 3, 6, 7, 8, 10
-INV_SIGMA2, STATE, SCALE, NU, ENTRY_NUMBERS = 12, 13, 14, 15, 16  # 1/px²; its share of f
+INV_SIGMA2, STATE, SCALE, NU, ENTRY_NUMBERS = 12, 13, 14, 15, 16  # 1/σ² in 1/px²; SCALE: the entry's share of f
 # States of an entry: padding, assigned, and a contour point that can have no edge.
 ABSENT, ASSIGNED, UNASSIGNABLE = 0, 1, 2
 
@@ -35,8 +35,8 @@ def load_entry(entries: ti.template(), b: int, e: int, first: ti.template()):
 def image_residual(
     frames: ti.template(), c: int, cameras: ti.template(), entries: ti.template(), b: int, e: int, origin
 ):
-    """(valid, residual, l (3,), t (3,)): a twist (ω, v) about the origin moves the image across the contour by
-    l · ω + t · v, in pixels."""
+    """Return (valid, residual, l (3,), t (3,)), pixels: a twist (ω, v) about the origin changes the residual by
+    l · ω + t · v."""
     k = ti.cast(entries[b, e, LAST_DOF], ti.i32)
     v = ti.cast(entries[b, e, CAMERA], ti.i32)
     R, t = load_rotation(frames, c, k), load_translation(frames, c, k)
@@ -58,7 +58,7 @@ def image_residual(
 
 @ti.func
 def _turned(J, x):
-    """L (2, 3) with L ω = J (ω × x)."""
+    """Return L (2, 3) with L ω = J (ω × x)."""
     first = cross(x, ti.Vector([J[0, a] for a in ti.static(range(3))]))
     second = cross(x, ti.Vector([J[1, a] for a in ti.static(range(3))]))
     return ti.Matrix.rows([first, second])
@@ -104,7 +104,7 @@ def add_curvature(
     floor,
     origin,
 ):
-    """Add entry e of pose 0 to the inertias; outliers weigh ``floor``."""
+    """Add entry e of pose 0 to the inertias; outliers weigh at least ``floor``."""
     if ti.cast(entries[0, e, STATE], ti.i32) == ASSIGNED:
         valid, r, moment, force = image_residual(scratch, c, cameras, entries, 0, e, origin)
         if valid:

@@ -15,8 +15,8 @@ one byte, so they repeat bit for bit. Pixels outside the image add nothing to a 
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.launch import Launcher
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
+from tk.kernels.taichi_internals import Launcher
 
 STEPS_PER_OCTAVE = 8
 """Levels of the logarithmic scale for a factor of two."""

@@ -1,12 +1,12 @@
 """Frusta of elliptical cones and ellipsoids under perspective: occluding contours and viewing rays in closed form.
 
-A part has a frame of its own. ``shape`` is (a, b, h, m): a cone's cross-section at height z = u h, 0 ≤ u ≤ 1, has the
-semi-axes a r and b r with r = 1 + (m - 1) u. An ellipsoid has the semi-axes a, b, h about its origin.
+In a part's own frame ``shape`` is (a, b, h, m): a cone's cross-section at height z = u h, 0 ≤ u ≤ 1, has the semi-axes
+a r and b r with r = 1 + (m - 1) u. An ellipsoid has the semi-axes a, b, h about its origin.
 
 Seen from c, the occluding contour of a cone is two straight generators, those at the angles φ with
 (cₓ/a) cos φ + (c_y/b) sin φ = 1 + (m - 1) c_z / h, and an arc of each rim, between the generators, on the side where
 only one of cap and mantle faces c. With the axes of an ellipsoid scaled to 1 its contour is a circle about c. (The
-silhouette paper, section 4.1, does not say how it finds the contours.)
+silhouette paper, section 4.1, is silent about how it computes contours.)
 
 A curve is one of these pieces; u in [0, 1] runs along it.
 """
@@ -21,9 +21,9 @@ SIDE_A, SIDE_B, END_NEAR, END_FAR, OUTLINE = 0, 1, 2, 3, 4
 
 @ti.func
 def curve_of(kind: int, shape, c):
-    """(visible, (q0, q1)) of a curve seen from c, in the part's frame: what :func:`point_on` needs.
+    """Return (visible, (q0, q1)) of a curve seen from c, in the part's frame, for :func:`point_on`.
 
-    Generators: q0 is the angle. Rims: start angle and span; sides none. Outlines: nothing.
+    Generators: q0 is the angle. Rims: start angle and span. Outlines: unused.
     """
     q = ti.Vector([0.0 * shape[0], 0.0 * shape[0]])
     visible = 1
@@ -64,7 +64,7 @@ def curve_of(kind: int, shape, c):
 
 @ti.func
 def point_on(kind: int, shape, c, q, u):
-    """Point and tangent (d/du) of a curve at u, in the part's frame."""
+    """Return point and tangent (d/du) of a curve at u, in the part's frame."""
     x = c * 0.0
     tangent = c * 0.0
     if kind == OUTLINE:
@@ -105,7 +105,7 @@ def point_on(kind: int, shape, c, q, u):
 
 @ti.func
 def unscaled(kind: int, shape, x):
-    """A surface point in coordinates that do not depend on the shape: (x / a r, y / b r, z / h)."""
+    """Return a surface point in coordinates that do not depend on the shape: (x / a r, y / b r, z / h)."""
     r = 1.0 + 0.0 * shape[0]
     if kind != OUTLINE:
         r = 1.0 + (shape[3] - 1.0) * x[2] / shape[2]
@@ -114,7 +114,7 @@ def unscaled(kind: int, shape, x):
 
 @ti.func
 def interior_point(part_kind: int, shape):
-    """A point well inside a part."""
+    """Return a point well inside a part."""
     z = 0.0 * shape[2]
     if part_kind == CONE:
         z = 0.5 * shape[2]
@@ -123,7 +123,7 @@ def interior_point(part_kind: int, shape):
 
 @ti.func
 def enclosing_radius(part_kind: int, shape):
-    """Radius of a sphere about :func:`interior_point` that holds the part."""
+    """Return the radius of a sphere about :func:`interior_point` that encloses the part."""
     wide = ti.max(shape[0], shape[1])
     result = ti.max(wide, shape[2])
     if part_kind == CONE:
@@ -134,7 +134,7 @@ def enclosing_radius(part_kind: int, shape):
 
 @ti.func
 def enter(part_kind: int, shape, c, d, shrink):
-    """Where the ray c + t d, t > 0, enters a part; -1 where it misses. ``shrink`` scales the cross-section."""
+    """Return t > 0 where the ray c + t d enters a part; -1 if it misses. ``shrink`` scales the cross-section."""
     result = -1.0 + 0.0 * d[0]
     middle = interior_point(part_kind, shape) - c
     reach = enclosing_radius(part_kind, shape)
@@ -148,7 +148,7 @@ def enter(part_kind: int, shape, c, d, shrink):
 
 @ti.func
 def capsule(part_kind: int, shape):
-    """(z0, z1, radius): spheres of this radius at both places of the axis, and all between them, hold the part."""
+    """Return (z0, z1, radius) of a capsule along the axis that encloses the part."""
     radius = ti.max(shape[0], shape[1])
     z0, z1 = 0.0 * radius, shape[2]
     if part_kind == CONE:
@@ -161,7 +161,7 @@ def capsule(part_kind: int, shape):
 
 @ti.func
 def extent(part_kind: int, shape, shrink):
-    """What a part's coordinates are divided by to make it :func:`enter_unit`'s."""
+    """Return the divisors (3,) that turn a part's coordinates into the unit coordinates of :func:`enter_unit`."""
     length = shape[2]
     if part_kind == ELLIPSOID:
         length *= shrink
@@ -170,7 +170,7 @@ def extent(part_kind: int, shape, shrink):
 
 @ti.func
 def enter_unit(part_kind: int, m, c, d):
-    """The same for the unit ball, or the frustum of radius 1 at z = 0 and m at z = 1; from outside of it or inside."""
+    """Return :func:`enter` of the unit ball, or of the frustum of radius 1 at z = 0 and m at z = 1."""
     # A t² + 2 B t + C < 0 inside, for lower < t < upper
     A, B, C = d[0] * d[0] + d[1] * d[1], c[0] * d[0] + c[1] * d[1], c[0] * c[0] + c[1] * c[1]
     lower, upper = 0.0 * A, 1e9 + 0.0 * A

@@ -1,4 +1,4 @@
-"""The model's occluding contour in the pictures, batched over poses: one launch for all of them (Kehl 2006, 5.2, 5.3).
+"""The model's occluding contour in the images, batched over poses, in one launch (Kehl 2006, sections 5.2 and 5.3).
 
 A strip is a row of surface points of one superellipsoid along a circle of latitude or a meridian. Where n·v changes its
 sign along it, with n the normal and v the viewing ray, the contour passes (eq. 3). The camera is moved into the piece's
@@ -7,17 +7,17 @@ eq. 1), so with C the moved camera's centre
 
     t = n_d · v = n_d · (r − C) = 1 − n_d · C,
 
-and a strip needs no more than its angles and normals. Equation 5 as printed divides by t₁ + t₂, which have opposite
-signs: it extrapolates, and fails where they cancel. The linear interpolation that is meant takes their magnitudes,
+and a strip needs only its angles and normals. Equation 5 as printed divides by t₁ + t₂, which have opposite signs: it
+extrapolates, and fails where they cancel. Linear interpolation, which must be meant, takes their magnitudes,
 
     u_c = (u₁ |t₂| + u₂ |t₁|) / (|t₁| + |t₂|).
 
 A superellipsoid is convex: on a strip n_d · C crosses 1 at most once in each direction. Slot 0 of a strip is the
-crossing from the hidden to the visible side, slot 1 the one back, so the two points of a circle of latitude never swap.
-They are the pair symmetric about the limb's axis. On a meridian either may be there; each stands for itself.
+crossing from the hidden to the visible side, slot 1 the opposite one, so the two points of a circle of latitude never
+swap: they are a pair symmetric about the limb's axis. On a meridian either slot may be empty; the points are no pair.
 
-A pose that puts a point so far beside a picture that the lens model folds back cannot be told from one inside it;
-cameras that see the volume do not come near.
+A point so far outside an image that the lens model folds back is taken for a point inside; in cameras that see the
+whole volume no pose comes near this.
 """
 
 import functools
@@ -42,7 +42,7 @@ from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.superellipsoid import power
 from tk.kernels.vectors import times
 
-# Strips that one parallel task handles, each task with its own forward kinematics (some microseconds).
+# Strips of one parallel task. Each task has its own forward kinematics, some microseconds. Affects speed only.
 STRIPS_PER_TASK = 10
 
 FOUND, VISIBLE = 1, 2  # bits of a point's flags
@@ -87,13 +87,13 @@ def surface_normal(turns, radii, e1, e2):
 
 @ti.func
 def strip_piece(strips: ti.template(), s: int):
-    """The piece of strip s."""
+    """Return the piece of strip s."""
     return ti.cast(strips[s, strips.shape[1] - 1, 0], ti.i32)
 
 
 @ti.func
 def rim_crossings(strips: ti.template(), s: int, camera):  # (S, N + 1, 5), camera centre in the piece's frame
-    """Where strip s crosses the rim: (found₀, η₀, ω₀, found₁, η₁, ω₁), slots as in the module's docstring."""
+    """Return where strip s crosses the rim: (found₀, η₀, ω₀, found₁, η₁, ω₁), slots as in the module's docstring."""
     zero = camera[0] * 0.0
     result = ti.Vector([zero, zero, zero, zero, zero, zero])
     before = zero
@@ -113,7 +113,7 @@ def rim_crossings(strips: ti.template(), s: int, camera):  # (S, N + 1, 5), came
 
 @ti.func
 def rim_point(placed: ti.template(), c: int, pieces: ti.template(), i: int, eta, omega):
-    """A point of piece i: in the piece's frame, in the world, and its unit normal in the world."""
+    """Return a point of piece i in the piece's frame and in the world, and its unit normal in the world."""
     radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
     e1, e2 = pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4]
     R = load_placed_rotation(placed, c, i)
@@ -125,14 +125,14 @@ def rim_point(placed: ti.template(), c: int, pieces: ti.template(), i: int, eta,
 
 @ti.func
 def to_zero_configuration(pieces: ti.template(), i: int, q):
-    """A point of piece i from the piece's frame to the zero configuration, where it is a material point."""
+    """Transform a point from the frame of piece i to the zero configuration, where it is a material point."""
     R = ti.Matrix([[pieces[i, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
     return times(R, q) + ti.Vector([pieces[i, 4 * a + 3] for a in ti.static(range(3))])
 
 
 @ti.func
 def image_normal(J, n):
-    """Unit normal (2,) of the contour's image at a point of the rim; J (2, 3) the projection's derivative.
+    """Return the unit normal (2,) of the contour's image at a rim point; J (2, 3) is the projection's derivative.
 
     Normal to the images J s of all tangents s of the surface, lens distortion included: on the rim n is perpendicular
     to the viewing ray, which is J's null space, so Jᵀ m ∝ n has the solution m ∝ (J Jᵀ)⁻¹ J n.
@@ -213,15 +213,16 @@ def _contour_kernel(real):
 
 @dataclass(frozen=True)
 class ContourPoints:
-    """Contour points of B poses in C cameras on K strips, two slots each. What was not found is zero.
+    """Contour points of B poses in C cameras on K strips, two slots each. Values of points not found are zero.
 
     Attributes:
-        strip: (B, K) the strips; segment: (B, K) their body segments; paired: (B, K) whether the two slots are a pair
-            symmetric about the limb's axis (circles of latitude) or points of their own (meridians).
+        strip: (B, K) the strips.
+        segment: (B, K) their body segments.
+        paired: (B, K) True where the two slots are a pair symmetric about the limb's axis (circles of latitude).
         points_zero: (B, C, K, 2, 3) the points in the zero configuration, metres: they move with p as material points.
-        pixels: (B, C, K, 2, 2) their images (x, y), lens distortion included; they may lie outside the picture.
+        pixels: (B, C, K, 2, 2) their projections (x, y), lens distortion included; they may lie outside the image.
         normals: (B, C, K, 2, 2) unit normals of the contour in the image, outward.
-        scale: (B, C, K, 2) pixels a metre there.
+        scale: (B, C, K, 2) pixels per metre there.
         found: (B, C, K, 2) uint8, 1 where the strip crosses the rim in front of the camera.
         visible: (B, C, K, 2) uint8, 1 where found and not hidden by another piece.
     """
@@ -238,7 +239,7 @@ class ContourPoints:
 
     @property
     def occluded(self) -> np.ndarray:
-        """(B, C) contour points found and hidden: section 6.1.2 takes the three views with the fewest.
+        """(B, C) number of contour points that are hidden: section 6.1.2 takes the three views with the fewest.
 
         Where the paper is silent: a strip that a camera sees end-on has no contour and counts as neither.
         """
@@ -246,19 +247,23 @@ class ContourPoints:
 
 
 class ContourKernel:
-    """The contours of one body in a rig's cameras: constants and scratch are laid out once.
+    """The contours of one body in a rig's cameras. Constants and scratch are prepared once.
 
     Args:
         body: the body.
         strip_angles: (S, N, 2) η and ω along each strip, radians; a circle's last sample is its first.
         strip_normals: (S, N, 3) n_d of eq. 2 there, in the piece's frame, 1/m.
-        strip_piece: (S,) the piece of each strip; strip_segment: (S,) its segment.
+        strip_piece: (S,) the piece of each strip.
+        strip_segment: (S,) its segment.
         strip_paired: (S,) True for circles of latitude.
         cameras: (C, 22) rows of :func:`tk.kernels.projection.pack_camera`.
         dtype: np.float32, or np.float64 for checks.
 
     Attributes:
-        tree: (D, 11); pieces: (P, 20); strips: (S, N + 1, 5); cameras: (C, 22): the constants as kernels take them.
+        tree: (D, 11), packed for the kernels.
+        pieces: (P, 20).
+        strips: (S, N + 1, 5).
+        cameras: (C, 22).
     """
 
     def __init__(
@@ -294,7 +299,7 @@ class ContourKernel:
         self._scratch: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def scratch_of(self, tasks: int) -> tuple[np.ndarray, np.ndarray]:
-        """(T, D, 18) joints and (T, P, 20) placed pieces of T tasks; kept."""
+        """Return the scratch of T tasks: joints (T, D, 18) and placed pieces (T, P, 20)."""
         if tasks not in self._scratch:
             self._scratch[tasks] = (
                 np.empty((tasks, len(self.tree), JOINT_NUMBERS), self.dtype),
@@ -303,14 +308,14 @@ class ContourKernel:
         return self._scratch[tasks]
 
     def checked(self, chosen: np.ndarray) -> np.ndarray:
-        """Strips (B, K) as a kernel takes them; IndexError where there is no such strip."""
+        """Return strips (B, K) as the kernel takes them; IndexError if a strip does not exist."""
         chosen = np.ascontiguousarray(chosen, np.int32)
         if chosen.size and (chosen.min() < 0 or chosen.max() >= len(self.strips)):
             raise IndexError(f"strips {chosen.min()} to {chosen.max()}: there are 0 to {len(self.strips) - 1}")
         return chosen
 
     def __call__(self, pose: np.ndarray, chosen: np.ndarray) -> ContourPoints:
-        """Contour points of B poses in all C cameras, occlusion included; one launch.
+        """Return the contour points of B poses in all C cameras, occlusion included; one launch.
 
         Args:
             pose: (B, D).

@@ -1,18 +1,18 @@
-"""Which picture edges belong to the model's contour points (Kehl 2006, section 6.1.2). One launch for all lines.
+"""Assign image edges to the model's contour points (Kehl 2006, section 6.1.2). One launch for all lines.
 
 Two kinds of search, both along a straight line of pixels (Bresenham's: a pixel a step along the longer axis):
 
 pair
-    through two contour points symmetric about the limb's axis, and ``reach`` beyond each. Of all pairs of edges on it
-    the one with the least ``|length difference| / (s_a s_b)`` is taken (eq. 12), with the gradient score s of eq. 11.
+    through two contour points symmetric about the limb's axis, and ``reach`` beyond each. It takes the pair of edges
+    with the least ``|length difference| / (s_a s_b)`` (eq. 12), with the gradient score s of eq. 11.
 single
-    through one point along the contour's normal, the edge with the greatest score (eq. 14).
+    through one point along the contour's normal. It takes the edge with the greatest score (eq. 14).
 
-An edge is a pixel whose colour gradient (section 4.2) is at least ``threshold`` and the greatest along the line. The
-gradient is evaluated here, on demand.
+An edge is a pixel whose colour gradient (section 4.2) is at least ``threshold`` and a maximum along the line. The
+gradient is evaluated on demand.
 
-Where the paper is silent, or cannot be meant: equal lengths alone would win in eq. 12 with any gradient, as its
-numerator is 0 then; a length is known to about a pixel, so one pixel is added. Lines end at the picture's border.
+Departure from eq. 12: as printed, a pair of equal length wins with any gradient, because the numerator is 0. A length
+is exact to about a pixel, so one pixel is added. The paper is silent about the border: here lines end there.
 """
 
 import numpy as np
@@ -21,10 +21,10 @@ from tk.kernels.edges import EdgeSettings, rgb_gradient_at
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
 PAIR, SINGLE = 0, 1
-# Columns of a line: kind, camera, the pixels a and b (b = a unless PAIR), a's outward unit normal, b's, and how far
-# beyond the points edges are looked for, pixels.
+# Columns of a line: kind, camera, the pixels a and b (b = a unless PAIR), the outward unit normals at a and b, and the
+# reach of the search beyond the points, pixels.
 LINE_NUMBERS = 11
-# Edges kept along one line. More are met on clutter only; the first are kept.
+# Maximum number of edges of one line; the first are used. Only clutter has more.
 MOST_EDGES = 24
 
 
@@ -113,15 +113,15 @@ def search_edges(
     threshold: float,
     config: EdgeSettings,
 ) -> np.ndarray:
-    """The edges assigned to R lines.
+    """Return the edges assigned to R lines.
 
     Args:
         images: (C, H, W, 3) uint8 BGR.
-        sizes: (C, 2) int32 height and width of each picture in its zero-padded place.
+        sizes: (C, 2) int32 height and width of each image within its zero padding.
         lines: (R, 11) float32: kind, camera, pixel a (x, y), pixel b, outward unit normal at a, at b, reach
             in pixels.
-        threshold: least colour gradient, 0…1, along the line.
-        config: of the colour gradient.
+        threshold: minimum colour gradient of an edge, 0…1, along the line.
+        config: settings of the colour gradient.
 
     Returns:
         (R, 5) float32: 1 if found, pixel (x, y) of a's edge, of b's.

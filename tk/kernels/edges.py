@@ -1,4 +1,4 @@
-"""Edges of colour pictures: Euclidean distance and vector angle, mixed by intensity (Kehl 2006, section 4.2).
+"""Edges of colour images: Euclidean distance and vector angle, mixed by intensity (Kehl 2006, section 4.2).
 
 A shadow or a wrinkle scales a colour and leaves its direction in colour space; a change of material turns it. So the
 distance of two pixels ``a``, ``b`` is ::
@@ -8,21 +8,22 @@ distance of two pixels ``a``, ``b`` is ::
     ED      = |a - b| / (255 √3)
     w       = angle_share · s(mean of a) · s(mean of b),   s(i) = 1 / (1 + exp(-intensity_slope (i - intensity_offset)))
 
-and runs from 0 to 1. The vector angle counts only where both pixels are bright: in the dark it is noise. Intensity is
-the mean of the channels, as in the paper, which gives no formula for the weight; a sigmoid on each pixel is what its
-reference has (Wesolkowski & Jernigan 1999). The angle θ enters by the chord ``|â - b̂| = 2 sin(θ/2)``: monotonic, and no
-arc cosine. Angles between the things in a room are small (10° between skin and a pale wall), hence the scale; and a
-share of the Euclidean distance stays at any brightness, or a white sleeve before a grey wall would have no edge.
+with values from 0 to 1. The vector angle counts only where both pixels are bright: in the dark it is noise. Intensity
+is the mean of the channels, as in the paper. The paper gives no formula for the weight; the sigmoid on each pixel is
+from its reference (Wesolkowski & Jernigan 1999). The angle θ enters by the chord ``|â - b̂| = 2 sin(θ/2)``, which is
+monotonic and needs no arc cosine. Angles between materials in a room are small (10° between skin and a pale wall),
+hence the scale. A share of the Euclidean distance remains at any brightness, or a white sleeve in front of a grey wall
+would have no edge.
 
 The gradient at a pixel is the greatest distance over the four opposite pairs of its 3×3 window (difference vector
-operator). The paper needs its direction (eq. 11) and does not say how to find it; the best of four pairs is good to 22°
-at most. Here each pair's difference is projected on the difference of the winning pair, which makes signed numbers of
-vectors, and these are put together like Scharr's derivative. The direction is that of the greatest change, across
-the edge, towards the brighter side. Where both sides are as bright as each other the sign is arbitrary: compare
-directions by the absolute value of their dot product.
+operator). The paper needs its direction (eq. 11) and is silent about its computation; the best of four pairs is exact
+to 22° only. Here each pair's difference is projected on the difference of the winning pair, which turns vectors into
+signed numbers, and these are combined as in Scharr's derivative. The direction points across the edge, towards the
+brighter side. Where both sides are equally bright the sign is arbitrary: compare directions by the absolute value of
+their dot product.
 
-:func:`rgb_gradient_at` is for other kernels, which evaluate it along their search lines only; whole pictures, for
-looking at, are in scripts/paper/edge_maps.py.
+Other kernels evaluate :func:`rgb_gradient_at` along their search lines only; scripts/paper/edge_maps.py draws whole
+images.
 """
 
 import math
@@ -34,16 +35,16 @@ from tk.kernels.runtime import ti
 
 @dataclass(frozen=True)
 class EdgeSettings:
-    """What makes a colour edge. The paper tuned its own by hand for each camera and prints none of them.
+    """Parameters of the colour gradient. The paper tuned them by hand for each camera and prints none of them.
 
     The defaults were chosen with ``scripts/figure4_edges.py`` (two rendered captures): little clutter at equal recall
     of the person's outline.
 
     Attributes:
         intensity_offset: mean of the channels, 0…255, at which a pixel's sigmoid is one half.
-        intensity_slope: of the sigmoid, per level.
-        full_angle_rad: angle between two colours that counts as much as the step from black to white.
-        angle_share: weight of the angle between two bright pixels; 0 leaves the Euclidean distance alone.
+        intensity_slope: slope of the sigmoid, per level.
+        full_angle_rad: angle between two colours that weighs as much as the step from black to white.
+        angle_share: weight of the angle between two bright pixels; at 0 only the Euclidean distance counts.
 
     Raises:
         ConfigError: a value is out of range.
@@ -76,7 +77,7 @@ class EdgeSettings:
 
 
 _ED_SCALE = 1 / (255 * math.sqrt(3))
-_AXIS_WEIGHT = 10 / 3  # of a pair on an axis against one on a diagonal: Scharr's operator
+_AXIS_WEIGHT = 10 / 3  # weight of a pair on an axis relative to a pair on a diagonal: Scharr's operator
 _TINY = 1e-12
 
 
@@ -91,16 +92,16 @@ def rgb_gradient_at(
     c: ti.i32,
     y: ti.i32,
     x: ti.i32,
-    height: ti.i32,  # of camera c's own picture
+    height: ti.i32,  # of camera c's own image
     width: ti.i32,
     intensity_offset: ti.f32,
     intensity_slope: ti.f32,
     angle_scale: ti.f32,
     angle_share: ti.f32,
 ):
-    """(magnitude, dx, dy) of the colour gradient at pixel (y, x) of picture c; see the module.
+    """Return (magnitude, dx, dy) of the colour gradient at pixel (y, x) of image c; see the module.
 
-    The pixel must lie in the picture; beyond its border the picture is continued by its last row or column. (dx, dy) is
+    The pixel must lie in the image, which is continued beyond its border by its last row or column. (dx, dy) is
     a unit vector, (1, 0) where the magnitude is 0. The last four arguments are :attr:`EdgeSettings.constants`.
     """
     magnitude = ti.f32(-1.0)
@@ -121,7 +122,7 @@ def rgb_gradient_at(
             (1 + ti.exp(intensity_slope * (intensity_offset - mean_a)))
             * (1 + ti.exp(intensity_slope * (intensity_offset - mean_b)))
         )
-        # black has no direction; its weight is next to nothing, so any will do
+        # black has no direction; its weight is almost zero, so the direction does not matter
         angle = weight * angle_scale * (b / ti.max(b.norm(), 1.0) - a / ti.max(a.norm(), 1.0))
         euclidean = (1 - weight) * _ED_SCALE * (b - a)
         distance = ti.min(angle.norm(), weight) + euclidean.norm()

@@ -1,22 +1,22 @@
 """Visual hull kernels: carving by per-pixel look-up lists, surface voxels, their normals and colours.
 
-Kehl & Van Gool 2006, section 4.1. Where the paper gives each voxel a mask with a bit a camera, the same bits lie here
-in planes, one bit a voxel, packed along z into words of 32: voxel (x, y, z) is bit ``z % 32`` of word
-``(x * ny + y) * nw + z // 32`` with nw = ceil(nz / 32). W = nx * ny * nw words make a plane; a voxel's "place" in it is
+Kehl & Van Gool 2006, section 4.1. The paper gives each voxel a mask with one bit per camera. Here the same bits are
+stored in planes, one bit per voxel, packed along z into words of 32: voxel (x, y, z) is bit ``z % 32`` of word
+``(x * ny + y) * nw + z // 32`` with nw = ceil(nz / 32). A plane has W = nx * ny * nw words; a voxel's "place" in it is
 32 times its word plus its bit.
 
-Masks enter as int64 words, eight pixels at a time (little-endian, as all platforms are that Taichi runs on), M words a
-picture. The look-up lists are kept for such words: a word's list holds the voxels that project to its pixels, each as
-``place << 3 | pixel % 8``. So finding what changed, and what to do about it, both go eight pixels at a time.
+Masks enter as int64 words of eight pixels (little-endian, like all platforms of Taichi), M words an image. Each word
+has a look-up list of the voxels that project to its pixels, stored as ``place << 3 | pixel % 8``. So changes are found
+and applied eight pixels at a time.
 
 ``planes`` (2C, W) uint32
     Rows 2c and 2c + 1 together are camera c's bits: set where the camera does not carve the voxel, because its pixel is
-    foreground or it lies outside the picture. Two threads work on a camera, each on every other stretch of its pixels
-    and each in its own row; so nothing is shared, no atomics are needed, and a plane stays in the processor's cache.
+    foreground or it lies outside the image. Two threads work on a camera, each on every other stretch of its pixels and
+    each in its own row. So no memory is shared, no atomics are needed, and a plane stays in the processor's cache.
 ``occupied`` (W,) uint32
-    The active voxels: all cameras' planes anded. Surface and visibility read only this.
+    The active voxels: the bitwise and of all cameras. Surface and visibility read only this.
 
-All of it is integers: results are exact and do not depend on the order in which threads work.
+All values are integers: results are exact and do not depend on the order of the threads.
 """
 
 import numpy as np
@@ -37,30 +37,30 @@ __all__ = [
     "words_per_column",
 ]
 
-SHARES = 2  # tasks, and planes, a camera
-_STRETCH = 128  # mask words, 1024 pixels, that fall to one thread before it is the other's turn
+SHARES = 2  # tasks, and planes, per camera; affects speed only
+_STRETCH = 128  # mask words, 1024 pixels, of one thread before the other's turn; affects speed only
 _WINDOW = 2  # normals come from the voxels within a ball around a voxel: half width of its box ...
 _BALL = 6  # ... and squared radius, both in voxels
-_FRONTAL = 0.1  # cosine below which a camera sees a surface only at a grazing angle, that is, not truly
-_LIFT = 1.25  # voxels by which a line of sight starts off the surface, so that its own neighbours do not block it
+_FRONTAL = 0.1  # cosine (84°) below which a camera sees a surface at a grazing angle and gives it no colour; chosen
+_LIFT = 1.25  # voxels between the surface and a line of sight's start, so that neighbours do not block it; chosen
 
 
 # --- layout ------------------------------------------------------------------------------------------------------
 
 
 def words_per_column(nz: int) -> int:
-    """Words that hold a column of voxels along z."""
+    """Return the number of words of a column of voxels along z."""
     return (nz + 31) // 32
 
 
 def places(voxels: NDArray[np.int32], nz: int) -> NDArray[np.int32]:
-    """Places in a packed plane of voxels given by flat index (z fastest)."""
+    """Return the places in a packed plane of voxels given by flat index (z fastest)."""
     gap = 32 * words_per_column(nz) - nz
     return voxels if gap == 0 else voxels + voxels // np.int32(nz) * np.int32(gap)
 
 
 def pack(flags: NDArray[np.bool_]) -> NDArray[np.uint32]:
-    """(nx, ny, nz) bool to a plane (W,) uint32."""
+    """Pack (nx, ny, nz) bool into a plane (W,) uint32."""
     nx, ny, nz = flags.shape
     padded = np.zeros((nx, ny, 32 * words_per_column(nz)), dtype=np.bool_)
     padded[:, :, :nz] = flags
@@ -68,7 +68,7 @@ def pack(flags: NDArray[np.bool_]) -> NDArray[np.uint32]:
 
 
 def unpack(plane: NDArray[np.uint32], shape: tuple[int, int, int]) -> NDArray[np.bool_]:
-    """A plane (W,) uint32 to (nx, ny, nz) bool."""
+    """Unpack a plane (W,) uint32 into (nx, ny, nz) bool."""
     octets = np.ascontiguousarray(plane).view(np.uint8).reshape(shape[0], shape[1], -1)
     return np.unpackbits(octets, axis=-1, count=shape[2], bitorder="little").view(np.bool_)
 
@@ -93,11 +93,11 @@ def _sort_kernel(
 
 
 def look_up_lists(pixels: NDArray[np.int32], mask_words: int, nz: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Turn the voxels' pixels into the pixels' voxels, in compressed rows of eight pixels.
+    """Convert the voxels' pixels to the pixels' voxels, in compressed rows of eight pixels.
 
     Args:
-        pixels: (C, V) int32, the pixel each voxel's centre falls on in each camera; -1 outside the picture.
-        mask_words: M, words of eight pixels in a picture.
+        pixels: (C, V) int32, the pixel of each voxel's centre in each camera; -1 outside the image.
+        mask_words: M, words of eight pixels in an image.
         nz: voxels along z.
 
     Returns:
@@ -121,7 +121,7 @@ def look_up_lists(pixels: NDArray[np.int32], mask_words: int, nz: int) -> tuple[
 
 @ti.func
 def _foreground(word: ti.i64) -> ti.i64:
-    """The lowest bit of each byte set where the byte is not zero."""
+    """Return a word with the lowest bit of each byte set where the byte is not zero."""
     low = (ti.i64(0x7F7F7F7F) << 32) | ti.i64(0x7F7F7F7F)
     return ((((word & low) + low) | word) >> 7) & ((ti.i64(0x01010101) << 32) | ti.i64(0x01010101))
 
@@ -138,7 +138,7 @@ def _carve_kernel(
     planes: ti.types.ndarray(dtype=ti.u32, ndim=1),  # (2C * W,) in and out
     occupied: ti.types.ndarray(dtype=ti.u32, ndim=1),  # (W,) out
 ):
-    # arrays are flat here: the shape of another would be read again at every access
+    # flat arrays: the shape of a two-dimensional array would be read at every access
     mask_words = current.shape[0] // cameras
     plane_words = enough.shape[0]
     stretches = (mask_words + SHARES * _STRETCH - 1) // (SHARES * _STRETCH)
@@ -160,7 +160,7 @@ def _carve_kernel(
                         entry = entries[k]
                         flip = ti.cast(changed >> ((entry & 7) << 3), ti.u32) & ti.u32(1)
                         at = plane + (entry >> 8)
-                        # not ^=, which Taichi makes an atomic operation, four times as slow
+                        # not ^=: Taichi's atomic operation takes four times as long
                         planes[at] = planes[at] ^ (flip << ti.cast((entry >> 3) & 31, ti.u32))
     for w in range(plane_words):
         active = enough[w]
@@ -183,15 +183,15 @@ def carve(
     planes: NDArray[np.uint32],
     occupied: NDArray[np.uint32],
 ) -> None:
-    """Bring ``planes``, ``occupied`` and ``previous`` from the masks ``previous`` to the masks ``current``, in place.
+    """Update ``planes``, ``occupied`` and ``previous`` in place from the masks ``previous`` to the masks ``current``.
 
-    Only the lists of words in which a pixel changed are visited. A pixel is background where 0, else foreground. From
-    scratch is the same with ``previous`` zero and ``planes`` as no foreground at all leaves them: row 2c has the voxels
-    outside camera c's picture, row 2c + 1 nothing.
+    Only the lists of words with a changed pixel are visited. A pixel is background where 0, else foreground. To carve
+    from scratch, ``previous`` is zero and ``planes`` have no foreground: row 2c has the voxels outside camera c's
+    image, row 2c + 1 is empty.
 
     Args:
         row_offsets, entries: the look-up lists of :func:`look_up_lists`.
-        enough: (W,) uint32, the voxels that may be active at all.
+        enough: (W,) uint32, the voxels in enough images to be active.
         current, previous: (C, M) int64, each camera's mask (H * W,) uint8, zero-padded to whole words.
         planes: (2C, W) uint32.
         occupied: (W,) uint32.
@@ -203,8 +203,7 @@ def carve(
 
 
 def missing_at_most_one(planes: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """(W,) the voxels that at most one camera carves, from ``planes`` (2C, W): bitwise, all voxels of a word at
-    once."""
+    """Return the voxels (W,) that at most one camera carves, from ``planes`` (2C, W)."""
     once = np.zeros(planes.shape[1], np.uint32)
     twice = np.zeros(planes.shape[1], np.uint32)
     for shares in planes.reshape(-1, SHARES, planes.shape[1]):
@@ -266,12 +265,12 @@ def _surface_kernel(
 def surface_voxels(
     occupied: NDArray[np.uint32], shape: tuple[int, int, int], found: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Active voxels with at least one inactive neighbour of six; outside the grid counts as inactive.
+    """Return the active voxels with at least one inactive neighbour of six; outside the grid counts as inactive.
 
     Args:
         occupied: (W,) uint32.
         shape: (nx, ny, nz).
-        found: (V,) int32, scratch space that the caller keeps from frame to frame.
+        found: (V,) int32, scratch that the caller reuses.
 
     Returns:
         voxels (N,) int32, flat and ascending, and box (2, 3) int32: lowest and highest index along x, y, z.
@@ -292,7 +291,7 @@ def surface_voxels(
 
 @ti.func
 def _is_occupied(occupied: ti.template(), x: ti.i32, y: ti.i32, z: ti.i32, nz: ti.i32) -> ti.i32:
-    """1 where the voxel is active, 0 where it is not or lies outside the grid."""
+    """Return 1 if the voxel is active, 0 if it is inactive or outside the grid."""
     result = ti.u32(0)
     if 0 <= x < occupied.shape[0] and 0 <= y < occupied.shape[1] and 0 <= z < nz:
         result = (occupied[x, y, z >> 5] >> ti.cast(z & 31, ti.u32)) & ti.u32(1)
@@ -301,7 +300,7 @@ def _is_occupied(occupied: ti.template(), x: ti.i32, y: ti.i32, z: ti.i32, nz: t
 
 @ti.func
 def _outward(occupied: ti.template(), x: ti.i32, y: ti.i32, z: ti.i32, nz: ti.i32) -> ti.math.vec3:
-    """Unit vector from the centroid of the active voxels in a ball to its centre; zero where they coincide."""
+    """Return the unit vector from the centroid of the active voxels in a ball to its centre; zero if they coincide."""
     moment = ti.Vector([0, 0, 0])
     for dx in range(-_WINDOW, _WINDOW + 1):
         for dy in range(-_WINDOW, _WINDOW + 1):
@@ -319,9 +318,9 @@ def _outward(occupied: ti.template(), x: ti.i32, y: ti.i32, z: ti.i32, nz: ti.i3
 def _in_sight(
     occupied: ti.template(), start: ti.math.vec3, view: ti.math.vec3, box: ti.template(), nz: ti.i32
 ) -> ti.i32:
-    """1 where no active voxel lies on the way from ``start`` along the unit vector ``view`` until out of the box.
+    """Return 1 if no active voxel lies on the line from ``start`` along the unit vector ``view`` within the box.
 
-    The line is sampled where it crosses the layers of its dominant axis; all in voxels.
+    The line is sampled where it crosses the layers of its dominant axis. All in voxels.
     """
     step = view / ti.abs(view).max()
     layers = ti.f32(1e9)
@@ -409,20 +408,20 @@ def shade_surface(
     voxels: NDArray[np.int32],
     box: NDArray[np.int32],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
-    """Normals and colours of surface voxels, and the cameras that truly see them.
+    """Return normals and colours of surface voxels, and the cameras that see them.
 
-    A camera truly sees a voxel if it lies in the picture, its surface faces the camera, and no active voxel stands
-    between the two. Colours are averages over such cameras, weighted by the squared cosine between normal and line of
-    sight. The paper (section 4.1) leaves texturing to its reference [19]; this is ours.
+    A camera sees a voxel if it lies in the image, its surface faces the camera, and no active voxel hides it. Colours
+    are averages over such cameras, weighted by the squared cosine between normal and line of sight. (The paper, section
+    4.1, refers to its reference [19] for texturing; this method is not from there.)
 
     Args:
         occupied: (W,) uint32.
         shape: (nx, ny, nz).
-        pixels: (V, C) int32, pixel of each voxel in each camera, -1 outside the picture.
+        pixels: (V, C) int32, pixel of each voxel in each camera, -1 outside the image.
         eyes: (C, 3) float32, centres of projection in voxels: the centre of voxel (0, 0, 0) is the origin.
-        spacing: (C,) int32, pixels between the three by three samples that make up a voxel's colour.
+        spacing: (C,) int32, pixels between the three by three samples of a voxel's colour.
         images: (C, H, W, 3) uint8, or None for no colours.
-        masks: (C, at least H * W) uint8; only foreground pixels lend their colour.
+        masks: (C, at least H * W) uint8; only foreground pixels count.
         voxels: (N,) int32 flat indices.
         box: (2, 3) int32 from :func:`surface_voxels`.
 

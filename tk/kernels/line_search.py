@@ -1,4 +1,4 @@
-"""Along a contour's normal line: where the silhouette's edge lies on it, or the border between colours.
+"""Search along a contour's normal line for the silhouette's edge or for the border between two colours.
 
 The silhouette paper, sections 4.1 and 4.4; region-based tracking (Stoiber et al. 2022, SRT3D).
 """
@@ -12,33 +12,35 @@ from numpy.typing import NDArray
 from tk.errors import ConfigError
 from tk.kernels.runtime import ti
 
-# Colours are told apart by 16 levels of each channel.
+# Colour bins: 16 levels of each channel.
 COLOR_BINS = 4096
-# A pixel says no more than this about which of two parts it shows: models are never that sure.
+# Maximum log likelihood ratio of one pixel (a factor of 20): colour models are not more certain. Chosen; sensitivity
+# not measured.
 _MOST_LOG_RATIO = 3.0
-# Neighbouring pixels of a line are alike (texture, blur, coding): so many of them count as one.
+# Neighbouring pixels of a line are correlated (texture, blur, coding): this many count as one. Chosen; sensitivity not
+# measured. At 1 the border's certainty is overestimated.
 _ALIKE_PIXELS = 3.0
 
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """How the silhouette is searched.
+    """Settings of the search along normals.
 
     Attributes:
-        window_px: how far along the normal, in pixels of the scale (the paper: typically 8).
-        spacing_px: distance between samples, in pixels of the scale (the paper: typically every pixel; three are as
-            good to a millimetre and take a third of the time).
-        most_samples: of a curve; longer ones are sampled more coarsely, with more weight each.
+        window_px: search range along the normal, in pixels of the scale (the paper: typically 8).
+        spacing_px: distance between samples, in pixels of the scale (the paper: typically every pixel; with three,
+            joints differ by less than a millimetre, in a third of the time).
+        most_samples: maximum number of samples of a curve; longer curves have wider spacing and more weight a sample.
         ambiguous_px: an edgel nearer than this, in pixels of the scale, to a model edge of another limb is shared with
-            it (4.4); 0 gives every edgel its full weight. The paper does not say how near; 8, its window, suits.
+            it (4.4); at 0 every edgel has its full weight. The paper gives no distance; 8 is its window.
         tangential: weight of the row along the contour (1: the paper's dx and dy; 0: the distance along the normal).
-        robust_px: where the Geman-McClure weights (1 + (d/s)²)⁻² have fallen to a quarter, in pixels of the scale; 0:
-            the paper's least squares, which shadows at the feet pull at. 8, the window, was chosen with the treadmill
-            and dance captures in view.
-        lost_px: what a sample costs, as a distance, that finds no edge. Only poses are compared by it.
-        interior: whether contours before another part are searched, too, as in the paper. No silhouette edge is
-            expected there, and most of what they find belongs to others: sharing ambiguous edgels (4.4) mends part of
-            that, leaving the contours out mends more, and there is little left to share.
+        robust_px: distance at which the Geman-McClure weights (1 + (d/s)²)⁻² are a quarter, in pixels of the scale; 0:
+            the paper's least squares, which shadows at the feet distort. 8, the window, was chosen on the treadmill and
+            dance captures.
+        lost_px: cost, as a distance, of a sample without an edge. It only affects the comparison of poses.
+        interior: whether contours in front of another part are searched, too, as in the paper. No silhouette edge is
+            expected there, and most edges found belong to other contours. Sharing ambiguous edgels (4.4) corrects this
+            in part; excluding these contours corrects more.
 
     Raises:
         ConfigError: a value is out of range.
@@ -68,14 +70,13 @@ class SearchSettings:
 
 
 class Regions(NamedTuple):
-    """What the colours on either side of a contour tell where it lies before another part (region-based tracking,
-    Stoiber et al. 2022, SRT3D).
+    """Colours on either side of contours in front of another part (region-based tracking, Stoiber et al. 2022, SRT3D).
 
     Attributes:
-        image: (V, H, W, 3) uint8 BGR, the full picture.
+        image: (V, H, W, 3) uint8 BGR, the full image.
         log_likelihood: (G, :data:`COLOR_BINS`) float32 log p(colour | group), see :func:`color_bin`.
         group: (P,) int32 the colour group of each part.
-        weight: of a contour whose place the colours tell exactly, beside that of a silhouette's edge.
+        weight: weight of a contour with an exact colour border, relative to a silhouette's edge.
     """
 
     image: NDArray[np.uint8]
@@ -86,7 +87,7 @@ class Regions(NamedTuple):
 
 @ti.func
 def bilinear(mask: ti.template(), v: int, width: int, height: int, x):
-    """Mask value, 0 to 255, at a place inside the picture."""
+    """Return the mask value, 0 to 255, at a place inside the image."""
     i = ti.min(ti.max(ti.cast(ti.floor(x[0]), ti.i32), 0), width - 2)
     j = ti.min(ti.max(ti.cast(ti.floor(x[1]), ti.i32), 0), height - 2)
     s, t = x[0] - i, x[1] - j
@@ -102,24 +103,24 @@ def in_picture(width: int, height: int, x):
 
 @ti.func
 def search_mask(mask: ti.template(), v: int, width: int, height: int, x, n, window):
-    """(found, signed distance) of the transition along ±n: outwards from foreground, inwards from background."""
+    """Return (found, signed distance) of the transition along ±n: outwards from foreground, inwards from background."""
     inside = bilinear(mask, v, width, height, x) >= 127.5
-    way = 1.0 + 0.0 * window
+    direction = 1.0 + 0.0 * window
     if not inside:
-        way = -way
+        direction = -direction
     found = 0
     distance = 0.0 * window
     before = bilinear(mask, v, width, height, x)
     step = 1
     while step <= window and found == 0:
-        place = x + way * step * n
+        place = x + direction * step * n
         if not in_picture(width, height, place):
             step = 1 << 20
         else:
             value = bilinear(mask, v, width, height, place)
             if (value >= 127.5) != inside:
                 found = 1
-                distance = way * (step - 1.0 + (before - 127.5) / (before - value))
+                distance = direction * (step - 1.0 + (before - 127.5) / (before - value))
             before = value
             step += 1
     return found, distance
@@ -127,7 +128,7 @@ def search_mask(mask: ti.template(), v: int, width: int, height: int, x, n, wind
 
 @ti.func
 def color_bin(image: ti.template(), v: int, j: int, i: int):
-    """The bin of a pixel's colour: its blue, green and red in 16 levels each."""
+    """Return the bin of a pixel's colour: blue, green and red in 16 levels each."""
     b, g, r = ti.cast(image[v, j, i, 0], ti.i32), ti.cast(image[v, j, i, 1], ti.i32), ti.cast(image[v, j, i, 2], ti.i32)
     return ((b >> 4) << 8) | ((g >> 4) << 4) | (r >> 4)
 
@@ -136,10 +137,11 @@ def color_bin(image: ti.template(), v: int, j: int, i: int):
 def search_colors(
     image: ti.template(), likelihood: ti.template(), v: int, width: int, height: int, x, n, window, scale, front, back
 ):
-    """(certainty in [0, 1], mean place) of the border between two colour groups on the line x + s n.
+    """Return (certainty in [0, 1], mean place) of the border between two colour groups on the line x + s n.
 
-    The border lies behind step d with probability ∝ exp of the summed log ratios of the pixels before it (Stoiber et
-    al. 2022, eqs. 3-8 with a hard step); its mean is the Newton step, its variance beside a uniform one's the weight.
+    The border lies behind step d with a probability proportional to the exponential of the summed log ratios of the
+    pixels before it (Stoiber et al. 2022, eqs. 3-8 with a hard step). Its mean is the Newton step; its variance,
+    relative to a uniform distribution's, gives the weight.
     """
     log_sum = 0.0 * window
     total, first, second = 1.0 + 0.0 * window, -(window + 0.5), (window + 0.5) ** 2

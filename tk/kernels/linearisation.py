@@ -1,4 +1,4 @@
-"""What the objective's kernel says of one pose beside its value: pairs and the Gauss-Newton Hessian."""
+"""The objective's pairs and Gauss-Newton Hessian at one pose."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ class Linearisation:
 
     Attributes:
         residual: (K, 3) x − x̄, metres; zero where a pair is missing.
-        hessian: (D, D) Gauss-Newton Hessian of f, outliers weighing at least the floor asked for.
+        hessian: (D, D) Gauss-Newton Hessian of f; outliers weigh at least the given floor.
         partner: (K,) the voxel, -1 where missing.
         inv_sigma2: (K,) 1/σ², 1/m².
     """

@@ -1,8 +1,8 @@
 """Colour-constrained nearest neighbours among the hull's surface voxels (Kehl 2006, sections 6.1.1 and 6.1.3).
 
 The voxels are sorted into cubic cells once a frame. A query visits the cells ring by ring around its own and stops when
-nothing nearer can follow: some hundred candidates instead of all (the paper searches all that fit the colour).
-A voxel is a candidate when its bit of the query's colour patch is set.
+no nearer voxel can follow: about a hundred candidates (the paper searches all voxels of the colour). A voxel is a
+candidate if its bit of the query's colour patch is set.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ class SurfaceIndex:
         fits: (V,) int64, bit p set where the voxel's colour fits patch p.
         starts: (G0·G1·G2 + 1,) int32, first voxel of each cell.
         grid: (7,) float32, lower corner of cell 0 and edge of a cell (metres), cells along each axis.
-        order: (V,) the voxels' places in the arrays given to :meth:`build`.
+        order: (V,) the voxels' indices in the arrays given to :meth:`build`.
     """
 
     positions: np.ndarray
@@ -53,7 +53,7 @@ class SurfaceIndex:
 
 @ti.func
 def _gap(cell: int, at: ti.f32):
-    """How far a coordinate is from the cell, in cells; 0 inside."""
+    """Return the distance of a coordinate from the cell, in cells; 0 inside."""
     return ti.max(ti.max(cell - at, at - cell - 1.0), 0.0)
 
 
@@ -68,7 +68,7 @@ def nearest_voxel(
     patch: int,
     reach: ti.f32,
 ):
-    """Index of the nearest candidate within ``reach`` metres, or -1."""
+    """Return the index of the nearest candidate within ``reach`` metres, or -1."""
     best = -1
     best_d2 = reach * reach
     cell_m = ti.cast(grid[first + 3], ti.f32)
@@ -93,12 +93,12 @@ def nearest_voxel(
                 # a column of cells is one run of voxels; of an inner column the ring has its two ends only
                 whole = ring == 0 or ti.abs(i - home[0]) == ring or ti.abs(j - home[1]) == ring
                 column = (i * cells[1] + j) * cells[2]
-                aside = _gap(i, local[0]) ** 2 + _gap(j, local[1]) ** 2
+                across = _gap(i, local[0]) ** 2 + _gap(j, local[1]) ** 2
                 for run in range(ti.select(whole, 1, 2)):
                     k0 = ti.max(ti.select(run == 0, low, high), 0)
                     k1 = ti.min(ti.select(whole or run == 1, high, low), cells[2] - 1)
                     away = ti.select(whole, 0.0, ti.min(_gap(low, local[2]), _gap(high, local[2])))
-                    if k0 <= k1 and (aside + away * away) * nearly_cell2 < best_d2:
+                    if k0 <= k1 and (across + away * away) * nearly_cell2 < best_d2:
                         for v in range(starts[column + k0], starts[column + k1 + 1]):
                             if (fits[v] >> patch) & 1 == 1:
                                 d2 = (ti.Vector([voxels[v, a] for a in ti.static(range(3))]) - point).norm_sqr()

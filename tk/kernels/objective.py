@@ -1,4 +1,4 @@
-"""The objective f(p), its gradient and Gauss-Newton products, batched over poses: one launch an evaluation.
+"""The objective f(p), its gradient and Gauss-Newton products, batched over poses, in one launch (Kehl 2006, 6.1).
 
 Three terms share one form, ρ(e) = 1 − exp(−e / ν) with e = ½ (‖x − x̄‖ / σ)² (Kehl 2006, eqs. 8-10):
 
@@ -6,12 +6,12 @@ surface
     model to data: a surface sample x and its nearest surface voxel x̄, which fits x's colour patch (6.1.1, 6.1.3).
 coverage
     data to model: a surface voxel x̄ and the nearest point x of the nearest superellipsoid that has the voxel's colour
-    on it. Not in the paper: it keeps a limb from hiding inside the trunk, where every sample of it still finds a voxel.
+    on it. Not in the paper: a limb inside the trunk still finds a voxel for every sample; this term pulls it out.
 alignment
-    model contour to picture: entries made beforehand, see :mod:`tk.kernels.alignment` (6.1.2).
+    model contour to image: entries made before the launch, see :mod:`tk.kernels.alignment` (6.1.2).
 
-No two parts of a body are in one place: a sample deep inside a part that it may not enter finds no voxel. Without this,
-upper arms fold into the trunk, whose surface fits them, and a leg that the hull has lost goes to the other one.
+Parts of a body do not penetrate each other: a sample deep inside a part that it may not enter finds no voxel. Without
+this, upper arms fold into the trunk, whose surface fits them, and a leg missing from the hull moves to the other leg.
 
 Where the paper is silent: a sample without any candidate within reach counts as an outlier (ρ = 1, no gradient), and
 the Hessian of eq. 19 is approximated, as Schraudolph does, by the positive semi-definite part Σ ρ'(e)/σ² JᵀJ.
@@ -24,7 +24,6 @@ import numpy as np
 
 from tk.kernels.alignment import ENTRY_NUMBERS, add_alignment, add_curvature
 from tk.kernels.kinematics import forward_tree, load_rotation, load_translation
-from tk.kernels.launch import Launcher
 from tk.kernels.linearisation import Linearisation
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective_pairs import (
@@ -38,6 +37,7 @@ from tk.kernels.objective_pairs import (
 from tk.kernels.piece_arrays import PieceArrays
 from tk.kernels.projection import CAMERA_NUMBERS
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
+from tk.kernels.taichi_internals import Launcher
 from tk.kernels.vectors import norm_sqr, times
 from tk.kernels.wrench import (
     SCRATCH_NUMBERS,
@@ -48,9 +48,9 @@ from tk.kernels.wrench import (
     start_wrenches,
 )
 
-# Points that one parallel task handles: few enough to share 310 points among threads, and a chain's 50 in one; many
-# enough that each task's own forward kinematics (some µs) stays in the noise. An entry of the alignment term, of which
-# many are absent, counts a quarter.
+# Points of one parallel task, and entries of the alignment term that count as one point (many are absent): 310 points
+# of a pose are shared among threads, the 50 of a chain are not, and each task's own forward kinematics (some µs) stays
+# small. Affects speed and the order of sums only.
 POINTS_PER_TASK = 52
 ENTRIES_PER_POINT = 4
 
@@ -113,7 +113,8 @@ def _objective_kernel(real):
     return objective
 
 
-# Fewer and longer tasks: each hands its inertias down the tree.
+# Pairs of one parallel task of the linearisation: fewer and longer tasks, because each passes its inertias down the
+# tree. Affects speed and the order of sums only.
 PAIRS_PER_TASK = 256
 
 
@@ -177,10 +178,11 @@ class ObjectiveParameters:
 
     Attributes:
         nu: Leclerc's ν of the surface term, in units of ½ (d/σ)².
-        reach_m: greatest distance at which a voxel is looked for.
-        coverage_weight: w_c of the coverage term beside the surface term's 1; 0 leaves it out, as the paper does.
-        coverage_nu, coverage_reach_m: the same for the coverage term.
-        surface_weight: w_s of eq. 8; 0 leaves the surface term out.
+        reach_m: search radius of a sample for its voxel, metres.
+        coverage_weight: w_c of the coverage term; 0 removes it, as in the paper.
+        coverage_nu: ν of the coverage term.
+        coverage_reach_m: search radius of a voxel for the body, metres.
+        surface_weight: w_s of eq. 8; 0 removes the surface term.
     """
 
     nu: float = 0.35
@@ -193,24 +195,31 @@ class ObjectiveParameters:
 
 @dataclass(frozen=True)
 class Held:
-    """Assignments of one evaluation: voxels (B, M) of the samples, pieces and points (B, Q, 4) of the voxels."""
+    """Assignments of one evaluation.
+
+    Attributes:
+        assigned: (B, M) voxel of each sample, -1 without.
+        covering: (B, Q, 4) piece of each voxel, -1 without, and the nearest point in the zero configuration, metres.
+    """
 
     assigned: np.ndarray
     covering: np.ndarray
 
 
 class ObjectiveKernel:
-    """The objective of one body: constants and scratch are laid out once, a frame's voxels are handed in.
+    """The objective of one body. Constants and scratch are prepared once; each call takes a frame's voxels.
 
     Args:
         body: the body.
-        local: (N, 3) surface samples in the zero configuration; last_dof, patch: (N,).
+        local: (N, 3) surface samples in the zero configuration, metres.
+        last_dof: (N,) last degree of freedom above each sample.
+        patch: (N,) colour patch of each sample.
         sigma: (N,) σ of eq. 10 at the samples, metres.
         piece_sigma: (P,) σ of voxels that the piece covers, metres.
         piece_patches: (P,) int64 bit masks of the colour patches on each piece: a voxel that fits none of them is not
             covered by the piece. All patches by default.
-        barred: (N,) bit masks of the parts of the body in which a sample may not lie: there it finds no voxel. None by
-            default.
+        barred: (N,) bit masks of the parts of the body that a sample may not enter: inside it finds no voxel. No parts
+            by default.
         piece_part: (P,) the part, 0 to 23, that each piece belongs to.
         cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_camera`, for the alignment term.
         dtype: np.float32, or np.float64 for checks of derivatives.
@@ -261,7 +270,7 @@ class ObjectiveKernel:
         self._scratch: dict[int, np.ndarray] = {}
 
     def _scratch_of(self, tasks: int) -> np.ndarray:
-        """(T, D + P, 39) joints and pieces of T tasks; kept."""
+        """Return the scratch of T tasks: joints and pieces (T, D + P, 39)."""
         if tasks not in self._scratch:
             self._scratch[tasks] = np.empty((tasks, self.degrees + len(self._pieces), SCRATCH_NUMBERS), self.dtype)
         return self._scratch[tasks]
@@ -272,7 +281,7 @@ class ObjectiveKernel:
         )
 
     def _packed(self, s: ObjectiveParameters, M: int, Q: int, index: SurfaceIndex) -> np.ndarray:
-        """The settings in the order in which the kernels read them."""
+        """Pack the settings in the kernels' order, from NU to GRID."""
         values = [s.nu, s.reach_m, s.coverage_nu, s.coverage_reach_m]
         shares = [s.surface_weight / max(M, 1), s.coverage_weight / max(Q, 1)]
         return np.array([*values, *shares, *index.grid.tolist()], self.dtype)
@@ -288,7 +297,7 @@ class ObjectiveKernel:
         held: Held | None = None,
         entries: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Held]:
-        """Value, gradient and Hessian-vector product at B poses.
+        """Return value, gradient and Hessian-vector product at B poses.
 
         Args:
             index: the frame's surface voxels.
@@ -297,8 +306,8 @@ class ObjectiveKernel:
             pose: (B, D).
             direction: (B, D) the v of H·v; None for zeros.
             settings: constants.
-            held: assignments to keep instead of searching anew.
-            entries: (B, E, 16) of the alignment term (:mod:`tk.kernels.alignment`), if any.
+            held: assignments to use instead of a new search.
+            entries: (B, E, 16) of the alignment term (:mod:`tk.kernels.alignment`), if it counts.
 
         Returns:
             f (B,): ``surface_weight`` times mean ρ over the samples plus ``coverage_weight`` times mean ρ over the
@@ -351,14 +360,17 @@ class ObjectiveKernel:
         floor: float = 0.0,
         entries: np.ndarray | None = None,
     ) -> Linearisation:
-        """Residuals and the Gauss-Newton Hessian at one pose.
+        """Return residuals and the Gauss-Newton Hessian at one pose.
 
         Args:
-            chosen: (M,) samples; voxels: (Q,) voxels of the coverage term.
+            index: the frame's surface voxels.
+            chosen: (M,) samples.
+            voxels: (Q,) voxels of the coverage term.
             pose: (D,).
             held: assignments of :meth:`evaluate` at this pose, with B = 1.
-            floor: least weight of an outlier in the Hessian.
-            entries: (1, E, 16) of the alignment term: they count in the Hessian, and are no pairs.
+            settings: constants.
+            floor: minimum weight of an outlier in the Hessian.
+            entries: (1, E, 16) of the alignment term; they count in the Hessian and are no pairs.
         """
         E = 0 if entries is None else entries.shape[1]
         M, Q = len(chosen), len(voxels) if settings.coverage_weight > 0 else 0

@@ -1,7 +1,4 @@
-"""What the objective pairs: the body's pieces in the world, samples with voxels and voxels with pieces.
-
-Part of :mod:`tk.kernels.objective`, which says what the terms are.
-"""
+"""Pairs of the objective: surface samples with voxels, voxels with pieces. For :mod:`tk.kernels.objective`."""
 
 from tk.kernels.kinematics import load_rotation, load_translation, load_vector3
 from tk.kernels.nearest import nearest_voxel
@@ -11,18 +8,18 @@ from tk.kernels.superellipsoid import implicit, project
 from tk.kernels.vectors import cross, norm_sqr, product, times, transposed_times
 from tk.kernels.wrench import MOTION, WRENCH, add_wrench, load_wrench
 
-# Columns of the packed arrays. Every array that a launch is handed costs about 6 µs, so the body comes in few.
-# Of a sample, after its position; the weight is 1/σ²:
+# Columns of a sample, after its position; the weight is 1/σ².
 SAMPLE_DOF, SAMPLE_PATCH, SAMPLE_WEIGHT, SAMPLE_BARRED = range(3, 7)
-# Of a piece, after those of PieceArrays. Its colour patches, a bit mask of 63, are in three numbers of 21 bits, which a
-# float32 represents exactly.
+# Columns of a piece, after those of PieceArrays. Its colour patches, a bit mask of 63, are in three numbers of 21 bits,
+# which a float32 represents exactly.
 PIECE_WEIGHT, PIECE_PART, PIECE_PATCHES = PIECE_NUMBERS, PIECE_NUMBERS + 1, PIECE_NUMBERS + 2
 PATCH_BITS = 21
-# Of the scratch's rows after the joints, one a piece: after the 3×4 frame in the world the bounding sphere.
+# Columns of the scratch's rows of pieces, which follow the joints: after the 3×4 frame in the world a bounding sphere.
 SPHERE, SPHERE_RADIUS = 12, 15
-# Deep inside: G (1 on the surface, growing linearly from the centre) below this.
+# A point is deep inside a piece where G (1 on the surface, growing linearly from the centre) is below this. Chosen on
+# the development captures; sensitivity not measured. Near 1, parts that touch lose their samples.
 BURIED = 0.8
-# Places in the packed settings; what grid (tk.kernels.nearest) follows.
+# Indices of the packed settings; the grid of tk.kernels.nearest follows from GRID on.
 NU, REACH, COVERAGE_NU, COVERAGE_REACH, SCALE, COVERAGE_SCALE, GRID = range(7)
 
 
@@ -33,7 +30,7 @@ def place_pieces(
     D: int,
     pieces: ti.template(),  # (P, 25)
 ):
-    """Fill the scratch's rows of the pieces: frames in the world, bounding spheres."""
+    """Store the pieces' frames in the world and their bounding spheres in the scratch."""
     for i in range(pieces.shape[0]):
         k = ti.cast(pieces[i, PIECE_DOF], ti.i32)
         R, t = load_rotation(scratch, c, k), load_translation(scratch, c, k)
@@ -58,7 +55,7 @@ def sphere(scratch: ti.template(), c: int, row: int):
 
 @ti.func
 def has_patch(pieces: ti.template(), i: int, fits: ti.i64):
-    """Whether piece i has any of the patches of a bit mask."""
+    """Return whether piece i has any of the patches of a bit mask."""
     common = 0
     for part in ti.static(range(3)):
         patches = ti.cast(pieces[i, PIECE_PATCHES + part], ti.i32)
@@ -76,11 +73,11 @@ def nearest_piece(
     y,  # voxel, world
     reach,
 ):
-    """(index or -1, x, y, z of the projection in the zero configuration) of the piece nearest to a voxel."""
+    """Return the piece nearest to a voxel, or -1, and the nearest point (3,) on it in the zero configuration."""
     best = -1
     best_d = reach
     best_on = y * 0.0
-    # the piece that the voxel is deepest in or least outside of, by its bounding sphere, bounds the others' distances
+    # the first candidate, by the bounding spheres, bounds the distance of the others
     likely = 0
     least = y[0] * 0.0 + 1e30
     for i in range(pieces.shape[0]):
@@ -97,7 +94,7 @@ def nearest_piece(
         q = transposed_times(R, y - load_translation(scratch, c, D + i))
         radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
         z_lower, z_upper = pieces[i, PIECE_SHAPE + 5], pieces[i, PIECE_SHAPE + 6]
-        # a box about the piece: what lies further outside it than the best so far cannot win
+        # a voxel farther outside the piece's box than the best distance has no nearer point on it
         over = ti.Vector(
             [
                 ti.max(ti.abs(q[0]) - radii[0], 0.0),
@@ -108,7 +105,7 @@ def nearest_piece(
         if norm_sqr(over) < best_d * best_d and has_patch(pieces, i, fits):
             on = project(q, radii, pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4], z_lower, z_upper)
             d = ti.sqrt(norm_sqr(q - on))
-            # of two pieces as near as each other the first, in whatever order they are visited
+            # of two equally near pieces the first, in any order of visits
             if d < best_d or (d == best_d and i < best):
                 best = i
                 best_d = d
@@ -150,7 +147,7 @@ def is_buried(
     barred: int,
     x,
 ):
-    """Whether a world point lies deep inside a piece of one of the parts of the bit mask ``barred``."""
+    """Return whether a world point lies deep inside a piece of a part in the bit mask ``barred``."""
     buried = False
     i = 0
     while not buried and i < pieces.shape[0]:
@@ -185,7 +182,7 @@ def pair_sample(
     D: int,
     n: int,
 ):
-    """The voxel of surface sample n, or -1."""
+    """Return the voxel of surface sample n, or -1."""
     k = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
     R = load_rotation(scratch, c, k)
     x = times(R, load_vector3(samples, n)) + load_translation(scratch, c, k)

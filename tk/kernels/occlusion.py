@@ -1,16 +1,15 @@
-"""Does a piece of the body hide a point from a camera? Taichi functions (Kehl 2006, section 5.3, eqs. 6 and 7).
+"""Test whether a piece of the body hides a point from a camera (Kehl 2006, section 5.3, eqs. 6 and 7).
 
 The paper's three steps for each other superellipsoid: clip the viewing ray to its bounding box, test whether the point
-itself lies inside, search the clipped ray recursively from the middle. Before all three, a ray outside the cone in
-which the camera sees the piece's bounding sphere is done with: all rays end in the camera, so that is one product.
+itself lies inside, search the clipped ray recursively from the middle. Before these, rays outside the cone in which the
+camera sees the piece's bounding sphere are rejected: all rays end in the camera, so that takes one dot product.
 
-An ellipsoid is asked for its nearest approach to the ray, which is known in closed form. For the others the recursion
-becomes a bisection. G = F^(ε₁/2) is a norm for exponents in (0, 2), so along a ray it is convex:
-only the half towards which it falls can hold a point inside, and the tangent in the middle bounds G on it from below.
-Most rays are decided by the first or second middle.
+For an ellipsoid the nearest approach to the ray has a closed form. For other pieces the recursion is a bisection.
+G = F^(ε₁/2) is a norm for exponents in (0, 2), so it is convex along a ray: only the half towards which it falls can
+contain a point inside, and the tangent in the middle bounds G from below. The first or second middle decides most rays.
 
-Where the paper is silent: a point inside another piece (at the joints) counts as hidden, and pieces that only touch do
-not hide each other, or every seam of the model would flicker.
+The paper is silent about two cases. Here a point inside another piece (at the joints) counts as hidden, and pieces that
+only touch do not hide each other, or every seam of the model would flicker.
 """
 
 from tk.kernels.kinematics import load_rotation, load_translation
@@ -21,26 +20,26 @@ from tk.kernels.vectors import dot, norm_sqr, product, times, transposed_times
 
 # Rounds of the bisection. A ray undecided after them runs less than 1/4096 of its clipped length inside the piece.
 DEPTH = 12
-# A ray that passes through the outermost thousandth of a piece touches it.
+# A ray within the outermost thousandth of a piece only touches it. Chosen; at 0 seams flicker by rounding.
 TOUCH = 1e-3
 
 # Columns of a placed piece: rotation (9, row by row) and translation (3) to the world, the camera's centre in the
-# piece's frame (3); of its bounding sphere the direction in which the camera sees it (3), the cosine of the half angle
-# of its cone, and how near it comes to the camera.
+# piece's frame (3); direction (3) of the bounding sphere from the camera, cosine of the half angle of its cone, and its
+# least distance from the camera.
 PLACED_TRANSLATION, PLACED_CAMERA, PLACED_CONE, PLACED_NEAR, PLACED_NUMBERS = 9, 12, 15, 19, 20
-# The cone is opened by this much of a cosine, for rounding: half a millimetre at the least of a body's pieces.
+# The cone's cosine is lowered by this, for rounding: half a millimetre at the smallest of a body's pieces.
 _SLACK = 1e-6
 
 
 @ti.func
 def place_pieces(
-    frames: ti.template(),  # (T, D, 12) filled by kinematics.forward
+    frames: ti.template(),  # (T, D, 18) filled by kinematics.forward_tree
     c: int,
     pieces: ti.template(),  # (P, 20 or more) as in tk.kernels.objective
     center,  # camera centre, world
     placed: ti.template(),  # (T, P, 20) out
 ):
-    """Fill row c of the scratch with the pieces at a pose, as one camera sees them."""
+    """Fill row c of ``placed`` with the pieces at a pose relative to one camera."""
     for i in range(pieces.shape[0]):
         k = ti.cast(pieces[i, PIECE_DOF], ti.i32)
         R = load_rotation(frames, c, k)
@@ -80,7 +79,7 @@ def load_placed_vector(placed: ti.template(), c: int, i: int, first: ti.template
 
 @ti.func
 def segment_enters(q, d, radii, e1, e2, z_lower, z_upper):
-    """1 if the segment q + λ d, 0 ≤ λ ≤ 1, enters a truncated superellipsoid, all in its frame."""
+    """Return 1 if the segment q + λ d, 0 ≤ λ ≤ 1, enters a truncated superellipsoid, all in its frame."""
     low = ti.Vector([-radii[0], -radii[1], z_lower])
     high = ti.Vector([radii[0], radii[1], z_upper])
     start = q[0] * 0.0
@@ -123,9 +122,9 @@ def pieces_beside(
     own: int,
     margin_m: float,
 ):
-    """Bit mask of the other pieces that rays through piece ``own``, or past it within the margin, may meet.
+    """Return a bit mask of the other pieces that rays through piece ``own``, or within the margin of it, may meet.
 
-    The points of one piece share it: the cones in which the camera sees the two bounding spheres overlap.
+    All points of a piece share the mask: it has the pieces whose bounding spheres overlap its own in the image.
     """
     beside = ti.cast(0, ti.i64)
     u = load_placed_vector(placed, c, own, PLACED_CONE)
@@ -149,11 +148,11 @@ def is_occluded(
     placed: ti.template(),  # (T, P, 20)
     c: int,
     pieces: ti.template(),  # (P, 20 or more)
-    among: ti.i64,  # bit mask of the pieces asked; a piece's own rim cannot hide from itself, it is convex
+    among: ti.i64,  # bit mask of the pieces tested; not the point's own, which is convex and cannot hide its rim
     x,  # world
     center,  # camera centre, world
 ):
-    """1 if one of some pieces lies between a point and the camera that row c of the scratch was placed for."""
+    """Return 1 if one of the pieces lies between a point and the camera of row c of ``placed``."""
     ray = x - center
     distance = ti.max(ti.sqrt(norm_sqr(ray)), 1e-6)
     ray = ray / distance

@@ -20,12 +20,13 @@ def pack_camera(
     translation: NDArray[np.float64],
     fisheye: bool,
 ) -> NDArray[np.float64]:
-    """(22,) the row of one camera.
+    """Pack a camera into a row (22,).
 
     Args:
         matrix: (3, 3) intrinsic matrix, pixels.
         distortions: (4,) or (5,) k1 k2 p1 p2 [k3]; (4,) k1…k4 when ``fisheye``.
-        rotation, translation: (3, 3), (3,) from world to camera, metres.
+        rotation: (3, 3) from world to camera.
+        translation: (3,) metres.
         fisheye: OpenCV's equidistant model.
     """
     row = np.zeros(CAMERA_NUMBERS)
@@ -39,7 +40,7 @@ def pack_camera(
 
 @ti.func
 def camera_center(camera: ti.template(), v: int):
-    """(3,) centre of projection of camera v, world frame."""
+    """Return the centre of projection (3,) of camera v, world frame."""
     R = ti.Matrix([[camera[v, 3 * i + j] for j in ti.static(range(3))] for i in ti.static(range(3))])
     t = ti.Vector([camera[v, 9 + i] for i in ti.static(range(3))])
     return -transposed_times(R, t)
@@ -47,7 +48,7 @@ def camera_center(camera: ti.template(), v: int):
 
 @ti.func
 def project(camera: ti.template(), v: int, x):
-    """Pixel (2,), its derivative (2, 3) by the world point, depth. Behind the camera only the depth is valid."""
+    """Return pixel (2,), its derivative (2, 3) by the world point, and depth. Behind the camera only depth is valid."""
     R = ti.Matrix([[camera[v, 3 * i + j] for j in ti.static(range(3))] for i in ti.static(range(3))])
     t = ti.Vector([camera[v, 9 + i] for i in ti.static(range(3))])
     p = times(R, x) + t

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from tk.kernels.cone_arrays import NEAREST_M, PART_DOF, ConeArrays, kind_of, place_part, shape_of, store_frame
 from tk.kernels.cones import capsule, enter_unit, extent, interior_point
 from tk.kernels.kinematics import JOINT_NUMBERS, TREE_PARENT, forward_chain, load_rotation, load_translation
-from tk.kernels.launch import Launcher
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
+from tk.kernels.taichi_internals import Launcher
 from tk.kernels.vectors import norm2, norm_sqr, times
 
 # Safety factors of the capsule that encloses a part in an image, beyond first order: of its radius, and of the distance

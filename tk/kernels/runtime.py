@@ -1,7 +1,7 @@
 """The one place where Taichi is imported and started.
 
 Other modules write ``from tk.kernels.runtime import ti`` and call :func:`ensure_runtime` in each public host
-function. The runtime starts lazily on the first call; a runtime that the caller made before is left as it is.
+function. The runtime starts lazily on the first call; a runtime that the caller has started is left as it is.
 Never ``fork`` after it has started: use the ``spawn`` start method for worker processes.
 """
 
@@ -19,31 +19,31 @@ import time
 import warnings
 from pathlib import Path
 
-from tk.kernels.source_notes import brief
+from tk.kernels.taichi_internals import program, shorten_notes
 
 _LOG = logging.getLogger(__name__)
 
-# Taichi greets on import unless told otherwise; a library has no business on the user's stdout.
+# Without this Taichi prints a greeting on import; a library does not write to the user's stdout.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_LOG_LEVEL", "error")
 
 
 def _choose_cache() -> None:
-    """Name a folder for compiled kernels where Taichi would find none: without HOME it aborts the process, and where it
-    may not write it compiles everything anew at each start."""
-    usual = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))  # the password file knows homes
-    if _is_usable(usual):
+    """Set the folder for compiled kernels where Taichi's default fails: without HOME Taichi aborts the process, and
+    without write permission it compiles everything again at each start."""
+    default = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))  # the password file has homes
+    if _is_usable(default):
         if "HOME" not in os.environ:
-            os.environ["XDG_CACHE_HOME"] = str(usual)
+            os.environ["XDG_CACHE_HOME"] = str(default)
         return
     temporary = Path(tempfile.gettempdir()) / f"tk-cache-{os.getuid()}"
-    # compiled kernels are code: what somebody else has put there is not ours to run
+    # compiled kernels are code: those of another user must not run
     ours = _is_usable(temporary) and temporary.stat().st_uid == os.getuid()
     os.environ["XDG_CACHE_HOME"] = str(temporary) if ours else tempfile.mkdtemp(prefix="tk-cache-")
 
 
 def _is_usable(folder: Path) -> bool:
-    """Whether the folder is there or can be made, and can be written to."""
+    """Return whether the folder exists or can be made, and is writable."""
     if folder.is_absolute():
         with contextlib.suppress(OSError):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -54,16 +54,18 @@ def _is_usable(folder: Path) -> bool:
 _choose_cache()
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # taichi's own deprecation notices are not ours to mend
+    warnings.simplefilter("ignore")  # deprecation notices inside Taichi
     import taichi as ti
 
 __all__ = ["ensure_runtime", "spread_of", "ti"]
 
-# Taichi hands a CPU thread so many turns of a loop at once; what loop_config says of block_dim changes nothing. Long
-# tasks are handed out in about so many shares a thread: one that wakes late, or has the longer tasks, is made up for.
-_LEAST_TURNS, _SHARES = 512, 8
-
-# Taichi locks its cache of compiled kernels for milliseconds; an older lock was left by a process that was killed
+# Turns of a loop that Taichi gives to a CPU thread at once; block_dim of loop_config does not change it (measured).
+_LEAST_TURNS = 512
+# Long tasks are split into about this many shares a thread, so that threads that wake late or have longer tasks are
+# compensated. Affects speed only.
+_SHARES = 8
+# Age above which the lock on Taichi's cache of compiled kernels is stale, seconds: Taichi holds it for milliseconds, so
+# an older lock was left by a killed process.
 _STALE_S = 60.0
 
 
@@ -73,7 +75,7 @@ def ensure_runtime() -> None:
     ``fast_math`` is off, so that NaN and infinity keep their meaning. ``TK_DEBUG=1`` in the environment turns on
     bounds checking (slow), ``TK_THREADS`` limits the number of CPU threads.
     """
-    if ti.lang.impl.get_runtime().prog is not None:
+    if program() is not None:
         return
     options: dict[str, object] = {
         "arch": ti.cpu,
@@ -88,18 +90,18 @@ def ensure_runtime() -> None:
         options["cpu_max_num_threads"] = int(threads)
     _break_stale_lock()
     with contextlib.suppress(ImportError, AttributeError):  # another Taichi
-        brief(importlib.import_module("taichi.lang.ast.ast_transformer_utils"), ti.lang.kernel_impl)
-    _LOG.info("starting the kernels; what this machine has not compiled yet takes some seconds")
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints that it starts, whatever the log level
+        shorten_notes(importlib.import_module("taichi.lang.ast.ast_transformer_utils"), ti.lang.kernel_impl)
+    _LOG.info("starting the kernels; compiling them for the first time takes some seconds")
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints a line at start at any log level
         ti.init(**options)
-    # Taichi leaves its program, and the threads of it, to the interpreter's end, which takes modules apart in any order
+    # else the program and its threads are destroyed at the interpreter's end, in any order
     atexit.register(ti.reset)
 
 
 def _break_stale_lock() -> None:
-    """Remove the lock that a killed process has left on Taichi's cache of compiled kernels.
+    """Remove the lock of a killed process from Taichi's cache of compiled kernels.
 
-    Taichi itself never does: from then on nothing is cached any more, and every start compiles all kernels again.
+    Taichi never removes it: nothing would be cached any more, and every start would compile all kernels again.
     """
     with contextlib.suppress(OSError, AttributeError):  # no lock, somebody else's folder, or another Taichi
         folder = Path(
@@ -111,10 +113,10 @@ def _break_stale_lock() -> None:
 
 
 def spread_of(tasks: int) -> int:
-    """How many turns of a kernel's loop to give to each of a few long tasks, so that they go to all threads.
+    """Return the number of loop turns for each of a few long tasks that lets them run on all threads.
 
-    A loop of fewer than 512 turns runs on one thread, however long a turn takes. So a loop over tasks is written as one
-    over ``spread * tasks`` turns of which every ``spread``-th does a task::
+    A loop of fewer than 512 turns runs on one thread, even if a turn takes long. So a loop over tasks is written as a
+    loop over ``spread * tasks`` turns, of which every ``spread``-th does a task::
 
         for turn in range(spread * tasks):
             if turn % spread != 0:
@@ -127,4 +129,4 @@ def spread_of(tasks: int) -> int:
 @functools.cache
 def _threads() -> int:
     ensure_runtime()
-    return int(ti.lang.impl.get_runtime().prog.config().cpu_max_num_threads)
+    return int(program().config().cpu_max_num_threads)

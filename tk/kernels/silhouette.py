@@ -29,10 +29,10 @@ from tk.kernels.cone_contours import (
 )
 from tk.kernels.cones import point_on, unscaled
 from tk.kernels.kinematics import forward_tree, load_rotation, load_translation
-from tk.kernels.launch import Launcher
 from tk.kernels.line_search import COLOR_BINS, Regions, SearchSettings, in_picture, search_colors, search_mask
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
+from tk.kernels.taichi_internals import Launcher
 from tk.kernels.vectors import cross, norm2, pulled, times, transposed_times
 from tk.kernels.wrench import (
     INERTIA,

@@ -9,19 +9,19 @@ from tk.kernels.runtime import ti
 
 @ti.func
 def power(base, exponent):
-    """|base|^exponent, safe at zero."""
+    """Return |base|^exponent, with |base| of at least 1e-6."""
     return ti.exp(exponent * ti.log(ti.max(ti.abs(base), 1e-6)))
 
 
 @ti.func
 def is_quadric(e1, e2):
-    """An ellipsoid needs no powers, and most pieces of a body are ellipsoids."""
+    """Return whether the piece is an ellipsoid, which needs no powers; most pieces of a body are ellipsoids."""
     return e1 == 1.0 and e2 == 1.0
 
 
 @ti.func
 def inside_outside(q, radii, e1, e2):
-    """F(q): below 1 inside, above 1 outside."""
+    """Return F(q): below 1 inside, above 1 outside."""
     F = (q / radii).norm_sqr()
     if not is_quadric(e1, e2):
         xy = power(q[0] / radii[0], 2.0 / e2) + power(q[1] / radii[1], 2.0 / e2)
@@ -31,7 +31,7 @@ def inside_outside(q, radii, e1, e2):
 
 @ti.func
 def implicit(q, radii, e1, e2):
-    """G(q) and its gradient, as one vector (G, ∂x, ∂y, ∂z)."""
+    """Return G(q) and its gradient as one vector (G, ∂x, ∂y, ∂z)."""
     u = q / radii
     G = ti.sqrt(ti.max(u.norm_sqr(), 1e-12))
     result = ti.Vector([G, u[0] / (radii[0] * G), u[1] / (radii[1] * G), u[2] / (radii[2] * G)])
@@ -65,16 +65,16 @@ def _away_from_zero(x):
 
 @ti.func
 def project(q, radii, e1, e2, z_lower, z_upper):
-    """The surface point nearest to q, to first order.
+    """Return the surface point nearest to q, to first order.
 
-    Points beyond a cutting plane are first moved onto it, so that a truncated piece attracts to its rim.
+    A point beyond a cutting plane is first moved onto the plane: a truncated piece attracts to its rim.
     """
     c = ti.Vector([q[0], q[1], ti.min(ti.max(q[2], z_lower), z_upper)])
     g = implicit(c, radii, e1, e2)
     gradient = ti.Vector([g[1], g[2], g[3]])
     square = ti.max(gradient.norm_sqr(), 1e-9)
-    # Deep inside, near the centre, the gradient is no guide: there the step is bounded by the piece's own size. A point
-    # far outside is taken all the way; left where it is, it would count as lying on the surface.
+    # Near the centre the gradient is unreliable: there the step is bounded by the piece's size. A point far outside
+    # takes the whole step; without a step it would count as lying on the surface.
     step = (g[0] - 1.0) / square
     s = c - step * gradient
     limit = 2.0 * ti.max(radii[0], ti.max(radii[1], radii[2]))

@@ -5,18 +5,18 @@ of f by x, contributes
 
     F · (ω × x + v) = ω · (x × F) + v · F
 
-to ∂f/∂p_k: the wrench (x × F, F) has all that any degree of freedom above asks of the point. The wrenches of the points
-of a segment are added up, and at the end handed down the tree once, from the leaves to the root (as in the recursive
-Newton-Euler algorithm; Featherstone, Rigid Body Dynamics Algorithms, 2008, chapter 5). In the same way the velocity of
-a point along a direction in p, the J·v of H·v = JᵀM J v, comes from its segment's one twist.
+to ∂f/∂p_k: the wrench (x × F, F) contains the point's contribution for every degree of freedom above it. The wrenches
+of a segment's points are summed, and at the end passed along the tree once, from the leaves to the root (as in the
+recursive Newton-Euler algorithm; Featherstone, Rigid Body Dynamics Algorithms, 2008, chapter 5). In the same manner the
+velocity of a point along a direction in p, the J·v of H·v = JᵀM J v, follows from its segment's twist.
 
-The Gauss-Newton Hessian Σ JᵀMJ needs of a segment's points the 6×6 sum of PᵀMP, where P (3, 6) takes a twist to the
-point's velocity: an inertia, and handed down the tree like one (the composite rigid body algorithm; chapter 6 there).
-It holds squares of distances, which cost digits where they are long, so all is about an origin near the body.
+The Gauss-Newton Hessian Σ JᵀMJ needs for each segment the 6×6 sum of PᵀMP over its points, where P (3, 6) maps a twist
+to the point's velocity. The sum is an inertia and is passed along the tree like one (the composite rigid body
+algorithm; Featherstone, chapter 6). It contains squares of distances, so it is taken about an origin near the body for precision.
 
 Columns of the scratch ``(C, D, 39)``, after frames and twists (:mod:`tk.kernels.kinematics`): the twist of the segment
-along the direction, and two wrenches, of the gradient and of the Hessian-vector product; or, in their place, the lower
-triangle of the inertia, row by row.
+along the direction, and two wrenches, of the gradient and of the Hessian-vector product; or instead the lower triangle
+of the inertia, row by row.
 """
 
 from tk.kernels.kinematics import JOINT_NUMBERS, TWIST, parent_of
@@ -33,13 +33,13 @@ PULL, PULL_NUMBERS = SCRATCH_NUMBERS, 6
 
 @ti.func
 def load_wrench(scratch: ti.template(), c: int, k: int, first: ti.template()):
-    """Three numbers of row k from column ``first``."""
+    """Return three numbers of row k from column ``first`` on."""
     return ti.Vector([scratch[c, k, first + a] for a in ti.static(range(3))])
 
 
 @ti.func
 def start_wrenches(tree: ti.template(), state: ti.template(), row: int, c: int, scratch: ti.template()):
-    """Wrenches to zero, and the segments' twists along the direction in a row of ``state``; joints are placed."""
+    """Clear the wrenches and store the segments' twists along the direction in a row of ``state``."""
     for k in range(tree.shape[0]):
         up = parent_of(tree, k)
         for a in range(6):
@@ -53,7 +53,7 @@ def start_wrenches(tree: ti.template(), state: ti.template(), row: int, c: int, 
 
 @ti.func
 def add_wrench(scratch: ti.template(), c: int, k: int, first: ti.template(), moment, force):
-    """Add a wrench to that of row k from column ``first``."""
+    """Add a wrench to row k from column ``first`` on."""
     for a in ti.static(range(3)):
         scratch[c, k, first + a] = scratch[c, k, first + a] + moment[a]
         scratch[c, k, first + 3 + a] = scratch[c, k, first + 3 + a] + force[a]
@@ -61,7 +61,7 @@ def add_wrench(scratch: ti.template(), c: int, k: int, first: ti.template(), mom
 
 @ti.func
 def collect_wrenches(tree: ti.template(), c: int, scratch: ti.template(), sums: ti.template()):
-    """Gradient and Hessian-vector product into the last 2 D columns of row c of the sums."""
+    """Write gradient and Hessian-vector product into the last 2 D columns of row c of the sums."""
     D = tree.shape[0]
     for back in range(D):
         k = D - 1 - back
@@ -79,7 +79,7 @@ def collect_wrenches(tree: ti.template(), c: int, scratch: ti.template(), sums: 
 
 @ti.func
 def start_inertias(tree: ti.template(), c: int, scratch: ti.template()):
-    """Inertias to zero."""
+    """Clear the inertias."""
     for k in range(tree.shape[0]):
         for a in range(INERTIA_NUMBERS):
             scratch[c, k, INERTIA + a] = 0.0
@@ -87,7 +87,7 @@ def start_inertias(tree: ti.template(), c: int, scratch: ti.template()):
 
 @ti.func
 def add_inertia(scratch: ti.template(), c: int, k: int, x, weight):
-    """Add weight·PᵀP of a point x, seen from the origin, to row k."""
+    """Add weight·PᵀP of a point x, relative to the origin, to row k."""
     square = norm_sqr(x)
     for i in ti.static(range(3)):
         for j in ti.static(range(i + 1)):

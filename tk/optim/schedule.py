@@ -1,10 +1,10 @@
 """The two passes of a frame (Kehl 2006, section 6.4): all degrees of freedom at ε₁, then the chains at ε₂ < ε₁ with the
-torso held, as one batch. What they optimise is known only as a :class:`Problem`.
+torso held, as one batch. They see the frame's objective as a :class:`Problem`.
 
 Beyond the paper, SMD works in directions that whiten the Gauss-Newton Hessian at the start of each pass. The paper's
-step sizes (2500 for most angles, 5000 for rolls, 10000 for knees and elbows) are a diagonal guess at the inverse
-Hessian in its own units; here the same is read off the data, so that a step of 1 is a Newton step. ``whiten = False``
-takes the diagonal alone.
+step sizes (2500 for most angles, 5000 for rolls, 10000 for knees and elbows) are a diagonal estimate of the inverse
+Hessian in its own units; here it follows from the data, so that a step of 1 is a Newton step. ``whiten = False`` takes
+the diagonal only.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from tk.optim import smd
 
 Float = NDArray[np.float64]
 
-# A parameter whose points all lie nearer to its axis is damped as if they lay this far, metres, in the first pass and
-# for the chains: the roll of a straight limb follows noise otherwise.
+# Damping of each parameter, as if all points lay this far from its axis, metres, in the first pass and for the chains:
+# without it the roll of a straight limb follows noise. Chosen on the
+# development captures; sensitivity not measured.
 LEVER_M, CHAIN_LEVER_M = 0.03, 0.06
-# Greatest change in one iteration: samples that happen to see little of a parameter ask for more. At 15 Hz a joint
-# turns by up to 31° between frames (7.4).
+# Maximum change in one iteration: a draw of samples with little evidence on a parameter yields longer steps. At 15 Hz a
+# joint turns by up to 31° between frames (7.4), two steps. Chosen; sensitivity not measured.
 MAX_STEP_DEG, MAX_STEP_M = 20.0, 0.15
 
 
 class Problem(Protocol):
-    """One frame's objective, as the schedule sees it. D parameters, K chains."""
+    """One frame's objective with D parameters and K chains."""
 
     @property
     def free(self) -> NDArray[np.bool_]:
@@ -42,37 +43,38 @@ class Problem(Protocol):
         ...
 
     def constrain(self, poses: Float) -> Float:
-        """Poses (B, D) mapped into the limits."""
+        """Map poses (B, D) into the limits."""
         ...
 
     def full(self) -> smd.Objective:
-        """The objective of all parameters."""
+        """Return the objective of all parameters."""
         ...
 
     def values(self, poses: Float) -> Float:
-        """(B,) the objective at poses (B, D) on samples that do not change from call to call."""
+        """Return the objective (B,) at poses (B, D) on samples that do not change from call to call."""
         ...
 
     def curvature(self, pose: Float) -> Float:
-        """(D, D) Gauss-Newton Hessian at a pose."""
+        """Return the Gauss-Newton Hessian (D, D) at a pose."""
         ...
 
     def damping(self, lever_m: float) -> Float:
-        """(D,) curvature that a parameter would have, were all points ``lever_m`` from its axis."""
+        """Return the curvature (D,) that each parameter would have if all points lay ``lever_m`` from its axis."""
         ...
 
     def chains(self, owner: NDArray[np.intp], pose: Float) -> smd.Objective:
-        """The objective whose row b is chain ``owner[b]``, the rest of the body being at ``pose``."""
+        """Return the objective whose row b is chain ``owner[b]``, the rest of the body at ``pose``."""
         ...
 
 
 @dataclass(frozen=True)
 class ScheduleSettings:
-    """Settings of the two passes. How many iterations each may take is ``smd.max_iterations``.
+    """Settings of the two passes. ``smd.max_iterations`` limits the iterations of each.
 
     Attributes:
-        tolerance_deg, tolerance_m: ε₁ of eq. 20 for angles and for the displacement. The paper has 2° and 2 cm; at its
-            n of 3 that stops a joint that still turns by 5° in three iterations, and a person in motion is lost.
+        tolerance_deg: ε₁ of eq. 20 for angles. The paper has 2° and 2 cm; at its n of 3 a joint that still turns by 5°
+            in three iterations is stopped, and a moving person is lost.
+        tolerance_m: ε₁ for the displacement, metres.
         refine: ε₂ / ε₁ (paper: ½).
         rate: first step size, as a share of a Newton step.
         whiten: see the module's docstring.
@@ -94,19 +96,25 @@ class ScheduleSettings:
 
 @dataclass(frozen=True)
 class ScheduleResult:
-    """pose (D,) and the iterations made: of the first pass and of each chain, (1 + K,)."""
+    """The result of both passes.
+
+    Attributes:
+        pose: (D,).
+        iterations: (1 + K,) of the first pass and of each chain.
+    """
 
     pose: Float
     iterations: NDArray[np.int32]
 
 
 def optimise(problem: Problem, starts: Float, config: ScheduleSettings, smd_config: smd.SmdSettings) -> ScheduleResult:
-    """Both passes.
+    """Optimise all parameters, then the chains.
 
     Args:
         problem: the frame.
         starts: (S, D) predictions; the first pass begins at the best of them.
-        config, smd_config: settings.
+        config: settings of the passes.
+        smd_config: settings of SMD.
     """
     tolerance = np.where(problem.angular, np.radians(config.tolerance_deg), config.tolerance_m)
     starts = problem.constrain(starts)
@@ -123,7 +131,7 @@ def optimise(problem: Problem, starts: Float, config: ScheduleSettings, smd_conf
 def _all(
     problem: Problem, start: Float, tolerance: Float, config: ScheduleSettings, smd_config: smd.SmdSettings
 ) -> smd.SmdResult:
-    """The pass over all parameters, from ``start`` (D,)."""
+    """Optimise all parameters from ``start`` (D,)."""
     free = np.ones(len(start), bool)
     basis, inverse = descent_basis(problem.curvature(start), free, problem.damping(LEVER_M), config.whiten)
     return smd.minimise(
@@ -142,7 +150,7 @@ def _all(
 def _chains(
     problem: Problem, pose: Float, tolerance: Float, config: ScheduleSettings, smd_config: smd.SmdSettings
 ) -> smd.SmdResult:
-    """The pass over the chains, a row each, with the torso at ``pose`` (D,)."""
+    """Optimise the chains, one row each, with the torso at ``pose`` (D,)."""
     K = len(problem.free)
     H = problem.curvature(pose)
     damping = problem.damping(CHAIN_LEVER_M)
@@ -161,14 +169,14 @@ def _chains(
 
 
 def max_step(angular: NDArray[np.bool_]) -> Float:
-    """(D,) most that an iteration may change each parameter."""
+    """Return the maximum change (D,) of each parameter in an iteration."""
     return np.where(angular, np.radians(MAX_STEP_DEG), MAX_STEP_M)
 
 
 def descent_basis(hessian: Float, free: NDArray[np.bool_], damping: Float, whiten: bool) -> tuple[Float, Float]:
-    """Directions (D, D) with unit curvature in the free parameters, zero in the others; and their pseudo-inverse.
+    """Return directions (D, D) with unit curvature in the free parameters, zero elsewhere, and their pseudo-inverse.
 
-    Without ``whiten`` the curvature is 1 along each parameter, and their coupling stays.
+    Without ``whiten`` the curvature is 1 along each parameter, and the coupling of parameters remains.
     """
     index = np.flatnonzero(free)
     basis, inverse = np.zeros_like(hessian), np.zeros_like(hessian)

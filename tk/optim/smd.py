@@ -1,19 +1,18 @@
-"""Stochastic Meta Descent (Kehl 2006, section 6.2, after Schraudolph 1999), for a batch of problems at once.
+"""Stochastic Meta Descent (Kehl 2006, section 6.2, after Schraudolph 1999) for a batch of problems.
 
-Gradient descent with a step size for every parameter, adapted while it runs:
+Gradient descent with a step size for every parameter, adapted during the iterations:
 
     a ← a ⊗ max(½, 1 + μ v ⊗ g)                  (18)
     p ← constrain(p − a ⊗ g)                     (17, 22)
     gᶜ = (p_old − p) / a                         (23)
     v ← λ v + a ⊗ (gᶜ − λ H v)                   (19)
 
-The optimiser knows an objective as a callable of a batch of poses and nothing of bodies. The objective draws its
-samples anew for each iteration number it is called with; ``shuffle = False`` calls it with the same number throughout,
-which is the deterministic variant of section 7.1.
+An objective is a callable of a batch of poses. It draws new samples for each iteration number that it is called with;
+``shuffle = False`` calls it with one number throughout, the deterministic variant of section 7.1.
 
-Beyond the paper, which bounds no step: ``max_step`` bounds the update of an iteration. One factor for the row scales
-all of it, so that its direction stays; eqs. 19 and 23 take the step sizes so scaled, as p moved by those; and no step
-size grows in such an iteration, where growth could only turn the direction and a steep objective would let it run away.
+Beyond the paper, which bounds no step: ``max_step`` bounds the update of an iteration. One factor scales the whole row,
+so that its direction stays. Equations 19 and 23 take the scaled step sizes, by which p has moved. No step size grows in
+such an iteration: growth would turn the direction, and on a steep objective continue without bound.
 """
 
 from __future__ import annotations
@@ -47,17 +46,17 @@ Objective = Callable[[Float, Float, int], Evaluation]
 
 @dataclass(frozen=True)
 class SmdSettings:
-    """Settings of SMD. The paper's values where it gives any that do not depend on its units.
+    """Settings of SMD: the paper's values, as far as they do not depend on its units.
 
     Attributes:
-        meta_step: μ of eq. 18, per unit of the objective, which runs from 0 to 1 here. The paper takes a tenth of its
-            initial step sizes, a number that belongs to its objective's scale.
+        meta_step: μ of eq. 18, per unit of the objective, which lies between 0 and 1 here. The paper takes a tenth of
+            its initial step sizes, which depends on its objective's scale.
         memory: λ of eq. 19 (paper: 0.3).
         max_iterations: i_max of eq. 21 (paper: 40).
         window: n of eq. 20 (paper: 3).
         shuffle: new samples each iteration.
-        average: return the mean of the last ``window`` states, whose change eq. 20 bounds, and not the last one, which
-            carries the last sample's noise. The paper does not say which of the two it returns.
+        average: return the mean of the last ``window`` states, whose change eq. 20 bounds, instead of the last state,
+            which has the last sample's noise. The paper is silent about this.
     """
 
     meta_step: float = 1.0
@@ -79,14 +78,14 @@ class SmdSettings:
 
 @dataclass(frozen=True)
 class SmdResult:
-    """Where B descents ended.
+    """The minima of B problems.
 
     Attributes:
         pose: (B, D).
-        value: (B,) the objective at the last evaluation before the end, on that iteration's samples.
-        iterations: (B,) iterations made.
-        converged: (B,) True where eq. 20 stopped it, False where eq. 21 did.
-        path: (I + 1, B, D) all states when asked for, else None; a finished row repeats its last state.
+        value: (B,) the objective of the last evaluation, on that iteration's samples.
+        iterations: (B,) number of iterations.
+        converged: (B,) True if eq. 20 stopped the row, False if eq. 21 did.
+        path: (I + 1, B, D) all states with ``keep_path``, else None; a finished row repeats its last state.
     """
 
     pose: Float
@@ -119,18 +118,17 @@ def minimise(
         constrain: maps states (B, D) into the feasible region (eq. 22).
         basis: (B, D, U) directions in which SMD works, p = p_start + basis·u, with a step size for each of the U
             directions; the unit vectors of p by default, as in the paper. With a basis that whitens the Hessian the
-            diagonal step sizes lose nothing to the coupling of the joints along a limb. Columns of zeros hold a row's
-            parameters still.
+            diagonal step sizes are unaffected by the coupling of the joints along a limb. Columns of zeros keep a row's
+            parameters fixed.
         config: see :class:`SmdSettings`.
         keep_path: record every state.
         max_step: (D,) most that an iteration may change each parameter, in its own unit, positive; None for no bound.
-        basis_inverse: (B, U, D) the pseudo-inverse of ``basis``, where the caller has it at hand.
+        basis_inverse: (B, U, D) the pseudo-inverse of ``basis``, if the caller has it.
 
     Raises:
         ConfigError: when a step size or a bound on the update is not positive.
-        FloatingPointError: when the objective returns a gradient or a Hessian-vector product that is not finite, or the
-            descent diverges until its state is not. To take such a gradient for zero would end the descent wherever it
-            is and call it converged.
+        FloatingPointError: when a gradient, a Hessian-vector product or a diverging state is not finite. A gradient
+            replaced by zero would end the iterations as converged.
     """
     config = config or SmdSettings()
     p = constrain(np.array(start, dtype=np.float64, ndmin=2))
@@ -155,7 +153,7 @@ def minimise(
         _require_finite("the objective's Hessian-vector product", now.hessian_vector, active, i)
         value = np.where(active, now.value, value)
         running = active[:, None]
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # of rows at rest; the others are checked
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # in finished rows; the others are checked
             g = _times(W.transpose(0, 2, 1), now.gradient)
             Hv = _times(W.transpose(0, 2, 1), now.hessian_vector)
             adapted = np.where(running, a * np.maximum(0.5, 1.0 + config.meta_step * v * g), a)
@@ -185,7 +183,7 @@ def minimise(
 
 
 def _bounded(W: Float, a: Float, adapted: Float, g: Float, bound: Float) -> tuple[Float, Float]:
-    """Step sizes (B, U) and the factor (B, 1), at most 1, that keeps the update within ``bound`` (D,)."""
+    """Return step sizes (B, U) and the factor (B, 1), at most 1, that keeps the update within ``bound`` (D,)."""
 
     def factor(a: Float) -> Float:
         excess = np.max(np.abs(_times(W, a * g)) / bound, axis=1, keepdims=True)
@@ -196,15 +194,15 @@ def _bounded(W: Float, a: Float, adapted: Float, g: Float, bound: Float) -> tupl
 
 
 def _require_finite(what: str, values: Float, active: NDArray[np.bool_], iteration: int) -> None:
-    """Refuse NaN and infinity in the active rows of ``values`` (B, ·)."""
+    """Raise FloatingPointError for NaN or infinity in the active rows of ``values`` (B, ·)."""
     bad = np.argwhere(active[:, None] & ~np.isfinite(values))
     if len(bad):
         raise FloatingPointError(
             f"SMD: {what} is not finite at iteration {iteration}, row {bad[0][0]}, component {bad[0][1]}; "
-            "where the descent diverges, take a smaller first step or bound the update with max_step"
+            "if it diverges, choose a smaller first step or bound the update with max_step"
         )
 
 
 def _times(matrices: Float, vectors: Float) -> Float:
-    """(B, D, U) times (B, U)."""
+    """Multiply (B, D, U) by (B, U)."""
     return np.einsum("bdu,bu->bd", matrices, vectors)
