@@ -12,7 +12,8 @@ velocity of a point along a direction in p, the J·v of H·v = JᵀM J v, follow
 
 The Gauss-Newton Hessian Σ JᵀMJ needs for each segment the 6×6 sum of PᵀMP over its points, where P (3, 6) maps a twist
 to the point's velocity. The sum is an inertia and is passed along the tree like one (the composite rigid body
-algorithm; Featherstone, chapter 6). It contains squares of distances, so it is taken about an origin near the body for precision.
+algorithm; Featherstone, chapter 6). It contains squares of distances, so it is taken about an origin near the body for
+precision.
 
 Columns of the scratch ``(C, D, 39)``, after frames and twists (:mod:`tk.kernels.kinematics`): the twist of the segment
 along the direction, and two wrenches, of the gradient and of the Hessian-vector product; or instead the lower triangle
