@@ -62,6 +62,7 @@ from tk.model.cues.appearance import Appearance
 from tk.model.cues.objective import BodyObjective, objective_parameters
 from tk.model.hull.hull import VisualHull
 from tk.run import session
+from tk.run.reporter import Silent
 from tk.run.segmentation import make_segmenter
 from tk.settings import Settings
 from tk.trackers.bodies import body_and_poses
@@ -125,7 +126,7 @@ def counted_launches() -> Iterator[Counter[str]]:
         yield counts
 
 
-class _Clock(session.Silent):
+class _Clock(Silent):
     """Notes when frames are told of, which some are together, what each took, and how many launches there had been."""
 
     def __init__(self, counts: Counter[str]) -> None:

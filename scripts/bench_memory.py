@@ -25,6 +25,7 @@ from tk.io.captures.capture import Capture, open_capture
 from tk.model.cameras.camera import Camera, Rig
 from tk.render.video import video_writer
 from tk.run import session
+from tk.run.reporter import Silent
 from tk.settings import Settings
 from tk.trackers.protocol import Estimate
 
@@ -84,7 +85,7 @@ def _children() -> list[int]:
     return sorted(int(pid) for task in tasks for pid in (task / "children").read_text().split())
 
 
-class Telling(session.Silent):
+class Telling(Silent):
     """Tells what is held."""
 
     def __init__(self, every: int) -> None:

@@ -14,11 +14,12 @@ import numpy as np
 from tk.io.captures.capture import open_capture
 from tk.io.results.writer import read_result
 from tk.run import session
+from tk.run.reporter import Silent
 from tk.settings import Settings
 from tk.trackers.protocol import Estimate
 
 
-class _Clock(session.Silent):
+class _Clock(Silent):
     """Remembers when each frame was told of, which some are together."""
 
     def __init__(self) -> None:

@@ -17,6 +17,7 @@ from tk.io.captures.capture import open_capture
 from tk.io.results.writer import read_joints
 from tk.model.body.skeleton import JOINTS
 from tk.run import session
+from tk.run.reporter import Silent
 from tk.settings import Settings
 
 matplotlib.use("Agg")
@@ -100,7 +101,7 @@ def track(
     truth = read_joints(capture / "truth.h5")
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "result.h5"
-        session.track(open_capture(capture, cameras), out, config, session.Silent(), method, (0, frames))
+        session.track(open_capture(capture, cameras), out, config, Silent(), method, (0, frames))
         result = read_joints(out)
         with h5py.File(out) as file:
             pose, units = file["pose"][:], tuple(file["pose"].attrs["units"])
