@@ -191,17 +191,17 @@ class RegionSettings:
 
     Attributes:
         hypotheses: most poses that are tracked at the same time.
-        search_excess: a frame triggers a limb search when its residual, averaged over the views, exceeds the running
-            mean by more than this value. One view counts for at most 0.15, so a value above 0.15 switches this off.
+        false_alarm: probability with which the residual of a right pose counts as high in a frame. A high residual
+            triggers a limb search; if it lasts, a search for the person. Below 3e-7 it never does.
         colors: whether the colours of the segments are learned and used.
     """
 
     hypotheses: int = 3
-    search_excess: float = 0.065
+    false_alarm: float = 0.02
     colors: bool = True
 
     def __post_init__(self) -> None:
-        _check("region", self, hypotheses=(1, 20), search_excess=(0, 1))
+        _check("region", self, hypotheses=(1, 20), false_alarm=(1e-12, 0.5))
 
 
 @dataclass(frozen=True)
