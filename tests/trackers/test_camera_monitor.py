@@ -1,4 +1,4 @@
-"""A tracker under watch: cameras that are wrong for some frames, a person who is away, poses that cannot be true."""
+"""The camera monitor: cameras that are wrong in some frames, a person who is absent, impossible poses."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Spoil = Callable[[Observation], Observation]
 
 
 class Scene:
-    """The tiny capture's frames, and a tracker that has been started on them once."""
+    """The tiny capture's frames, and a tracker that was started on them once."""
 
     def __init__(self, folder: Path) -> None:
         self.capture: Capture = open_capture(folder)
@@ -40,16 +40,16 @@ class Scene:
     def _tracker(self) -> RegionTracker:
         return RegionTracker(self.capture.rig, self.capture.up, CONFIG.silhouette, CONFIG.region)
 
-    def watch(self) -> CameraMonitor:
+    def monitor(self) -> CameraMonitor:
         tracker = self._tracker()
         tracker.restore(self.model, self.state)
         return CameraMonitor(tracker, self.setup, self.setup.subjects[0])
 
     def follow(self, spoil: Spoil) -> tuple[CameraMonitor, list[Estimate], list[np.ndarray]]:
         """All frames, spoilt; the estimates, and which cameras were used in each."""
-        watch = self.watch()
-        steps = [watch.step(spoil(frame)) for frame in self.frames]
-        return watch, [e for e, _ in steps], [used.masks.any(axis=(1, 2)) for _, used in steps]
+        monitor = self.monitor()
+        steps = [monitor.step(spoil(frame)) for frame in self.frames]
+        return monitor, [e for e, _ in steps], [used.masks.any(axis=(1, 2)) for _, used in steps]
 
     def error(self, estimates: list[Estimate], frames: range) -> float:
         return max(float(np.linalg.norm(estimates[i].joints - self.truth[i], axis=1).mean()) for i in frames)
@@ -61,7 +61,7 @@ def scene(tiny: Path) -> Scene:
 
 
 def moved(camera: int, frames: range, by: int = 30) -> Spoil:
-    """The camera looks aside in these frames."""
+    """The camera is turned in these frames."""
 
     def spoil(frame: Observation) -> Observation:
         if frame.index not in frames:
@@ -87,9 +87,9 @@ def blind(cameras: list[int], frames: range) -> Spoil:
     return spoil
 
 
-def torn(camera: int, frames: range, part: tuple[float, float], in_doubt: bool = False) -> Spoil:
-    """A part of the person, as shares of the height in the picture, is not in the camera's masks of these frames; it is
-    background there, or in doubt."""
+def torn(camera: int, frames: range, part: tuple[float, float], uncertain_part: bool = False) -> Spoil:
+    """A part of the person, as shares of the height in the image, is missing from the camera's masks in these frames:
+    background or uncertain."""
 
     def spoil(frame: Observation) -> Observation:
         if frame.index not in frames:
@@ -99,34 +99,34 @@ def torn(camera: int, frames: range, part: tuple[float, float], in_doubt: bool =
         first, last = rows[0], rows[-1] + 1
         low, high = (round(first + share * (last - first)) for share in part)
         uncertain = np.zeros(masks.shape, np.bool_)
-        uncertain[camera, low:high] = in_doubt & (masks[camera, low:high] > 0)
+        uncertain[camera, low:high] = uncertain_part & (masks[camera, low:high] > 0)
         masks[camera, low:high] = 0
         return replace(frame, masks=masks, uncertain=uncertain)
 
     return spoil
 
 
-def test_nothing_is_left_out_of_a_good_recording(scene: Scene) -> None:
-    watch, estimates, used = scene.follow(lambda frame: frame)
-    assert watch.report() == [] and np.all(used)
+def test_good_recording_excludes_no_camera(scene: Scene) -> None:
+    monitor, estimates, used = scene.follow(lambda frame: frame)
+    assert monitor.report() == [] and np.all(used)
     assert not any(e.status == "lost" for e in estimates)
-    alone = scene.watch().tracker
+    alone = scene.monitor().tracker
     for frame, estimate in zip(scene.frames, estimates, strict=True):
         np.testing.assert_allclose(alone.step(frame).joints, estimate.joints, rtol=0, atol=1e-7)
 
 
-def test_a_camera_that_looks_aside_is_left_out_and_comes_back(scene: Scene) -> None:
-    watch, estimates, used = scene.follow(moved(1, range(5, 10)))
+def test_turned_camera_is_excluded_and_included_again(scene: Scene) -> None:
+    monitor, estimates, used = scene.follow(moved(1, range(5, 10)))
     assert [bool(u[1]) for u in used[:12]] == [True] * 5 + [False] * 5 + [False, True]
     assert all(u[[0, 2, 3]].all() for u in used)
     assert scene.error(estimates, range(FRAMES)) < 0.08
-    (line,) = watch.report()
+    (line,) = monitor.report()
     assert "camera cam2 disagrees with the others" in line and "frames 5 to 10" in line
-    # its fit is told as unknown where it was not used
+    # the residual of an excluded camera is unknown
     assert estimates[6].residual is not None and np.isnan(estimates[6].residual[1]).all()
 
 
-def test_a_frozen_and_a_black_camera_are_named(scene: Scene) -> None:
+def test_frozen_and_black_cameras_are_excluded_and_reported(scene: Scene) -> None:
     def spoil(frame: Observation) -> Observation:
         images, masks = frame.images.copy(), frame.masks.copy()
         if frame.index >= 4:
@@ -135,70 +135,72 @@ def test_a_frozen_and_a_black_camera_are_named(scene: Scene) -> None:
             images[3], masks[3] = 0, 255
         return replace(frame, images=images, masks=masks)
 
-    watch, estimates, used = scene.follow(spoil)
+    monitor, estimates, used = scene.follow(spoil)
     assert not any(u[3] for u in used[8:]) and not used[-1][0]
     assert scene.error(estimates, range(FRAMES)) < 0.10
-    told = " | ".join(watch.report())
-    assert "cam1 stands still" in told and "cam4 shows nothing: left out of frames 8 to 13" in told
+    lines = " | ".join(monitor.report())
+    assert "cam1 stands still" in lines and "cam4 shows nothing: left out of frames 8 to 13" in lines
 
 
 @pytest.mark.parametrize("cameras", [[0, 1, 2, 3], [0, 1, 3]], ids=["no mask", "one mask"])
-def test_nobody_to_be_seen_is_lost_and_found_again_at_once(scene: Scene, cameras: list[int]) -> None:
-    watch, estimates, _ = scene.follow(blind(cameras, range(5, 8)))
+def test_absent_person_is_lost_and_recovered_on_return(scene: Scene, cameras: list[int]) -> None:
+    monitor, estimates, _ = scene.follow(blind(cameras, range(5, 8)))
     status = [e.status for e in estimates]
     assert status[5:8] == ["lost"] * 3 and "lost" not in status[:5] + status[9:]
     assert "recovered" in status[8:10]
     assert all(e.sigma is not None and np.isnan(e.sigma).all() for e in estimates[5:8])
     found = range(status.index("recovered"), FRAMES)
     assert scene.error(estimates, found) < 0.10
-    assert "fewer than two cameras see anybody: lost, frames 5 to 7" in watch.report()
+    assert "fewer than two cameras see anybody: lost, frames 5 to 7" in monitor.report()
 
 
 @pytest.mark.parametrize("part", [(0.0, 0.5), (0.5, 1.0)], ids=["the head's half", "the feet's half"])
-def test_a_mask_with_a_piece_missing_is_no_camera_that_disagrees(scene: Scene, part: tuple[float, float]) -> None:
-    watch, estimates, used = scene.follow(torn(1, range(2, 5), part))
-    # it comes back once its masks have been whole for six frames
+def test_camera_with_torn_mask_is_excluded_until_its_masks_are_whole(scene: Scene, part: tuple[float, float]) -> None:
+    monitor, estimates, used = scene.follow(torn(1, range(2, 5), part))
+    # included again after six frames with whole masks
     assert [bool(u[1]) for u in used] == [True] * 2 + [False] * 9 + [True] * (FRAMES - 11)
-    assert watch.report() == ["camera cam2 misses a part of the person: left out of frames 2 to 10"]
+    assert monitor.report() == ["camera cam2 misses a part of the person: left out of frames 2 to 10"]
     assert not any(e.status == "lost" for e in estimates)
     assert scene.error(estimates, range(FRAMES)) < 0.05
 
 
 @pytest.mark.parametrize("part", [(0.0, 0.2), (0.7, 1.0)], ids=["the head", "the shanks"])
-def test_a_mask_in_doubt_is_no_reason_to_go_without_what_it_does_show(scene: Scene, part: tuple[float, float]) -> None:
-    watch, estimates, used = scene.follow(torn(1, range(2, 8), part, in_doubt=True))
-    assert np.all(used) and watch.report() == []
+def test_camera_with_uncertain_pixels_is_not_excluded(scene: Scene, part: tuple[float, float]) -> None:
+    monitor, estimates, used = scene.follow(torn(1, range(2, 8), part, uncertain_part=True))
+    assert np.all(used) and monitor.report() == []
     assert not any(e.status == "lost" for e in estimates)
     assert scene.error(estimates, range(FRAMES)) < 0.05
 
 
-def test_of_a_mask_that_lacks_half_too_little_is_left_in_doubt_or_not(scene: Scene) -> None:
-    watch, estimates, used = scene.follow(torn(1, range(2, 8), (0.0, 0.5), in_doubt=True))
+def test_camera_with_half_of_its_mask_uncertain_is_excluded(scene: Scene) -> None:
+    monitor, estimates, used = scene.follow(torn(1, range(2, 8), (0.0, 0.5), uncertain_part=True))
     assert not any(u[1] for u in used[2:8]) and all(u[1] for u in used[:2])
-    assert watch.report() == ["camera cam2 misses a part of the person: left out of frames 2 to 13"]
+    assert monitor.report() == ["camera cam2 misses a part of the person: left out of frames 2 to 13"]
     assert scene.error(estimates, range(FRAMES)) < 0.05
 
 
-def test_the_opening_goes_without_a_camera_that_disagrees(scene: Scene) -> None:
-    watch = scene.watch()
+def test_inconsistent_camera_is_excluded_from_the_opening(scene: Scene) -> None:
+    monitor = scene.monitor()
     spoil = moved(2, range(FRAMES))
-    opening = watch.start([spoil(frame) for frame in scene.frames[:3]])
+    opening = monitor.start([spoil(frame) for frame in scene.frames[:3]])
     assert all(f.masks.any(axis=(1, 2)).tolist() == [True, True, False, True] for f in opening)
     for frame in scene.frames:
-        estimate, used = watch.step(spoil(frame))
+        estimate, used = monitor.step(spoil(frame))
         assert not used.masks[2].any() and estimate.status != "lost"
-    (line,) = watch.report()
+    (line,) = monitor.report()
     assert "camera cam3 disagrees" in line and f"frames 0 to {FRAMES - 1}" in line
 
 
-def test_a_person_of_another_size_than_told_is_refused(scene: Scene) -> None:
-    watch = CameraMonitor(scene.watch().tracker, scene.setup, Subject(height_m=0.95))
+def test_person_whose_size_contradicts_the_given_height_is_refused(scene: Scene) -> None:
+    monitor = CameraMonitor(scene.monitor().tracker, scene.setup, Subject(height_m=0.95))
     with pytest.raises(CaptureError, match=r"measures 1\.\d+ m in the pictures, but .* says 0.95 m"):
-        watch.start(scene.frames[:3])
+        monitor.start(scene.frames[:3])
 
 
 class Jumping:
-    """A tracker whose estimate is elsewhere in one frame."""
+    """A tracker whose estimate jumps in one frame."""
+
+    can_exclude_cameras = False
 
     def __init__(self, joints: np.ndarray, when: int) -> None:
         self.joints, self.when = joints, when
@@ -209,23 +211,23 @@ class Jumping:
         return Estimate(np.zeros(24), at, "tracked", 0.0, none, {}, sigma=np.full(15, 0.01))
 
 
-def test_an_estimate_that_cannot_be_true_is_lost(scene: Scene) -> None:
+def test_impossible_pose_is_lost(scene: Scene) -> None:
     tracker: Any = Jumping(scene.truth[0], 3)
-    watch = CameraMonitor(tracker, scene.setup, scene.setup.subjects[0])
-    estimates = [watch.step(frame)[0] for frame in scene.frames[:6]]
+    monitor = CameraMonitor(tracker, scene.setup, scene.setup.subjects[0])
+    estimates = [monitor.step(frame)[0] for frame in scene.frames[:6]]
     assert [e.status for e in estimates] == ["tracked"] * 3 + ["lost"] + ["tracked"] * 2
     assert estimates[3].sigma is not None and np.isnan(estimates[3].sigma).all()
-    assert watch.report() == ["the pose found cannot be true: it jumps: lost, frame 3"]
+    assert monitor.report() == ["the pose found cannot be true: it jumps: lost, frame 3"]
 
 
-def test_it_is_taken_up_again(scene: Scene) -> None:
+def test_resumed_run_is_the_same(scene: Scene) -> None:
     spoil = moved(1, range(4, 9))
     whole, expected, _ = scene.follow(spoil)
-    first = scene.watch()
+    first = scene.monitor()
     for frame in scene.frames[:6]:
         first.step(spoil(frame))
     state: Mapping[str, Any] = {**first.tracker.state()}
-    again = scene.watch()
+    again = scene.monitor()
     again.tracker.restore(scene.model, state)
     again.restore({name: v if isinstance(v, str) else np.asarray(v) for name, v in first.state().items()})
     for frame, estimate in zip(scene.frames[6:], expected[6:], strict=True):

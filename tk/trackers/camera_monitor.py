@@ -1,20 +1,19 @@
-"""A tracker under watch: a camera that cannot be believed is left out of a frame, and what cannot be true is lost.
+"""The camera monitor: steps a tracker without the cameras that are wrong, and rejects impossible poses.
 
-A camera is left out whose picture shows nothing or stands still (:mod:`tk.model.masks.image_health`), whose masks
-the hull
-of the others contradicts in the opening frames (:mod:`tk.model.masks.mask_agreement`), and, from frame to frame, one
-that the
-body explains badly: the frame is then tracked a second time without it, and if the body still does not explain it,
-but does the others, the camera was what was wrong and not the pose. It comes back when the body that the others see
-explains it again. This is the iteratively reweighted fit of robust statistics with weights of 0 and 1 and the camera as
-the unit: what is wrong with one picture is wrong everywhere in it.
+Three checks exclude a camera: its image shows nothing or is frozen (:mod:`tk.model.masks.image_health`); in the opening
+frames its masks contradict the hull of the other cameras (:mod:`tk.model.masks.mask_agreement`); or, in a later frame,
+its residual is an outlier of its baseline (:class:`~tk.trackers.residual.ResidualBaseline`). In the last case the frame
+is tracked again without the camera. If the other cameras then have a normal residual and the camera still has an
+outlier, the camera was wrong and not the pose. The camera is included again when its residual, at the pose that the
+others give, is normal. This is the iteratively reweighted fit of robust statistics with weights of 0 and 1 and the
+camera as the unit.
 
-A poor mask is no wrong camera: where it is in doubt it contradicts nothing. What a camera that is turned, moved or late
-lacks of the body on one side it shows beside the body on the other; a mask with pieces missing shows nothing there. It
-would still pull limbs out of what is missing, so the camera is left out, too, but the pose that the others found is not
-doubted for it, and it comes back when its masks have been whole for some frames.
+A poor mask is not a wrong camera. Uncertain pixels contradict nothing. A camera that is turned, moved or late has
+missing area on one side of the body and surplus area on the other; a torn mask has only missing area. A torn mask would
+still pull limbs out of the missing area, so its camera is excluded until its masks have been whole for some frames, but
+the pose is not rejected because of it.
 
-Only for trackers of contours: a visual hull without one of its masks is empty, so those of hulls take all cameras.
+Only contour trackers can go without a camera: a visual hull without one of its masks is empty.
 """
 
 from __future__ import annotations
@@ -29,53 +28,46 @@ from numpy.typing import NDArray
 
 from tk.model.body.plausibility import Plausibility, check_extent, check_stature
 from tk.model.body.skeleton import JOINTS
+from tk.model.cues.ray_costs import residual_of
 from tk.model.masks.image_health import ImageHealth, described
 from tk.model.masks.mask_agreement import MaskAgreement
 from tk.model.setup import Setup, Subject
 from tk.trackers.contour_tracker import ContourTracker
 from tk.trackers.protocol import Estimate, Observation, Tracker
+from tk.trackers.region import RegionTracker
+from tk.trackers.residual import OUTLIER
 
 Float = NDArray[np.float64]
 
 # Frames of the opening whose masks are compared.
 _OPENING = 5
-# A camera is looked into whose E_S is above this, and above its usual by this factor.
-_SUSPECT, _SUSPECT_RATIO = 0.25, 1.8
-# It is left out if so much of the body, fitted without it, lies outside its mask; or if the body leaves its usual E_S
-# times this unexplained, and the others' mean falls by this share.
-_CULPRIT_RATIO, _RELIEF, _HOPELESS = 3.0, 0.15, 0.2
-# The others must then be explained about as well as is usual, by these factors in the mean in the two cases.
-_OTHERS_FIT = 1.5, 1.3
-# A mask of which the person explains less than a quarter shows anything.
-_BLOB = 0.75
-# What it lacks where its mask is in doubt counts only if it is more than so much of the mask: then too little is left.
+# A camera with a residual (E_S) above this shows something unrelated to the person: the body covers less than a quarter
+# of its mask.
+_UNRELATED = 0.75
+# Missing area on uncertain pixels is ignored, unless it is more than this share of the mask: then too little is left.
 _TOO_LITTLE = 0.5
-# Its mask has pieces missing if it shows beside the body no more than this share of what it lacks.
+# A mask is torn if its surplus area is at most this share of its missing area.
 _TORN = 0.5
-# It comes back when the others' body leaves no more than its usual times this unexplained; with a torn mask, when it
-# has done so for some frames, for such masks come and go.
-_BACK_RATIO, _WHOLE = 1.6, 6
-# Whoever was lost is found when the masks are explained as well as is usual, by this factor in the mean.
-_FOUND = 2.0
-# A camera that was looked into in vain is not looked into again for so many frames unless it gets worse by this factor.
-_PAUSE, _WORSE = 6, 1.2
-# The usual E_S that is assumed at first, and how fast a better and a worse one is learned.
-_FIRST_USUAL, _BETTER, _SLOWLY = 0.12, 0.1, 0.02
-# Reasons, as messages tell them.
+# Consecutive frames after which a camera whose mask was torn is included again, because such masks come and go; and
+# after which a camera is tested again that was found right. Chosen on the development captures; sensitivity not
+# measured.
+_WHOLE = _PAUSE = 6
+_STATE = ("excluded", "torn", "normal_for", "since_test", "at_test")
+# Reasons, as in messages.
 _DISAGREES, _TOO_FEW = "disagrees with the others", "fewer than two cameras see anybody"
-_LACKS = "misses a part of the person"
+_MISSING = "misses a part of the person"
 _IMPLAUSIBLE = "the pose found cannot be true"
 
 Span = tuple[int, int, int]
-"""Of frames: the first, the last, how many."""
+"""Frames: the first, the last, and their number."""
 
 
 class CameraMonitor:
-    """Steps a tracker.
+    """Steps a tracker; excludes cameras that are wrong.
 
     Args:
-        tracker: started by :meth:`start`, or restored by whoever resumes.
-        setup: the scene.
+        tracker: started by :meth:`start`, or restored by the caller.
+        setup: rig, working volume, upward direction and rate.
         subject: what is known of the person.
     """
 
@@ -85,168 +77,168 @@ class CameraMonitor:
         self._health = ImageHealth()
         self._plausibility = Plausibility(setup.up, setup.fps)
         C = len(self._names)
-        self._usual = np.full(C, _FIRST_USUAL)
-        self._distrusted = np.zeros(C, bool)
-        self._lacks = np.zeros(C, bool)  # those of them whose masks miss a part of the person
-        self._whole_for = np.zeros(C, np.int64)
-        self._since_trial = np.full(C, _PAUSE)
-        self._at_trial = np.zeros(C)
-        self._left_out: dict[str, Span] = {}  # by "camera/reason"
+        self._excluded = np.zeros(C, bool)
+        self._torn = np.zeros(C, bool)  # excluded because of a torn mask
+        self._normal_for = np.zeros(C, np.int64)  # consecutive frames with a normal residual
+        self._since_test = np.full(C, _PAUSE)
+        self._at_test = np.zeros(C)  # excess at the last test
+        self._spans: dict[str, Span] = {}  # of exclusion, by "camera/reason"
         self._lost: dict[str, Span] = {}  # by reason
-        self._why_apart: dict[int, str] = {}
-        self._beside_usual = 1.0  # E_S of the last frame beside the usual
+        self._opening_reasons: dict[int, str] = {}
+        self._excess = 0.0  # of the last frame, mean over the cameras used
 
     def start(self, frames: Sequence[Observation]) -> list[Observation]:
-        """The opening frames without the cameras that cannot be believed, for the tracker's start.
+        """Return the opening frames without the cameras that are wrong, for the tracker's start.
 
         Raises:
-            CaptureError: the person has not the size that `capture.toml` tells.
+            CaptureError: the person's size contradicts the height in `capture.toml`.
         """
         health = ImageHealth()
         bad = np.array([self._bad(health.look(f.images, f.masks)) for f in frames])
         shown = [_without(f, b) for f, b in zip(frames, bad, strict=True)]
         chosen = np.unique(np.linspace(0, len(shown) - 1, _OPENING).round().astype(int))
         agreement = MaskAgreement(self._setup.rig, self._setup.volume).compare([shown[i].masks for i in chosen])
-        for camera in agreement.inconsistent if isinstance(self.tracker, ContourTracker) else ():
-            if len(self._names) - self._distrusted.sum() > 2:
-                self._distrusted[camera] = True
-                self._why_apart[camera] = agreement.reason(camera)
+        for camera in agreement.inconsistent if self.tracker.can_exclude_cameras else ():
+            if len(self._names) - self._excluded.sum() > 2:
+                self._excluded[camera] = True
+                self._opening_reasons[camera] = agreement.reason(camera)
         if self._subject.height_m is not None:
             check_extent(agreement.extent_m, self._subject.height_m)
-        return [_without(f, self._distrusted) for f in shown]
+        return [_without(f, self._excluded) for f in shown]
 
     def check_body(self) -> None:
-        """Refuse a body that nobody has, as the tracker's start found it.
+        """Refuse a body of an impossible size, after the tracker's start.
 
         Raises:
-            CaptureError: of the person's size.
+            CaptureError: with the size and its likely causes.
         """
         if self._subject.height_m is None:
             check_stature(self.tracker.body.dimensions.stature)
 
     def step(self, frame: Observation) -> tuple[Estimate, Observation]:
-        """The pose in the next frame, and what of the frame it was made from."""
-        sick = self._health.look(frame.images, frame.masks)
-        bad = self._bad(sick)
-        out = bad | self._distrusted
+        """Return the estimate for the next frame, and the observation without the excluded cameras."""
+        unhealthy = self._health.look(frame.images, frame.masks)
+        bad = self._bad(unhealthy)
+        out = bad | self._excluded
         used = _without(frame, out)
         if np.count_nonzero(used.masks.any(axis=(1, 2))) < 2:
-            used = _without(frame, np.ones(len(out), bool))  # depth is free with one view
-        watched = isinstance(self.tracker, ContourTracker) and len(out) - bad.sum() >= 3
-        before = self.tracker.state() if watched else {}
+            used = _without(frame, np.ones(len(out), bool))  # one view does not determine depth
+        monitored = isinstance(self.tracker, RegionTracker) and len(out) - bad.sum() >= 3
+        before = self.tracker.state() if monitored else {}
         estimate = self.tracker.step(used)
-        aside = None
-        if watched and used.masks.any() and estimate.residual is not None:
-            estimate, used, aside = self._weigh(frame, used, bad, before, estimate)
-        for camera, reason in enumerate(sick):
+        offset = None
+        if monitored and used.masks.any() and estimate.residual is not None:
+            estimate, used, offset = self._test(frame, used, bad, before, estimate)
+        for camera, reason in enumerate(unhealthy):
             if reason is not None and bad[camera]:
-                _count(self._left_out, f"{camera}/{reason}", frame.index)
-        for camera in np.flatnonzero((out | self._distrusted) & ~bad).tolist():
-            said = _LACKS if self._lacks[camera] else _DISAGREES
-            _count(self._left_out, f"{camera}/{said}", frame.index)
-        return self._judged(frame.index, estimate, used, aside), used
+                _count(self._spans, f"{camera}/{reason}", frame.index)
+        for camera in np.flatnonzero((out | self._excluded) & ~bad).tolist():
+            reason = _MISSING if self._torn[camera] else _DISAGREES
+            _count(self._spans, f"{camera}/{reason}", frame.index)
+        return self._plausible(frame.index, estimate, used, offset), used
 
-    def _bad(self, sick: Sequence[str | None]) -> NDArray[np.bool_]:
-        """(C,) the cameras to go without. A visual hull is empty where a mask is, so its trackers take them all."""
-        leaves_out = isinstance(self.tracker, ContourTracker)
-        return np.array([leaves_out and reason is not None for reason in sick])
+    def _bad(self, unhealthy: Sequence[str | None]) -> NDArray[np.bool_]:
+        """Return (C,) the cameras whose image excludes them. Trackers of hulls need all cameras."""
+        return np.array([self.tracker.can_exclude_cameras and reason is not None for reason in unhealthy])
 
-    def _weigh(
+    def _test(
         self, frame: Observation, used: Observation, bad: NDArray[np.bool_], before: Mapping[str, Any], first: Estimate
     ) -> tuple[Estimate, Observation, Float]:
-        """Leave out a camera that the body does not explain, and take back one that it does.
+        """Exclude a camera that is wrong, and include those again that are right.
 
         Returns:
-            the estimate, what it was made from, and (C,) by how much each used camera's mask lies beside the body.
+            the estimate, the observation without the excluded cameras, and (C,) the offset of each used camera's mask
+            from the body, see :func:`_offset`.
         """
-        assert first.residual is not None
-        error = aside = first.residual.sum(axis=1)  # no mask can lie farther beside the body
-        if self._distrusted.any() or np.nanmax(error, initial=0.0) > _SUSPECT:
-            lacking, surplus = self._errors(frame, first)
-            error, aside = lacking + surplus, _aside(lacking, surplus)
-        ratio = error / self._usual
-        usable = ~bad & np.isfinite(error)
-        whole = usable & ((ratio < _BACK_RATIO) | (error < 0.8 * _SUSPECT))
-        self._whole_for = np.where(whole, self._whole_for + 1, 0)
-        back = self._distrusted & (self._whole_for >= np.where(self._lacks, _WHOLE, 1))
-        kept = usable & ~self._distrusted
-        self._since_trial += 1
-        suspects = np.flatnonzero(kept & (error > _SUSPECT) & (ratio > _SUSPECT_RATIO))
-        suspects = suspects[
-            (self._since_trial[suspects] > _PAUSE) | (error[suspects] > _WORSE * self._at_trial[suspects])
-        ]
-        estimate = first
         tracker = self.tracker
-        assert isinstance(tracker, ContourTracker)
-        if len(suspects) and kept.sum() >= 3:
-            worst = int(suspects[np.argmax(ratio[suspects])])
+        assert isinstance(tracker, RegionTracker) and first.residual is not None
+        baseline = tracker.residuals
+        error, offset = first.residual.sum(axis=1), _offset(first.residual)
+        if self._excluded.any() or np.nanmax(baseline.excess(error), initial=0.0) > OUTLIER:
+            residual = self._residual(frame, first)
+            error, offset = residual.sum(axis=1), _offset(residual)
+        excess = baseline.excess(error)
+        usable = ~bad & np.isfinite(error)
+        self._normal_for = np.where(usable & (excess < self._normal), self._normal_for + 1, 0)
+        back = self._excluded & (self._normal_for >= np.where(self._torn, _WHOLE, 1))
+        kept = usable & ~self._excluded
+        self._since_test += 1
+        suspects = kept & (excess > OUTLIER)
+        suspects &= (self._since_test > _PAUSE) | (excess > self._at_test + baseline.threshold)
+        estimate = first
+        if suspects.any() and kept.sum() >= 3:
+            worst = int(np.argmax(np.where(suspects, excess, -np.inf)))
             others = kept.copy()
             others[worst] = False
             after = tracker.state()
             fewer = _without(used, ~others)
             tracker.rewind(before)
             second = tracker.step(fewer)
-            lacking, surplus = self._errors(frame, second)
-            again = lacking + surplus
-            relief = 1.0 - float(np.mean(again[others]) / np.mean(error[others]))
-            # Where the body does not explain the others either, it is the pose that is wrong. A mask with somebody else
-            # beside the person misleads contours little. A body that two cameras see may be anywhere in a third.
-            others_fit = float(np.mean(again[others] / self._usual[others]))
-            outside = lacking[worst] > (_HOPELESS if others.sum() >= 3 else 2 * _HOPELESS)
-            hopeless = others_fit < _OTHERS_FIT[0] and (outside or again[worst] > _BLOB)
-            much = others.sum() >= 3 and again[worst] > _CULPRIT_RATIO * self._usual[worst]
-            relieved = others_fit < _OTHERS_FIT[1] and much and relief > _RELIEF
-            culprit = relief > -_RELIEF / 2 and (hopeless or relieved)
-            if culprit:
-                self._distrusted[worst] = True
-                self._lacks[worst] = surplus[worst] < _TORN * lacking[worst]
+            residual = self._residual(frame, second)
+            again = residual.sum(axis=1)
+            if self._is_wrong(worst, residual, error, others):
+                self._excluded[worst] = True
+                self._torn[worst] = residual[worst, 1] < _TORN * residual[worst, 0]
                 estimate, used, kept = replace(second, status=first.status), fewer, others
-                aside = _aside(lacking, surplus)
+                error, offset = again, _offset(residual)
             else:
                 tracker.rewind(after)
-                self._since_trial[worst], self._at_trial[worst] = 0, error[worst]
-        told = error if estimate is first else again
-        self._beside_usual = float(np.mean((told / self._usual)[kept])) if kept.any() else np.inf
-        if estimate.status != "lost" and self._beside_usual < _FOUND:
-            rate = np.where(error < self._usual, _BETTER, _SLOWLY)
-            self._usual = np.where(kept, np.maximum(self._usual + rate * (error - self._usual), 0.05), self._usual)
-        self._distrusted &= ~back
-        return estimate, used, np.where(kept, aside, np.nan)
+                self._since_test[worst], self._at_test[worst] = 0, excess[worst]
+        self._excess = tracker.residuals.mean_excess(np.where(kept, error, np.nan))
+        self._excluded &= ~back
+        return estimate, used, np.where(kept, offset, np.nan)
 
-    def _errors(self, frame: Observation, estimate: Estimate) -> Float:
-        """(2, C) the two parts of E_S at the estimate's pose, of cameras left out, too: body outside the mask, unless
-        that is in doubt there and much is left, and mask outside the body. NaN where a camera sees nobody, or no body
-        was fitted.
+    def _is_wrong(self, camera: int, residual: Float, before: Float, others: NDArray[np.bool_]) -> bool:
+        """Return whether a camera is wrong, by the residual (C, 2) of the pose without it.
+
+        If the other cameras have a high residual too, the pose is wrong instead. Surplus area alone, such as a second
+        person in the mask, hardly misleads contours: it counts only if the others' E_S falls without the camera, from
+        ``before`` (C,), by one spread. A pose from two cameras is uncertain, so a third must have twice the excess.
+        """
+        assert isinstance(self.tracker, RegionTracker)
+        baseline, error = self.tracker.residuals, residual.sum(axis=1)
+        excess_of_others = baseline.mean_excess(np.where(others, error, np.nan))
+        if excess_of_others > baseline.threshold:
+            return False
+        many = others.sum() >= 3
+        missing = baseline.excess(residual[:, 0])[camera] > (OUTLIER if many else 2 * OUTLIER)
+        relief = baseline.mean_excess(np.where(others, before, np.nan)) - excess_of_others
+        return bool(
+            missing
+            or error[camera] > _UNRELATED
+            or (many and baseline.excess(error)[camera] > OUTLIER and relief > 1.0)
+        )
+
+    def _residual(self, frame: Observation, estimate: Estimate) -> Float:
+        """Return (C, 2) missing and surplus area at the estimate's pose, of excluded cameras, too. Missing area on
+        uncertain pixels is not counted if enough of the mask is left. NaN where a camera sees nobody, or no body was
+        fitted.
         """
         tracker, drawn = self.tracker, estimate.drawn
         assert isinstance(tracker, ContourTracker)
         if drawn is None or estimate.masks is None:
-            return np.full((2, len(frame.masks)), np.nan)
-        # what it took for the person, where it had the camera
-        masks, had = estimate.masks, estimate.masks.any(axis=(1, 2))
-        if not had.all():
+            return np.full((len(frame.masks), 2), np.nan)
+        masks, used = estimate.masks, estimate.masks.any(axis=(1, 2))
+        if not used.all():
             masks = masks.copy()
-            masks[~had] = tracker.cleaned(frame.masks[~had])
+            masks[~used] = tracker.cleaned(frame.masks[~used])
         person = tracker.screen.sample(masks) >= 128
-        seen = np.count_nonzero(person, axis=(1, 2)).astype(np.float64)
-        seen[seen == 0] = np.nan
-        missing, surplus = drawn & ~person, person & ~drawn
-        lacking = np.count_nonzero(missing, axis=(1, 2)) / seen
+        residual = residual_of(drawn, person)
         if frame.uncertain is not None:
-            excused = np.count_nonzero(missing & tracker.screen.sample(frame.uncertain), axis=(1, 2)) / seen
-            lacking -= np.where(excused < _TOO_LITTLE, excused, 0.0)
-        return np.stack([lacking, np.count_nonzero(surplus, axis=(1, 2)) / seen])
+            excused = residual_of(drawn & tracker.screen.sample(frame.uncertain), person)[:, 0]
+            residual[:, 0] -= np.where(excused < _TOO_LITTLE, excused, 0.0)
+        return residual
 
-    def _judged(self, index: int, estimate: Estimate, used: Observation, aside: Float | None) -> Estimate:
-        """The estimate, lost where it cannot be true."""
+    def _plausible(self, index: int, estimate: Estimate, used: Observation, offset: Float | None) -> Estimate:
+        """Return the estimate, with status lost if it is impossible."""
         if estimate.status == "lost":
             self._plausibility.forget()
             if not used.masks.any():
                 _count(self._lost, _TOO_FEW, index)
             return estimate
-        reason = self._plausibility.judge(index, estimate.joints, aside)
-        if aside is not None and estimate.status == "recovered" and self._beside_usual > _FOUND:
-            reason = reason or "after a loss it does not explain the masks yet"
+        reason = self._plausibility.judge(index, estimate.joints, offset)
+        if reason is None and offset is not None and estimate.status == "recovered" and self._excess > self._normal:
+            reason = "after a loss its residual is still high"
         if reason is None:
             return estimate
         _count(self._lost, f"{_IMPLAUSIBLE}: {reason}", index)
@@ -255,55 +247,53 @@ class CameraMonitor:
             self.tracker.lose()
         return replace(estimate, status="lost", sigma=None if estimate.sigma is None else np.full(len(JOINTS), np.nan))
 
+    @property
+    def _normal(self) -> float:
+        """The excess below which a residual is normal again: halfway between a high one and an outlier."""
+        assert isinstance(self.tracker, RegionTracker)
+        return (self.tracker.residuals.threshold + OUTLIER) / 2
+
     def report(self) -> list[str]:
-        """What was left out or lost, a line a camera and reason."""
+        """Return a line for each camera and reason of exclusion, and for each reason of a loss."""
         lines = []
-        for key, span in sorted(self._left_out.items()):
+        for key, span in sorted(self._spans.items()):
             camera, _, reason = key.partition("/")
-            because = self._why_apart.get(int(camera)) if reason == _DISAGREES else None
+            because = self._opening_reasons.get(int(camera)) if reason == _DISAGREES else None
             more = f" ({because})" if because else ""
             lines.append(f"camera {self._names[int(camera)]} {reason}{more}: left out of {described(*span)}")
         return lines + [f"{reason}: lost, {described(*span)}" for reason, span in self._lost.items()]
 
     def state(self) -> Mapping[str, Any]:
-        """What :meth:`restore` needs beside the tracker's own state."""
+        """Return what :meth:`restore` needs beside the tracker's own state."""
         return {
-            "usual": self._usual,
-            "distrusted": self._distrusted,
-            "lacks": self._lacks,
-            "whole_for": self._whole_for,
-            "since_trial": self._since_trial,
-            "at_trial": self._at_trial,
+            **{name: getattr(self, f"_{name}") for name in _STATE},
             **{f"health/{name}": value for name, value in self._health.state().items()},
             **{f"plausibility/{name}": value for name, value in self._plausibility.state().items()},
-            "spans": json.dumps([self._left_out, self._lost, self._why_apart]),
+            "spans": json.dumps([self._spans, self._lost, self._opening_reasons]),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Take up what :meth:`state` gave; the tracker is restored by whoever has its model."""
+        """Continue from a state; the caller restores the tracker."""
         part: dict[str, dict[str, Any]] = {"health": {}, "plausibility": {}}
         for name, value in state.items():
             group, slash, rest = name.partition("/")
             if slash and group in part:
                 part[group][rest] = value
-        self._usual = np.array(state["usual"], np.float64)
-        self._distrusted = np.array(state["distrusted"], bool)
-        self._lacks = np.array(state["lacks"], bool)
-        self._whole_for = np.array(state["whole_for"], np.int64)
-        self._since_trial = np.array(state["since_trial"], np.int64)
-        self._at_trial = np.array(state["at_trial"], np.float64)
+        for name in _STATE:
+            setattr(self, f"_{name}", np.array(state[name]))
         self._health.restore(part["health"])
         self._plausibility.restore(part["plausibility"])
-        left_out, lost, apart = json.loads(str(state["spans"]))
-        self._left_out = {key: (span[0], span[1], span[2]) for key, span in left_out.items()}
+        spans, lost, reasons = json.loads(str(state["spans"]))
+        self._spans = {key: (span[0], span[1], span[2]) for key, span in spans.items()}
         self._lost = {key: (span[0], span[1], span[2]) for key, span in lost.items()}
-        self._why_apart = {int(camera): reason for camera, reason in apart.items()}
+        self._opening_reasons = {int(camera): reason for camera, reason in reasons.items()}
 
 
-def _aside(lacking: Float, surplus: Float) -> Float:
-    """(C,) by how much masks lie beside a body: what they lack of it, but no more than they show beside it, as a share
-    of the mask or of the body, whichever is larger; of both parts of E_S."""
-    return np.asarray(np.minimum(lacking, surplus) / np.maximum(1.0 + lacking - surplus, 1.0))
+def _offset(residual: Float) -> Float:
+    """Return (C,) the smaller of missing and surplus area (C, 2), as a share of the larger region, mask or body. A
+    shifted mask has both; a torn mask has only missing area."""
+    missing, surplus = residual.T
+    return np.asarray(np.minimum(missing, surplus) / np.maximum(1.0 + missing - surplus, 1.0))
 
 
 def _count(spans: dict[str, Span], key: str, index: int) -> None:
@@ -312,7 +302,7 @@ def _count(spans: dict[str, Span], key: str, index: int) -> None:
 
 
 def _without(frame: Observation, out: NDArray[np.bool_]) -> Observation:
-    """The frame as if some cameras (C,) saw nobody."""
+    """Return the frame with empty masks in some cameras (C,)."""
     if not out.any():
         return frame
     masks = frame.masks.copy()
@@ -322,7 +312,7 @@ def _without(frame: Observation, out: NDArray[np.bool_]) -> Observation:
         uncertain = uncertain.copy()
         uncertain[out] = False
     images = frame.images
-    if images.size:  # one colour has no borders
+    if images.size:  # a single colour has no edges
         images = images.copy()
         images[out] = 0
     return replace(frame, images=images, masks=masks, uncertain=uncertain)
