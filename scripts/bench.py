@@ -9,7 +9,7 @@ Three kinds of figures, all medians:
   the hull, SciPy's cKDTree for the nearest neighbours. All in one process, so that they share the machine's mood.
 * *growth* (with `--growth`): the hull from 4, 5 and 9 cameras, as table 1 of Kehl & Van Gool 2006.
 
-With ``--method silhouette`` the same of the other tracker, which has no voxels. ``--pictures`` only tells what the
+With ``--method silhouette`` the same of the other tracker, which has no voxels. ``--pictures`` only reports what the
 overlay video and the report cost beside a default run.
 
     python -m scripts.bench [CAPTURE] [--voxels 64 128] [--repeat 3] [--growth CAPTURE] [--json FILE]
@@ -127,7 +127,7 @@ def counted_launches() -> Iterator[Counter[str]]:
 
 
 class _Clock(Silent):
-    """Notes when frames are told of, which some are together, what each took, and how many launches there had been."""
+    """Record the time of each report of frames, the time of each frame and the number of launches."""
 
     def __init__(self, counts: Counter[str]) -> None:
         self._counts = counts

@@ -3,7 +3,7 @@
     python -m scripts.bench_batch [CAPTURE] [--copies 4] [--frames 45] [--workers 1 2]
 
 The capture, by default the demo, is given several times under different names. Each count of workers gets a folder of
-its own; what is told includes the start of the workers and both passes.
+its own; the reported time includes the start of the workers and both passes.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
 
 A line a capture: E_S of each camera where the capture has exact masks (share of wrong pixels, |mask xor truth| over
 |truth|), the share of the person that is missed, and milliseconds a set of pictures: of decoding, of the masks, and
-their ratio. Both are given as wall time and as processor time over all threads, which tells more where other processes
-run beside. Each is measured alone.
+their ratio. Both are given as wall time and as processor time over all threads, which is more reliable while other
+processes run. Each is measured alone.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
     python -m scripts.bench_memory [--frames 10000] [--every 1000] [--causal]
 
 The demo's videos, made small, run forwards and backwards until there are as many frames. They are tracked, and what
-the tracker and the process ahead of it hold is told every so many frames, and after the second pass. Linux only.
+the tracker and the process ahead of it hold is reported every so many frames, and after the second pass. Linux only.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def make_loop(folder: Path, count: int) -> Capture:
 
 
 def held_mib(process: int | str = "self") -> float:
-    """What a process holds, MiB: in memory, and of it what the system has put aside."""
+    """What a process holds, MiB: in memory, and the part that the system has swapped out."""
     fields = dict(line.split(":", 1) for line in Path(f"/proc/{process}/status").read_text().splitlines())
     return sum(int(fields.get(name, "0").split()[0]) for name in ("VmRSS", "VmSwap")) / 1024  # none once it has ended
 
@@ -85,8 +85,8 @@ def _children() -> list[int]:
     return sorted(int(pid) for task in tasks for pid in (task / "children").read_text().split())
 
 
-class Telling(Silent):
-    """Tells what is held."""
+class MemoryReport(Silent):
+    """Report the memory held."""
 
     def __init__(self, every: int) -> None:
         self._every, self._count = every, 0
@@ -109,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         capture = make_loop(folder, chosen.frames)
         print(f"{len(capture.rig)} cameras of {capture.rig[0].width}×{capture.rig[0].height}", flush=True)
         done = session.track(
-            capture, Path(scratch) / "loop.h5", Settings(), Telling(chosen.every), causal=chosen.causal
+            capture, Path(scratch) / "loop.h5", Settings(), MemoryReport(chosen.every), causal=chosen.causal
         )
         print(f"{done.frames} frames in {done.seconds:.0f} s, {done.lost} lost; at the end {held_mib():.1f} MiB")
 

@@ -20,7 +20,7 @@ from tk.trackers.protocol import Estimate
 
 
 class _Clock(Silent):
-    """Remembers when each frame was told of, which some are together."""
+    """Record the time of each report of frames."""
 
     def __init__(self) -> None:
         self.times: list[float] = []
@@ -37,7 +37,7 @@ class Speed:
         decoding: milliseconds a set of pictures, decoded by nobody but this run's reader.
         mean: milliseconds a frame, from the first finished one to the last.
         frames: (F - 1,) milliseconds that each of them took, as the tracker's own clock says.
-        searched: (F - 1,) frames whose limbs were looked for.
+        searched: (F - 1,) frames with a limb search.
         first_s: from opening the capture to the first pose.
         after_s: what followed the last frame: the second pass, unless causal.
     """

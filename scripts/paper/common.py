@@ -28,7 +28,7 @@ Float = NDArray[np.float64]
 
 ARM_JOINTS = tuple(JOINTS.index(f"{joint}_{side}") for side in "lr" for joint in ("elbow", "wrist"))
 # A frame whose mean joint error exceeds this has lost the person, or most of the limbs, cm.
-ASTRAY_CM = 10.0
+LOST_CM = 10.0
 
 
 @dataclass(frozen=True)
@@ -81,9 +81,9 @@ class Track:
         return float(self.error_cm[:, list(ARM_JOINTS)].mean())
 
     @property
-    def astray(self) -> int:
-        """Frames with a mean joint error above :data:`ASTRAY_CM`."""
-        return int((self.frame_cm > ASTRAY_CM).sum())
+    def lost_frames(self) -> int:
+        """Frames with a mean joint error above :data:`LOST_CM`."""
+        return int((self.frame_cm > LOST_CM).sum())
 
 
 def track(

@@ -31,7 +31,7 @@ def run(options: Options) -> str:
                 "cues": name,
                 "15 joints: mean [cm]": spread([t.mean_cm for t in tracks]),
                 "elbows, wrists [cm]": spread([t.arms_cm for t in tracks]),
-                "frames > 10 cm": spread([t.astray for t in tracks], 0),
+                "frames > 10 cm": spread([t.lost_frames for t in tracks], 0),
                 "optimisation [ms]": spread([float(sorted(t.optimise_ms)[len(t.optimise_ms) // 2]) for t in tracks], 0),
             }
         )

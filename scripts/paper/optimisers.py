@@ -32,7 +32,7 @@ def run(options: Options) -> str:
             {
                 "optimiser": name,
                 "15 joints: mean [cm]": spread([t.mean_cm for t in tracks]),
-                "frames > 10 cm": spread([t.astray for t in tracks], 0),
+                "frames > 10 cm": spread([t.lost_frames for t in tracks], 0),
                 "median [ms]": spread([float(np.median(t.optimise_ms)) for t in tracks], 0),
                 "90th percentile [ms]": spread([float(np.quantile(t.optimise_ms, 0.9)) for t in tracks], 0),
                 "iterations of a descent": spread([float(t.iterations.mean()) for t in tracks], 1),

@@ -21,7 +21,7 @@ def run(options: Options) -> str:
                 "voxels": f"{voxels}³",
                 "15 joints: mean [cm]": spread([t.mean_cm for t in tracks]),
                 "elbows, wrists [cm]": spread([t.arms_cm for t in tracks]),
-                "frames > 10 cm": spread([t.astray for t in tracks], 0),
+                "frames > 10 cm": spread([t.lost_frames for t in tracks], 0),
                 "optimisation [ms]": spread([float(np.median(t.optimise_ms)) for t in tracks], 0),
             }
         )

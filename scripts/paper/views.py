@@ -25,7 +25,7 @@ def run(options: Options) -> str:
                 "cameras": ", ".join(chosen),
                 "15 joints: mean [cm]": spread([t.mean_cm for t in tracks]),
                 "elbows, wrists [cm]": spread([t.arms_cm for t in tracks]),
-                "frames > 10 cm": spread([t.astray for t in tracks], 0),
+                "frames > 10 cm": spread([t.lost_frames for t in tracks], 0),
             }
         )
         axes.plot(tracks[0].frame_cm, label=f"{len(chosen)} views", linewidth=1)

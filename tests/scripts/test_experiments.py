@@ -116,7 +116,7 @@ def test_a_capture_is_tracked_by_levenberg_marquardt() -> None:
 def test_a_track_is_of_the_capture() -> None:
     track = common.track(DEMO, replace(settings_file.from_toml(QUICK), voxels=48), 4)
     assert track.error_cm.shape == (4, len(JOINTS)) and track.pose.shape[0] == 4
-    assert 0.5 < track.mean_cm < 15 and track.astray <= 4
+    assert 0.5 < track.mean_cm < 15 and track.lost_frames <= 4
     assert (track.optimise_ms > 0).all() and (track.iterations > 0).all()
 
 

@@ -62,7 +62,7 @@ def _objective_kernel(real):
         tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
         samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 7)
         pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 25)
-        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
+        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (C, 22)
         voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 3)
         fits: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (V,)
         starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
@@ -75,10 +75,10 @@ def _objective_kernel(real):
         chosen: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, M + Q) samples, then voxels of the coverage term
         entries: ti.types.ndarray(dtype=real, ndim=3),  # (B, E, 16) of the alignment term
         state: ti.types.ndarray(dtype=real, ndim=2),  # (2 B, D) poses, then directions
-        scratch: ti.types.ndarray(dtype=real, ndim=3),  # (C, D + P, 39)
+        scratch: ti.types.ndarray(dtype=real, ndim=3),  # (T, D + P, 39)
         assigned: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (B, M) out, in when hold = 1
         covering: ti.types.ndarray(dtype=real, ndim=3),  # (B, Q, 4) piece and projection, out, in when hold = 1
-        sums: ti.types.ndarray(dtype=real, ndim=2),  # (C, 1 + 2 D) out
+        sums: ti.types.ndarray(dtype=real, ndim=2),  # (T, 1 + 2 D) out
     ):
         for turn in range(spread * sums.shape[0]):
             if turn % spread != 0:
@@ -125,7 +125,7 @@ def _linearise_kernel(real):
         tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
         samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 7)
         pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 25)
-        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
+        cameras: ti.types.ndarray(dtype=real, ndim=2),  # (C, 22)
         voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 3)
         settings: ti.types.ndarray(dtype=real, ndim=1),  # (13,)
         spread: ti.i32,
@@ -136,11 +136,11 @@ def _linearise_kernel(real):
         chosen: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (1, M + Q)
         entries: ti.types.ndarray(dtype=real, ndim=3),  # (1, E, 16)
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (1, D)
-        scratch: ti.types.ndarray(dtype=real, ndim=3),  # (C, D or more, 39)
+        scratch: ti.types.ndarray(dtype=real, ndim=3),  # (T, D or more, 39)
         assigned: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (1, M)
         covering: ti.types.ndarray(dtype=real, ndim=3),  # (1, Q, 4)
         residual: ti.types.ndarray(dtype=real, ndim=2),  # (M + Q, 4) out, metres, and the voxel or -1
-        hessian: ti.types.ndarray(dtype=real, ndim=3),  # (C, D, D) out, zeroed by the caller
+        hessian: ti.types.ndarray(dtype=real, ndim=3),  # (T, D, D) out, zeroed by the caller
     ):
         for turn in range(spread * hessian.shape[0]):
             if turn % spread != 0:
@@ -221,7 +221,7 @@ class ObjectiveKernel:
         barred: (N,) bit masks of the parts of the body that a sample may not enter: inside it finds no voxel. No parts
             by default.
         piece_part: (P,) the part, 0 to 23, that each piece belongs to.
-        cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_camera`, for the alignment term.
+        cameras: (C, 22) rows of :func:`tk.kernels.projection.pack_camera`, for the alignment term.
         dtype: np.float32, or np.float64 for checks of derivatives.
     """
 
