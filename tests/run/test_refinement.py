@@ -27,13 +27,13 @@ from tk.run.prefetch import open_observations
 from tk.run.refinement import retimed
 from tk.run.session import track
 
-TURNED = 1.0  # degrees, of cam2: a camera that is further off is left out instead
+TURNED = 1.0  # degrees, of cam2; a camera with a larger error is excluded
 
 
 @pytest.fixture(scope="module")
-def astray(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def turned(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The tiny capture, its second camera turned by :data:`TURNED` degrees about its vertical."""
-    folder = Path(shutil.copytree(tiny, tmp_path_factory.mktemp("astray") / "capture"))
+    folder = Path(shutil.copytree(tiny, tmp_path_factory.mktemp("turned") / "capture"))
     document = load_toml(folder / "calibration.toml")
     name = sorted(key for key in document if key != "metadata")[1]
     turn = np.asarray(cv2.Rodrigues(np.radians([0.0, TURNED, 0.0]))[0])
@@ -45,10 +45,10 @@ def astray(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def run(astray: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Silent]:
+def run(turned: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Silent]:
     """A result, and what was said."""
     path, reporter = tmp_path_factory.mktemp("results") / "result.h5", Silent()
-    assert track(open_capture(astray), path, settings_file.from_toml(QUICK), reporter).lost == 0
+    assert track(open_capture(turned), path, settings_file.from_toml(QUICK), reporter).lost == 0
     return path, reporter
 
 
@@ -57,32 +57,32 @@ def turns(one: Rig, other: Rig) -> np.ndarray:
     return np.array([turn_between(a, b) for a, b in zip(one, other, strict=True)])
 
 
-def test_tracking_refines_cameras_that_disagree(run: tuple[Path, Silent], astray: Path, tiny: Path) -> None:
+def test_tracking_refines_cameras_that_disagree(run: tuple[Path, Silent], turned: Path, tiny: Path) -> None:
     path, reporter = run
     said = [note for note in reporter.notes if "the cameras disagreed" in note]
     assert len(said) == 1 and "px off" in said[0]
     used = read_result(path).cameras
     assert used is not None
-    true, given = open_capture(tiny).rig, open_capture(astray).rig
+    true, given = open_capture(tiny).rig, open_capture(turned).rig
     assert turns(used.rig, true).max() < 0.75 * turns(given, true).max()
 
 
 def test_refine_writes_a_calibration(
-    run: tuple[Path, Silent], astray: Path, tiny: Path, tk: Tk, tmp_path: Path
+    run: tuple[Path, Silent], turned: Path, tiny: Path, tk: Tk, tmp_path: Path
 ) -> None:
     path, _ = run
     output = tmp_path / "refined.toml"
-    ran = tk("refine", astray, path, "-o", output, "--trust", "4")
+    ran = tk("refine", turned, path, "-o", output, "--trust", "4")
     assert ran.code == 0 and "cam2" in ran.out and "±" in ran.out, ran.err
-    true, given = open_capture(tiny).rig, open_capture(astray).rig
+    true, given = open_capture(tiny).rig, open_capture(turned).rig
     refined = read_calibration(output)
     assert turns(refined.rig, true).max() < 0.75 * turns(given, true).max()
     assert len(refined.time_offset_s) == len(given)
-    tk("refine", astray, path, "-o", output).complaint(str(output), "--force")
+    tk("refine", turned, path, "-o", output).complaint(str(output), "--force")
 
 
-def test_pictures_out_of_step_are_tracked_again(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The delays are made up: here it is about which pictures are tracked then, and that every frame keeps its row."""
+def test_late_videos_are_tracked_again(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With invented delays: which frames are tracked again, and that every frame keeps its row."""
     asked: list[np.ndarray] = []
 
     def made_up(tracker: Any, store: Any, frames: Any, *_: Any) -> Any:
@@ -109,7 +109,7 @@ def test_pictures_out_of_step_are_tracked_again(tiny: Path, tmp_path: Path, monk
     assert np.isnan(result.residual[[0, -1], [2, 3]]).all() and np.isfinite(result.residual[1:-1]).all()
 
 
-def test_what_does_not_belong_together_is_refused(tiny: Path, tracked: Path, tk: Tk, tmp_path: Path) -> None:
+def test_result_without_a_body_and_bad_options_are_refused(tiny: Path, tracked: Path, tk: Tk, tmp_path: Path) -> None:
     output = tmp_path / "refined.toml"
     bare = tmp_path / "bare.h5"
     shutil.copy(tracked, bare)

@@ -12,7 +12,7 @@ from tk.model.body.cone_body import build_cone_body
 from tk.model.body.gait_poses import neutral_pose, standing_pose, walking_pose
 from tk.model.body.skeleton import JOINTS, shoulder_angles
 from tk.model.masks.silhouettes import draw_silhouettes
-from tk.optim.gauss_newton import Descent
+from tk.optim.gauss_newton import BatchSolution
 from tk.settings import SilhouetteSettings
 from tk.trackers.initialisation import TrajectoryHypothesis, find_person, stature_of
 from tk.trackers.protocol import Observation
@@ -122,7 +122,7 @@ def test_poses_with_similar_residuals_in_one_frame_all_become_hypotheses(monkeyp
     frames = [Observation(i, np.zeros(0, np.uint8), m) for i, m in enumerate(masks)]
     tracker = tracker_of()
     monkeypatch.setattr(
-        tracker, "settle", lambda _, starts, *__: Descent(np.array(starts), np.zeros(0), np.zeros(3, np.int32))
+        tracker, "settle", lambda _, starts, *__: BatchSolution(np.array(starts), np.zeros(0), np.zeros(3, np.int32))
     )
     monkeypatch.setattr("tk.trackers.initialisation.gait.hypotheses", lambda *_: np.array([wrong, right]))
     monkeypatch.setattr("tk.trackers.initialisation._searched", lambda _, __, ___, pose: pose)
@@ -167,7 +167,7 @@ def test_recovered_person_keeps_the_heading_where_silhouettes_are_ambiguous(monk
     pyramid = tracker.pyramid(Observation(0, np.zeros(0, np.uint8), draw_silhouettes(BODY, RIG, there[None])[0]))
     facing = SKELETON.index("torso_yaw")
     monkeypatch.setattr(
-        tracker, "settle", lambda _, starts, levels: Descent(starts, np.zeros(0), np.zeros(len(levels), np.int32))
+        tracker, "settle", lambda _, starts, levels: BatchSolution(starts, np.zeros(0), np.zeros(len(levels), np.int32))
     )
 
     def residual_function(better_if_turned):

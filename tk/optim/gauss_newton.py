@@ -100,7 +100,7 @@ class Prior:
     precision: Float
 
 
-class Descent(NamedTuple):
+class BatchSolution(NamedTuple):
     """Result of :func:`minimise` for B states.
 
     Attributes:
@@ -123,7 +123,7 @@ def minimise(
     config: GaussNewtonSettings | None = None,
     prior: Prior | None = None,
     levels: Sequence[int] | None = None,
-) -> Descent:
+) -> BatchSolution:
     """Iterate from B states at once; each state's result is independent of the others.
 
     Args:
@@ -152,7 +152,7 @@ def minimise(
             moving &= np.abs(step).max(axis=1, initial=0.0) > config.tolerance
             if not moving.any():
                 break
-    return Descent(state, hessian, iterations)
+    return BatchSolution(state, hessian, iterations)
 
 
 class _FreeParameters:

@@ -30,7 +30,7 @@ from tk.model.cues.ray_costs import Evidence, RayGrid, mean_of_views
 from tk.model.masks.silhouettes import Pyramid, Views
 from tk.model.setup import InitPose
 from tk.optim import gauss_newton
-from tk.optim.gauss_newton import Descent, GaussNewtonSettings, Prior
+from tk.optim.gauss_newton import BatchSolution, GaussNewtonSettings, Prior
 from tk.settings import BodyFitSettings, SilhouetteSettings
 from tk.trackers.initialisation import HEADINGS, PHASES, TrajectoryHypothesis, centroid, find_person, stature_of
 from tk.trackers.protocol import Observation
@@ -281,7 +281,7 @@ class ContourTracker:
         images: NDArray[np.uint8] | None = None,
         prior: Prior | None = None,
         limb: Limb | None = None,
-    ) -> Descent:
+    ) -> BatchSolution:
         """Minimise by Gauss-Newton from poses (B, D), all in one frame or each in its own.
 
         Args:

@@ -27,7 +27,7 @@ def test_limbs_taper_and_thighs_hardly_overlap():
     assert d.upper_arm_radius > d.elbow_radius > d.wrist_radius
     assert d.thigh_radius > d.knee_radius > d.ankle_radius
     assert d.hip_half_width < d.hips_half_width and d.neck_radius < d.head_radius
-    # the two legs' flesh does not overlap by more than it can press together
+    # the two thighs do not overlap
     assert d.thigh_radius < d.hip_half_width
 
 

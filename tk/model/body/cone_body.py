@@ -303,7 +303,7 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
         knee = hip - d.thigh * z
         ankle = knee - d.calf * z
         if preset == "full":
-            # the flesh lies before the hip, behind the knee and outside of the ankle
+            # the surface lies in front of the hip, behind the knee and outside of the ankle
             top = hip + PELVIS_FORWARD * d.stature * x
             hollow = knee - KNEE_BACK * d.stature * x
             low = ankle + ANKLE_OUTWARD * d.stature * (M @ y)
