@@ -1,6 +1,6 @@
-"""A headless Chromium, driven by its DevTools protocol through two pipes: open pages, run scripts, take pictures.
+"""Control a headless Chromium with its DevTools protocol: open pages, run scripts, take screenshots.
 
-Nothing is downloaded and no port is opened: commands go in as JSON through descriptor 3 and come out through 4.
+Nothing is downloaded and no port is opened: commands are JSON on descriptor 3, answers on descriptor 4.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-#: where Chromium may be
+#: names of Chromium's program
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 _FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
     "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage", "--hide-scrollbars",
     "--remote-debugging-pipe",
 )  # fmt: skip
-_PATIENCE_S = 60.0
-# gives Chromium the descriptors that it expects and becomes it
+_TIMEOUT_S = 60.0  # of an answer
+# moves the pipes to the descriptors that Chromium expects, and executes it
 _START = (
     "import os, sys; a, b = int(sys.argv[1]), int(sys.argv[2]); os.dup2(a, 100); os.dup2(b, 101); os.dup2(100, 3); "
     "os.dup2(101, 4); os.closerange(5, 200); os.execv(sys.argv[3], sys.argv[3:])"
@@ -35,7 +35,7 @@ _START = (
 
 
 def find_browser() -> str | None:
-    """The path of a Chromium, or None."""
+    """Return the path of Chromium, or None."""
     return next((path for name in NAMES if (path := shutil.which(name))), None)
 
 
@@ -43,7 +43,7 @@ class Page:
     """A page of a running browser.
 
     Attributes:
-        said: what the page wrote to the console at the levels warning and error, exceptions included.
+        said: the page's warnings and errors on the console, exceptions included.
     """
 
     def __init__(self, commands: int, answers: int) -> None:
@@ -72,10 +72,10 @@ class Page:
             self._take(self._receive())
 
     def run(self, script: str) -> Any:
-        """The value of an expression in the page; of a promise, what it becomes.
+        """Return the value of an expression in the page; await a promise.
 
         Raises:
-            RuntimeError: it throws.
+            RuntimeError: the expression throws.
         """
         answer = self._call("Runtime.evaluate", {"expression": script, "returnByValue": True, "awaitPromise": True})
         if "exceptionDetails" in answer:
@@ -83,19 +83,19 @@ class Page:
         return answer["result"].get("value")
 
     def press(self, key: str) -> None:
-        """Press and let go a key, such as " " or "ArrowRight"."""
+        """Press and release a key, such as " " or "ArrowRight"."""
         text = {"text": key} if len(key) == 1 else {}
         self._call("Input.dispatchKeyEvent", {"type": "keyDown", "key": key, **text})
         self._call("Input.dispatchKeyEvent", {"type": "keyUp", "key": key})
 
     def drag(self, start: tuple[float, float], stop: tuple[float, float]) -> None:
-        """Move the pressed mouse from one place of the window to another."""
+        """Drag the mouse from one point of the window to another."""
         for kind, (x, y) in (("mousePressed", start), ("mouseMoved", stop), ("mouseReleased", stop)):
             values = {"type": kind, "x": x, "y": y, "button": "left", "buttons": 1, "clickCount": 1}
             self._call("Input.dispatchMouseEvent", values)
 
     def screenshot(self, path: Path, whole: bool = False) -> None:
-        """A PNG of the window, or of the ``whole`` page."""
+        """Write a PNG of the window, or of the ``whole`` page."""
         values: dict[str, Any] = {"format": "png", "captureBeyondViewport": whole}
         if whole:
             size = self._call("Page.getLayoutMetrics")["cssContentSize"]
@@ -120,7 +120,7 @@ class Page:
             self._take(answer)
 
     def _take(self, event: dict[str, Any]) -> None:
-        """An event: what the page says, or that it is loaded."""
+        """Handle an event: a console message, or the end of loading."""
         name, values = event.get("method"), event.get("params", {})
         if name == "Page.loadEventFired":
             self._loaded = True
@@ -133,12 +133,12 @@ class Page:
             self.said.append(values["entry"]["text"])
 
     def _receive(self) -> dict[str, Any]:
-        deadline = time.monotonic() + _PATIENCE_S
+        deadline = time.monotonic() + _TIMEOUT_S
         while b"\0" not in self._buffer:
             ready, _, _ = select.select([self._answers], [], [], max(deadline - time.monotonic(), 0))
             data = os.read(self._answers, 1 << 20) if ready else b""
             if not data:
-                raise RuntimeError("Chromium has ended" if ready else f"Chromium says nothing for {_PATIENCE_S:g} s")
+                raise RuntimeError("Chromium has ended" if ready else f"Chromium has not answered for {_TIMEOUT_S:g} s")
             self._buffer += data
         line, _, self._buffer = self._buffer.partition(b"\0")
         message: dict[str, Any] = json.loads(line)
@@ -147,10 +147,10 @@ class Page:
 
 @contextlib.contextmanager
 def browser_page() -> Iterator[Page]:
-    """A page in a browser of its own, with a profile of its own; both end with the block.
+    """Yield a page in a new browser with a temporary profile; both end with the block.
 
     Raises:
-        RuntimeError: there is no Chromium.
+        RuntimeError: Chromium is not installed.
     """
     program = find_browser()
     if program is None:

@@ -120,18 +120,18 @@ def _materials(image: Image, inside: Mask) -> NDArray[np.uint8]:
 
 
 def describe(image: Image, plate: Image, mask: Image) -> Picture:
-    """Split a picture by its mask (h, w) uint8 and the empty scene."""
+    """Split an image by its mask (h, w) uint8 and the empty scene."""
     inside = mask > 0
-    # the picture's border is no outline
+    # the border of the image is not an outline
     outline = inside & (cv2.erode(mask, _disc(1), borderValue=255) == 0)
     band = _near(outline, BAND_PX)
     materials = _materials(image, inside)
     uniform = cv2.dilate(materials, _disc(BAND_PX)) == cv2.erode(materials, _disc(BAND_PX))
     away = ~_near(inside, 4 * BAND_PX)
-    # lamps flicker and cameras adapt
+    # corrects for flickering lamps and automatic exposure
     gain = np.median(image[away] / np.maximum(plate[away], 1.0), axis=0) if away.any() else np.ones(3)
     empty = plate * gain
-    # the person out of the picture, or the blur would carry them into the floor
+    # without the person, because the blur would spread them over the floor
     without = np.where(_near(inside, BAND_PX)[..., None], empty, image)
     difference = np.abs(cv2.GaussianBlur(without - empty, (0, 0), 2.0)).max(axis=2)
     shadow = _near(difference > CHANGED, BAND_PX) & ~inside & ~band
@@ -139,10 +139,10 @@ def describe(image: Image, plate: Image, mask: Image) -> Picture:
 
 
 def load(folder: Path, frames: Sequence[int], cameras: Sequence[str] | None = None) -> Iterator[Picture]:
-    """The pictures of some frames, camera by camera; of all cameras if None.
+    """Yield the images of some frames, camera by camera; of all cameras if None.
 
     Raises:
-        CaptureError: the capture lacks masks, an empty scene, or one of the frames.
+        CaptureError: the capture has no masks, no empty scene, or not all frames.
     """
     capture = open_capture(folder, cameras)
     background = capture.background()
@@ -179,7 +179,7 @@ def measure(pictures: Sequence[Picture], detector: Detector) -> Curve:
         for row, high in zip(counts, detector.thresholds, strict=True):
             low = LOW_SHARE * high
             edges = detect(low, high)
-            # all that hysteresis might follow, were it led there by the person's own edges
+            # everything that hysteresis could follow from the person's own edges
             static = detect_empty(low, low)
             moving = edges & ~_near(static, RECALL_PX)
             row += (

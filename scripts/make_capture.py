@@ -40,7 +40,7 @@ class SizeType(click.ParamType[tuple[int, int]]):
 
 
 class ColorType(click.ParamType[tuple[float, float, float]]):
-    """``#rrggbb``, turned into linear light."""
+    """``#rrggbb``, converted to linear light."""
 
     name = "#rrggbb"
 
@@ -60,13 +60,13 @@ class ColorType(click.ParamType[tuple[float, float, float]]):
 
 
 @click.command()
-@click.option("--out", required=True, type=click.Path(path_type=Path, file_okay=False), help="The capture's folder.")
+@click.option("--out", required=True, type=click.Path(path_type=Path, file_okay=False), help="Folder of the capture.")
 @click.option("--motion", type=click.Choice(list(MOTIONS)), default="demo", show_default=True)
 @click.option("--frames", type=click.IntRange(min=1), help="Number of frames [default: the motion's own length].")
 @click.option("--cameras", type=click.Choice([str(n) for n in RIGS]), default="5", show_default=True)
 @click.option("--size", type=SizeType(), default="640x480", show_default=True)
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of cameras and noise.")
-@click.option("--masks", is_flag=True, help="Write exact masks, too.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of cameras and noise.")
+@click.option("--masks", is_flag=True, help="Also write exact masks.")
 @click.option("--shirt", type=ColorType(), help="Colour of the T-shirt.")
 @click.option("--stripes", is_flag=True, help="A striped T-shirt.")
 @click.option("--trousers", type=ColorType(), help="Colour of the trousers.")

@@ -1,9 +1,9 @@
 """Tables 1 and 2 and figure 6 of the silhouette paper, on a treadmill capture with masks and truth.
 
-Table 1: E_S and the ankles' error with 2, 3 and 4 views, 2, 3 and 5 iterations, without ambiguity weighting, with a
-single scale. E_S is averaged over all views, tracked or not; the ankles' error over the tracked ones, pixels. "paper"
-rows search contours inside the outline, too, by plain least squares, and use no prediction and no search for lost
-limbs; "tk" rows are the defaults. Table 2: milliseconds a frame. Figure 6: the ankles' x in one view against truth.
+Table 1: E_S and the ankles' error with 2, 3 and 4 views, with 2, 3 and 5 iterations, without ambiguity weights, and
+with a single scale. E_S is the mean over all views, used or not; the ankles' error over the used ones, pixels. Rows
+"paper" also search contours inside the outline, with plain least squares, without prediction and limb search; rows "tk"
+are the defaults. Table 2: milliseconds per frame. Figure 6: the ankles' x in one view and in the ground truth.
 
     python -m scripts.silhouette_tables CAPTURE [--cameras a,b,c,d] [--frames 340] [--every 1] [--figure FILE.png]
 """
@@ -68,7 +68,7 @@ class Sequence3D:
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the tables: errors in %, pixels and cm, milliseconds a frame for the fit and for all."""
+    """A row of the tables: errors in %, pixels and cm; milliseconds per frame of the fit and in total."""
 
     name: str
     views: int
@@ -84,7 +84,7 @@ class Row:
 
 
 def load(folder: Path, cameras: Sequence[str], frames: int, every: int = 1) -> Sequence3D:
-    """Masks and truth of every so many of the first frames, views in the order of ``cameras``."""
+    """Return masks and ground truth of every ``every``-th of the first frames, views in the order of ``cameras``."""
     capture = open_capture(folder, cameras=list(cameras))
     order = [capture.rig.names.index(name) for name in cameras]
     with capture.frames(0, frames) as reader:
@@ -95,7 +95,7 @@ def load(folder: Path, cameras: Sequence[str], frames: int, every: int = 1) -> S
 
 
 def variants() -> list[tuple[str, int, Variant]]:
-    """Names, views and settings of table 1, then ours."""
+    """Return names, views and settings of table 1, then the defaults."""
 
     def iterations(n: int) -> Variant:
         return replace(PAPER, solver=replace(PAPER.solver, iterations=n))
@@ -118,7 +118,7 @@ def variants() -> list[tuple[str, int, Variant]]:
 
 
 def track(data: Sequence3D, name: str, views: int, config: Variant) -> tuple[Row, Float]:
-    """Track with the first views; a row of the tables and the joints (F, 15, 3)."""
+    """Track with the first views; return a row of the tables and the joints (F, 15, 3)."""
     rig = Rig(data.rig.cameras[:views])
     empty = np.zeros(0, np.uint8)
     frames = [Observation(i, empty, np.ascontiguousarray(m[:views])) for i, m in enumerate(data.masks)]
@@ -143,7 +143,7 @@ def track(data: Sequence3D, name: str, views: int, config: Variant) -> tuple[Row
         height.append(np.linalg.norm(crown - ankle, axis=1).mean())
     straight = np.linalg.norm(found - true, axis=2).sum(axis=1)
     crossed = np.linalg.norm(found[:, ::-1] - true, axis=2).sum(axis=1)
-    # the first step compiles nothing any more, but it is no typical frame either
+    # the first step is not typical
     timing = [e.timing for e in estimates[1:]]
     row = Row(
         name=name,
@@ -162,7 +162,7 @@ def track(data: Sequence3D, name: str, views: int, config: Variant) -> tuple[Row
 
 
 def table(rows: Sequence[Row]) -> str:
-    """The rows as a Markdown table."""
+    """Return the rows as a Markdown table."""
     lines = [
         "| settings | views | iterations × scales | E_S % | ankles px (% of height) | joints cm | swaps "
         "| fit ms | all ms |",
@@ -177,7 +177,7 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def draw_figure(data: Sequence3D, joints: Float, file: Path) -> None:
-    """Figure 6: the ankles' x in the first view, tracked and true."""
+    """Draw figure 6: the ankles' x in the first view, tracked and ground truth."""
     import matplotlib
 
     matplotlib.use("Agg")

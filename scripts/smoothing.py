@@ -1,8 +1,8 @@
-"""What smoothing and bridging do to a result of known truth.
+"""Measure the effect of smoothing and bridging on a result with ground truth.
 
-Prints the mean distance of the joints from the truth, the same with each joint's constant offset taken off, and the
-mean error of velocity and acceleration, before and after smoothing; then the mean distance between tracked and bridged
-joints where known frames are taken out.
+Prints the mean distance of the joints from the ground truth, raw and without each joint's constant offset, and the mean
+error of velocity and acceleration, before and after smoothing; then the mean distance between tracked and bridged
+joints in frames that were removed.
 
     python -m scripts.smoothing RESULT.h5 TRUTH.h5 [--gaps 2 4 7]
 """
@@ -38,7 +38,7 @@ class Errors:
 
 
 def errors(joints: Float, true: Float, fps: float) -> Errors:
-    """The errors of joints (F, 15, 3) against the truth, metres."""
+    """Return the errors of joints (F, 15, 3) against the ground truth, metres."""
     e = joints - true
 
     def mean(differences: Float) -> float:
@@ -49,7 +49,7 @@ def errors(joints: Float, true: Float, fps: float) -> Errors:
 
 
 def compare(result: Path, truth: Path) -> tuple[Errors, Errors]:
-    """The errors before and after smoothing, of the frames that are known in both."""
+    """Return the errors before and after smoothing in the frames that both have."""
     plain, smoothed = (read_motion(result, is_smoothed)[0] for is_smoothed in (False, True))
     true = read_joints(truth)
     where = {int(frame): k for k, frame in enumerate(true.frames)}
@@ -60,7 +60,7 @@ def compare(result: Path, truth: Path) -> tuple[Errors, Errors]:
 
 
 def bridging_cm(result: Path, gap: int) -> float:
-    """The mean distance of bridged joints from tracked ones, every ``gap`` of ``gap + 8`` frames being taken out."""
+    """Return the mean distance of bridged from tracked joints if ``gap`` of every ``gap + 8`` frames are removed."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(shutil.copyfile(result, Path(folder) / "gaps.h5"))
         with h5py.File(copy, "r+") as file:

@@ -1,4 +1,4 @@
-"""The commands from outside: what they print, how they end, and what they say to bad input."""
+"""The commands: output, exit codes, and messages about bad input."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def edit_toml(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
 # --- the main job -----------------------------------------------------------------------------------------------------
 
 
-def test_track_writes_what_the_contract_says(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+def test_track_writes_all_datasets_of_the_result_format(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
     result = tmp_path / "result.h5"
     ran = tk("track", tiny, "-o", result, "--config", quick, "--frames", "2:8", "--seed", "5")
     assert ran.code == 0, ran.err
     assert ran.out == ""  # progress is no result
     lines = ran.err.splitlines()
-    assert all(line.isprintable() for line in lines)  # plain lines, no bar: this is no terminal
+    assert all(line.isprintable() for line in lines)  # plain lines, no bar, because stderr is not a terminal
     done = next(i for i, line in enumerate(lines) if line.startswith("frame 7: 6/6, "))
     assert "second pass" in lines[done + 1] and ran.told == lines[-1:]
     assert lines[-1].startswith(f"6 frames in {result}, 0 lost, ")
@@ -91,7 +91,7 @@ def test_track_writes_what_the_contract_says(tk: Tk, quick: Path, tiny: Path, tm
 
 
 def test_track_finds_the_person(tk: Tk, tracked: Path, tiny: Path) -> None:
-    """Voxels of 7 cm and pictures of 160×120: this shows that all is connected, and not how well it works."""
+    """With voxels of 7 cm and images of 160×120: a test of the whole chain, not of its accuracy."""
     ran = tk("evaluate", tracked, tiny / "truth.h5", "--json")
     assert ran.code == 0 and ran.err == ""
     found = json.loads(ran.out)
@@ -103,7 +103,7 @@ def test_track_finds_the_person(tk: Tk, tracked: Path, tiny: Path) -> None:
     assert f"{FRAMES} frames judged: 0 lost" in table.out
 
 
-def test_track_segments_the_videos_where_masks_are_not_wanted(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+def test_masks_none_segments_the_videos(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
     result = tmp_path / "r.h5"
     ran = tk("track", tiny, "-o", result, "--config", quick, "--frames", ":5", "--masks", "none")
     assert ran.code == 0, ran.err
@@ -112,7 +112,7 @@ def test_track_segments_the_videos_where_masks_are_not_wanted(tk: Tk, quick: Pat
         assert (file["status"][()] < 3).all()
 
 
-def test_masks_and_cameras_of_ones_own_choice(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
+def test_masks_from_a_folder_and_chosen_cameras_are_used(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
     shutil.move(copy / "masks", tmp_path / "mine")
     shutil.rmtree(copy / "background")  # masks could not be made from the videos
     first, second = tmp_path / "a.h5", tmp_path / "b.h5"
@@ -124,7 +124,7 @@ def test_masks_and_cameras_of_ones_own_choice(tk: Tk, quick: Path, copy: Path, t
         assert (b["status"][()] < 3).all()
 
 
-def test_settings_from_a_file_and_options_over_them(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+def test_options_override_the_settings_file(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
     settings = tmp_path / "settings.toml"
     settings.write_text(f"seed = 3\n{QUICK}[tracking]\nprediction = 0\n".replace("32", "40"), encoding="utf-8")
     result = tmp_path / "r.h5"
@@ -142,8 +142,10 @@ def test_help_and_version(tk: Tk) -> None:
         assert ran.code == 0 and f"tk {command}" in ran.out and ran.err == ""
 
 
-def test_demo_tracks_and_says_how_well(tk: Tk, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`tk demo` on a stand-in for the capture that ships; that one has its test among the slow ones."""
+def test_demo_tracks_and_prints_the_accuracy(
+    tk: Tk, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a small capture instead of the one that ships, which has a slow test."""
     package = tmp_path / "package"
     shutil.copytree(tiny, package / "data" / "demo")
     monkeypatch.setattr("importlib.resources.files", lambda name: package)
@@ -258,7 +260,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], list[str]]] = {
 
 
 @pytest.mark.parametrize(("method", "spoil"), [*(("region", name) for name in SPOILT), ("volumetric", "nobody there")])
-def test_a_bad_capture_is_one_line_that_names_the_file(
+def test_error_of_a_bad_capture_is_one_line_with_the_file(
     tk: Tk, quick: Path, copy: Path, tmp_path: Path, method: str, spoil: str
 ) -> None:
     change, parts = SPOILT[spoil]
@@ -268,14 +270,12 @@ def test_a_bad_capture_is_one_line_that_names_the_file(
     assert list(tmp_path.iterdir()) == [copy]
 
 
-def test_a_missing_capture(tk: Tk, tmp_path: Path) -> None:
+def test_missing_capture_is_reported(tk: Tk, tmp_path: Path) -> None:
     for command in ("track", "reconstruct"):
         tk(command, tmp_path / "nowhere", "-o", tmp_path / "r.h5").complaint("nowhere", "not a folder")
 
 
-def test_videos_of_different_lengths_are_tracked_as_far_as_they_all_go(
-    tk: Tk, quick: Path, copy: Path, tmp_path: Path
-) -> None:
+def test_shortest_video_limits_the_frames(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
     write_video(copy / "videos" / "cam2.mp4", [picture(1, k, SIZE) for k in range(6)])
     ran = tk("track", copy, "-o", tmp_path / "r.h5", "--config", quick)
     assert ran.code == 0
@@ -286,10 +286,10 @@ def test_videos_of_different_lengths_are_tracked_as_far_as_they_all_go(
 
 
 @pytest.mark.parametrize("broken", [2, 7])
-def test_what_is_finished_is_kept_when_the_input_breaks(
+def test_finished_frames_are_kept_when_a_file_is_damaged(
     tk: Tk, quick: Path, copy: Path, tmp_path: Path, broken: int
 ) -> None:
-    """At frame 2 as well, which is among those that the body is fitted to."""
+    """Also at frame 2, one of the frames that the body is fitted to."""
     mask = copy / "masks" / "cam2" / f"{broken:06d}.png"
     good = mask.read_bytes()
     mask.write_bytes(good[: len(good) // 3])
@@ -309,7 +309,9 @@ def test_what_is_finished_is_kept_when_the_input_breaks(
 
 
 @pytest.mark.parametrize("command", ["track", "reconstruct"])
-def test_results_that_cannot_be_written(tk: Tk, quick: Path, tiny: Path, tmp_path: Path, command: str) -> None:
+def test_output_that_cannot_be_written_is_refused(
+    tk: Tk, quick: Path, tiny: Path, tmp_path: Path, command: str
+) -> None:
     def run(output: Path) -> Any:
         return tk(command, tiny, "-o", output, "--config", quick, "--frames", ":1")
 
@@ -323,27 +325,29 @@ def test_results_that_cannot_be_written(tk: Tk, quick: Path, tiny: Path, tmp_pat
     run(tmp_path / "other.h5").complaint("other.h5", "not overwritten")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "other.h5"]
     assert (tmp_path / "file").read_text() == "mine"
-    if os.path.isdir("/proc"):  # where not even root may make a file
+    if os.path.isdir("/proc"):  # not even root may create a file there
         run(Path("/proc/r.h5")).complaint("/proc/r.h5", "cannot be written")
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="permissions do not bind root")
 @pytest.mark.parametrize("command", ["track", "reconstruct"])
-def test_a_folder_without_permission(tk: Tk, quick: Path, tiny: Path, tmp_path: Path, command: str) -> None:
+def test_output_folder_without_permission_is_refused(
+    tk: Tk, quick: Path, tiny: Path, tmp_path: Path, command: str
+) -> None:
     locked = tmp_path / "locked"
     locked.mkdir(mode=0o500)
     tk(command, tiny, "-o", locked / "r.h5", "--config", quick).complaint("r.h5")
 
 
 def spoil(path: Path, name: str, value: Any) -> None:
-    """Replace a dataset or group of a result; None leaves nothing in its place."""
+    """Replace a dataset or group of a result; None deletes it."""
     with h5py.File(path, "r+") as file:
         del file[name]
         if value is not None:
             file[name] = value
 
 
-def test_evaluate_takes_no_damaged_result(tk: Tk, tracked: Path, tiny: Path, tmp_path: Path) -> None:
+def test_evaluate_refuses_damaged_results(tk: Tk, tracked: Path, tiny: Path, tmp_path: Path) -> None:
     pipe = tmp_path / "pipe.h5"
     os.mkfifo(pipe)
     tk("evaluate", pipe, tiny / "truth.h5").complaint("pipe.h5", "not a file")
@@ -368,7 +372,7 @@ def test_evaluate_takes_no_damaged_result(tk: Tk, tracked: Path, tiny: Path, tmp
         (["--causal"], [("resume/state/poses", None), ("resume/state/costs", "text"), ("model/parts", None)]),
     ],
 )
-def test_a_damaged_state_is_not_taken_up(
+def test_resume_refuses_a_damaged_state(
     tk: Tk, quick: Path, tiny: Path, tmp_path: Path, options: list[str], own: list[tuple[str, Any]]
 ) -> None:
     result = tmp_path / "r.h5"
@@ -386,7 +390,7 @@ def test_a_damaged_state_is_not_taken_up(
         tk(*command, "--frames", ":4", "--resume").complaint("r.h5")
 
 
-def test_evaluate_names_what_it_cannot_read(tk: Tk, tracked: Path, tiny: Path, tmp_path: Path) -> None:
+def test_evaluate_names_files_that_cannot_be_read(tk: Tk, tracked: Path, tiny: Path, tmp_path: Path) -> None:
     tk("evaluate", tmp_path / "r.h5", tiny / "truth.h5").complaint("r.h5", "no such file")
     tk("evaluate", tracked, tiny / "calibration.toml").complaint("calibration.toml", "not an HDF5 file")
     with h5py.File(tmp_path / "other.h5", "w") as file:

@@ -1,4 +1,4 @@
-"""What exists is not replaced unasked, how a run ends, and what scripts read."""
+"""Existing output is kept, exit codes, and JSON output."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 
 
-def test_a_result_is_not_replaced_unasked(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+def test_result_is_replaced_only_with_force(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
     result = tmp_path / "r.h5"
     command = ["track", tiny, "-o", result, "--config", quick, "--frames", ":2"]
     assert tk(*command).code == 0
@@ -34,7 +34,7 @@ def test_a_result_is_not_replaced_unasked(tk: Tk, quick: Path, tiny: Path, tmp_p
         assert file.attrs["seed"] == 4
 
 
-def test_force_leaves_alone_what_is_no_result(tk: Tk, tiny: Path, tmp_path: Path) -> None:
+def test_force_does_not_replace_other_files(tk: Tk, tiny: Path, tmp_path: Path) -> None:
     other = tmp_path / "thesis.h5"
     other.write_text("mine")
     for command in ("track", "reconstruct"):
@@ -42,7 +42,7 @@ def test_force_leaves_alone_what_is_no_result(tk: Tk, tiny: Path, tmp_path: Path
     assert other.read_text() == "mine"
 
 
-def test_a_hull_and_its_point_clouds_are_not_replaced_unasked(tk: Tk, tiny: Path, tmp_path: Path) -> None:
+def test_hull_and_point_clouds_are_replaced_only_with_force(tk: Tk, tiny: Path, tmp_path: Path) -> None:
     settings = tmp_path / "s.toml"
     settings.write_text("voxels = 16\nahead = 0\n")
     command = ["reconstruct", tiny, "--config", settings, "--frames", ":2"]
@@ -57,7 +57,7 @@ def test_a_hull_and_its_point_clouds_are_not_replaced_unasked(tk: Tk, tiny: Path
     assert tk(*command, "-o", tmp_path / "h.h5", "--ply", tmp_path / "ply", "--force").code == 0
 
 
-def test_python_follows_the_same_rule(tiny: Path, tmp_path: Path) -> None:
+def test_python_replaces_a_result_only_with_force(tiny: Path, tmp_path: Path) -> None:
     path = tmp_path / "r.h5"
     config = settings_file.from_toml(QUICK)
     capture = open_capture(tiny)
@@ -70,7 +70,7 @@ def test_python_follows_the_same_rule(tiny: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(first.pose, again.pose)
 
 
-def test_most_frames_lost_is_an_exit_code_of_its_own(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
+def test_exit_code_3_if_most_frames_are_lost(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
     for mask in (copy / "masks").glob("*/*.png"):
         if int(mask.stem) >= 4:  # the person has left
             cv2.imwrite(str(mask), np.zeros_like(cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE)))
@@ -81,7 +81,7 @@ def test_most_frames_lost_is_an_exit_code_of_its_own(tk: Tk, quick: Path, copy: 
     assert (found["frames"], found["lost"], found["interrupted"]) == (FRAMES, FRAMES - 4, False)
 
 
-def test_scripts_get_json_and_nothing_else(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+def test_quiet_json_prints_nothing_but_json(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
     command = ["--config", quick, "--frames", ":2", "--quiet", "--json"]
     ran = tk("track", tiny, "-o", tmp_path / "r.h5", *command)
     assert (ran.code, ran.err) == (0, "")
@@ -93,7 +93,7 @@ def test_scripts_get_json_and_nothing_else(tk: Tk, quick: Path, tiny: Path, tmp_
     assert json.loads(hull.out)["frames"] == 2
 
 
-def test_a_run_says_what_it_does_before_the_first_frame(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+def test_stages_are_printed_before_the_first_frame(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
     ran = tk("track", tiny, "-o", tmp_path / "r.h5", "--config", quick, "--frames", ":1")
     before = ran.err.partition("frame 0: ")[0]
     said = [re.sub(r"^\[ *[\d.]+ s\] ", "", line) for line in before.splitlines()]
@@ -106,7 +106,7 @@ def commands() -> list[str]:
     return sorted(main.commands)
 
 
-def test_no_summary_is_cut_off(tk: Tk) -> None:
+def test_help_lists_commands_with_full_sentences(tk: Tk) -> None:
     listed = tk("--help").out.partition("Commands:")[2]
     assert "..." not in listed and "…" not in listed
     for name in commands():
@@ -114,7 +114,7 @@ def test_no_summary_is_cut_off(tk: Tk) -> None:
 
 
 @pytest.mark.parametrize("name", commands())
-def test_each_commands_help_has_an_example_that_it_accepts(tk: Tk, name: str) -> None:
+def test_help_has_an_example_that_the_command_accepts(tk: Tk, name: str) -> None:
     ran = tk(name, "--help")
     assert ran.code == 0 and f"tk {name}" in ran.out and ran.err == ""
     assert isinstance(main, click.Group)
@@ -127,6 +127,6 @@ def test_each_commands_help_has_an_example_that_it_accepts(tk: Tk, name: str) ->
         main.commands[first].make_context(first, rest)
 
 
-def test_the_shells_completion_can_be_had(tk: Tk, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shell_completion_is_available(tk: Tk, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("_TK_COMPLETE", "zsh_source")
     assert "compdef" in tk().out

@@ -1,4 +1,4 @@
-"""``tk view``: on a display that exists in memory only, and without one."""
+"""`tk view` on a display in memory, and without a display."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def display(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """An X server that draws into memory."""
+    """Start an X server that draws into memory."""
     if shutil.which("Xvfb") is None:
         pytest.skip("needs Xvfb (Debian: xvfb)")
     read, write = os.pipe()
@@ -43,7 +43,10 @@ def display(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 def run(display: str | None, *arguments: object) -> subprocess.CompletedProcess[str]:
     env = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    env |= {"VK_ICD_FILENAMES": os.devnull, "VK_DRIVER_FILES": os.devnull}  # no card: every machine draws alike
+    env |= {
+        "VK_ICD_FILENAMES": os.devnull,
+        "VK_DRIVER_FILES": os.devnull,
+    }  # without a graphics card, every machine draws the same
     return subprocess.run(
         [sys.executable, "-c", "from tk.cli import main; main(prog_name='tk')", "view", *map(str, arguments)],
         cwd=ROOT,
@@ -54,11 +57,11 @@ def run(display: str | None, *arguments: object) -> subprocess.CompletedProcess[
     )
 
 
-def test_a_frame_is_drawn(display: str, tracked: Path, tiny: Path, tmp_path: Path) -> None:
+def test_screenshot_shows_body_and_floor(display: str, tracked: Path, tiny: Path, tmp_path: Path) -> None:
     picture = tmp_path / "shot.png"
     ran = run(display, tracked, tiny, "--frame", 5, "--screenshot", picture)
     assert ran.returncode == 0, ran.stderr
-    assert ran.stdout == "", "the engine's chatter belongs on stderr"
+    assert ran.stdout == "", "messages belong on stderr"
     assert "frame 5" in ran.stderr
     image = cv2.imread(str(picture))
     assert image is not None and image.shape[0] > 600 and image.shape[1] > 1000
@@ -69,7 +72,9 @@ def test_a_frame_is_drawn(display: str, tracked: Path, tiny: Path, tmp_path: Pat
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="displays of X are Linux's")
-def test_without_a_display_one_line_says_so(tk: Tk, tracked: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_display_is_reported_with_the_alternative(
+    tk: Tk, tracked: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     tk("view", tracked).complaint("DISPLAY is not set", "tk report RESULT.h5")
     monkeypatch.setenv("DISPLAY", ":4711")
@@ -88,13 +93,13 @@ def test_bad_options(tk: Tk, tracked: Path, options: list[str], said: str) -> No
     tk("view", tracked, *options).complaint(said)
 
 
-def test_shapes_are_those_of_the_result(tracked: Path) -> None:
+def test_shapes_match_the_result(tracked: Path) -> None:
     result = read_result(tracked)
     figure = figure_of(result)
     body = shapes.body_mesh(figure, 3)
     np.testing.assert_allclose(np.asarray(body.vertices), figure.placed(3))
     _, counts, _ = body.cluster_connected_triangles()
-    assert len(counts) == len(figure.solids), "each part is in one piece, and none is joined to another"
+    assert len(counts) == len(figure.solids), "each solid is one connected mesh"
     assert body.is_orientable() and body.has_vertex_colors()
     assert len(shapes.skeleton_lines(figure.joints[3]).lines) == 14
     joints = figure.joints[3].copy()

@@ -1,4 +1,4 @@
-"""A whole capture: plan the motion, place the rig, render, write the folder of the contract."""
+"""A whole capture: plan the motion, place the rig, render, write the folder."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything about a capture but its pixels.
+    """Everything of a capture except its pixels.
 
     Attributes:
         poses: (F) bone frames at the middle of each exposure.
@@ -88,7 +88,7 @@ class Plan:
 
 
 def plan_capture(options: Options) -> Plan:
-    """Choose motion, rig and volume. Same options, same plan."""
+    """Choose motion, rig and volume; the same options give the same plan."""
     skeleton = make_skeleton(options.stature_m)
     motion = MOTIONS[options.motion](skeleton)
     frames = motion.frames if options.frames is None else options.frames
@@ -122,7 +122,7 @@ def plan_capture(options: Options) -> Plan:
 
 
 def _volume(lower: Float, upper: Float) -> Volume:
-    """The box with its margin, in round centimetres; it ends just below the floor."""
+    """Return the box with its margin, rounded to 5 cm; it ends just below the floor."""
     low = np.floor((lower - VOLUME_MARGIN_M) * 20) / 20
     high = np.ceil((upper + VOLUME_MARGIN_M) * 20) / 20
     low[2] = max(low[2], -0.05)
@@ -163,7 +163,7 @@ class CameraRenderer:
         return Picture(self.sensor.expose(linear, frame, np.random.default_rng([*self._noise_seed, frame])), mask)
 
     def background(self) -> Iterator[NDArray[np.uint8]]:
-        """The empty scene, :data:`BACKGROUND_FRAMES` times, filmed before the capture."""
+        """Yield :data:`BACKGROUND_FRAMES` images of the empty scene, recorded before the capture."""
         linear = self._room.indirect + self._room.direct.sum(axis=0)
         for frame in range(-BACKGROUND_FRAMES, 0):
             yield self.sensor.expose(linear, frame, np.random.default_rng([*self._noise_seed, 10_000 - frame]))
@@ -236,7 +236,7 @@ def _write_truth(plan: Plan, name: str, path: Path) -> None:
 
 
 class _Video:
-    """An H.264 file, written picture by picture."""
+    """Writes an H.264 file image by image."""
 
     def __init__(self, path: Path, camera: Camera, plan: Plan) -> None:
         self._container = av.open(str(path), "w")

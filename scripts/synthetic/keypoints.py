@@ -1,4 +1,4 @@
-"""2D keypoints as a detector makes them: true joints projected, noise, confusions, files as OpenPose writes them."""
+"""Simulated 2D keypoints: projected joints with noise and outliers, in files of OpenPose's format."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ Float = NDArray[np.float64]
 def detect(
     camera_pixels: Float, rng: np.random.Generator, count: int, noise_px: float = 5.0, wrong: float = 0.1
 ) -> list[float]:
-    """The numbers of one person of ``count`` keypoints, from joints (15, 2) in a picture, pixels.
+    """Return x, y, confidence of the ``count`` keypoints of one person, from joints (15, 2) pixels.
 
-    Each is off by ``noise_px`` (one standard deviation a direction); a share ``wrong`` of them lies anywhere within the
-    person's box, with as much confidence as the others. What ``count`` keypoints have beside our joints is zeros.
+    Each has noise of ``noise_px`` (one standard deviation per direction); a share ``wrong`` of them lies anywhere in
+    the person's box, with the same confidence. Keypoints that are not joints of tk are zeros.
     """
     numbers = np.zeros((count, 3))
     low, high = camera_pixels.min(axis=0), camera_pixels.max(axis=0)
@@ -44,7 +44,7 @@ def write_keypoints(
     noise_px: float = 5.0,
     wrong: float = 0.1,
 ) -> None:
-    """Files of one frame for all cameras: people with joints (15, 3) in metres, in another order in each camera."""
+    """Write the files of one frame for all cameras; the order of the people (joints (15, 3) m) is random in each."""
     for camera in rig:
         found = [camera.project(joints)[0] for joints in people]
         order = rng.permutation(len(people))

@@ -1,4 +1,4 @@
-"""Arm angles that bring a wrist to a place and leg angles that bring the toes to one, within the joint limits."""
+"""Inverse kinematics within the joint limits: arm angles for a wrist position, leg angles for a toe position."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _NAMES = ("shoulder_abd", "shoulder_flex", "shoulder_in", "elbow")
 _LEG_NAMES = ("hip_open", "hip_abd", "hip_flex", "hip_in", "knee")
 _LEG_GUESS_DEG = (0.0, 5.0, 15.0, 0.0, 25.0)
 _LEG_WEIGHT = np.array([2e-3, 1e-3, 0.0, 2e-3, 0.0])
-"""Metres a radian: of the ways to reach a place, the one that turns the hip least about its lesser axes."""
+"""Metres per radian: of several solutions, prefer small angles of the hip about its minor axes."""
 
 
 def arm_angles(
     skeleton: Skeleton, side: str, wrist_m: tuple[float, float, float], guess: Mapping[str, float]
 ) -> dict[str, float]:
-    """Degrees of the four arm angles of ``side`` for a wrist at ``wrist_m`` in the frame of the chest.
+    """Return the four arm angles of ``side``, degrees, for a wrist at ``wrist_m`` in the frame of the chest.
 
     Three coordinates do not fix four angles; the solution stays near ``guess`` (degrees, zero where not named).
     """
@@ -43,7 +43,7 @@ def arm_angles(
 
 
 def leg_angles(skeleton: Skeleton, side: str, angles: Angles, root: Float, toe: Float, heading: Float) -> Angles:
-    """Radians of the five leg angles of ``side`` at T times, one after the other: Newton's method with damping.
+    """Return the five leg angles of ``side``, radians, at T times, by damped Newton steps from one time to the next.
 
     The toe tip's place and the foot's direction fix four of the five; the ankle keeps the sole level as far as it goes
     and lifts the heel beyond (see `forward`), so that one rule serves for standing, squatting and kneeling.
@@ -72,7 +72,7 @@ def leg_angles(skeleton: Skeleton, side: str, angles: Angles, root: Float, toe: 
     step, solved = 1e-5, np.empty((len(toe), len(names)))
     probes = np.concatenate([np.zeros((1, len(names))), step * np.eye(len(names))])
     x = np.radians(_LEG_GUESS_DEG)
-    for at in range(len(toe)):  # from the time before: there are other ways to reach the same place
+    for at in range(len(toe)):  # from the previous solution, because there are others
         for _ in range(40):
             miss = residual(x + probes, at)
             jacobian = (miss[1:] - miss[0]).T / step

@@ -1,4 +1,4 @@
-"""Cameras around the actor whose fields of view just hold all of the motion."""
+"""Cameras around the actor whose fields of view just contain the whole motion."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tk.model.cameras.camera import Camera, Rig
 
 Float = NDArray[np.float64]
 
-# azimuth (degrees), distance and height (metres); the overhead camera has no azimuth worth the name
+# azimuth (degrees), distance and height (metres); the azimuth of the overhead camera is arbitrary
 _PLACES = {
     4: ((38, 3.70, 1.30), (128, 3.90, 1.95), (221, 3.75, 1.55), (312, 3.55, 2.15)),
     5: ((38, 3.70, 1.30), (128, 3.90, 1.95), (221, 3.75, 1.55), (312, 3.55, 2.15), (160, 0.25, 3.65)),
@@ -20,7 +20,7 @@ _PLACES = {
     ),
 }  # fmt: skip
 RIGS = tuple(_PLACES)
-"""Numbers of cameras there is a rig for."""
+"""Available numbers of cameras."""
 
 # slight barrel and pincushion; some lenses have none
 _DISTORTIONS = (
@@ -33,7 +33,7 @@ _DISTORTIONS = (
 
 
 def make_rig(count: int, width: int, height: int, centers: Float, radii: Float, rng: np.random.Generator) -> Rig:
-    """A rig that sees all of these balls entirely, with a margin.
+    """Return a rig that sees all of these balls entirely, with a margin.
 
     Args:
         count: one of :data:`RIGS`.
@@ -70,7 +70,7 @@ def make_rig(count: int, width: int, height: int, centers: Float, radii: Float, 
 
 
 def _aim(eye: Float, target: Float, up: Float, centers: Float, radii: Float) -> Float:
-    """A point to look at that centres the balls' picture, not their box."""
+    """Return the point to look at so that the image of the balls is centred."""
     for _ in range(4):
         rotation = look_at(eye, target, up)
         seen = (centers - eye) @ rotation.T

@@ -1,4 +1,4 @@
-"""From linear light to the bytes of a cheap machine-vision camera."""
+"""Convert linear light to the bytes of a cheap machine-vision camera."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Sensor:
 
     @staticmethod
     def draw(rng: np.random.Generator, width: int) -> Sensor:
-        """A sensor with slightly different settings each time."""
+        """Return a sensor with random settings."""
         balance = rng.uniform(0.93, 1.07, 3) * rng.uniform(0.9, 1.12)
         return Sensor(
             balance.astype(np.float32),
@@ -45,7 +45,7 @@ class Sensor:
         )
 
     def expose(self, linear: NDArray[np.float32], frame: int, rng: np.random.Generator) -> NDArray[np.uint8]:
-        """(H, W, 3) linear RGB to (H, W, 3) RGB bytes of frame number ``frame``."""
+        """Convert linear RGB (H, W, 3) to RGB bytes (H, W, 3) of frame number ``frame``."""
         image = cv2.GaussianBlur(linear, (0, 0), self.blur_px) if self.blur_px > 0.1 else linear
         beat = 1.0 + self.flicker * np.sin(2.4 * frame + self.phase)
         level = np.clip(image * self.gain * np.float32(beat), 0.0, 1.0) ** np.float32(1 / GAMMA) * 255

@@ -1,4 +1,4 @@
-"""Footsteps: where the toes are over time, for motions whose feet are placed and whose legs follow from that."""
+"""Footsteps: positions of the toes over time, for motions whose legs follow from the feet."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class FootTrack:
 
 
 def foot_track(steps: Sequence[Step], frame: Float) -> FootTrack:
-    """The toes of one foot at (T,) frames. The first step tells where the foot stands before the second."""
+    """Return the track of one foot at (T,) frames. The foot stands at the first step until the second begins."""
     toe = np.tile(np.array([*steps[0].toe_m, 0.0]), (len(frame), 1))
     heading = np.full(len(frame), np.radians(steps[0].heading_deg))
     push = np.zeros(len(frame))

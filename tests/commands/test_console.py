@@ -1,4 +1,4 @@
-"""What a command shows while it works: on a terminal of 80 columns, and elsewhere."""
+"""The progress of a command on a terminal of 80 columns, and without a terminal."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ def terminal() -> Console:
 
 
 def shown(console: Console) -> str:
-    """What was printed, without the codes that move the cursor."""
+    """Return the printed text without cursor codes."""
     assert isinstance(console.file, io.StringIO)
     return re.sub(r"\x1b\[[?\d;]*\w", "\n", console.file.getvalue())
 
 
-def test_the_bar_with_all_that_may_stand_in_it_fits_80_columns() -> None:
+def test_longest_progress_bar_fits_80_columns() -> None:
     console = terminal()
     with ConsoleReporter(console=console) as reporter:
         reporter.begin(12000, 9000)
@@ -42,7 +42,7 @@ def test_the_bar_with_all_that_may_stand_in_it_fits_80_columns() -> None:
     assert "…" not in last
 
 
-def test_a_terminal_shows_what_is_being_done_before_the_first_frame() -> None:
+def test_terminal_shows_stages_and_progress() -> None:
     console = terminal()
     with ConsoleReporter(console=console) as reporter:
         reporter.stage("finding the person")
@@ -59,7 +59,7 @@ def test_a_terminal_shows_what_is_being_done_before_the_first_frame() -> None:
     assert reporter._live is None
 
 
-def test_the_packages_log_is_told(capfd: pytest.CaptureFixture[str]) -> None:
+def test_log_of_the_package_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
     log = logging.getLogger("tk.run.session")
     before = logging.getLogger("tk").level, list(logging.getLogger("tk").handlers)
     with ConsoleReporter():

@@ -1,4 +1,4 @@
-"""The overlay at a small size: a body drawn where it is, in pictures made for it."""
+"""The overlay of small results with known poses."""
 
 from __future__ import annotations
 
@@ -44,21 +44,21 @@ SKELETON = build_skeleton(BODY.dimensions)
 
 
 def camera(distance_m: float = 4.0) -> Camera:
-    """Looks along +y at the origin's height 0."""
+    """Return a camera that looks along +y at height 0."""
     rotation = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     matrix = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
     return Camera("cam1", 320, 240, matrix, np.zeros(5), rotation, np.array([0, 0, distance_m]))
 
 
 def figure(body: ConeBody, pose: np.ndarray) -> Figure:
-    """One frame."""
+    """Return the figure of one pose."""
     joints, transforms = body.skeleton.joints(pose), body.skeleton.segment_transforms(pose[None])
     return Figure(np.zeros(1, int), joints[None], None, np.zeros(1, np.uint8), solids_of(body), transforms)
 
 
 @pytest.fixture()
 def result(tmp_path: Path) -> Path:
-    """A result of three frames of the demo: the neutral pose at the true pelvis; the last frame is lost."""
+    """A result of three frames of the demo with the neutral pose at the true pelvis; the last frame is lost."""
     path = tmp_path / "result.h5"
     skeleton, truth = SKELETON, read_joints(DEMO / "truth.h5")
     pose = neutral_pose(skeleton)
@@ -89,7 +89,7 @@ def test_bones_join_all_joints_into_one_tree() -> None:
     assert {name for bone in BONES for name in bone} == set(JOINTS)
 
 
-def test_body_is_built_anew_from_the_model(result: Path) -> None:
+def test_body_is_restored_from_the_model(result: Path) -> None:
     restored = body_and_poses(read_result(result))
     assert restored is not None
     body, poses = restored
@@ -98,7 +98,7 @@ def test_body_is_built_anew_from_the_model(result: Path) -> None:
 
 
 def test_outlines_of_cones_are_their_silhouette() -> None:
-    """With waist and ankles bent: filled, they are what rays through the pixels meet."""
+    """Filled outlines equal the silhouette that rays hit, also with bent waist and ankles."""
     body = build_cone_body(BodyDimensions.from_stature(1.7))
     pose = np.random.default_rng(0).normal(0, 0.2, len(body.skeleton.names))
     pose[:3] = 0.0
@@ -127,11 +127,11 @@ def test_results_of_the_region_tracker_are_drawn(tiny: Path, tmp_path: Path) -> 
     assert 0.01 < differ.mean() < 0.5, "the body is drawn, and not everywhere"
 
 
-def test_what_is_behind_the_camera_is_not_drawn() -> None:
+def test_body_behind_the_camera_is_not_drawn() -> None:
     assert figure(BODY, neutral_pose(BODY.skeleton)).seen(0, camera(-5.0))[0] == []
 
 
-def test_a_tile_shows_what_it_is_cut_around() -> None:
+def test_tile_contains_its_points() -> None:
     cam = camera()
     points = np.array([[100.0, 60.0], [130.0, 180.0]])
     view = View.around(points, cam, 150, 200)
@@ -147,7 +147,7 @@ def test_a_tile_shows_what_it_is_cut_around() -> None:
     assert (near_edge.origin == 0).all()
 
 
-def test_the_near_segment_hides_the_far_one() -> None:
+def test_near_segment_hides_far_segment() -> None:
     tile = np.full((40, 40, 3), 200, np.uint8)
     square = (np.array([[5.0, 5.0], [35.0, 5.0], [35.0, 35.0], [5.0, 35.0]]),)
     view = View(np.zeros(2), 1.0, 40, 40)
@@ -163,7 +163,7 @@ def test_the_near_segment_hides_the_far_one() -> None:
     assert len(set(grey[20, 20].tolist())) == 1, "a lost body has no colour"
 
 
-def test_what_reaches_beyond_the_tile_is_cut_off() -> None:
+def test_body_is_clipped_at_the_tile() -> None:
     whole, part = (np.full((60, 60, 3), 90, np.uint8) for _ in range(2))
     polygon = np.array([[-20.0, 10.0], [80.0, 10.0], [80.0, 200.0], [-20.0, 200.0]])
     draw_body(whole, View(np.zeros(2), 1.0, 60, 60), [Outline("torso", 1.0, (polygon,))])
@@ -172,7 +172,7 @@ def test_what_reaches_beyond_the_tile_is_cut_off() -> None:
     assert (part == 90).all()
 
 
-def test_a_joint_tells_its_standard_deviation() -> None:
+def test_joint_colour_shows_standard_deviation() -> None:
     xy = np.full((len(JOINTS), 2), np.nan)
     xy[:4] = [[10.0, 10.0], [30.0, 10.0], [10.0, 30.0], [30.0, 30.0]]
     sigma = np.full(len(JOINTS), 0.01)
@@ -213,7 +213,7 @@ def test_sheets_are_written(result: Path, tmp_path: Path, tk: Tk) -> None:
     assert whole.shape == (360, 5 * 480 + 4 * 6, 3)
 
 
-def test_lost_frames_cannot_be_missed(result: Path) -> None:
+def test_lost_frames_are_marked_red(result: Path) -> None:
     overlay = Overlay(open_capture(DEMO, masks="none"), read_result(result))
     pictures = {frame: overlay.mosaic(frame, images).copy() for frame, images in overlay.pictures([0, 2])}
     height = overlay.grid.height
@@ -234,8 +234,8 @@ def test_videos_show_where_the_person_moves(result: Path) -> None:
     assert max(view.scale for view in near._views) > 1.1 * near.grid.scale
 
 
-def test_cameras_and_time_offsets_are_those_of_the_run(result: Path) -> None:
-    """A camera that the run has refined, by a turn and by a frame: drawn where and on what it saw the person."""
+def test_overlay_uses_cameras_and_time_offsets_of_the_run(result: Path) -> None:
+    """The run has refined the rotation and the time offset of a camera."""
     capture = open_capture(DEMO, ("cam1", "cam2"), masks="none")
     turn = cv2.Rodrigues(np.array([0.0, 0.05, 0.0]))[0]
     turned = replace(capture.rig[0], rotation=turn @ capture.rig[0].rotation)
@@ -258,7 +258,7 @@ def test_cameras_and_time_offsets_are_those_of_the_run(result: Path) -> None:
     assert (drawn[old[:, 1], old[:, 0]] == BONE).all(axis=1).mean() < 0.5
 
 
-def test_a_frame_that_is_not_there_is_named(result: Path, tmp_path: Path, tk: Tk) -> None:
+def test_missing_frame_is_named(result: Path, tmp_path: Path, tk: Tk) -> None:
     said = tk("render", result, DEMO, "--png", tmp_path, "--frames", "1,7")
     said.complaint("frame 7 is not in it; it has frames 0 to 2")
     tk("render", tmp_path / "nothing.h5", DEMO).complaint("nothing.h5: no such file")
@@ -267,7 +267,7 @@ def test_a_frame_that_is_not_there_is_named(result: Path, tmp_path: Path, tk: Tk
     tk("render", result, "--view", "hull").complaint("holds no hull")
 
 
-def test_a_result_of_another_capture_is_refused(result: Path, tiny: Path) -> None:
+def test_result_of_another_capture_is_refused(result: Path, tiny: Path) -> None:
     with h5py.File(result, "a") as file:
         file["frames"][...] = [100, 101, 102]
     with pytest.raises(ResultError, match="name the capture that was tracked"):

@@ -1,4 +1,4 @@
-"""Videos: whole or not there, playable, and nobody else's file is replaced."""
+"""Videos: complete or absent, playable, and replaced only with --force."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tk.render.video import made_here, video_writer
 
 
 def moving(count: int) -> list[np.ndarray]:
-    """A bright square that moves to the right over grey."""
+    """Return images of a bright square that moves to the right over grey."""
     pictures = np.full((count, 64, 96, 3), 60, np.uint8)
     for k, picture in enumerate(pictures):
         picture[20:40, 4 * k : 4 * k + 20] = (40, 200, 240)
@@ -32,7 +32,7 @@ def decoded(path: Path) -> list[np.ndarray]:
         return [frame.to_ndarray(format="bgr24") for frame in container.decode(stream)]
 
 
-def test_a_video_holds_its_pictures(tmp_path: Path) -> None:
+def test_video_contains_its_images(tmp_path: Path) -> None:
     path = tmp_path / "square.mp4"
     pictures = moving(12)
     with video_writer(path, 29.97) as add:
@@ -48,7 +48,7 @@ def test_a_video_holds_its_pictures(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path], "nothing is left beside it"
 
 
-def test_an_error_leaves_the_earlier_video(tmp_path: Path) -> None:
+def test_error_keeps_the_earlier_video(tmp_path: Path) -> None:
     path = tmp_path / "video.mp4"
     path.write_bytes(b"precious")
     with pytest.raises(RuntimeError, match="while drawing"), video_writer(path, 15) as add:
@@ -61,7 +61,7 @@ def test_an_error_leaves_the_earlier_video(tmp_path: Path) -> None:
     assert not made_here(path)
 
 
-def test_files_take_their_name_when_they_are_whole(tmp_path: Path) -> None:
+def test_file_is_renamed_when_complete(tmp_path: Path) -> None:
     path = tmp_path / "page.html"
     with replacing(path) as part:
         part.write_text("half")
@@ -71,7 +71,7 @@ def test_files_take_their_name_when_they_are_whole(tmp_path: Path) -> None:
         part.write_text("")
 
 
-def test_the_view_in_three_dimensions(tracked: Path) -> None:
+def test_3d_view_turns_and_shows_body_or_hull(tracked: Path) -> None:
     result = read_result(tracked)
     body, hull = Scene(result), Scene(result, hull=True)
     first, last = body.picture(0), body.picture(len(result) - 1)
@@ -86,7 +86,7 @@ def test_the_view_in_three_dimensions(tracked: Path) -> None:
     assert abs(x.mean() - pelvis[0]) < 60 and abs(y.mean() - pelvis[1]) < 120
 
 
-def test_render_writes_what_is_asked_for(tracked: Path, tiny: Path, tmp_path: Path, tk: Tk) -> None:
+def test_render_writes_the_requested_views_and_frames(tracked: Path, tiny: Path, tmp_path: Path, tk: Tk) -> None:
     for name, arguments, frames in (
         ("overlay.mp4", [tiny, "--frames", "2:6"], 4),
         ("3d.mp4", ["--view", "3d", "--frames", "1,3"], 2),

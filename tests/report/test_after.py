@@ -15,7 +15,7 @@ from tk.report.after import write_video_and_report
 from tk.report.page import made_here as is_our_page
 
 
-def test_track_leaves_a_video_and_a_report(tk: Tk, tiny: Path, quick: Path, tmp_path: Path) -> None:
+def test_track_writes_a_video_and_a_report(tk: Tk, tiny: Path, quick: Path, tmp_path: Path) -> None:
     ran = tk("track", tiny, "-o", tmp_path / "r.h5", "--config", quick, "--frames", "1:3", "--causal", pictures=True)
     assert ran.code == 0
     assert f"wrote {tmp_path / 'r.mp4'}, {tmp_path / 'r.html'}" in ran.err.splitlines()
@@ -23,7 +23,7 @@ def test_track_leaves_a_video_and_a_report(tk: Tk, tiny: Path, quick: Path, tmp_
     assert is_our_video(tmp_path / "r.mp4") and is_our_page(tmp_path / "r.html")
 
 
-def test_nobody_elses_file_is_replaced(complete: Path, tiny: Path, tmp_path: Path) -> None:
+def test_files_of_other_programs_are_not_replaced(complete: Path, tiny: Path, tmp_path: Path) -> None:
     result = tmp_path / "walk.h5"
     result.write_bytes(complete.read_bytes())
     capture = open_capture(tiny)
@@ -49,7 +49,7 @@ def test_nobody_elses_file_is_replaced(complete: Path, tiny: Path, tmp_path: Pat
     "error",
     [ExportError("no encoder here"), RuntimeError("a defect\nof ours"), OSError(28, "full"), KeyboardInterrupt()],
 )
-def test_what_fails_is_told_in_a_line(
+def test_failure_is_one_warning_line(
     error: BaseException, complete: Path, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:

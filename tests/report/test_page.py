@@ -1,4 +1,4 @@
-"""What stands in a report, and what becomes of it in a real browser."""
+"""The contents of a report, and its behaviour in a browser."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tk.report.pictures import choose_rows
 
 
 def data_of(page: str) -> dict[str, Any]:
-    """The data in a page."""
+    """Return the data in a page."""
     (text,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)
     found: dict[str, Any] = json.loads(text)
     return found
@@ -36,7 +36,7 @@ def unpacked(packed: dict[str, Any]) -> np.ndarray:
     return np.frombuffer(base64.b64decode(packed["data"]), "<f4").reshape(packed["shape"])
 
 
-def test_the_page_holds_the_result(complete: Path) -> None:
+def test_page_contains_the_result(complete: Path) -> None:
     result = read_result(complete)
     page = build_page(result, [])
     data = data_of(page)
@@ -60,7 +60,7 @@ def test_the_page_holds_the_result(complete: Path) -> None:
     assert {camera["name"] for camera in data["scene"]["cameras"]} == set()
 
 
-def test_the_bodys_points_are_where_the_overlay_draws_them(complete: Path) -> None:
+def test_body_points_match_the_overlay(complete: Path) -> None:
     result = read_result(complete)
     scene = data_of(build_page(result, []))["scene"]
     figure = figure_of(result)
@@ -80,7 +80,7 @@ def test_the_bodys_points_are_where_the_overlay_draws_them(complete: Path) -> No
         )
 
 
-def test_nothing_is_loaded_from_elsewhere_and_no_text_becomes_code(complete: Path) -> None:
+def test_page_loads_nothing_and_escapes_text(complete: Path) -> None:
     page = build_page(read_result(complete), [])
     assert "default-src 'none'" in page
     assert set(re.findall(r"https?://[^\"'\s]+", page)) == {"http://www.w3.org/2000/svg"}, "a name, not an address"
@@ -90,7 +90,7 @@ def test_nothing_is_loaded_from_elsewhere_and_no_text_becomes_code(complete: Pat
 
 
 def longer(result: Result, count: int) -> Result:
-    """The same frames over and over."""
+    """Return a result that repeats the same frames."""
     rows = np.arange(count) % len(result)
     columns = {
         name: getattr(result, name)[rows]
@@ -103,17 +103,17 @@ def longer(result: Result, count: int) -> Result:
     return replace(result, **columns, angles=angles, timing=timing, frames=frames, time=frames / 15, smoothed=None)
 
 
-def test_a_thousand_frames_take_a_few_megabytes(complete: Path) -> None:
+def test_page_of_1000_frames_is_below_4_megabytes(complete: Path) -> None:
     page = build_page(longer(read_result(complete), 1000), [])
     assert len(page) < 4e6  # and five pictures of some 100 kB
 
 
-def test_flexions_standard_deviation_is_that_of_drawn_positions(complete: Path) -> None:
+def test_sigma_of_flexion_matches_random_positions(complete: Path) -> None:
     figure = figure_of(read_result(complete))
     rng = np.random.default_rng(2)
     names = ("hip_l", "knee_l", "ankle_l")
     index = [JOINTS.index(name) for name in names]
-    told = hinge_sigma_deg(figure, names)
+    sigma_deg = hinge_sigma_deg(figure, names)
     assert figure.sigma is not None
     for row in (1, 2, 5):
         scale = 0.1  # small errors: the formula is of first order
@@ -122,10 +122,10 @@ def test_flexions_standard_deviation_is_that_of_drawn_positions(complete: Path) 
         cosine = (u * v).sum(axis=1) / np.linalg.norm(u, axis=1) / np.linalg.norm(v, axis=1)
         angle = np.degrees(np.arccos(cosine))
         if angle.mean() < 170:  # a straight leg's angle cannot grow
-            assert told[row] == pytest.approx(angle.std() / scale, rel=0.05)
+            assert sigma_deg[row] == pytest.approx(angle.std() / scale, rel=0.05)
 
 
-def test_pictures_are_of_lost_worst_and_typical_frames(complete: Path, tracked: Path) -> None:
+def test_images_show_lost_worst_and_typical_frames(complete: Path, tracked: Path) -> None:
     result = read_result(complete)
     choices = {choice.row: choice.why for choice in choose_rows(result)}
     assert choices[LOST[0]] == "first lost frame" and choices[11] == "among the worst: mean E_S 30 %"
@@ -155,13 +155,13 @@ chromium = pytest.mark.skipif(find_browser() is None, reason="no Chromium is ins
 
 @pytest.fixture(scope="module")
 def page() -> Iterator[Page]:
-    """A page of one browser for all tests."""
+    """A page of one browser, shared by all tests."""
     with browser_page() as opened:
         yield opened
 
 
 def wait_for(page: Page, condition: str, seconds: float = 20.0) -> None:
-    """Until an expression is true."""
+    """Wait until an expression is true."""
     deadline = time.monotonic() + seconds
     while not page.run(condition):
         assert time.monotonic() < deadline, condition
@@ -178,7 +178,7 @@ def opened(complete: Path, tiny: Path, page: Page, tmp_path: Path, tk: Tk) -> Pa
 
 
 @chromium
-def test_it_plays_and_stops_at_the_end(opened: Page) -> None:
+def test_page_plays_and_stops_at_the_end(opened: Page) -> None:
     assert opened.run("report.row") == 0 and opened.run("report.playing") is False
     before = opened.run("document.getElementById('view').toDataURL()")
     opened.press(" ")
@@ -194,7 +194,7 @@ def test_it_plays_and_stops_at_the_end(opened: Page) -> None:
 
 
 @chromium
-def test_it_goes_where_it_is_sent(opened: Page) -> None:
+def test_page_seeks_by_keys_slider_and_images(opened: Page) -> None:
     opened.press("ArrowRight")
     opened.press("ArrowRight")
     opened.press("ArrowLeft")
@@ -219,7 +219,7 @@ def test_it_goes_where_it_is_sent(opened: Page) -> None:
 
 
 @chromium
-def test_lost_frames_are_seen(opened: Page) -> None:
+def test_page_marks_lost_frames(opened: Page) -> None:
     opened.run(f"report.show({LOST[0] - 1})")
     assert opened.run("document.getElementById('badge').hidden") is True
     opened.run(f"report.show({LOST[0]})")
@@ -230,7 +230,7 @@ def test_lost_frames_are_seen(opened: Page) -> None:
 
 
 @chromium
-def test_all_of_it_is_there(opened: Page) -> None:
+def test_page_shows_all_sections(opened: Page) -> None:
     assert opened.run("document.querySelectorAll('#notes li')[1].textContent") == NOTE
     assert opened.run("document.getElementById('title').textContent") == "made <up>"
     assert opened.run("document.querySelectorAll('#angle-charts .chart').length") > 15
@@ -243,7 +243,7 @@ def test_all_of_it_is_there(opened: Page) -> None:
 
 
 @chromium
-def test_on_a_small_screen(opened: Page, tmp_path: Path) -> None:
+def test_page_fits_a_small_screen(opened: Page, tmp_path: Path) -> None:
     opened.open(tmp_path / "walk.html", 390, 800)
     assert opened.run("document.documentElement.scrollWidth <= window.innerWidth") is True, "nothing sticks out"
     assert opened.run("document.getElementById('scrubber').getBoundingClientRect().width") > 250
@@ -264,7 +264,7 @@ def test_results_of_the_volumetric_tracker_are_shown(tracked: Path, page: Page, 
     assert page.said == []
 
 
-def test_statuses_have_their_meaning() -> None:
-    """The page's colours go by the numbers."""
+def test_status_numbers_match_the_page() -> None:
+    """The page chooses colours by these numbers."""
     assert [status.name for status in Status] == ["TRACKED", "INITIALISED", "RECOVERED", "LOST", "SUSPECT", "ABSENT"]
     assert [int(status) for status in Status] == list(range(6))

@@ -11,5 +11,5 @@ SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in SCRIPTS.glob("[!_]*.py")))
-def test_it_can_be_imported(name: str) -> None:
+def test_script_can_be_imported(name: str) -> None:
     importlib.import_module(f"scripts.{name}")

@@ -36,7 +36,7 @@ def scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return cv2.GaussianBlur(image, (0, 0), 0.7), plate, mask
 
 
-def test_a_picture_is_split_into_outline_shadow_and_clothes() -> None:
+def test_image_is_split_into_outline_shadow_and_clothes() -> None:
     picture = describe(*scene())
     y, x = np.nonzero(picture.outline)
     assert len(y) == 2 * (80 + 40) - 4
@@ -86,7 +86,7 @@ def test_figure_from_a_capture(tmp_path: Path) -> None:
     assert clutter["RGB edges"] < clutter["grey Canny"], "the paper's claim"
 
 
-def test_a_capture_that_cannot_serve_is_named(tmp_path: Path) -> None:
+def test_unsuitable_capture_is_named(tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as stop:
         main([str(tmp_path / "nowhere"), "--out", str(tmp_path / "out")])
     assert "nowhere" in str(stop.value)

@@ -9,7 +9,7 @@ import pytest
 from scripts.figure6_contours import HIDDEN, SCALE, VISIBLE, main
 
 
-def test_the_figure_shows_visible_and_occluded_contours(tmp_path: Path) -> None:
+def test_figure_shows_visible_and_occluded_contours(tmp_path: Path) -> None:
     out = tmp_path / "figures" / "figure6.png"
     main(["-o", str(out)])
     sheet = cv2.imread(str(out))
@@ -20,12 +20,12 @@ def test_the_figure_shows_visible_and_occluded_contours(tmp_path: Path) -> None:
     assert not (np.split(sheet, 4, axis=1)[3] == VISIBLE).all(axis=2).any(), "the strips have a panel of their own"
 
 
-def test_a_capture_wants_its_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_capture_without_result_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["-o", str(tmp_path / "a.png"), "--capture", str(tmp_path)])
     assert "go together" in capsys.readouterr().err
 
 
-def test_a_capture_that_cannot_serve_is_named(tmp_path: Path) -> None:
+def test_unsuitable_capture_is_named(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="nowhere"):
         main(["-o", str(tmp_path / "a.png"), "--capture", str(tmp_path / "nowhere"), "--result", "none.h5"])

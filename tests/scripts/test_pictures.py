@@ -14,7 +14,7 @@ from tests.report.conftest import complete_result
 
 
 @pytest.mark.skipif(find_browser() is None, reason="no Chromium is installed (Debian's package: chromium)")
-def test_the_documentations_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_images_of_the_docs_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     result = complete_result(tmp_path / "demo.h5", screenshots.DEMO, max(screenshots.FRAMES) + 1)
     screenshots.main([str(result), "-o", str(tmp_path)])
     assert capsys.readouterr().out.split() == [str(tmp_path / "demo.png"), str(tmp_path / "report.png")]
@@ -24,7 +24,7 @@ def test_the_documentations_pictures(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert demo.std() > 30
 
 
-def test_the_cost_of_pictures(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cost_of_video_and_report_is_measured(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def track(capture: object, output: Path, *_: object, **__: object) -> SimpleNamespace:
         complete_result(output, tiny)
         return SimpleNamespace(frames=14)

@@ -11,7 +11,7 @@ from tests.export.conftest import FRAMES, Write, write
 __all__ = ["write"]  # the fixture
 
 
-def test_it_compares_with_the_truth(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
+def test_smoothing_is_compared_with_the_ground_truth(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
     result = write("result.h5", lost=np.zeros(FRAMES, np.uint8))
     main([str(result), str(write("truth.h5")), "--gaps", "2"])
     lines = capsys.readouterr().out.splitlines()
@@ -20,7 +20,7 @@ def test_it_compares_with_the_truth(write: Write, capsys: pytest.CaptureFixture[
     assert 0 < bridging_cm(result, 2) < 3
 
 
-def test_errors_are_what_they_say() -> None:
+def test_errors_match_their_definition() -> None:
     true = np.zeros((5, 15, 3))
     joints = np.add(true, [0.03, 0.0, 0.04])
     found = errors(joints, true, 10.0)

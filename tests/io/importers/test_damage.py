@@ -1,4 +1,4 @@
-"""Calibrations with random damage: either they can still be read, or one line says what is wrong."""
+"""Randomly damaged calibrations are read, or refused with one line."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ FORMATS: dict[str, Callable[[Path], object]] = {
 
 
 def damaged(data: bytes, rng: random.Random) -> bytes:
-    """Cut off, a stretch lost, twice there, or a few bytes changed."""
+    """Return the data truncated, with a part removed or repeated, or with some bytes changed."""
     a, b = sorted(rng.randrange(len(data) + 1) for _ in range(2))
     b = min(b, a + rng.choice([1, 8, 200]))
     kind = rng.randrange(5)
@@ -54,7 +54,9 @@ def damaged(data: bytes, rng: random.Random) -> bytes:
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_damage_is_one_line(name: str, folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_damaged_calibration_is_read_or_refused_in_one_line(
+    name: str, folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     (folder / "videos").mkdir()
     for camera in NAMES:
         (folder / "videos" / f"{camera}.mp4").write_bytes(b"")

@@ -1,4 +1,4 @@
-"""What all formats have in common: finding, refusing, writing; and the command."""
+"""What all formats share: search, errors, output; and the command."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def write_project(folder: Path) -> Path:
     return folder
 
 
-def test_the_command(folder: Path, tmp_path: Path, tk: Tk) -> None:
+def test_import_command_prints_notes_and_errors(folder: Path, tmp_path: Path, tk: Tk) -> None:
     write_project(folder)
     ran = tk("import", folder, "-o", tmp_path / "capture")
     assert ran.code == 0 and ran.out == ""
@@ -40,12 +40,12 @@ def test_the_command(folder: Path, tmp_path: Path, tk: Tk) -> None:
     tk("import", tmp_path / "nowhere", "-o", tmp_path / "c").complaint("nowhere: is not a folder")
 
 
-def test_a_capture_needs_no_import(folder: Path, tmp_path: Path, tk: Tk) -> None:
+def test_capture_as_input_is_refused(folder: Path, tmp_path: Path, tk: Tk) -> None:
     tk("import", write_project(folder), "-o", tmp_path / "capture")
     tk("import", tmp_path / "capture", "-o", tmp_path / "c").complaint("is a capture already", "tk track")
 
 
-def test_nothing_matches(folder: Path, check: Import) -> None:
+def test_unknown_project_lists_all_formats(folder: Path, check: Import) -> None:
     (folder / "readme.md").write_text("# Nothing")
     with pytest.raises(CaptureError) as caught:
         import_project(folder, check.output)
@@ -67,7 +67,7 @@ def test_nothing_matches(folder: Path, check: Import) -> None:
         "calibration/Calib.toml",
     ],
 )
-def test_a_pipe_does_not_hang(folder: Path, check: Import, name: str) -> None:
+def test_pipe_as_calibration_is_refused(folder: Path, check: Import, name: str) -> None:
     write_clips(folder / "videos", CAMS[:2])
     path = folder / name
     path.parent.mkdir(exist_ok=True)
@@ -78,13 +78,13 @@ def test_a_pipe_does_not_hang(folder: Path, check: Import, name: str) -> None:
     assert str(path) in str(caught.value)
 
 
-def test_a_pipe_is_no_video(folder: Path, check: Import) -> None:
+def test_pipe_as_video_is_ignored(folder: Path, check: Import) -> None:
     write_project(folder)
     os.mkfifo(folder / "videos-raw" / "cam5.mp4")
     check(folder, make_rig())
 
 
-def test_a_huge_file_is_not_read(folder: Path, check: Import) -> None:
+def test_huge_calibration_is_refused(folder: Path, check: Import) -> None:
     path = folder / "session.qca.txt"
     with path.open("wb") as file:
         file.truncate(LARGEST + 1)
@@ -101,7 +101,7 @@ def test_a_huge_file_is_not_read(folder: Path, check: Import) -> None:
         ((WIDTH * 2, HEIGHT * 2), (2.0, 0.5), "scaled by 2, and so is the matrix"),
     ],
 )
-def test_videos_of_another_size(
+def test_camera_is_adapted_to_padded_and_scaled_videos(
     folder: Path, check: Import, size: tuple[int, int], expected: tuple[float, float], note: str
 ) -> None:
     """A pixel x of the calibration is the pixel scale · x + shift of the video, pixel centres being whole numbers."""
@@ -112,15 +112,15 @@ def test_videos_of_another_size(
     for camera, true in zip(open_capture(check.output).rig, make_rig(), strict=True):
         assert (camera.width, camera.height) == size
         np.testing.assert_allclose(camera.project(points())[0], scale * true.project(points())[0] + shift, atol=0.01)
-    told = [line for line in imported.notes if note in line]
-    assert len(told) == 4 and f"calibrated at {WIDTH}×{HEIGHT}, video {size[0]}×{size[1]}" in told[0]
+    found = [line for line in imported.notes if note in line]
+    assert len(found) == 4 and f"calibrated at {WIDTH}×{HEIGHT}, video {size[0]}×{size[1]}" in found[0]
 
 
 @pytest.mark.parametrize(
     ("size", "complaint"),
     [((HEIGHT, WIDTH), "is the video turned by 90°?"), ((WIDTH, HEIGHT // 2), "(1 and 0.5)")],
 )
-def test_videos_of_a_size_that_nothing_explains(
+def test_video_of_an_unrelated_size_is_refused(
     folder: Path, check: Import, size: tuple[int, int], complaint: str
 ) -> None:
     write_toml(folder / "calibration.toml", tables(make_rig()))
@@ -132,9 +132,7 @@ def test_videos_of_a_size_that_nothing_explains(
     assert str(folder / "videos" / "cam1.mp4") in text and "\n" not in text
 
 
-def test_links_take_no_room_and_other_file_systems_get_copies(
-    folder: Path, check: Import, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_videos_are_linked_or_copied(folder: Path, check: Import, monkeypatch: pytest.MonkeyPatch) -> None:
     write_project(folder)
     check(folder, make_rig()).note("hard links")
     original = folder / "videos-raw" / "cam2.mp4"
@@ -150,7 +148,7 @@ def test_links_take_no_room_and_other_file_systems_get_copies(
     assert original.stat().st_ino != copied.stat().st_ino and original.read_bytes() == copied.read_bytes()
 
 
-def test_a_failed_import_leaves_nothing(folder: Path, check: Import) -> None:
+def test_failed_import_leaves_no_files(folder: Path, check: Import) -> None:
     write_project(folder)
     (folder / "videos-raw" / "cam3.mp4").write_bytes(b"no video")
     with pytest.raises(VideoError) as caught:
@@ -159,25 +157,25 @@ def test_a_failed_import_leaves_nothing(folder: Path, check: Import) -> None:
     assert sorted(path.name for path in folder.parent.iterdir()) == ["project"]
 
 
-def test_an_output_that_cannot_be_written(folder: Path, check: Import) -> None:
+def test_unwritable_output_is_refused(folder: Path, check: Import) -> None:
     write_project(folder)
     (folder.parent / "file").write_text("")
     with pytest.raises(CaptureError, match="cannot be written"):
         import_project(folder, folder.parent / "file" / "capture")
 
 
-def test_an_empty_folder_may_be_the_output(folder: Path, check: Import) -> None:
+def test_empty_folder_is_accepted_as_output(folder: Path, check: Import) -> None:
     check.output.mkdir()
     check(write_project(folder), make_rig())
 
 
-def test_a_camera_without_a_video_is_left_out(folder: Path, check: Import) -> None:
+def test_camera_without_video_is_left_out(folder: Path, check: Import) -> None:
     write_project(folder)
     (folder / "videos-raw" / "cam4.mp4").unlink()
     check(folder, Rig(make_rig().cameras[:3])).note("no video of cam4: left out")
 
 
-def test_names_that_files_cannot_have(folder: Path, check: Import) -> None:
+def test_invalid_file_names_of_cameras_are_replaced(folder: Path, check: Import) -> None:
     rig = renamed(make_rig(), "a/b", "a b", "metadata", "ok")
     write_toml(folder / "calibration.toml", {f"cam{k}": table for k, table in enumerate(tables(rig).values())})
     write_clips(folder / "videos-raw", ["cam0", "cam1", "cam2", "cam3"])
@@ -186,7 +184,7 @@ def test_names_that_files_cannot_have(folder: Path, check: Import) -> None:
     checked.note("camera 'a/b' is called a_b in the capture")
 
 
-def test_videos_in_a_format_that_is_not_read(folder: Path, check: Import) -> None:
+def test_unsupported_video_format_is_named(folder: Path, check: Import) -> None:
     write_qca(folder / "session.qca.txt", make_rig())
     for name in CAMS:
         (folder / f"{name}.mts").write_bytes(b"\x47")
@@ -194,15 +192,15 @@ def test_videos_in_a_format_that_is_not_read(folder: Path, check: Import) -> Non
         import_project(folder, check.output)
 
 
-def test_two_videos_of_one_name(folder: Path, check: Import) -> None:
+def test_two_videos_of_one_camera_are_refused(folder: Path, check: Import) -> None:
     write_project(folder)
     write_clips(folder / "videos-raw", ["cam1"], suffix=".avi")
     with pytest.raises(VideoError, match=r"holds both cam1.avi and cam1.mp4; keep one of them"):
         import_project(folder, check.output)
 
 
-def test_cameras_that_look_past_each_other_get_no_volume(folder: Path, check: Import) -> None:
-    """Parallel cameras: the capture is written, its volume is for the user to give."""
+def test_parallel_cameras_get_no_volume(folder: Path, check: Import) -> None:
+    """The capture is written without a volume, which the user has to add."""
     document = tables(make_rig())
     for index, table in enumerate(document.values()):
         table |= {"rotation": [-np.pi / 2, 0.0, 0.0], "translation": [float(index), 0.0, 0.0]}

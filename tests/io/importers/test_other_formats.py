@@ -81,7 +81,7 @@ def test_easymocap_with_pictures(folder: Path, check: Import) -> None:
     ]
 
 
-def test_easymocap_as_opencv_itself_writes_it(folder: Path, check: Import) -> None:
+def test_easymocap_files_written_by_opencv(folder: Path, check: Import) -> None:
     """Numbers like `1.`, lines that are wrapped, names within brackets."""
     rig = make_rig()
     for file, keys in (("intri.yml", ("K", "dist")), ("extri.yml", ("Rot", "T"))):
@@ -236,7 +236,7 @@ def test_projection_matrices(folder: Path, check: Import, kind: str) -> None:
     check(folder, rig)
 
 
-def test_a_text_that_is_no_matrix_is_told(folder: Path, check: Import) -> None:
+def test_text_without_matrix_is_noted(folder: Path, check: Import) -> None:
     rig = make_rig(distorted=False)
     for camera in rig:
         np.savetxt(folder / f"{camera.name}.txt", camera.projection)
@@ -245,7 +245,7 @@ def test_a_text_that_is_no_matrix_is_told(folder: Path, check: Import) -> None:
     check(folder, rig).note("notes.txt: holds no 3×4 matrix: left out")
 
 
-def test_factorise_says_what_is_no_camera() -> None:
+def test_factorise_refuses_singular_matrices() -> None:
     with pytest.raises(CalibrationError, match="left 3×3 part is singular"):
         factorise(np.ones((3, 4)), "P.txt")
     skewed = make_rig(distorted=False)[0]
@@ -257,7 +257,7 @@ def test_factorise_says_what_is_no_camera() -> None:
     np.testing.assert_allclose(translation, skewed.translation, atol=1e-9)
 
 
-def test_skew_is_left_out_aloud(folder: Path, check: Import) -> None:
+def test_skew_is_left_out_with_a_note(folder: Path, check: Import) -> None:
     for camera in make_rig(distorted=False):
         K = camera.matrix + np.array([[0, 0.4, 0], [0, 0, 0], [0, 0, 0]])
         np.savetxt(folder / f"{camera.name}.txt", K @ np.column_stack([camera.rotation, camera.translation]))
@@ -266,7 +266,7 @@ def test_skew_is_left_out_aloud(folder: Path, check: Import) -> None:
     assert sum("skew of 0.4 px, which is left out" in note for note in imported.notes) == 4
 
 
-def test_text_without_matrices_is_no_project(folder: Path, check: Import) -> None:
+def test_folder_of_texts_is_not_a_project(folder: Path, check: Import) -> None:
     (folder / "a.txt").write_text("1 2 3")
     (folder / "b.txt").write_text("1 2 3 4 5 6 7 8 9 10 11 nan")
     (folder / "c.npy").write_bytes(pickle.dumps(np.zeros((3, 4))))  # no array file
@@ -274,7 +274,7 @@ def test_text_without_matrices_is_no_project(folder: Path, check: Import) -> Non
         import_project(folder, check.output)
 
 
-def test_the_conversion_in_the_manual(folder: Path, check: Import, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_conversion_script_of_the_docs_works(folder: Path, check: Import, monkeypatch: pytest.MonkeyPatch) -> None:
     """The program that docs/import.md gives makes a project that is read; the pickles are then nobody's business."""
     rig = renamed(make_rig(), "Cam0", "Cam1", "Cam2", "Cam3")
     for camera in rig:

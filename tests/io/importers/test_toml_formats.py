@@ -63,14 +63,14 @@ def test_pose2sim(folder: Path, check: Import) -> None:
     assert "\n# up: the axis" in text and "[volume]" in text
 
 
-def test_pose2sim_matches_in_order_where_names_do_not_tell(folder: Path, check: Import) -> None:
+def test_pose2sim_matches_in_order_if_names_differ(folder: Path, check: Import) -> None:
     rig = write_pose2sim(folder)
     write_clips(folder / "raw-2d", ["back", "front", "left", "right"])
     note = check(folder, rig).note("matched in their order")
     assert "int_cam01_img ↔ back.mp4" in note and "int_cam04_img ↔ right.mp4" in note
 
 
-def test_a_trial_finds_the_calibration_of_its_session(folder: Path, check: Import) -> None:
+def test_trial_uses_the_calibration_of_its_session(folder: Path, check: Import) -> None:
     rig = write_pose2sim(folder)
     for trial in ("walk", "run"):
         write_clips(folder / trial / "videos", ["cam01", "cam02", "cam03", "cam04"])
@@ -183,14 +183,14 @@ def test_anipose_in_millimetres(folder: Path, check: Import, metadata: dict[str,
     checked.note("lengths are in mm, as the file says" if metadata else "lengths are taken for mm")
 
 
-def test_units_of_the_command_line_come_first(folder: Path, check: Import) -> None:
+def test_units_option_overrides_the_file(folder: Path, check: Import) -> None:
     rig = make_rig()
     write_toml(folder / "calibration.toml", {**tables(rig, unit_m=0.01), "metadata": {"units": "m"}})
     write_clips(folder, CAMS)
     check(folder, rig, unit="cm").note("lengths are in cm, as --units says")
 
 
-def test_masks_and_background_come_along(folder: Path, check: Import) -> None:
+def test_masks_and_background_are_imported_if_complete(folder: Path, check: Import) -> None:
     rig = make_rig()
     write_toml(folder / "calibration.toml", tables(rig))
     write_clips(folder / "videos-raw", CAMS)
@@ -247,7 +247,7 @@ def test_too_few_cameras_have_a_pose(folder: Path, check: Import) -> None:
         import_project(folder, check.output)
 
 
-def test_two_calibrations(folder: Path, check: Import) -> None:
+def test_two_calibrations_are_refused(folder: Path, check: Import) -> None:
     write_pose2sim(folder)
     (folder / "calibration" / "Calib_old.toml").write_text("")
     with pytest.raises(CalibrationError, match=r"several calibrations: Calib_old.toml, Calib_scene.toml"):

@@ -27,7 +27,7 @@ def named(*names: str) -> list[CameraNames]:
         (["left", "right"], ["subject left", "subject right"]),
     ],
 )
-def test_each_finds_its_own(cameras: list[str], stems: list[str]) -> None:
+def test_names_are_matched(cameras: list[str], stems: list[str]) -> None:
     order = match_clips(named(*cameras), stems[::-1], in_order=False)
     assert order is not None and list(order.stems) == stems
 
@@ -43,11 +43,11 @@ def test_each_finds_its_own(cameras: list[str], stems: list[str]) -> None:
         (["cam1", "cam2"], []),
     ],
 )
-def test_what_cannot_be_told_is_not_guessed(cameras: list[str], stems: list[str]) -> None:
+def test_ambiguous_names_are_not_matched(cameras: list[str], stems: list[str]) -> None:
     assert match_clips(named(*cameras), stems, in_order=False) is None
 
 
-def test_some_are_missing() -> None:
+def test_missing_video_leaves_its_camera_unmatched() -> None:
     order = match_clips(named("cam1", "cam2", "cam3", "cam4"), ["x_cam4", "x_cam2", "x_cam1"], in_order=False)
     assert order is not None and order.stems == ("x_cam1", "x_cam2", None, "x_cam4")
 

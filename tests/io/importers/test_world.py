@@ -18,7 +18,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def rolled(rig: Rig, degrees: float, seed: int = 1) -> Rig:
-    """Each camera turned about its optical axis by up to so much."""
+    """Return the rig with each camera rotated about its optical axis by up to ``degrees``."""
     rng = np.random.default_rng(seed)
     cameras = []
     for camera in rig:
@@ -28,7 +28,7 @@ def rolled(rig: Rig, degrees: float, seed: int = 1) -> Rig:
 
 
 @pytest.mark.parametrize("name", UP_AXES)
-def test_worlds_along_an_axis(name: str) -> None:
+def test_up_along_an_axis_is_found(name: str) -> None:
     turn = Rotation.align_vectors([up_vector(name)], [[0.0, 0.0, 1.0]])[0].as_matrix()
     assert infer_up(make_rig(world=turn)).up == name
     found = infer_up(rolled(make_rig(world=turn), 10.0))
@@ -37,7 +37,7 @@ def test_worlds_along_an_axis(name: str) -> None:
 
 @given(seed=seeds)
 @settings(max_examples=30, deadline=None)
-def test_any_other_world(seed: int) -> None:
+def test_up_of_a_rotated_world_is_found(seed: int) -> None:
     turn = Rotation.random(random_state=seed).as_matrix()
     found = infer_up(make_rig(world=turn))
     off = np.degrees(np.arccos(np.clip(up_vector(found.up) @ turn[:, 2], -1, 1)))
@@ -45,8 +45,8 @@ def test_any_other_world(seed: int) -> None:
     assert off < 1e-3 or (found.up in UP_AXES and off <= 10.0)
 
 
-def test_a_camera_overhead_does_not_tilt_it() -> None:
-    """Its upward direction is horizontal; its rightward one is, too."""
+def test_overhead_camera_does_not_change_up() -> None:
+    """Its up and right directions are both horizontal."""
     turn = Rotation.from_euler("xyz", [0.5, -0.4, 0.2]).as_matrix()
     rig = make_rig(world=turn)
     down = np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, -1.0]]) @ turn.T
@@ -55,7 +55,7 @@ def test_a_camera_overhead_does_not_tilt_it() -> None:
     np.testing.assert_allclose(up_vector(found.up), turn[:, 2], atol=1e-6)
 
 
-def test_cameras_side_by_side_fall_back_on_the_mean() -> None:
+def test_parallel_cameras_use_the_mean_direction() -> None:
     rig = make_rig()
     twins = Rig(tuple(replace(rig[0], name=str(k)) for k in range(3)))
     found = infer_up(twins)
@@ -63,7 +63,7 @@ def test_cameras_side_by_side_fall_back_on_the_mean() -> None:
     assert "the mean" in found.how
 
 
-def test_cameras_that_are_mounted_every_way() -> None:
+def test_inconsistent_mounting_is_noted() -> None:
     rig = make_rig()
     half = Rotation.from_euler("z", 180, degrees=True).as_matrix()
     two = [replace(c, rotation=half @ c.rotation, translation=half @ c.translation) for c in rig.cameras[:2]]
@@ -71,22 +71,22 @@ def test_cameras_that_are_mounted_every_way() -> None:
     assert "z is a guess" in infer_up(Rig((rig[0], replace(two[0], name="upside down")))).how
 
 
-def test_the_volume_holds_the_person() -> None:
+def test_volume_contains_the_person() -> None:
     volume, how = find_volume(make_rig())
     assert volume is not None and "all cameras see" in how
     assert (points() > volume.lower).all() and (points() < volume.upper).all()
 
 
-def test_one_camera_that_looks_elsewhere_does_not_matter() -> None:
+def test_volume_ignores_one_camera_that_looks_elsewhere() -> None:
     rig = make_rig()
-    aside = Rotation.from_euler("y", 75, degrees=True).as_matrix()
-    astray = replace(rig[3], name="astray", rotation=aside @ rig[3].rotation, translation=aside @ rig[3].translation)
-    volume, how = find_volume(Rig((*rig.cameras, astray)))
+    turn = Rotation.from_euler("y", 75, degrees=True).as_matrix()
+    other = replace(rig[3], name="other", rotation=turn @ rig[3].rotation, translation=turn @ rig[3].translation)
+    volume, how = find_volume(Rig((*rig.cameras, other)))
     assert volume is not None and "4 of the 5 cameras see" in how
     assert (points().mean(axis=0) > volume.lower).all() and (points().mean(axis=0) < volume.upper).all()
 
 
-def test_cameras_that_look_outwards() -> None:
+def test_cameras_that_look_outwards_get_no_volume() -> None:
     outwards = [
         replace(c, rotation=c.rotation * [[-1], [1], [-1]], translation=c.translation * [-1, 1, -1]) for c in make_rig()
     ]

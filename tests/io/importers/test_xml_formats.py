@@ -110,7 +110,7 @@ def test_vicon(folder: Path, check: Import) -> None:
     checked.note("lengths are in mm, as the format says")
 
 
-def test_vicon_distortion_undoes_opencvs(folder: Path, check: Import) -> None:
+def test_vicon_distortion_is_the_inverse_of_opencvs(folder: Path, check: Import) -> None:
     """A pixel that Vicon's model corrects to the ideal projection is the pixel that our camera projects to."""
     rig = renamed(make_rig(distorted=False), *SERIALS)
     k1, k2 = 6e-7, 4e-13
@@ -160,8 +160,8 @@ def test_damaged_vicon(folder: Path, check: Import, old: str, new: str, complain
     assert complaint in str(caught.value) and str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_camera_turned_by_half(folder: Path, check: Import) -> None:
-    """QTM's viewrotation is told: whether the exported video is turned, the file does not say."""
+def test_rotated_view_of_qualisys_is_noted(folder: Path, check: Import) -> None:
+    """The file does not say whether the exported video is rotated."""
     rig = renamed(make_rig(), *SERIALS)
     path = folder / "session.qca.txt"
     write_qca(path, rig)
@@ -170,7 +170,7 @@ def test_a_camera_turned_by_half(folder: Path, check: Import) -> None:
     check(folder, rig).note("QTM shows 26578 turned (viewrotation)")
 
 
-def test_the_first_test_rig_is_seen_by_all() -> None:
-    """What the other tests rest on: the points are in all pictures."""
+def test_all_cameras_of_the_test_rig_see_the_person() -> None:
+    """The other tests rely on points that are in all images."""
     cameras: tuple[Camera, ...] = make_rig().cameras
     assert all(camera.sees(points()).all() for camera in cameras)
