@@ -1,12 +1,12 @@
-"""What a user did wrong, in one line.
+"""Errors that a user can correct.
 
-Every message names the file (or option) and the fix. The command line prints it and exits with 2;
-anything that is not a :class:`TkError` is a defect of ours and keeps its traceback.
+Every message is one line that names the file or option, and the remedy. The command line prints it and exits with
+2. Any other exception is a defect of the program and keeps its traceback.
 """
 
 
 class TkError(Exception):
-    """Base of all errors that a user can mend."""
+    """Base of all errors that a user can correct."""
 
 
 class CaptureError(TkError):
@@ -22,7 +22,7 @@ class VideoError(CaptureError):
 
 
 class VolumeError(CaptureError):
-    """The working volume is empty or out of the cameras' sight."""
+    """The working volume is empty, or the cameras do not see it."""
 
 
 class ResultError(TkError):
@@ -38,7 +38,7 @@ class ExportError(TkError):
 
 
 class DisplayError(TkError):
-    """There is no display to show something on, or nothing that can draw on it."""
+    """There is no display, or no driver that can draw on it."""
 
 
 class ConfigError(TkError):
@@ -46,4 +46,4 @@ class ConfigError(TkError):
 
 
 class WorkerError(TkError):
-    """A process that worked for this one has been killed."""
+    """A worker process has been killed."""

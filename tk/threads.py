@@ -1,9 +1,8 @@
-"""One thread in BLAS and in OpenCV while masks are made, poses and cameras found, and pictures drawn.
+"""One thread in BLAS and in OpenCV for masks, poses, cameras and drawings.
 
-Cameras, processes and captures are what runs side by side here. A pool of threads divides a matrix product otherwise
-than one thread does, so that a run's last digits would hang on who started it. And pools wait for work by spinning:
-matrices and pictures are small, so `tk refine` takes 2.3 times the processor time with one, and drawing with nothing
-beside 1.9 times.
+tk runs cameras, processes and captures in parallel instead. A pool of threads splits a matrix product differently from
+one thread, so the last digits of a result would depend on the number of cores. Pools also wait for work by spinning:
+matrices and images are small, so `tk refine` takes 2.3 times the processor time with a pool, and drawing 1.9 times.
 """
 
 from __future__ import annotations
@@ -18,10 +17,9 @@ from threadpoolctl import ThreadpoolController
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Inside, NumPy's and SciPy's BLAS, whenever they were loaded, and OpenCV run on one thread; afterwards on as many
-    as before.
+    """Run NumPy's and SciPy's BLAS and OpenCV on one thread inside; afterwards on as many as before.
 
-    20 µs; a decorator, too. Meant for the whole process, as the pools are.
+    Takes 20 µs. Works as a decorator, too. It concerns the whole process, because the pools do.
     """
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
@@ -34,6 +32,6 @@ def one_thread() -> Iterator[None]:
 
 @functools.cache
 def _pools() -> ThreadpoolController:
-    import scipy.linalg  # noqa: F401  (its pool is to be among those found)
+    import scipy.linalg  # noqa: F401  (so that its pool is found)
 
     return ThreadpoolController()

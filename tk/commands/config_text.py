@@ -1,7 +1,4 @@
-"""The settings as a file that explains itself: `tk config`.
-
-What a setting means, its unit and its source stand once, in the docstring of its class; here they become comments.
-"""
+"""All settings as a commented TOML file: `tk config`. The comments are the docstrings of the settings classes."""
 
 from __future__ import annotations
 
@@ -24,14 +21,14 @@ Presets, given with --preset: {", ".join(PRESETS)}."""
 
 
 def annotated_toml(config: Settings) -> str:
-    """The configuration as TOML; before each setting what it means, and its default."""
+    """Return the settings as TOML, each with a comment on its meaning and its default."""
     blocks = [_comment(_HEAD)]
     blocks += _table(config, Settings(), "", "")
     return "\n\n".join(blocks) + "\n"
 
 
 def meanings(kind: type) -> dict[str, str]:
-    """What the docstring of a settings class says of each of its attributes, in its order.
+    """Return the description of each attribute in the docstring of a settings class, in its order.
 
     Raises:
         ConfigError: Python runs without docstrings (``-OO``).
@@ -40,37 +37,39 @@ def meanings(kind: type) -> dict[str, str]:
     if text is None:
         raise ConfigError("tk config: Python runs without docstrings (-OO), and the explanations are in them")
     found = re.search(r"^Attributes:\n((?:[ ]{4}.*\n?|\n)+)", text, re.M)
-    told: dict[str, str] = {}
+    described: dict[str, str] = {}
     names: list[str] = []
     for line in textwrap.dedent(found[1]).splitlines() if found else ():
         start = re.match(r"([a-z_]\w*(?:, [a-z_]\w*)*): (.*)", line)
         if start:
             names = start[1].split(", ")
-            told |= dict.fromkeys(names, start[2])
+            described |= dict.fromkeys(names, start[2])
         else:
-            told |= {name: f"{told[name]} {line.strip()}".strip() for name in names}
-    return told
+            described |= {name: f"{described[name]} {line.strip()}".strip() for name in names}
+    return described
 
 
 def _table(values: Any, defaults: Any, path: str, title: str) -> list[str]:
-    """The blocks of a table and of those within it."""
-    said = meanings(type(values))
+    """Return the blocks of a table and of the tables in it."""
+    described = meanings(type(values))
     lines, inner = [], []
     for field in dataclasses.fields(values):
         value, default = getattr(values, field.name), getattr(defaults, field.name)
         if dataclasses.is_dataclass(value):
-            about = said.get(field.name) or (inspect.getdoc(type(value)) or "").partition("\n\n")[0]
+            about = described.get(field.name) or (inspect.getdoc(type(value)) or "").partition("\n\n")[0]
             inner += _table(value, default, f"{path}{field.name}.", about)
             continue
-        usual = _toml(field.name, default).partition(" = ")[2]
-        lines.append(f"{_comment(f'{_sentence(said[field.name])} Default: {usual}')}\n{_toml(field.name, value)}")
+        standard = _toml(field.name, default).partition(" = ")[2]
+        lines.append(
+            f"{_comment(f'{_sentence(described[field.name])} Default: {standard}')}\n{_toml(field.name, value)}"
+        )
     if lines and path:
         lines[0] = f"{_comment(_sentence(title))}\n[{path[:-1]}]\n{lines[0]}"
     return lines + inner
 
 
 def _sentence(text: str) -> str:
-    """With a capital, unless a symbol begins it, and a full stop."""
+    """Return the text with a full stop, and a capital unless it begins with a symbol."""
     symbol = not re.match(r"[a-z]{2}|a ", text)
     return (text if symbol else text[0].upper() + text[1:]).rstrip(".") + "."
 

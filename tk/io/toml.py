@@ -1,4 +1,4 @@
-"""Read TOML tables with errors that name the file and the key. Every number has a bound."""
+"""TOML tables, with errors that name the file and the key. Every number has a bound."""
 
 from __future__ import annotations
 
@@ -18,22 +18,23 @@ from tk.errors import CaptureError, TkError
 _toml = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 
 
-#: no number that a person writes down is larger, in whatever unit
+#: largest number in a TOML file, in any unit: 10⁶ km in mm. A larger one is taken for a mistake.
 LARGE = 1e9
 
-#: bytes of a TOML file: a calibration has some hundred a camera
+#: most bytes of a TOML file. A calibration has some hundred a camera; a larger file was not written by a person.
 _MOST_BYTES = 2**24
 
 
 def load_toml(path: Path, error: type[TkError] = CaptureError) -> dict[str, Any]:
-    """The document in ``path``. Raises ``error`` when it cannot be read or is not TOML."""
+    """Return the document in ``path``. Raises ``error`` when it cannot be read or is not TOML."""
     return parse_toml(read_text(path, error), str(path), error)
 
 
 def read_text(path: Path, error: type[TkError] = CaptureError) -> str:
-    """The text of a small file. Raises ``error`` when it cannot be read, is no file (a pipe would never end) or large.
+    """Return the text of a small file. Raises ``error`` if it cannot be read, is large, or is not a file (a pipe would
+    never end).
 
-    Reads a byte order mark as Windows editors leave it.
+    A byte order mark, which Windows editors write, is skipped.
     """
     try:
         if path.exists() and not path.is_file():
@@ -48,7 +49,7 @@ def read_text(path: Path, error: type[TkError] = CaptureError) -> str:
 
 
 def parse_toml(text: str, where: str, error: type[TkError] = CaptureError) -> dict[str, Any]:
-    """The document in ``text``; raises ``error``, which names it by ``where``, when it is not TOML."""
+    """Return the document in ``text``. Raises ``error``, whose message begins with ``where``, if it is not TOML."""
     try:
         return _toml.loads(text)
     except ValueError as reason:  # TOMLDecodeError, or Python's own for a number of thousands of digits
@@ -58,7 +59,7 @@ def parse_toml(text: str, where: str, error: type[TkError] = CaptureError) -> di
 
 
 def shown(value: object) -> str:
-    """A value for a message: short, whatever it is."""
+    """Return a value as a short text for a message."""
     try:
         text = repr(value)
     except ValueError:  # Python writes no numbers of thousands of digits
@@ -67,7 +68,7 @@ def shown(value: object) -> str:
 
 
 class Table:
-    """One TOML table: typed access, and every complaint carries where the value stands.
+    """One TOML table: typed access; each error names the place of the value.
 
     Args:
         values: the parsed table.
@@ -88,14 +89,14 @@ class Table:
         raise self.error(f"{self.where}: {message}")
 
     def table(self, key: str) -> Table:
-        """The sub-table ``key``, empty when it is absent."""
+        """Return the sub-table ``key``; an empty one if it is absent."""
         value = self.values.get(key, {})
         if not isinstance(value, Mapping):
             self.fail(f"{key} must be a table [{key}]")
         return Table(value, f"{self.where}: [{key}]", self.error)
 
     def text(self, key: str, default: str) -> str:
-        """The string ``key``, not empty."""
+        """Return the string ``key``, which must not be empty."""
         value = self.values.get(key, default)
         if not isinstance(value, str) or not value.strip():
             self.fail(f"{key} = {shown(value)} must be a text that is not empty")
@@ -116,7 +117,7 @@ class Table:
         return value
 
     def number(self, key: str, default: float | None = None) -> float:
-        """The number ``key``, at most :data:`LARGE`; it must be there when no ``default`` is given."""
+        """Return the number ``key``, at most :data:`LARGE`. Without a ``default`` the key is required."""
         value = self.values.get(key, default)
         if value is None:
             self.fail(f"{key} is missing")
@@ -127,7 +128,7 @@ class Table:
         return float(value)
 
     def array(self, key: str, *shapes: tuple[int, ...]) -> NDArray[np.float64]:
-        """The numbers ``key``, each at most :data:`LARGE`, as an array of one of these shapes."""
+        """Return the numbers ``key``, each at most :data:`LARGE`, as an array of one of these shapes."""
         if key not in self.values:
             self.fail(f"{key} is missing")
         value = self.values[key]
@@ -145,12 +146,12 @@ class Table:
 
 
 def _is_endless(value: float) -> bool:
-    """Infinite or NaN; a whole number never is, however large."""
+    """Return whether a value is infinite or NaN; an integer never is."""
     return isinstance(value, float) and not math.isfinite(value)
 
 
 def _flat(value: Any) -> Iterator[float]:
-    """The numbers in nested lists."""
+    """Yield the numbers in nested lists."""
     if isinstance(value, (int, float)):
         yield value
     else:
@@ -159,7 +160,7 @@ def _flat(value: Any) -> Iterator[float]:
 
 
 def _shape(value: object) -> tuple[int, ...] | None:
-    """The shape of nested lists of numbers, None when they are ragged or hold anything else."""
+    """Return the shape of nested lists of numbers; None if they are ragged or contain anything else."""
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         return ()
     if not isinstance(value, Sequence) or isinstance(value, str):

@@ -1,4 +1,4 @@
-"""A person's body from an earlier recording: a result file, or a TOML file with its dimensions."""
+"""Bodies of earlier recordings: from a result, or from a TOML file with dimensions."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from tk.trackers.contour_tracker import restore_body, restore_dimensions
 
 
 def read_body(path: Path, up: str) -> ConeBody:
-    """The body that a result holds, or that a TOML file describes by ``[dimensions]`` in metres, or by ``stature``.
+    """Return the body of a result, or of a TOML file with ``[dimensions]`` in metres, or with ``stature``.
 
-    Dimensions that the TOML file leaves out are the average ones of its stature.
+    Missing dimensions are the average ones of the stature.
 
     Raises:
-        ConfigError: there is no such file, or no body of contours in it.
+        ConfigError: there is no such file, or it has no cone body.
         ResultError: a damaged result.
     """
     if path.suffix.lower() != ".toml":

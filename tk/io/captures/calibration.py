@@ -17,28 +17,28 @@ from tk.io.captures.units import UNITS, FoundUnit, infer_unit
 from tk.io.toml import Table, load_toml
 from tk.model.cameras.camera import Camera, Rig
 
-#: a reciprocal condition number below this is a singular intrinsic matrix: focal lengths of 10^-9 of the rest
+#: reciprocal condition number below which an intrinsic matrix counts as singular
 _SINGULAR = 1e-9
 
-#: pixels of a side of a picture
+#: most pixels of a side of an image; a larger number is a mistake in the file
 _MOST_PIXELS = 2**16
-#: seconds by which a video may be late
+#: largest delay of a video, seconds; a larger number is a mistake in the file
 _MOST_OFFSET_S = 3600.0
-#: how far a 3×3 rotation may be from orthonormal: files are written with six digits and more
+#: largest element of R Rᵀ - 1 of a rotation: files have six digits and more
 _ORTHONORMAL = 1e-4
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a calibration file says.
+    """Content of a calibration file.
 
     Attributes:
         path: the file.
         rig: its cameras, in the file's order.
         keys: the table's key of each camera, which may differ from its name.
-        notes: what was inferred, a line each, for the user to read.
-        time_offset_s: seconds by which each camera's pictures are taken later than their number says; empty: by none.
-        metres: in a unit of the file's translations.
+        notes: lines for the user about inferred values.
+        time_offset_s: delay of each camera, seconds; empty: no delays.
+        metres: length of the unit of the file's translations, metres.
     """
 
     path: Path
@@ -49,7 +49,7 @@ class Calibration:
     metres: float = 1.0
 
     def select(self, names: Sequence[str] | None) -> Calibration:
-        """The calibration of these cameras only, still in the file's order; all of them for None.
+        """Return the calibration of these cameras, in the file's order; of all cameras if None.
 
         Raises:
             CaptureError: a name is unknown, or fewer than two cameras are left.
@@ -92,7 +92,7 @@ def read_calibration(path: str | Path) -> Calibration:
 
 
 def camera_tables(document: Mapping[str, object], path: Path) -> dict[str, Mapping[str, object]]:
-    """The tables of a calibration document that are cameras, by key.
+    """Return the tables of the cameras in a calibration document, by key.
 
     Raises:
         CalibrationError: there are none.
@@ -101,7 +101,7 @@ def camera_tables(document: Mapping[str, object], path: Path) -> dict[str, Mappi
     nested = tables.get("cameras")
     if isinstance(nested, Mapping) and all(isinstance(value, Mapping) for value in nested.values()):
         tables = nested
-    # plain values beside the tables (a date, a tool's version) are nobody's camera
+    # plain values beside the tables, such as a date or a version, are not cameras
     found = {key: value for key, value in tables.items() if isinstance(value, Mapping)}
     if not found:
         raise CalibrationError(f"{path}: has no cameras; it needs one table a camera")
@@ -109,10 +109,10 @@ def camera_tables(document: Mapping[str, object], path: Path) -> dict[str, Mappi
 
 
 def given_unit(document: Mapping[str, object], path: Path) -> str | None:
-    """``[metadata] units`` of a calibration document, None where it has none.
+    """Return ``[metadata] units`` of a calibration document; None if it has none.
 
     Raises:
-        CalibrationError: it is no unit that is known.
+        CalibrationError: the unit is unknown.
     """
     metadata = Table(document, str(path), CalibrationError).table("metadata")
     if "units" not in metadata:
@@ -124,7 +124,7 @@ def given_unit(document: Mapping[str, object], path: Path) -> str | None:
 
 
 def calibration_of(path: Path, tables: Mapping[str, Mapping[str, object]], unit: str | None) -> Calibration:
-    """The calibration in these tables; ``unit`` is that of the translations, None to infer it.
+    """Return the calibration in these tables; ``unit``: unit of the translations, None to infer it.
 
     Raises:
         CalibrationError: with the file, the camera and the key that is wrong.
@@ -157,13 +157,13 @@ def camera_table(camera: Camera) -> dict[str, object]:
 
 
 def write_calibration(path: Path, source: Calibration, rig: Rig, time_offset_s: Sequence[float]) -> None:
-    """Write the file that ``source`` was read from with other cameras: all that is not said here stays as it is.
+    """Write a copy of the file that ``source`` was read from, with other cameras. Other entries do not change.
 
     Args:
         path: the new file.
         source: the calibration as it was read.
         rig: its cameras, in its order, metres.
-        time_offset_s: of each camera, seconds.
+        time_offset_s: delay of each camera, seconds.
 
     Raises:
         CalibrationError: the source is no TOML file, or the new one cannot be written.
@@ -192,12 +192,12 @@ def _time_offset(name: str, values: Mapping[str, object], path: Path) -> float:
 
 
 def scale_world(rig: Rig, metres: float) -> Rig:
-    """The rig with its translations multiplied by ``metres``, the metres in a unit: its projections stay."""
+    """Return the rig with translations multiplied by ``metres``; its projections do not change."""
     return Rig(tuple(replace(camera, translation=camera.translation * metres) for camera in rig))
 
 
 def _camera(key: str, values: Mapping[str, object], path: Path) -> Camera:
-    """One table's camera, its translation in the file's unit."""
+    """Return the camera of a table, with its translation in the file's unit."""
     name = Table(values, f"{path}: camera {key!r}", CalibrationError).text("name", key)
     table = Table(values, f"{path}: camera {name!r}", CalibrationError)
 
@@ -244,13 +244,13 @@ def _rotation(table: Table) -> NDArray[np.float64]:
 
 
 def match_camera(name: str, key: str, stems: Iterable[str]) -> str | None:
-    """The file stem that belongs to a camera, None when there is none.
+    """Return the file stem of a camera; None if there is none.
 
-    It is the one that equals the camera's ``name``, else its table's ``key``, else the one that equals either once
-    everything but letters and digits is dropped (`cam_01` and `cam01`).
+    The stem equals the camera's ``name``, else its table's ``key``, else one of these up to characters that are no
+    letters and no digits (`cam_01` and `cam01`).
 
     Raises:
-        CaptureError: several stems are equal in that last sense.
+        CaptureError: several stems match in the last sense.
     """
     stems = list(stems)
     for exact in (name, key):

@@ -1,4 +1,4 @@
-"""A capture: the folder that goes in. Opening one checks everything that can be checked without decoding it all."""
+"""A capture: the folder of a recording. Opening it checks what can be checked without decoding all images."""
 
 from __future__ import annotations
 
@@ -27,45 +27,44 @@ from tk.model.setup import Setup, Subject
 
 __all__ = ["Capture", "FrameReader", "FrameSet", "open_capture"]
 
-#: in a folder of masks that `tk masks` has made: where they come from
+#: file in a folder of masks from `tk masks` that says how they were made
 MASKS_RECORD = "masks.toml"
 
-#: frames a second when neither `capture.toml` nor the videos say
+#: frame rate, 1/s, if neither `capture.toml` nor the videos give one; a note says so
 DEFAULT_FPS = 30.0
 
-#: pictures of the empty scene that are kept a camera, and the bytes that all of them may take
+#: most images of the empty scene for each camera, and most bytes of all of them. Enough for a mean and a variance.
 _BACKGROUND_FRAMES = 50
 _BACKGROUND_BYTES = 384 * 2**20
 
-#: what points up when `capture.toml` does not say, unless the cameras' mounting is farther from it, degrees
+#: axis that points up if `capture.toml` gives none, unless the cameras' mounting differs by more than _UP_DEG degrees
 DEFAULT_UP, _UP_DEG = "z", 25.0
 
-#: cameras farther apart than this, in metres, are taken for millimetres in disguise
+#: metres; a note asks for the unit if cameras are farther apart, because their positions may be in millimetres
 _FAR_APART_M = 100.0
 
 
 @dataclass(frozen=True)
 class Capture:
-    """An open capture folder: a few numbers, and where the pictures are. Pictures are read by :meth:`frames`.
+    """An open capture folder, a :class:`~tk.io.captures.source.Source`. :meth:`frames` reads its images.
 
     Attributes:
         path: the folder.
         name: from `capture.toml`, else the folder's name.
-        fps: frames a second, from `capture.toml`, else from the videos, else 30.
-        up: what points up in the world: x, y, z, -x, -y or -z, or a unit vector's text, "[0.02, -0.9998, 0.01]".
+        fps: frame rate, 1/s, from `capture.toml`, else from the videos, else 30.
+        up: axis that points up in the world: x, y, z, -x, -y or -z, or a unit vector, "[0.02, -0.9998, 0.01]".
         rig: the cameras, in the calibration file's order.
-        volume: the working volume, world frame, metres; inferred from the rig where `capture.toml` has none.
-        frame_count: frames that all cameras (and masks) have.
-        subject_height_m: metres, None if unknown.
+        volume: the working volume, world frame, metres; inferred from the rig if `capture.toml` has none.
+        frame_count: number of frames that all cameras (and masks) have.
+        subject_height_m: height of the subject, metres; None if unknown.
         init_frame: the frame in which the subject stands in the initialisation pose.
-        init_pose: "da-vinci", or "any" when no pose is promised.
-        init_keypoints: a folder of 2D keypoints that tell the first pose; None where there is none.
-        warnings: what was put up with, a line each, for the user to read.
-        clips: a clip a camera.
-        mask_clips: a mask clip a camera, None without ready masks.
-        masks: what :func:`open_capture` was asked for, which says where masks come from if there are none.
-        time_offset_s: seconds by which each camera's pictures are later than their number says, from the calibration;
-            whole frames of it are put right by :meth:`frames`.
+        init_pose: "da-vinci", or "any" if the subject may begin in any pose.
+        init_keypoints: folder of 2D keypoints of the first pose; None if there is none.
+        warnings: lines about the capture that the user should read.
+        clips: one clip for each camera.
+        mask_clips: one clip of masks for each camera; None without given masks.
+        masks: the argument of :func:`open_capture`.
+        time_offset_s: delay of each camera, seconds, from the calibration; :meth:`frames` corrects whole frames of it.
     """
 
     path: Path
@@ -88,22 +87,22 @@ class Capture:
 
     @property
     def late_frames(self) -> tuple[int, ...]:
-        """The time offsets in whole frames: frame k of the capture holds picture k - late of each camera."""
+        """Delay of each camera in whole frames: frame k of the capture holds image k - late."""
         return tuple(round(late * self.fps) for late in self.time_offset_s)
 
     @property
     def first_frame(self) -> int:
-        """The first frame of which every camera has a picture."""
+        """First frame of which every camera has an image."""
         return max(0, *self.late_frames)
 
     def as_recorded(self) -> Capture:
-        """The capture without its time offsets: frame k holds picture k of every camera."""
+        """Return the capture without its time offsets: frame k holds image k of every camera."""
         clips = (*self.clips, *(self.mask_clips or ()))
         return replace(self, time_offset_s=(0.0,) * len(self.rig), frame_count=min(clip.frame_count for clip in clips))
 
     @property
     def calibration(self) -> Calibration:
-        """The calibration file's cameras that are used."""
+        """The calibration of the cameras that are used."""
         return self._calibration
 
     @property
@@ -142,9 +141,9 @@ class Capture:
         return up_vector(self.up)
 
     def frames(self, start: int = 0, stop: int | None = None) -> FrameReader:
-        """The frames ``start`` … ``stop - 1``, decoded ahead; up to the capture's end by default.
+        """Return the frames ``start`` … ``stop - 1``, decoded ahead; up to the capture's end by default.
 
-        Before :attr:`first_frame` a camera whose video begins later shows its first picture.
+        Before :attr:`first_frame` a camera whose video begins later shows its first image.
 
         Raises:
             CaptureError: there are no such frames.
@@ -157,10 +156,10 @@ class Capture:
         return FrameReader(self.clips, self.mask_clips, self.rig.frame_shape, start, stop, self.late_frames, self.fps)
 
     def background(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """The empty scene: an array (T, h, w, 3) uint8 BGR a camera, None without a `background/` folder.
+        """Return the empty scene: an array (T, h, w, 3) uint8 BGR for each camera; None without a `background/` folder.
 
-        T is 1 for a picture. Of a clip at most 50 frames are kept, spread evenly over it, and fewer of large
-        pictures (384 MiB over all cameras): enough for a mean and a variance.
+        T is 1 for an image. Of a clip at most 50 frames are used, spread evenly over it, and fewer of large images
+        (384 MiB over all cameras).
 
         Raises:
             VideoError: a camera has no background, or it cannot be read, or has another size.
@@ -263,7 +262,7 @@ def _open_masks(calibration: Calibration, path: Path, masks: str) -> tuple[Clip,
 def _clips_of(
     calibration: Calibration, folder: Path, what: str, suffix: str, *, pictures: bool = False, is_mask: bool = False
 ) -> tuple[Clip, ...]:
-    """The clip in ``folder`` of each camera, probed and of the camera's size."""
+    """Return each camera's clip in ``folder``, checked to be of the camera's size."""
     found = list_clips(folder, pictures)
     taken: dict[str, Camera] = {}
     clips: list[Clip] = []
@@ -292,7 +291,7 @@ def _clips_of(
 
 
 def _common_length(clips: Sequence[Clip], late: Sequence[int], warn: Callable[[str], None]) -> int:
-    """Frames until the first clip ends; each clip (those of masks behind those of videos) is so many frames late."""
+    """Return the number of frames until the first clip ends; ``late``: delays of the videos, which come first."""
     counts = [clip.frame_count + late[i % len(late)] for i, clip in enumerate(clips)]
     common = min(counts)
     if common <= max(0, *late):
@@ -302,8 +301,8 @@ def _common_length(clips: Sequence[Clip], late: Sequence[int], warn: Callable[[s
         )
     if any(late):
         first, last = max(0, *late), common - 1
-        told = ", ".join(f"{clip.path.stem} {n:+d}" for clip, n in zip(clips, late, strict=False) if n)
-        warn(f"time offsets: {told} frames; all cameras have pictures of frames {first} to {last}")
+        delays = ", ".join(f"{clip.path.stem} {n:+d}" for clip, n in zip(clips, late, strict=False) if n)
+        warn(f"time offsets: {delays} frames; all cameras have pictures of frames {first} to {last}")
         return common
     if common < max(counts):
         short = ", ".join(str(clip.path) for clip in clips if clip.frame_count == common)
@@ -327,7 +326,7 @@ def _frame_rate(settings: CaptureSettings, clips: Sequence[Clip], path: Path, wa
 
 
 def _up(settings: CaptureSettings, rig: Rig, path: Path, warn: Callable[[str], None]) -> str:
-    """What points up: z unless `capture.toml` says otherwise, or says nothing and the cameras are mounted otherwise."""
+    """Return the axis of `capture.toml`; if it gives none, z, unless the cameras' mounting indicates another one."""
     if settings.up is not None:
         return settings.up
     found = infer_up(rig)
@@ -338,7 +337,7 @@ def _up(settings: CaptureSettings, rig: Rig, path: Path, warn: Callable[[str], N
 
 
 def _working_volume(settings: CaptureSettings, rig: Rig, path: Path, warn: Callable[[str], None]) -> Volume:
-    """The volume from `capture.toml`, or the inferred one; checked to be in sight of two cameras somewhere."""
+    """Return the volume from `capture.toml`, or the inferred one; at least two cameras must see a part of it."""
     file = path / "capture.toml"
     if settings.volume is None:
         try:

@@ -1,4 +1,4 @@
-"""`capture.toml`: what a person says about a capture. Everything in it is optional."""
+"""`capture.toml`: description of a capture. Every key is optional."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from tk.io.toml import Table, load_toml
 from tk.model.cameras.up import up_text
 from tk.model.cameras.volume import Volume
 
-#: known initialisation poses; "any" promises none
+#: known initialisation poses; "any": the subject may begin in any pose
 INIT_POSES = ("da-vinci", "any")
 
-#: frames a second, from one picture in 100 s to the fastest cameras
+#: range of the frame rate, 1/s: from one image in 100 s to the fastest cameras
 FPS_RANGE = (0.01, 1e5)
 
-#: metres: the largest side of a working volume, and how far away its middle may be
+#: metres, largest side of a working volume, and largest distance of its centre from the origin
 _MOST_VOLUME_M, _FARTHEST_M = 1000.0, 1e6
 
 _KEYS: dict[str, tuple[str, ...]] = {
@@ -32,21 +32,19 @@ _TOP_KEYS = ("name", "fps", "up", *_KEYS)
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """What `capture.toml` says; None where it is silent and the default comes from elsewhere.
+    """Content of `capture.toml`; None for keys that it does not have.
 
     Attributes:
-        name: of the capture.
-        fps: frames a second.
-        up: what points up in the world, as :func:`tk.model.cameras.up.up_text` tells it: "z", or a unit vector's
-            text; None
-            where the cameras have to tell.
+        name: name of the capture.
+        fps: frame rate, 1/s.
+        up: axis that points up in the world, as :func:`tk.model.cameras.up.up_text` writes it: "z", or a unit vector.
+            None: inferred from the cameras.
         volume: the working volume, metres.
         subject_height_m: the subject's height without shoes, metres.
         init_frame: the frame in which the subject stands in the initialisation pose.
         init_pose: one of :data:`INIT_POSES`.
-        init_keypoints: a folder of 2D keypoints that tell the first pose, relative to the capture's; None where there
-            is none.
-        unknown: keys that mean nothing to us, e.g. a misspelt one.
+        init_keypoints: folder of 2D keypoints of the first pose, relative to the capture's; None if there is none.
+        unknown: unknown keys, for example misspelt ones.
     """
 
     name: str | None = None
@@ -61,7 +59,7 @@ class CaptureSettings:
 
 
 def read_settings(path: Path) -> CaptureSettings:
-    """Read `capture.toml`; a missing file is an empty one.
+    """Read `capture.toml`; a missing file counts as an empty one.
 
     Raises:
         CaptureError: invalid TOML or a value out of range, with the file and the key.
@@ -106,7 +104,7 @@ def read_settings(path: Path) -> CaptureSettings:
 
 
 def _up(document: Table) -> str:
-    """The text of ``up``: the name of an axis, or an array that need not be of unit length."""
+    """Return the text of ``up``: the name of an axis, or a vector of any length."""
     value = document.values.get("up", "z")
     try:
         return up_text(document.array("up", (3,)) if isinstance(value, list) else document.text("up", "z"))

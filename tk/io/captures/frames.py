@@ -1,4 +1,4 @@
-"""Synchronised frames of all cameras, decoded ahead of whoever consumes them."""
+"""Synchronised frames of all cameras, decoded ahead of the consumer."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tk.io.captures.video import Clip
 
-#: frames decoded ahead at most, and the bytes that they may take
+#: most frames decoded ahead, and most bytes of them. Fewer make the consumer wait for a slow image.
 _AHEAD = 8
 _AHEAD_BYTES = 128 * 2**20
 
@@ -41,10 +41,10 @@ class FrameSet:
 class FrameReader(Iterator[FrameSet]):
     """Iterates over the frames ``start`` … ``stop - 1``, one decoding thread a camera.
 
-    Every thread decodes straight into its layer of a shared stack, up to 8 frames (128 MiB) ahead. Use it as a
-    context manager, or let the iteration run out, or drop it: each ends the threads.
+    Every thread decodes directly into its layer of a shared stack, up to 8 frames (128 MiB) ahead. The threads end with
+    the context manager, with the iteration, or when the reader is no longer referenced.
 
-    An error in a picture is raised when the iteration gets to that frame: all frames before it have been handed out.
+    An error in an image is raised when the iteration reaches that frame; all frames before it have been returned.
     """
 
     def __init__(
@@ -124,31 +124,31 @@ class FrameReader(Iterator[FrameSet]):
 
 
 class _Stacks:
-    """Stacks of pictures whose memory is used again once nobody holds them.
+    """Stacks of images whose memory is used again when they are no longer referenced.
 
-    Allocated afresh, each decoding thread would keep freed ones in its own part of the heap: measured, 20 MB more in
-    1,000 frames; and fresh memory has to be cleared.
+    With new memory each time, each decoding thread would keep freed memory in its own part of the heap: 20 MB more in
+    1,000 frames (measured). New memory also has to be cleared.
     """
 
     def __init__(self, shape: tuple[int, ...], most: int) -> None:
-        """At most ``most`` lie ready."""
+        """Keep at most ``most`` free stacks."""
         self._shape = shape
         self._free: deque[bytearray] = deque(maxlen=most)
 
     def take(self) -> NDArray[np.uint8]:
-        """A stack of the shape. What was never written in it is zero."""
+        """Return a stack of the shape. Pixels that were never written are zero."""
         try:
             memory = self._free.pop()
         except IndexError:
             memory = bytearray(math.prod(self._shape))
         stack = np.frombuffer(memory, np.uint8)
-        # every view has this array for its base, so it goes with the last of them
+        # every view has this array as its base, so it is freed with the last view
         weakref.finalize(stack, self._free.append, memory).atexit = False
         return stack.reshape(self._shape)
 
 
 class _Slot:
-    """A frame set in the making."""
+    """A frame set that is not complete yet."""
 
     def __init__(self, frame_set: FrameSet, cameras: int) -> None:
         self.frame_set = frame_set
@@ -157,7 +157,7 @@ class _Slot:
 
 
 class _Window:
-    """The frame sets between the consumer and the fastest camera: all that the threads share."""
+    """The frame sets between the consumer and the fastest camera, shared by the threads."""
 
     def __init__(self, blank: Callable[[int], FrameSet], cameras: int, start: int, ahead: int) -> None:
         self._blank = blank
@@ -169,7 +169,7 @@ class _Window:
         self._changed = threading.Condition()
 
     def claim(self, index: int) -> _Slot | None:
-        """The slot to decode frame ``index`` into, once it is within reach; None when there is no more use for it."""
+        """Wait until frame ``index`` may be decoded and return its slot; None after the reader was closed."""
         with self._changed:
             self._changed.wait_for(lambda: self.closed or index < self._next + self._ahead)
             if self.closed:
@@ -187,7 +187,7 @@ class _Window:
                 self._changed.notify_all()
 
     def take(self) -> FrameSet | None:
-        """The consumer's next frame set, None once closed. Waits for all cameras; raises the first one's failure."""
+        """Return the consumer's next frame set, None after closing. Waits for all cameras; raises the first failure."""
         with self._changed:
             self._changed.wait_for(self._ready)
             if self.closed:
@@ -211,11 +211,11 @@ class _Window:
 
 
 def _decode(window: _Window, camera: int, clip: Clip, mask_clip: Clip | None, start: int, stop: int, late: int) -> None:
-    """A camera's thread."""
+    """Decode one camera's images; runs in its own thread."""
     index = start
     slot: _Slot | None = None
     last = clip.frame_count - 1 if mask_clip is None else min(clip.frame_count, mask_clip.frame_count) - 1
-    kept, kept_mask = np.empty((2, 0), np.uint8)  # what is handed out again
+    kept, kept_mask = np.empty((2, 0), np.uint8)  # an image that several frames show
 
     def picture_of(index: int) -> int:
         return min(max(index - late, 0), last)
@@ -235,7 +235,7 @@ def _decode(window: _Window, camera: int, clip: Clip, mask_clip: Clip | None, st
                 if slot is None:
                     return
                 layer = slot.frame_set.images[camera, : clip.height, : clip.width]
-                # a first or last picture that was read for the frame before, or that the next frame shows, too
+                # the first or last image may stand for several frames
                 stands_in = index > start and picture_of(index) == picture_of(index - 1)
                 again = picture_of(index) == picture_of(index + 1)
                 if stands_in:

@@ -1,9 +1,9 @@
-"""Reads 2D keypoints as OpenPose and Pose2Sim write them: a folder a camera, in it a JSON file a picture.
+"""Reads 2D keypoints in the layout of OpenPose and Pose2Sim: a folder for each camera with a JSON file for each image.
 
     FOLDER/cam1/…_000000000012_keypoints.json      or FOLDER/cam1_json/cam1_000012.json
 
-The number that the file's name ends with is that of the picture in its video. How many keypoints a person has tells
-which they are: 25 of OpenPose's BODY_25, 26 of HALPE_26 (what Pose2Sim makes by default), 17 of COCO.
+The number at the end of the file's name is the number of the image in its video. The number of keypoints of a person
+determines their layout: 25 for OpenPose's BODY_25, 26 for HALPE_26 (the default of Pose2Sim), 17 for COCO.
 """
 
 from __future__ import annotations
@@ -35,29 +35,30 @@ _BODY_25 = {
     for k, joint in enumerate(_LIMBS)
     for side, first in (("r", 2 if k < 3 else 9), ("l", 5 if k < 3 else 12))
 } | {"pelvis": 8}
-#: joints by keypoints, by how many keypoints there are. Their neck lies lower than ours, between the shoulders.
+#: index of each joint's keypoint, by the number of keypoints. Necks are left out: theirs lie lower, between the
+#: shoulders.
 LAYOUTS: Mapping[int, Mapping[str, int]] = {
     17: _COCO_17,
     25: _BODY_25,
     26: {**_COCO_17, "head_top": 17, "pelvis": 19},
 }
 
-#: people in a picture, of whom one is the subject; files in a folder
+#: most people in an image, and most files in a folder; more are a mistake in the input
 _MOST_PEOPLE, _MOST_FILES = 30, 1_000_000
 _NUMBER = re.compile(r"(\d+)(?:_keypoints)?$")
 
 
 def read_keypoints(folder: Path, capture: Capture, frame: int) -> list[Float]:
-    """Everybody who was found in the pictures of a frame.
+    """Return all people that were detected in the images of a frame.
 
     Args:
-        folder: holds a folder a camera.
-        capture: whose cameras, by their names or by their tables' keys, and time offsets.
-        frame: of the capture.
+        folder: folder with a folder for each camera.
+        capture: gives the cameras, by their names or by their tables' keys, and the time offsets.
+        frame: frame of the capture.
 
     Returns:
-        Of each camera (P, 15, 3), pixels x, y and confidence, in the order of JOINTS; NaN where no keypoint tells a
-        joint.
+        For each camera (P, 15, 3), x, y in pixels and confidence, in the order of JOINTS; NaN for joints without a
+        keypoint.
 
     Raises:
         CaptureError: a camera has no folder, or no file of this frame, or a file is damaged.
@@ -79,7 +80,7 @@ def read_keypoints(folder: Path, capture: Capture, frame: int) -> list[Float]:
 
 
 def _file_of(folder: Path, picture: int) -> Path:
-    """The file of a picture."""
+    """Return the file of an image."""
     numbers: dict[int, Path] = {}
     for count, path in enumerate(sorted(folder.glob("*.json"))):
         number = _NUMBER.search(path.stem)
@@ -100,7 +101,7 @@ def _file_of(folder: Path, picture: int) -> Path:
 
 
 def read_people(path: Path) -> Float:
-    """(P, 15, 3) the people in a picture: x, y, confidence in the order of JOINTS; NaN where no keypoint tells a joint.
+    """Return the people in an image (P, 15, 3): x, y, confidence in the order of JOINTS, NaN without keypoint.
 
     Raises:
         CaptureError: the file cannot be read, or is not one of OpenPose's.
@@ -122,7 +123,7 @@ def read_people(path: Path) -> Float:
 
 
 def _joints(person: object, where: str) -> Float:
-    """(15, 3) one person's; all NaN where there is a person without keypoints."""
+    """Return (15, 3) of one person; all NaN for a person without keypoints."""
     numbers = person.get("pose_keypoints_2d") if isinstance(person, dict) else None
     if not isinstance(numbers, list):
         raise CaptureError(f'{where} has no list "pose_keypoints_2d"')
@@ -151,17 +152,17 @@ def _joints(person: object, where: str) -> Float:
 
 
 def first_pose(capture: Capture, pose_names: tuple[str, ...], given: Path | None, first_frame: int) -> InitPose | None:
-    """The rough pose to begin with, from a file or a folder of keypoints; None where nobody gives one.
+    """Return the rough initial pose from a file or a folder of keypoints; None if there is neither.
 
     Args:
-        capture: whose `[init] keypoints` count where nothing is ``given``.
-        pose_names: (D,) names of the configuration vector.
+        capture: gives `[init] keypoints` if nothing is ``given``.
+        pose_names: (D,) names of the entries of the pose vector.
         given: a TOML file with a pose, or a folder of keypoints.
-        first_frame: the first that is asked for; keypoints are read in this one or, if that is later, in the capture's
-            `[init] frame`.
+        first_frame: first frame that is asked for; keypoints are read in this frame or, if that is later, in the
+            capture's `[init] frame`.
 
     Raises:
-        CaptureError: what was given cannot be used.
+        CaptureError: file or folder cannot be used.
     """
     if given is not None and not given.is_dir():
         return read_init_pose(given, pose_names)
@@ -172,12 +173,12 @@ def first_pose(capture: Capture, pose_names: tuple[str, ...], given: Path | None
 
 
 def keypoint_pose(folder: Path, capture: Capture, frame: int) -> InitPose:
-    """The joints of the subject in a frame, triangulated from keypoints: a rough pose to begin with.
+    """Return a rough initial pose: the subject's joints in a frame, triangulated from keypoints.
 
-    The subject is who stands in the working volume and is seen by most cameras.
+    The subject is the person in the working volume that most cameras see.
 
     Raises:
-        CaptureError: too few joints are seen alike by two cameras; and as :func:`read_keypoints` does.
+        CaptureError: two cameras agree on too few joints; and as :func:`read_keypoints` does.
     """
     people = read_keypoints(folder, capture, frame)
     seeing = [camera.name for camera, found in zip(capture.rig, people, strict=True) if len(found)]

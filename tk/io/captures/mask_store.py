@@ -1,7 +1,7 @@
-"""Masks of a whole recording in little memory: a bit a pixel, compressed; some 10 kB for five pictures of 640×480.
+"""Masks of a whole recording in little memory: one bit a pixel, compressed; about 10 kB for five images of 640×480.
 
-Those of a long recording go to a file, so that memory stays flat: a temporary one without a name, or one beside the
-result, from which a run that was killed is taken up.
+Masks of a long recording are stored in a file: a temporary one without a name, or one beside the result, with which a
+killed run can be resumed.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from tk.errors import TkError
 
 Masks = NDArray[np.uint8]
 
-#: bytes that are kept in memory; with more, all of them are on disk
+#: most bytes in memory; larger stores are on disk
 IN_MEMORY = 32 * 2**20
 
 
-#: before each frame: its number, the bytes that follow, and the masks' shape
+#: header of each frame: its number, the number of bytes that follow, and the masks' shape
 _HEAD = struct.Struct("<qqiii")
 
 
@@ -34,13 +34,13 @@ class MaskStore:
     """Masks (C, H, W), 0 or 255, by frame number.
 
     Args:
-        path: a file to keep them in, made with the first of them; None: memory, or a file without a name.
-        resume: take up what the file holds; what is damaged in it, and all behind that, is left out.
+        path: file of the masks, created with the first frame; None: memory, or a file without a name.
+        resume: use the frames in the file, up to the first damaged one.
     """
 
     def __init__(self, path: Path | None = None, resume: bool = False) -> None:
         self._path = path
-        self._places: dict[int, tuple[int, int]] = {}  # where a frame begins, and its bytes
+        self._places: dict[int, tuple[int, int]] = {}  # start and size of each frame, bytes
         self._shape: tuple[int, ...] = ()
         self._opened: IO[bytes] | None = None
         if path is not None and resume and path.is_file():
@@ -61,7 +61,7 @@ class MaskStore:
         return TkError(f"{where}: masks cannot be kept there: {error.strerror or error}")
 
     def _take_up(self, file: IO[bytes]) -> None:
-        """Find the frames that are in the file already; what cannot be read is cut off."""
+        """Find the frames in the file; cut off the file at the first damaged frame."""
         whole, end = os.fstat(file.fileno()).st_size, 0
         while end + _HEAD.size <= whole:
             index, size, *shape = _HEAD.unpack(file.read(_HEAD.size))
@@ -82,10 +82,10 @@ class MaskStore:
         return index in self._places
 
     def put(self, index: int, masks: Masks) -> None:
-        """Keep a frame's masks; values of 128 and more are the person.
+        """Store a frame's masks; values of 128 and more are the person.
 
         Raises:
-            TkError: there is no room for them on the disk.
+            TkError: the file cannot be written, for example because the disk is full.
         """
         self._shape = masks.shape
         packed = zlib.compress(np.packbits(masks >= 128).tobytes(), 1)
@@ -100,7 +100,7 @@ class MaskStore:
         self._places[index] = (place, len(packed))
 
     def get(self, index: int) -> Masks:
-        """(C, H, W) the masks of a frame that was put."""
+        """Return the masks (C, H, W) of a stored frame."""
         place, size = self._places[index]
         assert self._opened is not None
         self._opened.seek(place)
@@ -109,7 +109,7 @@ class MaskStore:
         return np.unpackbits(bits, count=count).reshape(self._shape) * np.uint8(255)
 
     def sequence(self, indices: NDArray[np.int64]) -> Frames:
-        """The masks of these frames, unpacked when they are asked for."""
+        """Return the masks of these frames, unpacked on access."""
         return Frames(self, [int(i) for i in indices])
 
 

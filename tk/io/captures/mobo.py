@@ -1,11 +1,11 @@
-"""The folders and camera files of the CMU Motion of Body (MoBo) database, as a capture.
+"""Reads a walk of the CMU Motion of Body (MoBo) database as a capture.
 
 R. Gross and J. Shi, *The CMU Motion of Body (MoBo) Database*, CMU-RI-TR-01-18, 2001: 25 subjects on a treadmill, four
 walks, six cameras (vr03_7, vr05_7, vr07_7, vr13_7, vr16_7, vr17_7), 30 frames/s, masks from a background subtraction.
 
-    ROOT/moboJpg/04002/slowWalk/vr03_7/*.jpg       pictures: the capture is the folder of the walk
+    ROOT/moboJpg/04002/slowWalk/vr03_7/*.jpg       images: the capture is the folder of the walk
     ROOT/moboBgSub/04002/slowWalk/vr03_7/*         masks, in a tree beside it; optional
-    ROOT/calibration/vr03_7.cal                    cameras; or beside the pictures, or in any folder between
+    ROOT/calibration/vr03_7.cal                    cameras; or beside the images, or in any folder between
 
 A camera file holds the parameters of Tsai's model, one number after the other, as R. Willson's programs order them:
 Ncx, Nfx, dx, dy, dpx, dpy, Cx, Cy, sx, f, kappa1, Tx, Ty, Tz, Rx, Ry, Rz (millimetres, radians).
@@ -28,7 +28,7 @@ from tk.io.captures.calibration import Calibration
 from tk.io.captures.capture_toml import CaptureSettings
 from tk.model.cameras.camera import Camera, Rig
 
-#: frames a second; nobody stands in the Da Vinci pose
+#: the walks begin in any pose
 SETTINGS = CaptureSettings(fps=30.0, up="z", init_pose="any")
 
 _PICTURES, _MASKS = "moboJpg", "moboBgSub"
@@ -43,9 +43,9 @@ class MoboWalk:
     """One walk of one subject.
 
     Attributes:
-        path: the folder that holds a folder of pictures a camera.
-        files: the camera files, by camera.
-        masks: the folder of the masks, None if there is none.
+        path: folder with a folder of images for each camera.
+        files: camera files, by camera.
+        masks: folder of the masks; None if there is none.
     """
 
     path: Path
@@ -54,7 +54,7 @@ class MoboWalk:
 
 
 def find_walk(path: Path) -> MoboWalk | None:
-    """The walk at ``path``; None if this is no such folder: no ``vr…`` folders, or a ``calibration.toml``."""
+    """Return the walk at ``path``; None if the folder has no ``vr…`` folders, or has a ``calibration.toml``."""
     cameras = sorted(folder.name for folder in path.glob("vr[0-9][0-9]*") if folder.is_dir())
     if not cameras or (path / "calibration.toml").exists():
         return None
@@ -74,10 +74,10 @@ def find_walk(path: Path) -> MoboWalk | None:
 
 
 def read_cameras(walk: MoboWalk) -> Calibration:
-    """The cameras of a walk that have a camera file; their sizes are those of the pictures.
+    """Return the cameras of a walk that have a camera file; their sizes are those of the images.
 
     Raises:
-        CalibrationError: fewer than two have one, or one cannot be read.
+        CalibrationError: fewer than two cameras have one, or a file cannot be read.
     """
     if len(walk.files) < 2:
         raise CalibrationError(
@@ -99,7 +99,7 @@ def _read_camera(name: str, file: Path, size: tuple[int, int]) -> Camera:
 
 
 def camera_from_tsai(name: str, tsai: dict[str, float], size: tuple[int, int], file: Path) -> Camera:
-    """A camera from Tsai's parameters (millimetres, radians).
+    """Return a camera from Tsai's parameters (millimetres, radians).
 
     Tsai undistorts by 1 + kappa1 r² in the sensor's plane; the camera here distorts. The inverse's series gives
     k1 = -κf², k2 = 3κ²f⁴, k3 = -12κ³f⁶.
@@ -120,7 +120,7 @@ def camera_from_tsai(name: str, tsai: dict[str, float], size: tuple[int, int], f
 
 
 def rotation_zyx(x: float, y: float, z: float) -> NDArray[np.float64]:
-    """(3, 3) Rz Ry Rx."""
+    """Return the matrix Rz Ry Rx (3, 3)."""
     axes = np.diag([x, y, z])
     Rx, Ry, Rz = (cv2.Rodrigues(axis)[0] for axis in axes)
     return np.asarray(Rz @ Ry @ Rx, np.float64)

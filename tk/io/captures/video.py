@@ -1,4 +1,4 @@
-"""One camera's pictures, read in order: a video file, a folder of numbered pictures, or a single picture."""
+"""The images of one camera, read in order: a video file, a folder of numbered images, or a single image."""
 
 from __future__ import annotations
 
@@ -19,34 +19,34 @@ Image = NDArray[np.uint8]
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pbm", ".pgm", ".ppm")
 
-#: a mask's pixel is foreground from this grey value on
+#: least grey value of the foreground in a mask: half of 255, because video coding blurs edges
 MASK_THRESHOLD = 128
 
 
 class Reader(Protocol):
-    """Hands out a clip's pictures one after the other. One thread at a time."""
+    """Reads the images of a clip in order. One thread at a time."""
 
     def read(self, out: Image) -> None:
-        """Put the next picture into ``out``: (H, W, 3) BGR, or (H, W) with 0 and 255 for a mask.
+        """Write the next image into ``out``: (H, W, 3) BGR, or (H, W) with 0 and 255 for a mask.
 
         Raises:
-            VideoError: there is no next picture, or it cannot be decoded, or it has another size.
+            VideoError: there is no next image, it cannot be decoded, or its size differs.
         """
 
     def skip(self) -> None:
-        """Pass over the next picture. Raises as :meth:`read` does."""
+        """Skip the next image. Raises as :meth:`read` does."""
 
     def close(self) -> None: ...
 
 
 class Clip(Protocol):
-    """A sequence of pictures on disk.
+    """A sequence of images on disk.
 
     Attributes:
         path: the file or folder, as messages name it.
         width, height: pixels.
-        frame_count: pictures in it.
-        fps: pictures a second, None when the clip does not say.
+        frame_count: number of images.
+        fps: frame rate, 1/s; None if the clip gives none.
     """
 
     @property
@@ -61,7 +61,7 @@ class Clip(Protocol):
     def fps(self) -> float | None: ...
 
     def open(self) -> Reader:
-        """A reader that stands before the first picture."""
+        """Return a reader at the first image."""
 
 
 @dataclass(frozen=True)
@@ -99,17 +99,17 @@ class PictureClip:
 
 
 def probe(path: Path, is_mask: bool = False) -> Clip:
-    """The clip at ``path``, whichever kind it is: its first picture has been decoded, so it can be read."""
+    """Return the clip at ``path``, of either kind. Its first image has been decoded as a check."""
     if path.is_dir() or path.suffix.lower() in PICTURE_SUFFIXES:
         return probe_pictures(path, is_mask)
     return probe_video(path, is_mask)
 
 
 def probe_video(path: Path, is_mask: bool = False) -> VideoClip:
-    """Open a video file and look at its first picture.
+    """Open a video file and decode its first image.
 
-    Frames are counted by walking through the coded packets, without decoding (about 10 µs a frame): the header of an
-    `.mkv` holds an estimate only, and a file that is cut off still promises all its frames.
+    Frames are counted by reading the coded packets without decoding (about 10 µs a frame), because the header of an
+    `.mkv` is only an estimate, and the header of a truncated file counts all frames.
 
     Raises:
         VideoError: no video, empty, cut off, or of a codec that OpenCV cannot decode.
@@ -134,9 +134,9 @@ def probe_video(path: Path, is_mask: bool = False) -> VideoClip:
 
 
 def probe_pictures(path: Path, is_mask: bool = False) -> PictureClip:
-    """List the numbered pictures of a folder, or take one picture file, and look at the first.
+    """List the numbered images of a folder, or take one image file, and decode the first.
 
-    The number is what the file's name ends with; the first picture has number 0 or 1, and none is left out.
+    The number stands at the end of the file's name. The first number is 0 or 1, and there are no gaps.
 
     Raises:
         VideoError: no pictures, a gap in the numbers, a number used twice, or the first cannot be decoded.
@@ -147,7 +147,7 @@ def probe_pictures(path: Path, is_mask: bool = False) -> PictureClip:
 
 
 def list_clips(folder: Path, pictures: bool = False) -> dict[str, Path]:
-    """What a folder holds for each stem: video files, folders of pictures, and single pictures where ``pictures``.
+    """Return the video files, folders of images and, with ``pictures``, single images in a folder, by stem.
 
     Raises:
         VideoError: the same stem twice.
@@ -165,7 +165,7 @@ def list_clips(folder: Path, pictures: bool = False) -> dict[str, Path]:
 
 
 def picture_number(path: Path) -> int | None:
-    """The number that a picture's name ends with."""
+    """Return the number at the end of an image's name; None without one."""
     digits = re.search(r"[0-9]+$", path.stem)
     return int(digits.group()) if digits else None
 
@@ -177,14 +177,14 @@ class _VideoReader:
         self._capture = _open_video(clip.path)
 
     def skip(self) -> None:
-        # Never sought: seeking lands on key frames or off by one, depending on the codec and FFmpeg's version.
+        # no seeking: depending on codec and FFmpeg version it lands on key frames, or is off by one
         if not self._capture.grab():
             self._fail()
         self._index += 1
 
     def read(self, out: Image) -> None:
         clip = self._clip
-        # OpenCV decodes straight into an array that fits, and makes its own otherwise.
+        # OpenCV decodes directly into a suitable array, and allocates its own otherwise
         fits = not clip.is_mask and out.flags.c_contiguous
         ok, picture = self._capture.read(out) if fits else self._capture.read()
         if not ok:
@@ -237,7 +237,7 @@ class _PictureReader:
 def _open_video(path: Path) -> cv2.VideoCapture:
     if path.exists() and not path.is_file():  # OpenCV would wait for a pipe
         raise VideoError(f"{path}: is not a file")
-    # One decoding thread: the cameras are decoded side by side already (measured: 5 % faster on 2 cores, less memory).
+    # one decoding thread: the cameras are decoded in parallel already (measured: 5 % faster on 2 cores, less memory)
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
     if not capture.isOpened():
         raise VideoError(f"{path}: {_why_unreadable(path)}")
@@ -258,7 +258,7 @@ def _why_unreadable(path: Path) -> str:
 
 
 def _count_packets(path: Path) -> int:
-    """The number of coded pictures in a video file."""
+    """Return the number of coded images in a video file."""
     raw = -1  # CAP_PROP_FORMAT's way to ask for packets
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, raw])
     count = 0
@@ -308,7 +308,7 @@ def _read_picture(path: Path, is_mask: bool) -> NDArray[Any]:
 
 
 def _has_end(coded: bytes) -> bool:
-    """False for a PNG or JPEG that is cut off: OpenCV would fill up a JPEG with grey, and libpng complain aloud."""
+    """Return False for a truncated PNG or JPEG: OpenCV would fill up a JPEG with grey, libpng would print an error."""
     if not coded:
         return False
     if coded.startswith(b"\x89PNG"):
