@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.results.data import STATUS_MEANING
+from tk.io.results.status import STATUS_MEANING
 from tk.io.results.writer import Result, Status
 from tk.render.canvas import Image, write
 from tk.render.figure import Figure

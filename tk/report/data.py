@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tk.io.results.data import STATUS_MEANING
+from tk.io.results.status import STATUS_MEANING
 from tk.io.results.writer import Result, Status
 from tk.model.body.skeleton import JOINTS, SEGMENTS
 from tk.model.cameras.camera import Rig

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.results.data import STATUS_MEANING
+from tk.io.results.status import STATUS_MEANING
 from tk.io.results.writer import Result, read_joints
 from tk.model.cameras.camera import Rig
 from tk.render.figure import Figure, figure_of

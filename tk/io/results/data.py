@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ResultError
+from tk.io.results.status import Status
 from tk.io.toml import parse_toml
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import JOINTS, paper_poses, skeleton_of_names
@@ -24,22 +24,8 @@ if TYPE_CHECKING:
 FORMAT = "tk-result"
 FORMAT_VERSION = 3
 
-#: the points of the feet, in the order of `/feet/position`
-FOOT_POINTS = ("heel_l", "toe_l", "heel_r", "toe_r")
-
 Float = NDArray[np.float64]
 Value = NDArray[Any] | float | int | str
-
-
-class Status(IntEnum):
-    """The values of `/status`."""
-
-    TRACKED = 0
-    INITIALISED = 1
-    RECOVERED = 2
-    LOST = 3
-    SUSPECT = 4
-    ABSENT = 5
 
 
 #: fields of ResultMeta that hold names
@@ -47,8 +33,6 @@ _LISTS = (
     "pose_names", "pose_units", "stages", "timing_stages", "joint_names",
     "residual_cameras", "segment_names",
 )  # fmt: skip
-
-STATUS_MEANING = ("tracked", "initialised", "recovered after loss", "lost", "suspect", "absent")
 
 
 def has_pose(status: NDArray[np.integer]) -> NDArray[np.bool_]:
@@ -95,7 +79,7 @@ class ResultMeta:
         sigma: whether there is a standard deviation of each joint's position.
         residual_cameras: names of the C cameras of `/residual`.
         segment_names: names of the segments whose rotation is told.
-        feet: whether there are the positions of :data:`FOOT_POINTS`.
+        feet: whether there are the positions of :data:`~tk.model.motion.segments.FOOT_POINTS`.
         angles: the joints' angles as a clinician reads them.
         objective_kind: what the numbers of `/objective` are; empty if nobody says.
     """
@@ -190,7 +174,7 @@ class FrameResult:
         sigma: (J,) one standard deviation of each joint's position, metres; NaN where a joint has no evidence.
         residual: (C, 2) missing and surplus area by camera, shares of the person's pixels; their sum is E_S.
         segments_rotation: (S, 4) quaternions (w, x, y, z), segment to world.
-        feet: (4, 3) the :data:`FOOT_POINTS`, metres, world frame.
+        feet: (4, 3) the :data:`~tk.model.motion.segments.FOOT_POINTS`, metres, world frame.
         angles: degrees by joint; a joint that is not mentioned is NaN.
     """
 

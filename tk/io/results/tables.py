@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ExportError
-from tk.io.results.data import FOOT_POINTS, STATUS_MEANING
+from tk.io.results.status import STATUS_MEANING
+from tk.model.motion.segments import FOOT_POINTS
 
 if TYPE_CHECKING:
     import pandas

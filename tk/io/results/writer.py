@@ -22,7 +22,6 @@ from types import TracebackType
 from tk.errors import ResultError
 from tk.io.hdf5 import open_hdf5
 from tk.io.results.data import (
-    FOOT_POINTS,
     FORMAT,
     FrameResult,
     Hull,
@@ -31,7 +30,6 @@ from tk.io.results.data import (
     JointTrack,
     Result,
     ResultMeta,
-    Status,
     UsedCameras,
     Value,
     has_pose,
@@ -57,9 +55,9 @@ from tk.io.results.reader import (
     read_values,
 )
 from tk.io.results.revision import revise_result
+from tk.io.results.status import Status
 
 __all__ = [
-    "FOOT_POINTS",
     "FORMAT",
     "FrameResult",
     "Hull",
