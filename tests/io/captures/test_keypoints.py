@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from scripts.synthetic.keypoints import write_keypoints
 from tests.conftest import QUICK, Silent, Tk
 from tk.errors import CaptureError
+from tk.io import settings_file
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.captures.keypoints import LAYOUTS, keypoint_pose, read_people
 from tk.io.results.writer import read_joints, read_result
@@ -75,9 +76,9 @@ def test_noise_wrong_points_and_a_bystander(detected: Path, capture: Capture, tr
 def test_tracking_begins_with_them(detected: Path, tiny: Path, tmp_path: Path, tk: Tk, quick: Path) -> None:
     folder = Path(shutil.copytree(tiny, tmp_path / "capture"))
     shutil.copytree(detected, folder / "pose")
-    settings_file = folder / "capture.toml"
-    text = settings_file.read_text().replace('pose = "da-vinci"', 'pose = "any"\nkeypoints = "pose"')
-    settings_file.write_text(text.replace("frame = 0", f"frame = {FRAME}"))
+    capture_file = folder / "capture.toml"
+    text = capture_file.read_text().replace('pose = "da-vinci"', 'pose = "any"\nkeypoints = "pose"')
+    capture_file.write_text(text.replace("frame = 0", f"frame = {FRAME}"))
     results = []
     opened = open_capture(folder)
     assert opened.init_keypoints == folder / "pose"
