@@ -1,4 +1,4 @@
-"""The region tracker on silhouettes and pictures of its own body, drawn by ray casting."""
+"""The region tracker on silhouettes and images rendered from its own body."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def tracker_at(
     return tracker
 
 
-def test_a_walk_is_followed_and_can_be_taken_up_again() -> None:
+def test_walk_is_tracked_and_a_resumed_run_is_the_same() -> None:
     tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=3))
     estimates = []
     for i, masks in enumerate(MASKS):
@@ -81,7 +81,7 @@ def test_a_walk_is_followed_and_can_be_taken_up_again() -> None:
             np.testing.assert_array_equal(getattr(again, name), getattr(estimates[i], name), err_msg=name)
 
 
-def test_an_estimate_says_all_that_the_contract_has() -> None:
+def test_estimate_has_all_fields_of_the_contract() -> None:
     tracker = tracker_at(POSES[0])
     tracker.step(observe(MASKS[0]))
     estimate = tracker.step(observe(MASKS[1], 1))
@@ -106,13 +106,13 @@ def test_sigma_is_finite_and_larger_where_less_is_seen() -> None:
     assert one_view.residual is not None and np.isnan(one_view.residual[:, 0]).tolist() == [False, True, True]
 
 
-def test_an_arm_elsewhere_is_found_again_by_the_search() -> None:
+def test_limb_search_finds_an_arm_that_has_jumped() -> None:
     """From one frame to the next an arm is raised to the side: no contour is near."""
     raised = np.array([with_arm(pose, "l", (0.1, 1.0, 0.6), 15.0) for pose in POSES])
     masks = draw_silhouettes(BODY, RIG, raised)
     found = {}
     for every in (0, 1):
-        # without a search where a frame is explained badly, the arm stays where it was
+        # without the search the arm stays in its old pose
         config = RegionSettings(false_alarm=0.4 if every else 1e-9)
         tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=every), config=config)
         tracker.step(observe(MASKS[0]))
@@ -124,7 +124,7 @@ def test_an_arm_elsewhere_is_found_again_by_the_search() -> None:
     assert errors(found[1], raised[3]).mean() < 1.5 * CLOSE_M
 
 
-def test_a_frame_that_is_explained_badly_is_searched_unasked() -> None:
+def test_high_residual_triggers_a_limb_search() -> None:
     raised = with_arm(POSES[1], "r", (0.1, 1.0, 0.5), 15.0)
     tracker = tracker_at(POSES[0])
     assert tracker.step(observe(MASKS[0])).iterations[1] == 0
@@ -136,7 +136,7 @@ def test_a_frame_that_is_explained_badly_is_searched_unasked() -> None:
 def test_sigma_is_unknown_while_the_residual_stays_high() -> None:
     tracker = tracker_at(POSES[0])
     nonsense = MASKS[0].copy()
-    for mask in nonsense:  # half of the person's pixels beside the person
+    for mask in nonsense:  # surplus area of half the person's pixels
         rows, columns = np.nonzero(mask)
         across = int(0.5 * len(rows) / np.ptp(rows))
         mask[rows.min() : rows.max(), max(columns.min() - across, 0) : columns.min()] = 255
@@ -146,8 +146,8 @@ def test_sigma_is_unknown_while_the_residual_stays_high() -> None:
     assert known == [True] * UNKNOWN_AFTER + [False, True]
 
 
-def test_a_run_that_stops_behind_a_jump_goes_on_as_an_unbroken_one() -> None:
-    """The arm has come from where it was: its motion is tried as a prediction, and none."""
+def test_run_resumed_after_a_jump_is_the_same() -> None:
+    """After a jump the frame starts from poses with and without the motion."""
     further = [with_arm(POSES[1], "r", direction, 15.0) for direction in ((0.1, 1.0, 0.5), (0.1, 0.6, 1.0))]
     masks = draw_silhouettes(BODY, RIG, np.array(further))
     first = tracker_at(POSES[0])
@@ -166,7 +166,7 @@ def test_a_run_that_stops_behind_a_jump_goes_on_as_an_unbroken_one() -> None:
     [(25.0, 12.0, 0.7), (25.0, 12.0, 2.1), (0.0, 24.0, 0.0), (15.0, 18.0, 1.5)],
 )
 def test_legs_that_cross_are_not_exchanged(forward_deg: float, across_deg: float, heading: float) -> None:
-    """Each leg is then near the other one's place, and neither can leave it for its own alone."""
+    """Each leg is then near the other one's pose, and neither can leave it alone."""
     spread = standing_pose(SKELETON)
     spread[:3], spread[NAMES.index("torso_yaw")] = POSES[0][:3], heading
     crossed = spread.copy()
@@ -185,14 +185,14 @@ def test_legs_that_cross_are_not_exchanged(forward_deg: float, across_deg: float
     assert SKELETON.apart(exchanged, there) > 0.3
     alone, _ = tracker.search(frame, pyramid, tracker.evidence(tracker.screen, frame, pyramid), exchanged)
     assert SKELETON.apart(alone, there).min() > 0.2
-    # what a search misses those of the frames that follow find
+    # searches of the next frames find what one has missed
     estimates = [tracker.step(observe(masks[1], i)) for i in (1, 2, 3, 4)]
     legs = [JOINTS.index(f"{joint}_{side}") for joint in ("knee", "ankle") for side in "lr"]
     assert errors(estimates[-2], now)[legs].max() < 0.06
     assert errors(estimates[-1], now).max() < 0.06
 
 
-def test_nobody_in_sight_is_a_lost_frame_and_then_the_person_is_recovered() -> None:
+def test_person_is_lost_in_empty_frames_and_recovered_afterwards() -> None:
     tracker = tracker_at(POSES[0])
     first = tracker.step(observe(MASKS[0]))
     for index in (1, 2):
@@ -207,24 +207,24 @@ def test_nobody_in_sight_is_a_lost_frame_and_then_the_person_is_recovered() -> N
     assert tracker.step(observe(MASKS[2], 4)).status == "tracked"
 
 
-def test_somebody_who_comes_back_elsewhere_is_found() -> None:
+def test_person_who_returns_at_another_place_is_recovered() -> None:
     find_again_elsewhere(tracker_at(POSES[0]), RIG, POSES[:4], 2 * CLOSE_M)
 
 
-def test_who_stays_in_a_wrong_pose_is_looked_for_as_if_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a pose from which no limb alone leads out, below what says lost."""
+def test_person_is_searched_for_if_the_residual_stays_high(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wrong heading, from which no limb search leads out, with a residual below the limit of a loss."""
     tracker = tracker_at(POSES[0])
     for _ in range(3):
         tracker.step(observe(MASKS[0]))
     state = dict(tracker.state())
     wrong = tracker.world.poses_in(POSES[0])
     wrong[SKELETON.index("torso_yaw")] += np.radians(105)
-    looked_for = []
+    searches = []
     recover = tracker.recover
 
     def watched(*arguments: Any) -> Any:
-        looked_for.append(recover(*arguments))
-        return looked_for[-1]
+        searches.append(recover(*arguments))
+        return searches[-1]
 
     monkeypatch.setattr(tracker, "recover", watched)
     monkeypatch.setattr(tracker, "search", lambda _frame, _pyramid, _evidence, pose, *_: (pose[None], np.zeros(1)))
@@ -233,8 +233,8 @@ def test_who_stays_in_a_wrong_pose_is_looked_for_as_if_lost(monkeypatch: pytest.
     estimates = [tracker.step(observe(MASKS[0])) for _ in range(4)]
     assert [e.status for e in estimates] == ["tracked"] * 4
     assert errors(estimates[1], POSES[0]).mean() > 2 * CLOSE_M
-    assert len(looked_for) == 1 and errors(estimates[3], POSES[0]).mean() < CLOSE_M
-    # what is told with it is of the pose found, not of the one given up
+    assert len(searches) == 1 and errors(estimates[3], POSES[0]).mean() < CLOSE_M
+    # residual and rendering are of the new pose
     person = tracker.screen.sample(estimates[3].masks) >= 128
     wrong_rays = np.count_nonzero(estimates[3].drawn != person, axis=(1, 2)) / np.count_nonzero(person, axis=(1, 2))
     np.testing.assert_allclose(estimates[3].residual.sum(axis=1), wrong_rays)
@@ -242,7 +242,7 @@ def test_who_stays_in_a_wrong_pose_is_looked_for_as_if_lost(monkeypatch: pytest.
     assert (tracker.state()["residual_mean"] - mean).max() < 0.2 * LEAST_SPREAD
 
 
-def test_a_frame_begins_at_the_scale_that_sees_as_far_as_joints_may_come() -> None:
+def test_first_scale_reaches_as_far_as_the_prediction_may_err() -> None:
     tracker = tracker_at(POSES[0])
     tracker.step(observe(MASKS[0]))
     state = dict(tracker.state())
@@ -256,7 +256,7 @@ def test_a_frame_begins_at_the_scale_that_sees_as_far_as_joints_may_come() -> No
         assert tracker.step(observe(MASKS[0])).iterations[0] == steps, (share, more)
 
 
-def test_the_person_is_found_without_any_hint() -> None:
+def test_person_is_found_without_a_given_pose() -> None:
     tracker = RegionTracker(RIG, "z", SETTINGS)
     tracker.start([observe(m, i) for i, m in enumerate(MASKS[:3])], STATURE, None)
     estimate = tracker.step(observe(MASKS[0]))
@@ -297,7 +297,7 @@ def crossing(count: int) -> np.ndarray:
     return np.array(poses)
 
 
-def test_colors_show_a_forearm_that_silhouettes_do_not() -> None:
+def test_colors_locate_a_forearm_inside_the_silhouette() -> None:
     """Learned while the forearm sticks out, they tell where it is before the chest. No search finds it by chance, and a
     swing that ends well or badly by chance is one of five."""
     wrist = JOINTS.index("wrist_l")
@@ -321,7 +321,7 @@ def error_of(body: ConeBody, poses: np.ndarray, masks: np.ndarray) -> float:
     return float(np.mean([(d != m).sum() / (m > 0).sum() for d, m in zip(drawn, masks, strict=True)]))
 
 
-def test_the_second_pass_mends_a_wrong_body() -> None:
+def test_second_pass_corrects_a_wrong_body() -> None:
     """A first pass with a body that is too thin; the second fits it to all frames."""
     thin = build_cone_body(BODY.dimensions.scaled(thigh_radius=0.75, chest_half_width=0.85, upper_arm_radius=0.75))
     tracker = RegionTracker(RIG, "z", replace(SETTINGS, adapt=True))
@@ -346,7 +346,7 @@ def test_the_second_pass_mends_a_wrong_body() -> None:
     assert np.mean(off) < CLOSE_M
 
 
-def test_frames_before_a_limb_was_found_again_are_mended_backwards() -> None:
+def test_second_pass_corrects_the_frames_before_a_limb_was_found() -> None:
     raised = np.array([with_arm(pose, "l", (0.1, 1.0, 0.3), 15.0) for pose in POSES])
     masks = draw_silhouettes(BODY, RIG, raised)
     first = np.concatenate([POSES[:4], raised[4:]])  # until it is found again in frame 4 the arm hangs
@@ -363,7 +363,7 @@ def test_frames_before_a_limb_was_found_again_are_mended_backwards() -> None:
     assert (told(np.arange(6) == 3) > 0.25).tolist() == [True] * 4 + [False] * 2
 
 
-def test_two_poses_that_explain_a_frame_alike_make_its_sigma_large() -> None:
+def test_sigma_is_large_if_two_poses_have_similar_costs() -> None:
     """The masks show an arm at both of its places; frames before and after tell of one each."""
     hanging = np.repeat(POSES[:1], 3, axis=0)
     raised = np.array([with_arm(pose, "l", (0.1, 1.0, 0.3), 15.0) for pose in hanging])
@@ -378,7 +378,7 @@ def test_two_poses_that_explain_a_frame_alike_make_its_sigma_large() -> None:
     assert (sigma(np.array([half, half, half]), hanging) < 0.05).all()
 
 
-def test_a_body_that_was_given_is_kept_in_the_second_pass() -> None:
+def test_second_pass_keeps_a_given_body() -> None:
     tracker = tracker_at(POSES[0])
     poses, error = POSES[:3], np.full((3, 3, 2), 0.05)
     result, found, _ = tracker.second_pass(MASKS[:3], poses, np.zeros(3, bool), error, STATURE, keep_body=True)

@@ -40,11 +40,12 @@ FINALISTS, OPPOSITE = 4, 2
 # the development captures an average body of the right stature has 0.15 to 0.31 in the right pose and never less than
 # 0.25 in a wrong one.
 ANCHORS, CLEAR = 4, 0.2
-# How far a residual must exceed another one, as a factor, to be certainly worse. Over the whole opening: hypotheses
-# within AMBIGUOUS are all kept. A hypothesis that faces the same way as the best one in its frame must be better by
-# HANDICAP, because legs that change places explain a walk equally well but for noise. In a single frame the opposite
-# heading is kept within NEARLY, and a frame above WORSE times the anchor's residual triggers a limb search. Chosen on
-# the development captures; sensitivity not measured.
+# Factors by which a residual must exceed another one to be certainly worse. They are no excess over a baseline: before
+# the start there is no baseline, and the residual of an average body varies by a factor of two between captures (see
+# CLEAR). Over the whole opening, hypotheses within AMBIGUOUS are all kept. A hypothesis that faces the same way as the
+# best one in its frame must be better by HANDICAP, because legs that change places explain a walk equally well but for
+# noise. In a single frame the opposite heading is kept within NEARLY, and a frame above WORSE times the anchor's
+# residual triggers a limb search. Chosen on the development captures; sensitivity not measured.
 AMBIGUOUS, HANDICAP, NEARLY, WORSE = 1.1, 1.1, 1.4, 1.2
 # Stature of the body that the first estimate of the stature renders, metres.
 _AVERAGE_M = 1.7

@@ -17,7 +17,7 @@ def poses(count: int, spread: float = 0.3) -> np.ndarray:
     return np.random.default_rng(3).normal(scale=spread, size=(count, len(NAMES)))
 
 
-def test_the_contours_variance_is_that_of_poses_drawn_from_their_information() -> None:
+def test_contour_variance_equals_that_of_poses_sampled_from_the_information() -> None:
     rng = np.random.default_rng(1)
     pose = poses(1)[0]
     D = len(pose)
@@ -31,14 +31,14 @@ def test_the_contours_variance_is_that_of_poses_drawn_from_their_information() -
     )
 
 
-def test_what_may_not_change_has_no_variance() -> None:
+def test_fixed_degrees_of_freedom_have_no_variance() -> None:
     free = np.zeros(len(NAMES), bool)
     free[SKELETON.index("elbow_l_flexion")] = True
     variance = contour_variance(SKELETON, poses(1)[0], 1e4 * np.eye(len(NAMES)), free)
     assert [JOINTS[j] for j in np.flatnonzero(variance > 1e-12)] == ["wrist_l"]
 
 
-def test_the_variances_of_many_poses_are_those_of_each() -> None:
+def test_batched_variances_equal_single_ones() -> None:
     D = len(NAMES)
     root = np.random.default_rng(4).normal(size=(6, D, D))
     precision, free = root @ root.swapaxes(1, 2) + np.eye(D), SKELETON.is_paper
@@ -47,7 +47,7 @@ def test_the_variances_of_many_poses_are_those_of_each() -> None:
     np.testing.assert_allclose(many.reshape(6, -1), each, rtol=1e-9)
 
 
-def test_directions_stay_when_the_person_walks_and_turns() -> None:
+def test_directions_do_not_depend_on_place_and_heading() -> None:
     pose = poses(5)
     elsewhere = pose.copy()
     elsewhere[:, [NAMES.index(f"torso_{name}") for name in ("x", "y", "z", "yaw", "roll", "pitch")]] += 0.4
@@ -59,7 +59,7 @@ def test_directions_stay_when_the_person_walks_and_turns() -> None:
     np.testing.assert_allclose(length[:, ~own], 1.0)
 
 
-def test_the_usual_posture_adds_nothing_and_an_arm_that_is_turned_over_all_there_is() -> None:
+def test_mean_posture_has_no_variance_and_a_turned_arm_the_largest() -> None:
     straight = np.zeros(len(NAMES))
     usual = directions(SKELETON, straight)
     assert posture_variance(SKELETON, straight, usual).max() < 1e-12
@@ -71,7 +71,7 @@ def test_the_usual_posture_adds_nothing_and_an_arm_that_is_turned_over_all_there
     assert np.delete(found, arm).max() < 1e-12
 
 
-def test_a_bent_waist_is_told_of_all_joints() -> None:
+def test_bent_waist_adds_variance_to_all_joints() -> None:
     pose = np.zeros(len(NAMES))
     pose[SKELETON.index("waist_pitch")] = 0.5
     found = posture_variance(SKELETON, pose, directions(SKELETON, pose))
@@ -79,7 +79,7 @@ def test_a_bent_waist_is_told_of_all_joints() -> None:
 
 
 @pytest.mark.parametrize("shape", [(), (4,), (2, 3)])
-def test_batches_are_what_single_poses_are(shape: tuple[int, ...]) -> None:
+def test_batches_equal_single_poses(shape: tuple[int, ...]) -> None:
     batch = poses(int(np.prod(shape, dtype=int))).reshape(*shape, -1)
     usual = directions(SKELETON, poses(8)).mean(axis=0)
     whole = posture_variance(SKELETON, batch, usual)

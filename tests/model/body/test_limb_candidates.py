@@ -1,4 +1,4 @@
-"""Where a limb is looked for: all over the sphere, within the limits; and which of the places are kept."""
+"""Candidate poses of a limb: over its range of motion, within the limits; and the choice of different ones."""
 
 import numpy as np
 import pytest
@@ -56,7 +56,7 @@ def directions(name, ends):
 
 
 @pytest.mark.parametrize("name", ["arm_l", "arm_r"])
-def test_arms_are_looked_for_in_all_directions(name):
+def test_arm_candidates_cover_all_directions(name):
     """But through the back and far across; no direction is farther than 35° from one that is tried."""
     found = directions(name, ("shoulder", "elbow"))
     wanted = np.random.default_rng(1).normal(size=(500, 3))
@@ -67,14 +67,14 @@ def test_arms_are_looked_for_in_all_directions(name):
 
 
 @pytest.mark.parametrize("name", ["arm_l", "arm_r"])
-def test_elbows_are_stretched_and_bent_to_all_sides(name):
+def test_elbow_candidates_are_straight_and_bent_to_all_sides(name):
     elbow = list(LIMB[name].dofs).index(SKELETON.index(f"elbow_{name[-1]}_flexion"))
     bends = np.degrees(LIMB[name].grid[:, elbow])
     assert bends.min() < 20 and bends.max() > 110 and len(np.unique(bends.round())) >= 3
 
 
 @pytest.mark.parametrize("name", ["leg_l", "leg_r"])
-def test_legs_are_looked_for_from_behind_to_a_high_kick(name):
+def test_leg_candidates_reach_from_behind_to_a_high_kick(name):
     found = directions(name, ("hip", "knee"))
     forward = np.degrees(np.arctan2(found @ FORWARD, -found @ UP))
     assert forward.min() < -15 and forward.max() > 90
@@ -85,7 +85,7 @@ def test_legs_are_looked_for_from_behind_to_a_high_kick(name):
 
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 6))
 @settings(max_examples=20, deadline=None)
-def test_distinct_places_lie_apart_and_the_cheapest_comes_first(seed, count):
+def test_distinct_poses_differ_and_the_cheapest_is_first(seed, count):
     rng = np.random.default_rng(seed)
     limb = LIMB[LIMBS[rng.integers(4)]]
     poses = limb.candidates(POSE, 20, rng)
@@ -101,12 +101,12 @@ def test_distinct_places_lie_apart_and_the_cheapest_comes_first(seed, count):
     assert costs == sorted(costs)
 
 
-def test_the_same_place_twice_is_one():
+def test_equal_poses_count_once():
     limb = LIMB["arm_l"]
     assert len(limb.distinct(SKELETON, np.repeat(POSE[None], 5, axis=0), np.arange(5.0), 3)) == 1
 
 
-def test_combined_are_all_places_of_one_limb_with_all_of_another():
+def test_combined_has_all_pairs_of_two_limbs_poses():
     rng = np.random.default_rng(0)
     left, right = (LIMB[name].candidates(POSE, 0, rng)[:n] for name, n in (("leg_l", 3), ("leg_r", 4)))
     found = LIMB["leg_r"].combined(left, right)

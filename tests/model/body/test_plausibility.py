@@ -40,7 +40,7 @@ def test_walking_turning_jumping_and_sprinting_are_possible() -> None:
     ],
     ids=["a jump", "back to front", "in the air", "a view without the body", "NaN"],
 )
-def test_what_is_impossible_is_told(then: np.ndarray, error: np.ndarray, reason: str) -> None:
+def test_impossible_pose_has_a_reason(then: np.ndarray, error: np.ndarray, reason: str) -> None:
     judge = Plausibility("z", 15.0)
     assert judge.judge(0, joints(), FINE) is None
     told = judge.judge(1, then, error)
@@ -55,7 +55,7 @@ def test_after_a_loss_the_person_may_be_anywhere() -> None:
     assert judge.judge(1, joints(x=5.0, yaw_deg=180.0), None) is None
 
 
-def test_it_is_taken_up_again() -> None:
+def test_state_is_restored() -> None:
     judge, again = Plausibility("z", 15.0), Plausibility("z", 15.0)
     judge.judge(4, joints(), FINE)
     again.restore(judge.state())
@@ -63,7 +63,7 @@ def test_it_is_taken_up_again() -> None:
         assert again.judge(5, told, FINE) == judge.judge(5, told, FINE)
 
 
-def test_sizes_that_no_person_has_are_refused() -> None:
+def test_impossible_sizes_are_refused() -> None:
     for stature in (1.05, 1.5, 2.2):
         check_stature(stature)
     for stature in (0.9, 2.4):

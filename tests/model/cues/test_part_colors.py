@@ -56,7 +56,7 @@ def test_nothing_is_known_before_anything_is_learned():
     assert colors.mismatch.shape == (COLOR_BINS, len(GROUPS)) and not colors.mismatch.any()
 
 
-def test_colors_tell_parts_apart():
+def test_colors_distinguish_parts():
     colors = PartColors(BODY)
     clothed(colors)
     mismatch = colors.mismatch

@@ -54,12 +54,12 @@ def test_without_colors_the_cost_is_the_papers_error():
     np.testing.assert_allclose(mean_of_views(total), expected.mean(axis=1), atol=1e-6)
 
 
-def test_a_coarse_grid_says_nearly_the_same():
+def test_coarse_grid_gives_nearly_the_same_cost():
     coarse, _ = cast(Evidence.of(RayGrid(RIG, 54), MASKS))
     np.testing.assert_allclose(coarse[1], share_wrong(DRAWN[1], MASKS), rtol=0.2)
 
 
-def test_a_view_that_sees_nobody_does_not_count():
+def test_view_without_a_person_does_not_count():
     masks = MASKS.copy()
     masks[1] = 0
     evidence = Evidence.of(FINE, masks)
@@ -71,7 +71,7 @@ def test_a_view_that_sees_nobody_does_not_count():
     assert np.isnan(nobody).all() and np.isinf(mean_of_views(nobody)).all()
 
 
-def test_doubt_halves_what_a_part_costs_outside_the_mask():
+def test_uncertain_pixels_halve_the_cost_outside_the_mask():
     """Where the mask may have missed the person, a part that covers it costs less; what it holds costs the same."""
     whole, _ = cast(Evidence.of(FINE, MASKS))
     doubted, _ = cast(Evidence.of(FINE, MASKS, MASKS == 0))
@@ -80,7 +80,7 @@ def test_doubt_halves_what_a_part_costs_outside_the_mask():
     np.testing.assert_allclose(cast(Evidence.of(FINE, MASKS, MASKS == 255))[0], whole, atol=1e-6)
 
 
-def test_colors_cost_where_they_belong_to_another_part():
+def test_color_of_another_part_costs():
     """A picture in the parts' own colours costs the pose nothing; with arms and trunk changed about it does."""
     _, met = cast(Evidence.of(FINE, MASKS), POSES[:1], export=True)
     assert met is not None
@@ -113,7 +113,7 @@ NAMES = [part.name for part in BODY.parts]
 GROUP_OF = dict(zip(NAMES, COLORS.group.tolist(), strict=True))
 
 
-def test_pictures_of_different_sizes_are_told_apart():
+def test_images_of_different_sizes_are_handled():
     narrow = Rig((RIG[0], replace(RIG[1], width=80, height=100), RIG[2]))
     masks = MASKS.copy()
     masks[1, 100:], masks[1, :, 80:] = 0, 0
@@ -123,7 +123,7 @@ def test_pictures_of_different_sizes_are_told_apart():
 
 
 @pytest.mark.parametrize("views", [[0], [0, 1], [0, 1, 2]])
-def test_the_mean_is_over_the_views_that_tell(views):
+def test_mean_is_over_the_views_that_see_anybody(views):
     cost = np.full((2, 3), np.nan)
     cost[:, views] = [[0.2] * len(views), np.arange(len(views)) / 10]
     np.testing.assert_allclose(mean_of_views(cost), [0.2, np.mean(np.arange(len(views)) / 10)])

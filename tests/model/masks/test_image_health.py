@@ -19,12 +19,12 @@ def frame(t: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     return images, masks
 
 
-def test_healthy_pictures_are_fine() -> None:
+def test_healthy_images_have_no_reason() -> None:
     rng, health = np.random.default_rng(0), ImageHealth()
     assert all(health.look(*frame(t, rng)) == [None] * C for t in range(12))
 
 
-def test_a_frozen_camera_is_told_once_the_others_have_moved_and_not_when_it_goes_on() -> None:
+def test_frozen_camera_is_found_once_the_others_have_moved_until_it_moves_again() -> None:
     rng, health = np.random.default_rng(0), ImageHealth()
     held = None
     told = []
@@ -41,14 +41,14 @@ def test_a_frozen_camera_is_told_once_the_others_have_moved_and_not_when_it_goes
     assert frozen in (list(range(4, 10)), list(range(5, 10)))
 
 
-def test_nobody_moves_and_nothing_is_frozen() -> None:
+def test_unchanged_images_are_healthy_while_nobody_moves() -> None:
     images, masks = frame(0, np.random.default_rng(0))
     health = ImageHealth()
     assert all(health.look(images, masks) == [None] * C for _ in range(5))
 
 
 @pytest.mark.parametrize(("frozen", "told"), [((0, 1), [FROZEN, FROZEN, None, None]), ((0, 1, 3), [None] * C)])
-def test_several_cameras_are_frozen_as_long_as_half_of_the_others_go_on(frozen: tuple[int, ...], told: list) -> None:
+def test_several_frozen_cameras_are_found_if_half_of_the_others_move(frozen: tuple[int, ...], told: list) -> None:
     rng, health = np.random.default_rng(0), ImageHealth()
     first = frame(0, rng)
     for t in range(8):
@@ -60,13 +60,13 @@ def test_several_cameras_are_frozen_as_long_as_half_of_the_others_go_on(frozen: 
 
 
 @pytest.mark.parametrize("level", [0, 128])
-def test_a_picture_of_one_grey_shows_nothing(level: int) -> None:
+def test_uniform_image_is_blank(level: int) -> None:
     images, masks = frame(0, np.random.default_rng(0))
     images[2] = level
     assert ImageHealth().look(images, masks) == [None, None, BLANK, None]
 
 
-def test_masks_stand_for_pictures_that_nobody_gives() -> None:
+def test_masks_are_compared_if_there_are_no_images() -> None:
     rng, health = np.random.default_rng(0), ImageHealth()
     first = frame(0, rng)[1]
     told = []
@@ -77,7 +77,7 @@ def test_masks_stand_for_pictures_that_nobody_gives() -> None:
     assert told[0] == [None] * C and told[-1] == [None, None, None, FROZEN]
 
 
-def test_it_is_taken_up_again() -> None:
+def test_state_is_restored() -> None:
     rng, health = np.random.default_rng(0), ImageHealth()
     frames = [frame(t, rng) for t in range(10)]
     for images, masks in frames:

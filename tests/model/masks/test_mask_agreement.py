@@ -46,7 +46,7 @@ def test_exact_masks_agree(masks: np.ndarray) -> None:
     assert 1.6 < found.extent_m < 2.1
 
 
-def test_a_turned_camera_is_named_with_its_pixels(masks: np.ndarray) -> None:
+def test_turned_camera_is_identified_with_its_shift(masks: np.ndarray) -> None:
     turn = cv2.Rodrigues(np.radians([0.0, 3.0, 0.0]))[0]
     cameras = list(RIG)
     cameras[3] = replace(cameras[3], rotation=turn @ cameras[3].rotation, translation=turn @ cameras[3].translation)
@@ -67,7 +67,7 @@ def test_a_turned_camera_is_named_with_its_pixels(masks: np.ndarray) -> None:
     ],
     ids=["somebody beside", "half of the person missing"],
 )
-def test_what_a_mask_shows_too_much_or_too_little_is_told(
+def test_mask_that_is_too_large_or_too_small_is_identified(
     masks: np.ndarray, spoil: Callable[[np.ndarray], np.ndarray], reason: str
 ) -> None:
     spoilt = masks.copy()
@@ -77,7 +77,7 @@ def test_what_a_mask_shows_too_much_or_too_little_is_told(
     assert reason in found.reason(2)
 
 
-def test_nobody_is_no_hull(masks: np.ndarray) -> None:
+def test_empty_masks_have_no_hull(masks: np.ndarray) -> None:
     found = compare(np.zeros_like(masks))
     assert not found.closes.any() and found.odd is None and np.isnan(found.extent_m)
     only = np.zeros_like(masks)
@@ -85,14 +85,14 @@ def test_nobody_is_no_hull(masks: np.ndarray) -> None:
     assert not compare(only).closes.any()
 
 
-def test_a_mask_of_nobody_in_one_frame_of_several(masks: np.ndarray) -> None:
+def test_empty_mask_in_one_frame_is_ignored(masks: np.ndarray) -> None:
     spoilt = masks.copy()
     spoilt[1] = 0
     found = compare(spoilt)
     assert found.closes.tolist() == [True, False, True] and found.odd is None
 
 
-def test_two_cameras_have_no_majority(masks: np.ndarray) -> None:
+def test_of_two_cameras_none_is_identified(masks: np.ndarray) -> None:
     rig = Rig(RIG.cameras[:2])
     found = MaskAgreement(rig, VOLUME).compare(list(masks[:, :2]))
     assert found.odd is None and np.isnan(found.without).all()

@@ -31,7 +31,7 @@ def sighted(camera, at, score=0.9, z=0.95):
     blind=st.sampled_from([*range(4), None]),
 )
 @example(at=(0.0, 0.5), others=[((0.76, 0.0), 1)], blind=1)
-def test_the_one_whom_most_cameras_see(at, others, blind) -> None:
+def test_person_seen_by_most_cameras_is_the_subject(at, others, blind) -> None:
     """Whoever else single cameras take for a person, and though one camera does not see the subject."""
     sightings = [[sighted(camera, at)] if c != blind else [] for c, camera in enumerate(RIG)]
     for c in range(4):
@@ -46,7 +46,7 @@ def test_the_one_whom_most_cameras_see(at, others, blind) -> None:
     assert np.linalg.norm(found.center[:2] - at) < 0.5 or len(others) >= 2
 
 
-def test_nobody_in_two_pictures() -> None:
+def test_no_subject_without_two_matching_sightings() -> None:
     assert locate(RIG, VOLUME, [[], [], [], []]) is None
     assert locate(RIG, VOLUME, [[sighted(RIG[0], (0, 0))], [], [], []]) is None
     assert locate(RIG, VOLUME, [[sighted(c, (2.0, 0.5))] for c in RIG]) is None, "beyond the volume"
@@ -66,7 +66,7 @@ def test_a_subject_is_upright_in_its_square() -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(st.floats(20, 140), st.floats(20, 180), st.integers(20, 90), st.floats(-np.pi, np.pi))
-def test_what_is_cut_is_pasted_back(x: float, y: float, side: int, angle: float) -> None:
+def test_cut_and_paste_are_inverse(x: float, y: float, side: int, angle: float) -> None:
     v, u = np.mgrid[:200, :160].astype(np.float32)
     values = np.sin(u / 15) * np.cos(v / 20) * 0.5 + 0.5
     patch = Patch((x, y), side, angle)
@@ -111,7 +111,7 @@ def masks_of(balls) -> np.ndarray:
     return masks
 
 
-def test_the_hull_is_of_what_all_see() -> None:
+def test_coarse_hull_contains_what_all_cameras_see() -> None:
     hull = CoarseHull(RIG, VOLUME)
     everyone = range(4)
     alone = hull.subject(masks_of([(0.3, 0.2, 1.0, 0.4, everyone)]))
