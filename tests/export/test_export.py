@@ -16,8 +16,8 @@ from tk.export import FORMATS, export, read_motion
 from tk.io.results.writer import Status
 from tk.model.body.angles import segment_quaternions
 from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.joints import FOOT_POINTS
 from tk.model.body.skeleton import JOINTS, SEGMENTS, build_skeleton
-from tk.model.motion.segments import FOOT_POINTS
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:

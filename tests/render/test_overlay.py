@@ -27,11 +27,12 @@ from tk.io.results.writer import (
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.gait_poses import neutral_pose
+from tk.model.body.joints import BONES
 from tk.model.body.skeleton import JOINTS, build_skeleton
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.masks.silhouettes import draw_silhouettes
 from tk.render.canvas import View, dots, draw_body, draw_joints
-from tk.render.figure import BONES, Figure, Outline, solids_of
+from tk.render.figure import Figure, Outline, solids_of
 from tk.render.overlay import Grid, Overlay, write_sheets
 from tk.render.palette import BONE, LOST, SEGMENT_COLORS, sigma_colors
 from tk.run.session import track

@@ -8,6 +8,7 @@ import click
 
 from tk.commands import base
 from tk.errors import CaptureError
+from tk.model.body.joints import ANKLE_JOINTS
 
 
 @click.command(epilog=base.example("tk evaluate result.h5 CAPTURE/truth.h5"))
@@ -17,7 +18,7 @@ from tk.errors import CaptureError
     "--capture", type=base.PATH, metavar="DIR",
     help="Also compare in the images: pixels and silhouettes.  [default: the folder of TRUTH, if it is a capture]",
 )  # fmt: skip
-@click.option("--joints", default="ankle_l,ankle_r", show_default=True, help="Joints to compare in pixels.")
+@click.option("--joints", default=",".join(ANKLE_JOINTS), show_default=True, help="Joints to compare in pixels.")
 @base.masks_option
 @base.json_option
 def evaluate(result: Path, truth: Path, capture: Path | None, joints: str, masks: str, as_json: bool) -> None:

@@ -19,18 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.body.skeleton import JOINTS
+from tk.model.body.joints import HINGE_KINDS, HINGES, JOINTS
 
 Float = NDArray[np.float64]
 
-LIMB_JOINTS = tuple(
-    f"{joint}_{side}" for side in "lr" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-)
-#: the joints before and after each that flexes
-HINGES = {
-    **{f"knee_{side}": (f"hip_{side}", f"ankle_{side}") for side in "lr"},
-    **{f"elbow_{side}": (f"shoulder_{side}", f"wrist_{side}") for side in "lr"},
-}
 ASTRAY_CM = 15.0
 
 
@@ -95,7 +87,7 @@ def flexion_deg(p_world: Float) -> dict[str, Float]:
 def flexion_errors(p_result: Float, p_truth: Float) -> dict[str, FlexionError]:
     """By hinge, and of ``knees`` and ``elbows`` together, from joints (F, 15, 3) of the same frames."""
     found, true = flexion_deg(p_result), flexion_deg(p_truth)
-    groups = {name: (name,) for name in HINGES} | {f"{kind}s": (f"{kind}_l", f"{kind}_r") for kind in ("knee", "elbow")}
+    groups = {name: (name,) for name in HINGES} | {f"{kind}s": sides for kind, sides in HINGE_KINDS.items()}
     return {
         name: _flexion_error(np.concatenate([found[n] for n in names]), np.concatenate([true[n] for n in names]))
         for name, names in groups.items()

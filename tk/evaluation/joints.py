@@ -34,7 +34,6 @@ from numpy.typing import NDArray
 from tk.errors import ResultError
 from tk.evaluation.details import (
     ASTRAY_CM,
-    LIMB_JOINTS,
     FlexionError,
     Run,
     SigmaShares,
@@ -43,7 +42,7 @@ from tk.evaluation.details import (
     sigma_shares,
 )
 from tk.io.results.writer import JointTrack, has_pose, read_joints
-from tk.model.body.skeleton import JOINTS
+from tk.model.body.joints import HINGE_KINDS, HIPS, JOINTS, LIMB_JOINTS, SHOULDERS
 
 Float = NDArray[np.float64]
 
@@ -164,7 +163,7 @@ class Evaluation:
         parts = [
             f"{kind}s {self.flexion[f'{kind}s'].mean_deg:.1f}° "
             f"(left {self.flexion[f'{kind}_l'].mean_deg:.1f}°, right {self.flexion[f'{kind}_r'].mean_deg:.1f}°)"
-            for kind in ("knee", "elbow")
+            for kind in HINGE_KINDS
         ]
         run = self.longest_astray
         where = f", {run.first} to {run.last}" if run.frames else ""
@@ -260,7 +259,7 @@ def trunk_axes(p_world: Float) -> Float:
     """
     joint = {name: p_world[:, index] for index, name in enumerate(JOINTS)}
     up = _unit(joint["neck"] - joint["pelvis"])
-    left = joint["hip_l"] - joint["hip_r"] + joint["shoulder_l"] - joint["shoulder_r"]
+    left = joint[HIPS[0]] - joint[HIPS[1]] + joint[SHOULDERS[0]] - joint[SHOULDERS[1]]
     left = _unit(left - np.sum(left * up, axis=1, keepdims=True) * up)
     return np.stack([np.cross(left, up), left, up], axis=2)
 

@@ -24,14 +24,12 @@ from tk.errors import CaptureError, ConfigError
 from tk.evaluation.joints import plain_values
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.results.writer import Result, blamed_on, read_joints, read_result
-from tk.model.body.skeleton import JOINTS
+from tk.model.body.joints import ANKLE_JOINTS, JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.masks.silhouettes import draw_silhouettes, share_wrong
 from tk.trackers.bodies import body_and_poses
 
 Float = NDArray[np.float64]
-
-ANKLES = ("ankle_l", "ankle_r")
 
 
 @dataclass(frozen=True)
@@ -115,7 +113,7 @@ def evaluate_views(
     result: str | os.PathLike[str],
     truth: str | os.PathLike[str],
     capture: str | Path,
-    joints: Sequence[str] = ANKLES,
+    joints: Sequence[str] = ANKLE_JOINTS,
     masks: str = "auto",
 ) -> ViewEvaluation:
     """Judge a result in all views of its capture.
@@ -159,7 +157,7 @@ def _pixel_error(view: Rig, estimate: Float, truth: Float, joints: Sequence[str]
     camera = view[0]
     chosen = [JOINTS.index(name) for name in joints]
     a, b = (camera.project(p[:, chosen].reshape(-1, 3))[0] for p in (estimate, truth))
-    ankles = truth[:, [JOINTS.index(name) for name in ANKLES]].mean(axis=1)
+    ankles = truth[:, [JOINTS.index(name) for name in ANKLE_JOINTS]].mean(axis=1)
     crown, foot = (camera.project(p)[0] for p in (truth[:, JOINTS.index("head_top")], ankles))
     distance = float(np.nanmean(np.linalg.norm(a - b, axis=1)))
     return distance, distance / float(np.nanmean(np.linalg.norm(crown - foot, axis=1)))

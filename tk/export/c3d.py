@@ -14,12 +14,8 @@ import numpy as np
 
 from tk.errors import ExportError
 from tk.export.motion import Motion
+from tk.model.body.joints import SEGMENT_ORIGIN
 
-# Where a segment begins.
-_ORIGINS = {
-    "torso": "neck", "head": "neck", "pelvis": "pelvis", "upper_arm": "shoulder", "forearm": "elbow", "thigh": "hip",
-    "calf": "knee", "foot": "ankle",
-}  # fmt: skip
 # A byte of a signed word: ezc3d would wrap 256 to 0, which is a point without an error.
 _MOST_RESIDUAL = 127
 
@@ -50,8 +46,7 @@ def write_c3d(motion: Motion, path: Path) -> None:
     T[3, 3] = 1.0
     T[:3, :3] = motion.rotations.transpose(2, 3, 1, 0)
     for s, name in enumerate(motion.segments):
-        side = name[-2:] if name.endswith(("_l", "_r")) else ""
-        T[:3, 3, s] = 1000.0 * motion.point(_ORIGINS[name.removesuffix(side)] + side).T
+        T[:3, 3, s] = 1000.0 * motion.point(SEGMENT_ORIGIN[name]).T
     T[:, :, :, ~motion.known] = np.nan
     file["data"]["rotations"] = T
     file.add_parameter("ROTATION", "LABELS", list(motion.segments))

@@ -12,10 +12,11 @@ from tk.errors import ConfigError, ResultError
 from tk.io.results.writer import Result, Status, read_result
 from tk.model.body.angles import segment_rotations
 from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.joints import FOOT_POINTS, JOINTS, LIMBS, SEGMENTS
 from tk.model.body.rotations import to_matrices
-from tk.model.body.skeleton import JOINTS, SEGMENTS, Skeleton, skeleton_of_names
+from tk.model.body.skeleton import Skeleton, skeleton_of_names
 from tk.model.motion.derived import derive
-from tk.model.motion.segments import FOOT_POINTS, sole_offset
+from tk.model.motion.segments import sole_offset
 from tk.model.motion.smoothing import smooth
 
 Float = NDArray[np.float64]
@@ -166,7 +167,7 @@ def _in_order(result: Result) -> Result:
 
 def _sole(motion: Motion, name: str) -> Float:
     """(F, 3) heel or toe of a foot, from its ankle and its segment's rotation."""
-    ankle, foot = motion.point("ankle" + name[-2:]), motion.rotation("foot" + name[-2:])
+    ankle, foot = motion.point(LIMBS["leg" + name[-2:]][2]), motion.rotation("foot" + name[-2:])
     return ankle + foot @ sole_offset(name, motion.dimensions)
 
 

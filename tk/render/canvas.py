@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.model.body.joints import BONES
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Camera
-from tk.render.figure import BONES, Outline
+from tk.render.figure import Outline
 from tk.render.palette import BONE, INK, LOST_BODY, SEGMENT_COLORS, TEXT, Color, sigma_colors
 
 Float = NDArray[np.float64]

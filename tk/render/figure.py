@@ -12,19 +12,11 @@ from tk.errors import ResultError
 from tk.io.results.writer import Result, has_pose
 from tk.kernels.cones import ELLIPSOID
 from tk.model.body.cone_body import ConeBody, ConePart
-from tk.model.body.skeleton import JOINTS, SEGMENTS
+from tk.model.body.joints import JOINTS, SEGMENTS
 from tk.model.cameras.camera import Camera
 from tk.trackers.bodies import body_and_poses
 
 Float = NDArray[np.float64]
-
-BONES = (
-    ("pelvis", "neck"), ("neck", "head_top"),
-    ("neck", "shoulder_l"), ("shoulder_l", "elbow_l"), ("elbow_l", "wrist_l"),
-    ("neck", "shoulder_r"), ("shoulder_r", "elbow_r"), ("elbow_r", "wrist_r"),
-    ("pelvis", "hip_l"), ("hip_l", "knee_l"), ("knee_l", "ankle_l"),
-    ("pelvis", "hip_r"), ("hip_r", "knee_r"), ("knee_r", "ankle_r"),
-)  # fmt: skip
 
 #: points around a solid, appearance only
 AROUND = 24

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from tk.io.results.status import STATUS_MEANING
 from tk.io.results.writer import Result, Status
-from tk.model.body.skeleton import JOINTS, SEGMENTS
+from tk.model.body.joints import BONES, HINGES, JOINTS, SEGMENTS
 from tk.model.cameras.camera import Rig
-from tk.render.figure import AROUND, BONES, Figure, figure_of
+from tk.render.figure import AROUND, Figure, figure_of
 from tk.render.palette import BONE, LOST, LOST_BODY, SEGMENT_COLORS, SIGMA_MOST_M, hexadecimal, sigma_colors
 from tk.render.scene import Stage, camera_pyramid
 
@@ -21,8 +21,6 @@ Float = NDArray[np.float64]
 
 #: stops of the colour scale of σ; the page interpolates between them
 _SIGMA_STOPS = 9
-#: joints whose flexion angle is at the middle one of three
-_HINGES = {"elbow": ("shoulder", "elbow", "wrist"), "knee": ("hip", "knee", "ankle")}
 
 
 def describe(result: Result, rig: Rig | None = None) -> dict[str, Any]:
@@ -117,8 +115,12 @@ def _angles(result: Result, figure: Figure) -> list[dict[str, Any]]:
             )
             line: dict[str, Any] = {"side": {"_l": "left", "_r": "right", "": "middle"}[side]}
             line |= {"values": packed(result.angles[joint.joint][:, column])}
-            if name == "flexion" and base in _HINGES and figure.sigma is not None:
-                line |= {"sigma": packed(hinge_sigma_deg(figure, [part + side for part in _HINGES[base]]))}
+            if name == "flexion" and joint.joint in HINGES and figure.sigma is not None:
+                line |= {
+                    "sigma": packed(
+                        hinge_sigma_deg(figure, (HINGES[joint.joint][0], joint.joint, HINGES[joint.joint][1]))
+                    )
+                }
             panel["lines"].append(line)
     return list(panels.values())
 

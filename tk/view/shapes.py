@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.results.writer import HullPoints
+from tk.model.body.joints import BONES
 from tk.model.body.skeleton import JOINTS, SEGMENTS
 from tk.model.cameras.camera import Rig
-from tk.render.figure import BONES, Figure
+from tk.render.figure import Figure
 from tk.render.palette import LOST_BODY, SEGMENT_COLORS, sigma_colors
 from tk.render.scene import PYRAMID_EDGES, Stage, camera_pyramid
 

@@ -13,7 +13,7 @@ from tests.conftest import QUICK
 from tk.errors import ExportError
 from tk.io import settings_file
 from tk.io.results.writer import Result, read_result
-from tk.model.motion.segments import FOOT_POINTS
+from tk.model.body.joints import FOOT_POINTS
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ FORWARD, UP = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
 def test_limbs_have_the_parts_and_angles_that_the_body_has(preset):
     body = build_cone_body(BODY.dimensions, preset=preset)
     limbs = limbs_of(body)
-    assert [limb.name for limb in limbs] == list(LIMBS[2:] if preset == "walker" else LIMBS)
+    assert [limb.name for limb in limbs] == list(LIMBS)[2 * (preset == "walker") :]
     for limb in limbs:
         assert limb.grid.shape[1] == len(limb.dofs) and len(np.unique(limb.grid, axis=0)) == len(limb.grid)
         assert body.free[limb.dofs].all() and body.skeleton.chain_dofs(limb.name)[limb.dofs].all()
@@ -87,7 +87,7 @@ def test_leg_candidates_reach_from_behind_to_a_high_kick(name):
 @settings(max_examples=20, deadline=None)
 def test_distinct_poses_differ_and_the_cheapest_is_first(seed, count):
     rng = np.random.default_rng(seed)
-    limb = LIMB[LIMBS[rng.integers(4)]]
+    limb = LIMB[list(LIMBS)[rng.integers(4)]]
     poses = limb.candidates(POSE, 20, rng)
     cost = rng.uniform(size=len(poses))
     chosen = limb.distinct(SKELETON, poses, cost, count)

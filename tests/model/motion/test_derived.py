@@ -7,10 +7,10 @@ import pytest
 
 from tk.model.body.angles import ANGLES, joint_angles
 from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.joints import FOOT_POINTS
 from tk.model.body.rotations import to_matrices
 from tk.model.body.skeleton import JOINTS, SEGMENTS, build_skeleton
 from tk.model.motion.derived import derive
-from tk.model.motion.segments import FOOT_POINTS
 
 BODY = BodyDimensions.from_stature(1.75)
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.joints import FOOT_POINTS
 from tk.model.body.skeleton import JOINTS, build_skeleton
-from tk.model.motion.segments import FOOT_POINTS, foot_points, joint_positions
+from tk.model.motion.segments import foot_points, joint_positions
 
 BODY = BodyDimensions.from_stature(1.75)
 

@@ -22,17 +22,16 @@ from tk.io.captures.calibration import match_camera
 from tk.io.captures.capture import Capture
 from tk.io.captures.init_pose import LEAST_JOINTS, LEAST_SPREAD_M, read_init_pose, spread_m
 from tk.io.toml import LARGE, read_text, shown
-from tk.model.body.skeleton import JOINTS
+from tk.model.body.joints import JOINTS, LIMB_KINDS
 from tk.model.cameras.triangulation import same_person, triangulate_joints
 from tk.model.setup import InitPose
 
 Float = NDArray[np.float64]
 
-_LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-_COCO_17 = {f"{joint}_{side}": 5 + 2 * k + s for k, joint in enumerate(_LIMBS) for s, side in enumerate("lr")}
+_COCO_17 = {f"{joint}_{side}": 5 + 2 * k + s for k, joint in enumerate(LIMB_KINDS) for s, side in enumerate("lr")}
 _BODY_25 = {
     f"{joint}_{side}": first + k % 3
-    for k, joint in enumerate(_LIMBS)
+    for k, joint in enumerate(LIMB_KINDS)
     for side, first in (("r", 2 if k < 3 else 9), ("l", 5 if k < 3 else 12))
 } | {"pelvis": 8}
 #: index of each joint's keypoint, by the number of keypoints. Necks are left out: theirs lie lower, between the

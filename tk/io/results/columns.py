@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tk.io.results.data import FrameResult, ResultMeta
 from tk.io.results.status import STATUS_MEANING
-from tk.model.motion.segments import FOOT_POINTS
+from tk.model.body.joints import FOOT_POINTS
 
 #: no number in a result makes sense beyond these: metres from the world's origin, anything else, a frame's number
 FAR_M, LARGE, LAST_FRAME = 1e6, 1e12, 10**9

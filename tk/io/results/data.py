@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ResultError
-from tk.io.results.status import Status
+from tk.io.results.status import has_pose
 from tk.io.toml import parse_toml
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.skeleton import JOINTS, paper_poses, skeleton_of_names
+from tk.model.body.joints import JOINTS
+from tk.model.body.skeleton import paper_poses, skeleton_of_names
 from tk.model.cameras.camera import Rig
 
 if TYPE_CHECKING:
@@ -33,11 +34,6 @@ _LISTS = (
     "pose_names", "pose_units", "stages", "timing_stages", "joint_names",
     "residual_cameras", "segment_names",
 )  # fmt: skip
-
-
-def has_pose(status: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Whether frames of this status (...) hold a pose: True unless the person is lost or absent."""
-    return ~np.isin(status, (Status.LOST, Status.ABSENT))
 
 
 @dataclass(frozen=True)

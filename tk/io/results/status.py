@@ -1,8 +1,11 @@
-"""The values of `/status`."""
+"""Status of a frame: the values of `/status`."""
 
 from __future__ import annotations
 
 from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
 
 
 class Status(IntEnum):
@@ -18,3 +21,8 @@ class Status(IntEnum):
 
 #: meaning of each value
 STATUS_MEANING = ("tracked", "initialised", "recovered after loss", "lost", "suspect", "absent")
+
+
+def has_pose(status: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Whether frames of this status (...) hold a pose: True unless the person is lost or absent."""
+    return ~np.isin(status, (Status.LOST, Status.ABSENT))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tk.errors import ExportError
 from tk.io.results.status import STATUS_MEANING
-from tk.model.motion.segments import FOOT_POINTS
+from tk.model.body.joints import FOOT_POINTS
 
 if TYPE_CHECKING:
     import pandas

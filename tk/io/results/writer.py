@@ -32,7 +32,6 @@ from tk.io.results.data import (
     ResultMeta,
     UsedCameras,
     Value,
-    has_pose,
 )
 from tk.io.results.files import (
     WRITE_ERRORS,
@@ -55,7 +54,7 @@ from tk.io.results.reader import (
     read_values,
 )
 from tk.io.results.revision import revise_result
-from tk.io.results.status import Status
+from tk.io.results.status import Status, has_pose
 
 __all__ = [
     "FORMAT",

@@ -27,6 +27,7 @@ from tk.model.body.anthropometry import (
     PELVIS_FORWARD,
     BodyDimensions,
 )
+from tk.model.body.joints import CHAINS, LIMBS, ROWS
 from tk.model.body.skeleton import SEGMENTS, Skeleton, build_skeleton, up_rotation
 
 Float = NDArray[np.float64]
@@ -51,31 +52,16 @@ _FORWARD = np.array([1.0, 0.0, 0.0])
 SHAPE_NUMBERS = 8
 
 # Limb of each segment: an edge of one limb can be mistaken for that of another (section 4.4).
-_LIMBS = {
+_LIMBS = {segment: 2 + k for k, chain in enumerate(LIMBS) for segment in CHAINS[chain]} | {
     "torso": 0,
-    "head": 1,
-    "upper_arm_l": 2,
-    "forearm_l": 2,
-    "upper_arm_r": 3,
-    "forearm_r": 3,
-    "thigh_l": 4,
-    "calf_l": 4,
-    "thigh_r": 5,
-    "calf_r": 5,
     "pelvis": 0,
-    "foot_l": 4,
-    "foot_r": 5,
+    "head": 1,
 }
 
 # The seven degrees of freedom of the paper's experiments (section 6): translation, hips and knees.
 _WALKER_DOFS = (
-    "torso_x",
-    "torso_y",
-    "torso_z",
-    "hip_l_pitch",
-    "knee_l_flexion",
-    "hip_r_pitch",
-    "knee_r_flexion",
+    *ROWS["torso"].dof_names[:3],
+    *(ROWS[joint].dof_names[0] for leg in ("leg_l", "leg_r") for joint in LIMBS[leg][:2]),
 )
 
 

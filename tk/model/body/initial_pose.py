@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.block_least_squares import Equations, minimise
 from tk.model.body.anthropometry import FRACTIONS, BodyDimensions
 from tk.model.body.gait_poses import neutral_pose
+from tk.model.body.joints import HIPS, LIMBS, SHOULDERS
 from tk.model.body.skeleton import JOINTS, Skeleton, build_skeleton, shoulder_angles
 from tk.model.cameras.tracker_frame import TrackerFrame
 
@@ -59,9 +62,9 @@ def _fitted(skeleton: Skeleton, rows: NDArray[np.int64], targets: Float) -> Floa
     headings."""
     rest = neutral_pose(skeleton)
     hanging = shoulder_angles(np.array([0.0, 0.2, -0.98]))
-    for side in ("l", "r"):  # arms down, legs together
-        rest[skeleton.index(f"shoulder_{side}_yaw")], rest[skeleton.index(f"shoulder_{side}_pitch")] = hanging
-        rest[skeleton.index(f"hip_{side}_yaw")] = 0.0
+    for shoulder, hip in zip(SHOULDERS, HIPS, strict=True):  # arms down, legs together
+        rest[[skeleton.index(f"{shoulder}_{angle}") for angle in ("yaw", "pitch")]] = hanging
+        rest[skeleton.index(f"{hip}_yaw")] = 0.0
     start = np.repeat(rest[None], _HEADINGS, 0)
     start[:, skeleton.index("torso_yaw")] = np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS
     for pose in start:
@@ -96,13 +99,11 @@ def _stature_of(joints: dict[str, Float]) -> float | None:
     table = {
         ("pelvis", "neck"): FRACTIONS["trunk"],
         ("neck", "head_top"): FRACTIONS["head"],
-        ("shoulder_l", "shoulder_r"): 2 * FRACTIONS["shoulder_half_width"],
+        SHOULDERS: 2 * FRACTIONS["shoulder_half_width"],
     }
-    for side in ("l", "r"):
-        chain = ("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")
-        for names, dimensions in zip(chain, (("upper_arm", "forearm"), ("thigh", "calf")), strict=True):
-            for a, b, dimension in zip(names[:-1], names[1:], dimensions, strict=True):
-                table[f"{a}_{side}", f"{b}_{side}"] = FRACTIONS[dimension]
+    for limb, names in LIMBS.items():
+        dimensions = ("upper_arm", "forearm") if limb.startswith("arm") else ("thigh", "calf")
+        table |= {bone: FRACTIONS[name] for bone, name in zip(pairwise(names), dimensions, strict=True)}
     known = [(a, b, ratio) for (a, b), ratio in table.items() if a in joints and b in joints]
     found = [np.linalg.norm(joints[a] - joints[b]) / ratio for a, b, ratio in known]
     return float(np.clip(np.median(found), LEAST_STATURE, GREATEST_STATURE)) if len(found) >= 3 else None

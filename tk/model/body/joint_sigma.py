@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.model.body.joints import LIMBS
 from tk.model.body.skeleton import JOINTS, SEGMENTS, Skeleton
 
 Float = NDArray[np.float64]
@@ -22,13 +23,9 @@ Float = NDArray[np.float64]
 OFFSET_M, BENT_M = 0.0067, 0.0145
 
 # The bone that each joint turns with, by the joints at its ends; the trunk's own joints have none.
-_BONES = {
-    "head_top": ("neck", "head_top"),
-    **{f"{joint}_{side}": (f"shoulder_{side}", f"elbow_{side}") for side in "lr" for joint in ("shoulder", "elbow")},
-    **{f"wrist_{side}": (f"elbow_{side}", f"wrist_{side}") for side in "lr"},
-    **{f"{joint}_{side}": (f"hip_{side}", f"knee_{side}") for side in "lr" for joint in ("hip", "knee")},
-    **{f"ankle_{side}": (f"knee_{side}", f"ankle_{side}") for side in "lr"},
-}
+_BONES = {"head_top": ("neck", "head_top")}
+for _start, _middle, _end in LIMBS.values():
+    _BONES |= {_start: (_start, _middle), _middle: (_start, _middle), _end: (_middle, _end)}
 _TURNED = np.array([JOINTS.index(name) for name in _BONES])
 _FROM = np.array([JOINTS.index(start) for start, _ in _BONES.values()])
 _TO = np.array([JOINTS.index(end) for _, end in _BONES.values()])

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from tk.kernels.cone_arrays import ConeArrays
 from tk.model.body.cone_body import ConeBody
-from tk.model.body.skeleton import CHAINS, JOINTS, Skeleton, shoulder_angles
+from tk.model.body.joints import CHAINS, JOINTS, LIMBS
+from tk.model.body.skeleton import Skeleton, shoulder_angles
 
 Float = NDArray[np.float64]
 
-LIMBS = ("arm_l", "arm_r", "leg_l", "leg_r")
 # Two poses of a limb are different if a joint's positions differ by more than this, metres: about an arm's width.
 DISTINCT_M = 0.12
 
@@ -104,7 +104,6 @@ def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
     skeleton = body.skeleton
     result = []
     for name in LIMBS:
-        side = name[-1]
         parts = np.array([p.segment in CHAINS[name] for p in body.parts])
         if not parts.any():
             continue
@@ -118,7 +117,6 @@ def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
         own = parts[body.arrays.curves[:, 0]]
         free = np.zeros(len(skeleton.names), bool)
         free[dofs] = True
-        ends = ("elbow", "wrist") if arm else ("knee", "ankle")
         result.append(
             Limb(
                 name=name,
@@ -126,7 +124,7 @@ def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
                 free=free,
                 parts=np.flatnonzero(parts).astype(np.int32),
                 arrays=body.arrays._replace(curves=body.arrays.curves[own]),
-                joints=(JOINTS.index(f"{ends[0]}_{side}"), JOINTS.index(f"{ends[1]}_{side}")),
+                joints=(JOINTS.index(LIMBS[name][1]), JOINTS.index(LIMBS[name][2])),
                 grid=np.clip(grid, lower, upper),
                 lower=lower,
                 upper=upper,

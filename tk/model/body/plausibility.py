@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
+from tk.model.body.joints import ANKLE_JOINTS, HIPS, SHOULDERS
 from tk.model.body.skeleton import JOINTS, up_rotation
 
 Float = NDArray[np.float64]
@@ -35,9 +36,9 @@ MOST_OFFSET = 0.5
 
 _CAUSES = "the unit or the scale of calibration.toml is wrong, or the masks show more or less than the person"
 _PELVIS, _NECK = JOINTS.index("pelvis"), JOINTS.index("neck")
-_HIPS = JOINTS.index("hip_l"), JOINTS.index("hip_r")
-_SHOULDERS = JOINTS.index("shoulder_l"), JOINTS.index("shoulder_r")
-_ANKLES = JOINTS.index("ankle_l"), JOINTS.index("ankle_r")
+_HIPS = tuple(map(JOINTS.index, HIPS))
+_SHOULDERS = tuple(map(JOINTS.index, SHOULDERS))
+_ANKLES = tuple(map(JOINTS.index, ANKLE_JOINTS))
 
 
 def fits_height(extent_m: float, height_m: float) -> bool:

@@ -30,97 +30,28 @@ from numpy.typing import ArrayLike, NDArray
 
 from tk.kernels.kinematics import ARM_UP
 from tk.model.body.anthropometry import FRACTIONS, RAISED_SHOULDERS, BodyDimensions
+from tk.model.body.joints import (
+    ANKLES,
+    CHAINS,
+    HIPS,
+    JOINTS,
+    ROWS,
+    SEGMENTS,
+    SHOULDERS,
+    TABLE,
+    WAIST,
+    WAIST_HEIGHT,
+    Dof,
+    Joint,
+)
 from tk.model.cameras.up import up_vector
+
+__all__ = ["ANKLES", "CHAINS", "JOINTS", "SEGMENTS", "WAIST", "WAIST_HEIGHT"]
 
 Float = NDArray[np.float64]
 
-JOINTS = (
-    "pelvis",
-    "neck",
-    "head_top",
-    "shoulder_l",
-    "elbow_l",
-    "wrist_l",
-    "shoulder_r",
-    "elbow_r",
-    "wrist_r",
-    "hip_l",
-    "knee_l",
-    "ankle_l",
-    "hip_r",
-    "knee_r",
-    "ankle_r",
-)
-
-SEGMENTS = (
-    "torso",
-    "head",
-    "upper_arm_l",
-    "forearm_l",
-    "upper_arm_r",
-    "forearm_r",
-    "thigh_l",
-    "calf_l",
-    "thigh_r",
-    "calf_r",
-    "pelvis",
-    "foot_l",
-    "foot_r",
-)
-
-# The five chains that are refined one by one with the torso held (section 6.4): the segments of each.
-CHAINS: dict[str, tuple[str, ...]] = {
-    "head": ("head",),
-    "arm_l": ("upper_arm_l", "forearm_l"),
-    "arm_r": ("upper_arm_r", "forearm_r"),
-    "leg_l": ("thigh_l", "calf_l", "foot_l"),
-    "leg_r": ("thigh_r", "calf_r", "foot_r"),
-}
-
-# Zero configuration of the left arm (see the module's docstring).
-_ARM = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
-_ARM_POLE = np.array([-1.0, 1.0, 1.0]) / np.sqrt(3)
-_ARM_RISE = np.cross(_ARM, _ARM_POLE)
-# An elbow at zero twist bends inward and up: forward when the arm hangs, inward when it is raised.
-_ELBOW = np.cross(_ARM, [0.5, -0.5, np.sqrt(0.5)])
-
-# Ranges in degrees. Active ranges of healthy men with three standard deviations, Boone & Azen, J. Bone Joint Surg. Am.
-# 61 (1979) 756-759, widened by 10° because a single hinge or ball stands for a whole joint complex (the shoulder
-# girdle, the lumbar spine): hip flexion 122±6, extension 10±7, abduction 46±9, adduction 27±4, rotation 47±6; knee
-# 143±5; elbow 143±6. The shoulder's ranges (flexion 167±5, extension 62±10, abduction 184±7, rotation 69/104) are given
-# about other axes than ours: the box below holds them, and every direction of the arm but a cone of 10° about the
-# singular diagonal (tests/model/test_skeleton.py samples them). Neck: Youdas et al., Phys. Ther. 72 (1992) 770-780:
-# flexion and extension 60-70 together with the upper spine, lateral bending 40-45. Waist: what textbooks give for the
-# lumbar spine (flexion 50, extension 15, bending 20-25, rotation 5-10), more for what the chest above it turns. Ankle:
-# Boone & Azen, plantar flexion 56±6, dorsiflexion 13±4 (more when the knee is bent and loaded), inversion 37±5,
-# eversion 21±5.
-_LIMITS_DEG: dict[str, tuple[float, float]] = {
-    "torso_yaw": (-np.inf, np.inf),
-    "torso_roll": (-80.0, 80.0),
-    "torso_pitch": (-np.inf, np.inf),
-    "waist_pitch": (-25.0, 50.0),
-    "waist_roll": (-30.0, 30.0),
-    "waist_yaw": (-35.0, 35.0),
-    "neck_pitch": (-70.0, 65.0),
-    "neck_yaw": (-50.0, 50.0),
-    "shoulder_yaw": (-180.0, 180.0),
-    "shoulder_pitch": (-80.0, 80.0),
-    "shoulder_roll": (-110.0, 110.0),
-    "elbow_flexion": (-5.0, 155.0),
-    "hip_pitch": (-150.0, 40.0),
-    "hip_yaw": (-45.0, 80.0),
-    "hip_roll": (-70.0, 70.0),
-    "knee_flexion": (-10.0, 160.0),
-    "ankle_flexion": (-60.0, 40.0),
-    "ankle_inversion": (-30.0, 40.0),
-}
-
-WAIST = ("waist_roll", "waist_pitch", "waist_yaw")
 # How stiff each is beside the first: nothing outlines the pelvis from the front, and a hip can turn as well as it.
 WAIST_STIFFNESS = (1.0, 3.0, 5.0)
-ANKLES = ("ankle_l_flexion", "ankle_l_inversion", "ankle_r_flexion", "ankle_r_inversion")
-# Where the waist bends, as a share of the trunk's length above the hip centres: about L4, in the middle of what bends.
-WAIST_HEIGHT = 0.25
 # Single poses whose transforms are kept.
 REMEMBERED = 8
 
@@ -300,15 +231,8 @@ class Skeleton:
         return result
 
     def chain_dofs(self, chain: str) -> NDArray[np.bool_]:
-        """(D,) True for the degrees of freedom of one of :data:`CHAINS`; the torso's are none of them."""
-        prefixes = {
-            "head": ("neck",),
-            "arm_l": ("shoulder_l", "elbow_l"),
-            "arm_r": ("shoulder_r", "elbow_r"),
-            "leg_l": ("hip_l", "knee_l", "ankle_l"),
-            "leg_r": ("hip_r", "knee_r", "ankle_r"),
-        }[chain]
-        return np.array([name.startswith(prefixes) for name in self.names])
+        """(D,) True for the degrees of freedom of one of :data:`CHAINS`; the torso's are in none of them."""
+        return np.isin(self.names, [name for row in TABLE if row.chain == chain for name in row.dof_names])
 
 
 def shoulder_angles(direction: Float) -> tuple[float, float]:
@@ -359,8 +283,8 @@ def _with_waist_in_hips(skeleton: Skeleton, poses: Float) -> Float:
     result = np.array(poses, dtype=np.float64)
     B = skeleton.T_world_body
     waist = skeleton.rotation(np.flatnonzero(skeleton.is_waist), result)
-    for side, spin in (("l", 1.0), ("r", -1.0)):
-        dofs = [skeleton.index(f"hip_{side}_{name}") for name in ("pitch", "yaw", "roll")]
+    for hip, spin in zip(HIPS, (1.0, -1.0), strict=True):
+        dofs = [skeleton.index(name) for name in ROWS[hip].dof_names]
         M = B.T @ waist @ skeleton.rotation(dofs, result) @ B  # rotations about y, then spin x, then -spin z
         result[..., dofs[0]] = np.arctan2(M[..., 0, 2], M[..., 2, 2])
         result[..., dofs[1]] = -spin * np.arcsin(np.clip(M[..., 1, 2], -1.0, 1.0))
@@ -386,102 +310,41 @@ def up_rotation(up: str) -> Float:
 def build_skeleton(dimensions: BodyDimensions, up: str = "z", waist: bool = False, ankles: bool = False) -> Skeleton:
     """The skeleton with these dimensions, standing upright along ``up``: the paper's 24 degrees of freedom, three more
     with a waist, four more with ankles."""
-    d = dimensions
     B = up_rotation(up) if up != "z" else np.eye(3)
-    x, y, z = np.eye(3)
-    pelvis = np.zeros(3)
-    neck = np.array([0.0, 0.0, d.trunk])
-    mirror = np.diag([1.0, -1.0, 1.0])
-    shoulder = np.array([0.0, d.shoulder_half_width, d.trunk - d.shoulder_drop])
-    hip = np.array([0.0, d.hip_half_width, 0.0])
-
-    rows: list[tuple[str, Float, Float, int]] = []  # name, axis, point, parent
-
-    def add(name: str, axis: Float, point: Float, parent: int) -> int:
-        rows.append((name, np.asarray(axis, dtype=float), point, parent))
-        return len(rows) - 1
-
-    last = -1
-    for name, axis in (("torso_x", x), ("torso_y", y), ("torso_z", z)):
-        last = add(name, axis, pelvis, last)
-    for name, axis in (("torso_yaw", z), ("torso_roll", x), ("torso_pitch", y)):
-        last = add(name, axis, pelvis, last)
-    torso = last
-    lumbar = np.array([0.0, 0.0, WAIST_HEIGHT * d.trunk])
-    for name, axis in zip(WAIST, (x, -y, z), strict=True) if waist else ():
-        last = add(name, axis, lumbar, last)
-    hips = last
-    last = add("neck_pitch", y, neck, torso)
-    head = add("neck_yaw", x, neck, last)
-    segment_dof = {"torso": torso, "pelvis": hips, "head": head}
-
-    joints: dict[str, tuple[str, Float]] = {
-        "pelvis": ("pelvis", pelvis),
-        "neck": ("torso", neck),
-        "head_top": ("head", neck + d.head * z),
-    }
-    for side in ("l", "r"):
-        M = np.eye(3) if side == "l" else mirror
-        spin = 1.0 if side == "l" else -1.0  # a mirrored rotation turns about the negative mirrored axis
-        arm = M @ _ARM
-        s, e = M @ shoulder, M @ shoulder + d.upper_arm * arm
-        last = add(f"shoulder_{side}_yaw", spin * M @ _ARM_POLE, s, torso)
-        last = add(f"shoulder_{side}_pitch", spin * M @ _ARM_RISE, s, last)
-        segment_dof[f"upper_arm_{side}"] = add(f"shoulder_{side}_roll", spin * M @ _ARM, s, last)
-        segment_dof[f"forearm_{side}"] = add(
-            f"elbow_{side}_flexion", spin * M @ _ELBOW, e, segment_dof[f"upper_arm_{side}"]
-        )
-        joints[f"shoulder_{side}"] = (f"upper_arm_{side}", s)
-        joints[f"elbow_{side}"] = (f"upper_arm_{side}", e)
-        joints[f"wrist_{side}"] = (f"forearm_{side}", e + d.forearm * arm)
-    for side in ("l", "r"):
-        M = np.eye(3) if side == "l" else mirror
-        spin = 1.0 if side == "l" else -1.0
-        h = M @ hip
-        knee = h - d.thigh * z
-        last = add(f"hip_{side}_pitch", y, h, hips)
-        last = add(f"hip_{side}_yaw", spin * x, h, last)
-        segment_dof[f"thigh_{side}"] = add(f"hip_{side}_roll", -spin * z, h, last)
-        segment_dof[f"calf_{side}"] = add(f"knee_{side}_flexion", y, knee, segment_dof[f"thigh_{side}"])
-        ankle = knee - d.calf * z
-        last = segment_dof[f"calf_{side}"]
-        for name, axis in (("flexion", -y), ("inversion", -spin * x)) if ankles else ():
-            last = add(f"ankle_{side}_{name}", axis, ankle, last)
-        segment_dof[f"foot_{side}"] = last
-        joints[f"hip_{side}"] = ("pelvis", h)
-        joints[f"knee_{side}"] = (f"thigh_{side}", knee)
-        joints[f"ankle_{side}"] = (f"calf_{side}", ankle)
-
-    names = tuple(row[0] for row in rows)
-    lift = RAISED_SHOULDERS / FRACTIONS["trunk"] * d.trunk * z
-    rise = np.array([lift * (n.startswith("shoulder") and n.endswith("yaw")) for n in names])
-    prismatic = np.array([name in ("torso_x", "torso_y", "torso_z") for name in names])
-    limits = np.array([_limits(name) for name in names])
-    axis = np.array([row[1] for row in rows])
+    has = {"": True, "waist": waist, "ankles": ankles}
+    dofs: list[tuple[Joint, Dof, str]] = []
+    parents: list[int] = []
+    last = {"": -1}  # joint: its last degree of freedom
+    segment_dof: dict[str, int] = {}
+    for row in TABLE:
+        last[row.name] = last[row.above]
+        for dof, name in zip(row.dofs, row.dof_names, strict=True) if has[row.optional] else ():
+            parents.append(last[row.name])
+            dofs.append((row, dof, name))
+            last[row.name] = len(dofs) - 1
+        if row.turns:
+            segment_dof[row.turns] = last[row.name]
+    lift = RAISED_SHOULDERS / FRACTIONS["trunk"] * dimensions.trunk * np.array([0.0, 0.0, 1.0])
+    lifting = {ROWS[name].dof_names[0] for name in SHOULDERS}
+    prismatic = np.array([dof.prismatic for _, dof, _ in dofs])
+    axis = np.array([dof.axis for _, dof, _ in dofs])
     axis[~prismatic] = axis[~prismatic] @ B.T
+    joints = [ROWS[name] for name in JOINTS]
     return Skeleton(
-        names=names,
+        names=tuple(name for _, _, name in dofs),
         units=tuple("m" if p else "rad" for p in prismatic),
         axis=axis,
-        point=np.array([row[2] for row in rows]) @ B.T,
-        rise=rise @ B.T,
+        point=np.array([row.place(dimensions) for row, _, _ in dofs]) @ B.T,
+        rise=np.array([lift * (name in lifting) for _, _, name in dofs]) @ B.T,
         prismatic=prismatic,
-        parent=np.array([row[3] for row in rows], dtype=np.int32),
-        lower=limits[:, 0],
-        upper=limits[:, 1],
+        parent=np.array(parents, dtype=np.int32),
+        lower=np.radians([dof.lower for _, dof, _ in dofs]),
+        upper=np.radians([dof.upper for _, dof, _ in dofs]),
         segment_dof=np.array([segment_dof[s] for s in SEGMENTS], dtype=np.int32),
-        joint_segment=np.array([SEGMENTS.index(joints[j][0]) for j in JOINTS], dtype=np.int32),
-        joint_position=np.array([joints[j][1] for j in JOINTS]) @ B.T,
+        joint_segment=np.array([SEGMENTS.index(row.carrier) for row in joints], dtype=np.int32),
+        joint_position=np.array([row.place(dimensions) for row in joints]) @ B.T,
         T_world_body=B,
     )
-
-
-def _limits(name: str) -> tuple[float, float]:
-    if name in ("torso_x", "torso_y", "torso_z"):
-        return -np.inf, np.inf
-    key = name.replace("_l_", "_").replace("_r_", "_")
-    lower, upper = _LIMITS_DEG[key]
-    return float(np.radians(lower)), float(np.radians(upper))
 
 
 def skeleton_of_names(names: Sequence[str], dimensions: BodyDimensions, up: str) -> Skeleton:

@@ -6,12 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.skeleton import JOINTS, SEGMENTS, Skeleton
+from tk.model.body.joints import FOOT_POINTS, JOINTS, LIMBS, SEGMENTS
+from tk.model.body.skeleton import Skeleton
 
 Float = NDArray[np.float64]
 
-# The points of the feet, in the order of :func:`foot_points`.
-FOOT_POINTS = ("heel_l", "toe_l", "heel_r", "toe_r")
 # Behind and ahead of the ankle's centre, as shares of the foot's length: where tk.model.body.cone_body lays the foot.
 _HEEL, _TOE = -0.2, 0.8
 
@@ -28,7 +27,7 @@ def foot_points(skeleton: Skeleton, dimensions: BodyDimensions, transforms: Floa
     The foot rides on the calf where the skeleton has no segment of its own for it.
     """
     T = transforms[:, [foot_segment(name) for name in FOOT_POINTS]]
-    ankles = skeleton.joint_position[[JOINTS.index("ankle" + name[-2:]) for name in FOOT_POINTS]]
+    ankles = skeleton.joint_position[[JOINTS.index(LIMBS["leg" + name[-2:]][2]) for name in FOOT_POINTS]]
     soles = np.array([sole_offset(name, dimensions) for name in FOOT_POINTS]) @ skeleton.T_world_body.T
     return np.einsum("fpab,pb->fpa", T[..., :3, :3], ankles + soles) + T[..., :3, 3]
 
@@ -40,6 +39,5 @@ def sole_offset(name: str, dimensions: BodyDimensions) -> Float:
 
 
 def foot_segment(name: str) -> int:
-    """The segment that carries the foot of the side with which ``name`` ends ("_l" or "_r")."""
-    side = name[-2:]
-    return SEGMENTS.index("foot" + side if "foot" + side in SEGMENTS else "calf" + side)
+    """Return the segment that carries the foot of the side with which ``name`` ends ("_l" or "_r")."""
+    return SEGMENTS.index("foot" + name[-2:])

@@ -1,0 +1,222 @@
+"""The joint table: one row per joint, from which names, chains, limits, bones and the skeleton are derived.
+
+A row of a limb is written for the left side; the right one is its mirror image. To add a joint, add a row: the pose
+vector, the result file and the drawings follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.model.body.anthropometry import BodyDimensions
+
+Float = NDArray[np.float64]
+
+_X, _Y, _Z = np.eye(3)
+# Zero configuration of the left arm (see tk.model.body.skeleton).
+ARM = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
+_ARM_POLE = np.array([-1.0, 1.0, 1.0]) / np.sqrt(3)
+_ARM_RISE = np.cross(ARM, _ARM_POLE)
+# An elbow at zero twist bends inward and up: forward when the arm hangs, inward when it is raised.
+_ELBOW_AXIS = np.cross(ARM, [0.5, -0.5, np.sqrt(0.5)])
+
+# Height of the waist above the hip centres, as a share of the trunk's length: about L4, the middle of the lumbar spine.
+WAIST_HEIGHT = 0.25
+
+
+@dataclass(frozen=True)
+class Dof:
+    """A degree of freedom.
+
+    Attributes:
+        name: what follows the joint's name, such as ``flexion``.
+        axis: (3,) unit axis in the zero configuration, body frame, left side.
+        lower, upper: limits, degrees.
+        prismatic: True for a translation.
+    """
+
+    name: str
+    axis: Float
+    lower: float = -np.inf
+    upper: float = np.inf
+    prismatic: bool = False
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A row of the table.
+
+    Attributes:
+        name: with the side, ``_l`` or ``_r``, for a limb's joint.
+        place: the joint centre in the zero configuration, body frame, left side, metres.
+        dofs: its degrees of freedom, in the order of the pose vector.
+        above: the joint whose last degree of freedom carries it; empty at the root.
+        turns: the segment that it moves; empty for the end of a chain.
+        chain: the chain that is optimised as one (section 6.4); empty for the trunk.
+        carrier: the segment that carries the joint centre in `/joints/position`; empty: not an output.
+        bone_from: the joint at the other end of the bone in drawings; empty at the root.
+        optional: the group of degrees of freedom that a simpler body omits.
+    """
+
+    name: str
+    place: Callable[[BodyDimensions], Float]
+    dofs: tuple[Dof, ...] = ()
+    above: str = ""
+    turns: str = ""
+    chain: str = ""
+    carrier: str = ""
+    bone_from: str = ""
+    optional: str = ""
+
+    @property
+    def side(self) -> str:
+        """``_l``, ``_r``, or empty in the middle."""
+        return side_of(self.name)
+
+    @property
+    def dof_names(self) -> tuple[str, ...]:
+        """Names of its entries of the pose vector."""
+        return tuple(f"{self.name}_{dof.name}" for dof in self.dofs)
+
+
+def side_of(name: str) -> str:
+    """The side with which a name ends, ``_l`` or ``_r``; empty in the middle."""
+    return name[-2:] if name.endswith(("_l", "_r")) else ""
+
+
+def _shoulder(d: BodyDimensions) -> Float:
+    return np.array([0.0, d.shoulder_half_width, d.trunk - d.shoulder_drop])
+
+
+def _elbow(d: BodyDimensions) -> Float:
+    return _shoulder(d) + d.upper_arm * ARM
+
+
+def _hip(d: BodyDimensions) -> Float:
+    return np.array([0.0, d.hip_half_width, 0.0])
+
+
+def _knee(d: BodyDimensions) -> Float:
+    return _hip(d) - d.thigh * _Z
+
+
+def _ankle(d: BodyDimensions) -> Float:
+    return _knee(d) - d.calf * _Z
+
+
+def _neck(d: BodyDimensions) -> Float:
+    return np.array([0.0, 0.0, d.trunk])
+
+
+# Limits in degrees. Active ranges of healthy men with three standard deviations, Boone & Azen, J. Bone Joint Surg. Am.
+# 61 (1979) 756-759, widened by 10° because a single hinge or ball stands for a whole joint complex (the shoulder
+# girdle, the lumbar spine): hip flexion 122±6, extension 10±7, abduction 46±9, adduction 27±4, rotation 47±6; knee
+# 143±5; elbow 143±6. The shoulder's ranges (flexion 167±5, extension 62±10, abduction 184±7, rotation 69/104) are given
+# about other axes than ours: the box below holds them, and every direction of the arm but a cone of 10° about the
+# singular diagonal (tests/model/body/test_skeleton.py samples them). Neck: Youdas et al., Phys. Ther. 72 (1992)
+# 770-780: flexion and extension 60-70 together with the upper spine, lateral bending 40-45. Waist: textbook ranges of
+# the lumbar spine (flexion 50, extension 15, bending 20-25, rotation 5-10), more for the rotation of the chest. Ankle:
+# Boone & Azen, plantar flexion 56±6, dorsiflexion 13±4 (more when the knee is bent and loaded), inversion 37±5,
+# eversion 21±5.
+_MIDDLE = (
+    Joint("torso", lambda d: np.zeros(3), turns="torso", dofs=(
+        Dof("x", _X, prismatic=True), Dof("y", _Y, prismatic=True), Dof("z", _Z, prismatic=True),
+        Dof("yaw", _Z), Dof("roll", _X, -80.0, 80.0), Dof("pitch", _Y),
+    )),
+    Joint("waist", lambda d: np.array([0.0, 0.0, WAIST_HEIGHT * d.trunk]), above="torso", turns="pelvis", dofs=(
+        Dof("roll", _X, -30.0, 30.0), Dof("pitch", -_Y, -25.0, 50.0), Dof("yaw", _Z, -35.0, 35.0),
+    ), optional="waist"),
+    Joint("pelvis", lambda d: np.zeros(3), above="waist", carrier="pelvis"),
+    Joint("neck", _neck, above="torso", turns="head", chain="head", carrier="torso", bone_from="pelvis", dofs=(
+        Dof("pitch", _Y, -70.0, 65.0), Dof("yaw", _X, -50.0, 50.0),
+    )),
+    Joint("head_top", lambda d: _neck(d) + d.head * _Z, above="neck", chain="head", carrier="head", bone_from="neck"),
+)  # fmt: skip
+_ARM_ROWS = (
+    Joint("shoulder", _shoulder, above="torso", turns="upper_arm", chain="arm", carrier="upper_arm", bone_from="neck",
+          dofs=(Dof("yaw", _ARM_POLE, -180.0, 180.0), Dof("pitch", _ARM_RISE, -80.0, 80.0),
+                Dof("roll", ARM, -110.0, 110.0))),
+    Joint("elbow", _elbow, above="shoulder", turns="forearm", chain="arm", carrier="upper_arm", bone_from="shoulder",
+          dofs=(Dof("flexion", _ELBOW_AXIS, -5.0, 155.0),)),
+    Joint("wrist", lambda d: _elbow(d) + d.forearm * ARM, above="elbow", chain="arm", carrier="forearm",
+          bone_from="elbow"),
+)  # fmt: skip
+_LEG_ROWS = (
+    Joint("hip", _hip, above="waist", turns="thigh", chain="leg", carrier="pelvis", bone_from="pelvis",
+          dofs=(Dof("pitch", _Y, -150.0, 40.0), Dof("yaw", _X, -45.0, 80.0), Dof("roll", -_Z, -70.0, 70.0))),
+    Joint("knee", _knee, above="hip", turns="calf", chain="leg", carrier="thigh", bone_from="hip",
+          dofs=(Dof("flexion", _Y, -10.0, 160.0),)),
+    Joint("ankle", _ankle, above="knee", turns="foot", chain="leg", carrier="calf", bone_from="knee",
+          dofs=(Dof("flexion", -_Y, -60.0, 40.0), Dof("inversion", -_X, -30.0, 40.0)), optional="ankles"),
+)  # fmt: skip
+
+
+def _on_side(rows: tuple[Joint, ...], side: str) -> tuple[Joint, ...]:
+    """The rows of one limb; an axis of the right side is the negative mirrored one, a mirrored rotation's."""
+    own = {row.name for row in rows}
+    mirror = np.diag([1.0, -1.0, 1.0])
+
+    def sided(row: Joint) -> Joint:
+        place, dofs = row.place, row.dofs
+        if side == "_r":
+            place = lambda d: mirror @ row.place(d)  # noqa: E731
+            dofs = tuple(replace(dof, axis=0.0 - mirror @ dof.axis) for dof in dofs)
+        names = {name: value + side for name in ("name", "turns", "chain") if (value := getattr(row, name))}
+        names |= {name: value + side for name in ("above", "bone_from") if (value := getattr(row, name)) in own}
+        carrier = row.carrier + side if row.carrier in {other.turns for other in rows} else row.carrier
+        return replace(row, place=place, dofs=dofs, carrier=carrier, **names)
+
+    return tuple(sided(row) for row in rows)
+
+
+TABLE: tuple[Joint, ...] = (
+    *_MIDDLE,
+    *(row for rows in (_ARM_ROWS, _LEG_ROWS) for side in ("_l", "_r") for row in _on_side(rows, side)),
+)
+ROWS = {row.name: row for row in TABLE}
+
+#: joints of `/joints/position`
+JOINTS = tuple(row.name for row in TABLE if row.carrier)
+#: segments of `/segments/rotation`: what the paper's joints turn, then what optional joints turn
+SEGMENTS = tuple(
+    row.turns for optional in (False, True) for row in TABLE if row.turns and bool(row.optional) == optional
+)
+#: bones of drawings, as pairs of joints
+BONES = tuple((row.bone_from, row.name) for row in TABLE if row.bone_from)
+#: the segments of the chains that are optimised one by one with the torso held (section 6.4)
+CHAINS: dict[str, tuple[str, ...]] = {
+    chain: tuple(row.turns for row in TABLE if row.chain == chain and row.turns)
+    for chain in dict.fromkeys(row.chain for row in TABLE if row.chain)
+}
+#: the joints at the start, in the middle and at the end of each limb: arm_l, arm_r, leg_l, leg_r
+LIMBS: dict[str, tuple[str, str, str]] = {}
+for _chain in CHAINS:
+    _names = [row.name for row in TABLE if row.chain == _chain]
+    if side_of(_chain):
+        LIMBS[_chain] = (_names[0], _names[1], _names[2])
+#: hinges: the middle joint of each limb, with the joints before and after it
+HINGES = {LIMBS[limb][1]: LIMBS[limb][::2] for limb in ("leg_l", "leg_r", "arm_l", "arm_r")}
+#: kinds of hinges, with the names of both sides
+HINGE_KINDS = {
+    name.removesuffix("_l"): (name, name.removesuffix("_l") + "_r") for name in HINGES if name.endswith("_l")
+}
+#: limb joints, side by side
+LIMB_JOINTS = tuple(name for side in ("_l", "_r") for limb in ("arm", "leg") for name in LIMBS[limb + side])
+#: limb joints without their side
+LIMB_KINDS = tuple(name.removesuffix("_l") for name in LIMB_JOINTS if name.endswith("_l"))
+#: the joint at which a segment begins; the trunk's segments begin at an output joint
+SEGMENT_ORIGIN = {row.turns: row.name for row in TABLE if row.turns} | {"torso": "neck", "pelvis": "pelvis"}
+#: degrees of freedom of the optional groups
+WAIST, ANKLES = (
+    tuple(name for row in TABLE if row.optional == group for name in row.dof_names) for group in ("waist", "ankles")
+)
+#: the points of the feet, in the order of `/feet/position`
+FOOT_POINTS = ("heel_l", "toe_l", "heel_r", "toe_r")
+
+
+HIPS, SHOULDERS = ((LIMBS[f"{chain}_l"][0], LIMBS[f"{chain}_r"][0]) for chain in ("leg", "arm"))
+ANKLE_JOINTS = (LIMBS["leg_l"][2], LIMBS["leg_r"][2])
