@@ -1,6 +1,6 @@
-"""A tiny capture with everything in it, and the command line as a function.
+"""A small rendered capture with everything in it, and the command line as a function.
 
-Workers of pytest-xdist (`-n 2`) make what costs seconds once among them, and share the cores.
+Workers of pytest-xdist (`-n 2`) share the expensive fixtures, which one of them makes, and the cores.
 """
 
 from __future__ import annotations
@@ -22,17 +22,28 @@ from tk.io import settings_file
 from tk.io.captures.capture import Capture
 from tk.model.setup import Setup
 
-# every run draws the same examples; `pytest --hypothesis-profile default` draws new ones
+# every run uses the same examples; `pytest --hypothesis-profile default` draws new ones
 hypothesis.settings.register_profile("same", derandomize=True)
 hypothesis.settings.load_profile("same")
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # before any kernel runs: the results are the same with fewer threads
+if "PYTEST_XDIST_WORKER" in os.environ:  # set before any kernel runs; results do not depend on the number of threads
     _cores = len(os.sched_getaffinity(0))
     os.environ.setdefault("TK_THREADS", str(max(_cores // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]), 1)))
 
 FRAMES = 14
 
-# coarse, short fits of the body, and no second process to be started: a whole run takes a second or two
+DEVELOPMENT_CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "captures"
+
+
+def development_capture(name: str) -> Path:
+    """Return the folder of a development capture; skip the test where there is none."""
+    folder = DEVELOPMENT_CAPTURES / name
+    if not folder.is_dir():
+        pytest.skip(f"needs the development capture {folder}")
+    return folder
+
+
+# settings for a run of one or two seconds: coarse, with short body fits and without a second process
 QUICK = """
 voxels = 32
 ahead = 0
@@ -52,24 +63,24 @@ def setup_and_source(capture: Capture) -> tuple[Setup, Capture]:
 
 @dataclass(frozen=True)
 class Ran:
-    """What a command said."""
+    """Exit code and output of a command."""
 
     code: int
     out: str
     err: str
 
     @property
-    def told(self) -> list[str]:
-        """The lines of stderr but for those that tell the progress."""
+    def messages(self) -> list[str]:
+        """The lines of stderr without progress."""
         progress = re.compile(r"frame \d+: \d+/\d+, |\[ *\d+\.\d s\] ")
         return [line for line in self.err.splitlines() if not progress.match(line)]
 
     def complaint(self, *parts: str) -> str:
-        """The one line that a command left that could not use its input; it holds these parts.
+        """Check that the command refused its input in one line that contains these parts; return the line.
 
-        Notes and lines of progress may stand before it.
+        Notes and progress may precede it.
         """
-        lines = self.told
+        lines = self.messages
         assert self.code == 2, (self.code, self.out, self.err)
         assert self.out == ""
         assert len([line for line in lines if not line.startswith("note: ")]) == 1, self.err
@@ -84,9 +95,10 @@ Tk = Callable[..., Ran]
 
 @pytest.fixture
 def tk(capfd: pytest.CaptureFixture[str]) -> Tk:
-    """``tk("track", capture, "-o", result)`` in this process; what libraries print below Python is heard, too.
+    """Return a function that runs a command in this process: ``tk("track", capture, "-o", result)``.
 
-    A run of `tk track` leaves no video and no report, which take their time, unless ``pictures`` is set.
+    Output of C libraries is captured, too. `tk track` writes neither video nor report unless ``pictures`` is set, to
+    save time.
     """
     from tk.cli import main
 
@@ -104,14 +116,14 @@ def tk(capfd: pytest.CaptureFixture[str]) -> Tk:
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
-    """A path that ``make`` has written, whichever worker of this test run came first."""
+    """Return a path written by ``make``, in the first worker of this test run that needs it."""
     root = factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         root = root.parent
     (root / "shared").mkdir(exist_ok=True)
     path, done = root / "shared" / name, root / "shared" / f".{name}.done"
     with (root / "shared" / f".{name}.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # goes with its process, however that ends
+        fcntl.flock(lock, fcntl.LOCK_EX)  # released when the process ends, however it ends
         if not done.exists():
             make(path)
             done.touch()
@@ -120,7 +132,7 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A rendered capture: 4 cameras of 160×120, :data:`FRAMES` frames, backgrounds, masks, truth. Not to be changed."""
+    """A rendered capture, read-only: 4 cameras of 160×120, :data:`FRAMES` frames, backgrounds, masks, truth."""
 
     def make(folder: Path) -> None:
         write_capture(plan_capture(Options(frames=FRAMES, cameras=4, size=(160, 120), seed=3)), folder, masks=True)
@@ -130,13 +142,13 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def copy(tiny: Path, tmp_path: Path) -> Path:
-    """The tiny capture, to be spoilt."""
+    """A writable copy of the rendered capture."""
     return Path(shutil.copytree(tiny, tmp_path / "capture"))
 
 
 @pytest.fixture(scope="session")
 def tracked(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The result of an unbroken run of the volumetric tracker over the tiny capture. Not to be changed."""
+    """The result, read-only, of an uninterrupted run of the volumetric tracker over the rendered capture."""
     from tk.io.captures.capture import open_capture
     from tk.run.session import track
 
@@ -148,14 +160,14 @@ def tracked(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def quick(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """:data:`QUICK` as a file for ``--config``."""
+    """A settings file with :data:`QUICK`, for ``--config``."""
     path = tmp_path_factory.mktemp("settings") / "quick.toml"
     path.write_text(QUICK, encoding="utf-8")
     return path
 
 
 class Silent:
-    """A reporter that remembers, for runs without a command line."""
+    """A reporter that records notes and frames, for runs without a command line."""
 
     def __init__(self) -> None:
         self.notes: list[str] = []

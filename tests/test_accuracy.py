@@ -1,4 +1,4 @@
-"""How well whole captures are tracked: minutes, run by `make test-slow`."""
+"""Accuracy on whole captures. Takes minutes; run by `make test-slow`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.conftest import Silent, Tk
+from tests.conftest import Silent, Tk, development_capture
 from tk.evaluation.joints import Evaluation, evaluate_files
 from tk.io.captures.capture import open_capture
 from tk.io.results.writer import read_result
@@ -19,15 +19,14 @@ from tk.settings import Settings
 
 pytestmark = pytest.mark.slow
 
-SHARED = Path(__file__).parents[2] / "shared" / "captures"
 DEMO = Path(__file__).parents[1] / "tk" / "data" / "demo"
 FRAMES = {"walk": 80, "dance": 120, "punch": 150}
 SEEDS = 5
 MEAN_CM = 2.9  # Kehl & Van Gool 2006, section 7.3
-DEMO_CM = 6.0  # a body of other proportions
+DEMO_CM = 6.0  # larger, because the subject's proportions are not the average
 MEMORY_MIB = 2048
 
-# the peak memory of the command alone: this process has Open3D and a compiler's caches in it
+# prints the peak memory of a command in a process of its own, without the memory of the test process
 MEASURED = """
 import resource, sys
 from tk.cli import main
@@ -38,21 +37,14 @@ finally:
 """
 
 
-def shared(name: str) -> Path:
-    folder = SHARED / name
-    if not folder.is_dir():
-        pytest.skip(f"the development captures are not here: {folder}")
-    return folder
-
-
 def assert_complete(found: Evaluation, frames: int) -> None:
     assert (found.judged, found.missing_outside, found.lost, found.nan_frames) == (frames, 0, 0, 0)
 
 
 @pytest.mark.parametrize("name", FRAMES)
-def test_captures_with_an_initial_pose_from_their_videos(name: str, tmp_path: Path) -> None:
-    """64³, five cameras, masks from the videos and the background clips; the mean over the seeds."""
-    folder = shared(name)
+def test_mean_error_of_captures_segmented_from_their_videos(name: str, tmp_path: Path) -> None:
+    """64³, five cameras, masks from the videos and the background clips; mean over the seeds."""
+    folder = development_capture(name)
     means = []
     for seed in range(SEEDS):
         result = tmp_path / f"{seed}.h5"
@@ -64,8 +56,8 @@ def test_captures_with_an_initial_pose_from_their_videos(name: str, tmp_path: Pa
 
 
 @pytest.mark.parametrize("name", FRAMES)
-def test_the_same_seed_gives_the_same_poses(name: str, tmp_path: Path) -> None:
-    capture = open_capture(shared(name), masks="none")
+def test_runs_with_the_same_seed_give_the_same_poses(name: str, tmp_path: Path) -> None:
+    capture = open_capture(development_capture(name), masks="none")
     poses = []
     for run in ("a.h5", "b.h5"):
         track(capture, tmp_path / run, Settings(), Silent(), frames=(0, 30))
@@ -75,20 +67,20 @@ def test_the_same_seed_gives_the_same_poses(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs getrusage")
-def test_memory_stays_below_two_gibibytes(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", MEASURED, "track", str(shared("walk")), "-o", str(tmp_path / "r.h5")]
+def test_tracking_needs_less_than_two_gibibytes(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", MEASURED, "track", str(development_capture("walk")), "-o", str(tmp_path / "r.h5")]
     ran = subprocess.run([*command, "--masks", "none"], capture_output=True, text=True, cwd=Path(__file__).parents[1])
     assert ran.returncode == 0, ran.stderr
     unit = 2**20 if sys.platform == "darwin" else 2**10
     assert int(ran.stdout) / unit < MEMORY_MIB
 
 
-def test_the_capture_that_ships(tk: Tk, tmp_path: Path) -> None:
+def test_demo_capture_is_tracked_and_its_error_printed(tk: Tk, tmp_path: Path) -> None:
     ran = tk("demo", "-o", tmp_path / "demo.h5")
     assert ran.code == 0, ran.err
     found = evaluate_files(tmp_path / "demo.h5", DEMO / "truth.h5")
     assert found.format_table() in ran.out
     assert_complete(found, found.judged)
     assert found.raw.all.mean_cm <= DEMO_CM, found.format_table()
-    told = json.loads(tk("evaluate", tmp_path / "demo.h5", DEMO / "truth.h5", "--json").out)
-    assert told["lost"] == 0
+    report = json.loads(tk("evaluate", tmp_path / "demo.h5", DEMO / "truth.h5", "--json").out)
+    assert report["lost"] == 0

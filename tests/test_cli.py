@@ -46,7 +46,7 @@ def test_track_writes_all_datasets_of_the_result_format(tk: Tk, quick: Path, tin
     lines = ran.err.splitlines()
     assert all(line.isprintable() for line in lines)  # plain lines, no bar, because stderr is not a terminal
     done = next(i for i, line in enumerate(lines) if line.startswith("frame 7: 6/6, "))
-    assert "second pass" in lines[done + 1] and ran.told == lines[-1:]
+    assert "second pass" in lines[done + 1] and ran.messages == lines[-1:]
     assert lines[-1].startswith(f"6 frames in {result}, 0 lost, ")
     assert {path.name for path in tmp_path.iterdir()} == {"result.h5"}  # --no-report
     shapes = {
@@ -279,7 +279,7 @@ def test_shortest_video_limits_the_frames(tk: Tk, quick: Path, copy: Path, tmp_p
     write_video(copy / "videos" / "cam2.mp4", [picture(1, k, SIZE) for k in range(6)])
     ran = tk("track", copy, "-o", tmp_path / "r.h5", "--config", quick)
     assert ran.code == 0
-    warning = ran.told[0]
+    warning = ran.messages[0]
     assert "cam2.mp4" in warning and "only the first 6 are used" in warning
     with h5py.File(tmp_path / "r.h5", "r") as file:
         assert len(file["frames"]) == 6

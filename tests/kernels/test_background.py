@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tk.kernels.background import BRIGHT, DARK, GREY, Statistic, level_of
+from tk.kernels.background import GREY, Statistic, level_of
 
 SETTINGS = {"darkness_offset": 40.0, "shadow_min": 0.7, "difference_min": 4.0}
-LABELS = {"shadow_max": 0.95, "threshold": 6.0, "octaves_per_neighbour": 0.5, "iterations": 3}
+LABELS = {"threshold": 6.0, "octaves_per_neighbour": 0.5, "iterations": 3}
 ONE_LEVEL = 1  # float32 sums in another order may cross the border between two levels
 
 
@@ -39,16 +39,16 @@ def oracle(image, plate, weight, precision, darkness_offset, shadow_min, differe
     return difference, collinearity
 
 
-def measure(images, plates, weights=None, precision=None, boxes=None, brightness=None, **changes):
+def measure(images, plates, weights=None, precision=None, boxes=None, bright_sum=None, **changes):
     """The statistic, the boxes side by side with a column of zeros between them and a frame of zeros around."""
     count, height, width = images.shape[:3]
     weights = np.ones(images.shape[:3], np.float32) if weights is None else weights
     precision = np.full(count, 0.5, np.float32) if precision is None else precision
     boxes = np.array([[0, 0, width, height]] * count if boxes is None else boxes, np.int32)
-    brightness = np.zeros((count, 2), np.float32) if brightness is None else brightness
+    bright_sum = np.zeros(count, np.float32) if bright_sum is None else bright_sum
     statistic = Statistic(np.ascontiguousarray(images), np.ascontiguousarray(plates), weights)
     corners, shape = layout(boxes)
-    statistic.measure(precision, brightness, boxes, corners, shape, **{**SETTINGS, **LABELS, **changes})
+    statistic.measure(precision, bright_sum, boxes, corners, shape, **{**SETTINGS, **LABELS, **changes})
     return statistic
 
 
@@ -116,7 +116,7 @@ def test_a_shadow_stays_collinear_and_a_highlight_does_not(factor, seed):
     np.testing.assert_array_equal(statistic.collinearity, statistic.difference)
 
 
-def test_the_offset_keeps_dark_noise_from_firing():
+def test_darkness_offset_suppresses_the_noise_of_dark_windows():
     rng = np.random.default_rng(0)
     dark = rng.integers(0, 4, (2, 1, 20, 20, 3)).astype(np.uint8)
     small = measure(dark[0], dark[1], darkness_offset=0.5, shadow_min=0.05, difference_min=0.1)
@@ -132,7 +132,7 @@ def test_equal_pictures_have_no_difference():
     assert not statistic.difference.any() and not statistic.collinearity.any()
 
 
-def test_measuring_again_leaves_nothing_behind():
+def test_buffers_are_cleared_between_measurements():
     images, plates = scene(0)
     statistic = measure(images, plates)
     assert statistic.labels.any()
@@ -141,8 +141,8 @@ def test_measuring_again_leaves_nothing_behind():
     again = Statistic(images, plates, np.ones(images.shape[:3], np.float32))
     for picture in (255 - plates, plates):
         images[...] = picture
-        again.measure(np.ones(2, np.float32), np.zeros((2, 2), np.float32), boxes, *layout(boxes), **SETTINGS, **LABELS)
-    assert not again.labels.any() and not again.difference.any() and not again.shades.any()
+        again.measure(np.ones(2, np.float32), np.zeros(2, np.float32), boxes, *layout(boxes), **SETTINGS, **LABELS)
+    assert not again.labels.any() and not again.difference.any() and not again.bright.any()
 
 
 @settings(deadline=None, max_examples=20)
@@ -164,13 +164,13 @@ def test_relaxation_matches_the_oracle(seed, iterations):
     seed=st.integers(0, 100),
     box=st.tuples(st.integers(0, 10), st.integers(0, 20), st.integers(1, 7), st.integers(1, 9)),
 )
-def test_a_box_is_a_part_of_the_whole(seed, box):
-    """Windows at its edge see what lies beyond it, labels do not."""
+def test_statistic_in_a_box_equals_that_of_the_whole_image(seed, box):
+    """Windows at the edge of the box read pixels beyond it; labels do not."""
     images, plates = scene(seed)
     whole = measure(images, plates)
     left, top, w, h = box
     part = measure(images, plates, boxes=[box, (0, 0, 0, 0)], iterations=0)
-    for name in ("difference", "collinearity", "shades"):
+    for name in ("difference", "collinearity", "bright"):
         mosaic = getattr(part, name)
         expected = pictures(getattr(whole, name), 17)[0, top : top + h, left : left + w]
         np.testing.assert_array_equal(mosaic[1 : 1 + h, 1 : 1 + w], expected)
@@ -178,17 +178,19 @@ def test_a_box_is_a_part_of_the_whole(seed, box):
     np.testing.assert_array_equal(part.labels, part.collinearity >= level_of(6.0))
 
 
-def test_shades_tell_brighter_and_darker():
+def test_bright_windows_are_marked_and_dark_ones_are_not():
     plates = np.full((1, 12, 30, 3), 120, np.uint8)
     images = plates.copy()
     images[:, 2:10, 1:9] = 150
     images[:, 2:10, 11:19] = 90
-    images[:, 2:10, 21:29] = 118  # too faint for a shadow
-    unit = 9 * sum(GREY)
-    statistic = measure(images, plates, brightness=np.array([[5 * unit, 0]], np.float32), difference_min=0.5)
-    shades = pictures(statistic.shades, 30)[0]
-    assert (shades[3:9, 2:8] == BRIGHT).all() and (shades[3:9, 12:18] == DARK).all()
-    assert (pictures(statistic.difference, 30)[0, 3:9, 22:28] > 0).all() and not shades[3:9, 22:28].any()
+    images[:, 2:10, 21:29] = 124  # brighter, but by less than the limit of 5 grey levels
+    limit = np.array([5 * 9 * sum(GREY)], np.float32)
+    statistic = measure(images, plates, bright_sum=limit, difference_min=0.5)
+    bright, difference = (pictures(mosaic, 30)[0] for mosaic in (statistic.bright, statistic.difference))
+    assert (
+        (difference[3:9, 2:8] > 0).all() and (difference[3:9, 12:18] > 0).all() and (difference[3:9, 22:28] > 0).all()
+    )
+    assert (bright[3:9, 2:8] == 1).all() and not bright[:, 11:].any()
 
 
 def test_levels_are_monotonic_and_eight_an_octave():

@@ -21,8 +21,7 @@ from scripts.figure4_edges import (
     run,
 )
 from scripts.paper.edge_maps import HIGH
-
-WALK = Path(__file__).resolve().parents[3] / "shared" / "captures" / "walk"
+from tests.conftest import development_capture
 
 
 def scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -75,9 +74,8 @@ def test_clutter_is_read_between_thresholds() -> None:
     assert np.isnan(curve.at(0.95, "shadow")), "not reached, not made up"
 
 
-@pytest.mark.skipif(not WALK.is_dir(), reason="shared capture 'walk' is not here")
 def test_figure_from_a_capture(tmp_path: Path) -> None:
-    curves = run([WALK], [30], tmp_path, cameras=["cam1", "cam2"])
+    curves = run([development_capture("walk")], [30], tmp_path, cameras=["cam1", "cam2"])
     assert (tmp_path / "figure4-walk.png").stat().st_size > 20_000
     assert (tmp_path / "figure4.md").read_text(encoding="utf-8").count("| walk |") == len(detectors()) == 4
     for _, curve in curves["walk"]:

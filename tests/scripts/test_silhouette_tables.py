@@ -1,17 +1,11 @@
 """The tables of the silhouette paper at a small size."""
 
-from pathlib import Path
-
-import pytest
-
 from scripts import silhouette_tables
+from tests.conftest import development_capture
 
-CAPTURE = Path(__file__).parents[3] / "shared" / "captures" / "treadmill-slow"
 
-
-@pytest.mark.skipif(not CAPTURE.is_dir(), reason="../shared/captures/treadmill-slow is not there")
-def test_few_frames_of_the_treadmill_make_a_row_and_a_figure(tmp_path):
-    data = silhouette_tables.load(CAPTURE, ("cam3", "cam6", "cam1", "cam4"), 6)
+def test_a_few_frames_of_the_treadmill_make_a_row_and_a_figure(tmp_path):
+    data = silhouette_tables.load(development_capture("treadmill-slow"), ("cam3", "cam6", "cam1", "cam4"), 6)
     assert data.rig.names == ("cam3", "cam6", "cam1", "cam4")
     name, views, config = silhouette_tables.variants()[-2]
     row, joints = silhouette_tables.track(data, name, views, config)

@@ -148,7 +148,7 @@ def test_a_killed_causal_run_is_taken_up_and_equals_an_unbroken_one(
     assert_same(result, causal, slice(0, 6))
     ran = tk(*command, "--resume")
     assert ran.code == 0, ran.err
-    assert ran.told[0] == f"note: 6 of {FRAMES} frames are there already"
+    assert ran.messages[0] == f"note: 6 of {FRAMES} frames are there already"
     assert ran.err.splitlines()[-1].startswith(f"{FRAMES} frames in {result}, 0 lost")
     assert_same(result, causal)
     assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]  # the killed run's scraps are gone

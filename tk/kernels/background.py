@@ -24,11 +24,8 @@ STEPS_PER_OCTAVE = 8
 GREY = (29, 150, 77)
 """Weights of blue, green and red in the brightness (ITU-R BT.601, 256ths)."""
 
-BRIGHT, DARK = 1, 2
-"""Shades: brighter than the scene; darker than the scene is under the faintest shadow."""
-
 # The results' planes; labels after an even and after an odd number of iterations.
-DIFFERENCE, COLLINEARITY, SHADES, LABELS, SPARE = range(5)
+DIFFERENCE, COLLINEARITY, BRIGHT, LABELS, SPARE = range(5)
 PLANES = 5
 
 _MANTISSA_SHIFT = 20  # 23 bits of float32 mantissa less log2(STEPS_PER_OCTAVE)
@@ -96,20 +93,6 @@ def _clamped(dd: ti.f32, db: ti.f32, bb: ti.f32, shadow_min: ti.f32) -> ti.f32:
 
 
 @ti.func
-def _shade(plates: ti.template(), i: ti.i32, brighter: ti.f32, bright: ti.f32, dark: ti.f32, shadow_max: ti.f32):
-    """BRIGHT, DARK or 0 of a pixel whose window differs by ``brighter`` from the plate; ``i``: its first channel."""
-    scene = 0
-    for k in ti.static(range(3)):
-        scene += GREY[k] * ti.cast(plates[i + k], ti.i32)
-    shade = 0
-    if brighter > bright:
-        shade = BRIGHT
-    elif brighter < dark + (shadow_max - 1.0) * 9.0 * scene:
-        shade = DARK
-    return ti.cast(shade, ti.u8)
-
-
-@ti.func
 def _relabel(
     planes: ti.template(), open_pixels: ti.template(), begin: int, end: int, stride: int, per_neighbour: int,
     threshold: int, iterations: int,
@@ -136,7 +119,7 @@ def _label_kernel(
     open_pixels: ti.types.ndarray(dtype=ti.i32, ndim=1),  # [mosaic] pixels whose labels their neighbours can change
     # the frame
     precision: ti.types.ndarray(dtype=ti.f32, ndim=1),  # [C] 1 / noise variance
-    brightness: ti.types.ndarray(dtype=ti.f32, ndim=2),  # [C, 2] least of what is bright, and of the scene
+    bright_sum: ti.types.ndarray(dtype=ti.f32, ndim=1),  # [C] a larger sum of the brightness difference is bright
     boxes: ti.types.ndarray(dtype=ti.i32, ndim=2),  # [C, 6] left, top, width, height; left, top in the mosaic
     stride: ti.i32,  # of the mosaic
     height: ti.i32,
@@ -145,7 +128,6 @@ def _label_kernel(
     # settings
     offset_squared: ti.i32,
     shadow_min: ti.f32,
-    shadow_max: ti.f32,
     difference_min: ti.f32,  # noise variances, summed over the window
     threshold: ti.i32,  # level
     per_neighbour: ti.i32,  # levels
@@ -221,8 +203,7 @@ def _label_kernel(
                         if level > 0 and threshold - swing <= level < threshold + swing:
                             open_pixels[end] = i
                             end += 1
-                        brighter, bright, dark = ti.cast(sums[2], ti.f32), brightness[c, 0], brightness[c, 1]
-                        planes[SHADES * plane + i] = _shade(plates, 3 * pixel, brighter, bright, dark, shadow_max)
+                        planes[BRIGHT * plane + i] = ti.cast(ti.cast(sums[2], ti.f32) > bright_sum[c], ti.u8)
         _relabel(planes, open_pixels, begin, end, stride, per_neighbour, threshold, iterations)
 
 
@@ -235,7 +216,7 @@ class Statistic:
     Attributes:
         difference: level of ``|a - b|² / 2`` over 27 noise variances, 0 where it is below the least.
         collinearity: level of the clamped statistic over 27 noise variances, 0 where ``difference`` is.
-        shades: :data:`BRIGHT`, :data:`DARK` or 0 where ``difference`` is not 0.
+        bright: 1 where the image is brighter than the scene and ``difference`` is not 0, else 0.
         labels: 0 or 1.
     """
 
@@ -247,19 +228,18 @@ class Statistic:
         self._squares = np.zeros(cameras * 3 * (self._width + 2), np.int32)
         self._planes = np.zeros((PLANES, 0), np.uint8)
         self._launch: Launcher | None = None
-        self.difference, self.collinearity, self.shades, self.labels = (np.zeros((0, 0), np.uint8) for _ in range(4))
+        self.difference, self.collinearity, self.bright, self.labels = (np.zeros((0, 0), np.uint8) for _ in range(4))
 
     def measure(
         self,
         precision: NDArray[np.float32],
-        brightness: NDArray[np.float32],
+        bright_sum: NDArray[np.float32],
         boxes: NDArray[np.int32],
         corners: NDArray[np.int32],
         shape: tuple[int, int],
         *,
         darkness_offset: float,
         shadow_min: float,
-        shadow_max: float,
         difference_min: float,
         threshold: float,
         octaves_per_neighbour: float,
@@ -273,13 +253,13 @@ class Statistic:
 
         Args:
             precision: (C,) 1 / noise variance, grey levels⁻².
-            brightness: (C, 2) sums over a window of the difference in brightness (weights :data:`GREY`): that of the
-                least bright thing that the scene is not, and of the scene itself.
+            bright_sum: (C,) least sum over a window of the difference in brightness (weights :data:`GREY`) that is
+                brighter than the scene.
             boxes: (C, 4) left, top, width, height of what is measured, within the image; nothing else is labelled.
             corners: (C, 2) left, top of each box in the mosaic, a pixel or more from each other and the edge.
             shape: (height, width) of the mosaic.
             darkness_offset: the constant component, grey levels, > 0.
-            shadow_min, shadow_max: the darkest and the faintest shadow, as factors of the plate, in (0, 1].
+            shadow_min: the darkest shadow, as a factor of the plate, in (0, 1].
             difference_min: below this many noise variances of plain difference a pixel is background for certain.
         """
         ensure_runtime()
@@ -292,7 +272,7 @@ class Statistic:
         self._planes[:, :size] = 0
         self._launch(
             precision,
-            brightness,
+            bright_sum,
             np.concatenate([boxes, corners], axis=1),
             shape[1],
             self._height,
@@ -300,12 +280,11 @@ class Statistic:
             self._spread,
             max(round(darkness_offset**2), 1),
             shadow_min,
-            shadow_max,
             54.0 * difference_min,
             level_of(threshold),
             round(octaves_per_neighbour * STEPS_PER_OCTAVE),
             iterations,
         )
         planes = self._planes[:, :size].reshape(PLANES, *shape)
-        self.difference, self.collinearity, self.shades = planes[:LABELS]
+        self.difference, self.collinearity, self.bright = planes[:LABELS]
         self.labels = planes[LABELS + iterations % 2]

@@ -100,8 +100,9 @@ def _labeller(setup: Setup, source: Source, settings: Settings, note: Callable[[
 
 def _learn(setup: Setup, settings: Settings, clips: Sequence[NDArray[np.uint8]]) -> Foreground:
     sizes = [(camera.width, camera.height) for camera in setup.rig]
-    learner = CollinearityForeground if settings.segmentation == "collinearity" else Mog2Foreground
-    return learner.learn(clips, setup.rig.frame_shape, sizes, settings.foreground)
+    if settings.segmentation == "mog2":
+        return Mog2Foreground.learn(clips, setup.rig.frame_shape, sizes)
+    return CollinearityForeground.learn(clips, setup.rig.frame_shape, sizes, settings.foreground)
 
 
 def _learn_median(setup: Setup, source: Source, settings: Settings, note: Callable[[str], None]) -> Foreground:
@@ -116,7 +117,7 @@ def _learn_median(setup: Setup, source: Source, settings: Settings, note: Callab
     with source.frames() as frames:
         samples = [frame.images.copy() for frame in frames if frame.index % step == 0]
     foreground = _learn(setup, settings, median_plate(samples, [(c.width, c.height) for c in setup.rig]))
-    masks = np.array([foreground.segment(images) for images in samples]) > 0  # (K, C, H, W)
+    masks = np.array([foreground.label(images)[0] for images in samples]) > 0  # (K, C, H, W)
     from tk.model.hull.coarse import CoarseHull  # SciPy
 
     hull = CoarseHull(setup.rig, setup.volume)

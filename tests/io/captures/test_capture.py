@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.conftest import development_capture
 from tests.io.conftest import (
     CENTER,
     HEIGHT,
@@ -22,8 +23,6 @@ from tests.io.conftest import (
 )
 from tk.errors import CalibrationError, CaptureError, VideoError, VolumeError
 from tk.io.captures.capture import FrameReader, open_capture
-
-SHARED = Path(__file__).parents[4] / "shared" / "captures"
 
 
 def one_line(error: BaseException, *parts: str) -> None:
@@ -366,7 +365,6 @@ def test_no_volume_and_none_to_infer(make_capture: MakeCapture) -> None:
 # -------------------------------------------------------------------------------------------------- shared captures
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="needs the development captures in ../shared/captures")
 @pytest.mark.parametrize(
     ("name", "cameras", "frames", "masks", "background"),
     [
@@ -378,8 +376,10 @@ def test_no_volume_and_none_to_infer(make_capture: MakeCapture) -> None:
         ("balance", 4, 100, False, 1),
     ],
 )
-def test_shared_captures(name: str, cameras: int, frames: int, masks: bool, background: int | None) -> None:
-    capture = open_capture(SHARED / name)
+def test_development_captures_open_without_warnings(
+    name: str, cameras: int, frames: int, masks: bool, background: int | None
+) -> None:
+    capture = open_capture(development_capture(name))
     assert (capture.name, len(capture.rig), capture.frame_count) == (name, cameras, frames)
     assert capture.has_masks is masks and capture.warnings == ()
     empty = capture.background()
@@ -388,7 +388,7 @@ def test_shared_captures(name: str, cameras: int, frames: int, masks: bool, back
         frame_sets = list(reader)
     assert [frame_set.index for frame_set in frame_sets] == [3, 4]
     for camera, image in zip(capture.rig, frame_sets[0].images, strict=True):
-        assert image[: camera.height, : camera.width].std() > 10  # a picture, not a blank
+        assert image[: camera.height, : camera.width].std() > 10  # the image is not blank
     if masks:
         assert frame_sets[0].masks is not None
         share = (frame_sets[0].masks == 255).mean(axis=(1, 2))

@@ -15,7 +15,7 @@ from tk.io.captures.mask_store import MaskStore
 
 @given(masks=array_shapes(min_dims=3, max_dims=3, max_side=13).flatmap(lambda s: arrays(np.uint8, s)))
 @settings(max_examples=60, deadline=None)
-def test_masks_come_back_as_person_and_background(masks):
+def test_stored_masks_are_returned_as_0_and_255(masks):
     store = MaskStore()
     store.put(7, masks)
     found = store.get(7)
@@ -27,7 +27,7 @@ def test_masks_come_back_as_person_and_background(masks):
 
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=20, deadline=None)
-def test_frames_are_a_sequence_in_the_order_that_was_asked_for(seed):
+def test_a_sequence_of_frames_has_the_requested_order(seed):
     rng = np.random.default_rng(seed)
     store, masks = MaskStore(), {}
     for index in rng.permutation(20)[:6].tolist():
@@ -48,21 +48,21 @@ def test_frames_are_a_sequence_in_the_order_that_was_asked_for(seed):
         frames[6]
 
 
-def test_silhouettes_take_little_memory():
+def test_a_frame_of_silhouettes_takes_less_than_ten_kilobytes(tmp_path):
     masks = np.zeros((5, 480, 640), np.uint8)
     masks[:, 100:400, 250:350] = 255
-    store = MaskStore()
+    store = MaskStore(tmp_path / "masks")
     for index in range(10):
         store.put(index, masks)
-    assert sum(size for _, size in store._places.values()) < 10 * 10_000
+    assert (tmp_path / "masks").stat().st_size < 10 * 10_000
 
 
-def test_a_frame_that_was_not_put_is_told():
+def test_a_frame_that_was_not_stored_is_a_key_error():
     with pytest.raises(KeyError):
         MaskStore().get(0)
 
 
-def test_those_of_a_long_recording_are_on_disk(monkeypatch, tmp_path):
+def test_masks_beyond_the_memory_limit_go_to_an_unnamed_file(monkeypatch, tmp_path):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(mask_store, "IN_MEMORY", 2000)
     rng = np.random.default_rng(0)
@@ -70,13 +70,13 @@ def test_those_of_a_long_recording_are_on_disk(monkeypatch, tmp_path):
     store = MaskStore()
     for index, frame in enumerate(masks):
         store.put(index, frame)
-    assert store._opened._rolled, "a file by now"
+    assert store._opened._rolled, "on disk now"
     for index in (11, 0, 5):
         np.testing.assert_array_equal(store.get(index), masks[index])
-    assert list(tmp_path.iterdir()) == [], "without a name"
+    assert list(tmp_path.iterdir()) == [], "the file has no name"
 
 
-def test_a_full_disk_is_one_line(monkeypatch, tmp_path):
+def test_a_full_disk_is_reported_in_one_line(monkeypatch, tmp_path):
     def full(_):
         raise OSError(28, "No space left on device")
 
@@ -92,13 +92,13 @@ def test_a_full_disk_is_one_line(monkeypatch, tmp_path):
 
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=40, deadline=None)
-def test_a_run_that_was_killed_is_taken_up(seed, tmp_path_factory):
-    """However its file was damaged: what is there is right."""
+def test_masks_of_a_killed_run_are_read_up_to_the_damage(seed, tmp_path_factory):
+    """Whatever the damage, the masks that are read are right."""
     rng = np.random.default_rng(seed)
     path = tmp_path_factory.mktemp("run") / ".r.h5.masks"
     masks = (rng.random((6, 2, 7, 9)) < 0.5).astype(np.uint8) * 255
     store = MaskStore(path)
-    assert not path.exists(), "made with the first of them"
+    assert not path.exists(), "the first put creates it"
     for index, frame in enumerate(masks):
         store.put(index, frame)
     whole = MaskStore(path, resume=True)
@@ -115,4 +115,4 @@ def test_a_run_that_was_killed_is_taken_up(seed, tmp_path_factory):
     after.put(5, masks[5])
     np.testing.assert_array_equal(MaskStore(path, resume=True).get(5), masks[5])
     MaskStore(path).put(0, masks[0])
-    assert 5 not in MaskStore(path, resume=True), "a run that starts afresh"
+    assert 5 not in MaskStore(path, resume=True), "without resume the file is overwritten"

@@ -1,7 +1,6 @@
 """The visual hull of synthetic rigs and shared captures against a brute-force projection hull."""
 
 import os
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.conftest import development_capture
 from tk.errors import ConfigError, VolumeError
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.volume import Volume, VoxelGrid
@@ -352,16 +352,13 @@ def test_the_oldest_tables_go_first(tmp_path, monkeypatch):
 
 # --- shared captures -----------------------------------------------------------------------------------------------
 
-CAPTURES = Path(__file__).resolve().parents[4] / "shared" / "captures"
-
 
 @pytest.mark.parametrize("name", ["walk", "dance"])
-@pytest.mark.skipif(not CAPTURES.is_dir(), reason="needs the development captures beside the repository")
-def test_a_person_is_followed_exactly(name):
-    """Twenty frames of exact masks: followed equals from scratch, voxel for voxel; a person's volume at the end."""
+def test_incremental_hull_of_exact_masks_equals_the_hull_from_scratch(name):
+    """For twenty frames, voxel for voxel; and the volume is a person's."""
     from scripts import bench_hull
 
-    capture = bench_hull.load_masks(CAPTURES / name, range(20, 40))
+    capture = bench_hull.load_masks(development_capture(name), range(20, 40))
     grid = VoxelGrid.cover(capture.volume, 64)
     followed = VisualHull(capture.rig, grid)
     anew = VisualHull(capture.rig, grid)

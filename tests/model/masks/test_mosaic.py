@@ -1,4 +1,4 @@
-"""Boxes side by side: what goes in comes out, and nothing touches."""
+"""Boxes side by side in one image: contents are preserved and boxes do not touch."""
 
 import cv2
 import numpy as np
@@ -23,7 +23,7 @@ def boxes(draw):
 
 @settings(deadline=None, max_examples=50)
 @given(boxes=boxes(), gap=st.integers(1, 5), factor=st.integers(1, 3))
-def test_parts_and_crops_have_the_boxes_size_and_do_not_touch(boxes, gap, factor):
+def test_boxes_in_a_mosaic_have_their_size_and_do_not_touch(boxes, gap, factor):
     mosaic = Mosaic.of(boxes, gap).enlarged(factor)
     picture = np.arange(factor * HEIGHT * factor * WIDTH).reshape(factor * HEIGHT, factor * WIDTH) + 1
     whole = np.zeros(mosaic.shape, int)
@@ -37,7 +37,7 @@ def test_parts_and_crops_have_the_boxes_size_and_do_not_touch(boxes, gap, factor
         np.testing.assert_array_equal(mosaic.part(whole, c), mosaic.crop(picture, c))
 
 
-def test_tightened_boxes_hold_what_is_set_and_a_margin():
+def test_tightened_boxes_hold_the_set_pixels_and_a_margin():
     mosaic = Mosaic.of(np.array([[4, 2, 20, 15], [0, 0, 0, 0], [0, 0, 30, 20]], np.int32), 2)
     marks = np.zeros(mosaic.shape, np.uint8)
     mosaic.part(marks, 0)[1, 6:9] = 1
@@ -47,6 +47,6 @@ def test_tightened_boxes_hold_what_is_set_and_a_margin():
     assert part.shape == (5, 9) and part.sum() == 3 and part[1, 3:6].all()
 
 
-def test_a_doubled_picture_has_each_pixel_four_times():
+def test_doubled_repeats_each_pixel_four_times():
     picture = np.arange(35, dtype=np.uint8).reshape(5, 7) * 7
     np.testing.assert_array_equal(doubled(picture), picture.repeat(2, axis=0).repeat(2, axis=1))

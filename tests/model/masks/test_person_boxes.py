@@ -1,4 +1,4 @@
-"""The coarse look: a box about the person, wherever the clutter flickers."""
+"""Boxes around the person, with noise elsewhere in the image."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ MARGIN = 20  # of the 240 rows
 
 
 def look(change, shape=SHAPE):
-    """The box in a picture of an even scene, after ``change``."""
+    """Return the box in an image of an even scene after ``change``."""
     plate = np.full((1, *shape, 3), 120, np.uint8)
     picture = plate.copy()
     change(picture[0])
@@ -23,11 +23,11 @@ def person(picture):
     picture[PERSON] = (30, 30, 200)
 
 
-ABOUT_THE_PERSON = [120 - MARGIN, 60 - MARGIN, 50 + 2 * MARGIN, 140 + 2 * MARGIN]
+AROUND_THE_PERSON = [120 - MARGIN, 60 - MARGIN, 50 + 2 * MARGIN, 140 + 2 * MARGIN]
 
 
-def test_the_box_is_about_the_person():
-    assert look(person) == ABOUT_THE_PERSON
+def test_the_box_is_around_the_person():
+    assert look(person) == AROUND_THE_PERSON
 
 
 def test_an_empty_scene_and_a_shadow_have_no_box():
@@ -37,24 +37,24 @@ def test_an_empty_scene_and_a_shadow_have_no_box():
     assert look(lambda picture: None) == [0, 0, 0, 0] == look(shadow)
 
 
-def test_small_things_far_away_are_left_out():
+def test_small_regions_far_away_are_ignored():
     def flicker(picture):
         person(picture)
         picture[20:26, 20:26] = 180
         picture[220:226, 300:306] = 180
 
-    assert look(flicker) == ABOUT_THE_PERSON
+    assert look(flicker) == AROUND_THE_PERSON
 
 
 @pytest.mark.parametrize("at, size", [((100, 260), 16), ((100, 180), 6)], ids=["a hand far away", "a finger close by"])
-def test_a_hand_beyond_a_sleeve_that_is_not_seen_is_held(at, size):
+def test_the_box_holds_a_hand_beyond_an_invisible_sleeve(at, size):
     def hand(picture):
         person(picture)
         picture[at[0] : at[0] + size, at[1] : at[1] + size] = (120, 150, 220)
 
     left, _, width, _ = look(hand)
-    assert left == ABOUT_THE_PERSON[0] and left + width == at[1] + size + MARGIN
+    assert left == AROUND_THE_PERSON[0] and left + width == at[1] + size + MARGIN
 
 
-def test_sizes_that_are_no_multiple_of_a_cell():
-    assert look(person, (243, 322)) == ABOUT_THE_PERSON
+def test_image_sizes_that_are_no_multiple_of_a_cell():
+    assert look(person, (243, 322)) == AROUND_THE_PERSON

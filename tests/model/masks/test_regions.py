@@ -1,10 +1,10 @@
-"""Decisions on label pictures, on drawings small enough to see the answer."""
+"""Decisions on label images, on drawings small enough to know the answer."""
 
 import numpy as np
 import pytest
 
 from tk.kernels.background import level_of
-from tk.model.masks.regions import beyond_shadows, enclosed, joined, trim_rim, without_penumbrae
+from tk.model.masks.regions import enclosed, person_parts, trim_rim, without_penumbrae
 
 SHAPE = (40, 60)
 
@@ -20,12 +20,11 @@ def levels(mask, value):
     return np.where(mask, level_of(value), 0).astype(np.uint8)
 
 
-def join(mask, seen, statistic, reach=20.0, starts=(0,), hole=0.0):
-    person = joined(mask, seen, statistic, np.array(starts), seed=64.0, least=20, hole=hole, reach=reach, width=4)
-    return person.view(np.bool_)
+def parts(mask, statistic, starts=(0,), area_min=20.0):
+    return person_parts(mask, statistic, np.array(starts), 64.0, area_min).view(np.bool_)
 
 
-def test_edges_of_shadows_are_unsure_and_sharp_outlines_certain():
+def test_shadow_edges_are_removed_and_sharp_outlines_kept():
     labels = boxes((slice(5, 7), slice(5, 50)))
     difference = boxes((slice(5, 20), slice(5, 50)))
     plain = levels(difference, 200.0)
@@ -34,70 +33,45 @@ def test_edges_of_shadows_are_unsure_and_sharp_outlines_certain():
 
 
 @pytest.mark.parametrize("statistic, is_certain", [(4.0, False), (20.0, True)])
-def test_a_thick_region_is_certain_where_it_is_strong(statistic, is_certain):
+def test_a_thick_region_is_kept_where_its_statistic_is_strong(statistic, is_certain):
     labels = boxes((slice(5, 20), slice(5, 50)))
     certain = without_penumbrae(labels, levels(labels, 500.0), levels(labels, statistic), 0.2, 8.0)
     assert certain.any() == is_certain
 
 
-def test_a_faint_sleeve_is_no_shadow_and_a_dark_one_may_be():
-    hand = boxes((slice(10, 20), slice(40, 50)))
-    sleeve = boxes((slice(10, 20), slice(30, 40)))
-    assert np.array_equal(beyond_shadows(sleeve, hand, np.zeros(SHAPE, bool), 9, 0.2), sleeve)
-    assert not beyond_shadows(sleeve, hand, sleeve, 9, 0.2).any()
-    assert not beyond_shadows(sleeve, np.zeros(SHAPE, bool), np.zeros(SHAPE, bool), 9, 0.2).any()
-
-
-def test_enclosure_counts_the_border():
+def test_enclosed_compares_shares_of_the_border():
     patch = boxes((slice(10, 20), slice(10, 20)))
     three_sides = boxes((slice(7, 23), slice(7, 20))) & ~patch
     assert np.array_equal(enclosed(patch, three_sides, 0.6), patch)
     assert not enclosed(patch, three_sides, 0.9).any()
 
 
-def test_a_hand_is_joined_through_what_differs_only():
-    body = boxes((slice(10, 30), slice(5, 20)))
-    hand = boxes((slice(18, 24), slice(36, 44)))
-    arm = boxes((slice(18, 24), slice(20, 36)))
-    strong = levels(body | hand, 100.0)
-    bridged = join(body | hand, arm, strong)
-    assert bridged[21, 20:36].all() and not (bridged & ~(body | hand | arm)).any()
-    for seen, reach in ((arm & False, 20.0), (arm, 10.0)):
-        np.testing.assert_array_equal(join(body | hand, seen, strong, reach), body | hand)
-
-
-def test_pictures_side_by_side_are_not_joined():
-    """Each has a largest part of its own, which stays however weak it is."""
+def test_the_largest_part_of_each_image_is_kept_however_weak_it_is():
     body, other = boxes((slice(10, 30), slice(5, 20))), boxes((slice(18, 28), slice(26, 36)))
-    seen = boxes((slice(0, 40), slice(0, 60)))
-    mask = body | other
-    np.testing.assert_array_equal(join(mask, seen, levels(body, 100.0), starts=(0, 22)), mask)
-    np.testing.assert_array_equal(join(mask, seen, levels(body, 100.0)), body)
-    assert join(mask, seen, levels(mask, 100.0)).sum() > mask.sum()
-    np.testing.assert_array_equal(join(mask, seen, levels(mask, 100.0), starts=(0, 22)), mask)
+    strong = levels(body, 100.0)
+    np.testing.assert_array_equal(parts(body | other, strong, starts=(0, 22)), body | other)
+    np.testing.assert_array_equal(parts(body | other, strong), body)
 
 
-def test_weak_parts_go_but_never_the_largest():
+def test_a_weak_smaller_part_is_removed_and_a_strong_one_kept():
     body, edge = boxes((slice(10, 30), slice(5, 20))), boxes((slice(33, 36), slice(30, 50)))
-    weak = levels(body | edge, 10.0)
-    np.testing.assert_array_equal(join(body | edge, body, weak, 5.0), body)
-    strong = levels(body | edge, 100.0)
-    np.testing.assert_array_equal(join(body | edge, body, strong, 5.0), body | edge)
+    np.testing.assert_array_equal(parts(body | edge, levels(body | edge, 10.0)), body)
+    np.testing.assert_array_equal(parts(body | edge, levels(body | edge, 100.0)), body | edge)
 
 
-def test_specks_go_and_small_holes_close_as_the_parts_are_joined():
+def test_small_parts_are_removed_and_small_holes_filled():
     body, hole, speck = (boxes(at) for at in ((slice(5, 35), slice(5, 30)), (slice(12, 15), slice(10, 14)), (2, 50)))
     mask = (body & ~hole) | speck
     strong = levels(mask, 100.0)
-    np.testing.assert_array_equal(join(mask, mask, strong, hole=13), body)
-    np.testing.assert_array_equal(join(mask, mask, strong, hole=12), body & ~hole)
+    np.testing.assert_array_equal(parts(mask, strong, area_min=13), body)
+    np.testing.assert_array_equal(parts(mask, strong, area_min=12), body & ~hole)
 
 
-def test_the_rim_goes_where_it_shows_the_scene():
+def test_rim_pixels_that_show_the_scene_are_removed():
     person = boxes((slice(10, 30), slice(10, 40)))
     swollen = boxes((slice(7, 33), slice(7, 43)))
     contrast = np.where(person, 80, 2).astype(np.uint8)
     np.testing.assert_array_equal(trim_rim(swollen.view(np.uint8), contrast, 0.3, 4), person)
-    # a dark patch inside is no rim
+    # pixels without contrast deep inside are kept
     contrast[18:22, 20:30] = 0
     np.testing.assert_array_equal(trim_rim(swollen.view(np.uint8), contrast, 0.3, 4), person)

@@ -1,8 +1,7 @@
-"""A coarse look at whole pictures: boxes that hold the person, so that all else happens in them.
+"""Find a box around the person in each image, quickly and coarsely, so that the exact test runs only there.
 
-Its pixels are two of the reduced pictures that are tested each way. What is brighter than the scene, darker than a
-shadow makes it, or of another colour counts. A person is in one piece, or nearly; what lies apart from the largest
-thing and is much smaller is what coding makes of clutter.
+The search runs on images reduced once more by two. Pixels count if they are brighter than the scene, darker than a
+shadow or of another colour. Regions that are far from the largest one and much smaller are coding noise.
 """
 
 from __future__ import annotations
@@ -13,27 +12,33 @@ from numpy.typing import NDArray
 
 from tk.model.masks.background import Images, reduced
 
-_NOISE = 3.0  # deviations of a reduced pixel by which a coarse one differs
-_WHOLE = 128  # shares of the scene's light are counted in so many parts, to fit a byte
-_CROWD = 4  # of a coarse pixel and its eight neighbours, how many differ: fewer are noise
-# Coarse pixels that are one cell each way. Things in cells that touch, or with one cell between them, are one thing.
+_DEVIATIONS = 3.0  # a coarse pixel differs from the scene by this many standard deviations of a reduced pixel's noise
+_WHOLE = 128  # fixed-point value of the share 1 of the scene's light, so that twice the light fits into a byte
+_CROWD = 4  # of nine neighbouring coarse pixels, the number that must differ; without it boxes are larger, masks equal
+# Side of a cell in coarse pixels. Regions in cells that touch, or are one cell apart, are one region. It sets how far a
+# hand may be from the body; sensitivity not measured.
 _CELL = 4
-# A thing is left out that has less than this share of the largest one's pixels. A hand beyond a sleeve that cannot be
-# seen has more. Measured: the masks of 225 sets of pictures of four rendered captures are those of boxes about
-# everything; with a share of 0.1 nothing is cut off either.
+# Regions with a smaller share of the largest region's pixels are ignored. From 0 to 0.1 the masks of seven captures are
+# equal; with 0 the boxes are larger and segmentation slower.
 _SHARE = 0.02
-# The margin about them, share of the picture's height. The boxes of 535 pictures of five rendered captures cut nothing
-# off with 20 of 240 pixels, a hand in five of them with 12.
+# Margin of a box, share of the image height. In 535 images of five rendered captures a margin of 20 of 240 pixels cuts
+# nothing off; one of 12 pixels cuts a hand off in five of them.
 _MARGIN = 0.085
 
 _SQUARE3 = np.ones((3, 3), np.uint8)
 
 
 class PersonBoxes:
-    """Where to look in the pictures of a rig."""
+    """Finds the boxes in the images of a rig."""
 
     def __init__(self, plates: Images, shadow_min: float, height: int) -> None:
-        """Reduced plates (C, h, w, 3); the darkest shadow, a share of the scene; the reduced pictures' usual height."""
+        """Prepare buffers.
+
+        Args:
+            plates: (C, h, w, 3), the reduced empty scene.
+            shadow_min: darkest shadow, share of the lit scene.
+            height: image height that the margin refers to, reduced pixels.
+        """
         self._plates = reduced(plates, 2)
         self._scenes = np.empty_like(self._plates)
         darkest = self._plates.min(axis=3)
@@ -41,28 +46,28 @@ class PersonBoxes:
         self._shadow_min = shadow_min
         self._margin = round(_MARGIN * height)
 
-    def boxes(self, pictures: Images, gains: NDArray[np.float32], noise: NDArray[np.float32]) -> NDArray[np.int32]:
-        """(C, 4) left, top, width, height of the boxes in reduced pictures (C, h, w, 3); all 0 where there is nothing.
+    def boxes(self, images: Images, gains: NDArray[np.float32], noise: NDArray[np.float32]) -> NDArray[np.int32]:
+        """Return the boxes (C, 4): left, top, width, height in reduced pixels; all 0 where nothing differs.
 
         Args:
-            pictures: reduced.
-            gains: (C, 3) of the pictures against the plates.
-            noise: (C,) variance, grey levels².
+            images: (C, h, w, 3), reduced.
+            gains: (C, 3), gain of the images relative to the plates.
+            noise: (C,), variance in grey levels².
         """
-        coarse = reduced(pictures, 2)
+        coarse = reduced(images, 2)
         count, height, width = coarse.shape[:3]
         for plate, gain, scene in zip(self._plates, gains, self._scenes, strict=True):
             cv2.transform(plate, np.diag(gain), dst=scene)
-        # one below the other they are one picture
+        # stacked vertically, the images of all cameras are one image
         tall, scenes = coarse.reshape(-1, width, 3), self._scenes.reshape(-1, width, 3)
         shaded = cv2.convertScaleAbs(scenes, alpha=self._shadow_min)
-        # a shadow leaves the same share of every colour
+        # a shadow scales all colours by the same factor
         blue, green, red = cv2.split(cv2.divide(tall, scenes, scale=_WHOLE))
         uneven = cv2.subtract(cv2.max(cv2.max(blue, green), red), cv2.min(cv2.min(blue, green), red))
         tinted = cv2.multiply(uneven, self._darkest, scale=1 / _WHOLE)
         blue, green, red = cv2.split(cv2.max(cv2.subtract(tall, scenes), cv2.subtract(shaded, tall)))
         beyond = np.asarray(cv2.max(cv2.max(blue, green), cv2.max(red, tinted)), np.uint8).reshape(count, -1)
-        least = (_NOISE * np.sqrt(noise)).astype(np.uint8)
+        least = (_DEVIATIONS * np.sqrt(noise)).astype(np.uint8)
         differs = (beyond > least[:, None]).reshape(-1, width).view(np.uint8)
         crowd = cv2.boxFilter(differs, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
         differs &= crowd >= _CROWD
@@ -70,8 +75,8 @@ class PersonBoxes:
             differs, -1, (_CELL, _CELL), anchor=(0, 0), normalize=False, borderType=cv2.BORDER_CONSTANT
         ).reshape(count, height, width)[:, ::_CELL, ::_CELL]
         boxes = np.zeros((count, 4), np.int32)
-        for c, picture in enumerate(differs.reshape(count, height, width)):
-            x, y, w, h = (2 * n for n in _largest(picture, cells[c]))
+        for c, mask in enumerate(differs.reshape(count, height, width)):
+            x, y, w, h = (2 * n for n in _largest(mask, cells[c]))
             if w > 0:
                 left, top = max(x - self._margin, 0), max(y - self._margin, 0)
                 right, bottom = min(x + w + self._margin, 2 * width), min(y + h + self._margin, 2 * height)
@@ -80,15 +85,17 @@ class PersonBoxes:
 
 
 def _largest(differs: Images, cells: Images) -> tuple[int, ...]:
-    """Left, top, width, height of the largest thing in a coarse picture (h, w) of 0 and 1, and of all that is not much
-    smaller; zeros where there is nothing. ``cells``: how many pixels of each cell differ."""
+    """Return left, top, width, height of the box around all large regions; zeros if there is none.
+
+    ``differs`` (h, w) is 0 or 1; ``cells`` counts the pixels of each cell that differ.
+    """
     grown = cv2.dilate(np.minimum(cells, 1), _SQUARE3)
-    things, numbers = cv2.connectedComponents(grown)
-    if things <= 2:  # the scene, and one
+    count, regions = cv2.connectedComponents(grown)
+    if count <= 2:  # the scene and one region
         return tuple(cv2.boundingRect(differs))
-    sizes = np.bincount(np.asarray(numbers).ravel(), weights=cells.ravel(), minlength=things)
+    sizes = np.bincount(np.asarray(regions).ravel(), weights=cells.ravel(), minlength=count)
     large = sizes >= _SHARE * sizes.max()
     large[0] = False
-    left, top, width, height = (_CELL * n for n in cv2.boundingRect(large[numbers].view(np.uint8)))
+    left, top, width, height = (_CELL * n for n in cv2.boundingRect(large[regions].view(np.uint8)))
     x, y, w, h = cv2.boundingRect(differs[top : top + height, left : left + width])
     return x + left, y + top, w, h
