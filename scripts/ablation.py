@@ -1,9 +1,9 @@
-"""What each part of the volumetric tracker is worth: mean joint error with one thing changed at a time.
+"""Ablation of the volumetric tracker: mean joint error with one part changed at a time.
 
     python -m scripts.ablation CAPTURE [CAPTURE ...] --seeds 2
 
-The masks are made once a capture, from the videos; every row then tracks the whole capture, body fit
-included, with each seed. Prints a Markdown table.
+Each capture is segmented once, from its videos. Every row then tracks the whole capture with each seed, including the
+body fit. Prints a Markdown table.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Changes = dict[str, dict[str, Any]]
 
 VOLUMETRIC = "tk.trackers.volumetric"
 
-# label; what differs from the defaults: settings by their table, constants under the module that holds them
+# label; changes relative to the defaults: settings by their table, constants by their module
 ROWS: tuple[tuple[str, Changes], ...] = (
     ("defaults", {}),
     ("no coverage (data to model)", {"objective": {"coverage_weight": 0.0}}),
@@ -47,16 +47,16 @@ ROWS: tuple[tuple[str, Changes], ...] = (
     ),
     ("no prediction", {"tracking": {"prediction": 0.0}}),
     ("no waist", {"body": {"waist": False}}),
-    ("no other places of the limbs looked at", {"silhouette": {"search_every": 0}}),
+    ("no limb search", {"silhouette": {"search_every": 0}}),
     ("no colour edges", {"contours": {"edge_weight": 0.0}}),
-    ("colours ignored", {"appearance": {"enabled": False}}),
+    ("no colours", {"appearance": {"enabled": False}}),
     ("shoulders do not rise with the arms", {"tk.model.body.skeleton": {"RAISED_SHOULDERS": 0.0}}),
-    ("parts may enter each other", {"tk.model.cues.objective": {"BARRED": np.zeros_like(BARRED)}}),
+    ("no penalty for penetration of parts", {"tk.model.cues.objective": {"BARRED": np.zeros_like(BARRED)}}),
 )
 
 
 class Recorded:
-    """A capture in memory: pictures, masks from the videos, truth."""
+    """A capture in memory: images, masks from the videos, ground truth."""
 
     def __init__(self, path: Path) -> None:
         self.capture: Capture = open_capture(path, None, "none")
@@ -69,7 +69,7 @@ class Recorded:
         self.truth = read_joints(path / "truth.h5").positions
 
     def error(self, config: Settings) -> tuple[NDArray[np.float64], int]:
-        """(F, 15) distances from the truth, metres, and how many frames said lost."""
+        """Track with these settings; return the joint errors (F, 15), metres, and the number of lost frames."""
         tracker = VolumetricTracker(self.capture.rig, self.capture.volume, self.capture.up, config)
         tracker.start(self.frames[: tracker.opening_frames], self.capture.subject_height_m, None)
         found = [tracker.step(frame) for frame in self.frames]
@@ -79,7 +79,7 @@ class Recorded:
 
 @contextmanager
 def changed(changes: Changes) -> Iterator[Settings]:
-    """The configuration with changes; and, for the row, other constants."""
+    """Yield the settings with changes; constants are changed until the end of the block."""
     config = Settings()
     with ExitStack() as stack:
         for place, values in changes.items():
@@ -95,7 +95,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("captures", nargs="+", type=Path)
     parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--rows", nargs="*", type=int, help="numbers of the rows to run; all by default")
+    parser.add_argument("--rows", nargs="*", type=int, help="numbers of the rows to run [default: all]")
     options = parser.parse_args(arguments)
     recorded = [Recorded(path) for path in options.captures]
     print("| | " + " | ".join(f"{r.capture.name}: mean (seeds) [cm], lost" for r in recorded) + " | mean |")

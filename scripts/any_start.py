@@ -1,11 +1,11 @@
-"""What a start without the initialisation pose costs.
+"""Compare the accuracy with and without an initialisation pose.
 
     python -m scripts.any_start CAPTURE… [--from 22] [--masks none] [--work DIR]
 
-Each capture opens with the initialisation pose and has a ``truth.h5``. It is tracked as it is; then from frame
-``--from`` on with ``pose = "any"``, so that the initialisation pose is never shown; in this way once more without the
-person's height; and once from 2D keypoints of that frame (the true joints with noise of 5 px, one in ten anywhere).
-All are compared with the truth over the same frames: the mean distance of all joints as they are.
+Each capture begins with the initialisation pose and has a ``truth.h5``. It is tracked four times: as it is; from frame
+``--from`` with ``pose = "any"``, so that the initialisation pose is not visible; the same without the person's height;
+and from 2D keypoints of that frame (true joints with noise of 5 px, one in ten at a random place). The table shows the
+mean distance of all joints from the ground truth over the same frames, cm; lower is better.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from tk.run.session import track
 from tk.settings import Settings
 
 FROM = 22
-"""The development captures hold the initialisation pose for 10 frames and leave it during the 12 that follow."""
+"""The development captures show the initialisation pose for 10 frames and leave it in the next 12."""
 
 
 STARTS = ("normal", "cut", "cut, no height", "cut, keypoints")
 
 
 class Quiet:
-    """A reporter that keeps what is said."""
+    """A reporter that records the notes."""
 
     def __init__(self) -> None:
-        self.said: list[str] = []
+        self.notes: list[str] = []
 
     def note(self, text: str) -> None:
-        self.said.append(text)
+        self.notes.append(text)
 
     def begin(self, total: int, done: int) -> None:
         pass
@@ -49,15 +49,15 @@ class Quiet:
 
 
 def starts(capture: Capture, keypoints: Path) -> dict[str, Capture]:
-    """The capture as it is, and as those that nobody stands still for."""
+    """Return the capture by name of its start."""
     cut = replace(capture, init_pose="any")
     unmeasured = replace(cut, subject_height_m=None)
-    told = replace(unmeasured, init_keypoints=keypoints)
-    return {"normal": capture, "cut": cut, "cut, no height": unmeasured, "cut, keypoints": told}
+    with_keypoints = replace(unmeasured, init_keypoints=keypoints)
+    return {"normal": capture, "cut": cut, "cut, no height": unmeasured, "cut, keypoints": with_keypoints}
 
 
 def compare(capture: Capture, begin: int, work: Path, names: Sequence[str]) -> Iterator[str]:
-    """A line a start, of those that are named."""
+    """Yield a line of the table for each named start."""
     truth = read_joints(capture.path / "truth.h5")
     rows = {int(frame): row for row, frame in enumerate(truth.frames)}
     keypoints = work / f"{capture.name}-keypoints"
@@ -66,9 +66,9 @@ def compare(capture: Capture, begin: int, work: Path, names: Sequence[str]) -> I
     for name, started in starts(capture, keypoints).items():
         if name not in names:
             continue
-        said = Quiet()
+        reporter = Quiet()
         output = work / f"{capture.name}-{name.replace(', ', '-').replace(' ', '-')}.h5"
-        track(started, output, Settings(), said, frames=(0 if name == "normal" else begin, None), force=True)
+        track(started, output, Settings(), reporter, frames=(0 if name == "normal" else begin, None), force=True)
         result = read_result(output)
         kept = result.frames >= begin
         expected = truth.positions[[rows[int(frame)] for frame in result.frames[kept]]]
@@ -77,20 +77,20 @@ def compare(capture: Capture, begin: int, work: Path, names: Sequence[str]) -> I
         bad = int((tracked & (cm.mean(axis=1) > 100 * OFF_M)).sum())
         yield (
             f"{capture.name:16} {name:15} {cm.mean():6.2f} {cm.mean(axis=1).max():6.2f} {(~tracked).sum():4}/"
-            f"{len(tracked):<4} {bad:4}  {' | '.join(said.said)}"
+            f"{len(tracked):<4} {bad:4}  {' | '.join(reporter.notes)}"
         )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Track and print the table."""
+    """Track the captures and print the table."""
     parser = argparse.ArgumentParser(prog="python -m scripts.any_start", description=__doc__.splitlines()[0])
     parser.add_argument("captures", type=Path, nargs="+", metavar="CAPTURE")
-    parser.add_argument("--from", type=int, default=FROM, dest="begin", help="first frame that is shown")
+    parser.add_argument("--from", type=int, default=FROM, dest="begin", help="first frame of the cut captures")
     parser.add_argument("--only", default=";".join(STARTS), help=f"some of {'; '.join(STARTS)}")
-    parser.add_argument("--masks", default="none", help="as tk track has it")
-    parser.add_argument("--work", type=Path, help="keep the results here")
+    parser.add_argument("--masks", default="none", help="as for tk track")
+    parser.add_argument("--work", type=Path, help="folder for the results [default: temporary]")
     given = parser.parse_args(arguments)
-    print("capture          start           mean   worst   lost    bad  said")
+    print("capture          start           mean   worst   lost    bad  notes")
     with tempfile.TemporaryDirectory() as scratch:
         work = given.work or Path(scratch)
         work.mkdir(parents=True, exist_ok=True)

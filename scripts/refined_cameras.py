@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from scripts.any_start import Quiet
-from scripts.faults import spoil
+from scripts.faults import make_faulty
 from scripts.synthetic.capture import write_calibration
 from tk.evaluation.joints import evaluate
 from tk.io.captures.calibration import read_calibration
@@ -61,7 +61,7 @@ def compare(capture: Path, seeds: int, late: bool, masks: str, work: Path) -> It
     truth = read_joints(capture / "truth.h5")
     for seed in range(1 if known.exists() else seeds):
         folder = work / f"{capture.name}-{seed}"
-        spoiled = spoil("none", capture, folder, None, 0)
+        spoiled = make_faulty("none", capture, folder, None, 0)
         if not known.exists():
             rng = np.random.default_rng(seed)
             (folder / "calibration.toml").unlink()

@@ -1,13 +1,13 @@
-"""How often the search brings a limb back that is somewhere else.
+"""Measure how often the limb search recovers a displaced limb.
 
     python -m scripts.search_recall CAPTURE… [--every 4]
 
-In every few frames of a tracked capture each limb is put to places where the person's silhouettes nearly allow it, and
-the body settles there. Where that is another minimum of the descent (the limb is 15 cm off, and the body explains less
-than it did), the search is asked. It has brought the limb back if elbow and wrist, or knee and ankle, lie within 8 cm
-of where they were tracked. There is no truth in it, so any recording of one's own does.
+In every few frames of a tracked capture each limb is moved to poses that the silhouettes nearly allow, and the body is
+optimised from there. If that ends in another minimum (the limb is 15 cm off and the residual is higher), the search
+runs. It has recovered the limb if elbow and wrist, or knee and ankle, are within 8 cm of their tracked positions. No
+ground truth is needed, so any recording serves.
 
-Misplaced limbs, as the tracker itself calls them, are told apart from others: of those more places are descended from.
+Limbs that the tracker itself finds misplaced are counted separately: for them the search refines more candidates.
 """
 
 from __future__ import annotations
@@ -26,17 +26,24 @@ from tk.model.cues.ray_costs import mean_of_views
 from tk.trackers.protocol import Observation
 from tk.trackers.region import RegionTracker
 
-# Places of a limb that are tried a frame.
+# Candidate poses of a limb tested per frame.
 TRIES = 2
-# A place farther than this is another one, metres; nearly allowed, and worse: costs as a share of the person's pixels.
-ELSEWHERE_M, ALLOWED, WORSE = 0.2, 0.12, 0.01
-# After settling: the limb is still off; and it is back, metres.
+# A candidate is displaced by at least this distance, metres; the residual of nearly allowed candidates is at most this
+# much higher, and that of a wrong minimum at least this much, as shares of the person's pixels.
+DISPLACED_M, ALLOWED, WORSE = 0.2, 0.12, 0.01
+# Distances from the tracked position, metres: a limb is off beyond the first and recovered within the second.
 OFF_M, BACK_M = 0.15, 0.08
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One limb that was put elsewhere: was it called misplaced, was it brought back, and in how many seconds."""
+    """One displaced limb.
+
+    Attributes:
+        misplaced: the tracker found the limb misplaced.
+        back: the search recovered it.
+        seconds: duration of the search.
+    """
 
     misplaced: bool
     back: bool
@@ -44,10 +51,10 @@ class Trial:
 
 
 class Trials(RegionTracker):
-    """The tracker, which can be asked what its search does in the frame that it has just tracked."""
+    """The tracker, with a test of its limb search in the frame that it tracked last."""
 
     def trials(self, frame: Observation) -> Iterator[Trial]:
-        """Every limb put elsewhere."""
+        """Displace every limb and yield what the search does."""
         frame = self.without_foreign(frame)
         pyramid = self.pyramid(frame)
         evidence = self.evidence(self.screen, frame, pyramid)
@@ -57,7 +64,7 @@ class Trials(RegionTracker):
         for limb in self.limbs:
             places = limb.candidates(pose, 0, rng)
             cost = mean_of_views(evidence.cast(self.body, group, places)[0])
-            allowed = np.flatnonzero((self._off(limb, places, pose) > ELSEWHERE_M) & (cost < own + ALLOWED))
+            allowed = np.flatnonzero((self._off(limb, places, pose) > DISPLACED_M) & (cost < own + ALLOWED))
             for k in rng.choice(allowed, min(TRIES, len(allowed)), replace=False):
                 wrong = self.settle(pyramid, places[k][None], (1, 0), frame.images).states
                 by_view, met = evidence.cast(self.body, group, wrong, export=True)
@@ -72,14 +79,14 @@ class Trials(RegionTracker):
                 yield Trial(limb in misplaced, bool(self._off(limb, best[None], pose)[0] < BACK_M), seconds)
 
     def _off(self, limb: Limb, poses: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        """(B,) how far a limb's joints at poses (B, D) lie from those at a pose (D,), metres."""
+        """Return the largest distance (B,) of a limb's joints at poses (B, D) from those at a pose (D,), metres."""
         joints = self.body.skeleton.joints
         ends = list(limb.joints)
         return np.asarray(np.linalg.norm(joints(poses)[:, ends] - joints(pose)[ends], axis=2).max(axis=1))
 
 
 def recall(recorded: Recorded, every: int) -> list[Trial]:
-    """The trials of a capture, in every so many frames."""
+    """Return the trials of a capture, in every ``every``-th frame."""
     capture = recorded.capture
     tracker = Trials(capture.rig, capture.up)
     tracker.start(recorded.frames[: tracker.opening_frames], capture.subject_height_m, None)
@@ -92,7 +99,7 @@ def recall(recorded: Recorded, every: int) -> list[Trial]:
 
 
 def row(name: str, trials: Sequence[Trial]) -> str:
-    """A line of the table."""
+    """Return a line of the table."""
     cells = [name]
     for kind in (True, False):
         back = [trial.back for trial in trials if trial.misplaced == kind]
@@ -104,9 +111,9 @@ def row(name: str, trials: Sequence[Trial]) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("captures", nargs="+", type=Path)
-    parser.add_argument("--every", type=int, default=4, help="frames from one trial to the next")
+    parser.add_argument("--every", type=int, default=4, help="frames between trials")
     options = parser.parse_args(arguments)
-    print("| brought back | misplaced limbs | others | ms a search |\n|---|---|---|---|")
+    print("| recovered | misplaced limbs | other limbs | ms per search |\n|---|---|---|---|")
     everything: list[Trial] = []
     for path in options.captures:
         trials = recall(Recorded(path), options.every)

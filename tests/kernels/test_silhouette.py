@@ -17,7 +17,7 @@ from tk.kernels.line_search import COLOR_BINS, SearchSettings, search_colors
 from tk.kernels.runtime import ensure_runtime, ti
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.body_fit import pose_rows
+from tk.model.body.body_parameters import pose_rows
 from tk.model.body.cone_body import build_cone_body
 from tk.model.cameras.camera import Rig
 from tk.model.masks.silhouettes import Views, draw_silhouettes
