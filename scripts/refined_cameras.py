@@ -61,13 +61,13 @@ def compare(capture: Path, seeds: int, late: bool, masks: str, work: Path) -> It
     truth = read_joints(capture / "truth.h5")
     for seed in range(1 if known.exists() else seeds):
         folder = work / f"{capture.name}-{seed}"
-        spoiled = make_faulty("none", capture, folder, None, 0)
+        faulty = make_faulty("none", capture, folder, None, 0)
         if not known.exists():
             rng = np.random.default_rng(seed)
             (folder / "calibration.toml").unlink()
             write_calibration(Rig(tuple(disturbed(camera, rng) for camera in true)), folder / "calibration.toml")
         if late:
-            spoiled.change(lambda video: video[1:])
+            faulty.change(lambda video: video[1:])
         opened, errors = open_capture(folder, masks=masks), []
         for refine in (False, True):
             output = work / f"{folder.name}-{refine}.h5"

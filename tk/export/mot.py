@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.export.motion import FORWARD_UP_RIGHT, Motion
+from tk.export.motion import Motion
+from tk.model.body.angles import FORWARD_UP_RIGHT
 from tk.model.body.rotations import decompose, follow
 
 Float = NDArray[np.float64]

@@ -25,8 +25,7 @@ STATUS_WORDS = tuple(status.name.lower() for status in Status)
 
 # Axes of other programs as rows, in the body's (forward, left, up) when it stands as the skeleton does in its zero
 # configuration: that is (x, y, z) of a world whose z axis is up.
-FORWARD_UP_RIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # OpenSim, ISB
-LEFT_UP_FORWARD = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])  # glTF, and usual in BVH
+LEFT_UP_FORWARD = np.roll(np.eye(3), -1, axis=0)  # glTF, and usual in BVH
 
 
 @dataclass(frozen=True)

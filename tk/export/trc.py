@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tk.export.motion import FORWARD_UP_RIGHT, Motion
+from tk.export.motion import Motion
+from tk.model.body.angles import FORWARD_UP_RIGHT
 
 
 def write_trc(motion: Motion, path: Path) -> None:

@@ -5,25 +5,33 @@ A joint's colour shows its standard deviation. Colours are BGR, as in OpenCV.
 
 from __future__ import annotations
 
+from colorsys import hls_to_rgb
+
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Color = tuple[int, int, int]
 
-SEGMENT_COLORS: dict[str, Color] = {
-    "torso": (90, 170, 60),
-    "pelvis": (60, 140, 40),
-    "head": (120, 210, 120),
-    "upper_arm_l": (30, 110, 240),
-    "forearm_l": (70, 190, 250),
-    "upper_arm_r": (220, 90, 40),
-    "forearm_r": (245, 190, 90),
-    "thigh_l": (40, 60, 215),
-    "calf_l": (130, 140, 250),
-    "thigh_r": (190, 50, 140),
-    "calf_r": (240, 140, 210),
-    "foot_l": (90, 100, 235),
-    "foot_r": (215, 95, 175),
+# Hue of each group of segments, degrees, and its segments from dark to light. Appearance only.
+_HUES_DEG = {"": 135.0, "_arm_l": 25.0, "_leg_l": 5.0, "_arm_r": 215.0, "_leg_r": 280.0}
+_SEGMENTS = {"": ("pelvis", "torso", "head"), "_arm": ("upper_arm", "forearm"), "_leg": ("thigh", "foot", "calf")}
+
+
+def _shades(group: str, side: str) -> dict[str, Color]:
+    """Return the colours of the segments of one group and side."""
+    colors = {}
+    for k, segment in enumerate(_SEGMENTS[group]):
+        rgb = hls_to_rgb(_HUES_DEG[group + side] / 360, 0.45 + 0.1 * k, 0.7)
+        r, g, b = (round(255 * value) for value in rgb)
+        colors[segment + side] = (b, g, r)
+    return colors
+
+
+SEGMENT_COLORS = {
+    segment: color
+    for group, side in [("", ""), *((group, side) for group in ("_arm", "_leg") for side in ("_l", "_r"))]
+    for segment, color in _shades(group, side).items()
 }
 #: border of a lost frame, and the body in it
 LOST: Color = (50, 50, 225)
@@ -34,16 +42,16 @@ INK: Color = (20, 20, 20)
 
 #: standard deviation of the last colour, metres; larger ones have the same. Appearance only.
 SIGMA_MOST_M = 0.05
-#: certain to uncertain: pale yellow, orange, red, dark violet; lightness falls steadily, so it reads without colours
-_SIGMA_STOPS = np.array([[255, 246, 170], [254, 190, 75], [240, 90, 50], [190, 25, 95], [70, 15, 95]], float)
+#: the darkest of the 256 colours of Matplotlib's "inferno" that is used, dark violet: black would not show. The colours
+#: run from pale yellow; lightness falls steadily, so they can be read without colour.
+_DARKEST = 60
 
 
 def sigma_colors(sigma_m: ArrayLike) -> NDArray[np.uint8]:
     """Return the colours (N, 3) of N standard deviations along one axis, metres, none of them NaN."""
-    place = np.clip(np.asarray(sigma_m, float) / SIGMA_MOST_M, 0, 1) * (len(_SIGMA_STOPS) - 1)
-    stops = np.arange(len(_SIGMA_STOPS))
-    rgb = np.stack([np.interp(place, stops, channel) for channel in _SIGMA_STOPS.T], axis=-1)
-    return np.asarray(rgb[..., ::-1].round(), np.uint8)
+    table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[::-1, None], cv2.COLORMAP_INFERNO)[:, 0]
+    share = np.clip(np.asarray(sigma_m, float) / SIGMA_MOST_M, 0, 1)
+    return np.asarray(table[(share * (255 - _DARKEST)).round().astype(int)], np.uint8)
 
 
 def hexadecimal(color: Color) -> str:

@@ -33,7 +33,7 @@ _BACKGROUND, _FLOOR, _WIRE = (34, 30, 28), (78, 70, 66), (190, 170, 150)
 _NEAREST_M = 0.05  # near clipping plane
 
 #: lines between the points of :func:`camera_pyramid`
-PYRAMID_EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
+PYRAMID_EDGES = [edge for k in range(1, 5) for edge in ((0, k), (k, k % 4 + 1))]  # apex 0, corners 1 to 4
 
 
 @dataclass(frozen=True)

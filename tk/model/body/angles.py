@@ -23,8 +23,9 @@ from tk.model.body.skeleton import SEGMENTS, Skeleton
 
 Float = NDArray[np.float64]
 
-# ISB's axes (forward, up, right) as columns in ours (forward, left, up).
-_ISB = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+#: axes of ISB and OpenSim (forward, up, right) as rows in ours (forward, left, up)
+FORWARD_UP_RIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+_ISB = FORWARD_UP_RIGHT.T
 # What mirrors a left limb's rotation in ISB's axes: M R M.
 _MIRROR = np.diag([1.0, 1.0, -1.0])
 
