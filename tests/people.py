@@ -1,6 +1,6 @@
-"""A room with red people in it, seen by a ring of cameras, as a capture; and a segmenter that knows what is red.
+"""A capture of red people in a room, seen by a ring of cameras, and a segmenter that finds red pixels.
 
-What a network does is not tested with it, but what surrounds one: whom it is shown, and what is kept.
+They test the code around a segmentation network: the images that it receives, and the masks that are kept.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from scripts.synthetic.capture import write_calibration
 from tests.model.ring import ring_of_cameras
 from tk.model.cameras.camera import Camera, Rig
 
-#: where a person stands in a frame: x, y, metres; None for nobody
+#: position of a person by frame: x, y in metres; None where the person is absent
 Path2 = Callable[[int], tuple[float, float] | None]
 
 WIDTH, HEIGHT = 96, 120
 RIG = ring_of_cameras(4, WIDTH, HEIGHT)
 VOLUME = {"center": [0.0, 0.0, 1.0], "size": [2.4, 2.4, 2.2]}
 
-#: the segmenter "red" as an installed package brings one: a module and an entry point
+#: module of a package that brings the segmenter "red"; its entry point is written by :func:`install`
 SEGMENTER = '''
 import cv2
 import numpy as np
@@ -34,14 +34,14 @@ from tk.model.masks.subject import Sighting
 
 
 class Red:
-    """Takes everybody."""
+    """Segments all people."""
 
     def segment(self, picture):
         return np.where(red(picture) > 0, 0.9, 0.1).astype(np.float32)
 
 
 class Finding:
-    """Finds everybody, and takes the one about the middle."""
+    """Finds all people and segments the one in the middle."""
 
     def segment(self, picture):
         _, parts = cv2.connectedComponents(red(picture))
@@ -66,7 +66,7 @@ def red(picture):
 
 
 def person_mask(camera: Camera, at: tuple[float, float], height_m: float = 1.75) -> np.ndarray:
-    """(h, w) 0 or 255: an upright capsule of 22 cm radius that stands there."""
+    """Return the mask (h, w), 0 or 255, of an upright capsule of 22 cm radius at a position."""
     mask = np.zeros((camera.height, camera.width), np.uint8)
     angles = np.linspace(0, 2 * np.pi, 24)
     rings = []
@@ -83,7 +83,7 @@ def person_mask(camera: Camera, at: tuple[float, float], height_m: float = 1.75)
 
 
 def write_people(folder: Path, people: Sequence[Path2], frames: int = 20, rig: Rig = RIG) -> Path:
-    """A capture without masks and without an empty scene; the first person's true masks in ``truth/``."""
+    """Write a capture without masks and background; the first person's true masks go to ``truth/``."""
     folder.mkdir(parents=True)
     write_calibration(rig, folder / "calibration.toml")
     settings = {"fps": 15.0, "volume": VOLUME, "init": {"pose": "any"}}
@@ -107,13 +107,13 @@ def write_people(folder: Path, people: Sequence[Path2], frames: int = 20, rig: R
 
 
 def truth(folder: Path, k: int) -> np.ndarray:
-    """(C, H, W) bool."""
+    """Return the true masks (C, H, W) of a frame, bool."""
     files = [folder / "truth" / name / f"{k:06d}.png" for name in RIG.names]
     return np.stack([cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files]) > 0
 
 
 def install(folder: Path, monkeypatch: pytest.MonkeyPatch, **classes: str) -> None:
-    """Put segmenters on the path as a package would: by a name, a class of :data:`SEGMENTER`."""
+    """Install segmenters as a package would: names, and classes of :data:`SEGMENTER`."""
     folder.mkdir(parents=True)
     (folder / "redsegmenter.py").write_text(SEGMENTER, encoding="utf-8")
     info = folder / "redsegmenter-1.0.dist-info"

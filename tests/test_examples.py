@@ -1,4 +1,4 @@
-"""Each example runs on the capture that ships with tk, with settings that make it short, and does what it says."""
+"""Each example runs on the demo capture with short settings and gives the output that it promises."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import cv2
 import pytest
 
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
-#: what each is run with here: few frames
+#: options that make the examples short
 OPTIONS = {
     "01_track_and_plot": ["--frames", "4", "--out", "out"],
     "02_compare_methods_and_cameras": ["--frames", "2"],
@@ -18,9 +18,9 @@ OPTIONS = {
 }
 
 
-@pytest.mark.filterwarnings("default")  # of the packages that the examples show
+@pytest.mark.filterwarnings("default")  # warnings of other packages do not fail the test
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
-def test_an_example_runs(
+def test_example_runs(
     example: Path, quick: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -30,7 +30,7 @@ def test_an_example_runs(
     said = capfd.readouterr().out
     if example.stem.startswith("01"):
         assert "4 frames, 0 lost" in said
-        assert cv2.imread(str(tmp_path / "out" / "motion.png")).std() > 5  # something is drawn
+        assert cv2.imread(str(tmp_path / "out" / "motion.png")).std() > 5  # the image is not blank
     elif example.stem.startswith("02"):
         means = [float(line[28:].split()[0]) for line in said.splitlines()[1:]]
         assert len(means) == 4 and all(0 < mean < 15 for mean in means)
@@ -40,7 +40,7 @@ def test_an_example_runs(
         assert 1.5 < height < 2.1
 
 
-def test_every_example_is_short_and_tested() -> None:
+def test_examples_have_at_most_65_lines_and_are_all_tested() -> None:
     assert [path.stem for path in EXAMPLES] == sorted(OPTIONS)
     for path in EXAMPLES:
         assert len(path.read_text(encoding="utf-8").splitlines()) <= 65, path.name

@@ -1,4 +1,4 @@
-"""Tiny captures, made on the fly: cameras in a ring of 3 m around (0, 0, 1); a picture tells its frame and camera."""
+"""Small generated captures: cameras in a ring of 3 m around (0, 0, 1); images encode their camera and frame."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CENTER = np.array([0.0, 0.0, 1.0])
 
 
 def look_at(center: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation (3, 3) and translation (3,), world to camera, of a camera with z up in its picture."""
+    """Rotation (3, 3) and translation (3,), world to camera, of a camera whose image has z up."""
     z = (target - center) / np.linalg.norm(target - center)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)
@@ -44,14 +44,14 @@ def calibration_tables(count: int = 3, radius_m: float = 3.0) -> dict[str, Any]:
 
 
 def picture(camera: int, frame: int, size: tuple[int, int] = (WIDTH, HEIGHT)) -> np.ndarray:
-    """Eight stripes, black or white: the bits of ``32 * camera + frame``. See :func:`read_tag`."""
+    """Return an image of eight stripes, black or white: the bits of ``32 * camera + frame``. See :func:`read_tag`."""
     bits = [(32 * camera + frame) >> bit & 1 for bit in range(8)]
     row = np.repeat(np.array(bits, np.uint8) * 255, size[0] // 8)
     return np.ascontiguousarray(np.broadcast_to(row[None, :, None], (size[1], len(row), 3)))
 
 
 def read_tag(image: np.ndarray) -> tuple[int, int]:
-    """(camera, frame) of a picture made by :func:`picture`, through lossy coding."""
+    """Return (camera, frame) of an image made by :func:`picture`, after lossy coding."""
     grey = image.mean(axis=(0, 2)).reshape(8, -1).mean(axis=1)
     return divmod(sum(1 << bit for bit in range(8) if grey[bit] > 127), 32)
 
@@ -81,7 +81,7 @@ MakeCapture = Callable[..., Path]
 
 @pytest.fixture
 def make_capture(tmp_path: Path) -> MakeCapture:
-    """Writes a capture folder: ``make_capture(cameras=3, frames=12, settings={...} or None)``."""
+    """Return a function that writes a capture: ``make_capture(cameras=3, frames=12, settings={...} or None)``."""
 
     def make(cameras: int = 3, frames: int = 12, settings: dict[str, Any] | None = None, name: str = "cap") -> Path:
         folder = tmp_path / name

@@ -1,4 +1,4 @@
-"""Bodies of superellipsoids of average shape, and such a body as voxels: what tests look at instead of a hull."""
+"""Superellipsoid bodies of average shape, and their voxels, which stand for a hull in tests."""
 
 import numpy as np
 from scipy import ndimage

@@ -1,4 +1,4 @@
-"""Cameras in a ring about the origin's vertical: what the tests of the silhouette tracker look through."""
+"""A ring of cameras around the vertical axis, for tests of masks and trackers."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from tk.model.cameras.camera import Camera, Rig
 
 
 def ring_of_cameras(count: int, width: int, height: int, radius_m: float = 3.5) -> Rig:
-    """Level cameras at hip height that see a standing person from top to toe; no two opposite each other."""
+    """Return level cameras at hip height that see a whole standing person; no two face each other."""
     cameras = []
     for i in range(count):
         angle = 0.2 + i * 2 * np.pi / (count if count % 2 else count + 1)

@@ -21,6 +21,7 @@ from tk.model.body.angles import standing_axes
 from tk.model.body.rotations import continuous, to_quaternions
 from tk.model.body.skeleton import JOINTS, SEGMENTS, WAIST_HEIGHT, build_skeleton
 from tk.render.figure import AROUND, Solid, figure_of
+from tk.render.palette import SEGMENT_COLORS, unit_rgb
 
 Float = NDArray[np.float64]
 
@@ -28,8 +29,6 @@ _FLOAT, _UINT16 = 5126, 5123  # componentType
 _VERTICES, _INDICES = 34962, 34963  # bufferView.target
 # twice the area below which a triangle is none: those at the poles of an ellipsoid
 _NO_AREA_M2 = 1e-10
-# Left limbs warm, right limbs cool, trunk and head green, as in the overlays.
-_COLORS = {"_l": (0.85, 0.35, 0.15), "_r": (0.2, 0.4, 0.85), "": (0.3, 0.6, 0.3)}
 
 
 class _Buffer:
@@ -79,8 +78,11 @@ def write_glb(motion: Motion, path: Path) -> None:
         "nodes": nodes,
         "meshes": meshes,
         "materials": [
-            {"name": f"body{side}", "pbrMetallicRoughness": {"baseColorFactor": [*color, 1.0], "metallicFactor": 0.0}}
-            for side, color in _COLORS.items()
+            {
+                "name": segment,
+                "pbrMetallicRoughness": {"baseColorFactor": [*unit_rgb(color), 1.0], "metallicFactor": 0.0},
+            }
+            for segment, color in SEGMENT_COLORS.items()
         ],
         "animations": [_animation(motion, tree, buffer)],
         "accessors": buffer.accessors,
@@ -137,11 +139,10 @@ def _meshes(motion: Motion, tree: Tree, buffer: _Buffer, nodes: list[dict[str, A
             "NORMAL": buffer.add(_float32(turned @ to_rest.T), _VERTICES),
         }
         indices = np.concatenate([start + face.ravel() for start, face in zip(starts, faces, strict=True)])
-        side = segment[-2:] if segment[-2:] in _COLORS else ""
         primitive = {
             "attributes": attributes,
             "indices": buffer.add(indices.astype(np.uint16), _INDICES),
-            "material": list(_COLORS).index(side),
+            "material": list(SEGMENT_COLORS).index(segment),
         }
         nodes[node]["mesh"] = len(meshes)
         meshes.append({"name": segment, "primitives": [primitive]})

@@ -39,6 +39,12 @@ LOST_BODY: Color = (150, 150, 150)
 TEXT: Color = (240, 240, 240)
 BONE: Color = (245, 245, 245)
 INK: Color = (20, 20, 20)
+#: background, floor grid and cameras of the views in three dimensions
+BACKGROUND: Color = (34, 30, 28)
+FLOOR: Color = (78, 70, 66)
+WIRE: Color = (190, 170, 150)
+#: elevation of the viewer in these views, degrees
+ELEVATION_DEG = 14.0
 
 #: standard deviation of the last colour, metres; larger ones have the same. Appearance only.
 SIGMA_MOST_M = 0.05
@@ -52,6 +58,11 @@ def sigma_colors(sigma_m: ArrayLike) -> NDArray[np.uint8]:
     table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[::-1, None], cv2.COLORMAP_INFERNO)[:, 0]
     share = np.clip(np.asarray(sigma_m, float) / SIGMA_MOST_M, 0, 1)
     return np.asarray(table[(share * (255 - _DARKEST)).round().astype(int)], np.uint8)
+
+
+def unit_rgb(color: Color) -> list[float]:
+    """Return red, green and blue of a colour in [0, 1]."""
+    return [channel / 255 for channel in reversed(color)]
 
 
 def hexadecimal(color: Color) -> str:

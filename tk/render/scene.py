@@ -18,18 +18,16 @@ from tk.render.canvas import SUBPIXEL_BITS, Image, dots, draw_joints, fixed, wri
 from tk.render.figure import Figure, figure_of
 from tk.render.legend import LEGEND_HEIGHT, Legend
 from tk.render.overlay import choose_frames
-from tk.render.palette import LOST, LOST_BODY, SEGMENT_COLORS
+from tk.render.palette import BACKGROUND, ELEVATION_DEG, FLOOR, LOST, LOST_BODY, SEGMENT_COLORS, WIRE
 
 Float = NDArray[np.float64]
 
 # Appearance only; no measurement depends on these values.
 WIDTH, HEIGHT = 960, 720  # pixels
 _FIELD_OF_VIEW_DEG = 38.0
-_ELEVATION_DEG = 14.0
 _TURN_S = 16.0  # duration of a whole turn
 _SQUARE_M, _SQUARES = 0.5, 6  # side of the floor's squares, and their number on each side of the middle
 _PYRAMID_M = 0.25  # height of a camera's pyramid
-_BACKGROUND, _FLOOR, _WIRE = (34, 30, 28), (78, 70, 66), (190, 170, 150)
 _NEAREST_M = 0.05  # near clipping plane
 
 #: lines between the points of :func:`camera_pyramid`
@@ -137,7 +135,7 @@ class Scene:
 
     def picture(self, row: int) -> Image:
         """Return an image (HEIGHT + LEGEND_HEIGHT, WIDTH, 3). The camera turns once in 16 s of the recording."""
-        canvas = np.full((HEIGHT + LEGEND_HEIGHT, WIDTH, 3), _BACKGROUND, np.uint8)
+        canvas = np.full((HEIGHT + LEGEND_HEIGHT, WIDTH, 3), BACKGROUND, np.uint8)
         tile = canvas[:HEIGHT]
         turn = 2 * np.pi * (self.result.time[row] - self.result.time[0]) / _TURN_S
         eye = self._camera(float(turn))
@@ -159,7 +157,7 @@ class Scene:
     def _camera(self, turn: float) -> Camera:
         """Return the camera at this angle about the vertical, radians; it looks at the middle."""
         up = self.stage.axes[:, 2]
-        elevation = np.radians(_ELEVATION_DEG)
+        elevation = np.radians(ELEVATION_DEG)
         level = self.stage.axes @ np.array([np.cos(turn), np.sin(turn), 0.0])
         forward = -(np.cos(elevation) * level + np.sin(elevation) * up)
         right = np.cross(forward, up)
@@ -172,16 +170,16 @@ class Scene:
 
     def _draw_floor(self, tile: Image, eye: Camera) -> None:
         for a, b in self.stage.floor_lines():
-            _line(tile, eye, a, b, _FLOOR)
+            _line(tile, eye, a, b, FLOOR)
 
     def _draw_cameras(self, tile: Image, eye: Camera) -> None:
         for camera in self.rig or ():
             points = camera_pyramid(camera)
             for a, b in PYRAMID_EDGES:
-                _line(tile, eye, points[a], points[b], _WIRE)
+                _line(tile, eye, points[a], points[b], WIRE)
             xy, depth = eye.project(camera.center)
             if depth[0] > _NEAREST_M and np.isfinite(xy).all() and (np.abs(xy[0]) < 4 * WIDTH).all():
-                write(tile, camera.name, int(xy[0, 0]) + 8, int(xy[0, 1]) - 8, _WIRE)
+                write(tile, camera.name, int(xy[0, 0]) + 8, int(xy[0, 1]) - 8, WIRE)
 
     def _draw_body(self, tile: Image, eye: Camera, row: int, lost: bool) -> None:
         """Draw the faces of the solids, far ones first, lit from the viewer."""

@@ -14,6 +14,7 @@ from tk.io.results.status import STATUS_MEANING
 from tk.io.results.writer import Result, read_joints
 from tk.model.cameras.camera import Rig
 from tk.render.figure import Figure, figure_of
+from tk.render.palette import BONE, ELEVATION_DEG, FLOOR, WIRE, unit_rgb
 from tk.render.scene import Stage
 from tk.view import shapes
 
@@ -21,10 +22,7 @@ Float = NDArray[np.float64]
 
 # Appearance only; no measurement depends on these values.
 SIZE = (1280, 860)  # pixels
-BACKGROUND = (0.11, 0.12, 0.135)
-_WIRE, _FLOOR, _BONE = (0.62, 0.68, 0.78), (0.32, 0.34, 0.37), (0.95, 0.95, 0.95)
 FIELD_OF_VIEW_DEG = 40.0
-_ELEVATION_DEG = 14.0
 _AZIMUTH = 0.6  # radians
 
 
@@ -64,23 +62,23 @@ class Contents:
             found.append(shapes.body_mesh(figure, row))
         elif name == "joints":
             joints = figure.joints[row]
-            found.append(shapes.skeleton_lines(joints).paint_uniform_color(_BONE))
+            found.append(shapes.skeleton_lines(joints).paint_uniform_color(unit_rgb(BONE)))
             found.append(shapes.joint_spheres(joints, None if figure.sigma is None else figure.sigma[row]))
         elif name == "hull" and self.result.hull is not None:
             found.append(shapes.hull_cloud(self.result.hull[row]))
         elif name == "truth" and self.truth is not None:
             found.append(shapes.truth_spheres(self.truth[row]))
         elif name == "cameras" and self.rig is not None:
-            found.append(shapes.camera_lines(self.rig).paint_uniform_color(_WIRE))
+            found.append(shapes.camera_lines(self.rig).paint_uniform_color(unit_rgb(WIRE)))
         elif name == "floor":
-            found.append(shapes.floor_lines(self.stage).paint_uniform_color(_FLOOR))
+            found.append(shapes.floor_lines(self.stage).paint_uniform_color(unit_rgb(FLOOR)))
         return [geometry for geometry in found if not geometry.is_empty()]
 
     @property
     def eye(self) -> Float:
         """(3,) position of the camera, metres, world frame: beside and above the motion, all of it in view."""
         stage = self.stage
-        elevation = np.radians(_ELEVATION_DEG)
+        elevation = np.radians(ELEVATION_DEG)
         distance = 1.25 * stage.radius / np.sin(np.radians(FIELD_OF_VIEW_DEG / 2))
         horizontal = stage.axes @ np.array([np.cos(_AZIMUTH), np.sin(_AZIMUTH), 0.0])
         direction = np.cos(elevation) * horizontal + np.sin(elevation) * stage.axes[:, 2]

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from tk.errors import DisplayError, ExportError
-from tk.view.contents import BACKGROUND, FIELD_OF_VIEW_DEG, SIZE, Contents
+from tk.render.palette import BACKGROUND, unit_rgb
+from tk.view.contents import FIELD_OF_VIEW_DEG, SIZE, Contents
 
 _ALTERNATIVE = "tk report RESULT.h5 writes an HTML page to look at instead"
 _KEYS = (
@@ -68,7 +69,7 @@ class Window:
             raise DisplayError(
                 f"tk view: Open3D cannot open a window: install OpenGL (Debian: libgl1-mesa-dri); {_ALTERNATIVE}"
             )
-        self._window.get_render_option().background_color = np.array(BACKGROUND)
+        self._window.get_render_option().background_color = np.array(unit_rgb(BACKGROUND))
         self._shown = dict.fromkeys(contents.names, True)
         self._row, self._playing, self._due = -1, False, 0.0
 

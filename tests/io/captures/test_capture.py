@@ -26,7 +26,7 @@ from tk.io.captures.capture import FrameReader, open_capture
 
 
 def one_line(error: BaseException, *parts: str) -> None:
-    """The whole complaint is one line and holds these parts."""
+    """Check that the message is one line and contains these parts."""
     text = str(error)
     assert "\n" not in text
     for part in parts:
@@ -106,7 +106,7 @@ def test_cameras_of_different_sizes_are_padded(make_capture: MakeCapture) -> Non
 
 def test_a_subset_of_cameras(make_capture: MakeCapture) -> None:
     folder = make_capture()
-    (folder / "videos" / "cam2.mp4").unlink()  # not needed, not missed
+    (folder / "videos" / "cam2.mp4").unlink()  # not needed for the selected cameras
     capture = open_capture(folder, cameras=["cam3", "cam1"])
     assert capture.rig.names == ("cam1", "cam3")
     with capture.frames() as frames:
@@ -395,8 +395,8 @@ def test_development_captures_open_without_warnings(
         assert ((share > 0.005) & (share < 0.4)).all()
 
 
-def test_what_is_no_file_is_not_waited_for(make_capture: MakeCapture) -> None:
-    """A pipe in the place of a file would be read for ever."""
+def test_a_pipe_is_refused_without_waiting(make_capture: MakeCapture) -> None:
+    """Reading a pipe would never end."""
     folder = make_capture()
     for name in ("capture.toml", "calibration.toml", "videos/cam1.mp4"):
         path = folder / name

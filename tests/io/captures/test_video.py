@@ -30,12 +30,12 @@ def read_all(clip: Clip, start: int = 0) -> list[np.ndarray]:
     with closing(clip.open()) as reader:
         for _ in range(start):
             reader.skip()
-        pictures = []
+        images = []
         for _ in range(start, clip.frame_count):
             out = np.zeros((clip.height, clip.width, 3), np.uint8)
             reader.read(out)
-            pictures.append(out)
-    return pictures
+            images.append(out)
+    return images
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.avi", "a.mkv", "a.mov", "A.MP4"])
@@ -136,7 +136,7 @@ def noise_video(path: Path, frames: int) -> None:
 
 
 def index_first(data: bytes) -> bytes:
-    """An mp4 with its index (moov) moved before the pictures (mdat), as cameras for streaming write it."""
+    """Return an mp4 with its index (moov) before the images (mdat), as streaming cameras write it."""
     boxes, at = [], 0
     while at < len(data):
         size = int.from_bytes(data[at : at + 4], "big")
@@ -159,7 +159,7 @@ def test_a_video_that_is_cut_off(tmp_path: Path) -> None:
     noise_video(tmp_path / "whole.mp4", 40)
     data = (tmp_path / "whole.mp4").read_bytes()
     path = tmp_path / "cut.mp4"
-    path.write_bytes(data[: len(data) // 2])  # the index stood at the end
+    path.write_bytes(data[: len(data) // 2])  # without the index, which is at the end
     with pytest.raises(VideoError, match=r"cut\.mp4: is cut off: the index"):
         probe(path)
     data = index_first(data)
@@ -205,7 +205,7 @@ def test_opencv_and_ffmpeg_keep_silent(tmp_path: Path) -> None:
         (tmp_path / f"cut.{suffix}").write_bytes(coded[: len(coded) * 2 // 3])
     (tmp_path / "empty.png").touch()
     program = (
-        "import cv2, sys, pathlib\n"  # OpenCV first, as a user's script may do
+        "import cv2, sys, pathlib\n"  # OpenCV is imported first, as in a user's script
         "from tk.io.captures.video import probe\n"
         "from tk.errors import VideoError\n"
         "for name in ('cut.mp4', 'text.mp4', 'cut.png', 'cut.jpg', 'none.mp4', 'empty.png'):\n"
@@ -233,7 +233,7 @@ def test_list_clips(tmp_path: Path) -> None:
 
 @dataclass
 class FakeClip:
-    """A clip in memory that records how far it was read and fails where it is told to."""
+    """A clip in memory that records its position and fails at a given frame."""
 
     camera: int
     frame_count: int = 100
@@ -303,7 +303,7 @@ def test_memory_is_used_again_once_nobody_holds_it() -> None:
         addresses = set()
         for _ in range(60):
             addresses.add(next(reader).images.ctypes.data)
-        # those that lie ready, that are being filled, and the one at hand
+        # free ones, one being filled, and the current one
         assert len(addresses) <= 8 + 2
         for view, copy in zip(held, copies, strict=True):
             np.testing.assert_array_equal(view, copy)

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from tests.io.conftest import look_at
 from tk.errors import VolumeError
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import closest_to_axes, infer_volume, sample_box, views_of
@@ -18,12 +19,9 @@ def ring(count: int, radius_m: float = 3.0, height_m: float = 0.6, focal_px: flo
     cameras = []
     for angle in 2 * np.pi * np.arange(count) / count:
         center = TARGET + np.array([radius_m * np.cos(angle), radius_m * np.sin(angle), height_m])
-        z = (TARGET - center) / np.linalg.norm(TARGET - center)
-        x = np.cross(z, [0.0, 0.0, 1.0])
-        x /= np.linalg.norm(x)
-        rotation = np.stack([x, np.cross(z, x), z])
+        rotation, translation = look_at(center, TARGET)
         matrix = np.array([[focal_px, 0.0, 31.5], [0.0, focal_px, 23.5], [0.0, 0.0, 1.0]])
-        cameras.append(Camera(f"c{angle:.2f}", 64, 48, matrix, np.zeros(5), rotation, -rotation @ center))
+        cameras.append(Camera(f"c{angle:.2f}", 64, 48, matrix, np.zeros(5), rotation, translation))
     return Rig(tuple(cameras))
 
 
