@@ -9,7 +9,8 @@ import fcntl
 import os
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,18 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # set before any kernel runs; results d
     os.environ.setdefault("TK_THREADS", str(max(_cores // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]), 1)))
 
 FRAMES = 14
+
+
+@contextmanager
+def refused(error: type[Exception], *parts: object) -> Iterator[pytest.ExceptionInfo[Exception]]:
+    """Check that the block raises an error whose message is one line and contains these parts."""
+    with pytest.raises(error) as caught:
+        yield caught
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in parts:
+        assert str(part) in message, message
+
 
 DEVELOPMENT_CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "captures"
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.conftest import refused
 from tests.io.conftest import write_toml
 from tk.errors import CaptureError
 from tk.io.captures.init_pose import LEAST_JOINTS, read_init_pose
@@ -65,12 +66,9 @@ def test_angles_are_in_degrees_and_places_in_metres(tmp_path: Path) -> None:
 def test_mistakes_are_one_line(tmp_path: Path, document: dict[str, Any], parts: list[str]) -> None:
     file = tmp_path / "pose.toml"
     write_toml(file, document)
-    with pytest.raises(CaptureError) as caught:
+    with refused(CaptureError, *parts) as caught:
         read_init_pose(file, NAMES)
-    message = str(caught.value)
-    assert message.startswith(str(file)) and "\n" not in message
-    for part in parts:
-        assert part in message
+    assert str(caught.value).startswith(str(file))
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from scripts.synthetic.keypoints import write_keypoints
-from tests.conftest import QUICK, Silent, Tk
+from tests.conftest import QUICK, Silent, Tk, refused
 from tk.errors import CaptureError
 from tk.io import settings_file
 from tk.io.captures.capture import Capture, open_capture
@@ -131,12 +131,9 @@ def person(**changes: Any) -> dict[str, Any]:
 def test_mistakes_are_one_line(tmp_path: Path, document: object, parts: list[str]) -> None:
     file = tmp_path / "cam1_000000.json"
     file.write_text(json.dumps(document))
-    with pytest.raises(CaptureError) as caught:
+    with refused(CaptureError, *parts) as caught:
         read_people(file)
-    message = str(caught.value)
-    assert message.startswith(str(file)) and "\n" not in message
-    for part in parts:
-        assert part in message
+    assert str(caught.value).startswith(str(file))
 
 
 def test_nobody_and_unseen_keypoints(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.conftest import refused
 from tests.io.conftest import picture, write_picture
 from tests.io.importers.conftest import (
     FRAMES,
@@ -137,9 +138,8 @@ def test_damaged_easymocap(
         path.write_text(path.read_text().replace(old, new))
     write_clips(folder / "videos", ["cam1", "cam2", "cam3", "cam4"])
     capfd.readouterr()
-    with pytest.raises(CalibrationError) as caught:
+    with refused(CalibrationError, complaint):
         import_project(folder, check.output)
-    assert complaint in str(caught.value) and "\n" not in str(caught.value)
     assert capfd.readouterr() == ("", "")
 
 
@@ -214,9 +214,8 @@ def test_panoptic(folder: Path, check: Import) -> None:
 def test_damaged_panoptic(folder: Path, check: Import, old: str, new: str, complaint: str) -> None:
     path = write_panoptic(folder, make_rig(), ["00_00", "00_01", "00_02", "00_03"])
     path.write_text(path.read_text().replace(old, new))
-    with pytest.raises(CalibrationError) as caught:
+    with refused(CalibrationError, complaint, path):
         import_project(folder, check.output)
-    assert complaint in str(caught.value) and str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("kind", ["txt", "npy", "contour"])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.conftest import refused
 from tests.io.importers.conftest import HEIGHT, WIDTH, Import, make_rig, points, renamed, write_clips
 from tk.errors import CalibrationError, VideoError
 from tk.io.captures.capture import open_capture
@@ -96,9 +97,8 @@ def test_damaged_qualisys(folder: Path, check: Import, old: str, new: str, compl
     write_qca(path, renamed(make_rig(), *SERIALS))
     path.write_text(path.read_text().replace(old, new))
     write_clips(folder, SERIALS)
-    with pytest.raises(CalibrationError) as caught:
+    with refused(CalibrationError, complaint, path):
         import_project(folder, check.output)
-    assert complaint in str(caught.value) and str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_vicon(folder: Path, check: Import) -> None:
@@ -155,9 +155,8 @@ def test_damaged_vicon(folder: Path, check: Import, old: str, new: str, complain
     write_xcp(path, renamed(make_rig(distorted=False), *SERIALS))
     path.write_text(path.read_text().replace(old, new))
     write_clips(folder, SERIALS)
-    with pytest.raises(CalibrationError) as caught:
+    with refused(CalibrationError, complaint, path):
         import_project(folder, check.output)
-    assert complaint in str(caught.value) and str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_rotated_view_of_qualisys_is_noted(folder: Path, check: Import) -> None:
