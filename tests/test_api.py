@@ -15,7 +15,7 @@ from tk.errors import CaptureError
 from tk.io import settings_file
 
 
-def test_importing_changes_nothing_in_the_process():
+def test_import_has_no_side_effects():
     code = (
         "import os, sys, signal; before = dict(os.environ), set(sys.modules), signal.getsignal(signal.SIGINT);"
         "import tk; heavy = {'numpy', 'taichi', 'cv2', 'open3d', 'h5py', 'scipy'} & set(sys.modules);"
@@ -26,19 +26,19 @@ def test_importing_changes_nothing_in_the_process():
     assert ran.stdout.strip() == "['Body', 'track']"
 
 
-def test_every_public_name_is_there():
+def test_every_public_name_exists():
     for name in tk.__all__:
         assert getattr(tk, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         tk.nonsense  # noqa: B018
 
 
-def test_a_missing_capture_is_one_line(tmp_path):
+def test_a_missing_capture_is_reported_in_one_line(tmp_path):
     with pytest.raises(CaptureError, match="nowhere"):
         tk.open_capture(tmp_path / "nowhere")
 
 
-def test_what_is_worth_knowing_is_logged(copy, tmp_path, caplog):
+def test_notes_are_logged(copy, tmp_path, caplog):
     write_video(copy / "videos" / "cam2.mp4", [picture(1, k, (160, 120)) for k in range(3)])
     config = settings_file.from_toml(QUICK)
     list(tk.track(tk.open_capture(copy), config=config))
@@ -46,7 +46,7 @@ def test_what_is_worth_knowing_is_logged(copy, tmp_path, caplog):
     assert "only the first 3 are used" in said
 
 
-def test_estimates_one_by_one_are_those_of_the_file(tiny, tmp_path):
+def test_returned_estimates_equal_those_in_the_file(tiny, tmp_path):
     """The iterator's first pass is the file's, bit for bit."""
     config = settings_file.from_toml("ahead = 0\n[silhouette]\ninit_frames = 3\n")
     opened = tk.open_capture(tiny)

@@ -63,7 +63,7 @@ def test_values_round_trip(
     assert settings_file.from_toml(settings_file.to_toml(config)) == config
 
 
-def test_what_a_file_leaves_out_keeps_its_default() -> None:
+def test_settings_missing_in_a_file_keep_their_default() -> None:
     config = settings_file.from_toml("voxels = 128\n[tracking]\nprediction = 1\n")
     assert config.voxels == 128 and config.tracking.prediction == 1.0
     assert isinstance(config.tracking.prediction, float)
@@ -121,14 +121,14 @@ def test_mistakes_are_one_line_that_names_file_and_setting(tmp_path: Path, text:
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-inf"])
 @pytest.mark.parametrize("name", NUMBERS)
-def test_no_setting_takes_what_is_not_finite(name: str, value: str) -> None:
+def test_non_finite_values_are_refused(name: str, value: str) -> None:
     with pytest.raises(ConfigError, match=name.rpartition(".")[2]):
         settings_file.from_toml(toml(name, value))
 
 
 @pytest.mark.parametrize("name", [name for name in DEFAULTS if not isinstance(DEFAULTS[name], str)])
 @pytest.mark.parametrize("value", [-1, 0, 10**6])
-def test_extreme_values_are_taken_or_refused_as_the_users_mistake(name: str, value: int) -> None:
+def test_extreme_values_are_accepted_or_refused_with_a_message(name: str, value: int) -> None:
     default = DEFAULTS[name]
     text = str(bool(value)).lower() if isinstance(default, bool) else str(value)
     try:

@@ -32,7 +32,7 @@ def test_pools_have_one_thread_inside_and_their_own_outside() -> None:
             assert blas_threads() == before
 
 
-def test_opencv_has_its_own_number_again_even_after_an_error() -> None:
+def test_opencvs_thread_number_is_restored_after_an_error() -> None:
     before = cv2.getNumThreads()
     with pytest.raises(ZeroDivisionError), one_thread():
         assert cv2.getNumThreads() == 1

@@ -104,7 +104,7 @@ def test_limb_joints_are_the_twelve() -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 0.5))
-def test_another_definition_of_joints_vanishes(seed: int, size: float) -> None:
+def test_constant_joint_offsets_are_removed_in_corrected_figures(seed: int, size: float) -> None:
     """Any constant offset of any joint in the trunk's frame, the trunk's own joints included."""
     truth = make_truth(count=7, seed=seed)
     offsets = np.random.default_rng(seed).uniform(-size, size, (15, 3))
@@ -166,7 +166,7 @@ def test_a_result_of_nan_scores_nothing() -> None:
     json.loads(found.to_json(), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
 
 
-def test_a_lost_frame_is_a_miss_however_near_it_is() -> None:
+def test_a_lost_frame_counts_as_miss_at_any_distance() -> None:
     truth = make_truth()
     status = np.zeros(20, dtype=np.uint8)
     status[[3, 9]] = Status.LOST
@@ -182,7 +182,7 @@ def test_a_lost_frame_is_a_miss_however_near_it_is() -> None:
     assert "2 lost (10.0 %)" in found.format_table()
 
 
-def test_all_frames_lost_have_no_offsets_to_take_off() -> None:
+def test_corrected_figures_are_nan_if_all_frames_are_lost() -> None:
     truth = make_truth()
     found = evaluate(as_result(truth, status=np.full(20, Status.LOST, dtype=np.uint8)), truth)
     assert found.corrected.all.mean_cm == np.inf
@@ -190,7 +190,7 @@ def test_all_frames_lost_have_no_offsets_to_take_off() -> None:
     assert json.loads(found.to_json())["offsets_cm"]["neck"] == [None, None, None]
 
 
-def test_frames_left_out_inside_count_and_outside_are_told() -> None:
+def test_missing_frames_inside_the_range_count_and_others_are_reported() -> None:
     truth = make_truth()
     rows = [5, 6, 7, 10, 11]  # 8 and 9 are missing
     result = as_result(
@@ -205,7 +205,7 @@ def test_frames_left_out_inside_count_and_outside_are_told() -> None:
     assert "13 frames of the truth lie outside" in table
 
 
-def test_frames_without_truth_are_told() -> None:
+def test_frames_without_truth_are_reported() -> None:
     truth = make_truth()
     part = replace(truth, frames=truth.frames[:8], positions=truth.positions[:8])
     found = evaluate(as_result(truth), part)
@@ -221,7 +221,7 @@ def test_order_of_frames_does_not_matter() -> None:
     assert evaluate(shuffled, truth) == evaluate(result, truth)
 
 
-def test_joints_unknown_to_the_truth_are_left_out_and_told() -> None:
+def test_joints_without_truth_are_excluded_and_reported() -> None:
     truth = make_truth()
     gaps = truth.positions.copy()
     gaps[:5, JOINTS.index("wrist_l")] = np.nan
@@ -292,7 +292,7 @@ def test_flexion_is_zero_when_straight(degrees: float) -> None:
     np.testing.assert_allclose(found["knee_r"], 0, atol=1e-9)
 
 
-def test_flexion_errors_are_told_by_joint_and_kind() -> None:
+def test_flexion_errors_are_reported_by_joint_and_kind() -> None:
     truth = bent({"knee_l": 20, "elbow_l": 40, "elbow_r": 60})
     result = as_result(bent({"knee_l": 35, "elbow_l": 30, "elbow_r": 60}))
     found = evaluate(result, truth).flexion
@@ -322,7 +322,7 @@ def test_flexion_that_is_unknown_is_not_averaged_away() -> None:
 # --- runs astray ------------------------------------------------------------------------------------------------------
 
 
-def test_the_longest_run_astray() -> None:
+def test_longest_run_of_wrong_frames() -> None:
     truth = make_truth()
     positions = truth.positions.copy()
     positions[[2, 3, 4], JOINTS.index("wrist_l")] += 0.2
@@ -342,7 +342,7 @@ def test_the_longest_run_astray() -> None:
     assert "0 frames\n" in perfect.format_table()
 
 
-def test_missing_frames_are_astray_and_unknown_ones_are_not() -> None:
+def test_missing_frames_count_as_wrong_and_unknown_ones_do_not() -> None:
     truth = make_truth()
     rows = [0, 1, 2, 7, 8, 9]
     result = as_result(
@@ -366,7 +366,7 @@ def test_normal_shares_are_those_of_three_dimensions() -> None:
     assert (normal_share(1), normal_share(2)) == (pytest.approx(0.1987, abs=1e-4), pytest.approx(0.7385, abs=1e-4))
 
 
-def test_a_result_that_knows_how_sure_it_is() -> None:
+def test_shares_within_sigma_of_a_calibrated_result() -> None:
     truth = make_truth(count=400)
     generator = np.random.default_rng(5)
     sigma = generator.uniform(0.005, 0.05, size=(400, 15))
@@ -382,7 +382,7 @@ def test_a_result_that_knows_how_sure_it_is() -> None:
     assert boastful is not None and boastful["all"].raw[2] < 0.3
 
 
-def test_joints_without_sigma_are_left_out_and_failures_count() -> None:
+def test_joints_without_sigma_are_excluded_and_failures_count() -> None:
     truth = make_truth()
     sigma = np.full((20, 15), 0.01)
     sigma[3] = np.nan

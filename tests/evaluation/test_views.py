@@ -102,7 +102,7 @@ def test_results_without_a_body_have_pixels_only(tiny: Path, tracked: Path, tmp_
     assert found.silhouette_error is None and str(bare) in found.note and found.joint_px > 0
 
 
-def test_what_cannot_be_judged_is_told(tk: Tk, tiny: Path, three_views: Path, copy: Path, tmp_path: Path) -> None:
+def test_unusable_input_is_reported(tk: Tk, tiny: Path, three_views: Path, copy: Path, tmp_path: Path) -> None:
     tk("evaluate", three_views, tiny / "truth.h5", "--joints", "toe").complaint("--joints toe")
     tk("evaluate", three_views, tiny / "truth.h5", "--capture", tmp_path).complaint(str(tmp_path))
     shutil.rmtree(copy / "videos")

@@ -61,7 +61,7 @@ def test_without_a_waist(write: Write) -> None:
     np.testing.assert_allclose(motion.rotation("pelvis"), motion.rotation("torso"), atol=1e-12)
 
 
-def test_what_the_result_holds_goes_before_what_is_computed(write: Write) -> None:
+def test_stored_quantities_are_exported_rather_than_recomputed(write: Write) -> None:
     """Rotations and feet are the file's, in the order of its names."""
     q = segment_quaternions(SKELETON, poses())[:, ::-1]
     feet = np.arange(12.0).reshape(4, 3)

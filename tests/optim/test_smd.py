@@ -197,7 +197,7 @@ def test_returns_the_mean_of_the_last_states(window: int) -> None:
 # --- batches and bases ------------------------------------------------------------------------------------------------
 
 
-def test_a_row_is_the_same_alone_and_in_company() -> None:
+def test_a_row_does_not_depend_on_other_rows() -> None:
     rng = np.random.default_rng(6)
     B, count = 5, 30
     phases = rng.uniform(0, 2 * np.pi, size=(count, B, 6))
@@ -333,7 +333,7 @@ def test_the_step_sizes_find_their_way_through_a_curved_valley() -> None:
     np.testing.assert_allclose(adapted.pose[0], [1, 1], atol=0.2)
 
 
-def test_new_samples_escape_the_minima_that_fixed_samples_keep() -> None:
+def test_new_samples_escape_minima_of_fixed_samples() -> None:
     """Section 7.1: with samples drawn anew the spurious minima move around, while the true optimum stays put."""
     rng = np.random.default_rng(1)
     seeds, count = 100, 60

@@ -49,7 +49,7 @@ def nobody(text: str) -> None:
 @pytest.mark.parametrize(
     ("masks", "keep_images", "doubts"), [("auto", True, False), ("none", True, True), ("none", False, False)]
 )
-def test_frames_are_the_same(tiny: Path, masks: str, keep_images: bool, doubts: bool) -> None:
+def test_prefetched_frames_equal_direct_ones(tiny: Path, masks: str, keep_images: bool, doubts: bool) -> None:
     """Given masks are not in doubt; without pictures nobody asks for what is."""
     capture = open_capture(tiny, masks=masks)
     theirs = arrays(Ahead(capture.setup(), capture, AHEAD, nobody, keep_images), 2, FRAMES)
@@ -65,7 +65,7 @@ def test_frames_are_the_same(tiny: Path, masks: str, keep_images: bool, doubts: 
             np.testing.assert_array_equal(a[3], b[3], strict=True)
 
 
-def test_frames_stay_as_they_are_while_they_are_held(tiny: Path) -> None:
+def test_held_frames_are_not_overwritten(tiny: Path) -> None:
     """More of them than the ring has slots, some dropped in between, and views after their frame."""
     capture = open_capture(tiny)
     expected = arrays(Serial(capture.setup(), capture, AHEAD, nobody), 0, FRAMES)
@@ -76,7 +76,7 @@ def test_frames_stay_as_they_are_while_they_are_held(tiny: Path) -> None:
         np.testing.assert_array_equal(masks, expected[index][2][1:, ::2])
 
 
-def test_a_result_is_the_same(tiny: Path, tracked: Path, tmp_path: Path) -> None:
+def test_prefetching_does_not_change_the_result(tiny: Path, tracked: Path, tmp_path: Path) -> None:
     capture = open_capture(tiny)
     track(capture, tmp_path / "r.h5", AHEAD, Silent(), frames=(0, 6), store_hull=True)
     assert_same(tmp_path / "r.h5", tracked, slice(0, 6))
@@ -87,14 +87,14 @@ def test_a_result_is_the_same(tiny: Path, tracked: Path, tmp_path: Path) -> None
     assert (timing["total"] >= work - 1e-6).all() and (timing["masks"] > 0).all()
 
 
-def test_notes_are_handed_on(tmp_path: Path) -> None:
+def test_notes_of_the_process_are_reported(tmp_path: Path) -> None:
     folder = write_people(tmp_path / "walk", [lambda k: (0.85 * np.cos(k / 2), 0.85 * np.sin(k / 2))], 12)
     notes: list[str] = []
     assert len(arrays(Ahead(*setup_and_source(open_capture(folder, masks="median")), AHEAD, notes.append), 0, 1)) == 1
     assert "the median of 12 frames is taken for the empty scene" in notes[0]
 
 
-def test_an_error_comes_at_its_frame(copy: Path, tmp_path: Path) -> None:
+def test_an_error_is_raised_at_its_frame(copy: Path, tmp_path: Path) -> None:
     capture = open_capture(copy)
     broken = sorted((copy / "masks").iterdir())[1] / "000007.png"
     broken.write_bytes(broken.read_bytes()[:40])
@@ -103,7 +103,7 @@ def test_an_error_comes_at_its_frame(copy: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_result(tmp_path / "r.h5").frames, np.arange(7))
 
 
-def test_an_error_in_learning(copy: Path) -> None:
+def test_an_error_while_learning_the_background_is_raised(copy: Path) -> None:
     capture = open_capture(copy, masks="none")
     next((copy / "background").iterdir()).unlink()
     with Ahead(capture.setup(), capture, AHEAD, nobody) as source, pytest.raises(VideoError, match="has no background"):
@@ -120,7 +120,7 @@ def test_a_defect_keeps_its_traceback(tiny: Path) -> None:
     assert "in _serve" in str(raised.value)
 
 
-def test_a_killed_process_is_told_in_one_line(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_process_is_reported_in_one_line(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(session, "WRITE_EVERY_S", 0)
 
     class Killer(Silent):
@@ -139,7 +139,7 @@ def test_a_killed_process_is_told_in_one_line(tiny: Path, tmp_path: Path, monkey
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc")
-def test_nothing_is_left_behind(tiny: Path) -> None:
+def test_no_process_or_memory_remains(tiny: Path) -> None:
     def open_files() -> int:
         gc.collect()
         return len(os.listdir("/proc/self/fd"))
@@ -160,7 +160,7 @@ def test_nothing_is_left_behind(tiny: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="needs /proc")
-def test_it_ends_with_the_tracker(tiny: Path) -> None:
+def test_the_process_ends_with_the_tracker(tiny: Path) -> None:
     """Killed, the tracker cannot tell it to."""
     script = (
         "import os, signal, sys, tk.run.prefetch, tk.settings, tk.io.captures.capture as c\n"

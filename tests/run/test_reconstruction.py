@@ -17,7 +17,7 @@ from tk.run.reconstruction import reconstruct
 CONFIG = settings_file.from_toml(QUICK)
 
 
-def test_the_hull_is_the_trackers(tk: Tk, tiny: Path, tmp_path: Path) -> None:
+def test_reconstructed_hull_equals_the_trackers(tk: Tk, tiny: Path, tmp_path: Path) -> None:
     settings, tracked = tmp_path / "settings.toml", tmp_path / "tracked.h5"
     settings.write_text(QUICK, encoding="utf-8")
     ran = tk("track", tiny, "--method", "volumetric", "-o", tracked, "--config", settings, "--store-hull")
@@ -63,7 +63,7 @@ def test_frames_without_anybody_are_empty(tk: Tk, quick: Path, copy: Path, tmp_p
     assert len(open3d.io.read_point_cloud(ply / "000001.ply").points) == 0
 
 
-def test_what_is_finished_is_kept_when_a_mask_breaks(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
+def test_finished_hulls_are_kept_when_a_mask_is_damaged(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
     (copy / "masks" / "cam1" / "000003.png").write_text("white")
     ran = tk("reconstruct", copy, "-o", tmp_path / "h.h5", "--config", quick)
     ran.complaint("masks/cam1/000003.png")

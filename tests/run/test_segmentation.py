@@ -61,7 +61,7 @@ def wrong(masks: np.ndarray, true: np.ndarray) -> np.ndarray:
 # --------------------------------------------------------------------------------------------------------- the order
 
 
-def test_what_is_there_decides(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_source_of_masks_depends_on_the_capture(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(tmp_path / "site", monkeypatch, red="Red")
     assert names()[0] == "red"
     assert mask_source(open_capture(copy)) == "given"
@@ -76,13 +76,13 @@ def test_what_is_there_decides(copy: Path, tmp_path: Path, monkeypatch: pytest.M
 
 @pytest.mark.usefixtures("alone")
 @pytest.mark.parametrize("command", ["track", "reconstruct"])
-def test_nothing_to_make_masks_from_is_refused(tk: Tk, walk: Path, tmp_path: Path, command: str) -> None:
+def test_a_capture_without_any_source_of_masks_is_refused(tk: Tk, walk: Path, tmp_path: Path, command: str) -> None:
     ran = tk(command, walk, "-o", tmp_path / "r.h5")
     ran.complaint(str(walk), "--masks DIR", "background/", "pip install tk-mocap[segmenter]")
     assert not (tmp_path / "r.h5").exists()
 
 
-def test_a_segmenter_that_is_not_there(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_segmenter_is_reported(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(tmp_path / "site", monkeypatch, red="Red", lost="Missing", wrong="Wrong")
     with pytest.raises(ConfigError, match=r"segmenter blue: is not installed; installed: .*red"):
         load("blue")
@@ -95,7 +95,7 @@ def test_a_segmenter_that_is_not_there(walk: Path, tmp_path: Path, monkeypatch: 
 # ------------------------------------------------------------------------------------------------------- the median
 
 
-def test_a_median_where_the_person_moves(walk: Path) -> None:
+def test_median_background_of_a_moving_person(walk: Path) -> None:
     notes: list[str] = []
     capture = open_capture(walk, masks="median")
     segment = make_segmenter(capture.setup(), capture, Settings(), notes.append)
@@ -107,14 +107,14 @@ def test_a_median_where_the_person_moves(walk: Path) -> None:
 
 @pytest.mark.parametrize("masks", ["median", "none"])
 @pytest.mark.usefixtures("alone")
-def test_a_median_where_nobody_moves_is_refused(tmp_path: Path, masks: str) -> None:
+def test_median_background_of_a_still_person_is_refused(tmp_path: Path, masks: str) -> None:
     folder = write_people(tmp_path / "still", [standing], 12)
     with pytest.raises(CaptureError, match="hardly moves" if masks == "median" else "nothing tells") as caught:
         make_segmenter(*setup_and_source(open_capture(folder, masks=masks)), Settings(), lambda _: None)
     assert "--masks DIR" in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_median_that_holds_parts_of_the_person_says_so(tmp_path: Path) -> None:
+def test_median_background_with_parts_of_the_person_is_reported(tmp_path: Path) -> None:
     folder = write_people(tmp_path / "slow", [lambda k: (-0.75, 0.0) if k < 9 else (-0.75 + 0.13 * (k - 8), 0.0)], 20)
     notes: list[str] = []
     make_segmenter(*setup_and_source(open_capture(folder, masks="median")), Settings(), notes.append)
@@ -125,7 +125,7 @@ def test_a_median_that_holds_parts_of_the_person_says_so(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("segmenter", ["Red", "Finding"])
-def test_the_subject_is_who_stands_in_the_volume(
+def test_the_subject_is_the_person_in_the_volume(
     walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, segmenter: str
 ) -> None:
     """The bystander is nearer to some cameras, so larger, and red as well."""
@@ -156,7 +156,7 @@ def test_a_process_ahead_makes_the_same_masks(walk: Path, tmp_path: Path, monkey
             np.testing.assert_array_equal(observation.masks, here[observation.index], strict=True)
 
 
-def test_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_masks_without_a_person_are_empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(tmp_path / "site", monkeypatch, red="Finding")
     folder = write_people(tmp_path / "left", [lambda k: None], 2)
     capture = open_capture(folder)
@@ -167,7 +167,7 @@ def test_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 # --------------------------------------------------------------------------------------------------------- tk masks
 
 
-def test_masks_of_ones_own_for_track(tk: Tk, walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_track_uses_given_masks(tk: Tk, walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(tmp_path / "site", monkeypatch, red="Finding")
     out = tmp_path / "made"
     ran = tk("masks", walk, "-o", out, "--frames", ":5")
@@ -190,7 +190,7 @@ def test_masks_of_ones_own_for_track(tk: Tk, walk: Path, tmp_path: Path, monkeyp
     assert not [path for path in out.rglob("*") if path.name.endswith(".part")]
 
 
-def test_masks_that_another_command_has_made(
+def test_masks_of_the_masks_command_are_used(
     tk: Tk, walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     install(tmp_path / "site", monkeypatch, red="Finding", plain="Red")
@@ -217,7 +217,7 @@ HAS_LITERT = importlib.util.find_spec("ai_edge_litert") is not None
 
 
 @pytest.mark.skipif(not HAS_LITERT, reason="the extra segmenter is not installed")
-def test_the_network_knows_a_rendered_person(tiny: Path) -> None:
+def test_the_built_in_network_segments_a_rendered_person(tiny: Path) -> None:
     from tk.segmenters.weights import FILES, default_cache_dir
 
     if not all((default_cache_dir() / "segmenter" / name).is_file() for name in FILES):

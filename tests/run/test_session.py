@@ -114,7 +114,7 @@ def test_another_seed_gives_another_result(tiny: Path, tracked: Path, tmp_path: 
 # --- stopped and taken up again ---------------------------------------------------------------------------------------
 
 
-def test_a_run_that_is_stopped_twice_equals_an_unbroken_one(
+def test_a_run_interrupted_twice_equals_an_uninterrupted_one(
     tiny: Path, tracked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(session, "WRITE_EVERY_S", 0)
@@ -129,7 +129,7 @@ def test_a_run_that_is_stopped_twice_equals_an_unbroken_one(
     assert_same(result, tracked)
 
 
-def test_frames_that_are_written_together_are_told_of_when_they_are_in_the_file(
+def test_frames_are_reported_after_they_are_written(
     tiny: Path, tracked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(session, "WRITE_EVERY_S", 1e9)
@@ -143,7 +143,7 @@ def test_frames_that_are_written_together_are_told_of_when_they_are_in_the_file(
     assert_same(result, tracked)
 
 
-def test_a_killed_run_leaves_what_it_has_told_of(tiny: Path, tracked: Path, tmp_path: Path) -> None:
+def test_a_killed_run_leaves_every_reported_frame(tiny: Path, tracked: Path, tmp_path: Path) -> None:
     """With frames that are written together, as many as it may be."""
     result, settings = tmp_path / "r.h5", tmp_path / "s.toml"
     settings.write_text(QUICK, encoding="utf-8")
@@ -156,7 +156,7 @@ def test_a_killed_run_leaves_what_it_has_told_of(tiny: Path, tracked: Path, tmp_
 
 
 @pytest.mark.parametrize("frames", [(0, 1), (0, 6)])
-def test_a_run_may_be_prolonged(tiny: Path, tracked: Path, tmp_path: Path, frames: tuple[int, int]) -> None:
+def test_a_run_can_be_extended(tiny: Path, tracked: Path, tmp_path: Path, frames: tuple[int, int]) -> None:
     """The body is fitted to the same frames however few are asked for."""
     run(tiny, tmp_path / "r.h5", frames=frames, store_hull=True)
     assert_same(tmp_path / "r.h5", tracked, slice(*frames))
@@ -188,7 +188,7 @@ def test_ctrl_c_before_the_first_frame_leaves_an_older_result(tiny: Path, tmp_pa
         (["--store-hull"], "stored hull: no, not yes"),
     ],
 )
-def test_only_the_same_command_is_taken_up_again(
+def test_only_the_same_command_is_resumed(
     tk: Tk, quick: Path, tiny: Path, begun: Path, options: list[str], difference: str
 ) -> None:
     before = begun.read_bytes()
@@ -204,7 +204,7 @@ def begun(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_results_of_other_software_are_not_taken_up(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+def test_results_of_other_software_are_not_resumed(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.h5"
     with h5py.File(other, "w") as file:
         file["frames"] = np.arange(3)
@@ -233,7 +233,7 @@ def test_lost_frames_of_all_runs_are_counted(copy: Path, tmp_path: Path, monkeyp
 # --- what is kept -----------------------------------------------------------------------------------------------------
 
 
-def test_the_hull_is_kept_where_it_is_asked_for(tracked: Path) -> None:
+def test_the_hull_is_stored_on_request(tracked: Path) -> None:
     result = read_result(tracked)
     assert result.hull is not None and len(result.hull.offsets) == FRAMES + 1
     assert result.hull.positions.dtype == np.float32 and result.hull.colors.dtype == np.uint8
@@ -305,7 +305,7 @@ def test_frames_before_the_initial_one_are_left_out(copy: Path, tmp_path: Path) 
         run(copy, tmp_path / "other.h5", frames=(0, 2))
 
 
-def test_frames_that_are_asked_for(tiny: Path) -> None:
+def test_requested_frames_are_tracked(tiny: Path) -> None:
     capture, notes = open_capture(tiny), list[str]()
     assert choose_frames(capture, (0, None), notes.append) == (0, FRAMES)
     assert choose_frames(capture, (3, 7), notes.append) == (3, 7)
@@ -316,7 +316,7 @@ def test_frames_that_are_asked_for(tiny: Path) -> None:
         choose_frames(capture, (14, None), notes.append)
 
 
-def test_mog2_is_a_further_choice(tiny: Path, tmp_path: Path) -> None:
+def test_mog2_segmentation_tracks_the_person(tiny: Path, tmp_path: Path) -> None:
     config = settings_file.from_toml(f'segmentation = "mog2"\n{QUICK}')
     assert track(open_capture(tiny, masks="none"), tmp_path / "r.h5", config, Silent(), frames=(0, 4)).lost == 0
 

@@ -49,7 +49,9 @@ def tilted(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("method", "quick"), [("volumetric", QUICK), ("silhouette", QUICK_SILHOUETTE)], ids=["volumetric", "silhouette"]
 )
-def test_the_person_is_tracked(tiny: Path, tilted: Path, tmp_path: Path, method: str, quick: str) -> None:
+def test_the_person_is_tracked_in_a_tilted_world(
+    tiny: Path, tilted: Path, tmp_path: Path, method: str, quick: str
+) -> None:
     path = tmp_path / "r.h5"
     track(open_capture(tilted), path, settings_file.from_toml(quick), Silent(), method, (0, 6))
     with h5py.File(path) as file:
@@ -62,7 +64,7 @@ def test_the_person_is_tracked(tiny: Path, tilted: Path, tmp_path: Path, method:
 
 
 @pytest.mark.parametrize("method", ["region", "silhouette"])
-def test_a_turned_world_makes_no_difference(tiny: Path, tmp_path: Path, method: str) -> None:
+def test_results_do_not_depend_on_the_worlds_rotation(tiny: Path, tmp_path: Path, method: str) -> None:
     """Not even to rounding, which would decide between poses that explain the pictures alike."""
     capture, shift = open_capture(tiny), np.array([3.0, -2.0, 0.7])
     side = 1.15 * max(capture.volume.size)

@@ -33,7 +33,7 @@ def test_first_call_does_not_count() -> None:
     assert len(calls) == 4
 
 
-def test_a_small_capture(tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_benchmark_of_a_small_capture_runs(tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("open3d", exc_type=ImportError)
     file = tmp_path / "bench.json"
     main([str(tiny), "--voxels", "40", "--repeat", "1", "--frames", "4", "--json", str(file)])

@@ -84,7 +84,7 @@ def test_cues_are_what_their_names_say() -> None:
     assert len(set(found.values())) == len(found)
 
 
-def test_views_are_as_many_as_named(asked: list[tuple[Any, ...]], tmp_path: Path) -> None:
+def test_view_selection_has_the_named_number_of_views(asked: list[tuple[Any, ...]], tmp_path: Path) -> None:
     views.run(Options(DEMO, 6, 1, tmp_path / "views.png"))
     assert [len(set(cameras)) for *_, cameras in asked] == [4, 5, 5], "the demo has five cameras"
 
@@ -113,7 +113,7 @@ def test_a_capture_is_tracked_by_levenberg_marquardt() -> None:
     assert (track.iterations > 0).all() and track.iterations.shape == smd.iterations.shape
 
 
-def test_a_track_is_of_the_capture() -> None:
+def test_tracking_result_matches_the_capture() -> None:
     track = common.track(DEMO, replace(settings_file.from_toml(QUICK), voxels=48), 4)
     assert track.error_cm.shape == (4, len(JOINTS)) and track.pose.shape[0] == 4
     assert 0.5 < track.mean_cm < 15 and track.lost_frames <= 4
@@ -126,7 +126,7 @@ def scene() -> sampling.Scene:
     return sampling.look(Options(DEMO, 5, 1, Path("none.png")), settings_file.preset("kehl2006"))
 
 
-def test_an_arm_is_displaced_and_comes_back_or_not(
+def test_recovery_of_a_displaced_arm_is_judged(
     scene: sampling.Scene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(sampling, "look", lambda options, paper: scene)
@@ -147,6 +147,6 @@ def test_deterministic_points_stay_and_stochastic_ones_do_not(scene: sampling.Sc
     np.testing.assert_array_equal(start[0, held], scene.pose[held])
 
 
-def test_a_capture_that_is_none_is_named(tmp_path: Path) -> None:
+def test_a_folder_that_is_no_capture_is_named(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="nowhere"):
         main(["views", str(tmp_path / "nowhere"), "--out", str(tmp_path)])

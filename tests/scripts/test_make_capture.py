@@ -124,7 +124,7 @@ def test_hands_and_elbows_stay_out_of_the_trunk_and_the_legs(plan: Plan) -> None
         assert distances(trunk, pose, pose.origin[0, bones]).min() > -0.01, frame
 
 
-def test_paper_sequences_do_what_they_are_for() -> None:
+def test_paper_sequences_contain_their_motions() -> None:
     def degrees(name: str) -> dict[str, np.ndarray]:
         motion = MOTIONS[name](make_skeleton())
         return {k: np.degrees(v) for k, v in motion.angles(np.arange(motion.frames)).items()}
@@ -140,7 +140,7 @@ def test_paper_sequences_do_what_they_are_for() -> None:
     assert abs(turns[-1] - turns[0]) > 2 * 2 * np.pi
 
 
-def test_turn_leads_all_the_way_round_on_feet_that_step() -> None:
+def test_turn_is_a_full_turn_with_stepping_feet() -> None:
     plan = plan_capture(Options(motion="turn", size=(80, 60)))
     across = (joint(plan, "hip_l") - joint(plan, "hip_r"))[:, :2]
     heading = np.degrees(np.unwrap(np.arctan2(across[:, 1], across[:, 0])))

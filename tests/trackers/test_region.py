@@ -92,7 +92,7 @@ def test_estimate_has_all_fields_of_the_contract() -> None:
     assert (estimate.residual >= 0).all() and (estimate.residual < 0.15).all()
 
 
-def test_sigma_is_finite_and_larger_where_less_is_seen() -> None:
+def test_sigma_is_finite_and_larger_with_fewer_views() -> None:
     first = tracker_at(POSES[0]).step(observe(MASKS[0]))
     assert first.sigma is not None and first.sigma.shape == (15,)
     assert (first.sigma > 0).all() and (first.sigma < 0.2).all()
@@ -165,7 +165,7 @@ def test_run_resumed_after_a_jump_is_the_same() -> None:
     ("forward_deg", "across_deg", "heading"),
     [(25.0, 12.0, 0.7), (25.0, 12.0, 2.1), (0.0, 24.0, 0.0), (15.0, 18.0, 1.5)],
 )
-def test_legs_that_cross_are_not_exchanged(forward_deg: float, across_deg: float, heading: float) -> None:
+def test_crossing_legs_are_not_swapped(forward_deg: float, across_deg: float, heading: float) -> None:
     """Each leg is then near the other one's pose, and neither can leave it alone."""
     spread = standing_pose(SKELETON)
     spread[:3], spread[NAMES.index("torso_yaw")] = POSES[0][:3], heading

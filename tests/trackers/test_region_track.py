@@ -103,13 +103,13 @@ def test_without_the_initialisation_pose_the_body_is_fitted_again(tiny: Path, tm
     assert np.abs(models[0]["parts/shape"] - models[1]["parts/shape"]).max() > 1e-4
 
 
-def test_runs_repeat_and_the_seed_does_not_matter(tiny: Path, causal: Path, tmp_path: Path) -> None:
+def test_runs_repeat_bit_for_bit_with_any_seed(tiny: Path, causal: Path, tmp_path: Path) -> None:
     config = settings_file.from_toml(f"seed = 5\n{QUICK}")
     track(open_capture(tiny), tmp_path / "r.h5", config, Silent(), frames=(0, 6), causal=True)
     assert_same(tmp_path / "r.h5", causal, slice(0, 6))
 
 
-def test_estimates_are_those_of_the_first_pass(tiny: Path, causal: Path) -> None:
+def test_returned_estimates_are_those_of_the_first_pass(tiny: Path, causal: Path) -> None:
     found = list(estimates(*setup_and_source(open_capture(tiny)), CONFIG, frames=(0, 4)))
     expected = read_result(causal)
     assert [e.frame for e in found] == [0, 1, 2, 3]
@@ -117,7 +117,7 @@ def test_estimates_are_those_of_the_first_pass(tiny: Path, causal: Path) -> None
     np.testing.assert_array_equal([e.sigma for e in found], np.asarray(expected.sigma)[:4])
 
 
-def test_estimates_keep_no_pictures_alive(tiny: Path) -> None:
+def test_estimates_keep_no_reference_to_images(tiny: Path) -> None:
     """Whoever collects them holds some kilobytes a frame."""
     found = list(estimates(*setup_and_source(open_capture(tiny)), CONFIG, frames=(0, 4)))
     assert len(found) == 4
@@ -137,7 +137,7 @@ def memory_behind(array: np.ndarray) -> int:
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs POSIX signals")
-def test_a_killed_causal_run_is_taken_up_and_equals_an_unbroken_one(
+def test_a_killed_causal_run_is_resumed_and_equals_an_uninterrupted_one(
     tk: Tk, quick: Path, tiny: Path, causal: Path, tmp_path: Path
 ) -> None:
     result = tmp_path / "r.h5"
@@ -157,7 +157,7 @@ def test_a_killed_causal_run_is_taken_up_and_equals_an_unbroken_one(
     assert_same(result, causal)
 
 
-def test_a_broken_run_is_refined_when_it_is_complete(tiny: Path, refined: Path, tmp_path: Path) -> None:
+def test_an_interrupted_run_gets_its_second_pass_when_complete(tiny: Path, refined: Path, tmp_path: Path) -> None:
     """The first pass in two runs, the second over frames of both: masks of the earlier run are read again."""
 
     class Stop(Silent):
@@ -174,7 +174,7 @@ def test_a_broken_run_is_refined_when_it_is_complete(tiny: Path, refined: Path, 
     assert_same(result, refined)
 
 
-def test_a_run_killed_in_its_second_pass_gets_it_when_it_is_taken_up(
+def test_a_run_killed_in_its_second_pass_repeats_it_on_resume(
     tiny: Path, causal: Path, refined: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """All frames are there, and what follows from all of them is not."""
@@ -194,7 +194,7 @@ def test_a_run_killed_in_its_second_pass_gets_it_when_it_is_taken_up(
     assert_same(result, refined)
 
 
-def test_a_refined_result_is_not_prolonged(tk: Tk, tiny: Path, quick: Path, tmp_path: Path) -> None:
+def test_a_result_after_its_second_pass_cannot_be_extended(tk: Tk, tiny: Path, quick: Path, tmp_path: Path) -> None:
     result = tmp_path / "r.h5"
     run(tiny, result, frames=(0, 4))
     before = result.read_bytes()
@@ -208,14 +208,14 @@ def test_a_refined_result_is_not_prolonged(tk: Tk, tiny: Path, quick: Path, tmp_
 
 
 @pytest.mark.parametrize("frames", [(0, 1), (0, 6)])
-def test_a_causal_run_may_be_prolonged(tiny: Path, causal: Path, tmp_path: Path, frames: tuple[int, int]) -> None:
+def test_a_causal_result_can_be_extended(tiny: Path, causal: Path, tmp_path: Path, frames: tuple[int, int]) -> None:
     run(tiny, tmp_path / "r.h5", frames=frames, causal=True)
     assert_same(tmp_path / "r.h5", causal, slice(*frames))
     run(tiny, tmp_path / "r.h5", resume=True, causal=True)
     assert_same(tmp_path / "r.h5", causal)
 
 
-def test_lost_frames_stay_as_they_are_in_the_second_pass(copy: Path, tmp_path: Path) -> None:
+def test_the_second_pass_does_not_change_lost_frames(copy: Path, tmp_path: Path) -> None:
     for camera in (copy / "masks").iterdir():
         for index in (3, 4):
             write_picture(camera / f"{index:06d}.png", np.zeros((120, 160), np.uint8))
@@ -231,7 +231,7 @@ def test_lost_frames_stay_as_they_are_in_the_second_pass(copy: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("causal", [False, True])
-def test_frames_of_which_nothing_is_known_are_told(
+def test_frames_without_known_joints_are_reported(
     tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, causal: bool
 ) -> None:
     step = RegionTracker.step
@@ -256,7 +256,9 @@ def test_frames_of_which_nothing_is_known_are_told(
 # --- bodies from files ------------------------------------------------------------------------------------------------
 
 
-def test_a_body_of_an_earlier_result_is_taken_and_kept(tiny: Path, causal: Path, refined: Path, tmp_path: Path) -> None:
+def test_the_body_of_an_earlier_result_is_used_unchanged(
+    tiny: Path, causal: Path, refined: Path, tmp_path: Path
+) -> None:
     run(tiny, tmp_path / "r.h5", body=refined, frames=(0, 5))
     found, expected = read_result(tmp_path / "r.h5"), read_result(refined)
     np.testing.assert_array_equal(found.model["parts/shape"], expected.model["parts/shape"])
@@ -265,7 +267,7 @@ def test_a_body_of_an_earlier_result_is_taken_and_kept(tiny: Path, causal: Path,
     assert mean_error(found, tiny) < 0.08
 
 
-def test_a_body_of_dimensions_is_taken(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
+def test_a_body_given_by_dimensions_is_used(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
     file = tmp_path / "body.toml"
     file.write_text(tomli_w.dumps({"stature": 1.8, "dimensions": {"thigh": 0.45}}), encoding="utf-8")
     ran = tk("track", tiny, "-o", tmp_path / "r.h5", "--config", quick, "--frames", ":2", "--body", file)
@@ -288,7 +290,7 @@ def test_a_body_of_dimensions_is_taken(tk: Tk, quick: Path, tiny: Path, tmp_path
         ("stature = \n", ["body.toml"]),
     ],
 )
-def test_bodies_that_cannot_be_used_are_one_line(
+def test_unusable_bodies_are_reported_in_one_line(
     tk: Tk, quick: Path, tiny: Path, tmp_path: Path, text: str, parts: list[str]
 ) -> None:
     file = tmp_path / "body.toml"
@@ -296,7 +298,7 @@ def test_bodies_that_cannot_be_used_are_one_line(
     tk("track", tiny, "-o", tmp_path / "r.h5", "--config", quick, "--body", file).complaint(str(file), *parts)
 
 
-def test_results_without_a_body_of_contours_are_told(
+def test_results_without_a_cone_body_are_refused(
     tk: Tk, quick: Path, tiny: Path, tracked: Path, causal: Path, tmp_path: Path
 ) -> None:
     command = ["track", tiny, "-o", tmp_path / "r.h5", "--config", quick]
@@ -315,7 +317,7 @@ def test_results_without_a_body_of_contours_are_told(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_another_body_is_another_run(tiny: Path, refined: Path, tmp_path: Path) -> None:
+def test_a_run_with_another_body_is_not_resumed(tiny: Path, refined: Path, tmp_path: Path) -> None:
     run(tiny, tmp_path / "begun.h5", frames=(0, 2), causal=True)
     with pytest.raises(ResultError, match=r"given body \(its hash\): none, not "):
         run(tiny, tmp_path / "begun.h5", frames=(0, 4), causal=True, resume=True, body=refined)
@@ -332,7 +334,7 @@ def test_exit_codes(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
     assert tk("track", tiny).code == 2
 
 
-def test_any_pose_will_do_in_any_frame(copy: Path, tmp_path: Path) -> None:
+def test_tracking_starts_from_any_pose_in_any_frame(copy: Path, tmp_path: Path) -> None:
     file = copy / "capture.toml"
     file.write_text(file.read_text(encoding="utf-8").replace("da-vinci", "any"), encoding="utf-8")
     run(copy, tmp_path / "r.h5", frames=(4, 7), causal=True)
@@ -340,7 +342,7 @@ def test_any_pose_will_do_in_any_frame(copy: Path, tmp_path: Path) -> None:
     assert found.frames.tolist() == [4, 5, 6] and found.status[0] == Status.INITIALISED
 
 
-def test_the_volumetric_tracker_takes_a_body_in_any_pose_and_gives_one(
+def test_the_volumetric_tracker_accepts_and_stores_a_body(
     copy: Path, causal: Path, tracked: Path, tmp_path: Path
 ) -> None:
     """One body serves both skins."""

@@ -34,7 +34,7 @@ def tracker_at(pose, **settings) -> SilhouetteTracker:
     return tracker
 
 
-def test_a_disturbed_pose_is_recovered():
+def test_a_disturbed_pose_converges_to_the_true_one():
     rng = np.random.default_rng(2)
     disturbed = POSES[0] + np.where(np.arange(len(NAMES)) < 3, 0.03, 0.07) * rng.choice([-1, 1], len(NAMES))
     tracker = tracker_at(disturbed)
@@ -48,7 +48,7 @@ def test_a_disturbed_pose_is_recovered():
     assert (estimate.iterations <= [3, 3, 4]).all()
 
 
-def test_a_walk_is_followed_and_can_be_taken_up_again():
+def test_a_walk_is_tracked_and_resumed_bit_for_bit():
     tracker = tracker_at(POSES[0])
     estimates = []
     for i, masks in enumerate(MASKS):
@@ -63,7 +63,7 @@ def test_a_walk_is_followed_and_can_be_taken_up_again():
         np.testing.assert_array_equal(second.step(observe(MASKS[i], i)).pose, estimates[i].pose)
 
 
-def test_the_subject_is_found_without_any_hint():
+def test_the_subject_is_found_without_an_initial_pose():
     config = SilhouetteSettings(adapt=False)
     tracker = SilhouetteTracker(RIG, "z", config)
     tracker.start([observe(m, i) for i, m in enumerate(MASKS)], STATURE, None)
@@ -75,13 +75,13 @@ def test_the_subject_is_found_without_any_hint():
     assert np.linalg.norm(found - truth) < np.linalg.norm(found[::-1] - truth)
 
 
-def test_the_stature_is_read_off_the_silhouettes():
+def test_stature_is_estimated_from_the_silhouettes():
     tracker = SilhouetteTracker(RIG, "z", SilhouetteSettings(adapt=False))
     tracker.start([observe(MASKS[0])], None, None)
     assert tracker.body.dimensions.stature == pytest.approx(STATURE, rel=0.06)
 
 
-def test_dimensions_are_adapted_in_start():
+def test_start_adapts_the_body_dimensions():
     thick = BODY.dimensions.scaled(thigh_radius=1.25, head_radius=1.15)
     masks = draw_silhouettes(build_cone_body(thick), RIG, POSES[:3])
     config = SilhouetteSettings(fit=BodyFitSettings(frames=2, rounds=5))
@@ -96,7 +96,7 @@ def test_dimensions_are_adapted_in_start():
     assert found.stature == pytest.approx(STATURE, rel=0.02)
 
 
-def test_an_empty_picture_is_a_lost_frame_and_the_next_one_is_recovered():
+def test_empty_masks_are_a_lost_frame_and_the_next_frame_is_recovered():
     tracker = tracker_at(POSES[0])
     first = tracker.step(observe(MASKS[0]))
     lost = tracker.step(observe(np.zeros_like(MASKS[0]), 1))
@@ -106,11 +106,11 @@ def test_an_empty_picture_is_a_lost_frame_and_the_next_one_is_recovered():
     assert tracker.step(observe(MASKS[2], 3)).status == "tracked"
 
 
-def test_somebody_who_comes_back_elsewhere_is_found():
+def test_a_person_who_returns_at_another_place_is_found():
     find_again_elsewhere(tracker_at(POSES[0]), RIG, POSES[:3], 2 * CLOSE_M)
 
 
-def test_the_walker_moves_only_its_seven_degrees_of_freedom():
+def test_walking_model_changes_only_its_seven_degrees_of_freedom():
     tracker = tracker_at(POSES[0], body="walker")
     start = tracker.world.poses_out(tracker.state()["pose"])
     estimate = tracker.step(observe(MASKS[1]))
@@ -120,7 +120,7 @@ def test_the_walker_moves_only_its_seven_degrees_of_freedom():
     assert errors(estimate, POSES[1])[ankles].max() < 0.08
 
 
-def test_nobody_in_the_first_frame_is_told():
+def test_an_empty_first_frame_is_reported():
     tracker = SilhouetteTracker(RIG, "z")
     masks = MASKS[0].copy()
     masks[1:] = 0

@@ -48,7 +48,7 @@ def unbroken(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_the_result_is_as_the_contract_has_it(tiny: Path, unbroken: Path) -> None:
+def test_result_file_has_the_datasets_of_the_contract(tiny: Path, unbroken: Path) -> None:
     result = read_result(unbroken)
     assert result.meta.method == "silhouette" in METHODS
     assert result.status.tolist() == [Status.INITIALISED] + [Status.TRACKED] * 7
@@ -62,7 +62,7 @@ def test_the_result_is_as_the_contract_has_it(tiny: Path, unbroken: Path) -> Non
     assert np.linalg.norm(result.joints - truth, axis=2).mean() < 0.08
 
 
-def test_runs_repeat_and_are_taken_up_again(tiny: Path, unbroken: Path, tmp_path: Path) -> None:
+def test_repeated_and_resumed_runs_give_the_same_result(tiny: Path, unbroken: Path, tmp_path: Path) -> None:
     output = tmp_path / "r.h5"
     run(tiny, output, frames=(0, 5))
     summary = run(tiny, output, frames=(0, 8), resume=True)
@@ -70,7 +70,7 @@ def test_runs_repeat_and_are_taken_up_again(tiny: Path, unbroken: Path, tmp_path
     np.testing.assert_array_equal(read_result(output).pose, read_result(unbroken).pose)
 
 
-def test_any_pose_will_do_in_any_frame(copy: Path, tmp_path: Path) -> None:
+def test_tracking_starts_from_any_pose_in_any_frame(copy: Path, tmp_path: Path) -> None:
     file = copy / "capture.toml"
     file.write_text(file.read_text(encoding="utf-8").replace("da-vinci", "any"), encoding="utf-8")
     run(copy, tmp_path / "r.h5", frames=(4, 7))
@@ -78,13 +78,13 @@ def test_any_pose_will_do_in_any_frame(copy: Path, tmp_path: Path) -> None:
     assert found.frames.tolist() == [4, 5, 6] and found.status[0] == Status.INITIALISED
 
 
-def test_masks_are_made_from_the_videos(tiny: Path, tmp_path: Path) -> None:
+def test_videos_are_segmented_if_masks_are_none(tiny: Path, tmp_path: Path) -> None:
     run(tiny, tmp_path / "r.h5", masks="none", frames=(0, 3))
     truth = read_joints(tiny / "truth.h5").positions[:3]
     assert np.linalg.norm(read_joints(tmp_path / "r.h5").positions - truth, axis=2).mean() < 0.1
 
 
-def test_it_starts_from_a_pose_file(tiny: Path, tmp_path: Path) -> None:
+def test_tracking_starts_from_a_pose_file(tiny: Path, tmp_path: Path) -> None:
     truth = read_joints(tiny / "truth.h5").positions[0]
     lines = [f"{name} = {truth[i].round(2).tolist()}" for i, name in enumerate(JOINTS)]
     (tmp_path / "pose.toml").write_text("[joints]\n" + "\n".join(lines) + "\n", encoding="utf-8")
@@ -92,14 +92,14 @@ def test_it_starts_from_a_pose_file(tiny: Path, tmp_path: Path) -> None:
     assert np.linalg.norm(read_joints(tmp_path / "r.h5").positions[0] - truth, axis=1).mean() < 0.08
 
 
-def test_the_walker_is_a_choice(tiny: Path, tmp_path: Path) -> None:
+def test_walker_setting_selects_the_walking_model(tiny: Path, tmp_path: Path) -> None:
     run(tiny, tmp_path / "r.h5", QUICK.replace("init_frames", 'body = "walker"\ninit_frames'), frames=(0, 2))
     with h5py.File(tmp_path / "r.h5") as file:
         assert file["model/parts/shape"].shape == (6, 4)
         assert file["model/body"][()].decode() == "walker"
 
 
-def test_settings_are_checked(tiny: Path, tk: Tk, tmp_path: Path) -> None:
+def test_settings_out_of_range_are_refused(tiny: Path, tk: Tk, tmp_path: Path) -> None:
     for text, part in (
         ("[silhouette]\nbody = 'robot'\n", "robot"),
         ("[silhouette]\nprediction = 3.0\n", "prediction"),
@@ -111,7 +111,7 @@ def test_settings_are_checked(tiny: Path, tk: Tk, tmp_path: Path) -> None:
     said.complaint("bad.toml", "silhouette.bodies")
 
 
-def test_nobody_in_the_masks_is_told_in_one_line(copy: Path, quick: Path, tk: Tk, tmp_path: Path) -> None:
+def test_empty_masks_are_reported_in_one_line(copy: Path, quick: Path, tk: Tk, tmp_path: Path) -> None:
     import cv2
 
     for picture in (copy / "masks").rglob("*.png"):

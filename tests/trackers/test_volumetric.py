@@ -27,7 +27,7 @@ def test_a_body_without_hands_and_feet_is_refused() -> None:
 
 # level, somewhat forward; hanging, with the forearm folded up against the upper arm
 @pytest.mark.parametrize("angles", [(0.0, 1.5, 0.0, 0.0), (1.5, 0.0, 0.0, 2.3)], ids=["raised", "folded"])
-def test_an_arm_left_behind_is_found_by_the_search_that_looks_around(angles: tuple[float, ...], tmp_path: Path) -> None:
+def test_limb_search_recovers_a_displaced_arm(angles: tuple[float, ...], tmp_path: Path) -> None:
     rig = ring_of_cameras(4, width=240, height=300)
     pose = walk(1)[0]
     masks = draw_silhouettes(BODY, rig, pose[None])[0]

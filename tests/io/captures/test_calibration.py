@@ -21,7 +21,7 @@ def write(tmp_path: Path, document: dict[str, Any]) -> Path:
     return path
 
 
-def test_reads_every_field(tmp_path: Path) -> None:
+def test_every_field_is_read(tmp_path: Path) -> None:
     tables = calibration_tables(3)
     tables["cam2"]["distortions"] = [0.1, -0.05, 0.001, 0.002]
     tables["metadata"] = {"adjusted": True, "error": 0.3}
@@ -44,7 +44,7 @@ def test_units_scale_the_translation_only(tmp_path: Path, units: str, unit_m: fl
     np.testing.assert_array_equal(camera.matrix, tables["cam1"]["matrix"])
 
 
-def test_variants_of_the_neighbours(tmp_path: Path) -> None:
+def test_variants_of_other_tools_are_read(tmp_path: Path) -> None:
     tables = calibration_tables(2)
     pose2sim = {f"cam_{k}": {**table, "size": [64.0, 48.0]} for k, table in enumerate(tables.values())}
     assert read_calibration(write(tmp_path, pose2sim)).rig[0].width == 64
@@ -72,7 +72,7 @@ def test_a_rotation_may_be_a_matrix(tmp_path: Path) -> None:
         np.testing.assert_allclose(other.rotation @ other.rotation.T, np.eye(3), atol=1e-14)
 
 
-def test_byte_order_mark_is_no_obstacle(tmp_path: Path) -> None:
+def test_a_byte_order_mark_is_accepted(tmp_path: Path) -> None:
     path = write(tmp_path, calibration_tables(2))
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     assert len(read_calibration(path).rig) == 2
@@ -135,7 +135,7 @@ def test_a_missing_key_is_named(tmp_path: Path, key: str) -> None:
         read_calibration(write(tmp_path, tables))
 
 
-def test_the_file_itself(tmp_path: Path) -> None:
+def test_unreadable_files_are_reported(tmp_path: Path) -> None:
     path = tmp_path / "calibration.toml"
     with pytest.raises(CalibrationError, match="no such file"):
         read_calibration(path)
@@ -164,7 +164,7 @@ def test_names_and_units_are_checked(tmp_path: Path) -> None:
         read_calibration(write(tmp_path, {**calibration_tables(2), "metadata": {"units": "inch"}}))
 
 
-def test_select(tmp_path: Path) -> None:
+def test_select_keeps_the_named_cameras(tmp_path: Path) -> None:
     calibration = read_calibration(write(tmp_path, calibration_tables(4)))
     assert calibration.select(None).rig.names == ("cam1", "cam2", "cam3", "cam4")
     assert calibration.select(["cam4", " cam2"]).rig.names == ("cam2", "cam4")
@@ -197,14 +197,14 @@ def test_match_camera_refuses_to_guess() -> None:
         match_camera("cam_01", "cam_01", ["cam01", "cam-01"])
 
 
-def test_a_number_of_too_many_digits(tmp_path: Path) -> None:
+def test_a_number_of_too_many_digits_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, calibration_tables(2))
     path.write_text(path.read_text().replace("60.0", "9" * 400, 1))
     with pytest.raises(CalibrationError, match=r"camera 'cam1': matrix holds 9+.*, which is too large"):
         read_calibration(path)
 
 
-def test_a_written_calibration_is_the_old_one_but_for_its_cameras(tmp_path: Path) -> None:
+def test_a_written_calibration_differs_only_in_its_cameras(tmp_path: Path) -> None:
     tables = calibration_tables(3)
     tables["cam2"]["owner"] = "somebody"
     path = write(tmp_path, {"cameras": tables, "metadata": {"units": "mm"}})

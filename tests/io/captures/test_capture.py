@@ -33,7 +33,7 @@ def write_masks(folder: Path, cameras: int, frames: int) -> None:
             write_picture(folder / f"cam{camera + 1}" / f"{k:06d}.png", mask)
 
 
-def test_opens_with_what_capture_toml_says(make_capture: MakeCapture) -> None:
+def test_settings_of_capture_toml_are_used(make_capture: MakeCapture) -> None:
     folder = make_capture(
         settings={
             "name": "dance",
@@ -64,7 +64,7 @@ def test_up_may_be_any_direction(make_capture: MakeCapture) -> None:
     assert open_capture(make_capture(settings={"up": [0.0, -2.0, 0.0]}, name="axis")).up == "-y"
 
 
-def test_everything_in_capture_toml_has_a_default(make_capture: MakeCapture) -> None:
+def test_settings_of_capture_toml_have_defaults(make_capture: MakeCapture) -> None:
     capture = open_capture(make_capture(settings={}, name="ring"))
     assert (capture.name, capture.fps, capture.up) == ("ring", 15.0, "z")
     assert (capture.subject_height_m, capture.init_frame, capture.init_pose) == (None, 0, "da-vinci")
@@ -72,7 +72,7 @@ def test_everything_in_capture_toml_has_a_default(make_capture: MakeCapture) -> 
     assert len(capture.warnings) == 1 and "no [volume]" in capture.warnings[0]
 
 
-def test_frames_come_in_order_and_belong_together(make_capture: MakeCapture) -> None:
+def test_frames_are_in_order_and_synchronised(make_capture: MakeCapture) -> None:
     capture = open_capture(make_capture())
     for start, stop, expected in ((0, None, range(12)), (5, 9, range(5, 9)), (7, 99, range(7, 12))):
         with capture.frames(start, stop) as frames:
@@ -96,7 +96,7 @@ def test_cameras_of_different_sizes_are_padded(make_capture: MakeCapture) -> Non
     assert not images[0, 48:].any() and not images[1, :, 48:].any()
 
 
-def test_a_subset_of_cameras(make_capture: MakeCapture) -> None:
+def test_a_subset_of_cameras_can_be_selected(make_capture: MakeCapture) -> None:
     folder = make_capture()
     (folder / "videos" / "cam2.mp4").unlink()  # not needed for the selected cameras
     capture = open_capture(folder, cameras=["cam3", "cam1"])
@@ -107,7 +107,7 @@ def test_a_subset_of_cameras(make_capture: MakeCapture) -> None:
         open_capture(folder, cameras=["cam1", "cam7"])
 
 
-def test_pictures_instead_of_videos(make_capture: MakeCapture) -> None:
+def test_folders_of_images_replace_videos(make_capture: MakeCapture) -> None:
     folder = make_capture(cameras=2)
     (folder / "videos").rename(folder / "old")
     for camera in range(2):
@@ -157,7 +157,7 @@ def test_masks_auto_none_and_from_elsewhere(make_capture: MakeCapture, tmp_path:
         open_capture(folder, masks="nowhere")
 
 
-def test_masks_that_do_not_fit(make_capture: MakeCapture) -> None:
+def test_masks_of_another_size_or_length_are_refused(make_capture: MakeCapture) -> None:
     folder = make_capture()
     write_masks(folder / "masks", 2, 12)
     with refused(VideoError, f"{Path('masks', 'cam3.mp4')}: camera 'cam3' has no masks"):
@@ -172,7 +172,7 @@ def test_masks_that_do_not_fit(make_capture: MakeCapture) -> None:
         open_capture(folder)
 
 
-def test_background(make_capture: MakeCapture) -> None:
+def test_background_is_read_from_clips_and_images(make_capture: MakeCapture) -> None:
     folder = make_capture(cameras=2)
     write_video(folder / "background" / "cam1.mp4", [picture(0, k % 32) for k in range(60)])
     with pytest.raises(VideoError, match=r"background.cam2\.png: camera 'cam2' has no background"):
@@ -200,7 +200,7 @@ def test_a_missing_folder_or_calibration_is_reported(make_capture: MakeCapture, 
         open_capture(folder)
 
 
-def test_a_camera_without_video(make_capture: MakeCapture) -> None:
+def test_a_camera_without_video_is_reported(make_capture: MakeCapture) -> None:
     folder = make_capture()
     (folder / "videos" / "cam2.mp4").unlink()
     with refused(VideoError, str(folder / "videos" / "cam2.mp4"), "cam1.mp4, cam3.mp4"):
@@ -210,14 +210,14 @@ def test_a_camera_without_video(make_capture: MakeCapture) -> None:
         open_capture(folder)
 
 
-def test_an_image_size_unlike_the_calibrations(make_capture: MakeCapture) -> None:
+def test_an_image_size_other_than_calibrated_is_refused(make_capture: MakeCapture) -> None:
     folder = make_capture()
     write_video(folder / "videos" / "cam3.mp4", [picture(2, k, (80, 48)) for k in range(12)])
     with refused(VideoError, str(folder / "videos" / "cam3.mp4"), "80×48", "64×48", "calibration.toml"):
         open_capture(folder)
 
 
-def test_videos_of_different_lengths(make_capture: MakeCapture) -> None:
+def test_videos_of_different_lengths_are_cut_to_the_shortest(make_capture: MakeCapture) -> None:
     folder = make_capture()
     write_video(folder / "videos" / "cam2.mp4", [picture(1, k) for k in range(9)])
     capture = open_capture(folder)
@@ -229,7 +229,7 @@ def test_videos_of_different_lengths(make_capture: MakeCapture) -> None:
 
 
 @pytest.mark.parametrize("late", [2, -3])
-def test_time_offsets_choose_which_pictures_belong_together(make_capture: MakeCapture, late: int) -> None:
+def test_time_offsets_select_the_images_of_a_frame(make_capture: MakeCapture, late: int) -> None:
     folder = make_capture(settings={"fps": 10.0})
     tables = calibration_tables(3)
     tables["cam2"]["time_offset"] = late / 10 + 0.03  # less than half a frame of it stays
@@ -247,7 +247,7 @@ def test_time_offsets_choose_which_pictures_belong_together(make_capture: MakeCa
 
 
 @pytest.mark.parametrize("start", [0, 8, 11])
-def test_beyond_its_end_a_video_shows_its_last_picture(make_capture: MakeCapture, start: int) -> None:
+def test_after_its_end_a_video_repeats_its_last_image(make_capture: MakeCapture, start: int) -> None:
     clips = open_capture(make_capture()).clips
     with FrameReader(clips, None, (clips[0].height, clips[0].width), start, 14, (2, -3, 2)) as frames:
         for seen in frames:
@@ -255,7 +255,7 @@ def test_beyond_its_end_a_video_shows_its_last_picture(make_capture: MakeCapture
             assert [read_tag(image) for image in seen.images] == [(0, late), (1, early), (2, late)]
 
 
-def test_time_offsets_that_cannot_be(make_capture: MakeCapture) -> None:
+def test_impossible_time_offsets_are_refused(make_capture: MakeCapture) -> None:
     folder = make_capture(settings={"fps": 10.0})
     for value, complaint in ((1.3, "cam1.mp4: ends before all"), (1e5, "time_offset = 100000"), ("1", "finite number")):
         tables = calibration_tables(3)
@@ -265,7 +265,7 @@ def test_time_offsets_that_cannot_be(make_capture: MakeCapture) -> None:
             open_capture(folder)
 
 
-def test_a_text_file_called_mp4(make_capture: MakeCapture) -> None:
+def test_a_text_file_named_mp4_is_refused(make_capture: MakeCapture) -> None:
     folder = make_capture()
     (folder / "videos" / "cam1.mp4").write_text("a shopping list\n" * 30)
     with refused(VideoError, str(folder / "videos" / "cam1.mp4"), "not a video"):
@@ -303,7 +303,9 @@ def test_a_text_file_called_mp4(make_capture: MakeCapture) -> None:
         ({"init": {"pose": "t-pose"}}, CaptureError, "[init]: pose = 't-pose' must be one of da-vinci, any"),
     ],
 )
-def test_bad_settings(make_capture: MakeCapture, settings: dict[str, Any], error: type, complaint: str) -> None:
+def test_bad_settings_are_reported_in_one_line(
+    make_capture: MakeCapture, settings: dict[str, Any], error: type, complaint: str
+) -> None:
     folder = make_capture(cameras=2, settings=settings)
     with refused(error, str(folder / "capture.toml"), complaint):
         open_capture(folder)
@@ -336,7 +338,7 @@ def test_millimetres_without_units_are_recognised(make_capture: MakeCapture) -> 
     assert any('units = "mm" missing' in line for line in open_capture(folder).warnings)
 
 
-def test_no_volume_and_none_to_infer(make_capture: MakeCapture) -> None:
+def test_a_volume_that_cannot_be_inferred_is_reported(make_capture: MakeCapture) -> None:
     folder = make_capture(cameras=2, settings={})
     tables = calibration_tables(2)
     tables["cam2"] |= {key: tables["cam1"][key] for key in ("rotation", "translation")}

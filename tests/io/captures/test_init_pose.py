@@ -18,7 +18,7 @@ PLACES = {name: [0.1 * k, 0.2 * (k % 2), 1.0] for k, name in enumerate(JOINTS)}
 PLACE = {"torso_x": 0.1, "torso_y": -0.2, "torso_z": 1.0}
 
 
-def test_joints(tmp_path: Path) -> None:
+def test_joints_are_read(tmp_path: Path) -> None:
     file = tmp_path / "pose.toml"
     some = dict(list(PLACES.items())[:LEAST_JOINTS])
     write_toml(file, {"frame": 12, "joints": some, "subject": {"height": 1.8}})
@@ -30,7 +30,7 @@ def test_joints(tmp_path: Path) -> None:
     np.testing.assert_allclose(pose.center, np.mean(list(some.values()), axis=0))
 
 
-def test_angles_are_in_degrees_and_places_in_metres(tmp_path: Path) -> None:
+def test_angles_are_read_in_degrees_and_positions_in_metres(tmp_path: Path) -> None:
     file = tmp_path / "pose.toml"
     write_toml(file, {"angles": {**PLACE, "torso_yaw": 90, "elbow_l_pitch": -30.0}})
     pose = read_init_pose(str(file), NAMES)
@@ -63,7 +63,7 @@ def test_angles_are_in_degrees_and_places_in_metres(tmp_path: Path) -> None:
         ({"angles": PLACE, "subject": 3}, ["subject", "table"]),
     ],
 )
-def test_mistakes_are_one_line(tmp_path: Path, document: dict[str, Any], parts: list[str]) -> None:
+def test_mistakes_are_reported_in_one_line(tmp_path: Path, document: dict[str, Any], parts: list[str]) -> None:
     file = tmp_path / "pose.toml"
     write_toml(file, document)
     with refused(CaptureError, *parts) as caught:
@@ -71,7 +71,7 @@ def test_mistakes_are_one_line(tmp_path: Path, document: dict[str, Any], parts: 
     assert str(caught.value).startswith(str(file))
 
 
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+def test_unreadable_files_are_reported(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match=r"nowhere\.toml: no such file"):
         read_init_pose(tmp_path / "nowhere.toml", NAMES)
     with pytest.raises(CaptureError, match="no such file"):

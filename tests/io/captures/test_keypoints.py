@@ -47,7 +47,7 @@ def detected(tmp_path_factory: pytest.TempPathFactory, capture: Capture, true_jo
 
 
 @pytest.mark.parametrize("count", LAYOUTS)
-def test_every_layout(tmp_path: Path, capture: Capture, true_joints: np.ndarray, count: int) -> None:
+def test_every_keypoint_layout_is_read(tmp_path: Path, capture: Capture, true_joints: np.ndarray, count: int) -> None:
     write_keypoints(tmp_path / "pose", capture.rig, FRAME, [true_joints], np.random.default_rng(0), count, 0.0, 0.0)
     pose = keypoint_pose(tmp_path / "pose", capture, FRAME)
     assert set(pose.joints) == set(LAYOUTS[count]) and pose.frame == FRAME
@@ -55,7 +55,7 @@ def test_every_layout(tmp_path: Path, capture: Capture, true_joints: np.ndarray,
         np.testing.assert_allclose(place, true_joints[JOINTS.index(name)], atol=1e-4)
 
 
-def test_the_sides_of_the_layouts() -> None:
+def test_layouts_have_left_and_right_at_the_right_index() -> None:
     """As the tools' documents number them."""
     assert [LAYOUTS[25][name] for name in ("shoulder_r", "elbow_r", "wrist_r", "hip_r", "knee_r", "ankle_r")] == [
         *(2, 3, 4, 9, 10, 11)
@@ -66,14 +66,16 @@ def test_the_sides_of_the_layouts() -> None:
         assert [LAYOUTS[count][name] for name in ("hip_l", "knee_l", "ankle_l", "ankle_r")] == [11, 13, 15, 16]
 
 
-def test_noise_wrong_points_and_a_bystander(detected: Path, capture: Capture, true_joints: np.ndarray) -> None:
+def test_triangulation_survives_noise_wrong_points_and_a_bystander(
+    detected: Path, capture: Capture, true_joints: np.ndarray
+) -> None:
     pose = keypoint_pose(detected, capture, FRAME)
     error = [np.linalg.norm(place - true_joints[JOINTS.index(name)]) for name, place in pose.joints.items()]
     assert len(error) >= 10
     assert np.median(error) < 0.04  # a pixel is 3 cm wide there
 
 
-def test_tracking_begins_with_them(detected: Path, tiny: Path, tmp_path: Path, tk: Tk, quick: Path) -> None:
+def test_tracking_starts_from_keypoints(detected: Path, tiny: Path, tmp_path: Path, tk: Tk, quick: Path) -> None:
     folder = Path(shutil.copytree(tiny, tmp_path / "capture"))
     shutil.copytree(detected, folder / "pose")
     capture_file = folder / "capture.toml"
@@ -95,7 +97,7 @@ def test_tracking_begins_with_them(detected: Path, tiny: Path, tmp_path: Path, t
     tk("track", folder, "-o", tmp_path / "r.h5", "--config", quick).complaint("pose: is no folder")
 
 
-def test_a_late_video_is_read_in_step(detected: Path, capture: Capture, tmp_path: Path) -> None:
+def test_keypoints_follow_time_offsets(detected: Path, capture: Capture, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(detected, tmp_path / "pose"))
     first = capture.rig.names[0]
     (file,) = (folder / first).iterdir()
@@ -128,7 +130,7 @@ def person(**changes: Any) -> dict[str, Any]:
         (person(pose_keypoints_2d=[1.0, 1.0, -0.5] * 25), ["-0.5 is no confidence"]),
     ],
 )
-def test_mistakes_are_one_line(tmp_path: Path, document: object, parts: list[str]) -> None:
+def test_mistakes_are_reported_in_one_line(tmp_path: Path, document: object, parts: list[str]) -> None:
     file = tmp_path / "cam1_000000.json"
     file.write_text(json.dumps(document))
     with refused(CaptureError, *parts) as caught:
@@ -136,7 +138,7 @@ def test_mistakes_are_one_line(tmp_path: Path, document: object, parts: list[str
     assert str(caught.value).startswith(str(file))
 
 
-def test_nobody_and_unseen_keypoints(tmp_path: Path) -> None:
+def test_missing_people_and_keypoints_are_nan(tmp_path: Path) -> None:
     file = tmp_path / "cam1_000000.json"
     for people in ([], [{"pose_keypoints_2d": []}], [{"pose_keypoints_2d": [0.0] * 75}]):
         file.write_text(json.dumps({"people": people}))
@@ -145,7 +147,7 @@ def test_nobody_and_unseen_keypoints(tmp_path: Path) -> None:
     assert np.isfinite(read_people(file)[0]).all(axis=1).sum() == len(LAYOUTS[25])  # the nose is no joint of ours
 
 
-def test_folders_that_do_not_suit(tmp_path: Path, capture: Capture, detected: Path) -> None:
+def test_folders_without_matching_files_are_refused(tmp_path: Path, capture: Capture, detected: Path) -> None:
     names = capture.rig.names
     with pytest.raises(CaptureError, match="nowhere: is no folder"):
         keypoint_pose(tmp_path / "nowhere", capture, FRAME)
@@ -165,7 +167,7 @@ def test_folders_that_do_not_suit(tmp_path: Path, capture: Capture, detected: Pa
         keypoint_pose(folder, capture, FRAME)
 
 
-def test_people_in_other_places_are_refused(tmp_path: Path, capture: Capture, true_joints: np.ndarray) -> None:
+def test_people_outside_the_volume_are_refused(tmp_path: Path, capture: Capture, true_joints: np.ndarray) -> None:
     far = [true_joints + np.array([40.0, 0.0, 0.0])]
     write_keypoints(tmp_path / "pose", capture.rig, FRAME, far, np.random.default_rng(0), noise_px=0.0, wrong=0.0)
     with pytest.raises(CaptureError, match="in frame 4 cameras agree on 0 joints of one person in the working volume"):
@@ -174,7 +176,7 @@ def test_people_in_other_places_are_refused(tmp_path: Path, capture: Capture, tr
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_damaged_files_end_in_one_line_or_in_a_pose(
+def test_damaged_files_give_one_line_or_a_pose(
     data: st.DataObject, detected: Path, capture: Capture, tmp_path: Path
 ) -> None:
     """Bytes changed, cut off or put in: a pose with finite joints, or one line that names what it is about."""

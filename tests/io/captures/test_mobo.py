@@ -48,7 +48,7 @@ def walk(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return pictures
 
 
-def test_a_walk_is_a_capture(tiny: Path, walk: Path) -> None:
+def test_a_walk_opens_as_a_capture(tiny: Path, walk: Path) -> None:
     source, found = open_capture(tiny), open_capture(walk)
     assert found.rig.names == NAMES and found.frame_count == FRAMES
     assert (found.fps, found.init_pose, found.has_masks) == (30.0, "any", True)
@@ -74,7 +74,7 @@ def test_a_walk_is_tracked(tk: Tk, walk: Path, tmp_path: Path) -> None:
     assert ran.code == 0 and f"{FRAMES} frames in" in ran.err
 
 
-def test_lens_distortion_is_inverted() -> None:
+def test_tsais_lens_distortion_is_inverted() -> None:
     f, kappa = 6.0, 2e-3
     tsai = dict.fromkeys(["dx", "dy", "dpx", "dpy"], 0.01) | {"Ncx": 640, "Nfx": 640, "Cx": 320, "Cy": 240, "sx": 1.0}
     tsai |= {"f": f, "kappa1": kappa, "Tx": 100.0, "Ty": -50.0, "Tz": 3000.0, "Rx": 0.1, "Ry": -0.2, "Rz": 0.3}
@@ -86,7 +86,7 @@ def test_lens_distortion_is_inverted() -> None:
         np.testing.assert_allclose(d * (1 + kappa * d @ d), [f * x / z, f * y / z], atol=2e-4)
 
 
-def test_bad_camera_files_are_told_in_one_line(tk: Tk, walk: Path, tmp_path: Path) -> None:
+def test_bad_camera_files_are_reported_in_one_line(tk: Tk, walk: Path, tmp_path: Path) -> None:
     import shutil
 
     copy = Path(shutil.copytree(walk.parents[2], tmp_path / "mobo"))

@@ -39,7 +39,7 @@ def read_all(clip: Clip, start: int = 0) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.avi", "a.mkv", "a.mov", "A.MP4"])
-def test_a_video_is_read_in_order(tmp_path: Path, name: str) -> None:
+def test_images_of_a_video_are_read_in_order(tmp_path: Path, name: str) -> None:
     written = tmp_path / name.lower()
     write_video(written, [picture(1, k) for k in range(12)], fps=25)
     path = written.rename(tmp_path / name)
@@ -50,7 +50,7 @@ def test_a_video_is_read_in_order(tmp_path: Path, name: str) -> None:
     assert [read_tag(image) for image in read_all(clip, start=7)] == [(1, k) for k in range(7, 12)]
 
 
-def test_reading_into_part_of_an_array_equals_reading_into_its_own(tmp_path: Path) -> None:
+def test_reading_into_a_view_equals_reading_into_an_array(tmp_path: Path) -> None:
     write_video(tmp_path / "a.mp4", [picture(0, k) for k in range(3)])
     clip = probe(tmp_path / "a.mp4")
     larger = np.zeros((HEIGHT + 2, WIDTH + 2, 3), np.uint8)
@@ -62,7 +62,7 @@ def test_reading_into_part_of_an_array_equals_reading_into_its_own(tmp_path: Pat
 
 @pytest.mark.parametrize("first", [0, 1])
 @pytest.mark.parametrize("pattern", ["{:06d}.png", "frame_{:03d}.jpg"])
-def test_numbered_pictures(tmp_path: Path, first: int, pattern: str) -> None:
+def test_numbered_images_are_read_in_order(tmp_path: Path, first: int, pattern: str) -> None:
     for k in range(11):
         write_picture(tmp_path / "cam" / pattern.format(k + first), picture(2, k))
     clip = probe(tmp_path / "cam")
@@ -70,7 +70,7 @@ def test_numbered_pictures(tmp_path: Path, first: int, pattern: str) -> None:
     assert [read_tag(image) for image in read_all(clip, start=4)] == [(2, k) for k in range(4, 11)]
 
 
-def test_bad_folders_of_pictures(tmp_path: Path) -> None:
+def test_folders_with_gaps_or_damaged_images_are_refused(tmp_path: Path) -> None:
     folder = tmp_path / "cam"
     folder.mkdir()
     with pytest.raises(VideoError, match="holds no pictures"):
@@ -92,13 +92,13 @@ def test_bad_folders_of_pictures(tmp_path: Path) -> None:
         probe(folder)
 
 
-def test_pictures_must_start_at_the_start(tmp_path: Path) -> None:
+def test_the_first_image_must_have_number_0_or_1(tmp_path: Path) -> None:
     write_picture(tmp_path / "cam" / "000100.png", picture(0, 0))
     with pytest.raises(VideoError, match=r"starts with 000100\.png"):
         probe(tmp_path / "cam")
 
 
-def test_masks_are_black_and_white_from_128_on(tmp_path: Path) -> None:
+def test_masks_are_binarised_at_128(tmp_path: Path) -> None:
     grey = np.array([[0, 1, 127, 128, 200, 255]], np.uint8)
     write_picture(tmp_path / "cam" / "000000.png", grey)
     clip = probe(tmp_path / "cam", is_mask=True)
@@ -117,13 +117,13 @@ def test_masks_are_black_and_white_from_128_on(tmp_path: Path) -> None:
     assert np.mean(mask != blob[..., 0]) < 0.03  # coding blurs the outline
 
 
-def test_a_mask_of_ones_is_not_taken_for_empty(tmp_path: Path) -> None:
+def test_a_mask_of_zeros_and_ones_is_refused(tmp_path: Path) -> None:
     write_picture(tmp_path / "cam" / "000000.png", np.eye(8, dtype=np.uint8))
     with closing(probe(tmp_path / "cam", is_mask=True).open()) as reader, pytest.raises(VideoError, match="255"):
         reader.read(np.zeros((8, 8), np.uint8))
 
 
-def test_a_picture_of_another_size_is_named(tmp_path: Path) -> None:
+def test_an_image_of_another_size_is_refused(tmp_path: Path) -> None:
     write_picture(tmp_path / "cam" / "0.png", picture(0, 0))
     write_picture(tmp_path / "cam" / "1.png", picture(0, 1, (32, 32)))
     with pytest.raises(VideoError, match=r"1\.png: is 32×32; the pictures before it are 64×48"):
@@ -155,7 +155,7 @@ def index_first(data: bytes) -> bytes:
     return rest[0] + bytes(shifted) + b"".join(rest[1:])
 
 
-def test_a_video_that_is_cut_off(tmp_path: Path) -> None:
+def test_a_truncated_video_is_refused(tmp_path: Path) -> None:
     noise_video(tmp_path / "whole.mp4", 40)
     data = (tmp_path / "whole.mp4").read_bytes()
     path = tmp_path / "cut.mp4"
@@ -170,7 +170,7 @@ def test_a_video_that_is_cut_off(tmp_path: Path) -> None:
         probe(path)
 
 
-def test_a_video_that_ends_before_its_count(tmp_path: Path) -> None:
+def test_a_video_that_ends_early_is_reported_at_its_last_frame(tmp_path: Path) -> None:
     write_video(tmp_path / "a.mp4", [picture(0, k) for k in range(12)])
     clip = dataclasses.replace(probe_video(tmp_path / "a.mp4"), frame_count=20)
     reader = FrameReader([clip, clip], None, (HEIGHT, WIDTH), 0, 20)
@@ -181,7 +181,7 @@ def test_a_video_that_ends_before_its_count(tmp_path: Path) -> None:
     assert seen == list(range(12))
 
 
-def test_files_that_are_no_video(tmp_path: Path) -> None:
+def test_files_that_are_no_video_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "cam.mp4"
     path.write_text("These are the minutes of the meeting.\n" * 20)
     with pytest.raises(VideoError, match=r"cam\.mp4: is not a video"):
@@ -194,7 +194,7 @@ def test_files_that_are_no_video(tmp_path: Path) -> None:
         probe(path)
 
 
-def test_opencv_and_ffmpeg_keep_silent(tmp_path: Path) -> None:
+def test_opencv_and_ffmpeg_print_nothing(tmp_path: Path) -> None:
     noise_video(tmp_path / "whole.mp4", 20)
     data = index_first((tmp_path / "whole.mp4").read_bytes())
     (tmp_path / "cut.mp4").write_bytes(data[: len(data) // 2])
@@ -217,7 +217,7 @@ def test_opencv_and_ffmpeg_keep_silent(tmp_path: Path) -> None:
     assert done.stderr == ""
 
 
-def test_list_clips(tmp_path: Path) -> None:
+def test_list_clips_finds_videos_and_folders_by_stem(tmp_path: Path) -> None:
     for name in ("a.mp4", "b.MOV", "c.png", "notes.txt", ".hidden.mp4"):
         (tmp_path / name).touch()
     (tmp_path / "d.1").mkdir()
@@ -295,7 +295,7 @@ def test_reading_ahead_is_bounded() -> None:
         assert all(clip.position <= 5 + 8 for clip in clips)
 
 
-def test_memory_is_used_again_once_nobody_holds_it() -> None:
+def test_memory_is_reused_once_unreferenced() -> None:
     clips = [FakeClip(0), FakeClip(1)]
     with reader_of(clips) as reader:
         held = [next(reader).images[1:, ::2] for _ in range(3)]
@@ -309,7 +309,7 @@ def test_memory_is_used_again_once_nobody_holds_it() -> None:
             np.testing.assert_array_equal(view, copy)
 
 
-def test_everything_before_an_error_is_handed_out() -> None:
+def test_all_frames_before_an_error_are_returned() -> None:
     clips = [FakeClip(0), FakeClip(1, fails_at=20), FakeClip(2, fails_at=20)]
     seen = []
     reader = reader_of(clips)
@@ -322,7 +322,7 @@ def test_everything_before_an_error_is_handed_out() -> None:
     assert all(clip.closed == 1 for clip in clips)
 
 
-def test_an_error_on_opening_is_raised_on_the_first_frame() -> None:
+def test_an_error_on_opening_is_raised_at_the_first_frame() -> None:
     class Locked(FakeClip):
         def open(self) -> FakeClip:
             raise VideoError("locked")
@@ -331,7 +331,7 @@ def test_an_error_on_opening_is_raised_on_the_first_frame() -> None:
         next(reader)
 
 
-def test_a_consumer_that_raises_ends_the_threads() -> None:
+def test_threads_end_when_the_consumer_raises() -> None:
     clips = [FakeClip(0), FakeClip(1)]
     with pytest.raises(ZeroDivisionError), reader_of(clips) as reader:
         for _ in reader:
@@ -339,7 +339,7 @@ def test_a_consumer_that_raises_ends_the_threads() -> None:
     assert all(clip.closed == 1 for clip in clips)
 
 
-def test_a_reader_that_is_dropped_ends_the_threads() -> None:
+def test_threads_end_when_the_reader_is_deleted() -> None:
     clips = [FakeClip(0), FakeClip(1)]
     for frame_set in reader_of(clips):
         if frame_set.index == 3:
@@ -348,7 +348,7 @@ def test_a_reader_that_is_dropped_ends_the_threads() -> None:
     assert all(clip.closed == 1 for clip in clips)
 
 
-def test_closing_early_twice_and_while_skipping() -> None:
+def test_a_reader_can_be_closed_twice_and_while_skipping() -> None:
     clips = [FakeClip(0, frame_count=10**9)]
     reader = reader_of(clips, start=10**9 - 1, stop=10**9)
     reader.close()
@@ -357,7 +357,7 @@ def test_closing_early_twice_and_while_skipping() -> None:
     assert clips[0].closed == 1
 
 
-def test_a_reader_left_open_does_not_hold_up_the_interpreter(tmp_path: Path) -> None:
+def test_an_open_reader_does_not_block_the_exit(tmp_path: Path) -> None:
     write_video(tmp_path / "a.mp4", [picture(0, k) for k in range(30)])
     program = (
         "import sys, pathlib\n"

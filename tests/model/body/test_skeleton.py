@@ -65,7 +65,7 @@ def mirrored(pose):
 # The tree
 
 
-def test_layout():
+def test_joints_parents_and_degrees_of_freedom_of_the_skeleton():
     s = SKELETON
     assert len(s.names) == len(set(s.names)) == D == 24
     assert s.units == ("m",) * 3 + ("rad",) * 21

@@ -72,7 +72,7 @@ def on_limbs(term, points):
     return np.isin(term.strips.piece[points.strip], term.strips.limb_piece)
 
 
-def test_colour_edges_are_looked_for_in_the_views_with_the_fewest_hidden_points():
+def test_colour_edges_are_searched_in_the_views_with_the_fewest_hidden_points():
     poses = some_poses(6, seed=22)
     term = term_of(EDGES)
     entries, points = assigned(term, poses)
@@ -125,7 +125,7 @@ def test_weights_sum_to_the_terms_weight():
     assert (scale >= 0).all()
 
 
-def test_the_truth_explains_its_own_edges():
+def test_edge_cost_is_least_at_the_true_pose():
     entries, _ = assigned(term_of(replace(EDGES, hidden=0.0)), TRUTH)
     entries = entries[:, entries[0, :, a.SCALE] > 0]  # hidden points can have no edge
     distance = residual_px(entries, TRUTH)
@@ -148,7 +148,7 @@ def test_pictures_pull_a_displaced_body_back():
             assert sign * gradient[axis] > 0, (axis, sign)
 
 
-def test_a_batch_is_its_poses_one_by_one():
+def test_a_batch_equals_its_poses_one_by_one():
     term = term_of()
     poses = some_poses(3, seed=25)
     chosen = np.stack([term.draw(np.random.default_rng(i)) for i in range(3)])

@@ -166,14 +166,14 @@ def test_value_is_least_at_the_truth(frame, truth):
     assert frame.value(truth + 0.3 * np.eye(D)[0]) > 5 * best
 
 
-def test_fit_at_the_truth_leaves_nothing_over(frame, truth):
+def test_fit_at_the_truth_explains_all_voxels(frame, truth):
     fit = frame.fit(truth)
     assert fit.unmatched.mean() < 0.01 and fit.unexplained.mean() < 0.01
     assert len(fit.unmatched) == len(fit.samples) and len(fit.unexplained) == len(fit.voxels)
     assert len(set(fit.voxels)) == len(fit.voxels) >= 600
 
 
-def test_an_arm_elsewhere_is_stranded_and_leaves_its_voxels_astray(frame, truth):
+def test_a_displaced_arm_is_unsupported_and_its_voxels_unexplained(frame, truth):
     """The left arm hangs in the model and is level in the data."""
     pose = truth.copy()
     pose[SKELETON.index("shoulder_l_pitch")] -= np.radians(60)
@@ -187,7 +187,7 @@ def test_an_arm_elsewhere_is_stranded_and_leaves_its_voxels_astray(frame, truth)
     assert fit.unexplained.mean() > 0.02 and (x @ [-np.sin(yaw), np.cos(yaw), 0] > 0.1).all()
 
 
-def test_astray_is_beyond_a_distance(frame, truth):
+def test_voxels_are_unexplained_beyond_a_distance(frame, truth):
     fit = frame.fit(truth + 0.12 * np.eye(D)[0])
     distance = np.linalg.norm(fit.linear.residual[len(fit.samples) :], axis=1)
     np.testing.assert_array_equal(

@@ -49,7 +49,7 @@ def test_bins_have_sixteen_levels_of_each_channel(b, g, r):
     assert 0 <= found < COLOR_BINS
 
 
-def test_nothing_is_known_before_anything_is_learned():
+def test_likelihoods_are_uniform_before_learning():
     colors = PartColors(BODY)
     assert not colors.known and colors.state() == {}
     assert colors.regions(np.zeros((2, 4, 4, 3), np.uint8)) is None

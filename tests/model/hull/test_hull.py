@@ -94,7 +94,7 @@ def test_incremental_equals_from_scratch_equals_oracle(cameras, voxels, seed):
 
 @pytest.mark.parametrize("width", [47, 48])  # 4 * 40 * 47 bytes are whole words, 3 * 41 * 47 are not
 @pytest.mark.parametrize("height", [40, 41])
-def test_pictures_that_do_not_fill_whole_words(width, height):
+def test_image_widths_that_are_no_multiple_of_a_word(width, height):
     rig = Rig(
         tuple(look_at(f"c{i}", e, size=(width, height)) for i, e in enumerate([(2, 0, 1), (0, 2, 1), (-2, 1, 1)]))
     )
@@ -274,7 +274,7 @@ def test_the_default_cache_is_the_platforms(tmp_path, build_calls):
         assert hull_tables.default_cache_dir() == tmp_path / "cache" / "tk"
 
 
-def test_the_key_knows_every_number():
+def test_the_cache_key_depends_on_every_number():
     rig, grid = make_rig(3), VoxelGrid.cover(VOLUME, 16)
     keys = {hull_tables.table_key(rig, grid)}
     camera = rig[1]
@@ -294,7 +294,7 @@ def test_the_key_knows_every_number():
     assert len(keys) == 10
 
 
-def test_a_spoilt_cache_never_breaks_a_run(tmp_path, build_calls):
+def test_a_damaged_cache_is_rebuilt(tmp_path, build_calls):
     rig, grid = make_rig(4), VoxelGrid.cover(VOLUME, 16)
     good = hull_tables.load_or_build(rig, grid, tmp_path)
     (path,) = tmp_path.glob("*.npz")
@@ -326,7 +326,7 @@ def test_a_spoilt_cache_never_breaks_a_run(tmp_path, build_calls):
     assert len(build_calls) == len(spoilers) + 1  # the last spoilt file was mended
 
 
-def test_a_cache_that_cannot_be_written_is_left_aside(tmp_path, build_calls):
+def test_an_unwritable_cache_is_not_used(tmp_path, build_calls):
     rig, grid = make_rig(3), VoxelGrid.cover(VOLUME, 8)
     blocked = tmp_path / "a file"
     blocked.write_text("in the way")
@@ -335,7 +335,7 @@ def test_a_cache_that_cannot_be_written_is_left_aside(tmp_path, build_calls):
     assert hull.occupancy.any() and len(build_calls) == 1
 
 
-def test_the_oldest_tables_go_first(tmp_path, monkeypatch):
+def test_the_oldest_tables_are_deleted_first(tmp_path, monkeypatch):
     sizes = []
     for age, voxels in enumerate((8, 9, 10)):
         path = tmp_path / f"hull-{voxels}.npz"

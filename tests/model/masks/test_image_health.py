@@ -92,7 +92,7 @@ def test_state_is_restored() -> None:
     assert again.look(*frames[-1]) == [None] * C
 
 
-def test_frames_are_described() -> None:
+def test_frame_ranges_are_described_in_words() -> None:
     assert described(12, 12, 1) == "frame 12"
     assert described(30, 74, 45) == "frames 30 to 74"
     assert described(30, 74, 12) == "12 of the frames 30 to 74"

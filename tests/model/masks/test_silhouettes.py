@@ -16,7 +16,7 @@ POSE[2] = 0.9
 MASKS = draw_silhouettes(BODY, RIG, POSE[None])[0]
 
 
-def test_cleaning_removes_specks_and_holes_and_leaves_the_rest():
+def test_cleaning_removes_only_specks_and_holes():
     mask = MASKS[0]
     dirty = mask.copy()
     dirty[2:4, 2:5] = 255
@@ -35,7 +35,7 @@ def test_gaps_between_limbs_stay_open():
     np.testing.assert_array_equal(clean(mask), mask)
 
 
-def test_scales_halve_pictures_of_any_size():
+def test_pyramid_halves_images_of_any_size():
     pyramid = Views(RIG).pyramid(MASKS, 3, False)
     assert [m.shape for m in pyramid.masks] == [(2, 133, 101), (2, 67, 51), (2, 34, 26)]
     assert pyramid.sizes[2].tolist() == [[26, 34]] * 2
@@ -43,7 +43,7 @@ def test_scales_halve_pictures_of_any_size():
     assert np.abs(pyramid.masks[1][:, :66, :50] - fine).max() <= 1
 
 
-def test_the_share_of_wrong_pixels_is_the_papers():
+def test_share_of_wrong_pixels_follows_the_papers_definition():
     other = POSE.copy()
     other[0] += 0.1
     drawn = draw_silhouettes(BODY, RIG, other[None])[0]

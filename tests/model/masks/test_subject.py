@@ -54,7 +54,7 @@ def test_no_subject_without_two_matching_sightings() -> None:
     assert locate(RIG, VOLUME, [[low], [high], [], []]) is None, "their lines of sight do not meet"
 
 
-def test_a_subject_is_upright_in_its_square() -> None:
+def test_a_patch_shows_the_subject_upright() -> None:
     found = locate(RIG, VOLUME, [[sighted(camera, (0.3, -0.2))] for camera in RIG])
     assert found is not None
     for camera in RIG:
@@ -82,14 +82,14 @@ def test_cut_and_paste_are_inverse(x: float, y: float, side: int, angle: float) 
     assert (back[outside] == 0).all()
 
 
-def test_a_square_about_points() -> None:
+def test_a_patch_around_points() -> None:
     points = np.array([[10.0, 20.0], [50.0, 30.0]])
     assert Patch.about(points, 1.5) == Patch((30.0, 25.0), 60)
     turned = Patch.about(points, 1.0, np.pi / 2)
     assert turned.side == 40 and turned.center == pytest.approx((30.0, 25.0))
 
 
-def test_the_volume_in_a_picture() -> None:
+def test_the_patch_of_the_volume_covers_it() -> None:
     for camera in RIG:
         patch = volume_patch(camera, VOLUME)
         assert patch.holds(camera.project([[0, 0, 0.1], [0, 0, 1.9]])[0]) and patch.side <= 200

@@ -16,7 +16,7 @@ BODY = BodyDimensions.from_stature(1.75)
 
 
 @pytest.mark.parametrize("up", ["z", "-y"])
-def test_all_parts_belong_together(up: str) -> None:
+def test_derived_quantities_are_consistent(up: str) -> None:
     skeleton = build_skeleton(BODY, up, waist=True)
     poses = np.random.default_rng(0).uniform(-0.7, 0.7, (5, len(skeleton.names)))
     found = derive(skeleton, BODY, poses)

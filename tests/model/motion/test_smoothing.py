@@ -43,13 +43,13 @@ def test_error_falls_and_nothing_lags() -> None:
     np.testing.assert_allclose(found.noise, NOISE, rtol=0.35)
 
 
-def test_what_is_exact_stays() -> None:
+def test_exact_motion_is_not_changed() -> None:
     true = motion()
     found = smooth(SKELETON, true, np.ones(len(true), bool), FPS)
     np.testing.assert_allclose(found.poses, true, atol=4e-3)
 
 
-def test_stillness_becomes_stiller() -> None:
+def test_noise_of_a_still_person_is_reduced() -> None:
     true = np.full((200, D), 0.1)
     found = smooth(SKELETON, noisy(true), np.ones(200, bool), FPS)
     assert np.sqrt(((found.poses - true) ** 2).mean()) < 0.5 * NOISE
@@ -77,7 +77,7 @@ def test_a_gap_just_as_long_as_allowed_is_bridged() -> None:
     assert smooth(SKELETON, poses, known, 10.0, longest_gap_s=0.9).bridged.sum() == 0
 
 
-def test_limits_are_kept() -> None:
+def test_smoothed_angles_stay_within_joint_limits() -> None:
     true = np.tile(np.where(np.isfinite(SKELETON.upper), SKELETON.upper, 0.0), (100, 1))
     poses = SKELETON.clip(noisy(true))
     found = smooth(SKELETON, poses, np.ones(100, bool), FPS)
@@ -97,7 +97,7 @@ def test_a_turning_body_is_not_torn_where_the_angle_wraps() -> None:
 
 
 @pytest.mark.parametrize("fps", [15.0, 60.0])
-def test_motion_is_left_alone(fps: float) -> None:
+def test_real_motion_is_not_attenuated(fps: float) -> None:
     """What moves at 2 Hz keeps its size; what is quicker than any motion does not, where the frame rate shows it."""
     t = np.arange(200)[:, None] / fps
     true = np.tile(0.05 * np.sin(2 * np.pi * 2.0 * t), (1, D))
@@ -109,7 +109,7 @@ def test_motion_is_left_alone(fps: float) -> None:
     assert np.sqrt(((found - true) ** 2).mean()) < (1.0 if fps < 20 else 0.6) * NOISE
 
 
-def test_too_little_stays_as_it_is() -> None:
+def test_short_sequences_are_not_changed() -> None:
     poses = noisy(motion(SHORTEST - 1))
     found = smooth(SKELETON, poses, np.ones(len(poses), bool), FPS)
     np.testing.assert_array_equal(found.poses, poses)
