@@ -368,8 +368,11 @@ def test_evaluate_refuses_damaged_results(tk: Tk, tracked: Path, tiny: Path, tmp
 @pytest.mark.parametrize(
     ("options", "own"),
     [
-        (["--method", "volumetric"], [("resume/state/pose", None), ("model/patches", None)]),
-        (["--causal"], [("resume/state/poses", None), ("resume/state/costs", "text"), ("model/parts", None)]),
+        (
+            ["--method", "volumetric"],
+            [("resume/state/pose", None), ("resume/state/baseline", "text"), ("model/patches", None)],
+        ),
+        (["--causal"], [("resume/state/poses", None), ("resume/state/residual_mean", "text"), ("model/parts", None)]),
     ],
 )
 def test_resume_refuses_a_damaged_state(
@@ -381,7 +384,6 @@ def test_resume_refuses_a_damaged_state(
     good = result.read_bytes()
     for name, value in [
         *own,
-        ("resume/state/usual", "text"),
         ("resume/state/run/lost frames", np.zeros(3)),
         ("pose", np.zeros((2, 3))),
     ]:
