@@ -32,7 +32,7 @@ Float = NDArray[np.float64]
 # Headings, and walking phases of each, from which the person is searched for.
 HEADINGS, PHASES = 8, 8
 # Poses that differ by more than this, mean over the joints, metres, are different hypotheses. Coarser than the
-# tracker's own SAME_POSE_M: an average body that is not fitted yet reaches the same pose only to about 10 cm.
+# tracker's own SAME_POSE_M, because the body is an average one that is not fitted yet. Sensitivity not measured.
 SAME_START_M = 0.15
 # Poses of the best heading, and of those that face the other way, that are refined by a limb search.
 FINALISTS, OPPOSITE = 4, 2

@@ -24,8 +24,8 @@ START_SPREAD, LEAST_SPREAD, LEAST_SHARE = 0.03, 0.02, 0.2
 # mean of the first frames is a plain mean. Chosen on the development captures; sensitivity not measured.
 RATE = 0.05
 # An excess above this in one view, in spreads, is an outlier: the view is suspect, and counts no further in the mean
-# over the views, so that a torn mask in one of three or more views makes no frame's residual high. In 2 % of the views'
-# frames of the development captures the excess is larger.
+# over the views, so that a torn mask in one of three or more views makes no frame's residual high. In 2 % of the frames
+# of the development captures a view has a larger excess.
 OUTLIER = 5.0
 
 

@@ -19,7 +19,8 @@ from tk.model.body.skeleton import Skeleton, shoulder_angles
 
 Float = NDArray[np.float64]
 
-# Two poses of a limb are different if a joint's positions differ by more than this, metres: about an arm's width.
+# Two poses of a limb are different if a joint's positions differ by more than this, metres.
+# Sensitivity not measured.
 DISTINCT_M = 0.12
 
 # Grids of angles. The upper arm has directions on the sphere about 20° apart, without those through the back or far

@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 # Rows of an image that are compared, approximately.
 _ROWS = 64
-# An image is blank if the standard deviation of its grey levels is below this: sensor noise has 1 to 3 levels.
+# An image is blank if the standard deviation of its grey levels is below this.
+# It must lie above the sensor's noise. Sensitivity not measured.
 _BLANK_LEVELS = 3.0
 # Two images are the same if at most this share of the pixels differs by more than this many levels, which covers what
 # the coding of a still video changes. Chosen on the development captures; sensitivity not measured.
 _SAME_LEVELS, _SAME_SHARE = 6, 0.001
-# Change of another camera's mask, as a share of its area, that shows movement: noise of segmented masks is below 10 %.
+# Change of another camera's mask, as a share of its area, that shows movement.
+# It must lie above the noise of segmented masks. Sensitivity not measured.
 _MOVED = 0.15
 
 BLANK, FROZEN = "shows nothing", "stands still"
