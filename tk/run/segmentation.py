@@ -55,7 +55,7 @@ def mask_source(source: Source) -> str:
         return source.masks_from
     installed = names()
     if not installed:
-        raise CaptureError(f"{source.where}: nothing tells the person from the scene; {_WAYS_OUT}")
+        raise CaptureError(f"{source.where}: no masks, no empty scene and no segmenter; {_WAYS_OUT}")
     return _SEGMENTER + installed[0]
 
 

@@ -259,10 +259,3 @@ class Stopwatch:
         now = time.perf_counter()
         self.laps[stage] = self.laps.get(stage, 0.0) + now - self._last
         self._last = now
-
-
-def drift(usual: Float, now: Float) -> Float:
-    """What is usual after one more frame, element by element: quick to learn that it can be better, slow to put up with
-    worse; infinite as long as nothing is known."""
-    known = np.where(np.isfinite(usual), usual, now)
-    return np.asarray(known + np.where(now < known, 0.1, 0.05) * (now - known))

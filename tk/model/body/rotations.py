@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 Float = NDArray[np.float64]
 
-# Below this sine of the middle angle the first and the last turn cannot be told apart: all is given to the last.
+# Below this sine of the middle angle the first and the last turn are the same: all is given to the last.
 _SINGULAR = 1e-7
 
 

@@ -12,7 +12,7 @@ from tk.model.cameras.up import UP_AXES, up_text, up_vector
 #: an inferred direction this close to an axis is taken to be the axis, degrees: cameras that look down tilt it by less
 SNAP_DEG = 10.0
 
-#: the cameras are mounted in different ways if the mean of their upward directions is shorter than this
+#: the cameras are mounted differently if the mean of their upward directions is shorter than this
 _AGREE = 0.4
 
 #: cameras are rolled if their rightward directions are off the horizontal by more than this, root mean square, degrees
@@ -63,7 +63,7 @@ def infer_up(rig: Rig) -> FoundUp:
         roll_deg = float(np.degrees(np.sqrt(max(values[0], 0.0) / len(rig))))
         level = roll_deg <= _ROLLED_DEG
         estimates = [second] if level else [*estimates, second]
-    unsure = "; the cameras are mounted in different ways, so make sure of it" if agreement < _AGREE else ""
+    unsure = "; the cameras are mounted differently: check it" if agreement < _AGREE else ""
 
     own = next((camera.name for camera in rig if _is_world(camera)), None)
     if own is not None:

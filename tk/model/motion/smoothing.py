@@ -1,14 +1,12 @@
 """Smoothing the poses of a whole recording: noise out, short gaps bridged, nothing delayed.
 
-Each degree of freedom is a value that moves at a velocity, which white noise accelerates; it is seen with white noise.
-A Kalman filter runs forward, a Rauch-Tung-Striebel smoother back over it (Rauch, Tung & Striebel, AIAA J. 3 (1965)
-1445-1450): each frame is estimated from all frames, those after it too, so that no lag is left. Chosen over a low-pass
-filter run forth and back, because a frame without measurement needs no special treatment (across a gap the model gives
-the smoothest motion between its sides), and because each degree of freedom is smoothed as much as its own noise asks
-for: how strong either noise is, is found in the data by maximum likelihood. A person does not move as the model
-does, though, and what the model cannot follow would be taken for noise; so nothing slower than :data:`MOTION_HZ` is
-smoothed away. At 15 frames/s this leaves little to smooth, at 30 and more much. A tracker's errors that last for many
-frames are not white and stay: they cannot be told from motion.
+The model of each degree of freedom is a constant velocity with white acceleration noise, measured with white noise. A
+Kalman filter runs forward and a Rauch-Tung-Striebel smoother backward (Rauch, Tung & Striebel, AIAA J. 3 (1965)
+1445-1450), so each frame is estimated from all frames and has no lag. Two reasons against a low-pass filter in both
+directions: a frame without measurement needs no special treatment, and each degree of freedom is smoothed by its own
+noise, which is estimated by maximum likelihood. A person does not move as the model does, and would be smoothed too
+much; so the filter leaves everything slower than :data:`MOTION_HZ`. At 15 frames/s this leaves little to smooth, at 30
+and more much. A tracker's error that lasts for many frames is not white noise and stays: it looks like motion.
 
 Angles are smoothed one by one. The limits of the skeleton's ball joints keep them away from their singular directions,
 where the angles would not follow the rotation smoothly. A foot that stands is not held: it may slide by what its
@@ -31,7 +29,7 @@ Bool = NDArray[np.bool_]
 # Standard deviation of the acceleration's noise over that of the measurement's, both for steps of one frame: from
 # motion that is hardly seen to change within seconds to measurements that are taken as they are.
 _RATIOS = np.geomspace(1e-3, 10.0, 17)
-# Voluntary movement has next to no power above 6 Hz, the usual cut-off in gait analysis (Winter, Biomechanics and Motor
+# Voluntary movement has almost no power above 6 Hz, the common cut-off in gait analysis (Winter, Biomechanics and Motor
 # Control of Human Movement, 2009, chapter 3).
 MOTION_HZ = 6.0
 # A velocity that nothing is known of, against the measurement's noise a frame.
