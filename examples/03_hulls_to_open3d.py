@@ -27,7 +27,9 @@ options = parser.parse_args()
 options.out.mkdir(parents=True, exist_ok=True)
 
 capture = tk.open_capture(options.capture)
-segment = make_segmenter(capture, tk.Settings(), print)  # its masks, or those made against the empty scene
+segment = make_segmenter(
+    capture.setup(), capture, tk.Settings(), print
+)  # its masks, or those made against the empty scene
 grid = VoxelGrid.cover(capture.volume, options.voxels)
 hull = tk.VisualHull(capture.rig, grid)
 

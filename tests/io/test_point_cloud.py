@@ -38,7 +38,7 @@ def test_ply_round_trip(tmp_path: Path, count: int, seed: int) -> None:
 def test_a_ply_that_cannot_be_written(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     cloud = points(2)
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(ResultError, match=r"file: cannot be made"):
+    with pytest.raises(ResultError, match=r"file: cannot be created"):
         write_ply(tmp_path / "file" / "a.ply", cloud.positions, cloud.colors)
     with pytest.raises(ResultError, match="cannot be written"):
         write_ply(tmp_path, cloud.positions, cloud.colors)
@@ -55,7 +55,7 @@ def test_without_open3d(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         return real(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", refuse)
-    with pytest.raises(ResultError, match=r"a\.ply: PLY files need Open3D, which does not load here: libGL"):
+    with pytest.raises(ResultError, match=r"a\.ply: PLY files need Open3D, which does not load: libGL"):
         write_ply(tmp_path / "a.ply", np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
 
 

@@ -148,12 +148,12 @@ def test_a_killed_causal_run_is_resumed_and_equals_an_uninterrupted_one(
     assert_same(result, causal, slice(0, 6))
     ran = tk(*command, "--resume")
     assert ran.code == 0, ran.err
-    assert ran.messages[0] == f"note: 6 of {FRAMES} frames are there already"
+    assert ran.messages[0] == f"note: 6 of {FRAMES} frames are finished already"
     assert ran.err.splitlines()[-1].startswith(f"{FRAMES} frames in {result}, 0 lost")
     assert_same(result, causal)
     assert [path.name for path in tmp_path.iterdir()] == ["r.h5"]  # the killed run's scraps are gone
     done = tk(*command, "--resume")  # nothing is left to do
-    assert done.code == 0 and f"{FRAMES} of {FRAMES} frames are there already" in done.err
+    assert done.code == 0 and f"{FRAMES} of {FRAMES} frames are finished already" in done.err
     assert_same(result, causal)
 
 

@@ -53,7 +53,7 @@ def test_result_file_has_the_datasets_of_the_contract(tiny: Path, unbroken: Path
     assert result.meta.method == "silhouette" in METHODS
     assert result.status.tolist() == [Status.INITIALISED] + [Status.TRACKED] * 7
     with h5py.File(unbroken) as file:
-        assert file["pose"].shape == (8, 24) and file["iterations"].shape == (8, 3)
+        assert file["pose"].shape == (8, 31) and file["iterations"].shape == (8, 3)
         assert {"decode", "masks", "masks_clean", "optimise", "check", "total"} <= set(file["timing"])
         assert file["model/parts/shape"].shape == (22, 4)
         assert "silhouette" in file.attrs["config"]

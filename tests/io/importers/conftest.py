@@ -126,3 +126,8 @@ def folder(tmp_path: Path) -> Path:
 
 def renamed(rig: Rig, *names: str) -> Rig:
     return Rig(tuple(replace(camera, name=name) for camera, name in zip(rig, names, strict=True)))
+
+
+def projection_matrix(camera: Camera) -> np.ndarray:
+    """Return (3, 4) K [R | t], without lens distortion."""
+    return np.asarray(camera.matrix @ np.column_stack([camera.rotation, camera.translation]))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.io.conftest import write_toml
-from tests.io.importers.conftest import make_rig, renamed, tables
+from tests.io.importers.conftest import make_rig, projection_matrix, renamed, tables
 from tests.io.importers.test_other_formats import write_easymocap, write_panoptic
 from tests.io.importers.test_xml_formats import write_qca, write_xcp
 from tk.errors import CaptureError
@@ -24,7 +24,7 @@ DAMAGES = 40
 
 def write_projections(folder: Path) -> None:
     for camera in RIG:
-        np.savetxt(folder / f"{camera.name}.txt", camera.projection)
+        np.savetxt(folder / f"{camera.name}.txt", projection_matrix(camera))
 
 
 FORMATS: dict[str, Callable[[Path], object]] = {

@@ -21,6 +21,7 @@ from tests.io.importers.conftest import (
     Y_DOWN,
     Import,
     make_rig,
+    projection_matrix,
     renamed,
     write_clips,
 )
@@ -223,7 +224,7 @@ def test_projection_matrices(folder: Path, check: Import, kind: str) -> None:
     rig = make_rig(distorted=False)
     (folder / "calibration").mkdir()
     for index, camera in enumerate(rig):
-        P = (-1.0) ** index * (0.3 + index) * camera.projection  # its scale and sign mean nothing
+        P = (-1.0) ** index * (0.3 + index) * projection_matrix(camera)  # its scale and sign mean nothing
         path = folder / "calibration" / camera.name
         if kind == "npy":
             np.save(path.with_suffix(".npy"), P)
@@ -238,7 +239,7 @@ def test_projection_matrices(folder: Path, check: Import, kind: str) -> None:
 def test_text_without_matrix_is_noted(folder: Path, check: Import) -> None:
     rig = make_rig(distorted=False)
     for camera in rig:
-        np.savetxt(folder / f"{camera.name}.txt", camera.projection)
+        np.savetxt(folder / f"{camera.name}.txt", projection_matrix(camera))
     (folder / "notes.txt").write_text("recorded on Monday")
     write_clips(folder / "videos", [camera.name for camera in rig])
     check(folder, rig).note("notes.txt: holds no 3×4 matrix: left out")

@@ -67,7 +67,7 @@ def test_inconsistent_mounting_is_noted() -> None:
     rig = make_rig()
     half = Rotation.from_euler("z", 180, degrees=True).as_matrix()
     two = [replace(c, rotation=half @ c.rotation, translation=half @ c.translation) for c in rig.cameras[:2]]
-    assert "make sure of it" in infer_up(Rig((*two, *rig.cameras[2:]))).how
+    assert "check it" in infer_up(Rig((*two, *rig.cameras[2:]))).how
     assert "z is a guess" in infer_up(Rig((rig[0], replace(two[0], name="upside down")))).how
 
 
