@@ -24,7 +24,7 @@ from tk.batch.summary import write_summary
 from tk.errors import ConfigError, ResultBusyError, ResultError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
-from tk.io.results.files import Workshop
+from tk.io.results.files import TwinFolder
 from tk.run.session import track
 
 ROOT = Path(__file__).parents[1]
@@ -152,8 +152,8 @@ def test_two_batches_in_one_folder_are_refused(tk: Tk, tiny: Path, tmp_path: Pat
 
 
 def test_result_that_another_run_writes_is_busy(tmp_path: Path) -> None:
-    with Workshop(tmp_path / "r.h5"), pytest.raises(ResultBusyError):
-        Workshop(tmp_path / "r.h5")
+    with TwinFolder(tmp_path / "r.h5"), pytest.raises(ResultBusyError):
+        TwinFolder(tmp_path / "r.h5")
 
 
 # --- a real cluster ---------------------------------------------------------------------------------------------------

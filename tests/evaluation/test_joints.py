@@ -158,7 +158,7 @@ def test_one_nan_joint_is_not_averaged_away() -> None:
     assert "1 with NaN or missing joints" in found.format_table()
 
 
-def test_a_result_of_nan_scores_nothing() -> None:
+def test_result_of_nan_has_zero_pck() -> None:
     truth = make_truth()
     found = evaluate(as_result(truth, positions=np.full_like(truth.positions, np.nan)), truth)
     assert found.corrected.all.median_cm == found.raw.all.median_cm == np.inf
@@ -236,7 +236,7 @@ def test_joints_without_truth_are_excluded_and_reported() -> None:
     assert np.isnan(nothing.mean_cm)
 
 
-def test_nothing_in_common_is_an_error() -> None:
+def test_files_without_common_frames_are_refused() -> None:
     truth = make_truth()
     with pytest.raises(ResultError, match=r"result\.h5: .*truth\.h5: frames 100 to 119 .* frames 0 to 19"):
         evaluate(as_result(truth, frames=truth.frames + 100), truth)
@@ -319,7 +319,7 @@ def test_flexion_that_is_unknown_is_not_averaged_away() -> None:
     assert np.isnan(unknown["knee_r"].mean_deg) and unknown["knees"].mean_deg == pytest.approx(0, abs=1e-9)
 
 
-# --- runs astray ------------------------------------------------------------------------------------------------------
+# --- longest run of limb errors ---------------------------------------------------------------------------------------
 
 
 def test_longest_run_of_wrong_frames() -> None:
@@ -331,14 +331,14 @@ def test_longest_run_of_wrong_frames() -> None:
     positions[12, JOINTS.index("knee_l")] += 0.2
     result = as_result(truth, positions=positions)
     found = evaluate(result, truth)
-    for run in (found.longest_astray, found.longest_astray_raw):
+    for run in (found.longest_limb_error, found.longest_limb_error_raw):
         assert (run.frames, run.first, run.last) == (6, 2, 7)
     assert "15 cm off, offset taken off: 6 frames, 2 to 7" in found.format_table()
     order = np.random.default_rng(0).permutation(20)
     shuffled = replace(truth, frames=truth.frames[order], positions=truth.positions[order])
-    assert evaluate(result, shuffled).longest_astray == found.longest_astray
+    assert evaluate(result, shuffled).longest_limb_error == found.longest_limb_error
     perfect = evaluate(as_result(truth), truth)
-    assert (perfect.longest_astray.frames, perfect.longest_astray.first) == (0, None)
+    assert (perfect.longest_limb_error.frames, perfect.longest_limb_error.first) == (0, None)
     assert "0 frames\n" in perfect.format_table()
 
 
@@ -348,11 +348,11 @@ def test_missing_frames_count_as_wrong_and_unknown_ones_do_not() -> None:
     result = as_result(
         truth, frames=truth.frames[rows], positions=truth.positions[rows], status=np.zeros(6, dtype=np.uint8)
     )
-    run = evaluate(result, truth).longest_astray
+    run = evaluate(result, truth).longest_limb_error
     assert (run.frames, run.first, run.last) == (4, 3, 6)
     gaps = truth.positions.copy()
     gaps[5] = np.nan
-    run = evaluate(result, replace(truth, positions=gaps)).longest_astray_raw
+    run = evaluate(result, replace(truth, positions=gaps)).longest_limb_error_raw
     assert (run.frames, run.first, run.last) == (2, 3, 4)
 
 
@@ -378,8 +378,8 @@ def test_shares_within_sigma_of_a_calibrated_result() -> None:
         assert shares.raw[2] == pytest.approx(shares.expected[2], abs=0.03)
         assert shares.corrected[2] == pytest.approx(shares.expected[2], abs=0.03)
     assert (found["all"].judged, found["limbs"].judged, found["all"].without) == (6000, 4800, 0)
-    boastful = evaluate(as_result(truth, positions=positions, sigma=sigma / 3), truth).sigma
-    assert boastful is not None and boastful["all"].raw[2] < 0.3
+    overconfident = evaluate(as_result(truth, positions=positions, sigma=sigma / 3), truth).sigma
+    assert overconfident is not None and overconfident["all"].raw[2] < 0.3
 
 
 def test_joints_without_sigma_are_excluded_and_failures_count() -> None:
@@ -400,5 +400,5 @@ def test_joints_without_sigma_are_excluded_and_failures_count() -> None:
     assert evaluate(as_result(truth), truth).sigma is None
     plain = json.loads(evaluate(result, truth).to_json())
     assert plain["sigma"]["limbs"]["expected"]["1"] == pytest.approx(0.1987, abs=1e-4)
-    assert plain["longest_astray"] == {"frames": 1, "first": 5, "last": 5}
+    assert plain["longest_limb_error"] == {"frames": 1, "first": 5, "last": 5}
     assert plain["flexion"]["elbow_l"]["mean_deg"] is None

@@ -74,7 +74,7 @@ def test_the_command_finds_the_capture_beside_the_truth(tk: Tk, tiny: Path, thre
     assert "E_S %" in tk("evaluate", three_views, tmp_path / "truth.h5", "--capture", tiny).out
 
 
-def test_results_of_both_skins_are_judged_alike(tk: Tk, tiny: Path, tracked: Path) -> None:
+def test_results_of_both_body_models_are_evaluated(tk: Tk, tiny: Path, tracked: Path) -> None:
     """The volumetric tracker's are: its body is the contours'."""
     found = evaluate_views(tracked, tiny / "truth.h5", tiny)
     assert found.note == "" and found.joint_px > 0

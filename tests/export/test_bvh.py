@@ -38,7 +38,7 @@ def places(path: Path, at: int | None) -> dict[str, np.ndarray]:
     return found
 
 
-def test_joints_come_back_within_a_millimetre(write: Write) -> None:
+def test_bvh_reproduces_the_joints_within_a_millimetre(write: Write) -> None:
     path = write()
     motion, _ = read_motion(path)
     (target,) = export(path, ["bvh"]).files
@@ -54,7 +54,7 @@ def test_joints_come_back_within_a_millimetre(write: Write) -> None:
         np.testing.assert_allclose(found["tip of ankle_r"], toe[[1, 2, 0]], atol=1e-4)
 
 
-def test_lost_frames_hold_the_pose_before(write: Write) -> None:
+def test_lost_frames_repeat_the_last_known_pose(write: Write) -> None:
     written = export(write(), ["bvh"])
     assert any("2 lost frames" in note for note in written.notes)
     before = places(written.files[0], LOST[0] - 1)
@@ -74,7 +74,7 @@ def test_rest_pose_is_a_t(write: Write) -> None:
     assert rest["hip_l"][0] > 0 > rest["hip_r"][0]
 
 
-def test_only_what_moves_has_channels_for_its_place(write: Write) -> None:
+def test_only_moving_nodes_have_position_channels(write: Write) -> None:
     (target,) = export(write(), ["bvh"]).files
     file = Bvh(target.read_text())
     names = file.get_joints_names()

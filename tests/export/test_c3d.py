@@ -39,7 +39,7 @@ def test_points_and_segments(write: Write) -> None:
     assert np.isnan(T[:3, :3, :, list(LOST)]).all()
 
 
-def test_missing_points_as_the_format_says_it(write: Write) -> None:
+def test_missing_points_have_residual_minus_one(write: Write) -> None:
     """The words of a point, read without ezc3d: x, y, z and residual with cameras, as 32-bit floats."""
     path = write()
     data = export(path, ["c3d"]).files[0].read_bytes()

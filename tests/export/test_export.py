@@ -106,7 +106,7 @@ def test_smoothed_here_where_the_result_has_no_copy(write: Write) -> None:
     assert np.linalg.norm(motion.points[:, :15] - true, axis=2).max() < 0.06
 
 
-def test_refusals(write: Write, tmp_path: Path) -> None:
+def test_unusable_requests_are_refused(write: Write, tmp_path: Path) -> None:
     path = write()
     with pytest.raises(ExportError, match=r"fbx.*trc, mot, c3d, bvh, csv, gltf"):
         export(path, ["trc", "fbx"])
@@ -154,7 +154,7 @@ def test_joints_in_another_order(write: Write) -> None:
     np.testing.assert_array_equal(read_motion(path)[0].points, read_motion(other)[0].points)
 
 
-def test_lost_from_the_beginning_is_held_backwards(write: Write) -> None:
+def test_frames_lost_at_the_start_repeat_the_first_known_pose(write: Write) -> None:
     states = np.zeros(FRAMES, dtype=np.uint8)
     states[:3] = Status.LOST
     motion, _ = read_motion(write(lost=states))

@@ -71,7 +71,7 @@ def load(path: Path) -> pygltflib.GLTF2:
     return file
 
 
-def test_joints_come_back(write: Write) -> None:
+def test_gltf_reproduces_the_joints(write: Write) -> None:
     path = write()
     motion, _ = read_motion(path)
     (target,) = export(path, ["gltf"]).files
@@ -96,7 +96,7 @@ def test_lost_frames_are_held_and_listed(write: Write) -> None:
     assert file.asset.extras["lost_frames"] == [int(frames[f]) for f in LOST]
 
 
-def test_the_body_rides_on_the_nodes(write: Write) -> None:
+def test_segment_meshes_are_attached_to_their_nodes(write: Write) -> None:
     """The meshes in a frame lie where the body's surface lies."""
     path = write()
     restored = body_and_poses(read_result(path))

@@ -97,7 +97,7 @@ def test_mot_has_opensims_header_and_leaves_lost_frames_out(write: Write) -> Non
         np.testing.assert_allclose(columns[f"elbow_flex_{side}"], elbow, atol=1e-4)
 
 
-def test_mot_makes_the_limbs_directions(write: Write) -> None:
+def test_mot_angles_reproduce_the_limb_directions(write: Write) -> None:
     """The joints again from the coordinates, as OpenSim's model turns: Z-X-Y, the left side's X and Y mirrored."""
     motion, _ = read_motion(write())
     at = {name: np.radians(values) for name, values in coordinates(motion).items()}
@@ -121,7 +121,7 @@ def test_mot_makes_the_limbs_directions(write: Write) -> None:
             np.testing.assert_allclose(R @ down, bone / np.linalg.norm(bone, axis=1)[:, None], atol=1e-6)
 
 
-def test_mot_does_not_jump(write: Write) -> None:
+def test_mot_angles_are_continuous(write: Write) -> None:
     motion, _ = read_motion(write())
     turning = {name: values for name, values in coordinates(motion).items() if not name.startswith("pelvis_t")}
     assert np.ptp(turning["pelvis_rotation"]) > 270  # a whole turn of the trunk; the waist turns, too

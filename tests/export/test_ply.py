@@ -49,7 +49,7 @@ def test_every_part_is_closed_and_turned_outwards(write: Write) -> None:
         assert (np.cross(a, b) * c).sum() > 0, "the volume inside"
 
 
-def test_a_lost_frame_holds_the_body_before_and_says_so(write: Write) -> None:
+def test_lost_frame_repeats_the_last_known_body_and_gives_a_note(write: Write) -> None:
     done = export(write(), ["ply"])
     assert any("ply: in 2 lost frames the pose before is held" in note for note in done.notes)
     before, lost = (np.asarray(read(done.files[0] / f"{FIRST + f:06d}.ply").vertices) for f in (LOST[0] - 1, LOST[1]))

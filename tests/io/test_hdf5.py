@@ -17,7 +17,7 @@ from tests.io.result_files import make_cameras, make_smoothed, write_truth
 from tests.io.result_victim import META, make_frame, make_state
 from tk.errors import ResultError, TkError
 from tk.evaluation.joints import evaluate_files
-from tk.io.hdf5 import DEEPEST, open_hdf5
+from tk.io.hdf5 import MAX_DEPTH, open_hdf5
 from tk.io.results.writer import ResultWriter, read_joints, read_result, revise_result
 from tk.model.body.skeleton import JOINTS
 
@@ -30,10 +30,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("hdf5")
     with ResultWriter.create(folder / "result.h5", META) as writer:
         writer.write_model({"torso/radii_m": np.arange(4.0), "height_m": 1.78, "sex": "any", "count": 3})
-        writer.write_cameras(make_cameras())
         for index in range(COUNT):
             writer.append(make_frame(index), make_state(index))
-    revise_result(folder / "result.h5", smoothed=make_smoothed(COUNT))
+    revise_result(folder / "result.h5", smoothed=make_smoothed(COUNT), cameras=make_cameras())
     write_truth(folder / "truth.h5", list(range(3, 3 + COUNT)))
     return folder
 
@@ -222,26 +221,26 @@ def ring_of_groups(file: h5py.File, folder: Path) -> None:
 
 
 def deep(file: h5py.File, folder: Path) -> None:
-    file.create_group("/".join(["deeper"] * (DEEPEST + 2)))
+    file.create_group("/".join(["deeper"] * (MAX_DEPTH + 2)))
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (soft_link, "link to elsewhere"),
-        (ring_of_links, "link to elsewhere"),
-        (external_link, "link to elsewhere"),
-        (external_storage, "lies in another file"),
-        (virtual, "lies in another file"),
+        (soft_link, "is a link"),
+        (ring_of_links, "is a link"),
+        (external_link, "is a link"),
+        (external_storage, "is stored in another file"),
+        (virtual, "is stored in another file"),
         (huge, "declares 360000000000000 bytes"),
         (huge_chunks, "bytes, and 0 are stored"),
         (bomb, "bytes, and .* are stored"),
-        (strange_filter, "compressed in a way"),
+        (strange_filter, "a compression that tk cannot read"),
         (ring_of_groups, "deep"),
         (deep, "deep"),
     ],
 )
-def test_nothing_is_followed_and_nothing_unfolds(
+def test_links_external_data_and_oversized_data_are_refused(
     truth: Path, folder: Path, make: Callable[[h5py.File, Path], None], message: str
 ) -> None:
     with h5py.File(truth, "r+") as file:
@@ -301,7 +300,7 @@ def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
         read_joints(dangling)
 
 
-def test_the_look_over_tells_what_there_is(result: Path) -> None:
+def test_reader_lists_datasets_and_groups(result: Path) -> None:
     with open_hdf5(result) as file:
         assert file.shapes["joints/position"] == (COUNT, 15, 3)
         assert "model" in file and "model/height_m" in file and "nothing" not in file
@@ -309,4 +308,4 @@ def test_the_look_over_tells_what_there_is(result: Path) -> None:
         with pytest.raises(ResultError, match=r"/pose has shape 6×24; any×3 is expected"):
             file.array("pose", "float64", (None, 3))
         with pytest.raises(ResultError, match="out of range"):
-            file.array("pose", "float64", (COUNT, 24), most=1.0)
+            file.array("pose", "float64", (COUNT, 24), limit=1.0)

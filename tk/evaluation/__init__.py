@@ -1,1 +1,1 @@
-"""How far a result is from ground truth, and how well it fits the images."""
+"""Distances of a result from ground truth, and its fit to the images."""

@@ -1,13 +1,13 @@
-"""Beyond distances: flexion in degrees, how long a limb is astray, whether a result knows how sure it is.
+"""Errors of flexion, the longest run of frames with a large limb error, and the share of errors within σ.
 
-- Flexion is the angle between a joint's two bones, 0 when the limb is straight, from the joint positions of result and
-  truth alike. It is never negative: a knee bent backwards counts as bent.
-- A limb joint is *astray* when it is more than 15 cm off; the longest run of consecutive judged frames with one or more
-  of them tells a moment's error from a limb that was lost.
-- ``/joints/sigma`` is one standard deviation along each axis, the same in all directions. An error is within k σ when
-  its length in space is at most k σ. Of normal errors 19.9 % are within 1 σ and 73.9 % within 2 σ (three dimensions:
-  not the 68 % and 95 % of one). A larger share means that the result is surer than it says, a smaller one that it is
-  less sure.
+- Flexion is the angle between a joint's two bones, 0 for a straight limb, computed from joint positions for both the
+  result and the ground truth. It is never negative: a knee bent backwards counts as bent.
+- A limb joint has a large error if it is more than 15 cm off. The longest run is the largest number of consecutive
+  judged frames in which at least one limb joint has a large error. It separates short errors from a lost limb.
+- ``/joints/sigma`` is one standard deviation along each axis, the same in all directions. An error is within k σ if its
+  length in space is at most k σ. Of normally distributed errors in three dimensions, 19.9 % are within 1 σ and 73.9 %
+  within 2 σ (not the 68 % and 95 % of one dimension). A larger share means that σ is too large, a smaller share that σ
+  is too small.
 """
 
 from __future__ import annotations
@@ -23,16 +23,17 @@ from tk.model.body.joints import HINGE_KINDS, HINGES, JOINTS
 
 Float = NDArray[np.float64]
 
-ASTRAY_CM = 15.0
+#: A limb joint with a larger error counts as wrong, cm; the largest PCK threshold. The longest run depends on it.
+LIMB_ERROR_CM = 15.0
 
 
 @dataclass(frozen=True)
 class FlexionError:
-    """How far flexion is off, degrees; infinite where NaN joints of the result make it so, NaN with nothing to judge.
+    """Error of flexion, degrees; infinite if the result has NaN joints, NaN without frames to judge.
 
     Attributes:
-        mean_deg, median_deg: of the absolute difference.
-        bias_deg: the mean of result less truth where both are known: positive if the result bends more.
+        mean_deg, median_deg: mean and median of the absolute difference.
+        bias_deg: mean of result minus ground truth where both are known; positive if the result bends more.
     """
 
     mean_deg: float
@@ -42,7 +43,7 @@ class FlexionError:
 
 @dataclass(frozen=True)
 class Run:
-    """Consecutive judged frames, ``first`` to ``last``; both None if there are 0 ``frames``."""
+    """Consecutive judged frames, ``first`` to ``last``; both None if ``frames`` is 0."""
 
     frames: int
     first: int | None
@@ -51,15 +52,15 @@ class Run:
 
 @dataclass(frozen=True)
 class SigmaShares:
-    """How many errors are within so many standard deviations.
+    """Shares of the errors that are within k standard deviations.
 
     Attributes:
-        raw, corrected: share by the number of standard deviations, of the errors as they are and with the joints'
-            constant offsets taken off; NaN with nothing to judge.
-        expected: of normal errors.
-        judged: how many joint positions that is.
-        without: how many more have no σ.
-        median_cm: of σ.
+        raw, corrected: share by k, of the raw errors and of the errors without the joints' constant offsets; NaN
+            without positions to judge.
+        expected: share by k of normally distributed errors.
+        judged: number of joint positions with σ.
+        without: number of joint positions without σ.
+        median_cm: median of σ, cm.
     """
 
     raw: Mapping[int, float]
@@ -71,7 +72,7 @@ class SigmaShares:
 
 
 def flexion_deg(p_world: Float) -> dict[str, Float]:
-    """Flexion of the :data:`HINGES` of joints (F, 15, 3): degrees (F,); NaN where a bone is unknown or of no length."""
+    """Return the flexion (F,) of each hinge, degrees, from joints (F, 15, 3); NaN if a bone is unknown or zero."""
     at = {name: p_world[:, index] for index, name in enumerate(JOINTS)}
     found = {}
     for name, (before, after) in HINGES.items():
@@ -85,7 +86,7 @@ def flexion_deg(p_world: Float) -> dict[str, Float]:
 
 
 def flexion_errors(p_result: Float, p_truth: Float) -> dict[str, FlexionError]:
-    """By hinge, and of ``knees`` and ``elbows`` together, from joints (F, 15, 3) of the same frames."""
+    """Return the errors by hinge, and of all ``knees`` and ``elbows``, from joints (F, 15, 3) of the same frames."""
     found, true = flexion_deg(p_result), flexion_deg(p_truth)
     groups = {name: (name,) for name in HINGES} | {f"{kind}s": sides for kind, sides in HINGE_KINDS.items()}
     return {
@@ -95,18 +96,18 @@ def flexion_errors(p_result: Float, p_truth: Float) -> dict[str, FlexionError]:
 
 
 def longest_run(frames: NDArray[np.int64], limbs: Float) -> Run:
-    """The longest run of frames in which a limb joint is astray.
+    """Return the longest run of frames in which a limb joint has an error above :data:`LIMB_ERROR_CM`.
 
     Args:
         frames: (F,) the judged frames.
-        limbs: (F, 12) distances of the limb joints, metres; infinite where the result fails, NaN: not to be judged.
+        limbs: (F, 12) errors of the limb joints, metres; infinite if the result has no position, NaN if not judged.
     """
     order = np.argsort(frames)
-    astray = np.any(limbs > ASTRAY_CM / 100, axis=1)[order]  # NaN is not
+    wrong = np.any(limbs > LIMB_ERROR_CM / 100, axis=1)[order]  # False for NaN
     best = current = 0
     end = -1
-    for row, is_astray in enumerate(astray):
-        current = current + 1 if is_astray else 0
+    for row, is_wrong in enumerate(wrong):
+        current = current + 1 if is_wrong else 0
         if current > best:
             best, end = current, row
     if best == 0:
@@ -115,11 +116,11 @@ def longest_run(frames: NDArray[np.int64], limbs: Float) -> Run:
 
 
 def sigma_shares(sigma: Float, raw: Float, corrected: Float) -> SigmaShares:
-    """How many errors are within 1 and 2 σ.
+    """Return the shares of the errors within 1 and 2 σ.
 
     Args:
-        sigma: (F, J) one standard deviation along each axis, metres; NaN where unknown.
-        raw, corrected: (F, J) distances, metres; infinite where the result fails, NaN where not to be judged.
+        sigma: (F, J) m, standard deviation along one axis; NaN if unknown.
+        raw, corrected: (F, J) errors, metres; infinite if the result has no position, NaN if not judged.
     """
     known = np.isfinite(sigma) & ~np.isnan(raw)
 
@@ -138,8 +139,10 @@ def sigma_shares(sigma: Float, raw: Float, corrected: Float) -> SigmaShares:
 
 
 def normal_share(count: float) -> float:
-    """The probability that a normal error in space is no longer than so many of its standard deviations an axis:
-    the distribution function of the Maxwell distribution."""
+    """Return the probability that a normal error in space is at most ``count`` standard deviations of one axis long.
+
+    It is the distribution function of the Maxwell distribution.
+    """
     return math.erf(count / math.sqrt(2)) - math.sqrt(2 / math.pi) * count * math.exp(-(count**2) / 2)
 
 

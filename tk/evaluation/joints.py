@@ -1,22 +1,22 @@
-"""How far a result is from the truth (``tk evaluate``).
+"""Compute the errors of a result against ground truth (``tk evaluate``).
 
-Frames are matched by their source index. What a tracker failed at is never averaged away:
+Frames are matched by their source index. Failures of a tracker always count:
 
-- A joint that is NaN in the result has an infinite error. Means over it are infinite (``null`` in JSON), medians and
-  PCK stay meaningful: it lies above every threshold.
-- A frame that says *lost* (status 3) is a miss of every joint for PCK. Its distances stay in the means: they are what
-  the user would get.
-- A frame that is missing between the first and the last frame of the result counts like one full of NaN. Frames before
-  and after it, which the user did not ask for or which a stopped run did not reach, are counted and not judged.
-- A joint that the truth itself does not know (NaN) cannot be judged: it is left out, and counted.
+- A joint that is NaN in the result has an infinite error. Means over it are infinite (``null`` in JSON). Medians and
+  PCK stay meaningful: the error is above every threshold.
+- A frame whose status is *lost* or *absent* counts as a miss of every joint for PCK. Its distances are part of the
+  means, because the user gets its positions.
+- A frame that is missing between the first and the last frame of the result counts as a frame of NaN. Frames of the
+  ground truth before and after the result are counted and not judged.
+- A joint that is NaN in the ground truth is counted and not judged.
 
-Different definitions of a joint (skin or bone, hip centre or hip marker) give a constant offset that is no error of the
-tracking. The corrected figures take it off: the median, a joint and an axis, of ``R_t^T (estimate - truth)`` over the
-frames that are not lost, where the columns of ``R_t`` are the axes of the truth's trunk. The truth's, and not the
-estimate's, because only then an offset that is constant vanishes exactly, for the trunk's own joints too, and a wrong
-hip in the estimate does not spoil all other joints. Kehl 2006 reports no errors in centimetres, so this is ours.
+Different definitions of a joint (skin or bone, hip centre or hip marker) cause a constant offset, which is no tracking
+error. The corrected figures remove it: the median over the frames that are not lost of ``R_t^T (estimate - truth)``,
+for each joint and axis, where the columns of ``R_t`` are the trunk axes of the ground truth. With these axes, an
+offset that is constant vanishes exactly, also for the trunk, and a wrong hip of the estimate does not change the other
+joints. Kehl 2006 reports no errors in centimetres, so this definition is our own.
 
-What else is told - flexion, runs of bad frames, σ - is defined in :mod:`tk.evaluation.details`.
+Flexion, the longest run and σ are defined in :mod:`tk.evaluation.details`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from tk.errors import ResultError
 from tk.evaluation.details import (
-    ASTRAY_CM,
+    LIMB_ERROR_CM,
     FlexionError,
     Run,
     SigmaShares,
@@ -51,11 +51,11 @@ PCK_CM = (5, 10, 15)
 
 @dataclass(frozen=True)
 class Score:
-    """Distances of some joints over all judged frames.
+    """Errors of some joints over all judged frames.
 
     Attributes:
-        mean_cm, median_cm: infinite where NaN joints make them so; NaN where there is nothing to judge.
-        pck: share of joints that are nearer than so many centimetres.
+        mean_cm, median_cm: mean and median distance, cm; infinite if NaN joints count, NaN without joints to judge.
+        pck: share of the joints with an error below each threshold, by threshold in cm.
     """
 
     mean_cm: float
@@ -65,7 +65,7 @@ class Score:
 
 @dataclass(frozen=True)
 class Scores:
-    """``all`` 15 joints, the 12 ``limbs``, and each of ``joints`` by name."""
+    """Scores of ``all`` 15 joints, of the 12 ``limbs`` joints, and of each of ``joints`` by name."""
 
     all: Score
     limbs: Score
@@ -77,22 +77,22 @@ class Evaluation:
     """Accuracy of a result.
 
     Attributes:
-        raw: distances as they are.
-        corrected: the same with each joint's median offset in the trunk's frame taken off.
-        offsets_cm: that offset by joint: forward, left, up.
-        judged: frames that are judged: common to both files, or missing inside the result.
-        missing_inside: frames of the truth between the result's first and last that the result lacks.
-        missing_outside: frames of the truth before the result's first or after its last.
-        without_truth: frames of the result that the truth lacks.
-        lost: frames that say so, of those judged.
-        nan_frames: judged frames with at least one NaN joint in the result, missing ones included.
-        unknown_joints: joints of judged frames that the truth does not know.
-        frames_per_second: frames of the whole result over the wall time spent on them; None if not recorded.
-        median_frames_per_second: of the median frame: without start-up and compilation.
+        raw: raw errors.
+        corrected: errors without each joint's median offset in the trunk's frame.
+        offsets_cm: median offset of each joint: forward, left, up, cm.
+        judged: number of judged frames: frames of both files, and frames missing inside the result.
+        missing_inside: number of frames of the ground truth that are missing between the result's first and last.
+        missing_outside: number of frames of the ground truth before the result's first or after its last.
+        without_truth: number of frames of the result without ground truth.
+        lost: number of judged frames whose status is lost or absent.
+        nan_frames: number of judged frames with at least one NaN joint in the result, missing frames included.
+        unknown_joints: number of joint positions of judged frames that are NaN in the ground truth.
+        frames_per_second: mean rate: all frames of the result over their total wall time; None if not recorded.
+        median_frames_per_second: rate of the median frame, which excludes start-up and compilation.
         flexion: errors of the flexion by ``knee_l`` … ``elbow_r``, and of all ``knees`` and ``elbows``.
-        longest_astray, longest_astray_raw: the longest run of frames with a limb joint more than 15 cm off, with the
-            joints' offsets taken off and as it is.
-        sigma: how many errors are within 1 and 2 σ, of ``all`` joints and of the ``limbs``; None where there is no σ.
+        longest_limb_error, longest_limb_error_raw: longest run of frames with a limb joint more than 15 cm off, without
+            the joints' offsets and raw.
+        sigma: shares of the errors within 1 and 2 σ, of ``all`` joints and of the ``limbs``; None without σ.
     """
 
     raw: Scores
@@ -108,17 +108,17 @@ class Evaluation:
     frames_per_second: float | None
     median_frames_per_second: float | None
     flexion: Mapping[str, FlexionError]
-    longest_astray: Run
-    longest_astray_raw: Run
+    longest_limb_error: Run
+    longest_limb_error_raw: Run
     sigma: Mapping[str, SigmaShares] | None
 
     @property
     def lost_share(self) -> float:
-        """Share of the judged frames that say they are lost."""
+        """Return the share of lost frames among the judged frames."""
         return self.lost / self.judged
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON: shares added, infinite and NaN as None."""
+        """Return plain values for JSON, with shares added; infinity and NaN become None."""
         values = asdict(self) | {"lost_share": self.lost_share, "nan_share": self.nan_frames / self.judged}
         plain = plain_values(values)
         assert isinstance(plain, dict)
@@ -128,7 +128,7 @@ class Evaluation:
         return json.dumps(self.to_dict(), indent=2, allow_nan=False)
 
     def format_table(self) -> str:
-        """A table for people, lines of up to 100 characters."""
+        """Return the table that ``tk evaluate`` prints; lines have at most 100 characters."""
         thresholds = "".join(f"{f'PCK{cm}':>8}" for cm in PCK_CM)
         half = f"{'mean':>8}{'median':>8}{thresholds}"
         lines = [
@@ -159,17 +159,18 @@ class Evaluation:
         return "\n".join(lines)
 
     def _details(self) -> list[str]:
-        """Flexion, the longest run astray, and shares within σ, a line each."""
+        """Return a line each for flexion, the longest run and the shares within σ."""
         parts = [
             f"{kind}s {self.flexion[f'{kind}s'].mean_deg:.1f}° "
             f"(left {self.flexion[f'{kind}_l'].mean_deg:.1f}°, right {self.flexion[f'{kind}_r'].mean_deg:.1f}°)"
             for kind in HINGE_KINDS
         ]
-        run = self.longest_astray
+        run = self.longest_limb_error
         where = f", {run.first} to {run.last}" if run.frames else ""
         lines = [
             f"flexion, mean error: {', '.join(parts)}",
-            f"longest run with a limb joint over {ASTRAY_CM:g} cm off, offset taken off: {run.frames} frames{where}",
+            f"longest run with a limb joint over {LIMB_ERROR_CM:g} cm off, offset taken off: "
+            f"{run.frames} frames{where}",
         ]
         for name, shares in (self.sigma or {}).items():
             within, expected = shares.corrected, shares.expected
@@ -182,12 +183,12 @@ class Evaluation:
 
 
 def evaluate_files(result: str | os.PathLike[str], truth: str | os.PathLike[str]) -> Evaluation:
-    """Compare two files; see :func:`evaluate`."""
+    """Compare a result file with a ground truth file; see :func:`evaluate`."""
     return evaluate(read_joints(result), read_joints(truth))
 
 
 def evaluate(result: JointTrack, truth: JointTrack) -> Evaluation:
-    """Compare a result with the truth.
+    """Compare a result with ground truth.
 
     Raises:
         ResultError: the two have no frame in common, or the result has no frames.
@@ -240,8 +241,8 @@ def evaluate(result: JointTrack, truth: JointTrack) -> Evaluation:
         frames_per_second=mean_rate,
         median_frames_per_second=median_rate,
         flexion=flexion_errors(p_result, p_truth),
-        longest_astray=longest_run(frames, distances["corrected"][:, limbs]),
-        longest_astray_raw=longest_run(frames, distances["raw"][:, limbs]),
+        longest_limb_error=longest_run(frames, distances["corrected"][:, limbs]),
+        longest_limb_error_raw=longest_run(frames, distances["raw"][:, limbs]),
         sigma=None
         if sigma is None
         else {
@@ -252,10 +253,10 @@ def evaluate(result: JointTrack, truth: JointTrack) -> Evaluation:
 
 
 def trunk_axes(p_world: Float) -> Float:
-    """The trunk-fixed frame of joints (F, 15, 3): rotations (F, 3, 3) whose columns point forward, left and up.
+    """Return the trunk axes (F, 3, 3) of joints (F, 15, 3): the columns point forward, left and up.
 
-    Up runs from the pelvis to the neck. Left is the sum of the hips' and the shoulders' lines from right to left, made
-    perpendicular to up; forward completes a right-handed frame. NaN where the trunk is unknown or degenerate.
+    Up points from the pelvis to the neck. Left is the sum of the vectors from right to left hip and shoulder, made
+    perpendicular to up; forward completes a right-handed frame. NaN if the trunk is unknown or degenerate.
     """
     joint = {name: p_world[:, index] for index, name in enumerate(JOINTS)}
     up = _unit(joint["neck"] - joint["pelvis"])
@@ -265,13 +266,13 @@ def trunk_axes(p_world: Float) -> Float:
 
 
 def _unit(vectors: Float) -> Float:
-    """(F, 3) vectors of length one; NaN where there is no direction."""
+    """Return the vectors (F, 3) scaled to length one; NaN for zero vectors."""
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.where(lengths > 1e-6, lengths, np.nan)
 
 
 def _median_where_finite(values: Float) -> Float:
-    """(F, J, 3) to (J, 3): the median of what is finite; NaN where nothing is."""
+    """Return the median (J, 3) over the finite values of each joint (F, J, 3); NaN without finite values."""
     result = np.full(values.shape[1:], np.nan)
     for joint in range(values.shape[1]):
         finite = values[np.isfinite(values[:, joint]).all(axis=1), joint]
@@ -281,7 +282,7 @@ def _median_where_finite(values: Float) -> Float:
 
 
 def _distances(difference: Float, known: NDArray[np.bool_]) -> Float:
-    """(F, J) metres: infinite where the result fails, NaN where the truth does not know."""
+    """Return distances (F, J), metres: infinite if the result has no position, NaN if the ground truth has none."""
     lengths = np.linalg.norm(difference, axis=2)
     return np.where(known, np.where(np.isnan(lengths), np.inf, lengths), np.nan)
 
@@ -301,7 +302,7 @@ def _scores(distances: Float, lost: NDArray[np.bool_]) -> Scores:
 
 
 def _frames_per_second(seconds: Float | None) -> tuple[float | None, float | None]:
-    """Over all frames, and of the median frame; None where the file does not tell."""
+    """Return the rate over all frames and of the median frame; None if wall times are not stored."""
     if seconds is None or len(seconds) == 0 or not np.isfinite(seconds).all() or not np.median(seconds) > 0:
         return None, None
     return float(len(seconds) / seconds.sum()), float(1 / np.median(seconds))
@@ -313,7 +314,7 @@ def _format_score(score: Score) -> str:
 
 
 def plain_values(value: Any) -> Any:
-    """JSON has no infinity and no NaN."""
+    """Return the value with infinity and NaN replaced by None, which JSON can represent."""
     if isinstance(value, Mapping):
         return {str(key): plain_values(item) for key, item in value.items()}
     if isinstance(value, (tuple, list)):

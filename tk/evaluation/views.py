@@ -1,12 +1,11 @@
-"""How well a result fits the pictures: the silhouette paper's two measures (its section 5), view by view.
+"""Compute the fit of a result to the images: the two measures of the silhouette paper (its section 5), for each view.
 
-- E_S (eq. 12), the share of wrongly classified pixels, against the capture's masks as they are given: the body that the
-  result holds is drawn into every view.
-- The distance of chosen joints from the truth in pixels: "averaged across both feet and all marked frames, and averaged
-  across all the views used for tracking". The paper says "mean squared" and gives
-  pixels; here it is the mean distance.
+- E_S (eq. 12): share of wrongly classified pixels. The body of the result is rendered into every view and compared
+  with the capture's masks.
+- Distance of chosen joints from ground truth in pixels: "averaged across both feet and all marked frames, and averaged
+  across all the views used for tracking". The paper says "mean squared" and gives pixels; here it is the mean distance.
 
-Views that were not used for tracking are judged, too, and said to be so.
+Views that were not used for tracking are judged and marked.
 """
 
 from __future__ import annotations
@@ -34,14 +33,14 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One camera's.
+    """Measures of one camera.
 
     Attributes:
-        camera: its name.
-        tracked: whether the result was made with it; None if the result does not say.
+        camera: name of the camera.
+        tracked: True if the camera was used for tracking; None if unknown.
         joint_px: mean distance of the chosen joints, pixels.
-        joint_share: the same as a share of the subject's height in this view.
-        silhouette_error: E_S, averaged over the frames; None without masks or body.
+        joint_share: joint_px as a share of the subject's height in this view.
+        silhouette_error: E_S, mean over the frames; None without masks or body.
     """
 
     camera: str
@@ -53,13 +52,13 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class ViewEvaluation:
-    """All views of a capture.
+    """Measures of all views of a capture.
 
     Attributes:
         joints: the chosen joints.
-        frames: how many frames are in both the result and the truth.
-        views: one score a camera.
-        note: why there is no E_S; empty if there is.
+        frames: number of frames in both the result and the ground truth.
+        views: one score per camera.
+        note: reason for a missing E_S; empty if there is none.
     """
 
     joints: tuple[str, ...]
@@ -69,7 +68,7 @@ class ViewEvaluation:
 
     @property
     def joint_px(self) -> float:
-        """Over the views that were used for tracking (section 5.1)."""
+        """Return the mean over the views that were used for tracking (section 5.1)."""
         return float(np.mean([view.joint_px for view in self._used]))
 
     @property
@@ -78,7 +77,7 @@ class ViewEvaluation:
 
     @property
     def silhouette_error(self) -> float | None:
-        """Over all views, tracked or not (section 5.2)."""
+        """Return the mean over all views, tracked or not (section 5.2)."""
         values = [view.silhouette_error for view in self.views if view.silhouette_error is not None]
         return float(np.mean(values)) if values else None
 
@@ -87,14 +86,14 @@ class ViewEvaluation:
         return [view for view in self.views if view.tracked is not False]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, what is not finite as None."""
+        """Return plain values for JSON; infinity and NaN become None."""
         means = {"joint_px": self.joint_px, "joint_share": self.joint_share, "silhouette_error": self.silhouette_error}
         plain = plain_values(asdict(self) | means)
         assert isinstance(plain, dict)
         return plain
 
     def format_table(self) -> str:
-        """A table for people."""
+        """Return the table that ``tk evaluate`` prints."""
         lines = [f"{'view':14}{'tracked':>8}{'joints px':>11}{'% height':>10}{'E_S %':>8}"]
         for view in self.views:
             used = {True: "yes", False: "no", None: "?"}[view.tracked]
@@ -116,18 +115,18 @@ def evaluate_views(
     joints: Sequence[str] = ANKLE_JOINTS,
     masks: str = "auto",
 ) -> ViewEvaluation:
-    """Judge a result in all views of its capture.
+    """Measure the fit of a result in all views of its capture.
 
     Args:
         result: the result file.
-        truth: the true joints.
+        truth: the ground truth file.
         capture: the capture's folder.
-        joints: the joints whose distance is taken.
+        joints: joints whose distance is measured.
         masks: as for :func:`~tk.io.captures.capture.open_capture`.
 
     Raises:
         ConfigError: an unknown joint.
-        CaptureError: the capture cannot be read, or is of another recording.
+        CaptureError: the capture cannot be read, or shows another recording.
     """
     for name in joints:
         if name not in JOINTS:
@@ -153,7 +152,7 @@ def evaluate_views(
 
 
 def _pixel_error(view: Rig, estimate: Float, truth: Float, joints: Sequence[str]) -> tuple[float, float]:
-    """Mean distance in one view over joints and frames, and as a share of the truth's height from ankles to crown."""
+    """Return the mean distance in one view, pixels and as a share of the true height from ankles to crown."""
     camera = view[0]
     chosen = [JOINTS.index(name) for name in joints]
     a, b = (camera.project(p[:, chosen].reshape(-1, 3))[0] for p in (estimate, truth))
@@ -164,10 +163,10 @@ def _pixel_error(view: Rig, estimate: Float, truth: Float, joints: Sequence[str]
 
 
 def _silhouette_errors(result: Result, capture: Capture) -> tuple[list[float] | None, str]:
-    """E_S by view over the frames of the result, or why there is none."""
+    """Return the mean E_S of each view over the frames of the result, or None and the reason."""
     found = body_and_poses(result)
     if found is None:
-        return None, f"no E_S: {result.path} does not hold the body that it tracked with"
+        return None, f"no E_S: {result.path} does not contain the tracked body"
     if not capture.has_masks:
         return None, f"no E_S: {capture.path} has no masks/"
     body, poses = found
@@ -180,14 +179,14 @@ def _silhouette_errors(result: Result, capture: Capture) -> tuple[list[float] | 
             if row is not None and frame.masks is not None and np.isfinite(result.pose[row]).all():
                 errors.append(share_wrong(draw_silhouettes(body, capture.rig, poses[row][None])[0], frame.masks))
     values = np.array(errors).reshape(-1, len(capture.rig))
-    seen = np.isfinite(values)  # an empty mask has no share
+    seen = np.isfinite(values)  # NaN for an empty mask
     if not seen.any(axis=0).all():
         return None, f"no E_S: {capture.path} has a view whose masks are all empty"
     return [float(values[seen[:, v], v].mean()) for v in range(len(capture.rig))], ""
 
 
 def capture_of(truth: str | os.PathLike[str]) -> Path | None:
-    """The capture that a truth file lies in, if it does."""
+    """Return the capture folder that contains the ground truth file; None if there is none."""
     folder = Path(truth).parent
     return folder if (folder / "calibration.toml").is_file() else None
 

@@ -1,4 +1,4 @@
-"""Results in the formats of other programs. A format is a module that writes it and a line in :data:`FORMATS`."""
+"""Export results to formats of other programs. Each format has a module and an entry in :data:`FORMATS`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["FORMATS", "Exported", "Motion", "export", "read_motion"]
 
 Writer = Callable[[Motion, Path], None]
 
-# A format's files, or folder of files: what is added to the result's name, and who writes it.
+# For each format the files or folders to write: the suffix added to the result's name, and the function that writes it.
 FORMATS: dict[str, tuple[tuple[str, Writer], ...]] = {
     "trc": ((".trc", write_trc),),
     "mot": ((".mot", write_mot),),
@@ -34,13 +34,13 @@ FORMATS: dict[str, tuple[tuple[str, Writer], ...]] = {
     "gltf": ((".glb", write_glb),),
     "ply": (("_ply", write_body_meshes),),
 }
-# Formats that cannot say that a pose is not known.
+# Formats that cannot mark a pose as unknown.
 _HOLDING = ("bvh", "gltf", "ply")
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What :func:`export` has written, and what its user should know of it."""
+    """The files that :func:`export` has written, and notes for the user."""
 
     files: tuple[Path, ...]
     notes: tuple[str, ...]
@@ -56,14 +56,14 @@ def export(
     """Write a result in other formats; the files take its name.
 
     Args:
-        formats: of :data:`FORMATS`.
-        folder: where to; beside the result by default. It is made if it does not exist.
-        smoothed: the smoothed copy; `_smoothed` is added to the files' names.
-        force: replace files that exist.
+        formats: names of :data:`FORMATS`.
+        folder: output folder, created if necessary; None: the folder of the result.
+        smoothed: export the smoothed copy; `_smoothed` is added to the files' names.
+        force: replace existing files.
 
     Raises:
-        ResultError: the result cannot be read, or holds nothing to export.
-        ExportError: an unknown format, a file that exists, a package that is missing, or a file that cannot be written.
+        ResultError: the result cannot be read, or has nothing to export.
+        ExportError: a format is unknown, a file exists, a package is missing, or a file cannot be written.
     """
     unknown = [name for name in formats if name not in FORMATS]
     if unknown or not formats:
@@ -86,12 +86,12 @@ def export(
 
 
 def _write(motion: Motion, target: Path, write: Writer) -> None:
-    """Write beside the target and rename: a file that has its name is whole."""
-    part = target.with_name(f".{target.stem}.part{target.suffix}")  # ezc3d adds an ending that it misses
+    """Write to a temporary file and rename it, so that a file with the final name is complete."""
+    part = target.with_name(f".{target.stem}.part{target.suffix}")  # keep the suffix: ezc3d would add a missing one
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         write(motion, part)
-        if target.is_dir():  # which no rename replaces
+        if target.is_dir():  # a rename does not replace a folder
             _remove(target)
         os.replace(part, target)
     except OSError as error:
@@ -102,7 +102,7 @@ def _write(motion: Motion, target: Path, write: Writer) -> None:
 
 
 def _remove(folder: Path) -> None:
-    """Remove a folder that an earlier export has made."""
+    """Remove the folder of an earlier export; refuse a folder with other files."""
     other = next((file for file in folder.iterdir() if not re.fullmatch(r"\d{6,}\.ply", file.name)), None)
     if other is not None:
         raise ExportError(f"{other}: tk export did not make it, so its folder is not replaced; choose another with -o")

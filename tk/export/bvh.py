@@ -1,9 +1,9 @@
-"""BVH, for Blender and other programs of animation.
+"""Write BVH files, for Blender and other animation programs.
 
-Axes, units and rest pose as in :mod:`tk.export.tree`: Y up, facing +Z, metres, a T pose with the fitted body's
-lengths. Rotations are Z, then X, then Y about moving axes, degrees. The root has channels for its place, and so have
-the shoulders, which rise with the arms; such a channel stands for the place in the parent and replaces the OFFSET.
-A frame that is not known holds the pose before.
+Axes, units and rest pose are those of :mod:`tk.export.tree`: Y up, facing +Z, metres, a T pose with the lengths of the
+fitted body. Rotations are Z, then X, then Y about moving axes, degrees. The root and the shoulders, which rise with the
+arms, have position channels; they are the position in the parent and replace the OFFSET. An unknown frame repeats the
+last known pose.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from tk.export.motion import Motion
 from tk.export.tree import Tree, build_tree
 from tk.model.body.rotations import decompose, follow
 
-_PLACE = ("Xposition", "Yposition", "Zposition")
-_TURN = ("Zrotation", "Xrotation", "Yrotation")
+_POSITION = ("Xposition", "Yposition", "Zposition")
+_ROTATION = ("Zrotation", "Xrotation", "Yrotation")
 
 
 def write_bvh(motion: Motion, path: Path) -> None:
-    """Write the tree; a node's tip (head, hand, toe) is an End Site. Heels, a second tip of the foot, are left out."""
+    """Write the tree; head, hands and toes are End Sites. Heels are omitted: a foot can have only one End Site."""
     tree = build_tree(motion)
     columns = []
     for node in _in_order(tree, 0):
@@ -41,7 +41,7 @@ def _is_tip(tree: Tree, node: int) -> bool:
 
 
 def _in_order(tree: Tree, node: int) -> Iterator[int]:
-    """The nodes with channels, as the hierarchy lists them."""
+    """Yield the nodes with channels in the order of the hierarchy."""
     yield node
     for child in tree.children(node):
         if not _is_tip(tree, child):
@@ -49,7 +49,7 @@ def _in_order(tree: Tree, node: int) -> Iterator[int]:
 
 
 def _node(tree: Tree, node: int, indent: str) -> Iterator[str]:
-    """The hierarchy's lines from a node down."""
+    """Yield the lines of the hierarchy for a node and its descendants."""
     name, inner = tree.names[node], indent + "  "
     if _is_tip(tree, node):
         yield f"{indent}End Site"
@@ -58,7 +58,7 @@ def _node(tree: Tree, node: int, indent: str) -> Iterator[str]:
     yield f"{indent}{{"
     yield f"{inner}OFFSET " + _numbers(tree.offsets[node])
     if not _is_tip(tree, node):
-        channels = (*(_PLACE if tree.moving[node] else ()), *_TURN)
+        channels = (*(_POSITION if tree.moving[node] else ()), *_ROTATION)
         yield f"{inner}CHANNELS {len(channels)} " + " ".join(channels)
         for child in tree.children(node):
             if not tree.names[child].startswith("heel"):

@@ -1,9 +1,8 @@
-"""C3D: points and rotations, the file of motion laboratories, written through ezc3d.
+"""Write C3D files, the format of motion laboratories, with points and segment rotations. It needs ezc3d.
 
-World frame as in the result, millimetres. A point's residual is its standard deviation in whole millimetres
-(127 at
-most) where the result tells one, else 0. In frames that are not known it is -1, and the coordinates are 0, which is how
-the format says that a point is missing; ROTATION, each segment's 4×4 transform to the world, has the reliability -1.
+World frame of the result, millimetres. A point's residual is its standard deviation in whole millimetres, at most 127;
+0 if the result has none. In unknown frames the residual is -1 and the coordinates are 0, the format's mark of a missing
+point. ROTATION is each segment's 4×4 transform to the world; in unknown frames its reliability is -1.
 """
 
 from __future__ import annotations
@@ -16,12 +15,12 @@ from tk.errors import ExportError
 from tk.export.motion import Motion
 from tk.model.body.joints import SEGMENT_ORIGIN
 
-# A byte of a signed word: ezc3d would wrap 256 to 0, which is a point without an error.
+# The residual is a signed byte: ezc3d would wrap 256 to 0, a point without error.
 _MOST_RESIDUAL = 127
 
 
 def write_c3d(motion: Motion, path: Path) -> None:
-    """Write the joints, the points of the feet, and the segments.
+    """Write the joints, the points of the feet and the segments.
 
     Raises:
         ExportError: ezc3d is not installed.

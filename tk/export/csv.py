@@ -1,4 +1,4 @@
-"""CSV, one observation a line: the points, and the joint angles as a clinician reads them."""
+"""Write CSV files with one value set per line: points, and clinical joint angles."""
 
 from __future__ import annotations
 
@@ -12,21 +12,20 @@ from tk.model.body.angles import ANGLES, joint_angles
 
 
 def write_points_csv(motion: Motion, path: Path) -> None:
-    """Write ``frame,time,status,point,x,y,z,sigma``: metres, world frame as in the result; blank where not known."""
+    """Write ``frame,time,status,point,x,y,z,sigma``: metres, world frame of the result; blank if unknown."""
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream)
         writer.writerow(("frame", "time", "status", "point", "x", "y", "z", "sigma"))
         for f in range(len(motion)):
             start = _start(motion, f)
             for p, name in enumerate(motion.point_names):
-                place = [f"{value:.6f}" for value in motion.points[f, p]] if motion.known[f] else [""] * 3
-                is_told = motion.known[f] and np.isfinite(motion.sigma[f, p])
-                writer.writerow((*start, name, *place, f"{motion.sigma[f, p]:.6f}" if is_told else ""))
+                position = [f"{value:.6f}" for value in motion.points[f, p]] if motion.known[f] else [""] * 3
+                has_sigma = motion.known[f] and np.isfinite(motion.sigma[f, p])
+                writer.writerow((*start, name, *position, f"{motion.sigma[f, p]:.6f}" if has_sigma else ""))
 
 
 def write_angles_csv(motion: Motion, path: Path) -> None:
-    """Write ``frame,time,status,joint,angle,degrees`` after :data:`tk.model.body.angles.ANGLES`; blank where not
-    known."""
+    """Write ``frame,time,status,joint,angle,degrees`` for :data:`tk.model.body.angles.ANGLES`; blank if unknown."""
     degrees = joint_angles(motion.rotations, motion.T_world_body, motion.segments)
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream)

@@ -1,7 +1,7 @@
-"""glTF 2.0 in one file (.glb): the tree of nodes, its animation, and the body's pieces riding on the nodes.
+"""Write glTF 2.0 as one file (.glb): the tree of nodes, its animation, and a mesh of each segment on its node.
 
-Axes, units and rest pose as in :mod:`tk.export.tree`, which are glTF's own. A frame that is not known holds the pose
-before; `asset.extras.lost_frames` of the file lists such frames.
+Axes, units and rest pose are those of :mod:`tk.export.tree` and of glTF. An unknown frame repeats the last known pose;
+`asset.extras.lost_frames` of the file lists these frames.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ Float = NDArray[np.float64]
 
 _FLOAT, _UINT16 = 5126, 5123  # componentType
 _VERTICES, _INDICES = 34962, 34963  # bufferView.target
-# twice the area below which a triangle is none: those at the poles of an ellipsoid
+# twice the area of the largest triangle that is omitted: triangles at the poles of an ellipsoid have no area
 _NO_AREA_M2 = 1e-10
 
 
 class _Buffer:
-    """The binary chunk, and the JSON that tells what lies in it."""
+    """The binary chunk and the JSON that describes it."""
 
     def __init__(self) -> None:
         self.data = bytearray()
@@ -40,7 +40,7 @@ class _Buffer:
         self.accessors: list[dict[str, Any]] = []
 
     def add(self, values: NDArray[Any], target: int | None = None, bounds: bool = False) -> int:
-        """Append an array (N,) or (N, k), float32 or uint16; the index of its accessor."""
+        """Append an array (N,) or (N, k), float32 or uint16, and return the index of its accessor."""
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": values.nbytes}
         self.views.append(view if target is None else view | {"target": target})
         self.data += values.tobytes()
@@ -97,7 +97,7 @@ def write_glb(motion: Motion, path: Path) -> None:
 
 
 def _animation(motion: Motion, tree: Tree, buffer: _Buffer) -> dict[str, Any]:
-    """Turns of all nodes but the tips, places of those that move; linear between frames, the first at time 0."""
+    """Return the animation: rotations of all nodes except leaves, positions of moving nodes, linear in time from 0."""
     times = buffer.add((motion.time - motion.time[0]).astype(np.float32), bounds=True)
     quaternions = continuous(to_quaternions(tree.rotations))[..., [1, 2, 3, 0]].astype(np.float32)
     samplers: list[dict[str, Any]] = []
@@ -114,7 +114,7 @@ def _animation(motion: Motion, tree: Tree, buffer: _Buffer) -> dict[str, Any]:
 
 
 def _meshes(motion: Motion, tree: Tree, buffer: _Buffer, nodes: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A mesh for each segment of the tracked body with solids; it is put onto its node."""
+    """Return a mesh for each segment that has solids, and refer to it in the segment's node."""
     skeleton = build_skeleton(motion.dimensions)
     solids = figure_of(motion.result).solids
     meshes: list[dict[str, Any]] = []
@@ -150,9 +150,10 @@ def _meshes(motion: Motion, tree: Tree, buffer: _Buffer, nodes: list[dict[str, A
 
 
 def _surface(solid: Solid) -> tuple[Float, Float, NDArray[np.int64]]:
-    """Points (N, 3), normals (N, 3) and triangles (M, 3) of a solid, its segment's frame.
+    """Return points (N, 3), normals (N, 3) and triangles (M, 3) of a solid in its segment's frame.
 
-    The ends of a frustum are flat with an edge around, so they have points of their own; what has no area is left out.
+    The flat ends of a frustum have points of their own, so that their edge stays sharp. Triangles without area are
+    omitted.
     """
     rings = solid.rings
     count = rings.shape[0] * AROUND
@@ -160,7 +161,7 @@ def _surface(solid: Solid) -> tuple[Float, Float, NDArray[np.int64]]:
     faces = solid.triangles.copy()
     is_end = [(faces < AROUND).all(axis=1), (faces >= count - AROUND).all(axis=1)]
     faces[is_end[0]] += count
-    faces[is_end[1]] += 2 * AROUND  # the last circle's copy follows the first one's
+    faces[is_end[1]] += 2 * AROUND  # the copy of the last ring follows the copy of the first
     corners = points[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     kept = np.linalg.norm(across, axis=1) > _NO_AREA_M2

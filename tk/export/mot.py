@@ -1,9 +1,10 @@
-"""MOT: joint angles over time as OpenSim reads them.
+"""Write MOT files: joint angles over time for OpenSim.
 
 Coordinates have the names, the axes and the signs of the full-body model of Rajagopal et al., IEEE Trans. Biomed. Eng.
-63 (2016) 2068-2079 (`Rajagopal2016.osim`): turns Z-X-Y at pelvis, lumbar joint, hip and shoulder, hinges at knee and
-elbow. The pelvis is placed at the midpoint of the hip centres; that model's own origin lies elsewhere in the pelvis, so
-that translations agree up to a constant in the pelvis. Axes as in :mod:`tk.export.trc`; degrees and metres.
+63 (2016) 2068-2079 (`Rajagopal2016.osim`): rotations Z-X-Y at pelvis, lumbar joint, hip and shoulder, hinges at knee
+and elbow. The pelvis position is the midpoint of the hip centres; the origin of that model is elsewhere in the pelvis,
+so translations differ by an offset that is constant in the pelvis frame. Axes as in :mod:`tk.export.trc`; degrees and
+metres.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ Float = NDArray[np.float64]
 
 _MIRROR = np.diag([1.0, 1.0, -1.0])
 
-# Parent, child, and the coordinates of the turns about Z, X, Y (None: left out); a side's two are written alike.
+# Parent, child, and the coordinates for the rotations about Z, X, Y (None: not written; minus: opposite sign).
 _TRUNK = (("pelvis", "torso", ("lumbar_extension", "lumbar_bending", "lumbar_rotation")),)
 _SIDE = (
     ("pelvis", "thigh", ("hip_flexion", "hip_adduction", "hip_rotation")),
@@ -33,7 +34,7 @@ _SIDE = (
 
 
 def write_mot(motion: Motion, path: Path) -> None:
-    """Write the coordinates; frames that are not known are left out, as their times tell."""
+    """Write the coordinates; unknown frames are omitted, so the times have gaps."""
     columns = coordinates(motion)
     rows = np.flatnonzero(motion.known)
     lines = [
@@ -51,7 +52,7 @@ def write_mot(motion: Motion, path: Path) -> None:
 
 
 def coordinates(motion: Motion) -> dict[str, Float]:
-    """OpenSim's coordinates, each (F,), degrees; the pelvis' translations in metres."""
+    """Return OpenSim's coordinates, each (F,), degrees; translations of the pelvis in metres."""
     A = FORWARD_UP_RIGHT @ motion.T_world_body.T
     pelvis = _turns(A @ motion.rotation("pelvis") @ FORWARD_UP_RIGHT.T)
     found = {name: pelvis[:, k] for k, name in enumerate(("pelvis_tilt", "pelvis_list", "pelvis_rotation"))}
@@ -68,5 +69,5 @@ def coordinates(motion: Motion) -> dict[str, Float]:
 
 
 def _turns(R: Float) -> Float:
-    """(F, 3) degrees about Z, X, Y, without jumps."""
+    """Return angles (F, 3) about Z, X, Y, degrees, without jumps."""
     return np.degrees(follow(decompose("zxy", R)))

@@ -1,4 +1,4 @@
-"""A result as the exporters want it: points and rotations over time, for files of any version."""
+"""Read a result for export: points and rotations over time."""
 
 from __future__ import annotations
 
@@ -23,28 +23,31 @@ Float = NDArray[np.float64]
 
 STATUS_WORDS = tuple(status.name.lower() for status in Status)
 
-# Axes of other programs as rows, in the body's (forward, left, up) when it stands as the skeleton does in its zero
-# configuration: that is (x, y, z) of a world whose z axis is up.
-LEFT_UP_FORWARD = np.roll(np.eye(3), -1, axis=0)  # glTF, and usual in BVH
+# Axes of glTF, used here for BVH too (left, up, forward), as rows in the body's axes (forward, left, up) in the zero
+# configuration of the skeleton; these are (x, y, z) of a world whose z axis is up.
+LEFT_UP_FORWARD = np.roll(np.eye(3), -1, axis=0)
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A person's motion over F frames. Where a frame is not known, its numbers are those of the last known one before.
+    """A person's motion over F frames. An unknown frame has the values of the last known frame before it.
 
     Attributes:
-        name: the result's name without its ending.
-        fps: frames a second.
-        frames, time: (F,) source frames, seconds.
-        status: (F,) as in the result; bridged: (F,) True where the smoothed copy fills a gap.
+        name: the result's file name without suffix.
+        fps: frames per second.
+        frames, time: (F,) source frame indices; times, s.
+        status: (F,) as in the result.
+        bridged: (F,) True where the smoothed copy fills a gap.
         known: (F,) False where the person was lost and the gap was not bridged.
-        point_names: P joints and points of the feet; points: (F, P, 3) metres, world frame.
-        sigma: (F, P) one standard deviation of a point, metres; NaN where nobody says.
-        segments: S names; rotations: (F, S, 3, 3) segment to world, axes as in :mod:`tk.model.body.angles`.
-        dimensions: of the fitted body.
-        T_world_body: (3, 3) the world's forward, left and up as columns.
-        result: what all this was read from; its smoothed copy where that was asked for.
-        held: (F,) the result's row that each frame shows: its own, or the last known one's.
+        point_names: names of the P joints and points of the feet.
+        points: (F, P, 3) metres, world frame.
+        sigma: (F, P) m, standard deviation of each point along one axis; NaN if unknown.
+        segments: names of the S segments.
+        rotations: (F, S, 3, 3) segment to world, axes as in :mod:`tk.model.body.angles`.
+        dimensions: dimensions of the fitted body.
+        T_world_body: (3, 3) the world's forward, left and up axes as columns.
+        result: the result, or its smoothed copy if that was requested.
+        held: (F,) row of the result that each frame shows: its own, or that of the last known frame.
     """
 
     name: str
@@ -68,28 +71,28 @@ class Motion:
         return len(self.frames)
 
     def point(self, name: str) -> Float:
-        """(F, 3) a point, metres, world frame."""
+        """Return the positions (F, 3) of a point, metres, world frame."""
         return self.points[:, self.point_names.index(name)]
 
     def rotation(self, segment: str) -> Float:
-        """(F, 3, 3) a segment's rotation to the world; a foot without a segment of its own has that of its calf."""
+        """Return a segment's rotations (F, 3, 3) to the world; a foot that is no segment has those of its calf."""
         if segment not in self.segments:
             segment = segment.replace("foot", "calf")
         return self.rotations[:, self.segments.index(segment)]
 
     def status_word(self, frame: int) -> str:
-        """One of :data:`STATUS_WORDS`, or "bridged"."""
+        """Return one of :data:`STATUS_WORDS`, or "bridged"."""
         return "bridged" if self.bridged[frame] else STATUS_WORDS[self.status[frame]]
 
 
 def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[Motion, tuple[str, ...]]:
-    """Read a result for export, and what there is to say about it.
+    """Read a result for export, and return it with notes for the user.
 
     Args:
-        smoothed: take the smoothed copy; it is made here where the result has none.
+        smoothed: use the smoothed copy; the poses are smoothed here if the result has none.
 
     Raises:
-        ResultError: as :func:`tk.io.results.writer.read_result`, or no body or no known frame is in it.
+        ResultError: as :func:`tk.io.results.writer.read_result`, or the result has no body or no known frame.
     """
     result = read_result(path)
     bridged = np.zeros(len(result), dtype=bool)
@@ -108,17 +111,21 @@ def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[M
     if missing:
         raise ResultError(f"{path}: /segments/rotation has no segment {missing[0]}; track the capture again")
     skeleton = _skeleton(result, dimensions)
-    # (F, …) what the segments' rotations are made of
+    # (F, …) values from which the segments' rotations are computed
     source = result.pose if result.segments_rotation is None else result.segments_rotation
     known = bridged | result.has_pose
     for numbers in (result.joints, source):
         known &= np.isfinite(numbers).reshape(len(known), -1).all(axis=1)
     if result.segments_rotation is not None:
-        known &= np.linalg.norm(result.segments_rotation, axis=2).min(axis=1) > 0  # a quaternion of zeros is none
+        known &= (
+            np.linalg.norm(result.segments_rotation, axis=2).min(axis=1) > 0
+        )  # a quaternion of zeros is no rotation
     if not known.any():
         raise ResultError(f"{path}: the person is lost in every frame; there is nothing to export")
     if (np.diff(result.frames) != 1).any():
-        raise ResultError(f"{path}: its frames are not consecutive, which no other format can tell; track all of them")
+        raise ResultError(
+            f"{path}: its frames are not consecutive, which other formats cannot represent; track all of them"
+        )
     held = _held(known)
     rotations = (
         segment_rotations(skeleton, source[held])
@@ -154,7 +161,7 @@ def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[M
 
 
 def _in_order(result: Result) -> Result:
-    """The result with its joints in the order of :data:`JOINTS`."""
+    """Return the result with its joints in the order of :data:`JOINTS`."""
     names = result.meta.joint_names
     missing = [name for name in JOINTS if name not in names]
     if missing:
@@ -165,13 +172,13 @@ def _in_order(result: Result) -> Result:
 
 
 def _sole(motion: Motion, name: str) -> Float:
-    """(F, 3) heel or toe of a foot, from its ankle and its segment's rotation."""
+    """Return the positions (F, 3) of a heel or toe, from the ankle and the rotation of the foot."""
     ankle, foot = motion.point(LIMBS["leg" + name[-2:]][2]), motion.rotation("foot" + name[-2:])
     return ankle + foot @ sole_offset(name, motion.dimensions)
 
 
 def _held(known: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """(F,) for each frame the last known one up to it; the first known one where there is none before."""
+    """Return for each frame (F,) the last known frame up to it; before the first known frame, the first known one."""
     latest = np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))
     return np.where(latest < 0, int(np.argmax(known)), latest)
 
@@ -195,7 +202,7 @@ def _skeleton(result: Result, dimensions: BodyDimensions) -> Skeleton:
 
 
 def _smooth(result: Result, dimensions: BodyDimensions) -> tuple[Result, NDArray[np.bool_]]:
-    """The result with smoothed poses and what follows from them, and (F,) the frames that were bridged."""
+    """Return the result with smoothed poses and derived quantities, and the bridged frames (F,)."""
     skeleton = _skeleton(result, dimensions)
     known = result.has_pose & np.isfinite(result.pose).all(axis=1)
     found = smooth(skeleton, result.pose, known, result.meta.fps)

@@ -1,8 +1,7 @@
-"""The body's surface as a sequence of meshes: a folder with a PLY file a frame, named by the source frame.
+"""Write the body's surface as a folder of meshes: one PLY file per frame, named by the source frame.
 
-World frame, metres; the parts of the body are closed meshes that reach into each other, in the colours of the
-overlays.
-A frame that is not known holds the body before.
+World frame, metres. Each part of the body is a closed mesh in the colour of the overlays; neighbouring parts overlap.
+An unknown frame repeats the last known body.
 """
 
 from __future__ import annotations
@@ -20,15 +19,15 @@ from tk.render.palette import SEGMENT_COLORS
 
 
 def write_body_meshes(motion: Motion, folder: Path) -> None:
-    """Write a mesh a frame.
+    """Write one mesh per frame.
 
     Raises:
-        ExportError: the result holds no body.
+        ExportError: the result has no body.
         ResultError: Open3D cannot be loaded, or a file cannot be written.
     """
     figure = figure_of(motion.result)
     if not figure.solids:
-        raise ExportError(f"{motion.result.path}: holds no body, so there is no surface of it; track it again")
+        raise ExportError(f"{motion.result.path}: has no body and thus no surface; track the capture again")
     counts = [len(solid.rings) * solid.rings.shape[1] for solid in figure.solids]
     starts = np.cumsum([0, *counts[:-1]])
     faces = [solid.triangles + start for solid, start in zip(figure.solids, starts, strict=True)]

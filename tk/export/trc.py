@@ -1,6 +1,6 @@
-"""TRC: points over time as OpenSim reads them (Motion Analysis' "track row column").
+"""Write TRC files: points over time for OpenSim (Motion Analysis' "track row column").
 
-Axes are OpenSim's: X forward, Y up, Z to the right, where the world's x axis is forward. For a world with z up this is
+Axes are OpenSim's: X forward (the world's x axis), Y up, Z to the right. For a world with z up this is
 the rotation by -90° about x: (x, y, z) becomes (x, z, -y). Millimetres.
 """
 
@@ -13,7 +13,7 @@ from tk.model.body.angles import FORWARD_UP_RIGHT
 
 
 def write_trc(motion: Motion, path: Path) -> None:
-    """Write the joints and the points of the feet; a frame that is not known has blank coordinates."""
+    """Write the joints and the points of the feet; an unknown frame has blank coordinates."""
     points = 1000.0 * motion.points @ (FORWARD_UP_RIGHT @ motion.T_world_body.T).T
     count, rate = len(motion), f"{motion.fps:.6f}"
     names = motion.point_names
@@ -28,7 +28,7 @@ def write_trc(motion: Motion, path: Path) -> None:
         "",
     ]
     for f, frame in enumerate(motion.frames):
-        # OpenSim takes a tab at a line's end for its end: without one more, the last blank would be missing
+        # OpenSim ignores one tab at the end of a line: without an extra tab, the last blank would be missing
         cells = [f"{value:.4f}" for value in points[f].ravel()] if motion.known[f] else [""] * (points[f].size + 1)
         lines.append("\t".join((str(frame), f"{motion.time[f]:.6f}", *cells)))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

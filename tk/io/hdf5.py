@@ -1,8 +1,8 @@
-"""Opening and reading HDF5 files that anybody may have made, or that are damaged.
+"""Open and read HDF5 files from any source, damaged files included.
 
-Everything in the file is looked over before anything is read: only groups and datasets that lie in the file itself, no
-links to elsewhere, no storage outside, no more data declared than the file can hold. What is then read has the type and
-the shape that were asked for. HDF5 and h5py raise nearly any exception for a damaged file; here all of them become a
+All objects of the file are checked before any data are read: groups and datasets must be in the file itself, without
+links and external storage, and declare no more data than the file can hold. Data are returned only with the requested
+type and shape. HDF5 and h5py raise many kinds of exceptions for a damaged file; all of them become a
 :class:`~tk.errors.ResultError` of one line.
 """
 
@@ -22,29 +22,29 @@ from numpy.typing import NDArray
 
 from tk.errors import ResultError, TkError
 
-#: groups and datasets in a file, groups within groups, bytes of an attribute: far more than a result has
-MOST_OBJECTS, DEEPEST, MOST_ATTRIBUTE_BYTES = 10_000, 12, 2**20
+#: limits of groups and datasets in a file, nested groups, bytes of an attribute: far more than a result has
+MAX_OBJECTS, MAX_DEPTH, MAX_ATTRIBUTE_BYTES = 10_000, 12, 2**20
 
 #: filters that only compress or check: deflate, shuffle, Fletcher's checksum, and h5py's LZF
 FILTERS = (1, 2, 3, 32000)
 
-#: compressed data may unfold to so many times what is stored; so many bytes may be declared though nothing is stored
-#: (HDF5 stores no parts that nobody wrote)
-MOST_UNFOLDED, MOST_UNWRITTEN_BYTES = 100, 2**16
+#: limits of the compression ratio, and of the declared bytes of a dataset without stored data (HDF5 does not store
+#: chunks that were never written)
+MAX_COMPRESSION, MAX_UNWRITTEN_BYTES = 100, 2**16
 
-_HEAP = b"GCOL\x01\x00\x00\x00"  # how a heap of texts begins: signature, version, reserved
+_HEAP = b"GCOL\x01\x00\x00\x00"  # start of a heap of texts: signature, version, reserved
 
 _NUMBERS = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.ENUM)  # h5py stores bool as an enumeration
-_KINDS = {"f": "fiu", "i": "iuf", "u": "iuf", "b": "biu"}  # what may be stored where a kind is asked for
+_KINDS = {"f": "fiu", "i": "iuf", "u": "iuf", "b": "biu"}  # stored kinds that are accepted for a requested kind
 
 
 class Hdf5Reader:
-    """An open file that has been looked over. Make one with :func:`open_hdf5`.
+    """An open file whose objects have been checked. Make one with :func:`open_hdf5`.
 
     Attributes:
         path: the file.
-        shapes: the shape of every dataset, by its name without a leading slash.
-        groups: the names of all groups.
+        shapes: shape of every dataset, by its name without a leading slash.
+        groups: names of all groups.
     """
 
     def __init__(self, path: Path, file: h5py.File) -> None:
@@ -61,7 +61,7 @@ class Hdf5Reader:
         return name in self.shapes or name in self.groups
 
     def fail(self, message: str) -> NoReturn:
-        """Raise a ResultError about this file: one line, whatever the message quotes from it."""
+        """Raise a ResultError about this file, as one line even if the message quotes several."""
         raise self._error(message)
 
     def _error(self, message: str) -> ResultError:
@@ -69,23 +69,23 @@ class Hdf5Reader:
         return ResultError(f"{self.path}: {line if len(line) <= 400 else f'{line[:400]}...'}")
 
     def below(self, group: str) -> list[str]:
-        """The names of the datasets below a group, relative to it, sorted."""
+        """Return the names of the datasets below a group, relative to it, sorted."""
         return sorted(name[len(group) + 1 :] for name in self.shapes if name.startswith(f"{group}/"))
 
     def array(
-        self, name: str, dtype: str, shape: tuple[int | None, ...], most: float = math.inf, missing: str = ""
+        self, name: str, dtype: str, shape: tuple[int | None, ...], limit: float = math.inf, missing: str = ""
     ) -> NDArray[Any]:
-        """A dataset of numbers.
+        """Return a dataset of numbers.
 
         Args:
-            name: of the dataset.
-            dtype: numpy's name of the type that is wanted.
-            shape: that is wanted; None stands for any length.
-            most: the largest magnitude that makes sense; NaN and infinity pass.
-            missing: what to say if there is no such dataset.
+            name: name of the dataset.
+            dtype: numpy's name of the requested type.
+            shape: requested shape; None stands for any length.
+            limit: largest valid magnitude; NaN and infinity are accepted.
+            missing: message for a missing dataset.
 
         Raises:
-            ResultError: it is not there, of another shape, not of numbers that fit the type, or out of range.
+            ResultError: the dataset is missing, has another shape, or numbers that do not fit the type or the limit.
         """
         if name not in self.shapes:
             self.fail(missing or f"has no /{name}; the file is damaged")
@@ -101,16 +101,16 @@ class Hdf5Reader:
             limits = np.iinfo(wanted)
             if len(finite) < values.size or (finite != np.round(finite)).any():
                 self.fail(f"/{name} holds numbers that are not whole")
-            low, high = max(float(limits.min), -most), min(float(limits.max), most)
+            low, high = max(float(limits.min), -limit), min(float(limits.max), limit)
         else:
-            low, high = (0.0, 1.0) if wanted.kind == "b" else (-most, most)
+            low, high = (0.0, 1.0) if wanted.kind == "b" else (-limit, limit)
         outside = finite[(finite < low) | (finite > high)]
         if len(outside):
             self.fail(f"/{name} holds {outside[0]:g}, which is out of range; the file is damaged")
         return values.astype(wanted)
 
     def value(self, name: str) -> Any:
-        """A dataset of a few numbers or of texts, as h5py gives it."""
+        """Return a dataset of a few numbers or of texts, with the type that h5py returns."""
         with self._guarded(name):
             dataset = self._file[name]
             is_text = dataset.id.get_type().get_class() == h5py.h5t.STRING
@@ -120,25 +120,25 @@ class Hdf5Reader:
             return value.decode() if isinstance(value, bytes) else value
 
     def attribute(self, holder: str, name: str) -> Any:
-        """An attribute of a dataset or group: texts, numbers, or arrays of them; None if it is not there."""
+        """Return an attribute of a dataset or group: texts, numbers, or arrays of them; None if it does not exist."""
         with self._guarded(f"{holder}, attribute {name},"):
             held = self._file[f"/{holder}"]
             if name not in held.attrs:
                 return None
             found = held.attrs.get_id(name)
             size = math.prod(found.shape) * found.get_type().get_size()
-            if found.get_type().get_class() not in (*_NUMBERS, h5py.h5t.STRING) or size > MOST_ATTRIBUTE_BYTES:
+            if found.get_type().get_class() not in (*_NUMBERS, h5py.h5t.STRING) or size > MAX_ATTRIBUTE_BYTES:
                 self.fail(f"the attribute {name} of /{holder} is neither text nor numbers; the file is damaged")
             value = held.attrs[name]
             return value.decode() if isinstance(value, bytes) else value
 
     def is_format(self, name: str) -> bool:
-        """Whether the file says that it is of this format."""
+        """Return True if the attribute `format` of the file has this value."""
         found = self.attribute("", "format")
         return isinstance(found, str) and found == name
 
     def text(self, holder: str, name: str, default: str | None = None) -> str:
-        """An attribute that is one text."""
+        """Return an attribute that is one text."""
         value = self.attribute(holder, name)
         if value is None and default is not None:
             return default
@@ -147,14 +147,14 @@ class Hdf5Reader:
         return value
 
     def number(self, holder: str, name: str) -> float:
-        """An attribute that is one finite number."""
+        """Return an attribute that is one finite number."""
         value = self.attribute(holder, name)
         if np.ndim(value) or not isinstance(value, (int, float, np.integer, np.floating)) or not math.isfinite(value):
             self._no_attribute(holder, name, "a number")
         return float(value)
 
     def names(self, holder: str, name: str) -> tuple[str, ...]:
-        """An attribute that is a list of texts."""
+        """Return an attribute that is a list of texts."""
         value = self.attribute(holder, name)
         listed = [item.decode("utf-8", "replace") if isinstance(item, bytes) else item for item in np.atleast_1d(value)]
         if value is None or np.ndim(value) > 1 or not all(isinstance(item, str) for item in listed):
@@ -165,7 +165,7 @@ class Hdf5Reader:
         self.fail(f"/{holder} has no attribute {name} that is {expected}; the file is damaged")
 
     def _numbers(self, name: str) -> NDArray[Any]:
-        """A dataset whose type is one of numbers, each NaN the usual one: others make numpy warn later."""
+        """Return a dataset of numbers. Each NaN becomes numpy's NaN, because other NaN bits cause warnings later."""
         with self._guarded(name):
             dataset = self._file[name]
             kind = dataset.dtype.kind if dataset.id.get_type().get_class() in _NUMBERS else "?"
@@ -189,8 +189,8 @@ class Hdf5Reader:
         waiting: list[tuple[str, int]] = [("", 0)]
         while waiting:
             name, depth = waiting.pop()
-            if depth > DEEPEST:
-                self.fail(f"/{name}: groups lie within each other more than {DEEPEST} deep; the file is damaged")
+            if depth > MAX_DEPTH:
+                self.fail(f"/{name}: groups are nested more than {MAX_DEPTH} deep; the file is damaged")
             group = h5py.h5g.open(self._file.id, f"/{name}".encode())
             for link in self._links(group, name):
                 path = f"{name}/{link}" if name else link
@@ -200,58 +200,58 @@ class Hdf5Reader:
                     waiting.append((path, depth + 1))
                 elif kind == h5py.h5o.TYPE_DATASET:
                     self.shapes[path] = self._check_storage(path, h5py.h5d.open(group, link.encode()))
-                if len(self.shapes) + len(self.groups) > MOST_OBJECTS:
-                    self.fail(f"holds more than {MOST_OBJECTS} groups and datasets; the file is damaged")
+                if len(self.shapes) + len(self.groups) > MAX_OBJECTS:
+                    self.fail(f"holds more than {MAX_OBJECTS} groups and datasets; the file is damaged")
 
     def _links(self, group: h5py.h5g.GroupID, name: str) -> list[str]:
-        """The names in a group, all of them of things in this file."""
+        """Return the names in a group; refuse links."""
         found: list[tuple[bytes, int]] = []
 
-        def take(link: bytes, info: h5py.h5l.LinkInfo) -> bool | None:  # what it raises would not arrive
+        def take(link: bytes, info: h5py.h5l.LinkInfo) -> bool | None:  # HDF5 does not pass on its exceptions
             found.append((link, info.type))
-            return True if len(found) > MOST_OBJECTS else None
+            return True if len(found) > MAX_OBJECTS else None
 
         group.links.iterate(take, info=True)
-        if len(found) > MOST_OBJECTS:
-            self.fail(f"holds more than {MOST_OBJECTS} groups and datasets; the file is damaged")
+        if len(found) > MAX_OBJECTS:
+            self.fail(f"holds more than {MAX_OBJECTS} groups and datasets; the file is damaged")
         for link, kind in found:
             if kind != h5py.h5l.TYPE_HARD:
                 path = f"/{name}/{link.decode()}".replace("//", "/")
-                self.fail(f"{path} is a link to elsewhere; copy what it stands for")
+                self.fail(f"{path} is a link; replace it by a copy of the data")
         return [link.decode() for link, _ in found]
 
     def _check_storage(self, name: str, dataset: h5py.h5d.DatasetID) -> tuple[int, ...]:
-        """The shape of a dataset whose data lie in this file, and not more of them than it can hold."""
+        """Return the shape of a dataset; refuse external data and more data than the file can hold."""
         made = dataset.get_create_plist()
         layout = made.get_layout()
         if layout not in (h5py.h5d.COMPACT, h5py.h5d.CONTIGUOUS, h5py.h5d.CHUNKED) or made.get_external_count():
-            self.fail(f"/{name} lies in another file; copy it into this one")
+            self.fail(f"/{name} is stored in another file; copy it into this one")
         shape = tuple(int(length) for length in dataset.shape)
         item = int(dataset.get_type().get_size())
         stored = int(dataset.get_storage_size())
         filters = [made.get_filter(index)[0] for index in range(made.get_nfilters())]
         if any(code not in FILTERS for code in filters):
-            self.fail(f"/{name} is compressed in a way that is not read here; write it with gzip or without")
-        most = max(stored * (MOST_UNFOLDED if filters else 1), MOST_UNWRITTEN_BYTES)
+            self.fail(f"/{name} has a compression that tk cannot read; write it with gzip or uncompressed")
+        limit = max(stored * (MAX_COMPRESSION if filters else 1), MAX_UNWRITTEN_BYTES)
         declared = item * math.prod(shape)
         if layout == h5py.h5d.CHUNKED and declared:
             declared = max(declared, item * math.prod(made.get_chunk()))
-        if stored > self._bytes or declared > most:
+        if stored > self._bytes or declared > limit:
             self.fail(f"/{name} declares {declared} bytes, and {stored} are stored; the file is damaged")
         return shape
 
 
 def _check_text_heaps(path: Path, file: h5py.File) -> None:
-    """Walk through the heaps that hold texts of any length, as HDF5 will.
+    """Check the heaps that hold texts of variable length.
 
-    HDF5 (2.0.0 and before) goes round for ever in a heap with an object of no size. The layout: section III.E of the
+    HDF5 (up to 2.0.0) loops for ever in a heap with an object of size zero. Source of the layout: section III.E of the
     HDF5 file format specification.
 
     Raises:
         ResultError: a heap is damaged.
     """
     if file.id.get_create_plist().get_sizes() != (8, 8):
-        raise ResultError(f"{path}: has addresses of another length than 8 bytes; write it anew with another HDF5")
+        raise ResultError(f"{path}: its addresses do not have 8 bytes; write it again with another HDF5")
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         start = data.find(_HEAP)
         while start >= 0:
@@ -270,10 +270,10 @@ def _check_text_heaps(path: Path, file: h5py.File) -> None:
 
 @contextlib.contextmanager
 def open_hdf5(path: Path) -> Iterator[Hdf5Reader]:
-    """Open for reading, and look it over. Without locks: a published result is never written to.
+    """Open a file for reading and check its objects. No lock is needed: a published result is never modified.
 
     Raises:
-        ResultError: no such file, not HDF5, or it cannot be trusted.
+        ResultError: the file does not exist, is not HDF5, or is damaged.
     """
     if not path.is_file():
         if path.exists():
@@ -282,11 +282,11 @@ def open_hdf5(path: Path) -> Iterator[Hdf5Reader]:
     try:
         try:
             file = h5py.File(path, "r", locking=False)
-        except OSError:  # HDF5 refuses, too, if this process holds the file open with locks, as h5py does by default
+        except OSError:  # HDF5 also refuses if this process has the file open with locks, h5py's default
             file = h5py.File(path, "r")
     except PermissionError:
         raise ResultError(f"{path}: no permission to read it") from None
-    except Exception as error:  # almost any, if it is damaged
+    except Exception as error:  # a damaged file raises exceptions of almost any type
         raise ResultError(f"{path}: is not an HDF5 file, or is damaged") from error
     with file:
         yield Hdf5Reader(path, file)

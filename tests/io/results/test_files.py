@@ -89,7 +89,7 @@ def test_older_results_are_not_resumed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("make", [other_software, not_hdf5])
-def test_files_of_others_are_neither_overwritten_nor_resumed(tmp_path: Path, make) -> None:
+def test_files_of_other_software_are_neither_overwritten_nor_resumed(tmp_path: Path, make) -> None:
     path = tmp_path / "some.h5"
     make(path)
     before = path.read_bytes()
@@ -135,7 +135,7 @@ def test_an_old_result_stays_until_the_first_new_frame(tmp_path: Path) -> None:
     assert assert_complete(path, 1) == 1
 
 
-def test_a_link_is_followed(tmp_path: Path) -> None:
+def test_symbolic_link_is_followed(tmp_path: Path) -> None:
     (tmp_path / "disk").mkdir()
     link = tmp_path / "result.h5"
     link.symlink_to(tmp_path / "disk" / "real.h5")
@@ -144,7 +144,7 @@ def test_a_link_is_followed(tmp_path: Path) -> None:
     assert assert_complete(tmp_path / "disk" / "real.h5", 2) == 2
 
 
-def test_two_runs_do_not_write_one_file(tmp_path: Path) -> None:
+def test_two_runs_cannot_write_the_same_file(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
     with ResultWriter.create(path, META) as writer:
         with pytest.raises(ResultError, match=r"result\.h5: another run"):
@@ -163,7 +163,7 @@ def test_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert assert_complete(path, 5) == 5
 
 
-def test_a_full_disk_is_one_line_and_keeps_the_finished_frames(tmp_path: Path) -> None:
+def test_full_disk_gives_one_line_and_keeps_finished_frames(tmp_path: Path) -> None:
     """On a real file system of 1 MB, in a process of its own: after a failed write HDF5 likes to crash at exit."""
     disk = tmp_path / "disk"
     disk.mkdir()
@@ -201,7 +201,7 @@ except ResultError as error:
     assert assert_complete(tmp_path / "kept.h5", appended) == appended
 
 
-def test_use_after_close_is_a_defect(tmp_path: Path) -> None:
+def test_use_after_close_raises_value_error(tmp_path: Path) -> None:
     writer = ResultWriter.create(tmp_path / "result.h5", META)
     writer.close()
     writer.close()

@@ -57,7 +57,7 @@ def survive_kills(path: Path, kills: int, seed: int) -> None:
             done = 0
 
 
-def test_a_killed_run_leaves_every_finished_frame_and_is_resumed(tmp_path: Path) -> None:
+def test_killed_run_keeps_every_finished_frame_and_can_be_resumed(tmp_path: Path) -> None:
     survive_kills(tmp_path / "result.h5", kills=4, seed=1)
 
 
@@ -101,7 +101,7 @@ def test_resume_without_a_file_starts_one(tmp_path: Path) -> None:
         assert writer.state == {}
 
 
-def test_frames_after_the_last_state_are_done_again(tmp_path: Path) -> None:
+def test_frames_after_the_last_state_are_written_again(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
     with ResultWriter.create(path, META) as writer:
         for index in range(9):
@@ -144,7 +144,7 @@ def test_resuming_another_run_is_refused(tmp_path: Path, change: dict[str, Any],
     assert [entry.name for entry in tmp_path.iterdir()] == ["result.h5"]
 
 
-def test_config_that_only_looks_different_is_the_same(tmp_path: Path) -> None:
+def test_equal_settings_in_different_notation_can_be_resumed(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
     write(path, 1)
     same = '# a comment\nmethod = "volumetric"\nsmd = { mu = 0.10 }\n'

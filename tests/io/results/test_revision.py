@@ -17,7 +17,7 @@ from tk.io.results.writer import ResultWriter, read_result, revise_result
 from tk.model.body.skeleton import JOINTS
 
 
-def test_a_second_pass_replaces_what_it_names_and_nothing_else(tmp_path: Path) -> None:
+def test_second_pass_replaces_only_the_given_datasets(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
     write(path, 6)
     before = read_result(path)
@@ -38,7 +38,7 @@ def test_a_second_pass_replaces_what_it_names_and_nothing_else(tmp_path: Path) -
     np.testing.assert_array_equal(read_result(path).pose[:6], pose)
 
 
-def test_what_is_smoothed_stands_beside_and_can_take_its_place(tmp_path: Path) -> None:
+def test_smoothed_copy_is_stored_separately_and_can_replace_the_raw_values(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
     write(path, 6)
     smoothed = make_smoothed(6)
@@ -61,7 +61,7 @@ def test_what_is_smoothed_stands_beside_and_can_take_its_place(tmp_path: Path) -
     assert again is not None and again.keys() == {"bridged"}
 
 
-def test_what_was_smoothed_does_not_outlive_what_it_was_made_of(tmp_path: Path) -> None:
+def test_smoothed_copy_is_deleted_when_its_source_changes(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
     write(path, 4)
     revise_result(path, smoothed=make_smoothed(4))
@@ -86,7 +86,7 @@ def test_what_was_smoothed_does_not_outlive_what_it_was_made_of(tmp_path: Path) 
         {"smoothed": {"status": np.zeros(4), "bridged": np.zeros(4)}},
     ],
 )
-def test_a_second_pass_of_the_wrong_shape_changes_nothing(tmp_path: Path, change: dict[str, Any]) -> None:
+def test_second_pass_of_wrong_shape_changes_nothing(tmp_path: Path, change: dict[str, Any]) -> None:
     path = tmp_path / "result.h5"
     write(path, 4)
     before = path.read_bytes()
@@ -95,7 +95,7 @@ def test_a_second_pass_of_the_wrong_shape_changes_nothing(tmp_path: Path, change
     assert path.read_bytes() == before
 
 
-def test_a_second_pass_that_fails_on_the_way_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_second_pass_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "result.h5"
     write(path, 4)
     before = path.read_bytes()
@@ -110,7 +110,7 @@ def test_a_second_pass_that_fails_on_the_way_changes_nothing(tmp_path: Path, mon
     assert [entry.name for entry in tmp_path.iterdir()] == ["result.h5"]
 
 
-def test_a_second_pass_keeps_off_a_result_that_is_being_written(tmp_path: Path) -> None:
+def test_second_pass_refuses_a_result_that_is_being_written(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
     with ResultWriter.create(path, META) as writer:
         writer.append(make_frame(0), make_state(0))

@@ -22,7 +22,7 @@ def result(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Result:
     return tk.track(tk.open_capture(tiny), path, config=settings_file.from_toml(QUICK), frames=(2, 5), causal=True)
 
 
-def test_a_table_has_a_row_a_frame_and_all_that_the_file_tells(result: Result) -> None:
+def test_table_has_one_row_per_frame_and_all_values_of_the_file(result: Result) -> None:
     pytest.importorskip("pandas")
     table = result.to_pandas()
     assert list(table.index) == [2, 3, 4] and table.index.name == "frame"
@@ -37,7 +37,7 @@ def test_a_table_has_a_row_a_frame_and_all_that_the_file_tells(result: Result) -
     assert len(table.columns) == expected + 2 * len(result.meta.residual_cameras)
 
 
-def test_a_dataset_names_its_dimensions(result: Result) -> None:
+def test_xarray_dataset_has_named_dimensions(result: Result) -> None:
     pytest.importorskip("xarray")
     data = result.to_xarray()
     assert data.sizes["frame"] == 3 and data.sizes["dof"] == 31
@@ -51,7 +51,7 @@ def test_a_dataset_names_its_dimensions(result: Result) -> None:
     assert data["joints"].attrs["units"] == "m" and data.attrs["fps"] == 15.0
 
 
-def test_what_a_tracker_does_not_tell_is_left_out(tracked: Path) -> None:
+def test_values_that_the_file_does_not_have_are_omitted(tracked: Path) -> None:
     pytest.importorskip("pandas")
     pytest.importorskip("xarray")
     volumetric = read_result(tracked)
@@ -60,7 +60,9 @@ def test_what_a_tracker_does_not_tell_is_left_out(tracked: Path) -> None:
 
 
 @pytest.mark.parametrize("package", ["pandas", "xarray"])
-def test_a_missing_package_is_one_line(tracked: Path, monkeypatch: pytest.MonkeyPatch, package: str) -> None:
+def test_missing_package_gives_an_error_of_one_line(
+    tracked: Path, monkeypatch: pytest.MonkeyPatch, package: str
+) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ExportError, match=f"pip install {package}"):
         getattr(read_result(tracked), f"to_{package}")()

@@ -29,12 +29,13 @@ from tk.io.results.writer import (
     Value,
     read_joints,
     read_result,
+    revise_result,
 )
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import JOINTS, build_skeleton, paper_poses
 
 
-def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+def test_written_values_are_read_back(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
     model = {"torso/radii_m": np.array([0.1, 0.2]), "height_m": 1.78, "sex": "any"}
     with ResultWriter.create(path, META) as writer:
@@ -108,7 +109,7 @@ def test_layout_is_the_contract(tmp_path: Path) -> None:
     assert path.read_bytes()[8] < 3
 
 
-def test_an_appended_frame_is_in_the_file_at_once(tmp_path: Path) -> None:
+def test_appended_frame_is_in_the_file_immediately(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
     with ResultWriter.create(path, META) as writer:
         for index in range(5):
@@ -119,7 +120,7 @@ def test_an_appended_frame_is_in_the_file_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("done", [0, 2])
-def test_frames_that_wait_to_be_written_are_kept_whatever_ends_the_run(tmp_path: Path, done: int) -> None:
+def test_frames_not_yet_flushed_are_kept_when_the_run_ends(tmp_path: Path, done: int) -> None:
     """Whether one is in the file already, or an older result is still there."""
     path = tmp_path / "result.h5"
     with ResultWriter.create(path, META) as writer:
@@ -150,7 +151,7 @@ def test_arrays_may_be_reused_after_append(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_result(path).state["mean"], np.full(3, 3.0))
 
 
-def test_model_can_be_refined_on_the_way(tmp_path: Path) -> None:
+def test_model_can_be_replaced_during_the_run(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
     with ResultWriter.create(path, META) as writer:
         writer.write_model({"height_m": 1.7, "guess": 1.0})
@@ -211,7 +212,7 @@ def test_result_without_pose_or_joints(tmp_path: Path) -> None:
         {"angles": {"knee_l": np.zeros(2)}},
     ],
 )
-def test_a_frame_of_the_wrong_shape_is_refused_and_the_rest_kept(tmp_path: Path, change: dict[str, Any]) -> None:
+def test_frame_of_wrong_shape_is_refused_and_earlier_frames_are_kept(tmp_path: Path, change: dict[str, Any]) -> None:
     path = tmp_path / "result.h5"
     with ResultWriter.create(path, META) as writer:
         writer.append(make_frame(0), make_state(0))
@@ -230,7 +231,7 @@ def plain_frame(index: int) -> FrameResult:
     return replace(make_frame(index), sigma=None, residual=None, segments_rotation=None, feet=None, angles={})
 
 
-def test_what_is_optional_is_read_back(tmp_path: Path) -> None:
+def test_optional_values_are_read_back(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
     write(path, 5)
     result = read_result(path)
@@ -249,7 +250,7 @@ def test_what_is_optional_is_read_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(track.sigma, result.sigma)
 
 
-def test_what_a_tracker_does_not_have_is_absent(tmp_path: Path) -> None:
+def test_undeclared_datasets_are_absent(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
     with ResultWriter.create(path, PLAIN) as writer:
         writer.append(plain_frame(0), make_state(0))
@@ -278,25 +279,23 @@ def test_paper_pose_is_derived_from_the_names_of_the_pose(tmp_path: Path) -> Non
         read_result(path).paper_pose()
 
 
-def test_the_same_angles_twice_are_refused() -> None:
+def test_repeated_angles_are_refused() -> None:
     with pytest.raises(ValueError, match="same name"):
         replace(META, angles=META.angles * 2)
     with pytest.raises(ValueError, match="slash"):
         JointAngles("a/b", ("flexion",), "")
 
 
-def test_cameras_as_used_are_kept_and_may_be_refined(tmp_path: Path) -> None:
+def test_cameras_can_be_replaced_and_are_kept_by_a_resumed_run(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
     with ResultWriter.create(path, META) as writer:
-        writer.write_cameras(make_cameras())
         writer.append(make_frame(0), make_state(0))
-        assert_same_cameras(read_result(path).cameras, make_cameras())
-        writer.append(make_frame(1), make_state(1))
-        writer.write_cameras(make_cameras(shift_m=0.5))
-        writer.append(make_frame(2), make_state(2))
+    revise_result(path, cameras=make_cameras())
+    assert_same_cameras(read_result(path).cameras, make_cameras())
+    revise_result(path, cameras=make_cameras(shift_m=0.5))
     with ResultWriter.resume(path, META)[0] as writer:
-        writer.append(make_frame(3), make_state(3))
-    assert assert_complete(path, 4) == 4
+        writer.append(make_frame(1), make_state(1))
+    assert assert_complete(path, 2) == 2
     assert_same_cameras(read_result(path).cameras, make_cameras(shift_m=0.5))
     with h5py.File(path) as file:
         assert list(file["cameras"].attrs["names"]) == ["cam1", "cam2"]
@@ -322,7 +321,7 @@ def test_joints_of_a_result(tmp_path: Path) -> None:
     np.testing.assert_array_equal(track.seconds, [0.05, 1.05, 2.05])
 
 
-def test_joints_of_a_truth_come_in_the_contracts_order(tmp_path: Path) -> None:
+def test_joints_of_ground_truth_are_returned_in_the_order_of_the_contract(tmp_path: Path) -> None:
     path = tmp_path / "truth.h5"
     write_truth(path, [4, 2], names=(*reversed(JOINTS), "nose"))
     track = read_joints(path)
@@ -335,7 +334,7 @@ def test_joints_of_a_truth_come_in_the_contracts_order(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"frames": [1, 2, 1]}, "frame 1 is there twice"),
+        ({"frames": [1, 2, 1]}, "frame 1 is listed twice"),
         ({"frames": [1], "names": JOINTS[1:]}, "no joint pelvis"),
         ({"frames": [1], "units": "mm"}, "units = mm"),
     ],

@@ -1,4 +1,4 @@
-"""The datasets of a result with one row a frame: names, types, attributes. Writer and reader both go by this list."""
+"""The datasets of a result with one row per frame: names, types, attributes. Writer and reader use this list."""
 
 from __future__ import annotations
 
@@ -10,35 +10,36 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.results.data import FrameResult, ResultMeta
+from tk.io.results.data import FIELDS, FrameResult, ResultMeta
 from tk.io.results.status import STATUS_MEANING
 from tk.model.body.joints import FOOT_POINTS
 
-#: no number in a result makes sense beyond these: metres from the world's origin, anything else, a frame's number
-FAR_M, LARGE, LAST_FRAME = 1e6, 1e12, 10**9
-LAST_STATUS = len(STATUS_MEANING) - 1
+#: Largest valid values: distance from the world's origin in metres, any other number, frame index. They are far above
+#: what a capture holds; a larger value means a damaged file.
+MAX_DISTANCE_M, MAX_NUMBER, MAX_FRAME = 1e6, 1e12, 10**9
+MAX_STATUS = len(STATUS_MEANING) - 1
 
 
 @dataclass(frozen=True)
 class Column:
-    """A dataset with one row a frame.
+    """A dataset with one row per frame.
 
     Attributes:
-        shape, dtype: of a row.
-        attributes: of the dataset: a text, or a list of texts.
-        most: the largest magnitude of a number that makes sense.
+        shape, dtype: shape and numpy type of a row.
+        attributes: attributes of the dataset; each is a text or a list of texts.
+        limit: largest valid magnitude.
     """
 
     shape: tuple[int, ...]
     dtype: str
     attributes: Mapping[str, str | Sequence[str]] = field(default_factory=dict)
-    most: float = LARGE
+    limit: float = MAX_NUMBER
 
     def checked(self, name: str, values: Any, rows: int | None = None) -> NDArray[Any]:
-        """A copy of a row (or of so many rows) in this column's type.
+        """Return a copy of one row, or of ``rows`` rows, in this column's type.
 
         Raises:
-            ValueError: the shape is another.
+            ValueError: the shape is wrong.
         """
         array = np.array(values, dtype=self.dtype)
         expected = self.shape if rows is None else (rows, *self.shape)
@@ -48,32 +49,32 @@ class Column:
 
 
 def columns_of(meta: ResultMeta) -> dict[str, Column]:
-    """The columns of a result, by the names of their datasets."""
+    """Return the columns of a result by dataset name."""
     joints = meta.joint_names
     columns = {
-        "frames": Column((), "i8", most=LAST_FRAME),
+        "frames": Column((), "i8", limit=MAX_FRAME),
         "time": Column((), "f8"),
         "pose": Column((len(meta.pose_names),), "f8", {"names": meta.pose_names, "units": meta.pose_units}),
-        "joints/position": Column((len(joints), 3), "f8", {"names": joints}, FAR_M),
+        "joints/position": Column((len(joints), 3), "f8", {"names": joints}, MAX_DISTANCE_M),
         "status": Column(
             (),
             "u1",
             {"meaning": tuple(f"{value}: {text}" for value, text in enumerate(STATUS_MEANING))},
-            LAST_STATUS,
+            MAX_STATUS,
         ),
         "objective": Column((), "f8", {"kind": meta.objective_kind} if meta.objective_kind else {}, np.inf),
         "iterations": Column((len(meta.stages),), "i4", {"stages": meta.stages}),
         **{f"timing/{stage}": Column((), "f8") for stage in meta.timing_stages},
     }
     if meta.sigma:
-        columns["joints/sigma"] = Column((len(joints),), "f8", {"names": joints}, FAR_M)
+        columns["joints/sigma"] = Column((len(joints),), "f8", {"names": joints}, MAX_DISTANCE_M)
     if meta.residual_cameras:
         attributes = {"cameras": meta.residual_cameras, "areas": ("missing", "surplus")}
         columns["residual"] = Column((len(meta.residual_cameras), 2), "f8", attributes)
     if meta.segment_names:
         columns["segments/rotation"] = Column((len(meta.segment_names), 4), "f8", {"names": meta.segment_names})
     if meta.feet:
-        columns["feet/position"] = Column((len(FOOT_POINTS), 3), "f8", {"names": FOOT_POINTS}, FAR_M)
+        columns["feet/position"] = Column((len(FOOT_POINTS), 3), "f8", {"names": FOOT_POINTS}, MAX_DISTANCE_M)
     for angles in meta.angles:
         columns[f"angles/{angles.joint}"] = Column(
             (len(angles.names),), "f8", {"names": angles.names, "convention": angles.convention}
@@ -82,36 +83,23 @@ def columns_of(meta: ResultMeta) -> dict[str, Column]:
 
 
 def row_of(frame: FrameResult, meta: ResultMeta) -> dict[str, NDArray[Any]]:
-    """A frame's row in each column: copies, NaN where the frame does not know.
+    """Return the frame's row of each column, as copies; NaN for optional values that the frame does not have.
 
     Raises:
-        ValueError: a shape or the status is not what it should be, or the frame brings what ``meta`` does not declare.
+        ValueError: a shape or the status is invalid, or the frame has a value that ``meta`` does not declare.
     """
     if int(frame.status) not in range(len(STATUS_MEANING)):
         raise ValueError(f"status {frame.status} has no meaning")
-    optional = {
-        "joints/sigma": frame.sigma,
-        "residual": frame.residual,
-        "segments/rotation": frame.segments_rotation,
-        "feet/position": frame.feet,
-        **{f"angles/{joint}": values for joint, values in frame.angles.items()},
-    }
-    brought = {name for name, values in optional.items() if values is not None}
-    brought |= {f"timing/{stage}" for stage in frame.timing}
+    values: dict[str, Any] = {"frames": frame.frame}
+    values |= {name: getattr(frame, field) for name, field in FIELDS.items() if name != "frames"}
+    values |= {f"angles/{joint}": degrees for joint, degrees in frame.angles.items()}
+    values |= {f"timing/{stage}": seconds for stage, seconds in frame.timing.items()}
+    values = {name: value for name, value in values.items() if value is not None}
     columns = columns_of(meta)
-    if brought - set(columns):
-        raise ValueError(f"{', '.join(sorted(brought - set(columns)))}: not declared for this result")
-    values: dict[str, Any] = {
-        "frames": frame.frame,
-        "time": frame.time,
-        "pose": frame.pose,
-        "joints/position": frame.joints,
-        "status": int(frame.status),
-        "objective": frame.objective,
-        "iterations": frame.iterations,
-        **{f"timing/{stage}": frame.timing.get(stage, 0.0) for stage in meta.timing_stages},
-        **{name: values for name, values in optional.items() if values is not None},
-    }
+    undeclared = sorted(set(values) - set(columns))
+    if undeclared:
+        raise ValueError(f"{', '.join(undeclared)}: not declared for this result")
+    values = {f"timing/{stage}": 0.0 for stage in meta.timing_stages} | values
     return {
         name: column.checked(name, values[name]) if name in values else np.full(column.shape, np.nan)
         for name, column in columns.items()
@@ -125,5 +113,5 @@ def put_attributes(dataset: h5py.Dataset, column: Column) -> None:
 
 
 def strings(values: Iterable[str]) -> NDArray[Any]:
-    """Texts as HDF5 keeps them in an attribute."""
+    """Return texts as an array that can be an HDF5 attribute."""
     return np.array(list(values), dtype=h5py.string_dtype())

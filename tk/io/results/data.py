@@ -1,4 +1,4 @@
-"""What a result file holds, as values. :mod:`tk.io.results.writer` writes it, :mod:`tk.io.results.reader` reads it."""
+"""The content of a result file. :mod:`tk.io.results.writer` writes it, :mod:`tk.io.results.reader` reads it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Float = NDArray[np.float64]
 Value = NDArray[Any] | float | int | str
 
 
-#: fields of ResultMeta that hold names
+#: fields of ResultMeta that are lists of names
 _LISTS = (
     "pose_names", "pose_units", "stages", "timing_stages", "joint_names",
     "residual_cameras", "segment_names",
@@ -38,12 +38,12 @@ _LISTS = (
 
 @dataclass(frozen=True)
 class JointAngles:
-    """What the columns of `/angles/<joint>` mean.
+    """The meaning of the columns of `/angles/<joint>`.
 
     Attributes:
-        joint: the dataset's name, such as ``knee_l``.
-        names: of its angles, such as ``flexion``.
-        convention: where zero lies and which way is positive, in words.
+        joint: name of the dataset, such as ``knee_l``.
+        names: names of the angles, such as ``flexion``.
+        convention: zero position and positive direction, in words.
     """
 
     joint: str
@@ -52,32 +52,31 @@ class JointAngles:
 
     def __post_init__(self) -> None:
         if not self.joint or "/" in self.joint or not self.names:
-            raise ValueError(f"angles of {self.joint!r}: a name without a slash and one angle at least are expected")
+            raise ValueError(f"angles of {self.joint!r}: the name must have no slash, and at least one angle is needed")
 
 
 @dataclass(frozen=True)
 class ResultMeta:
-    """What is fixed for a whole run. A run is resumed only with an equal one.
+    """The values that are constant during a run. A run can be resumed only with equal values.
 
-    The fields from ``sigma`` on declare what a tracker may have or not: what is declared here is in the file, and
-    each frame should bring it.
+    The fields from ``sigma`` on declare the optional datasets of the file. A frame without a declared value gets NaN.
 
     Attributes:
         pose_names, pose_units: names and units of the D entries of the configuration vector.
-        stages: names of the optimiser's S stages, for `/iterations`.
-        timing_stages: names of the timed stages. ``total``, if among them, is the frame's wall time.
-        fps: frames a second of the capture.
-        up: the axis that points up.
-        capture, method: what was tracked, and how.
-        seed: of the random generator.
+        stages: names of the S optimiser stages of `/iterations`.
+        timing_stages: names of the timed stages. The stage ``total``, if present, is the frame's wall time.
+        fps: frames per second of the capture.
+        up: world axis that points up.
+        capture, method: name of the capture, and tracking method.
+        seed: seed of the random generator.
         config_toml: the full configuration as TOML text.
-        joint_names: J names, in the order of `/joints/position`.
-        sigma: whether there is a standard deviation of each joint's position.
+        joint_names: J names in the order of `/joints/position`.
+        sigma: True if `/joints/sigma` exists.
         residual_cameras: names of the C cameras of `/residual`.
-        segment_names: names of the segments whose rotation is told.
-        feet: whether there are the positions of :data:`~tk.model.motion.segments.FOOT_POINTS`.
-        angles: the joints' angles as a clinician reads them.
-        objective_kind: what the numbers of `/objective` are; empty if nobody says.
+        segment_names: names of the segments of `/segments/rotation`.
+        feet: True if `/feet/position` exists, the points :data:`~tk.model.body.joints.FOOT_POINTS`.
+        angles: the clinical joint angles of `/angles`.
+        objective_kind: meaning of the numbers of `/objective`; empty if unknown.
     """
 
     pose_names: tuple[str, ...]
@@ -107,7 +106,7 @@ class ResultMeta:
             raise ValueError("two sets of angles have the same name")
 
     def difference(self, other: ResultMeta) -> str | None:
-        """In what the two differ, as ``seed is 1, not 2``; None if in nothing."""
+        """Return the first difference, such as ``seed is 1, not 2``; None if the two are equal."""
         sizes = len(self.pose_names), len(other.pose_names)
         if sizes[0] != sizes[1]:
             return f"the pose has {sizes[0]} entries, not {sizes[1]}"
@@ -126,24 +125,32 @@ class ResultMeta:
         return _config_difference(mine, others)
 
 
-#: fields of Result by the name of their dataset, for those that can be smoothed; `/angles` have a field for all
-_SMOOTHED_FIELDS = {
+#: field of Result for each dataset with one row per frame, except the groups `/timing` and `/angles`. FrameResult has
+#: the same fields, but `frame` instead of `frames`.
+FIELDS = {
+    "frames": "frames",
+    "time": "time",
     "pose": "pose",
     "joints/position": "joints",
+    "status": "status",
+    "objective": "objective",
+    "iterations": "iterations",
     "joints/sigma": "sigma",
+    "residual": "residual",
     "segments/rotation": "segments_rotation",
     "feet/position": "feet",
 }
+_SMOOTHED = ("pose", "joints/position", "joints/sigma", "segments/rotation", "feet/position")
 
 
 def can_be_smoothed(name: str) -> bool:
-    """Whether a dataset may stand below `/smoothed`."""
-    return name in _SMOOTHED_FIELDS or name.startswith("angles/")
+    """Return True if the dataset may have a copy below `/smoothed`."""
+    return name in _SMOOTHED or name.startswith("angles/")
 
 
 @dataclass(frozen=True)
 class HullPoints:
-    """A frame's surface voxels: ``positions`` (N, 3) metres, world frame; ``colors`` (N, 3) uint8 RGB."""
+    """Surface voxels of a frame: ``positions`` (N, 3) metres, world frame; ``colors`` (N, 3) uint8 RGB."""
 
     positions: NDArray[np.floating]
     colors: NDArray[np.uint8]
@@ -154,24 +161,24 @@ class FrameResult:
     """One finished frame.
 
     Attributes:
-        frame: source frame index.
-        time: seconds.
+        frame: index of the source frame.
+        time: time of the frame, s.
         pose: (D,) configuration vector, radians and metres.
         joints: (J, 3) joint centres, metres, world frame.
         status: a :class:`Status`.
         objective: final value of the objective.
-        iterations: (S,) optimiser iterations a stage.
-        timing: seconds a stage; a stage that is not mentioned took none.
-        hull: the surface voxels, if they are to be stored.
+        iterations: (S,) number of optimiser iterations per stage.
+        timing: duration of each stage, s; 0 is stored for a stage that is not given.
+        hull: surface voxels; None to store none.
 
-    What follows may be None: nothing is known in this frame, which the file tells by NaN. It is refused where
-    :class:`ResultMeta` does not declare it.
+    The following fields may be None if the value is unknown in this frame; the file then has NaN. A value that
+    :class:`ResultMeta` does not declare is refused.
 
-        sigma: (J,) one standard deviation of each joint's position, metres; NaN where a joint has no evidence.
+        sigma: (J,) m, standard deviation of each joint position along one axis; NaN for a joint without evidence.
         residual: (C, 2) missing and surplus area by camera, shares of the person's pixels; their sum is E_S.
         segments_rotation: (S, 4) quaternions (w, x, y, z), segment to world.
-        feet: (4, 3) the :data:`~tk.model.motion.segments.FOOT_POINTS`, metres, world frame.
-        angles: degrees by joint; a joint that is not mentioned is NaN.
+        feet: (4, 3) the :data:`~tk.model.body.joints.FOOT_POINTS`, metres, world frame.
+        angles: angles of each joint, degrees; NaN is stored for a joint that is not given.
     """
 
     frame: int
@@ -192,11 +199,11 @@ class FrameResult:
 
 @dataclass(frozen=True)
 class UsedCameras:
-    """The calibration as a run used it, after refinement where there was one.
+    """The calibration that a run used, refined if the run refined it.
 
     Attributes:
         rig: the C cameras.
-        time_offset_s: (C,) seconds by which a camera's frame k was taken later than k / fps.
+        time_offset_s: (C,) s, delay of each camera: its frame k was taken at k / fps + time_offset_s.
     """
 
     rig: Rig
@@ -209,7 +216,7 @@ class UsedCameras:
 
 @dataclass(frozen=True)
 class Hull:
-    """Surface voxels of all frames, ragged: row i of the result has ``offsets[i]:offsets[i + 1]``.
+    """Surface voxels of all frames: row i of the result has the voxels ``offsets[i]:offsets[i + 1]``.
 
     ``positions`` (N, 3) float32 metres, world frame; ``colors`` (N, 3) uint8 RGB; ``offsets`` (F + 1,) int64.
     """
@@ -227,7 +234,7 @@ class Hull:
 class Result:
     """A whole result file: F frames, D degrees of freedom, J joints, S optimiser stages.
 
-    What the file does not have is None (no angles: an empty mapping).
+    A dataset that the file does not have is None; without angles, ``angles`` is an empty mapping.
     """
 
     path: Path
@@ -242,36 +249,36 @@ class Result:
     timing: Mapping[str, Float]  # each (F,) seconds
     model: Mapping[str, Value]  # nested groups as names with slashes
     hull: Hull | None
-    state: Mapping[str, Value]  # what the tracker needs to go on after the last frame
+    state: Mapping[str, Value]  # state from which the tracker continues after the last frame
     software: str
     created: str
-    sigma: Float | None = None  # (F, J) metres, NaN where a joint has no evidence
+    sigma: Float | None = None  # (F, J) metres, NaN for a joint without evidence
     residual: Float | None = None  # (F, C, 2) missing and surplus area, shares of the person's pixels
     segments_rotation: Float | None = None  # (F, S, 4) w, x, y, z; segment to world
     feet: Float | None = None  # (F, 4, 3) metres
     angles: Mapping[str, Float] = field(default_factory=dict)  # by joint, each (F, k) degrees
     cameras: UsedCameras | None = None
-    smoothed: Mapping[str, NDArray[Any]] | None = None  # by the datasets' names, and "bridged" (F,) bool
-    notes: tuple[str, ...] = ()  # what the run said
+    smoothed: Mapping[str, NDArray[Any]] | None = None  # by dataset name, and "bridged" (F,) bool
+    notes: tuple[str, ...] = ()  # messages of the run
 
     def __len__(self) -> int:
         return len(self.frames)
 
     @property
     def silhouette_error(self) -> Float | None:
-        """(F, C) E_S by camera: the sum of missing and surplus area; None if the result has no residual."""
+        """Return E_S by camera (F, C), the sum of missing and surplus area; None if the result has no residual."""
         return None if self.residual is None else np.asarray(self.residual.sum(axis=2))
 
     @property
     def has_pose(self) -> NDArray[np.bool_]:
-        """(F,) True where the person is present and found; the rows of other frames hold no usable pose."""
+        """Return (F,) True for frames in which the person is present and found; other frames have no usable pose."""
         return has_pose(self.status)
 
     def paper_pose(self) -> Float:
-        """(F, 24) the pose vectors of Kehl & Van Gool's body: no waist, hips as angles against the trunk.
+        """Return the pose vectors (F, 24) of Kehl & Van Gool's body: no waist, hip angles relative to the trunk.
 
         Raises:
-            ResultError: `/pose` is not a pose vector of this program's body.
+            ResultError: the columns of `/pose` are not those of tk's skeleton.
         """
         try:
             skeleton = skeleton_of_names(self.meta.pose_names, BodyDimensions.from_stature(1.75), self.meta.up)
@@ -280,36 +287,36 @@ class Result:
         return paper_poses(skeleton, self.pose)
 
     def to_pandas(self) -> pandas.DataFrame:
-        """A table, one row a frame; see :func:`tk.io.results.tables.to_pandas`."""
+        """Return a table with one row per frame; see :func:`tk.io.results.tables.to_pandas`."""
         from tk.io.results.tables import to_pandas
 
         return to_pandas(self)
 
     def to_xarray(self) -> xarray.Dataset:
-        """Arrays with named dimensions; see :func:`tk.io.results.tables.to_xarray`."""
+        """Return arrays with named dimensions; see :func:`tk.io.results.tables.to_xarray`."""
         from tk.io.results.tables import to_xarray
 
         return to_xarray(self)
 
     def with_smoothed(self) -> Result:
-        """The same result with what is below `/smoothed` in its place; as it is where nothing was smoothed."""
+        """Return the result with each dataset replaced by its smoothed copy, if `/smoothed` has one."""
         smoothed = self.smoothed or {}
-        fields: dict[str, Any] = {field: smoothed[name] for name, field in _SMOOTHED_FIELDS.items() if name in smoothed}
+        fields: dict[str, Any] = {FIELDS[name]: smoothed[name] for name in _SMOOTHED if name in smoothed}
         angles = {joint: smoothed.get(f"angles/{joint}", values) for joint, values in self.angles.items()}
         return replace(self, **fields, angles=angles, smoothed=None)
 
 
 @dataclass(frozen=True)
 class JointTrack:
-    """Joint centres over time, from a result or from a capture's truth.
+    """Joint centres over time, from a result or from the ground truth of a capture.
 
     Attributes:
         path: the file.
-        frames: (F,) source frame indices, each once.
-        positions: (F, 15, 3) metres, world frame, in the order of :data:`tk.model.body.skeleton.JOINTS`.
-        status: (F,) as in a result; None for a truth.
-        seconds: (F,) wall time of each frame; None where the file does not tell.
-        sigma: (F, 15) one standard deviation of each position, metres, NaN where unknown; None where there is none.
+        frames: (F,) source frame indices without repetition.
+        positions: (F, 15, 3) metres, world frame, in the order of :data:`tk.model.body.joints.JOINTS`.
+        status: (F,) as in a result; None for ground truth.
+        seconds: (F,) wall time of each frame; None if not stored.
+        sigma: (F, 15) m, standard deviation of each position along one axis, NaN if unknown; None if not stored.
     """
 
     path: Path

@@ -1,4 +1,4 @@
-"""Where a result is made before it takes its name, and what the file system says to it."""
+"""The hidden folder in which a result is written, checks of the output path, and file system errors."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from tk.io.hdf5 import open_hdf5
 from tk.io.results.data import FORMAT
 
 
-class Workshop:
-    """The hidden folder beside a result in which its twins are made. Holding it keeps other runs away."""
+class TwinFolder:
+    """The hidden folder beside a result in which its two twins are written. A lock on it excludes other runs."""
 
     def __init__(self, target: Path) -> None:
         self._target = target
@@ -33,17 +33,17 @@ class Workshop:
                 f"{target}: another run is writing this result; wait for it, or choose another name"
             ) from None
         except OSError:
-            pass  # no locks on this file system: nothing keeps a second run away
+            pass  # this file system has no locks: a second run is not detected
         for leftover in self._folder.iterdir():  # of a run that was killed
             leftover.unlink()
         self.twin_paths = (self._folder / "0.h5", self._folder / "1.h5")
 
     def publish(self, twin: Path) -> None:
-        """Let the result's name stand for this twin, in one step."""
+        """Give this twin the name of the result, in one rename."""
         new = self._folder / "new.h5"
         try:
             os.link(twin, new)
-        except FileExistsError:  # a rename failed before
+        except FileExistsError:  # left by an earlier rename that failed
             new.unlink()
             os.link(twin, new)
         except OSError:
@@ -54,7 +54,7 @@ class Workshop:
         os.close(self._handle)
         shutil.rmtree(self._folder, ignore_errors=True)
 
-    def __enter__(self) -> Workshop:
+    def __enter__(self) -> TwinFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -64,18 +64,19 @@ class Workshop:
 # --- files and their errors -------------------------------------------------------------------------------------------
 
 
-#: what h5py raises for a full disk, a lost folder, or a file that turns out to be damaged
+#: exceptions that h5py raises for a full disk, a removed folder or a damaged file
 WRITE_ERRORS = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 
 
 def open_for_writing(path: Path, mode: str) -> h5py.File:
-    # "earliest": newer superblocks carry a flag "being written" that a killed process leaves set, and the file then
-    # refuses to open. No locks: readers of the published twin must not be kept out.
+    """Open a twin, so that it can be read even if this process is killed."""
+    # libver: newer superblocks have a flag "being written"; a killed process leaves it set, and HDF5 then refuses to
+    # open the file. No locks: other processes must be able to read the published twin.
     return h5py.File(path, mode, libver="earliest", locking=False)
 
 
 def check_is_result(target: Path) -> None:
-    """Refuse to replace what is not a result of any version."""
+    """Raise ResultError if the file is not a tk result of any version."""
     try:
         with open_hdf5(target) as file:
             if file.is_format(FORMAT):
@@ -86,16 +87,16 @@ def check_is_result(target: Path) -> None:
 
 
 def check_output(path: Path, force: bool, resume: bool = False) -> None:
-    """Refuse a path where a result cannot be written, or must not be: nothing that exists is replaced unasked.
+    """Raise an error if a result cannot be written to the path, or if a file exists that must not be replaced.
 
     Args:
-        path: where the result is to be.
-        force: replace a result that is there; other files are left alone all the same.
-        resume: go on with a result that is there.
+        path: path of the result.
+        force: replace an existing result; files that are not results are never replaced.
+        resume: continue an existing result.
 
     Raises:
-        ResultError: what is there, and what to do about it.
-        ConfigError: both ``force`` and ``resume``.
+        ResultError: the path cannot be used; the message says what to do.
+        ConfigError: ``force`` and ``resume`` are both set.
     """
     if force and resume:
         raise ConfigError("--force replaces a result and --resume goes on with it: give one of them")
@@ -108,11 +109,11 @@ def check_output(path: Path, force: bool, resume: bool = False) -> None:
 
 
 def move_to_memory(file: h5py.File) -> None:
-    """After a failed write: let HDF5 go on in memory, for the file is lost.
+    """Redirect a file that cannot be written to memory, after a failed write.
 
-    HDF5 1.10 to 2.0 crash the process when a file is closed, at the latest at exit, that still cannot be written.
+    HDF5 1.10 to 2.0 crash the process if they cannot write a file when they close it, at exit at the latest.
     """
-    if not hasattr(os, "memfd_create"):  # Linux
+    if not hasattr(os, "memfd_create"):  # not on Linux
         return
     handle = file.id.get_vfd_handle()
     memory = os.memfd_create("tk-result")
@@ -125,7 +126,7 @@ def move_to_memory(file: h5py.File) -> None:
 
 @contextlib.contextmanager
 def as_result_error(target: Path) -> Iterator[None]:
-    """The system's and HDF5's refusals as one line; HDF5 reports a full disk as either of the two types."""
+    """Convert errors of the system and of HDF5 to a ResultError of one line."""
     try:
         yield
     except WRITE_ERRORS as error:
@@ -136,7 +137,11 @@ def as_result_error(target: Path) -> Iterator[None]:
 
 
 def writable(path: Path) -> Path:
-    """The path with links followed, so that a rename does not replace the link; refuse what can be seen to fail."""
+    """Return the path with links resolved, so that a rename does not replace the link.
+
+    Raises:
+        ResultError: no file can be written there.
+    """
     target = path.resolve()
     if target.is_dir():
         raise ResultError(f"{path}: is a folder; name a file in it")

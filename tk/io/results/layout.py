@@ -1,5 +1,4 @@
-"""The datasets of a result file, and adding frames to them. :mod:`tk.io.results.writer` decides when and in which
-file."""
+"""Create the datasets of a result file and append frames. :mod:`tk.io.results.writer` decides when and where."""
 
 from __future__ import annotations
 
@@ -18,15 +17,16 @@ from numpy.typing import NDArray
 from tk.io.results.columns import columns_of, put_attributes, row_of, strings
 from tk.io.results.data import FORMAT, FORMAT_VERSION, FrameResult, HullPoints, ResultMeta, UsedCameras, Value
 
-CHUNK_SECONDS = 1.5  # rows of a chunk: few enough to be rewritten each frame, enough to be read back fast
-HULL_CHUNK = 8192  # voxels: some seconds of frames at 64³, a few frames at 128³
+# Duration of a chunk of rows, s. A longer chunk makes each append slower, a shorter one makes reading slower.
+CHUNK_SECONDS = 1.5
+HULL_CHUNK = 8192  # voxels per chunk: some seconds of frames at 64³, a few frames at 128³
 
 State = Mapping[str, Value]
 
 
 @dataclass(frozen=True)
 class Row:
-    """A frame as it goes into the file. A copy: the tracker may reuse its arrays before the second twin has them."""
+    """A frame to be written. It is a copy: the tracker may reuse its arrays before the second twin is written."""
 
     index: int
     columns: Mapping[str, NDArray[Any]]
@@ -38,7 +38,7 @@ class Row:
         """Copy and check a frame.
 
         Raises:
-            ValueError: a shape, the status or a timing stage is not what ``meta`` says.
+            ValueError: a shape, the status or a timing stage does not match ``meta``.
         """
         columns = row_of(result, meta)
         hull = result.hull
@@ -52,34 +52,33 @@ class Row:
 
 
 class Twin:
-    """One of the two files, and how far it has got. Datasets stay open: opening one costs more than writing a row."""
+    """One of the two files and its number of rows. Datasets stay open: opening one costs more than writing a row."""
 
     def __init__(self, path: Path, file: h5py.File) -> None:
         self.path = path
         self.file = file
         self.rows = int(file["frames"].shape[0])
         self.model_version = 0
-        self.cameras_version = 0
         self._has_smoothed = "smoothed" in file
         self._open: dict[str, h5py.h5d.DatasetID] = {}
         self._state_names = _dataset_names(file, "resume/state")
-        self._put_last: dict[str, tuple[object, bytes]] = {}  # most of a state is the same in every frame
+        self._put_last: dict[str, tuple[object, bytes]] = {}  # most of the state is the same in every frame
 
-    def append(self, news: Sequence[Row]) -> None:
-        """Add frames, and the latest state among them. Nothing is flushed. What was smoothed goes: it lacks them."""
+    def append(self, new_rows: Sequence[Row]) -> None:
+        """Append frames and the latest state, without flushing. `/smoothed` is deleted: it is now incomplete."""
         self._drop_smoothed()
-        for name in news[0].columns:
-            self._extend(name, np.array([row.columns[name] for row in news]), self.rows)
-        if "hull" in self.file or any(row.hull is not None for row in news):
-            self._append_hulls([row.hull for row in news])
-        self.rows += len(news)
-        for row in reversed(news):
+        for name in new_rows[0].columns:
+            self._extend(name, np.array([row.columns[name] for row in new_rows]), self.rows)
+        if "hull" in self.file or any(row.hull is not None for row in new_rows):
+            self._append_hulls([row.hull for row in new_rows])
+        self.rows += len(new_rows)
+        for row in reversed(new_rows):
             if row.state is not None:
                 self._put_state(row.state, row.index + 1)
                 break
 
     def drop_rows_without_state(self, meta: ResultMeta) -> None:
-        """Cut a resumed file back to the frame that its state belongs to."""
+        """Remove the rows after the frame of the stored state."""
         rows = int(self.file["resume/rows"][()]) if "resume/rows" in self.file else self.rows
         if rows >= self.rows:
             return
@@ -103,7 +102,7 @@ class Twin:
             _create_growing(self.file, "hull/positions", (3,), "f4", HULL_CHUNK)
             _create_growing(self.file, "hull/colors", (3,), "u1", HULL_CHUNK).attrs["order"] = "RGB"
             _create_growing(self.file, "hull/offsets", (), "i8", 64)
-            self._extend("hull/offsets", np.zeros(self.rows + 1, dtype=np.int64))  # no voxels up to here
+            self._extend("hull/offsets", np.zeros(self.rows + 1, dtype=np.int64))  # earlier frames have no voxels
         stored = self._dataset("hull/positions").shape[0]
         for hull in hulls:
             if hull is not None:
@@ -113,7 +112,7 @@ class Twin:
         self._extend("hull/offsets", stored + np.cumsum(counts, dtype=np.int64))
 
     def _put_state(self, state: State, rows: int) -> None:
-        """Overwrite `/resume`: the tracker's state after so many frames."""
+        """Overwrite `/resume` with the tracker's state after ``rows`` frames."""
         if self._state_names - set(state):
             self._drop("resume/state")
         self._state_names = set(state)
@@ -122,7 +121,7 @@ class Twin:
             self._put(f"resume/state/{name}", value)
 
     def _put(self, name: str, value: Value) -> None:
-        """Overwrite a small dataset, in place where the new value fits."""
+        """Overwrite a small dataset, in place if the new value fits."""
         array = np.asarray(encode(value), order="C")
         is_text = isinstance(value, str)
         content = ((array.dtype, array.shape, is_text), array.tobytes())
@@ -139,15 +138,15 @@ class Twin:
                     dataset.write(h5py.h5s.ALL, h5py.h5s.ALL, array)
                 return
             self._drop(name)
-        elif name in self.file:  # a group, in a file that was tampered with
+        elif name in self.file:  # a group, in a damaged file
             self._drop(name)
-        if is_text:  # HDF5's own strings of varying length leave their old bytes in the file at every write
+        if is_text:  # with HDF5's strings of variable length, each write would leave the old bytes in the file
             self.file.create_dataset(name, data=array, maxshape=(None,), chunks=(1024,)).attrs["encoding"] = "utf-8"
         else:
             self.file.create_dataset(name, data=array)
 
     def _extend(self, name: str, values: NDArray[Any], rows: int | None = None) -> None:
-        """Add rows to a dataset, which has ``rows`` if the caller knows.
+        """Append values to a dataset. ``rows`` is its current number of rows; None: ask HDF5.
 
         The low-level calls take a third of the time of ``resize`` and ``[n:] =``.
         """
@@ -156,7 +155,7 @@ class Twin:
         dataset = self._dataset(name)
         start = dataset.shape[0] if rows is None else rows
         dataset.set_extent((start + len(values), *values.shape[1:]))
-        if values.size == 0:  # rows of no columns
+        if values.size == 0:  # rows without columns
             return
         space = dataset.get_space()
         space.select_hyperslab((start, *(0 for _ in values.shape[1:])), values.shape)
@@ -174,7 +173,7 @@ class Twin:
 
 
 def write_layout(file: h5py.File, meta: ResultMeta) -> None:
-    """Attributes and empty datasets of a new result."""
+    """Write the attributes and the empty datasets of a new result."""
     file.attrs.update(
         {
             "format": FORMAT,
@@ -208,7 +207,7 @@ def put_model(file: h5py.File, model: Mapping[str, Value]) -> None:
 
 
 def put_cameras(file: h5py.File, cameras: UsedCameras) -> None:
-    """Write or replace `/cameras`: an array a kind, a row a camera; the attribute `names`."""
+    """Write or replace `/cameras`: each dataset has one row per camera, the attribute `names` their names."""
     if "cameras" in file:
         del file["cameras"]
     group = file.create_group("cameras")
@@ -223,7 +222,7 @@ def put_cameras(file: h5py.File, cameras: UsedCameras) -> None:
 
 
 def encode(value: Value) -> NDArray[Any]:
-    """A value as an array that HDF5 can hold in place: text becomes its UTF-8 bytes."""
+    """Return a value as an array that can be overwritten in place: text as its UTF-8 bytes."""
     return np.frombuffer(value.encode(), dtype=np.uint8) if isinstance(value, str) else np.asarray(value)
 
 
@@ -238,7 +237,7 @@ def _create_growing(file: h5py.File, name: str, shape: tuple[int, ...], dtype: s
     return file.create_dataset(
         name,
         shape=(0, *shape),
-        maxshape=(None, *(n or None for n in shape)),  # HDF5 has no chunks of no columns
+        maxshape=(None, *(n or None for n in shape)),  # HDF5 has no chunks without columns
         chunks=(rows, *(max(1, n) for n in shape)),
         dtype=dtype,
     )

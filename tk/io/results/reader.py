@@ -1,4 +1,4 @@
-"""How a result file is read: all of it, or the joints alone, which a capture's truth has, too."""
+"""Read a whole result file, or only the joint positions of a result or of ground truth."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from tk.errors import ResultError
 from tk.io.hdf5 import Hdf5Reader, open_hdf5
-from tk.io.results.columns import FAR_M, LARGE, LAST_FRAME, LAST_STATUS, columns_of
+from tk.io.results.columns import MAX_DISTANCE_M, MAX_FRAME, MAX_NUMBER, MAX_STATUS, columns_of
 from tk.io.results.data import (
+    FIELDS,
     FORMAT,
     FORMAT_VERSION,
     Float,
@@ -36,7 +37,7 @@ def read_result(path: str | os.PathLike[str]) -> Result:
     """Read a whole result.
 
     Raises:
-        ResultError: no such file, not HDF5, of other software or another version, incomplete or damaged.
+        ResultError: the file does not exist, is not a result of this format version, or is incomplete or damaged.
     """
     path = Path(path)
     with open_hdf5(path) as file:
@@ -44,25 +45,16 @@ def read_result(path: str | os.PathLike[str]) -> Result:
         meta = read_meta(file)
         rows = count_rows(file, meta)
         columns = {
-            name: file.array(name, column.dtype, (rows, *column.shape), column.most)
+            name: file.array(name, column.dtype, (rows, *column.shape), column.limit)
             for name, column in columns_of(meta).items()
         }
         _check_frames(file, columns["frames"])
+        fields: dict[str, Any] = {field: columns.get(name) for name, field in FIELDS.items()}
         return Result(
             path=path,
             meta=meta,
-            frames=columns["frames"],
-            time=columns["time"],
-            pose=columns["pose"],
-            joints=columns["joints/position"],
-            status=columns["status"],
-            objective=columns["objective"],
-            iterations=columns["iterations"],
+            **fields,
             timing={stage: columns[f"timing/{stage}"] for stage in meta.timing_stages},
-            sigma=columns.get("joints/sigma"),
-            residual=columns.get("residual"),
-            segments_rotation=columns.get("segments/rotation"),
-            feet=columns.get("feet/position"),
             angles={angles.joint: columns[f"angles/{angles.joint}"] for angles in meta.angles},
             cameras=_read_cameras(file),
             smoothed=_read_smoothed(file, meta, rows),
@@ -76,10 +68,10 @@ def read_result(path: str | os.PathLike[str]) -> Result:
 
 
 def read_joints(path: str | os.PathLike[str]) -> JointTrack:
-    """Read `/frames` and `/joints/position` of a result or a truth, the joints in the contract's order.
+    """Read the joints of a result or of ground truth, in the order of :data:`tk.model.body.joints.JOINTS`.
 
     Raises:
-        ResultError: as :func:`read_result`, or a joint is missing, a frame is there twice, or the unit is not metres.
+        ResultError: as :func:`read_result`, or a joint is missing, a frame is repeated, or the unit is not metres.
     """
     path = Path(path)
     with open_hdf5(path) as file:
@@ -91,7 +83,7 @@ def read_joints(path: str | os.PathLike[str]) -> JointTrack:
         for name in ("frames", "joints/position"):
             if name not in file.shapes:
                 file.fail(f"has no /{name}; it is neither a tk result nor a capture's truth")
-        frames = file.array("frames", "int64", (None,), LAST_FRAME)
+        frames = file.array("frames", "int64", (None,), MAX_FRAME)
         _check_frames(file, frames)
         names = file.names("joints/position", "names")
         missing = [joint for joint in JOINTS if joint not in names]
@@ -99,14 +91,16 @@ def read_joints(path: str | os.PathLike[str]) -> JointTrack:
             file.fail(f"/joints/position has no joint {missing[0]} in its attribute names")
         order = [names.index(joint) for joint in JOINTS]
         rows, joints = len(frames), len(names)
-        positions = file.array("joints/position", "float64", (rows, joints, 3), FAR_M)[:, order]
+        positions = file.array("joints/position", "float64", (rows, joints, 3), MAX_DISTANCE_M)[:, order]
         positions[~np.isfinite(positions)] = np.nan
-        status = file.array("status", "uint8", (rows,), LAST_STATUS) if "status" in file else None
-        sigma = file.array("joints/sigma", "float64", (rows, joints), FAR_M) if "joints/sigma" in file else None
+        status = file.array("status", "uint8", (rows,), MAX_STATUS) if "status" in file else None
+        sigma = (
+            file.array("joints/sigma", "float64", (rows, joints), MAX_DISTANCE_M) if "joints/sigma" in file else None
+        )
         if sigma is not None and (sigma < 0).any():
             file.fail("/joints/sigma holds negative numbers; the file is damaged")
         stages = [name for name in file.below("timing") if "/" not in name]
-        timing = {stage: file.array(f"timing/{stage}", "float64", (rows,), LARGE) for stage in stages}
+        timing = {stage: file.array(f"timing/{stage}", "float64", (rows,), MAX_NUMBER) for stage in stages}
     seconds: Float | None = None
     if timing:
         seconds = timing["total"] if "total" in timing else np.sum(list(timing.values()), axis=0)
@@ -115,10 +109,9 @@ def read_joints(path: str | os.PathLike[str]) -> JointTrack:
 
 @contextlib.contextmanager
 def blamed_on(path: Path, what: str) -> Iterator[None]:
-    """Whatever goes wrong inside is the fault of ``what`` in a result: of a body or a state that no tracker wrote.
+    """Convert exceptions that values of a wrong type, shape or size cause to a ResultError that names ``what``.
 
-    Raises:
-        ResultError: in the place of the exceptions that values of a wrong kind, shape or size cause.
+    It is for values that this module cannot check, such as a body or the state of a tracker.
     """
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -143,7 +136,7 @@ def check_format(file: Hdf5Reader) -> None:
 
 
 def read_meta(file: Hdf5Reader) -> ResultMeta:
-    """The metadata of an open result."""
+    """Return the metadata of an open result."""
     for name in ("pose", "iterations", "timing", "joints/position", "frames"):
         if name not in file:
             file.fail(f"has no /{name}; the file is damaged")
@@ -172,13 +165,13 @@ def read_meta(file: Hdf5Reader) -> ResultMeta:
 
 
 def count_rows(file: Hdf5Reader, meta: ResultMeta) -> int:
-    """The number of frames. Every dataset with a row a frame has as many, of the shape that ``meta`` says.
+    """Return the number of frames, after checking the shape of every dataset with one row per frame.
 
     Raises:
-        ResultError: one is missing or has another shape.
+        ResultError: a dataset is missing or has the wrong shape.
     """
     if len(file.shapes.get("frames", ())) != 1:
-        file.fail("has no /frames with a number a frame; the file is damaged")
+        file.fail("has no /frames with one number per frame; the file is damaged")
     rows = file.shapes["frames"][0]
     for name, column in columns_of(meta).items():
         if file.shapes.get(name) != (rows, *column.shape):
@@ -188,10 +181,10 @@ def count_rows(file: Hdf5Reader, meta: ResultMeta) -> int:
 
 
 def check_hull(file: Hdf5Reader, rows: int) -> NDArray[np.int64] | None:
-    """`/hull/offsets`, which divide the voxels into frames; None if there is no hull.
+    """Return `/hull/offsets`, which divide the voxels into frames; None if there is no hull.
 
     Raises:
-        ResultError: they do not, or colours or positions are missing.
+        ResultError: the offsets do not match the positions and colours.
     """
     if "hull" not in file:
         return None
@@ -203,16 +196,16 @@ def check_hull(file: Hdf5Reader, rows: int) -> NDArray[np.int64] | None:
 
 
 def read_values(file: Hdf5Reader, group: str) -> dict[str, Value]:
-    """All datasets below a group as a flat mapping; {} if there is no such group.
+    """Return all datasets below a group as a flat mapping; {} if there is no such group.
 
     Raises:
-        ResultError: one holds something else than numbers or text, or a number that is out of all range.
+        ResultError: a dataset holds neither numbers nor text, or a number above :data:`MAX_NUMBER`.
     """
     found: dict[str, Value] = {name: file.value(f"{group}/{name}") for name in file.below(group)}
     for name, value in found.items():
         numbers = np.asarray(value)
-        if numbers.dtype.kind == "f" and (np.abs(numbers[np.isfinite(numbers)]) > LARGE).any():
-            file.fail(f"/{group}/{name} holds a number out of all range; the file is damaged")
+        if numbers.dtype.kind == "f" and (np.abs(numbers[np.isfinite(numbers)]) > MAX_NUMBER).any():
+            file.fail(f"/{group}/{name} holds a number that is out of range; the file is damaged")
     return found
 
 
@@ -230,7 +223,7 @@ def _check_frames(file: Hdf5Reader, frames: NDArray[np.int64]) -> None:
     if (values < 0).any():
         file.fail(f"/frames holds {values[0]}; frames count from 0")
     if (counts > 1).any():
-        file.fail(f"frame {values[counts > 1][0]} is there twice; each frame must be listed once")
+        file.fail(f"frame {values[counts > 1][0]} is listed twice; each frame must be listed once")
 
 
 def _read_cameras(file: Hdf5Reader) -> UsedCameras | None:
@@ -242,7 +235,7 @@ def _read_cameras(file: Hdf5Reader) -> UsedCameras | None:
         "matrix": (count, 3, 3), "distortions": (count, 5), "rotation": (count, 3), "translation": (count, 3),
         "size": (count, 2), "fisheye": (count,), "time_offset": (count,),
     }  # fmt: skip
-    found = {name: file.array(f"cameras/{name}", "float64", shape, LARGE) for name, shape in shapes.items()}
+    found = {name: file.array(f"cameras/{name}", "float64", shape, MAX_NUMBER) for name, shape in shapes.items()}
     if not all(np.isfinite(values).all() for values in found.values()) or (found["size"] < 1).any():
         file.fail("/cameras describes no cameras; the file is damaged")
     cameras = [
@@ -265,7 +258,7 @@ def _read_smoothed(file: Hdf5Reader, meta: ResultMeta, rows: int) -> dict[str, N
     if "smoothed" not in file:
         return None
     found = {
-        name: file.array(f"smoothed/{name}", column.dtype, (rows, *column.shape), column.most)
+        name: file.array(f"smoothed/{name}", column.dtype, (rows, *column.shape), column.limit)
         for name, column in columns_of(meta).items()
         if can_be_smoothed(name) and f"smoothed/{name}" in file
     }
@@ -278,5 +271,7 @@ def _read_hull(file: Hdf5Reader, rows: int) -> Hull | None:
         return None
     shape = (int(offsets[-1]), 3)
     return Hull(
-        file.array("hull/positions", "float32", shape, FAR_M), file.array("hull/colors", "uint8", shape), offsets
+        file.array("hull/positions", "float32", shape, MAX_DISTANCE_M),
+        file.array("hull/colors", "uint8", shape),
+        offsets,
     )

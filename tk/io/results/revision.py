@@ -1,7 +1,7 @@
-"""Changing a finished result as a whole: a second pass over all frames, or what was smoothed.
+"""Change a finished result: the columns of a second pass, smoothed copies, body, cameras, notes.
 
-The change is made in a copy beside the result, which is synced to the disk and takes the result's name in one rename:
-whatever happens, the name stands for the old file or the new one.
+The change is made in a copy beside the result. The copy is synced to the disk and takes the result's name in one
+rename, so at any time the name refers to the complete old file or to the complete new one.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from tk.io.hdf5 import open_hdf5
 from tk.io.results.columns import Column, columns_of, put_attributes, strings
 from tk.io.results.data import ResultMeta, UsedCameras, Value, can_be_smoothed
-from tk.io.results.files import WRITE_ERRORS, Workshop, as_result_error, move_to_memory, open_for_writing, writable
+from tk.io.results.files import WRITE_ERRORS, TwinFolder, as_result_error, move_to_memory, open_for_writing, writable
 from tk.io.results.layout import put_cameras, put_model
 from tk.io.results.reader import check_format, count_rows, read_meta
 
@@ -31,26 +31,25 @@ def revise_result(
     cameras: UsedCameras | None = None,
     notes: Sequence[str] | None = None,
 ) -> ResultMeta:
-    """Replace parts of a finished result in one step; what is not given stays.
+    """Replace parts of a finished result in one step; other parts stay as they are.
 
     Args:
-        path: the result. Nobody may be writing it.
-        columns: new values of datasets with one row a frame, by name, all F frames of each:
-            ``{"pose": (F, 24), "joints/position": (F, 15, 3)}``. The result must have these datasets: a tracker that
-            leaves them to a second pass declares them in its :class:`ResultMeta`, and the first pass fills them with
-            NaN. What was smoothed from the old values goes unless ``smoothed`` is given, too.
-        smoothed: the whole of `/smoothed`, by the names of the unsmoothed datasets; ``bridged`` (F,) bool must be
-            there.
-        model: the whole of `/model`.
-        cameras: the whole of `/cameras`.
-        notes: what the run said, a line each.
+        path: the result; no run may be writing it.
+        columns: new values of datasets with one row per frame, by dataset name, for all F frames:
+            ``{"pose": (F, D), "joints/position": (F, 15, 3)}``. The result must have these datasets: a tracker that
+            fills them in a second pass declares them in its :class:`ResultMeta`, and the first pass writes NaN.
+            New columns delete `/smoothed`, unless ``smoothed`` is given.
+        smoothed: all of `/smoothed`, by the names of the unsmoothed datasets; ``bridged`` (F,) bool is required.
+        model: all of `/model`.
+        cameras: all of `/cameras`.
+        notes: messages of the run, one line each.
 
     Returns:
         the result's metadata.
 
     Raises:
-        ResultError: it is no result, another run is writing it, or it cannot be written. It is then as it was.
-        ValueError: an unknown dataset or a wrong shape.
+        ResultError: the file is no result, another run is writing it, or it cannot be written. It is unchanged.
+        ValueError: a dataset is unknown or has the wrong shape.
     """
     target = writable(Path(path))
     with open_hdf5(target) as file:
@@ -60,8 +59,8 @@ def revise_result(
     known = columns_of(meta)
     changed = {name: _column(known, name).checked(name, values, rows) for name, values in (columns or {}).items()}
     filtered = None if smoothed is None else _smoothed_values(known, smoothed, rows)
-    with as_result_error(target), Workshop(target) as workshop:
-        revised = workshop.twin_paths[0]
+    with as_result_error(target), TwinFolder(target) as twin_folder:
+        revised = twin_folder.twin_paths[0]
         shutil.copyfile(target, revised)
         with open_for_writing(revised, "r+") as copy:
             try:
@@ -85,7 +84,7 @@ def revise_result(
                 raise
         with revised.open("rb") as stream:
             os.fsync(stream.fileno())
-        workshop.publish(revised)
+        twin_folder.publish(revised)
     return meta
 
 
@@ -96,8 +95,8 @@ def _column(known: Mapping[str, Column], name: str) -> Column:
 
 
 def _smoothed_values(known: Mapping[str, Column], smoothed: Mapping[str, ArrayLike], rows: int) -> dict[str, Any]:
-    """What goes below `/smoothed`, checked against the unsmoothed datasets."""
+    """Return the datasets of `/smoothed`, checked against the unsmoothed ones."""
     if "bridged" not in smoothed:
-        raise ValueError("bridged is missing among what was smoothed")
+        raise ValueError("/smoothed needs bridged, which is missing")
     columns = {**{name: column for name, column in known.items() if can_be_smoothed(name)}, "bridged": Column((), "?")}
     return {name: _column(columns, name).checked(name, values, rows) for name, values in smoothed.items()}

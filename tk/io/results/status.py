@@ -24,5 +24,5 @@ STATUS_MEANING = ("tracked", "initialised", "recovered after loss", "lost", "sus
 
 
 def has_pose(status: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Whether frames of this status (...) hold a pose: True unless the person is lost or absent."""
+    """Return for each status (...) whether the frame has a pose: True unless the person is lost or absent."""
     return ~np.isin(status, (Status.LOST, Status.ABSENT))

@@ -1,4 +1,4 @@
-"""A result as a pandas table or an xarray dataset, where these are installed; they are imported only then."""
+"""Convert a result to a pandas table or an xarray dataset. Each package is imported only when it is needed."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _AXES = ("x", "y", "z")
 
 
 def to_pandas(result: Result) -> pandas.DataFrame:
-    """One row a frame, indexed by the frame's number.
+    """Return a table with one row per frame, indexed by frame number.
 
     Columns: ``time`` (seconds), ``status`` (a word), ``objective``; ``<joint>_x``, ``_y``, ``_z`` and ``<joint>_sigma``
-    (metres), the feet likewise; the pose by its names (radians and metres);
+    (metres); ``_x``, ``_y``, ``_z`` of the points of the feet; the pose by its names (radians and metres);
     ``<joint>_<angle>_deg``; ``<camera>_missing`` and ``<camera>_surplus``, the residual.
 
     Raises:
@@ -59,9 +59,9 @@ def to_pandas(result: Result) -> pandas.DataFrame:
 
 
 def to_xarray(result: Result) -> xarray.Dataset:
-    """Arrays whose dimensions have names: ``frame``, ``joint``, ``axis``, ``dof``, ``foot``, ``camera``, ``segment`` …
+    """Return arrays with named dimensions: ``frame``, ``joint``, ``axis``, ``dof``, ``foot``, ``camera``, ``segment`` …
 
-    The frames' ``time`` is a coordinate beside their numbers. The attribute ``units`` tells a variable's unit.
+    ``time`` is a second coordinate of the dimension ``frame``. The attribute ``units`` is the unit of a variable.
 
     Raises:
         ExportError: xarray is not installed.
@@ -95,10 +95,10 @@ def to_xarray(result: Result) -> xarray.Dataset:
         variables["rotation"] = (("frame", "segment", "quaternion"), result.segments_rotation)
         coords |= {"segment": list(meta.segment_names), "quaternion": list("wxyz")}
     angles = {
-        f"{told.joint} {name}": result.angles[told.joint][:, i]
-        for told in meta.angles
-        if told.joint in result.angles
-        for i, name in enumerate(told.names)
+        f"{joint_angles.joint} {name}": result.angles[joint_angles.joint][:, i]
+        for joint_angles in meta.angles
+        if joint_angles.joint in result.angles
+        for i, name in enumerate(joint_angles.names)
     }
     if angles:
         variables["angles"] = (("frame", "angle"), np.stack(list(angles.values()), axis=1), {"units": "degrees"})

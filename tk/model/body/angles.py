@@ -1,13 +1,14 @@
-"""Joint angles as a clinician reads them, from the rotations of the segments.
+"""Compute clinical joint angles from the rotations of the segments.
 
-A segment's axes are x forward, y to the left, z up along its length, all when the body stands upright with hanging arms
-(thumbs forward, elbows straight): all segments then have the same rotation. Angles follow the International Society of
-Biomechanics where it has a rule: Wu et al., J. Biomech. 35 (2002) 543-548 for hip, ankle and spine; Wu et al., J.
-Biomech. 38 (2005) 981-992 for shoulder and elbow. Their axes are X forward, Y up, Z to the right. They lie in bony
-landmarks, which no camera sees; ours lie in the model, so an angle may differ by a constant of some degrees. The knee
-follows Grood & Suntay, J. Biomech. Eng. 105 (1983) 136-144, the pelvis Baker, Gait & Posture 13 (2001) 1-6.
+When the body stands upright with hanging arms (thumbs forward, elbows straight), every segment has the axes x forward,
+y to the left, z up along its length, and thus the same rotation. Angles follow the recommendations of the International
+Society of Biomechanics (ISB) where they exist: Wu et al., J. Biomech. 35 (2002) 543-548 for hip, ankle and spine; Wu et
+al., J. Biomech. 38 (2005) 981-992 for shoulder and elbow. Its axes are X forward, Y up, Z to the right. The ISB defines
+them by bony landmarks, which cameras do not see; here they are axes of the model, so an angle may differ by a constant
+of some degrees. The knee follows Grood & Suntay, J. Biomech. Eng. 105 (1983) 136-144, the pelvis Baker, Gait & Posture
+13 (2001) 1-6.
 
-A left limb is mirrored first: the same movement has the same sign on both sides.
+Rotations of left limbs are mirrored first, so that the same movement has the same sign on both sides.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ Float = NDArray[np.float64]
 #: axes of ISB and OpenSim (forward, up, right) as rows in ours (forward, left, up)
 FORWARD_UP_RIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _ISB = FORWARD_UP_RIGHT.T
-# What mirrors a left limb's rotation in ISB's axes: M R M.
+# Mirrors a rotation R of a left limb in ISB axes: M R M.
 _MIRROR = np.diag([1.0, 1.0, -1.0])
 
 # The axes of the left arm in the zero configuration, body frame: up along the arm, and forward, where the forearm goes
@@ -41,11 +42,11 @@ class AngleSet:
     """The angles of one joint.
 
     Attributes:
-        joint: its name, that of the dataset `/angles/<joint>`.
-        parent, child: the segments; the parent None is the world.
-        sequence: the turns that take the parent's axes (ISB's) to the child's, about moving axes.
-        columns: for each angle its name, which turn of the sequence it is, and its sign.
-        convention: zero, signs and source, in words.
+        joint: name of the joint and of the dataset `/angles/<joint>`.
+        parent, child: names of the segments; parent None is the world.
+        sequence: Euler sequence (moving axes) from the parent's to the child's ISB axes.
+        columns: for each angle its name, its index in the sequence, and its sign.
+        convention: zero position, signs and source, in words.
     """
 
     joint: str
@@ -57,12 +58,12 @@ class AngleSet:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The angles' names, in the order of the columns."""
+        """Return the names of the angles, in the order of the columns."""
         return tuple(name for name, _, _ in self.columns)
 
     @property
     def mirrored(self) -> bool:
-        """Whether it is of the left side."""
+        """Return True for a joint of the left side, whose rotation is mirrored."""
         return self.joint.endswith("_l")
 
 
@@ -138,38 +139,38 @@ ANGLES: tuple[AngleSet, ...] = _sets()
 
 
 def segment_rotations(skeleton: Skeleton, poses: Float) -> Float:
-    """(F, S, 3, 3) rotations of the segments' axes (see the module's docstring) to the world, from poses (F, D)."""
+    """Return rotations (F, S, 3, 3) from the segments' axes (defined above) to the world, from poses (F, D)."""
     return standing_rotations(skeleton, skeleton.segment_transforms(poses))
 
 
 def standing_rotations(skeleton: Skeleton, transforms: Float) -> Float:
-    """(F, S, 3, 3) the same from :meth:`Skeleton.segment_transforms`."""
+    """Return the rotations of :func:`segment_rotations` from :meth:`Skeleton.segment_transforms`."""
     return transforms[..., :3, :3] @ skeleton.T_world_body @ standing_axes()
 
 
 def segment_quaternions(skeleton: Skeleton, poses: Float) -> Float:
-    """(F, S, 4) the same as quaternions (w, x, y, z), w not negative: what `/segments/rotation` holds."""
+    """Return the rotations as quaternions (F, S, 4) with order (w, x, y, z) and w ≥ 0, as in `/segments/rotation`."""
     return to_quaternions(segment_rotations(skeleton, poses))
 
 
 def standing_axes() -> Float:
-    """(S, 3, 3) the segments' axes in the zero configuration, body frame: not unity for the arms, which are level."""
+    """Return the segments' axes (S, 3, 3) in the zero configuration, body frame; identity except for the arms."""
     mirror = np.diag([1.0, -1.0, 1.0])
     arms = {"_l": _ARM_AXES, "_r": mirror @ _ARM_AXES @ mirror}
     return np.array([arms[name[-2:]] if "arm" in name else np.eye(3) for name in SEGMENTS])
 
 
 def joint_angles(rotations: Float, T_world_body: Float, segments: Sequence[str] = SEGMENTS) -> dict[str, Float]:
-    """Degrees by joint, each (..., k) with the columns of :data:`ANGLES`.
+    """Return the angles by joint, degrees, each (..., k) with the columns of :data:`ANGLES`.
 
     Args:
-        rotations: (..., S, 3, 3) of :func:`segment_rotations`.
+        rotations: (..., S, 3, 3) from :func:`segment_rotations`.
         T_world_body: (3, 3) the world's forward, left and up axes as columns; see :class:`Skeleton`.
-        segments: the S segments' names.
+        segments: names of the S segments.
     """
     result = {}
     for angles in ANGLES:
-        if angles.child not in segments:  # a foot that rides on the shin
+        if angles.child not in segments:  # a foot that is fixed to the calf
             result[angles.joint] = np.zeros((*rotations.shape[:-3], len(angles.columns)))
             continue
         parent = T_world_body if angles.parent is None else rotations[..., segments.index(angles.parent), :, :]
@@ -180,9 +181,9 @@ def joint_angles(rotations: Float, T_world_body: Float, segments: Sequence[str] 
 
 
 def joint_rotation(angles: AngleSet, degrees: Float) -> Float:
-    """(..., 3, 3) the child's axes in the parent's from degrees (..., k): the inverse of :func:`joint_angles`.
+    """Return the child's axes in the parent's (..., 3, 3) from degrees (..., k): the inverse of :func:`joint_angles`.
 
-    A turn that is no column, such as a knee's rotation, is none.
+    An angle of the sequence that is no column, such as the rotation of a knee, is 0.
     """
     turns = np.zeros((*np.shape(degrees)[:-1], 3))
     for column, (_, k, sign) in enumerate(angles.columns):
@@ -193,6 +194,6 @@ def joint_rotation(angles: AngleSet, degrees: Float) -> Float:
 
 
 def _in_isb(R: Float, mirrored: bool) -> Float:
-    """A rotation (..., 3, 3) between two segments in ISB's axes, mirrored if it is of the left side."""
+    """Return a rotation (..., 3, 3) between two segments in ISB axes, mirrored if requested."""
     R = _ISB.T @ R @ _ISB
     return _MIRROR @ R @ _MIRROR if mirrored else R

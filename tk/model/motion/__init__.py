@@ -1,1 +1,1 @@
-"""What follows from a sequence of poses."""
+"""Quantities derived from a sequence of poses, and smoothing."""

@@ -1,4 +1,4 @@
-"""What follows from poses: joints, segments, feet and angles, as the result file keeps them."""
+"""Compute joints, segment rotations, feet and angles from poses, as stored in the result file."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Derived:
-    """What F poses mean.
+    """Quantities derived from F poses.
 
     Attributes:
         joints: (F, 15, 3) metres, world frame: `/joints/position`.
         rotations: (F, S, 4) quaternions (w, x, y, z), segment to world: `/segments/rotation`, the segments being
             :data:`tk.model.body.skeleton.SEGMENTS` with the axes of :mod:`tk.model.body.angles`.
         feet: (F, 4, 3) metres, world frame: `/feet/position`, in the order of
-        :data:`tk.model.motion.segments.FOOT_POINTS`.
-        angles: degrees by joint, each (F, k): `/angles/<joint>`; names and conventions in
+            :data:`tk.model.body.joints.FOOT_POINTS`.
+        angles: angles by joint, degrees, each (F, k): `/angles/<joint>`; names and conventions in
             :data:`tk.model.body.angles.ANGLES`.
     """
 
@@ -37,7 +37,7 @@ class Derived:
 
 
 def derive(skeleton: Skeleton, dimensions: BodyDimensions, poses: Float) -> Derived:
-    """What the poses (F, D) mean; they must be finite."""
+    """Return the quantities derived from finite poses (F, D)."""
     T = skeleton.segment_transforms(poses)
     R = standing_rotations(skeleton, T)
     return Derived(

@@ -1,4 +1,4 @@
-"""A skeleton over many frames at once: segments, joints and feet from poses (F, D)."""
+"""Compute joint positions and points of the feet for many frames at once."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from tk.model.body.skeleton import Skeleton
 
 Float = NDArray[np.float64]
 
-# Behind and ahead of the ankle's centre, as shares of the foot's length: where tk.model.body.cone_body lays the foot.
+# Heel and toe in front of the ankle's centre, shares of the foot's length: as in tk.model.body.cone_body.
 _HEEL, _TOE = -0.2, 0.8
 
 
 def joint_positions(skeleton: Skeleton, transforms: Float) -> Float:
-    """(F, 15, 3) joint centres, metres, world frame, from :meth:`Skeleton.segment_transforms`."""
+    """Return joint centres (F, 15, 3), metres, world frame, from :meth:`Skeleton.segment_transforms`."""
     T = transforms[:, skeleton.joint_segment]
     return np.einsum("fjab,jb->fja", T[..., :3, :3], skeleton.joint_position) + T[..., :3, 3]
 
 
 def foot_points(skeleton: Skeleton, dimensions: BodyDimensions, transforms: Float) -> Float:
-    """(F, 4, 3) the :data:`FOOT_POINTS` on the sole, metres, world frame, from :meth:`Skeleton.segment_transforms`.
+    """Return the :data:`FOOT_POINTS` (F, 4, 3) on the sole, metres, world frame.
 
-    The foot rides on the calf where the skeleton has no segment of its own for it.
+    ``transforms`` are those of :meth:`Skeleton.segment_transforms`. A skeleton without ankle joints has its feet fixed
+    to the calves.
     """
     T = transforms[:, [foot_segment(name) for name in FOOT_POINTS]]
     ankles = skeleton.joint_position[[JOINTS.index(LIMBS["leg" + name[-2:]][2]) for name in FOOT_POINTS]]
@@ -33,7 +34,7 @@ def foot_points(skeleton: Skeleton, dimensions: BodyDimensions, transforms: Floa
 
 
 def sole_offset(name: str, dimensions: BodyDimensions) -> Float:
-    """(3,) one of the :data:`FOOT_POINTS` from the ankle of a standing body: forward, left, up, metres."""
+    """Return the vector (3,) from the ankle to one of the :data:`FOOT_POINTS`, standing body: forward, left, up, m."""
     share = _HEEL if name.startswith("heel") else _TOE
     return np.array([share * dimensions.foot, 0.0, -dimensions.ankle_height])
 

@@ -1,16 +1,15 @@
-"""Smoothing the poses of a whole recording: noise out, short gaps bridged, nothing delayed.
+"""Smooth the poses of a whole recording without delay, and bridge short gaps.
 
-The model of each degree of freedom is a constant velocity with white acceleration noise, measured with white noise. A
+Each degree of freedom is modelled by a constant velocity with white acceleration noise, measured with white noise. A
 Kalman filter runs forward and a Rauch-Tung-Striebel smoother backward (Rauch, Tung & Striebel, AIAA J. 3 (1965)
-1445-1450), so each frame is estimated from all frames and has no lag. Two reasons against a low-pass filter in both
-directions: a frame without measurement needs no special treatment, and each degree of freedom is smoothed by its own
-noise, which is estimated by maximum likelihood. A person does not move as the model does, and would be smoothed too
-much; so the filter leaves everything slower than :data:`MOTION_HZ`. At 15 frames/s this leaves little to smooth, at 30
-and more much. A tracker's error that lasts for many frames is not white noise and stays: it looks like motion.
+1445-1450), so each frame is estimated from all frames and has no lag. It has two advantages over a low-pass filter in
+both directions: a frame without measurement needs no special treatment, and each degree of freedom is smoothed
+according to its own noise, which is estimated by maximum likelihood. Human motion does not follow the model exactly and
+would be smoothed too much, so motion slower than :data:`MOTION_HZ` passes the smoother. At 15 frames/s little smoothing
+remains, at 30 frames/s and more it is strong. A tracking error that lasts for many frames is not white noise and stays.
 
-Angles are smoothed one by one. The limits of the skeleton's ball joints keep them away from their singular directions,
-where the angles would not follow the rotation smoothly. A foot that stands is not held: it may slide by what its
-tracking errors leave.
+Angles are smoothed separately. The limits of the skeleton's ball joints keep them away from the singular directions,
+where angles do not change smoothly with the rotation. Standing feet are not fixed: tracking errors may let them slide.
 """
 
 from __future__ import annotations
@@ -26,15 +25,15 @@ from tk.model.body.skeleton import Skeleton
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-# Standard deviation of the acceleration's noise over that of the measurement's, both for steps of one frame: from
-# motion that is hardly seen to change within seconds to measurements that are taken as they are.
+# Candidate ratios of the standard deviations of acceleration noise and measurement noise, per frame. At the smallest,
+# motion hardly changes within seconds; at the largest, measurements stay unchanged.
 _RATIOS = np.geomspace(1e-3, 10.0, 17)
 # Voluntary movement has almost no power above 6 Hz, the common cut-off in gait analysis (Winter, Biomechanics and Motor
 # Control of Human Movement, 2009, chapter 3).
 MOTION_HZ = 6.0
-# A velocity that nothing is known of, against the measurement's noise a frame.
+# Standard deviation of the unknown initial velocity, in units of the measurement noise per frame; in effect infinite.
 _UNKNOWN = 1e3
-# Frames of a stretch below which there is too little to estimate noise from; it stays as it is.
+# Frames. Shorter sections have too few measurements to estimate noise; they stay unchanged.
 SHORTEST = 8
 
 
@@ -43,10 +42,9 @@ class Smoothed:
     """A smoothed copy of F poses.
 
     Attributes:
-        poses: (F, D) radians and metres; as they were given where neither known nor bridged.
-        bridged: (F,) True where no pose was known and one has been filled in.
-        noise: (D,) the standard deviation of the measurements' noise as estimated, radians or metres; NaN where there
-            was too little to estimate it from.
+        poses: (F, D) radians and metres; unchanged in frames that are neither known nor bridged.
+        bridged: (F,) True where the pose was unknown and has been filled in.
+        noise: (D,) estimated standard deviation of the measurement noise, radians or metres; NaN with too few frames.
     """
 
     poses: Float
@@ -58,42 +56,42 @@ def smooth(skeleton: Skeleton, poses: Float, known: Bool, fps: float, longest_ga
     """Smooth the poses of a recording.
 
     Args:
-        skeleton: whose limits the result keeps.
-        poses: (F, D) tracked poses, frames at equal steps.
-        known: (F,) False where the person was lost; such a pose is not looked at.
-        fps: frames a second.
-        longest_gap_s: a loss up to this long between known frames is bridged; a longer one divides the recording.
+        skeleton: skeleton of the poses; the smoothed poses respect its joint limits.
+        poses: (F, D) tracked poses at equal time steps.
+        known: (F,) False where the person was lost; these poses are ignored.
+        fps: frames per second.
+        longest_gap_s: s, longest gap that is bridged; a longer gap divides the recording.
     """
     poses = np.asarray(poses, dtype=np.float64)
     result, bridged = poses.copy(), np.zeros(len(poses), dtype=bool)
-    stretches = [stretch for stretch in _stretches(known, longest_gap_s * fps) if known[stretch].sum() >= SHORTEST]
-    if not stretches:
+    sections = [section for section in _sections(known, longest_gap_s * fps) if known[section].sum() >= SHORTEST]
+    if not sections:
         return Smoothed(result, bridged, np.full(poses.shape[1], np.nan))
     turning = np.array([unit == "rad" for unit in skeleton.units])
     pieces = []
-    for stretch in stretches:
-        values, seen = poses[stretch].copy(), known[stretch]
+    for section in sections:
+        values, seen = poses[section].copy(), known[section]
         values[np.ix_(seen, turning)] = np.unwrap(values[np.ix_(seen, turning)], axis=0)
         pieces.append((values, seen))
     ratio, noise = _noise(pieces)
     ratio = np.maximum(ratio, _ratio_of(MOTION_HZ / fps))
-    for stretch, (values, seen) in zip(stretches, pieces, strict=True):
+    for section, (values, seen) in zip(sections, pieces, strict=True):
         smoothed = _smooth(values, seen, ratio)
-        result[stretch] = skeleton.clip(_into_limits(skeleton, smoothed, turning))
-        bridged[stretch] = ~seen
+        result[section] = skeleton.clip(_into_limits(skeleton, smoothed, turning))
+        bridged[section] = ~seen
     return Smoothed(result, bridged, noise)
 
 
 def _ratio_of(cutoff: float) -> float:
-    """The ratio (as :data:`_RATIOS`) under which a swing of this frequency, in cycles a frame, is halved.
+    """Return the ratio (see :data:`_RATIOS`) with which the smoother has gain 0.5 at ``cutoff``, cycles per frame.
 
-    The smoother is a filter of gain 1 / (1 + ω⁴ / ratio²): that of the cubic smoothing spline.
+    The smoother has the gain 1 / (1 + ω⁴ / ratio²) of a cubic smoothing spline.
     """
     return float((2 * np.pi * cutoff) ** 2)
 
 
-def _stretches(known: Bool, longest_gap: float) -> list[slice]:
-    """Runs of frames that begin and end with a known one and hold no gap longer than ``longest_gap`` frames."""
+def _sections(known: Bool, longest_gap: float) -> list[slice]:
+    """Return the sections that start and end with a known frame and have no gap longer than ``longest_gap`` frames."""
     frames = np.flatnonzero(known)
     if not len(frames):
         return []
@@ -103,7 +101,7 @@ def _stretches(known: Bool, longest_gap: float) -> list[slice]:
 
 
 def _into_limits(skeleton: Skeleton, poses: Float, turning: Bool) -> Float:
-    """Angles (F, D) that were unwrapped, back by whole turns to where the limits lie."""
+    """Return poses (F, D) with angles shifted by whole turns to within half a turn of the middle of their limits."""
     bounded = np.isfinite(skeleton.lower)
     middle = np.zeros(len(bounded))
     middle[bounded] = (skeleton.lower[bounded] + skeleton.upper[bounded]) / 2
@@ -111,19 +109,19 @@ def _into_limits(skeleton: Skeleton, poses: Float, turning: Bool) -> Float:
     return np.where(turning, poses - 2 * np.pi * turns, poses)
 
 
-# --- the filter; values are taken in units of the measurement's noise, time in frames ---------------------------------
+# --- the filter; values are in units of the measurement noise, time in frames -----------------------------------------
 
 
 def _noise(pieces: list[tuple[Float, Bool]]) -> tuple[Float, Float]:
-    """(D,) the ratio of :data:`_RATIOS` under which the measurements are most likely, and (D,) their noise."""
+    """Return the maximum likelihood estimates of the ratio (D,), one of :data:`_RATIOS`, and of the noise (D,)."""
     degrees = pieces[0][0].shape[1]
     ratio = np.repeat(_RATIOS, degrees)
     squares, logs, count = np.zeros(len(ratio)), np.zeros(len(ratio)), 0
     for values, seen in pieces:
-        judged = np.flatnonzero(seen)[2:]  # the first two fix the line that it starts with
+        judged = np.flatnonzero(seen)[2:]  # the first two initialise the filter
         for f, step in enumerate(_filter(np.tile(values, len(_RATIOS)), seen, ratio)):
             if seen[f] and f >= judged[0]:
-                squares += step.surprise**2 / step.variance
+                squares += step.innovation**2 / step.variance
                 logs += np.log(step.variance)
         count += len(judged)
     variance = (squares / count).reshape(len(_RATIOS), degrees)
@@ -140,29 +138,29 @@ class _Step:
     predicted_covariance: Float
     state: Float
     covariance: Float
-    surprise: Float  # (N,) measurement less prediction
-    variance: Float  # (N,) what was expected of its square
+    innovation: Float  # (N,) measurement minus prediction
+    variance: Float  # (N,) expected square of innovation
 
 
 def _filter(values: Float, seen: Bool, ratio: Float) -> Iterator[_Step]:
-    """Forward over values (F, N), for each of N series with the noise of its acceleration, ratio (N,)."""
+    """Filter values (F, N) forward, with the noise ratio (N,) of each series."""
     series = values.shape[1]
-    q = ratio**2 * np.array([[1 / 3], [1 / 2], [1.0]])  # of white acceleration over one frame: xx, xv, vv
+    q = ratio**2 * np.array([[1 / 3], [1 / 2], [1.0]])  # covariance of white acceleration over one frame: xx, xv, vv
     x, v = values[0], np.zeros(series)
     xx, xv, vv = np.ones(series), np.zeros(series), np.full(series, _UNKNOWN**2)
     for f in range(len(values)):
         if f:
             x, (xx, xv, vv) = x + v, (xx + 2 * xv + vv + q[0], xv + vv + q[1], vv + q[2])
         predicted, predicted_covariance = np.array([x, v]), np.array([xx, xv, vv])
-        surprise, variance = values[f] - x, xx + 1
+        innovation, variance = values[f] - x, xx + 1
         if seen[f] and f:
-            x, v = x + xx / variance * surprise, v + xv / variance * surprise
+            x, v = x + xx / variance * innovation, v + xv / variance * innovation
             xx, xv, vv = xx / variance, xv / variance, vv - xv**2 / variance
-        yield _Step(predicted, predicted_covariance, np.array([x, v]), np.array([xx, xv, vv]), surprise, variance)
+        yield _Step(predicted, predicted_covariance, np.array([x, v]), np.array([xx, xv, vv]), innovation, variance)
 
 
 def _smooth(values: Float, seen: Bool, ratio: Float) -> Float:
-    """(F, N) the smoothed values: forward, and back by Rauch, Tung and Striebel's gain."""
+    """Return the smoothed values (F, N): filter forward, then smooth backward with the Rauch-Tung-Striebel gain."""
     steps = list(_filter(values, seen, ratio))
     x, v = steps[-1].state
     smoothed = [x]
