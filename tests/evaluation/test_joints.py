@@ -202,7 +202,7 @@ def test_missing_frames_inside_the_range_count_and_others_are_reported() -> None
     assert found.raw.all.pck[5] == pytest.approx(5 / 7)
     table = found.format_table()
     assert "2 frames are missing inside" in table
-    assert "13 frames of the truth lie outside" in table
+    assert "13 frames of the truth are outside" in table
 
 
 def test_frames_without_truth_are_reported() -> None:
@@ -333,7 +333,7 @@ def test_longest_run_of_wrong_frames() -> None:
     found = evaluate(result, truth)
     for run in (found.longest_limb_error, found.longest_limb_error_raw):
         assert (run.frames, run.first, run.last) == (6, 2, 7)
-    assert "15 cm off, offset taken off: 6 frames, 2 to 7" in found.format_table()
+    assert "15 cm off, without offset: 6 frames, 2 to 7" in found.format_table()
     order = np.random.default_rng(0).permutation(20)
     shuffled = replace(truth, frames=truth.frames[order], positions=truth.positions[order])
     assert evaluate(result, shuffled).longest_limb_error == found.longest_limb_error

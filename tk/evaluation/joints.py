@@ -132,7 +132,7 @@ class Evaluation:
         thresholds = "".join(f"{f'PCK{cm}':>8}" for cm in PCK_CM)
         half = f"{'mean':>8}{'median':>8}{thresholds}"
         lines = [
-            f"{'':12}{'as it is [cm, %]':>{len(half)}}  {'offset taken off [cm, %]':>{len(half)}}",
+            f"{'':12}{'raw [cm, %]':>{len(half)}}  {'without offset [cm, %]':>{len(half)}}",
             f"{'':12}{half}  {half}",
         ]
         named = [("all 15", self.raw.all, self.corrected.all), ("12 limb", self.raw.limbs, self.corrected.limbs)]
@@ -147,7 +147,7 @@ class Evaluation:
         if self.missing_inside:
             lines.append(f"{self.missing_inside} frames are missing inside the result; they count as errors")
         if self.missing_outside:
-            lines.append(f"{self.missing_outside} frames of the truth lie outside the result; they are not judged")
+            lines.append(f"{self.missing_outside} frames of the truth are outside the result; they are not judged")
         if self.without_truth:
             lines.append(f"{self.without_truth} frames of the result have no truth; they are not judged")
         if self.unknown_joints:
@@ -169,14 +169,13 @@ class Evaluation:
         where = f", {run.first} to {run.last}" if run.frames else ""
         lines = [
             f"flexion, mean error: {', '.join(parts)}",
-            f"longest run with a limb joint over {LIMB_ERROR_CM:g} cm off, offset taken off: "
-            f"{run.frames} frames{where}",
+            f"longest run with a limb joint over {LIMB_ERROR_CM:g} cm off, without offset: {run.frames} frames{where}",
         ]
         for name, shares in (self.sigma or {}).items():
             within, expected = shares.corrected, shares.expected
             label = {"all": "all 15", "limbs": "12 limb"}[name]
             lines.append(
-                f"{label}: {100 * within[1]:.1f} % within 1 σ, {100 * within[2]:.1f} % within 2 σ, offset taken off"
+                f"{label}: {100 * within[1]:.1f} % within 1 σ, {100 * within[2]:.1f} % within 2 σ, without offset"
                 f" (if normal: {100 * expected[1]:.1f} %, {100 * expected[2]:.1f} %)"
             )
         return lines

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError, ConfigError
 from tk.evaluation.joints import plain_values
 from tk.io.captures.capture import Capture, open_capture
-from tk.io.results.writer import Result, blamed_on, read_joints, read_result
+from tk.io.results.writer import Result, as_damage_error, read_joints, read_result
 from tk.model.body.joints import ANKLE_JOINTS, JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.masks.silhouettes import draw_silhouettes, share_wrong
@@ -138,7 +138,7 @@ def evaluate_views(
     estimate, position = found.joints[rows], true.positions[true_rows]
     used = found.state.get("run/cameras")
     names = None if used is None else [name.strip() for name in str(used).split(",")]
-    with blamed_on(found.path, "the body or a pose"):
+    with as_damage_error(found.path, "the body or a pose"):
         error, note = _silhouette_errors(found, opened)
     views = []
     for v, camera in enumerate(opened.rig):

@@ -244,7 +244,7 @@ class Hdf5Reader:
 def _check_text_heaps(path: Path, file: h5py.File) -> None:
     """Check the heaps that hold texts of variable length.
 
-    HDF5 (up to 2.0.0) loops for ever in a heap with an object of size zero. Source of the layout: section III.E of the
+    HDF5 (up to 2.0.0) loops forever in a heap with an object of size zero. Source of the layout: section III.E of the
     HDF5 file format specification.
 
     Raises:

@@ -23,7 +23,7 @@ from tk.io.results.writer import (
     ResultWriter,
     Status,
     Value,
-    blamed_on,
+    as_damage_error,
     read_result,
     revise_result,
 )
@@ -267,7 +267,7 @@ class _Run:
         plan, output = self.plan, self.output
         done = output.done if output else 0
         if output and done:
-            with blamed_on(output.writer.path, "the state of the run"):
+            with as_damage_error(output.writer.path, "the state of the run"):
                 self.lost = int(np.asarray(output.writer.state[_ORIGIN + _LOST]))
         if plan.stop is not None and plan.begin + done >= plan.stop:
             return
@@ -312,7 +312,7 @@ class _Run:
 
     def _restore(self, output: _Output) -> None:
         person = self.people[0]
-        with blamed_on(output.writer.path, "the state of the run"):
+        with as_damage_error(output.writer.path, "the state of the run"):
             person.tracker.restore(output.writer.model, output.writer.state)
             person.monitor.restore(_below(_WATCH, output.writer.state))
 

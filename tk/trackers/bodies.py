@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError, ResultError
-from tk.io.results.writer import Result, blamed_on, read_result
+from tk.io.results.writer import Result, as_damage_error, read_result
 from tk.io.toml import parse_toml, read_text
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import ConeBody, build_cone_body
@@ -30,7 +30,7 @@ def read_body(path: Path, up: str) -> ConeBody:
         model = read_result(path).model
         if "parts/shape" not in model or "body" not in model:
             raise ConfigError(f"{path}: holds no body of contours; give a result of --method region or a TOML file")
-        with blamed_on(path, "the body"):
+        with as_damage_error(path, "the body"):
             return restore_body(model, up)
     values = parse_toml(read_text(path, ConfigError), str(path), ConfigError)
     given = values.get("dimensions", {})

@@ -108,7 +108,7 @@ def read_joints(path: str | os.PathLike[str]) -> JointTrack:
 
 
 @contextlib.contextmanager
-def blamed_on(path: Path, what: str) -> Iterator[None]:
+def as_damage_error(path: Path, what: str) -> Iterator[None]:
     """Convert exceptions that values of a wrong type, shape or size cause to a ResultError that names ``what``.
 
     It is for values that this module cannot check, such as a body or the state of a tracker.

@@ -44,7 +44,7 @@ from tk.io.results.files import (
 )
 from tk.io.results.layout import Row, Twin, put_model, write_layout
 from tk.io.results.reader import (
-    blamed_on,
+    as_damage_error,
     check_format,
     check_hull,
     count_rows,
@@ -69,7 +69,7 @@ __all__ = [
     "Status",
     "UsedCameras",
     "Value",
-    "blamed_on",
+    "as_damage_error",
     "has_pose",
     "read_joints",
     "read_result",

@@ -24,7 +24,7 @@ from tk.model.body.skeleton import SEGMENTS, Skeleton
 
 Float = NDArray[np.float64]
 
-#: axes of ISB and OpenSim (forward, up, right) as rows in ours (forward, left, up)
+#: axes of ISB and OpenSim (forward, up, right) as rows in tk's axes (forward, left, up)
 FORWARD_UP_RIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _ISB = FORWARD_UP_RIGHT.T
 # Mirrors a rotation R of a left limb in ISB axes: M R M.
