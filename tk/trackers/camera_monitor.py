@@ -35,7 +35,7 @@ from tk.model.setup import Setup, Subject
 from tk.trackers.contour_tracker import ContourTracker
 from tk.trackers.protocol import Estimate, Observation, Tracker
 from tk.trackers.region import RegionTracker
-from tk.trackers.residual import OUTLIER
+from tk.trackers.residual import OUTLIER, RATE
 
 Float = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ _TORN = 0.5
 # after which a camera is tested again that was found right. Chosen on the development captures; sensitivity not
 # measured.
 _WHOLE = _PAUSE = 6
-_STATE = ("excluded", "torn", "normal_for", "since_test", "at_test")
+_STATE = ("excluded", "torn", "normal_for", "since_test", "at_test", "refused")
 # Reasons, as in messages.
 _DISAGREES, _TOO_FEW = "disagrees with the others", "fewer than two cameras see anybody"
 _MISSING = "misses a part of the person"
@@ -85,6 +85,7 @@ class CameraMonitor:
         self._spans: dict[str, Span] = {}  # of exclusion, by "camera/reason"
         self._lost: dict[str, Span] = {}  # by reason
         self._opening_reasons: dict[int, str] = {}
+        self._refused = np.zeros((), np.int64)  # poses refused since the last accepted one, because of their residual
         self._excess = 0.0  # of the last frame, mean over the cameras used
 
     def start(self, frames: Sequence[Observation]) -> list[Observation]:
@@ -237,15 +238,24 @@ class CameraMonitor:
                 _count(self._lost, _TOO_FEW, index)
             return estimate
         reason = self._plausibility.judge(index, estimate.joints, offset)
-        if reason is None and offset is not None and estimate.status == "recovered" and self._excess > self._normal:
+        if reason is None and offset is not None and estimate.status == "recovered" and self._excess > self._accepted:
             reason = "after a loss its residual is still high"
+            self._refused = self._refused + 1
         if reason is None:
+            self._refused = np.zeros((), np.int64)
             return estimate
         _count(self._lost, f"{_IMPLAUSIBLE}: {reason}", index)
         self._plausibility.forget()
         if isinstance(self.tracker, ContourTracker):
             self.tracker.lose()
         return replace(estimate, status="lost", sigma=None if estimate.sigma is None else np.full(len(JOINTS), np.nan))
+
+    @property
+    def _accepted(self) -> float:
+        """The largest excess of a pose after a loss: one spread, because no prediction supports such a pose. After the
+        frames in which a baseline follows a change (1 / RATE), the level itself may have changed, and only an abnormal
+        residual refuses a pose. With twice the limit, a mirrored pose was accepted for 12 frames (fault "away")."""
+        return 1.0 if self._refused < 1 / RATE else self._normal
 
     @property
     def _normal(self) -> float:

@@ -85,9 +85,10 @@ class ResidualBaseline:
         rate = np.where(right, np.maximum(RATE, 1 / (2 + self._frames)), RATE)
         self._frames = self._frames + right
         mean = mean + rate * deviation
+        # a high residual is no sample of what is normal; it would widen the spread until it counts as normal itself
         spread = self.spread + RATE * (1.25 * np.abs(deviation) - self.spread)
         self.mean = np.where(seen, mean, self.mean)
-        self.spread = np.where(seen, np.maximum(spread, np.maximum(LEAST_SPREAD, LEAST_SHARE * mean)), self.spread)
+        self.spread = np.where(right, np.maximum(spread, np.maximum(LEAST_SPREAD, LEAST_SHARE * mean)), self.spread)
 
     def state(self) -> Mapping[str, Any]:
         """Return what :meth:`restore` needs."""
