@@ -1,7 +1,7 @@
 """The joint table: one row per joint, from which names, chains, limits, bones and the skeleton are derived.
 
-A row of a limb is written for the left side; the right one is its mirror image. To add a joint, add a row: the pose
-vector, the result file and the drawings follow.
+A row of a limb is written for the left side; the right one is its mirror image. The pose vector, its limits and the
+result's columns follow from a row; docs/architecture.md lists what else a new joint touches.
 """
 
 from __future__ import annotations
