@@ -1,11 +1,20 @@
 """Run `tk track` on recordings with artificial faults and print a table.
 
-    python -m scripts.faults CAPTURE [--only NAME,…] [--begin N] [--camera NAME] [--work DIR] [-- further options]
+    python -m scripts.faults CAPTURE [--only NAME,…] [--begin N] [--camera NAME] [--foreign CAPTURE] [--work DIR]
+        [-- further options]
 
 Each fault is made in a copy of the capture without masks, so that the masks show the fault, too. ``tk track`` runs in a
-process of its own. Columns: mean distance of all joints from the ground truth over frames that are not lost, cm; the
-largest mean of such a frame; lost frames; frames that are "tracked" but more than 10 cm off; and the messages. Without
-a ``truth.h5`` the run without a fault is the reference.
+process of its own. Columns:
+
+- mean, worst: distance of all joints from the ground truth, mean over a frame, over frames that are neither lost nor
+  suspect, cm.
+- lost, suspect: number of such frames.
+- bad: frames more than 10 cm off that are neither lost nor suspect.
+- silent: joints more than 15 cm off without a warning (their frame is neither lost nor suspect, their sigma is at most
+  5 cm), % of all joints.
+- alarm: frames less than 6 cm off that are lost, suspect or have a joint without sigma, % of all frames.
+
+Without a ``truth.h5`` the run without a fault is the reference.
 """
 
 from __future__ import annotations
@@ -19,7 +28,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -32,7 +41,8 @@ from numpy.typing import NDArray
 from scripts.synthetic.capture import write_calibration
 from tk.io.captures.calibration import read_calibration
 from tk.io.captures.capture import Capture, open_capture
-from tk.io.results.writer import Status, read_joints
+from tk.io.results.reader import read_joints
+from tk.io.results.status import Status, has_pose
 from tk.model.cameras.camera import Rig
 from tk.run.segmentation import make_labeller
 from tk.settings import Settings
@@ -41,7 +51,14 @@ Video = list[NDArray[np.uint8]]
 
 OFF_M = 0.10
 """A frame with a larger mean error must not be "tracked"."""
+SILENT_M, SIGMA_M = 0.15, 0.05
+"""A joint with a larger error must be marked; a larger sigma marks it."""
+RIGHT_M = 0.06
+"""A frame with a smaller mean error should not be marked."""
 TURN_DEG = 2.0  # rotation of the faulty camera
+MORE_DEG = 3.0  # rotation of the faulty cameras where too few correct ones are left to contradict them
+FAR_DEG = 10.0  # rotation that excludes a camera
+CUT = 40  # frames missing at a cut
 LATE = 3  # frames
 FLIPPED_BYTES = 400
 
@@ -55,12 +72,18 @@ class Faulty:
         original: the capture.
         camera: index of the faulty camera.
         begin: first frame of faults that do not last from the start.
+        foreign: another capture with as many cameras; None: there is none.
+        used: names of the cameras to track with; empty: all.
+        cut: number of frames missing from :attr:`begin` on.
     """
 
     folder: Path
     original: Capture
     camera: int
     begin: int
+    foreign: Path | None = None
+    used: tuple[str, ...] = ()
+    cut: int = 0
 
     @property
     def count(self) -> int:
@@ -114,31 +137,90 @@ def frozen(faulty: Faulty) -> None:
     faulty.change(lambda video: [video[min(i, faulty.begin)] for i in range(len(video))])
 
 
+def turn(faulty: Faulty, angles_deg: dict[int, float]) -> None:
+    """Rotate cameras in the calibration, by index, each about its own upright axis."""
+    path = faulty.folder / "calibration.toml"
+    cameras = list(read_calibration(path).rig)
+    for i, angle in angles_deg.items():
+        T = cv2.Rodrigues(np.radians([0.0, angle, 0.0]))[0]
+        cameras[i] = replace(cameras[i], rotation=T @ cameras[i].rotation, translation=T @ cameras[i].translation)
+    path.unlink()
+    write_calibration(Rig(tuple(cameras)), path)
+
+
 def turned(faulty: Faulty) -> None:
-    """Rotate the camera by 2° in the calibration."""
-    turn = cv2.Rodrigues(np.radians([0.0, TURN_DEG, 0.0]))[0]
-    calibration = read_calibration(faulty.folder / "calibration.toml")
-    cameras = list(calibration.rig)
-    camera = cameras[faulty.camera]
-    cameras[faulty.camera] = type(camera)(
-        camera.name, camera.width, camera.height, camera.matrix, camera.distortions,
-        turn @ camera.rotation, turn @ camera.translation, camera.fisheye,
-    )  # fmt: skip
-    (faulty.folder / "calibration.toml").unlink()
-    write_calibration(Rig(tuple(cameras)), faulty.folder / "calibration.toml")
+    """Rotate the camera in the calibration."""
+    turn(faulty, {faulty.camera: TURN_DEG})
 
 
-def bumped(faulty: Faulty) -> None:
-    """Rotate the camera by 2° in the middle of the recording."""
+def two_turned(faulty: Faulty) -> None:
+    """Rotate two cameras in the calibration, in opposite directions."""
+    turn(faulty, {faulty.camera: MORE_DEG, (faulty.camera + 2) % len(faulty.original.rig): -MORE_DEG})
+
+
+def one_of_two_turned(faulty: Faulty) -> None:
+    """Use two cameras and rotate one of them in the calibration."""
+    turn(faulty, {faulty.camera: MORE_DEG})
+    names = faulty.original.rig.names
+    faulty.used = names[faulty.camera - 1], names[faulty.camera]
+
+
+def facing_cameras(faulty: Faulty) -> None:
+    """Use two cameras that face each other."""
+    axes = np.array([camera.rotation[2] for camera in faulty.original.rig])
+    first, second = np.unravel_index(int(np.argmin(axes @ axes.T)), (len(axes), len(axes)))
+    names = faulty.original.rig.names
+    faulty.used = names[first], names[second]
+
+
+def foreign_calibration(faulty: Faulty) -> None:
+    """Use the calibration of another capture."""
+    if faulty.foreign is None:
+        raise SystemExit(f"{faulty.original.path}: no capture beside it has as many cameras (give --foreign CAPTURE)")
+    path = faulty.folder / "calibration.toml"
+    path.unlink()
+    shutil.copy(faulty.foreign / "calibration.toml", path)
+
+
+def swapped_videos(faulty: Faulty) -> None:
+    """Swap the videos of two cameras."""
+    one, other = faulty.video(faulty.camera), faulty.video((faulty.camera + 1) % len(faulty.original.rig))
+    between = one.with_name("between" + one.suffix)
+    one.rename(between)
+    other.rename(one)
+    between.rename(other)
+
+
+def cut(faulty: Faulty) -> None:
+    """Remove frames from all videos, so that the person jumps."""
+    faulty.cut = CUT
+    for camera in range(len(faulty.original.rig)):
+        video = faulty.images(camera)
+        faulty.write(camera, video[: faulty.begin] + video[faulty.begin + CUT :])
+
+
+def bump(faulty: Faulty, angle_deg: float) -> None:
+    """Rotate the camera in the middle of the recording."""
     camera = faulty.original.rig[faulty.camera]
-    turn = cv2.Rodrigues(np.radians([0.0, TURN_DEG, 0.0]))[0]
-    warp = camera.matrix @ turn @ np.linalg.inv(camera.matrix)
+    T = cv2.Rodrigues(np.radians([0.0, angle_deg, 0.0]))[0]
+    warp = camera.matrix @ T @ np.linalg.inv(camera.matrix)
 
     def moved(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         warped = cv2.warpPerspective(image, warp, image.shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(warped, np.uint8)
 
     faulty.change(lambda video: [p if i < faulty.begin else moved(p) for i, p in enumerate(video)])
+
+
+def bumped(faulty: Faulty) -> None:
+    bump(faulty, TURN_DEG)
+
+
+def camera_excluded(faulty: Faulty) -> None:
+    """Use three cameras and rotate one so far that it must be excluded."""
+    bump(faulty, FAR_DEG)
+    names = faulty.original.rig.names
+    faulty.used = tuple(names[(faulty.camera + i) % len(names)] for i in (-1, 0, 1))
 
 
 def short(faulty: Faulty) -> None:
@@ -232,6 +314,13 @@ FAULTS: dict[str, Callable[[Faulty], None]] = {
     "bystander": bystander,
     "away": away,
     "flipped": flipped,
+    "foreign calibration": foreign_calibration,
+    "two turned": two_turned,
+    "one of two turned": one_of_two_turned,
+    "facing cameras": facing_cameras,
+    "swapped videos": swapped_videos,
+    "cut": cut,
+    "camera excluded": camera_excluded,
 }
 
 
@@ -242,27 +331,67 @@ class Outcome:
     Attributes:
         code: exit code; None after a timeout.
         messages: lines printed, without progress.
-        error_m: (F,), mean joint error of each frame.
+        error_m: (F, 15), error of each joint.
         status: (F,), status of each frame.
+        sigma_m: (F, 15), sigma of each joint.
     """
 
     code: int | None
     messages: list[str]
     error_m: NDArray[np.float64]
     status: NDArray[np.uint8]
+    sigma_m: NDArray[np.float64]
+
+    @staticmethod
+    def empty(code: int | None, messages: list[str]) -> Outcome:
+        """Return the outcome of a run without a result."""
+        return Outcome(code, messages, np.zeros((0, 15)), np.zeros(0, np.uint8), np.zeros((0, 15)))
+
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        return ~has_pose(self.status)
+
+    @property
+    def suspect(self) -> NDArray[np.bool_]:
+        return self.status == Status.SUSPECT
+
+    @property
+    def silent(self) -> NDArray[np.bool_]:
+        """(F, 15), joints far off without a warning."""
+        marked = (self.lost | self.suspect)[:, None] | ~(self.sigma_m <= SIGMA_M)
+        return (self.error_m > SILENT_M) & ~marked
+
+    @property
+    def alarm(self) -> NDArray[np.bool_]:
+        """(F,), correct frames that are marked."""
+        marked = self.lost | self.suspect | np.isnan(self.sigma_m).any(axis=1)
+        return (self.error_m.mean(axis=1) < RIGHT_M) & marked
 
     def row(self, name: str) -> str:
-        kept = self.status != Status.LOST
-        cm = 100 * self.error_m[kept]
-        bad = int((cm > 100 * OFF_M).sum())
+        F = len(self.status)
+        cm = 100 * self.error_m.mean(axis=1)[~(self.lost | self.suspect)]
         figures = f"{cm.mean():6.2f} {cm.max():6.2f}" if len(cm) else "     -      -"
-        lost = int((~kept).sum())
+        shares = f"{100 * self.silent.mean():6.2f} {100 * self.alarm.mean():5.1f}" if F else "     -     -"
         code = "hang" if self.code is None else str(self.code)
-        return f"{name:10} {code:>4} {figures} {lost:4}/{len(kept):<4} {bad:4}  {' | '.join(self.messages)}"
+        return (
+            f"{name:20} {code:>4} {figures} {self.lost.sum():4}/{F:<4} {self.suspect.sum():7} "
+            f"{(cm > 100 * OFF_M).sum():4} {shares}  {' | '.join(self.messages)}"
+        )
 
 
-def make_faulty(name: str, capture: Path, folder: Path, camera: str | None, begin: int) -> Faulty:
-    """Copy the capture without its masks and add a fault."""
+def make_faulty(
+    name: str, capture: Path, folder: Path, camera: str | None, begin: int, foreign: Path | None = None
+) -> Faulty:
+    """Copy the capture without its masks and add a fault.
+
+    Args:
+        name: of the fault.
+        capture: the capture.
+        folder: the copy.
+        camera: the faulty camera; None: the second one.
+        begin: first frame of faults that do not last from the start.
+        foreign: another capture with as many cameras; None: the first one beside the capture.
+    """
     shutil.copytree(
         capture, folder, copy_function=os.link, ignore=shutil.ignore_patterns("masks*", "*.h5", "calibration_*")
     )
@@ -271,13 +400,20 @@ def make_faulty(name: str, capture: Path, folder: Path, camera: str | None, begi
         settings.write_text(tomli_w.dumps({"name": capture.name}), encoding="utf-8")
     original = open_capture(folder)
     names = original.rig.names
-    faulty = Faulty(folder, original, names.index(camera) if camera else 1, begin)
+    if foreign is None and name == "foreign calibration":
+        others = (path.parent for path in sorted(capture.resolve().parent.glob("*/calibration.toml")))
+        same = (
+            o for o in others if o != capture.resolve() and read_calibration(o / "calibration.toml").rig.names == names
+        )
+        foreign = next(same, None)
+    faulty = Faulty(folder, original, names.index(camera) if camera else 1, begin, foreign)
     FAULTS[name](faulty)
     return faulty
 
 
-def run(folder: Path, truth: Path | None, result: Path, options: Sequence[str], limit_s: float) -> Outcome:
-    """Track a folder in a process of its own and compare it with the ground truth, if there is one."""
+def run(faulty: Faulty, truth: Path | None, result: Path, options: Sequence[str], limit_s: float) -> Outcome:
+    """Track a copy in a process of its own and compare it with the ground truth, if there is one."""
+    folder = faulty.folder
     command = [
         sys.executable,
         "-c",
@@ -288,26 +424,30 @@ def run(folder: Path, truth: Path | None, result: Path, options: Sequence[str], 
         str(result),
         *options,
     ]
+    if faulty.used:
+        command += ["--cameras", ",".join(faulty.used)]
     try:
         ran = subprocess.run(command, capture_output=True, text=True, timeout=limit_s)
     except subprocess.TimeoutExpired:
-        return Outcome(None, [], np.zeros(0), np.zeros(0, np.uint8))
+        return Outcome.empty(None, [])
     lines = [line.replace(str(folder) + "/", "") for line in ran.stderr.splitlines()]
     if (crash := "Traceback (most recent call last):") in lines:
         lines = [*lines[: lines.index(crash)], f"crash: {lines[-1]}"]
     messages = [line for line in lines if line and not line.startswith(("frame ", "["))]
     if not result.exists():
-        return Outcome(ran.returncode, messages, np.zeros(0), np.zeros(0, np.uint8))
+        return Outcome.empty(ran.returncode, messages)
     found = read_joints(result)
     assert found.status is not None
+    sigma = np.full(found.positions.shape[:2], np.nan) if found.sigma is None else found.sigma
     if truth is None:
-        return Outcome(ran.returncode, messages, np.zeros(len(found.frames)), found.status)
+        return Outcome(ran.returncode, messages, np.zeros(sigma.shape), found.status, sigma)
     true = read_joints(truth)
     rows = {int(frame): row for row, frame in enumerate(true.frames)}
-    known = np.array([int(frame) in rows for frame in found.frames])
-    expected = true.positions[[rows[int(frame)] for frame in found.frames[known]]]
-    error = np.linalg.norm(found.positions[known] - expected, axis=2).mean(axis=1)
-    return Outcome(ran.returncode, messages, error, found.status[known])
+    frames = np.where(found.frames < faulty.begin, found.frames, found.frames + faulty.cut)
+    known = np.array([int(frame) in rows for frame in frames])
+    expected = true.positions[[rows[int(frame)] for frame in frames[known]]]
+    error = np.linalg.norm(found.positions[known] - expected, axis=2)
+    return Outcome(ran.returncode, messages, error, found.status[known], sigma[known])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -317,6 +457,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", default=",".join(FAULTS), help=f"some of {', '.join(FAULTS)}")
     parser.add_argument("--camera", help="the faulty camera [default: the second]")
     parser.add_argument("--begin", type=int, default=30, help="first frame of the fault")
+    parser.add_argument("--foreign", type=Path, help="another capture with as many cameras [default: one beside it]")
     parser.add_argument("--work", type=Path, help="folder for captures and results [default: temporary]")
     parser.add_argument("--limit", type=float, default=1200.0, help="time limit of a run, seconds")
     given, options = parser.parse_known_args(arguments)
@@ -324,7 +465,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     names = given.only.split(",")
     if unknown := set(names) - set(FAULTS):
         parser.error(f"no such fault: {', '.join(sorted(unknown))}; there are {', '.join(FAULTS)}")
-    print("fault      exit   mean  worst   lost      bad  messages")
+    print(f"{'fault':20} exit   mean  worst   lost     suspect  bad silent alarm  messages")
     with tempfile.TemporaryDirectory() as scratch:
         work = given.work or Path(scratch)
         truth = given.capture / "truth.h5"
@@ -336,9 +477,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             shutil.rmtree(folder, ignore_errors=True)
             result.unlink(missing_ok=True)
             work.mkdir(parents=True, exist_ok=True)
-            make_faulty(name, given.capture, folder, given.camera, given.begin)
+            faulty = make_faulty(name, given.capture, folder, given.camera, given.begin, given.foreign)
             started = time.perf_counter()
-            outcome = run(folder, known, result, options, given.limit)
+            outcome = run(faulty, known, result, options, given.limit)
             print(outcome.row(name), f"[{time.perf_counter() - started:.0f} s]", flush=True)
             if known is None and name == "none":
                 known = result

@@ -1,0 +1,16 @@
+from __future__ import annotations
+
+import numpy as np
+
+from scripts.faults import Outcome
+from tk.io.results.status import Status
+
+
+def test_joint_is_silent_only_without_any_warning() -> None:
+    error, sigma = np.full((4, 15), 0.2), np.full((4, 15), 0.02)
+    sigma[1], sigma[2] = np.nan, 0.06
+    status = np.array([Status.TRACKED, Status.TRACKED, Status.TRACKED, Status.SUSPECT], np.uint8)
+    outcome = Outcome(0, [], error, status, sigma)
+    assert outcome.silent.all(axis=1).tolist() == [True, False, False, False]
+    assert not outcome.alarm.any()
+    assert Outcome(0, [], error / 10, status, sigma).alarm.tolist() == [False, True, False, True]
