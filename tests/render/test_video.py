@@ -10,8 +10,10 @@ import pytest
 from tests.conftest import Tk
 from tk.errors import ExportError
 from tk.io.results.writer import read_result
+from tk.model.body.joints import SEGMENTS
 from tk.render.files import replacing
-from tk.render.scene import Scene
+from tk.render.palette import SEGMENT_COLORS
+from tk.render.scene import HEIGHT, WIDTH, Scene
 from tk.render.video import made_here, video_writer
 
 
@@ -82,8 +84,37 @@ def test_3d_view_turns_and_shows_body_or_hull(tracked: Path) -> None:
     assert 0.01 < differ.mean() < 0.5, "the hull in the place of the body"
     # where the person is in one picture, there is the person in the other
     y, x = np.nonzero(differ)
-    pelvis = body._camera(0.0).project(result.joints[0, 0])[0][0]
+    pelvis = body._camera(0).project(result.joints[0, 0])[0][0]
     assert abs(x.mean() - pelvis[0]) < 60 and abs(y.mean() - pelvis[1]) < 120
+
+
+def test_3d_view_shows_the_nearest_solid_in_each_pixel(tracked: Path) -> None:
+    scene = Scene(read_result(tracked))
+    eye, figure = scene._camera(0), scene.figure
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    scene._draw_body(image, eye, 0, lost=False)
+    own = [eye.to_camera(points) for points in np.split(figure.placed(0), figure.starts[1:-1])]
+    triangles = np.concatenate([points[s.triangles] for s, points in zip(figure.solids, own, strict=True)])
+    owner = np.repeat([s.segment for s in figure.solids], [len(s.triangles) for s in figure.solids])
+    edges = np.stack([triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]], axis=-1)
+    drawn = np.argwhere(image.any(axis=2))
+    checked = 0
+    for y, x in drawn[:: len(drawn) // 60]:
+        nearest = set()
+        for dx, dy in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
+            ray = np.linalg.inv(eye.matrix) @ (x + dx, y + dy, 1.0)
+            system = np.concatenate([edges, np.broadcast_to(-ray[:, None], (len(edges), 3, 1))], axis=-1)
+            crosses = np.abs(np.linalg.det(system)) > 1e-12  # not parallel to the triangle, which has an area
+            solution = np.full((len(edges), 3), -1.0)
+            solution[crosses] = np.linalg.solve(system[crosses], -triangles[crosses, 0, :, None])[..., 0]
+            u, v, depth = solution.T
+            hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (depth > 0)
+            nearest.add(int(owner[hit][np.argmin(depth[hit])]) if hit.any() else -1)
+        if len(nearest) == 1 and -1 not in nearest:  # else the pixel is a mixture
+            color, base = image[y, x].astype(float), np.array(SEGMENT_COLORS[SEGMENTS[nearest.pop()]], float)
+            np.testing.assert_allclose(color, base * (color.sum() / base.sum()), atol=2)
+            checked += 1
+    assert checked > 30
 
 
 def test_render_writes_the_requested_views_and_frames(tracked: Path, tiny: Path, tmp_path: Path, tk: Tk) -> None:

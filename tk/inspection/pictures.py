@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -15,14 +16,15 @@ from tk.inspection.checks import Inspection, Sample
 from tk.io.captures.capture import Capture
 from tk.model.cameras.camera import Camera
 from tk.model.cameras.up import up_vector
+from tk.render.canvas import text_width, write
 from tk.render.overlay import joined
 
 Image = NDArray[np.uint8]
 Float = NDArray[np.float64]
 
-#: layout, pixels: height of a tile, height of a line of text
-_TILE, _LINE = 300, 20
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
+#: layout, pixels: height of a tile, height of a line of text, width of a column of a terminal
+_TILE, _LINE, _COLUMN = 300, 20, 9
+_SIZE = 0.45  # of the letters
 _PAPER, _INK, _BAD = (255, 255, 255), (40, 40, 40), (40, 40, 200)
 #: BGR
 _MASK, _HULL, _OUTSIDE, _BOX, _UP = (80, 220, 80), (230, 120, 230), (40, 40, 255), (230, 190, 90), (60, 190, 250)
@@ -57,34 +59,39 @@ def write_sheet(path: Path, capture: Capture, inspection: Inspection, samples: S
 def _text(inspection: Inspection, width: int) -> Image:
     lines = [(line, _INK) for line in inspection.format_table().split("\n")[: -max(len(inspection.findings), 1)]]
     lines += [(line, _BAD) for line in inspection.findings] or [("No problems found.", (60, 140, 60))]
-    wrapped = [(part, color) for line, color in lines for part in _wrapped(line, (width - 20) // 8)]
+    wrapped = [(part, color) for line, color in lines for part in _wrapped(line, width - 20)]
     image = np.full(((len(wrapped) + 2) * _LINE, width, 3), 255, np.uint8)
     for i, (line, color) in enumerate(wrapped):
         _columns(image, line, (i + 1) * _LINE, color)
-    x = 10
+    x, y = 10, (len(wrapped) + 1) * _LINE
     for name, color in _LEGEND:
-        y = (len(wrapped) + 1) * _LINE
         cv2.line(image, (x, y - 5), (x + 24, y - 5), color, 3, cv2.LINE_AA)
-        cv2.putText(image, name, (x + 30, y), _FONT, 0.45, _INK, 1, cv2.LINE_AA)
-        x += 50 + 9 * len(name)
+        x = write(image, name, x + 30, y, _INK, _SIZE) + 20
     return image
 
 
 def _wrapped(line: str, most: int) -> list[str]:
+    """Return a line of the table as it is; other lines in parts of at most ``most`` pixels.
+
+    OpenCV's letters are ASCII.
+    """
+    for sign, ascii in (("—", "-"), ("°", " deg"), ("±", "+/-")):
+        line = line.replace(sign, ascii)
     parts = [""]
-    for word in line.replace("—", "-").split(" "):
-        if len(parts[-1]) + len(word) >= most:
+    for word in line.split(" "):
+        if "  " not in line and text_width(parts[-1] + word, _SIZE) >= most:
             parts.append("  ")
         parts[-1] += word + " "
     return [part.rstrip() for part in parts]
 
 
 def _columns(image: Image, line: str, y: int, color: tuple[int, int, int]) -> None:
-    """Write a line in columns of equal width, as on a terminal: OpenCV's letters differ in width."""
-    for i, character in enumerate(line):
-        if character != " ":
-            shown = {"°": "o", "±": "+"}.get(character, character)
-            cv2.putText(image, shown, (10 + 8 * i, y), _FONT, 0.45, color, 1, cv2.LINE_AA)
+    """Write a line; cells, which two spaces or more separate, end in the same column as on a terminal."""
+    cells = list(re.finditer(r"\S+(?: \S+)*", line))
+    for cell in cells:
+        first = cell is cells[0]
+        left = 10 if first else 10 + _COLUMN * cell.end() - text_width(cell[0], _SIZE)
+        write(image, cell[0], left, y, color, _SIZE)
 
 
 def _tile(capture: Capture, inspection: Inspection, frame: Sample, c: int) -> Image:
@@ -115,9 +122,8 @@ def _tile(capture: Capture, inspection: Inspection, frame: Sample, c: int) -> Im
     tile = cv2.resize(picture, (round(camera.width * scale), _TILE), interpolation=cv2.INTER_AREA)
     report = inspection.cameras[c]
     name = f"{camera.name}  frame {frame.index}"
-    (width, _), _ = cv2.getTextSize(name, _FONT, 0.5, 1)
-    cv2.rectangle(tile, (0, 0), (width + 14, 24), _INK, cv2.FILLED)
-    cv2.putText(tile, name, (7, 17), _FONT, 0.5, _PAPER, 1, cv2.LINE_AA)
+    cv2.rectangle(tile, (0, 0), (text_width(name, 0.5) + 14, 24), _INK, cv2.FILLED)
+    write(tile, name, 7, 17, _PAPER, 0.5)
     if report.verdict:
         cv2.rectangle(tile, (0, 0), (tile.shape[1] - 1, _TILE - 1), _BAD, 4)
     return np.asarray(tile, np.uint8)

@@ -45,22 +45,19 @@ class Solid:
         return Solid(self.segment, (1 - share) * self.rings[0] + share * self.rings[1])
 
     @cached_property
-    def faces(self) -> NDArray[np.int64]:
-        """(N, 4) corners of the faces, indices into the points of all circles; both ends are closed.
-
-        The normal of a face, the cross product of its diagonals, points outwards.
-        """
-        R = len(self.rings)
-        index = np.arange(R * AROUND).reshape(R, AROUND)
+    def mantle(self) -> NDArray[np.int64]:
+        """(M, 3) triangles between the circles, indices into the points of all circles; normals point outwards."""
+        index = np.arange(len(self.rings) * AROUND).reshape(-1, AROUND)
         following = np.roll(index, -1, axis=1)
-        side = np.stack([index[:-1], following[:-1], following[1:], index[1:]], axis=-1).reshape(-1, 4)
-        fan = np.array([[0, k, k + 1, k + 2] for k in range(1, AROUND - 2, 2)])
-        return np.concatenate([side, index[0][fan[:, ::-1]], index[-1][fan]])
+        a, b, c, d = (part.ravel() for part in (index[:-1], following[:-1], following[1:], index[1:]))
+        return np.concatenate([np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)])
 
     @cached_property
     def triangles(self) -> NDArray[np.int64]:
-        """(M, 3) the faces split into triangles, with normals outwards."""
-        return np.concatenate([self.faces[:, [0, 1, 2]], self.faces[:, [0, 2, 3]]])
+        """(M, 3) :attr:`mantle` and both flat ends."""
+        fan = np.array([[0, k, k + 1] for k in range(1, AROUND - 1)])
+        last = (len(self.rings) - 1) * AROUND
+        return np.concatenate([self.mantle, fan[:, ::-1], last + fan])
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 
 from tk.errors import ResultError
 from tk.io.results.writer import Result
@@ -29,6 +30,8 @@ _TURN_S = 16.0  # duration of a whole turn
 _SQUARE_M, _SQUARES = 0.5, 6  # side of the floor's squares, and their number on each side of the middle
 _PYRAMID_M = 0.25  # height of a camera's pyramid
 _NEAREST_M = 0.05  # near clipping plane
+_FOLLOW_S = 0.5  # standard deviation of the smoothing of the point that the camera follows
+_MARGIN_M = 0.15  # from the joints to the outline of hands, feet and head
 
 #: lines between the points of :func:`camera_pyramid`
 PYRAMID_EDGES = [edge for k in range(1, 5) for edge in ((0, k), (k, k % 4 + 1))]  # apex 0, corners 1 to 4
@@ -114,15 +117,12 @@ class Scene:
         if hull and result.hull is None:
             raise ResultError(f"{result.path}: holds no hull; track with --method volumetric --store-hull")
         self.result, self.hull = result, result.hull if hull else None
-        figure = figure_of(result)
-        self.figure = replace(figure, solids=tuple(solid.divided for solid in figure.solids), _placed={})
+        self.figure = figure_of(result)
         self._legend = Legend(result, self.figure, WIDTH)
         self.stage = Stage.of(result, self.figure)
         self.rig = rig or (result.cameras.rig if result.cameras else None)
-        away = [] if self.rig is None else np.linalg.norm(self.rig.centers - self.stage.middle, axis=1)
-        fitting = self.stage.radius / np.sin(np.radians(_FIELD_OF_VIEW_DEG / 2))
-        # beyond the recording's cameras, so that they are visible; but near enough to show the person large
-        self._distance = float(np.clip(1.15 * np.median(away), fitting, 2.2 * fitting)) if len(away) else fitting
+        self._middles, reach = _followed(self.figure, result.meta.fps)
+        self._distance = reach / np.sin(np.radians(_FIELD_OF_VIEW_DEG / 2))
 
     def rows(self, frames: Sequence[int] = ()) -> list[int]:
         """Return the rows of these frames; all rows by default.
@@ -134,11 +134,13 @@ class Scene:
         return np.flatnonzero(np.isin(self.result.frames, wanted)).tolist()
 
     def picture(self, row: int) -> Image:
-        """Return an image (HEIGHT + LEGEND_HEIGHT, WIDTH, 3). The camera turns once in 16 s of the recording."""
+        """Return an image (HEIGHT + LEGEND_HEIGHT, WIDTH, 3).
+
+        The camera follows the person and turns once in 16 s of the recording.
+        """
         canvas = np.full((HEIGHT + LEGEND_HEIGHT, WIDTH, 3), BACKGROUND, np.uint8)
         tile = canvas[:HEIGHT]
-        turn = 2 * np.pi * (self.result.time[row] - self.result.time[0]) / _TURN_S
-        eye = self._camera(float(turn))
+        eye = self._camera(row)
         self._draw_floor(tile, eye)
         self._draw_cameras(tile, eye)
         lost = self.figure.lost(row)
@@ -154,8 +156,9 @@ class Scene:
         self._legend.draw(canvas[HEIGHT:], row)
         return canvas
 
-    def _camera(self, turn: float) -> Camera:
-        """Return the camera at this angle about the vertical, radians; it looks at the middle."""
+    def _camera(self, row: int) -> Camera:
+        """Return the camera, which turns about the vertical with time and looks at the middle of the person."""
+        turn = 2 * np.pi * (self.result.time[row] - self.result.time[0]) / _TURN_S
         up = self.stage.axes[:, 2]
         elevation = np.radians(ELEVATION_DEG)
         level = self.stage.axes @ np.array([np.cos(turn), np.sin(turn), 0.0])
@@ -163,7 +166,7 @@ class Scene:
         right = np.cross(forward, up)
         right /= np.linalg.norm(right)
         R = np.stack([right, np.cross(forward, right), forward])
-        center = self.stage.middle - self._distance * forward
+        center = self._middles[row] - self._distance * forward
         focal = 0.5 * HEIGHT / np.tan(np.radians(_FIELD_OF_VIEW_DEG / 2))
         matrix = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
         return Camera("view", WIDTH, HEIGHT, matrix, np.zeros(5), R, -R @ center)
@@ -175,6 +178,8 @@ class Scene:
     def _draw_cameras(self, tile: Image, eye: Camera) -> None:
         for camera in self.rig or ():
             points = camera_pyramid(camera)
+            if (eye.to_camera(points)[:, 2] < self._distance / 2).any():
+                continue  # so near to the eye that it would hide the person
             for a, b in PYRAMID_EDGES:
                 _line(tile, eye, points[a], points[b], WIRE)
             xy, depth = eye.project(camera.center)
@@ -182,30 +187,52 @@ class Scene:
                 write(tile, camera.name, int(xy[0, 0]) + 8, int(xy[0, 1]) - 8, WIRE)
 
     def _draw_body(self, tile: Image, eye: Camera, row: int, lost: bool) -> None:
-        """Draw the faces of the solids, far ones first, lit from the viewer."""
+        """Draw the body, lit from the viewer: each pixel is the mean of rays through its quarters."""
         if not self.figure.solids or not np.isfinite(self.figure.transforms[row]).all():
             return
-        polygons, depths, colors = [], [], []
-        seen = np.split(eye.to_camera(self.figure.placed(row)), self.figure.starts[1:-1])
-        for solid, points in zip(self.figure.solids, seen, strict=True):
-            corners = points[solid.faces]  # (N, 4, 3)
-            if (corners[..., 2] < _NEAREST_M).any():
-                continue
-            normal = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-            center = corners.mean(axis=1)
-            length = np.linalg.norm(normal, axis=1) * np.linalg.norm(center, axis=1)
-            facing = -(normal * center).sum(axis=1) / np.maximum(length, 1e-12)
-            shown = facing > 0
-            base = np.array(LOST_BODY if lost else SEGMENT_COLORS[SEGMENTS[solid.segment]])
-            polygons.append(corners[shown] @ eye.matrix.T)
-            depths.append(center[shown, 2])
-            colors.append(base * (0.35 + 0.65 * facing[shown, None]))
-        if not polygons:
+        points = self.figure.placed(row)
+        xy, depth = eye.project(points)
+        low = np.clip(np.floor(np.nanmin(xy, axis=0)), 0, (WIDTH, HEIGHT)).astype(int)
+        high = np.clip(np.ceil(np.nanmax(xy, axis=0)) + 1, 0, (WIDTH, HEIGHT)).astype(int)
+        if (depth < _NEAREST_M).any() or (low >= high).any():
             return
-        homogeneous, shades = np.concatenate(polygons), np.concatenate(colors).round().astype(int)
-        corners2 = fixed(homogeneous[..., :2] / homogeneous[..., 2:])
-        for k in np.argsort(-np.concatenate(depths)):
-            cv2.fillConvexPoly(tile, corners2[k], shades[k].tolist(), cv2.LINE_8, SUBPIXEL_BITS)
+        from open3d.core import Tensor
+        from open3d.t.geometry import RaycastingScene
+
+        tensor, scene = Tensor.from_numpy, RaycastingScene()
+        for solid, own in zip(self.figure.solids, np.split(points, self.figure.starts[1:-1]), strict=True):
+            scene.add_triangles(tensor(own.astype(np.float32)), tensor(solid.triangles.astype(np.uint32)))
+        columns, rows = (np.arange(2 * a, 2 * b) / 2 - 0.25 for a, b in zip(low, high, strict=True))
+        pixels = np.stack([*np.meshgrid(columns, rows), np.ones((len(rows), len(columns)))], axis=-1)
+        rays = pixels @ np.linalg.inv(eye.matrix).T @ eye.rotation
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        cast = np.concatenate([np.broadcast_to(eye.center, rays.shape), rays], axis=-1)
+        hit = scene.cast_rays(tensor(cast.astype(np.float32)))
+        facing = np.abs((hit["primitive_normals"].numpy() * rays).sum(axis=-1))
+        solids = hit["geometry_ids"].numpy().astype(np.int64)
+        seen = solids < len(self.figure.solids)
+        base = np.array([LOST_BODY if lost else SEGMENT_COLORS[SEGMENTS[s.segment]] for s in self.figure.solids])
+        part = tile[low[1] : high[1], low[0] : high[0]]
+        drawn = np.repeat(np.repeat(part, 2, axis=0), 2, axis=1).astype(np.float64)
+        drawn[seen] = base[solids[seen]] * (0.35 + 0.65 * facing[seen, None])
+        part[...] = drawn.reshape(len(part), 2, -1, 2, 3).mean(axis=(1, 3)).round()
+
+
+def _followed(figure: Figure, fps: float) -> tuple[Float, float]:
+    """Return the point (F, 3) that the camera looks at in each frame, and the radius of a ball around it, metres.
+
+    The point is the middle of the joints, smoothed over time. The ball contains the person in every frame.
+    """
+    joints = figure.joints
+    known = np.isfinite(joints).all(axis=(1, 2))
+    if not known.any():
+        return np.zeros((len(joints), 3)), 1.0
+    frames = np.arange(len(joints))
+    middles = (joints[known].min(axis=1) + joints[known].max(axis=1)) / 2
+    filled = np.stack([np.interp(frames, frames[known], axis) for axis in middles.T], axis=1)
+    smooth = gaussian_filter1d(filled, _FOLLOW_S * fps, axis=0, mode="nearest")
+    reach = np.linalg.norm(joints[known] - smooth[known, None], axis=-1).max()
+    return smooth, float(reach) + _MARGIN_M
 
 
 def _line(tile: Image, eye: Camera, a: Float, b: Float, color: tuple[int, int, int]) -> None:

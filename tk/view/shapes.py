@@ -24,7 +24,8 @@ _PLAIN_JOINT = (0.96, 0.94, 0.65)
 def body_mesh(figure: Figure, row: int) -> Any:
     """Return the body in a frame in the colours of its segments, grey if lost; empty without a body.
 
-    The faces are turned inwards, so that only the far side is drawn, and joints and bones inside stay visible.
+    The faces are turned inwards, so that only the far side is drawn, and joints and bones inside stay visible. The flat
+    ends of the solids are left out: they would hide what is behind them.
     """
     import open3d as o3d
 
@@ -35,7 +36,7 @@ def body_mesh(figure: Figure, row: int) -> Any:
     bgr = [LOST_BODY if lost else SEGMENT_COLORS[SEGMENTS[solid.segment]] for solid in figure.solids]
     counts = [solid.rings.shape[0] * solid.rings.shape[1] for solid in figure.solids]
     starts = np.cumsum([0, *counts[:-1]])
-    faces = np.concatenate([solid.triangles + start for solid, start in zip(figure.solids, starts, strict=True)])
+    faces = np.concatenate([solid.mantle + start for solid, start in zip(figure.solids, starts, strict=True)])
     mesh.vertices = o3d.utility.Vector3dVector(figure.placed(row))
     mesh.triangles = o3d.utility.Vector3iVector(faces[:, ::-1].astype(np.int32))
     mesh.vertex_colors = o3d.utility.Vector3dVector(np.repeat(np.array(bgr)[:, ::-1] / 255, counts, axis=0))
