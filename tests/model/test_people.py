@@ -1,0 +1,142 @@
+"""People in frame sets: bodies drawn into the views of a ring of cameras."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.model.ring import ring_of_cameras
+from tk.model.body import gait_poses as gait
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.cone_body import build_cone_body
+from tk.model.cameras.camera import Rig
+from tk.model.cameras.volume import Volume
+from tk.model.masks.silhouettes import draw_silhouettes
+from tk.model.people import LocatedPerson, PeopleFinder, order_people, person_pixels
+
+RIG = ring_of_cameras(5, 240, 240)
+VOLUME = Volume((0.0, 0.0, 1.0), (2.4, 2.4, 2.2))
+FINDER = PeopleFinder(RIG, VOLUME, "z")
+TALL, SHORT = 1.85, 1.60
+
+
+def drawn(places: list[tuple[float, float]], statures: list[float] | None = None, rig: Rig = RIG) -> np.ndarray:
+    """Return (P, C, H, W) bool, the silhouette of each walker, as if nobody hid another."""
+    alone = []
+    for k, (x, y) in enumerate(places):
+        stature = statures[k] if statures else 1.75
+        body = build_cone_body(BodyDimensions.from_stature(stature), "z", "full")
+        pose = gait.walking_pose(body.skeleton, 0.3 * k)
+        pose[:3] = x, y, 0.54 * stature
+        alone.append(draw_silhouettes(body, rig, pose[None])[0] > 0)
+    return np.array(alone)
+
+
+def nearest(found: tuple[LocatedPerson, ...], places: list[tuple[float, float]]) -> list[float]:
+    """Return the distance on the floor from each place to the nearest person, metres."""
+    return [min(float(np.linalg.norm(person.position[:2] - place)) for person in found) for place in places]
+
+
+@pytest.mark.parametrize(
+    "places",
+    [
+        [(0.1, 0.2)],
+        [(-0.6, 0.0), (0.6, 0.1)],
+        [(-0.3, 0.0), (0.3, 0.0)],
+        [(-0.7, -0.7), (0.7, -0.6), (0.0, 0.8)],
+        [(-0.8, -0.8), (0.8, 0.8), (-0.8, 0.8), (0.8, -0.8)],
+    ],
+)
+def test_people_are_counted_and_located(places: list[tuple[float, float]]) -> None:
+    """Ghosts, which silhouettes of three or four people leave between them, are not counted."""
+    found = FINDER.find(drawn(places).any(axis=0))
+    assert len(found) == len(places)
+    assert max(nearest(found, places)) < 0.15
+    assert all(person.inside and person.views.all() for person in found)
+    assert all(1.5 < person.height_m < 2.0 and 0.04 < person.volume_m3 < 0.25 for person in found)
+
+
+def test_nobody_is_found_in_empty_masks_and_specks() -> None:
+    masks = np.zeros((5, 240, 240), np.uint8)
+    assert FINDER.find(masks) == ()
+    masks[:, 118:124, 118:124] = 255
+    assert FINDER.find(masks) == ()
+
+
+def test_operator_at_the_edge_of_some_images_is_found_outside_the_volume() -> None:
+    places = [(0.0, 0.0), (1.9, 1.2)]
+    found = order_people(FINDER.find(drawn(places).any(axis=0)), VOLUME)
+    assert [person.inside for person in found] == [True, False]
+    assert found[1].views[[2, 3]].all() and not found[1].views[[1, 4]].any()
+    assert nearest(found[1:], places[1:])[0] < 0.3
+
+
+def test_person_behind_furniture_in_two_views_is_found() -> None:
+    places = [(-0.6, 0.0), (0.6, 0.1)]
+    alone = drawn(places)
+    alone[1, [0, 3]] = False
+    found = FINDER.find(alone.any(axis=0))
+    assert len(found) == 2 and max(nearest(found, places)) < 0.2
+    right = max(found, key=lambda person: person.position[0])
+    assert right.views[[1, 2, 4]].all() and not right.views[[0, 3]].all()
+
+
+def test_empty_mask_of_one_camera_hides_nobody() -> None:
+    places = [(-0.6, 0.0), (0.6, 0.1)]
+    masks = drawn(places).any(axis=0)
+    masks[2] = False
+    found = FINDER.find(masks)
+    assert len(found) == 2 and max(nearest(found, places)) < 0.2
+    assert all(person.views.tolist() == [True, True, False, True, True] for person in found)
+
+
+def test_gap_in_one_mask_leaves_the_person_whole() -> None:
+    masks = drawn([(0.0, 0.0)]).any(axis=0)
+    masks[1, 140:] = False  # no legs
+    (person,) = FINDER.find(masks)
+    assert person.height_m > 1.6
+
+
+def test_embraced_people_are_split_by_their_last_positions() -> None:
+    places = [(-0.12, 0.0), (0.12, 0.05)]
+    masks = drawn(places).any(axis=0)
+    last = np.array([[-0.3, 0.0, 0.9], [0.3, 0.0, 0.9]])
+    found = FINDER.find(masks, near=last)
+    assert len(found) == 2
+    left, right = sorted(found, key=lambda person: person.position[0])
+    assert left.position[0] < 0 < right.position[0]
+
+
+def test_pixels_go_to_the_person_in_front() -> None:
+    places = [(-0.6, 0.0), (0.6, 0.1)]
+    alone = drawn(places)
+    masks = alone.any(axis=0)
+    found = sorted(FINDER.find(masks), key=lambda person: person.position[0])
+    pixels = person_pixels(found, RIG, masks)
+    assert pixels.shape == (2, *masks.shape)
+    assert not (pixels[0] & pixels[1]).any()
+    assert (pixels.any(axis=0) & ~masks).sum() == 0
+    for k in range(2):
+        only = alone[k] & ~alone[1 - k]
+        assert (pixels[k] & only).sum() > 0.9 * only.sum()
+    for c, camera in enumerate(RIG):
+        both = alone[0, c] & alone[1, c]
+        if both.sum() > 100:
+            depth = [camera.to_camera(np.array([[x, y, 0.9]]))[0, 2] for x, y in places]
+            assert pixels[int(np.argmin(depth)), c][both].mean() > 0.8
+
+
+def test_numbers_follow_height_then_views_then_distance_to_the_centre() -> None:
+    places = [(-0.7, 0.0), (0.5, 0.1)]
+    found = FINDER.find(drawn(places, [TALL, SHORT]).any(axis=0))
+
+    def first(**known: object) -> float:
+        return float(order_people(found, VOLUME, **known)[0].position[0])  # type: ignore[arg-type]
+
+    assert first() > 0  # nearer to the centre
+    assert first(height_m=TALL) < 0 and first(height_m=SHORT) > 0
+    assert first(position=np.array([-0.6, 0.0, 0.9])) < 0
+    fewer = [replace(p, views=p.views & (np.arange(5) > 0)) if p.position[0] > 0 else p for p in found]
+    assert order_people(fewer, VOLUME)[0].position[0] < 0

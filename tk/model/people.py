@@ -1,0 +1,362 @@
+"""Find all people in a frame set: components of a coarse visual hull that together explain the masks.
+
+Candidates are the connected components of the hull of all masks. Where they leave much of some masks unexplained, the
+components of these masks' hull are candidates, too: furniture may hide a person in the other cameras. A component with
+several upright columns is split into people. Where silhouettes of different people meet, the hull also contains
+ghosts: places where nobody is, although every mask shows somebody there. The people are the smallest set of candidates
+that explains the masks: the description length of pixels by people, minimised over all subsets. A ghost explains no
+pixel that a person does not.
+
+Sources: hull, Laurentini (1994); ghosts and their removal by occupancy and reprojection, Guan, Franco and Pollefeys,
+"Multi-view occlusion reasoning" (2008); choice of a set by description length, Rissanen (1978).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from tk.model.body.plausibility import EXTENT, STATURE_M
+from tk.model.body.skeleton import up_rotation
+from tk.model.cameras.camera import Camera, Rig
+from tk.model.cameras.volume import Volume, VoxelGrid
+from tk.model.hull.coarse import Voxels, dilated
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+# Edge of a voxel, metres: a trunk is 0.2 m deep, and a forearm of 0.08 m does not connect two people who shake hands.
+_VOXEL_M = 0.06
+# Rows of the images that are used, approximately: a voxel has then about two pixels at 4 m.
+_ROWS = 240
+# How far outside the working volume people are looked for, metres, where two cameras see: operators stand about there.
+_BEYOND_M = 2.0
+# Volume of a person's hull, litres: a child of six weighs 20 kg (WHO growth reference), and a part of it may be hidden;
+# a man of 125 kg, whose hull may be twice as large. Smaller components than a head (4 litres) are ignored.
+_LITRES, _SPECK_LITRES = (10.0, 250.0), 4.0
+# A column of the floor plan is part of a trunk if so many metres of it are in the hull: an arm has 0.1 m, the trunk of
+# a crouching adult 0.6 m.
+_TRUNK_M = 0.5
+# Trunks of two people are at least so far apart, metres: the depth of a chest (0.25 m) and an error of a voxel.
+_APART_M = 0.3
+# Standard deviation of the smoothed floor plan, metres: half of a trunk's depth.
+_SMOOTH_M = 0.1
+# Two columns are two people if the floor plan between them falls to this share of the lower one.
+_SADDLE = 0.7
+# A person costs as much as this area of unexplained pixels, sum over the views, m²: half the silhouette of an adult in
+# one view. A ghost explains less than 0.1, a person half hidden in four views explains 1.
+_LEAST_AREA_M2 = 0.3
+# Weight of pixels that a candidate covers beside the masks: furniture may hide a person in several cameras, and the
+# candidate's silhouette is up to twice as large as the person's.
+_CONTRADICTED = 0.25
+# Area that the people leave unexplained in a camera before others are looked for, m²: a quarter of a person.
+_LEFT_M2 = 0.15
+# The heights of two people are told apart in steps of this, metres: hair, shoes and half a voxel at both ends.
+_HEIGHT_STEP_M = 0.1
+# Most candidates that are compared, by volume: all 2^12 subsets take 10 ms.
+_MOST = 12
+
+
+@dataclass(frozen=True)
+class LocatedPerson:
+    """A person in one frame set.
+
+    Attributes:
+        position: (3,) m, world: centre of the trunk's column, half-way between floor and crown.
+        height_m: extent along up. It is too large with raised arms, and too small for somebody who bends.
+        volume_m3: volume of the hull; larger than the person's, by up to two with four cameras.
+        points: (N, 3) m, centres of the voxels.
+        voxel_m: edge of a voxel, metres.
+        views: (C,) bool, cameras whose masks show the person.
+        share: (C,) share of the person's silhouette that the mask covers; NaN for cameras that see nothing of it.
+        inside: whether the position is in the working volume.
+        merged: whether the hull is wide enough for two people, but cannot be split.
+    """
+
+    position: Float
+    height_m: float
+    volume_m3: float
+    points: Float
+    voxel_m: float
+    views: Bool
+    share: Float
+    inside: bool
+    merged: bool = False
+
+
+def locate_people(
+    rig: Rig, volume: Volume, up: str, masks: NDArray, uncertain: Bool | None = None, near: Float | None = None
+) -> tuple[LocatedPerson, ...]:
+    """Return the people in one frame set, see :meth:`PeopleFinder.find`."""
+    return PeopleFinder(rig, volume, up).find(masks, uncertain, near)
+
+
+def order_people(
+    people: Sequence[LocatedPerson], volume: Volume, height_m: float | None = None, position: Float | None = None
+) -> tuple[LocatedPerson, ...]:
+    """Return the people in the order of their numbers; number 0 is tracked by default.
+
+    People in the working volume come first. Among them the order is: nearest to ``position`` if it is given; then
+    closest to ``height_m``, in steps of 10 cm, if it is given; then seen by most cameras; then nearest to the volume's
+    centre.
+
+    Args:
+        people: the people in the first frame.
+        volume: the working volume.
+        height_m: the subject's height, metres.
+        position: (3,) m, the subject's rough position, world.
+    """
+
+    def rank(person: LocatedPerson) -> tuple[float, ...]:
+        away = 0.0 if position is None else float(np.linalg.norm(person.position - position))
+        misfit = 0 if height_m is None else round(abs(person.height_m - height_m) / _HEIGHT_STEP_M)
+        off = float(np.linalg.norm(person.position - np.asarray(volume.center)))
+        return not person.inside, away, misfit, -int(person.views.sum()), off
+
+    return tuple(sorted(people, key=rank))
+
+
+def person_pixels(people: Sequence[LocatedPerson], rig: Rig, masks: NDArray) -> Bool:
+    """Return (P, C, H, W) the pixels of masks (C, H, W) that show each person.
+
+    A pixel that several people cover belongs to the nearest of them. A pixel that nobody covers, such as one of a thin
+    limb, belongs to the person with the nearest pixel in its connected part of the mask. Parts of the mask without
+    people belong to nobody.
+    """
+    pixels = np.zeros((len(people), *masks.shape), np.bool_)
+    if not people:
+        return pixels
+    for c, camera in enumerate(rig):
+        mask = np.asarray(masks[c] > 0)
+        depths = np.stack([_depth(person, camera, mask.shape) for person in people])
+        owner = np.where(np.isfinite(depths).any(axis=0) & mask, depths.argmin(axis=0), -1)
+        _, regions = cv2.connectedComponents(mask.astype(np.uint8))
+        for region in np.unique(regions[mask & (owner < 0)]):
+            within = regions == region
+            known = within & (owner >= 0)
+            if known.any():
+                nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+                owner[within] = owner[tuple(nearest)][within]
+        for k in range(len(people)):
+            pixels[k, c] = owner == k
+    return pixels
+
+
+def _depth(person: LocatedPerson, camera: Camera, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return the depth (h, w) of a person's voxels in a camera, metres; infinite beside them."""
+    depth = np.full(shape, np.inf, np.float32)
+    pixels, distance = camera.project(person.points)
+    seen = camera.sees(person.points)
+    if seen.any():
+        x, y = np.rint(pixels[seen]).astype(np.int64).T
+        np.minimum.at(depth, (y, x), distance[seen].astype(np.float32))
+        size = int(np.ceil(person.voxel_m * camera.matrix[0, 0] / float(np.median(distance[seen])))) | 1
+        depth = np.asarray(cv2.erode(depth, np.ones((size + 2, size + 2), np.uint8)), np.float32)
+    return depth
+
+
+class PeopleFinder:
+    """Finds the people in frame sets of one rig.
+
+    Args:
+        rig: C cameras.
+        volume: the working volume. People are also found around it, where at least two cameras see.
+        up: axis that points up.
+    """
+
+    def __init__(self, rig: Rig, volume: Volume, up: str) -> None:
+        self._rig, self._volume = rig, volume
+        self._to_plan = up_rotation(up).T  # rows: two directions on the floor, and up
+        self._step = max(1, round(rig.frame_shape[0] / _ROWS))
+        around = _around(volume, self._to_plan[2])
+        self._grid = VoxelGrid.cover(around, round(max(around.size) / _VOXEL_M))
+        whole = Voxels.of(rig, self._grid.centers(), self._grid.voxel_m, self._step)
+        self._flat = np.flatnonzero(whole.sees.sum(axis=0) >= 2)
+        sees, pixels = whole.sees[:, self._flat], whole.pixels[:, self._flat]
+        self._voxels = replace(whole, centers=whole.centers[self._flat], sees=sees, pixels=pixels)
+        middle = np.asarray(volume.center)
+        focal = np.array([c.matrix[0, 0] * c.matrix[1, 1] for c in rig])
+        # area of a pixel at the middle of the volume, m²
+        self._pixel_m2 = (np.linalg.norm(rig.centers - middle, axis=1) * self._step) ** 2 / focal
+
+    def find(
+        self, masks: NDArray, uncertain: Bool | None = None, near: Float | None = None
+    ) -> tuple[LocatedPerson, ...]:
+        """Return the people, those in the working volume first, then by volume of their hull, the largest first.
+
+        Args:
+            masks: (C, H, W), other than 0 where people are.
+            uncertain: (C, H, W) bool, pixels that may show a person although their mask is 0.
+            near: (P, 3) m, positions of people in the last frame. A component that holds several of them is split.
+        """
+        small, inside = self._reduced(masks)
+        allowed = inside if uncertain is None else inside | self._reduced(uncertain)[1]
+        known = [c for c in range(len(self._rig)) if small[c].any()]
+        parts = self._components(inside, allowed, known, near)
+        chosen = self._explaining([self._person(part, inside) for part in parts], small)
+        left = small & ~self._covered(chosen)
+        missed = [c for c in known if left[c].sum() * self._pixel_m2[c] > _LEFT_M2]
+        if 2 <= len(missed) < len(known):
+            # only these cameras show somebody: he or she is hidden in the others, or their masks have a gap
+            parts += self._components(inside, allowed, missed, near)
+            chosen = self._explaining([self._person(part, inside) for part in parts], small)
+        return tuple(sorted(chosen, key=lambda person: (not person.inside, -person.volume_m3)))
+
+    def _reduced(self, masks: NDArray) -> tuple[Bool, Bool]:
+        """Return masks in reduced images (C, h, w), and the voxels (C, N) whose centre each camera sees in its mask."""
+        offset = self._step // 2
+        small = np.asarray(masks[:, offset :: self._step, offset :: self._step] > 0)
+        return small, self._voxels.inside(small) & self._voxels.sees
+
+    def _components(
+        self, inside: Bool, allowed: Bool, cameras: Sequence[int], near: Float | None
+    ) -> list[NDArray[np.int64]]:
+        """Return the voxels of each component of the cameras' hull that may be a person; wide components are split.
+
+        Args:
+            inside, allowed: (C, N) whether the mask, or the mask with its uncertain pixels, shows a voxel.
+            cameras: the cameras of the hull; each of its voxels is in two masks or more.
+            near: see :meth:`find`.
+        """
+        hull = (allowed[cameras] | ~self._voxels.sees[cameras]).all(axis=0) & (inside[cameras].sum(axis=0) >= 2)
+        dense = np.zeros(self._grid.count, np.bool_)
+        dense[self._flat[hull]] = True
+        labels, count = ndimage.label(dense.reshape(self._grid.shape))  # by faces
+        label = labels.reshape(-1)[self._flat]
+        order = np.argsort(label, kind="stable")
+        sizes = np.bincount(label, minlength=count + 1)
+        wholes: list[NDArray[np.int64]] = []
+        for whole in np.split(order, np.cumsum(sizes)[:-1])[1:]:
+            if len(whole) * self._litres >= _SPECK_LITRES:
+                middle = self._trunk(whole)
+                # a gap in the masks cuts a person in two; nobody stands above somebody else
+                above = [k for k, other in enumerate(wholes) if np.linalg.norm(self._trunk(other) - middle) < _APART_M]
+                for k in reversed(above):
+                    whole = np.concatenate([wholes.pop(k), whole])
+                wholes.append(whole)
+        return [part for whole in wholes for part in self._split(whole, near) if self._plausible(part)]
+
+    @property
+    def _litres(self) -> float:
+        return 1000 * self._grid.voxel_m**3
+
+    def _plausible(self, part: NDArray[np.int64]) -> bool:
+        """Return whether voxels have a person's volume and extent, lying or standing."""
+        extent = float(np.ptp(self._voxels.centers[part] @ self._to_plan.T, axis=0).max()) + self._grid.voxel_m
+        litres = len(part) * self._litres
+        return _LITRES[0] <= litres <= _LITRES[1] and EXTENT[0] * STATURE_M[0] <= extent <= EXTENT[1] * STATURE_M[1]
+
+    def _plan(self, part: NDArray[np.int64]) -> tuple[Float, NDArray[np.int64], Float]:
+        """Return the floor plan of voxels: metres of hull by cell, the cell (M, 2) of each voxel, and the first cell.
+
+        Cells have the voxels' edge.
+        """
+        across = self._voxels.centers[part] @ self._to_plan[:2].T
+        low = across.min(axis=0) - 3 * self._grid.voxel_m
+        cell = np.rint((across - low) / self._grid.voxel_m).astype(np.int64)
+        plan = np.zeros(cell.max(axis=0) + 4)
+        np.add.at(plan, tuple(cell.T), self._grid.voxel_m)
+        return plan, cell, low
+
+    def _split(self, part: NDArray[np.int64], near: Float | None) -> list[NDArray[np.int64]]:
+        """Return the voxels of each person in a component: each belongs to the nearest upright column.
+
+        Columns are at the positions ``near`` that the component holds, if there are two or more, else at the maxima of
+        the floor plan.
+        """
+        plan, cell, low = self._plan(part)
+        seeds = self._maxima(plan)
+        if near is not None and len(near):
+            at = np.rint((near @ self._to_plan[:2].T - low) / self._grid.voxel_m).astype(np.int64)
+            held = [np.linalg.norm(cell - place, axis=1).min() * self._grid.voxel_m < _APART_M for place in at]
+            if sum(held) >= 2:
+                seeds = at[held]
+        if len(seeds) < 2:
+            return [part]
+        nearest = np.linalg.norm(cell[:, None] - seeds[None], axis=2).argmin(axis=1)
+        return [part[nearest == k] for k in range(len(seeds))]
+
+    def _trunk(self, part: NDArray[np.int64]) -> Float:
+        """Return where the tallest column of voxels stands on the floor plan (2,), metres."""
+        plan, _, low = self._plan(part)
+        smooth = ndimage.gaussian_filter(plan, _SMOOTH_M / self._grid.voxel_m)
+        return np.array(np.unravel_index(smooth.argmax(), plan.shape)) * self._grid.voxel_m + low
+
+    def _maxima(self, plan: Float) -> NDArray[np.int64]:
+        """Return the cells (K, 2) of the people's trunks in a floor plan, the tallest column first."""
+        edge = self._grid.voxel_m
+        smooth = ndimage.gaussian_filter(plan, _SMOOTH_M / edge)
+        reach = max(1, round(_APART_M / edge))
+        peaks = np.argwhere((smooth == ndimage.maximum_filter(smooth, 2 * reach + 1)) & (smooth >= _TRUNK_M))
+        peaks = peaks[np.argsort(-smooth[tuple(peaks.T)], kind="stable")]
+        kept: list[NDArray[np.int64]] = []
+        for peak in peaks:
+            height = smooth[tuple(peak)]
+            steps = np.linspace(0, 1, 20)[:, None]
+            between = [ndimage.map_coordinates(smooth, (peak + steps * (o - peak)).T, order=1).min() for o in kept]
+            if all(lowest < _SADDLE * height for lowest in between):
+                kept.append(peak)
+        return np.array(kept).reshape(-1, 2)
+
+    def _person(self, part: NDArray[np.int64], inside: Bool) -> LocatedPerson:
+        points, edge = self._voxels.centers[part], self._grid.voxel_m
+        height = points @ self._to_plan[2]
+        floor, crown = float(height.min()) - edge / 2, float(height.max()) + edge / 2
+        position = np.array([*self._trunk(part), (floor + crown) / 2]) @ self._to_plan
+        sees = self._voxels.sees[:, part]
+        share = np.full(len(self._rig), np.nan)
+        np.divide(inside[:, part].sum(axis=1), sees.sum(axis=1), out=share, where=sees.any(axis=1))
+        within = bool(((self._volume.lower <= position) & (position <= self._volume.upper)).all())
+        return LocatedPerson(
+            position, crown - floor, len(part) * edge**3, points, edge, np.nan_to_num(share) >= 0.5, share, within
+        )
+
+    def _explaining(self, found: Sequence[LocatedPerson], masks: Bool) -> list[LocatedPerson]:
+        """Return the subset of candidates with the least area of unexplained pixels and the least people.
+
+        A candidate costs the area of its silhouettes that masks contradict, too.
+        """
+        if not found:
+            return []
+        covers = np.array([self._silhouettes(person) for person in found])
+        share = np.nan_to_num([person.share for person in found], nan=1.0)
+        contradicted = ((1 - share) * covers.sum(axis=(2, 3))) @ self._pixel_m2
+        price = _CONTRADICTED * contradicted + _LEAST_AREA_M2
+        gain = (covers & masks).sum(axis=(2, 3)) @ self._pixel_m2 - price
+        best = np.argsort(-gain, kind="stable")[:_MOST]
+        best = best[gain[best] > 0]
+        # pixels that the same candidates cover count together
+        code = np.tensordot(1 << np.arange(len(best)), covers[best].astype(np.int64), 1)
+        values, which = np.unique(code[masks], return_inverse=True)
+        area = np.broadcast_to(self._pixel_m2[:, None, None], masks.shape)[masks]
+        weights = np.bincount(which, area, len(values))
+        subsets = np.arange(1 << len(best))
+        unexplained = ((subsets[:, None] & values) == 0) @ weights
+        cost = unexplained + ((subsets[:, None] >> np.arange(len(best))) & 1) @ price[best]
+        return [found[k] for i, k in enumerate(best) if int(cost.argmin()) >> i & 1]
+
+    def _covered(self, people: Sequence[LocatedPerson]) -> Bool:
+        """Return (C, h, w) the pixels of reduced images that people cover."""
+        covered = np.zeros((len(self._rig), *self._voxels.shape), np.bool_)
+        for person in people:
+            covered |= self._silhouettes(person)
+        return covered
+
+    def _silhouettes(self, person: LocatedPerson) -> Bool:
+        """Return (C, h, w) the silhouettes of a person in reduced images, rather too large than too small."""
+        projected = Voxels.of(self._rig, person.points, person.voxel_m, self._step)
+        images = np.zeros((len(self._rig), *projected.shape), np.uint8)
+        for image, sees, pixels in zip(images, projected.sees, projected.pixels, strict=True):
+            image.ravel()[pixels[sees]] = 1
+        return np.array([dilated(image, int(reach)) for image, reach in zip(images, projected.reach, strict=True)])
+
+
+def _around(volume: Volume, up: Float) -> Volume:
+    """Return the volume, larger on the floor by :data:`_BEYOND_M` on all sides and as high as a tall person."""
+    grown = np.array(volume.size) + 2 * _BEYOND_M * (1 - np.abs(up))
+    return replace(volume, size=(float(grown[0]), float(grown[1]), float(grown[2])))
