@@ -17,6 +17,7 @@ import pytest
 from scripts.browser import Page, browser_page, find_browser
 from tests.conftest import FRAMES, Tk
 from tests.report.conftest import LOST, NOTE
+from tk.evaluation.joints import evaluate_files
 from tk.io.results.writer import Result, Status, read_result
 from tk.model.body.skeleton import JOINTS
 from tk.render.figure import figure_of
@@ -78,6 +79,16 @@ def test_body_points_match_the_overlay(complete: Path) -> None:
         np.testing.assert_allclose(
             np.linalg.norm(a - joints[k], axis=1), np.linalg.norm(b - figure.joints[row, k], axis=1), atol=1e-4
         )
+
+
+def test_page_has_errors_only_with_a_truth(complete: Path, tiny: Path, tmp_path: Path) -> None:
+    result = read_result(complete)
+    assert data_of(build_page(result, []))["truth"] is None
+    assert data_of(build_page(result, [], truth=tmp_path / "none.h5"))["truth"] is None
+    errors = data_of(build_page(result, [], truth=tiny / "truth.h5"))["truth"]
+    found = evaluate_files(complete, tiny / "truth.h5")
+    assert errors["rows"][1] == ["12 limb joints", found.raw.limbs.mean_cm, found.corrected.limbs.mean_cm]
+    assert unpacked(errors["frames"]).mean() == pytest.approx(found.raw.all.mean_cm, rel=1e-4)
 
 
 def test_page_loads_nothing_and_escapes_text(complete: Path) -> None:
@@ -240,6 +251,14 @@ def test_page_shows_all_sections(opened: Page) -> None:
     assert opened.run("document.documentElement.scrollWidth <= window.innerWidth") is True, "nothing sticks out"
     assert opened.run("document.querySelector('.chart path.line').getAttribute('d').includes('NaN')") is False
     assert opened.said == []
+
+
+@chromium
+def test_page_compares_with_the_truth(opened: Page) -> None:
+    rows = opened.run("[...document.querySelectorAll('#truth-table tr')].map((row) => row.textContent)")
+    assert len(rows) == 1 + 2 + len(JOINTS) and rows[1].startswith("all 15") and rows[3].startswith("pelvis")
+    assert opened.run("document.getElementById('truth').hidden") is False
+    assert opened.run("document.querySelectorAll('#truth-charts path.line').length") == 1
 
 
 @chromium

@@ -21,8 +21,9 @@ def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path
     CAPTURE adds its cameras, if the result has none, and its ground truth, if it has one.
     """
     from tk.io.captures.capture import open_capture
+    from tk.io.results.truth import truth_of
     from tk.io.results.writer import read_result
-    from tk.view.contents import Contents, truth_of
+    from tk.view.contents import Contents
     from tk.view.window import Window, require_display
 
     loaded = read_result(result)
@@ -38,8 +39,8 @@ def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path
     rig = loaded.cameras.rig if loaded.cameras else None
     truth = None
     if capture is not None:
-        rig = rig or open_capture(capture, masks="none").rig
-        truth = truth_of(loaded, capture / "truth.h5")
+        opened = open_capture(capture, masks="none")
+        rig, truth = rig or opened.rig, truth_of(loaded, opened.truth_file)
     require_display()
     window, row = Window(Contents(loaded, rig, truth)), 0 if frame is None else known.index(frame)
     if screenshot is not None:

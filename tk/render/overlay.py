@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from tk.errors import ExportError, ResultError
 from tk.io.captures.capture import Capture
 from tk.io.results.status import STATUS_MEANING
-from tk.io.results.writer import Result, has_pose, read_joints
+from tk.io.results.truth import truth_of
+from tk.io.results.writer import Result, has_pose
 from tk.model.cameras.camera import Camera, Rig
 from tk.render.canvas import Image, View, dots, draw_body, draw_joints, draw_truth, text_width, write
 from tk.render.figure import Figure, figure_of
@@ -63,9 +64,8 @@ class Overlay:
         self._colors: dict[int, Sequence[Color | None]] = {}
         self._views = [self._steady_view(camera, full) for camera in self.rig]
         self.row_of = {int(frame): row for row, frame in enumerate(result.frames)}
-        truth_file = capture.path / "truth.h5"
-        truth = read_joints(truth_file) if truth_file.is_file() else None
-        self._truth = {} if truth is None else dict(zip(truth.frames.tolist(), truth.positions, strict=True))
+        truth = truth_of(result, capture.truth_file)
+        self._truth = {} if truth is None else dict(zip(result.frames.tolist(), truth, strict=True))
 
     def pictures(self, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """Yield these frames, ascending, and their images (C, H, W, 3); decoding starts immediately."""

@@ -60,6 +60,6 @@ def _write(capture: Capture, result_path: Path) -> list[Path]:
             row = overlay.row_of[frame]
             if row in wanted:
                 shots[row] = shot(overlay, frame, images)
-        text = build_page(result, embedded(choices, shots), overlay.rig)
+        text = build_page(result, embedded(choices, shots), overlay.rig, capture.truth_file)
     write_page(page, text)
     return [video, page]

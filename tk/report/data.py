@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tk.evaluation.joints import evaluate_files, plain_values
 from tk.io.results.status import STATUS_MEANING
+from tk.io.results.truth import truth_of
 from tk.io.results.writer import Result, Status
-from tk.model.body.joints import BONES, HINGES, JOINTS, SEGMENTS
+from tk.model.body.joints import BONES, HINGES, JOINTS, LIMB_JOINTS, SEGMENTS
 from tk.model.cameras.camera import Rig
 from tk.render.figure import AROUND, Figure, figure_of
 from tk.render.palette import BONE, LOST, LOST_BODY, SEGMENT_COLORS, SIGMA_MOST_M, hexadecimal, sigma_colors
@@ -23,12 +26,13 @@ Float = NDArray[np.float64]
 _SIGMA_STOPS = 9
 
 
-def describe(result: Result, rig: Rig | None = None) -> dict[str, Any]:
+def describe(result: Result, rig: Rig | None = None, truth: Path | None = None) -> dict[str, Any]:
     """Return all data of the report except the images.
 
     Args:
         result: the result, with at least one frame.
         rig: the cameras, if the result does not have them.
+        truth: the ground truth; the file need not exist.
 
     Raises:
         ResultError: there are no frames or joints, or the body cannot be used.
@@ -54,6 +58,7 @@ def describe(result: Result, rig: Rig | None = None) -> dict[str, Any]:
         "sigma": None if figure.sigma is None else packed(figure.sigma),
         "cameras": list(meta.residual_cameras),
         "silhouetteError": None if (error := result.silhouette_error) is None else packed(error),
+        "truth": None if truth is None else _errors(result, truth),
         "objective": packed(result.objective),
         "objectiveKind": meta.objective_kind,
         "angles": _angles(result, figure),
@@ -141,6 +146,22 @@ def hinge_sigma_deg(figure: Figure, joints: Sequence[str]) -> Float:
         # sensitivity to the middle joint: it moves relative to both ends at the same time
         middle = 1 / p**2 + 1 / q**2 - 2 * cosine / (p * q)
         return np.asarray(np.degrees(np.sqrt((a / p) ** 2 + (c / q) ** 2 + b**2 * middle)))
+
+
+def _errors(result: Result, truth: Path) -> dict[str, Any] | None:
+    """Return the errors against the ground truth, cm: by joint, and the mean of each frame; None without a truth."""
+    positions = truth_of(result, truth)
+    if positions is None or not np.isfinite(positions).any():
+        return None
+    found = evaluate_files(result.path, truth)
+    groups = {f"all {len(JOINTS)}": (found.raw.all, found.corrected.all)}
+    groups |= {f"{len(LIMB_JOINTS)} limb joints": (found.raw.limbs, found.corrected.limbs)}
+    groups |= {name: (found.raw.joints[name], found.corrected.joints[name]) for name in JOINTS}
+    rows = [[name, *plain_values([raw.mean_cm, corrected.mean_cm])] for name, (raw, corrected) in groups.items()]
+    distances = np.linalg.norm(result.joints - positions, axis=-1)
+    known = np.isfinite(distances)
+    means = np.where(known, distances, 0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    return {"rows": rows, "frames": packed(np.where(known.any(axis=1), 100 * means, np.nan))}
 
 
 def _timing(result: Result) -> list[dict[str, Any]]:

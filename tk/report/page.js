@@ -232,6 +232,17 @@
   } else {
     get("sigma-text").textContent = "This result has no σ.";
   }
+  if (data.truth) {
+    get("truth").hidden = false;
+    charts.push(new Chart(get("truth-charts"), {
+      ...common, title: "Mean error of the joints", unit: " cm", width: wide, height: 110, zero: true, digits: 1,
+      lines: [{ name: "", color: "var(--accent)", values: Array.from(unpack(data.truth.frames)) }],
+    }));
+    get("truth-table").append(line(["joint", "mean", "without offset"], "th"));
+    for (const [name, ...errors] of data.truth.rows) {
+      get("truth-table").append(line([joint(name), ...errors.map((error) => error === null ? "–" : error.toFixed(2))]));
+    }
+  }
   get("times-text").textContent = "Mean, ms. Decoding and segmentation run in a separate process and are not part of the total.";
   get("times-table").append(line(["stage", "", "ms"], "th"));
   const longest = Math.max(...data.timing.map(({ ms }) => ms), 1e-9);

@@ -19,18 +19,21 @@ _SCRIPTS = ("viewer.js", "charts.js", "page.js")
 _GENERATOR = '<meta name="generator" content="tk">'
 
 
-def build_page(result: Result, pictures: list[dict[str, Any]], rig: Rig | None = None) -> str:
+def build_page(
+    result: Result, pictures: list[dict[str, Any]], rig: Rig | None = None, truth: Path | None = None
+) -> str:
     """Return the page of a result.
 
     Args:
         result: the result, with at least one frame.
         pictures: images, from :func:`tk.report.pictures.embedded`.
         rig: the cameras, if the result does not have them.
+        truth: the ground truth; the file need not exist.
 
     Raises:
         ResultError: the result cannot be drawn.
     """
-    data = describe(result, rig) | {"file": result.path.name, "pictures": pictures}
+    data = describe(result, rig, truth) | {"file": result.path.name, "pictures": pictures}
     # "<" could close the script element
     text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     page = _read("page.html")
@@ -72,14 +75,14 @@ def report(result_path: Path, capture_path: Path | None, output: Path | None, fo
     result = read_result(result_path)
     target = check_target(output or result_path.with_suffix(".html"), force)
     shown: list[dict[str, Any]] = []
-    rig = None
+    rig = truth = None
     if capture_path is not None:
         overlay = Overlay(open_capture(capture_path, masks="none"), result)
-        choices, rig = choose_rows(result), overlay.rig
+        choices, rig, truth = choose_rows(result), overlay.rig, overlay.capture.truth_file
         frames = [int(result.frames[choice.row]) for choice in choices]
         shots = {overlay.row_of[frame]: shot(overlay, frame, images) for frame, images in overlay.pictures(frames)}
         shown = embedded(choices, shots)
-    write_page(target, build_page(result, shown, rig))
+    write_page(target, build_page(result, shown, rig, truth))
     return target
 
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.results.status import STATUS_MEANING
-from tk.io.results.writer import Result, read_joints
+from tk.io.results.writer import Result
 from tk.model.cameras.camera import Rig
 from tk.render.figure import Figure, figure_of
 from tk.render.palette import BONE, ELEVATION_DEG, FLOOR, WIRE, unit_rgb
@@ -94,14 +93,3 @@ class Contents:
         if result.sigma is not None and np.isfinite(result.sigma[row]).any():
             parts.append(f"median sigma {100 * np.nanmedian(result.sigma[row]):.1f} cm")
         return "    ".join(parts)
-
-
-def truth_of(result: Result, path: Path) -> Float | None:
-    """Return the ground-truth joints (F, 15, 3) in the result's frames, NaN if missing; None without the file."""
-    if not path.exists():
-        return None
-    truth = read_joints(path)
-    places = np.full((len(result), *truth.positions.shape[1:]), np.nan)
-    _, mine, theirs = np.intersect1d(result.frames, truth.frames, return_indices=True)
-    places[mine] = truth.positions[theirs]
-    return places

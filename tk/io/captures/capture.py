@@ -106,6 +106,11 @@ class Capture:
         return self._calibration
 
     @property
+    def truth_file(self) -> Path:
+        """The ground truth; only evaluation captures have the file."""
+        return self.path / "truth.h5"
+
+    @property
     def has_masks(self) -> bool:
         """Whether masks are given."""
         return self.mask_clips is not None
