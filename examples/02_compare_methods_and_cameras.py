@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import tk
-from tk.io.results.writer import read_joints
+from tk.io.results.reader import read_joints
 
 DEMO = Path(tk.__file__).parent / "data" / "demo"
 LIMBS = slice(3, 15)  # shoulders, elbows, wrists, hips, knees, ankles

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.captures.capture import Capture, open_capture
-from tk.io.results.writer import read_joints
+from tk.io.results.reader import read_joints
 from tk.model.cues.objective import BARRED
 from tk.run.segmentation import make_labeller
 from tk.settings import Settings

@@ -21,7 +21,8 @@ import numpy as np
 from scripts.faults import OFF_M
 from scripts.synthetic.keypoints import write_keypoints
 from tk.io.captures.capture import Capture, open_capture
-from tk.io.results.writer import Status, read_joints, read_result
+from tk.io.results.reader import read_joints, read_result
+from tk.io.results.status import Status
 from tk.run.session import track
 from tk.settings import Settings
 

@@ -23,7 +23,9 @@ from scipy.spatial.transform import Rotation
 
 from scripts.any_start import Quiet
 from tk.io.captures.capture import Capture, open_capture
-from tk.io.results.writer import Result, Status, read_result
+from tk.io.results.data import Result
+from tk.io.results.reader import read_result
+from tk.io.results.status import Status
 from tk.model.cameras.mounting import infer_up
 from tk.model.cameras.tracker_frame import seen_from
 from tk.model.cameras.up import up_text

@@ -51,7 +51,8 @@ from tk import __version__
 from tk.errors import TkError
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.captures.frames import FrameSet
-from tk.io.results.writer import Result, read_result
+from tk.io.results.data import Result
+from tk.io.results.reader import read_result
 from tk.kernels.nearest import SurfaceIndex, nearest
 from tk.kernels.runtime import ti
 from tk.kernels.taichi_internals import Launcher

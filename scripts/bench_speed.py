@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from tk.io.captures.capture import open_capture
-from tk.io.results.writer import read_result
+from tk.io.results.reader import read_result
 from tk.run import session
 from tk.run.reporter import Silent
 from tk.settings import Settings

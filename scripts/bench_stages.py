@@ -12,7 +12,7 @@ import numpy as np
 
 from tk.io.captures.capture import Capture
 from tk.io.captures.frames import FrameSet
-from tk.io.results.writer import Result
+from tk.io.results.data import Result
 from tk.kernels.edge_search import search_edges
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.raycast import Cast

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from tk.errors import TkError
 from tk.io.captures.capture import open_capture
-from tk.io.results.writer import read_result
+from tk.io.results.reader import read_result
 from tk.kernels.contour import ContourPoints
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body

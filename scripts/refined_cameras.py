@@ -27,7 +27,7 @@ from scripts.synthetic.capture import write_calibration
 from tk.evaluation.joints import evaluate
 from tk.io.captures.calibration import read_calibration
 from tk.io.captures.capture import open_capture
-from tk.io.results.writer import read_joints, read_result
+from tk.io.results.reader import read_joints, read_result
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.refinement import aligned, turn_between
 from tk.run.session import track

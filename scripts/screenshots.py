@@ -16,7 +16,7 @@ from PIL import Image  # comes with Matplotlib
 
 from scripts.browser import browser_page, find_browser
 from tk.io.captures.capture import open_capture
-from tk.io.results.writer import read_result
+from tk.io.results.reader import read_result
 from tk.render.overlay import Overlay, joined
 from tk.report.page import report
 

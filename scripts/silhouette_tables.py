@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.captures.capture import open_capture
-from tk.io.results.writer import read_joints
+from tk.io.results.reader import read_joints
 from tk.kernels.line_search import SearchSettings
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Rig

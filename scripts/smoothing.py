@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.export import read_motion
-from tk.io.results.writer import Status, read_joints
+from tk.io.results.reader import read_joints
+from tk.io.results.status import Status
 from tk.model.body.skeleton import JOINTS
 
 Float = NDArray[np.float64]

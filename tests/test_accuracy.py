@@ -13,7 +13,7 @@ import pytest
 from tests.conftest import Silent, Tk, development_capture
 from tk.evaluation.joints import Evaluation, evaluate_files
 from tk.io.captures.capture import open_capture
-from tk.io.results.writer import read_result
+from tk.io.results.reader import read_result
 from tk.run.session import track
 from tk.settings import Settings
 

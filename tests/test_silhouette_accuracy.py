@@ -10,7 +10,7 @@ import pytest
 from scripts.silhouette_tables import CAMERAS, OURS, load, track
 from tests.conftest import Silent, development_capture
 from tk.io.captures.capture import open_capture
-from tk.io.results.writer import read_joints
+from tk.io.results.reader import read_joints
 from tk.run.session import track as track_capture
 from tk.settings import Settings
 

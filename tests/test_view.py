@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import Tk
-from tk.io.results.writer import read_result
+from tk.io.results.reader import read_result
 from tk.render.figure import figure_of
 from tk.view import shapes
 

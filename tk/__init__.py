@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tk.api import open_capture, track
-    from tk.io.results.writer import Result, read_result
+    from tk.io.results.data import Result
+    from tk.io.results.reader import read_result
     from tk.io.settings_file import read as read_settings
     from tk.model.body.cone_body import ConeBody as Body
     from tk.model.hull.hull import VisualHull
@@ -42,10 +43,10 @@ _HOMES = {
     "Body": ("tk.model.body.cone_body", "ConeBody"),
     "Settings": ("tk.settings", "Settings"),
     "Estimate": ("tk.trackers.protocol", "Estimate"),
-    "Result": ("tk.io.results.writer", "Result"),
+    "Result": ("tk.io.results.data", "Result"),
     "VisualHull": ("tk.model.hull.hull", "VisualHull"),
     "open_capture": ("tk.api", "open_capture"),
-    "read_result": ("tk.io.results.writer", "read_result"),
+    "read_result": ("tk.io.results.reader", "read_result"),
     "read_settings": ("tk.io.settings_file", "read"),
     "track": ("tk.api", "track"),
 }

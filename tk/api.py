@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, TypedDict, overload
 
 from tk.io.captures.capture import Capture
 from tk.io.captures.capture import open_capture as _open_capture
-from tk.io.results.writer import Result, read_result
+from tk.io.results.data import Result
+from tk.io.results.reader import read_result
 from tk.run import session
 from tk.run.plan import recording_setup
 from tk.run.reporter import Silent
@@ -102,7 +103,7 @@ def track(
     Returns:
         Without ``output`` an iterator of :class:`~tk.trackers.protocol.Estimate`: ``frame``, ``time`` (seconds),
         ``pose`` (D,), ``joints`` (15, 3) metres, ``sigma`` (15,) metres, ``status`` … With it the finished
-        :class:`~tk.io.results.writer.Result`.
+        :class:`~tk.io.results.data.Result`.
 
     Raises:
         tk.errors.TkError: bad input, in one line; every frame finished before it is in the file.

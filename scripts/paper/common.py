@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.captures.capture import open_capture
-from tk.io.results.writer import read_joints
+from tk.io.results.reader import read_joints
 from tk.model.body.skeleton import JOINTS
 from tk.run import session
 from tk.run.reporter import Silent

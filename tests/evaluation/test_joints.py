@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from tk.errors import ResultError
 from tk.evaluation.details import flexion_deg, normal_share
 from tk.evaluation.joints import LIMB_JOINTS, evaluate, evaluate_files, trunk_axes
-from tk.io.results.writer import JointTrack, Status
+from tk.io.results.data import JointTrack
+from tk.io.results.status import Status
 from tk.model.body.skeleton import JOINTS
 
 # a standing person, rough: forward, left, up in metres

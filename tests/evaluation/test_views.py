@@ -14,7 +14,7 @@ from tests.conftest import Silent, Tk
 from tk.evaluation.views import capture_of, evaluate_views
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
-from tk.io.results.writer import read_joints, read_result
+from tk.io.results.reader import read_joints, read_result
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import ANKLES, JOINTS, skeleton_of_names
 from tk.model.masks.silhouettes import draw_silhouettes

@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tk.io.results.writer import FrameResult, ResultMeta, ResultWriter, Status
+from tk.io.results.data import FrameResult, ResultMeta
+from tk.io.results.status import Status
+from tk.io.results.writer import ResultWriter
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import Skeleton, build_skeleton
 

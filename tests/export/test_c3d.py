@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from tests.export.conftest import FPS, FRAMES, LOST, Write
-from tk.errors import ExportError
+from tk.errors import ExportError, ResultError
 from tk.export import export, read_motion
-from tk.io.results.writer import ResultError
 from tk.model.body.skeleton import JOINTS, SEGMENTS
 
 

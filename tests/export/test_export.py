@@ -13,7 +13,7 @@ from tests.conftest import Tk
 from tests.export.conftest import FIRST, FPS, FRAMES, LOST, SKELETON, Write, poses, status
 from tk.errors import ExportError, ResultError
 from tk.export import FORMATS, export, read_motion
-from tk.io.results.writer import Status
+from tk.io.results.status import Status
 from tk.model.body.angles import segment_quaternions
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.joints import FOOT_POINTS

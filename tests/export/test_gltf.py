@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.export.conftest import FPS, FRAMES, LOST, Write
 from tk.export import export, read_motion
-from tk.io.results.writer import read_result
+from tk.io.results.reader import read_result
 from tk.kernels.cones import CONE
 from tk.model.body.skeleton import JOINTS
 from tk.trackers.bodies import body_and_poses

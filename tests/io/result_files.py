@@ -9,7 +9,9 @@ import h5py
 import numpy as np
 
 from tests.io.result_victim import META, make_frame, make_state
-from tk.io.results.writer import ResultMeta, ResultWriter, UsedCameras, Value, read_result
+from tk.io.results.data import ResultMeta, UsedCameras, Value
+from tk.io.results.reader import read_result
+from tk.io.results.writer import ResultWriter
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Camera, Rig
 

@@ -10,7 +10,9 @@ import sys
 
 import numpy as np
 
-from tk.io.results.writer import FrameResult, HullPoints, JointAngles, ResultMeta, ResultWriter, Status
+from tk.io.results.data import FrameResult, HullPoints, JointAngles, ResultMeta
+from tk.io.results.status import Status
+from tk.io.results.writer import ResultWriter
 
 META = ResultMeta(
     pose_names=tuple(f"p{i}" for i in range(24)),

@@ -18,7 +18,9 @@ from tests.io.result_victim import META, make_frame, make_state
 from tk.errors import ResultError, TkError
 from tk.evaluation.joints import evaluate_files
 from tk.io.hdf5 import MAX_DEPTH, open_hdf5
-from tk.io.results.writer import ResultWriter, read_joints, read_result, revise_result
+from tk.io.results.reader import read_joints, read_result
+from tk.io.results.revision import revise_result
+from tk.io.results.writer import ResultWriter
 from tk.model.body.skeleton import JOINTS
 
 COUNT = 6
@@ -308,4 +310,4 @@ def test_reader_lists_datasets_and_groups(result: Path) -> None:
         with pytest.raises(ResultError, match=r"/pose has shape 6×24; any×3 is expected"):
             file.array("pose", "float64", (None, 3))
         with pytest.raises(ResultError, match="out of range"):
-            file.array("pose", "float64", (COUNT, 24), limit=1.0)
+            file.array("pose", "float64", (COUNT, 24), high=1.0)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tk.errors import ResultError
 from tk.io.mesh import Mesh, hull_mesh, write_mesh
-from tk.io.results.writer import HullPoints
+from tk.io.results.data import HullPoints
 from tk.model.cameras.volume import VoxelGrid
 
 GRID = VoxelGrid((1.0, -2.0, 0.5), 0.04, (24, 20, 30))

@@ -16,7 +16,7 @@ from tests.io.conftest import MakeCapture
 from tk.errors import CaptureError, ResultError
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.point_cloud import write_hulls, write_ply
-from tk.io.results.writer import HullPoints
+from tk.io.results.data import HullPoints
 from tk.model.cameras.volume import VoxelGrid
 
 

@@ -14,16 +14,11 @@ from tests.conftest import QUICK, Silent, Tk
 from tk.errors import ResultError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
-from tk.io.results.writer import (
-    FrameResult,
-    ResultMeta,
-    ResultWriter,
-    Status,
-    UsedCameras,
-    read_joints,
-    read_result,
-    revise_result,
-)
+from tk.io.results.data import FrameResult, ResultMeta, UsedCameras
+from tk.io.results.reader import read_joints, read_result
+from tk.io.results.revision import revise_result
+from tk.io.results.status import Status
+from tk.io.results.writer import ResultWriter
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.gait_poses import neutral_pose

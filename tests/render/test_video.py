@@ -9,7 +9,7 @@ import pytest
 
 from tests.conftest import Tk
 from tk.errors import ExportError
-from tk.io.results.writer import read_result
+from tk.io.results.reader import read_result
 from tk.model.body.joints import SEGMENTS
 from tk.render.files import replacing
 from tk.render.palette import SEGMENT_COLORS

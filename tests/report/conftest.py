@@ -12,7 +12,11 @@ import pytest
 from tests.conftest import FRAMES
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
-from tk.io.results.writer import FrameResult, JointAngles, ResultMeta, ResultWriter, Status, read_joints, revise_result
+from tk.io.results.data import FrameResult, JointAngles, ResultMeta
+from tk.io.results.reader import read_joints
+from tk.io.results.revision import revise_result
+from tk.io.results.status import Status
+from tk.io.results.writer import ResultWriter
 from tk.model.body.angles import ANGLES
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body

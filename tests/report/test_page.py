@@ -18,7 +18,9 @@ from scripts.browser import Page, browser_page, find_browser
 from tests.conftest import FRAMES, Tk
 from tests.report.conftest import LOST, NOTE
 from tk.evaluation.joints import evaluate_files
-from tk.io.results.writer import Result, Status, read_result
+from tk.io.results.data import Result
+from tk.io.results.reader import read_result
+from tk.io.results.status import Status
 from tk.model.body.skeleton import JOINTS
 from tk.render.figure import figure_of
 from tk.report.data import hinge_sigma_deg

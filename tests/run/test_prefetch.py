@@ -23,7 +23,7 @@ from tests.run.test_session import assert_same, send
 from tk.errors import ConfigError, VideoError, WorkerError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
-from tk.io.results.writer import read_result
+from tk.io.results.reader import read_result
 from tk.run import session
 from tk.run.prefetch import Ahead, Observations, Serial, open_observations
 from tk.settings import Settings

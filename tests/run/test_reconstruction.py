@@ -11,7 +11,7 @@ from tests.conftest import FRAMES, QUICK, Silent, Tk
 from tests.io.conftest import write_picture
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
-from tk.io.results.writer import read_result
+from tk.io.results.reader import read_result
 from tk.run.reconstruction import reconstruct
 
 CONFIG = settings_file.from_toml(QUICK)

@@ -17,7 +17,8 @@ from tk.io import settings_file
 from tk.io.captures.calibration import read_calibration
 from tk.io.captures.capture import open_capture
 from tk.io.captures.mask_store import MaskStore
-from tk.io.results.writer import Status, read_result
+from tk.io.results.reader import read_result
+from tk.io.results.status import Status
 from tk.io.toml import load_toml
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import turn_between

@@ -23,7 +23,8 @@ from tests.io.conftest import write_picture
 from tk.errors import ConfigError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
-from tk.io.results.writer import Status, read_joints, read_result
+from tk.io.results.reader import read_joints, read_result
+from tk.io.results.status import Status
 from tk.model.body.skeleton import JOINTS
 from tk.run import session
 from tk.run.plan import choose_frames

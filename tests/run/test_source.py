@@ -15,7 +15,7 @@ from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, STATURE, walk
 from tk.io import settings_file
 from tk.io.captures.frames import FrameSet
-from tk.io.results.writer import read_result
+from tk.io.results.reader import read_result
 from tk.model.cameras.volume import Volume
 from tk.model.masks.silhouettes import draw_silhouettes
 from tk.model.setup import Setup, Subject

@@ -17,7 +17,7 @@ from tests.trackers.test_silhouette_track import QUICK as QUICK_SILHOUETTE
 from tk.io import settings_file
 from tk.io.captures.calibration import camera_table
 from tk.io.captures.capture import open_capture
-from tk.io.results.writer import read_joints, read_result
+from tk.io.results.reader import read_joints, read_result
 from tk.model.cameras.tracker_frame import seen_from
 from tk.model.cameras.up import up_text
 from tk.model.cameras.volume import Volume

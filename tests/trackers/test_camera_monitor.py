@@ -14,7 +14,7 @@ from tests.conftest import FRAMES, QUICK
 from tk.errors import CaptureError
 from tk.io import settings_file
 from tk.io.captures.capture import Capture, open_capture
-from tk.io.results.writer import read_joints
+from tk.io.results.reader import read_joints
 from tk.model.setup import Subject
 from tk.trackers.camera_monitor import CameraMonitor
 from tk.trackers.protocol import Estimate, Observation

@@ -21,7 +21,9 @@ from tests.run.test_session import send
 from tk.errors import ResultError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
-from tk.io.results.writer import Result, Status, read_joints, read_result
+from tk.io.results.data import Result
+from tk.io.results.reader import read_joints, read_result
+from tk.io.results.status import Status
 from tk.model.body.anthropometry import BodyDimensions
 from tk.run.offline import REFINED
 from tk.run.session import Summary, estimates, track

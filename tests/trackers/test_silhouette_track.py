@@ -13,7 +13,8 @@ from tests.conftest import Silent, Tk
 from tk.errors import ConfigError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
-from tk.io.results.writer import Status, read_joints, read_result
+from tk.io.results.reader import read_joints, read_result
+from tk.io.results.status import Status
 from tk.model.body.skeleton import JOINTS
 from tk.run.session import Summary, track
 from tk.trackers.registry import METHODS

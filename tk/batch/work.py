@@ -50,7 +50,7 @@ def work(job: Job) -> Outcome:
 
 def _track(job: Job, reporter: _Reporter) -> Outcome:
     from tk.io.captures.capture import open_capture
-    from tk.io.results.writer import read_result
+    from tk.io.results.reader import read_result
     from tk.report.after import write_video_and_report
     from tk.run import session  # heavy; the process that starts the batch does not need it
 

@@ -60,7 +60,7 @@ def _render(
 ) -> list[Path]:
     """Write the files and return their paths."""
     from tk.io.captures.capture import open_capture
-    from tk.io.results.writer import read_result
+    from tk.io.results.reader import read_result
     from tk.render.files import check_target
     from tk.render.overlay import Overlay, choose_frames, write_sheets
     from tk.render.scene import Scene

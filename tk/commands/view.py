@@ -21,8 +21,8 @@ def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path
     CAPTURE adds its cameras, if the result has none, and its ground truth, if it has one.
     """
     from tk.io.captures.capture import open_capture
+    from tk.io.results.reader import read_result
     from tk.io.results.truth import truth_of
-    from tk.io.results.writer import read_result
     from tk.view.contents import Contents
     from tk.view.window import Window, require_display
 

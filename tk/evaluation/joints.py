@@ -41,7 +41,9 @@ from tk.evaluation.details import (
     longest_run,
     sigma_shares,
 )
-from tk.io.results.writer import JointTrack, has_pose, read_joints
+from tk.io.results.data import JointTrack
+from tk.io.results.reader import read_joints
+from tk.io.results.status import has_pose
 from tk.model.body.joints import HINGE_KINDS, HIPS, JOINTS, LIMB_JOINTS, SHOULDERS
 
 Float = NDArray[np.float64]

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError, ConfigError
 from tk.evaluation.joints import plain_values
 from tk.io.captures.capture import Capture, open_capture
-from tk.io.results.writer import Result, as_damage_error, read_joints, read_result
+from tk.io.results.data import Result
+from tk.io.results.reader import as_damage_error, read_joints, read_result
 from tk.model.body.joints import ANKLE_JOINTS, JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.masks.silhouettes import draw_silhouettes, share_wrong

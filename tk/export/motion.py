@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError, ResultError
-from tk.io.results.writer import Result, Status, read_result
+from tk.io.results.data import Result
+from tk.io.results.reader import read_result
+from tk.io.results.status import Status
 from tk.model.body.angles import segment_rotations
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.joints import FOOT_POINTS, JOINTS, LIMBS, SEGMENTS
@@ -92,7 +94,7 @@ def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[M
         smoothed: use the smoothed copy; the poses are smoothed here if the result has none.
 
     Raises:
-        ResultError: as :func:`tk.io.results.writer.read_result`, or the result has no body or no known frame.
+        ResultError: as :func:`tk.io.results.reader.read_result`, or the result has no body or no known frame.
     """
     result = read_result(path)
     bridged = np.zeros(len(result), dtype=bool)

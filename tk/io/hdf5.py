@@ -73,7 +73,13 @@ class Hdf5Reader:
         return sorted(name[len(group) + 1 :] for name in self.shapes if name.startswith(f"{group}/"))
 
     def array(
-        self, name: str, dtype: str, shape: tuple[int | None, ...], limit: float = math.inf, missing: str = ""
+        self,
+        name: str,
+        dtype: str,
+        shape: tuple[int | None, ...],
+        low: float = -math.inf,
+        high: float = math.inf,
+        finite: bool = False,
     ) -> NDArray[Any]:
         """Return a dataset of numbers.
 
@@ -81,14 +87,14 @@ class Hdf5Reader:
             name: name of the dataset.
             dtype: numpy's name of the requested type.
             shape: requested shape; None stands for any length.
-            limit: largest valid magnitude; NaN and infinity are accepted.
-            missing: message for a missing dataset.
+            low, high: range of valid numbers.
+            finite: refuse NaN and infinity, which are valid otherwise.
 
         Raises:
-            ResultError: the dataset is missing, has another shape, or numbers that do not fit the type or the limit.
+            ResultError: the dataset is missing, has another shape, or numbers that do not fit the type or the range.
         """
         if name not in self.shapes:
-            self.fail(missing or f"has no /{name}; the file is damaged")
+            self.fail(f"has no /{name}; the file is damaged")
         found, wanted = self.shapes[name], np.dtype(dtype)
         if len(found) != len(shape) or any(b is not None and a != b for a, b in zip(found, shape, strict=True)):
             expected = "×".join("any" if length is None else str(length) for length in shape) or "one number"
@@ -96,28 +102,40 @@ class Hdf5Reader:
         values = self._numbers(name)
         if values.dtype.kind not in _KINDS[wanted.kind]:
             self.fail(f"/{name} holds {values.dtype}; {wanted} is expected")
-        finite = values[np.isfinite(values)]
+        known = values[np.isfinite(values)]
         if wanted.kind in "iu":
-            limits = np.iinfo(wanted)
-            if len(finite) < values.size or (finite != np.round(finite)).any():
+            if (known != np.round(known)).any():
                 self.fail(f"/{name} holds numbers that are not whole")
-            low, high = max(float(limits.min), -limit), min(float(limits.max), limit)
-        else:
-            low, high = (0.0, 1.0) if wanted.kind == "b" else (-limit, limit)
-        outside = finite[(finite < low) | (finite > high)]
+            low, high = max(float(np.iinfo(wanted).min), low), min(float(np.iinfo(wanted).max), high)
+        elif wanted.kind == "b":
+            low, high = 0.0, 1.0
+        if len(known) < values.size and (finite or wanted.kind in "iu"):
+            self.fail(f"/{name} holds NaN or infinity; the file is damaged")
+        outside = known[(known < low) | (known > high)]
         if len(outside):
             self.fail(f"/{name} holds {outside[0]:g}, which is out of range; the file is damaged")
         return values.astype(wanted)
 
-    def value(self, name: str) -> Any:
-        """Return a dataset of a few numbers or of texts, with the type that h5py returns."""
-        with self._guarded(name):
-            dataset = self._file[name]
-            is_text = dataset.id.get_type().get_class() == h5py.h5t.STRING
-            value = dataset[()] if is_text else self._numbers(name)[()]
-            if dataset.attrs.get("encoding") == "utf-8":
-                return np.asarray(value, dtype=np.uint8).tobytes().decode()
-            return value.decode() if isinstance(value, bytes) else value
+    def values(self, group: str, limit: float) -> dict[str, Any]:
+        """Return all datasets below a group as a flat mapping of texts, numbers and arrays; {} if there is no group.
+
+        Raises:
+            ResultError: a dataset holds neither numbers nor text, or a number of a magnitude above ``limit``.
+        """
+        if group in self.shapes:
+            self.fail(f"/{group} is a dataset, not a group; the file is damaged")
+        found: dict[str, Any] = {}
+        for name in self.below(group):
+            path = f"{group}/{name}"
+            with self._guarded(path):
+                dataset = self._file[path]
+                is_text = dataset.id.get_type().get_class() == h5py.h5t.STRING
+                value = dataset[()] if is_text else self._numbers(path)[()]
+                found[name] = value.decode() if isinstance(value, bytes) else value
+            numbers = np.asarray(value)
+            if numbers.dtype.kind == "f" and (np.abs(numbers[np.isfinite(numbers)]) > limit).any():
+                self.fail(f"/{path} holds a number that is out of range; the file is damaged")
+        return found
 
     def attribute(self, holder: str, name: str) -> Any:
         """Return an attribute of a dataset or group: texts, numbers, or arrays of them; None if it does not exist."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tk.io.point_cloud import create_empty_ply, load_open3d, ply_error
-from tk.io.results.writer import HullPoints
+from tk.io.results.data import HullPoints
 from tk.model.cameras.volume import VoxelGrid
 
 Float = NDArray[np.float64]

@@ -16,7 +16,7 @@ from tk import __version__
 from tk.errors import ResultError
 from tk.io.captures.capture import Capture
 from tk.io.hdf5 import open_hdf5
-from tk.io.results.writer import HullPoints
+from tk.io.results.data import HullPoints
 from tk.model.cameras.volume import VoxelGrid
 
 HULL_FORMAT = "tk-hull"

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ResultError
-from tk.io.results.writer import Result, has_pose
+from tk.io.results.data import Result
+from tk.io.results.status import has_pose
 from tk.kernels.cones import ELLIPSOID
 from tk.model.body.cone_body import ConeBody, ConePart
 from tk.model.body.joints import JOINTS, SEGMENTS

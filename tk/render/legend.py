@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.results.status import STATUS_MEANING
-from tk.io.results.writer import Result, Status
+from tk.io.results.data import Result
+from tk.io.results.status import STATUS_MEANING, Status
 from tk.render.canvas import Image, write
 from tk.render.figure import Figure
 from tk.render.palette import INK, LOST, SEGMENT_COLORS, SIGMA_MOST_M, TEXT, Color, sigma_colors

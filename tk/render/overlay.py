@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from tk.errors import ExportError, ResultError
 from tk.io.captures.capture import Capture
-from tk.io.results.status import STATUS_MEANING
+from tk.io.results.data import Result
+from tk.io.results.status import STATUS_MEANING, has_pose
 from tk.io.results.truth import truth_of
-from tk.io.results.writer import Result, has_pose
 from tk.model.cameras.camera import Camera, Rig
 from tk.render.canvas import Image, View, dots, draw_body, draw_joints, draw_truth, text_width, write
 from tk.render.figure import Figure, figure_of

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from tk.errors import ResultError
-from tk.io.results.writer import Result
+from tk.io.results.data import Result
 from tk.model.body.skeleton import SEGMENTS
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.up import up_vector

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tk.errors import ExportError, TkError
 from tk.io.captures.capture import Capture
-from tk.io.results.writer import read_result
+from tk.io.results.reader import read_result
 from tk.render.overlay import Overlay
 from tk.render.video import check_encoder, video_writer
 from tk.render.video import made_here as is_our_video

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tk.evaluation.joints import evaluate_files, plain_values
-from tk.io.results.status import STATUS_MEANING
+from tk.io.results.data import Result
+from tk.io.results.status import STATUS_MEANING, Status
 from tk.io.results.truth import truth_of
-from tk.io.results.writer import Result, Status
 from tk.model.body.joints import BONES, HINGES, JOINTS, LIMB_JOINTS, SEGMENTS
 from tk.model.cameras.camera import Rig
 from tk.render.figure import AROUND, Figure, figure_of

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from tk.io.captures.capture import open_capture
-from tk.io.results.writer import Result, read_result
+from tk.io.results.data import Result
+from tk.io.results.reader import read_result
 from tk.model.cameras.camera import Rig
 from tk.render.files import check_target, replacing
 from tk.render.overlay import Overlay

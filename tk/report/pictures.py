@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.results.writer import Result
+from tk.io.results.data import Result
 from tk.render.overlay import Overlay
 
 # Frames with the largest and with a typical E_S; width of an image with all cameras, pixels; JPEG quality. Appearance

@@ -12,7 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.captures.mask_store import MaskStore
-from tk.io.results.writer import Result, Status, UsedCameras, Value, read_result, revise_result
+from tk.io.results.data import Result, UsedCameras, Value
+from tk.io.results.reader import read_result
+from tk.io.results.revision import revise_result
+from tk.io.results.status import Status
 from tk.model.body.cone_body import ConeBody
 from tk.model.masks.image_health import described
 from tk.model.motion.derived import derive

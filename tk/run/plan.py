@@ -13,7 +13,7 @@ from tk.errors import CaptureError, ConfigError
 from tk.io.captures.capture import Capture
 from tk.io.captures.keypoints import first_pose
 from tk.io.captures.source import Source
-from tk.io.results.writer import JointAngles, ResultMeta
+from tk.io.results.data import JointAngles, ResultMeta
 from tk.io.settings_file import to_toml
 from tk.model.body.angles import ANGLES
 from tk.model.body.anthropometry import BodyDimensions

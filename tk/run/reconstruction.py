@@ -11,7 +11,7 @@ from tk.errors import ConfigError, ResultError
 from tk.io.captures.capture import Capture
 from tk.io.mesh import hull_mesh, write_mesh
 from tk.io.point_cloud import check_hull_path, ply_path, write_hulls, write_ply
-from tk.io.results.writer import HullPoints
+from tk.io.results.data import HullPoints
 from tk.model.cameras.volume import VoxelGrid
 from tk.model.hull.hull import VisualHull
 from tk.run.plan import choose_frames

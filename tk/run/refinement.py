@@ -14,7 +14,7 @@ from tk.errors import CaptureError, ConfigError, ResultError
 from tk.io.captures.calibration import write_calibration
 from tk.io.captures.capture import Capture
 from tk.io.captures.mask_store import MaskStore
-from tk.io.results.writer import read_result
+from tk.io.results.reader import read_result
 from tk.model.block_least_squares import Stop
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.agreement import LATE_FRAMES, camera_agreement

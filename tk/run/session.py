@@ -16,17 +16,12 @@ from tk.errors import CaptureError, ResultError, TkError
 from tk.io.captures.capture import Capture
 from tk.io.captures.mask_store import MaskStore
 from tk.io.captures.source import Source
+from tk.io.results.data import FrameResult, HullPoints, Value
 from tk.io.results.files import check_output
-from tk.io.results.writer import (
-    FrameResult,
-    HullPoints,
-    ResultWriter,
-    Status,
-    Value,
-    as_damage_error,
-    read_result,
-    revise_result,
-)
+from tk.io.results.reader import as_damage_error, read_result
+from tk.io.results.revision import revise_result
+from tk.io.results.status import Status
+from tk.io.results.writer import ResultWriter
 from tk.model.hull.hull import HullSurface
 from tk.model.setup import Setup, Subject
 from tk.run.offline import REFINED, finish, report_unknown

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError, ResultError
-from tk.io.results.writer import Result, as_damage_error, read_result
+from tk.io.results.data import Result
+from tk.io.results.reader import as_damage_error, read_result
 from tk.io.toml import parse_toml, read_text
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import ConeBody, build_cone_body

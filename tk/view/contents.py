@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.io.results.data import Result
 from tk.io.results.status import STATUS_MEANING
-from tk.io.results.writer import Result
 from tk.model.cameras.camera import Rig
 from tk.render.figure import Figure, figure_of
 from tk.render.palette import BONE, ELEVATION_DEG, FLOOR, WIRE, unit_rgb

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.results.writer import HullPoints
+from tk.io.results.data import HullPoints
 from tk.model.body.joints import BONES
 from tk.model.body.skeleton import JOINTS, SEGMENTS
 from tk.model.cameras.camera import Rig

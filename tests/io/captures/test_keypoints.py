@@ -19,7 +19,7 @@ from tk.errors import CaptureError
 from tk.io import settings_file
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.captures.keypoints import LAYOUTS, keypoint_pose, read_people
-from tk.io.results.writer import read_joints, read_result
+from tk.io.results.reader import read_joints, read_result
 from tk.model.body.skeleton import JOINTS
 from tk.run.session import track
 

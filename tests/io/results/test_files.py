@@ -17,7 +17,8 @@ import pytest
 from tests.io.result_files import assert_complete, write
 from tests.io.result_victim import META, make_frame, make_state
 from tk.errors import ResultError
-from tk.io.results.writer import ResultWriter, read_joints, read_result
+from tk.io.results.reader import read_joints, read_result
+from tk.io.results.writer import ResultWriter
 
 ROOT = Path(__file__).parents[3]
 

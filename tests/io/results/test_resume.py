@@ -17,7 +17,8 @@ import pytest
 from tests.io.result_files import assert_complete, assert_equal_values, write
 from tests.io.result_victim import META, make_frame, make_state
 from tk.errors import ResultError
-from tk.io.results.writer import ResultWriter, read_result
+from tk.io.results.reader import read_result
+from tk.io.results.writer import ResultWriter
 
 ROOT = Path(__file__).parents[3]
 
@@ -138,7 +139,7 @@ def test_resuming_another_run_is_refused(tmp_path: Path, change: dict[str, Any],
     path = tmp_path / "result.h5"
     write(path, 2)
     before = path.read_bytes()
-    with pytest.raises(ResultError, match=rf"result\.h5: .*{message}.*--resume"):
+    with pytest.raises(ResultError, match=rf"result\.h5: .*{message}.*cannot be resumed"):
         ResultWriter.resume(path, replace(META, **change))
     assert path.read_bytes() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["result.h5"]

@@ -13,7 +13,9 @@ import pytest
 from tests.io.result_files import assert_equal_values, assert_same_cameras, make_cameras, make_smoothed, write
 from tests.io.result_victim import META, make_frame, make_state
 from tk.errors import ResultError
-from tk.io.results.writer import ResultWriter, read_result, revise_result
+from tk.io.results.reader import read_result
+from tk.io.results.revision import revise_result
+from tk.io.results.writer import ResultWriter
 from tk.model.body.skeleton import JOINTS
 
 

@@ -12,7 +12,8 @@ import tk
 from tests.conftest import QUICK
 from tk.errors import ExportError
 from tk.io import settings_file
-from tk.io.results.writer import Result, read_result
+from tk.io.results.data import Result
+from tk.io.results.reader import read_result
 from tk.model.body.joints import FOOT_POINTS
 
 

@@ -20,17 +20,11 @@ from tests.io.result_files import (
 )
 from tests.io.result_victim import META, make_frame, make_state
 from tk.errors import ResultError
-from tk.io.results.writer import (
-    FrameResult,
-    JointAngles,
-    ResultWriter,
-    Status,
-    UsedCameras,
-    Value,
-    read_joints,
-    read_result,
-    revise_result,
-)
+from tk.io.results.data import FrameResult, JointAngles, UsedCameras, Value
+from tk.io.results.reader import read_joints, read_result
+from tk.io.results.revision import revise_result
+from tk.io.results.status import Status
+from tk.io.results.writer import ResultWriter
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import JOINTS, build_skeleton, paper_poses
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ResultError
+from tk.io.results.schema import columns_of
 from tk.io.results.status import has_pose
 from tk.io.toml import parse_toml
 from tk.model.body.anthropometry import BodyDimensions
@@ -22,18 +23,8 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
-FORMAT = "tk-result"
-FORMAT_VERSION = 3
-
 Float = NDArray[np.float64]
 Value = NDArray[Any] | float | int | str
-
-
-#: fields of ResultMeta that are lists of names
-_LISTS = (
-    "pose_names", "pose_units", "stages", "timing_stages", "joint_names",
-    "residual_cameras", "segment_names",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -62,14 +53,14 @@ class ResultMeta:
     The fields from ``sigma`` on declare the optional datasets of the file. A frame without a declared value gets NaN.
 
     Attributes:
-        pose_names, pose_units: names and units of the D entries of the configuration vector.
-        stages: names of the S optimiser stages of `/iterations`.
-        timing_stages: names of the timed stages. The stage ``total``, if present, is the frame's wall time.
-        fps: frames per second of the capture.
-        up: world axis that points up.
         capture, method: name of the capture, and tracking method.
         seed: seed of the random generator.
+        fps: frames per second of the capture.
+        up: world axis that points up.
         config_toml: the full configuration as TOML text.
+        pose_names, pose_units: names and units of the D entries of the configuration vector.
+        stages: names of the T optimiser stages of `/iterations`.
+        timing_stages: names of the timed stages. The stage ``total``, if present, is the frame's wall time.
         joint_names: J names in the order of `/joints/position`.
         sigma: True if `/joints/sigma` exists.
         residual_cameras: names of the C cameras of `/residual`.
@@ -79,16 +70,16 @@ class ResultMeta:
         objective_kind: meaning of the numbers of `/objective`; empty if unknown.
     """
 
+    capture: str
+    method: str
+    seed: int
+    fps: float
+    up: str
+    config_toml: str
     pose_names: tuple[str, ...]
     pose_units: tuple[str, ...]
     stages: tuple[str, ...]
     timing_stages: tuple[str, ...]
-    fps: float
-    up: str
-    capture: str
-    method: str
-    seed: int
-    config_toml: str
     joint_names: tuple[str, ...] = JOINTS
     sigma: bool = False
     residual_cameras: tuple[str, ...] = ()
@@ -110,42 +101,19 @@ class ResultMeta:
         sizes = len(self.pose_names), len(other.pose_names)
         if sizes[0] != sizes[1]:
             return f"the pose has {sizes[0]} entries, not {sizes[1]}"
-        for name in ("capture", "method", "seed", "fps", "up", "sigma", "feet", "objective_kind"):
-            if getattr(self, name) != getattr(other, name):
-                both = ["none" if value == "" else str(value) for value in (getattr(self, name), getattr(other, name))]
+        for name in (item.name for item in fields(self) if item.name != "config_toml"):
+            values = getattr(self, name), getattr(other, name)
+            if values[0] == values[1]:
+                continue
+            if not isinstance(values[0], tuple):
+                both = ["none" if value == "" else str(value) for value in values]
                 return f"{name} is {both[0]}, not {both[1]}"
-        for name in _LISTS:
-            if getattr(self, name) != getattr(other, name):
-                both = [", ".join(getattr(meta, name)) or "none" for meta in (self, other)]
-                return f"{name} are {both[0]}; not {both[1]}"
-        if self.angles != other.angles:
-            both = [", ".join(angles.joint for angles in meta.angles) or "none" for meta in (self, other)]
-            return f"angles are {both[0]}; not {both[1]}" if both[0] != both[1] else "angles differ in their convention"
+            both = [", ".join(getattr(item, "joint", item) for item in value) or "none" for value in values]
+            return (
+                f"{name} are {both[0]}; not {both[1]}" if both[0] != both[1] else f"{name} differ in their convention"
+            )
         mine, others = (parse_toml(meta.config_toml, "config", ResultError) for meta in (self, other))
         return _config_difference(mine, others)
-
-
-#: field of Result for each dataset with one row per frame, except the groups `/timing` and `/angles`. FrameResult has
-#: the same fields, but `frame` instead of `frames`.
-FIELDS = {
-    "frames": "frames",
-    "time": "time",
-    "pose": "pose",
-    "joints/position": "joints",
-    "status": "status",
-    "objective": "objective",
-    "iterations": "iterations",
-    "joints/sigma": "sigma",
-    "residual": "residual",
-    "segments/rotation": "segments_rotation",
-    "feet/position": "feet",
-}
-_SMOOTHED = ("pose", "joints/position", "joints/sigma", "segments/rotation", "feet/position")
-
-
-def can_be_smoothed(name: str) -> bool:
-    """Return True if the dataset may have a copy below `/smoothed`."""
-    return name in _SMOOTHED or name.startswith("angles/")
 
 
 @dataclass(frozen=True)
@@ -167,7 +135,7 @@ class FrameResult:
         joints: (J, 3) joint centres, metres, world frame.
         status: a :class:`Status`.
         objective: final value of the objective.
-        iterations: (S,) number of optimiser iterations per stage.
+        iterations: (T,) number of optimiser iterations per stage.
         timing: duration of each stage, s; 0 is stored for a stage that is not given.
         hull: surface voxels; None to store none.
 
@@ -232,9 +200,10 @@ class Hull:
 
 @dataclass(frozen=True)
 class Result:
-    """A whole result file: F frames, D degrees of freedom, J joints, S optimiser stages.
+    """The result of one person: F frames, D degrees of freedom, J joints, T optimiser stages.
 
-    A dataset that the file does not have is None; without angles, ``angles`` is an empty mapping.
+    A dataset that the file does not have is None; without angles, ``angles`` is an empty mapping. For a file with
+    several people, :func:`~tk.io.results.reader.read_result` returns person 0, and ``people`` are all.
     """
 
     path: Path
@@ -245,7 +214,7 @@ class Result:
     joints: Float  # (F, J, 3) metres
     status: NDArray[np.uint8]  # (F,)
     objective: Float  # (F,)
-    iterations: NDArray[np.int32]  # (F, S)
+    iterations: NDArray[np.int32]  # (F, T)
     timing: Mapping[str, Float]  # each (F,) seconds
     model: Mapping[str, Value]  # nested groups as names with slashes
     hull: Hull | None
@@ -260,6 +229,13 @@ class Result:
     cameras: UsedCameras | None = None
     smoothed: Mapping[str, NDArray[Any]] | None = None  # by dataset name, and "bridged" (F,) bool
     notes: tuple[str, ...] = ()  # messages of the run
+    person: int = 0  # number of the person in the file
+    others: tuple[Result, ...] = ()  # persons 1, 2, … of the file, if this is person 0
+
+    @property
+    def people(self) -> tuple[Result, ...]:
+        """Return the results of all people of the file: only this one if the file has one person."""
+        return (self, *self.others)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -300,10 +276,15 @@ class Result:
 
     def with_smoothed(self) -> Result:
         """Return the result with each dataset replaced by its smoothed copy, if `/smoothed` has one."""
-        smoothed = self.smoothed or {}
-        fields: dict[str, Any] = {FIELDS[name]: smoothed[name] for name in _SMOOTHED if name in smoothed}
-        angles = {joint: smoothed.get(f"angles/{joint}", values) for joint, values in self.angles.items()}
-        return replace(self, **fields, angles=angles, smoothed=None)
+        changed: dict[str, Any] = {"angles": dict(self.angles)}
+        columns = columns_of(self.meta)
+        for path, values in (self.smoothed or {}).items():
+            if path != "bridged" and columns[path].key:
+                changed[columns[path].entry.field][columns[path].key] = values
+            elif path != "bridged":
+                changed[columns[path].entry.field] = values
+        others = tuple(person.with_smoothed() for person in self.others)
+        return replace(self, **changed, others=others, smoothed=None)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import h5py
 
 from tk.errors import ConfigError, ResultBusyError, ResultError
 from tk.io.hdf5 import open_hdf5
-from tk.io.results.data import FORMAT
+from tk.io.results.schema import FORMAT
 
 
 class TwinFolder:
@@ -68,51 +68,29 @@ class TwinFolder:
 WRITE_ERRORS = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 
 
-def open_for_writing(path: Path, mode: str) -> h5py.File:
-    """Open a twin, so that it can be read even if this process is killed."""
+@contextlib.contextmanager
+def opened_for_writing(path: Path, mode: str) -> Iterator[h5py.File]:
+    """Open a twin, so that it can be read even if this process is killed; flush and close it at the end.
+
+    A file that cannot be written is redirected to memory before it is closed. Otherwise HDF5 (1.10 to 2.0) keeps it in
+    its list of open files, tries to write it once more when the process ends, and crashes.
+    """
     # libver: newer superblocks have a flag "being written"; a killed process leaves it set, and HDF5 then refuses to
     # open the file. No locks: other processes must be able to read the published twin.
-    return h5py.File(path, mode, libver="earliest", locking=False)
-
-
-def check_is_result(target: Path) -> None:
-    """Raise ResultError if the file is not a tk result of any version."""
+    file = h5py.File(path, mode, libver="earliest", locking=False)
     try:
-        with open_hdf5(target) as file:
-            if file.is_format(FORMAT):
-                return
-    except ResultError:
-        pass
-    raise ResultError(f"{target}: exists and is not a {FORMAT}; it is not overwritten: choose another name")
+        yield file
+    finally:
+        try:
+            file.flush()
+        except WRITE_ERRORS:
+            _move_to_memory(file)
+            raise
+        finally:
+            file.close()
 
 
-def check_output(path: Path, force: bool, resume: bool = False) -> None:
-    """Raise an error if a result cannot be written to the path, or if a file exists that must not be replaced.
-
-    Args:
-        path: path of the result.
-        force: replace an existing result; files that are not results are never replaced.
-        resume: continue an existing result.
-
-    Raises:
-        ResultError: the path cannot be used; the message says what to do.
-        ConfigError: ``force`` and ``resume`` are both set.
-    """
-    if force and resume:
-        raise ConfigError("--force replaces a result and --resume goes on with it: give one of them")
-    target = writable(path)
-    if resume or not target.exists():
-        return
-    check_is_result(target)
-    if not force:
-        raise ResultError(f"{path}: exists; go on with it by --resume, replace it by --force, or choose another name")
-
-
-def move_to_memory(file: h5py.File) -> None:
-    """Redirect a file that cannot be written to memory, after a failed write.
-
-    HDF5 1.10 to 2.0 crash the process if they cannot write a file when they close it, at exit at the latest.
-    """
+def _move_to_memory(file: h5py.File) -> None:
     if not hasattr(os, "memfd_create"):  # not on Linux
         return
     handle = file.id.get_vfd_handle()
@@ -142,11 +120,46 @@ def writable(path: Path) -> Path:
     Raises:
         ResultError: no file can be written there.
     """
-    target = path.resolve()
-    if target.is_dir():
+    try:
+        target = path.resolve(strict=path.is_symlink() and path.exists())
+        is_folder = target.is_dir()
+    except (OSError, RuntimeError) as error:  # RuntimeError: a loop of links, up to Python 3.12
+        reason = error.strerror if isinstance(error, OSError) else "a loop of links"
+        raise ResultError(f"{path}: cannot be written: {reason}; choose another name") from None
+    if is_folder:
         raise ResultError(f"{path}: is a folder; name a file in it")
     if not target.parent.is_dir():
         raise ResultError(f"{path}: the folder {target.parent} does not exist; make it first")
-    if target.exists() and not (target.is_file() and os.access(target, os.W_OK)):
+    if target.is_symlink() or (target.exists() and not (target.is_file() and os.access(target, os.W_OK))):
         raise ResultError(f"{path}: cannot be written; choose another name")
     return target
+
+
+def check_output(path: Path, force: bool, resume: bool = False) -> None:
+    """Raise an error if a result cannot be written to the path, or if a file exists that must not be replaced.
+
+    Args:
+        path: path of the result.
+        force: replace an existing result; files that are not results are never replaced.
+        resume: continue an existing result.
+
+    Raises:
+        ResultError: the path cannot be used; the message says what to do.
+        ConfigError: ``force`` and ``resume`` are both set.
+    """
+    if force and resume:
+        raise ConfigError("--force replaces a result and --resume goes on with it: give one of them")
+    target = writable(path)
+    if resume or not target.exists():
+        return
+    check_is_result(target)
+    if not force:
+        raise ResultError(f"{path}: exists; go on with it by --resume, replace it by --force, or choose another name")
+
+
+def check_is_result(target: Path) -> None:
+    """Raise ResultError if the file is not a tk result of any version."""
+    with contextlib.suppress(ResultError), open_hdf5(target) as file:
+        if file.is_format(FORMAT):
+            return
+    raise ResultError(f"{target}: exists and is not a {FORMAT}; it is not overwritten: choose another name")

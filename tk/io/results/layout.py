@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
@@ -14,8 +16,19 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.results.columns import columns_of, put_attributes, row_of, strings
-from tk.io.results.data import FORMAT, FORMAT_VERSION, FrameResult, HullPoints, ResultMeta, UsedCameras, Value
+from tk.io.results.data import FrameResult, HullPoints, ResultMeta, UsedCameras, Value
+from tk.io.results.schema import (
+    ATTRIBUTES,
+    CAMERAS,
+    FORMAT,
+    FORMAT_VERSION,
+    HULL,
+    PERSON,
+    Column,
+    columns_of,
+    prefix_of,
+    row_of,
+)
 
 # Duration of a chunk of rows, s. A longer chunk makes each append slower, a shorter one makes reading slower.
 CHUNK_SECONDS = 1.5
@@ -25,125 +38,156 @@ State = Mapping[str, Value]
 
 
 @dataclass(frozen=True)
-class Row:
-    """A frame to be written. It is a copy: the tracker may reuse its arrays before the second twin is written."""
+class FrameSet:
+    """The rows of a frame set, by person. They are copies: a tracker may reuse its arrays before they are written."""
 
     index: int
-    columns: Mapping[str, NDArray[Any]]
-    hull: HullPoints | None
+    rows: Mapping[int, Mapping[str, NDArray[Any]]]
+    hulls: Mapping[int, HullPoints | None]
     state: State | None
 
     @staticmethod
-    def of(index: int, result: FrameResult, state: State | None, meta: ResultMeta) -> Row:
-        """Copy and check a frame.
+    def of(
+        index: int, people: Mapping[int, FrameResult], state: State | None, columns: Mapping[str, Column]
+    ) -> FrameSet:
+        """Copy and check the frames.
 
         Raises:
-            ValueError: a shape, the status or a timing stage does not match ``meta``.
+            ValueError: a shape, the status or a timing stage does not match the columns.
         """
-        columns = row_of(result, meta)
-        hull = result.hull
-        if hull is not None:
-            hull = HullPoints(np.array(hull.positions, dtype=np.float32), np.array(hull.colors, dtype=np.uint8))
-            if hull.positions.shape != hull.colors.shape or hull.positions.shape[1:] != (3,):
-                raise ValueError(f"hull: positions {hull.positions.shape} and colours {hull.colors.shape}, not (N, 3)")
         if state is not None:
             state = {name: value if isinstance(value, str) else np.array(value) for name, value in state.items()}
-        return Row(index, columns, hull, state)
+        rows = {person: row_of(frame, columns) for person, frame in people.items()}
+        return FrameSet(index, rows, {person: _copied(frame.hull) for person, frame in people.items()}, state)
 
 
 class Twin:
-    """One of the two files and its number of rows. Datasets stay open: opening one costs more than writing a row."""
+    """One of the two files. Datasets stay open: opening one costs more than writing a row.
 
-    def __init__(self, path: Path, file: h5py.File) -> None:
-        self.path = path
-        self.file = file
-        self.rows = int(file["frames"].shape[0])
-        self.model_version = 0
-        self._has_smoothed = "smoothed" in file
+    Attributes:
+        closing: closes the file.
+        count: number of frame sets in the file.
+        models: the bodies in the file.
+    """
+
+    def __init__(
+        self, path: Path, file: h5py.File, closing: contextlib.ExitStack, meta: ResultMeta, models: Sequence[State]
+    ) -> None:
+        self.path, self.file, self.closing = path, file, closing
+        self.models = list(models)
+        self._meta = meta
+        self._rows = [int(file[f"{prefix_of(person)}frames"].shape[0]) for person in range(len(models))]
+        self.count = self._rows[0]
         self._open: dict[str, h5py.h5d.DatasetID] = {}
-        self._state_names = _dataset_names(file, "resume/state")
-        self._put_last: dict[str, tuple[object, bytes]] = {}  # most of the state is the same in every frame
+        self._written: dict[str, NDArray[Any]] = {}  # content of `/resume`; most of it is the same in every frame
+        self._smoothed = {prefix for person in range(len(models)) if f"{(prefix := prefix_of(person))}smoothed" in file}
+        self._relink = False
+        if "resume" in file:
+            self._drop_rows_without_state()
+            file["resume"].visititems(self._take_up)
 
-    def append(self, new_rows: Sequence[Row]) -> None:
-        """Append frames and the latest state, without flushing. `/smoothed` is deleted: it is now incomplete."""
-        self._drop_smoothed()
-        for name in new_rows[0].columns:
-            self._extend(name, np.array([row.columns[name] for row in new_rows]), self.rows)
-        if "hull" in self.file or any(row.hull is not None for row in new_rows):
-            self._append_hulls([row.hull for row in new_rows])
-        self.rows += len(new_rows)
-        for row in reversed(new_rows):
-            if row.state is not None:
-                self._put_state(row.state, row.index + 1)
-                break
+    def append(self, new: Sequence[FrameSet]) -> None:
+        """Append frame sets and the latest state, without flushing. `/smoothed` is deleted: it is now incomplete."""
+        with_state = max((k for k, frame_set in enumerate(new, 1) if frame_set.state is not None), default=0)
+        for part in (new[:with_state], new[with_state:]):
+            for person in range(1 + max((person for frame_set in part for person in frame_set.rows), default=-1)):
+                self._append_rows(person, [frame_set for frame_set in part if person in frame_set.rows])
+            self.count += len(part)
+            if part and part[-1].state is not None:
+                self._put_state(part[-1].state)
+        if self._relink:
+            link_first_person(self.file)
+            self._relink = False
 
-    def drop_rows_without_state(self, meta: ResultMeta) -> None:
-        """Remove the rows after the frame of the stored state."""
-        rows = int(self.file["resume/rows"][()]) if "resume/rows" in self.file else self.rows
-        if rows >= self.rows:
+    def put_models(self, models: Sequence[State]) -> None:
+        """Write the bodies that this file does not have yet."""
+        for person, model in enumerate(models):
+            if person >= len(self.models) or self.models[person] is not model:
+                if person == len(self._rows):
+                    self._add_person()
+                put_model(self.file, model, person)
+                self._relink = True
+        self.models = list(models)
+
+    def _take_up(self, name: str, item: h5py.Dataset | h5py.Group) -> None:
+        if isinstance(item, h5py.Dataset):
+            self._written[name] = np.asarray(item[()])
+
+    def _drop_rows_without_state(self) -> None:
+        self.count = int(self.file["resume/rows"][()])
+        for person, rows in enumerate(self.file["resume/people"][()].tolist()):
+            prefix = prefix_of(person)
+            if rows == self._rows[person]:
+                continue
+            self._rows[person] = rows
+            self._drop_smoothed(prefix)
+            for name in columns_of(self._meta):
+                self.file[prefix + name].resize(rows, axis=0)
+            if f"{prefix}hull" in self.file:
+                hull = self.file[f"{prefix}hull"]
+                voxels = int(hull["offsets"][rows])
+                for name, length in (("offsets", rows + 1), ("positions", voxels), ("colors", voxels)):
+                    hull[name].resize(length, axis=0)
+
+    def _append_rows(self, person: int, new: Sequence[FrameSet]) -> None:
+        prefix = prefix_of(person)
+        if person == len(self._rows):
+            self._add_person()
+        if not new:
             return
-        self.rows = rows
-        for name in columns_of(meta):
-            self.file[name].resize(self.rows, axis=0)
-        self._drop_smoothed()
-        if "hull" in self.file:
-            voxels = int(self.file["hull/offsets"][self.rows])
-            self.file["hull/offsets"].resize(self.rows + 1, axis=0)
-            self.file["hull/positions"].resize(voxels, axis=0)
-            self.file["hull/colors"].resize(voxels, axis=0)
+        self._drop_smoothed(prefix)
+        for name in new[0].rows[person]:
+            values = np.array([frame_set.rows[person][name] for frame_set in new])
+            self._extend(prefix + name, values, self._rows[person])
+        hulls = [frame_set.hulls[person] for frame_set in new]
+        if f"{prefix}hull" in self.file or any(hull is not None for hull in hulls):
+            self._append_hulls(prefix, hulls, self._rows[person])
+        self._rows[person] += len(new)
 
-    def _drop_smoothed(self) -> None:
-        if self._has_smoothed:
-            del self.file["smoothed"]
-            self._has_smoothed = False
-
-    def _append_hulls(self, hulls: Sequence[HullPoints | None]) -> None:
-        if "hull" not in self.file:
-            _create_growing(self.file, "hull/positions", (3,), "f4", HULL_CHUNK)
-            _create_growing(self.file, "hull/colors", (3,), "u1", HULL_CHUNK).attrs["order"] = "RGB"
-            _create_growing(self.file, "hull/offsets", (), "i8", 64)
-            self._extend("hull/offsets", np.zeros(self.rows + 1, dtype=np.int64))  # earlier frames have no voxels
-        stored = self._dataset("hull/positions").shape[0]
+    def _append_hulls(self, prefix: str, hulls: Sequence[HullPoints | None], rows: int) -> None:
+        if f"{prefix}hull" not in self.file:
+            for entry in HULL:
+                shape = entry.lengths({"N": 0, "F+1": 0})[1:]
+                chunk = 64 if entry is HULL[-1] else HULL_CHUNK
+                _create_growing(self.file, prefix + entry.path, shape, entry.dtype, chunk)
+            self.file[f"{prefix}hull/colors"].attrs["order"] = "RGB"
+            self._relink = True
+            self._extend(f"{prefix}hull/offsets", np.zeros(rows + 1, np.int64))  # earlier frames have no voxels
+        stored = self._dataset(f"{prefix}hull/positions").shape[0]
         for hull in hulls:
             if hull is not None:
-                self._extend("hull/positions", hull.positions)
-                self._extend("hull/colors", hull.colors)
+                self._extend(f"{prefix}hull/positions", hull.positions)
+                self._extend(f"{prefix}hull/colors", hull.colors)
         counts = [0 if hull is None else len(hull.positions) for hull in hulls]
-        self._extend("hull/offsets", stored + np.cumsum(counts, dtype=np.int64))
+        self._extend(f"{prefix}hull/offsets", stored + np.cumsum(counts, dtype=np.int64))
 
-    def _put_state(self, state: State, rows: int) -> None:
-        """Overwrite `/resume` with the tracker's state after ``rows`` frames."""
-        if self._state_names - set(state):
-            self._drop("resume/state")
-        self._state_names = set(state)
-        self._put("resume/rows", rows)
-        for name, value in state.items():
-            self._put(f"resume/state/{name}", value)
+    def _add_person(self) -> None:
+        create_person(self.file, self._meta, len(self._rows))
+        self._rows.append(0)
+        self._relink = True
 
-    def _put(self, name: str, value: Value) -> None:
-        """Overwrite a small dataset, in place if the new value fits."""
-        array = np.asarray(encode(value), order="C")
-        is_text = isinstance(value, str)
-        content = ((array.dtype, array.shape, is_text), array.tobytes())
-        if self._put_last.get(name) == content:
-            return
-        self._put_last[name] = content
-        if name in self._open or isinstance(self.file.get(name), h5py.Dataset):
-            dataset = self._dataset(name)
-            growing = dataset.get_create_plist().get_layout() == h5py.h5d.CHUNKED
-            if dataset.dtype == array.dtype and growing == is_text and (is_text or dataset.shape == array.shape):
-                if is_text:
-                    dataset.set_extent(array.shape)
-                if array.size:
-                    dataset.write(h5py.h5s.ALL, h5py.h5s.ALL, array)
-                return
-            self._drop(name)
-        elif name in self.file:  # a group, in a damaged file
-            self._drop(name)
-        if is_text:  # with HDF5's strings of variable length, each write would leave the old bytes in the file
-            self.file.create_dataset(name, data=array, maxshape=(None,), chunks=(1024,)).attrs["encoding"] = "utf-8"
-        else:
-            self.file.create_dataset(name, data=array)
+    def _drop_smoothed(self, prefix: str) -> None:
+        if prefix in self._smoothed:
+            del self.file[f"{prefix}smoothed"]
+            self._smoothed.remove(prefix)
+            self._relink = True
+
+    def _put_state(self, state: State) -> None:
+        """Overwrite `/resume` with the state after the last frame set."""
+        content = {"rows": encode(self.count), "people": encode(np.array(self._rows))}
+        content |= {f"state/{name}": encode(value) for name, value in state.items()}
+        content["checksum"] = encode(checksum(content))
+        for name, before in list(self._written.items()):
+            array = content.get(name)
+            if array is None or (array.dtype, array.shape) != (before.dtype, before.shape):
+                del self.file[f"resume/{name}"], self._written[name]
+                self._open.pop(f"resume/{name}", None)
+        for name, array in content.items():
+            if name not in self._written:
+                self.file[f"resume/{name}"] = array
+            elif self._written[name].tobytes() != array.tobytes():
+                self._dataset(f"resume/{name}").write(h5py.h5s.ALL, h5py.h5s.ALL, np.ascontiguousarray(array))
+            self._written[name] = array
 
     def _extend(self, name: str, values: NDArray[Any], rows: int | None = None) -> None:
         """Append values to a dataset. ``rows`` is its current number of rows; None: ask HDF5.
@@ -166,42 +210,53 @@ class Twin:
             self._open[name] = self.file[name].id
         return self._open[name]
 
-    def _drop(self, name: str) -> None:
-        self._open = {key: handle for key, handle in self._open.items() if not f"{key}/".startswith(f"{name}/")}
-        self._put_last = {key: last for key, last in self._put_last.items() if key in self._open}
-        del self.file[name]
 
-
-def write_layout(file: h5py.File, meta: ResultMeta) -> None:
+def write_layout(file: h5py.File, meta: ResultMeta, people: int) -> None:
     """Write the attributes and the empty datasets of a new result."""
+    file.attrs.update({name: kind(getattr(meta, source)) for name, (source, kind) in ATTRIBUTES.items()})
     file.attrs.update(
         {
             "format": FORMAT,
             "format_version": FORMAT_VERSION,
-            "fps": float(meta.fps),
             "units": "m",
-            "up": meta.up,
-            "capture": meta.capture,
-            "method": meta.method,
-            "seed": int(meta.seed),
-            "config": meta.config_toml,
             "software": f"tk-mocap {_software_version()}",
             "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         }
     )
-    rows = max(1, round(CHUNK_SECONDS * meta.fps))
-    file.create_group("timing").attrs["stages"] = strings(meta.timing_stages)
+    for person in range(people):
+        create_person(file, meta, person)
+    link_first_person(file)
+
+
+def create_person(file: h5py.File, meta: ResultMeta, person: int) -> None:
+    """Create the empty datasets of a person. Person 0 is at the top level."""
+    prefix, rows = prefix_of(person), max(1, round(CHUNK_SECONDS * meta.fps))
+    file.create_group(f"{prefix}timing").attrs["stages"] = _strings(meta.timing_stages)
     if meta.angles:
-        file.create_group("angles").attrs["joints"] = strings(angles.joint for angles in meta.angles)
+        file.create_group(f"{prefix}angles").attrs["joints"] = _strings(angles.joint for angles in meta.angles)
     for name, column in columns_of(meta).items():
-        put_attributes(_create_growing(file, name, column.shape, column.dtype, rows), column)
+        dataset = _create_growing(file, prefix + name, column.shape, column.entry.dtype, rows)
+        put_attributes(dataset, column.attributes)
 
 
-def put_model(file: h5py.File, model: Mapping[str, Value]) -> None:
-    """Write or replace `/model`. A name may hold slashes."""
-    if "model" in file:
-        del file["model"]
-    group = file.create_group("model")
+def link_first_person(file: h5py.File) -> None:
+    """Let `/people/0`, if there are several people, hold hard links to what the top level has of person 0."""
+    if "people" not in file:
+        return
+    if "0" in file["people"]:
+        del file["people/0"]
+    group = file.create_group("people/0")
+    for name in PERSON:
+        if name in file:
+            group[name] = file[name]
+
+
+def put_model(file: h5py.File, model: Mapping[str, Value], person: int = 0) -> None:
+    """Write or replace `/model` of a person. A name may hold slashes."""
+    name = f"{prefix_of(person)}model"
+    if name in file:
+        del file[name]
+    group = file.create_group(name)
     for name, value in model.items():
         group[name] = value
 
@@ -210,27 +265,39 @@ def put_cameras(file: h5py.File, cameras: UsedCameras) -> None:
     """Write or replace `/cameras`: each dataset has one row per camera, the attribute `names` their names."""
     if "cameras" in file:
         del file["cameras"]
-    group = file.create_group("cameras")
-    group.attrs["names"] = strings(cameras.rig.names)
-    group["matrix"] = np.array([camera.matrix for camera in cameras.rig])
-    group["distortions"] = np.array([np.pad(c.distortions, (0, 5 - len(c.distortions))) for c in cameras.rig])
-    group["rotation"] = np.array([cv2.Rodrigues(camera.rotation)[0].ravel() for camera in cameras.rig])
-    group["translation"] = np.array([camera.translation for camera in cameras.rig])
-    group["size"] = np.array([(camera.width, camera.height) for camera in cameras.rig], dtype=np.int64)
-    group["fisheye"] = np.array([camera.fisheye for camera in cameras.rig], dtype=np.uint8)
-    group["time_offset"] = np.array(cameras.time_offset_s, dtype=np.float64)
+    file.create_group("cameras").attrs["names"] = _strings(cameras.rig.names)
+    values = {
+        "matrix": [camera.matrix for camera in cameras.rig],
+        "distortions": [np.pad(camera.distortions, (0, 5 - len(camera.distortions))) for camera in cameras.rig],
+        "rotation": [cv2.Rodrigues(camera.rotation)[0].ravel() for camera in cameras.rig],
+        "translation": [camera.translation for camera in cameras.rig],
+        "size": [(camera.width, camera.height) for camera in cameras.rig],
+        "fisheye": [camera.fisheye for camera in cameras.rig],
+        "time_offset": cameras.time_offset_s,
+    }
+    for entry in CAMERAS:
+        file[entry.path] = np.array(values[entry.path.split("/")[1]], entry.dtype)
+
+
+def put_attributes(holder: h5py.Dataset | h5py.Group, attributes: Mapping[str, str | Iterable[str]]) -> None:
+    """Write attributes that are texts or lists of texts."""
+    for name, value in attributes.items():
+        holder.attrs[name] = value if isinstance(value, str) else _strings(value)
 
 
 def encode(value: Value) -> NDArray[Any]:
-    """Return a value as an array that can be overwritten in place: text as its UTF-8 bytes."""
-    return np.frombuffer(value.encode(), dtype=np.uint8) if isinstance(value, str) else np.asarray(value)
+    """Return a value as the array that `/resume` holds: a text as its UTF-8 bytes."""
+    return np.asarray(value.encode() if isinstance(value, str) else value)
 
 
-def _dataset_names(file: h5py.File, group: str) -> set[str]:
-    names: set[str] = set()
-    if group in file:
-        file[group].visititems(lambda name, item: names.add(name) if isinstance(item, h5py.Dataset) else None)
-    return names
+def checksum(content: Mapping[str, Value]) -> int:
+    """Return the CRC-32 of names, types, shapes and values; the order and the bits of a NaN make no difference."""
+    total = 0
+    for name, array in sorted((name, encode(value)) for name, value in content.items()):
+        if array.dtype.kind == "f":
+            array = np.where(np.isnan(array), np.asarray(np.nan, array.dtype), array)
+        total = zlib.crc32(f"{name} {array.dtype.str} {array.shape}".encode() + array.tobytes(), total)
+    return total
 
 
 def _create_growing(file: h5py.File, name: str, shape: tuple[int, ...], dtype: str, rows: int) -> h5py.Dataset:
@@ -241,6 +308,20 @@ def _create_growing(file: h5py.File, name: str, shape: tuple[int, ...], dtype: s
         chunks=(rows, *(max(1, n) for n in shape)),
         dtype=dtype,
     )
+
+
+def _copied(hull: HullPoints | None) -> HullPoints | None:
+    if hull is None:
+        return None
+    hull = HullPoints(np.array(hull.positions, np.float32), np.array(hull.colors, np.uint8))
+    if hull.positions.shape != hull.colors.shape or hull.positions.shape[1:] != (3,):
+        raise ValueError(f"hull: positions {hull.positions.shape} and colours {hull.colors.shape}, not (N, 3)")
+    return hull
+
+
+def _strings(values: Iterable[str]) -> NDArray[Any]:
+    """Return texts as an array that can be an HDF5 attribute."""
+    return np.array(list(values), dtype=h5py.string_dtype())
 
 
 def _software_version() -> str:

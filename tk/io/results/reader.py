@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,27 +15,29 @@ from numpy.typing import NDArray
 
 from tk.errors import ResultError
 from tk.io.hdf5 import Hdf5Reader, open_hdf5
-from tk.io.results.columns import MAX_DISTANCE_M, MAX_FRAME, MAX_NUMBER, MAX_STATUS, columns_of
-from tk.io.results.data import (
-    FIELDS,
+from tk.io.results.data import Float, Hull, JointAngles, JointTrack, Result, ResultMeta, UsedCameras, Value
+from tk.io.results.schema import (
+    ATTRIBUTES,
+    CAMERAS,
     FORMAT,
     FORMAT_VERSION,
-    Float,
-    Hull,
-    JointAngles,
-    JointTrack,
-    Result,
-    ResultMeta,
-    UsedCameras,
-    Value,
-    can_be_smoothed,
+    HULL,
+    MAX_NUMBER,
+    ROWS,
+    Dataset,
+    columns_of,
+    prefix_of,
+    smoothed_columns,
 )
-from tk.model.body.skeleton import JOINTS
+from tk.model.body.joints import JOINTS
 from tk.model.cameras.camera import Camera, Rig
+
+_ENTRIES = {entry.path: entry for entry in ROWS}
+_TEXTS = {field.name for field in fields(ResultMeta) if field.type == "str"}
 
 
 def read_result(path: str | os.PathLike[str]) -> Result:
-    """Read a whole result.
+    """Read a whole result; of a file with several people, person 0, whose ``people`` are all.
 
     Raises:
         ResultError: the file does not exist, is not a result of this format version, or is incomplete or damaged.
@@ -42,33 +45,20 @@ def read_result(path: str | os.PathLike[str]) -> Result:
     path = Path(path)
     with open_hdf5(path) as file:
         check_format(file)
-        meta = read_meta(file)
-        rows = count_rows(file, meta)
-        columns = {
-            name: file.array(name, column.dtype, (rows, *column.shape), column.limit)
-            for name, column in columns_of(meta).items()
+        shared = {
+            "path": path,
+            "cameras": _read_cameras(file),
+            "state": file.values("resume/state", MAX_NUMBER),
+            "software": file.text("", "software", ""),
+            "created": file.text("", "created", ""),
+            "notes": file.names("", "notes") if file.attribute("", "notes") is not None else (),
         }
-        _check_frames(file, columns["frames"])
-        fields: dict[str, Any] = {field: columns.get(name) for name, field in FIELDS.items()}
-        return Result(
-            path=path,
-            meta=meta,
-            **fields,
-            timing={stage: columns[f"timing/{stage}"] for stage in meta.timing_stages},
-            angles={angles.joint: columns[f"angles/{angles.joint}"] for angles in meta.angles},
-            cameras=_read_cameras(file),
-            smoothed=_read_smoothed(file, meta, rows),
-            model=read_values(file, "model"),
-            hull=_read_hull(file, rows),
-            state=read_values(file, "resume/state"),
-            software=file.text("", "software", ""),
-            created=file.text("", "created", ""),
-            notes=file.names("", "notes") if file.attribute("", "notes") is not None else (),
-        )
+        others = [_read_person(file, person, shared) for person in range(1, count_people(file))]
+        return _read_person(file, 0, {**shared, "others": tuple(others)})
 
 
-def read_joints(path: str | os.PathLike[str]) -> JointTrack:
-    """Read the joints of a result or of ground truth, in the order of :data:`tk.model.body.joints.JOINTS`.
+def read_people(path: str | os.PathLike[str]) -> tuple[JointTrack, ...]:
+    """Read the joints of each person of a result or of ground truth, in the order of :data:`JOINTS`.
 
     Raises:
         ResultError: as :func:`read_result`, or a joint is missing, a frame is repeated, or the unit is not metres.
@@ -80,31 +70,14 @@ def read_joints(path: str | os.PathLike[str]) -> JointTrack:
         units = file.text("", "units", "m")
         if units != "m":
             file.fail(f"units = {units}; joint positions must be in metres (m)")
-        for name in ("frames", "joints/position"):
-            if name not in file.shapes:
-                file.fail(f"has no /{name}; it is neither a tk result nor a capture's truth")
-        frames = file.array("frames", "int64", (None,), MAX_FRAME)
-        _check_frames(file, frames)
-        names = file.names("joints/position", "names")
-        missing = [joint for joint in JOINTS if joint not in names]
-        if missing:
-            file.fail(f"/joints/position has no joint {missing[0]} in its attribute names")
-        order = [names.index(joint) for joint in JOINTS]
-        rows, joints = len(frames), len(names)
-        positions = file.array("joints/position", "float64", (rows, joints, 3), MAX_DISTANCE_M)[:, order]
-        positions[~np.isfinite(positions)] = np.nan
-        status = file.array("status", "uint8", (rows,), MAX_STATUS) if "status" in file else None
-        sigma = (
-            file.array("joints/sigma", "float64", (rows, joints), MAX_DISTANCE_M) if "joints/sigma" in file else None
-        )
-        if sigma is not None and (sigma < 0).any():
-            file.fail("/joints/sigma holds negative numbers; the file is damaged")
-        stages = [name for name in file.below("timing") if "/" not in name]
-        timing = {stage: file.array(f"timing/{stage}", "float64", (rows,), MAX_NUMBER) for stage in stages}
-    seconds: Float | None = None
-    if timing:
-        seconds = timing["total"] if "total" in timing else np.sum(list(timing.values()), axis=0)
-    return JointTrack(path, frames, positions, status, seconds, None if sigma is None else sigma[:, order])
+        if "people" not in file:
+            return (_read_track(file, ""),)
+        return tuple(_read_track(file, f"people/{person}/") for person in range(count_people(file)))
+
+
+def read_joints(path: str | os.PathLike[str]) -> JointTrack:
+    """Read the joints of the first person; see :func:`read_people`."""
+    return read_people(path)[0]
 
 
 @contextlib.contextmanager
@@ -116,7 +89,9 @@ def as_damage_error(path: Path, what: str) -> Iterator[None]:
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             yield
-    except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, AssertionError) as error:
+    except (
+        LookupError, ValueError, TypeError, AttributeError, ArithmeticError, AssertionError, RecursionError, MemoryError
+    ) as error:  # fmt: skip
         detail = " ".join(str(error).split())[:100]
         raise ResultError(f"{path}: {what} cannot be used; the file is damaged ({detail})") from error
 
@@ -131,113 +106,187 @@ def check_format(file: Hdf5Reader) -> None:
     found = file.attribute("", "format_version")
     if np.ndim(found) or found != FORMAT_VERSION:
         newer = isinstance(found, int | np.integer) and found > FORMAT_VERSION
-        remedy = "use a newer tk" if newer else "track the capture again (--force replaces the file)"
+        remedy = "use a newer tk" if newer else "track the capture again"
         file.fail(f"format_version is {found}; this version of tk reads and resumes version {FORMAT_VERSION}: {remedy}")
 
 
-def read_meta(file: Hdf5Reader) -> ResultMeta:
-    """Return the metadata of an open result."""
-    for name in ("pose", "iterations", "timing", "joints/position", "frames"):
-        if name not in file:
-            file.fail(f"has no /{name}; the file is damaged")
+def count_people(file: Hdf5Reader) -> int:
+    """Return the number of people in the file.
+
+    Raises:
+        ResultError: the people are not numbered 0, 1, …
+    """
+    if "people" not in file:
+        return 1
+    names = {name.split("/")[1] for name in (*file.groups, *file.shapes) if name.startswith("people/")}
+    if not names or names != {str(person) for person in range(len(names))} or "people" in file.shapes:
+        file.fail("/people does not hold groups 0, 1, …; the file is damaged")
+    return len(names)
+
+
+def read_meta(file: Hdf5Reader, prefix: str = "") -> ResultMeta:
+    """Return the metadata of a person in an open result."""
+    found: dict[str, Any] = {}
+    for name, (source, kind) in ATTRIBUTES.items():
+        found[source] = file.text("", name) if kind is str else kind(file.number("", name))
+    found["timing_stages"] = file.names(f"{prefix}timing", "stages") if f"{prefix}timing" in file else ()
+    angles = file.names(f"{prefix}angles", "joints") if f"{prefix}angles" in file else ()
+    for entry in (entry for entry in ROWS if not entry.each):
+        path = prefix + entry.path
+        exists = path in file.shapes
+        if not exists and not entry.optional:
+            file.fail(f"has no /{path}; the file is damaged")
+        for attribute, item in entry.attributes.items():
+            if item in _TEXTS:
+                found[str(item)] = file.text(path, attribute, "")
+            elif isinstance(item, str) and item not in found:
+                found[item] = file.names(path, attribute) if exists else ()
+        if entry.optional:
+            found.setdefault(entry.optional, exists)
     try:
-        return ResultMeta(
-            pose_names=file.names("pose", "names"),
-            pose_units=file.names("pose", "units"),
-            stages=file.names("iterations", "stages"),
-            timing_stages=file.names("timing", "stages"),
-            fps=file.number("", "fps"),
-            up=file.text("", "up"),
-            capture=file.text("", "capture"),
-            method=file.text("", "method"),
-            seed=int(file.number("", "seed")),
-            config_toml=file.text("", "config"),
-            joint_names=file.names("joints/position", "names"),
-            sigma="joints/sigma" in file,
-            residual_cameras=file.names("residual", "cameras") if "residual" in file else (),
-            segment_names=file.names("segments/rotation", "names") if "segments/rotation" in file else (),
-            feet="feet/position" in file,
-            angles=_read_angles(file),
-            objective_kind=file.text("objective", "kind", "") if "objective" in file else "",
+        found["angles"] = tuple(
+            JointAngles(
+                joint,
+                file.names(f"{prefix}angles/{joint}", "names"),
+                file.text(f"{prefix}angles/{joint}", "convention"),
+            )
+            for joint in angles
         )
+        return ResultMeta(**found)
     except ValueError as error:
         file.fail(f"{error}; the file is damaged")
 
 
-def count_rows(file: Hdf5Reader, meta: ResultMeta) -> int:
-    """Return the number of frames, after checking the shape of every dataset with one row per frame.
+def count_rows(file: Hdf5Reader, meta: ResultMeta, prefix: str = "") -> int:
+    """Return the number of a person's frames, after checking the shape of every dataset with one row per frame.
 
     Raises:
         ResultError: a dataset is missing or has the wrong shape.
     """
-    if len(file.shapes.get("frames", ())) != 1:
-        file.fail("has no /frames with one number per frame; the file is damaged")
-    rows = file.shapes["frames"][0]
+    if len(file.shapes.get(f"{prefix}frames", ())) != 1:
+        file.fail(f"has no /{prefix}frames with one number per frame; the file is damaged")
+    rows = file.shapes[f"{prefix}frames"][0]
     for name, column in columns_of(meta).items():
-        if file.shapes.get(name) != (rows, *column.shape):
-            found = f"has shape {file.shapes[name]}" if name in file.shapes else "is missing"
-            file.fail(f"/{name} {found}; {(rows, *column.shape)} is expected for {rows} frames")
+        expected, path = (rows, *column.shape), prefix + name
+        if file.shapes.get(path) != expected:
+            found = f"has shape {file.shapes[path]}" if path in file.shapes else "is missing"
+            file.fail(f"/{path} {found}; {expected} is expected for {rows} frames")
     return rows
 
 
-def check_hull(file: Hdf5Reader, rows: int) -> NDArray[np.int64] | None:
-    """Return `/hull/offsets`, which divide the voxels into frames; None if there is no hull.
+def check_hull(file: Hdf5Reader, rows: int, prefix: str = "") -> NDArray[np.int64] | None:
+    """Return `/hull/offsets`; None if there is no hull.
 
     Raises:
         ResultError: the offsets do not match the positions and colours.
     """
-    if "hull" not in file:
+    if f"{prefix}hull" not in file:
         return None
-    offsets = file.array("hull/offsets", "int64", (rows + 1,))
-    shapes = [file.shapes.get(name) for name in ("hull/positions", "hull/colors")]
+    offsets = _read(file, HULL[2], prefix, {"F+1": rows + 1})
+    shapes = [file.shapes.get(prefix + entry.path) for entry in HULL[:2]]
     if offsets[0] != 0 or (np.diff(offsets) < 0).any() or shapes != [(offsets[-1], 3)] * 2:
-        file.fail("/hull/offsets does not divide /hull/positions and /hull/colors into frames; the file is damaged")
+        file.fail(f"/{prefix}hull/offsets does not divide the voxels into frames; the file is damaged")
     return offsets
 
 
-def read_values(file: Hdf5Reader, group: str) -> dict[str, Value]:
-    """Return all datasets below a group as a flat mapping; {} if there is no such group.
-
-    Raises:
-        ResultError: a dataset holds neither numbers nor text, or a number above :data:`MAX_NUMBER`.
-    """
-    found: dict[str, Value] = {name: file.value(f"{group}/{name}") for name in file.below(group)}
-    for name, value in found.items():
-        numbers = np.asarray(value)
-        if numbers.dtype.kind == "f" and (np.abs(numbers[np.isfinite(numbers)]) > MAX_NUMBER).any():
-            file.fail(f"/{group}/{name} holds a number that is out of range; the file is damaged")
-    return found
+def read_model(file: Hdf5Reader, prefix: str = "") -> dict[str, Value]:
+    """Return the fitted body of a person; {} if there is none."""
+    return file.values(f"{prefix}model", MAX_NUMBER)
 
 
-def _read_angles(file: Hdf5Reader) -> tuple[JointAngles, ...]:
-    if "angles" not in file:
-        return ()
-    return tuple(
-        JointAngles(joint, file.names(f"angles/{joint}", "names"), file.text(f"angles/{joint}", "convention"))
-        for joint in file.names("angles", "joints")
+def _read(file: Hdf5Reader, entry: Dataset, prefix: str, counts: dict[str, int]) -> NDArray[Any]:
+    return file.array(prefix + entry.path, entry.dtype, entry.lengths(counts), *entry.valid, entry.finite)
+
+
+def _read_person(file: Hdf5Reader, person: int, shared: dict[str, Any]) -> Result:
+    prefix = prefix_of(person)
+    meta = read_meta(file, prefix)
+    rows = count_rows(file, meta, prefix)
+    columns = columns_of(meta)
+
+    def read(path: str, entry: Dataset, shape: tuple[int, ...]) -> NDArray[Any]:
+        return file.array(prefix + path, entry.dtype, (rows, *shape), *entry.valid, entry.finite)
+
+    found: dict[str, Any] = {"timing": {}, "angles": {}}
+    for path, column in columns.items():
+        values = read(path, column.entry, column.shape)
+        if column.key:
+            found[column.entry.field][column.key] = values
+        else:
+            found[column.entry.field] = values
+    _check_frames(file, prefix, found["frames"])
+    smoothed = None
+    if f"{prefix}smoothed" in file:
+        copies = {f"smoothed/{path}": column for path, column in smoothed_columns(columns).items()}
+        smoothed = {
+            path.removeprefix("smoothed/"): read(path, column.entry, column.shape)
+            for path, column in copies.items()
+            if prefix + path in file or path == "smoothed/bridged"
+        }
+    return Result(
+        meta=meta,
+        person=person,
+        smoothed=smoothed,
+        model=read_model(file, prefix),
+        hull=_read_hull(file, rows, prefix),
+        **found,
+        **shared,
     )
 
 
-def _check_frames(file: Hdf5Reader, frames: NDArray[np.int64]) -> None:
+def _read_hull(file: Hdf5Reader, rows: int, prefix: str) -> Hull | None:
+    offsets = check_hull(file, rows, prefix)
+    if offsets is None:
+        return None
+    positions, colors = (_read(file, entry, prefix, {"N": int(offsets[-1])}) for entry in HULL[:2])
+    return Hull(positions, colors, offsets)
+
+
+def _read_track(file: Hdf5Reader, prefix: str) -> JointTrack:
+    """Return the joints of a person. Ground truth has no other datasets, and may list the frames for all people."""
+    listed = f"{prefix}frames" if f"{prefix}frames" in file.shapes else "frames"
+    for name in (listed, f"{prefix}joints/position"):
+        if name not in file.shapes:
+            file.fail(f"has no /{name}; it is neither a tk result nor a capture's truth")
+    entry = _ENTRIES["frames"]
+    frames = file.array(listed, entry.dtype, (None,), *entry.valid)
+    _check_frames(file, prefix, frames)
+    names = file.names(f"{prefix}joints/position", "names")
+    missing = [joint for joint in JOINTS if joint not in names]
+    if missing:
+        file.fail(f"/{prefix}joints/position has no joint {missing[0]} in its attribute names")
+    order = [names.index(joint) for joint in JOINTS]
+    counts = {"F": len(frames), "J": len(names)}
+
+    def read(name: str) -> NDArray[Any] | None:
+        return _read(file, _ENTRIES[name], prefix, counts) if prefix + name in file else None
+
+    positions, status, sigma = (read(name) for name in ("joints/position", "status", "joints/sigma"))
+    assert positions is not None
+    positions = positions[:, order]
+    positions[~np.isfinite(positions)] = np.nan
+    stages = [name for name in file.below(f"{prefix}timing") if "/" not in name]
+    entry = _ENTRIES["timing/<stage>"]
+    timing = {name: file.array(f"{prefix}timing/{name}", entry.dtype, (len(frames),), *entry.valid) for name in stages}
+    seconds: Float | None = None
+    if timing:
+        seconds = timing["total"] if "total" in timing else np.sum(list(timing.values()), axis=0)
+    return JointTrack(file.path, frames, positions, status, seconds, None if sigma is None else sigma[:, order])
+
+
+def _check_frames(file: Hdf5Reader, prefix: str, frames: NDArray[np.int64]) -> None:
     values, counts = np.unique(frames, return_counts=True)
-    if (values < 0).any():
-        file.fail(f"/frames holds {values[0]}; frames count from 0")
     if (counts > 1).any():
-        file.fail(f"frame {values[counts > 1][0]} is listed twice; each frame must be listed once")
+        file.fail(f"/{prefix}frames: frame {values[counts > 1][0]} is listed twice; each frame must be listed once")
 
 
 def _read_cameras(file: Hdf5Reader) -> UsedCameras | None:
     if "cameras" not in file:
         return None
     names = file.names("cameras", "names")
-    count = len(names)
-    shapes: dict[str, tuple[int, ...]] = {
-        "matrix": (count, 3, 3), "distortions": (count, 5), "rotation": (count, 3), "translation": (count, 3),
-        "size": (count, 2), "fisheye": (count,), "time_offset": (count,),
-    }  # fmt: skip
-    found = {name: file.array(f"cameras/{name}", "float64", shape, MAX_NUMBER) for name, shape in shapes.items()}
-    if not all(np.isfinite(values).all() for values in found.values()) or (found["size"] < 1).any():
-        file.fail("/cameras describes no cameras; the file is damaged")
+    found = {entry.path.split("/")[1]: _read(file, entry, "", {"C": len(names)}) for entry in CAMERAS}
+    if (found["size"] < 1).any():
+        file.fail("/cameras/size holds an image without pixels; the file is damaged")
     cameras = [
         Camera(
             name=name,
@@ -252,26 +301,3 @@ def _read_cameras(file: Hdf5Reader) -> UsedCameras | None:
         for c, name in enumerate(names)
     ]
     return UsedCameras(Rig(tuple(cameras)), found["time_offset"])
-
-
-def _read_smoothed(file: Hdf5Reader, meta: ResultMeta, rows: int) -> dict[str, NDArray[Any]] | None:
-    if "smoothed" not in file:
-        return None
-    found = {
-        name: file.array(f"smoothed/{name}", column.dtype, (rows, *column.shape), column.limit)
-        for name, column in columns_of(meta).items()
-        if can_be_smoothed(name) and f"smoothed/{name}" in file
-    }
-    return {**found, "bridged": file.array("smoothed/bridged", "bool", (rows,))}
-
-
-def _read_hull(file: Hdf5Reader, rows: int) -> Hull | None:
-    offsets = check_hull(file, rows)
-    if offsets is None:
-        return None
-    shape = (int(offsets[-1]), 3)
-    return Hull(
-        file.array("hull/positions", "float32", shape, MAX_DISTANCE_M),
-        file.array("hull/colors", "uint8", shape),
-        offsets,
-    )

@@ -12,14 +12,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from tk.io.hdf5 import open_hdf5
-from tk.io.results.columns import Column, columns_of, put_attributes, strings
-from tk.io.results.data import ResultMeta, UsedCameras, Value, can_be_smoothed
-from tk.io.results.files import WRITE_ERRORS, TwinFolder, as_result_error, move_to_memory, open_for_writing, writable
-from tk.io.results.layout import put_cameras, put_model
-from tk.io.results.reader import check_format, count_rows, read_meta
+from tk.io.results.data import ResultMeta, UsedCameras, Value
+from tk.io.results.files import TwinFolder, as_result_error, opened_for_writing, writable
+from tk.io.results.layout import link_first_person, put_attributes, put_cameras, put_model
+from tk.io.results.reader import check_format, count_people, count_rows, read_meta
+from tk.io.results.schema import Column, columns_of, prefix_of, smoothed_columns
 
 
 def revise_result(
@@ -30,6 +30,7 @@ def revise_result(
     model: Mapping[str, Value] | None = None,
     cameras: UsedCameras | None = None,
     notes: Sequence[str] | None = None,
+    person: int = 0,
 ) -> ResultMeta:
     """Replace parts of a finished result in one step; other parts stay as they are.
 
@@ -43,60 +44,55 @@ def revise_result(
         model: all of `/model`.
         cameras: all of `/cameras`.
         notes: messages of the run, one line each.
+        person: the person to whom ``columns``, ``smoothed`` and ``model`` belong.
 
     Returns:
         the result's metadata.
 
     Raises:
         ResultError: the file is no result, another run is writing it, or it cannot be written. It is unchanged.
-        ValueError: a dataset is unknown or has the wrong shape.
+        ValueError: a dataset or the person is unknown, or a dataset has the wrong shape.
     """
-    target = writable(Path(path))
+    target, prefix = writable(Path(path)), prefix_of(person)
     with open_hdf5(target) as file:
         check_format(file)
-        meta = read_meta(file)
-        rows = count_rows(file, meta)
+        if not 0 <= person < count_people(file):
+            raise ValueError(f"{path}: has no person {person}")
+        meta = read_meta(file, prefix)
+        rows = count_rows(file, meta, prefix)
     known = columns_of(meta)
-    changed = {name: _column(known, name).checked(name, values, rows) for name, values in (columns or {}).items()}
-    filtered = None if smoothed is None else _smoothed_values(known, smoothed, rows)
+    copies = smoothed_columns(known)
+    changed = _checked(known, columns or {}, rows)
+    if smoothed is not None and "bridged" not in smoothed:
+        raise ValueError("/smoothed needs bridged, which is missing")
+    filtered = _checked(copies, smoothed or {}, rows)
     with as_result_error(target), TwinFolder(target) as twin_folder:
         revised = twin_folder.twin_paths[0]
         shutil.copyfile(target, revised)
-        with open_for_writing(revised, "r+") as copy:
-            try:
-                for name, values in changed.items():
-                    copy[name][...] = values
-                if (changed or filtered is not None) and "smoothed" in copy:
-                    del copy["smoothed"]
-                for name, values in (filtered or {}).items():
-                    dataset = copy.create_dataset(f"smoothed/{name}", data=values)
-                    if name in known:
-                        put_attributes(dataset, known[name])
-                if model is not None:
-                    put_model(copy, model)
-                if cameras is not None:
-                    put_cameras(copy, cameras)
-                if notes is not None:
-                    copy.attrs["notes"] = strings(notes)
-                copy.flush()
-            except WRITE_ERRORS:
-                move_to_memory(copy)
-                raise
+        with opened_for_writing(revised, "r+") as copy:
+            for name, values in changed.items():
+                copy[prefix + name][...] = values
+            if (changed or filtered) and f"{prefix}smoothed" in copy:
+                del copy[f"{prefix}smoothed"]
+            for name, values in filtered.items():
+                dataset = copy.create_dataset(f"{prefix}smoothed/{name}", data=values)
+                put_attributes(dataset, copies[name].attributes)
+            if model is not None:
+                put_model(copy, model, person)
+            if cameras is not None:
+                put_cameras(copy, cameras)
+            if notes is not None:
+                put_attributes(copy, {"notes": notes})
+            link_first_person(copy)
         with revised.open("rb") as stream:
             os.fsync(stream.fileno())
         twin_folder.publish(revised)
     return meta
 
 
-def _column(known: Mapping[str, Column], name: str) -> Column:
-    if name not in known:
-        raise ValueError(f"/{name} is not in this result")
-    return known[name]
-
-
-def _smoothed_values(known: Mapping[str, Column], smoothed: Mapping[str, ArrayLike], rows: int) -> dict[str, Any]:
-    """Return the datasets of `/smoothed`, checked against the unsmoothed ones."""
-    if "bridged" not in smoothed:
-        raise ValueError("/smoothed needs bridged, which is missing")
-    columns = {**{name: column for name, column in known.items() if can_be_smoothed(name)}, "bridged": Column((), "?")}
-    return {name: _column(columns, name).checked(name, values, rows) for name, values in smoothed.items()}
+def _checked(known: Mapping[str, Column], values: Mapping[str, ArrayLike], rows: int) -> dict[str, NDArray[Any]]:
+    """Return the values of datasets in their types; refuse unknown datasets and wrong shapes."""
+    unknown = sorted(values.keys() - known.keys())
+    if unknown:
+        raise ValueError(f"/{unknown[0]} is not in this result")
+    return {name: known[name].checked(name, array, rows) for name, array in values.items()}

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.results.writer import Result, read_joints
+from tk.io.results.data import Result
+from tk.io.results.reader import read_joints
 
 Float = NDArray[np.float64]
 

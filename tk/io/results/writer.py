@@ -19,62 +19,24 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 
+import numpy as np
+
 from tk.errors import ResultError
-from tk.io.hdf5 import open_hdf5
-from tk.io.results.data import (
-    FORMAT,
-    FrameResult,
-    Hull,
-    HullPoints,
-    JointAngles,
-    JointTrack,
-    Result,
-    ResultMeta,
-    UsedCameras,
-    Value,
-)
-from tk.io.results.files import (
-    WRITE_ERRORS,
-    TwinFolder,
-    as_result_error,
-    check_is_result,
-    move_to_memory,
-    open_for_writing,
-    writable,
-)
-from tk.io.results.layout import Row, Twin, put_model, write_layout
+from tk.io.hdf5 import Hdf5Reader, open_hdf5
+from tk.io.results.data import FrameResult, ResultMeta, Value
+from tk.io.results.files import TwinFolder, as_result_error, check_is_result, opened_for_writing, writable
+from tk.io.results.layout import FrameSet, Twin, checksum, write_layout
 from tk.io.results.reader import (
-    as_damage_error,
     check_format,
     check_hull,
+    count_people,
     count_rows,
-    read_joints,
     read_meta,
-    read_result,
-    read_values,
+    read_model,
 )
-from tk.io.results.revision import revise_result
-from tk.io.results.status import Status, has_pose
+from tk.io.results.schema import MAX_NUMBER, columns_of, prefix_of
 
-__all__ = [
-    "FORMAT",
-    "FrameResult",
-    "Hull",
-    "HullPoints",
-    "JointAngles",
-    "JointTrack",
-    "Result",
-    "ResultMeta",
-    "ResultWriter",
-    "Status",
-    "UsedCameras",
-    "Value",
-    "as_damage_error",
-    "has_pose",
-    "read_joints",
-    "read_result",
-    "revise_result",
-]
+Model = Mapping[str, Value]
 
 
 class ResultWriter:
@@ -82,23 +44,34 @@ class ResultWriter:
 
     When :meth:`append` returns, the frame is in the file, unless ``flush`` is False. An older result of the same name
     exists until the first frame is written. After an exception in the ``with`` block all finished frames are kept.
+
+    Attributes:
+        state: the last state given to :meth:`append`.
+        models: the fitted body of each person, as given to :meth:`write_model`.
     """
 
-    def __init__(self, path: Path, meta: ResultMeta, twin_folder: TwinFolder, twins: list[Twin]) -> None:
+    def __init__(
+        self, path: Path, meta: ResultMeta, twin_folder: TwinFolder, twins: list[Twin], models: list[Model]
+    ) -> None:
         self.path = path
         self.meta = meta
-        self.state: dict[str, Value] = {}
-        self._workshop = twin_folder
+        self.state: Mapping[str, Value] = {}
+        self.models = models
+        self._columns = columns_of(meta)
+        self._folder = twin_folder
         self._twins = twins  # [0] is written next, [1] is published (neither at first)
-        self._recent: list[Row] = []  # rows that are not yet in both twins
-        self.model: dict[str, Value] = {}
-        self._model_version = 0
+        self._recent: list[FrameSet] = []  # frame sets that are not yet in both twins
         self._published = False
         self._intact = True
 
     @classmethod
-    def create(cls, path: str | os.PathLike[str], meta: ResultMeta) -> ResultWriter:
+    def create(cls, path: str | os.PathLike[str], meta: ResultMeta, people: int = 1) -> ResultWriter:
         """Start a result; an existing result of that name is replaced when the first frame is written.
+
+        Args:
+            path: the file.
+            meta: the metadata, the same for every person.
+            people: number of people. Others can be added by :meth:`append`.
 
         Raises:
             ResultError: the file cannot be written, another run is writing it, or a file of that name exists and is
@@ -107,83 +80,88 @@ class ResultWriter:
         target = writable(Path(path))
         if target.exists():
             check_is_result(target)
-        with as_result_error(target), contextlib.ExitStack() as undo:
-            twin_folder = undo.enter_context(TwinFolder(target))
-            twins = []
-            for twin_path in twin_folder.twin_paths:
-                file = undo.enter_context(open_for_writing(twin_path, "w"))
-                write_layout(file, meta)
-                twins.append(Twin(twin_path, file))
-            undo.pop_all()
-        return cls(target, meta, twin_folder, twins)
+        return cls._opened(target, meta, [{} for _ in range(people)], None)
 
     @classmethod
-    def resume(cls, path: str | os.PathLike[str], meta: ResultMeta) -> tuple[ResultWriter, int]:
-        """Continue a result after the last frame that has a state; start a new one if there is none.
-
-        The writer's ``state`` is the last state given to :meth:`append`, its ``model`` the one given to
-        :meth:`write_model`.
+    def resume(cls, path: str | os.PathLike[str], meta: ResultMeta, people: int = 1) -> tuple[ResultWriter, int]:
+        """Continue a result after the last frame set that has a state; start a new one if there is none.
 
         Returns:
-            the writer and the number of finished frames.
+            the writer, with the stored ``state`` and ``models``, and the number of finished frame sets.
 
         Raises:
-            ResultError: as in :meth:`create`, or the file was made from another capture or configuration.
+            ResultError: as in :meth:`create`, or the file was made from another capture or configuration, for another
+                number of people, or its state is damaged.
         """
         target = writable(Path(path))
         if not target.exists():
-            return cls.create(path, meta), 0
+            return cls.create(path, meta, people), 0
         with open_hdf5(target) as done:
             check_format(done)
-            found = read_meta(done)
-            try:
-                difference = found.difference(meta)
-            except ResultError as reason:
-                done.fail(f"{reason}; start again with --force instead of --resume")
-            if difference:
-                done.fail(f"was made differently: {difference}; start again with --force instead of --resume")
-            rows = count_rows(done, found)
-            check_hull(done, rows)
-            if "resume/rows" in done:
-                done.array("resume/rows", "int64", (), limit=rows)
-            state, model = read_values(done, "resume/state"), read_values(done, "model")
-        with as_result_error(target), contextlib.ExitStack() as undo:
-            twin_folder = undo.enter_context(TwinFolder(target))
-            twins = []
-            for twin_path in twin_folder.twin_paths:
-                shutil.copyfile(target, twin_path)
-                file = undo.enter_context(open_for_writing(twin_path, "r+"))
-                twins.append(Twin(twin_path, file))
-                twins[-1].drop_rows_without_state(meta)
-            undo.pop_all()
-        writer = cls(target, meta, twin_folder, twins)
-        writer.state, writer.model = state, model
-        return writer, twins[0].rows
+            if count_people(done) != people:
+                done.fail(f"was made differently: people is {count_people(done)}, not {people}; {_REMEDY}")
+            rows = [_check_resumable(done, meta, person) for person in range(people)]
+            state = _read_state(done, rows)
+            models: list[Model] = [read_model(done, prefix_of(person)) for person in range(people)]
+        writer = cls._opened(target, meta, models, target)
+        writer.state = state
+        return writer, writer._twins[0].count
 
-    def write_model(self, model: Mapping[str, Value]) -> None:
-        """Replace the fitted body of `/model`; it is written with the next frame.
+    @classmethod
+    def _opened(cls, target: Path, meta: ResultMeta, models: list[Model], source: Path | None) -> ResultWriter:
+        """Return a writer with two twins, copies of ``source`` or empty."""
+        with as_result_error(target), contextlib.ExitStack() as undo:
+            folder = undo.enter_context(TwinFolder(target))
+            twins = []
+            for path in folder.twin_paths:
+                if source:
+                    shutil.copyfile(source, path)
+                closing = undo.enter_context(contextlib.ExitStack())
+                file = closing.enter_context(opened_for_writing(path, "r+" if source else "w"))
+                if not source:
+                    write_layout(file, meta, len(models))
+                twins.append(Twin(path, file, closing, meta, models))
+            undo.pop_all()
+        return cls(target, meta, folder, twins, models)
+
+    @property
+    def model(self) -> Model:
+        """Return the fitted body of person 0."""
+        return self.models[0]
+
+    def write_model(self, model: Model, person: int = 0) -> None:
+        """Replace the fitted body of a person; it is written with the next frame.
 
         A name may contain slashes: ``{"torso/radii_m": ...}``.
         """
-        self.model = dict(model)
-        self._model_version += 1
+        self._add_people(person + 1)
+        self.models[person] = dict(model)
 
-    def append(self, result: FrameResult, state: Mapping[str, Value] | None = None, flush: bool = True) -> None:
-        """Add a finished frame. With ``flush``, the frame is in the file on return, even if the process is then killed.
+    def append(
+        self,
+        results: FrameResult | Mapping[int, FrameResult],
+        state: Mapping[str, Value] | None = None,
+        flush: bool = True,
+    ) -> None:
+        """Add a finished frame set. With ``flush``, it is in the file on return, even if the process is then killed.
 
         Args:
-            result: the frame.
-            state: state from which the tracker continues with bit-identical results: a few small arrays, numbers and
-                strings. Only the latest state is kept.
-            flush: False keeps the frame in memory until the next call of :meth:`append`, :meth:`flush` or
+            results: the frame, or the frame of each person who is present, by the person's number.
+            state: state from which the run continues with bit-identical results: a few small arrays, numbers and
+                texts. Only the latest state is kept.
+            flush: False keeps the frame set in memory until the next call of :meth:`append`, :meth:`flush` or
                 :meth:`close`. It saves time: most of it is a cost per flush, not per frame.
 
         Raises:
             ResultError: the disk is full, or the folder was removed.
+            ValueError: a frame does not match the metadata, or a person's number is not the next one.
         """
         self._require_open()
-        rows = self._recent[-1].index + 1 if self._recent else self._twins[1].rows
-        self._recent.append(Row.of(rows, result, state, self.meta))
+        people = {0: results} if isinstance(results, FrameResult) else results
+        count = self._recent[-1].index + 1 if self._recent else self._twins[1].count
+        frame_set = FrameSet.of(count, people, state, self._columns)
+        self._add_people(1 + max(people, default=0))
+        self._recent.append(frame_set)
         if flush:
             self.flush()
 
@@ -192,33 +170,26 @@ class ResultWriter:
         self._require_open()
         with as_result_error(self.path):
             self._intact = False
-            twin = self._twins[0]
-            self._update(twin)
-            self._workshop.publish(twin.path)
+            self._update(self._twins[0])
+            self._publish(self._twins[0])
             self._twins.reverse()
-            self._published = True
             self._intact = True
-        behind = self._twins[0].rows
-        self._recent = [row for row in self._recent if row.index >= behind]
+        behind = self._twins[0].count
+        self._recent = [frame_set for frame_set in self._recent if frame_set.index >= behind]
 
     def close(self) -> None:
         """Close the file and remove the hidden folder. A second call does nothing."""
         if not self._twins:
             return
-        twins, self._twins = self._twins, []
-        try:
-            with as_result_error(self.path):
+        (twin, other), self._twins = self._twins, []
+        with as_result_error(self.path), self._folder, other.closing:
+            with twin.closing:  # HDF5 modifies a file while closing it: close it, then publish it
                 if self._intact:
-                    # HDF5 modifies a file while closing it: close it, then publish it
-                    self._update(twins[0])
-                    twins[0].file.close()
-                    with twins[0].path.open("rb") as stream:
-                        os.fsync(stream.fileno())
-                    self._workshop.publish(twins[0].path)
-        finally:
-            for twin in twins:
-                twin.file.close()
-            self._workshop.close()
+                    self._update(twin)
+            if self._intact:
+                with twin.path.open("rb") as stream:
+                    os.fsync(stream.fileno())
+                self._publish(twin)
 
     def __enter__(self) -> ResultWriter:
         return self
@@ -240,16 +211,51 @@ class ResultWriter:
         if not self._intact:
             raise ValueError(f"{self.path}: an earlier write failed")
 
+    def _add_people(self, count: int) -> None:
+        if count > len(self.models) + 1:
+            raise ValueError(f"person {count - 1} is not the next one: the file has {len(self.models)}")
+        if count > len(self.models):
+            self.models.append({})
+
     def _update(self, twin: Twin) -> None:
-        """Write the body and the rows that this twin does not have yet."""
-        try:
-            if twin.model_version != self._model_version:
-                put_model(twin.file, self.model)
-                twin.model_version = self._model_version
-            new_rows = [row for row in self._recent if row.index >= twin.rows]
-            if new_rows:
-                twin.append(new_rows)
-            twin.file.flush()
-        except WRITE_ERRORS:
-            move_to_memory(twin.file)
-            raise
+        """Write the bodies and the frame sets that this twin does not have yet."""
+        twin.put_models(self.models)
+        twin.append([frame_set for frame_set in self._recent if frame_set.index >= twin.count])
+        twin.file.flush()
+
+    def _publish(self, twin: Twin) -> None:
+        self._folder.publish(twin.path)
+        self._published = True
+
+
+_REMEDY = "it cannot be resumed: start again, or choose another name"
+
+
+def _check_resumable(file: Hdf5Reader, meta: ResultMeta, person: int) -> int:
+    """Return a person's number of rows, or raise ResultError if they cannot be continued with this metadata."""
+    prefix = prefix_of(person)
+    found = read_meta(file, prefix)
+    try:
+        difference = found.difference(meta)
+    except ResultError as reason:
+        file.fail(f"{reason}; {_REMEDY}")
+    if difference:
+        file.fail(f"was made differently: {difference}; {_REMEDY}")
+    rows = count_rows(file, meta, prefix)
+    check_hull(file, rows, prefix)
+    return rows
+
+
+def _read_state(file: Hdf5Reader, rows: list[int]) -> dict[str, Value]:
+    """Return the state of the run; {} if there is none.
+
+    Raises:
+        ResultError: it is not what was written.
+    """
+    content = file.values("resume", MAX_NUMBER)
+    if not content:
+        return {}
+    stored = content.pop("checksum", None)
+    if np.ndim(stored) or stored != checksum(content):
+        file.fail(f"the state of the run is damaged; {_REMEDY}")
+    return {name.removeprefix("state/"): value for name, value in content.items() if name.startswith("state/")}

@@ -1,0 +1,173 @@
+"""Results with several people: `/people`, links to person 0, resuming and revising."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.io.result_files import assert_equal_values, make_cameras, make_smoothed, write
+from tests.io.result_victim import META, make_frame, make_state
+from tk.errors import ResultError
+from tk.io.results.data import FrameResult
+from tk.io.results.reader import read_joints, read_people, read_result
+from tk.io.results.revision import revise_result
+from tk.io.results.writer import ResultWriter
+from tk.model.body.joints import JOINTS
+
+
+def people_at(index: int) -> dict[int, FrameResult]:
+    """Return person 0 in every frame, person 1 in frames 2 to 5, and nobody in frame 7."""
+    if index == 7:
+        return {}
+    frame = make_frame(index)
+    other = replace(frame, joints=frame.joints + 1.0, pose=frame.pose + 1.0)
+    return {0: frame, 1: other} if 2 <= index <= 5 else {0: frame}
+
+
+def write_two(path: Path, count: int, with_state: int | None = None) -> None:
+    with ResultWriter.create(path, META, people=2) as writer:
+        writer.write_model({"height_m": 1.7})
+        writer.write_model({"height_m": 1.9}, person=1)
+        for index in range(count):
+            state = make_state(index) if with_state is None or index < with_state else None
+            writer.append(people_at(index), state, flush=index % 3 == 0)
+
+
+def assert_linked(path: Path) -> None:
+    """Check that `/people/0` and the top level hold the same objects."""
+    with h5py.File(path) as file:
+        first = file["people/0"]
+        assert set(first) == set(file) - {"people", "resume", "cameras"}
+        assert all(first[name] == file[name] for name in first)
+
+
+def test_each_person_has_rows_of_the_frames_in_which_they_are_present(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    write_two(path, 10)
+    result = read_result(path)
+    first, second = result.people
+    assert (first.person, second.person) == (0, 1) and first is result and second.people == (second,)
+    np.testing.assert_array_equal(first.frames - 3, [0, 1, 2, 3, 4, 5, 6, 8, 9])
+    np.testing.assert_array_equal(second.frames - 3, [2, 3, 4, 5])
+    np.testing.assert_array_equal(second.joints[0], make_frame(2).joints + 1.0)
+    np.testing.assert_array_equal(second.pose[3], make_frame(5).pose + 1.0)
+    assert first.model == {"height_m": 1.7} and second.model == {"height_m": 1.9}
+    assert second.meta == META and second.hull is not None and len(second.hull[0].positions) == 202
+    assert_linked(path)
+
+
+def test_file_of_one_person_has_no_people_group(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    write(path, 3)
+    result = read_result(path)
+    assert result.people == (result,)
+    with h5py.File(path) as file:
+        assert "people" not in file
+    assert len(read_people(path)) == 1
+
+
+def test_run_with_several_people_is_resumed_after_the_last_state(tmp_path: Path) -> None:
+    whole, path = tmp_path / "whole.h5", tmp_path / "result.h5"
+    write_two(whole, 12)
+    write_two(path, 9, with_state=5)  # frames 5 to 8 have no state
+    writer, done = ResultWriter.resume(path, META, people=2)
+    with writer:
+        assert done == 5
+        assert_equal_values(writer.state, make_state(4))
+        assert [model["height_m"] for model in writer.models] == [1.7, 1.9]
+        for index in range(done, 12):
+            writer.append(people_at(index), make_state(index))
+    assert_linked(path)
+    for a, b in zip(read_result(whole).people, read_result(path).people, strict=True):
+        np.testing.assert_array_equal(a.frames, b.frames)
+        np.testing.assert_array_equal(a.joints, b.joints)
+        assert a.hull is not None and b.hull is not None
+        np.testing.assert_array_equal(a.hull.offsets, b.hull.offsets)
+
+
+def test_frames_without_anybody_count_as_finished(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    write_two(path, 8)
+    writer, done = ResultWriter.resume(path, META, people=2)
+    writer.close()
+    assert done == 8 and len(read_result(path)) == 7
+
+
+def test_resuming_with_another_number_of_people_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    write_two(path, 4)
+    with pytest.raises(ResultError, match=r"result\.h5: .*people is 2, not 1"):
+        ResultWriter.resume(path, META)
+
+
+def test_person_can_be_added_during_the_run(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    with ResultWriter.create(path, META) as writer:
+        for index in range(4):
+            writer.append(people_at(index), make_state(index))
+        with pytest.raises(ValueError, match="person 3 is not the next one"):
+            writer.append({3: make_frame(4)})
+        writer.append(people_at(4), make_state(4))
+        writer.write_model({"height_m": 1.8}, person=2)
+    people = read_result(path).people
+    assert [len(person) for person in people] == [5, 3, 0]
+    assert people[2].model == {"height_m": 1.8}
+    assert_linked(path)
+
+
+@pytest.mark.parametrize("person", [0, 1])
+def test_revision_changes_one_person_and_renews_the_links(tmp_path: Path, person: int) -> None:
+    path = tmp_path / "result.h5"
+    write_two(path, 7)
+    before = read_result(path).people
+    count = len(before[person])
+    revise_result(
+        path,
+        {"pose": np.zeros((count, 24))},
+        smoothed=make_smoothed(count),
+        model={"height_m": 1.5},
+        cameras=make_cameras(),
+        notes=["a note"],
+        person=person,
+    )
+    after = read_result(path).people
+    assert after[person].model == {"height_m": 1.5} and not after[person].pose.any()
+    assert after[person].smoothed is not None and after[person].with_smoothed().joints.max() == 0.25
+    other = 1 - person
+    assert after[other].model == before[other].model and after[other].smoothed is None
+    np.testing.assert_array_equal(after[other].pose, before[other].pose)
+    assert all(found.cameras is not None and found.notes == ("a note",) for found in after)
+    assert_linked(path)
+    with pytest.raises(ValueError, match="no person 2"):
+        revise_result(path, model={}, person=2)
+
+
+def test_joints_of_several_people_are_read_from_results_and_ground_truth(tmp_path: Path) -> None:
+    path, truth = tmp_path / "result.h5", tmp_path / "truth.h5"
+    write_two(path, 6)
+    found = read_people(path)
+    assert [track.frames.tolist() for track in found] == [[3, 4, 5, 6, 7, 8], [5, 6, 7, 8]]
+    assert found[1].status is not None and found[1].sigma is not None and found[1].seconds is not None
+    with h5py.File(truth, "w") as file:  # frames for all people, nothing at the top level
+        file["frames"] = [4, 5]
+        for person in range(2):
+            file[f"people/{person}/joints/position"] = np.full((2, 15, 3), float(person))
+            file[f"people/{person}/joints/position"].attrs["names"] = list(JOINTS)
+    expected = read_people(truth)
+    assert [float(track.positions[0, 0, 0]) for track in expected] == [0.0, 1.0]
+    np.testing.assert_array_equal(read_joints(truth).frames, [4, 5])
+
+
+@pytest.mark.parametrize("name", ["2", "left"])
+def test_people_must_be_numbered_without_gaps(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "result.h5"
+    write_two(path, 4)
+    with h5py.File(path, "r+") as file:
+        file.move("people/1", f"people/{name}")
+    for read in (read_result, read_people):
+        with pytest.raises(ResultError, match=r"result\.h5: /people does not hold groups 0, 1"):
+            read(path)

@@ -1,0 +1,260 @@
+"""The datasets of a result file. Writing, reading, checking, revising and the docs' table follow this list."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.io.results.status import STATUS_MEANING
+from tk.model.body.joints import FOOT_POINTS
+
+if TYPE_CHECKING:
+    from tk.io.results.data import FrameResult, ResultMeta
+
+FORMAT = "tk-result"
+FORMAT_VERSION = 3
+
+#: Largest valid values: distance from the world's origin in metres, any other number, frame index. They are far above
+#: what a capture holds; a larger value means a damaged file.
+MAX_DISTANCE_M, MAX_NUMBER, MAX_FRAME = 1e6, 1e12, 10**9
+
+#: root attributes: field of ResultMeta and type
+ATTRIBUTES = {
+    "fps": ("fps", float),
+    "up": ("up", str),
+    "capture": ("capture", str),
+    "method": ("method", str),
+    "seed": ("seed", int),
+    "config": ("config_toml", str),
+}
+
+#: field that lists what a letter of a shape counts; `k` counts the angles of one joint
+COUNTED = {
+    "D": "pose_names", "J": "joint_names", "S": "segment_names", "C": "residual_cameras", "T": "stages", "k": "names",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A dataset, or a family of datasets whose path ends with a variable name.
+
+    Attributes:
+        path: path in the file, without a leading slash; ``<…>`` stands for a name.
+        shape: length of each axis: a number, or a letter of :data:`COUNTED`, ``F`` frames, ``C`` cameras, ``N`` voxels.
+        dtype: numpy type.
+        meaning: description for the docs, with unit.
+        attributes: attributes of the dataset: a field of ResultMeta, or the values themselves.
+        field: field of Result with the values; a mapping by name for a family.
+        each: field of ResultMeta that lists the names of a family.
+        optional: field of ResultMeta that is false or empty if the file has no such dataset.
+        smoothed: True if `/smoothed` may have a copy.
+        valid: range of valid numbers.
+        finite: True if NaN and infinity are not valid.
+    """
+
+    path: str
+    shape: str
+    dtype: str
+    meaning: str
+    attributes: Mapping[str, str | tuple[str, ...]] = field(default_factory=dict)
+    field: str = ""
+    each: str = ""
+    optional: str = ""
+    smoothed: bool = False
+    valid: tuple[float, float] = (-MAX_NUMBER, MAX_NUMBER)
+    finite: bool = False
+
+    def lengths(self, counts: Mapping[str, int]) -> tuple[int, ...]:
+        """Return the shape in numbers, from the number that each letter stands for."""
+        return tuple(int(item) if item.isdigit() else counts[item] for item in self.shape.split())
+
+
+_METRES = (-MAX_DISTANCE_M, MAX_DISTANCE_M)
+_NAMES = {"names": "joint_names"}
+_STATUS = tuple(f"{value}: {text}" for value, text in enumerate(STATUS_MEANING))
+
+#: datasets with one row per frame
+ROWS = (
+    Dataset("frames", "F", "int64", "number of the source frame", field="frames", valid=(0, MAX_FRAME)),
+    Dataset("time", "F", "float64", "seconds", field="time", finite=True),
+    Dataset(
+        "pose", "F D", "float64",
+        "the pose vector, one column per degree of freedom (31 by default, 27 with `--method volumetric`)",
+        {"names": "pose_names", "units": "pose_units"}, field="pose", smoothed=True,
+    ),
+    Dataset(
+        "joints/position", "F J 3", "float64", "joint positions",
+        _NAMES, field="joints", smoothed=True, valid=_METRES,
+    ),
+    Dataset(
+        "joints/sigma", "F J", "float64",
+        "one standard deviation of a joint's position along each axis; NaN without evidence",
+        _NAMES, field="sigma", optional="sigma", smoothed=True, valid=(0, MAX_DISTANCE_M),
+    ),
+    Dataset(
+        "segments/rotation", "F S 4", "float64", "quaternions w, x, y, z, segment to world",
+        {"names": "segment_names"}, field="segments_rotation", optional="segment_names", smoothed=True,
+    ),
+    Dataset(
+        "angles/<joint>", "F k", "float64", "degrees; the group's attribute `joints` gives the order",
+        {"names": "names", "convention": "convention"}, field="angles", each="angles", smoothed=True,
+    ),
+    Dataset(
+        "feet/position", "F 4 3", "float64", ", ".join(FOOT_POINTS),
+        {"names": FOOT_POINTS}, field="feet", optional="feet", smoothed=True, valid=_METRES,
+    ),
+    Dataset(
+        "status", "F", "uint8",
+        "0 tracked, 1 initialised, 2 recovered after loss, 3 lost, 4 suspect (tracked, but the residual contradicts "
+        "it), 5 absent (nobody in the volume); rows of lost and absent frames hold no usable pose",
+        {"meaning": _STATUS}, field="status", valid=(0, len(_STATUS) - 1),
+    ),
+    Dataset(
+        "objective", "F", "float64", "final value of the objective",
+        {"kind": "objective_kind"}, field="objective", valid=(-np.inf, np.inf),
+    ),
+    Dataset(
+        "residual", "F C 2", "float64",
+        "missing area and surplus area by camera, shares of the person's pixels; their sum is E_S; NaN for an "
+        "excluded camera",
+        {"cameras": "residual_cameras", "areas": ("missing", "surplus")}, field="residual",
+        optional="residual_cameras",
+    ),
+    Dataset("iterations", "F T", "int32", "optimiser iterations by stage", {"stages": "stages"}, field="iterations"),
+    Dataset(
+        "timing/<stage>", "F", "float64", "seconds by stage; `total` is the frame's share of the wall time",
+        field="timing", each="timing_stages",
+    ),
+)  # fmt: skip
+
+BRIDGED = Dataset("smoothed/bridged", "F", "bool", "frames that were filled in")
+
+#: surface voxels of all frames: row i has the voxels offsets[i] to offsets[i + 1]
+HULL = (
+    Dataset("hull/positions", "N 3", "float32", "surface voxels of all frames, with `--store-hull`", valid=_METRES),
+    Dataset("hull/colors", "N 3", "uint8", "their colours; `order`"),
+    Dataset(
+        "hull/offsets", "F+1", "int64", "frame i has the voxels `offsets[i]` to `offsets[i + 1]`", valid=(0, MAX_NUMBER)
+    ),
+)
+
+#: cameras as used, after refinement; the group's attribute `names` gives their order
+CAMERAS = tuple(
+    Dataset(f"cameras/{name}", shape, dtype, meaning, finite=True)
+    for name, shape, dtype, meaning in (
+        ("matrix", "C 3 3", "float64", "camera matrix, pixels"),
+        ("distortions", "C 5", "float64", "OpenCV's order, padded with zeros; a fisheye camera uses the first four"),
+        ("rotation", "C 3", "float64", "Rodrigues vector, world to camera"),
+        ("translation", "C 3", "float64", "world to camera"),
+        ("size", "C 2", "int64", "width and height, pixels"),
+        ("fisheye", "C", "uint8", "1 for a fisheye camera"),
+        ("time_offset", "C", "float64", "seconds; frame k was taken at k / fps + `time_offset`"),
+    )
+)
+
+SCHEMA = (*ROWS, BRIDGED, *HULL, *CAMERAS)
+
+#: datasets and groups of one person; the other parts of a file belong to all
+PERSON = (*dict.fromkeys(entry.path.split("/")[0] for entry in (*ROWS, BRIDGED, *HULL)), "model")
+
+
+@dataclass(frozen=True)
+class Column:
+    """A dataset with one row per frame in a file with certain metadata.
+
+    Attributes:
+        entry: its entry in the table.
+        key: name within a family, such as ``knee_l``; "" otherwise.
+        shape: shape of a row.
+        attributes: values of the attributes.
+    """
+
+    entry: Dataset
+    key: str
+    shape: tuple[int, ...]
+    attributes: Mapping[str, str | tuple[str, ...]]
+
+    def checked(self, name: str, values: Any, rows: int | None = None) -> NDArray[Any]:
+        """Return a copy of one row, or of ``rows`` rows, in this column's type.
+
+        Raises:
+            ValueError: the shape is wrong.
+        """
+        array = np.array(values, dtype=self.entry.dtype)
+        expected = self.shape if rows is None else (rows, *self.shape)
+        if array.shape != expected:
+            raise ValueError(f"{name} has shape {array.shape}, {expected} is expected")
+        return array
+
+
+def prefix_of(person: int) -> str:
+    """Return the start of the paths of a person's datasets; person 0 is at the top level."""
+    return f"people/{person}/" if person else ""
+
+
+def columns_of(meta: ResultMeta) -> dict[str, Column]:
+    """Return the columns of a result by path."""
+
+    def columns() -> Iterator[tuple[str, Column]]:
+        for entry in ROWS:
+            if entry.optional and not getattr(meta, entry.optional):
+                continue
+            for item in getattr(meta, entry.each) if entry.each else (meta,):
+                key = "" if item is meta else str(getattr(item, "joint", item))
+                counts = {letter: len(getattr(item, name, ())) for letter, name in COUNTED.items()} | {"F": 0}
+                attributes = {
+                    name: getattr(item, source) if isinstance(source, str) else source
+                    for name, source in entry.attributes.items()
+                }
+                path = f"{entry.path.split('<')[0]}{key}"
+                yield (
+                    path,
+                    Column(entry, key, entry.lengths(counts)[1:], {k: v for k, v in attributes.items() if v != ""}),
+                )
+
+    return dict(columns())
+
+
+def smoothed_columns(columns: Mapping[str, Column]) -> dict[str, Column]:
+    """Return the columns that `/smoothed` may have, by path below it."""
+    copies = {path: column for path, column in columns.items() if column.entry.smoothed}
+    return copies | {"bridged": Column(BRIDGED, "", (), {})}
+
+
+def row_of(frame: FrameResult, columns: Mapping[str, Column]) -> dict[str, NDArray[Any]]:
+    """Return the frame's row of each column, as copies; NaN for optional values that the frame does not have.
+
+    Raises:
+        ValueError: a shape or the status is invalid, or the frame has a value that no column takes.
+    """
+    if int(frame.status) not in range(len(STATUS_MEANING)):
+        raise ValueError(f"status {frame.status} has no meaning")
+    values: dict[str, Any] = {}
+    for entry in ROWS:
+        value: Any = frame.frame if entry.field == "frames" else getattr(frame, entry.field)
+        values |= {entry.path.split("<")[0] + key: v for key, v in value.items()} if entry.each else {entry.path: value}
+    undeclared = sorted(path for path, value in values.items() if value is not None and path not in columns)
+    if undeclared:
+        raise ValueError(f"{', '.join(undeclared)}: not declared for this result")
+    row = {}
+    for path, column in columns.items():
+        value = values.get(path)
+        if value is None:  # a stage that did not run took no time
+            row[path] = np.full(column.shape, 0.0 if column.entry.field == "timing" else np.nan)
+        else:
+            row[path] = column.checked(path, value)
+    return row
+
+
+def docs_rows() -> list[str]:
+    """Return the rows of the table of datasets in docs/result-file.md."""
+    return [
+        f"| `/{entry.path}` | {'×'.join(entry.shape.split())} {entry.dtype} | {entry.meaning}"
+        + (f"; {', '.join(f'`{name}`' for name in entry.attributes)}" if entry.attributes else "")
+        + " |"
+        for entry in SCHEMA
+    ]
