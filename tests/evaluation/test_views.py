@@ -16,7 +16,8 @@ from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.reader import read_joints, read_result
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.skeleton import ANKLES, JOINTS, skeleton_of_names
+from tk.model.body.joints import ROWS
+from tk.model.body.skeleton import JOINTS, Skeleton, skeleton_of_names
 from tk.model.masks.silhouettes import draw_silhouettes
 from tk.run.session import track
 from tk.trackers.bodies import body_and_poses
@@ -112,11 +113,15 @@ def test_unusable_input_is_reported(tk: Tk, tiny: Path, three_views: Path, copy:
         assert "state" in file["resume"]
 
 
+def is_ankle(skeleton: Skeleton) -> np.ndarray:
+    return skeleton.is_straight & ~skeleton.is_waist
+
+
 def test_waist_and_ankles_are_drawn(tiny: Path, three_views: Path, tmp_path: Path) -> None:
     """A body whose ankles or waist are bent otherwise covers other pixels; without them it is drawn straight."""
     straight = evaluate_views(three_views, tiny / "truth.h5", tiny)
     skeleton = skeleton_of_names(read_result(three_views).meta.pose_names, BodyDimensions.from_stature(1.7), "z")
-    for name, bent_dofs in (("ankles", skeleton.is_ankle), ("waist", skeleton.is_waist)):
+    for name, bent_dofs in (("ankles", is_ankle(skeleton)), ("waist", skeleton.is_waist)):
         bent = Path(shutil.copy(three_views, tmp_path / f"{name}.h5"))
         with h5py.File(bent, "a") as file:
             file["pose"][...] = file["pose"][()] + 0.4 * bent_dofs
@@ -139,10 +144,11 @@ def without_columns(path: Path, names: tuple[str, ...]) -> Path:
 
 
 def test_a_result_without_ankles_is_drawn_with_straight_ones(three_views: Path, tmp_path: Path) -> None:
-    restored = body_and_poses(read_result(without_columns(Path(shutil.copy(three_views, tmp_path / "r.h5")), ANKLES)))
+    ankles = tuple(name for side in "lr" for name in ROWS[f"ankle_{side}"].dof_names)
+    restored = body_and_poses(read_result(without_columns(Path(shutil.copy(three_views, tmp_path / "r.h5")), ankles)))
     assert restored is not None
     body, poses = restored
-    assert not poses[:, body.skeleton.is_ankle].any() and poses[:, body.skeleton.is_waist].any()
+    assert not poses[:, is_ankle(body.skeleton)].any() and poses[:, body.skeleton.is_waist].any()
 
 
 def test_poses_of_another_body_are_refused(tk: Tk, tiny: Path, three_views: Path, tmp_path: Path) -> None:

@@ -14,10 +14,11 @@ from tk.io.results.data import FrameResult, ResultMeta
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.joints import WAIST
 from tk.model.body.skeleton import Skeleton, build_skeleton
 
 BODY = BodyDimensions.from_stature(1.75)
-SKELETON = build_skeleton(BODY, waist=True)
+SKELETON = build_skeleton(BODY, optional=(WAIST,))
 FRAMES, FPS, FIRST = 24, 12.5, 5
 LOST = (10, 11)
 

@@ -10,6 +10,7 @@ import numpy as np
 from tests.export.conftest import FIRST, FPS, FRAMES, LOST, SKELETON, Write, poses
 from tk.export import export, read_motion
 from tk.export.mot import coordinates
+from tk.model.body.joints import WAIST
 from tk.model.body.rotations import turn
 from tk.model.body.skeleton import JOINTS, build_skeleton
 
@@ -76,7 +77,7 @@ def test_trc_holds_the_joints(write: Write) -> None:
 
 
 def test_trc_is_upright_whatever_the_world(write: Write) -> None:
-    skeleton = build_skeleton(read_motion(write())[0].dimensions, "-y", waist=True)
+    skeleton = build_skeleton(read_motion(write())[0].dimensions, "-y", optional=(WAIST,))
     a = read_trc(export(write("a.h5"), ["trc"]).files[0]).points
     b = read_trc(export(write("b.h5", skeleton, up="-y"), ["trc"]).files[0]).points
     # the same pose: about the pelvis the same points; the root's coordinates are along the world's axes in both

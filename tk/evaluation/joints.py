@@ -49,6 +49,7 @@ from tk.model.body.joints import HINGE_KINDS, HIPS, JOINTS, LIMB_JOINTS, SHOULDE
 Float = NDArray[np.float64]
 
 PCK_CM = (5, 10, 15)
+_LABELS = {"all": f"all {len(JOINTS)}", "limbs": f"{len(LIMB_JOINTS)} limb"}
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Score:
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of ``all`` 15 joints, of the 12 ``limbs`` joints, and of each of ``joints`` by name."""
+    """Scores of ``all`` joints, of the ``limbs`` joints, and of each of ``joints`` by name."""
 
     all: Score
     limbs: Score
@@ -137,7 +138,7 @@ class Evaluation:
             f"{'':12}{'raw [cm, %]':>{len(half)}}  {'without offset [cm, %]':>{len(half)}}",
             f"{'':12}{half}  {half}",
         ]
-        named = [("all 15", self.raw.all, self.corrected.all), ("12 limb", self.raw.limbs, self.corrected.limbs)]
+        named = [(_LABELS[name], getattr(self.raw, name), getattr(self.corrected, name)) for name in _LABELS]
         named += [(name, self.raw.joints[name], self.corrected.joints[name]) for name in JOINTS]
         for name, raw, corrected in named:
             lines.append(f"{name:12}{_format_score(raw)}  {_format_score(corrected)}")
@@ -175,10 +176,9 @@ class Evaluation:
         ]
         for name, shares in (self.sigma or {}).items():
             within, expected = shares.corrected, shares.expected
-            label = {"all": "all 15", "limbs": "12 limb"}[name]
             lines.append(
-                f"{label}: {100 * within[1]:.1f} % within 1 σ, {100 * within[2]:.1f} % within 2 σ, without offset"
-                f" (if normal: {100 * expected[1]:.1f} %, {100 * expected[2]:.1f} %)"
+                f"{_LABELS[name]}: {100 * within[1]:.1f} % within 1 σ, {100 * within[2]:.1f} % within 2 σ, "
+                f"without offset (if normal: {100 * expected[1]:.1f} %, {100 * expected[2]:.1f} %)"
             )
         return lines
 

@@ -18,8 +18,8 @@ from tk import __version__
 from tk.export.motion import Motion
 from tk.export.tree import Tree, build_tree, rest_axes
 from tk.model.body.angles import standing_axes
+from tk.model.body.joints import ROWS, SEGMENTS
 from tk.model.body.rotations import continuous, to_quaternions
-from tk.model.body.skeleton import JOINTS, SEGMENTS, WAIST_HEIGHT, build_skeleton
 from tk.render.figure import AROUND, Solid, figure_of
 from tk.render.palette import SEGMENT_COLORS, unit_rgb
 
@@ -115,7 +115,6 @@ def _animation(motion: Motion, tree: Tree, buffer: _Buffer) -> dict[str, Any]:
 
 def _meshes(motion: Motion, tree: Tree, buffer: _Buffer, nodes: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return a mesh for each segment that has solids, and refer to it in the segment's node."""
-    skeleton = build_skeleton(motion.dimensions)
     solids = figure_of(motion.result).solids
     meshes: list[dict[str, Any]] = []
     for s, segment in enumerate(SEGMENTS):
@@ -123,12 +122,7 @@ def _meshes(motion: Motion, tree: Tree, buffer: _Buffer, nodes: list[dict[str, A
         if not own:
             continue
         node = tree.segments.index(segment)
-        name = tree.names[node]
-        origin = (
-            np.array([0.0, 0.0, WAIST_HEIGHT * motion.dimensions.trunk])
-            if name == "lumbar"
-            else skeleton.joint_position[JOINTS.index(name)]
-        )
+        origin = ROWS[tree.joints[node]].place(motion.dimensions)
         to_rest = rest_axes(segment) @ standing_axes()[s].T  # from the zero configuration to the rest pose
         points, normals, faces = zip(*(_surface(solid) for solid in own), strict=True)
         starts = np.cumsum([0, *(len(p) for p in points[:-1])])

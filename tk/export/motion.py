@@ -12,9 +12,19 @@ from tk.errors import ConfigError, ResultError
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 from tk.io.results.status import Status
-from tk.model.body.angles import segment_rotations
+from tk.model.body.angles import segment_rotations, standing_axes
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.joints import FOOT_POINTS, JOINTS, LIMBS, SEGMENTS
+from tk.model.body.joints import (
+    FOOT_POINTS,
+    FOOT_SEGMENT,
+    JOINTS,
+    LIMBS,
+    REQUIRED_JOINTS,
+    ROWS,
+    SEGMENT_ORIGIN,
+    SEGMENTS,
+    segment_below,
+)
 from tk.model.body.rotations import to_matrices
 from tk.model.body.skeleton import Skeleton, skeleton_of_names
 from tk.model.motion.derived import derive
@@ -73,13 +83,23 @@ class Motion:
         return len(self.frames)
 
     def point(self, name: str) -> Float:
-        """Return the positions (F, 3) of a point, metres, world frame."""
-        return self.points[:, self.point_names.index(name)]
+        """Return the positions (F, 3) of a point, or of a joint that is not one of the points; metres, world frame."""
+        if name in self.point_names:
+            return self.points[:, self.point_names.index(name)]
+        return self.fixed_point(segment_below(ROWS[name].above), ROWS[name].place(self.dimensions))
+
+    def fixed_point(self, segment: str, place: Float) -> Float:
+        """Return the positions (F, 3) of a point fixed to a segment, from its place (3,) in the body frame of the zero
+        configuration; metres."""
+        origin = SEGMENT_ORIGIN[segment]
+        offset = standing_axes()[SEGMENTS.index(segment)].T @ (place - ROWS[origin].place(self.dimensions))
+        return self.point(origin) + self.rotation(segment) @ offset
 
     def rotation(self, segment: str) -> Float:
-        """Return a segment's rotations (F, 3, 3) to the world; a foot that is no segment has those of its calf."""
-        if segment not in self.segments:
-            segment = segment.replace("foot", "calf")
+        """Return a segment's rotations (F, 3, 3) to the world; the file may lack a foot, which then turns with the
+        calf."""
+        while segment not in self.segments:
+            segment = segment_below(ROWS[SEGMENT_ORIGIN[segment]].above)
         return self.rotations[:, self.segments.index(segment)]
 
     def status_word(self, frame: int) -> str:
@@ -102,21 +122,23 @@ def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[M
     if smoothed and result.smoothed is not None:
         bridged = np.asarray(result.smoothed["bridged"], dtype=bool)
         result = result.with_smoothed()
-    result = _in_order(result)
+    joint_names = tuple(name for name in JOINTS if name in result.meta.joint_names)
+    result = result.in_joint_order()
     dimensions = _dimensions(result)
     notes: tuple[str, ...] = ()
     if is_made_here:
         result, bridged = _smooth(result, dimensions)
         notes = (f"{path}: has no smoothed copy; the poses were smoothed for this export",)
     segments = result.meta.segment_names if result.segments_rotation is not None else SEGMENTS
-    missing = [name for name in SEGMENTS if name not in segments and not name.startswith("foot")]
+    missing = [ROWS[name].carrier for name in REQUIRED_JOINTS if ROWS[name].carrier not in segments]
     if missing:
         raise ResultError(f"{path}: /segments/rotation has no segment {missing[0]}; track the capture again")
     skeleton = _skeleton(result, dimensions)
     # (F, …) values from which the segments' rotations are computed
     source = result.pose if result.segments_rotation is None else result.segments_rotation
     known = bridged | result.has_pose
-    for numbers in (result.joints, source):
+    joints = [JOINTS.index(name) for name in joint_names]
+    for numbers in (result.joints[:, joints], source):
         known &= np.isfinite(numbers).reshape(len(known), -1).all(axis=1)
     if result.segments_rotation is not None:
         known &= (
@@ -134,9 +156,9 @@ def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[M
         if result.segments_rotation is None
         else to_matrices(result.segments_rotation[held])
     )
-    sigma = np.full((len(result), len(JOINTS) + len(FOOT_POINTS)), np.nan)
+    sigma = np.full((len(result), len(joints) + len(FOOT_POINTS)), np.nan)
     if result.sigma is not None:
-        sigma[:, : len(JOINTS)] = result.sigma
+        sigma[:, : len(joints)] = result.sigma[:, joints]
     motion = Motion(
         name=result.path.stem,
         fps=result.meta.fps,
@@ -145,8 +167,8 @@ def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[M
         status=result.status,
         bridged=bridged,
         known=known,
-        point_names=(*JOINTS, *FOOT_POINTS),
-        points=result.joints[held],
+        point_names=(*joint_names, *FOOT_POINTS),
+        points=result.joints[held][:, joints],
         sigma=sigma,
         segments=tuple(segments),
         rotations=rotations,
@@ -158,25 +180,11 @@ def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[M
     if result.feet is not None and np.isfinite(result.feet[known]).all():
         feet = result.feet[held]
     else:
-        feet = np.stack([_sole(motion, name) for name in FOOT_POINTS], axis=1)
+        ankles = [ROWS[LIMBS["leg" + name[-2:]][2]].place(dimensions) for name in FOOT_POINTS]
+        soles = [ankle + sole_offset(name, dimensions) for ankle, name in zip(ankles, FOOT_POINTS, strict=True)]
+        placed = zip(FOOT_SEGMENT.values(), soles, strict=True)
+        feet = np.stack([motion.fixed_point(segment, place) for segment, place in placed], axis=1)
     return replace(motion, points=np.concatenate([motion.points, feet], axis=1)), notes
-
-
-def _in_order(result: Result) -> Result:
-    """Return the result with its joints in the order of :data:`JOINTS`."""
-    names = result.meta.joint_names
-    missing = [name for name in JOINTS if name not in names]
-    if missing:
-        raise ResultError(f"{result.path}: /joints/position has no joint {missing[0]}; the file is damaged")
-    order = [names.index(name) for name in JOINTS]
-    sigma = None if result.sigma is None else result.sigma[:, order]
-    return replace(result, joints=result.joints[:, order], sigma=sigma)
-
-
-def _sole(motion: Motion, name: str) -> Float:
-    """Return the positions (F, 3) of a heel or toe, from the ankle and the rotation of the foot."""
-    ankle, foot = motion.point(LIMBS["leg" + name[-2:]][2]), motion.rotation("foot" + name[-2:])
-    return ankle + foot @ sole_offset(name, motion.dimensions)
 
 
 def _held(known: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -12,18 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.export.motion import LEFT_UP_FORWARD, Motion
+from tk.model.body.joints import FOOT_SEGMENT, LIMBS, SEGMENT_ORIGIN, TABLE, WAIST, segment_below
 from tk.model.body.rotations import turn
-from tk.model.body.skeleton import WAIST_HEIGHT
 
 Float = NDArray[np.float64]
 
-# Node, its parent, the segment that it rotates; leaves rotate with their parent.
-_TRUNK = (("pelvis", "", "pelvis"), ("lumbar", "pelvis", "torso"), ("neck", "lumbar", "head"), ("head_top", "neck", ""))
-_SIDE = (
-    ("shoulder", "lumbar", "upper_arm"), ("elbow", "shoulder", "forearm"), ("wrist", "elbow", "forearm"),
-    ("hand", "wrist", ""), ("hip", "pelvis", "thigh"), ("knee", "hip", "calf"), ("ankle", "knee", "foot"),
-    ("toe", "ankle", ""), ("heel", "ankle", ""),
-)  # fmt: skip
+# The trunk's nodes: name, parent, segment that it rotates. The tree begins at the pelvis, the joint table at the torso.
+_TRUNK = (("pelvis", "", "pelvis"), ("lumbar", "pelvis", "torso"))
+# The wrist of each hand: its tip is a leaf.
+_HANDS = {f"hand{side}": LIMBS[f"arm{side}"][2] for side in ("_l", "_r")}
 # m, variation of a node's position in its parent above which the position is written for each frame.
 _FIXED_WITHIN = 1e-4
 
@@ -33,7 +30,8 @@ class Tree:
     """N nodes over F frames, parents first.
 
     Attributes:
-        names: names of the 15 joints, the lumbar joint, tips of hands, toes and heels.
+        names: names of the joints, with ``lumbar`` for the waist, and of the tips of hands, toes and heels.
+        joints: the joint in whose place each node is; empty for the tips.
         parents: (N,) index of each node's parent; -1 for the root.
         segments: segment that each node rotates; empty for leaves.
         offsets: (N, 3) position of each node in its parent, rest pose; zero for the root.
@@ -43,6 +41,7 @@ class Tree:
     """
 
     names: tuple[str, ...]
+    joints: tuple[str, ...]
     parents: tuple[int, ...]
     segments: tuple[str, ...]
     offsets: Float
@@ -57,8 +56,9 @@ class Tree:
 
 def build_tree(motion: Motion) -> Tree:
     """Return the tree of a motion."""
-    rows = [*_TRUNK, *(_sided(row, side) for side in ("_l", "_r") for row in _SIDE)]
+    rows = _nodes()
     names = tuple(row[0] for row in rows)
+    joints = tuple({"lumbar": WAIST}.get(name, "" if name in (*_HANDS, *FOOT_SEGMENT) else name) for name in names)
     parents = tuple(names.index(row[1]) if row[1] else -1 for row in rows)
     segments = tuple(row[2] for row in rows)
     A = LEFT_UP_FORWARD @ motion.T_world_body.T
@@ -77,12 +77,21 @@ def build_tree(motion: Motion) -> Tree:
     offsets[0] = 0.0
     moving = np.abs(translations - offsets).max(axis=(0, 2)) > _FIXED_WITHIN
     moving[0] = True
-    return Tree(names, parents, segments, offsets, rotations, translations, moving)
+    return Tree(names, joints, parents, segments, offsets, rotations, translations, moving)
 
 
-def _sided(row: tuple[str, ...], side: str) -> tuple[str, ...]:
-    """Return a row of :data:`_SIDE` for one side."""
-    return tuple(part + side if part and part not in ("lumbar", "pelvis") else part for part in row)
+def _nodes() -> list[tuple[str, str, str]]:
+    """Return name, parent and segment of each node, parents first; leaves have no segment."""
+    above = {"torso": "lumbar", WAIST: "pelvis"}
+    limbs = [row for row in TABLE if row.above and row.name not in (WAIST, "pelvis")]
+    rows = [*_TRUNK, *((row.name, above.get(row.above, row.above), row.turns) for row in limbs)]
+    rows += [(hand, wrist, "") for hand, wrist in _HANDS.items()]
+    rows += [(point, SEGMENT_ORIGIN[segment], "") for point, segment in FOOT_SEGMENT.items()]
+    parents = {parent for _, parent, _ in rows}
+    return [
+        (name, parent, segment_below(name) if name in parents and not segment else segment)
+        for name, parent, segment in rows
+    ]
 
 
 def rest_axes(segment: str) -> Float:
@@ -93,10 +102,7 @@ def rest_axes(segment: str) -> Float:
 
 def _position(motion: Motion, name: str) -> Float:
     """Return the positions (F, 3) of a node, metres, world frame."""
-    d = motion.dimensions
-    if name == "lumbar":
-        return motion.point("pelvis") + motion.rotation("pelvis") @ [0.0, 0.0, WAIST_HEIGHT * d.trunk]
-    if name.startswith("hand"):
-        side = name[-2:]
-        return motion.point("wrist" + side) + motion.rotation("forearm" + side) @ [0.0, 0.0, -d.hand]
-    return motion.point(name)
+    if name in _HANDS:
+        wrist = _HANDS[name]
+        return motion.point(wrist) + motion.rotation(segment_below(wrist)) @ [0.0, 0.0, -motion.dimensions.hand]
+    return motion.point(WAIST if name == "lumbar" else name)

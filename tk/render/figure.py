@@ -13,7 +13,7 @@ from tk.io.results.data import Result
 from tk.io.results.status import has_pose
 from tk.kernels.cones import ELLIPSOID
 from tk.model.body.cone_body import ConeBody, ConePart
-from tk.model.body.joints import JOINTS, SEGMENTS
+from tk.model.body.joints import SEGMENTS
 from tk.model.cameras.camera import Camera
 from tk.trackers.bodies import body_and_poses
 
@@ -152,19 +152,14 @@ def figure_of(result: Result) -> Figure:
     """
     if not len(result):
         raise ResultError(f"{result.path}: has no frames")
-    names = result.meta.joint_names
-    missing = [name for name in JOINTS if name not in names]
-    if missing:
-        raise ResultError(f"{result.path}: /joints/position has no joint {missing[0]}; track anew")
-    order = [names.index(name) for name in JOINTS]
-    sigma = None if result.sigma is None else result.sigma[:, order]
+    result = result.in_joint_order()
     restored = body_and_poses(result)
     solids: tuple[Solid, ...] = ()
     transforms = np.zeros((len(result), 0, 4, 4))
     if restored is not None:
         body, poses = restored
         solids, transforms = solids_of(body), body.skeleton.segment_transforms(poses)
-    return Figure(result.frames, result.joints[:, order], sigma, result.status, solids, transforms)
+    return Figure(result.frames, result.joints, result.sigma, result.status, solids, transforms)
 
 
 def solids_of(body: ConeBody) -> tuple[Solid, ...]:

@@ -5,33 +5,36 @@ A joint's colour shows its standard deviation. Colours are BGR, as in OpenCV.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from colorsys import hls_to_rgb
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tk.model.body.joints import CHAINS, SEGMENTS, side_of
+
 Color = tuple[int, int, int]
 
-# Hue of each group of segments, degrees, and its segments from dark to light. Appearance only.
-_HUES_DEG = {"": 135.0, "_arm_l": 25.0, "_leg_l": 5.0, "_arm_r": 215.0, "_leg_r": 280.0}
-_SEGMENTS = {"": ("pelvis", "torso", "head"), "_arm": ("upper_arm", "forearm"), "_leg": ("thigh", "foot", "calf")}
+# Hue of each limb, degrees, and of the trunk with the head. Appearance only.
+_HUES_DEG = {"": 135.0, "arm_l": 25.0, "leg_l": 5.0, "arm_r": 215.0, "leg_r": 280.0}
 
 
-def _shades(group: str, side: str) -> dict[str, Color]:
-    """Return the colours of the segments of one group and side."""
+def _shades(hue_deg: float, segments: Sequence[str]) -> dict[str, Color]:
+    """Return the colours of segments, dark ones beside light ones."""
     colors = {}
-    for k, segment in enumerate(_SEGMENTS[group]):
-        rgb = hls_to_rgb(_HUES_DEG[group + side] / 360, 0.45 + 0.1 * k, 0.7)
+    for k, segment in enumerate((*segments[::2], *segments[1::2])):
+        rgb = hls_to_rgb(hue_deg / 360, 0.45 + 0.1 * k, 0.7)
         r, g, b = (round(255 * value) for value in rgb)
-        colors[segment + side] = (b, g, r)
+        colors[segment] = (b, g, r)
     return colors
 
 
+_TRUNK = tuple(segment for segment in SEGMENTS if not side_of(segment))
 SEGMENT_COLORS = {
     segment: color
-    for group, side in [("", ""), *((group, side) for group in ("_arm", "_leg") for side in ("_l", "_r"))]
-    for segment, color in _shades(group, side).items()
+    for limb, hue_deg in _HUES_DEG.items()
+    for segment, color in _shades(hue_deg, CHAINS.get(limb, _TRUNK)).items()
 }
 #: border of a lost frame, and the body in it
 LOST: Color = (50, 50, 225)

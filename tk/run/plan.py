@@ -17,7 +17,7 @@ from tk.io.results.data import JointAngles, ResultMeta
 from tk.io.settings_file import to_toml
 from tk.model.body.angles import ANGLES
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.skeleton import SEGMENTS, build_skeleton
+from tk.model.body.skeleton import OPTIONAL, SEGMENTS, build_skeleton
 from tk.model.setup import Setup
 from tk.run.prefetch import TIMING_STAGES, Observations, open_observations
 from tk.run.segmentation import mask_source
@@ -44,7 +44,7 @@ def recording_setup(capture: Capture, init_pose: Path | None, body: Path | None,
     """
     setup = capture.setup()
     (subject,) = setup.subjects
-    names = build_skeleton(BodyDimensions.from_stature(1.7), waist=True, ankles=True).names
+    names = build_skeleton(BodyDimensions.from_stature(1.7), optional=OPTIONAL).names
     init = first_pose(capture, names, init_pose, first_frame)
     frame = subject.init_frame
     if init is not None:

@@ -22,7 +22,7 @@ from tk.model.body.body_fit import STATURE_DEVIATION, fit_body
 from tk.model.body.cone_body import ConeBody, ConePart, build_cone_body
 from tk.model.body.initial_pose import rough_pose
 from tk.model.body.limb_candidates import Limb, distinct, limbs_of, pairs
-from tk.model.body.skeleton import build_skeleton, convert_poses
+from tk.model.body.skeleton import OPTIONAL, build_skeleton, convert_poses
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.tracker_frame import TrackerFrame
 from tk.model.cues.part_colors import PartColors
@@ -108,8 +108,8 @@ class ContourTracker:
         self.world = TrackerFrame.of(rig, up)
         self.views = Views(self.world.rig)
         self.screen, self.choice = (RayGrid(self.world.rig, rows) for rows in (SCREEN_ROWS, CHOICE_ROWS))
-        full = config.body == "full"
-        skeleton = build_skeleton(BodyDimensions.from_stature(1.7), waist=full, ankles=full)
+        optional = OPTIONAL if config.body == "full" else ()
+        skeleton = build_skeleton(BodyDimensions.from_stature(1.7), optional=optional)
         self.pose_names, self.pose_units = skeleton.names, skeleton.units
         self._body: ConeBody | None = None
         self._lost_for = 0

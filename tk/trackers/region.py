@@ -47,9 +47,9 @@ Float = NDArray[np.float64]
 INFORMATION = 1.0 / (2.0**2 * 10.0)
 # Scales of a frame, at least: from the finest alone Gauss-Newton does not converge.
 FEWEST = 2
-# Standard deviations of the priors: waist and ankles about zero, the others about their prediction. Chosen on the
+# Standard deviations of the priors about the predicted pose (tk.model.body.joints has those about zero). Chosen on the
 # development captures; sensitivity not measured.
-WAIST_DEG, ANKLE_DEG, ANGLE_DEG, TRANSLATION_M = 12.0, 20.0, 40.0, 0.3
+ANGLE_DEG, TRANSLATION_M = 40.0, 0.3
 # Frames during which a hypothesis is tracked beside the best one, and the share of its running cost that a frame
 # replaces. A hypothesis that costs MARGIN more than the best one, as a share of the person's pixels, is dropped. Chosen
 # on the development captures; sensitivity not measured.
@@ -268,12 +268,11 @@ class RegionTracker(ContourTracker):
         return list(range(first, -1, -1))
 
     def _prior(self, mean: Float, angle_deg: float = ANGLE_DEG) -> Prior:
-        """Return the prior: waist and ankles about zero, all other degrees of freedom about ``mean`` (..., D)."""
+        """Return the prior: straight joints about zero, all other degrees of freedom about ``mean`` (..., D)."""
         skeleton = self.body.skeleton
         deviation = np.where(skeleton.prismatic, TRANSLATION_M, np.radians(angle_deg))
-        deviation[skeleton.is_waist] = np.radians(WAIST_DEG)
-        deviation[skeleton.is_ankle] = np.radians(ANKLE_DEG)
-        straight = skeleton.is_waist | skeleton.is_ankle
+        straight = skeleton.is_straight
+        deviation[straight] = skeleton.straight[straight]
         return Prior(np.where(straight, 0.0, mean), deviation**-2 / INFORMATION)
 
     def _rank(self) -> None:

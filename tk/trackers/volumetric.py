@@ -26,6 +26,7 @@ from tk.errors import CaptureError, ConfigError
 from tk.kernels.nearest import SurfaceIndex
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import ConeBody
+from tk.model.body.joints import WAIST
 from tk.model.body.skeleton import CHAINS, JOINTS, build_skeleton, convert_poses
 from tk.model.body.superellipsoid_body import SuperellipsoidBody, build_superellipsoid_body
 from tk.model.cameras.camera import Rig
@@ -129,7 +130,7 @@ class VolumetricTracker:
         self.rig = rig
         self.hull = VisualHull(rig, VoxelGrid.cover(volume, config.voxels), cache_dir)
         self._finder = ContourTracker(rig, up, replace(config.silhouette, body="full"))
-        skeleton = build_skeleton(BodyDimensions.from_stature(1.7), up, config.body.waist)
+        skeleton = build_skeleton(BodyDimensions.from_stature(1.7), up, (WAIST,) if config.body.waist else ())
         self.pose_names, self.pose_units = skeleton.names, skeleton.units
         self.skin: SuperellipsoidBody
         self._objective: BodyObjective

@@ -7,9 +7,10 @@ import pytest
 
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.joint_sigma import BENT_M, OFFSET_M, contour_variance, directions, posture_variance
+from tk.model.body.joints import OPTIONAL
 from tk.model.body.skeleton import JOINTS, build_skeleton
 
-SKELETON = build_skeleton(BodyDimensions.from_stature(1.75), waist=True, ankles=True)
+SKELETON = build_skeleton(BodyDimensions.from_stature(1.75), optional=OPTIONAL)
 NAMES = SKELETON.names
 
 
@@ -41,7 +42,7 @@ def test_fixed_degrees_of_freedom_have_no_variance() -> None:
 def test_batched_variances_equal_single_ones() -> None:
     D = len(NAMES)
     root = np.random.default_rng(4).normal(size=(6, D, D))
-    precision, free = root @ root.swapaxes(1, 2) + np.eye(D), SKELETON.is_paper
+    precision, free = root @ root.swapaxes(1, 2) + np.eye(D), ~SKELETON.is_straight
     many = contour_variance(SKELETON, poses(6).reshape(2, 3, D), precision.reshape(2, 3, D, D), free)
     each = [contour_variance(SKELETON, pose, p, free) for pose, p in zip(poses(6), precision, strict=True)]
     np.testing.assert_allclose(many.reshape(6, -1), each, rtol=1e-9)

@@ -9,12 +9,11 @@ from scipy.linalg import expm
 from tk.errors import ConfigError
 from tk.model.body.anthropometry import FRACTIONS, RAISED_SHOULDERS, BodyDimensions
 from tk.model.body.gait_poses import neutral_pose
+from tk.model.body.joints import OPTIONAL, ROWS, WAIST
 from tk.model.body.skeleton import (
-    ANKLES,
     CHAINS,
     JOINTS,
     SEGMENTS,
-    WAIST,
     arm_elevation,
     build_skeleton,
     convert_poses,
@@ -90,18 +89,18 @@ def test_joints_parents_and_degrees_of_freedom_of_the_skeleton():
 
 # The waist
 
-WAISTED = build_skeleton(DIMENSIONS, waist=True)
+WAISTED = build_skeleton(DIMENSIONS, optional=(WAIST,))
 
 
 def waisted_poses(count=20, up="z"):
-    skeleton = build_skeleton(DIMENSIONS, up, waist=True)
+    skeleton = build_skeleton(DIMENSIONS, up, optional=(WAIST,))
     poses = np.random.default_rng(3).normal(0, 0.4, (count, len(skeleton.names)))
     return skeleton, skeleton.clip(poses)
 
 
 def test_a_waist_is_three_more_degrees_of_freedom_between_trunk_and_pelvis():
     assert tuple(np.array(WAISTED.names)[~WAISTED.is_waist]) == SKELETON.names
-    assert tuple(np.array(WAISTED.names)[WAISTED.is_waist]) == WAIST
+    assert tuple(np.array(WAISTED.names)[WAISTED.is_waist]) == ROWS[WAIST].dof_names
     assert (WAISTED.parent < np.arange(27)).all()
     moved = WAISTED.ancestors()[:, WAISTED.is_waist]
     below = {SEGMENTS[s] for s in np.flatnonzero(moved.all(axis=1))}
@@ -123,21 +122,24 @@ def test_a_straight_waist_changes_nothing():
 
 
 def whole(up="z"):
-    return build_skeleton(DIMENSIONS, up, waist=True, ankles=True)
+    return build_skeleton(DIMENSIONS, up, optional=OPTIONAL)
+
+
+def is_ankle(skeleton):
+    return skeleton.is_straight & ~skeleton.is_waist
 
 
 def test_ankles_are_two_more_degrees_of_freedom_a_side_that_move_the_foot_only():
     skeleton = whole()
-    assert len(skeleton.names) == 31 and tuple(np.array(skeleton.names)[skeleton.is_ankle]) == ANKLES
-    assert tuple(np.array(skeleton.names)[skeleton.is_paper]) == SKELETON.names
-    assert (skeleton.is_paper ^ skeleton.is_waist ^ skeleton.is_ankle).all()
+    assert len(skeleton.names) == 31 and OPTIONAL == (WAIST, "ankle")
+    assert tuple(np.array(skeleton.names)[~skeleton.is_straight]) == SKELETON.names
     for side in "lr":
         moved = skeleton.ancestors()[:, [skeleton.index(f"ankle_{side}_{n}") for n in ("flexion", "inversion")]]
         assert [s for s, m in zip(SEGMENTS, moved.any(axis=1), strict=True) if m] == [f"foot_{side}"]
         assert moved[SEGMENTS.index(f"foot_{side}")].all()
     pose = np.random.default_rng(0).uniform(-0.5, 0.5, 31)
     bent = pose.copy()
-    bent[skeleton.is_ankle] = 0.3
+    bent[is_ankle(skeleton)] = 0.3
     np.testing.assert_array_equal(skeleton.joints(bent), skeleton.joints(pose), err_msg="no joint is below an ankle")
 
 
@@ -158,7 +160,7 @@ def test_signs_of_the_ankles_are_anatomical(side):
     for name, low, high in (("flexion", -60, 40), ("inversion", -30, 40)):
         k = skeleton.index(f"ankle_{side}_{name}")
         np.testing.assert_allclose(np.degrees([skeleton.lower[k], skeleton.upper[k]]), [low, high])
-    assert (skeleton.clip(np.full(31, -9.0))[skeleton.is_ankle] < 0).all()
+    assert (skeleton.clip(np.full(31, -9.0))[is_ankle(skeleton)] < 0).all()
 
 
 @pytest.mark.parametrize("up", ["z", "-y"])
@@ -182,7 +184,7 @@ def test_paper_pose_keeps_the_orientation_of_trunk_head_and_limbs(up, seed):
 def test_poses_of_another_skeleton_are_taken_by_name():
     pose = SKELETON.clip(random_pose(3))
     full = convert_poses(pose, SKELETON, whole())
-    assert not full[whole().is_waist | whole().is_ankle].any()
+    assert not full[whole().is_straight].any()
     np.testing.assert_array_equal(full[np.isin(whole().names, SKELETON.names)], pose)
     np.testing.assert_allclose(convert_poses(full, whole(), SKELETON), pose, atol=1e-12)
 

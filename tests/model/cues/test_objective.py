@@ -9,7 +9,7 @@ from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective import ObjectiveParameters
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.gait_poses import neutral_pose
-from tk.model.body.skeleton import CHAINS, JOINTS, SEGMENTS, WAIST_STIFFNESS
+from tk.model.body.skeleton import CHAINS, JOINTS, SEGMENTS
 from tk.model.cues.objective import (
     CHAIN_NAMES,
     CHAIN_OF_SEGMENT,
@@ -328,7 +328,7 @@ def test_a_stiff_waist_costs_its_square_with_the_derivatives_to_it(index, truth)
     pose[0, body.skeleton.is_waist] = [0.2, -0.1, 0.3]
     pose[0, ~body.skeleton.is_waist] = truth
     k = np.zeros(27)
-    k[body.skeleton.is_waist] = 0.7 * np.array(WAIST_STIFFNESS)
+    k[body.skeleton.is_waist] = [0.7, 2.1, 3.5]
     cost = 0.5 * float(k @ pose[0] ** 2)
     v = np.random.default_rng(0).normal(size=(1, 27))
     plain, bent = (FrameObjective(o, index, np.random.default_rng(0)).full()(pose, v, 0) for o in (soft, stiff))

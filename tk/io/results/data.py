@@ -15,7 +15,7 @@ from tk.io.results.schema import columns_of
 from tk.io.results.status import has_pose
 from tk.io.toml import parse_toml
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.joints import JOINTS
+from tk.model.body.joints import JOINTS, in_joint_order
 from tk.model.body.skeleton import paper_poses, skeleton_of_names
 from tk.model.cameras.camera import Rig
 
@@ -273,6 +273,21 @@ class Result:
         from tk.io.results.tables import to_xarray
 
         return to_xarray(self)
+
+    def in_joint_order(self) -> Result:
+        """Return the result with its joints in the order of :data:`~tk.model.body.joints.JOINTS`; NaN where the file
+        has no such joint.
+
+        Raises:
+            ResultError: a joint that every result has is missing.
+        """
+        names = self.meta.joint_names
+        try:
+            joints = in_joint_order(self.joints, names)
+            sigma = None if self.sigma is None else in_joint_order(self.sigma, names)
+        except KeyError as error:
+            raise ResultError(f"{self.path}: /joints/position has no joint {error.args[0]}; track anew") from None
+        return replace(self, meta=replace(self.meta, joint_names=JOINTS), joints=joints, sigma=sigma)
 
     def with_smoothed(self) -> Result:
         """Return the result with each dataset replaced by its smoothed copy, if `/smoothed` has one."""

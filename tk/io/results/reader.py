@@ -29,7 +29,7 @@ from tk.io.results.schema import (
     prefix_of,
     smoothed_columns,
 )
-from tk.model.body.joints import JOINTS
+from tk.model.body.joints import REQUIRED_JOINTS, in_joint_order
 from tk.model.cameras.camera import Camera, Rig
 
 _ENTRIES = {entry.path: entry for entry in ROWS}
@@ -58,7 +58,8 @@ def read_result(path: str | os.PathLike[str]) -> Result:
 
 
 def read_people(path: str | os.PathLike[str]) -> tuple[JointTrack, ...]:
-    """Read the joints of each person of a result or of ground truth, in the order of :data:`JOINTS`.
+    """Read the joints of each person of a result or of ground truth, in the order of
+    :data:`~tk.model.body.joints.JOINTS`.
 
     Raises:
         ResultError: as :func:`read_result`, or a joint is missing, a frame is repeated, or the unit is not metres.
@@ -252,10 +253,9 @@ def _read_track(file: Hdf5Reader, prefix: str) -> JointTrack:
     frames = file.array(listed, entry.dtype, (None,), *entry.valid)
     _check_frames(file, prefix, frames)
     names = file.names(f"{prefix}joints/position", "names")
-    missing = [joint for joint in JOINTS if joint not in names]
+    missing = [joint for joint in REQUIRED_JOINTS if joint not in names]
     if missing:
         file.fail(f"/{prefix}joints/position has no joint {missing[0]} in its attribute names")
-    order = [names.index(joint) for joint in JOINTS]
     counts = {"F": len(frames), "J": len(names)}
 
     def read(name: str) -> NDArray[Any] | None:
@@ -263,7 +263,7 @@ def _read_track(file: Hdf5Reader, prefix: str) -> JointTrack:
 
     positions, status, sigma = (read(name) for name in ("joints/position", "status", "joints/sigma"))
     assert positions is not None
-    positions = positions[:, order]
+    positions = in_joint_order(positions, names)
     positions[~np.isfinite(positions)] = np.nan
     stages = [name for name in file.below(f"{prefix}timing") if "/" not in name]
     entry = _ENTRIES["timing/<stage>"]
@@ -271,7 +271,8 @@ def _read_track(file: Hdf5Reader, prefix: str) -> JointTrack:
     seconds: Float | None = None
     if timing:
         seconds = timing["total"] if "total" in timing else np.sum(list(timing.values()), axis=0)
-    return JointTrack(file.path, frames, positions, status, seconds, None if sigma is None else sigma[:, order])
+    sigma = None if sigma is None else in_joint_order(sigma, names)
+    return JointTrack(file.path, frames, positions, status, seconds, sigma)
 
 
 def _check_frames(file: Hdf5Reader, prefix: str, frames: NDArray[np.int64]) -> None:

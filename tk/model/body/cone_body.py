@@ -27,7 +27,7 @@ from tk.model.body.anthropometry import (
     PELVIS_FORWARD,
     BodyDimensions,
 )
-from tk.model.body.joints import CHAINS, LIMBS, ROWS
+from tk.model.body.joints import CHAINS, LIMBS, OPTIONAL, ROWS
 from tk.model.body.skeleton import SEGMENTS, Skeleton, build_skeleton, up_rotation
 
 Float = NDArray[np.float64]
@@ -303,8 +303,7 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
 
 
 def _skeleton(dimensions: BodyDimensions, up: str, preset: str) -> Skeleton:
-    full = preset == "full"
-    return build_skeleton(dimensions, up, waist=full, ankles=full)
+    return build_skeleton(dimensions, up, OPTIONAL if preset == "full" else ())
 
 
 def _calf(side: str, knee: Float, ankle: Float, d: BodyDimensions) -> list[ConePart]:

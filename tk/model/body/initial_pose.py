@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tk.model.block_least_squares import Equations, minimise
 from tk.model.body.anthropometry import FRACTIONS, BodyDimensions
 from tk.model.body.gait_poses import neutral_pose
-from tk.model.body.joints import HIPS, LIMBS, SHOULDERS
+from tk.model.body.joints import HIPS, LIMBS, OPTIONAL, SHOULDERS
 from tk.model.body.skeleton import JOINTS, Skeleton, build_skeleton, shoulder_angles
 from tk.model.cameras.tracker_frame import TrackerFrame
 
@@ -47,7 +47,7 @@ def rough_pose(
     """
     dimensions = BodyDimensions.from_stature(height_m or _stature_of(joints) or _STATURE_M)
     if angles:
-        skeleton = build_skeleton(dimensions, waist=True, ankles=True)
+        skeleton = build_skeleton(dimensions, optional=OPTIONAL)
         pose = neutral_pose(skeleton)
         for name, value in angles.items():
             pose[skeleton.index(name)] = value

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.body.joints import LIMBS
+from tk.model.body.joints import BONES, LIMBS, ROWS
 from tk.model.body.skeleton import JOINTS, SEGMENTS, Skeleton
 
 Float = NDArray[np.float64]
@@ -23,9 +23,8 @@ Float = NDArray[np.float64]
 OFFSET_M, BENT_M = 0.0067, 0.0145
 
 # The bone that each joint turns with, by the joints at its ends; the trunk's own joints have none.
-_BONES = {"head_top": ("neck", "head_top")}
-for _start, _middle, _end in LIMBS.values():
-    _BONES |= {_start: (_start, _middle), _middle: (_start, _middle), _end: (_middle, _end)}
+_BONES = {b: (a, b) for a, b in BONES if ROWS[a].chain and ROWS[a].chain == ROWS[b].chain}
+_BONES |= {start: (start, middle) for start, middle, _ in LIMBS.values()}
 _TURNED = np.array([JOINTS.index(name) for name in _BONES])
 _FROM = np.array([JOINTS.index(start) for start, _ in _BONES.values()])
 _TO = np.array([JOINTS.index(end) for _, end in _BONES.values()])

@@ -6,7 +6,7 @@ result's columns follow from a row; docs/architecture.md lists what else a new j
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,6 +37,9 @@ class Dof:
         axis: (3,) unit axis in the zero configuration, body frame, left side.
         lower, upper: limits, degrees.
         prismatic: True for a translation.
+        straight_deg: standard deviation, degrees, of a joint that is nearly straight in most frames: its prior is about
+            zero. Infinite: the prior is about the predicted angle.
+        stiffness: of the volumetric tracker's spring to zero, as a factor of the setting.
     """
 
     name: str
@@ -44,6 +47,8 @@ class Dof:
     lower: float = -np.inf
     upper: float = np.inf
     prismatic: bool = False
+    straight_deg: float = np.inf
+    stiffness: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,9 @@ class Joint:
         chain: the chain that is optimised as one (section 6.4); empty for the trunk.
         carrier: the segment that carries the joint centre in `/joints/position`; empty: not an output.
         bone_from: the joint at the other end of the bone in drawings; empty at the root.
-        optional: the group of degrees of freedom that a simpler body omits.
+        optional: whether a simpler body omits its degrees of freedom.
+        added: True for an output joint beyond the 15 that every result and ground truth has; where a file lacks it,
+            readers return NaN.
     """
 
     name: str
@@ -70,12 +77,13 @@ class Joint:
     chain: str = ""
     carrier: str = ""
     bone_from: str = ""
-    optional: str = ""
+    optional: bool = False
+    added: bool = False
 
     @property
-    def side(self) -> str:
-        """``_l``, ``_r``, or empty in the middle."""
-        return side_of(self.name)
+    def kind(self) -> str:
+        """The name without the side."""
+        return self.name.removesuffix(side_of(self.name))
 
     @property
     def dof_names(self) -> tuple[str, ...]:
@@ -122,14 +130,20 @@ def _neck(d: BodyDimensions) -> Float:
 # the lumbar spine (flexion 50, extension 15, bending 20-25, rotation 5-10), more for the rotation of the chest. Ankle:
 # Boone & Azen, plantar flexion 56±6, dorsiflexion 13±4 (more when the knee is bent and loaded), inversion 37±5,
 # eversion 21±5.
+#
+# Standard deviations of waist and ankles about zero, degrees. Chosen on the development captures; sensitivity not
+# measured. Stiffness of the waist: nothing outlines the pelvis from the front, and a hip can turn as well as it.
+_WAIST_DEG, _ANKLE_DEG = 12.0, 20.0
 _MIDDLE = (
     Joint("torso", lambda d: np.zeros(3), turns="torso", dofs=(
         Dof("x", _X, prismatic=True), Dof("y", _Y, prismatic=True), Dof("z", _Z, prismatic=True),
         Dof("yaw", _Z), Dof("roll", _X, -80.0, 80.0), Dof("pitch", _Y),
     )),
     Joint("waist", lambda d: np.array([0.0, 0.0, WAIST_HEIGHT * d.trunk]), above="torso", turns="pelvis", dofs=(
-        Dof("roll", _X, -30.0, 30.0), Dof("pitch", -_Y, -25.0, 50.0), Dof("yaw", _Z, -35.0, 35.0),
-    ), optional="waist"),
+        Dof("roll", _X, -30.0, 30.0, straight_deg=_WAIST_DEG, stiffness=1.0),
+        Dof("pitch", -_Y, -25.0, 50.0, straight_deg=_WAIST_DEG, stiffness=3.0),
+        Dof("yaw", _Z, -35.0, 35.0, straight_deg=_WAIST_DEG, stiffness=5.0),
+    ), optional=True),
     Joint("pelvis", lambda d: np.zeros(3), above="waist", carrier="pelvis"),
     Joint("neck", _neck, above="torso", turns="head", chain="head", carrier="torso", bone_from="pelvis", dofs=(
         Dof("pitch", _Y, -70.0, 65.0), Dof("yaw", _X, -50.0, 50.0),
@@ -151,13 +165,18 @@ _LEG_ROWS = (
     Joint("knee", _knee, above="hip", turns="calf", chain="leg", carrier="thigh", bone_from="hip",
           dofs=(Dof("flexion", _Y, -10.0, 160.0),)),
     Joint("ankle", _ankle, above="knee", turns="foot", chain="leg", carrier="calf", bone_from="knee",
-          dofs=(Dof("flexion", -_Y, -60.0, 40.0), Dof("inversion", -_X, -30.0, 40.0)), optional="ankles"),
+          dofs=(Dof("flexion", -_Y, -60.0, 40.0, straight_deg=_ANKLE_DEG),
+                Dof("inversion", -_X, -30.0, 40.0, straight_deg=_ANKLE_DEG)), optional=True),
 )  # fmt: skip
+
+
+_LIMB_ROWS = (_ARM_ROWS, _LEG_ROWS)
 
 
 def _on_side(rows: tuple[Joint, ...], side: str) -> tuple[Joint, ...]:
     """The rows of one limb; an axis of the right side is the negative mirrored one, a mirrored rotation's."""
-    own = {row.name for row in rows}
+    sided_names = {row.name for limb in _LIMB_ROWS for row in limb}
+    sided_segments = {row.turns for limb in _LIMB_ROWS for row in limb if row.turns}
     mirror = np.diag([1.0, -1.0, 1.0])
 
     def sided(row: Joint) -> Joint:
@@ -166,8 +185,8 @@ def _on_side(rows: tuple[Joint, ...], side: str) -> tuple[Joint, ...]:
             place = lambda d: mirror @ row.place(d)  # noqa: E731
             dofs = tuple(replace(dof, axis=0.0 - mirror @ dof.axis) for dof in dofs)
         names = {name: value + side for name in ("name", "turns", "chain") if (value := getattr(row, name))}
-        names |= {name: value + side for name in ("above", "bone_from") if (value := getattr(row, name)) in own}
-        carrier = row.carrier + side if row.carrier in {other.turns for other in rows} else row.carrier
+        names |= {name: value + side for name in ("above", "bone_from") if (value := getattr(row, name)) in sided_names}
+        carrier = row.carrier + side if row.carrier in sided_segments else row.carrier
         return replace(row, place=place, dofs=dofs, carrier=carrier, **names)
 
     return tuple(sided(row) for row in rows)
@@ -175,16 +194,18 @@ def _on_side(rows: tuple[Joint, ...], side: str) -> tuple[Joint, ...]:
 
 TABLE: tuple[Joint, ...] = (
     *_MIDDLE,
-    *(row for rows in (_ARM_ROWS, _LEG_ROWS) for side in ("_l", "_r") for row in _on_side(rows, side)),
+    *(row for rows in _LIMB_ROWS for side in ("_l", "_r") for row in _on_side(rows, side)),
 )
 ROWS = {row.name: row for row in TABLE}
 
-#: joints of `/joints/position`
-JOINTS = tuple(row.name for row in TABLE if row.carrier)
+#: joints of `/joints/position`: those that every file has, then the added ones
+JOINTS = tuple(row.name for added in (False, True) for row in TABLE if row.carrier and row.added == added)
+#: those that every result and ground truth has
+REQUIRED_JOINTS = tuple(name for name in JOINTS if not ROWS[name].added)
 #: segments of `/segments/rotation`: what the paper's joints turn, then what optional joints turn
-SEGMENTS = tuple(
-    row.turns for optional in (False, True) for row in TABLE if row.turns and bool(row.optional) == optional
-)
+SEGMENTS = tuple(row.turns for optional in (False, True) for row in TABLE if row.turns and row.optional == optional)
+#: kinds of joints whose degrees of freedom a simpler body omits
+OPTIONAL = tuple(dict.fromkeys(row.kind for row in TABLE if row.optional))
 #: bones of drawings, as pairs of joints
 BONES = tuple((row.bone_from, row.name) for row in TABLE if row.bone_from)
 #: the segments of the chains that are optimised one by one with the torso held (section 6.4)
@@ -210,13 +231,35 @@ LIMB_JOINTS = tuple(name for side in ("_l", "_r") for limb in ("arm", "leg") for
 LIMB_KINDS = tuple(name.removesuffix("_l") for name in LIMB_JOINTS if name.endswith("_l"))
 #: the joint at which a segment begins; the trunk's segments begin at an output joint
 SEGMENT_ORIGIN = {row.turns: row.name for row in TABLE if row.turns} | {"torso": "neck", "pelvis": "pelvis"}
-#: degrees of freedom of the optional groups
-WAIST, ANKLES = (
-    tuple(name for row in TABLE if row.optional == group for name in row.dof_names) for group in ("waist", "ankles")
-)
+#: the segment that carries each point of the feet
+FOOT_SEGMENT = {"heel_l": "foot_l", "toe_l": "foot_l", "heel_r": "foot_r", "toe_r": "foot_r"}
 #: the points of the feet, in the order of `/feet/position`
-FOOT_POINTS = ("heel_l", "toe_l", "heel_r", "toe_r")
+FOOT_POINTS = tuple(FOOT_SEGMENT)
+
+HIPS, SHOULDERS, ANKLE_JOINTS = (
+    tuple(LIMBS[chain + side][k] for side in ("_l", "_r")) for chain, k in (("leg", 0), ("arm", 0), ("leg", 2))
+)
+#: the joint between trunk and pelvis
+WAIST = ROWS[HIPS[0]].above
 
 
-HIPS, SHOULDERS = ((LIMBS[f"{chain}_l"][0], LIMBS[f"{chain}_r"][0]) for chain in ("leg", "arm"))
-ANKLE_JOINTS = (LIMBS["leg_l"][2], LIMBS["leg_r"][2])
+def segment_below(joint: str) -> str:
+    """Return the segment that a joint turns; of the end of a chain, the segment that carries it."""
+    row = ROWS[joint]
+    return row.turns or (segment_below(row.above) if row.above else "")
+
+
+def in_joint_order(values: Float, names: Sequence[str]) -> Float:
+    """Return values (F, J, ...) of :data:`JOINTS` from values (F, K, ...) of joints ``names``; NaN for absent ones.
+
+    Raises:
+        KeyError: the first of :data:`REQUIRED_JOINTS` that is absent.
+    """
+    for name in REQUIRED_JOINTS:
+        if name not in names:
+            raise KeyError(name)
+    result = np.full((len(values), len(JOINTS), *values.shape[2:]), np.nan)
+    for k, name in enumerate(JOINTS):
+        if name in names:
+            result[:, k] = values[:, names.index(name)]
+    return result

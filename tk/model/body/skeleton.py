@@ -21,7 +21,7 @@ while the trunk leans; the paper's torso takes them along.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -31,27 +31,24 @@ from numpy.typing import ArrayLike, NDArray
 from tk.kernels.kinematics import ARM_UP
 from tk.model.body.anthropometry import FRACTIONS, RAISED_SHOULDERS, BodyDimensions
 from tk.model.body.joints import (
-    ANKLES,
     CHAINS,
     HIPS,
     JOINTS,
+    OPTIONAL,
     ROWS,
     SEGMENTS,
     SHOULDERS,
     TABLE,
     WAIST,
-    WAIST_HEIGHT,
     Dof,
     Joint,
 )
 from tk.model.cameras.up import up_vector
 
-__all__ = ["ANKLES", "CHAINS", "JOINTS", "SEGMENTS", "WAIST", "WAIST_HEIGHT"]
+__all__ = ["CHAINS", "JOINTS", "OPTIONAL", "SEGMENTS"]
 
 Float = NDArray[np.float64]
 
-# How stiff each is beside the first: nothing outlines the pelvis from the front, and a hip can turn as well as it.
-WAIST_STIFFNESS = (1.0, 3.0, 5.0)
 # Single poses whose transforms are kept.
 REMEMBERED = 8
 
@@ -60,8 +57,8 @@ REMEMBERED = 8
 class Skeleton:
     """The kinematic tree as plain arrays: D = 24 degrees of freedom, S = 13 segments, J = 15 joints.
 
-    A waist has three more degrees of freedom, ankles have two each; without them pelvis and feet are carried by torso
-    and calves.
+    Optional joints have more: a waist three, ankles two each; without them pelvis and feet are carried by torso and
+    calves.
 
     Attributes:
         names: (D,) names of the degrees of freedom; translations first.
@@ -73,6 +70,9 @@ class Skeleton:
         prismatic: (D,) True for translations.
         parent: (D,) index of the degree of freedom before, -1 at the root.
         lower, upper: (D,) limits, radians; infinite where there is none.
+        straight: (D,) radians, standard deviation about zero of a joint that is nearly straight in most frames;
+            infinite for the others.
+        stiffness: (D,) of the volumetric tracker's spring to zero, as a factor of the setting.
         segment_dof: (S,) the last degree of freedom above each segment.
         joint_segment: (J,) the segment that carries each joint.
         joint_position: (J, 3) joint centres in the zero configuration, metres.
@@ -88,6 +88,8 @@ class Skeleton:
     parent: NDArray[np.int32]
     lower: Float
     upper: Float
+    straight: Float
+    stiffness: Float
     segment_dof: NDArray[np.int32]
     joint_segment: NDArray[np.int32]
     joint_position: Float
@@ -95,18 +97,13 @@ class Skeleton:
 
     @cached_property
     def is_waist(self) -> NDArray[np.bool_]:
-        """(D,) True for the waist's degrees of freedom, where there are any."""
-        return np.isin(self.names, WAIST)
+        """(D,) True for the degrees of freedom between trunk and pelvis, where there are any."""
+        return np.isin(self.names, ROWS[WAIST].dof_names)
 
     @cached_property
-    def is_ankle(self) -> NDArray[np.bool_]:
-        """(D,) True for the ankles' degrees of freedom, where there are any."""
-        return np.isin(self.names, ANKLES)
-
-    @cached_property
-    def is_paper(self) -> NDArray[np.bool_]:
-        """(D,) True for the paper's 24."""
-        return ~(self.is_waist | self.is_ankle)
+    def is_straight(self) -> NDArray[np.bool_]:
+        """(D,) True where :attr:`straight` is finite."""
+        return np.isfinite(self.straight)
 
     def index(self, name: str) -> int:
         """The position of a degree of freedom in p."""
@@ -307,18 +304,17 @@ def up_rotation(up: str) -> Float:
     return np.column_stack([x, np.cross(z, x), z])
 
 
-def build_skeleton(dimensions: BodyDimensions, up: str = "z", waist: bool = False, ankles: bool = False) -> Skeleton:
-    """The skeleton with these dimensions, standing upright along ``up``: the paper's 24 degrees of freedom, three more
-    with a waist, four more with ankles."""
+def build_skeleton(dimensions: BodyDimensions, up: str = "z", optional: Collection[str] = ()) -> Skeleton:
+    """The skeleton with these dimensions, standing upright along ``up``: the paper's 24 degrees of freedom, and those
+    of the ``optional`` joints, some of :data:`OPTIONAL`."""
     B = up_rotation(up) if up != "z" else np.eye(3)
-    has = {"": True, "waist": waist, "ankles": ankles}
     dofs: list[tuple[Joint, Dof, str]] = []
     parents: list[int] = []
     last = {"": -1}  # joint: its last degree of freedom
     segment_dof: dict[str, int] = {}
     for row in TABLE:
         last[row.name] = last[row.above]
-        for dof, name in zip(row.dofs, row.dof_names, strict=True) if has[row.optional] else ():
+        for dof, name in zip(row.dofs, row.dof_names, strict=True) if not row.optional or row.kind in optional else ():
             parents.append(last[row.name])
             dofs.append((row, dof, name))
             last[row.name] = len(dofs) - 1
@@ -340,6 +336,8 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z", waist: bool = Fals
         parent=np.array(parents, dtype=np.int32),
         lower=np.radians([dof.lower for _, dof, _ in dofs]),
         upper=np.radians([dof.upper for _, dof, _ in dofs]),
+        straight=np.radians([dof.straight_deg for _, dof, _ in dofs]),
+        stiffness=np.array([dof.stiffness for _, dof, _ in dofs]),
         segment_dof=np.array([segment_dof[s] for s in SEGMENTS], dtype=np.int32),
         joint_segment=np.array([SEGMENTS.index(row.carrier) for row in joints], dtype=np.int32),
         joint_position=np.array([row.place(dimensions) for row in joints]) @ B.T,
@@ -353,9 +351,8 @@ def skeleton_of_names(names: Sequence[str], dimensions: BodyDimensions, up: str)
     Raises:
         ValueError: no skeleton has them.
     """
-    skeleton = build_skeleton(
-        dimensions, up, waist=not {*WAIST}.isdisjoint(names), ankles=not {*ANKLES}.isdisjoint(names)
-    )
+    has = {row.kind for row in TABLE if not {*row.dof_names}.isdisjoint(names)}
+    skeleton = build_skeleton(dimensions, up, has)
     if skeleton.names != tuple(names):
         different = sorted({*skeleton.names} ^ {*names}) or ["other order"]
         raise ValueError(f"the pose vector is not one of this body ({different[0]})")

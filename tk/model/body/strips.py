@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from tk.errors import ConfigError
 from tk.kernels.contour import ContourKernel
 from tk.kernels.projection import pack_camera
+from tk.model.body import joints
 from tk.model.body.skeleton import SEGMENTS
 from tk.model.body.superellipsoid import Superellipsoid
 from tk.model.body.superellipsoid_body import SuperellipsoidBody
@@ -26,7 +27,7 @@ Float = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 # segments with contour points
-LIMBS = tuple(s for s in SEGMENTS if s not in ("torso", "pelvis", "head", "foot_l", "foot_r"))
+LIMBS = tuple(segment for limb in joints.LIMBS for segment in joints.CHAINS[limb][:2])
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from tk.kernels.kinematics import pack_tree
 from tk.kernels.piece_arrays import PieceArrays, pack_pieces
 from tk.model.body.cone_body import ConeBody, ConePart, group_of
 from tk.model.body.gait_poses import neutral_pose
+from tk.model.body.joints import WAIST
 from tk.model.body.skeleton import SEGMENTS, Skeleton, build_skeleton
 from tk.model.body.superellipsoid import Superellipsoid
 
@@ -96,7 +97,7 @@ def build_superellipsoid_body(
             no ankles, as in the paper: a foot moves with its calf.
         spacing_m: distance between neighbouring surface samples.
     """
-    skeleton = build_skeleton(body.dimensions, up, waist)
+    skeleton = build_skeleton(body.dimensions, up, (WAIST,) if waist else ())
     pieces = tuple(piece_of(part) for part in body.parts)
     points, normals = [], []
     for piece in pieces:
@@ -173,6 +174,8 @@ def _patches(points: Float, normals: Float, segment: NDArray[np.int32]) -> tuple
     patch = np.zeros(len(points), dtype=np.int32)
     for s, name in enumerate(SEGMENTS):
         here = segment == s
+        if not here.any():
+            continue
         axis = np.array([1.0, np.sign(points[here][0, 1]), 0.0]) if "arm" in name else np.array([0.0, 0.0, 1.0])
         along = points[here] @ axis
         low, high = along.min(), along.max()

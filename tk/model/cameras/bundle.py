@@ -202,12 +202,11 @@ class ContourBundle:
             first = D + view.camera * k
             columns = [slice(0, D), slice(first, first + k), slice(D + S - K, D + S)]
             found.add(view.frame, columns, rows, self._information * edgels.weight, edgels.distance)
-        straight = s.is_waist | s.is_ankle
         precision = np.full(D, POSE_DEVIATION**-2.0)
         precision[P:] = (self._segment_m or 1.0) ** -2.0
         for f, (frame, pose) in enumerate(zip(self.frames, state.poses, strict=True)):
             difference, excess = np.zeros(D), np.zeros(D)
-            difference[:P] = np.where(straight, 0.0, frame.pose) - pose
+            difference[:P] = np.where(s.is_straight, 0.0, frame.pose) - pose
             excess[:P] = s.clip(pose) - pose
             found.add_block_prior(f, precision, difference)
             found.add_block_prior(f, np.where(excess != 0, _LIMIT, 0.0), excess)

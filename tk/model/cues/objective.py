@@ -17,7 +17,7 @@ from tk.errors import ConfigError
 from tk.kernels.linearisation import Linearisation
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective import Held, ObjectiveKernel, ObjectiveParameters
-from tk.model.body.skeleton import CHAINS, SEGMENTS, WAIST_STIFFNESS
+from tk.model.body.skeleton import CHAINS, SEGMENTS
 from tk.model.body.superellipsoid_body import SuperellipsoidBody
 from tk.model.cues.edge_term import RENEW, ContourTerm
 from tk.settings import ObjectiveSettings
@@ -123,10 +123,7 @@ class BodyObjective:
         waist_stiffness: float = 0.0,
     ) -> None:
         self.body = body
-        self.stiffness = np.zeros(len(body.skeleton.names))
-        self.stiffness[body.skeleton.is_waist] = (
-            waist_stiffness * np.array(WAIST_STIFFNESS)[: body.skeleton.is_waist.sum()]
-        )
+        self.stiffness = waist_stiffness * body.skeleton.stiffness
         self.settings = settings
         self.sampling = sampling
         self.contours = contours

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from tk.kernels.line_search import COLOR_BINS, Regions
-from tk.model.body.cone_body import ConeBody
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.cone_body import ConeBody, build_cone_body
+from tk.model.body.joints import side_of
 
 Float = NDArray[np.float64]
 
-GROUPS = ("torso", "pelvis", "head", "upper_arm", "forearm", "hand", "thigh", "calf", "foot")
 # Standard deviation of the smoothing over bins, in bins: gain and white balance differ a little between cameras. Chosen
 # on the development captures, as the following constants; sensitivity not measured.
 _SMOOTHING = 0.7
@@ -33,6 +34,16 @@ _RATE = 0.05
 _MOST_LOG_RATIO = 5.0
 # Weight of a contour between two parts of different colours, relative to a silhouette's edge.
 _CONTOUR_WEIGHT = 0.5
+
+
+def _group(component: str) -> str:
+    return component.removesuffix(side_of(component))
+
+
+# rigid components of the full body without their sides, one colour model each
+GROUPS = tuple(
+    dict.fromkeys(_group(part.component) for part in build_cone_body(BodyDimensions.from_stature(1.7)).parts)
+)
 
 
 class PartColors:
@@ -112,7 +123,3 @@ def _smooth(counts: Float) -> NDArray[np.float32]:
     for _ in range(3):  # along the last axis, which then becomes the first of the three
         cubes = np.moveaxis(cubes @ _SMOOTH, 3, 1)
     return cubes.reshape(counts.shape)
-
-
-def _group(component: str) -> str:
-    return component[:-2] if component.endswith(("_l", "_r")) else component

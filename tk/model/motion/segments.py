@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.joints import FOOT_POINTS, JOINTS, LIMBS, SEGMENTS
+from tk.model.body.joints import FOOT_POINTS, FOOT_SEGMENT, JOINTS, LIMBS, SEGMENTS
 from tk.model.body.skeleton import Skeleton
 
 Float = NDArray[np.float64]
@@ -27,7 +27,7 @@ def foot_points(skeleton: Skeleton, dimensions: BodyDimensions, transforms: Floa
     ``transforms`` are those of :meth:`Skeleton.segment_transforms`. A skeleton without ankle joints has its feet fixed
     to the calves.
     """
-    T = transforms[:, [foot_segment(name) for name in FOOT_POINTS]]
+    T = transforms[:, [SEGMENTS.index(segment) for segment in FOOT_SEGMENT.values()]]
     ankles = skeleton.joint_position[[JOINTS.index(LIMBS["leg" + name[-2:]][2]) for name in FOOT_POINTS]]
     soles = np.array([sole_offset(name, dimensions) for name in FOOT_POINTS]) @ skeleton.T_world_body.T
     return np.einsum("fpab,pb->fpa", T[..., :3, :3], ankles + soles) + T[..., :3, 3]
@@ -37,8 +37,3 @@ def sole_offset(name: str, dimensions: BodyDimensions) -> Float:
     """Return the vector (3,) from the ankle to one of the :data:`FOOT_POINTS`, standing body: forward, left, up, m."""
     share = _HEEL if name.startswith("heel") else _TOE
     return np.array([share * dimensions.foot, 0.0, -dimensions.ankle_height])
-
-
-def foot_segment(name: str) -> int:
-    """Return the segment that carries the foot of the side with which ``name`` ends ("_l" or "_r")."""
-    return SEGMENTS.index("foot" + name[-2:])
