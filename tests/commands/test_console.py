@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import re
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -73,3 +74,29 @@ def test_log_of_the_package_is_printed(capfd: pytest.CaptureFixture[str]) -> Non
     assert lines[0].startswith("[") and lines[0].endswith(" s] finding the person")
     assert lines[1:] == ["note: a camera is dark", "note: shown"]
     assert (logging.getLogger("tk").level, list(logging.getLogger("tk").handlers)) == before
+
+
+def test_time_left_includes_later_stages() -> None:
+    with ConsoleReporter(console=terminal(), later=2.0) as reporter:
+        reporter.begin(10, 0)
+        assert reporter.seconds_left() is None
+        begin = time.perf_counter()
+        for frame in range(5):
+            reporter.advance(frame, None)
+            time.sleep(0.02)
+        left, each = reporter.seconds_left(), (time.perf_counter() - begin) / 5
+        assert left is not None
+        assert 0.5 * 25 * each < left < 1.5 * 25 * each, "five frames and twice ten"
+
+
+def test_long_stage_shows_that_it_goes_on(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tk.commands.console._PERIOD_S", 0.05)
+    with ConsoleReporter() as reporter:
+        reporter.stage("compiling")
+        time.sleep(0.3)
+    with ConsoleReporter(quiet=True) as reporter:
+        reporter.stage("compiling")
+        time.sleep(0.2)
+    lines = capfd.readouterr().err.splitlines()
+    assert len(lines) > 2 and lines[0].endswith("] compiling")
+    assert all(line.endswith("] still compiling") for line in lines[1:])

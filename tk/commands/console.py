@@ -7,7 +7,9 @@ through the logger "tk", and :class:`ConsoleReporter` prints them.
 from __future__ import annotations
 
 import logging
+import threading
 import time
+from datetime import timedelta
 from types import TracebackType
 from typing import TYPE_CHECKING
 
@@ -17,19 +19,22 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
     SpinnerColumn,
+    Task,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.text import Text
 
 if TYPE_CHECKING:
     from tk.batch import Outcome
 
 _LOG = logging.getLogger("tk")
 
-#: seconds between two lines of progress, of one capture and of a batch, if stderr is no terminal. The values only
-#: decide how many lines a log file gets.
+#: longest silence and seconds between two lines of progress of one capture, and of a batch, if stderr is no terminal.
+#: The values only decide how many lines a log file gets.
 _PERIOD_S, _BATCH_PERIOD_S = 2.0, 5.0
 #: captures named in a batch's line of progress; more would not fit on a line
 _NAMED_CAPTURES = 4
@@ -46,15 +51,30 @@ class _Notes:
         self._console.print(f"note: {text}", style="yellow", markup=False)
 
 
+class _TimeLeft(ProgressColumn):
+    """Shows the time left of a reporter."""
+
+    def __init__(self, reporter: ConsoleReporter) -> None:
+        super().__init__()
+        self._reporter = reporter
+
+    def render(self, task: Task) -> Text:
+        left = self._reporter.seconds_left()
+        return Text("" if left is None else str(timedelta(seconds=round(left))))
+
+
 class ConsoleReporter(_Notes):
     """The reporter of a command, see :class:`tk.run.session.Reporter`; a context manager.
+
+    Without a terminal a line every two seconds shows that a long stage goes on.
 
     Args:
         quiet: print notes only, no progress.
         console: where to print; stderr by default.
+        later: duration of the stages after the last frame, as a multiple of the duration of all frames.
     """
 
-    def __init__(self, quiet: bool = False, console: Console | None = None) -> None:
+    def __init__(self, quiet: bool = False, console: Console | None = None, later: float = 0.0) -> None:
         super().__init__(console)
         self._quiet = quiet
         self._handler = logging.Handler(logging.INFO)
@@ -62,16 +82,22 @@ class ConsoleReporter(_Notes):
         self._live: Progress | None = None
         self._lost = self._count = self._done = self._total = 0
         self._begun = self._started = self._last = time.perf_counter()
+        self._later, self._end = later, float("-inf")
+        self._stage = ""
+        self._closed = threading.Event()
 
     def __enter__(self) -> ConsoleReporter:
         self._level_before = _LOG.level
         _LOG.addHandler(self._handler)
         _LOG.setLevel(logging.INFO)
+        if not self._quiet and not self._console.is_terminal:
+            threading.Thread(target=self._show_life, daemon=True).start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._closed.set()
         _LOG.removeHandler(self._handler)
         _LOG.setLevel(self._level_before)
         self._stop()
@@ -80,16 +106,34 @@ class ConsoleReporter(_Notes):
         """Print a record of the package's log: warnings as notes, everything else as the current stage."""
         (self.note if record.levelno >= logging.WARNING else self.stage)(record.getMessage())
 
+    def _show_life(self) -> None:
+        """Print a line whenever nothing was printed for two seconds."""
+        while not self._closed.wait(_PERIOD_S / 4):
+            if self._stage and time.perf_counter() - self._last > _PERIOD_S:
+                left = self.seconds_left()
+                self._print(f"still {self._stage}" + ("" if left is None else f", about {left:.0f} s left"))
+
+    def _print(self, text: str) -> None:
+        """Print a line with the time since the begin."""
+        self._last = time.perf_counter()
+        click.echo(f"[{self._last - self._begun:5.1f} s] {text}", err=True)
+
+    def seconds_left(self) -> float | None:
+        """Return how long the command still takes, later stages included; None if unknown."""
+        left = self._end - time.perf_counter()
+        return left if left > 0 else None
+
     def stage(self, text: str) -> None:
         """Show what is being done from now on."""
         if self._quiet:
             return
+        self._stage = text
         if not self._console.is_terminal:
-            click.echo(f"[{time.perf_counter() - self._begun:5.1f} s] {text}", err=True)
+            self._print(text)
             return
         self._stop()
         self._live = Progress(
-            SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn(),
+            SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn(), _TimeLeft(self),
             console=self._console, transient=True,
         )  # fmt: skip
         self._live.add_task(text, total=None)
@@ -111,12 +155,14 @@ class ConsoleReporter(_Notes):
         now = time.perf_counter()
         made = self._done + self._count
         if self._count == 1:
-            rate, left = f"first after {now - self._begun:.1f} s", ""
+            rate = f"first after {now - self._begun:.1f} s"
             self._started = self._last = now
+            self._stage = ""
         else:
             speed = (self._count - 1) / max(now - self._started, 1e-9)
             rate = f"{speed:.1f} frames/s"
-            left = f"{(self._total - made) / speed:.0f} s left" if made < self._total else ""
+            if self._total:
+                self._end = now + (self._total - made + self._later * self._total) / speed
         lost = f"{self._lost} lost" if self._lost else ""
         if self._console.is_terminal:
             if self._count == 1:
@@ -125,6 +171,8 @@ class ConsoleReporter(_Notes):
             self._live.update(self._live.task_ids[0], completed=made, rate=rate, lost=lost)
         elif self._count == 1 or now - self._last > _PERIOD_S or made == self._total:
             self._last = now
+            seconds = self.seconds_left()
+            left = "" if seconds is None else f"about {seconds:.0f} s left"
             progress = ", ".join(part for part in (rate, left, lost) if part)
             click.echo(f"frame {frame}: {made}/{self._total}, {progress}", err=True)
 
@@ -133,7 +181,7 @@ class ConsoleReporter(_Notes):
         # fits into 80 columns with the longest texts
         columns = (
             TextColumn("frames"), BarColumn(20), MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"), TimeRemainingColumn(), TextColumn("{task.fields[lost]}"),
+            TextColumn("{task.fields[rate]}"), _TimeLeft(self), TextColumn("{task.fields[lost]}"),
         )  # fmt: skip
         self._live = Progress(*columns, console=self._console)
         self._live.add_task("", total=self._total, completed=self._done, rate="", lost="")

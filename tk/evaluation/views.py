@@ -26,7 +26,7 @@ from tk.io.results.data import Result
 from tk.io.results.reader import as_damage_error, read_joints, read_result
 from tk.model.body.joints import ANKLE_JOINTS, JOINTS
 from tk.model.cameras.camera import Rig
-from tk.model.masks.silhouettes import draw_silhouettes, share_wrong
+from tk.model.masks.silhouettes import SilhouetteRenderer, share_wrong
 from tk.trackers.bodies import body_and_poses
 
 Float = NDArray[np.float64]
@@ -173,12 +173,12 @@ def _silhouette_errors(result: Result, capture: Capture) -> tuple[list[float] | 
     body, poses = found
     row_of = {int(frame): row for row, frame in enumerate(result.frames)}
     first, last = int(result.frames.min()), int(result.frames.max())
-    errors = []
+    errors, renderer = [], SilhouetteRenderer(body, capture.rig)
     with capture.frames(first, last + 1) as frames:
         for frame in frames:
             row = row_of.get(frame.index)
             if row is not None and frame.masks is not None and np.isfinite(result.pose[row]).all():
-                errors.append(share_wrong(draw_silhouettes(body, capture.rig, poses[row][None])[0], frame.masks))
+                errors.append(share_wrong(renderer.draw(poses[row]), frame.masks))
     values = np.array(errors).reshape(-1, len(capture.rig))
     seen = np.isfinite(values)  # NaN for an empty mask
     if not seen.any(axis=0).all():

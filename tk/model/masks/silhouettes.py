@@ -149,15 +149,23 @@ def share_wrong(drawn: Masks, seen: Masks) -> Float:
         return np.where(total > 0, wrong / total, np.inf)
 
 
+class SilhouetteRenderer:
+    """Renders silhouettes of a body in the cameras of a rig."""
+
+    def __init__(self, body: ConeBody, rig: Rig) -> None:
+        self._arrays = body.arrays
+        self._rays, self._cameras = pixel_rays(rig), pack_rig(rig).astype(np.float32)
+        self._group = np.zeros(len(body.parts), np.int32)
+        self._cost = np.zeros((*self._rays.shape[:3], 2), np.float32)
+
+    def draw(self, pose: Float) -> NDArray[np.uint8]:
+        """Return the silhouettes (V, H, W) at a pose (D,), 0 or 255."""
+        _, met = cast(self._arrays, self._group, self._cameras, 1, self._rays, self._cost, pose[None], export=True)
+        assert met is not None
+        return np.where(met.label[0] > 0, np.uint8(255), np.uint8(0))
+
+
 def draw_silhouettes(body: ConeBody, rig: Rig, poses: Float) -> NDArray[np.uint8]:
     """Render silhouettes (B, V, H, W) of the body at poses (B, D), 0 or 255."""
-    rays = pixel_rays(rig)
-    group = np.zeros(len(body.parts), np.int32)
-    cost = np.zeros((*rays.shape[:3], 2), np.float32)
-    cameras = pack_rig(rig).astype(np.float32)
-    pictures = []
-    for pose in poses:  # one at a time: depths of all pixels of many poses need much memory
-        _, met = cast(body.arrays, group, cameras, 1, rays, cost, pose[None], export=True)
-        assert met is not None
-        pictures.append(np.where(met.label[0] > 0, np.uint8(255), np.uint8(0)))
-    return np.array(pictures)
+    renderer = SilhouetteRenderer(body, rig)
+    return np.array([renderer.draw(pose) for pose in poses])  # depths of all pixels of many poses need much memory
