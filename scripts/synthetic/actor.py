@@ -6,6 +6,7 @@ A round cone is the hull of two spheres. Each primitive lives in a bone frame th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,8 +21,9 @@ SKIN, HAIR, SHIRT, TROUSERS, SHOES, OBJECT = range(6)
 NO_CUT = (0.0, 0.0, 1.0, -9.0)
 
 # columns of `Actor.shape`
-COL_A, COL_RA, COL_B, COL_RB, COL_SCALE, COL_CUT, COL_BLEND, COL_WRINKLE = 0, 3, 4, 7, 8, 11, 15, 16
-SHAPE_COLUMNS = 17
+COL_A, COL_RA, COL_B, COL_RB, COL_SCALE, COL_CUT, COL_BLEND, COL_WRINKLE, COL_NUMBER = 0, 3, 4, 7, 8, 11, 15, 16, 17
+SHAPE_COLUMNS = 18
+MATERIALS = 6
 
 
 @dataclass(frozen=True)
@@ -68,8 +70,8 @@ class Actor:
 
     Attributes:
         bones: (N,) bone of each primitive.
-        material: (N,) its material.
-        shape: (N, 17) float64, see the ``COL_`` constants.
+        material: (N,) its material; 6 more for each actor before it, see :func:`join`.
+        shape: (N, 18) float64, see the ``COL_`` constants.
         centers: (N, 3) centre of its bounding sphere in the bone frame, metres.
         radii: (N,) radius of that sphere, blending and wrinkles included, metres.
     """
@@ -129,13 +131,26 @@ def make_actor(skeleton: Skeleton, *, cube_bone: str | None = None) -> Actor:
         row[COL_B:COL_RB], row[COL_RB] = b, rb
         row[COL_SCALE:COL_CUT] = scale
         row[COL_CUT:COL_BLEND] = (*p.cut[:3], p.cut[3] * size)
-        row[COL_BLEND], row[COL_WRINKLE] = p.blend * size, p.wrinkle * size
+        row[COL_BLEND], row[COL_WRINKLE], row[COL_NUMBER] = p.blend * size, p.wrinkle * size, i
         center[:] = (a + b) / 2 * scale
         axis_max = float(np.max(scale))
         reach = max(ra, rb) * (np.sqrt(3) if p.material == OBJECT else axis_max)
         radii[i] = np.linalg.norm((b - a) / 2 * scale) + reach + (p.blend + p.wrinkle) * size
     bones = np.array([skeleton.index(p.bone) for p in primitives])
     return Actor(skeleton, bones, np.array([p.material for p in primitives]), shape, centers, radii)
+
+
+def join(actors: Sequence[Actor]) -> Actor:
+    """Return several actors as one, whose poses are joined along the bones: what they touch does not blend."""
+    bones = np.cumsum([0, *(len(actor.skeleton.names) for actor in actors)])
+    return Actor(
+        actors[0].skeleton,
+        np.concatenate([actor.bones + first for actor, first in zip(actors, bones, strict=False)]),
+        np.concatenate([actor.material + MATERIALS * k for k, actor in enumerate(actors)]),
+        np.concatenate([actor.shape for actor in actors]),
+        np.concatenate([actor.centers for actor in actors]),
+        np.concatenate([actor.radii for actor in actors]),
+    )
 
 
 def _ball(bone: str, material: int, at: Vec, radius: float, scale: Vec = (1, 1, 1), blend: float = 0.02) -> Primitive:

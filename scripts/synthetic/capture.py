@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from fractions import Fraction
+from itertools import combinations
 from pathlib import Path
 
 import av
@@ -14,10 +15,12 @@ import h5py
 import numpy as np
 import tomli_w
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from scripts.synthetic.actor import Actor, Look, make_actor
 from scripts.synthetic.motion import MOTIONS, Motion, plan_path, pose_at
 from scripts.synthetic.motion import Path as PelvisPath
+from scripts.synthetic.people import SCENES, STAGE_M, Role
 from scripts.synthetic.render import Body, composite, render_actor, sample_rays, shadow_maps
 from scripts.synthetic.rig import make_rig
 from scripts.synthetic.scene import Lamps, RoomView, make_lamps, view_room
@@ -42,7 +45,15 @@ _AMBIENT_RADII_M = (0.07, 0.07, 0.07, 0.07, 0.11, 0.11, 0.15, 0.15, 0.11)
 
 @dataclass(frozen=True)
 class Options:
-    """What to render. ``size`` is (width, height) in pixels, ``crf`` x264's constant rate factor."""
+    """What to render.
+
+    Attributes:
+        motion: name of a motion, or of a scene with several people.
+        size: (width, height) in pixels.
+        stature_m, look: those of the actor; in a scene, of person 0.
+        crf: x264's constant rate factor.
+        alone: number of the only person to render in a scene; everything else is as with all of them.
+    """
 
     motion: str = "demo"
     frames: int | None = None
@@ -52,11 +63,12 @@ class Options:
     stature_m: float = 1.75
     look: Look = field(default_factory=Look)
     crf: int = 20
+    alone: int | None = None
 
 
 @dataclass(frozen=True)
-class Plan:
-    """Everything of a capture except its pixels.
+class Performer:
+    """One person of a capture.
 
     Attributes:
         poses: (F) bone frames at the middle of each exposure.
@@ -64,61 +76,144 @@ class Plan:
         bodies: by holding side of the cube, or {None: body}.
     """
 
-    options: Options
     motion: Motion
     skeleton: Skeleton
     path: PelvisPath
     poses: Pose
     joints: Float
     bodies: dict[str | None, Body]
+
+    @staticmethod
+    def plan(motion: Motion, skeleton: Skeleton, look: Look, frames: int) -> Performer:
+        """Return the person who performs a motion."""
+        path = plan_path(motion, skeleton, frames)
+        poses = pose_at(motion, skeleton, path, np.arange(frames, dtype=np.float64))
+        holders: list[str | None] = [*sorted({side for _, side in motion.cube})] or [None]
+        bodies = {
+            side: Body.of(
+                make_actor(skeleton, cube_bone=None if side is None else "wrist" + side), look.colors(), look.stripes
+            )
+            for side in holders
+        }
+        return Performer(motion, skeleton, path, poses, joint_positions(skeleton, poses), bodies)
+
+    def body(self, frame: int) -> Body:
+        return self.bodies[self.motion.held_by(frame)]
+
+    def balls(self, chosen: NDArray[np.bool_]) -> tuple[Float, Float]:
+        """Return centres (K, 3) and radii (K,) of balls that bound the body in the chosen frames (F,), metres."""
+        centers, radii = [np.zeros((0, 3))], [np.zeros(0)]
+        for side, body in self.bodies.items():
+            held = chosen & np.array([self.motion.held_by(frame) == side for frame in range(len(chosen))])
+            c, r = body.actor.balls(self.poses[np.flatnonzero(held)])
+            centers.append(c.reshape(-1, 3))
+            radii.append(np.tile(r, int(held.sum())))
+        return np.concatenate(centers), np.concatenate(radii)
+
+    def within(self, volume: Volume) -> NDArray[np.int64]:
+        """Return the frames in which the pelvis is in a volume."""
+        pelvis = self.joints[:, JOINTS.index("pelvis")]
+        return np.flatnonzero(((volume.lower <= pelvis) & (pelvis <= volume.upper)).all(axis=1))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything of a capture except its pixels.
+
+    Attributes:
+        people: those who are rendered, by number.
+    """
+
+    options: Options
+    people: dict[int, Performer]
     rig: Rig
     volume: Volume
     lamps: Lamps
 
     @property
+    def subject(self) -> Performer:
+        """The person with the smallest number."""
+        return self.people[min(self.people)]
+
+    @property
     def frame_count(self) -> int:
-        return len(self.joints)
+        return len(self.subject.joints)
+
+    @property
+    def fps(self) -> float:
+        return self.subject.motion.fps
 
     def body(self, frame: int) -> Body:
-        return self.bodies[self.motion.held_by(frame)]
+        return Body.join([person.body(frame) for person in self.people.values()])
+
+    def poses(self, frames: Float) -> Pose:
+        """Return the bone frames of all people at (T,) times in frames."""
+        return Pose.join([pose_at(p.motion, p.skeleton, p.path, frames) for p in self.people.values()])
 
     def shadow(self, frame: int) -> NDArray[np.float32]:
         """The lamps' shadow maps at this frame, the same for all cameras."""
-        return shadow_maps(self.body(frame), self.poses[frame : frame + 1], self.lamps)
+        return shadow_maps(self.body(frame), self.poses(np.array([float(frame)])), self.lamps)
 
 
 def plan_capture(options: Options) -> Plan:
-    """Choose motion, rig and volume; the same options give the same plan."""
-    skeleton = make_skeleton(options.stature_m)
-    motion = MOTIONS[options.motion](skeleton)
-    frames = motion.frames if options.frames is None else options.frames
-    path = plan_path(motion, skeleton, frames)
-    poses = pose_at(motion, skeleton, path, np.arange(frames, dtype=np.float64))
-    holders: list[str | None] = [*sorted({side for _, side in motion.cube})] or [None]
-    bodies = {
-        side: Body.of(
-            make_actor(skeleton, cube_bone=None if side is None else "wrist" + side),
-            options.look.colors(),
-            options.look.stripes,
-        )
-        for side in holders
-    }
+    """Choose motion, rig and volume; the same options give the same plan.
+
+    The rig sees a single actor all the time; in a scene, everybody who is on the stage.
+    """
+    scene = SCENES.get(options.motion)
+    roles = scene or (Role(MOTIONS[options.motion]),)
+    people = []
+    for role in roles:
+        skeleton = make_skeleton(role.stature_m or options.stature_m)
+        motion = role.motion(skeleton)
+        frames = motion.frames if options.frames is None else options.frames
+        people.append(Performer.plan(motion, skeleton, role.look or options.look, frames))
     centers, radii = [], []
-    for side, body in bodies.items():
-        held = np.array([motion.held_by(frame) == side for frame in range(frames)])
-        c, r = body.actor.balls(poses[np.flatnonzero(held)])
-        centers.append(c.reshape(-1, 3))
-        radii.append(np.tile(r, int(held.sum())))
+    for person in people:
+        pelvis = person.joints[:, JOINTS.index("pelvis"), :2]
+        c, r = person.balls(np.linalg.norm(pelvis, axis=1) <= (STAGE_M if scene else np.inf))
+        centers.append(c)
+        radii.append(r)
     ball_centers, ball_radii = np.concatenate(centers), np.concatenate(radii)
     lower = (ball_centers - ball_radii[:, None]).min(axis=0)
     upper = (ball_centers + ball_radii[:, None]).max(axis=0)
-    lamps = make_lamps(lower, upper)
     rng = np.random.default_rng([options.seed, 1])
     rig = make_rig(options.cameras, *options.size, ball_centers, ball_radii, rng)
-    return Plan(
-        options, motion, skeleton, path, poses, joint_positions(skeleton, poses), bodies, rig,
-        _volume(lower, upper), lamps,
-    )  # fmt: skip
+    rendered = {k: person for k, person in enumerate(people) if options.alone in (None, k)}
+    if not rendered:
+        raise ValueError(f"{options.motion} has {len(people)} people, and no number {options.alone}")
+    return Plan(options, rendered, rig, _volume(lower, upper), make_lamps(lower, upper))
+
+
+def crossings(plan: Plan, step: int = 4) -> int:
+    """Return how often two people cross: their silhouettes overlap in two views or more, pelvises less than 1 m apart.
+
+    Silhouettes are drawn in every ``step``-th pixel, as discs of the balls that the bodies consist of.
+    """
+    people = list(plan.people.values())
+    shown = [_discs(plan, person, step) for person in people]
+    count = 0
+    for (a, one), (b, other) in combinations(zip(people, shown, strict=True), 2):
+        apart = np.linalg.norm(a.joints[:, JOINTS.index("pelvis")] - b.joints[:, JOINTS.index("pelvis")], axis=1)
+        cross = ((one & other).any(axis=(2, 3)).sum(axis=1) >= 2) & (apart < 1.0)
+        # a pause of less than half a second ends no crossing
+        cross = ndimage.binary_closing(np.pad(cross, 8), np.ones(8, np.bool_))
+        count += int(ndimage.label(cross)[1])
+    return count
+
+
+def _discs(plan: Plan, person: Performer, step: int) -> NDArray[np.bool_]:
+    """Return (F, C, h, w) a person's silhouettes in every ``step``-th pixel, drawn as discs."""
+    width, height = (side // step for side in plan.options.size)
+    images = np.zeros((plan.frame_count, len(plan.rig), height, width), np.uint8)
+    for frame, views in enumerate(images):
+        centers, radii = person.body(frame).actor.balls(person.poses[frame : frame + 1])
+        for camera, image in zip(plan.rig, views, strict=True):
+            pixels, depth = camera.project(centers[0])
+            for xy, r in zip(pixels / step, camera.matrix[0, 0] * radii / depth / step, strict=True):
+                if np.isfinite(xy).all() and np.abs(xy).max() < 1e4:
+                    cv2.circle(image, (round(xy[0]), round(xy[1])), max(round(r), 1), 1, cv2.FILLED)
+    return images.astype(np.bool_)
 
 
 def _volume(lower: Float, upper: Float) -> Volume:
@@ -156,7 +251,7 @@ class CameraRenderer:
         plan = self.plan
         body = plan.body(frame)
         shadow = plan.shadow(frame) if shadow is None else shadow
-        moving = pose_at(plan.motion, plan.skeleton, plan.path, frame + _MOMENTS)
+        moving = plan.poses(frame + _MOMENTS)
         actor = render_actor(self.camera, self._rays, body, moving, plan.lamps, shadow)
         linear = composite(self._room, plan.lamps, shadow, _ambient_balls(plan, frame), actor)
         mask = np.where(actor[..., 3] >= 0.5, 255, 0).astype(np.uint8)
@@ -170,8 +265,11 @@ class CameraRenderer:
 
 
 def _ambient_balls(plan: Plan, frame: int) -> NDArray[np.float32]:
-    bones = [plan.skeleton.index(name) for name in _AMBIENT_BONES]
-    return np.column_stack([plan.poses.origin[frame, bones], _AMBIENT_RADII_M]).astype(np.float32)
+    balls = []
+    for person in plan.people.values():
+        bones = [person.skeleton.index(name) for name in _AMBIENT_BONES]
+        balls.append(np.column_stack([person.poses.origin[frame, bones], _AMBIENT_RADII_M]))
+    return np.concatenate(balls).astype(np.float32)
 
 
 def write_capture(
@@ -216,23 +314,30 @@ def write_calibration(rig: Rig, path: Path) -> None:
 def _write_settings(plan: Plan, name: str, path: Path) -> None:
     settings = {
         "name": name,
-        "fps": plan.motion.fps,
+        "fps": plan.fps,
         "up": "z",
         "volume": {"center": list(plan.volume.center), "size": list(plan.volume.size)},
-        "subject": {"height": plan.options.stature_m},
+        "subject": {"height": plan.subject.skeleton.stature_m},
         "init": {"frame": 0, "pose": "da-vinci"},
     }
     path.write_text(tomli_w.dumps(settings), encoding="utf-8")
 
 
 def _write_truth(plan: Plan, name: str, path: Path) -> None:
+    """Write the joints. In a scene, /people/<n> holds the frames in which person n is in the volume, too."""
     with h5py.File(path, "w") as file:
-        frames = np.arange(plan.frame_count, dtype=np.int64)
-        file["frames"] = frames
-        file["time"] = frames / plan.motion.fps
-        position = file.create_dataset("joints/position", data=plan.joints)
-        position.attrs.create("names", list(JOINTS), dtype=h5py.string_dtype())
-        file.attrs.update({"capture": name, "fps": plan.motion.fps, "units": "m", "up": "z"})
+        _write_joints(file, plan.subject, np.arange(plan.frame_count, dtype=np.int64))
+        if plan.options.motion in SCENES:
+            for number, person in plan.people.items():
+                _write_joints(file.create_group(f"people/{number}"), person, person.within(plan.volume))
+        file.attrs.update({"capture": name, "fps": plan.fps, "units": "m", "up": "z"})
+
+
+def _write_joints(group: h5py.Group, person: Performer, frames: NDArray[np.int64]) -> None:
+    group["frames"] = frames
+    group["time"] = frames / person.motion.fps
+    position = group.create_dataset("joints/position", data=person.joints[frames])
+    position.attrs.create("names", list(JOINTS), dtype=h5py.string_dtype())
 
 
 class _Video:
@@ -240,7 +345,7 @@ class _Video:
 
     def __init__(self, path: Path, camera: Camera, plan: Plan) -> None:
         self._container = av.open(str(path), "w")
-        self._stream = self._container.add_stream("libx264", rate=Fraction(plan.motion.fps).limit_denominator(1000))
+        self._stream = self._container.add_stream("libx264", rate=Fraction(plan.fps).limit_denominator(1000))
         self._stream.width, self._stream.height = camera.width, camera.height
         self._stream.pix_fmt = "yuv420p"
         # with macroblock trees some files of a hundred differ from run to run on a busy machine, one thread or not
@@ -267,6 +372,7 @@ __all__ = [
     "Options",
     "Picture",
     "Plan",
+    "crossings",
     "plan_capture",
     "write_calibration",
     "write_capture",

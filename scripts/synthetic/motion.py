@@ -60,6 +60,7 @@ class Motion:
         frames: natural length.
         fps: frames a second.
         root: the pelvis (T, 3) in metres over (T,) frames; without it, it goes where the standing foot takes it.
+        placed: whether ``root`` is in the world; otherwise the path is centred on the world's origin.
     """
 
     name: str
@@ -69,6 +70,7 @@ class Motion:
     cube: tuple[tuple[int, str], ...] = ()
     fps: float = FPS
     root: Callable[[Float], Float] | None = None
+    placed: bool = False
 
     def angles(self, frame: Float) -> dict[str, Float]:
         """Radians of every angle at (T,) times in frames."""
@@ -117,12 +119,13 @@ class Path:
 def plan_path(motion: Motion, skeleton: Skeleton, frames: int) -> Path:
     """Where the pelvis goes: the lower foot stands on the floor and does not slide, the other one is free.
 
-    The horizontal path is centred on the world's origin.
+    The horizontal path is centred on the world's origin, unless the motion is placed.
     """
     frame = np.arange(-_STEPS, (frames + 1) * _STEPS) / _STEPS
     if motion.root is not None:
         root = motion.root(frame)
-        root[:, :2] -= (root[:, :2].max(axis=0) + root[:, :2].min(axis=0)) / 2
+        if not motion.placed:
+            root[:, :2] -= (root[:, :2].max(axis=0) + root[:, :2].min(axis=0)) / 2
         return Path(frame, root)
     soles = sole_points(skeleton, forward(skeleton, motion.angles(frame)))  # (T, 2, 3, 3), pelvis at the origin
     low = soles[..., 2].min(axis=2)  # (T, 2)
@@ -155,8 +158,8 @@ def pose_at(motion: Motion, skeleton: Skeleton, path: Path, frame: Float) -> Pos
 # --- the motions ---------------------------------------------------------------------------------------------------
 
 
-def _opening(first: Mapping[str, float] | None = None, until: float = START) -> list[Key]:
-    """Da Vinci pose, then ``first`` (standing by default) from frame ``until`` on."""
+def opening(first: Mapping[str, float] | None = None, until: float = START) -> list[Key]:
+    """Return the first keys: Da Vinci pose, then ``first`` (standing by default) from frame ``until`` on."""
     target = dict.fromkeys(DA_VINCI, 0.0) | STAND | dict(first or {})
     start = dict.fromkeys([*target, "pitch", "neck_flex", "spine_flex"], 0.0) | DA_VINCI
     return [(0, start), (HOLD, start), (until, target)]
@@ -198,7 +201,7 @@ def gait(frame: Float, start: float, stop: float, cycle: float = 17.0) -> dict[s
 
 def demo(skeleton: Skeleton) -> Motion:
     """Steps, a turn of the body, a raised arm, a bend, a kick."""
-    keys = _opening()
+    keys = opening()
     keys += [
         (26, {"yaw": 0.0}),
         (46, {"yaw": 50.0, "shoulder_abd_l": 14, "shoulder_flex_l": 2, "shoulder_in_l": 12, "elbow_l": 18,
@@ -224,7 +227,7 @@ def arms_close(skeleton: Skeleton) -> Motion:
     near = _both({"shoulder_abd": 4, "shoulder_flex": 4, "elbow": 8, "shoulder_in": 15})
     wide = _both({"shoulder_abd": 62, "shoulder_flex": 5, "elbow": 12, "shoulder_in": 0})
     front = _both({"shoulder_abd": 10, "shoulder_flex": 22, "elbow": 98, "shoulder_in": 38})
-    keys = _opening(near)
+    keys = opening(near)
     for frame, pose in (
         (32, near),
         (40, wide),
@@ -254,7 +257,7 @@ def fast(skeleton: Skeleton) -> Motion:
             "knee_r": legs * 18 * kick,
         }
 
-    return Motion("fast", tuple(_opening({"shoulder_in_l": 0, "shoulder_in_r": 0})), 90, swings)
+    return Motion("fast", tuple(opening({"shoulder_in_l": 0, "shoulder_in_r": 0})), 90, swings)
 
 
 def pass_cube(skeleton: Skeleton) -> Motion:
@@ -263,7 +266,7 @@ def pass_cube(skeleton: Skeleton) -> Motion:
     hold_l = arm_angles(skeleton, "_l", (0.42, 0.16, 0.02), {"shoulder_in": 25, "elbow": 80})
     away_r = arm_angles(skeleton, "_r", (0.30, -0.52, 0.08), {"shoulder_abd": 45, "elbow": 60})
     away_l = arm_angles(skeleton, "_l", (0.30, 0.52, 0.08), {"shoulder_abd": 45, "elbow": 60})
-    keys = _opening()
+    keys = opening()
     for frame, values in (
         (30, STAND | away_r), (40, hold_r | hold_l), (43, hold_r | hold_l), (52, away_l | away_r),
         (58, away_l | {"yaw": 25.0}), (68, hold_r | hold_l | {"yaw": 25.0}), (71, hold_r | hold_l),
@@ -276,7 +279,7 @@ def pass_cube(skeleton: Skeleton) -> Motion:
 
 def pedal(skeleton: Skeleton) -> Motion:
     """The lower arms rotate around each other like the pedals of a bicycle (Kehl 2006, fig. 11)."""
-    cycle, keys = 20.0, _opening()
+    cycle, keys = 20.0, opening()
     guess = {"_l": {"shoulder_in": 45.0, "elbow": 85.0, "shoulder_flex": 30.0}, "_r": {}}
     guess["_r"] = dict(guess["_l"])
     previous: dict[str, dict[str, float]] = guess
@@ -304,7 +307,7 @@ def kick(skeleton: Skeleton) -> Motion:
             skeleton, side, (0.30, s * 0.10, 0.16), {"elbow": 120, "shoulder_in": 30, "shoulder_flex": 35}
         )
     ready = {"hip_flex_l": 10.0, "hip_flex_r": 10.0, "knee_l": 16.0, "knee_r": 16.0, "hip_abd_l": 9.0, "hip_abd_r": 9.0}
-    keys = _opening(hips | ready)
+    keys = opening(hips | ready)
     keys += [(34, hips | ready | {"yaw": 0.0, "spine_flex": 0.0}), (41, guard | ready | {"yaw": 10.0})]
     for at, leg, yaw in ((47, "r", 25.0), (61, "l", 5.0), (75, "r", 40.0)):
         keys += [
@@ -317,11 +320,11 @@ def kick(skeleton: Skeleton) -> Motion:
     return Motion("kick", tuple(keys), 90)
 
 
-def _on_feet(
+def on_feet(
     motion: Motion, skeleton: Skeleton, root: Mapping[float, tuple[float, float, float]],
     steps: Mapping[str, Sequence[Step]],
 ) -> Motion:  # fmt: skip
-    """The motion with legs that lead from the pelvis, keyed by frame in metres, to the feet of ``steps`` by side."""
+    """Return the motion with legs from the pelvis, keyed by frame in metres, to the feet of ``steps`` by side."""
     curve = PchipInterpolator(np.array(list(root), dtype=np.float64), np.array(list(root.values())))
     last = max(root)
 
@@ -344,8 +347,8 @@ def _on_feet(
     return replace(motion, keys=keys, layer=layer, root=pelvis)
 
 
-def _da_vinci_stand(skeleton: Skeleton) -> tuple[Float, dict[str, Float]]:
-    """The pelvis (3,) above the origin, and each side's toe tip (3,), in the Da Vinci pose; metres."""
+def da_vinci_stand(skeleton: Skeleton) -> tuple[Float, dict[str, Float]]:
+    """Return the pelvis (3,) above the origin, and each side's toe tip (3,), in the Da Vinci pose; metres."""
     pose = forward(skeleton, {name: np.radians([value]) for name, value in DA_VINCI.items()})
     soles = sole_points(skeleton, pose)[0]
     height = np.array([0.0, 0.0, -soles[..., 2].min()])
@@ -355,7 +358,7 @@ def _da_vinci_stand(skeleton: Skeleton) -> tuple[Float, dict[str, Float]]:
 def turn(skeleton: Skeleton) -> Motion:
     """Eleven steps on the spot that lead all the way round in three seconds, with the arms swinging and gesturing."""
     h, begin, cycle = skeleton.stature_m, 30.0, 9.2
-    pelvis, toes = _da_vinci_stand(skeleton)
+    pelvis, toes = da_vinci_stand(skeleton)
     across = {"shoulder_abd": 28.0, "shoulder_in": 50.0, "elbow": 85.0, "shoulder_flex": 25.0}
     front_r = arm_angles(skeleton, "_r", (0.30, 0.0, -0.11), across)
     front_l = arm_angles(skeleton, "_l", (0.28, 0.0, -0.05), across)
@@ -363,7 +366,7 @@ def turn(skeleton: Skeleton) -> Motion:
     point_r = arm_angles(skeleton, "_r", (0.34, -0.28, 0.06), {"elbow": 75, "shoulder_flex": 35})
     down = {name: STAND[name] for name in ("shoulder_abd_l", "shoulder_flex_l", "shoulder_in_l", "elbow_l")}
     down_l, down_r = down | {"elbow_l": 32.0}, {name[:-1] + "r": value for name, value in down.items()}
-    keys = _opening(until=28)
+    keys = opening(until=28)
     keys += [
         (31, {"yaw": 0.0, "neck_turn": 0.0, "spine_turn": 0.0}),
         (36, {"yaw": 14.0, "neck_turn": 16.0, "spine_turn": 6.0}),
@@ -416,13 +419,13 @@ def turn(skeleton: Skeleton) -> Motion:
         x, y = middle(yaw(lifts - 0.1 * cycle))
         root[lifts - 0.1 * cycle] = (float(x), float(y), 0.520 * h)
     root[133.0] = (*map(float, middle(360.0)), 0.528 * h)
-    return _on_feet(motion, skeleton, dict(sorted(root.items())), steps)
+    return on_feet(motion, skeleton, dict(sorted(root.items())), steps)
 
 
 def crouch(skeleton: Skeleton) -> Motion:
     """Down into a squat, on one knee, on both, sitting on the heels; up again over one knee."""
     h = skeleton.stature_m
-    pelvis, toes = _da_vinci_stand(skeleton)
+    pelvis, toes = da_vinci_stand(skeleton)
     foot = 0.072 * h + 0.06  # the toe tip ahead of the ankle
     toe_x, toe_y, out = float(toes["_l"][0]), 0.064 * h, 5.0
     knee_x, knee_z, shank_deg = _kneeling_shank(skeleton)
@@ -479,7 +482,7 @@ def crouch(skeleton: Skeleton) -> Motion:
     before = hands(0.44 * size, 0.14 * size, 0.21 * size, {"shoulder_abd": 25, "elbow": 70, "shoulder_flex": 70})
     low = hands(0.36 * size, 0.13 * size, -0.12, {"shoulder_in": 25, "elbow": 75, "shoulder_flex": 25})
     lap = hands(0.27 * size, 0.16 * size, -0.31 * size, {"shoulder_in": 20, "elbow": 45, "shoulder_flex": 20})
-    keys = _opening({"spine_flex": 2.0}, until=28)
+    keys = opening({"spine_flex": 2.0}, until=28)
     keys += [
         (40, before | {"pitch": 15.0, "spine_flex": 14.0, "neck_flex": -8.0}),
         (50, before | {"pitch": 16.0, "spine_flex": 30.0, "neck_flex": -18.0}),
@@ -495,7 +498,7 @@ def crouch(skeleton: Skeleton) -> Motion:
         (148, low | {"pitch": 20.0, "spine_flex": 16.0, "neck_flex": -8.0}),
         (164, STAND | {"pitch": 0.0, "spine_flex": 2.0, "neck_flex": 0.0}),
     ]
-    return _on_feet(Motion("crouch", tuple(keys), 166, fps=30.0), skeleton, dict(sorted(root.items())), steps)
+    return on_feet(Motion("crouch", tuple(keys), 166, fps=30.0), skeleton, dict(sorted(root.items())), steps)
 
 
 def _kneeling_shank(skeleton: Skeleton) -> tuple[float, float, float]:

@@ -7,13 +7,14 @@ samples; sample s has its own place inside the pixel and its own moment of the e
 coverage and motion blur at once.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scripts.synthetic.actor import Actor
+from scripts.synthetic.actor import Actor, join
 from scripts.synthetic.noise import noise3
 from scripts.synthetic.scene import Lamps, RoomView
 from scripts.synthetic.skeleton import Pose
@@ -57,7 +58,9 @@ def make_tiles(camera: Camera, actor: Actor, pose: Pose) -> Tiles:
     # 1.25: distortion and obliqueness stretch a sphere's picture a little
     spread = 1.25 * focal * reach / np.maximum(depth - reach, 0.1) + 2.0
     pixels = pixels.reshape(samples, count, 2)
-    low, high = np.nanmin(pixels - spread[..., None], axis=0), np.nanmax(pixels + spread[..., None], axis=0)
+    # a sphere behind the camera has no pixels
+    low = np.nan_to_num(pixels - spread[..., None], nan=np.inf).min(axis=0)
+    high = np.nan_to_num(pixels + spread[..., None], nan=-np.inf).max(axis=0)
     columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
     x, y = np.arange(columns) * TILE, np.arange(rows) * TILE
     in_x = (low[:, None, 0] < x + TILE) & (high[:, None, 0] > x - 1)  # (N, columns)
@@ -96,7 +99,7 @@ def _primitive(p, frame, i, frames: ti.template(), shape: ti.template(), materia
     b = vec3(shape[i, 4], shape[i, 5], shape[i, 6])
     ra, rb = shape[i, 3], shape[i, 7]
     result = 0.0
-    if material == 5:  # a box with rounded edges
+    if material % 6 == 5:  # a box with rounded edges
         edge = 0.006
         e = ti.abs(q - a) - (ra - edge)
         result = ti.max(e, 0.0).norm() + ti.min(e.max(), 0.0) - edge
@@ -118,8 +121,8 @@ def _primitive(p, frame, i, frames: ti.template(), shape: ti.template(), materia
     wrinkle = shape[i, 16]
     if wrinkle > 0.0 and result < 0.02:
         # folds: warped waves, mostly across the bone
-        w = ti.sin(23.0 * q[2] + 9.0 * q[0] + 2.5 * ti.sin(17.0 * q[1] + 11.0 * q[0] + 1.7 * i))
-        w += 0.6 * ti.sin(47.0 * q[2] - 21.0 * q[1] + 2.0 * ti.sin(31.0 * q[0] + 1.3 * i))
+        w = ti.sin(23.0 * q[2] + 9.0 * q[0] + 2.5 * ti.sin(17.0 * q[1] + 11.0 * q[0] + 1.7 * shape[i, 17]))
+        w += 0.6 * ti.sin(47.0 * q[2] - 21.0 * q[1] + 2.0 * ti.sin(31.0 * q[0] + 1.3 * shape[i, 17]))
         result -= 0.6 * wrinkle * w
     cut = shape[i, 11] * q[0] + shape[i, 12] * q[1] + shape[i, 13] * q[2] - shape[i, 14]
     return ti.max(result, -cut), q
@@ -232,9 +235,10 @@ def _shade(p, light: ti.template(), axes: ti.template(), veil: ti.template(), la
 
 
 @ti.func
-def _albedo(i, m, q, colors: ti.template(), stripes):
-    """The material's colour at a point of the bone frame."""
-    c = vec3(colors[m, 0], colors[m, 1], colors[m, 2])
+def _albedo(i, person_m, q, colors: ti.template(), stripes):
+    """The material's colour at a point of the bone frame; ``i`` is the primitive's number within its actor."""
+    c = vec3(colors[person_m, 0], colors[person_m, 1], colors[person_m, 2])
+    m = person_m % 6
     if m == 0:
         c *= 0.92 + 0.16 * noise3(q * 40.0)
         if i < 6 and q[0] > 0.06 and ti.abs(q[2] - 0.055) < 0.2:  # the face: eyes, brows, mouth
@@ -250,7 +254,7 @@ def _albedo(i, m, q, colors: ti.template(), stripes):
         c *= 0.7 + 0.6 * noise3(vec3(q[0] * 60.0, q[1] * 60.0, q[2] * 15.0))
     elif m == 2:
         c *= 0.88 + 0.24 * noise3(q * 25.0)
-        if stripes == 1 and ti.sin(q[2] * 110.0) > 0.55:
+        if (stripes >> (person_m // 6)) & 1 and ti.sin(q[2] * 110.0) > 0.55:
             c = 0.25 * c + vec3(0.45, 0.45, 0.42)
     elif m == 3:
         c *= 0.75 + 0.3 * noise3(q * 18.0) + 0.25 * noise3(vec3(q[0] * 160.0, q[1] * 160.0, q[2] * 30.0))
@@ -268,9 +272,9 @@ def _render_kernel(
     origin: Array(dtype=ti.f32, ndim=1),  # (3,)
     rays: Array(dtype=ti.f32, ndim=4),  # (S, H, W, 3)
     frames: Array(dtype=ti.f32, ndim=3),  # (S, N, 16)
-    shape: Array(dtype=ti.f32, ndim=2),  # (N, 17)
+    shape: Array(dtype=ti.f32, ndim=2),  # (N, 18)
     materials: Array(dtype=ti.i32, ndim=1),  # (N,)
-    colors: Array(dtype=ti.f32, ndim=2),  # (6, 3)
+    colors: Array(dtype=ti.f32, ndim=2),  # (6 P, 3)
     first: Array(dtype=ti.i32, ndim=2),  # (K, 2)
     start: Array(dtype=ti.i32, ndim=1),  # (K+1,)
     primitives: Array(dtype=ti.i32, ndim=1),
@@ -314,7 +318,7 @@ def _render_kernel(
                         if facing > 0.0:
                             lit = facing * _visibility(p, light, axes, shadow, lamp, SHADOW_BIAS_M)
                             radiance += lit * vec3(light[lamp, 3], light[lamp, 4], light[lamp, 5])
-                    total += _albedo(i, m, q, colors, stripes) * radiance
+                    total += _albedo(ti.cast(shape[i, 17], ti.i32), m, q, colors, stripes) * radiance
                     covered += 1.0
             count = ti.cast(rays.shape[0], ti.f32)
             for c in ti.static(range(3)):
@@ -399,17 +403,25 @@ def _f32(a: NDArray[np.floating]) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class Body:
-    """The actor as kernel arguments: everything that does not change from frame to frame."""
+    """Actors as kernel arguments: everything that does not change from frame to frame. Bit k of ``stripes`` is actor
+    k's."""
 
     actor: Actor
     shape: NDArray[np.float32]
     materials: NDArray[np.int32]
     colors: NDArray[np.float32]
-    stripes: bool
+    stripes: int
 
     @staticmethod
     def of(actor: Actor, colors: NDArray[np.float64], stripes: bool) -> "Body":
-        return Body(actor, _f32(actor.shape), actor.material.astype(np.int32), _f32(colors), stripes)
+        return Body(actor, _f32(actor.shape), actor.material.astype(np.int32), _f32(colors), int(stripes))
+
+    @staticmethod
+    def join(bodies: Sequence["Body"]) -> "Body":
+        """Return several actors as one body; its poses are those of :meth:`Pose.join`."""
+        actor, colors = join([body.actor for body in bodies]), np.concatenate([body.colors for body in bodies])
+        stripes = sum(body.stripes << k for k, body in enumerate(bodies))
+        return Body(actor, _f32(actor.shape), actor.material.astype(np.int32), colors, stripes)
 
 
 def shadow_maps(body: Body, pose: Pose, lamps: Lamps) -> NDArray[np.float32]:
@@ -433,7 +445,7 @@ def render_actor(
     ensure_runtime()
     out = np.zeros((camera.height, camera.width, 4), dtype=np.float32)
     tiles = make_tiles(camera, body.actor, poses)
-    _render_kernel(int(body.stripes), _f32(camera.center), rays, _f32(body.actor.frames(poses)), body.shape,
+    _render_kernel(body.stripes, _f32(camera.center), rays, _f32(body.actor.frames(poses)), body.shape,
                    body.materials, body.colors, tiles.first, tiles.start, tiles.primitive, tiles.near_far,
                    lamps.light, lamps.axes, shadow, lamps.ambient, out)  # fmt: skip
     return out

@@ -8,7 +8,7 @@ centres; hip and shoulder centres are therefore set a little inside it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,6 +82,12 @@ class Pose:
     def point(self, bone: int, p_bone: Float) -> Float:
         """(T, 3) where a point given in a bone's frame lies in the world."""
         return self.origin[:, bone] + self.rotation[:, bone] @ p_bone
+
+    @staticmethod
+    def join(poses: Sequence[Pose]) -> Pose:
+        """Return several bodies' poses as one, bones in a row."""
+        rotation = np.concatenate([pose.rotation for pose in poses], axis=1)
+        return Pose(rotation, np.concatenate([pose.origin for pose in poses], axis=1))
 
     def __getitem__(self, item: slice | NDArray[np.integer]) -> Pose:
         return Pose(self.rotation[item], self.origin[item])

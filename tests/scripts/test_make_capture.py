@@ -48,7 +48,7 @@ def plan(request: pytest.FixtureRequest) -> Plan:
 
 
 def joint(plan: Plan, name: str) -> np.ndarray:
-    return plan.joints[:, JOINTS.index(name)]
+    return plan.subject.joints[:, JOINTS.index(name)]
 
 
 def test_bone_lengths_are_constant_and_follow_the_table(plan: Plan) -> None:
@@ -81,7 +81,7 @@ def test_joints_bend_the_right_way() -> None:
 
 
 def test_motions_respect_joint_limits(plan: Plan) -> None:
-    for name, values in plan.motion.angles(np.arange(0, plan.frame_count, 0.25)).items():
+    for name, values in plan.subject.motion.angles(np.arange(0, plan.frame_count, 0.25)).items():
         low, high = LIMITS_DEG[name]
         assert np.degrees(values).min() >= low - 1e-9, name
         assert np.degrees(values).max() <= high + 1e-9, name
@@ -97,7 +97,7 @@ def test_motions_start_in_the_da_vinci_pose(plan: Plan) -> None:
 
 
 def test_feet_stand_on_the_floor_and_do_not_slide(plan: Plan) -> None:
-    soles = sole_points(plan.skeleton, plan.poses)  # (F, 2, 3, 3)
+    soles = sole_points(plan.subject.skeleton, plan.subject.poses)  # (F, 2, 3, 3)
     lowest = soles[..., 2].min(axis=(1, 2))
     assert np.abs(lowest).max() < 0.015
     flat = soles[:, :, :, 2].max(axis=2) < 0.012  # (F, 2) feet that stand with the whole sole
@@ -107,8 +107,8 @@ def test_feet_stand_on_the_floor_and_do_not_slide(plan: Plan) -> None:
 
 
 def test_hands_and_elbows_stay_out_of_the_trunk_and_the_legs(plan: Plan) -> None:
-    body = next(iter(plan.bodies.values()))
-    actor, names = body.actor, plan.skeleton.names
+    body = next(iter(plan.subject.bodies.values()))
+    actor, names = body.actor, plan.subject.skeleton.names
     core = {"pelvis", "lumbar", "thorax", "chest", "head", "hip_l", "hip_r", "knee_l", "knee_r"}
     keep = np.array([names[bone] in core for bone in actor.bones])
     trunk = Body.of(
@@ -120,7 +120,7 @@ def test_hands_and_elbows_stay_out_of_the_trunk_and_the_legs(plan: Plan) -> None
     )  # fmt: skip
     bones = [names.index(name + side) for name in ("elbow", "wrist", "knuckles") for side in ("_l", "_r")]
     for frame in range(0, plan.frame_count, 3):
-        pose = plan.poses[frame : frame + 1]
+        pose = plan.subject.poses[frame : frame + 1]
         assert distances(trunk, pose, pose.origin[0, bones]).min() > -0.01, frame
 
 
@@ -146,17 +146,19 @@ def test_turn_is_a_full_turn_with_stepping_feet() -> None:
     heading = np.degrees(np.unwrap(np.arctan2(across[:, 1], across[:, 0])))
     assert heading[-1] - heading[0] == pytest.approx(360, abs=1)
     turning = (np.abs(heading - heading[0]) > 4) & (np.abs(heading - heading[-1]) > 4)
-    assert turning.sum() / plan.motion.fps < 3
-    tips = sole_points(plan.skeleton, plan.poses)[:, :, 2]
+    assert turning.sum() / plan.subject.motion.fps < 3
+    tips = sole_points(plan.subject.skeleton, plan.subject.poses)[:, :, 2]
     assert tips[..., 2].max(axis=0).min() > 0.03
     on_floor = (tips[1:, :, 2] < 0.003) & (tips[:-1, :, 2] < 0.003)
     assert np.linalg.norm(np.diff(tips[..., :2], axis=0), axis=2)[on_floor].max() < 0.005
     for side in range(2):  # up and down, five times at least, the steps out of the Da Vinci pose not counted
         assert (np.diff((tips[30:, side, 2] > 0.03).astype(int)) == 1).sum() >= 5
-    feet = np.stack([plan.poses.rotation[:, plan.skeleton.index("ankle" + side), :2, 0] for side in ("_l", "_r")], 1)
+    feet = np.stack(
+        [plan.subject.poses.rotation[:, plan.subject.skeleton.index("ankle" + side), :2, 0] for side in ("_l", "_r")], 1
+    )
     pointing = np.degrees(np.arctan2(feet[..., 1], feet[..., 0])) - (heading - 90)[:, None]
     assert np.abs((pointing + 180) % 360 - 180).max() < 45  # hips turn no further
-    elbows = np.degrees([plan.motion.angles(np.arange(30.0, 120))["elbow" + side] for side in ("_l", "_r")])
+    elbows = np.degrees([plan.subject.motion.angles(np.arange(30.0, 120))["elbow" + side] for side in ("_l", "_r")])
     assert (elbows.max(axis=1) > 70).all()
     assert (elbows.min(axis=1) < 45).all()
 
@@ -174,7 +176,7 @@ def test_crouch_goes_over_one_knee_to_the_heels_and_up_again() -> None:
     assert squat.any()
     hands = (joint(plan, "wrist_l") + joint(plan, "wrist_r")) / 2 - joint(plan, "neck")
     assert hands[squat, 0].min() > 0.2
-    heels = sole_points(plan.skeleton, plan.poses)[:, :, 0]
+    heels = sole_points(plan.subject.skeleton, plan.subject.poses)[:, :, 0]
     apart = np.linalg.norm(np.stack([joint(plan, "hip_l"), joint(plan, "hip_r")], axis=1) - heels, axis=2)
     sits = kneels.all(axis=1) & (apart.max(axis=1) < 0.15 * h)
     assert sits.sum() > 5
@@ -186,9 +188,11 @@ def test_crouch_goes_over_one_knee_to_the_heels_and_up_again() -> None:
 def test_legs_reach_their_steps_at_every_stature(name: str) -> None:
     for stature in (1.5, 2.0):
         plan = plan_capture(Options(motion=name, size=(80, 60), stature_m=stature))
-        lowest = sole_points(plan.skeleton, plan.poses)[..., 2].min(axis=(1, 2))
+        lowest = sole_points(plan.subject.skeleton, plan.subject.poses)[..., 2].min(axis=(1, 2))
         assert np.abs(lowest).max() < 1e-3
-        knees = [plan.poses.origin[:, plan.skeleton.index("knee" + side), 2].min() for side in ("_l", "_r")]
+        knees = [
+            plan.subject.poses.origin[:, plan.subject.skeleton.index("knee" + side), 2].min() for side in ("_l", "_r")
+        ]
         assert min(knees) > KNEE_RADIUS * stature - 0.004
 
 
@@ -216,9 +220,9 @@ def test_distance_kernel_agrees_with_a_plain_union(tiny: Plan) -> None:
     radii = np.maximum(shape[:, 3], shape[:, 7]) + np.linalg.norm(shape[:, 4:7] - shape[:, 0:3], axis=1) / 2
     centers = (shape[:, 0:3] + shape[:, 4:7]) / 2
     plain = Body.of(replace(actor, shape=shape, radii=radii, centers=centers), Look().colors(), False)
-    pose = tiny.poses[:1]
+    pose = tiny.subject.poses[:1]
     rng = np.random.default_rng(0)
-    joints = tiny.joints[0]
+    joints = tiny.subject.joints[0]
     points = joints[rng.integers(0, len(joints), 300)] + rng.normal(0, 0.15, (300, 3))
     expected, found = oracle_distance(plain, pose, points), distances(plain, pose, points)
     near = found < CLOSE_M
@@ -231,7 +235,7 @@ def test_render_shows_the_actor_where_the_truth_is(tiny: Plan) -> None:
     for index in range(2):
         renderer = CameraRenderer(tiny, index)
         picture = renderer.frame(1)
-        pixels, _ = tiny.rig[index].project(tiny.joints[1])
+        pixels, _ = tiny.rig[index].project(tiny.subject.joints[1])
         x, y = np.rint(pixels).astype(int).T
         grown = cv2.dilate(picture.mask, np.ones((3, 3), np.uint8))
         assert (grown[y, x] == 255).all()
@@ -249,7 +253,7 @@ def test_materials_are_where_they_belong(tiny: Plan) -> None:
     renderer = CameraRenderer(tiny, 0)
     image = renderer.frame(0).image.astype(int)
     camera: Camera = tiny.rig[0]
-    chest = (tiny.joints[0, JOINTS.index("neck")] * 0.7 + tiny.joints[0, 0] * 0.3)[None]
+    chest = (tiny.subject.joints[0, JOINTS.index("neck")] * 0.7 + tiny.subject.joints[0, 0] * 0.3)[None]
     x, y = np.rint(camera.project(chest)[0][0]).astype(int)
     assert image[y, x, 0] > 1.5 * image[y, x, 2]
     x, y = np.rint(camera.project(joint(tiny, "knee_l")[:1])[0][0]).astype(int)
@@ -260,8 +264,8 @@ def test_materials_are_where_they_belong(tiny: Plan) -> None:
 def test_every_rig_sees_all_of_the_volume_that_matters(count: int) -> None:
     plan = plan_capture(Options(cameras=count, size=(160, 120)))
     assert len(plan.rig) == count
-    body = plan.body(0)
-    centers, radii = body.actor.balls(plan.poses)
+    body = plan.subject.body(0)
+    centers, radii = body.actor.balls(plan.subject.poses)
     for camera in plan.rig:
         pixels, _ = camera.project(centers.reshape(-1, 3))
         assert camera.sees(centers.reshape(-1, 3)).all(), camera.name
@@ -324,4 +328,4 @@ def test_shipped_capture_is_small_and_agrees_with_itself() -> None:
 def test_shipped_truth_is_what_the_generator_makes() -> None:
     plan = plan_capture(Options(seed=7))
     with h5py.File(DEMO / "truth.h5") as truth:
-        np.testing.assert_allclose(truth["joints/position"][:], plan.joints, atol=1e-6)
+        np.testing.assert_allclose(truth["joints/position"][:], plan.subject.joints, atol=1e-6)
