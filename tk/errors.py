@@ -1,12 +1,25 @@
 """Errors that a user can correct.
 
-Every message is one line that names the file or option, and the remedy. The command line prints it and exits with
-2. Any other exception is a defect of the program and keeps its traceback.
+Every message is one line that names the file or the option, and the remedy. The command line prints it, followed by
+the hint, and exits with 2. Any other exception is a defect of the program and keeps its traceback.
 """
 
 
 class TkError(Exception):
-    """Base of all errors that a user can correct."""
+    """Base of all errors that a user can correct.
+
+    Attributes:
+        hint: what to type on the command line; no part of the message, because scripts have no such options.
+    """
+
+    def __init__(self, message: str = "", hint: str = "") -> None:
+        super().__init__(message)
+        self.hint = hint
+
+    @property
+    def line(self) -> str:
+        """The message and the hint in one line."""
+        return " ".join((f"{self}; {self.hint}" if self.hint else str(self)).split())
 
 
 class CaptureError(TkError):

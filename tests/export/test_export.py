@@ -170,7 +170,7 @@ def test_command(tk: Tk, write: Write, tmp_path: Path) -> None:
     assert {file.name for file in (tmp_path / "out" / "deep").iterdir()} == names
     assert "note: bvh, gltf, ply: in 2 lost frames the pose before is held" in ran.err
     tk("export", path, "--to", "trc", "-o", tmp_path / "out" / "deep").complaint("walk.trc", "--force")
-    tk("export", path, "--to", "fbx").complaint("--to fbx", "gltf")
+    tk("export", path, "--to", "fbx").complaint("formats fbx", "gltf")
     tk("export", tmp_path / "none.h5", "--to", "trc").complaint("none.h5", "no such file")
     assert tk("export", path, "--to", "trc", "--smoothed").code == 0
     assert (tmp_path / "walk_smoothed.trc").exists()

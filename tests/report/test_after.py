@@ -32,7 +32,7 @@ def test_files_of_other_programs_are_not_replaced(complete: Path, tiny: Path, tm
         (tmp_path / name).write_bytes(b"a recording of mine")
         assert write_video_and_report(capture, result, warnings.append) == []
         warning = warnings[-1]
-        assert f"{name} was not made by tk" in warning and "\n" not in warning
+        assert f"{name}: exists and is not a" in warning and "\n" not in warning
         assert (tmp_path / name).read_bytes() == b"a recording of mine"
         (tmp_path / name).unlink()
         assert [path.name for path in tmp_path.iterdir()] == ["walk.h5"]
@@ -47,7 +47,7 @@ def test_files_of_other_programs_are_not_replaced(complete: Path, tiny: Path, tm
 
 @pytest.mark.parametrize(
     "error",
-    [ExportError("no encoder here"), RuntimeError("a defect\nof ours"), OSError(28, "full"), KeyboardInterrupt()],
+    [ExportError("no encoder here"), RuntimeError("a defect\nof ours"), OSError(28, "full")],
 )
 def test_failure_is_one_warning_line(
     error: BaseException, complete: Path, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from tk.errors import ConfigError, ResultError
+from tk.io.paths import check_not_input, resolved
 from tk.io.settings_file import to_toml
 from tk.settings import Settings
 
@@ -185,11 +186,13 @@ def make_jobs(captures: Sequence[Path], folder: Path, options: TrackOptions, pic
         ConfigError: a capture is given twice.
         ResultError: the folder contains a result of another command, or a damaged record.
     """
-    folder = folder.resolve()
-    paths = [capture.resolve() for capture in captures]
+    folder = resolved(folder)
+    paths = [resolved(capture) for capture in captures]
     twice = next((given for given, path in zip(captures, paths, strict=True) if paths.count(path) > 1), None)
     if twice is not None:
         raise ConfigError(f"{twice}: is given twice; give each capture once")
+    for path in paths:
+        check_not_input(folder, capture=path)
     known: dict[str, str] = {}
     for record in sorted((folder / RECORDS).glob("*.json")):
         known[str(_read_record(record).get("capture"))] = record.stem

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import functools
+import io
 import json
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
@@ -22,18 +25,47 @@ if TYPE_CHECKING:
 
 @contextmanager
 def errors_in_one_line() -> Iterator[None]:
-    """Print a user's mistake, in the input or in the command, as one line, and exit with 2."""
+    """Print a user's mistake, in the input or in the command, as one line, and exit with 2; an interruption: with 1."""
     try:
-        yield
+        with _terminated_as_interrupted():
+            yield
     except TkError as error:
-        click.echo(f"tk: {' '.join(str(error).split())}", err=True)
+        click.echo(f"tk: {error.line}", err=True)
         raise click.exceptions.Exit(2) from None
+    except KeyboardInterrupt as reason:
+        click.echo(f"tk: interrupted{f'; {reason}' if str(reason) else ''}", err=True)
+        raise click.exceptions.Exit(1) from None
     except click.UsageError as error:
         if type(error).__name__ == "NoArgsIsHelpError":  # `tk` alone prints the help
             raise
         command = error.ctx.command_path if error.ctx else "tk"
         click.echo(f"tk: {' '.join(error.format_message().split())} See {command} --help", err=True)
         raise click.exceptions.Exit(2) from None
+
+
+@contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """Handle SIGTERM, which `kill` and cluster schedulers send, as Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():  # Python sets handlers in the main thread only
+        yield
+        return
+
+    def interrupt(*_: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not stop the clean-up
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
+
+
+def print_any_text() -> None:
+    """Let stdout and stderr print text that their encoding lacks, such as a path, as escape sequences."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 @contextmanager
@@ -48,6 +80,7 @@ class Commands(click.Group):
     """A group of commands that reports mistakes as :func:`errors_in_one_line` does."""
 
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
+        print_any_text()
         with errors_in_one_line():
             return super().make_context(*args, **kwargs)
 

@@ -27,10 +27,10 @@ def demo(output: Path, voxels: int | None, resume: bool, force: bool, no_report:
             reporter.stage("loading")
             from tk.evaluation.joints import evaluate_files
             from tk.io.captures.capture import open_capture
-            from tk.io.results.files import check_output
+            from tk.io.results.files import check_result_path
             from tk.run import session
 
-            check_output(output, force, resume)
+            check_result_path(output, force, resume)
             reporter.stage(f"opening the capture that ships with tk, {folder}")
             settings = base.load_settings(None, voxels=voxels)
             capture = open_capture(folder)

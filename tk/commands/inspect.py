@@ -20,17 +20,20 @@ def inspect(
     capture: Path, output: Path | None, cameras: str | None, masks: str, config_file: Path | None, as_json: bool
 ) -> None:
     """Check CAPTURE before tracking: masks, inconsistent or unsynchronised cameras, working volume, floor, up."""
+    sheet = None if output is None else output / "inspect.png"
     with base.working(f"inspecting {capture}"):
         from tk.inspection.checks import inspect as check
         from tk.inspection.pictures import write_sheet
         from tk.io.captures.capture import open_capture
+        from tk.io.paths import check_not_input
 
+        if sheet is not None:
+            check_not_input(sheet, capture=capture)
         opened = open_capture(capture, base.split_names(cameras), masks)
         found, shown = check(opened, base.load_settings(config_file))
-        if output is not None:
-            write_sheet(output / "inspect.png", opened, found, shown)
-    if output is not None:
-        click.echo(f"wrote {output / 'inspect.png'}", err=True)
+        if sheet is not None:
+            write_sheet(sheet, opened, found, shown)
+            click.echo(f"wrote {sheet}", err=True)
     if as_json:
         base.print_json(**found.to_dict())
     else:

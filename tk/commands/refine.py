@@ -8,7 +8,6 @@ import click
 
 from tk.commands import base
 from tk.commands.console import ConsoleReporter
-from tk.errors import ConfigError
 
 
 @click.command(epilog=base.example("tk refine CAPTURE result.h5 -o refined.toml"))
@@ -46,8 +45,6 @@ def refine(
         from tk.model.cameras.refinement import RefinementSettings
         from tk.run.refinement import refine_capture
 
-        if output.exists() and not force:
-            raise ConfigError(f"{output}: exists; choose another name, or replace it with --force")
         refinement = RefinementSettings(focal=focal, offsets=offsets, trust=trust)
         settings = base.load_settings(config_file)
         reporter.stage(f"opening {capture}")
@@ -55,7 +52,7 @@ def refine(
         for warning in opened.warnings:
             reporter.note(warning)
         reporter.stage("refining the cameras")
-        done = refine_capture(opened, result, output, settings, reporter.note, refinement)
+        done = refine_capture(opened, result, output, settings, reporter.note, refinement, force)
         for warning in done.warnings:
             reporter.note(warning)
     click.echo(done.format_table())

@@ -60,11 +60,11 @@ def _render(
 ) -> list[Path]:
     """Write the files and return their paths."""
     from tk.io.captures.capture import open_capture
+    from tk.io.paths import check_not_input, check_output
     from tk.io.results.reader import read_result
-    from tk.render.files import check_target
     from tk.render.overlay import Overlay, choose_frames, write_sheets
     from tk.render.scene import Scene
-    from tk.render.video import check_encoder, video_writer
+    from tk.render.video import VIDEO, check_encoder, video_writer
 
     result = read_result(result_path)
     if not len(result):
@@ -75,11 +75,10 @@ def _render(
     if png is not None:
         if view != "overlay" or capture is None:
             raise ConfigError("--png: contact sheets need images; give RESULT.h5 CAPTURE and no other --view")
+        check_not_input(png, [result_path], capture_path)
         return write_sheets(Overlay(capture, result), png, chosen, full=full)
     output = output or result_path.with_name(result_path.stem + (".mp4" if view == "overlay" else f"-{view}.mp4"))
-    if output.suffix.lower() != ".mp4":
-        raise ConfigError(f"-o {output}: a video must end in .mp4; for images give --png DIR")
-    check_target(output, force)
+    check_output(output, VIDEO, force, [result_path], capture_path)
     check_encoder()
     if view != "overlay":
         scene = Scene(result, capture.rig if capture and not result.cameras else None, hull=view == "hull")

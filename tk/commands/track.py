@@ -59,11 +59,11 @@ def track(
     with ConsoleReporter(quiet, later=later_stages(options.causal, no_report)) as reporter:
         reporter.stage("loading")
         from tk.io.captures.capture import open_capture
-        from tk.io.results.files import check_output
+        from tk.io.results.files import check_result_path
         from tk.run import session
 
         settings = options.settings()
-        check_output(output, force, resume)
+        check_result_path(output, force, resume)
         reporter.stage(f"opening {capture}")
         opened = open_capture(capture, base.split_names(options.cameras), options.masks)
         summary = session.track(
@@ -89,7 +89,10 @@ def draw_video_and_report(
     from tk.report.after import write_video_and_report
 
     reporter.stage("drawing the overlay video and the report")
-    files = write_video_and_report(capture, result, lambda text: click.echo(f"warning: {text}", err=True))
+    try:
+        files = write_video_and_report(capture, result, lambda text: click.echo(f"warning: {text}", err=True))
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"{result} is complete; tk render and tk report draw it") from None
     if files and not quiet:
         click.echo(f"wrote {', '.join(str(file) for file in files)}", err=True)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from tk.commands import base
-from tk.errors import ConfigError, ExportError, ResultError
+from tk.errors import ConfigError, ResultError
 
 
 @click.command(epilog=base.example("tk view walk.h5 --frame 40"))
@@ -15,12 +15,14 @@ from tk.errors import ConfigError, ExportError, ResultError
 @base.optional_capture_argument
 @click.option("--frame", type=int, metavar="N", help="Frame to show first.  [default: the first]")
 @click.option("--screenshot", type=base.PATH, metavar="FILE.png", help="Write an image of the frame, and close.")
-def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path | None) -> None:
+@base.force_option
+def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path | None, force: bool) -> None:
     """Show RESULT.h5 in a window: body, joints, hull, cameras. Keys move through time and switch parts on and off.
 
     CAPTURE adds its cameras, if the result has none, and its ground truth, if it has one.
     """
     from tk.io.captures.capture import open_capture
+    from tk.io.paths import Kind, check_output, looks_like
     from tk.io.results.reader import read_result
     from tk.io.results.truth import truth_of
     from tk.view.contents import Contents
@@ -32,10 +34,9 @@ def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path
     known = loaded.frames.tolist()
     if frame is not None and frame not in known:
         raise ConfigError(f"--frame {frame}: the result has frames {min(known)} to {max(known)}")
-    if screenshot is not None and screenshot.suffix.lower() != ".png":
-        raise ConfigError(f"--screenshot {screenshot}: an image must end in .png")
-    if screenshot is not None and not screenshot.parent.is_dir():
-        raise ExportError(f"{screenshot}: the folder {screenshot.parent} does not exist; make it first")
+    if screenshot is not None:
+        kind = Kind("an image", (".png",), looks_like(rb"\x89PNG"))
+        check_output(screenshot, kind, force, [result], capture)
     rig = loaded.cameras.rig if loaded.cameras else None
     truth = None
     if capture is not None:

@@ -19,6 +19,7 @@ from tk.export.mot import write_mot
 from tk.export.motion import Motion, read_motion
 from tk.export.ply import write_body_meshes
 from tk.export.trc import write_trc
+from tk.io.paths import Kind, check_not_input, check_output, looks_like
 
 __all__ = ["FORMATS", "Exported", "Motion", "export", "read_motion"]
 
@@ -33,6 +34,15 @@ FORMATS: dict[str, tuple[tuple[str, Writer], ...]] = {
     "csv": ((".csv", write_points_csv), ("_angles.csv", write_angles_csv)),
     "gltf": ((".glb", write_glb),),
     "ply": (("_ply", write_body_meshes),),
+}
+#: how a file of each format begins
+_SIGNATURES = {
+    ".trc": looks_like(rb"PathFileType\t"),
+    ".mot": looks_like(rb"[^\n]*\nversion=1\n"),
+    ".c3d": looks_like(rb".P"),
+    ".bvh": looks_like(rb"HIERARCHY"),
+    ".csv": looks_like(rb"frame,time,status,"),
+    ".glb": looks_like(rb"glTF"),
 }
 # Formats that cannot mark a pose as unknown.
 _HOLDING = ("bvh", "gltf", "ply")
@@ -67,14 +77,17 @@ def export(
     """
     unknown = [name for name in formats if name not in FORMATS]
     if unknown or not formats:
-        raise ExportError(f"--to {','.join(formats)}: give some of {', '.join(FORMATS)}")
+        raise ExportError(f"formats {', '.join(formats)}: give some of {', '.join(FORMATS)}")
     path = Path(result)
     folder = path.parent if folder is None else folder
     stem = path.stem + ("_smoothed" if smoothed else "")
     jobs = [(folder / (stem + ending), write) for name in dict.fromkeys(formats) for ending, write in FORMATS[name]]
-    taken = [target for target, _ in jobs if target.exists()]
-    if taken and not force:
-        raise ExportError(f"{taken[0]}: exists; choose another folder with -o, or replace it with --force")
+    for target, _ in jobs:
+        if target.suffix in _SIGNATURES and target.parent.is_dir():
+            kind = Kind(f"a file of tk export in {target.suffix}", (target.suffix,), _SIGNATURES[target.suffix])
+            check_output(target, kind, force, [path])
+        elif check_not_input(target, [path]).exists() and not force:
+            raise ExportError(f"{target}: exists; choose another folder", hint="or replace it with --force")
     motion, notes = read_motion(path, smoothed)
     lost = int((~motion.known).sum())
     holding = [name for name in formats if name in _HOLDING]
@@ -105,5 +118,5 @@ def _remove(folder: Path) -> None:
     """Remove the folder of an earlier export; refuse a folder with other files."""
     other = next((file for file in folder.iterdir() if not re.fullmatch(r"\d{6,}\.ply", file.name)), None)
     if other is not None:
-        raise ExportError(f"{other}: tk export did not make it, so its folder is not replaced; choose another with -o")
+        raise ExportError(f"{other}: tk export did not make it, so its folder is not replaced; choose another folder")
     shutil.rmtree(folder)

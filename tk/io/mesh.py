@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from tk.errors import ResultError
+from tk.io.paths import c_name
 from tk.io.point_cloud import create_empty_ply, load_open3d, ply_error
 from tk.io.results.data import HullPoints
 from tk.model.cameras.volume import VoxelGrid
@@ -73,5 +75,5 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
     )
     written.vertex_colors = open3d.utility.Vector3dVector(mesh.colors / 255)
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        if not open3d.io.write_triangle_mesh(path, written, write_vertex_normals=False):
+        if not open3d.io.write_triangle_mesh(c_name(path, ResultError), written, write_vertex_normals=False):
             raise ply_error(path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -15,11 +14,14 @@ from numpy.typing import NDArray
 from tk import __version__
 from tk.errors import ResultError
 from tk.io.captures.capture import Capture
-from tk.io.hdf5 import open_hdf5
+from tk.io.paths import Kind, c_name, check_output, looks_like
 from tk.io.results.data import HullPoints
+from tk.io.results.files import SUFFIXES, is_hdf5_of
 from tk.model.cameras.volume import VoxelGrid
 
 HULL_FORMAT = "tk-hull"
+
+PLY = Kind("a PLY file", (".ply",), looks_like(rb"ply\n|ply\r"))
 
 _PLY_VERTICES = """ply
 format binary_little_endian 1.0
@@ -54,7 +56,7 @@ def write_ply(path: Path, positions: NDArray[np.floating], colors_rgb: NDArray[n
     cloud.points = open3d.utility.Vector3dVector(np.asarray(positions, np.float64))
     cloud.colors = open3d.utility.Vector3dVector(np.asarray(colors_rgb, np.float64) / 255)
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        written = open3d.io.write_point_cloud(path, cloud)
+        written = open3d.io.write_point_cloud(c_name(path, ResultError), cloud)
     if not written:
         raise ply_error(path)
 
@@ -168,29 +170,14 @@ def _publish(temporary: Path, path: Path, count: int) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def check_hull_path(path: Path, force: bool = True) -> None:
+def check_hull_path(path: Path, force: bool = True, capture: Path | None = None) -> None:
     """Check that a hull file may be written: not over other files, and over a hull file only with ``force``.
 
     Raises:
-        ResultError: with the remedy.
+        TkError: with the remedy, see :func:`tk.io.paths.check_output`.
     """
-    if path.is_dir():
-        raise ResultError(f"{path}: is a folder; name a file in it")
-    if not path.parent.is_dir():
-        raise ResultError(f"{path}: the folder {path.parent} does not exist; make it first")
-    if not os.access(path.parent, os.W_OK):
-        raise ResultError(f"{path}: no permission to write in {path.parent}; choose another folder")
-    if not path.exists():
-        return
-    try:
-        with open_hdf5(path) as file:
-            known = file.is_format(HULL_FORMAT)
-    except ResultError:
-        known = False
-    if not known:
-        raise ResultError(f"{path}: exists and is not a {HULL_FORMAT} file; it is not overwritten: choose another name")
-    if not force:
-        raise ResultError(f"{path}: exists; replace it with --force, or choose another name")
+    kind = Kind(f"a {HULL_FORMAT} file", SUFFIXES, lambda found: is_hdf5_of(found, HULL_FORMAT))
+    check_output(path, kind, force, capture=capture, error=ResultError)
 
 
 def ply_path(folder: Path, frame: int) -> Path:

@@ -271,8 +271,11 @@ def write_sheets(
         sheet.append((frame, overlay.sheet_row(frame, images, tile_height, full)))
         if len(sheet) == rows or frame == chosen[-1]:
             path = folder / f"overlay-{sheet[0][0]:06d}-{sheet[-1][0]:06d}.png"
-            if not cv2.imwrite(str(path), joined([image for _, image in sheet], axis=0)):
-                raise ExportError(f"{path}: cannot be written")
+            _, coded = cv2.imencode(".png", joined([image for _, image in sheet], axis=0))
+            try:
+                path.write_bytes(coded.tobytes())
+            except OSError as error:
+                raise ExportError(f"{path}: cannot be written: {error.strerror or error}") from None
             written.append(path)
             sheet = []
     return written

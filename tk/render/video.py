@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ExportError
+from tk.io.paths import Kind
 from tk.render.files import replacing
 
 Image = NDArray[np.uint8]
@@ -110,6 +111,9 @@ def made_here(path: Path) -> bool:
             return container.metadata.get("comment") == _COMMENT
     except (OSError, ValueError):  # base classes of PyAV's errors
         return False
+
+
+VIDEO = Kind("a video of tk", (".mp4",), made_here)
 
 
 def check_encoder() -> None:

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from tk.errors import ExportError, TkError
+from tk.errors import TkError
 from tk.io.captures.capture import Capture
+from tk.io.paths import check_output
 from tk.io.results.reader import read_result
 from tk.render.overlay import Overlay
-from tk.render.video import check_encoder, video_writer
-from tk.render.video import made_here as is_our_video
-from tk.report.page import build_page, write_page
-from tk.report.page import made_here as is_our_page
+from tk.render.video import VIDEO, check_encoder, video_writer
+from tk.report.page import PAGE, build_page, write_page
 from tk.report.pictures import choose_rows, embedded, shot
 from tk.threads import one_thread
 
@@ -31,8 +30,6 @@ def write_video_and_report(
     """
     try:
         return _write(capture, result_path)
-    except KeyboardInterrupt:
-        warn("no overlay video and report: interrupted; the result is complete")
     except TkError as error:
         warn(f"no overlay video and report: {error}")
     except Exception as error:  # a defect of tk; the result itself is complete
@@ -44,9 +41,8 @@ def write_video_and_report(
 def _write(capture: Capture, result_path: Path) -> list[Path]:
     video, page = result_path.with_suffix(".mp4"), result_path.with_suffix(".html")
     # in a folder of recordings a video may have the result's name
-    for path, ours in ((video, is_our_video), (page, is_our_page)):
-        if path.exists() and not ours(path):
-            raise ExportError(f"{path} was not made by tk and is not replaced; choose another name for the result")
+    for path, kind in ((video, VIDEO), (page, PAGE)):
+        check_output(path, kind, force=True, inputs=[result_path], capture=capture.path)
     result = read_result(result_path)
     overlay = Overlay(capture, result, _WIDEST)
     choices = choose_rows(result)

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from tk.io.captures.capture import open_capture
+from tk.io.paths import Kind, check_output
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 from tk.model.cameras.camera import Rig
-from tk.render.files import check_target, replacing
+from tk.render.files import replacing
 from tk.render.overlay import Overlay
 from tk.report.data import describe
 from tk.report.pictures import choose_rows, embedded, shot
@@ -67,6 +68,9 @@ def made_here(path: Path) -> bool:
         return False
 
 
+PAGE = Kind("a report of tk", (".html", ".htm"), made_here)
+
+
 def report(result_path: Path, capture_path: Path | None, output: Path | None, force: bool = False) -> Path:
     """Write the report of a result, and return its path.
 
@@ -74,7 +78,8 @@ def report(result_path: Path, capture_path: Path | None, output: Path | None, fo
         TkError: the result or the capture cannot be used, or the page cannot be written.
     """
     result = read_result(result_path)
-    target = check_target(output or result_path.with_suffix(".html"), force)
+    target = output or result_path.with_suffix(".html")
+    check_output(target, PAGE, force, [result_path], capture_path)
     shown: list[dict[str, Any]] = []
     rig = truth = None
     if capture_path is not None:

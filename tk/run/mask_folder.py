@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ConfigError
 from tk.io.captures.capture import MASKS_RECORD, Capture
+from tk.io.paths import check_not_input, resolved
 from tk.io.toml import load_toml
 from tk.run.plan import choose_frames
 from tk.run.reporter import Reporter
@@ -69,6 +70,7 @@ def write_masks(
         if not installed:
             raise CaptureError(f"{capture.path}: {NO_SEGMENTER}")
         segmenter = installed[0]
+    _check_folder(capture, folder)
     made = SubjectMasks(load(segmenter), segmenter, capture.rig, capture.volume)
     _claim(folder, {"capture": capture.name, "segmenter": segmenter, "cameras": list(capture.rig.names)})
     missing = [k for k in range(start, stop) if not all(_file(folder, n, k).exists() for n in capture.rig.names)]
@@ -90,6 +92,12 @@ def write_masks(
     if start > 0 and not all(_file(folder, name, 0).exists() for name in capture.rig.names):
         reporter.note(f"{folder}: frames before {start} are missing; tk track takes a folder of masks from frame 0 on")
     return Written(stop - start, len(missing), empty)
+
+
+def _check_folder(capture: Capture, folder: Path) -> None:
+    """Raise ConfigError for a folder in which the capture has files, except masks that `tk masks` has made."""
+    if resolved(folder) != resolved(capture.path / "masks"):
+        check_not_input(folder, capture=capture.path)
 
 
 def _file(folder: Path, camera: str, index: int) -> Path:

@@ -360,6 +360,7 @@ def serve(socket: int, handle: int) -> None:
         socket, handle: descriptors of the socket to the tracker and of the memory that both share.
     """
     cv2.setNumThreads(1)  # the cameras are segmented in parallel already
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # may be sent to all processes of a job; the tracker ends this one
     with Connection(socket) as tracker, mmap.mmap(handle, 0) as memory:
         os.close(handle)
         # the tracker closed its end of the socket

@@ -10,7 +10,8 @@ import numpy as np
 from tk.errors import ConfigError, ResultError
 from tk.io.captures.capture import Capture
 from tk.io.mesh import hull_mesh, write_mesh
-from tk.io.point_cloud import check_hull_path, ply_path, write_hulls, write_ply
+from tk.io.paths import check_not_input, check_output
+from tk.io.point_cloud import PLY, check_hull_path, ply_path, write_hulls, write_ply
 from tk.io.results.data import HullPoints
 from tk.model.cameras.volume import VoxelGrid
 from tk.model.hull.hull import VisualHull
@@ -49,16 +50,19 @@ def reconstruct(
     Raises:
         TkError: bad input; every frame finished before it is in the file.
     """
-    check_hull_path(output, force)
+    check_hull_path(output, force, capture.path)
+    for folder in (ply, mesh):
+        if folder is not None:
+            check_not_input(folder, capture=capture.path)
     for warning in capture.warnings:
         reporter.note(warning)
     start, stop = choose_frames(capture, frames, reporter.note)
     if ply is not None and mesh is not None and ply.resolve() == mesh.resolve():
-        raise ConfigError(f"--ply {ply}, --mesh {mesh}: give each a folder of its own")
+        raise ConfigError(f"{ply}: is the folder of point clouds and of meshes; give each a folder of its own")
     files = [ply_path(folder, frame) for folder in (ply, mesh) if folder is not None for frame in range(start, stop)]
-    taken = None if force else next((file for file in files if file.exists()), None)
-    if taken is not None:
-        raise ResultError(f"{taken}: exists; replace it by --force, or choose another folder")
+    for file in files:
+        if file.exists():
+            check_output(file, PLY, force, capture=capture.path, error=ResultError)
     segment = make_segmenter(capture.setup(), capture, config, reporter.note)
     hull = VisualHull(capture.rig, VoxelGrid.cover(capture.volume, config.voxels))
     reporter.begin(stop - start, 0)

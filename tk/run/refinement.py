@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import CaptureError, ConfigError, ResultError
-from tk.io.captures.calibration import write_calibration
+from tk.errors import CalibrationError, CaptureError, ConfigError, ResultError
+from tk.io.captures.calibration import CALIBRATION, write_calibration
 from tk.io.captures.capture import Capture
 from tk.io.captures.mask_store import MaskStore
+from tk.io.paths import check_output
 from tk.io.results.reader import read_result
 from tk.model.block_least_squares import Stop
 from tk.model.body.cone_body import ConeBody
@@ -98,14 +99,16 @@ def refine_capture(
     config: Settings,
     note: Note,
     how: RefinementSettings | None = None,
+    force: bool = False,
 ) -> Refinement:
-    """Refine a capture's cameras by a result of tracking it, and write a new calibration file.
+    """Refine a capture's cameras by a result of tracking it, and write a new calibration file; ``force`` replaces one.
 
     Raises:
         ConfigError: the result has no cone body.
         CaptureError, ResultError: capture and result do not match, or too few frames are tracked.
         CalibrationError: the new file cannot be written.
     """
+    check_output(output, CALIBRATION, force, [result], capture.path, CalibrationError)
     found = read_result(result)
     tracked = body_and_poses(found)
     if tracked is None:

@@ -17,7 +17,7 @@ from tk.io.captures.capture import Capture
 from tk.io.captures.mask_store import MaskStore
 from tk.io.captures.source import Source
 from tk.io.results.data import FrameResult, HullPoints, Value
-from tk.io.results.files import check_output
+from tk.io.results.files import check_result_path
 from tk.io.results.reader import as_damage_error, read_result
 from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
@@ -83,7 +83,8 @@ def track(
     Raises:
         TkError: bad input; every frame finished before it is in the file.
     """
-    check_output(output, force, resume)
+    masks = Path(capture.masks) if capture.masks not in ("auto", "none", "median") else None
+    check_result_path(output, force, resume, [init_pose, capture.init_keypoints, body, masks], capture.path)
     setup = recording_setup(capture, init_pose, body, frames[0])
     notes = capture.warnings
     return track_source(
@@ -127,7 +128,7 @@ def track_source(
     Raises:
         TkError: bad input; every frame finished before it is in the file.
     """
-    check_output(output, force, resume)
+    check_result_path(output, force, resume)
     said: list[str] = []
 
     def note(text: str) -> None:

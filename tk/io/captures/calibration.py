@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from tk.errors import CalibrationError, CaptureError
 from tk.io.captures.units import UNITS, FoundUnit, infer_unit
+from tk.io.paths import Kind
 from tk.io.toml import Table, load_toml
 from tk.model.cameras.camera import Camera, Rig
 
@@ -154,6 +155,16 @@ def camera_table(camera: Camera) -> dict[str, object]:
         "translation": camera.translation.tolist(),
         "fisheye": camera.fisheye,
     }
+
+
+def _is_calibration(path: Path) -> bool:
+    try:
+        return bool(camera_tables(load_toml(path, CalibrationError), path))
+    except CalibrationError:
+        return False
+
+
+CALIBRATION = Kind("a calibration", (".toml",), _is_calibration)
 
 
 def write_calibration(path: Path, source: Calibration, rig: Rig, time_offset_s: Sequence[float]) -> None:

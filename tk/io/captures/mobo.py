@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from tk.errors import CalibrationError
 from tk.io.captures.calibration import Calibration
 from tk.io.captures.capture_toml import CaptureSettings
+from tk.io.paths import c_name
 from tk.model.cameras.camera import Camera, Rig
 
 #: the walks begin in any pose
@@ -128,7 +129,7 @@ def rotation_zyx(x: float, y: float, z: float) -> NDArray[np.float64]:
 
 def _picture_size(folder: Path) -> tuple[int, int]:
     for file in sorted(folder.iterdir()):
-        picture = cv2.imread(str(file)) if file.is_file() and file.suffix != ".cal" else None
+        picture = cv2.imread(c_name(file, CalibrationError)) if file.is_file() and file.suffix != ".cal" else None
         if picture is not None:
             return picture.shape[1], picture.shape[0]
     raise CalibrationError(f"{folder}: holds no pictures")

@@ -7,13 +7,15 @@ import fcntl
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
 
 from tk.errors import ConfigError, ResultBusyError, ResultError
 from tk.io.hdf5 import open_hdf5
+from tk.io.paths import Kind, check_output, resolved
 from tk.io.results.schema import FORMAT
 
 
@@ -90,6 +92,57 @@ def opened_for_writing(path: Path, mode: str) -> Iterator[h5py.File]:
             file.close()
 
 
+def is_hdf5_of(path: Path, name: str) -> bool:
+    """Return whether a file is HDF5 with this value of the attribute `format`, of any version."""
+    try:
+        with open_hdf5(path) as file:
+            return file.is_format(name)
+    except ResultError:
+        return False
+
+
+#: suffixes of tk's HDF5 files
+SUFFIXES = (".h5", ".hdf5")
+RESULT = Kind(f"a {FORMAT}", SUFFIXES, lambda path: is_hdf5_of(path, FORMAT))
+
+
+def check_is_result(target: Path) -> None:
+    """Raise ResultError if the file is not a tk result of any version."""
+    if not RESULT.is_one(target):
+        raise ResultError(f"{target}: exists and is not {RESULT.name}; it is not overwritten: choose another name")
+
+
+def check_result_path(
+    path: Path,
+    force: bool,
+    resume: bool = False,
+    inputs: Sequence[Path | None] = (),
+    capture: Path | None = None,
+) -> None:
+    """Raise an error if a result cannot be written to the path, or if a file exists that must not be replaced.
+
+    Args:
+        path: path of the result.
+        force: replace an existing result.
+        resume: continue an existing result.
+        inputs, capture: see :func:`tk.io.paths.check_output`.
+
+    Raises:
+        ResultError: the path cannot be used; the message says what to do.
+        ConfigError: ``force`` and ``resume`` are both set, or the path is an input.
+    """
+    if force and resume:
+        raise ConfigError("force replaces a result and resume continues it: choose one of them")
+    try:
+        # resuming reports by itself what is wrong with a file
+        kind = replace(RESULT, is_one=lambda _: True) if resume else RESULT
+        check_output(path, kind, force or resume, inputs, capture, ResultError)
+    except ResultError as error:
+        if error.hint:
+            error.hint = "continue it with --resume, or replace it with --force"
+        raise
+
+
 def _move_to_memory(file: h5py.File) -> None:
     if not hasattr(os, "memfd_create"):  # not on Linux
         return
@@ -120,46 +173,11 @@ def writable(path: Path) -> Path:
     Raises:
         ResultError: no file can be written there.
     """
-    try:
-        target = path.resolve(strict=path.is_symlink() and path.exists())
-        is_folder = target.is_dir()
-    except (OSError, RuntimeError) as error:  # RuntimeError: a loop of links, up to Python 3.12
-        reason = error.strerror if isinstance(error, OSError) else "a loop of links"
-        raise ResultError(f"{path}: cannot be written: {reason}; choose another name") from None
-    if is_folder:
+    target = resolved(path, ResultError)
+    if target.is_dir():
         raise ResultError(f"{path}: is a folder; name a file in it")
     if not target.parent.is_dir():
         raise ResultError(f"{path}: the folder {target.parent} does not exist; make it first")
     if target.is_symlink() or (target.exists() and not (target.is_file() and os.access(target, os.W_OK))):
         raise ResultError(f"{path}: cannot be written; choose another name")
     return target
-
-
-def check_output(path: Path, force: bool, resume: bool = False) -> None:
-    """Raise an error if a result cannot be written to the path, or if a file exists that must not be replaced.
-
-    Args:
-        path: path of the result.
-        force: replace an existing result; files that are not results are never replaced.
-        resume: continue an existing result.
-
-    Raises:
-        ResultError: the path cannot be used; the message says what to do.
-        ConfigError: ``force`` and ``resume`` are both set.
-    """
-    if force and resume:
-        raise ConfigError("--force replaces a result and --resume goes on with it: give one of them")
-    target = writable(path)
-    if resume or not target.exists():
-        return
-    check_is_result(target)
-    if not force:
-        raise ResultError(f"{path}: exists; go on with it by --resume, replace it by --force, or choose another name")
-
-
-def check_is_result(target: Path) -> None:
-    """Raise ResultError if the file is not a tk result of any version."""
-    with contextlib.suppress(ResultError), open_hdf5(target) as file:
-        if file.is_format(FORMAT):
-            return
-    raise ResultError(f"{target}: exists and is not a {FORMAT}; it is not overwritten: choose another name")
