@@ -317,14 +317,14 @@ def test_output_that_cannot_be_written_is_refused(
 
     run(tmp_path / "missing" / "r.h5").complaint("r.h5", "does not exist")
     run(tmp_path).complaint(str(tmp_path), "is a folder")
-    (tmp_path / "file").write_text("mine")
-    run(tmp_path / "file" / "r.h5").complaint("r.h5")
-    run(tmp_path / "file").complaint("not overwritten")
+    (tmp_path / "file.h5").write_text("mine")
+    run(tmp_path / "file.h5" / "r.h5").complaint("r.h5")
+    run(tmp_path / "file.h5").complaint("not overwritten")
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["data"] = 1
     run(tmp_path / "other.h5").complaint("other.h5", "not overwritten")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "other.h5"]
-    assert (tmp_path / "file").read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file.h5", "other.h5"]
+    assert (tmp_path / "file.h5").read_text() == "mine"
     if os.path.isdir("/proc"):  # not even root may create a file there
         run(Path("/proc/r.h5")).complaint("/proc/r.h5", "cannot be written")
 

@@ -27,7 +27,7 @@ def test_result_is_replaced_only_with_force(tk: Tk, quick: Path, tiny: Path, tmp
     assert tk(*command).code == 0
     before = result.read_bytes()
     tk(*command).complaint(str(result), "exists", "--resume", "--force")
-    tk(*command, "--resume", "--force").complaint("--resume", "--force", "one of them")
+    tk(*command, "--resume", "--force").complaint("force", "resume", "one of them")
     assert result.read_bytes() == before
     assert tk(*command, "--seed", "4", "--force").code == 0
     with h5py.File(result, "r") as file:

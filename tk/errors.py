@@ -38,6 +38,10 @@ class VolumeError(CaptureError):
     """The working volume is empty, or the cameras do not see it."""
 
 
+class ClockError(CaptureError):
+    """The cameras were not recorded at the same times, or `fps` contradicts the videos."""
+
+
 class ResultError(TkError):
     """A result file cannot be written, read or continued."""
 

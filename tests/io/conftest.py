@@ -91,7 +91,10 @@ def make_capture(tmp_path: Path) -> MakeCapture:
         if document:
             write_toml(folder / "capture.toml", document)
         for camera in range(cameras):
-            write_video(folder / "videos" / f"cam{camera + 1}.mp4", [picture(camera, k) for k in range(frames)])
+            fps = document.get("fps")  # the videos have the same, if it is a possible one
+            rate = float(fps) if isinstance(fps, (int, float)) and 1 <= fps <= 1000 else 15.0
+            video = folder / "videos" / f"cam{camera + 1}.mp4"
+            write_video(video, [picture(camera, k) for k in range(frames)], rate)
         return folder
 
     return make

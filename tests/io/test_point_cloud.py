@@ -110,9 +110,9 @@ def test_an_older_file_stays_until_a_frame_is_finished(capture: Capture, tmp_pat
 
 
 def test_files_of_others_are_left_alone(capture: Capture, tmp_path: Path) -> None:
-    path = tmp_path / "notes.txt"
+    path = tmp_path / "notes.h5"
     path.write_text("mine")
-    with pytest.raises(ResultError, match=r"notes\.txt: exists and is not a tk-hull file"):
+    with pytest.raises(ResultError, match=r"notes\.h5: exists and is not a tk-hull file"):
         write_hulls(path, capture, grid(capture), [(0, points(4))])
     assert path.read_text() == "mine"
     with pytest.raises(ResultError, match="is a folder"):

@@ -81,7 +81,7 @@ def check_output(
     if target.suffix.lower() not in kind.suffixes:
         raise ConfigError(f"{path}: {kind.name} must end in {' or '.join(kind.suffixes)}")
     if not target.parent.is_dir():
-        raise error(f"{path}: the folder {target.parent} does not exist; make it first")
+        raise error(f"{path}: the folder {path.parent} does not exist; make it first")
     if target.exists() or target.is_symlink():
         if not kind.is_one(target):
             raise error(f"{path}: exists and is not {kind.name}; it is not overwritten: choose another name")

@@ -17,6 +17,8 @@ from tk.io.captures.capture_toml import CaptureSettings, read_settings
 from tk.io.captures.frames import FrameReader, FrameSet
 from tk.io.captures.mobo import SETTINGS as MOBO_SETTINGS
 from tk.io.captures.mobo import find_walk, read_cameras
+from tk.io.captures.timing import check_clock, read_stamps
+from tk.io.captures.timing import resample as resampled
 from tk.io.captures.video import Clip, Image, PictureClip, list_clips, picture_number, probe
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import infer_volume, sample_box, views_of
@@ -51,7 +53,7 @@ class Capture:
     Attributes:
         path: the folder.
         name: from `capture.toml`, else the folder's name.
-        fps: frame rate, 1/s, from `capture.toml`, else from the videos, else 30.
+        fps: frame rate, 1/s, from `capture.toml`, else from the time stamps, else 30.
         up: axis that points up in the world: x, y, z, -x, -y or -z, or a unit vector, "[0.02, -0.9998, 0.01]".
         rig: the cameras, in the calibration file's order.
         volume: the working volume, world frame, metres; inferred from the rig if `capture.toml` has none.
@@ -63,7 +65,7 @@ class Capture:
         warnings: lines about the capture that the user should read.
         clips: one clip for each camera.
         mask_clips: one clip of masks for each camera; None without given masks.
-        masks: the argument of :func:`open_capture`.
+        masks, resampled: arguments of :func:`open_capture`.
         time_offset_s: delay of each camera, seconds, from the calibration; :meth:`frames` corrects whole frames of it.
     """
 
@@ -82,6 +84,7 @@ class Capture:
     clips: tuple[Clip, ...]
     mask_clips: tuple[Clip, ...] | None
     masks: str
+    resampled: bool
     _calibration: Calibration
     time_offset_s: tuple[float, ...]
 
@@ -178,7 +181,9 @@ class Capture:
         return tuple(_read_some(clip, most) for clip in clips)
 
 
-def open_capture(path: str | Path, cameras: Sequence[str] | None = None, masks: str = "auto") -> Capture:
+def open_capture(
+    path: str | Path, cameras: Sequence[str] | None = None, masks: str = "auto", resample: bool = False
+) -> Capture:
     """Open a capture folder.
 
     Args:
@@ -186,6 +191,7 @@ def open_capture(path: str | Path, cameras: Sequence[str] | None = None, masks: 
         cameras: names of the cameras to use; all of them by default.
         masks: "auto" takes the capture's `masks/` where there is one; "none" and "median" take no masks, and leave it
             to :mod:`tk.run.segmentation` to make some; anything else is a folder in the layout of `masks/`.
+        resample: choose each frame's images by their time stamps, for cameras of different or variable rates.
 
     Raises:
         CaptureError: or one of its subclasses, with one line that names the file and what is wrong with it.
@@ -208,7 +214,16 @@ def open_capture(path: str | Path, cameras: Sequence[str] | None = None, masks: 
     if settings.unknown:
         warnings.append(f"{path / 'capture.toml'}: unknown keys are ignored: {', '.join(settings.unknown)}")
     _warn_of_units(calibration, warnings.append)
-    fps = _frame_rate(settings, clips, path, warnings.append)
+    stamps = read_stamps(path, calibration, clips)
+    if resample:
+        clips, mask_clips, fps = resampled(clips, mask_clips, stamps, settings.fps, warnings.append)
+    else:
+        found = check_clock(stamps, settings.fps, path / "capture.toml", warnings.append)
+        if found is None:
+            warnings.append(
+                f"{path / 'capture.toml'}: gives no fps, and neither do the pictures; {DEFAULT_FPS:g} is assumed"
+            )
+        fps = found or DEFAULT_FPS
     offsets = calibration.time_offset_s or (0.0,) * len(rig)
     frame_count = _common_length(
         [*clips, *(mask_clips or ())], [round(late * fps) for late in offsets], warnings.append
@@ -233,6 +248,7 @@ def open_capture(path: str | Path, cameras: Sequence[str] | None = None, masks: 
         clips=clips,
         mask_clips=mask_clips,
         masks=masks_asked,
+        resampled=resample,
         _calibration=calibration,
         time_offset_s=offsets,
     )
@@ -313,21 +329,6 @@ def _common_length(clips: Sequence[Clip], late: Sequence[int], warn: Callable[[s
         short = ", ".join(str(clip.path) for clip in clips if clip.frame_count == common)
         warn(f"{short}: has {common} frames, others up to {max(counts)}; only the first {common} are used")
     return common
-
-
-def _frame_rate(settings: CaptureSettings, clips: Sequence[Clip], path: Path, warn: Callable[[str], None]) -> float:
-    if settings.fps is not None:
-        return settings.fps
-    rates = [clip.fps for clip in clips if clip.fps is not None]
-    if not rates:
-        warn(f"{path / 'capture.toml'}: gives no fps, and neither do the pictures; {DEFAULT_FPS:g} is assumed")
-        return DEFAULT_FPS
-    if max(rates) > 1.01 * min(rates):
-        listed = ", ".join(f"{clip.path.name} {clip.fps:g}" for clip in clips if clip.fps is not None)
-        warn(
-            f"{path / 'videos'}: frame rates differ ({listed}); {rates[0]:g} is used, fps in capture.toml overrides it"
-        )
-    return rates[0]
 
 
 def _up(settings: CaptureSettings, rig: Rig, path: Path, warn: Callable[[str], None]) -> str:

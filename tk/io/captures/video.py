@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -47,7 +47,7 @@ class Clip(Protocol):
         path: the file or folder, as messages name it.
         width, height: pixels.
         frame_count: number of images.
-        fps: frame rate, 1/s; None if the clip gives none.
+        times_s: (N,) times of the images, seconds, increasing; None if the clip gives none.
     """
 
     @property
@@ -59,7 +59,7 @@ class Clip(Protocol):
     @property
     def frame_count(self) -> int: ...
     @property
-    def fps(self) -> float | None: ...
+    def times_s(self) -> NDArray[np.float64] | None: ...
 
     def open(self) -> Reader:
         """Return a reader at the first image."""
@@ -73,7 +73,7 @@ class VideoClip:
     width: int
     height: int
     frame_count: int
-    fps: float | None
+    times_s: NDArray[np.float64] | None = field(compare=False)
     is_mask: bool = False
 
     def open(self) -> Reader:
@@ -89,7 +89,7 @@ class PictureClip:
     height: int
     files: tuple[Path, ...]
     is_mask: bool = False
-    fps: float | None = None
+    times_s: None = None
 
     @property
     def frame_count(self) -> int:
@@ -109,8 +109,8 @@ def probe(path: Path, is_mask: bool = False) -> Clip:
 def probe_video(path: Path, is_mask: bool = False) -> VideoClip:
     """Open a video file and decode its first image.
 
-    Frames are counted by reading the coded packets without decoding (about 10 µs a frame), because the header of an
-    `.mkv` is only an estimate, and the header of a truncated file counts all frames.
+    Frames are counted, and their times read, from the coded packets without decoding (about 10 µs a frame): the header
+    of an `.mkv` is only an estimate, and the header of a truncated file counts all frames.
 
     Raises:
         VideoError: no video, empty, cut off, or of a codec that OpenCV cannot decode.
@@ -118,20 +118,21 @@ def probe_video(path: Path, is_mask: bool = False) -> VideoClip:
     capture = _open_video(path)
     try:
         promised = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        fps = float(capture.get(cv2.CAP_PROP_FPS))
         ok, picture = capture.read()
     finally:
         capture.release()
     if not ok:
         raise VideoError(f"{path}: no picture in it can be decoded; re-encode it, e.g. as H.264")
-    frame_count = _count_packets(path)
+    times_s = _packet_times(path)
+    frame_count = len(times_s)
     # one percent: headers that give a duration only are rounded
     if frame_count < promised - max(1, promised // 100):
         raise VideoError(
             f"{path}: is cut off: {frame_count} of its {promised} frames are there; copy it again, or re-encode it"
         )
     height, width = picture.shape[:2]
-    return VideoClip(path, width, height, frame_count, fps if 0 < fps < 10_000 else None, is_mask)
+    increasing = bool((np.diff(times_s) > 0).all())
+    return VideoClip(path, width, height, frame_count, times_s if increasing else None, is_mask)
 
 
 def probe_pictures(path: Path, is_mask: bool = False) -> PictureClip:
@@ -258,17 +259,17 @@ def _why_unreadable(path: Path) -> str:
     return "is not a video that can be decoded; put a video file in its place"
 
 
-def _count_packets(path: Path) -> int:
-    """Return the number of coded images in a video file."""
+def _packet_times(path: Path) -> NDArray[np.float64]:
+    """Return the times (N,) of the coded images in a video file, seconds, ascending."""
     raw = -1  # CAP_PROP_FORMAT's way to ask for packets
     capture = cv2.VideoCapture(c_name(path, VideoError), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, raw])
-    count = 0
+    times: list[float] = []
     try:
         while capture.grab():
-            count += 1
+            times.append(capture.get(cv2.CAP_PROP_POS_MSEC))
     finally:
         capture.release()
-    return count
+    return 1e-3 * np.sort(times)  # some codecs store images in another order
 
 
 def _numbered_pictures(folder: Path) -> tuple[Path, ...]:
