@@ -114,7 +114,7 @@ def test_unusable_requests_are_refused(write: Write, tmp_path: Path) -> None:
         export(path, [])
     first = export(path, ["trc"]).files[0]
     text = first.read_text()
-    with pytest.raises(ExportError, match="--force"):
+    with pytest.raises(ExportError, match="exists; choose another name"):
         export(path, ["csv", "trc"])
     assert not (tmp_path / "walk.csv").exists()  # all or nothing
     first.write_text("old")
