@@ -117,7 +117,7 @@ def test_unusable_requests_are_refused(write: Write, tmp_path: Path) -> None:
     with pytest.raises(ExportError, match="exists; choose another name"):
         export(path, ["csv", "trc"])
     assert not (tmp_path / "walk.csv").exists()  # all or nothing
-    first.write_text("old")
+    first.write_text("PathFileType\told")
     export(path, ["trc"], force=True)
     assert first.read_text() == text
     (tmp_path / "file").write_text("")
