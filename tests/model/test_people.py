@@ -100,13 +100,34 @@ def test_gap_in_one_mask_leaves_the_person_whole() -> None:
 
 
 def test_embraced_people_are_split_by_their_last_positions() -> None:
-    places = [(-0.12, 0.0), (0.12, 0.05)]
-    masks = drawn(places).any(axis=0)
-    last = np.array([[-0.3, 0.0, 0.9], [0.3, 0.0, 0.9]])
+    last = FINDER.find(drawn([(-0.4, 0.0), (0.4, 0.0)]).any(axis=0))
+    masks = drawn([(-0.12, 0.0), (0.12, 0.05)]).any(axis=0)
+    assert len(FINDER.find(masks)) == 1
     found = FINDER.find(masks, near=last)
     assert len(found) == 2
     left, right = sorted(found, key=lambda person: person.position[0])
     assert left.position[0] < 0 < right.position[0]
+
+
+def test_person_at_the_place_of_someone_who_left_is_not_split() -> None:
+    last = FINDER.find(drawn([(-0.3, 0.0), (0.3, 0.0)]).any(axis=0))
+    assert len(last) == 2
+    assert len(FINDER.find(drawn([(0.0, 0.0)])[0], near=last)) == 1
+
+
+def test_person_in_one_image_stands_where_the_feet_meet_the_floor() -> None:
+    behind = RIG[0].center * (-1.1, -1.1, 0.0)  # on the far side of the volume
+    alone = drawn([(0.3, 0.6), (float(behind[0]), float(behind[1]))])
+    alone[1, 1:] = False
+    floor = Volume((0.0, 0.0, 1.0), (2.4, 2.4, 2.0))
+    finder = PeopleFinder(RIG, floor, "z")
+    found = order_people(finder.find(alone.any(axis=0)), floor)
+    assert len(found) == 2
+    assert np.flatnonzero(found[1].views).tolist() == [0] and not found[1].inside
+    assert nearest(found[1:], [(float(behind[0]), float(behind[1]))])[0] < 0.5
+    assert found[1].height_m == pytest.approx(1.75, abs=0.15)
+    pixels = person_pixels(found, RIG, alone.any(axis=0))
+    assert (pixels[1, 0] & alone[1, 0]).sum() > 0.95 * alone[1, 0].sum()
 
 
 def test_pixels_go_to_the_person_in_front() -> None:

@@ -51,6 +51,10 @@ _SADDLE = 0.7
 # A person costs as much as this area of unexplained pixels, sum over the views, m²: half the silhouette of an adult in
 # one view. A ghost explains less than 0.1, a person half hidden in four views explains 1.
 _LEAST_AREA_M2 = 0.3
+# Two people in one component have at least this share of the volume that they had apart: more than one of two equals.
+_TOGETHER = 0.75
+# Least pixels of a silhouette of a person whom one camera shows, in the reduced image: 20 rows of 5 pixels.
+_LEAST_PIXELS = 100
 # Weight of pixels that a candidate covers beside the masks: furniture may hide a person in several cameras, and the
 # candidate's silhouette is up to twice as large as the person's.
 _CONTRADICTED = 0.25
@@ -69,13 +73,12 @@ class LocatedPerson:
     Attributes:
         position: (3,) m, world: centre of the trunk's column, half-way between floor and crown.
         height_m: extent along up. It is too large with raised arms, and too small for somebody who bends.
-        volume_m3: volume of the hull; larger than the person's, by up to two with four cameras.
-        points: (N, 3) m, centres of the voxels.
+        volume_m3: volume of the hull, up to twice the person's with four cameras; NaN if one camera shows the person.
+        points: (N, 3) m, centres of the voxels. With one camera: points of the silhouette, upright above the feet.
         voxel_m: edge of a voxel, metres.
         views: (C,) bool, cameras whose masks show the person.
         share: (C,) share of the person's silhouette that the mask covers; NaN for cameras that see nothing of it.
         inside: whether the position is in the working volume.
-        merged: whether the hull is wide enough for two people, but cannot be split.
     """
 
     position: Float
@@ -86,11 +89,15 @@ class LocatedPerson:
     views: Bool
     share: Float
     inside: bool
-    merged: bool = False
 
 
 def locate_people(
-    rig: Rig, volume: Volume, up: str, masks: NDArray, uncertain: Bool | None = None, near: Float | None = None
+    rig: Rig,
+    volume: Volume,
+    up: str,
+    masks: NDArray,
+    uncertain: Bool | None = None,
+    near: Sequence[LocatedPerson] = (),
 ) -> tuple[LocatedPerson, ...]:
     """Return the people in one frame set, see :meth:`PeopleFinder.find`."""
     return PeopleFinder(rig, volume, up).find(masks, uncertain, near)
@@ -185,14 +192,18 @@ class PeopleFinder:
         self._pixel_m2 = (np.linalg.norm(rig.centers - middle, axis=1) * self._step) ** 2 / focal
 
     def find(
-        self, masks: NDArray, uncertain: Bool | None = None, near: Float | None = None
+        self, masks: NDArray, uncertain: Bool | None = None, near: Sequence[LocatedPerson] = ()
     ) -> tuple[LocatedPerson, ...]:
         """Return the people, those in the working volume first, then by volume of their hull, the largest first.
+
+        A person whom only one camera shows is found if the silhouette is whole and touches nobody else's: he or she
+        stands where the line of sight of the feet meets the floor, the lower end of the working volume.
 
         Args:
             masks: (C, H, W), other than 0 where people are.
             uncertain: (C, H, W) bool, pixels that may show a person although their mask is 0.
-            near: (P, 3) m, positions of people in the last frame. A component that holds several of them is split.
+            near: the people of the last frame. A component that holds the positions of several is split between them
+                if it is as large as they were together.
         """
         small, inside = self._reduced(masks)
         allowed = inside if uncertain is None else inside | self._reduced(uncertain)[1]
@@ -205,7 +216,44 @@ class PeopleFinder:
             # only these cameras show somebody: he or she is hidden in the others, or their masks have a gap
             parts += self._components(inside, allowed, missed, near)
             chosen = self._explaining([self._person(part, inside) for part in parts], small)
-        return tuple(sorted(chosen, key=lambda person: (not person.inside, -person.volume_m3)))
+        chosen += self._alone(small, self._covered(chosen))
+        return tuple(sorted(chosen, key=lambda person: (not person.inside, -np.nan_to_num(person.volume_m3))))
+
+    def _alone(self, masks: Bool, covered: Bool) -> list[LocatedPerson]:
+        """Return the people whom one camera shows: parts of masks (C, h, w) that nobody's voxels touch."""
+        up = self._to_plan[2]
+        floor = float(min(corner @ up for corner in (self._volume.lower, self._volume.upper)))
+        found = []
+        for c, camera in enumerate(self._rig):
+            count, regions, stats, _ = cv2.connectedComponentsWithStats(masks[c].astype(np.uint8))
+            height, width = masks[c].shape
+            for k in range(1, count):
+                left, top, across, down = stats[k, :4].tolist()
+                cut = top == 0 or left == 0 or left + across >= width or top + down >= height
+                y, x = np.nonzero(regions == k)
+                if cut or len(y) < _LEAST_PIXELS or covered[c][y, x].any():
+                    continue
+                rays = camera.rays(np.column_stack([x, y]) * self._step + self._step // 2)
+                with np.errstate(divide="ignore"):
+                    away = (floor - camera.center @ up) / (rays[y == y.max()].mean(axis=0) @ up)
+                feet = camera.center + away * rays[y == y.max()].mean(axis=0)
+                level = (feet - camera.center) - ((feet - camera.center) @ up) * up
+                # the silhouette stands in the plane through the feet that faces the camera
+                points = camera.center + rays * (level @ level / (rays @ level))[:, None]
+                stature = float(np.ptp(points @ up))
+                if away > 0 and np.isfinite(points).all() and STATURE_M[0] <= stature <= STATURE_M[1]:
+                    views = np.arange(len(self._rig)) == c
+                    position = feet + stature / 2 * up
+                    share = np.where(views, 1.0, np.nan)
+                    found.append(
+                        LocatedPerson(
+                            position, stature, np.nan, points, self._grid.voxel_m, views, share, self._holds(position)
+                        )
+                    )
+        return found
+
+    def _holds(self, position: Float) -> bool:
+        return bool(((self._volume.lower <= position) & (position <= self._volume.upper)).all())
 
     def _reduced(self, masks: NDArray) -> tuple[Bool, Bool]:
         """Return masks in reduced images (C, h, w), and the voxels (C, N) whose centre each camera sees in its mask."""
@@ -214,7 +262,7 @@ class PeopleFinder:
         return small, self._voxels.inside(small) & self._voxels.sees
 
     def _components(
-        self, inside: Bool, allowed: Bool, cameras: Sequence[int], near: Float | None
+        self, inside: Bool, allowed: Bool, cameras: Sequence[int], near: Sequence[LocatedPerson]
     ) -> list[NDArray[np.int64]]:
         """Return the voxels of each component of the cameras' hull that may be a person; wide components are split.
 
@@ -263,19 +311,20 @@ class PeopleFinder:
         np.add.at(plan, tuple(cell.T), self._grid.voxel_m)
         return plan, cell, low
 
-    def _split(self, part: NDArray[np.int64], near: Float | None) -> list[NDArray[np.int64]]:
+    def _split(self, part: NDArray[np.int64], near: Sequence[LocatedPerson]) -> list[NDArray[np.int64]]:
         """Return the voxels of each person in a component: each belongs to the nearest upright column.
 
-        Columns are at the positions ``near`` that the component holds, if there are two or more, else at the maxima of
-        the floor plan.
+        Columns are at the maxima of the floor plan, or at the positions of the people ``near``, see :meth:`find`.
         """
         plan, cell, low = self._plan(part)
         seeds = self._maxima(plan)
-        if near is not None and len(near):
-            at = np.rint((near @ self._to_plan[:2].T - low) / self._grid.voxel_m).astype(np.int64)
-            held = [np.linalg.norm(cell - place, axis=1).min() * self._grid.voxel_m < _APART_M for place in at]
-            if sum(held) >= 2:
-                seeds = at[held]
+        if len(near) > len(seeds):
+            at = [self._to_plan[:2] @ person.position - low for person in near]
+            held = [np.linalg.norm(cell * self._grid.voxel_m - place, axis=1).min() < _APART_M for place in at]
+            expected = sum(person.volume_m3 for person, holds in zip(near, held, strict=True) if holds)
+            if sum(held) > len(seeds) and len(part) * self._litres >= 1000 * _TOGETHER * expected:
+                held_at = [place for place, holds in zip(at, held, strict=True) if holds]
+                seeds = np.rint(np.array(held_at) / self._grid.voxel_m).astype(np.int64)
         if len(seeds) < 2:
             return [part]
         nearest = np.linalg.norm(cell[:, None] - seeds[None], axis=2).argmin(axis=1)
@@ -311,9 +360,15 @@ class PeopleFinder:
         sees = self._voxels.sees[:, part]
         share = np.full(len(self._rig), np.nan)
         np.divide(inside[:, part].sum(axis=1), sees.sum(axis=1), out=share, where=sees.any(axis=1))
-        within = bool(((self._volume.lower <= position) & (position <= self._volume.upper)).all())
         return LocatedPerson(
-            position, crown - floor, len(part) * edge**3, points, edge, np.nan_to_num(share) >= 0.5, share, within
+            position,
+            crown - floor,
+            len(part) * edge**3,
+            points,
+            edge,
+            np.nan_to_num(share) >= 0.5,
+            share,
+            self._holds(position),
         )
 
     def _explaining(self, found: Sequence[LocatedPerson], masks: Bool) -> list[LocatedPerson]:
