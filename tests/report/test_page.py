@@ -21,7 +21,7 @@ from tk.evaluation.joints import evaluate_files
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 from tk.io.results.status import Status
-from tk.model.body.skeleton import JOINTS
+from tk.model.body.joints import JOINTS, ROWS
 from tk.render.figure import figure_of
 from tk.report.data import hinge_sigma_deg
 from tk.report.page import build_page, made_here
@@ -81,6 +81,19 @@ def test_body_points_match_the_overlay(complete: Path) -> None:
         np.testing.assert_allclose(
             np.linalg.norm(a - joints[k], axis=1), np.linalg.norm(b - figure.joints[row, k], axis=1), atol=1e-4
         )
+
+
+def test_expected_error_adds_the_offset_of_a_joint_to_sigma(complete: Path) -> None:
+    result = read_result(complete)
+    assert result.sigma is not None and result.expected_error is not None
+    expected = unpacked(data_of(build_page(result, []))["expected"])
+    knee, hip = JOINTS.index("knee_l"), JOINTS.index("hip_r")
+    for joint, offset in ((knee, ROWS["knee_l"].offset_m), (hip, ROWS["hip_l"].offset_m)):
+        assert offset > 0
+        np.testing.assert_allclose(expected[:, joint] ** 2, 3 * result.sigma[:, joint] ** 2 + offset**2, rtol=1e-5)
+    assert np.isnan(expected[3, 8]), "unknown where sigma is unknown"
+    without = replace(result, sigma=None)
+    assert without.expected_error is None
 
 
 def test_page_has_errors_only_with_a_truth(complete: Path, tiny: Path, tmp_path: Path) -> None:

@@ -97,6 +97,19 @@ def draw_video_and_report(
         click.echo(f"wrote {', '.join(str(file) for file in files)}", err=True)
 
 
+def _expected_error(path: Path) -> list[str]:
+    """Return a text with the expected error of a joint, median over joints and frames with a pose; [] if unknown."""
+    import numpy as np
+
+    from tk.io.results.reader import read_result
+
+    result = read_result(path)
+    expected = result.expected_error
+    if expected is None or not np.isfinite(expected[result.has_pose]).any():
+        return []
+    return [f"expected error of a joint {100 * np.nanmedian(expected[result.has_pose]):.1f} cm"]
+
+
 def end(output: Path, summary: Summary, quiet: bool, as_json: bool) -> None:
     """Print how a run ended, and exit: with 1 after an interruption, with 3 if most frames are lost."""
     rate = summary.tracked_now / summary.seconds if summary.seconds > 0 else 0.0
@@ -111,7 +124,8 @@ def end(output: Path, summary: Summary, quiet: bool, as_json: bool) -> None:
             interrupted=summary.interrupted,
         )
     if summary.frames and not quiet:
-        click.echo(f"{summary.frames} frames in {output}, {summary.lost} lost, {rate:.1f} frames/s", err=True)
+        parts = [f"{summary.frames} frames in {output}", f"{summary.lost} lost", *_expected_error(output)]
+        click.echo(", ".join([*parts, f"{rate:.1f} frames/s"]), err=True)
     if summary.interrupted:
         next_step = "continue with the same command and --resume" if summary.frames else "no frame was finished"
         click.echo(f"tk: interrupted; {next_step}", err=True)

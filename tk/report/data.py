@@ -56,6 +56,7 @@ def describe(result: Result, rig: Rig | None = None, truth: Path | None = None) 
         "scene": _scene(result, figure, rig),
         "joints": list(JOINTS),
         "sigma": None if figure.sigma is None else packed(figure.sigma),
+        "expected": None if (expected := result.in_joint_order().expected_error) is None else packed(expected),
         "cameras": list(meta.residual_cameras),
         "silhouetteError": None if (error := result.silhouette_error) is None else packed(error),
         "truth": None if truth is None else _errors(result, truth),

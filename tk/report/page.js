@@ -8,7 +8,7 @@
   const lost = data.status.map((status) => data.withoutPose.includes(status));
   const lostCount = lost.filter(Boolean).length;
   const silhouetteError = data.silhouetteError && unpack(data.silhouetteError);
-  const sigma = data.sigma && unpack(data.sigma);
+  const sigma = data.sigma && unpack(data.sigma), expected = data.expected && unpack(data.expected);
   const objective = unpack(data.objective);
   const C = data.cameras.length, J = data.joints.length;
   const segments = data.colors.segments;
@@ -29,6 +29,7 @@
     return sorted.length ? sorted[Math.min(sorted.length - 1, Math.floor(share * sorted.length))] : NaN;
   };
   const column = (values, width, k) => Array.from({ length: values.length / width }, (_, row) => values[row * width + k]);
+  const rows = (values, width) => Array.from(values).filter((_, k) => !lost[Math.floor(k / width)]);
   const good = (values) => values.filter((_, row) => !lost[row]);
   const joint = (name) => name.replace(/^(.*)_([lr])$/, (_, part, side) => `${side === "l" ? "left" : "right"} ${part}`).replace("_", " ");
 
@@ -49,7 +50,7 @@
     return known.length ? known.reduce((a, b) => a + b) / known.length : NaN;
   });
   if (meanError) addFigure("E_S, median frame", short(100 * quantile(good(meanError), 0.5)), "%");
-  if (sigma) addFigure("σ of a joint, median", short(1000 * quantile(sigma, 0.5)), "mm");
+  if (expected) addFigure("expected error of a joint, median", short(100 * quantile(rows(expected, J), 0.5)), "cm");
   const total = data.timing.find(({ stage }) => stage === "total");
   if (total) addFigure("time per frame, mean", short(total.ms), "ms");
 
@@ -223,11 +224,15 @@
     return made;
   };
   if (sigma) {
-    get("sigma-text").textContent = "One standard deviation of a joint position along one axis, mm; frames that are not lost.";
-    get("sigma-table").append(line(["joint", "median", "90 %", "largest"], "th"));
+    get("sigma-text").textContent = "One standard deviation of a joint position along one axis, mm; frames that are not lost. "
+      + "Expected error: distance to the true position, median, mm; it adds the constant offset that a joint of this kind had on rendered recordings.";
+    get("sigma-table").append(line(["joint", "median", "90 %", "largest", "expected error"], "th"));
     data.joints.forEach((name, k) => {
       const values = good(column(sigma, J, k));
-      get("sigma-table").append(line([joint(name), ...[0.5, 0.9, 1].map((share) => listed(1000 * quantile(values, share)))]));
+      get("sigma-table").append(line([
+        joint(name), ...[0.5, 0.9, 1].map((share) => listed(1000 * quantile(values, share))),
+        listed(1000 * quantile(good(column(expected, J, k)), 0.5)),
+      ]));
     });
   } else {
     get("sigma-text").textContent = "This result has no σ.";

@@ -15,7 +15,7 @@ from tk.io.results.schema import columns_of
 from tk.io.results.status import has_pose
 from tk.io.toml import parse_toml
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.joints import JOINTS, in_joint_order
+from tk.model.body.joints import JOINTS, ROWS, in_joint_order
 from tk.model.body.skeleton import paper_poses, skeleton_of_names
 from tk.model.cameras.camera import Rig
 
@@ -244,6 +244,18 @@ class Result:
     def silhouette_error(self) -> Float | None:
         """Return E_S by camera (F, C), the sum of missing and surplus area; None if the result has no residual."""
         return None if self.residual is None else np.asarray(self.residual.sum(axis=2))
+
+    @property
+    def expected_error(self) -> Float | None:
+        """Return the expected distance of each joint from its true position (F, J), metres; None without sigma.
+
+        The root of three variances along the axes and the squared constant offset of the joint's kind
+        (:class:`tk.model.body.joints.Joint`): sigma alone does not contain the offset.
+        """
+        if self.sigma is None:
+            return None
+        offsets = np.array([ROWS[name].offset_m if name in ROWS else np.nan for name in self.meta.joint_names])
+        return np.asarray(np.sqrt(3 * self.sigma**2 + offsets**2))
 
     @property
     def has_pose(self) -> NDArray[np.bool_]:
