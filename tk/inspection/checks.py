@@ -1,8 +1,9 @@
 """Check a capture before tracking: `tk inspect`.
 
-The masks of ten frames are compared through the calibration (:mod:`tk.model.masks.mask_agreement`): do they have a
-visual hull in common, which camera is inconsistent, by how many pixels, and would its video be consistent some frames
-earlier or later? Further checks: each camera's masks, the working volume, the floor, and the up direction.
+The masks of ten frames are compared through the calibration (:mod:`tk.model.masks.mask_agreement`, the test that
+`tk track` makes at its start): do they have a visual hull in common, which camera is inconsistent, by how many pixels,
+and would its video be consistent some frames earlier or later? Further checks: each camera's masks, the working volume,
+the floor, and the up direction.
 """
 
 from __future__ import annotations
@@ -188,7 +189,7 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
     agreement = compare.compare(chosen)
     late = _delays(compare, masks, centers, agreement)
     hulls = compare.hulls([compare.small(m) for m in chosen])
-    good = [c for c in range(len(capture.rig)) if c not in agreement.inconsistent]
+    good = agreement.right
     points = [hull.points(good) for hull in hulls if hull is not None]
     leveling = find_up(capture.rig, capture.up, points)
     p = np.concatenate(points) if points else np.zeros((0, 3))
@@ -226,7 +227,7 @@ def _delays(
     late = np.zeros(C, np.int64)
     out = np.zeros((C, len(shifts)))
     for c in range(C):
-        others = [k for k in range(C) if k != c and (k != agreement.odd)]
+        others = [k for k in agreement.right if k != c]
         out[c] = _outside_by_shift(small, centers, hulls, others, c, shifts)
     best = shifts[np.nanargmin(np.where(np.isfinite(out), out, np.inf), axis=1)]
     now = out[:, _LARGEST_DELAY]
@@ -293,7 +294,7 @@ def _camera(
             f"its video seems to start {abs(late)} frame(s) {'late' if late > 0 else 'early'}: its frame k shows what "
             f"frame k {late:+d} of the others shows"
         )
-    elif c in agreement.inconsistent:
+    elif c in agreement.wrong:
         verdict = agreement.reason(c)
     return CameraReport(
         name=camera.name,
@@ -302,7 +303,7 @@ def _camera(
         holes=float(np.mean(holes)) if holes else 0.0,
         empty=1.0 - len(shown) / len(own),
         cut=cut / len(own),
-        outside=float(agreement.own[c]),
+        outside=float(agreement.outside[c]),
         shift_px=float(np.hypot(*agreement.shift_px[c])),
         late_frames=late,
         bad_images=bad_images,
@@ -312,7 +313,9 @@ def _camera(
 
 def _findings(found: Inspection, capture: Capture, agreement: Agreement) -> list[str]:
     lines = [f"camera {c.name} is inconsistent with the others: {c.verdict}" for c in found.cameras if c.verdict]
-    if not lines and agreement.disagreement > INCONSISTENT:
+    if agreement.refusal:
+        lines.insert(0, agreement.refusal)
+    elif not lines and agreement.disagreement > INCONSISTENT:
         lines.append(
             f"the cameras are inconsistent, none more than the others: {agreement.disagreement:.0%} of the masks lie "
             "outside the hulls of the others; check the calibration, and whether masks miss parts of the person"

@@ -1,7 +1,7 @@
 """The camera monitor: steps a tracker without the cameras that are wrong, and rejects impossible poses.
 
 Three checks exclude a camera: its image shows nothing or is frozen (:mod:`tk.model.masks.image_health`); in the opening
-frames its masks contradict the hull of the other cameras (:mod:`tk.model.masks.mask_agreement`); or, in a later frame,
+frames its masks contradict those of the other cameras (:mod:`tk.model.masks.mask_agreement`); or, in a later frame,
 its residual is an outlier of its baseline (:class:`~tk.trackers.residual.ResidualBaseline`). In the last case the frame
 is tracked again without the camera. If the other cameras then have a normal residual and the camera still has an
 outlier, the camera was wrong and not the pose. The camera is included again when its residual, at the pose that the
@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.errors import CaptureError
 from tk.model.body.plausibility import Plausibility, check_extent, check_stature
 from tk.model.body.skeleton import JOINTS
 from tk.model.cues.ray_costs import residual_of
@@ -92,17 +93,24 @@ class CameraMonitor:
         """Return the opening frames without the cameras that are wrong, for the tracker's start.
 
         Raises:
-            CaptureError: the person's size contradicts the height in `capture.toml`.
+            CaptureError: the cameras contradict each other, or the person's size contradicts the height in
+                `capture.toml`.
         """
         health = ImageHealth()
         bad = np.array([self._bad(health.look(f.images, f.masks)) for f in frames])
         shown = [_without(f, b) for f, b in zip(frames, bad, strict=True)]
         chosen = np.unique(np.linspace(0, len(shown) - 1, _OPENING).round().astype(int))
         agreement = MaskAgreement(self._setup.rig, self._setup.volume).compare([shown[i].masks for i in chosen])
-        for camera in agreement.inconsistent if self.tracker.can_exclude_cameras else ():
-            if len(self._names) - self._excluded.sum() > 2:
-                self._excluded[camera] = True
-                self._opening_reasons[camera] = agreement.reason(camera)
+        if agreement.refusal:
+            raise CaptureError(agreement.refusal)
+        for camera in agreement.wrong:
+            self._excluded[camera] = True
+            self._opening_reasons[camera] = agreement.reason(camera)
+        if self._excluded.any() and not self.tracker.can_exclude_cameras:
+            reasons = (
+                f"camera {self._names[c]} {_DISAGREES} ({reason})" for c, reason in self._opening_reasons.items()
+            )
+            raise CaptureError(f"{'; '.join(reasons)}: this method needs masks that fit from all cameras")
         if self._subject.height_m is not None:
             check_extent(agreement.extent_m, self._subject.height_m)
         return [_without(f, self._excluded) for f in shown]

@@ -1,65 +1,83 @@
-"""Whether the masks of several cameras can show one person at one time: each against the visual hull of the others.
+"""Whether the cameras and the silhouettes are consistent with one another, before anybody is tracked.
 
-A point of the person lies in every mask, so the hull of any cameras contains the person. Where its silhouette in
-another camera does not cover that camera's mask, one of the cameras is wrong: turned, late, or its mask is too large
-or too small. Without the wrong camera the others agree, which identifies it. The property of the hull is Kehl & Van
-Gool's (2006) and Laurentini's (1994); the test is ours.
+Pairs of cameras are tested by epipolar tangency (:mod:`tk.model.masks.tangency`). The largest majority of cameras that
+agree with most of their partners is right; the others are wrong. What no pair shows, such as a second person beside the
+first in one view, the visual hull shows: a point of the person lies in every mask, so the hull of any cameras contains
+the person (Laurentini, 1994), and its silhouette in another camera covers that camera's mask. `tk inspect` and the
+start of the tracking use the same test. The tests of hulls and sets are ours.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.cameras.camera import Rig
+from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
 from tk.model.cameras.volume import Volume, VoxelGrid
 from tk.model.hull.coarse import Hull, Voxels, dilated
+from tk.model.masks.tangency import Outline, Tangency, tangency
 
 Float = NDArray[np.float64]
 Masks = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 
+# Error of a pair that correct cameras may have, as a share of the person's size, beside one pixel of either mask.
+# Measured on the opening of walk, dance, fold, cube, treadmill-slow, rig9, hd, sixteen and pair: pairs of correct
+# cameras reach 0.003 with exact masks and 0.012 with segmented ones; a camera turned by 2° has 0.02 to 0.11 with most
+# partners, swapped videos 0.04 to 0.6, another recording's calibration 0.08 to 0.28. Below 0.01, cameras are excluded
+# that the refinement would mend; with 0.03, a camera turned by 3° about its upright axis stays.
+TOLERANCE = 0.015
 # Voxels along the working volume's longest side; those near the person are divided by two.
 _COARSE = 36
-# Rows of an image that are used, approximately.
+# Rows of an image that are used for hulls, approximately.
 _ROWS = 120
-# Cameras are inconsistent if this share of the masks lies outside the hulls of the others: exact masks leave less than
-# 1 % outside, segmented ones 1 to 3 %.
+# Share of the masks outside the hulls of the others above which a camera is wrong: exact masks leave less than 1 %
+# outside, segmented ones 1 to 3 %.
 INCONSISTENT = 0.06
-# One camera is identified as wrong if the share outside falls to this fraction without it.
-_LEFT_OVER = 0.5
-# Several cameras are wrong if their shares exceed the median camera's by this factor. Chosen on the development
-# captures; sensitivity not measured.
-_ABOVE_MEDIAN = 4.0
+# One camera is identified as wrong if the share outside falls to this fraction without it. If none is identified, the
+# cameras are refused above this many times INCONSISTENT: poor masks of correct cameras leave 4 % (treadmill-slow).
+_LEFT_OVER, _REFUSED = 0.5, 2.0
 # Share of a mask that may stay outside when it is shifted into the hull of the others: what segmented masks leave.
 _OUTSIDE_SHIFTED = 0.03
+
+_CAUSES = (
+    "a camera was turned or moved after the calibration, calibration.toml is of another recording, the videos do not "
+    "belong to these cameras or to the same time, or the masks show something else than the person"
+)
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Consistency of C cameras' masks over several frames.
+    """Consistency of C cameras and their masks over several frames.
 
     Attributes:
-        outside: (C,) share of each camera's mask that lies outside the hull of the others; NaN if it shows nobody.
-        without: (C,) mean of the others' ``outside`` if this camera is removed; NaN if unknown.
-        shift_px: (C, 2) smallest shift, x and y, pixels of the full image, that moves each camera's mask into the hull
-            of the others (without the odd one); NaN if none does.
-        own: (C,) ``outside`` against the hull of the others, without the odd one.
-        closes: (F,) whether each frame has a hull at all.
-        odd: the one camera that is inconsistent with all others; None if there is none, or more than one.
-        extent_m: the greatest extent of the hull, median of the frames; NaN without a hull.
+        names: of the cameras.
+        tangency: the errors of all pairs.
+        wrong: cameras that contradict the others; empty if the cameras are refused.
+        swapped: two cameras whose videos look swapped; None if none do.
+        refusal: why the cameras cannot be used together, one line; empty if they can.
+        outside: (C,) share of each camera's mask that lies outside the hull of the right cameras; NaN if it shows
+            nobody.
+        shift_px: (C, 2) smallest shift, x and y, pixels of the full image, that moves each camera's mask into that
+            hull; NaN if none does.
+        closes: (F,) whether each frame has a hull of all cameras.
+        extent_m: greatest extent of the right cameras' hull, median of the frames; NaN without a hull.
     """
 
+    names: tuple[str, ...]
+    tangency: Tangency
+    wrong: tuple[int, ...]
+    swapped: tuple[int, int] | None
+    refusal: str
     outside: Float
-    without: Float
     shift_px: Float
-    own: Float
     closes: Bool
-    odd: int | None
     extent_m: float
 
     @property
@@ -68,20 +86,24 @@ class Agreement:
         return float(np.nanmean(self.outside)) if np.isfinite(self.outside).any() else float("nan")
 
     @property
-    def inconsistent(self) -> tuple[int, ...]:
-        """The cameras that are inconsistent with the others, the odd one first; never more than half of them."""
-        first = () if self.odd is None else (self.odd,)
-        median = float(np.nanmedian(self.own)) if np.isfinite(self.own).any() else 0.0
-        least = max(INCONSISTENT, _ABOVE_MEDIAN * median)
-        own = [c for c in range(len(self.own)) if c != self.odd and self.own[c] > least]
-        return (*first, *own) if len(first) + len(own) <= len(self.own) / 2 else first
+    def right(self) -> list[int]:
+        """The cameras that are not wrong."""
+        return [c for c in range(len(self.names)) if c not in self.wrong]
 
     def reason(self, camera: int) -> str:
-        """Return what is wrong with an inconsistent camera."""
-        if self.own[camera] < INCONSISTENT / 2:
+        """Return what is wrong with a camera."""
+        if self.swapped and camera in self.swapped:
+            other = self.swapped[1 - self.swapped.index(camera)]
+            return f"its video and that of {self.names[other]} look swapped"
+        error = self.tangency.error[camera, self.right]
+        error, tolerance = error[np.isfinite(error)], TOLERANCE + 2 * self.tangency.pixel[camera]
+        if self.outside[camera] < INCONSISTENT / 2 and not (error > tolerance).any():
             return "its masks miss a part of the person"
-        if np.isfinite(self.shift_px[camera]).all():
-            return f"off by {np.hypot(*self.shift_px[camera]):.0f} px or more: turned, moved or late"
+        off = np.hypot(*self.shift_px[camera])
+        if not off > 0 and (error < -tolerance).any():
+            off = np.abs(error).max() / self.tangency.pixel[camera]
+        if off > 0:
+            return f"off by {off:.0f} px or more: turned, moved or late"
         return "its masks show something else beside the person, or are wrong"
 
 
@@ -103,36 +125,99 @@ class MaskAgreement:
         offset = self.step // 2
         return np.asarray(masks[:, offset :: self.step, offset :: self.step] >= 128)
 
-    def compare(self, frames: Sequence[Masks], blame: bool = True) -> Agreement:
-        """Return the agreement over frames of masks (C, H, W); ``blame``: identify the odd camera, too."""
+    def compare(self, frames: Sequence[Masks]) -> Agreement:
+        """Return the agreement over frames of masks (C, H, W)."""
         C = len(self.rig)
+        outlines = [[Outline.of(camera, masks[c]) for c, camera in enumerate(self.rig)] for masks in frames]
+        pairs = tangency(outlines, self.rig.centers)
+        error = excess(pairs)
+        tested = np.flatnonzero(np.isfinite(error).any(axis=1)).tolist()
+        kept = largest_consistent(error)
+        wrong = [c for c in tested if c not in kept] if kept else []
+        swapped = None
+        if len(kept) < len(tested) and (kept or len(tested) <= 4):  # without the swapped ones, five cameras agree
+            swapped = self._swapped(frames, outlines, wrong or tested)
         seen = [self.small(masks) for masks in frames]
         hulls = self.hulls(seen)
-        closes = np.array([hull is not None and hull.carve(range(C)).any() for hull in hulls], bool)
-        pairs = [(masks, hull) for masks, hull in zip(seen, hulls, strict=True) if hull is not None]
-        shown = [any(bool(masks[c].any()) for masks in seen) for c in range(C)]
-        outside = self._outside(pairs, list(range(C)))
-        without, odd = np.full(C, np.nan), None
-        total = np.nanmean(outside) if np.isfinite(outside).any() else np.nan
-        if blame and C >= 3 and np.isfinite(total):
-            for k in range(C):
-                if shown[k]:
-                    rest = self._outside(pairs, [c for c in range(C) if c != k])
-                    without[k] = np.nanmean(rest) if np.isfinite(rest).any() else np.nan
-            if total > INCONSISTENT and np.isfinite(without).any():
-                best = int(np.nanargmin(without))
-                # with fewer cameras any hull is larger: the camera must stand out from the others' removal
-                if without[best] < _LEFT_OVER * min(total, float(np.nanmedian(without))):
-                    odd = best
-        shift, own = np.full((C, 2), np.nan), np.full(C, np.nan)
+        views = [(masks, hull) for masks, hull in zip(seen, hulls, strict=True) if hull is not None]
+        right = [c for c in range(C) if c not in wrong]
+        refused = not kept and bool(tested)
+        while not refused and (total := self._mean_outside(views, right)) > INCONSISTENT:
+            odd = self._odd(views, right, total)
+            if odd is None or len(right) - 1 <= C / 2:
+                refused = total > _REFUSED * INCONSISTENT
+                break
+            wrong.append(odd)
+            right.remove(odd)
+        refusal = (
+            self._contradiction(frames, pairs, right, swapped) if refused else self._one_sided(pairs, right, wrong)
+        )
+        outside, shift = np.full(C, np.nan), np.full((C, 2), np.nan)
         for c in range(C):
-            others = [k for k in range(C) if k != c and k != odd]
-            if len(others) >= 1:
-                views = [(masks[c], hull.silhouette(hull.carve(others), c)) for masks, hull in pairs]
-                own[c] = _share_outside(views)
-                shift[c] = self._least_shift(views)
-        extents = [hull.extent([c for c in range(C) if c != odd]) for _, hull in pairs]
-        return Agreement(outside, without, shift, own, closes, odd, float(np.median(extents)) if extents else np.nan)
+            others = [k for k in right if k != c]
+            if others:
+                shown = [(masks[c], hull.silhouette(hull.carve(others), c)) for masks, hull in views]
+                outside[c], shift[c] = _share_outside(shown), self._least_shift(shown)
+        extents = [hull.extent(right) for _, hull in views]
+        return Agreement(
+            names=self.rig.names,
+            tangency=pairs,
+            wrong=tuple(wrong),
+            swapped=swapped,
+            refusal=refusal,
+            outside=outside,
+            shift_px=shift,
+            closes=np.array([hull is not None and hull.carve(range(C)).any() for hull in hulls], bool),
+            extent_m=float(np.median(extents)) if extents else np.nan,
+        )
+
+    def _swapped(
+        self, frames: Sequence[Masks], outlines: Sequence[Sequence[Outline | None]], suspects: Sequence[int]
+    ) -> tuple[int, int] | None:
+        """Return the two suspects whose exchanged videos make all cameras consistent; None if no two do."""
+        found: list[tuple[float, tuple[int, int]]] = []
+        for a, b in combinations(suspects, 2):
+            if (self.rig[a].width, self.rig[a].height) != (self.rig[b].width, self.rig[b].height):
+                continue
+            exchanged = []
+            for masks, row in zip(frames, outlines, strict=True):
+                views = list(row)
+                views[a], views[b] = Outline.of(self.rig[a], masks[b]), Outline.of(self.rig[b], masks[a])
+                exchanged.append(views)
+            error = excess(tangency(exchanged, self.rig.centers))
+            error = error[np.isfinite(error).any(axis=1)]
+            if len(error) > 2 and np.nanmedian(error, axis=1).max() <= 1.0:
+                found.append((float(np.nanmean(error)), (a, b)))
+        return min(found)[1] if found else None
+
+    def _contradiction(
+        self, frames: Sequence[Masks], pairs: Tangency, cameras: Sequence[int], swapped: tuple[int, int] | None
+    ) -> str:
+        """Return why the cameras are refused if no majority of them is consistent."""
+        if swapped:
+            a, b = (self.rig.names[c] for c in swapped)
+            return f"the videos of {a} and {b} look swapped: with them exchanged all cameras agree"
+        names = [self.rig.names[c] for c in cameras]
+        listed = f"{', '.join(names[:-1])} and {names[-1]}"
+        if len(frames) > 1 and all(np.array_equal(masks, frames[0]) for masks in frames[1:]):
+            return f"the masks of {listed} contradict each other, and they never change: do they show the person?"
+        error = pairs.worst[np.ix_(cameras, cameras)]
+        apart = f" by up to {np.nanmax(error):.0%} of the person's size" if np.isfinite(error).any() else ""
+        if len(names) == 2:
+            return f"{listed} contradict each other{apart}, and two cameras do not show which one is wrong: {_CAUSES}"
+        return f"the cameras {listed} do not belong together: they contradict each other{apart}: {_CAUSES}"
+
+    def _one_sided(self, pairs: Tangency, right: Sequence[int], wrong: Sequence[int]) -> str:
+        """Return why depth cannot be measured with the right cameras; empty if it can."""
+        seeing = [c for c in right if np.isfinite(pairs.middle[c]).all()]
+        if len(seeing) < 2 or depth_information(pairs.middle[seeing]) >= LEAST_INFORMATION:
+            return ""
+        names = " and ".join(self.rig.names[c] for c in seeing)
+        without = f" (without {', '.join(self.rig.names[c] for c in wrong)}, which contradict the others)"
+        return (
+            f"{names}{without if wrong else ''} see the person from the same or from opposite sides, so the distance "
+            f"along their line of sight is unknown by more than 5 cm: use a camera from another side, at 30 to 150°"
+        )
 
     def hulls(self, seen: Sequence[Bool]) -> list[Hull | None]:
         """Return each frame's hulls from its small masks (C, h, w); None if no two cameras see the same voxel."""
@@ -157,16 +242,31 @@ class MaskAgreement:
             result.append(fine.hull(inside, chosen) if some and len(chosen) else None)
         return result
 
-    def _outside(self, pairs: Sequence[tuple[Bool, Hull]], cameras: Sequence[int]) -> Float:
-        """Return (len(cameras),) the share of each one's masks outside the hull of the others among them."""
-        result = np.full(len(cameras), np.nan)
-        for i, c in enumerate(cameras):
+    def _odd(self, views: Sequence[tuple[Bool, Hull]], cameras: Sequence[int], total: float) -> int | None:
+        """Return the camera without which the other masks lie in each other's hulls; None if there is none.
+
+        ``total`` is the mean share outside with all of them.
+        """
+        if len(cameras) < 3:
+            return None
+        without = [self._mean_outside(views, [k for k in cameras if k != c]) for c in cameras]
+        if not np.isfinite(without).any():
+            return None
+        best = int(np.nanargmin(without))
+        # with fewer cameras any hull is larger: the camera must stand out from the others' removal
+        return cameras[best] if without[best] < _LEFT_OVER * min(total, float(np.nanmedian(without))) else None
+
+    def _mean_outside(self, views: Sequence[tuple[Bool, Hull]], cameras: Sequence[int]) -> float:
+        """Return the mean share of the masks outside the hull of the others among these cameras; NaN if unknown."""
+        shares = []
+        for c in cameras:
             others = [k for k in cameras if k != c]
             if others:
-                result[i] = _share_outside(
-                    [(masks[c], hull.silhouette(hull.carve(others), c)) for masks, hull in pairs]
+                shares.append(
+                    _share_outside([(masks[c], hull.silhouette(hull.carve(others), c)) for masks, hull in views])
                 )
-        return result
+        known = np.isfinite(shares)
+        return float(np.array(shares)[known].mean()) if known.any() else float("nan")
 
     def _least_shift(self, pairs: Sequence[tuple[Bool, Bool]]) -> Float:
         """Return (2,) the smallest shift, the same in all frames, that moves masks into silhouettes, or NaN."""
@@ -197,3 +297,38 @@ def _share_outside(pairs: Sequence[tuple[Bool, Bool]]) -> float:
     area = sum(int(mask.sum()) for mask, _ in pairs)
     out = sum(int((mask & ~silhouette).sum()) for mask, silhouette in pairs)
     return out / area if area else float("nan")
+
+
+def excess(pairs: Tangency) -> Float:
+    """Return (C, C) the errors of all pairs in tolerances; NaN where a pair cannot be tested."""
+    return np.asarray(pairs.worst / (TOLERANCE + pairs.pixel[:, None] + pairs.pixel[None]))
+
+
+def largest_consistent(error: Float) -> list[int]:
+    """Return the largest majority of the tested cameras in which every camera agrees with most of its tested partners.
+
+    Most, not all, because a mask with a fault disagrees with one or two partners, and a wrong camera with most. Of
+    several such sets the one with the least errors is returned, and none if a set of the same size could be right that
+    has an untested camera: then nobody can be blamed.
+
+    Args:
+        error: (C, C) in tolerances; NaN where a pair cannot be tested.
+
+    Returns:
+        The cameras; empty if there is no such set.
+    """
+    tested = np.flatnonzero(np.isfinite(error).any(axis=1))
+    right, wrong = error <= 1.0, error > 1.0
+    for size in range(len(tested), len(tested) // 2, -1):
+        chosen = np.array(list(combinations(tested, size)))
+        member = np.zeros((len(chosen), len(error)), np.int64)
+        np.put_along_axis(member, chosen, 1, axis=1)
+        agree, contradict = member @ right, member @ wrong
+        possible = ((agree > contradict) | (contradict == 0) | (member == 0)).all(axis=1)
+        if possible.any():
+            supported = ((agree > 0) | (member == 0)).all(axis=1)
+            if not supported[possible].all():
+                return []
+            total = np.einsum("ni,ij,nj->n", member[possible], np.nan_to_num(error), member[possible])
+            return [int(c) for c in chosen[possible][np.argmin(total)]]
+    return []
