@@ -76,7 +76,9 @@ def test_exit_code_3_if_most_frames_are_lost(tk: Tk, quick: Path, copy: Path, tm
             cv2.imwrite(str(mask), np.zeros_like(cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE)))
     ran = tk("track", copy, "-o", tmp_path / "r.h5", "--config", quick, "--quiet", "--json")
     assert ran.code == 3, ran.err
-    assert f"{FRAMES - 4} of {FRAMES} frames are lost" in ran.messages[-1] and ran.messages[-1].startswith("tk: ")
+    assert f"{FRAMES - 4} of {FRAMES} frames are lost or suspect" in ran.messages[-1] and ran.messages[-1].startswith(
+        "tk: "
+    )
     found = json.loads(ran.out)
     assert (found["frames"], found["lost"], found["interrupted"]) == (FRAMES, FRAMES - 4, False)
 

@@ -68,7 +68,7 @@ class Outcome:
 
     Attributes:
         state: :data:`WAITING`, :data:`BEGUN`, :data:`DONE` or :data:`FAILED`.
-        frames, lost: number of frames, and of lost frames, in the result.
+        frames, lost, suspect: number of frames, of lost and of suspect frames, in the result.
         tracked_now: frames that the last attempt added; fewer than ``frames`` if it continued an earlier attempt.
         seconds: duration of the last attempt.
         error_cm, limbs_cm: mean joint distance from the ground truth, raw, and of the limbs without constant offsets;
@@ -83,6 +83,7 @@ class Outcome:
     state: str = WAITING
     frames: int = 0
     lost: int = 0
+    suspect: int = 0
     tracked_now: int = 0
     seconds: float = 0.0
     error_cm: float | None = None
@@ -100,8 +101,8 @@ class Outcome:
 
     @property
     def mostly_lost(self) -> bool:
-        """Whether more than half of the frames are lost."""
-        return self.state == DONE and 2 * self.lost > self.frames
+        """Whether more than half of the frames are lost or suspect."""
+        return self.state == DONE and 2 * (self.lost + self.suspect) > self.frames
 
     @property
     def frames_per_second(self) -> float | None:

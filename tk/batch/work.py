@@ -78,6 +78,7 @@ def _track(job: Job, reporter: _Reporter) -> Outcome:
         DONE,
         frames=summary.frames,
         lost=int((~known).sum()),
+        suspect=summary.suspect,
         tracked_now=summary.tracked_now,
         error_cm=error_cm,
         limbs_cm=limbs_cm,

@@ -15,11 +15,13 @@ if TYPE_CHECKING:
     from tk.io.captures.capture import Capture
     from tk.run.session import Summary
 
-#: exit code when more than half of the frames are lost
+#: exit code when more than half of the frames in which the person is present are lost or suspect
 EXIT_LOST = 3
 # Durations of the second pass and of drawing video and report, as multiples of the duration of the first pass: measured
 # on the demo. They change only the time left that is shown.
 _SECOND_PASS, _PICTURES = 0.5, 1.0
+# Share of lost and suspect frames above which the last line warns.
+WARN_SHARE = 0.2
 
 
 @click.command(
@@ -111,29 +113,35 @@ def _expected_error(path: Path) -> list[str]:
 
 
 def end(output: Path, summary: Summary, quiet: bool, as_json: bool) -> None:
-    """Print how a run ended, and exit: with 1 after an interruption, with 3 if most frames are lost."""
+    """Print how a run ended, and exit: with 1 after an interruption, with 3 if most frames are lost or suspect."""
     rate = summary.tracked_now / summary.seconds if summary.seconds > 0 else 0.0
     if as_json:
         base.print_json(
             result=str(output),
             frames=summary.frames,
             lost=summary.lost,
+            suspect=summary.suspect,
             tracked_now=summary.tracked_now,
             seconds=round(summary.seconds, 3),
             frames_per_second=round(rate, 3),
             interrupted=summary.interrupted,
         )
+    wrong = summary.lost + summary.suspect
     if summary.frames and not quiet:
-        parts = [f"{summary.frames} frames in {output}", f"{summary.lost} lost", *_expected_error(output)]
+        counts = [f"{summary.lost} lost", *([f"{summary.suspect} suspect"] if summary.suspect else [])]
+        parts = [f"{summary.frames} frames in {output}", *counts, *_expected_error(output)]
         click.echo(", ".join([*parts, f"{rate:.1f} frames/s"]), err=True)
     if summary.interrupted:
         next_step = "continue with the same command and --resume" if summary.frames else "no frame was finished"
         click.echo(f"tk: interrupted; {next_step}", err=True)
         sys.exit(1)
-    if summary.mostly_lost:
+    if wrong > WARN_SHARE * summary.present:
+        most = 2 * wrong > summary.present
+        advice = "do not use the result: check" if most else "check"
         click.echo(
-            f"tk: {output}: {summary.lost} of {summary.frames} frames are lost; do not use the result: check masks, "
-            "calibration and working volume with tk inspect",
+            f"tk: {output}: {wrong} of {summary.present} frames are lost or suspect; {advice} masks, calibration and "
+            "working volume with tk inspect",
             err=True,
         )
-        sys.exit(EXIT_LOST)
+        if most:
+            sys.exit(EXIT_LOST)

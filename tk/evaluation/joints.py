@@ -43,7 +43,7 @@ from tk.evaluation.details import (
 )
 from tk.io.results.data import JointTrack
 from tk.io.results.reader import read_joints
-from tk.io.results.status import has_pose
+from tk.io.results.status import Status, has_pose
 from tk.model.body.joints import HINGE_KINDS, HIPS, JOINTS, LIMB_JOINTS, SHOULDERS
 
 Float = NDArray[np.float64]
@@ -88,6 +88,7 @@ class Evaluation:
         missing_outside: number of frames of the ground truth before the result's first or after its last.
         without_truth: number of frames of the result without ground truth.
         lost: number of judged frames whose status is lost or absent.
+        suspect: number of judged frames whose status is suspect; they count like tracked ones.
         nan_frames: number of judged frames with at least one NaN joint in the result, missing frames included.
         unknown_joints: number of joint positions of judged frames that are NaN in the ground truth.
         frames_per_second: mean rate: all frames of the result over their total wall time; None if not recorded.
@@ -106,6 +107,7 @@ class Evaluation:
     missing_outside: int
     without_truth: int
     lost: int
+    suspect: int
     nan_frames: int
     unknown_joints: int
     frames_per_second: float | None
@@ -144,7 +146,7 @@ class Evaluation:
             lines.append(f"{name:12}{_format_score(raw)}  {_format_score(corrected)}")
         lines += ["", *self._details(), ""]
         lines.append(
-            f"{self.judged} frames judged: {self.lost} lost ({100 * self.lost_share:.1f} %), "
+            f"{self.judged} frames judged: {self.lost} lost ({100 * self.lost_share:.1f} %), {self.suspect} suspect, "
             f"{self.nan_frames} with NaN or missing joints"
         )
         if self.missing_inside:
@@ -207,9 +209,10 @@ def evaluate(result: JointTrack, truth: JointTrack) -> Evaluation:
     p_truth = truth.positions[inside]
     p_result = np.full_like(p_truth, np.nan)
     p_result[found] = result.positions[rows[found]]
-    lost = np.zeros(len(frames), dtype=bool)
+    lost, suspect = np.zeros((2, len(frames)), dtype=bool)
     if result.status is not None:
-        lost[found] = ~has_pose(result.status[rows[found]])
+        status = result.status[rows[found]]
+        lost[found], suspect[found] = ~has_pose(status), status == Status.SUSPECT
 
     known = np.isfinite(p_truth).all(axis=2)
     failed = ~np.isfinite(p_result).all(axis=2)
@@ -237,6 +240,7 @@ def evaluate(result: JointTrack, truth: JointTrack) -> Evaluation:
         missing_outside=int((~inside).sum()),
         without_truth=int((~np.isin(result.frames, truth.frames)).sum()),
         lost=int(lost.sum()),
+        suspect=int(suspect.sum()),
         nan_frames=int((failed & known).any(axis=1).sum()),
         unknown_joints=int((~known).sum()),
         frames_per_second=mean_rate,

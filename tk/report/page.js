@@ -44,7 +44,11 @@
     box.append(make("dt", name), number);
     get("figures").append(box);
   };
+  const suspect = data.statusWords.indexOf("suspect");
+  const suspectCount = data.status.filter((status) => status === suspect).length;
+  if (lostCount + suspectCount > 0.2 * count) get("title").textContent += `: ${lostCount + suspectCount} of ${count} frames are lost or suspect`;
   addFigure("lost frames", String(lostCount), `of ${count}`, lostCount > 0);
+  if (suspectCount) addFigure("suspect frames", String(suspectCount), `of ${count}`, true);
   const meanError = silhouetteError && Array.from({ length: count }, (_, row) => {
     const known = Array.from(silhouetteError.subarray(row * C, row * C + C)).filter(isFinite);
     return known.length ? known.reduce((a, b) => a + b) / known.length : NaN;

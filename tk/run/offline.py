@@ -24,6 +24,7 @@ from tk.run.plan import Plan
 from tk.run.prefetch import open_observations
 from tk.run.refinement import refine_if_inconsistent
 from tk.trackers.protocol import Estimate, TwoPassTracker, two_pass
+from tk.trackers.residual import contradicted
 
 _LOG = logging.getLogger(__name__)
 Float = NDArray[np.float64]
@@ -89,9 +90,17 @@ def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[st
         columns["joints/sigma"] = np.where(before <= _LESS_SURE * precise, precise, before)
         tracker = again
         model = {**tracker.model(), REFINED: 1}
-    sigma = columns.get("joints/sigma", result.sigma)
+    sigma, residual = columns.get("joints/sigma", result.sigma), columns.get("residual", result.residual)
     if sigma is not None:
         report_unknown(result.frames[np.isnan(sigma).all(axis=1) & ~lost], note)
+    if residual is not None:
+        status = columns.get("status", result.status).copy()
+        status[status == Status.SUSPECT] = Status.TRACKED
+        suspect = ~lost
+        suspect[suspect] = contradicted(residual[suspect], plan.settings.region.false_alarm)
+        status[suspect] = Status.SUSPECT
+        columns["status"] = status
+        report_suspect(result.frames[suspect], note)
     _LOG.info("angles, feet, and the smoothed copy")
     # poses of the first pass stay as they are
     kept = ("pose", "joints/position") if model is None else ()
@@ -107,6 +116,16 @@ def report_unknown(frames: Sequence[int] | NDArray[np.int64], note: Callable[[st
     if len(frames):
         which = described(int(frames[0]), int(frames[-1]), len(frames))
         note(f"the residual is high, and no better pose was found: σ is unknown, {which}")
+
+
+def report_suspect(frames: Sequence[int] | NDArray[np.int64], note: Callable[[str], None]) -> None:
+    """Report frames (F,) whose residual contradicts the pose."""
+    if len(frames):
+        which = described(int(frames[0]), int(frames[-1]), len(frames))
+        note(
+            f"body and masks differ more than in correct recordings: suspect, {which}; likely causes: the calibration "
+            "of another recording, moved cameras, or videos of different recordings (see tk inspect)"
+        )
 
 
 def _track_again(

@@ -18,13 +18,13 @@ from tk.io.captures.mask_store import MaskStore
 from tk.io.captures.source import Source
 from tk.io.results.data import FrameResult, HullPoints, Value
 from tk.io.results.files import check_result_path
-from tk.io.results.reader import as_damage_error, read_result
+from tk.io.results.reader import as_damage_error, read_joints, read_result
 from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 from tk.model.hull.hull import HullSurface
 from tk.model.setup import Setup, Subject
-from tk.run.offline import REFINED, finish, report_unknown
+from tk.run.offline import REFINED, finish, report_suspect, report_unknown
 from tk.run.plan import Plan, open_plan, recording_setup
 from tk.run.prefetch import Observed
 from tk.run.reporter import Reporter
@@ -41,23 +41,36 @@ class Summary:
     """Outcome of a run.
 
     Attributes:
-        frames: number of frames in the result, including those of earlier runs.
-        lost: number of lost frames among them.
+        status: (F,) status of the frames in the result, including those of earlier runs.
         seconds: duration of this run.
         tracked_now: number of frames that this run added.
         interrupted: whether Ctrl-C stopped it.
     """
 
-    frames: int
-    lost: int
+    status: NDArray[np.uint8]
     seconds: float
     tracked_now: int
     interrupted: bool = False
 
     @property
-    def mostly_lost(self) -> bool:
-        """Whether more than half of the result's frames are lost."""
-        return 2 * self.lost > self.frames
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.status)
+
+    @property
+    def present(self) -> int:
+        """Number of frames in which the person is present."""
+        return int((self.status != Status.ABSENT).sum())
+
+    @property
+    def lost(self) -> int:
+        """Number of frames in which the person is present, but not found."""
+        return int((self.status == Status.LOST).sum())
+
+    @property
+    def suspect(self) -> int:
+        """Number of frames with a pose that the residual contradicts."""
+        return int((self.status == Status.SUSPECT).sum())
 
 
 def track(
@@ -166,7 +179,10 @@ def track_source(
         except KeyboardInterrupt:
             # caught outside the writer, which then keeps an older result if no frame is finished
             interrupted = True
-        return Summary(done + run.tracked, run.lost, time.perf_counter() - started, run.tracked, interrupted)
+        status = read_joints(output).status if done + run.tracked else None
+        return Summary(
+            np.zeros(0, np.uint8) if status is None else status, time.perf_counter() - started, run.tracked, interrupted
+        )
 
 
 def estimates(
@@ -185,20 +201,24 @@ def estimates(
     with open_plan(setup, source, settings, note, method, frames) as plan:
         run = _Run(plan, None)
         unknown: list[int] = []
+        suspect: list[int] = []
         for estimate in run.estimates():
+            if estimate.status == "suspect":
+                suspect.append(estimate.frame)
             if estimate.status != "lost" and estimate.sigma is not None and np.isnan(estimate.sigma).all():
                 unknown.append(estimate.frame)
             yield estimate
         for line in run.people[0].monitor.report():
             note(line)
         report_unknown(unknown, note)
+        report_suspect(suspect, note)
 
 
 # Seconds between two writes to the file; frames finished within this time are written and reported together. A shorter
 # time costs more writes; a longer one loses more frames when the process is killed.
 WRITE_EVERY_S = 0.5
 
-_ORIGIN, _LOST, _WATCH = "run/", "lost frames", "watch/"
+_ORIGIN, _WATCH = "run/", "watch/"
 
 
 @dataclass
@@ -246,12 +266,11 @@ class _Person:
 
 
 class _Run:
-    """One run of trackers through a source. ``tracked`` and ``lost`` count frames, even if the run is interrupted."""
+    """One run of trackers through a source. ``tracked`` counts frames, even if the run is interrupted."""
 
     def __init__(self, plan: Plan, output: _Output | None, masks: MaskStore | None = None) -> None:
         self.plan, self.output = plan, output
         self.tracked = 0
-        self.lost = 0
         self.masks = masks
         self.people = [
             _Person(subject, tracker, CameraMonitor(tracker, plan.setup, subject))
@@ -262,9 +281,6 @@ class _Run:
         """Start or restore the trackers, and step them to the end; yielded estimates are in the file already."""
         plan, output = self.plan, self.output
         done = output.done if output else 0
-        if output and done:
-            with as_damage_error(output.writer.path, "the state of the run"):
-                self.lost = int(np.asarray(output.writer.state[_ORIGIN + _LOST]))
         if plan.stop is not None and plan.begin + done >= plan.stop:
             return
         if output and done:
@@ -357,7 +373,6 @@ class _Run:
         estimate, used = found[0]
         if self.masks is not None:
             self.masks.put(observation.index, self._kept(shared[0], used, estimate))
-        self.lost += estimate.status == "lost"
         # masks are large, and a view into the ring of frames: an estimate must not keep them
         return replace(estimate, frame=observation.index, time=observation.time, masks=None, drawn=None)
 
@@ -381,7 +396,7 @@ class _Run:
         person = self.people[0]
         origin = {_ORIGIN + name: value for name, value in output.origin.items()}
         monitor = {_WATCH + name: value for name, value in person.monitor.state().items()}
-        return {**person.tracker.state(), **monitor, **origin, _ORIGIN + _LOST: self.lost}
+        return {**person.tracker.state(), **monitor, **origin}
 
 
 def _below(prefix: str, state: Mapping[str, Value]) -> dict[str, Value]:

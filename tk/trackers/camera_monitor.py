@@ -36,7 +36,7 @@ from tk.model.setup import Setup, Subject
 from tk.trackers.contour_tracker import ContourTracker
 from tk.trackers.protocol import Estimate, Observation, Tracker
 from tk.trackers.region import RegionTracker
-from tk.trackers.residual import OUTLIER, RATE
+from tk.trackers.residual import OUTLIER, RATE, RECENT, contradicted
 
 Float = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ _TORN = 0.5
 # after which a camera is tested again that was found right. Chosen on the development captures; sensitivity not
 # measured.
 _WHOLE = _PAUSE = 6
-_STATE = ("excluded", "torn", "normal_for", "since_test", "at_test", "refused")
+_STATE = ("excluded", "torn", "normal_for", "since_test", "at_test", "refused", "recent")
 # Reasons, as in messages.
 _DISAGREES, _TOO_FEW = "disagrees with the others", "fewer than two cameras see anybody"
 _MISSING = "misses a part of the person"
@@ -87,6 +87,7 @@ class CameraMonitor:
         self._lost: dict[str, Span] = {}  # by reason
         self._opening_reasons: dict[int, str] = {}
         self._refused = np.zeros((), np.int64)  # poses refused since the last accepted one, because of their residual
+        self._recent = np.full((RECENT, C, 2), np.nan)  # residuals of the last frames
         self._excess = 0.0  # of the last frame, mean over the cameras used
 
     def start(self, frames: Sequence[Observation]) -> list[Observation]:
@@ -144,7 +145,7 @@ class CameraMonitor:
         for camera in np.flatnonzero((out | self._excluded) & ~bad).tolist():
             reason = _MISSING if self._torn[camera] else _DISAGREES
             _count(self._spans, f"{camera}/{reason}", frame.index)
-        return self._plausible(frame.index, estimate, used, offset), used
+        return self._suspect(self._plausible(frame.index, estimate, used, offset)), used
 
     def _bad(self, unhealthy: Sequence[str | None]) -> NDArray[np.bool_]:
         """Return (C,) the cameras whose image excludes them. Trackers of hulls need all cameras."""
@@ -257,6 +258,14 @@ class CameraMonitor:
         if isinstance(self.tracker, ContourTracker):
             self.tracker.lose()
         return replace(estimate, status="lost", sigma=None if estimate.sigma is None else np.full(len(JOINTS), np.nan))
+
+    def _suspect(self, estimate: Estimate) -> Estimate:
+        """Return the estimate, with status suspect if the residual of the last frames contradicts it."""
+        if estimate.status == "lost" or estimate.residual is None or not isinstance(self.tracker, RegionTracker):
+            return estimate
+        self._recent = np.concatenate([self._recent[1:], estimate.residual[None]])
+        wrong = contradicted(self._recent, self.tracker.config.false_alarm)[-1]
+        return replace(estimate, status="suspect") if wrong else estimate
 
     @property
     def _accepted(self) -> float:

@@ -27,19 +27,20 @@ from numpy.typing import NDArray
 
 from tk.model.body.body_fit import STATURE_DEVIATION
 from tk.model.body.cone_body import ConeBody
-from tk.model.body.joint_sigma import contour_variance, directions, posture_variance
+from tk.model.body.joint_sigma import contour_variance, directions, posture_variance, view_variance
 from tk.model.body.limb_candidates import Limb
 from tk.model.body.skeleton import JOINTS, Skeleton
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import color_bins
 from tk.model.cues.ray_costs import Evidence, mean_of_views
+from tk.model.cues.visible_contours import contour_shares
 from tk.model.masks.silhouettes import Pyramid
 from tk.model.setup import InitPose, Setup
 from tk.optim.gauss_newton import Prior
 from tk.settings import BodyFitSettings, RegionSettings, Settings, SilhouetteSettings
 from tk.trackers.contour_tracker import GAIN, RECOVER_EVERY, SAME_POSE_M, ContourTracker
 from tk.trackers.protocol import Estimate, Observation, Stopwatch
-from tk.trackers.residual import ResidualBaseline
+from tk.trackers.residual import ResidualBaseline, variance_factor
 
 Float = NDArray[np.float64]
 
@@ -200,7 +201,7 @@ class RegionTracker(ContourTracker):
         self._lost_for = self._lost_for + 1 if lost else 0
         self._fresh = False
         pose = self._best.pose
-        sigma = self._sigma(pose, curvature)
+        sigma = self._sigma(pose, curvature, label, residual)
         for limb in self.misplaced(evidence, label):
             sigma[list(limb.joints)] = np.nan
         if self._high_for >= UNKNOWN_AFTER and self.residuals.high(error):
@@ -359,12 +360,11 @@ class RegionTracker(ContourTracker):
         here = self.views.equations(self.body.arrays, pyramid, best, 0, self.line_search, regions)
         return met.label[0], here.hessian[0], evidence.residual(met.label[0])
 
-    def _sigma(self, pose: Float, curvature: Float) -> Float:
-        """Return (15,) one standard deviation of each joint's position along an axis, metres: from the contours' noise,
-        the difference to the mean posture until now, and the spread of the hypotheses."""
+    def _sigma(self, pose: Float, curvature: Float, label: NDArray[np.uint8], residual: Float) -> Float:
+        """Return (15,) one standard deviation of each joint's position along an axis, metres: from the evidence of this
+        frame, the difference to the mean posture until now, and the spread of the hypotheses."""
         skeleton = self.body.skeleton
-        precision = INFORMATION * (curvature + np.diag(self._prior(pose).precision))
-        variance = contour_variance(skeleton, pose, precision, self.body.free)
+        variance = self._variance(pose, curvature, self._prior(pose), label, residual)
         self._postures = min(self._postures + 1, POSTURE_FRAMES)
         self._mean_posture += (directions(skeleton, pose) - self._mean_posture) / self._postures
         variance += posture_variance(skeleton, pose, self._mean_posture)
@@ -372,6 +372,27 @@ class RegionTracker(ContourTracker):
             poses, cost = (np.array(column) for column in zip(*((h.pose, h.cost) for h in self._alive), strict=True))
             variance += _disagreement(skeleton, poses, cost)
         return np.asarray(np.sqrt(variance))
+
+    def _variance(
+        self, pose: Float, curvature: Float, prior: Prior, label: NDArray[np.uint8], residual: Float
+    ) -> Float:
+        """Return (15,) variance of the joints' positions along an axis, metres², from the contours' noise and the
+        directions of the views.
+
+        Args:
+            pose: (D,).
+            curvature: (D, D) JᵀWJ.
+            prior: of the pose.
+            label: (V, h, w) the parts that the grid's rays meet.
+            residual: (V, 2); NaN for a view that was not used.
+        """
+        body, used = self.body, np.isfinite(residual[:, 0])
+        joints = body.skeleton.joints(pose)
+        precision = INFORMATION * (curvature + np.diag(prior.precision))
+        noise = contour_variance(body.skeleton, pose, precision, body.free) * variance_factor(residual)
+        rays = joints - self.world.rig.centers[used, None]
+        shares = contour_shares(body, self.screen, label, joints)[used]
+        return noise + view_variance(rays / np.linalg.norm(rays, axis=-1, keepdims=True), shares)
 
     def second_pass(
         self,
@@ -429,10 +450,9 @@ class RegionTracker(ContourTracker):
             prior = self._prior(poses[chunk], SECOND_ANGLE_DEG)
             settled = self.settle(Pyramid.of_all(seen), poses[chunk], (0,), prior=prior)
             result[chunk] = settled.states
-            precision = INFORMATION * (settled.hessian + np.diag(prior.precision))
-            variance[chunk] = contour_variance(body.skeleton, result[chunk], precision, body.free)
-            for i, pyramid in zip(chunk, seen, strict=True):
-                residuals[i] = self._costs(pyramid, result[i][None])[1][0]
+            for i, pyramid, curvature in zip(chunk, seen, settled.hessian, strict=True):
+                _, (residuals[i],), (label,) = self._costs(pyramid, result[i][None])
+                variance[i] = self._variance(result[i], curvature, prior, label, residuals[i])
         jumps = _jumps(body.skeleton, poses)
         later: Hypothesis | None = None
         for i in tracked[::-1]:
@@ -446,25 +466,25 @@ class RegionTracker(ContourTracker):
             prior = self._prior(later.pose[None], SECOND_ANGLE_DEG)
             settled = self.settle(pyramid, later.pose[None], (0,), prior=prior)
             both = np.stack([result[i], settled.states[0]])
-            costs, of_both = self._costs(pyramid, both)
+            costs, of_both, labels = self._costs(pyramid, both)
             later = self._backwards(later, both, costs)
             if later is None:
                 continue
             if later.cost < -GAIN:
                 result[i], residuals[i] = both[1], of_both[1]
-                precision = INFORMATION * (settled.hessian[0] + np.diag(prior.precision))
-                variance[i] = contour_variance(body.skeleton, result[i], precision, body.free)
+                variance[i] = self._variance(result[i], settled.hessian[0], prior, labels[1], residuals[i])
             variance[i] += _disagreement(body.skeleton, both, np.array([0.0, later.cost]))
         posture = np.median(directions(self.body.skeleton, result[tracked]), axis=0)
         variance[tracked] += posture_variance(self.body.skeleton, result[tracked], posture)
         return np.where(lost[:, None], given, self.world.poses_out(result)), residuals, np.sqrt(variance)
 
-    def _costs(self, pyramid: Pyramid, poses: Float) -> tuple[Float, Float]:
-        """Return the costs (B,) of poses (B, D) by masks alone, mean over the views, and their residuals (B, V, 2)."""
+    def _costs(self, pyramid: Pyramid, poses: Float) -> tuple[Float, Float, NDArray[np.uint8]]:
+        """Return the costs (B,) of poses (B, D) by masks alone, mean over the views, their residuals (B, V, 2), and the
+        parts that the grid's rays meet (B, V, h, w)."""
         evidence = Evidence.of(self.screen, pyramid.masks[0])
         by_view, met = evidence.cast(self.body, self.colors.group, poses, export=True)
         assert met is not None
-        return mean_of_views(by_view), np.array([evidence.residual(label) for label in met.label])
+        return mean_of_views(by_view), np.array([evidence.residual(label) for label in met.label]), met.label
 
     def _backwards(self, later: Hypothesis, poses: Float, cost: Float) -> Hypothesis | None:
         """Return the hypothesis from the next frame, tracked back by one, with its cost relative to this frame's pose;

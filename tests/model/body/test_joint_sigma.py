@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.joint_sigma import BENT_M, OFFSET_M, contour_variance, directions, posture_variance
+from tk.model.body.joint_sigma import (
+    BENT_M,
+    OFFSET_M,
+    REACH_M,
+    VIEW_M,
+    contour_variance,
+    directions,
+    posture_variance,
+    view_variance,
+)  # fmt: skip
 from tk.model.body.joints import OPTIONAL
 from tk.model.body.skeleton import JOINTS, build_skeleton
 
@@ -87,3 +96,31 @@ def test_batches_equal_single_poses(shape: tuple[int, ...]) -> None:
     assert whole.shape == (*shape, len(JOINTS))
     for at in np.ndindex(shape):
         np.testing.assert_allclose(whole[at], posture_variance(SKELETON, batch[at], usual), rtol=0, atol=1e-15)
+
+
+def rays(*headings_deg: float) -> np.ndarray:
+    """(V, 15, 3) horizontal rays to all joints."""
+    angles = np.radians(headings_deg)
+    one = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))], axis=-1)
+    return np.repeat(one[:, None], 15, axis=1)
+
+
+def test_views_around_the_person_add_no_variance_and_facing_views_much() -> None:
+    ring = view_variance(rays(0, 72, 144, 216, 288), np.ones((5, 15)))
+    assert not ring.any()
+    right, facing = (np.sqrt(view_variance(rays(0, angle), np.ones((2, 15)))) for angle in (90, 172))
+    assert (right < VIEW_M).all() and (facing > 4 * VIEW_M).all()
+
+
+def test_joint_that_no_view_shows_is_as_uncertain_as_a_bone_is_long() -> None:
+    shares = np.ones((3, 15))
+    shares[:, 5] = 0.0
+    variance = view_variance(rays(0, 120, 240), shares)
+    assert variance[5] == pytest.approx(REACH_M**2, rel=0.01) and (np.delete(variance, 5) < VIEW_M**2).all()
+
+
+def test_variance_grows_with_the_loss_of_a_view() -> None:
+    shares = np.ones((3, 15))
+    before = view_variance(rays(0, 60, 160), shares)
+    shares[1] = 0.0
+    assert (view_variance(rays(0, 60, 160), shares) > 4 * before).all()

@@ -38,6 +38,7 @@ class RayGrid:
     """
 
     def __init__(self, rig: Rig, rows: int) -> None:
+        self.rig = rig
         self.step = max(1, round(rig.frame_shape[0] / rows))
         self.rays = pixel_rays(rig, self.step)
         self.cameras = pack_rig(rig).astype(np.float32)

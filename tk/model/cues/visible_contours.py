@@ -1,0 +1,49 @@
+"""How much of each bone's outline a view shows against the background."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.model.body.cone_body import ConeBody
+from tk.model.body.joints import HIPS, LIMBS, ROWS, SHOULDERS
+from tk.model.body.skeleton import JOINTS
+from tk.model.cues.ray_costs import RayGrid
+
+Float = NDArray[np.float64]
+
+# The joints at the ends of a segment's bone; the pelvis belongs to the trunk.
+_BONES = {"torso": ("pelvis", "neck"), "head": ("neck", "head_top")}
+for _start, _middle, _end in LIMBS.values():
+    _BONES |= {ROWS[_middle].carrier: (_start, _middle), ROWS[_end].carrier: (_middle, _end)}
+_SEGMENTS = list(_BONES)
+_ENDS = np.array([[JOINTS.index(name) for name in ends] for ends in _BONES.values()])
+# (15, S) weights of the segments that a joint belongs to: its bones, and the trunk for shoulders and hips.
+_OF_JOINT = np.zeros((len(JOINTS), len(_BONES)))
+for _s, _ends in enumerate(_BONES.values()):
+    _OF_JOINT[[JOINTS.index(name) for name in _ends], _s] = 1.0
+_OF_JOINT[[JOINTS.index(name) for name in (*SHOULDERS, *HIPS)], _SEGMENTS.index("torso")] = 1.0
+_OF_JOINT /= _OF_JOINT.sum(axis=1, keepdims=True)
+
+
+def contour_shares(body: ConeBody, grid: RayGrid, label: NDArray[np.uint8], joints: Float) -> Float:
+    """Return (V, 15) how much of the outline of each joint's bones a view shows against the background, 0 to 1: 1 if
+    one side is visible over the bone's whole length, 0 if the bones lie before or behind other parts of the body.
+
+    Args:
+        body: the body.
+        grid: rays of the V views.
+        label: (V, h, w) 1 + the part that a ray meets, 0 where it meets nothing.
+        joints: (15, 3) m, in the world of the grid's cameras.
+    """
+    V, S = len(label), len(_SEGMENTS)
+    names = ["torso" if part.segment == "pelvis" else part.segment for part in body.parts]
+    segment = np.array([-1, *(_SEGMENTS.index(name) if name in _BONES else -1 for name in names)])[label]
+    empty = np.pad(label == 0, ((0, 0), (1, 1), (1, 1)))
+    beside = empty[:, :-2, 1:-1] | empty[:, 2:, 1:-1] | empty[:, 1:-1, :-2] | empty[:, 1:-1, 2:]
+    view, row, column = np.nonzero(beside & (segment >= 0))
+    found = np.bincount(view * S + segment[view, row, column], minlength=V * S).reshape(V, S)
+    pixels = np.array([camera.project(joints)[0] for camera in grid.rig])
+    length = np.linalg.norm(pixels[:, _ENDS[:, 0]] - pixels[:, _ENDS[:, 1]], axis=2) / grid.step
+    # two rays: a bone along the view is a disc of about this width
+    return np.asarray(np.minimum(found / np.maximum(length, 2.0), 1.0) @ _OF_JOINT.T)
