@@ -211,6 +211,21 @@ def test_person_who_returns_at_another_place_is_recovered() -> None:
     find_again_elsewhere(tracker_at(POSES[0]), RIG, POSES[:4], 2 * CLOSE_M)
 
 
+def test_person_who_is_elsewhere_after_a_cut_is_found_again() -> None:
+    tracker = tracker_at(POSES[0])
+    for index in range(4):
+        tracker.step(observe(MASKS[index], index))
+    elsewhere = walk(6, 0.2)
+    elsewhere[:, 0] += 0.7
+    elsewhere[:, NAMES.index("torso_yaw")] += 2.0
+    masks = draw_silhouettes(BODY, RIG, elsewhere)
+    after = [tracker.step(observe(mask, index)) for index, mask in enumerate(masks, 4)]
+    assert "recovered" in [estimate.status for estimate in after[:2]]
+    for estimate, pose in zip(after, elsewhere, strict=True):
+        assert estimate.status == "lost" or errors(estimate, pose).mean() < 2 * CLOSE_M
+    assert after[-1].status == "tracked"
+
+
 def test_person_is_searched_for_if_the_residual_stays_high(monkeypatch: pytest.MonkeyPatch) -> None:
     """A wrong heading, from which no limb search leads out, with a residual below the limit of a loss."""
     tracker = tracker_at(POSES[0])
@@ -228,6 +243,7 @@ def test_person_is_searched_for_if_the_residual_stays_high(monkeypatch: pytest.M
 
     monkeypatch.setattr(tracker, "recover", watched)
     monkeypatch.setattr(tracker, "search", lambda _frame, _pyramid, _evidence, pose, *_: (pose[None], np.zeros(1)))
+    monkeypatch.setattr(tracker.residuals, "jumped", lambda _: False)  # as if it had risen slowly
     tracker.restore(tracker.model(), {**state, "poses": wrong[None], "previous": wrong[None]})
     mean = tracker.state()["residual_mean"]
     estimates = [tracker.step(observe(MASKS[0])) for _ in range(4)]

@@ -246,6 +246,8 @@ class CameraMonitor:
             if not used.masks.any():
                 _count(self._lost, _TOO_FEW, index)
             return estimate
+        if estimate.status == "recovered":  # the person may be elsewhere, as after a cut
+            self._plausibility.forget()
         reason = self._plausibility.judge(index, estimate.joints, offset)
         if reason is None and offset is not None and estimate.status == "recovered" and self._excess > self._accepted:
             reason = "after a loss its residual is still high"

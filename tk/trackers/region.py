@@ -177,6 +177,10 @@ class RegionTracker(ContourTracker):
         residual = evidence.residual(label)
         error = residual.sum(axis=1)
         watch.lap("check")
+        cut = not self._lost_for and self.residuals.jumped(residual)
+        if cut and self._find_again(pyramid, error):
+            label, curvature, residual = self._look(evidence, pyramid, images)
+            error = residual.sum(axis=1)
         misplaced = self.misplaced(evidence, label)
         searched = self._needs_search(frame, self.residuals.high(error), misplaced)
         if searched:
@@ -196,8 +200,10 @@ class RegionTracker(ContourTracker):
         if self._best.pose is not followed:
             label, curvature, residual = self._look(evidence, pyramid, images)
             error = residual.sum(axis=1)
+        lost |= self._lost_for < UNKNOWN_AFTER and self.residuals.jumped(residual)
         self._learn(evidence, label, error, lost)
-        status = "lost" if lost else "initialised" if self._fresh else "recovered" if self._lost_for else "tracked"
+        again = cut or self._lost_for > 0
+        status = "lost" if lost else "initialised" if self._fresh else "recovered" if again else "tracked"
         self._lost_for = self._lost_for + 1 if lost else 0
         self._fresh = False
         pose = self._best.pose
@@ -340,6 +346,15 @@ class RegionTracker(ContourTracker):
         if found < (error - self.residuals.margin if stays_high else error):
             self._alive = [Hypothesis(pose, pose, self._best.cost)]
         return found > limit
+
+    def _find_again(self, pyramid: Pyramid, by_view: Float) -> bool:
+        """Search for the person as at the start, because E_S (V,) has jumped in all views; return whether a better pose
+        was found."""
+        pose, _ = self.recover(pyramid, self._best.pose, float(np.nanmean(by_view)))
+        if pose is self._best.pose:
+            return False
+        self._alive = [Hypothesis(pose, pose, self._best.cost)]
+        return True
 
     def _learn(self, evidence: Evidence, label: NDArray[np.uint8], by_view: Float, lost: bool) -> None:
         """Update the baseline of the residual; the colours, too, if E_S (V,) is not above the baseline."""

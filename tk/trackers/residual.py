@@ -41,10 +41,14 @@ LEVEL, LEVEL_SPREAD, RECENT = 0.091, 0.264, 5
 _TINY = 1e-3
 
 
+def displacements(residual: Float) -> Float:
+    """Return (..., V) the displacement of each view, of residuals (..., V, 2), missing and surplus area."""
+    return np.asarray(2.0 * np.sqrt(residual[..., 0] * residual[..., 1]))
+
+
 def displacement(residual: Float) -> Float:
-    """Return (..., ) the displacement, mean over the views that see anybody, of residuals (..., V, 2), missing and
-    surplus area; NaN if none does."""
-    by_view = 2.0 * np.sqrt(residual[..., 0] * residual[..., 1])
+    """Return (...) the mean of :func:`displacements` over the views that see anybody; NaN if none does."""
+    by_view = displacements(residual)
     seen = np.isfinite(by_view)
     total, count = np.where(seen, by_view, 0.0).sum(axis=-1), np.count_nonzero(seen, axis=-1)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
@@ -118,6 +122,13 @@ class ResidualBaseline:
     def high(self, error: Float) -> bool:
         """Return whether E_S (V,) is high in the mean over the views: the pose is probably wrong."""
         return self.mean_excess(error) > self.threshold
+
+    def jumped(self, residual: Float) -> bool:
+        """Return whether the displacement, of a residual (V, 2), is an outlier in all views at once: the person is
+        elsewhere, as after a cut."""
+        excess = self.excess(displacements(residual))
+        seen = np.isfinite(excess)
+        return bool(seen.any() and (excess[seen] > OUTLIER).all())
 
     @property
     def margin(self) -> float:
