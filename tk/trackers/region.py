@@ -392,7 +392,7 @@ class RegionTracker(ContourTracker):
         self, pose: Float, curvature: Float, prior: Prior, label: NDArray[np.uint8], residual: Float
     ) -> Float:
         """Return (15,) variance of the joints' positions along an axis, metres², from the contours' noise and the
-        directions of the views.
+        directions of the views, scaled by the residual.
 
         Args:
             pose: (D,).
@@ -404,10 +404,11 @@ class RegionTracker(ContourTracker):
         body, used = self.body, np.isfinite(residual[:, 0])
         joints = body.skeleton.joints(pose)
         precision = INFORMATION * (curvature + np.diag(prior.precision))
-        noise = contour_variance(body.skeleton, pose, precision, body.free) * variance_factor(residual)
+        noise = contour_variance(body.skeleton, pose, precision, body.free)
         rays = joints - self.world.rig.centers[used, None]
         shares = contour_shares(body, self.screen, label, joints)[used]
-        return noise + view_variance(rays / np.linalg.norm(rays, axis=-1, keepdims=True), shares)
+        views = view_variance(rays / np.linalg.norm(rays, axis=-1, keepdims=True), shares)
+        return np.asarray((noise + views) * variance_factor(residual))
 
     def second_pass(
         self,

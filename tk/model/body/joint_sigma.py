@@ -27,8 +27,8 @@ OFFSET_M, BENT_M = 0.0067, 0.0145
 # Displacement of a bone's contours in one view, metres; how far a joint can be from its place if no view shows it (the
 # length of a bone), metres; and the variance, in units of the first squared, up to which the contours' noise covers
 # this error, as it does with four or more cameras around the person. Fitted on walk, dance, fold, cube, hd and
-# treadmill-slow: with 5 or more, 3 and 2 cameras 75, 84, 86 % of the errors lie within 1 σ and 93, 96, 96 % within 2 σ;
-# without this term 72, 69, 65 % and 91, 89, 86 %. With two cameras that face each other 91 % instead of 63 % lie within
+# treadmill-slow: with 5 or more, 3 and 2 cameras 75, 85, 87 % of the errors lie within 1 σ and 93, 96, 96 % within 2 σ;
+# without this term 72, 69, 65 % and 91, 89, 86 %. With two cameras that face each other 93 % instead of 63 % lie within
 # 1 σ. With 0.012 or 0.02 m these shares change by up to 4 %.
 VIEW_M, REACH_M, WELL_SEEN = 0.015, 0.3, 0.49
 
