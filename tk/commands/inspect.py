@@ -11,7 +11,9 @@ from tk.commands import base
 
 @click.command(epilog=base.example("tk inspect CAPTURE -o sheets"))
 @base.capture_argument
-@click.option("-o", "--output", type=base.PATH, metavar="DIR", help="Also write a sheet of images to DIR/inspect.png.")
+@click.option(
+    "-o", "--output", type=base.PATH, metavar="DIR", help="Also write pictures to DIR: inspect.png, people.png."
+)
 @base.cameras_option
 @base.masks_option
 @base.config_option
@@ -20,20 +22,23 @@ def inspect(
     capture: Path, output: Path | None, cameras: str | None, masks: str, config_file: Path | None, as_json: bool
 ) -> None:
     """Check CAPTURE before tracking: masks, inconsistent or unsynchronised cameras, working volume, floor, up."""
-    sheet = None if output is None else output / "inspect.png"
+    sheet, plan = (None, None) if output is None else (output / "inspect.png", output / "people.png")
     with base.working(f"inspecting {capture}"):
         from tk.inspection.checks import inspect as check
+        from tk.inspection.floor_plan import write_floor_plan
         from tk.inspection.pictures import write_sheet
         from tk.io.captures.capture import open_capture
         from tk.io.paths import check_not_input
 
-        if sheet is not None:
-            check_not_input(sheet, capture=capture)
+        for picture in (sheet, plan):
+            if picture is not None:
+                check_not_input(picture, capture=capture)
         opened = open_capture(capture, base.split_names(cameras), masks)
         found, shown = check(opened, base.load_settings(config_file))
-        if sheet is not None:
+        if sheet is not None and plan is not None:
             write_sheet(sheet, opened, found, shown)
-            click.echo(f"wrote {sheet}", err=True)
+            write_floor_plan(plan, opened, found.people)
+            click.echo(f"wrote {sheet} and {plan}", err=True)
     if as_json:
         base.print_json(**found.to_dict())
     else:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.inspection.leveling import Leveling, find_up
+from tk.inspection.people import PeopleWatch, PersonReport, many_people
 from tk.io.captures.capture import Capture
 from tk.model.body.plausibility import fits_height
 from tk.model.cameras.common_view import sample_box, views_of
@@ -89,6 +90,7 @@ class Inspection:
         seen_by_all, seen_by_two: shares of the working volume that all cameras, or at least two, see.
         at_border: share of the hull at the border of the working volume.
         leveling: up direction and floor.
+        people: those who were found, by number.
         findings: problems, one line each, the worst first.
     """
 
@@ -101,6 +103,7 @@ class Inspection:
     seen_by_two: float
     at_border: float
     leveling: Leveling
+    people: tuple[PersonReport, ...]
     findings: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
@@ -131,6 +134,7 @@ class Inspection:
             f"floor: {self.leveling.floor_m:+.2f} m along up"
             if np.isfinite(self.leveling.floor_m)
             else "floor: not found",
+            *(person.line(len(self.cameras)) for person in self.people),
             "",
             *(self.findings or ("No problems found.",)),
         ]
@@ -173,14 +177,21 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
     kept = frames[np.linspace(0, len(frames) - 1, min(pictures, len(frames))).round().astype(int)]
     notes: list[str] = list(capture.warnings)
     label = make_labeller(capture.setup(), capture, config, notes.append)
+    watch = PeopleWatch(capture, span)
     health, sick = ImageHealth(), np.zeros(len(capture.rig), int)
     masks: dict[int, Masks] = {}
     images: dict[int, NDArray[np.uint8]] = {}
     with capture.frames(0, span) as reader:
         for frame in reader:
-            if frame.index not in near and frame.index not in frames:
+            compared = frame.index in near or frame.index in frames
+            if not compared and not watch.wants(frame.index):
                 continue
-            masks[frame.index] = label(frame)[0].copy()
+            labels, uncertain = label(frame)
+            if watch.wants(frame.index):
+                watch.look(frame.index, labels, uncertain)
+            if not compared:
+                continue
+            masks[frame.index] = labels.copy()
             sick += [reason is not None for reason in health.look(frame.images, masks[frame.index])]
             if frame.index in kept:
                 images[frame.index] = frame.images.copy()
@@ -207,13 +218,16 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
         seen_by_two=float((views >= 2).mean()),
         at_border=float(at_border.mean()) if len(p) else float("nan"),
         leveling=leveling,
+        people=watch.people(),
         findings=(),
     )
     seen = [
         Sample(int(i), images[int(i)], masks[int(i)], _silhouettes(hulls[list(frames).index(i)], good), compare.step)
         for i in kept
     ]
-    return replace(inspection, findings=(*_findings(inspection, capture, agreement), *notes)), seen
+    return replace(
+        inspection, findings=(*_findings(inspection, capture, agreement), *many_people(inspection.people), *notes)
+    ), seen
 
 
 def _delays(
@@ -333,7 +347,7 @@ def _findings(found: Inspection, capture: Capture, agreement: Agreement) -> list
             lines.append(
                 f"camera {c.name} shows the person cut off at the edge of the image in {c.cut:.0%} of the frames"
             )
-        if c.specks > _SPECKS:
+        if c.specks > _SPECKS and len(found.people) < 2:
             lines.append(f"camera {c.name}: {c.specks:.0%} of its masks is not connected to the largest part")
         if c.holes > _HOLES:
             lines.append(f"camera {c.name}: its masks have holes, {c.holes:.0%} of their area")

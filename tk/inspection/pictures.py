@@ -46,7 +46,16 @@ def write_sheet(path: Path, capture: Capture, inspection: Inspection, samples: S
     cameras = range(len(capture.rig))
     rows = [joined([_tile(capture, inspection, frame, c) for c in cameras], axis=1) for frame in samples]
     width = max([row.shape[1] for row in rows], default=900)
-    ok, coded = cv2.imencode(".png", joined([_text(inspection, width), *rows], axis=0))
+    write_png(path, joined([_text(inspection, width), *rows], axis=0))
+
+
+def write_png(path: Path, image: Image) -> None:
+    """Write an image (h, w, 3) BGR, and the folder if there is none.
+
+    Raises:
+        CaptureError: the file cannot be written.
+    """
+    ok, coded = cv2.imencode(".png", image)
     try:
         if not ok:
             raise OSError("the image is too large")

@@ -209,13 +209,13 @@ class PeopleFinder:
         allowed = inside if uncertain is None else inside | self._reduced(uncertain)[1]
         known = [c for c in range(len(self._rig)) if small[c].any()]
         parts = self._components(inside, allowed, known, near)
-        chosen = self._explaining([self._person(part, inside) for part in parts], small)
+        chosen = self._explaining([self._person(part, inside, allowed) for part in parts], small)
         left = small & ~self._covered(chosen)
         missed = [c for c in known if left[c].sum() * self._pixel_m2[c] > _LEFT_M2]
         if 2 <= len(missed) < len(known):
             # only these cameras show somebody: he or she is hidden in the others, or their masks have a gap
             parts += self._components(inside, allowed, missed, near)
-            chosen = self._explaining([self._person(part, inside) for part in parts], small)
+            chosen = self._explaining([self._person(part, inside, allowed) for part in parts], small)
         chosen += self._alone(small, self._covered(chosen))
         return tuple(sorted(chosen, key=lambda person: (not person.inside, -np.nan_to_num(person.volume_m3))))
 
@@ -352,12 +352,14 @@ class PeopleFinder:
                 kept.append(peak)
         return np.array(kept).reshape(-1, 2)
 
-    def _person(self, part: NDArray[np.int64], inside: Bool) -> LocatedPerson:
+    def _person(self, part: NDArray[np.int64], inside: Bool, allowed: Bool) -> LocatedPerson:
         points, edge = self._voxels.centers[part], self._grid.voxel_m
-        height = points @ self._to_plan[2]
+        sees = self._voxels.sees[:, part]
+        # shadows are uncertain, and add to feet and head
+        certain = ~(allowed[:, part] & ~inside[:, part]).any(axis=0)
+        height = points[certain if certain.any() else slice(None)] @ self._to_plan[2]
         floor, crown = float(height.min()) - edge / 2, float(height.max()) + edge / 2
         position = np.array([*self._trunk(part), (floor + crown) / 2]) @ self._to_plan
-        sees = self._voxels.sees[:, part]
         share = np.full(len(self._rig), np.nan)
         np.divide(inside[:, part].sum(axis=1), sees.sum(axis=1), out=share, where=sees.any(axis=1))
         return LocatedPerson(

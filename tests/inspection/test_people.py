@@ -1,0 +1,77 @@
+"""Who `tk inspect` finds in a capture: walkers drawn into the masks of a ring of cameras."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from scripts.synthetic.capture import write_calibration
+from tests.conftest import Tk
+from tests.io.conftest import write_picture
+from tests.model.ring import ring_of_cameras
+from tk.model.body import gait_poses as gait
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.cone_body import build_cone_body
+from tk.model.masks.silhouettes import draw_silhouettes
+
+FRAMES = 24
+RIG = ring_of_cameras(4, 160, 120)
+
+
+def write_walkers(folder: Path, ways: list[list[tuple[float, float]]]) -> None:
+    """Write a capture of people who walk from the first to the last point of their ways."""
+    body = build_cone_body(BodyDimensions.from_stature(1.75), "z", "full")
+    masks = np.zeros((FRAMES, len(RIG), 120, 160), bool)
+    for way in ways:
+        poses = []
+        for i, (x, y) in enumerate(np.linspace(*way, FRAMES)):
+            pose = gait.walking_pose(body.skeleton, i / 15 % 1)
+            pose[:3] = x, y, 0.95
+            poses.append(pose)
+        masks |= draw_silhouettes(body, RIG, np.array(poses)) > 0
+    for c, camera in enumerate(RIG):
+        for i in range(FRAMES):
+            write_picture(folder / "images" / camera.name / f"{i:06d}.png", np.zeros((120, 160, 3), np.uint8) + 90)
+            write_picture(folder / "masks" / camera.name / f"{i:06d}.png", 255 * masks[i, c].astype(np.uint8))
+    write_calibration(RIG, folder / "calibration.toml")
+    volume = "[volume]\ncenter = [0.0, 0.0, 1.0]\nsize = [2.6, 2.6, 2.4]\n"
+    (folder / "capture.toml").write_text(f"fps = 15.0\n{volume}")
+
+
+@pytest.fixture(scope="module")
+def crossing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two people who walk past each other, 0.7 m apart."""
+    folder = tmp_path_factory.mktemp("crossing")
+    write_walkers(folder, [[(-0.7, -0.35), (0.7, -0.35)], [(0.8, 0.35), (-0.8, 0.35)]])
+    return folder
+
+
+def test_people_who_cross_keep_their_numbers(tk: Tk, crossing: Path, tmp_path: Path) -> None:
+    ran = tk("inspect", crossing, "--json", "-o", tmp_path)
+    assert ran.code == 0, ran.err
+    found = json.loads(ran.out)
+    people = found["people"]
+    assert [person["number"] for person in people] == [0, 1]
+    for person, (start, stop) in zip(people, [(-0.7, 0.7), (0.8, -0.8)], strict=True):
+        assert person["inside"] == 1.0 and len(person["cameras"]) == 4
+        assert person["frames"][0] == 0 and person["frames"][-1] > FRAMES - 5
+        path = np.array(person["path"])
+        assert path[0, 0] == pytest.approx(start, abs=0.2)
+        assert path[-1, 0] == pytest.approx(stop, abs=0.45)
+        assert (np.sign(path[:, 1]) == np.sign(start)).all()
+    assert any(line.startswith("2 people are in view, 2 of them in the volume") for line in found["findings"])
+    assert not any("not connected" in line for line in found["findings"])
+    plan = cv2.imread(str(tmp_path / "people.png"))
+    assert min(plan.shape[:2]) > 500
+
+
+def test_one_person_is_listed_without_a_finding(tk: Tk, tmp_path: Path) -> None:
+    write_walkers(tmp_path, [[(-0.3, 0.0), (0.3, 0.0)]])
+    ran = tk("inspect", tmp_path)
+    assert ran.code == 0, ran.err
+    assert "person 0: frames 0 to " in ran.out and "person 1:" not in ran.out
+    assert "people are in view" not in ran.out

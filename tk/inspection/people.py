@@ -1,0 +1,158 @@
+"""Who is in a capture: people by number, with their paths on the floor, for `tk inspect`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from tk.io.captures.capture import Capture
+from tk.model.people import LocatedPerson, PeopleFinder, order_people
+
+Float = NDArray[np.float64]
+
+#: looks for people a second. In that time a walker (1.5 m/s) goes less far than people who meet are apart.
+_LOOKS_HZ = 5.0
+#: looks at most; each takes 0.1 to 0.3 s
+_MOST_LOOKS = 60
+#: a person may be so far from where he or she was in the last look: a sprint, and an error of the hull
+_FASTEST_M_S, _ERROR_M = 3.0, 0.3
+#: seconds for which a person may be hidden and keep the number
+_HIDDEN_S = 2.0
+#: seconds that somebody must be seen to be reported, if the capture is longer
+_SEEN_S = 0.5
+
+
+@dataclass(frozen=True)
+class PersonReport:
+    """One person over the sampled frames.
+
+    Attributes:
+        number: the number that `tk track --people` takes.
+        frames: (K,) frames in which the person was found.
+        path: (K, 3) m, world, positions in these frames.
+        height_m: median extent along up.
+        inside: share of these frames in which the person is in the working volume.
+        views: (K,) number of cameras that show the person.
+        cameras: names of the cameras that show the person in most of these frames.
+    """
+
+    number: int
+    frames: tuple[int, ...]
+    path: tuple[tuple[float, float, float], ...]
+    height_m: float
+    inside: float
+    views: tuple[int, ...]
+    cameras: tuple[str, ...]
+
+    def line(self, cameras: int) -> str:
+        """Return the person's line in the table."""
+        x, y, z = self.path[0]
+        few, many = min(self.views), max(self.views)
+        seen = f"{many}" if few == many else f"{few} to {many}"
+        return (
+            f"person {self.number}: frames {self.frames[0]} to {self.frames[-1]}, {self.inside:.0%} of them in the "
+            f"volume; first at ({x:.1f}, {y:.1f}, {z:.1f}) m; {self.height_m:.1f} m tall; seen by {seen} of {cameras} "
+            "cameras"
+        )
+
+
+@dataclass
+class _Path:
+    """A person who is followed over the looks."""
+
+    found: list[tuple[int, LocatedPerson]] = field(default_factory=list)
+
+    @property
+    def last(self) -> tuple[int, LocatedPerson]:
+        return self.found[-1]
+
+
+class PeopleWatch:
+    """Follows the people of a capture over its sampled frames, in order.
+
+    Args:
+        capture: the capture.
+        span: number of frames from the start that are looked at.
+    """
+
+    def __init__(self, capture: Capture, span: int) -> None:
+        self._capture = capture
+        self._finder = PeopleFinder(capture.rig, capture.volume, capture.up)
+        self._start = capture.init_frame if capture.init_frame < span else 0
+        self._every = max(1, round(capture.fps / _LOOKS_HZ), -(-(span - self._start) // _MOST_LOOKS))
+        self._paths: list[_Path] = []
+        self._open: list[_Path] = []
+        self._looks = 0
+
+    def wants(self, index: int) -> bool:
+        """Return whether to :meth:`look` at a frame."""
+        return index >= self._start and (index - self._start) % self._every == 0
+
+    def look(self, index: int, masks: NDArray[np.uint8], uncertain: NDArray[np.bool_] | None) -> None:
+        """Find the people in a frame's masks (C, H, W), and assign them to the paths so far.
+
+        The assignment has the least sum of distances on the way from the last positions (Kuhn 1955).
+        """
+        self._looks += 1
+        hidden = _HIDDEN_S * self._capture.fps
+        self._open = [path for path in self._open if index - path.last[0] <= max(hidden, self._every)]
+        near = [person for at, person in (path.last for path in self._open) if at == index - self._every]
+        found = self._finder.find(masks, uncertain, near)
+        if not self._paths:
+            capture = self._capture
+            found = order_people(found, capture.volume, capture.subject_height_m)
+        before = np.array([path.last[1].position for path in self._open]).reshape(-1, 3)
+        now = np.array([person.position for person in found]).reshape(-1, 3)
+        distance = np.linalg.norm(before[:, None] - now[None], axis=2)
+        seconds = np.array([index - path.last[0] for path in self._open]) / self._capture.fps
+        reach = np.minimum(_FASTEST_M_S * seconds, _FASTEST_M_S) + _ERROR_M
+        fits = distance <= reach[:, None]
+        rows, columns = linear_sum_assignment(np.where(fits, distance, 1e3))
+        taken = {int(k): self._open[i] for i, k in zip(rows, columns, strict=True) if fits[i, k]}
+        for k, person in enumerate(found):
+            if k not in taken:
+                taken[k] = _Path()
+                self._paths.append(taken[k])
+                self._open.append(taken[k])
+            taken[k].found.append((index, person))
+
+    def people(self) -> tuple[PersonReport, ...]:
+        """Return the people: those of the first look in the order of :func:`order_people`, then as they came."""
+        least = min(1 + round(_SEEN_S * self._capture.fps / self._every), self._looks)
+        kept = [path for path in self._paths if len(path.found) >= least]
+        return tuple(self._report(number, path.found) for number, path in enumerate(kept))
+
+    def _report(self, number: int, found: Sequence[tuple[int, LocatedPerson]]) -> PersonReport:
+        people = [person for _, person in found]
+        shown = np.mean([person.views for person in people], axis=0)
+        return PersonReport(
+            number=number,
+            frames=tuple(index for index, _ in found),
+            path=tuple((float(x), float(y), float(z)) for x, y, z in (person.position for person in people)),
+            height_m=float(np.median([person.height_m for person in people])),
+            inside=float(np.mean([person.inside for person in people])),
+            views=tuple(int(person.views.sum()) for person in people),
+            cameras=tuple(name for name, share in zip(self._capture.rig.names, shown, strict=True) if share > 0.5),
+        )
+
+
+def many_people(people: Sequence[PersonReport]) -> list[str]:
+    """Return what several people mean for tracking, one line each."""
+    if len(people) < 2:
+        return []
+    inside = [person for person in people if person.inside > 0]
+    lines = [
+        f"{len(people)} people are in view, {len(inside)} of them in the volume: tk track takes person 0, "
+        "--people 1 takes person 1, --people all takes everybody in the volume"
+    ]
+    for person in people:
+        if person.inside == 0:
+            lines.append(
+                f"person {person.number} stays outside the volume, in {', '.join(person.cameras)}: tk track does not "
+                "take these pixels for the subject's"
+            )
+    return lines
