@@ -1,16 +1,25 @@
 """Errors that a user can correct.
 
 Every message is one line that names the file or the option, and the remedy. The command line prints it, followed by
-the hint, and exits with 2. Any other exception is a defect of the program and keeps its traceback.
+the hint, and exits with the error's ``exit_code``. Any other exception is a defect of the program and keeps its
+traceback.
 """
+
+import errno
+
+#: numbers of system errors for a disk, a quota or a file size that is used up
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class TkError(Exception):
     """Base of all errors that a user can correct.
 
     Attributes:
+        exit_code: exit code of the command.
         hint: what to type on the command line; no part of the message, because scripts have no such options.
     """
+
+    exit_code = 2
 
     def __init__(self, message: str = "", hint: str = "") -> None:
         super().__init__(message)
@@ -48,6 +57,12 @@ class ResultError(TkError):
 
 class ResultBusyError(ResultError):
     """Another run is writing the result."""
+
+
+class DiskFullError(ResultError):
+    """There is no space left for a file; what was written before is kept."""
+
+    exit_code = 1
 
 
 class ExportError(TkError):

@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 @contextmanager
 def errors_in_one_line() -> Iterator[None]:
-    """Print a user's mistake, in the input or in the command, as one line, and exit with 2; an interruption: with 1."""
+    """Print a user's mistake as one line and exit with 2; with 1 after an interruption or if a disk is full."""
     try:
         with _terminated_as_interrupted():
             yield
     except TkError as error:
         click.echo(f"tk: {error.line}", err=True)
-        raise click.exceptions.Exit(2) from None
+        raise click.exceptions.Exit(error.exit_code) from None
     except KeyboardInterrupt as reason:
         click.echo(f"tk: interrupted{f'; {reason}' if str(reason) else ''}", err=True)
         raise click.exceptions.Exit(1) from None

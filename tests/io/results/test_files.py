@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import stat
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -145,6 +147,17 @@ def test_symbolic_link_is_followed(tmp_path: Path) -> None:
     assert assert_complete(tmp_path / "disk" / "real.h5", 2) == 2
 
 
+def test_loop_of_links_is_named(tmp_path: Path) -> None:
+    loop = tmp_path / "loop.h5"
+    loop.symlink_to(tmp_path / "again.h5")
+    (tmp_path / "again.h5").symlink_to(loop)
+    for use in (lambda: ResultWriter.create(loop, META), lambda: ResultWriter.resume(loop / "r.h5", META)):
+        with pytest.raises(ResultError, match=r"loop\.h5.*: cannot be written: .*loop"):
+            use()
+    with pytest.raises(ResultError, match="link to nowhere"):
+        read_result(loop)
+
+
 def test_two_runs_cannot_write_the_same_file(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
     with ResultWriter.create(path, META) as writer:
@@ -164,42 +177,113 @@ def test_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert assert_complete(path, 5) == 5
 
 
-def test_full_disk_gives_one_line_and_keeps_finished_frames(tmp_path: Path) -> None:
-    """On a real file system of 1 MB, in a process of its own: after a failed write HDF5 likes to crash at exit."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    script = f"""
+FULL = """
 import sys
+from pathlib import Path
+from tests.io.result_files import make_smoothed
 from tests.io.result_victim import META, make_frame, make_state
 from tk.errors import ResultError
+from tk.io.results.reader import read_result
+from tk.io.results.revision import revise_result
 from tk.io.results.writer import ResultWriter
+path = Path(sys.argv[1])
 try:
-    with ResultWriter.create(r"{disk}/result.h5", META) as writer:
+    with ResultWriter.create(path, META) as writer:
         for index in range(2000):
             writer.append(make_frame(index), make_state(index))
             print(index + 1)
 except ResultError as error:
     print(error, file=sys.stderr)
-    import h5py, shutil
-    with h5py.File(r"{disk}/result.h5", "r") as file:
-        assert len(file["frames"])
-    shutil.copyfile(r"{disk}/result.h5", r"{tmp_path}/kept.h5")
-    sys.exit(2)
+try:
+    revise_result(path, smoothed=make_smoothed(len(read_result(path))))
+except ResultError as error:
+    print(error, file=sys.stderr)
+Path(sys.argv[2]).write_bytes(path.read_bytes())
 """
+
+
+def test_full_disk_gives_one_line_and_keeps_finished_frames(tmp_path: Path) -> None:
+    """On a real file system of 1 MB, in a process of its own, which must not crash when it ends."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
     mount = f"mount -t tmpfs -o size=1m none '{disk}'"
     isolate = ["unshare", "--map-root-user", "--mount", "sh", "-c"]
     if shutil.which("unshare") is None or subprocess.run([*isolate, mount], capture_output=True).returncode:
         pytest.skip("no permission to mount a small file system")
+    arguments = ["-c", FULL, str(disk / "result.h5"), str(tmp_path / "kept.h5")]
     done = subprocess.run(
-        [*isolate, f'{mount} && exec "$@"', "sh", sys.executable, "-c", script],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
+        [*isolate, f'{mount} && exec "$@"', "sh", sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True
     )
-    assert done.returncode == 2, done.stderr
-    assert done.stderr == f"{disk}/result.h5: cannot be written: No space left on device\n"
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == f"{disk}/result.h5: cannot be written: No space left on device\n" * 2
     appended = int(done.stdout.split()[-1])
     assert assert_complete(tmp_path / "kept.h5", appended) == appended
+
+
+def fail_after(writes: int, monkeypatch: pytest.MonkeyPatch, failure: Callable[[], int]) -> None:
+    """Let all writes to disk after the first ``writes`` call ``failure``."""
+    left, pwrite = [writes], os.pwrite
+
+    def write(handle: int, data: memoryview, place: int) -> int:
+        left[0] -= 1
+        return failure() if left[0] < 0 else pwrite(handle, data, place)
+
+    monkeypatch.setattr(os, "pwrite", write)
+
+
+def no_space() -> int:
+    raise OSError(28, "No space left on device")
+
+
+@pytest.mark.parametrize("writes", [0, 1, 2, 3, 5, 10, 20, 50, 100, 150, 200, 300, 400])
+def test_run_is_resumable_whenever_a_write_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writes: int) -> None:
+    path = tmp_path / "result.h5"
+    write(path, 3)
+    appended = 3
+    with monkeypatch.context() as patch:
+        fail_after(writes, patch, no_space)
+        with pytest.raises(ResultError, match=r"result\.h5: cannot be written: No space left on device"):
+            writer, _ = ResultWriter.resume(path, META)
+            with writer:
+                for index in range(3, 40):
+                    writer.append(make_frame(index), make_state(index))
+                    appended = index + 1
+    assert assert_complete(path, appended) == appended
+    writer, done = ResultWriter.resume(path, META)
+    with writer:
+        writer.append(make_frame(done), make_state(done))
+    assert assert_complete(path, appended + 1) == appended + 1
+
+
+def test_interruption_while_hdf5_writes_takes_effect_afterwards(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "result.h5"
+
+    def interrupt(*arguments: Any) -> int:
+        os.kill(os.getpid(), signal.SIGINT)
+        return pwrite(*arguments)
+
+    pwrite = os.pwrite
+    with pytest.raises(KeyboardInterrupt), ResultWriter.create(path, META) as writer:
+        writer.append(make_frame(0), make_state(0))
+        monkeypatch.setattr(os, "pwrite", interrupt)
+        writer.append(make_frame(1), make_state(1))
+    assert assert_complete(path, 2) == 2
+
+
+def test_process_ends_normally_with_an_open_writer(tmp_path: Path) -> None:
+    script = """
+import sys
+from tests.io.result_victim import META, make_frame, make_state
+from tk.io.results.writer import ResultWriter
+writer = ResultWriter.create(sys.argv[1], META)
+writer.append(make_frame(0), make_state(0))
+"""
+    path = tmp_path / "result.h5"
+    done = subprocess.run([sys.executable, "-c", script, str(path)], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert assert_complete(path, 1) == 1
 
 
 def test_use_after_close_raises_value_error(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from typing import IO, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import TkError
+from tk.errors import FULL, DiskFullError, TkError
 
 Masks = NDArray[np.uint8]
 
@@ -58,7 +58,8 @@ class MaskStore:
 
     def _no_room(self, error: OSError) -> TkError:
         where = self._path or tempfile.gettempdir()
-        return TkError(f"{where}: masks cannot be kept there: {error.strerror or error}")
+        kind = DiskFullError if error.errno in FULL else TkError
+        return kind(f"{where}: masks cannot be kept there: {error.strerror or error}")
 
     def _take_up(self, file: IO[bytes]) -> None:
         """Find the frames in the file; cut off the file at the first damaged frame."""

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import io
 import os
-import re
 import shutil
+import signal
+import threading
+import weakref
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import h5py
 
-from tk.errors import ConfigError, ResultBusyError, ResultError
+from tk.errors import FULL, ConfigError, DiskFullError, ResultBusyError, ResultError
 from tk.io.hdf5 import open_hdf5
 from tk.io.paths import Kind, check_output, resolved
 from tk.io.results.schema import FORMAT
@@ -70,26 +73,154 @@ class TwinFolder:
 WRITE_ERRORS = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 
 
-@contextlib.contextmanager
-def opened_for_writing(path: Path, mode: str) -> Iterator[h5py.File]:
-    """Open a twin, so that it can be read even if this process is killed; flush and close it at the end.
+class SafeFile:
+    """An HDF5 file for writing, and the file on disk beneath it; a context manager.
 
-    A file that cannot be written is redirected to memory before it is closed. Otherwise HDF5 (1.10 to 2.0) keeps it in
-    its list of open files, tries to write it once more when the process ends, and crashes.
+    HDF5 (1.10 to 2.0) does not survive a failed write: it can neither flush nor close the file, tries again when the
+    process ends, and crashes. HDF5 therefore writes through this object (h5py's driver for file-like objects). After a
+    failure, its writes go to memory and succeed, and :meth:`flush_to_disk` and the end of the block raise the error.
+
+    Attributes:
+        path: path of the file.
+        file: the HDF5 file.
     """
-    # libver: newer superblocks have a flag "being written"; a killed process leaves it set, and HDF5 then refuses to
-    # open the file. No locks: other processes must be able to read the published twin.
-    file = h5py.File(path, mode, libver="earliest", locking=False)
-    try:
-        yield file
-    finally:
+
+    def __init__(self, path: Path, mode: str) -> None:
+        self.path = path
+        self._handle = os.open(path, os.O_RDWR | os.O_CLOEXEC | (os.O_CREAT | os.O_TRUNC if mode == "w" else 0), 0o666)
+        self._memory: io.BytesIO | None = None
+        self._error: OSError | None = None
+        self._place = 0
         try:
-            file.flush()
-        except WRITE_ERRORS:
-            _move_to_memory(file)
+            # libver: newer superblocks have a flag "being written"; a killed process leaves it set, and HDF5 then
+            # refuses to open the file
+            self.file = h5py.File(self, mode, libver="earliest")
+        except BaseException:
+            os.close(self._handle)
             raise
-        finally:
-            file.close()
+        self._closed_at_exit = weakref.finalize(self, self.file.close)  # HDF5 itself would call Python too late
+
+    def flush_to_disk(self) -> None:
+        """Write all that HDF5 holds back; raise OSError if a write has failed."""
+        self.file.flush()
+        if self._error is not None:
+            raise self._error
+
+    def __enter__(self) -> SafeFile:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if not self.file:  # closed already
+            return
+        self._closed_at_exit()
+        os.close(self._handle)
+        if kind is None and self._error is not None:
+            raise self._error
+
+    # --- called by HDF5 -------------------------------------------------------------------------------------------
+
+    def write(self, data: memoryview) -> int:
+        rest = memoryview(data).cast("B")
+        try:
+            while len(rest) and self._memory is None:  # a disk that becomes full takes a part
+                done = os.pwrite(self._handle, rest, self._place)
+                rest, self._place = rest[done:], self._place + done
+        except OSError as error:
+            self._divert(error)
+        if self._memory is not None:
+            self._memory.seek(self._place)
+            self._place += self._memory.write(rest)
+        return len(data)
+
+    def truncate(self, size: int) -> None:
+        try:
+            if self._memory is None:
+                os.ftruncate(self._handle, size)
+        except OSError as error:
+            self._divert(error)
+        if self._memory is not None:
+            self._memory.truncate(size)
+
+    def readinto(self, buffer: memoryview) -> int:
+        if self._memory is None:
+            data = os.pread(self._handle, len(buffer), self._place)
+        else:
+            self._memory.seek(self._place)
+            data = self._memory.read(len(buffer))
+        buffer[: len(data)] = data
+        self._place += len(data)
+        return len(data)
+
+    def read(self, size: int) -> bytes:
+        buffer = bytearray(size)
+        return bytes(buffer[: self.readinto(memoryview(buffer))])
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        if whence == os.SEEK_END:
+            offset += len(self._memory.getbuffer()) if self._memory else os.fstat(self._handle).st_size
+        self._place = offset
+        return offset
+
+    def tell(self) -> int:
+        return self._place
+
+    def flush(self) -> None:
+        pass
+
+    def _divert(self, error: OSError) -> None:
+        """Continue in memory."""
+        self._error = error
+        with self.path.open("rb") as file:
+            self._memory = io.BytesIO(file.read())
+
+
+@contextlib.contextmanager
+def writing(target: Path) -> Iterator[None]:
+    """Convert errors of the system and of HDF5 to a ResultError of one line; handle signals after the block.
+
+    A signal handler that raises an exception, as for Ctrl-C, would interrupt HDF5 in a call of :class:`SafeFile`.
+    """
+    try:
+        with _signals_deferred():
+            yield
+    except WRITE_ERRORS as error:
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        kind = DiskFullError if getattr(error, "errno", None) in FULL else ResultError
+        raise kind(f"{target}: cannot be written: {reason}") from error
+
+
+@contextlib.contextmanager
+def _signals_deferred() -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():  # Python handles signals in the main thread only
+        yield
+        return
+    received: list[int] = []
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number in handlers:
+        signal.signal(number, lambda number, _: received.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+        for caught in received:
+            signal.raise_signal(caught)
+
+
+def writable(path: Path) -> Path:
+    """Return the path with links resolved, so that a rename does not replace the link.
+
+    Raises:
+        ResultError: no file can be written there.
+    """
+    target = resolved(path, ResultError)
+    if target.is_dir():
+        raise ResultError(f"{path}: is a folder; name a file in it")
+    if not target.parent.is_dir():
+        raise ResultError(f"{path}: the folder {target.parent} does not exist; make it first")
+    if target.is_symlink() or (target.exists() and not (target.is_file() and os.access(target, os.W_OK))):
+        raise ResultError(f"{path}: cannot be written; choose another name")
+    return target
 
 
 def is_hdf5_of(path: Path, name: str) -> bool:
@@ -141,43 +272,3 @@ def check_result_path(
         if error.hint:
             error.hint = "continue it with --resume, or replace it with --force"
         raise
-
-
-def _move_to_memory(file: h5py.File) -> None:
-    if not hasattr(os, "memfd_create"):  # not on Linux
-        return
-    handle = file.id.get_vfd_handle()
-    memory = os.memfd_create("tk-result")
-    size, done = os.fstat(handle).st_size, 0
-    while done < size:
-        done += os.sendfile(memory, handle, done, size - done)
-    os.dup2(memory, handle)
-    os.close(memory)
-
-
-@contextlib.contextmanager
-def as_result_error(target: Path) -> Iterator[None]:
-    """Convert errors of the system and of HDF5 to a ResultError of one line."""
-    try:
-        yield
-    except WRITE_ERRORS as error:
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
-        system = re.search(r"error message = '([^']+)'", reason)
-        reason = system[1] if system else reason
-        raise ResultError(f"{target}: cannot be written: {reason}") from error
-
-
-def writable(path: Path) -> Path:
-    """Return the path with links resolved, so that a rename does not replace the link.
-
-    Raises:
-        ResultError: no file can be written there.
-    """
-    target = resolved(path, ResultError)
-    if target.is_dir():
-        raise ResultError(f"{path}: is a folder; name a file in it")
-    if not target.parent.is_dir():
-        raise ResultError(f"{path}: the folder {target.parent} does not exist; make it first")
-    if target.is_symlink() or (target.exists() and not (target.is_file() and os.access(target, os.W_OK))):
-        raise ResultError(f"{path}: cannot be written; choose another name")
-    return target

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -17,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.results.data import FrameResult, HullPoints, ResultMeta, UsedCameras, Value
+from tk.io.results.files import SafeFile
 from tk.io.results.schema import (
     ATTRIBUTES,
     CAMERAS,
@@ -65,15 +64,14 @@ class Twin:
     """One of the two files. Datasets stay open: opening one costs more than writing a row.
 
     Attributes:
-        closing: closes the file.
+        disk: the file.
         count: number of frame sets in the file.
         models: the bodies in the file.
     """
 
-    def __init__(
-        self, path: Path, file: h5py.File, closing: contextlib.ExitStack, meta: ResultMeta, models: Sequence[State]
-    ) -> None:
-        self.path, self.file, self.closing = path, file, closing
+    def __init__(self, disk: SafeFile, meta: ResultMeta, models: Sequence[State]) -> None:
+        self.disk = disk
+        self.file = file = disk.file
         self.models = list(models)
         self._meta = meta
         self._rows = [int(file[f"{prefix_of(person)}frames"].shape[0]) for person in range(len(models))]

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tk.io.hdf5 import open_hdf5
 from tk.io.results.data import ResultMeta, UsedCameras, Value
-from tk.io.results.files import TwinFolder, as_result_error, opened_for_writing, writable
+from tk.io.results.files import SafeFile, TwinFolder, writable, writing
 from tk.io.results.layout import link_first_person, put_attributes, put_cameras, put_model
 from tk.io.results.reader import check_format, count_people, count_rows, read_meta
 from tk.io.results.schema import Column, columns_of, prefix_of, smoothed_columns
@@ -66,10 +66,11 @@ def revise_result(
     if smoothed is not None and "bridged" not in smoothed:
         raise ValueError("/smoothed needs bridged, which is missing")
     filtered = _checked(copies, smoothed or {}, rows)
-    with as_result_error(target), TwinFolder(target) as twin_folder:
+    with writing(target), TwinFolder(target) as twin_folder:
         revised = twin_folder.twin_paths[0]
         shutil.copyfile(target, revised)
-        with opened_for_writing(revised, "r+") as copy:
+        with SafeFile(revised, "r+") as disk:
+            copy = disk.file
             for name, values in changed.items():
                 copy[prefix + name][...] = values
             if (changed or filtered) and f"{prefix}smoothed" in copy:

@@ -24,7 +24,7 @@ import numpy as np
 from tk.errors import ResultError
 from tk.io.hdf5 import Hdf5Reader, open_hdf5
 from tk.io.results.data import FrameResult, ResultMeta, Value
-from tk.io.results.files import TwinFolder, as_result_error, check_is_result, opened_for_writing, writable
+from tk.io.results.files import SafeFile, TwinFolder, check_is_result, writable, writing
 from tk.io.results.layout import FrameSet, Twin, checksum, write_layout
 from tk.io.results.reader import (
     check_format,
@@ -63,6 +63,7 @@ class ResultWriter:
         self._recent: list[FrameSet] = []  # frame sets that are not yet in both twins
         self._published = False
         self._intact = True
+        self._failure: ResultError | None = None
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], meta: ResultMeta, people: int = 1) -> ResultWriter:
@@ -110,17 +111,16 @@ class ResultWriter:
     @classmethod
     def _opened(cls, target: Path, meta: ResultMeta, models: list[Model], source: Path | None) -> ResultWriter:
         """Return a writer with two twins, copies of ``source`` or empty."""
-        with as_result_error(target), contextlib.ExitStack() as undo:
+        with writing(target), contextlib.ExitStack() as undo:
             folder = undo.enter_context(TwinFolder(target))
             twins = []
             for path in folder.twin_paths:
                 if source:
                     shutil.copyfile(source, path)
-                closing = undo.enter_context(contextlib.ExitStack())
-                file = closing.enter_context(opened_for_writing(path, "r+" if source else "w"))
+                disk = undo.enter_context(SafeFile(path, "r+" if source else "w"))
                 if not source:
-                    write_layout(file, meta, len(models))
-                twins.append(Twin(path, file, closing, meta, models))
+                    write_layout(disk.file, meta, len(models))
+                twins.append(Twin(disk, meta, models))
             undo.pop_all()
         return cls(target, meta, folder, twins, models)
 
@@ -168,12 +168,16 @@ class ResultWriter:
     def flush(self) -> None:
         """Write all appended frames to the file."""
         self._require_open()
-        with as_result_error(self.path):
-            self._intact = False
-            self._update(self._twins[0])
-            self._publish(self._twins[0])
-            self._twins.reverse()
-            self._intact = True
+        self._intact = False
+        try:
+            with writing(self.path):
+                self._update(self._twins[0])
+                self._publish(self._twins[0])
+                self._twins.reverse()
+                self._intact = True
+        except ResultError as error:
+            self._failure = error
+            raise
         behind = self._twins[0].count
         self._recent = [frame_set for frame_set in self._recent if frame_set.index >= behind]
 
@@ -182,12 +186,12 @@ class ResultWriter:
         if not self._twins:
             return
         (twin, other), self._twins = self._twins, []
-        with as_result_error(self.path), self._folder, other.closing:
-            with twin.closing:  # HDF5 modifies a file while closing it: close it, then publish it
+        with writing(self.path), self._folder, other.disk:
+            with twin.disk:  # HDF5 modifies a file while closing it: close it, then publish it
                 if self._intact:
                     self._update(twin)
             if self._intact:
-                with twin.path.open("rb") as stream:
+                with twin.disk.path.open("rb") as stream:
                     os.fsync(stream.fileno())
                 self._publish(twin)
 
@@ -209,7 +213,7 @@ class ResultWriter:
         if not self._twins:
             raise ValueError(f"{self.path} is closed")
         if not self._intact:
-            raise ValueError(f"{self.path}: an earlier write failed")
+            raise self._failure or ValueError(f"{self.path}: an earlier write failed")
 
     def _add_people(self, count: int) -> None:
         if count > len(self.models) + 1:
@@ -221,10 +225,10 @@ class ResultWriter:
         """Write the bodies and the frame sets that this twin does not have yet."""
         twin.put_models(self.models)
         twin.append([frame_set for frame_set in self._recent if frame_set.index >= twin.count])
-        twin.file.flush()
+        twin.disk.flush_to_disk()
 
     def _publish(self, twin: Twin) -> None:
-        self._folder.publish(twin.path)
+        self._folder.publish(twin.disk.path)
         self._published = True
 
 
