@@ -14,6 +14,7 @@ from tk.io.captures.capture import open_capture as _open_capture
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 from tk.run import session
+from tk.run.people import parse_choice
 from tk.run.plan import recording_setup
 from tk.run.reporter import Silent
 from tk.settings import Settings
@@ -58,6 +59,7 @@ class _Options(TypedDict, total=False):
     seed: int | None
     init_pose: PathLike | None
     body: PathLike | None
+    people: str | Sequence[int]
     causal: bool
     resume: bool
     force: bool
@@ -81,6 +83,7 @@ def track(
     seed: int | None = None,
     init_pose: PathLike | None = None,
     body: PathLike | None = None,
+    people: str | Sequence[int] = "auto",
     causal: bool = False,
     resume: bool = False,
     force: bool = False,
@@ -96,13 +99,15 @@ def track(
         seed: seed of the random generator, instead of the one in ``config``.
         init_pose: a file with a rough initial pose, or a folder of 2D keypoints.
         body: a result or a TOML file whose body is taken.
+        people: "auto" (one person, the first that :func:`tk.model.people.order_people` returns), "all", or numbers in
+            that order.
         causal: stop after the first pass. Without ``output`` there is no second one.
         resume: continue where an earlier run with the same ``output`` stopped.
         force: replace an existing ``output``; without it an existing file is an error.
 
     Returns:
         Without ``output`` an iterator of :class:`~tk.trackers.protocol.Estimate`: ``frame``, ``time`` (seconds),
-        ``pose`` (D,), ``joints`` (15, 3) metres, ``sigma`` (15,) metres, ``status`` … With it the finished
+        ``person``, ``pose`` (D,), ``joints`` (15, 3) metres, ``sigma`` (15,) metres, ``status`` … With it the finished
         :class:`~tk.io.results.data.Result`.
 
     Raises:
@@ -114,12 +119,13 @@ def track(
         chosen = replace(chosen, seed=seed)
     pose_file = Path(init_pose) if init_pose is not None else None
     body_file = Path(body) if body is not None else None
+    choice = parse_choice(people if isinstance(people, str) else ",".join(map(str, people)))
     reporter = _Logged()
     if output is None:
         for warning in capture.warnings:
             reporter.note(warning)
         setup = recording_setup(capture, pose_file, body_file, frames[0])
-        return session.estimates(setup, capture, chosen, reporter.note, method, frames)
+        return session.estimates(setup, capture, chosen, reporter.note, method, frames, choice)
     summary = session.track(
         capture,
         Path(output),
@@ -132,6 +138,7 @@ def track(
         body=body_file,
         causal=causal,
         force=force,
+        people=choice,
     )
     if summary.interrupted:
         raise KeyboardInterrupt

@@ -10,17 +10,18 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.conftest import QUICK, Silent
+from tests.conftest import QUICK, Silent, refused
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, STATURE, walk
+from tk.errors import CaptureError
 from tk.io import settings_file
 from tk.io.captures.frames import FrameSet
 from tk.io.results.reader import read_result
+from tk.io.results.status import Status
 from tk.model.cameras.volume import Volume
 from tk.model.masks.silhouettes import draw_silhouettes
 from tk.model.setup import Setup, Subject
 from tk.run.session import estimates, track_source
-from tk.trackers.protocol import Observation, share
 
 SETTINGS = settings_file.from_toml(QUICK)
 RIG = ring_of_cameras(3, width=160, height=200)
@@ -31,21 +32,24 @@ LATENCY_S = 0.25
 
 @dataclass(frozen=True)
 class Rendered:
-    """A source of unknown length, as a live camera is; its clock does not start at 0."""
+    """A source of unknown length, as a live camera is; its clock does not start at 0. Masks are (F, C, H, W)."""
 
-    poses: np.ndarray
+    masks: np.ndarray
     name = where = "rendered"
     first_frame = 0
     frame_count = None
-    time_offset_s = (0.0,) * len(RIG)
     has_masks = True
     masks_from = "rendered"
 
+    @property
+    def time_offset_s(self) -> tuple[float, ...]:
+        return (0.0,) * self.masks.shape[1]
+
     def frames(self, start: int = 0, stop: int | None = None) -> AbstractContextManager[Iterator[FrameSet]]:
-        scene = np.random.default_rng(0).integers(0, 200, (len(RIG), *RIG.frame_shape, 3), np.uint8)
+        scene = np.random.default_rng(0).integers(0, 200, (*self.masks.shape[1:], 3), np.uint8)
         sets = (
             FrameSet(i, LATENCY_S + i / SETUP.fps, np.maximum(scene, masks[..., None]), masks)
-            for i, masks in enumerate(draw_silhouettes(BODY, RIG, self.poses))
+            for i, masks in enumerate(self.masks)
         )
         return nullcontext(islice(sets, start, stop))
 
@@ -56,8 +60,11 @@ class Rendered:
         return None
 
 
+ONE = Rendered(draw_silhouettes(BODY, RIG, POSES))
+
+
 def test_a_source_in_memory_is_tracked() -> None:
-    found = list(estimates(SETUP, Rendered(POSES), SETTINGS, frames=(1, 4)))
+    found = list(estimates(SETUP, ONE, SETTINGS, frames=(1, 4)))
     assert [e.frame for e in found] == [1, 2, 3]
     assert [e.time for e in found] == [LATENCY_S + i / SETUP.fps for i in (1, 2, 3)]  # the source's clock
     for estimate, pose in zip(found, POSES[1:], strict=False):
@@ -65,7 +72,7 @@ def test_a_source_in_memory_is_tracked() -> None:
 
 
 def test_a_source_of_unknown_length_is_written_until_it_ends(tmp_path: Path) -> None:
-    summary = track_source(SETUP, Rendered(POSES), tmp_path / "r.h5", SETTINGS, Silent(), causal=True)
+    summary = track_source(SETUP, ONE, tmp_path / "r.h5", SETTINGS, Silent(), causal=True)
     result = read_result(tmp_path / "r.h5")
     assert summary.frames == len(result.frames) == len(POSES) and summary.lost == 0
     assert result.meta.capture == "rendered" and result.smoothed is not None
@@ -73,26 +80,70 @@ def test_a_source_of_unknown_length_is_written_until_it_ends(tmp_path: Path) -> 
 
 
 def test_the_second_pass_needs_no_folder(tmp_path: Path) -> None:
-    track_source(SETUP, Rendered(POSES), tmp_path / "r.h5", SETTINGS, Silent())
+    track_source(SETUP, ONE, tmp_path / "r.h5", SETTINGS, Silent())
     result = read_result(tmp_path / "r.h5")
     expected = np.array([BODY.skeleton.joints(pose) for pose in POSES])
     assert np.linalg.norm(result.joints - expected, axis=2).mean() < 0.03
 
 
-def test_pixels_of_another_subject_are_separated() -> None:
-    own, other = np.zeros((2, 3, 4, 4), bool)
-    own[:, :2], other[:, 1:3] = True, True
-    masks = np.where(own | other, np.uint8(255), np.uint8(0))
-    frame = Observation(0, np.zeros((3, 4, 4, 3), np.uint8), masks)
-    assert share(frame, [None]) == [frame]
-    first, second = share(frame, [own, other])
-    assert first.others is not None and second.others is not None
-    np.testing.assert_array_equal(first.others, other & ~own)
-    np.testing.assert_array_equal(first.masks > 0, own)
-    np.testing.assert_array_equal(second.masks > 0, other)
+# --- two people -------------------------------------------------------------------------------------------------------
+
+COUNT = 6
+# person 1 stands where some cameras see him behind person 0
+BOTH = np.array([walk(COUNT), walk(COUNT, first=0.4)])
+BOTH[:, :, :2] += [[[0.35, -0.05]], [[-0.35, 0.05]]]
+JOINTS = np.array([[BODY.skeleton.joints(pose) for pose in poses] for poses in BOTH])
+FOUR = ring_of_cameras(4, width=160, height=200)
+MASKS = np.array([draw_silhouettes(BODY, FOUR, poses) for poses in BOTH])
+PAIR = replace(SETUP, rig=FOUR, subjects=(Subject(STATURE, body=BODY, in_init_pose=False),) * 2)
 
 
-def test_a_session_of_two_subjects_returns_the_first() -> None:
-    """Both trackers begin at the same person, so each tracks what the other one covers in the frame before."""
-    found = list(estimates(replace(SETUP, subjects=2 * SETUP.subjects), Rendered(POSES), SETTINGS, frames=(0, 3)))
-    assert [e.frame for e in found] == [0, 1, 2] and all(np.isfinite(e.joints).all() for e in found)
+def far_off(joints: np.ndarray, person: int) -> float:
+    """Return the mean distance from a person's joints, metres."""
+    return float(np.linalg.norm(joints - JOINTS[person][: len(joints)], axis=2).mean())
+
+
+def test_silhouettes_of_the_pair_overlap() -> None:
+    assert np.count_nonzero((MASKS[0] & MASKS[1]).any(axis=(0, 2, 3))) >= 2
+
+
+def test_two_people_are_tracked_and_a_resumed_run_is_the_same(tmp_path: Path) -> None:
+    source, path = Rendered(MASKS.max(axis=0)), tmp_path / "r.h5"
+    track_source(PAIR, source, path, SETTINGS, Silent(), people="all", causal=True)
+    whole = read_result(path).people
+    assert len(whole) == 2
+    assert sorted(person for r in whole for person in (0, 1) if far_off(r.joints, person) < 0.03) == [0, 1]
+    assert not any((r.status == Status.LOST).any() for r in whole)
+    part = tmp_path / "part.h5"
+    for stop, resume in ((3, False), (None, True)):
+        track_source(
+            PAIR, source, part, SETTINGS, Silent(), frames=(0, stop), people="all", causal=True, resume=resume
+        )  # fmt: skip
+    for a, b in zip(read_result(part).people, whole, strict=True):
+        np.testing.assert_array_equal(a.pose, b.pose)
+        np.testing.assert_array_equal(a.status, b.status)
+
+
+def test_a_bystander_is_no_part_of_the_subject() -> None:
+    notes: list[str] = []
+    for person in (0, 1):
+        found = list(
+            estimates(PAIR, Rendered(MASKS.max(axis=0)), SETTINGS, notes.append, frames=(0, COUNT), people=(person,))
+        )
+        assert {e.person for e in found} == {0} and "lost" not in {e.status for e in found}
+        joints = np.array([e.joints for e in found])
+        assert min(far_off(joints, who) for who in (0, 1)) < 0.03
+    assert not notes
+    list(estimates(PAIR, Rendered(MASKS.max(axis=0)), SETTINGS, notes.append, frames=(0, 1)))
+    assert any("2 people are in view" in note for note in notes)
+
+
+def test_the_second_pass_keeps_two_people_apart(tmp_path: Path) -> None:
+    track_source(PAIR, Rendered(MASKS.max(axis=0)), tmp_path / "r.h5", SETTINGS, Silent(), people="all")
+    found = read_result(tmp_path / "r.h5").people
+    assert sorted(person for r in found for person in (0, 1) if far_off(r.joints, person) < 0.03) == [0, 1]
+
+
+def test_a_number_that_nobody_has_is_refused() -> None:
+    with refused(CaptureError, "person 2 is asked for, but 2 were found"):
+        list(estimates(PAIR, Rendered(MASKS.max(axis=0)), SETTINGS, people=(2,)))

@@ -1,39 +1,60 @@
-"""Pixels that show another subject, in front of the one that is tracked."""
+"""Pixels that show another person, in front of the one who is tracked."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, STATURE, errors, observe, walk
+from tk.kernels.mask_values import OTHERS
 from tk.model.cues.ray_costs import Evidence, RayGrid
-from tk.model.masks.silhouettes import draw_silhouettes
+from tk.model.masks.silhouettes import Views, draw_silhouettes
 from tk.settings import SilhouetteSettings
+from tk.trackers.contour_tracker import LINE_SEARCH
 from tk.trackers.region import RegionTracker
 
 RIG = ring_of_cameras(3, width=160, height=200)
 POSES = walk(3)
 MASKS = draw_silhouettes(BODY, RIG, POSES)
-# another subject hides the legs in the first camera
-OTHERS = np.zeros(MASKS.shape[1:], bool)
-OTHERS[0, RIG.frame_shape[0] * 55 // 100 :] = True
-HIDDEN = np.where(OTHERS, np.uint8(0), MASKS)
+# in the first camera another person hides the legs
+IN_FRONT = np.zeros(MASKS.shape[1:], bool)
+IN_FRONT[0, RIG.frame_shape[0] * 55 // 100 :] = True
+MARKED, CUT = (np.where(IN_FRONT, np.uint8(value), MASKS) for value in (OTHERS, 0))
 
 
-def test_a_body_part_on_another_subject_costs_nothing() -> None:
+def test_body_part_on_another_person_costs_nothing() -> None:
     grid, group = RayGrid(RIG, 50), np.zeros(len(BODY.parts), np.int32)
-    marked, unmarked = (Evidence.of(grid, HIDDEN[0], others=o) for o in (OTHERS, None))
-    (with_others, _), (without, _) = (e.cast(BODY, group, POSES[:1]) for e in (marked, unmarked))
-    assert with_others[0, 0] < 0.1 < without[0, 0]
-    np.testing.assert_array_equal(with_others[0, 1:], without[0, 1:])
+    found = []
+    for masks in (MARKED, CUT):
+        evidence = Evidence.of(grid, masks[0])
+        cost, met = evidence.cast(BODY, group, POSES[:1], export=True)
+        assert met is not None
+        np.testing.assert_allclose(evidence.residual(met.label[0]).sum(axis=1), cost[0], atol=1e-6)
+        found.append(cost[0])
+    marked, cut = found
+    assert marked[0] < 0.1 < cut[0]
+    np.testing.assert_array_equal(marked[1:], cut[1:])
 
 
-def test_a_subject_behind_another_one_is_tracked() -> None:
+def test_no_contour_is_searched_at_another_person() -> None:
+    views, border = Views(RIG), int(np.argmax(IN_FRONT[0].any(axis=1)))
+    lowest = []
+    for masks in (MARKED, CUT):
+        pyramid = views.pyramid(masks[0], 3, True)
+        assert all((level == OTHERS).any() == (masks is MARKED) for level in pyramid.masks)
+        for scale in range(3):
+            edgels = views.edgels(BODY, pyramid, POSES[0], scale, LINE_SEARCH)
+            found = (edgels.pixel + edgels.distance[:, None] * edgels.normal)[edgels.view == 0, 1]
+            assert len(found) > 10
+            lowest.append(found.max() - border)
+    marked, cut = np.reshape(lowest, (2, 3))
+    assert (marked[:2] < -1).all() and (cut[:2] > -1).all()  # pixels
+
+
+def test_person_behind_another_one_is_tracked() -> None:
     tracker = RegionTracker(RIG, "z", SilhouetteSettings(adapt=False))
     tracker.start([observe(MASKS[0])], STATURE, None, BODY)
     tracker.step(observe(MASKS[0]))
     for i in (1, 2):
-        estimate = tracker.step(replace(observe(HIDDEN[i], i), others=OTHERS))
+        estimate = tracker.step(observe(MARKED[i], i))
         assert estimate.status == "tracked" and errors(estimate, POSES[i]).mean() < 0.03

@@ -37,6 +37,10 @@ WARN_SHARE = 0.2
     "--init-pose", type=base.PATH, metavar="FILE",
     help="Start from the approximate pose in this TOML file, or from this folder of 2D keypoints.",
 )  # fmt: skip
+@click.option(
+    "--people", default="auto", show_default=True, metavar="auto|all|N,M",
+    help="Whom to track: auto: one person; all: everybody; N,M: by the numbers of tk inspect.",
+)  # fmt: skip
 @base.resume_option
 @base.force_option
 @base.no_report_option
@@ -47,13 +51,14 @@ def track(
     output: Path,
     options: base.TrackingOptions,
     init_pose: Path | None,
+    people: str,
     resume: bool,
     force: bool,
     no_report: bool,
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Track the person in CAPTURE and write the pose of every frame to RESULT.h5.
+    """Track the person or the people in CAPTURE and write the pose of every frame to RESULT.h5.
 
     An overlay video (RESULT.mp4) and a report (RESULT.html) are written next to it.
     """
@@ -63,14 +68,15 @@ def track(
         from tk.io.captures.capture import open_capture
         from tk.io.results.files import check_result_path
         from tk.run import session
+        from tk.run.people import parse_choice
 
-        settings = options.settings()
+        settings, choice = options.settings(), parse_choice(people)
         check_result_path(output, force, resume)
         reporter.stage(f"opening {capture}")
         opened = open_capture(capture, base.split_names(options.cameras), options.masks)
         summary = session.track(
             opened, output, settings, reporter, options.method, span, init_pose, resume, options.store_hull,
-            options.body, options.causal, force,
+            options.body, options.causal, force, choice,
         )  # fmt: skip
         if not no_report:
             draw_video_and_report(opened, output, summary, reporter, quiet)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
+from tk.kernels.mask_values import OTHERS
 from tk.kernels.runtime import ti
 
 # Colour bins: 16 levels of each channel.
@@ -102,15 +103,29 @@ def in_picture(width: int, height: int, x):
 
 
 @ti.func
+def beside_others(mask: ti.template(), v: int, width: int, height: int, x):
+    """Return whether one of the four pixels around a place shows another person."""
+    i = ti.min(ti.max(ti.cast(ti.floor(x[0]), ti.i32), 0), width - 2)
+    j = ti.min(ti.max(ti.cast(ti.floor(x[1]), ti.i32), 0), height - 2)
+    top = mask[v, j, i] == OTHERS or mask[v, j, i + 1] == OTHERS
+    return top or mask[v, j + 1, i] == OTHERS or mask[v, j + 1, i + 1] == OTHERS
+
+
+@ti.func
 def search_mask(mask: ti.template(), v: int, width: int, height: int, x, n, window):
-    """Return (found, signed distance) of the transition along ±n: outwards from foreground, inwards from background."""
-    inside = bilinear(mask, v, width, height, x) >= 127.5
+    """Return (found, signed distance) of the transition along ±n: outwards from foreground, inwards from background.
+
+    ``found`` is -1 where the search begins at pixels of another person or meets them: the edge may be hidden there.
+    """
+    before = bilinear(mask, v, width, height, x)
+    inside = before >= 127.5
     direction = 1.0 + 0.0 * window
     if not inside:
         direction = -direction
     found = 0
     distance = 0.0 * window
-    before = bilinear(mask, v, width, height, x)
+    if before > 0.0 and before < 255.0 and beside_others(mask, v, width, height, x):
+        found = -1
     step = 1
     while step <= window and found == 0:
         place = x + direction * step * n
@@ -118,7 +133,9 @@ def search_mask(mask: ti.template(), v: int, width: int, height: int, x, n, wind
             step = 1 << 20
         else:
             value = bilinear(mask, v, width, height, place)
-            if (value >= 127.5) != inside:
+            if value > 0.0 and value < 255.0 and beside_others(mask, v, width, height, place):
+                found = -1
+            elif (value >= 127.5) != inside:
                 found = 1
                 distance = direction * (step - 1.0 + (before - 127.5) / (before - value))
             before = value

@@ -246,10 +246,11 @@ def _equations_kernel(real, alone):
                         elif use:
                             found, d = search_mask(mask, frame[b] * V + v, width, height, at, n, window)
                             d *= scale
-                            all_samples += share
+                            if found >= 0:
+                                all_samples += share
                             if found == 0:
                                 cost += share * numbers[LOST] * numbers[LOST]
-                            else:
+                            elif found > 0:
                                 if numbers[AMBIGUOUS] > 0.0:
                                     reach_sqr = (numbers[AMBIGUOUS] * scale) ** 2
                                     near, square = nearest_rival(
@@ -373,8 +374,9 @@ def normal_equations(
         body: the cone body; its real type is the precision of the computation.
         cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_camera`, of the full picture.
         sizes: (V, 2) width and height of each camera's mask at this scale.
-        masks: (V, H, W) uint8 at this scale, values between 0 and 255 where a pixel is partly covered; or (B V, H, W),
-            one frame for each pose.
+        masks: (V, H, W) uint8 at this scale, values between 0 and 255 where a pixel is partly covered,
+            :data:`~tk.kernels.mask_values.OTHERS` where it shows another person; or (B V, H, W), one frame for each
+            pose.
         scale: pixels of the full picture in one of this scale (1, 2, …).
         poses: (B, D).
         settings: see :class:`SearchSettings`.

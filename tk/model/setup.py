@@ -47,11 +47,13 @@ class Subject:
 
     Attributes:
         height_m: height without shoes, metres; None if unknown.
+        position: (3,) m, rough position in the frame of the initialisation; None if unknown.
         init_frame: frame of the initialisation.
         init: rough pose in that frame; None if the tracker finds the person by itself.
         body: the body, from an earlier recording; None if it is to be fitted.
         in_init_pose: whether the subject stands in the initialisation pose in that frame, so that every limb is
             visible. If not, any frame may serve, and the body is fitted again at the end.
+        position: (3,) m, rough position in that frame, to choose among several people; None if unknown.
     """
 
     height_m: float | None = None
@@ -59,6 +61,7 @@ class Subject:
     init: InitPose | None = None
     body: ConeBody | None = None
     in_init_pose: bool = True
+    position: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.captures.mask_store import MaskStore
+from tk.io.captures.mask_store import MaskStore, MaskStores
 from tk.io.results.data import Result, UsedCameras, Value
 from tk.io.results.reader import read_result
 from tk.io.results.revision import revise_result
@@ -20,14 +20,16 @@ from tk.model.body.cone_body import ConeBody
 from tk.model.masks.image_health import described
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
+from tk.run.people import Member
 from tk.run.plan import Plan
 from tk.run.prefetch import open_observations
-from tk.run.refinement import refine_if_inconsistent
+from tk.run.refinement import refine_if_inconsistent, retimed
 from tk.trackers.protocol import Estimate, TwoPassTracker, two_pass
 from tk.trackers.residual import contradicted
 
 _LOG = logging.getLogger(__name__)
 Float = NDArray[np.float64]
+Note = Callable[[str], None]
 
 #: entry in `/model` of a result after the second pass
 REFINED = "refined"
@@ -36,38 +38,52 @@ REFINED = "refined"
 _LESS_SURE = 2.0
 
 
-def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[str], None]) -> None:
-    """Write what needs all frames: the second pass; segments, feet and angles; the smoothed copy; cameras.
+def finish(output: Path, plan: Plan, people: Sequence[Member], masks: MaskStores | None, note: Note) -> None:
+    """Write what needs all frames, see :func:`_finish`. Person 0 decides whether the cameras are refined."""
+    cameras = UsedCameras(plan.setup.rig, np.array(plan.source.time_offset_s))
+    for member in people:
+        store = None if masks is None else masks[member.number]
+        cameras = _finish(output, plan, member, store, note, cameras, len(people) == 1)
+
+
+def _finish(
+    output: Path, plan: Plan, member: Member, masks: MaskStore | None, note: Note, cameras: UsedCameras, alone: bool
+) -> UsedCameras:
+    """Write what needs all frames of a person: the second pass; segments, feet and angles; the smoothed copy; cameras.
 
     The second pass uses ``masks``; None: no second pass. It optimises every frame again, with the body fitted to frames
     of the whole recording unless that began with the initialisation pose, and with refined cameras if they disagree and
     ``settings.refine`` is True. The result is replaced in one step; if this function is interrupted, the result of the
-    first pass stays.
+    first pass stays. Returns the cameras that were used; persons after the first take those that are given.
     """
-    tracker, subject, fps = plan.trackers[0], plan.setup.subjects[0], plan.setup.fps
+    tracker, subject, fps = member.tracker, member.subject, plan.setup.fps
     if not tracker.has_segments:
-        return
-    result = read_result(output)
+        return cameras
+    result = read_result(output).people[member.number]
     poses = result.pose.copy()
     lost = ~result.has_pose
     columns: dict[str, NDArray[Any]] = {}
     model: Mapping[str, Value] | None = None
-    cameras = UsedCameras(plan.setup.rig, np.array(plan.source.time_offset_s))
     again = two_pass(tracker)
-    if again is not None and masks is not None:
+    missing = [] if masks is None else [int(f) for f in result.frames if int(f) not in masks]
+    if again is not None and missing and not alone:
+        note(f"person {member.number}: the second pass is omitted, because an earlier run kept no masks of each person")
+    elif again is not None and masks is not None:
         _LOG.info("second pass")
         assert result.residual is not None
-        missing = [int(f) for f in result.frames if int(f) not in masks]
         if missing:  # frames that an earlier run has tracked
             with open_observations(plan.setup, plan.source, plan.settings, lambda _: None) as observations:
                 for observation, _ in observations.frames(min(missing), max(missing) + 1):
                     masks.put(observation.index, again.cleaned(again.without_foreign(observation).masks))
-        if plan.settings.refine:
+        if member.number:
+            late = np.round((cameras.time_offset_s - plan.source.time_offset_s) * fps).astype(np.int64)
+            again, masks = again.with_cameras(cameras.rig), retimed(masks, result.frames, late)
+        elif plan.settings.refine:
             refined = refine_if_inconsistent(again, masks, result.frames, poses, ~lost, note)
             if refined is not None:
                 again, masks, offsets = refined
                 cameras = UsedCameras(again.rig, cameras.time_offset_s + offsets / fps)
-                if np.round(offsets).any():
+                if np.round(offsets).any() and alone:
                     note("tracking again: the images of the first pass were not synchronised")
                     found = _track_again(plan, again, cameras, result.frames, poses)
                     rows = np.flatnonzero(np.isin(result.frames, list(found)))
@@ -108,7 +124,8 @@ def finish(output: Path, plan: Plan, masks: MaskStore | None, note: Callable[[st
     columns |= {name: values for name, values in _columns(body, poses).items() if name not in kept}
     filtered = smooth(body.skeleton, poses, ~lost, fps)
     smoothed = {**_columns(body, filtered.poses), "bridged": filtered.bridged}
-    revise_result(output, columns, smoothed=smoothed, model=model, cameras=cameras)
+    revise_result(output, columns, smoothed=smoothed, model=model, cameras=cameras, person=member.number)
+    return cameras
 
 
 def report_unknown(frames: Sequence[int] | NDArray[np.int64], note: Callable[[str], None]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -84,7 +84,7 @@ class Plan:
     Attributes:
         setup, source, settings: the scene, its images, and all settings.
         observations: the source's frames, segmented.
-        trackers: one a subject, not started yet.
+        tracker: the first person's, not started yet.
         first: frame of the initialisation.
         begin, stop: range of frames written, stop exclusive; None: until the source ends.
     """
@@ -93,7 +93,7 @@ class Plan:
     source: Source
     settings: Settings
     observations: Observations
-    trackers: tuple[Tracker, ...]
+    tracker: Tracker
     first: int
     begin: int
     stop: int | None
@@ -105,7 +105,7 @@ class Plan:
 
     def meta(self) -> ResultMeta:
         """Return what the result says about itself."""
-        tracker, setup = self.trackers[0], self.setup
+        tracker, setup = self.tracker, self.setup
         return ResultMeta(
             pose_names=tracker.pose_names,
             pose_units=tracker.pose_units,
@@ -125,20 +125,25 @@ class Plan:
             objective_kind=tracker.objective_kind,
         )
 
+    def another_tracker(self) -> Tracker:
+        """Return a tracker of the same method for another person."""
+        return type(self.tracker).of(self.setup, self.settings)
+
     def origin(self, store_hull: bool) -> dict[str, str]:
         """Return what else must agree when a run is resumed, by the name that a user knows."""
-        subject, source = self.setup.subjects[0], self.source
+        subjects, source = self.setup.subjects, self.source
 
-        def hashed(value: object) -> str:
-            return "none" if value is None else hashlib.sha256(repr(value).encode()).hexdigest()[:12]
+        def hashed(given: Sequence[object]) -> str:
+            known = any(value is not None for value in given)
+            return hashlib.sha256(repr(given).encode()).hexdigest()[:12] if known else "none"
 
         return {
             "first frame": str(self.begin),
             "frame of the initial pose": str(self.first),
-            "given body (its hash)": hashed(subject.body),
+            "given body (its hash)": hashed([s.body for s in subjects]),
             "cameras": ", ".join(self.setup.rig.names),
             "masks": source.masks_from if source.has_masks else mask_source(source),
-            "initial pose (its hash)": hashed(subject.init),
+            "initial pose (its hash)": hashed([s.init for s in subjects]),
             "stored hull": "yes" if store_hull else "no",
         }
 
@@ -161,7 +166,7 @@ def open_plan(
     # the process of the observations starts while this one makes tables and compiles
     with open_observations(setup, source, settings, note, kind.needs_images) as observations:
         _LOG.info("preparing the %s tracker", method)
-        trackers = tuple(kind.of(setup, settings) for _ in setup.subjects)
+        tracker = kind.of(setup, settings)
         start, stop = max(frames[0], source.first_frame), frames[1]
         if source.frame_count is not None:
             start, stop = choose_frames(source, frames, note)
@@ -175,4 +180,4 @@ def open_plan(
             )
         if start < first:
             note(f"frames before {first} are left out: the subject is found in frame {first} and followed forwards")
-        yield Plan(setup, source, settings, observations, trackers, first, max(start, first), stop)
+        yield Plan(setup, source, settings, observations, tracker, first, max(start, first), stop)

@@ -14,24 +14,24 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ResultError, TkError
 from tk.io.captures.capture import Capture
-from tk.io.captures.mask_store import MaskStore
+from tk.io.captures.mask_store import MaskStores
 from tk.io.captures.source import Source
 from tk.io.results.data import FrameResult, HullPoints, Value
 from tk.io.results.files import check_result_path
-from tk.io.results.reader import as_damage_error, read_joints, read_result
+from tk.io.results.reader import as_damage_error, read_people, read_result
 from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 from tk.model.hull.hull import HullSurface
-from tk.model.setup import Setup, Subject
+from tk.model.setup import Setup
 from tk.run.offline import REFINED, finish, report_suspect, report_unknown
+from tk.run.people import Choice, People, Tracked, describe
 from tk.run.plan import Plan, open_plan, recording_setup
 from tk.run.prefetch import Observed
 from tk.run.reporter import Reporter
 from tk.settings import Settings
 from tk.threads import one_thread
-from tk.trackers.camera_monitor import CameraMonitor
-from tk.trackers.protocol import Estimate, Observation, Tracker, share, silhouette, two_pass
+from tk.trackers.protocol import Estimate, Observation, shows_person, two_pass
 
 _LOG = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ class Summary:
     """Outcome of a run.
 
     Attributes:
-        status: (F,) status of the frames in the result, including those of earlier runs.
+        status: (F,) status of the frames in the result, including those of earlier runs; of all people in turn.
         seconds: duration of this run.
         tracked_now: number of frames that this run added.
         interrupted: whether Ctrl-C stopped it.
@@ -86,6 +86,7 @@ def track(
     body: Path | None = None,
     causal: bool = False,
     force: bool = False,
+    people: Choice = "auto",
 ) -> Summary:
     """Track a recording, see :func:`track_source`.
 
@@ -101,7 +102,7 @@ def track(
     setup = recording_setup(capture, init_pose, body, frames[0])
     notes = capture.warnings
     return track_source(
-        setup, capture, output, settings, reporter, method, frames, resume, store_hull, causal, force, notes
+        setup, capture, output, settings, reporter, method, frames, resume, store_hull, causal, force, notes, people
     )
 
 
@@ -118,11 +119,12 @@ def track_source(
     causal: bool = False,
     force: bool = False,
     notes: tuple[str, ...] = (),
+    people: Choice = "auto",
 ) -> Summary:
-    """Track the subjects of a setup and write the result of the first one, frame by frame.
+    """Track the people in a scene and write the result, frame by frame.
 
-    A subject is found in its frame of initialisation and tracked forwards; frames before ``frames`` are tracked but not
-    written. Ctrl-C ends the run with all finished frames in the file, closed and ready for ``resume``.
+    People are found in the frame of the initialisation and tracked forwards; frames before ``frames`` are tracked but
+    not written. Ctrl-C ends the run with all finished frames in the file, closed and ready for ``resume``.
 
     Args:
         setup: the scene.
@@ -137,6 +139,8 @@ def track_source(
         causal: stop after the first pass, in which no frame depends on later ones.
         force: replace an existing result.
         notes: notes about the input, for reporter and result.
+        people: "auto": one person, the first by :func:`tk.model.people.order_people`; "all": everybody in the working
+            volume, also who enters later; or the numbers of people in that order.
 
     Raises:
         TkError: bad input; every frame finished before it is in the file.
@@ -152,37 +156,38 @@ def track_source(
         note(text)
     with open_plan(setup, source, settings, note, method, frames) as plan:
         meta = plan.meta()
-        writer, done = ResultWriter.resume(output, meta) if resume else (ResultWriter.create(output, meta), 0)
-        if done and len(setup.subjects) > 1:
-            raise ResultError(f"{output}: --resume works with one subject, not {len(setup.subjects)}")
-        again = not causal and plan.trackers[0].has_second_pass  # the second pass needs the masks
-        kept = output.with_name(f".{output.name}.masks")
-        masks = MaskStore(kept, resume=bool(done)) if again else None
+        if resume and output.exists():
+            writer, done = ResultWriter.resume(output, meta, len(read_result(output).people))
+        else:
+            writer, done = ResultWriter.create(output, meta), 0
+        again = not causal and plan.tracker.has_second_pass  # the second pass needs the masks
+        stores = MaskStores(output, bool(done))
         if not (done or again):
-            kept.unlink(missing_ok=True)  # of a stopped run; with a second pass, the first frame replaces it
-        run = _Run(plan, _Output(writer, done, plan.origin(store_hull), store_hull), masks)
+            stores.remove()  # of a stopped run; with a second pass, the first frame replaces them
+        masks = stores if again else None
+        origin = {**plan.origin(store_hull), "people": describe(people)}
+        run = _Run(plan, people, note, _Output(writer, done, origin, store_hull), masks)
         started = time.perf_counter()
         interrupted = False
         try:
             with writer:
                 reporter.begin(plan.total, min(done, plan.total) if plan.total else done)
-                for estimate in run.estimates():
-                    reporter.advance(estimate.frame, estimate)
+                for frame, estimates in enumerate(run.frames(), plan.begin + done):
+                    reporter.advance(frame, estimates[0] if estimates else None)
             if run.tracked or run.restore_unfinished(output, causal):
-                for line in run.people[0].monitor.report():
+                for line in run.people.report():
                     note(line)
                 with one_thread():
-                    finish(output, plan, masks, note)
+                    finish(output, plan, run.people.members, masks, note)
                 if said:
                     revise_result(output, notes=said)
-            kept.unlink(missing_ok=True)
+            stores.remove()
         except KeyboardInterrupt:
             # caught outside the writer, which then keeps an older result if no frame is finished
             interrupted = True
-        status = read_joints(output).status if done + run.tracked else None
-        return Summary(
-            np.zeros(0, np.uint8) if status is None else status, time.perf_counter() - started, run.tracked, interrupted
-        )
+        tracks = read_people(output) if done + run.tracked else ()
+        status = [track.status for track in tracks if track.status is not None] or [np.zeros(0, np.uint8)]
+        return Summary(np.concatenate(status), time.perf_counter() - started, run.tracked, interrupted)
 
 
 def estimates(
@@ -192,23 +197,24 @@ def estimates(
     note: Callable[[str], None] = lambda _: None,
     method: str = "region",
     frames: tuple[int, int | None] = (0, None),
+    people: Choice = "auto",
 ) -> Iterator[Estimate]:
-    """Track the subjects of a setup and yield the estimates of the first one, as the first pass finds them. No file is
-    written.
+    """Track the people in a scene and yield their estimates, as the first pass finds them, frame by frame and in the
+    order of the people's numbers. No file is written.
 
     Arguments and errors are those of :func:`track_source`.
     """
     with open_plan(setup, source, settings, note, method, frames) as plan:
-        run = _Run(plan, None)
+        run = _Run(plan, people, note)
         unknown: list[int] = []
         suspect: list[int] = []
-        for estimate in run.estimates():
+        for estimate in chain.from_iterable(run.frames()):
             if estimate.status == "suspect":
                 suspect.append(estimate.frame)
             if estimate.status != "lost" and estimate.sigma is not None and np.isnan(estimate.sigma).all():
                 unknown.append(estimate.frame)
             yield estimate
-        for line in run.people[0].monitor.report():
+        for line in run.people.report():
             note(line)
         report_unknown(unknown, note)
         report_suspect(suspect, note)
@@ -218,7 +224,7 @@ def estimates(
 # time costs more writes; a longer one loses more frames when the process is killed.
 WRITE_EVERY_S = 0.5
 
-_ORIGIN, _WATCH = "run/", "watch/"
+_ORIGIN = "run/"
 
 
 @dataclass
@@ -251,34 +257,24 @@ class _Output:
             )
 
 
-@dataclass
-class _Person:
-    """A subject during a run.
-
-    Attributes:
-        silhouette: (C, H, W) bool, pixels that the body covers in the last frame; None if unknown.
-    """
-
-    subject: Subject
-    tracker: Tracker
-    monitor: CameraMonitor
-    silhouette: NDArray[np.bool_] | None = None
-
-
 class _Run:
     """One run of trackers through a source. ``tracked`` counts frames, even if the run is interrupted."""
 
-    def __init__(self, plan: Plan, output: _Output | None, masks: MaskStore | None = None) -> None:
-        self.plan, self.output = plan, output
+    def __init__(
+        self,
+        plan: Plan,
+        people: Choice,
+        note: Callable[[str], None],
+        output: _Output | None = None,
+        masks: MaskStores | None = None,
+    ) -> None:
+        self.plan, self.output, self.masks = plan, output, masks
         self.tracked = 0
-        self.masks = masks
-        self.people = [
-            _Person(subject, tracker, CameraMonitor(tracker, plan.setup, subject))
-            for subject, tracker in zip(plan.setup.subjects, plan.trackers, strict=True)
-        ]
+        self.people = People(plan.setup, plan.tracker, plan.another_tracker, people, note)
 
-    def estimates(self) -> Iterator[Estimate]:
-        """Start or restore the trackers, and step them to the end; yielded estimates are in the file already."""
+    def frames(self) -> Iterator[tuple[Estimate, ...]]:
+        """Start or restore the trackers, step them to the end and yield the estimates of each frame's people; they are
+        in the file already."""
         plan, output = self.plan, self.output
         done = output.done if output else 0
         if plan.stop is not None and plan.begin + done >= plan.stop:
@@ -289,66 +285,60 @@ class _Run:
             yield from self._step_through(plan.observations.frames(plan.begin + done, plan.stop))
             return
         # The body is fitted to the same frames however few are asked for, so that --resume may extend a run.
-        count = max(person.tracker.opening_frames for person in self.people)
+        count = plan.tracker.opening_frames
         stop = None if plan.stop is None else max(plan.stop, plan.first + count)
         observations = plan.observations.frames(plan.first, stop)
         _LOG.info("reading the first frames and learning what the scene looks like")
-        for person in self.people:
-            person.tracker.prepare()
+        plan.tracker.prepare()
         opening, broken = _take(observations, count)
         _LOG.info("finding the person in frame %d and fitting the body to %d frames", plan.first, len(opening))
         try:
             with one_thread():
-                for person in self.people:
-                    seen, subject = person.monitor.start([o for o, _ in opening]), person.subject
-                    person.tracker.start(seen, subject.height_m, subject.init, subject.body)
-                    person.monitor.check_body()
-                    del seen
+                self.people.start([o for o, _ in opening])
         except CaptureError as error:
             raise CaptureError(f"{plan.source.where}: {error}") from None
-        if output:
-            output.writer.write_model(self.people[0].tracker.model())
         yield from self._step_through(chain(_emptied(opening), broken or observations))
 
     def restore_unfinished(self, path: Path, causal: bool) -> bool:
-        """Restore the tracker if an earlier run wrote the last frame, but did not finish the result; whether it did."""
-        output, tracker = self.output, self.people[0].tracker
+        """Restore the trackers if an earlier run wrote the last frame, but did not finish the result; whether it
+        did."""
+        output, tracker = self.output, self.plan.tracker
         if output is None or not output.done or not tracker.has_segments:
             return False
         refined = causal or not tracker.has_second_pass or REFINED in output.writer.model
-        if refined and read_result(path).smoothed is not None:
+        if refined and all(result.smoothed is not None for result in read_result(path).people):
             return False
         output.check()
         self._restore(output)
         return True
 
     def _restore(self, output: _Output) -> None:
-        person = self.people[0]
         with as_damage_error(output.writer.path, "the state of the run"):
-            person.tracker.restore(output.writer.model, output.writer.state)
-            person.monitor.restore(_below(_WATCH, output.writer.state))
+            self.people.restore(output.writer.models, output.writer.state)
 
-    def _step_through(self, observations: Iterator[Observed]) -> Iterator[Estimate]:
-        """Step the trackers to the end; an estimate is yielded when it is in the file."""
+    def _step_through(self, observations: Iterator[Observed]) -> Iterator[tuple[Estimate, ...]]:
+        """Step the trackers to the end; estimates are yielded when they are in the file."""
         output, stop = self.output, self.plan.stop
-        finished: list[Estimate] = []
+        finished: list[tuple[Estimate, ...]] = []
         written, writing = -np.inf, 0.0  # the first frame is written at once
         try:
             for observation, laps in observations:
                 if stop is not None and observation.index >= stop:
                     break
                 started = time.perf_counter()
-                estimate = self._step(observation)
-                if estimate is None:
+                estimates = self._step(observation)
+                if estimates is None:
                     continue
                 stepped = time.perf_counter()
-                timing = {**laps, **estimate.timing, "total": laps["wait"] + writing + stepped - started}
-                estimate = replace(estimate, timing=timing)
+                total = laps["wait"] + writing + stepped - started
+                estimates = tuple(replace(e, timing={**laps, **e.timing, "total": total}) for e in estimates)
                 due = not output or stepped - written > WRITE_EVERY_S
                 if output:
-                    output.writer.append(_row(estimate, output.store_hull), self._state(output), flush=due)
+                    self._write_models(output)
+                    rows = {e.person: _row(e, output.store_hull) for e in estimates}
+                    output.writer.append(rows, self._state(output), flush=due)
                 self.tracked += 1
-                finished.append(estimate)
+                finished.append(estimates)
                 writing = time.perf_counter() - stepped
                 if due:
                     written = stepped + writing
@@ -359,48 +349,49 @@ class _Run:
             raise
         yield from self._written(finished)
 
-    def _step(self, observation: Observation) -> Estimate | None:
-        """Step all trackers; return the first one's estimate, None before the first frame to be written."""
-        people = self.people
-        shared = share(observation, [person.silhouette for person in people])
+    def _write_models(self, output: _Output) -> None:
+        """Write the bodies of people whose trackers have just started."""
+        models = output.writer.models
+        for member in self.people.members:
+            if member.number >= len(models) or not models[member.number]:
+                output.writer.write_model(member.tracker.model(), person=member.number)
+
+    def _step(self, observation: Observation) -> tuple[Estimate, ...] | None:
+        """Step all trackers; return the estimates of the people who are present, None before the first frame to be
+        written."""
         with one_thread():
-            found = [person.monitor.step(own) for person, own in zip(people, shared, strict=True)]
-        if len(people) > 1:
-            for person, (estimate, _) in zip(people, found, strict=True):
-                person.silhouette = silhouette(estimate, observation.masks.shape)
+            answers = self.people.step(observation)
         if observation.index < self.plan.begin:
             return None
-        estimate, used = found[0]
-        if self.masks is not None:
-            self.masks.put(observation.index, self._kept(shared[0], used, estimate))
-        # masks are large, and a view into the ring of frames: an estimate must not keep them
-        return replace(estimate, frame=observation.index, time=observation.time, masks=None, drawn=None)
+        present = []
+        for number, answer in answers.items():
+            estimate = answer.estimate
+            if self.masks is not None:
+                self.masks[number].put(observation.index, self._kept(answer))
+            # masks are large, and a view into the ring of frames: an estimate must not keep them
+            whole = replace(estimate, frame=observation.index, time=observation.time, person=number)
+            present.append(replace(whole, masks=None, drawn=None))
+        return tuple(present)
 
-    def _kept(self, observation: Observation, used: Observation, estimate: Estimate) -> NDArray[np.uint8]:
+    def _kept(self, answer: Tracked) -> NDArray[np.uint8]:
         """Return the cleaned masks (C, H, W) of a frame, including those of excluded cameras, which may be refined."""
-        tracker = two_pass(self.people[0].tracker)
+        tracker = two_pass(self.plan.tracker)
         assert tracker is not None
-        taken = tracker.cleaned(used.masks) if estimate.masks is None else estimate.masks
-        out = np.asarray(observation.masks.any(axis=(1, 2)) & ~used.masks.any(axis=(1, 2)))
+        taken = tracker.cleaned(answer.used.masks) if answer.estimate.masks is None else answer.estimate.masks
+        out = shows_person(answer.share.masks) & ~shows_person(answer.used.masks)
         if out.any():
             taken = taken.copy()
-            taken[out] = tracker.cleaned(observation.masks[out])
+            taken[out] = tracker.cleaned(answer.share.masks[out])
         return taken
 
-    def _written(self, finished: list[Estimate]) -> Iterator[Estimate]:
+    def _written(self, finished: list[tuple[Estimate, ...]]) -> Iterator[tuple[Estimate, ...]]:
         if self.output and finished:
             self.output.writer.flush()
         yield from finished
 
     def _state(self, output: _Output) -> Mapping[str, Value]:
-        person = self.people[0]
         origin = {_ORIGIN + name: value for name, value in output.origin.items()}
-        monitor = {_WATCH + name: value for name, value in person.monitor.state().items()}
-        return {**person.tracker.state(), **monitor, **origin}
-
-
-def _below(prefix: str, state: Mapping[str, Value]) -> dict[str, Value]:
-    return {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
+        return {**self.people.state(), **origin}
 
 
 def _take(observations: Iterator[Observed], count: int) -> tuple[list[Observed], Iterator[Observed] | None]:

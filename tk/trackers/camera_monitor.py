@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
+from tk.kernels.mask_values import OTHERS
 from tk.model.body.plausibility import Plausibility, check_extent, check_stature
 from tk.model.body.skeleton import JOINTS
 from tk.model.cues.ray_costs import residual_of
@@ -34,7 +35,7 @@ from tk.model.masks.image_health import ImageHealth, described
 from tk.model.masks.mask_agreement import MaskAgreement
 from tk.model.setup import Setup, Subject
 from tk.trackers.contour_tracker import ContourTracker
-from tk.trackers.protocol import Estimate, Observation, Tracker
+from tk.trackers.protocol import Estimate, Observation, Tracker, shows_person
 from tk.trackers.region import RegionTracker
 from tk.trackers.residual import OUTLIER, RATE, RECENT, contradicted
 
@@ -112,7 +113,8 @@ class CameraMonitor:
                 f"camera {self._names[c]} {_DISAGREES} ({reason})" for c, reason in self._opening_reasons.items()
             )
             raise CaptureError(f"{'; '.join(reasons)}: this method needs masks that fit from all cameras")
-        if self._subject.height_m is not None:
+        alone = not any((f.masks == OTHERS).any() for f in frames)  # the hull of two people is larger than one
+        if self._subject.height_m is not None and alone:
             check_extent(agreement.extent_m, self._subject.height_m)
         return [_without(f, self._excluded) for f in shown]
 
@@ -131,13 +133,13 @@ class CameraMonitor:
         bad = self._bad(unhealthy)
         out = bad | self._excluded
         used = _without(frame, out)
-        if np.count_nonzero(used.masks.any(axis=(1, 2))) < 2:
+        if np.count_nonzero(shows_person(used.masks)) < 2:
             used = _without(frame, np.ones(len(out), bool))  # one view does not determine depth
         monitored = isinstance(self.tracker, RegionTracker) and len(out) - bad.sum() >= 3
         before = self.tracker.state() if monitored else {}
         estimate = self.tracker.step(used)
         offset = None
-        if monitored and used.masks.any() and estimate.residual is not None:
+        if monitored and shows_person(used.masks).any() and estimate.residual is not None:
             estimate, used, offset = self._test(frame, used, bad, before, estimate)
         for camera, reason in enumerate(unhealthy):
             if reason is not None and bad[camera]:
@@ -228,14 +230,15 @@ class CameraMonitor:
         assert isinstance(tracker, ContourTracker)
         if drawn is None or estimate.masks is None:
             return np.full((len(frame.masks), 2), np.nan)
-        masks, used = estimate.masks, estimate.masks.any(axis=(1, 2))
+        masks, used = estimate.masks, shows_person(estimate.masks)
         if not used.all():
             masks = masks.copy()
             masks[~used] = tracker.cleaned(frame.masks[~used])
-        person = tracker.screen.sample(masks) >= 128
-        residual = residual_of(drawn, person)
+        sampled = tracker.screen.sample(masks)
+        person, others = sampled >= 128, sampled == OTHERS
+        residual = residual_of(drawn, person, others)
         if frame.uncertain is not None:
-            excused = residual_of(drawn & tracker.screen.sample(frame.uncertain), person)[:, 0]
+            excused = residual_of(drawn & tracker.screen.sample(frame.uncertain), person, others)[:, 0]
             residual[:, 0] -= np.where(excused < _TOO_LITTLE, excused, 0.0)
         return residual
 
@@ -243,7 +246,7 @@ class CameraMonitor:
         """Return the estimate, with status lost if it is impossible."""
         if estimate.status == "lost":
             self._plausibility.forget()
-            if not used.masks.any():
+            if not shows_person(used.masks).any():
                 _count(self._lost, _TOO_FEW, index)
             return estimate
         if estimate.status == "recovered":  # the person may be elsewhere, as after a cut

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError
 from tk.kernels.line_search import SearchSettings
-from tk.kernels.raycast import Cast
+from tk.kernels.raycast import Cast, cast
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_fit import STATURE_DEVIATION, fit_body
@@ -94,6 +94,7 @@ class ContourTracker:
     reports_sigma = False
     has_segments = True
     has_second_pass = False
+    tracks_among_others = True
 
     def __init__(
         self,
@@ -263,6 +264,22 @@ class ContourTracker:
         """Take the last frame for lost: the person is searched for in the next one."""
         self._lost_for = max(self._lost_for, 1)
 
+    def last_poses(self) -> tuple[Float, Float]:
+        """Return the poses (D,) of the last frame and of the frame before, in the tracker's frame."""
+        raise NotImplementedError
+
+    def rendered(self, ahead: bool) -> Cast:
+        """Return the body on the grid :attr:`choice`: at the last pose, or at the one expected in the next frame."""
+        pose, before = self.last_poses()
+        if ahead:
+            pose = pose + self.contours.prediction * (pose - before)
+        grid, group = self.choice, np.zeros(len(self.body.parts), np.int32)
+        free = np.zeros((*grid.rays.shape[:3], 2), np.float32)
+        arrays = self.body.arrays
+        _, met = cast(arrays, group, grid.cameras, grid.step, grid.rays, free, pose[None], export=True)
+        assert met is not None
+        return Cast(met.label[0], met.depth[0])
+
     # --- one frame ----------------------------------------------------------------------------------------------
 
     def pyramid(self, frame: Observation) -> Pyramid:
@@ -308,7 +325,7 @@ class ContourTracker:
 
     def evidence(self, grid: RayGrid, frame: Observation, pyramid: Pyramid) -> Evidence:
         """Return the costs of a frame on a grid of rays."""
-        return Evidence.of(grid, pyramid.masks[0], frame.uncertain, frame.images, self.colors, frame.others)
+        return Evidence.of(grid, pyramid.masks[0], frame.uncertain, frame.images, self.colors)
 
     def mean_residual(self, pyramid: Pyramid, poses: Float, uncertain: NDArray[np.bool_] | None = None) -> Float:
         """Return (B,) E_S, mean over the views that see anybody, inf if none does. A body on ``uncertain`` pixels

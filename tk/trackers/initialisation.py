@@ -247,7 +247,8 @@ def stature_of(tracker: ContourTracker, pyramids: Sequence[Pyramid]) -> float:
         evidence = Evidence.of(tracker.screen, pyramid.masks[0])
         met = evidence.cast(body, group, poses, export=True)[1]
         assert met is not None
-        covered = np.count_nonzero(met.label, axis=(2, 3)).mean(axis=0)
+        drawn = met.label > 0 if evidence.others is None else (met.label > 0) & ~evidence.others
+        covered = np.count_nonzero(drawn, axis=(2, 3)).mean(axis=0)
         seen = np.count_nonzero(evidence.person, axis=(1, 2))
         known = (covered > 0) & (seen > 0)
         ratios.append(seen[known] / covered[known])

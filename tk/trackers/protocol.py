@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # the process that decodes and segments needs no parts of a tracker
+    from tk.kernels.raycast import Cast
     from tk.model.body.cone_body import ConeBody
     from tk.model.cameras.camera import Rig
     from tk.model.cameras.tracker_frame import TrackerFrame
+    from tk.model.cues.ray_costs import RayGrid
     from tk.model.hull.hull import HullSurface
     from tk.model.masks.silhouettes import Views
     from tk.model.setup import InitPose, Setup
@@ -29,11 +31,10 @@ class Observation:
     Attributes:
         index: number of the frame in its source.
         images: (C, H, W, 3) uint8 BGR.
-        masks: (C, H, W) uint8, 255 where the subject is, else 0.
+        masks: (C, H, W) uint8, 255 where the subject is, :data:`~tk.kernels.mask_values.OTHERS` where another person
+            is who may hide the subject, else 0. A body part on another person costs nothing.
         uncertain: (C, H, W) bool, pixels whose mask is 0 although they may show the subject: a shadow, or clothes of
             the scene's colour. A body part there costs half. None if unknown.
-        others: (C, H, W) bool, pixels that show another subject, which may hide this one: their mask is 0, and a body
-            part there costs nothing. None if there is no other subject.
         time: time stamp of the source, seconds.
     """
 
@@ -41,7 +42,6 @@ class Observation:
     images: NDArray[np.uint8]
     masks: NDArray[np.uint8]
     uncertain: NDArray[np.bool_] | None = None
-    others: NDArray[np.bool_] | None = None
     time: float = 0.0
 
 
@@ -65,6 +65,7 @@ class Estimate:
             in what :func:`tk.track` hands out. drawn: (C, h, w) bool, where the body is on the tracker's grid of rays,
             cameras left out included; None likewise.
         frame, time: the frame's number in the capture, and seconds; whoever steps the tracker knows them.
+        person: the person's number in the run.
     """
 
     pose: Float
@@ -80,6 +81,7 @@ class Estimate:
     drawn: NDArray[np.bool_] | None = None
     frame: int = -1
     time: float = 0.0
+    person: int = 0
 
 
 class Tracker(Protocol):
@@ -95,6 +97,7 @@ class Tracker(Protocol):
         reports_sigma: whether estimates have sigma and residual.
         has_segments: whether segments, feet, joint angles and a smoothed copy are derived from its poses.
         has_second_pass: whether it is a :class:`TwoPassTracker`.
+        tracks_among_others: whether it is a :class:`SharingTracker`. A visual hull needs whole masks.
     """
 
     method: str
@@ -108,6 +111,7 @@ class Tracker(Protocol):
     reports_sigma: bool
     has_segments: bool
     has_second_pass: bool
+    tracks_among_others: bool
 
     @classmethod
     def of(cls, setup: Setup, settings: Settings) -> Tracker:
@@ -159,6 +163,28 @@ class Tracker(Protocol):
 
     def restore(self, model: Mapping[str, Any], state: Mapping[str, Any]) -> None:
         """Continue where a run with this model and state stopped."""
+        ...
+
+
+class SharingTracker(Tracker, Protocol):
+    """A tracker that does without the pixels of other people, see :class:`Observation`.
+
+    Attributes:
+        choice: the grid on which its body is rendered.
+    """
+
+    choice: RayGrid
+
+    def rendered(self, ahead: bool) -> Cast:
+        """Return the body on the grid: at the last pose, or at the one expected in the next frame."""
+        ...
+
+    def lose(self) -> None:
+        """Take the last frame for lost: the person is searched for in the next one."""
+        ...
+
+    def rewind(self, state: Mapping[str, Any]) -> None:
+        """Go back to a state."""
         ...
 
 
@@ -215,36 +241,14 @@ def two_pass(tracker: Tracker) -> TwoPassTracker | None:
     return cast(TwoPassTracker, tracker) if tracker.has_second_pass else None
 
 
-def share(frame: Observation, silhouettes: Sequence[NDArray[np.bool_] | None]) -> list[Observation]:
-    """Return the observation of each subject: pixels that other subjects covered in the last frame are ``others``.
-
-    Args:
-        frame: images, and masks of all subjects together.
-        silhouettes: (C, H, W) pixels that each subject covered in the last frame; None if unknown.
-    """
-    if len(silhouettes) == 1:
-        return [frame]
-    shared = []
-    for own in silhouettes:
-        others = np.zeros(frame.masks.shape, np.bool_)
-        for other in silhouettes:
-            if other is not None and other is not own:
-                others |= other
-        if own is not None:
-            others &= ~own
-        shared.append(replace(frame, masks=np.where(others, np.uint8(0), frame.masks), others=others))
-    return shared
+def sharing(tracker: Tracker) -> SharingTracker | None:
+    """Return the tracker if it can track a person among others, else None."""
+    return cast(SharingTracker, tracker) if tracker.tracks_among_others else None
 
 
-def silhouette(estimate: Estimate, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
-    """Return the pixels that the body covers, as an array of this shape (C, H, W); None if the tracker renders none."""
-    if estimate.drawn is None:
-        return None
-    step = max(1, round(shape[1] / estimate.drawn.shape[1]))
-    full = np.zeros(shape, np.bool_)
-    covered = estimate.drawn.repeat(step, axis=1).repeat(step, axis=2)[:, : shape[1], : shape[2]]
-    full[:, : covered.shape[1], : covered.shape[2]] = covered
-    return full
+def shows_person(masks: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return (C,) whether each mask (C, H, W) shows the subject."""
+    return np.asarray(masks.reshape(len(masks), -1).max(axis=1) >= 128)
 
 
 class Stopwatch:

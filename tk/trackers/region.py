@@ -257,6 +257,10 @@ class RegionTracker(ContourTracker):
     def _best(self) -> Hypothesis:
         return self._alive[0]
 
+    def last_poses(self) -> tuple[Float, Float]:
+        """Return the poses (D,) of the last frame and of the frame before, in the tracker's frame."""
+        return self._best.pose, self._best.previous
+
     def _levels(self) -> list[int]:
         """Return the scales of the next frame, coarse to fine.
 

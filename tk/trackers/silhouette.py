@@ -11,6 +11,7 @@ or behind the trunk, and when the arm reappears, no contour may be near it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -61,9 +62,7 @@ class SilhouetteTracker(ContourTracker):
         body: ConeBody | None = None,
     ) -> None:
         """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourTracker.find`."""
-        # this tracker does not use colours
-        blind = [Observation(f.index, f.images[:0], f.masks) for f in frames]
-        self._pose = self._previous = self.find(blind, height_m, init, body)
+        self._pose = self._previous = self.find([_blind(f) for f in frames], height_m, init, body)
         self._lost_for = 0
         self._fresh = True
 
@@ -78,10 +77,8 @@ class SilhouetteTracker(ContourTracker):
         pose = settled.states[0]
         watch.lap("optimise")
         if config.search_every and frame.index % config.search_every == 0:
-            pose = self.improved(
-                Observation(frame.index, frame.images[:0], frame.masks, others=frame.others), pyramid, pose
-            )
-        error = float(self.mean_residual(pyramid, pose[None])[0])
+            pose = self.improved(_blind(frame), pyramid, pose)
+        error = float(self.mean_residual(pyramid, pose[None], frame.uncertain)[0])
         # after a loss a pose near the last one may fit by chance
         due = self._lost_for > 0 if error <= config.lost_error else self._lost_for % RECOVER_EVERY == 0
         if due and np.isfinite(error):
@@ -103,6 +100,10 @@ class SilhouetteTracker(ContourTracker):
             timing=watch.laps,
         )
 
+    def last_poses(self) -> tuple[Float, Float]:
+        """Return the poses (D,) of the last frame and of the frame before, in the tracker's frame."""
+        return self._pose, self._previous
+
     def state(self) -> Mapping[str, Any]:
         """Return what :meth:`restore` needs, beside the model, to continue after the last frame."""
         return {**super().state(), "pose": self._pose, "previous": self._previous, "lost_for": self._lost_for}
@@ -112,3 +113,8 @@ class SilhouetteTracker(ContourTracker):
         self._pose, self._previous = (np.array(state[name]) for name in ("pose", "previous"))
         self._lost_for = int(state["lost_for"])
         self._fresh = False
+
+
+def _blind(frame: Observation) -> Observation:
+    """Return the frame without images: this tracker does not use colours."""
+    return replace(frame, images=frame.images[:0])

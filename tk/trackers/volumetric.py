@@ -117,6 +117,7 @@ class VolumetricTracker:
     reports_sigma = False
     has_segments = False
     has_second_pass = False
+    tracks_among_others = False
 
     @classmethod
     def of(cls, setup: Setup, settings: Settings) -> VolumetricTracker:

@@ -6,6 +6,7 @@ killed run can be resumed.
 
 from __future__ import annotations
 
+import glob
 import os
 import struct
 import tempfile
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import FULL, DiskFullError, TkError
+from tk.kernels.mask_values import OTHERS
 
 Masks = NDArray[np.uint8]
 
@@ -26,12 +28,13 @@ Masks = NDArray[np.uint8]
 IN_MEMORY = 32 * 2**20
 
 
-#: header of each frame: its number, the number of bytes that follow, and the masks' shape
+#: header of each frame: its number (~number for the pixels of other people), the number of bytes that follow, and the
+#: masks' shape
 _HEAD = struct.Struct("<qqiii")
 
 
 class MaskStore:
-    """Masks (C, H, W), 0 or 255, by frame number.
+    """Masks (C, H, W), 0, 255 or :data:`~tk.kernels.mask_values.OTHERS`, by frame number.
 
     Args:
         path: file of the masks, created with the first frame; None: memory, or a file without a name.
@@ -88,8 +91,14 @@ class MaskStore:
         Raises:
             TkError: the file cannot be written, for example because the disk is full.
         """
+        others = masks == OTHERS
+        if others.any():  # first: a frame whose masks are in the file is whole
+            self._put(~index, others)
+        self._put(index, masks >= 128)
+
+    def _put(self, index: int, masks: NDArray[np.bool_]) -> None:
         self._shape = masks.shape
-        packed = zlib.compress(np.packbits(masks >= 128).tobytes(), 1)
+        packed = zlib.compress(np.packbits(masks).tobytes(), 1)
         file = self._opened or self._open("w+b")
         try:
             file.seek(0, os.SEEK_END)
@@ -102,16 +111,50 @@ class MaskStore:
 
     def get(self, index: int) -> Masks:
         """Return the masks (C, H, W) of a stored frame."""
+        masks = self._get(index) * np.uint8(255)
+        if ~index in self._places:
+            masks[self._get(~index) > 0] = OTHERS
+        return masks
+
+    def _get(self, index: int) -> NDArray[np.uint8]:
         place, size = self._places[index]
         assert self._opened is not None
         self._opened.seek(place)
         bits = np.frombuffer(zlib.decompress(self._opened.read(size)), np.uint8)
         count = int(np.prod(self._shape))
-        return np.unpackbits(bits, count=count).reshape(self._shape) * np.uint8(255)
+        return np.unpackbits(bits, count=count).reshape(self._shape)
 
     def sequence(self, indices: NDArray[np.int64]) -> Frames:
         """Return the masks of these frames, unpacked on access."""
         return Frames(self, [int(i) for i in indices])
+
+
+class MaskStores:
+    """The masks of several people, in files beside a result.
+
+    Args:
+        result: the result file.
+        resume: as for :class:`MaskStore`.
+    """
+
+    def __init__(self, result: Path, resume: bool) -> None:
+        self._result, self._resume = result, resume
+        self._stores: dict[int, MaskStore] = {}
+
+    def __getitem__(self, person: int) -> MaskStore:
+        """Return a person's store."""
+        if person not in self._stores:
+            self._stores[person] = MaskStore(self._path(person), self._resume)
+        return self._stores[person]
+
+    def remove(self) -> None:
+        """Delete the files of all people, also those of a stopped run."""
+        self._path(0).unlink(missing_ok=True)
+        for path in self._result.parent.glob(f".{glob.escape(self._result.name)}.masks.*"):
+            path.unlink(missing_ok=True)
+
+    def _path(self, person: int) -> Path:
+        return self._result.with_name(f".{self._result.name}.masks" + (f".{person}" if person else ""))
 
 
 class Frames(Sequence[Masks]):

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.mask_values import OTHERS
 from tk.kernels.raycast import Cast, cast
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.camera import Rig
@@ -27,6 +28,10 @@ COLOR_COST = 0.4
 # Cost of a part on a pixel outside the mask that is uncertain (a shadow, or clothes of the background's colour): both
 # values are equally likely.
 UNCERTAIN_COST = 0.5
+# Beside pixels of other people, a view of whose pixels few show the person counts as if it showed this share of those
+# in the view that shows most, so that a hand beside somebody's back does not count as much as a whole person. Chosen on
+# pair; sensitivity not measured.
+LEAST_SEEN = 0.25
 
 
 class RayGrid:
@@ -39,7 +44,7 @@ class RayGrid:
 
     def __init__(self, rig: Rig, rows: int) -> None:
         self.rig = rig
-        self.step = max(1, round(rig.frame_shape[0] / rows))
+        self.step: int = max(1, round(rig.frame_shape[0] / rows))
         self.rays = pixel_rays(rig, self.step)
         self.cameras = pack_rig(rig).astype(np.float32)
 
@@ -56,6 +61,7 @@ class Evidence:
     Attributes:
         grid: rays of the V views.
         person: (V, h, w) bool, the mask.
+        others: (V, h, w) bool, pixels of other people, where a body costs nothing; None if there are none.
         cost: (V, h, w, G + 1) float32, see :mod:`tk.kernels.raycast`.
         bins: (V, h, w) bin of each ray's colour; None without colours.
     """
@@ -64,6 +70,7 @@ class Evidence:
     person: NDArray[np.bool_]
     cost: NDArray[np.float32]
     bins: NDArray[np.int32] | None
+    others: NDArray[np.bool_] | None = None
 
     @staticmethod
     def of(
@@ -72,23 +79,23 @@ class Evidence:
         uncertain: NDArray[np.bool_] | None = None,
         images: NDArray[np.uint8] | None = None,
         colors: PartColors | None = None,
-        others: NDArray[np.bool_] | None = None,
     ) -> Evidence:
-        """Return the costs from masks (V, H, W), uncertain pixels, images, the learned colours of the parts,
-        and the pixels of other subjects, where a body costs nothing."""
-        person = grid.sample(masks) >= 128
+        """Return the costs from masks (V, H, W), uncertain pixels, images, and the learned colours of the parts."""
+        sampled = grid.sample(masks)
+        person, others = sampled >= 128, sampled == OTHERS
         outside = np.ones(person.shape, np.float32)
         if uncertain is not None:
             outside[grid.sample(uncertain)] = UNCERTAIN_COST
-        if others is not None:
-            outside[grid.sample(others)] = 0.0
+        shared = bool(others.any())
+        if shared:
+            outside[others] = 0.0
         cost = np.empty((*person.shape, len(GROUPS) + 1), np.float32)
         cost[..., 0] = person
         cost[..., 1:] = np.where(person, 0.0, outside)[..., None]
         bins = None if images is None or images.size == 0 else color_bins(grid.sample(images))
         if bins is not None and colors is not None and colors.known:
             cost[person, 1:] = COLOR_COST * colors.mismatch[bins[person]]
-        return Evidence(grid, person, cost, bins)
+        return Evidence(grid, person, cost, bins, others if shared else None)
 
     def cast(
         self,
@@ -119,12 +126,12 @@ class Evidence:
             export,
             most_outside,
         )
-        seen = np.count_nonzero(self.person, axis=(1, 2))
+        seen = _areas(self.person, self.others)
         return np.where(seen > 0, total / np.maximum(seen, 1), np.nan), met
 
     def residual(self, label: NDArray[np.uint8]) -> Float:
         """Return (V, 2) missing and surplus area of a rendered body, labels (V, h, w), see :func:`residual_of`."""
-        return residual_of(label > 0, self.person)
+        return residual_of(label > 0, self.person, self.others)
 
     def cost_of_parts(self, group: NDArray[np.int32], label: NDArray[np.uint8]) -> tuple[Float, NDArray[np.int64]]:
         """Return the summed cost (P,) and the number (P,) of the rays that hit each part, labels (V, h, w).
@@ -142,17 +149,28 @@ class Evidence:
         return float(mean_of_views(self.residual(label)[None, :, 1])[0])
 
 
-def residual_of(body: NDArray[np.bool_], person: NDArray[np.bool_]) -> Float:
+def residual_of(body: NDArray[np.bool_], person: NDArray[np.bool_], others: NDArray[np.bool_] | None = None) -> Float:
     """Return (V, 2) missing area (body outside the mask) and surplus area (mask outside the body), as shares of the
     person's pixels in each view; their sum is E_S.
 
     Args:
         body: (V, h, w) pixels that the body covers.
         person: (V, h, w) pixels of the mask. A view without any has a residual of NaN.
+        others: (V, h, w) pixels of other people, which are no missing area.
     """
-    areas = np.stack([np.count_nonzero(area, axis=(1, 2)) for area in (body & ~person, person & ~body)], axis=1)
-    seen = np.count_nonzero(person, axis=(1, 2))[:, None]
+    seen = _areas(person, others)[:, None]
+    empty = ~person if others is None else ~(person | others)
+    areas = np.stack([np.count_nonzero(area, axis=(1, 2)) for area in (body & empty, person & ~body)], axis=1)
     return np.where(seen > 0, areas / np.maximum(seen, 1), np.nan)
+
+
+def _areas(person: NDArray[np.bool_], others: NDArray[np.bool_] | None) -> NDArray[np.float64]:
+    """Return (V,) the person's area in each view, rays; 0 without the person, else see :data:`LEAST_SEEN`."""
+    seen = np.count_nonzero(person, axis=(1, 2)).astype(np.float64)
+    if others is None:
+        return seen
+    most = seen + np.count_nonzero(others, axis=(1, 2))
+    return np.where(seen > 0, np.maximum(seen, np.minimum(most, LEAST_SEEN * seen.max())), 0.0)
 
 
 def mean_of_views(cost: Float) -> Float:

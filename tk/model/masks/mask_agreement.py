@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.cameras.camera import Rig
+from tk.kernels.mask_values import OTHERS
+from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
 from tk.model.cameras.volume import Volume, VoxelGrid
 from tk.model.hull.coarse import Hull, Voxels, dilated
@@ -128,7 +129,7 @@ class MaskAgreement:
     def compare(self, frames: Sequence[Masks]) -> Agreement:
         """Return the agreement over frames of masks (C, H, W)."""
         C = len(self.rig)
-        outlines = [[Outline.of(camera, masks[c]) for c, camera in enumerate(self.rig)] for masks in frames]
+        outlines = [[_outline(camera, masks[c]) for c, camera in enumerate(self.rig)] for masks in frames]
         pairs = tangency(outlines, self.rig.centers)
         error = excess(pairs)
         tested = np.flatnonzero(np.isfinite(error).any(axis=1)).tolist()
@@ -138,7 +139,8 @@ class MaskAgreement:
         if len(kept) < len(tested) and (kept or len(tested) <= 4):  # without the swapped ones, five cameras agree
             swapped = self._swapped(frames, outlines, wrong or tested)
         seen = [self.small(masks) for masks in frames]
-        hulls = self.hulls(seen)
+        # the person may stand behind others
+        hulls = self.hulls([m | self.small(np.uint8(255) * (f == OTHERS)) for m, f in zip(seen, frames, strict=True)])
         views = [(masks, hull) for masks, hull in zip(seen, hulls, strict=True) if hull is not None]
         right = [c for c in range(C) if c not in wrong]
         refused = not kept and bool(tested)
@@ -290,6 +292,14 @@ class MaskAgreement:
         if len(shifts) == 0:
             return np.full(2, np.nan)
         return np.asarray(shifts[np.argmin((shifts**2).sum(axis=1))] * float(self.step), np.float64)
+
+
+def _outline(camera: Camera, mask: Masks) -> Outline | None:
+    """Return the outline of a mask (H, W); None if it is empty, or if another person may hide a part of it."""
+    others = (mask == OTHERS).astype(np.uint8)
+    if others.any() and (dilated(others, 1) & (mask >= 128)).any():
+        return None
+    return Outline.of(camera, mask)
 
 
 def _share_outside(pairs: Sequence[tuple[Bool, Bool]]) -> float:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tk.kernels import silhouette as kernels
 from tk.kernels.cone_arrays import ConeArrays
 from tk.kernels.line_search import Regions, SearchSettings
+from tk.kernels.mask_values import OTHERS
 from tk.kernels.projection import pack_camera
 from tk.kernels.raycast import cast
 from tk.kernels.silhouette import Edgels, NormalEquations
@@ -50,7 +51,8 @@ class Pyramid:
     """Masks at several scales, a factor of two apart.
 
     Attributes:
-        masks: (V, H, W) uint8 for each scale, or (F V, H, W) of F frames; scale 0 is the full image.
+        masks: (V, H, W) uint8 for each scale, or (F V, H, W) of F frames; scale 0 is the full image. Pixels of other
+            people are :data:`~tk.kernels.mask_values.OTHERS`.
         sizes: (V, 2) for each scale, width and height of each camera's image.
     """
 
@@ -78,8 +80,14 @@ class Views:
 
     def pyramid(self, masks: Masks, scales: int, cleaning: bool) -> Pyramid:
         """The scales of masks (V, H, W), cleaned if ``cleaning``."""
+        others = masks == OTHERS
+        shared = bool(others.any())
         if cleaning:
-            masks = np.stack([clean(mask) for mask in masks])
+            cleaned = np.stack([clean(np.where(hidden, 0, mask)) for mask, hidden in zip(masks, others, strict=True)]
+                               if shared else [clean(mask) for mask in masks])  # fmt: skip
+            if shared:  # a region that others cut off may be small: it is no evidence, rather than background
+                others |= (masks >= 128) & (cleaned == 0)
+            masks = cleaned
         levels, sizes = [masks], [self.sizes]
         for _ in range(scales - 1):
             last = levels[-1]
@@ -93,6 +101,9 @@ class Views:
                 cv2.resize(m, (width, height), dst=out, interpolation=cv2.INTER_AREA)
             levels.append(half)
             sizes.append((sizes[-1] + 1) // 2)
+        if shared:
+            for k, level in enumerate(levels):
+                levels[k] = _marked(level, others, 2**k)
         return Pyramid(tuple(levels), tuple(sizes))
 
     def equations(
@@ -121,6 +132,18 @@ class Views:
         return kernels.find_edgels(
             body.arrays, self._cameras32, pyramid.sizes[scale], pyramid.masks[scale], 2.0**scale, pose, settings
         )
+
+
+def _marked(level: Masks, others: NDArray[np.bool_], step: int) -> Masks:
+    """Return a scale's masks (V, h, w) in which each pixel that contains one of the others' (V, H, W) has their value.
+
+    ``step``: pixels of the full image along a side of the scale's pixel.
+    """
+    V, h, w = level.shape
+    padded = np.zeros((V, h * step, w * step), np.bool_)
+    padded[:, : others.shape[1], : others.shape[2]] = others
+    hidden = padded.reshape(V, h, step, w, step).any(axis=(2, 4))
+    return np.where(hidden, np.uint8(OTHERS), level)
 
 
 def pack_rig(rig: Rig) -> Float:

@@ -1,0 +1,5 @@
+"""Values of masks; without Taichi, for modules that need no kernel."""
+
+#: a pixel that shows another person, who may hide this one. Other pixels are 0 or 255, and the coarser scales are their
+#: means over 4 and 16 pixels, so none of them has this value.
+OTHERS = 1

@@ -1,0 +1,422 @@
+"""The people of a run: who is in the scene, who is tracked, and which pixels are whose in each frame.
+
+People are found in the first frame by their visual hulls. Those who are chosen get a tracker each. The others are
+followed by their hulls, so that their pixels are no evidence for those who are tracked. A person who enters later is
+found in the pixels that nobody explains.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from tk.errors import CaptureError, ConfigError
+from tk.kernels.raycast import FAR, Cast
+from tk.model.body.skeleton import up_rotation
+from tk.model.cues.ray_costs import RayGrid
+from tk.model.people import LocatedPerson, PeopleFinder, order_people
+from tk.model.setup import Setup, Subject
+from tk.trackers.camera_monitor import CameraMonitor
+from tk.trackers.protocol import Estimate, Observation, Tracker, sharing
+from tk.trackers.sharing import PixelOwners, assign, cast_points
+
+_LOG = logging.getLogger(__name__)
+Float = NDArray[np.float64]
+Choice = str | tuple[int, ...]
+"""Who is tracked: "auto" (one person), "all", or numbers."""
+
+# Seconds between two looks for people who enter; and during which somebody must be seen before a tracker is started.
+LOOK_EVERY_S, SEEN_FOR_S = 0.5, 0.5
+# Mean surplus area of the subject's masks, as a share of the person, above which somebody else may have entered: a
+# second person who is seen by all cameras has 1, by two of six cameras 0.3. Poor masks have 0.1 to 0.2.
+SURPLUS = 0.25
+# Half the width and half the height of the space in which the hull of somebody who is not tracked is carved, metres;
+# how far such a person may move between frames; and the edge of its voxels: a forearm is 0.08 m wide.
+_HALF_M, _HALF_HEIGHT_M, _STEP_M, _VOXEL_M = 0.9, 1.1, 0.4, 0.06
+# Somebody who is seen so far from a person who is tracked is somebody else, metres: half a stride, and a hull's error.
+_SAME_M = 0.6
+# Voxels of somebody who is not tracked, at least: 5 litres, a head's volume.
+_LEAST_VOXELS = 25
+# Frames of somebody who enters from which the body is fitted.
+_HISTORY = 8
+
+
+_WATCH, _LOST, _ABSENT, _PEOPLE, _BYSTANDERS = "watch/", "lost", "absent", "people/", "bystanders/"
+
+
+@dataclass
+class Member:
+    """A person who is tracked.
+
+    Attributes:
+        number: number in the result.
+        subject: what is known of the person.
+        lost: whether the last frame is lost.
+        absent: whether nobody was seen in the last frame who could be this person.
+    """
+
+    number: int
+    subject: Subject
+    tracker: Tracker
+    monitor: CameraMonitor
+    lost: bool = False
+    absent: bool = False
+
+
+@dataclass
+class Bystander:
+    """A person who is not tracked, or not yet.
+
+    Attributes:
+        position: (3,) m, centre of the trunk.
+        shape: the hull on the grid of the trackers.
+        since: frame in which the person was found.
+        history: the person's own observations of the last frames, if a tracker may be started.
+    """
+
+    position: Float
+    shape: Cast
+    since: int
+    history: list[Observation] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A member's answer for a frame: the estimate, the member's share of the frame, and what its tracker used."""
+
+    estimate: Estimate
+    share: Observation
+    used: Observation
+
+
+class People:
+    """Steps the trackers of a run.
+
+    Args:
+        setup: the scene.
+        first: a tracker.
+        make: makes another tracker.
+        choice: who is tracked.
+        note: receives messages for the user.
+    """
+
+    def __init__(
+        self, setup: Setup, first: Tracker, make: Callable[[], Tracker], choice: Choice, note: Callable[[str], None]
+    ) -> None:
+        self._setup, self._make, self._choice, self._note = setup, make, choice, note
+        self.members = [self._member(0, setup.subjects[0], first)]
+        self._bystanders: list[Bystander] = []
+        self._every = max(1, round(LOOK_EVERY_S * setup.fps))
+        self._finder: PeopleFinder | None = None
+        self._carver = _LocalHull(setup)
+        share = sharing(first)
+        self._grid: RayGrid | None = None if share is None else share.choice
+
+    def _member(self, number: int, subject: Subject, tracker: Tracker) -> Member:
+        return Member(number, subject, tracker, CameraMonitor(tracker, self._setup, subject))
+
+    @property
+    def alone(self) -> bool:
+        """Whether nobody but one tracked person has been seen."""
+        return len(self.members) == 1 and not self._bystanders
+
+    # --- the first frames ---------------------------------------------------------------------------------------------
+
+    def start(self, opening: Sequence[Observation]) -> None:
+        """Find the people in the first frame, and start a tracker for each who is chosen.
+
+        Raises:
+            CaptureError: a chosen person is not there, or too few cameras see the person.
+        """
+        found = self._find(opening[0].masks, opening[0].uncertain)
+        subjects = self._setup.subjects
+        found = order_people(found, self._setup.volume, subjects[0].height_m, _position(subjects[0]))
+        if len(found) <= 1 and len(subjects) == 1 and self._choice in ("auto", "all", (0,)):
+            self._begin(self.members[0], opening)
+            return
+        numbers = self._chosen(found)
+        known = _matched(subjects, [found[n] for n in numbers])
+        self.members = [self._member(0, known[0], self.members[0].tracker)]
+        for k, subject in enumerate(known[1:], 1):
+            tracker = self._make()
+            tracker.prepare()
+            self.members.append(self._member(k, subject, tracker))
+        if self._grid is None:
+            if len(self.members) > 1 or len(found) > 1:
+                raise ConfigError(f"the method {self.members[0].tracker.method} tracks one person who is alone in view")
+            self._begin(self.members[0], opening)
+            return
+        order = [*numbers, *(n for n in range(len(found)) if n not in numbers)]
+        shown = [Bystander(found[n].position, self._hull(found[n]), opening[0].index) for n in order]
+        shares: list[list[Observation]] = [[] for _ in numbers]
+        for frame in opening:
+            owners = self._owners([b.shape for b in shown])
+            if frame is not opening[0]:
+                self._follow(shown, frame, owners)
+                owners = self._owners([b.shape for b in shown])
+            for k, own in enumerate(shares):
+                own.append(owners.share(frame, k, False))
+        for member, frames in zip(self.members, shares, strict=True):
+            self._begin(member, frames)
+        first = [Bystander(found[n].position, self._hull(found[n]), opening[0].index) for n in order]
+        self._bystanders = first[len(numbers) :]
+
+    def _begin(self, member: Member, frames: Sequence[Observation]) -> None:
+        subject = member.subject
+        seen = member.monitor.start(frames)
+        member.tracker.start(seen, subject.height_m, subject.init, subject.body)
+        member.monitor.check_body()
+
+    def _find(self, masks: NDArray[np.uint8], uncertain: NDArray[np.bool_] | None = None) -> tuple[LocatedPerson, ...]:
+        if self._finder is None:
+            self._finder = PeopleFinder(self._setup.rig, self._setup.volume, self._setup.up)
+        return self._finder.find(masks, uncertain)
+
+    def _chosen(self, found: Sequence[LocatedPerson]) -> tuple[int, ...]:
+        """Return the numbers of the people to be tracked."""
+        present = [n for n, person in enumerate(found) if person.inside]
+        if isinstance(self._choice, tuple):
+            missing = [n for n in self._choice if n >= len(found)]
+            if missing:
+                raise CaptureError(
+                    f"person {missing[0]} is asked for, but {len(found)} were found in the first frame; the numbers "
+                    "start at 0, see tk inspect"
+                )
+            return self._choice
+        if self._choice == "all":
+            return tuple(present) or (0,)
+        if len(found) > 1:
+            x, y, z = found[0].position
+            self._note(
+                f"{len(found)} people are in view, and number 0 is tracked, at ({x:.1f}, {y:.1f}, {z:.1f}) m; the "
+                "option people chooses others by the numbers that tk inspect prints, or all"
+            )
+        return (0,)
+
+    # --- one frame ----------------------------------------------------------------------------------------------------
+
+    def step(self, frame: Observation) -> dict[int, Tracked]:
+        """Return the answers of the members for a frame, by number."""
+        if self.alone:
+            (member,) = self.members
+            tracked = self._step(member, frame)
+            self._look(frame, {0: tracked})
+            return {0: tracked}
+        before = [self._state_of(m) for m in self.members]
+        shown = [*(self._shape(m, True) for m in self.members), *(b.shape for b in self._bystanders)]
+        owners = self._owners(shown)
+        self._follow(self._bystanders, frame, owners, len(self.members))
+        owners = self._owners([*shown[: len(self.members)], *(b.shape for b in self._bystanders)])
+        answers = {m.number: self._step(m, owners.share(frame, k, m.lost)) for k, m in enumerate(self.members)}
+        now = self._owners([*(self._shape(m, False) for m in self.members), *(b.shape for b in self._bystanders)])
+        for k, member in enumerate(self.members):
+            if not member.lost and now.changed(owners, frame.masks, k):
+                tracker = sharing(member.tracker)
+                assert tracker is not None
+                tracker.rewind(before[k])
+                self._restore(member, before[k])
+                answers[member.number] = self._step(member, now.share(frame, k, False))
+        for k, bystander in enumerate(self._bystanders, len(self.members)):
+            bystander.history = [*bystander.history[1 - _HISTORY :], now.share(frame, k, False)]
+        self._look(frame, answers, now)
+        return answers
+
+    def _step(self, member: Member, share: Observation) -> Tracked:
+        estimate, used = member.monitor.step(share)
+        member.lost = estimate.status == "lost"
+        return Tracked(estimate, share, used)
+
+    def _shape(self, member: Member, ahead: bool) -> Cast | None:
+        tracker = sharing(member.tracker)
+        assert tracker is not None
+        return None if member.lost else tracker.rendered(ahead)
+
+    def _hull(self, person: LocatedPerson) -> Cast:
+        assert self._grid is not None
+        return cast_points(self._setup.rig, self._grid, person.points, person.voxel_m)
+
+    def _owners(self, shapes: Sequence[Cast | None]) -> PixelOwners:
+        assert self._grid is not None
+        return assign(self._setup.rig, self._grid, shapes)
+
+    def _follow(self, bystanders: Sequence[Bystander], frame: Observation, owners: PixelOwners, first: int = 0) -> None:
+        """Carve the hulls of people who are not tracked again; ``first``: number of the first in the owners."""
+        assert self._grid is not None
+        for k, bystander in enumerate(bystanders, first):
+            free = owners.share(frame, k, True).masks
+            points = self._carver.carve(bystander.position, free)
+            if len(points) >= _LEAST_VOXELS:
+                bystander.position = self._carver.centre(bystander.position, points)
+                bystander.shape = cast_points(self._setup.rig, self._grid, points, _VOXEL_M)
+
+    # --- what a result keeps ------------------------------------------------------------------------------------------
+
+    def report(self) -> list[str]:
+        """Return lines on excluded cameras and losses, see :meth:`CameraMonitor.report`."""
+        if len(self.members) == 1:
+            return self.members[0].monitor.report()
+        return [f"person {m.number}: {line}" for m in self.members for line in m.monitor.report()]
+
+    def state(self) -> dict[str, Any]:
+        """Return what :meth:`restore` needs beside the bodies. Person 0's entries have no prefix."""
+        state: dict[str, Any] = {}
+        for member in self.members:
+            prefix = f"{_PEOPLE}{member.number}/" if member.number else ""
+            state |= {prefix + name: value for name, value in self._state_of(member).items()}
+        for k, b in enumerate(self._bystanders):
+            prefix = f"{_BYSTANDERS}{k}/"
+            state |= {prefix + "position": b.position, prefix + "since": b.since, prefix + "depth": b.shape.depth}
+        return state
+
+    def restore(self, models: Sequence[Mapping[str, Any]], state: Mapping[str, Any]) -> None:
+        """Continue a run.
+
+        Args:
+            models: bodies of the people who are tracked.
+            state: of :meth:`state`.
+        """
+        subjects = self._setup.subjects
+        for number, model in enumerate(models):
+            own = below(f"{_PEOPLE}{number}/", state) if number else state
+            if number:
+                known = subjects[number] if number < len(subjects) else _unknown(subjects[0])
+                self.members.append(self._member(number, known, self._make()))
+            member = self.members[number]
+            member.tracker.restore(model, own)
+            self._restore(member, own)
+        k = 0
+        while found := below(f"{_BYSTANDERS}{k}/", state):
+            depth = np.asarray(found["depth"], np.float32)
+            shape = Cast((depth < FAR).astype(np.uint8), depth)
+            self._bystanders.append(Bystander(np.array(found["position"]), shape, int(found["since"])))
+            k += 1
+
+    def _state_of(self, member: Member) -> dict[str, Any]:
+        watch = {_WATCH + name: value for name, value in member.monitor.state().items()}
+        return {**member.tracker.state(), **watch, _LOST: member.lost, _ABSENT: member.absent}
+
+    def _restore(self, member: Member, state: Mapping[str, Any]) -> None:
+        member.monitor.restore(below(_WATCH, state))
+        member.lost, member.absent = bool(state[_LOST]), bool(state[_ABSENT])
+
+    # --- who enters and leaves ----------------------------------------------------------------------------------------
+
+    def _look(self, frame: Observation, answers: Mapping[int, Tracked], owners: PixelOwners | None = None) -> None:
+        """Look for people in the pixels that nobody explains, at intervals; note who is absent."""
+        lost = [m for m in self.members if m.lost]
+        for member in self.members:
+            member.absent &= member.lost
+        if self._grid is None or frame.index % self._every:
+            return
+        if owners is None:
+            residual = answers[self.members[0].number].estimate.residual
+            if not lost and (residual is None or not np.nanmean(residual[:, 1]) > SURPLUS):
+                return
+            owners = self._owners([self._shape(m, False) for m in self.members])
+        free = owners.unexplained(frame.masks)
+        found = [p for p in self._find(free) if p.inside] if free.any() else []
+        for member in lost:
+            member.absent = not found
+        known = [b.position for b in self._bystanders]
+        for person in found:
+            if lost or any(np.linalg.norm(person.position - other) < _SAME_M for other in known):
+                continue  # a lost person is searched for by the tracker
+            self._bystanders.append(Bystander(person.position, self._hull(person), frame.index))
+            x, y, z = person.position
+            self._note(f"frame {frame.index}: another person is in view, at ({x:.1f}, {y:.1f}, {z:.1f}) m")
+        self._bystanders = [b for b in self._bystanders if self._seen(b, frame)]
+
+    def _seen(self, bystander: Bystander, frame: Observation) -> bool:
+        """Return whether a person who is not tracked is still in view."""
+        covered = bystander.shape.label > 0
+        assert self._grid is not None
+        shown = covered & (self._grid.sample(frame.masks) >= 128)
+        return bool(np.count_nonzero(shown) > 0.3 * np.count_nonzero(covered))
+
+
+def parse_choice(text: str) -> Choice:
+    """Return the choice that a user gives as "auto", "all" or numbers, such as "0,2".
+
+    Raises:
+        ConfigError: it is none of these.
+    """
+    if text in ("auto", "all"):
+        return text
+    numbers = [part.strip() for part in text.split(",")]
+    if not all(part.isdecimal() for part in numbers) or len(set(numbers)) < len(numbers):
+        raise ConfigError(f"people {text!r}: give auto, all, or different numbers from 0 on, such as 0,2")
+    return tuple(map(int, numbers))
+
+
+def describe(choice: Choice) -> str:
+    """Return a choice as the user gives it."""
+    return choice if isinstance(choice, str) else ",".join(map(str, choice))
+
+
+def below(prefix: str, state: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of a state whose names begin with a prefix, without it."""
+    return {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
+
+
+def _position(subject: Subject) -> Float | None:
+    return subject.init.center if subject.init is not None else subject.position
+
+
+def _unknown(first: Subject) -> Subject:
+    """Return a subject of whom nothing is known but how the recording begins."""
+    return Subject(in_init_pose=first.in_init_pose)
+
+
+def _matched(subjects: Sequence[Subject], people: Sequence[LocatedPerson]) -> list[Subject]:
+    """Return the subject of each of the people: by position, else by height; nothing is known of the others."""
+    cost = np.zeros((len(people), len(subjects)))
+    for p, person in enumerate(people):
+        for s, subject in enumerate(subjects):
+            place = _position(subject)
+            if place is not None:
+                cost[p, s] += float(np.linalg.norm(person.position[:2] - place[:2]))
+            if subject.height_m is not None:
+                cost[p, s] += abs(person.height_m - subject.height_m)
+            cost[p, s] += 1e-6 * abs(p - s)
+    who = dict(zip(*linear_sum_assignment(cost), strict=True))
+    return [subjects[who[p]] if p in who else _unknown(subjects[0]) for p in range(len(people))]
+
+
+class _LocalHull:
+    """The visual hull in a small space around a person."""
+
+    def __init__(self, setup: Setup) -> None:
+        self._rig = setup.rig
+        self._to_plan = up_rotation(setup.up).T  # rows: two directions on the floor, and up
+        sides = [np.arange(-h, h + _VOXEL_M / 2, _VOXEL_M) for h in (_HALF_M, _HALF_M, _HALF_HEIGHT_M)]
+        self._offsets = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3) @ self._to_plan
+
+    def carve(self, position: Float, masks: NDArray[np.uint8]) -> Float:
+        """Return (N, 3) the centres of the voxels around a position (3,) that are in all masks (C, H, W) that see them,
+        and visibly in two."""
+        centers = self._offsets + position
+        inside = np.ones(len(centers), np.bool_)
+        visible = np.zeros(len(centers), np.int64)
+        for c, camera in enumerate(self._rig):
+            pixels, depth = camera.project(centers)
+            seen = camera.sees(centers) & (depth > 0)
+            x, y = np.rint(pixels[seen]).astype(np.int64).T
+            value = masks[c][np.clip(y, 0, camera.height - 1), np.clip(x, 0, camera.width - 1)]
+            inside[seen] &= value > 0
+            visible[seen] += value >= 128
+        return np.asarray(centers[inside & (visible >= 2)])
+
+    def centre(self, position: Float, points: Float) -> Float:
+        """Return the centre (3,) of the trunk of points (N, 3), near its last position (3,)."""
+        moved = (points - position) @ self._to_plan.T
+        near = moved[np.linalg.norm(moved[:, :2], axis=1) < _STEP_M]
+        if not len(near):
+            return position
+        x, y = np.median(near[:, :2], axis=0)
+        return np.asarray(position + [x, y, (near[:, 2].min() + near[:, 2].max()) / 2] @ self._to_plan)
