@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -57,6 +57,7 @@ def write(tmp_path: Path) -> Write:
         rows: Callable[[int], dict[str, Any]] = lambda f: {},
         lost: np.ndarray | None = None,
         frames: np.ndarray | None = None,
+        second: Collection[int] = (),  # rows in which another person makes the same movement
     ) -> Path:
         states = status() if lost is None else lost
         fixed = ResultMeta(
@@ -73,23 +74,24 @@ def write(tmp_path: Path) -> Write:
             **(meta or {}),
         )
         path = tmp_path / name
-        with ResultWriter.create(path, fixed) as writer:
-            writer.write_model({f"dimensions/{key}": value for key, value in asdict(BODY).items()})
+        people = 2 if second else 1
+        with ResultWriter.create(path, fixed, people=people) as writer:
+            for person in range(people):
+                writer.write_model({f"dimensions/{key}": value for key, value in asdict(BODY).items()}, person=person)
             for f, pose in enumerate(poses(skeleton)):
                 index = FIRST + f if frames is None else int(frames[f])
-                writer.append(
-                    FrameResult(
-                        frame=index,
-                        time=index / FPS,
-                        pose=pose,
-                        joints=skeleton.joints(pose),
-                        status=int(states[f]),
-                        objective=0.0,
-                        iterations=np.zeros(1, int),
-                        timing={},
-                        **rows(f),
-                    )
+                row = FrameResult(
+                    frame=index,
+                    time=index / FPS,
+                    pose=pose,
+                    joints=skeleton.joints(pose),
+                    status=int(states[f]),
+                    objective=0.0,
+                    iterations=np.zeros(1, int),
+                    timing={},
+                    **rows(f),
                 )
+                writer.append({person: row for person in range(people) if person == 0 or f in second})
         return path
 
     return run

@@ -55,6 +55,14 @@ def test_bvh_reproduces_the_joints_within_a_millimetre(write: Write) -> None:
         np.testing.assert_allclose(found["tip of ankle_r"], toe[[1, 2, 0]], atol=1e-4)
 
 
+def test_lengths_in_centimetres(write: Write) -> None:
+    path = write()
+    metres = places(export(path, ["bvh"]).files[0], 3)
+    centimetres = places(export(path, ["bvh"], force=True, bvh_units="cm").files[0], 3)
+    for name, place in metres.items():
+        np.testing.assert_allclose(centimetres[name], 100 * place, atol=1e-2, err_msg=name)
+
+
 def test_lost_frames_repeat_the_last_known_pose(write: Write) -> None:
     written = export(write(), ["bvh"])
     assert any("2 lost frames" in note for note in written.notes)

@@ -9,6 +9,7 @@ import ezc3d
 import numpy as np
 import pytest
 
+from tests.conftest import Tk
 from tests.export.conftest import FPS, FRAMES, LOST, Write
 from tk.errors import ExportError, ResultError
 from tk.export import export, read_motion
@@ -62,11 +63,13 @@ def test_residual_is_the_standard_deviation(write: Write) -> None:
     assert residuals[4, 0] == 127, "as much as the format holds, and not what is left over from 256"
 
 
-def test_missing_package_is_one_line(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_stops_its_format_only(tk: Tk, write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write()
     monkeypatch.setitem(sys.modules, "ezc3d", None)
-    with pytest.raises(ExportError, match=r"pip install 'tk-mocap\[export\]'"):
+    with pytest.raises(ExportError, match=r"c3d: needs the package ezc3d: pip install 'tk-mocap\[export\]'"):
         export(path, ["c3d"])
     assert not list(path.parent.glob("*c3d*"))
-    assert export(path, ["trc"]).files[0].exists()  # the others do without
     assert not issubclass(ExportError, ResultError)
+    ran = tk("export", path, "--to", "c3d,trc,bvh")
+    assert ran.code == 1 and ran.err.splitlines()[-1].startswith("tk: not written: c3d: needs the package ezc3d")
+    assert path.with_suffix(".trc").exists() and path.with_suffix(".bvh").exists()

@@ -11,8 +11,9 @@ import pytest
 
 from tests.conftest import Tk
 from tests.export.conftest import FIRST, FPS, FRAMES, LOST, SKELETON, Write, poses, status
+from tests.export.test_opensim import read_trc
 from tk.errors import ExportError, ResultError
-from tk.export import FORMATS, export, read_motion
+from tk.export import FORMATS, Motion, export, read_motion
 from tk.io.results.status import Status
 from tk.model.body.angles import segment_quaternions
 from tk.model.body.anthropometry import BodyDimensions
@@ -104,6 +105,34 @@ def test_smoothed_here_where_the_result_has_no_copy(write: Write) -> None:
     assert motion.known.all() and motion.bridged.sum() == len(LOST)
     true = np.array([SKELETON.joints(pose) for pose in poses()])
     assert np.linalg.norm(motion.points[:, :15] - true, axis=2).max() < 0.06
+
+
+def test_all_formats_and_a_format_that_fails(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write()
+    written = export(path, ["all"])
+    names = {file.name for file in written.files}
+    assert {f"walk{ending}" for outputs in FORMATS.values() for ending, _ in outputs} == names and not written.failed
+
+    def fail(motion: Motion, target: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setitem(FORMATS, "mot", ((".mot", fail),))
+    written = export(path, ["mot", "trc"], force=True)
+    assert [file.name for file in written.files] == ["walk.trc"]
+    assert written.failed == (f"mot: {path.with_suffix('.mot')}: cannot be written: No space left on device",)
+
+
+def test_each_person_has_files_with_a_number(write: Write) -> None:
+    """Person 1 enters later and is away for two frames, which the files mark as lost."""
+    away, first = (8, 9), 3
+    single = write(second=sorted({*range(first, FRAMES)} - {*away}))
+    written = export(single, ["trc", "bvh"])
+    assert [file.name for file in written.files] == ["walk_0.trc", "walk_0.bvh", "walk_1.trc", "walk_1.bvh"]
+    zero, one = (read_trc(path).points for path in written.files[::2])
+    assert len(one) == FRAMES - first
+    unknown = np.isnan(one).all(axis=(1, 2))
+    assert {*np.flatnonzero(unknown) + first} == {*away, *LOST}
+    np.testing.assert_array_equal(one[~unknown], zero[first:][~unknown])
 
 
 def test_unusable_requests_are_refused(write: Write, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from tk.kernels.cones import CONE
 from tk.model.body.skeleton import JOINTS
 from tk.trackers.bodies import body_and_poses
 
-TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 DTYPES = {5126: np.float32, 5123: np.uint16}
 
 
@@ -41,7 +41,7 @@ def frame_transforms(file: pygltflib.GLTF2, f: int) -> dict[str, np.ndarray]:
     for node in file.nodes:
         assert node.rotation is None or node.rotation == [0, 0, 0, 1]
         T = np.eye(4)
-        T[:3, 3] = node.translation
+        T[:3, 3] = node.translation or 0.0
         local.append(T)
     for channel in animation.channels:
         sampler = animation.samplers[channel.sampler]
@@ -96,8 +96,8 @@ def test_lost_frames_are_held_and_listed(write: Write) -> None:
     assert file.asset.extras["lost_frames"] == [int(frames[f]) for f in LOST]
 
 
-def test_segment_meshes_are_attached_to_their_nodes(write: Write) -> None:
-    """The meshes in a frame lie where the body's surface lies."""
+def test_the_skinned_mesh_lies_on_the_body(write: Write) -> None:
+    """In a frame, the vertices of each segment, moved by its bone, lie where the body's surface lies."""
     path = write()
     restored = body_and_poses(read_result(path))
     assert restored is not None
@@ -109,14 +109,19 @@ def test_segment_meshes_are_attached_to_their_nodes(write: Write) -> None:
     sampled = {p: body.place(tracked[f], np.full(len(unscaled), p), unscaled) for p in cones}
     file = load(export(path, ["gltf"]).files[0])
     T = frame_transforms(file, f)
-    assert {mesh.name for mesh in file.meshes} == {part.segment for part in body.parts}
-    for node in file.nodes:
-        if node.mesh is None:
-            continue
-        mesh = file.meshes[node.mesh]
-        (primitive,) = mesh.primitives
-        at = array(file, primitive.attributes.POSITION) @ T[node.name][:3, :3].T + T[node.name][:3, 3]
-        facing = array(file, primitive.attributes.NORMAL) @ T[node.name][:3, :3].T
+    (skin,), (mesh,) = file.skins, file.meshes
+    (node,) = (node for node in file.nodes if node.mesh is not None)
+    assert node.skin == 0 and file.nodes.index(node) in file.scenes[0].nodes
+    inverse = array(file, skin.inverseBindMatrices).reshape(-1, 4, 4).transpose(0, 2, 1)
+    bones = np.array([T[file.nodes[n].name] for n in skin.joints]) @ inverse
+    assert {file.materials[p.material].name for p in mesh.primitives} == {part.segment for part in body.parts}
+    for primitive in mesh.primitives:
+        segment = file.materials[primitive.material].name
+        weights = array(file, primitive.attributes.WEIGHTS_0)
+        np.testing.assert_array_equal(weights.sum(axis=1), 1)
+        moved = np.einsum("vj,vjab->vab", weights, bones[array(file, primitive.attributes.JOINTS_0)])
+        at = (moved[:, :3, :3] @ array(file, primitive.attributes.POSITION)[..., None])[..., 0] + moved[:, :3, 3]
+        facing = (moved[:, :3, :3] @ array(file, primitive.attributes.NORMAL)[..., None])[..., 0]
         triangles = array(file, primitive.indices).reshape(-1, 3)
         assert triangles.max() == len(at) - 1
         np.testing.assert_allclose(np.linalg.norm(facing, axis=1), 1, atol=1e-4)
@@ -127,8 +132,8 @@ def test_segment_meshes_are_attached_to_their_nodes(write: Write) -> None:
         along = (across * facing[triangles].mean(axis=1))[big].sum(axis=1)
         assert (along > 0).mean() > 0.98
         # glTF's axes are left, up, forward; a point of the surface lies on a triangle or nearly so
-        mine = np.concatenate([sampled[p] for p in cones if body.parts[p].segment == mesh.name] or [at[:, [2, 0, 1]]])
+        mine = np.concatenate([sampled[p] for p in cones if body.parts[p].segment == segment] or [at[:, [2, 0, 1]]])
         inside = np.random.default_rng(0).dirichlet([1, 1, 1], 40)
         surface = np.einsum("km,mta->kta", inside, np.stack([a, b, c])).reshape(-1, 3)
         distance, _ = cKDTree(np.concatenate([at, surface])).query(mine[:, [1, 2, 0]])
-        assert distance.mean() < 0.01 and distance.max() < 0.03, mesh.name
+        assert distance.mean() < 0.01 and distance.max() < 0.03, segment

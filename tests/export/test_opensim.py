@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from tests.export.conftest import FIRST, FPS, FRAMES, LOST, SKELETON, Write, poses
+from tests.export.conftest import BODY, FIRST, FPS, FRAMES, LOST, SKELETON, Write, poses
 from tk.export import export, read_motion
 from tk.export.mot import coordinates
 from tk.model.body.joints import WAIST
-from tk.model.body.rotations import turn
+from tk.model.body.rotations import compose, follow_rotations, turn
 from tk.model.body.skeleton import JOINTS, build_skeleton
 
 
@@ -67,9 +68,9 @@ def test_trc_holds_the_joints(write: Write) -> None:
     found = read_trc(target)
     assert found.header["Units"] == "mm" and found.markers[:15] == JOINTS
     assert [float(found.header[name]) for name in ("DataRate", "CameraRate", "OrigDataRate")] == [FPS] * 3
-    assert (found.header["OrigDataStartFrame"], found.header["OrigNumFrames"]) == (str(FIRST), str(FRAMES))
-    np.testing.assert_array_equal(found.frames, np.arange(FIRST, FIRST + FRAMES))
-    np.testing.assert_allclose(found.times, found.frames / FPS, atol=1e-6)
+    assert (found.header["OrigDataStartFrame"], found.header["OrigNumFrames"]) == (str(FIRST + 1), str(FRAMES))
+    np.testing.assert_array_equal(found.frames, np.arange(1, FRAMES + 1))
+    np.testing.assert_allclose(found.times, (FIRST + np.arange(FRAMES)) / FPS, atol=1e-6)
     assert np.isnan(found.points[list(LOST)]).all()
     joints = np.array([SKELETON.joints(pose) for pose in poses()])[known()]
     x, y, z = np.moveaxis(1000 * joints, -1, 0)
@@ -120,6 +121,32 @@ def test_mot_angles_reproduce_the_limb_directions(write: Write) -> None:
         ):  # fmt: skip
             bone = points[lower + side] - points[upper + side]
             np.testing.assert_allclose(R @ down, bone / np.linalg.norm(bone, axis=1)[:, None], atol=1e-6)
+
+
+def test_mot_pelvis_is_rajagopals_origin(write: Write) -> None:
+    """The hip centres of the model, placed by the coordinates and scaled to the body, are those of the result."""
+    motion, _ = read_motion(write())
+    at = coordinates(motion)
+    turns = [np.radians(at[f"pelvis_{name}"]) for name in ("tilt", "list", "rotation")]
+    R = turn("z", turns[0]) @ turn("x", turns[1]) @ turn("y", turns[2])
+    origin = np.stack([at[f"pelvis_t{axis}"] for axis in "xyz"], axis=1)
+    scale = BODY.hip_half_width / 0.07726
+    for side, sign in (("r", 1.0), ("l", -1.0)):
+        hip = origin + R @ (scale * np.array([-0.056276, -0.07849, sign * 0.07726]))
+        x, y, z = motion.point(f"hip_{side}").T
+        np.testing.assert_allclose(hip, np.stack([x, z, -y], axis=1), atol=1e-6)
+
+
+def test_mot_angles_of_a_level_arm_do_not_jump() -> None:
+    """An arm held level to the side is singular in Z-X-Y; noise of half a degree moves the angles by a few degrees."""
+    level, frames = compose("zxy", np.radians([0.0, -90.0, 0.0])), 60
+    noise = Rotation.from_rotvec(np.random.default_rng(0).normal(0, np.radians(0.5), (frames, 3))).as_matrix()
+    found = follow_rotations("zxy", level @ noise)
+    assert np.degrees(np.abs(np.diff(found, axis=0)).max()) < 5
+    error = Rotation.from_matrix(np.swapaxes(compose("zxy", found), 1, 2) @ level @ noise).magnitude()
+    assert np.degrees(error.max()) < 1.5
+    steep = compose("zxy", np.radians([[10.0, -75.0, 20.0], [30.0, 60.0, -20.0]]))
+    np.testing.assert_allclose(compose("zxy", follow_rotations("zxy", steep)), steep, atol=1e-12)
 
 
 def test_mot_angles_are_continuous(write: Write) -> None:

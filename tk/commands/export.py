@@ -13,17 +13,27 @@ from tk.commands import base
 @base.result_argument
 @click.option(
     "--to", "formats", required=True, metavar="A,B,…",
-    help="Formats: trc, mot (OpenSim), c3d, bvh, csv, gltf (.glb), ply (a folder).",
+    help="Formats: trc, mot (OpenSim), c3d, bvh, csv, gltf (.glb), ply (a folder); all.",
 )  # fmt: skip
+@click.option(
+    "--bvh-units", type=click.Choice(["m", "cm"]), default="m", show_default=True, help="Unit of lengths in BVH files."
+)
 @click.option("-o", "--output", type=base.PATH, metavar="DIR", help="Folder.  [default: the folder of RESULT.h5]")
 @click.option("--smoothed", is_flag=True, help="Export the smoothed motion, with short losses bridged.")
 @base.force_option
-def export(result: Path, formats: str, output: Path | None, smoothed: bool, force: bool) -> None:
-    """Write RESULT.h5 in the formats of other programs: OpenSim, Blender, spreadsheets."""
+def export(result: Path, formats: str, output: Path | None, bvh_units: str, smoothed: bool, force: bool) -> None:
+    """Write RESULT.h5 in the formats of other programs: OpenSim, Blender, spreadsheets.
+
+    A format that cannot be written is named at the end, with the remedy; the others are written.
+    """
     with base.working(f"exporting {result}"):
         from tk.export import export as write
 
-        written = write(result, base.split_names(formats) or (), output, smoothed, force)
+        written = write(result, base.split_names(formats) or (), output, smoothed, force, bvh_units)
     base.print_notes(written.notes)
     for file in written.files:
         click.echo(f"wrote {file}", err=True)
+    for line in written.failed:
+        click.echo(f"tk: not written: {line}", err=True)
+    if written.failed:
+        raise click.exceptions.Exit(1)

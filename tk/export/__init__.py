@@ -8,18 +8,22 @@ import re
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
-from tk.errors import ExportError
-from tk.export.bvh import write_bvh
+from tk.errors import ExportError, ResultError, TkError
+from tk.export.bvh import BVH_UNITS, write_bvh
 from tk.export.c3d import write_c3d
 from tk.export.csv import write_angles_csv, write_points_csv
 from tk.export.gltf import write_glb
 from tk.export.mot import write_mot
-from tk.export.motion import Motion, read_motion
+from tk.export.motion import Motion, motion_of, read_motion
 from tk.export.ply import write_body_meshes
 from tk.export.trc import write_trc
 from tk.io.paths import Kind, check_not_input, check_output, looks_like
+from tk.io.results.data import Result
+from tk.io.results.reader import read_result
 
 __all__ = ["FORMATS", "Exported", "Motion", "export", "read_motion"]
 
@@ -35,6 +39,8 @@ FORMATS: dict[str, tuple[tuple[str, Writer], ...]] = {
     "gltf": ((".glb", write_glb),),
     "ply": (("_ply", write_body_meshes),),
 }
+# Packages that a format needs beyond those of tk itself, and the command that installs each.
+_PACKAGES = {"c3d": ("ezc3d", "pip install 'tk-mocap[export]'"), "ply": ("open3d", "pip install open3d")}
 #: how a file of each format begins
 _SIGNATURES = {
     ".trc": looks_like(rb"PathFileType\t"),
@@ -50,10 +56,17 @@ _HOLDING = ("bvh", "gltf", "ply")
 
 @dataclass(frozen=True)
 class Exported:
-    """The files that :func:`export` has written, and notes for the user."""
+    """What :func:`export` has done.
+
+    Attributes:
+        files: the files and folders that were written.
+        notes: for the user.
+        failed: for each format that could not be written, its name, the reason and the remedy.
+    """
 
     files: tuple[Path, ...]
     notes: tuple[str, ...]
+    failed: tuple[str, ...] = ()
 
 
 def export(
@@ -62,40 +75,86 @@ def export(
     folder: Path | None = None,
     smoothed: bool = False,
     force: bool = False,
+    bvh_units: str = "m",
 ) -> Exported:
-    """Write a result in other formats; the files take its name.
+    """Write a result in other formats; the files take its name, with `_0`, `_1`, … if it has several people.
+
+    A format that cannot be written does not stop the others.
 
     Args:
-        formats: names of :data:`FORMATS`.
+        formats: names of :data:`FORMATS`, or "all".
         folder: output folder, created if necessary; None: the folder of the result.
         smoothed: export the smoothed copy; `_smoothed` is added to the files' names.
         force: replace existing files.
+        bvh_units: "m" or "cm", the unit of lengths in BVH files.
 
     Raises:
         ResultError: the result cannot be read, or has nothing to export.
-        ExportError: a format is unknown, a file exists, a package is missing, or a file cannot be written.
+        ExportError: a format is unknown, a file exists, or none of the formats can be written.
     """
-    unknown = [name for name in formats if name not in FORMATS]
-    if unknown or not formats:
-        raise ExportError(f"formats {', '.join(formats)}: give some of {', '.join(FORMATS)}")
+    formats = tuple(FORMATS) if "all" in formats else tuple(dict.fromkeys(formats))
+    if not formats or not {*formats} <= {*FORMATS}:
+        raise ExportError(f"formats {', '.join(formats)}: give some of {', '.join(FORMATS)}, or all")
+    if bvh_units not in BVH_UNITS:
+        raise ExportError(f"BVH unit {bvh_units}: give one of {', '.join(BVH_UNITS)}")
+    failed = {
+        name: f"needs the package {package}: {remedy}"
+        for name, (package, remedy) in _PACKAGES.items()
+        if name in formats and find_spec(package) is None
+    }
     path = Path(result)
     folder = path.parent if folder is None else folder
-    stem = path.stem + ("_smoothed" if smoothed else "")
-    jobs = [(folder / (stem + ending), write) for name in dict.fromkeys(formats) for ending, write in FORMATS[name]]
-    for target, _ in jobs:
+    people = read_result(path).people
+    writers: dict[str, tuple[tuple[str, Writer], ...]] = {
+        **FORMATS,
+        "bvh": ((".bvh", partial(write_bvh, units=bvh_units)),),
+    }
+    jobs = [
+        (person, name, folder / f"{path.stem}{_number(person, people)}{smoothed * '_smoothed'}{ending}", write)
+        for person in people
+        for name in formats
+        if name not in failed
+        for ending, write in writers[name]
+    ]
+    for _, _, target, _ in jobs:
         if target.suffix in _SIGNATURES and target.parent.is_dir():
             kind = Kind(f"a file of tk export in {target.suffix}", (target.suffix,), _SIGNATURES[target.suffix])
             check_output(target, kind, force, [path])
         elif check_not_input(target, [path]).exists() and not force:
             raise ExportError(f"{target}: exists; choose another folder", hint="or replace it with --force")
-    motion, notes = read_motion(path, smoothed)
-    lost = int((~motion.known).sum())
-    holding = [name for name in formats if name in _HOLDING]
-    if lost and holding:
-        notes = (*notes, f"{', '.join(holding)}: in {lost} lost frames the pose before is held")
-    for target, write in jobs:
-        _write(motion, target, write)
-    return Exported(tuple(target for target, _ in jobs), notes)
+    motions: dict[int, Motion] = {}
+    notes: list[str] = []
+    for person in people:
+        whose = f"person {person.person}: " if len(people) > 1 else ""
+        try:
+            motion, found = motion_of(person, smoothed)
+        except ResultError as error:
+            if not whose:
+                raise
+            notes.append(f"{whose}not exported: {error}")
+            continue
+        motions[person.person] = motion
+        notes += found
+        lost = int((~motion.known).sum())
+        holding = [name for name in formats if name in _HOLDING]
+        if lost and holding:
+            notes.append(f"{whose}{', '.join(holding)}: in {lost} lost frames the pose before is held")
+    written = []
+    for person, name, target, write in jobs:
+        if name in failed or person.person not in motions:
+            continue
+        try:
+            _write(motions[person.person], target, write)
+            written.append(target)
+        except TkError as error:
+            failed[name] = str(error)
+    if not written:
+        raise ExportError("; ".join(dict.fromkeys(f"{name}: {reason}" for name, reason in failed.items()) or notes))
+    return Exported(tuple(written), tuple(notes), tuple(f"{name}: {reason}" for name, reason in failed.items()))
+
+
+def _number(person: Result, people: Sequence[Result]) -> str:
+    return f"_{person.person}" if len(people) > 1 else ""
 
 
 def _write(motion: Motion, target: Path, write: Writer) -> None:

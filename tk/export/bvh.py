@@ -1,14 +1,15 @@
 """Write BVH files, for Blender and other animation programs.
 
-Axes, units and rest pose are those of :mod:`tk.export.tree`: Y up, facing +Z, metres, a T pose with the lengths of the
-fitted body. Rotations are Z, then X, then Y about moving axes, degrees. The root and the shoulders, which rise with the
-arms, have position channels; they are the position in the parent and replace the OFFSET. An unknown frame repeats the
-last known pose.
+Axes and rest pose are those of :mod:`tk.export.tree`: Y up, facing +Z, a T pose with the lengths of the fitted body.
+The format does not state its unit: metres, or centimetres, which many animation programs assume. Rotations are Z, then
+X, then Y about moving axes, degrees. The root and the shoulders, which rise with the arms, have position channels; they
+are the position in the parent and replace the OFFSET. An unknown frame repeats the last known pose.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +19,21 @@ from tk.export.motion import Motion
 from tk.export.tree import Tree, build_tree
 from tk.model.body.rotations import decompose, follow
 
+#: lengths of a metre
+BVH_UNITS = {"m": 1.0, "cm": 100.0}
 _POSITION = ("Xposition", "Yposition", "Zposition")
 _ROTATION = ("Zrotation", "Xrotation", "Yrotation")
 
 
-def write_bvh(motion: Motion, path: Path) -> None:
-    """Write the tree; head, hands and toes are End Sites. Heels are omitted: a foot can have only one End Site."""
+def write_bvh(motion: Motion, path: Path, units: str = "m") -> None:
+    """Write the tree; head, hands and toes are End Sites. Heels are omitted: a foot can have only one End Site.
+
+    Args:
+        units: one of :data:`BVH_UNITS`.
+    """
     tree = build_tree(motion)
+    scale = BVH_UNITS[units]
+    tree = replace(tree, offsets=scale * tree.offsets, translations=scale * tree.translations)
     columns = []
     for node in _in_order(tree, 0):
         if tree.moving[node]:
@@ -60,9 +69,11 @@ def _node(tree: Tree, node: int, indent: str) -> Iterator[str]:
     if not _is_tip(tree, node):
         channels = (*(_POSITION if tree.moving[node] else ()), *_ROTATION)
         yield f"{inner}CHANNELS {len(channels)} " + " ".join(channels)
-        for child in tree.children(node):
-            if not tree.names[child].startswith("heel"):
-                yield from _node(tree, child, inner)
+        children = [child for child in tree.children(node) if not tree.names[child].startswith("heel")]
+        for child in children:
+            yield from _node(tree, child, inner)
+        if not children:
+            yield from (f"{inner}End Site", f"{inner}{{", f"{inner}  OFFSET " + _numbers(np.zeros(3)), f"{inner}}}")
     yield f"{indent}}}"
 
 

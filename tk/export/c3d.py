@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from tk.errors import ExportError
 from tk.export.motion import Motion
 from tk.model.body.joints import SEGMENT_ORIGIN
 
@@ -20,15 +19,9 @@ _MOST_RESIDUAL = 127
 
 
 def write_c3d(motion: Motion, path: Path) -> None:
-    """Write the joints, the points of the feet and the segments.
+    """Write the joints, the points of the feet and the segments."""
+    import ezc3d
 
-    Raises:
-        ExportError: ezc3d is not installed.
-    """
-    try:
-        import ezc3d
-    except ImportError:
-        raise ExportError("--to c3d needs the package ezc3d: pip install 'tk-mocap[export]'") from None
     file = ezc3d.c3d()
     points = np.ones((4, len(motion.point_names), len(motion)))
     points[:3] = 1000.0 * motion.points.transpose(2, 1, 0)

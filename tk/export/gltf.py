@@ -1,4 +1,6 @@
-"""Write glTF 2.0 as one file (.glb): the tree of nodes, its animation, and a mesh of each segment on its node.
+"""Write glTF 2.0 as one file (.glb): the tree of nodes, its animation, and one mesh whose skin are the nodes.
+
+The mesh has a primitive, with a material, for each segment; every vertex follows the node of its segment.
 
 Axes, units and rest pose are those of :mod:`tk.export.tree` and of glTF. An unknown frame repeats the last known pose;
 `asset.extras.lost_frames` of the file lists these frames.
@@ -40,12 +42,13 @@ class _Buffer:
         self.accessors: list[dict[str, Any]] = []
 
     def add(self, values: NDArray[Any], target: int | None = None, bounds: bool = False) -> int:
-        """Append an array (N,) or (N, k), float32 or uint16, and return the index of its accessor."""
+        """Append an array (N,) or (N, k), float32 or uint16, and return the index of its accessor; 16 numbers are a
+        matrix, column by column."""
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": values.nbytes}
         self.views.append(view if target is None else view | {"target": target})
         self.data += values.tobytes()
         self.data += bytes(-len(self.data) % 4)
-        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1] if values.ndim > 1 else 1]
+        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}[values.shape[1] if values.ndim > 1 else 1]
         component = _UINT16 if values.dtype == np.uint16 else _FLOAT
         accessor: dict[str, Any] = {
             "bufferView": len(self.views) - 1, "componentType": component, "count": len(values), "type": kind,
@@ -58,7 +61,7 @@ class _Buffer:
 
 
 def write_glb(motion: Motion, path: Path) -> None:
-    """Write nodes, animation and meshes."""
+    """Write nodes, animation and the skinned mesh."""
     tree, buffer = build_tree(motion), _Buffer()
     nodes: list[dict[str, Any]] = []
     for n, name in enumerate(tree.names):
@@ -66,8 +69,7 @@ def write_glb(motion: Motion, path: Path) -> None:
         children = tree.children(n)
         nodes.append(node | {"children": children} if children else node)
     nodes[0]["translation"] = tree.translations[0, 0].tolist()
-    meshes = _meshes(motion, tree, buffer, nodes)
-    document = {
+    document: dict[str, Any] = {
         "asset": {
             "version": "2.0",
             "generator": f"tk {__version__}",
@@ -76,7 +78,6 @@ def write_glb(motion: Motion, path: Path) -> None:
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": nodes,
-        "meshes": meshes,
         "materials": [
             {
                 "name": segment,
@@ -85,10 +86,14 @@ def write_glb(motion: Motion, path: Path) -> None:
             for segment, color in SEGMENT_COLORS.items()
         ],
         "animations": [_animation(motion, tree, buffer)],
+        **_body(motion, tree, buffer),
         "accessors": buffer.accessors,
         "bufferViews": buffer.views,
         "buffers": [{"byteLength": len(buffer.data)}],
     }
+    if "meshes" in document:
+        document["scenes"][0]["nodes"].append(len(nodes))
+        nodes.append({"name": "body", "mesh": 0, "skin": 0})
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(buffer.data), b"BIN\0")
@@ -113,10 +118,14 @@ def _animation(motion: Motion, tree: Tree, buffer: _Buffer) -> dict[str, Any]:
     return {"name": motion.name, "channels": channels, "samplers": samplers}
 
 
-def _meshes(motion: Motion, tree: Tree, buffer: _Buffer, nodes: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return a mesh for each segment that has solids, and refer to it in the segment's node."""
+def _body(motion: Motion, tree: Tree, buffer: _Buffer) -> dict[str, Any]:
+    """Return the mesh in the rest pose and its skin; nothing if the result has no body."""
     solids = figure_of(motion.result).solids
-    meshes: list[dict[str, Any]] = []
+    place = np.zeros((len(tree.names), 3))  # of each node in the rest pose, the root at the origin
+    for n, parent in enumerate(tree.parents):
+        place[n] = tree.offsets[n] + (place[parent] if parent >= 0 else 0.0)
+    bones = [n for n, segment in enumerate(tree.segments) if segment]
+    primitives: list[dict[str, Any]] = []
     for s, segment in enumerate(SEGMENTS):
         own = [solid for solid in solids if solid.segment == s]
         if not own:
@@ -128,19 +137,32 @@ def _meshes(motion: Motion, tree: Tree, buffer: _Buffer, nodes: list[dict[str, A
         starts = np.cumsum([0, *(len(p) for p in points[:-1])])
         in_body = np.concatenate(points) @ motion.T_world_body - origin
         turned = np.concatenate(normals) @ motion.T_world_body
-        attributes = {
-            "POSITION": buffer.add(_float32(in_body @ to_rest.T), _VERTICES, bounds=True),
-            "NORMAL": buffer.add(_float32(turned @ to_rest.T), _VERTICES),
-        }
         indices = np.concatenate([start + face.ravel() for start, face in zip(starts, faces, strict=True)])
-        primitive = {
-            "attributes": attributes,
-            "indices": buffer.add(indices.astype(np.uint16), _INDICES),
-            "material": list(SEGMENT_COLORS).index(segment),
+        joints = np.zeros((len(in_body), 4), np.uint16)
+        joints[:, 0] = bones.index(node)
+        weights = np.tile(np.array([1, 0, 0, 0], np.float32), (len(in_body), 1))
+        attributes = {
+            "POSITION": buffer.add(_float32(in_body @ to_rest.T + place[node]), _VERTICES, bounds=True),
+            "NORMAL": buffer.add(_float32(turned @ to_rest.T), _VERTICES),
+            "JOINTS_0": buffer.add(joints, _VERTICES),
+            "WEIGHTS_0": buffer.add(weights, _VERTICES),
         }
-        nodes[node]["mesh"] = len(meshes)
-        meshes.append({"name": segment, "primitives": [primitive]})
-    return meshes
+        primitives.append(
+            {
+                "attributes": attributes,
+                "indices": buffer.add(indices.astype(np.uint16), _INDICES),
+                "material": list(SEGMENT_COLORS).index(segment),
+            }
+        )
+    if not primitives:
+        return {}
+    to_bones = np.tile(np.eye(4), (len(bones), 1, 1))
+    to_bones[:, 3, :3] = -place[bones]  # transposed: column by column
+    inverse = buffer.add(_float32(to_bones.reshape(-1, 16)))
+    return {
+        "meshes": [{"name": "body", "primitives": primitives}],
+        "skins": [{"joints": bones, "skeleton": 0, "inverseBindMatrices": inverse}],
+    }
 
 
 def _surface(solid: Solid) -> tuple[Float, Float, NDArray[np.int64]]:

@@ -2,9 +2,8 @@
 
 Coordinates have the names, the axes and the signs of the full-body model of Rajagopal et al., IEEE Trans. Biomed. Eng.
 63 (2016) 2068-2079 (`Rajagopal2016.osim`): rotations Z-X-Y at pelvis, lumbar joint, hip and shoulder, hinges at knee
-and elbow. The pelvis position is the midpoint of the hip centres; the origin of that model is elsewhere in the pelvis,
-so translations differ by an offset that is constant in the pelvis frame. Axes as in :mod:`tk.export.trc`; degrees and
-metres.
+and elbow. `pelvis_tx`, `ty`, `tz` are the position of that model's pelvis origin, midway between the anterior superior
+iliac spines, scaled to the width between the hip centres. Axes as in :mod:`tk.export.trc`; degrees and metres.
 """
 
 from __future__ import annotations
@@ -16,10 +15,12 @@ from numpy.typing import NDArray
 
 from tk.export.motion import Motion
 from tk.model.body.angles import FORWARD_UP_RIGHT
-from tk.model.body.rotations import decompose, follow
+from tk.model.body.rotations import follow_rotations
 
 Float = NDArray[np.float64]
 
+# The model's right hip centre in its pelvis frame (forward, up, right), metres: joint hip_r of Rajagopal2016.osim.
+_HIP_IN_PELVIS = np.array([-0.056276, -0.078490, 0.077260])
 _MIRROR = np.diag([1.0, 1.0, -1.0])
 
 # Parent, child, and the coordinates for the rotations about Z, X, Y (None: not written; minus: opposite sign).
@@ -54,9 +55,12 @@ def write_mot(motion: Motion, path: Path) -> None:
 def coordinates(motion: Motion) -> dict[str, Float]:
     """Return OpenSim's coordinates, each (F,), degrees; translations of the pelvis in metres."""
     A = FORWARD_UP_RIGHT @ motion.T_world_body.T
-    pelvis = _turns(A @ motion.rotation("pelvis") @ FORWARD_UP_RIGHT.T)
+    R_pelvis = A @ motion.rotation("pelvis") @ FORWARD_UP_RIGHT.T
+    pelvis = _turns(R_pelvis)
+    scale = motion.dimensions.hip_half_width / _HIP_IN_PELVIS[2]
+    origin = motion.point("pelvis") @ A.T - R_pelvis @ (scale * _HIP_IN_PELVIS * [1.0, 1.0, 0.0])
     found = {name: pelvis[:, k] for k, name in enumerate(("pelvis_tilt", "pelvis_list", "pelvis_rotation"))}
-    found |= {f"pelvis_t{axis}": (motion.point("pelvis") @ A.T)[:, k] for k, axis in enumerate("xyz")}
+    found |= {f"pelvis_t{axis}": origin[:, k] for k, axis in enumerate("xyz")}
     joints = [(*joint, "") for joint in _TRUNK] + [(*joint, side) for side in ("_r", "_l") for joint in _SIDE]
     for parent, child, names, side in joints:
         above, below = (name if name in ("pelvis", "torso") else name + side for name in (parent, child))
@@ -70,4 +74,4 @@ def coordinates(motion: Motion) -> dict[str, Float]:
 
 def _turns(R: Float) -> Float:
     """Return angles (F, 3) about Z, X, Y, degrees, without jumps."""
-    return np.degrees(follow(decompose("zxy", R)))
+    return np.degrees(follow_rotations("zxy", R))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +47,7 @@ class Motion:
     """A person's motion over F frames. An unknown frame has the values of the last known frame before it.
 
     Attributes:
-        name: the result's file name without suffix.
+        name: the result's file name without suffix; of several people with `_0`, `_1`, …
         fps: frames per second.
         frames, time: (F,) source frame indices; times, s.
         status: (F,) as in the result.
@@ -116,7 +118,16 @@ def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[M
     Raises:
         ResultError: as :func:`tk.io.results.reader.read_result`, or the result has no body or no known frame.
     """
-    result = read_result(path)
+    return motion_of(read_result(path), smoothed)
+
+
+def motion_of(result: Result, smoothed: bool = False) -> tuple[Motion, tuple[str, ...]]:
+    """Return the motion of one person; see :func:`read_motion`."""
+    path = result.path
+    name = path.stem
+    if result.person or result.others:
+        name += f"_{result.person}"
+        result = _with_absent_frames(result)
     bridged = np.zeros(len(result), dtype=bool)
     is_made_here = smoothed and result.smoothed is None
     if smoothed and result.smoothed is not None:
@@ -160,7 +171,7 @@ def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[M
     if result.sigma is not None:
         sigma[:, : len(joints)] = result.sigma[:, joints]
     motion = Motion(
-        name=result.path.stem,
+        name=name,
         fps=result.meta.fps,
         frames=result.frames,
         time=result.time,
@@ -185,6 +196,26 @@ def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[M
         placed = zip(FOOT_SEGMENT.values(), soles, strict=True)
         feet = np.stack([motion.fixed_point(segment, place) for segment, place in placed], axis=1)
     return replace(motion, points=np.concatenate([motion.points, feet], axis=1)), notes
+
+
+def _with_absent_frames(result: Result) -> Result:
+    """Return the result of one of several people with rows for the frames in which the person is absent."""
+    if not len(result):
+        raise ResultError(f"{result.path}: the person is in no frame")
+    frames = np.arange(result.frames[0], result.frames[-1] + 1)
+    rows = np.searchsorted(result.frames, frames, side="right") - 1
+    absent = result.frames[rows] != frames
+
+    def filled(values: Any) -> Any:
+        if isinstance(values, np.ndarray) and values.ndim and len(values) == len(result):
+            return values[rows]
+        return {name: filled(value) for name, value in values.items()} if isinstance(values, Mapping) else values
+
+    result = replace(
+        result, **{f.name: filled(getattr(result, f.name)) for f in fields(result) if f.name not in ("model", "state")}
+    )
+    time = result.time + (frames - result.frames) / result.meta.fps
+    return replace(result, frames=frames, time=time, status=np.where(absent, Status.ABSENT, result.status))
 
 
 def _held(known: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -1,7 +1,8 @@
 """Write TRC files: points over time for OpenSim (Motion Analysis' "track row column").
 
 Axes are OpenSim's: X forward (the world's x axis), Y up, Z to the right. For a world with z up this is
-the rotation by -90° about x: (x, y, z) becomes (x, z, -y). Millimetres.
+the rotation by -90° about x: (x, y, z) becomes (x, z, -y). Millimetres. Frames are numbered from 1;
+`OrigDataStartFrame` is the number of the first one in the recording, from 1 too.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ def write_trc(motion: Motion, path: Path) -> None:
     lines = [
         f"PathFileType\t4\t(X/Y/Z)\t{motion.name}.trc",
         "\t".join((*head, *original)),
-        "\t".join((rate, rate, str(count), str(len(names)), "mm", rate, str(motion.frames[0]), str(count))),
+        "\t".join((rate, rate, str(count), str(len(names)), "mm", rate, str(motion.frames[0] + 1), str(count))),
         "Frame#\tTime\t" + "\t\t\t".join(names) + "\t\t",
         "\t\t" + "\t".join(f"{axis}{k + 1}" for k in range(len(names)) for axis in "XYZ"),
         "",
     ]
-    for f, frame in enumerate(motion.frames):
+    for f in range(count):
         # OpenSim ignores one tab at the end of a line: without an extra tab, the last blank would be missing
         cells = [f"{value:.4f}" for value in points[f].ravel()] if motion.known[f] else [""] * (points[f].size + 1)
-        lines.append("\t".join((str(frame), f"{motion.time[f]:.6f}", *cells)))
+        lines.append("\t".join((str(f + 1), f"{motion.time[f]:.6f}", *cells)))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

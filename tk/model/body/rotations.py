@@ -10,6 +10,12 @@ Float = NDArray[np.float64]
 
 # Below this sine of the middle angle the first and the last turn are the same: all is given to the last.
 _SINGULAR = 1e-7
+# Cosine of the middle angle, 10° from the singularity, below which changes are damped, and weight of a change relative
+# to an error of the rotation. An arm held level to the side with 0.5° of noise then keeps its angles within 1° (without
+# damping they jump by 88°) at errors of up to 1°; with twice the weight, errors reach 3.5°.
+_NEAR_SINGULAR, _DAMPING = np.sin(np.radians(10.0)), 0.1
+# Gauss-Newton steps: enough to converge from the last frame's angles
+_DAMPED_STEPS = 20
 
 
 def to_quaternions(R: Float) -> Float:
@@ -82,8 +88,41 @@ def follow(angles: Float) -> Float:
     """
     result = np.array(angles, dtype=np.float64)
     for f in range(1, len(result)):
-        a, b, c = result[f]
-        found = np.array([[a, b, c], [a + np.pi, np.pi - b, c + np.pi]])
-        found -= 2 * np.pi * np.round((found - result[f - 1]) / (2 * np.pi))
-        result[f] = found[np.abs(found - result[f - 1]).sum(axis=1).argmin()]
+        result[f] = _nearest(result[f], result[f - 1])
+    return result
+
+
+def _nearest(angles: Float, near: Float) -> Float:
+    """The same rotation by the angles (3,) that are nearest to others (3,)."""
+    a, b, c = angles
+    found = np.array([[a, b, c], [a + np.pi, np.pi - b, c + np.pi]])
+    found -= 2 * np.pi * np.round((found - near) / (2 * np.pi))
+    return np.asarray(found[np.abs(found - near).sum(axis=1).argmin()])
+
+
+def follow_rotations(sequence: str, R: Float) -> Float:
+    """Angles (F, 3), radians, about three different axes, that change little from frame to frame, of rotations (F, 3,
+    3).
+
+    They begin near zero and follow as in :func:`follow`. Near the singular middle angle of ±90° only the sum or
+    difference of the first and the last is determined well, and noise turns both by large, opposite angles. There, the
+    change since the last frame is damped, at the expense of an error of the rotation (Nakamura & Hanafusa, J. Dyn.
+    Syst. Meas. Control 108 (1986) 163-171, section 5). Everywhere else the angles are exact.
+    """
+    axes = [np.eye(3)["xyz".index(axis)] for axis in sequence]
+    result = decompose(sequence, R)
+    last = np.zeros(3)
+    for f in range(len(result)):
+        angles = _nearest(result[f], last)
+        cosine = np.cos(angles[1])
+        if abs(cosine) < _NEAR_SINGULAR:
+            damping = _DAMPING**2 * (1 - (cosine / _NEAR_SINGULAR) ** 2)
+            angles = last
+            for _ in range(_DAMPED_STEPS):
+                third, second = turn(sequence[2], angles[2]), turn(sequence[1], angles[1])
+                J = np.column_stack([third.T @ second.T @ axes[0], third.T @ axes[1], axes[2]])
+                error = Rotation.from_matrix(compose(sequence, angles).T @ R[f]).as_rotvec()
+                H = J.T @ J + damping * np.eye(3)
+                angles = angles + np.linalg.solve(H, J.T @ error - damping * (angles - last))
+        result[f] = last = angles
     return result
