@@ -20,11 +20,15 @@ import pytest
 from tests.conftest import QUICK, Silent, Tk
 from tk.batch import Job, Outcome, TrackOptions, exit_code
 from tk.batch.jobs import DONE, FAILED, make_jobs
+from tk.batch.run import _finished
 from tk.batch.summary import write_summary
+from tk.batch.work import _errors
 from tk.errors import ConfigError, ResultBusyError, ResultError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.files import TwinFolder
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.skeleton import JOINTS, build_skeleton
 from tk.run.session import track
 
 ROOT = Path(__file__).parents[1]
@@ -66,7 +70,7 @@ def test_records_are_read_back_and_other_options_are_refused(tmp_path: Path) -> 
     walk, out = folders(tmp_path / "walk", tmp_path / "out" / "jobs")
     (job,) = make_jobs([walk], out.parent, TrackOptions())
     assert job.read() == Outcome()
-    outcome = Outcome(DONE, 14, 2, 10, 1.5, 2.0, None, 0.05, 1.2, ("a note",))
+    outcome = Outcome(DONE, 14, 2, 1, 10, 1.5, 2.0, None, 0.05, 1.2, ("a note",))
     job.write(outcome)
     assert job.read() == outcome
     (other,) = make_jobs([walk], out.parent, TrackOptions(method="silhouette"))
@@ -97,7 +101,7 @@ def test_summary_lists_all_outcomes(tmp_path: Path) -> None:
         zip(
             [job.name for job in jobs],
             [
-                Outcome(DONE, 10, 6, 10, 5.0, 2.345, 1.5, 0.031, 1.8, ("a note, with a comma",)),
+                Outcome(DONE, 10, 6, 0, 10, 5.0, 2.345, 1.5, 0.031, 1.8, ("a note, with a comma",)),
                 Outcome(FAILED, failure="x.mp4: is cut off"),
                 Outcome(),
             ],
@@ -139,6 +143,82 @@ def test_exit_codes() -> None:
 )
 def test_bad_options(tk: Tk, tiny: Path, tmp_path: Path, options: list[str], said: str) -> None:
     tk("batch", tiny, "-o", tmp_path / "out", *options).complaint(said)
+
+
+def test_dashboard_needs_bokeh(tk: Tk, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "bokeh", None)
+    tk("batch", tiny, "-o", tmp_path / "out", "--dashboard").complaint("Bokeh", "pip install bokeh")
+
+
+class _Client:
+    """A Dask client that delivers messages, then one finished capture."""
+
+    def __init__(self, messages: list[dict[str, Any]]) -> None:
+        self.messages = messages
+
+    def subscribe_topic(self, topic: str, handle: Callable[[Any], None]) -> None:
+        self.handle = handle
+
+    def submit(self, function: object, job: Job, key: str, **options: Any) -> Any:
+        client = self
+
+        class Done:
+            cancelled, exception, result = (lambda self: False), (lambda self: None), (lambda self: Outcome(DONE))
+
+            def add_done_callback(self, put: Callable[[Any], None]) -> None:
+                for message in client.messages:
+                    client.handle((0.0, message))
+                put(self)
+
+        done: Any = Done()
+        done.key = key
+        return done
+
+
+class _Notes:
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+    def progress(self, name: str, done: int, total: int) -> None: ...
+
+    def finished(self, name: str, outcome: Outcome, done: int, total: int) -> None: ...
+
+
+def test_death_of_a_worker_is_reported(tmp_path: Path) -> None:
+    """A capture that begins for the second time had another worker before."""
+    (job,) = make_jobs(folders(tmp_path / "walk"), tmp_path / "out", TrackOptions())
+    said = [(0, True), (7, False), (5, True), (9, False)]
+    messages = [{"name": "walk", "done": done, "total": 9, "begins": begins} for done, begins in said]
+    reporter = _Notes()
+    assert dict(_finished(_Client(messages), [job], reporter, None)) == {"walk": Outcome(DONE)}
+    assert reporter.notes == ["walk: its worker died (out of memory?); another one continues after 5 frames"]
+
+
+def test_error_without_offsets_is_not_given_for_a_still_person(tmp_path: Path) -> None:
+    capture, out = folders(tmp_path / "walk", tmp_path / "out")
+    (job,) = make_jobs([capture], out, TrackOptions())
+    still = build_skeleton(BodyDimensions.from_stature(1.75)).joints(np.zeros(24))
+    bent = still + 0.0
+    bent[[JOINTS.index(f"{name}_l") for name in ("elbow", "wrist", "knee", "ankle")], 0] += 0.3
+
+    def errors(second: np.ndarray) -> tuple[tuple[float | None, float | None], list[str]]:
+        notes: list[str] = []
+        positions = np.array([still, second] * 6)
+        for path, shift in ((capture / "truth.h5", 0.0), (job.output, 0.02)):
+            with h5py.File(path, "w") as file:
+                file["frames"] = np.arange(12)
+                file["joints/position"] = positions + shift
+                file["joints/position"].attrs["names"] = list(JOINTS)
+        return _errors(job, notes.append), notes
+
+    (error_cm, limbs_cm), notes = errors(still)
+    assert error_cm == pytest.approx(2 * np.sqrt(3)) and limbs_cm is None
+    assert len(notes) == 1 and "the limbs move by 0.0 cm" in notes[0]
+    (_, limbs_cm), notes = errors(bent)
+    assert limbs_cm == pytest.approx(0, abs=1e-6) and not notes
 
 
 def test_two_batches_in_one_folder_are_refused(tk: Tk, tiny: Path, tmp_path: Path) -> None:
@@ -261,6 +341,7 @@ def test_killed_worker_and_scheduler_lose_nothing_and_repeat_nothing(
     os.kill(records()[victim]["by"]["pid"], signal.SIGKILL)
     done_then = rows(out / f"{victim}.h5")
     assert 2 <= done_then < frames
+    first.until(lambda: f"{victim}: its worker died" in first.said or len(ended()) >= 2)
     first.until(lambda: len(ended()) >= 2)  # the broken one, and one of the worker that lives
     scheduler.process.kill()
     assert first.process.wait(120) == 1, first.said

@@ -9,6 +9,7 @@ from tk.commands.base import Commands
 from tk.commands.batch import batch
 from tk.commands.config import config
 from tk.commands.demo import demo
+from tk.commands.doctor import doctor
 from tk.commands.evaluate import evaluate
 from tk.commands.export import export
 from tk.commands.import_ import import_
@@ -30,7 +31,7 @@ def main() -> None:
 
 
 for _command in (
-    batch, config, demo, evaluate, export, import_, inspect, level, masks, reconstruct, refine, render, report, track,
-    view,
+    batch, config, demo, doctor, evaluate, export, import_, inspect, level, masks, reconstruct, refine, render, report,
+    track, view,
 ):  # fmt: skip
     main.add_command(_command)

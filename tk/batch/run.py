@@ -9,6 +9,7 @@ import os
 import queue
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -21,6 +22,8 @@ from tk.errors import ConfigError, ResultError, TkError, WorkerError
 _PATIENCE_S = 20.0
 #: killed workers after which a capture is not tried again: it probably needs too much memory
 _KILLED_AT_MOST = 3
+# Address of the dashboard, reached from this machine only; Dask's usual port, or another if it is taken.
+_DASHBOARD = "127.0.0.1:8787"
 
 
 class BatchReporter(Protocol):
@@ -47,6 +50,7 @@ def run_batch(
     workers: int | None = None,
     scheduler: str | None = None,
     pictures: bool = False,
+    dashboard: bool = False,
 ) -> Mapping[str, Outcome]:
     """Track captures, each in a worker process, into ``folder``: `NAME.h5`, `summary.csv`, `summary.html`.
 
@@ -61,6 +65,7 @@ def run_batch(
         workers: processes on this machine, which share its cores; half the number of cores by default.
         scheduler: address of a Dask scheduler to use instead of new processes on this machine.
         pictures: write an overlay video and a report next to each result.
+        dashboard: serve Dask's page about workers and tasks, and report its address.
 
     Returns:
         The outcome of each capture, by its name.
@@ -75,7 +80,7 @@ def run_batch(
     if workers is not None and not 1 <= workers <= 1000:
         raise ConfigError(f"--workers {workers}: choose from 1 to 1000")
     options.to_dict()  # fails early if the body cannot be read
-    _require_dask()
+    _require_dask(dashboard)
     with _locked(folder):
         jobs = make_jobs(captures, folder, options, pictures)
         outcomes = {job.name: job.read() for job in jobs}
@@ -86,8 +91,10 @@ def run_batch(
             outcomes[job.name] = Outcome()
         write_summary(folder, jobs, outcomes)
         if waiting:
-            with _cluster(workers, scheduler, len(waiting)) as client:
+            with _cluster(workers, scheduler, len(waiting), dashboard) as client:
                 _report_workers(client, reporter, len(waiting))
+                if dashboard:
+                    reporter.note(f"dashboard: {client.dashboard_link}")
                 for name, outcome in _finished(client, waiting, reporter, scheduler):
                     outcomes[name] = outcome
                     ended = sum(o.state in (DONE, FAILED) for o in outcomes.values())
@@ -108,11 +115,13 @@ def exit_code(outcomes: Mapping[str, Outcome]) -> int:
     return 3 if any(outcome.mostly_lost for outcome in outcomes.values()) else 0
 
 
-def _require_dask() -> None:
+def _require_dask(dashboard: bool) -> None:
     try:
         import distributed  # noqa: F401
     except ImportError:
         raise ConfigError("tk batch needs Dask: pip install 'tk-mocap[cluster]'") from None
+    if dashboard and find_spec("bokeh") is None:
+        raise ConfigError("the dashboard needs Bokeh: pip install bokeh")
 
 
 @contextlib.contextmanager
@@ -136,7 +145,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _cluster(workers: int | None, scheduler: str | None, captures: int) -> Iterator[Any]:
+def _cluster(workers: int | None, scheduler: str | None, captures: int, dashboard: bool) -> Iterator[Any]:
     """Yield a client of the scheduler, or of a cluster on this machine that ends with the block."""
     import dask
     from distributed import Client, LocalCluster
@@ -162,8 +171,9 @@ def _cluster(workers: int | None, scheduler: str | None, captures: int) -> Itera
     }
     with dask.config.set(settings):
         cluster = LocalCluster(
-            n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
-            memory_limit=None, silence_logs=logging.CRITICAL, env={"TK_THREADS": threads},
+            n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", memory_limit=None,
+            dashboard_address=_DASHBOARD if dashboard else None, silence_logs=logging.CRITICAL,
+            env={"TK_THREADS": threads},
         )  # fmt: skip
         with cluster, Client(cluster, set_as_default=False) as client:
             yield client
@@ -196,10 +206,15 @@ def _finished(
         future = client.submit(work, job, key=f"tk-{job.name}-{os.urandom(6).hex()}", priority=-priority, pure=False)
         waiting[future.key] = job
         future.add_done_callback(messages.put)
+    begun: set[str] = set()
     while waiting:
         item = messages.get()
         if isinstance(item, dict):
-            reporter.progress(str(item["name"]), int(item["done"]), int(item["total"]))
+            name, done = str(item["name"]), int(item["done"])
+            if item["begins"] and name in begun:
+                reporter.note(f"{name}: its worker died (out of memory?); another one continues after {done} frames")
+            begun |= {name} if item["begins"] else set()
+            reporter.progress(name, done, int(item["total"]))
             continue
         job = waiting.pop(item.key)
         try:

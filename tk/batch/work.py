@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 import traceback
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,10 @@ TOPIC = "tk-batch"
 _PERIOD_S = 1.0
 # A worker that lost the scheduler may still write the result. Seconds to wait for it, and between two attempts.
 _WAIT_S, _RETRY_S = 60.0, 2.0
+
+# Movement of the limbs below which errors without offsets are not given, cm: a limb of 30 cm then turns by less than
+# 10°, and the constant offset of its joint, which turns with it, changes by less than a fifth.
+_MOVEMENT_CM = 5.0
 
 # Taichi supports one thread of calls; a worker with several threads tracks its captures one by one
 _ONE_AT_A_TIME = threading.Lock()
@@ -96,11 +102,33 @@ def _errors(job: Job, note: Callable[[str], None]) -> tuple[float | None, float 
         return None, None
     try:
         found = evaluate_files(job.output, truth)
+        moved_cm = _movement_cm(job, truth)
     except TkError as error:
         note(f"no comparison with the ground truth: {error}")
         return None, None
     error_cm, limbs_cm = (float(score.mean_cm) for score in (found.raw.all, found.corrected.limbs))
+    if moved_cm < _MOVEMENT_CM:
+        note(
+            f"no error without offsets: the limbs move by {moved_cm:.1f} cm about the trunk, less than "
+            f"{_MOVEMENT_CM:g} cm, so constant offsets would explain nearly all of the error"
+        )
+        limbs_cm = math.nan
     return (error_cm if np.isfinite(error_cm) else None), (limbs_cm if np.isfinite(limbs_cm) else None)
+
+
+def _movement_cm(job: Job, truth: Path) -> float:
+    """Return how far the limb joints move about the trunk in the tracked frames: the largest root mean square of the
+    joints, cm, by the ground truth."""
+    from tk.evaluation.joints import trunk_axes
+    from tk.io.results.reader import read_joints
+    from tk.model.body.joints import JOINTS, LIMB_JOINTS
+
+    track = read_joints(truth)
+    p_world = track.positions[np.isin(track.frames, read_joints(job.output).frames)]
+    limbs = p_world[:, [JOINTS.index(name) for name in LIMB_JOINTS]] - p_world[:, None, JOINTS.index("pelvis")]
+    in_trunk = np.einsum("fki,fjk->fji", trunk_axes(p_world), limbs)
+    in_trunk = in_trunk[np.isfinite(in_trunk).all(axis=(1, 2))]
+    return 100 * float(np.sqrt(in_trunk.var(axis=0).sum(axis=1).max())) if len(in_trunk) else 0.0
 
 
 def _typical(
@@ -130,16 +158,16 @@ class _Reporter:
         self._total, self._done = total, done
         if done:
             self.note(f"{done} of {total} frames were finished already")
-        self._send()
+        self._send(begins=True)
 
     def advance(self, frame: int, estimate: object) -> None:
         self._done += 1
         if time.monotonic() - self._sent > _PERIOD_S or self._done == self._total:
             self._send()
 
-    def _send(self) -> None:
+    def _send(self, begins: bool = False) -> None:
         self._sent = time.monotonic()
-        self._send_message({"name": self._name, "done": self._done, "total": self._total})
+        self._send_message({"name": self._name, "done": self._done, "total": self._total, "begins": begins})
 
 
 def _sender() -> Callable[[dict[str, Any]], None]:

@@ -20,6 +20,7 @@ from tk.errors import WorkerError
     help="Captures to track at the same time on this machine.  [default: half the cores]",
 )  # fmt: skip
 @click.option("--scheduler", metavar="ADDRESS", help="Use the workers of this Dask scheduler: tcp://host:8786.")
+@click.option("--dashboard", is_flag=True, help="Serve Dask's page about workers and tasks.")
 @base.tracking_options
 @base.no_report_option
 @base.quiet_option
@@ -28,6 +29,7 @@ def batch(
     output: Path,
     workers: int | None,
     scheduler: str | None,
+    dashboard: bool,
     options: base.TrackingOptions,
     no_report: bool,
     quiet: bool,
@@ -47,7 +49,9 @@ def batch(
     )
     with BatchConsoleReporter(quiet) as reporter:
         try:
-            outcomes = run_batch(captures, output, track_options, reporter, workers, scheduler, not no_report)
+            outcomes = run_batch(
+                captures, output, track_options, reporter, workers, scheduler, not no_report, dashboard
+            )
         except KeyboardInterrupt:
             click.echo("tk: interrupted; the same command continues", err=True)
             sys.exit(1)

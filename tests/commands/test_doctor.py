@@ -1,0 +1,58 @@
+"""`tk doctor`: one line for each check, never a traceback."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.conftest import Tk
+from tk.commands import doctor
+from tk.commands.doctor import CHECKS, Check
+
+
+def test_one_line_each_on_this_machine(tk: Tk) -> None:
+    """This machine runs the tests, so all that tracking needs is there."""
+    ran = tk("doctor")
+    lines = ran.out.splitlines()
+    assert ran.code == 0 and lines[-1] == "tk track can work", ran.out
+    assert [line.split()[0] for line in lines[:-1]] == list(CHECKS)
+    assert all(line[10:].startswith(("ok: ", "missing: ")) for line in lines[:-1]), ran.out
+    assert "Traceback" not in ran.out + ran.err
+
+
+def test_what_tracking_needs_decides_the_exit_code(tk: Tk, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken() -> Check:
+        raise OSError("unexpected")
+
+    checks = {"display": lambda: Check("", "no display"), "cores": lambda: Check("4"), "cache": broken}
+    monkeypatch.setattr(doctor, "CHECKS", checks)
+    ran = tk("doctor")
+    assert ran.code == 0 and ran.out.splitlines() == [
+        "display   missing: no display",
+        "cores     ok: 4",
+        "cache     missing: the check failed: OSError: unexpected",
+        "tk track can work",
+    ]
+    checks["Taichi"] = lambda: Check("1.7", "does not start", needed=True)
+    ran = tk("doctor")
+    assert ran.code == 1 and ran.out.splitlines()[-1] == "tk track cannot work: Taichi"
+
+
+@pytest.mark.parametrize(
+    ("code", "why"),
+    [
+        ("import os; os.abort()", "the process was ended by signal 6"),
+        ("import time; time.sleep(60)", "gave no answer for 1 s"),
+        ("import no_such_package", "ModuleNotFoundError: No module named 'no_such_package'"),
+    ],
+)
+def test_crashes_and_hangs_are_reasons(code: str, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_LIMIT_S", 1.0)
+    assert doctor._try(code) == ("", why)
+
+
+def test_doctor_does_not_load_what_it_checks() -> None:
+    code = "import sys, tk.commands.doctor; sys.exit(any(name in sys.modules for name in ('taichi', 'open3d', 'cv2')))"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
