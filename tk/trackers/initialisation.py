@@ -49,6 +49,12 @@ ANCHORS, CLEAR = 4, 0.2
 AMBIGUOUS, HANDICAP, NEARLY, WORSE = 1.1, 1.1, 1.4, 1.2
 # Stature of the body that the first estimate of the stature renders, metres.
 _AVERAGE_M = 1.7
+# A pose with a higher residual explains nothing: twice what an average body of the right stature leaves. Without a better
+# one in any of the frames the person is not found.
+UNEXPLAINED = 0.6
+# Further hypotheses that are followed through the opening, the most likely of all frames: each may take seconds where
+# nothing fits.
+FOLLOWED = 6
 # A search that finds a better pose is repeated, at most this often.
 _SEARCHES = 2
 
@@ -85,19 +91,23 @@ def find_person(
         pose: (D,) pose in the first frame, if known; there is one hypothesis then.
 
     Raises:
-        CaptureError: fewer than two cameras see anybody in the first frame.
+        CaptureError: fewer than two cameras see anybody in the first frame, or no pose explains what they see.
     """
     if pose is not None:
         return [_follow(tracker, frames, pyramids, _searched(tracker, frames[0], pyramids[0], pose), 0)]
     skeleton = tracker.body.skeleton
     hypotheses: list[TrajectoryHypothesis] = []
     alternatives: list[tuple[int, Float, float]] = []
+    least = np.inf
     for anchor in np.unique(np.linspace(0, len(frames) - 1, ANCHORS).astype(int)):
         try:
             residual, poses = _find(tracker, frames[anchor], pyramids[anchor])
         except CaptureError:
             if anchor == 0:
                 raise
+            continue
+        least = min(least, residual)
+        if residual > UNEXPLAINED:
             continue
         for pose in poses[1:]:
             turned = _turned(skeleton, pose[None], poses[0])[0]
@@ -107,7 +117,12 @@ def find_person(
         hypotheses.append(_follow(tracker, frames, pyramids, poses[0], anchor))
         if residual < CLEAR:
             break
-    for anchor, pose, handicap in alternatives:
+    if not hypotheses:
+        raise CaptureError(
+            f"no pose of a person explains the masks: the best one leaves {least:.0%} of the person's pixels unexplained; "
+            "check that the masks show one whole person, and the calibration"
+        )
+    for anchor, pose, handicap in alternatives[:FOLLOWED]:
         if not _contains(skeleton, hypotheses, anchor, pose):
             hypotheses.append(_follow(tracker, frames, pyramids, pose, anchor)._replace(handicap=handicap))
     hypotheses.sort(key=lambda hypothesis: hypothesis.cost)

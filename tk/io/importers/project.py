@@ -9,11 +9,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tk.errors import CalibrationError, VideoError
+from tk.errors import CalibrationError, VideoError, VolumeError
 from tk.io.captures.calibration import scale_world
-from tk.io.captures.units import LEAST_APART_M, MOST_APART_M, FoundUnit, apart, infer_unit
+from tk.io.captures.units import LEAST_APART_M, MOST_APART_M, UNITS, FoundUnit, apart, infer_unit
 from tk.io.importers.videos import CameraNames, find_clips
 from tk.model.cameras.camera import Camera, Rig
+from tk.model.cameras.common_view import view_height
+
+#: metres, least height of the views in which a person fits: a child of one metre, and a margin
+PERSON_VIEW_M = 1.2
 
 
 @dataclass(frozen=True)
@@ -120,13 +124,19 @@ def read_format(form: Format, files: Sequence[Path], folder: Path, unit: str | N
 
 
 def _in_metres(cameras: Cameras, requested: str | None, default: str) -> Cameras:
-    """Return the cameras with lengths in metres, and a note about the unit: requested, specified, or inferred."""
+    """Return the cameras with lengths in metres, and a note about the unit: requested, specified, or inferred.
+
+    Raises:
+        CalibrationError: a table top in millimetres and a room in centimetres are both possible.
+    """
     if requested:
         found, reason = FoundUnit(requested), "as --units says"
     elif cameras.unit:
         found, reason = FoundUnit(cameras.unit), f"as {cameras.unit_from} says"
     else:
         found, reason = infer_unit(cameras.rig.centers, default), "the default of this format"
+        if found.name == "cm" and apart(cameras.rig.centers) * UNITS["mm"] >= LEAST_APART_M:
+            found = _by_person(cameras)
     rig = scale_world(cameras.rig, found.metres)
     if found.note:
         note = f"{found.note}; --units m, cm or mm overrides it"
@@ -135,6 +145,23 @@ def _in_metres(cameras: Cameras, requested: str | None, default: str) -> Cameras
         if not LEAST_APART_M <= apart(rig.centers) <= MOST_APART_M:
             note += f": the cameras are then up to {apart(rig.centers):.3g} m apart, which is unlikely"
     return replace(cameras, rig=rig, notes=(*cameras.notes, f"{cameras.source}: {note}"))
+
+
+def _by_person(cameras: Cameras) -> FoundUnit:
+    """Return millimetres if a person fits into the views then; the same numbers are a larger room in centimetres.
+
+    Raises:
+        CalibrationError: a person fits in centimetres alone, so the numbers are either those or a table top.
+    """
+    try:
+        view = view_height(cameras.rig)
+    except VolumeError:
+        view = 0.0
+    if view * UNITS["mm"] >= PERSON_VIEW_M:
+        return FoundUnit("mm", "lengths are taken for mm: a person fits into the views")
+    wide = apart(cameras.rig.centers)
+    sizes = [f"{unit} ({wide * UNITS[unit]:.2g} m apart, views {view * UNITS[unit]:.2g} m high)" for unit in ("cm", "mm")]
+    raise CalibrationError(f"{cameras.source}: the cameras may be in {' or '.join(sizes)}: give --units cm or --units mm")
 
 
 def check_camera(camera: Camera, where: str) -> Camera:

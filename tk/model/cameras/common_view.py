@@ -71,6 +71,16 @@ def depth_information(directions: Float) -> float:
     return float(np.linalg.eigvalsh(across.sum(axis=0))[0])
 
 
+def view_height(rig: Rig) -> float:
+    """Return the height of the cameras' views at the point closest to their axes, the median, in the rig's unit.
+
+    Raises:
+        VolumeError: the axes are parallel.
+    """
+    distances = np.linalg.norm(rig.centers - closest_to_axes(rig), axis=1)
+    return float(np.median([d * c.height / c.matrix[1, 1] for d, c in zip(distances, rig, strict=True)]))
+
+
 def infer_volume(rig: Rig) -> Volume:
     """Infer a working volume for a rig: the box around the region that all cameras see.
 

@@ -160,7 +160,7 @@ class MaskAgreement:
             if others:
                 shown = [(masks[c], hull.silhouette(hull.carve(others), c)) for masks, hull in views]
                 outside[c], shift[c] = _share_outside(shown), self._least_shift(shown)
-        extents = [hull.extent(right) for _, hull in views]
+        extents = [extent for _, hull in views if (extent := hull.extent(right)) > 0]
         return Agreement(
             names=self.rig.names,
             tangency=pairs,
