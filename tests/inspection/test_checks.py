@@ -79,6 +79,17 @@ def test_delay_of_a_video_is_found_in_frames(tk: Tk, tmp_path: Path) -> None:
     assert [c["late_frames"] for c in json.loads(ran.out)["cameras"]] == [0, 0, late, 0]
 
 
+def test_time_offset_is_a_note_and_no_problem(tk: Tk, copy: Path) -> None:
+    path = copy / "calibration.toml"
+    fps = open_capture(copy).fps
+    path.write_text(path.read_text().replace("[cam2]\n", f"[cam2]\ntime_offset = {1 / fps}\n", 1))
+    ran = tk("inspect", copy)
+    assert ran.code == 0, ran.err
+    assert "note: time offsets: " in ran.out
+    shown = ran.out.split("note: ")[0].rstrip().splitlines()[-1]
+    assert shown == "No problems found." or shown.startswith("camera cam2 is inconsistent")
+
+
 def test_empty_masks_are_reported(tk: Tk, copy: Path) -> None:
     for path in (copy / "masks").rglob("*.png"):
         cv2.imwrite(str(path), np.zeros((120, 160), np.uint8))

@@ -159,6 +159,16 @@ def test_empty_first_frame_is_refused() -> None:
         find_person(tracker, [empty], [tracker.pyramid(empty)])
 
 
+def test_masks_that_no_pose_explains_are_refused(monkeypatch) -> None:
+    tracker = tracker_of()
+    masks = draw_silhouettes(tracker.body, RIG, placed(standing_pose(SKELETON), 0.4)[None])[0]
+    frame = Observation(7, np.zeros(0, np.uint8), masks)
+    monkeypatch.setattr(tracker, "mean_residual", lambda _, poses, __: np.full(len(poses), 0.8))
+    monkeypatch.setattr(tracker, "improved", lambda _, __, pose: pose)
+    with pytest.raises(CaptureError, match="no pose of a person explains the masks: the best one leaves 80%"):
+        find_person(tracker, [frame], [tracker.pyramid(frame)])
+
+
 @pytest.mark.parametrize("yaw", [0.4, 0.4 + np.pi])
 def test_recovered_person_keeps_the_heading_where_silhouettes_are_ambiguous(monkeypatch, yaw):
     tracker = tracker_of()

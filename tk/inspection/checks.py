@@ -92,6 +92,7 @@ class Inspection:
         leveling: up direction and floor.
         people: those who were found, by number.
         findings: problems, one line each, the worst first.
+        notes: what the capture and the segmentation report, one line each.
     """
 
     capture: str
@@ -105,6 +106,7 @@ class Inspection:
     leveling: Leveling
     people: tuple[PersonReport, ...]
     findings: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the values for JSON, NaN as None."""
@@ -137,6 +139,7 @@ class Inspection:
             *(person.line(len(self.cameras)) for person in self.people),
             "",
             *(self.findings or ("No problems found.",)),
+            *(f"note: {note}" for note in self.notes),
         ]
         return "\n".join(lines)
 
@@ -220,13 +223,14 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
         leveling=leveling,
         people=watch.people(),
         findings=(),
+        notes=tuple(notes),
     )
     seen = [
         Sample(int(i), images[int(i)], masks[int(i)], _silhouettes(hulls[list(frames).index(i)], good), compare.step)
         for i in kept
     ]
     return replace(
-        inspection, findings=(*_findings(inspection, capture, agreement), *many_people(inspection.people), *notes)
+        inspection, findings=(*_findings(inspection, capture, agreement), *many_people(inspection.people))
     ), seen
 
 

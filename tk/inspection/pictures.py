@@ -66,8 +66,10 @@ def write_png(path: Path, image: Image) -> None:
 
 
 def _text(inspection: Inspection, width: int) -> Image:
-    lines = [(line, _INK) for line in inspection.format_table().split("\n")[: -max(len(inspection.findings), 1)]]
+    last = len(inspection.notes) + max(len(inspection.findings), 1)
+    lines = [(line, _INK) for line in inspection.format_table().split("\n")[:-last]]
     lines += [(line, _BAD) for line in inspection.findings] or [("No problems found.", (60, 140, 60))]
+    lines += [(f"note: {line}", _INK) for line in inspection.notes]
     wrapped = [(part, color) for line, color in lines for part in _wrapped(line, width - 20)]
     image = np.full(((len(wrapped) + 2) * _LINE, width, 3), 255, np.uint8)
     for i, (line, color) in enumerate(wrapped):

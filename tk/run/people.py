@@ -171,7 +171,7 @@ class People:
         subject = member.subject
         seen = member.monitor.start(frames)
         member.tracker.start(seen, subject.height_m, subject.init, subject.body)
-        member.monitor.check_body()
+        member.monitor.after_start()
 
     def _find(self, masks: NDArray[np.uint8], uncertain: NDArray[np.bool_] | None = None) -> tuple[LocatedPerson, ...]:
         if self._finder is None:

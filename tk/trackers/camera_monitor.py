@@ -80,6 +80,7 @@ class CameraMonitor:
         self._plausibility = Plausibility(setup.up, setup.fps)
         C = len(self._names)
         self._excluded = np.zeros(C, bool)
+        self._agree = np.zeros(C, bool)  # with the others before the start
         self._torn = np.zeros(C, bool)  # excluded because of a torn mask
         self._normal_for = np.zeros(C, np.int64)  # consecutive frames with a normal residual
         self._since_test = np.full(C, _PAUSE)
@@ -105,6 +106,7 @@ class CameraMonitor:
         agreement = MaskAgreement(self._setup.rig, self._setup.volume).compare([shown[i].masks for i in chosen])
         if agreement.refusal:
             raise CaptureError(agreement.refusal)
+        self._agree = agreement.tested_right
         for camera in agreement.wrong:
             self._excluded[camera] = True
             self._opening_reasons[camera] = agreement.reason(camera)
@@ -118,14 +120,16 @@ class CameraMonitor:
             check_extent(agreement.extent_m, self._subject.height_m)
         return [_without(f, self._excluded) for f in shown]
 
-    def check_body(self) -> None:
-        """Refuse a body of an impossible size, after the tracker's start.
+    def after_start(self) -> None:
+        """Refuse a body of an impossible size, after the tracker's start; trust the cameras that agreed before it.
 
         Raises:
             CaptureError: with the size and its likely causes.
         """
         if self._subject.height_m is None:
             check_stature(self.tracker.body.dimensions.stature)
+        if isinstance(self.tracker, RegionTracker):
+            self.tracker.residuals.trusted = self._agree
 
     def step(self, frame: Observation) -> tuple[Estimate, Observation]:
         """Return the estimate for the next frame, and the observation without the excluded cameras."""

@@ -49,8 +49,8 @@ ANCHORS, CLEAR = 4, 0.2
 AMBIGUOUS, HANDICAP, NEARLY, WORSE = 1.1, 1.1, 1.4, 1.2
 # Stature of the body that the first estimate of the stature renders, metres.
 _AVERAGE_M = 1.7
-# A pose with a higher residual explains nothing: twice what an average body of the right stature leaves. Without a better
-# one in any of the frames the person is not found.
+# A pose with a higher residual explains nothing: twice what an average body of the right stature leaves. Without a
+# better one in any of the frames the person is not found.
 UNEXPLAINED = 0.6
 # Further hypotheses that are followed through the opening, the most likely of all frames: each may take seconds where
 # nothing fits.
@@ -119,7 +119,7 @@ def find_person(
             break
     if not hypotheses:
         raise CaptureError(
-            f"no pose of a person explains the masks: the best one leaves {least:.0%} of the person's pixels unexplained; "
+            f"no pose of a person explains the masks: the best one leaves {least:.0%} of their pixels unexplained; "
             "check that the masks show one whole person, and the calibration"
         )
     for anchor, pose, handicap in alternatives[:FOLLOWED]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.io.conftest import write_picture, write_toml
+from tests.io.conftest import look_at, write_picture, write_toml
 from tests.io.importers.conftest import (
     FRAMES,
     HEIGHT,
@@ -181,6 +181,28 @@ def test_anipose_in_millimetres(folder: Path, check: Import, metadata: dict[str,
     write_clips(folder / "videos-raw", [f"trial1-cam{letter}" for letter in "ABCD"], suffix=".avi")
     checked = check(folder, rig)
     checked.note("lengths are in mm, as the file says" if metadata else "lengths are taken for mm")
+
+
+def test_table_top_in_millimetres_or_room_in_centimetres_needs_a_unit(folder: Path, check: Import) -> None:
+    write_toml(folder / "calibration.toml", tables(make_rig(), unit_m=0.01))
+    write_clips(folder / "videos-raw", CAMS)
+    with pytest.raises(CalibrationError, match=r"may be in cm \(.*\) or mm \(.*: give --units cm or --units mm"):
+        check(folder, make_rig())
+    check(folder, make_rig(), unit="cm")
+
+
+def test_close_cameras_that_see_a_person_are_in_millimetres(folder: Path, check: Import) -> None:
+    rig = make_rig()
+    center = np.array([3.0, 0.0, 1.0])
+    cameras = [
+        replace(camera, rotation=rotation, translation=-rotation @ place)
+        for k, camera in enumerate(rig)
+        for place in [center + np.array([0.0, 0.3 * k, 0.1 * k])]
+        for rotation in [look_at(place, np.array([0.0, 0.0, 1.0]))[0]]
+    ]
+    write_toml(folder / "calibration.toml", tables(Rig(tuple(cameras)), unit_m=0.001))
+    write_clips(folder / "videos-raw", CAMS)
+    check(folder, Rig(tuple(cameras))).note("lengths are taken for mm: a person fits into the views")
 
 
 def test_units_option_overrides_the_file(folder: Path, check: Import) -> None:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from scripts.synthetic.scene import look_at
 from tests.model.ring import ring_of_cameras
+from tk.kernels.mask_values import OTHERS
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
@@ -154,6 +155,15 @@ def test_silhouette_that_the_border_cuts_contradicts_nothing(masks: np.ndarray) 
     found = compare(cut, rig)
     assert found.wrong == () and found.refusal == ""
     assert np.nanmin(found.tangency.worst) < 0.02 and np.nanmax(found.tangency.worst) < 0.02
+
+
+def test_silhouette_that_another_person_cuts_contradicts_nothing(masks: np.ndarray) -> None:
+    hidden = masks.copy()
+    hidden[:, 2, 150:] = np.where(masks[:, 2, 150:] > 0, OTHERS, 0)
+    pairs = compare(hidden).tangency
+    assert np.nanmax(pairs.worst) < 0.02
+    hidden[:, 2, 150:] = 0
+    assert np.nanmax(compare(hidden).tangency.worst) > 0.1
 
 
 def test_set_with_an_untested_rival_blames_nobody() -> None:

@@ -160,8 +160,12 @@ def _by_person(cameras: Cameras) -> FoundUnit:
     if view * UNITS["mm"] >= PERSON_VIEW_M:
         return FoundUnit("mm", "lengths are taken for mm: a person fits into the views")
     wide = apart(cameras.rig.centers)
-    sizes = [f"{unit} ({wide * UNITS[unit]:.2g} m apart, views {view * UNITS[unit]:.2g} m high)" for unit in ("cm", "mm")]
-    raise CalibrationError(f"{cameras.source}: the cameras may be in {' or '.join(sizes)}: give --units cm or --units mm")
+    sizes = [
+        f"{unit} ({wide * UNITS[unit]:.2g} m apart, views {view * UNITS[unit]:.2g} m high)" for unit in ("cm", "mm")
+    ]
+    raise CalibrationError(
+        f"{cameras.source}: the cameras may be in {' or '.join(sizes)}: give --units cm or --units mm"
+    )
 
 
 def check_camera(camera: Camera, where: str) -> Camera:

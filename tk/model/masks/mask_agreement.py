@@ -91,6 +91,11 @@ class Agreement:
         """The cameras that are not wrong."""
         return [c for c in range(len(self.names)) if c not in self.wrong]
 
+    @property
+    def tested_right(self) -> Bool:
+        """(C,) cameras that were tested with another one, and are not wrong."""
+        return np.isfinite(self.tangency.worst).any(axis=1) & ~np.isin(np.arange(len(self.names)), self.wrong)
+
     def reason(self, camera: int) -> str:
         """Return what is wrong with a camera."""
         if self.swapped and camera in self.swapped:
