@@ -18,6 +18,7 @@ import tomli_w
 from tests.conftest import FRAMES, QUICK, Silent, Tk, setup_and_source
 from tests.io.conftest import write_picture
 from tests.run.test_session import send
+from tk.commands.track import EXIT_LOST, end
 from tk.errors import ResultError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
@@ -109,6 +110,26 @@ def test_runs_repeat_bit_for_bit_with_any_seed(tiny: Path, causal: Path, tmp_pat
     config = settings_file.from_toml(f"seed = 5\n{QUICK}")
     track(open_capture(tiny), tmp_path / "r.h5", config, Silent(), frames=(0, 6), causal=True)
     assert_same(tmp_path / "r.h5", causal, slice(0, 6))
+
+
+def test_result_that_contradicts_its_masks_is_suspect_and_ends_with_exit_code_3(
+    tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("tk.trackers.residual.LEVEL", 1e-4)  # as if correct recordings fitted perfectly
+    reporter = Silent()
+    summary = run(tiny, tmp_path / "r.h5", reporter, frames=(0, 4))
+    assert (summary.frames, summary.suspect, summary.lost) == (4, 4, 0)
+    result = read_result(tmp_path / "r.h5")
+    assert (result.status == Status.SUSPECT).all() and result.has_pose.all()
+    assert result.sigma is not None and np.isnan(result.sigma).all()
+    assert any("suspect, frames 0 to 3" in note for note in reporter.notes)
+    assert [e.status for e in estimates(*setup_and_source(open_capture(tiny)), CONFIG, frames=(0, 2))] == [
+        "suspect"
+    ] * 2
+    with pytest.raises(SystemExit) as ended:
+        end(tmp_path / "r.h5", summary, False, False)
+    assert ended.value.code == EXIT_LOST
+    assert "4 of 4 frames are lost or suspect" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_returned_estimates_are_those_of_the_first_pass(tiny: Path, causal: Path) -> None:

@@ -107,15 +107,14 @@ def _finish(
         tracker = again
         model = {**tracker.model(), REFINED: 1}
     sigma, residual = columns.get("joints/sigma", result.sigma), columns.get("residual", result.residual)
-    if sigma is not None:
-        report_unknown(result.frames[np.isnan(sigma).all(axis=1) & ~lost], note)
-    if residual is not None:
-        status = columns.get("status", result.status).copy()
-        status[status == Status.SUSPECT] = Status.TRACKED
+    if sigma is not None and residual is not None:
         suspect = ~lost
         suspect[suspect] = contradicted(residual[suspect], plan.settings.region.false_alarm)
-        status[suspect] = Status.SUSPECT
-        columns["status"] = status
+        status = columns.get("status", result.status)
+        status = np.where(status == Status.SUSPECT, np.uint8(Status.TRACKED), status)
+        columns["status"] = np.where(suspect, np.uint8(Status.SUSPECT), status)
+        columns["joints/sigma"] = np.where(suspect[:, None], np.nan, sigma)
+        report_unknown(result.frames[np.isnan(sigma).all(axis=1) & ~lost & ~suspect], note)
         report_suspect(result.frames[suspect], note)
     _LOG.info("angles, feet, and the smoothed copy")
     # poses of the first pass stay as they are
@@ -136,7 +135,7 @@ def report_unknown(frames: Sequence[int] | NDArray[np.int64], note: Callable[[st
 
 
 def report_suspect(frames: Sequence[int] | NDArray[np.int64], note: Callable[[str], None]) -> None:
-    """Report frames (F,) whose residual contradicts the pose."""
+    """Report frames (F,) whose residual contradicts the pose; their sigma is unknown."""
     if len(frames):
         which = described(int(frames[0]), int(frames[-1]), len(frames))
         note(
