@@ -56,12 +56,13 @@ def body_and_poses(result: Result) -> tuple[ConeBody, NDArray[np.float64]] | Non
     Raises:
         ResultError: the pose vector is not one of this body.
     """
-    if "parts/shape" in result.model and "body" in result.model:
-        body = restore_body(result.model, result.meta.up)
-    elif "dimensions/trunk" in result.model:
-        body = build_cone_body(restore_dimensions(result.model), result.meta.up)
-    else:
+    if not {"parts/shape", "dimensions/trunk"} & result.model.keys():
         return None
+    with as_damage_error(result.path, "the body"):
+        if "parts/shape" in result.model:
+            body = restore_body(result.model, result.meta.up)
+        else:
+            body = build_cone_body(restore_dimensions(result.model), result.meta.up)
     try:
         own = skeleton_of_names(result.meta.pose_names, body.dimensions, result.meta.up)
     except ValueError as error:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
+from tk.kernels.cones import CONE, ELLIPSOID
 from tk.kernels.line_search import SearchSettings
 from tk.kernels.raycast import Cast, cast
 from tk.model.body import gait_poses as gait
@@ -22,7 +23,7 @@ from tk.model.body.body_fit import STATURE_DEVIATION, fit_body
 from tk.model.body.cone_body import ConeBody, ConePart, build_cone_body
 from tk.model.body.initial_pose import rough_pose
 from tk.model.body.limb_candidates import Limb, distinct, limbs_of, pairs
-from tk.model.body.skeleton import OPTIONAL, build_skeleton, convert_poses
+from tk.model.body.skeleton import OPTIONAL, SEGMENTS, build_skeleton, convert_poses
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.tracker_frame import TrackerFrame
 from tk.model.cues.part_colors import PartColors
@@ -471,25 +472,39 @@ class ContourTracker:
 
 
 def restore_dimensions(model: Mapping[str, Any]) -> BodyDimensions:
-    """Return the dimensions that :meth:`ContourTracker.model` stored."""
+    """Return the dimensions that :meth:`ContourTracker.model` stored.
+
+    Raises:
+        ConfigError, TypeError, ValueError: they are incomplete, or impossible.
+    """
     prefix = "dimensions/"
     return BodyDimensions(**{k[len(prefix) :]: float(v) for k, v in model.items() if k.startswith(prefix)})
 
 
 def restore_body(model: Mapping[str, Any], up: str = "z") -> ConeBody:
-    """Return the body that :meth:`ContourTracker.model` stored."""
+    """Return the body that :meth:`ContourTracker.model` stored.
+
+    Raises:
+        ConfigError, LookupError, TypeError, ValueError: the model is incomplete, or describes no body.
+    """
     body = build_cone_body(restore_dimensions(model), up, str(model["body"]))
     # the stored parts, because another version of the program may divide the body differently
-    ends = {part.name: part.ends for part in body.parts}
-    parts = []
-    for name, segment, kind, shape, T in zip(
-        json.loads(str(model["parts/name"])),
-        json.loads(str(model["parts/segment"])),
-        model["parts/kind"],
-        model["parts/shape"],
-        model["parts/T_body_part"],
-        strict=True,
+    names, segments = (json.loads(str(model[f"parts/{name}"])) for name in ("name", "segment"))
+    kinds = np.asarray(model["parts/kind"])
+    shapes, places = (np.asarray(model[f"parts/{name}"], np.float64) for name in ("shape", "T_body_part"))
+    count = len(names)
+    if not set(segments) <= set(SEGMENTS) or not set(kinds.ravel().tolist()) <= {CONE, ELLIPSOID}:
+        raise ValueError("a part has an unknown segment or kind")
+    found = [np.shape(values) for values in (names, segments, kinds, shapes, places)]
+    if found != [(count,), (count,), (count,), (count, 4), (count, 4, 4)] or not (
+        np.isfinite(shapes).all() and np.isfinite(places).all()
     ):
-        a, b, h, m = (float(value) for value in shape)
-        parts.append(ConePart(name, segment, int(kind), (a, b, h, m), np.asarray(T), ends.get(name, (False, False))))
-    return replace(body, parts=tuple(parts))
+        raise ValueError("the parts have the wrong number, shape or values")
+    ends = {part.name: part.ends for part in body.parts}
+    return replace(
+        body,
+        parts=tuple(
+            ConePart(str(name), segment, int(kind), tuple(shape), T, ends.get(str(name), (False, False)))
+            for name, segment, kind, shape, T in zip(names, segments, kinds, shapes.tolist(), places, strict=True)
+        ),
+    )

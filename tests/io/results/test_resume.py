@@ -7,10 +7,12 @@ import random
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
@@ -18,6 +20,7 @@ from tests.io.result_files import assert_complete, assert_equal_values, write
 from tests.io.result_victim import META, make_frame, make_state
 from tk.errors import ResultError
 from tk.io.results.reader import read_result
+from tk.io.results.revision import revise_result
 from tk.io.results.writer import ResultWriter
 
 ROOT = Path(__file__).parents[3]
@@ -152,3 +155,55 @@ def test_equal_settings_in_different_notation_can_be_resumed(tmp_path: Path) -> 
     writer, done = ResultWriter.resume(path, replace(META, config_toml=same))
     writer.close()
     assert done == 1
+
+
+def replaced(name: str, value: Any) -> Callable[[h5py.File], None]:
+    def change(file: h5py.File) -> None:
+        if name in file:
+            del file[name]
+        if value is not None:
+            file[name] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        replaced("resume/state/mean", np.full((220, 3), np.nan)),
+        replaced("resume/state/mean", np.zeros((3, 220))),
+        replaced("resume/state/mean", np.full((220, 3), 3.0, np.float32)),
+        replaced("resume/state/mean", None),
+        replaced("resume/state/generator", "other"),
+        replaced("resume/state/more", 1),
+        replaced("resume/state", np.arange(3)),
+        replaced("resume", np.arange(3)),
+        replaced("resume/rows", -1),
+        replaced("resume/rows", 2),
+        replaced("resume/rows", np.nan),
+        replaced("resume/people", np.array([4, 4])),
+        replaced("resume/checksum", None),
+        replaced("resume/checksum", "text"),
+    ],
+)
+def test_damaged_state_is_refused(tmp_path: Path, change: Callable[[h5py.File], None]) -> None:
+    path = tmp_path / "result.h5"
+    write(path, 4)
+    with h5py.File(path, "r+") as file:
+        change(file)
+    before = path.read_bytes()
+    with pytest.raises(ResultError, match=r"result\.h5: .*damaged"):
+        ResultWriter.resume(path, META)
+    assert path.read_bytes() == before
+
+
+def test_state_is_intact_after_the_result_was_copied_and_revised(tmp_path: Path) -> None:
+    path = tmp_path / "result.h5"
+    state = {**make_state(3), "unknown": np.array([np.nan, -np.nan]), "none": "", "umlaut": "ä", "flag": True}
+    with ResultWriter.create(path, META) as writer:
+        writer.append(make_frame(0), state)
+    revise_result(path, notes=["a note"])
+    writer, done = ResultWriter.resume(path, META)
+    writer.close()
+    assert done == 1
+    assert_equal_values(writer.state, state)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import ResultError
+from tk.errors import ConfigError, ResultError
 from tk.io.hdf5 import Hdf5Reader, open_hdf5
 from tk.io.results.data import Float, Hull, JointAngles, JointTrack, Result, ResultMeta, UsedCameras, Value
 from tk.io.results.schema import (
@@ -81,6 +81,11 @@ def read_joints(path: str | os.PathLike[str]) -> JointTrack:
     return read_people(path)[0]
 
 
+_UNUSABLE = (
+    ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError, RecursionError, TypeError, ValueError,
+)  # fmt: skip
+
+
 @contextlib.contextmanager
 def as_damage_error(path: Path, what: str) -> Iterator[None]:
     """Convert exceptions that values of a wrong type, shape or size cause to a ResultError that names ``what``.
@@ -90,9 +95,7 @@ def as_damage_error(path: Path, what: str) -> Iterator[None]:
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             yield
-    except (
-        LookupError, ValueError, TypeError, AttributeError, ArithmeticError, AssertionError, RecursionError, MemoryError
-    ) as error:  # fmt: skip
+    except (*_UNUSABLE, ConfigError) as error:
         detail = " ".join(str(error).split())[:100]
         raise ResultError(f"{path}: {what} cannot be used; the file is damaged ({detail})") from error
 
