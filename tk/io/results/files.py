@@ -186,7 +186,8 @@ def writing(target: Path) -> Iterator[None]:
     except WRITE_ERRORS as error:
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         kind = DiskFullError if getattr(error, "errno", None) in FULL else ResultError
-        raise kind(f"{target}: cannot be written: {reason}") from error
+        hint = "make space, then continue with --resume" if kind is DiskFullError else ""
+        raise kind(f"{target}: cannot be written: {reason}", hint) from error
 
 
 @contextlib.contextmanager

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib import import_module
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +20,16 @@ if TYPE_CHECKING:
 
     from tk.io.results.data import Result
 
-_AXES = ("x", "y", "z")
+#: dimensions of a field of Result after the frame, and attributes of its variable
+_FIELDS: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
+    "joints": (("joint", "axis"), {"units": "m"}),
+    "sigma": (("joint",), {"units": "m"}),
+    "feet": (("foot", "axis"), {"units": "m"}),
+    "pose": (("dof",), {}),
+    "residual": (("camera", "area"), {}),
+    "segments_rotation": (("segment", "quaternion"), {}),
+    "angles": (("angle",), {"units": "degrees"}),
+}
 
 
 def to_pandas(result: Result) -> pandas.DataFrame:
@@ -38,23 +48,11 @@ def to_pandas(result: Result) -> pandas.DataFrame:
         "status": np.array(STATUS_MEANING)[np.minimum(result.status, len(STATUS_MEANING) - 1)],
         "objective": result.objective,
     }
-    for values, names in _points(result):
-        columns |= {f"{name}_{axis}": values[:, i, k] for i, name in enumerate(names) for k, axis in enumerate(_AXES)}
-    if result.sigma is not None:
-        columns |= {f"{name}_sigma": result.sigma[:, i] for i, name in enumerate(result.meta.joint_names)}
-    columns |= {name: result.pose[:, i] for i, name in enumerate(result.meta.pose_names)}
-    columns |= {
-        f"{angles.joint}_{name}_deg": result.angles[angles.joint][:, i]
-        for angles in result.meta.angles
-        if angles.joint in result.angles
-        for i, name in enumerate(angles.names)
-    }
-    if result.residual is not None:
-        columns |= {
-            f"{name}_{area}": result.residual[:, i, k]
-            for i, name in enumerate(result.meta.residual_cameras)
-            for k, area in enumerate(("missing", "surplus"))
-        }
+    suffix = {"sigma": "_sigma", "angles": "_deg"}
+    for name, values, labels in _variables(result):
+        if name != "segments_rotation":
+            headers = ["_".join(parts).replace(" ", "_") + suffix.get(name, "") for parts in product(*labels)]
+            columns |= dict(zip(headers, values.reshape(len(result), len(headers)).T, strict=True))
     return pd.DataFrame(columns, index=pd.Index(result.frames, name="frame"))
 
 
@@ -69,48 +67,42 @@ def to_xarray(result: Result) -> xarray.Dataset:
     xr = _load("xarray")
     meta = result.meta
     variables: dict[str, Any] = {
-        "joints": (("frame", "joint", "axis"), result.joints, {"units": "m"}),
-        "pose": (("frame", "dof"), result.pose),
         "status": (("frame",), result.status, {"meaning": ", ".join(STATUS_MEANING)}),
         "objective": (("frame",), result.objective, {"kind": meta.objective_kind}),
     }
     coords: dict[str, Any] = {
         "frame": result.frames,
         "time": ("frame", result.time, {"units": "s"}),
-        "joint": list(meta.joint_names),
-        "axis": list(_AXES),
-        "dof": list(meta.pose_names),
         "dof_unit": ("dof", list(meta.pose_units)),
     }
-    if result.sigma is not None:
-        variables["sigma"] = (("frame", "joint"), result.sigma, {"units": "m"})
-    if result.feet is not None:
-        variables["feet"] = (("frame", "foot", "axis"), result.feet, {"units": "m"})
-        coords["foot"] = list(FOOT_POINTS)
-    if result.residual is not None:
-        variables["residual"] = (("frame", "camera", "area"), result.residual)
-        coords["area"] = ["missing", "surplus"]
-        coords["camera"] = list(meta.residual_cameras)
-    if result.segments_rotation is not None:
-        variables["rotation"] = (("frame", "segment", "quaternion"), result.segments_rotation)
-        coords |= {"segment": list(meta.segment_names), "quaternion": list("wxyz")}
+    for name, values, labels in _variables(result):
+        dimensions, attributes = _FIELDS[name]
+        variables["rotation" if name == "segments_rotation" else name] = (("frame", *dimensions), values, attributes)
+        coords |= {dimension: list(names) for dimension, names in zip(dimensions, labels, strict=True)}
+    shared = {"fps": meta.fps, "up": meta.up, "capture": meta.capture, "method": meta.method}
+    return xr.Dataset(variables, coords, shared)
+
+
+def _variables(result: Result) -> Iterator[tuple[str, NDArray[np.float64], list[Sequence[str]]]]:
+    """Yield the name, the values (F, …) and the labels along each further axis of the fields that the result has."""
+    meta = result.meta
     angles = {
-        f"{joint_angles.joint} {name}": result.angles[joint_angles.joint][:, i]
-        for joint_angles in meta.angles
-        if joint_angles.joint in result.angles
-        for i, name in enumerate(joint_angles.names)
+        f"{item.joint} {name}": result.angles[item.joint][:, i]
+        for item in meta.angles
+        if item.joint in result.angles
+        for i, name in enumerate(item.names)
     }
-    if angles:
-        variables["angles"] = (("frame", "angle"), np.stack(list(angles.values()), axis=1), {"units": "degrees"})
-        coords["angle"] = list(angles)
-    attributes = {"fps": meta.fps, "up": meta.up, "capture": meta.capture, "method": meta.method}
-    return xr.Dataset(variables, coords, attributes)
-
-
-def _points(result: Result) -> Iterator[tuple[NDArray[np.float64], tuple[str, ...]]]:
-    yield result.joints, result.meta.joint_names
-    if result.feet is not None:
-        yield result.feet, FOOT_POINTS
+    labels: dict[str, Sequence[str]] = {
+        "joint": meta.joint_names, "axis": "xyz", "foot": FOOT_POINTS, "dof": meta.pose_names, "angle": list(angles),
+        "camera": meta.residual_cameras, "area": ("missing", "surplus"), "segment": meta.segment_names,
+        "quaternion": "wxyz",
+    }  # fmt: skip
+    for name, (dimensions, _) in _FIELDS.items():
+        values = getattr(result, name)
+        if name == "angles":
+            values = np.stack(list(angles.values()), axis=1) if angles else None
+        if values is not None:
+            yield name, values, [labels[dimension] for dimension in dimensions]
 
 
 def _load(package: str) -> Any:
