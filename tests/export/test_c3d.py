@@ -48,6 +48,9 @@ def test_missing_points_have_residual_minus_one(write: Write) -> None:
     assert scale < 0, "floats"
     frames = last - first + 1
     words = np.frombuffer(data, "<f4", frames * count * 4, 512 * (block - 1)).reshape(frames, count, 4)
+    assert 512 * (block - 1) + 16 * frames * count > len(data) - 512, (
+        "nothing after the points but the last block's rest"
+    )
     missing = np.isin(np.arange(FRAMES), LOST)
     assert (words[missing] == [0, 0, 0, -1]).all()
     assert (words[~missing, :, 3] >= 0).all() and (words[~missing, :, :3] != 0).any(axis=2).all()

@@ -145,6 +145,9 @@ def test_mot_angles_of_a_level_arm_do_not_jump() -> None:
     assert np.degrees(np.abs(np.diff(found, axis=0)).max()) < 5
     error = Rotation.from_matrix(np.swapaxes(compose("zxy", found), 1, 2) @ level @ noise).magnitude()
     assert np.degrees(error.max()) < 1.5
+    hanging = np.repeat(compose("zxy", np.radians([[10.0, -20.0, 5.0]])), 100, axis=0)
+    found = np.degrees(follow_rotations("zxy", np.concatenate([level @ noise, hanging])))
+    np.testing.assert_allclose(found[-1], [10.0, -20.0, 5.0], atol=1e-6)
     steep = compose("zxy", np.radians([[10.0, -75.0, 20.0], [30.0, 60.0, -20.0]]))
     np.testing.assert_allclose(compose("zxy", follow_rotations("zxy", steep)), steep, atol=1e-12)
 

@@ -7,6 +7,7 @@ point. ROTATION is each segment's 4×4 transform to the world; in unknown frames
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,9 @@ from tk.model.body.joints import SEGMENT_ORIGIN
 
 # The residual is a signed byte: ezc3d would wrap 256 to 0, a point without error.
 _MOST_RESIDUAL = 127
+# Of the format: bytes in a block, the place of the first data block's number in the header, the largest number that all
+# readers take, because some read it as signed.
+_BLOCK, _HEADER_DATA_START, _LAST_BLOCK = 512, 16, 32767
 
 
 def write_c3d(motion: Motion, path: Path) -> None:
@@ -44,3 +48,42 @@ def write_c3d(motion: Motion, path: Path) -> None:
     file.add_parameter("ROTATION", "LABELS", list(motion.segments))
     file.add_parameter("ROTATION", "RATE", [motion.fps])
     file.write(str(path))
+    _put_rotations_first(path)
+
+
+def _put_rotations_first(path: Path) -> None:
+    """Exchange the data sections of points and rotations in a file of ezc3d.
+
+    Readers that do not know rotations expect nothing after the points, and warn of bytes that are left over.
+    """
+    data = bytearray(path.read_bytes())
+    places = _parameters(data)
+    begins = [places[group, "DATA_START"] for group in ("POINT", "ROTATION")]
+    first, second = (struct.unpack_from("<H", data, begin)[0] for begin in begins)
+    points, rotations = data[_BLOCK * (first - 1) : _BLOCK * (second - 1)], data[_BLOCK * (second - 1) :]
+    rotations += bytes(-len(rotations) % _BLOCK)
+    start = first + len(rotations) // _BLOCK
+    if start > _LAST_BLOCK:
+        return
+    for place, block in ((begins[0], start), (begins[1], first), (_HEADER_DATA_START, start)):
+        struct.pack_into("<H", data, place, block)
+    path.write_bytes(data[: _BLOCK * (first - 1)] + rotations + points)
+
+
+def _parameters(data: bytearray) -> dict[tuple[str, str], int]:
+    """Return the place of the value of each scalar parameter, by the names of its group and its own."""
+    names: dict[int, str] = {}
+    found: dict[tuple[int, str], int] = {}
+    at = _BLOCK * (data[0] - 1) + 4
+    while data[at]:
+        length, group = struct.unpack_from("bb", data, at)
+        end = at + 2 + abs(length)  # negative: locked
+        name, following = data[at + 2 : end].decode(), struct.unpack_from("<H", data, end)[0]
+        if group < 0:
+            names[-group] = name
+        else:
+            found[group, name] = end + 4  # after the offset, the type and the number of dimensions
+        if not following:
+            break
+        at = end + following
+    return {(names[group], name): place for (group, name), place in found.items()}

@@ -104,10 +104,11 @@ def follow_rotations(sequence: str, R: Float) -> Float:
     """Angles (F, 3), radians, about three different axes, that change little from frame to frame, of rotations (F, 3,
     3).
 
-    They begin near zero and follow as in :func:`follow`. Near the singular middle angle of ±90° only the sum or
-    difference of the first and the last is determined well, and noise turns both by large, opposite angles. There, the
-    change since the last frame is damped, at the expense of an error of the rotation (Nakamura & Hanafusa, J. Dyn.
-    Syst. Meas. Control 108 (1986) 163-171, section 5). Everywhere else the angles are exact.
+    They follow as in :func:`follow`; of the equivalent sequences, that with medians near zero is returned. Near the
+    singular middle angle of ±90° only the sum or difference of the first and the last is determined well, and noise
+    turns both by large, opposite angles. There, the change since the last frame is damped, at the expense of an error
+    of the rotation (Nakamura & Hanafusa, J. Dyn. Syst. Meas. Control 108 (1986) 163-171, section 5). Everywhere else
+    the angles are exact.
     """
     axes = [np.eye(3)["xyz".index(axis)] for axis in sequence]
     result = decompose(sequence, R)
@@ -125,4 +126,6 @@ def follow_rotations(sequence: str, R: Float) -> Float:
                 H = J.T @ J + damping * np.eye(3)
                 angles = angles + np.linalg.solve(H, J.T @ error - damping * (angles - last))
         result[f] = last = angles
-    return result
+    mirrored = result * [1.0, -1.0, 1.0] + np.pi
+    choices = [angles - 2 * np.pi * np.round(np.median(angles, axis=0) / (2 * np.pi)) for angles in (result, mirrored)]
+    return min(choices, key=lambda angles: float(np.abs(np.median(angles, axis=0)).sum()))
