@@ -24,13 +24,12 @@ Float = NDArray[np.float64]
 # normal distribution. The joints' constant offsets on these captures are about as large as the first.
 OFFSET_M, BENT_M = 0.0067, 0.0145
 
-# Displacement of a bone's contours in one view, metres; how far a joint can be from its place if no view shows it (the
-# length of a bone), metres; and the variance, in units of the first squared, up to which the contours' noise covers
-# this error, as it does with four or more cameras around the person. Fitted on walk, dance, fold, cube, hd and
-# treadmill-slow: with 5 or more, 3 and 2 cameras 75, 85, 87 % of the errors lie within 1 σ and 93, 96, 96 % within 2 σ;
-# without this term 72, 69, 65 % and 91, 89, 86 %. With two cameras that face each other 93 % instead of 63 % lie within
-# 1 σ. With 0.012 or 0.02 m these shares change by up to 4 %.
-VIEW_M, REACH_M, WELL_SEEN = 0.015, 0.3, 0.49
+# Displacement of a bone's contours in one view, metres, and how far a joint can be from its place if no view shows it
+# (the length of a bone), metres. Fitted on walk, dance, fold, cube, hd and treadmill-slow: with 5 or more, 3 and 2
+# cameras 75, 78, 85 % of the errors lie within 1 σ and 93, 93, 96 % within 2 σ; without this term 72, 69, 65 % and 91,
+# 89, 86 %. With two cameras that face each other 95 % instead of 63 % lie within 1 σ. With 0.01 or 0.02 m these shares
+# change by up to 4 %.
+VIEW_M, REACH_M = 0.015, 0.3
 
 # The bone that each joint turns with, by the joints at its ends; the trunk's own joints have none.
 _BONES = {b: (a, b) for a, b in BONES if ROWS[a].chain and ROWS[a].chain == ROWS[b].chain}
@@ -61,11 +60,12 @@ def contour_variance(skeleton: Skeleton, pose: Float, precision: Float, free: ND
 
 
 def view_variance(rays: Float, shares: Float) -> Float:
-    """Return (15,) variance of the joints' positions along an axis, metres², from the directions of the views.
+    """Return (15,) variance of the joints' positions along the direction that the views determine least, metres².
 
     A view measures a joint's position across its ray only, and only as far as it shows the joint's bones. Priors and
     motion are no evidence of a position, so they do not count. This is the covariance of triangulation with weights
-    (Hartley and Zisserman, *Multiple View Geometry*, 2nd ed., section 12.6).
+    (Hartley and Zisserman, *Multiple View Geometry*, 2nd ed., section 12.6), beyond that of one full view across each
+    direction: so much three cameras around the person give, and the contours' noise covers it.
 
     Args:
         rays: (V, 15, 3) unit vectors between the cameras and the joints.
@@ -73,8 +73,8 @@ def view_variance(rays: Float, shares: Float) -> Float:
     """
     across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
     information = (shares[..., None, None] * across).sum(axis=0) + (VIEW_M / REACH_M) ** 2 * np.eye(3)
-    variance = np.trace(np.linalg.inv(information), axis1=1, axis2=2) / 3
-    return np.asarray(VIEW_M**2 * np.maximum(variance - WELL_SEEN, 0.0))
+    least = np.linalg.eigvalsh(information)[:, 0]
+    return np.asarray(VIEW_M**2 * np.maximum(1.0 / least - 1.0, 0.0))
 
 
 def directions(skeleton: Skeleton, poses: Float) -> Float:
