@@ -156,10 +156,7 @@ def track_source(
         note(text)
     with open_plan(setup, source, settings, note, method, frames) as plan:
         meta = plan.meta()
-        if resume and output.exists():
-            writer, done = ResultWriter.resume(output, meta, len(read_result(output).people))
-        else:
-            writer, done = ResultWriter.create(output, meta), 0
+        writer, done = ResultWriter.resume(output, meta) if resume else (ResultWriter.create(output, meta), 0)
         again = not causal and plan.tracker.has_second_pass  # the second pass needs the masks
         stores = MaskStores(output, bool(done))
         if not (done or again):

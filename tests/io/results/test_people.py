@@ -74,7 +74,7 @@ def test_run_with_several_people_is_resumed_after_the_last_state(tmp_path: Path)
     whole, path = tmp_path / "whole.h5", tmp_path / "result.h5"
     write_two(whole, 12)
     write_two(path, 9, with_state=5)  # frames 5 to 8 have no state
-    writer, done = ResultWriter.resume(path, META, people=2)
+    writer, done = ResultWriter.resume(path, META)
     with writer:
         assert done == 5
         assert_equal_values(writer.state, make_state(4))
@@ -92,16 +92,21 @@ def test_run_with_several_people_is_resumed_after_the_last_state(tmp_path: Path)
 def test_frames_without_anybody_count_as_finished(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
     write_two(path, 8)
-    writer, done = ResultWriter.resume(path, META, people=2)
+    writer, done = ResultWriter.resume(path, META)
     writer.close()
     assert done == 8 and len(read_result(path)) == 7
 
 
-def test_resuming_with_another_number_of_people_is_refused(tmp_path: Path) -> None:
+def test_person_added_after_the_last_state_has_no_rows_in_the_resumed_run(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
-    write_two(path, 4)
-    with pytest.raises(ResultError, match=r"result\.h5: .*people is 2, not 1"):
-        ResultWriter.resume(path, META)
+    with ResultWriter.create(path, META) as writer:
+        writer.append(people_at(0), make_state(0))
+        writer.append(people_at(2))
+    writer, done = ResultWriter.resume(path, META)
+    with writer:
+        assert done == 1
+        writer.append(people_at(3), make_state(1))
+    assert [person.frames.tolist() for person in read_result(path).people] == [[3, 6], [6]]
 
 
 def test_person_can_be_added_during_the_run(tmp_path: Path) -> None:

@@ -113,8 +113,9 @@ class Twin:
 
     def _drop_rows_without_state(self) -> None:
         self.count = int(self.file["resume/rows"][()])
-        for person, rows in enumerate(self.file["resume/people"][()].tolist()):
-            prefix = prefix_of(person)
+        counts = self.file["resume/people"][()].tolist()
+        for person in range(len(self._rows)):
+            prefix, rows = prefix_of(person), counts[person] if person < len(counts) else 0
             if rows == self._rows[person]:
                 continue
             self._rows[person] = rows

@@ -84,26 +84,25 @@ class ResultWriter:
         return cls._opened(target, meta, [{} for _ in range(people)], None)
 
     @classmethod
-    def resume(cls, path: str | os.PathLike[str], meta: ResultMeta, people: int = 1) -> tuple[ResultWriter, int]:
+    def resume(cls, path: str | os.PathLike[str], meta: ResultMeta) -> tuple[ResultWriter, int]:
         """Continue a result after the last frame set that has a state; start a new one if there is none.
 
         Returns:
-            the writer, with the stored ``state`` and ``models``, and the number of finished frame sets.
+            the writer, with the stored ``state`` and the ``models`` of the file's people, and the number of finished
+            frame sets.
 
         Raises:
-            ResultError: as in :meth:`create`, or the file was made from another capture or configuration, for another
-                number of people, or its state is damaged.
+            ResultError: as in :meth:`create`, or the file was made from another capture or configuration, or its state
+                is damaged.
         """
         target = writable(Path(path))
         if not target.exists():
-            return cls.create(path, meta, people), 0
+            return cls.create(path, meta), 0
         with open_hdf5(target) as done:
             check_format(done)
-            if count_people(done) != people:
-                done.fail(f"was made differently: people is {count_people(done)}, not {people}; {_REMEDY}")
-            rows = [_check_resumable(done, meta, person) for person in range(people)]
+            rows = [_check_resumable(done, meta, person) for person in range(count_people(done))]
             state = _read_state(done, rows)
-            models: list[Model] = [read_model(done, prefix_of(person)) for person in range(people)]
+            models: list[Model] = [read_model(done, prefix_of(person)) for person in range(len(rows))]
         writer = cls._opened(target, meta, models, target)
         writer.state = state
         return writer, writer._twins[0].count
@@ -260,6 +259,8 @@ def _read_state(file: Hdf5Reader, rows: list[int]) -> dict[str, Value]:
     if not content:
         return {}
     stored = content.pop("checksum", None)
-    if np.ndim(stored) or stored != checksum(content):
+    intact = np.ndim(stored) == 0 and stored == checksum(content)
+    counts = np.atleast_1d(content["people"]).tolist() if intact else []
+    if not intact or len(counts) > len(rows) or any(count > here for count, here in zip(counts, rows, strict=False)):
         file.fail(f"the state of the run is damaged; {_REMEDY}")
     return {name.removeprefix("state/"): value for name, value in content.items() if name.startswith("state/")}
