@@ -105,10 +105,9 @@ def _packages() -> Check:
 
 
 def _taichi() -> Check:
-    _, why = _try("from tk.kernels.runtime import ensure_runtime; ensure_runtime()")
-    return Check(
-        f"{version('taichi')}, kernels start", f"{why}: pip install --force-reinstall taichi" if why else "", True
-    )
+    code = "from tk.kernels.runtime import ensure_runtime, ti; ensure_runtime(); print(*ti.__version__, sep='.')"
+    out, why = _try(code)
+    return Check(f"{out}, kernels start", f"{why}: pip install --force-reinstall taichi" if why else "", True)
 
 
 def _open3d() -> Check:

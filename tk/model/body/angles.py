@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.model.body.joints import ARM, CROOK
 from tk.model.body.rotations import compose, decompose, to_quaternions
 from tk.model.body.skeleton import SEGMENTS, Skeleton
 
@@ -32,9 +33,7 @@ _MIRROR = np.diag([1.0, 1.0, -1.0])
 
 # The axes of the left arm in the zero configuration, body frame: up along the arm, and forward, where the forearm goes
 # when the elbow bends (see tk.model.body.skeleton).
-_ARM_UP_AXIS = -np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
-_ARM_FORWARD = np.array([0.5, -0.5, np.sqrt(0.5)])
-_ARM_AXES = np.column_stack([_ARM_FORWARD, np.cross(_ARM_UP_AXIS, _ARM_FORWARD), _ARM_UP_AXIS])
+_ARM_AXES = np.column_stack([CROOK, np.cross(-ARM, CROOK), -ARM])
 
 
 @dataclass(frozen=True)

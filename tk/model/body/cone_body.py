@@ -27,7 +27,7 @@ from tk.model.body.anthropometry import (
     PELVIS_FORWARD,
     BodyDimensions,
 )
-from tk.model.body.joints import CHAINS, LIMBS, OPTIONAL, ROWS
+from tk.model.body.joints import ARM, CHAINS, CROOK, ELBOW_AXIS, LIMBS, OPTIONAL, ROWS
 from tk.model.body.skeleton import SEGMENTS, Skeleton, build_skeleton, up_rotation
 
 Float = NDArray[np.float64]
@@ -41,10 +41,6 @@ CALF_BELLY = 1.1
 
 # Angle, degrees, by which the head's longest axis, from the chin to the back of the crown, leans back. An estimate.
 SKULL_TILT_DEG = 15.0
-
-# Direction that the crook of the left elbow faces in the zero configuration: perpendicular to the arm, half up.
-_BENT = np.array([0.5, -0.5, np.sqrt(0.5)])
-ELBOW_AXIS = np.cross(np.array([1.0, 1.0, 0.0]) / np.sqrt(2), _BENT)
 
 _FORWARD = np.array([1.0, 0.0, 0.0])
 
@@ -266,12 +262,9 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
     for side, sign in (("l", 1.0), ("r", -1.0)):
         M = np.diag([1.0, sign, 1.0])
         if preset != "walker":
-            u = M @ np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
-            shoulder = M @ np.array([0.0, d.shoulder_half_width, d.trunk - d.shoulder_drop])
-            elbow = shoulder + d.upper_arm * u
-            wrist = elbow + d.forearm * u
+            shoulder, elbow, wrist = (ROWS[name].place(d) for name in LIMBS[f"arm_{side}"])
             # the muscles lie on the side to which the elbow bends
-            crook = elbow + ELBOW_FRONT * d.stature * (M @ _BENT) if preset == "full" else elbow
+            crook = elbow + ELBOW_FRONT * d.stature * (M @ CROOK) if preset == "full" else elbow
             for segment, begin, end, r0, r1 in (
                 ("upper_arm", shoulder, crook, d.upper_arm_radius, d.elbow_radius),
                 ("forearm", crook, wrist, d.elbow_radius, d.wrist_radius),
@@ -281,13 +274,9 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "fu
             # half open: a little shorter than the stretched hand, wider than the wrist across the palm; the thumb's
             # side is that to which the elbow bends
             shape = (0.9 * d.wrist_radius, 1.4 * d.wrist_radius, 0.95 * d.hand, 0.6)
-            thin = M @ ELBOW_AXIS
-            parts.append(
-                ConePart(f"hand_{side}", f"forearm_{side}", CONE, shape, _frame(wrist, u, thin), ends=(False, True))
-            )
-        hip = M @ np.array([0.0, d.hip_half_width, 0.0])
-        knee = hip - d.thigh * z
-        ankle = knee - d.calf * z
+            frame = _frame(wrist, M @ ARM, M @ ELBOW_AXIS)
+            parts.append(ConePart(f"hand_{side}", f"forearm_{side}", CONE, shape, frame, ends=(False, True)))
+        hip, knee, ankle = (ROWS[name].place(d) for name in LIMBS[f"leg_{side}"])
         if preset == "full":
             # the surface lies in front of the hip, behind the knee and outside of the ankle
             top = hip + PELVIS_FORWARD * d.stature * x

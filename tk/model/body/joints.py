@@ -19,10 +19,11 @@ Float = NDArray[np.float64]
 _X, _Y, _Z = np.eye(3)
 # Zero configuration of the left arm (see tk.model.body.skeleton).
 ARM = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
-_ARM_POLE = np.array([-1.0, 1.0, 1.0]) / np.sqrt(3)
-_ARM_RISE = np.cross(ARM, _ARM_POLE)
+ARM_POLE = np.array([-1.0, 1.0, 1.0]) / np.sqrt(3)
+_ARM_RISE = np.cross(ARM, ARM_POLE)
 # An elbow at zero twist bends inward and up: forward when the arm hangs, inward when it is raised.
-_ELBOW_AXIS = np.cross(ARM, [0.5, -0.5, np.sqrt(0.5)])
+CROOK = np.array([0.5, -0.5, np.sqrt(0.5)])
+ELBOW_AXIS = np.cross(ARM, CROOK)
 
 # Height of the waist above the hip centres, as a share of the trunk's length: about L4, the middle of the lumbar spine.
 WAIST_HEIGHT = 0.25
@@ -157,10 +158,10 @@ _MIDDLE = (
 )  # fmt: skip
 _ARM_ROWS = (
     Joint("shoulder", _shoulder, above="torso", turns="upper_arm", chain="arm", carrier="upper_arm", bone_from="neck",
-          dofs=(Dof("yaw", _ARM_POLE, -180.0, 180.0), Dof("pitch", _ARM_RISE, -80.0, 80.0),
+          dofs=(Dof("yaw", ARM_POLE, -180.0, 180.0), Dof("pitch", _ARM_RISE, -80.0, 80.0),
                 Dof("roll", ARM, -110.0, 110.0)), offset_m=0.011),
     Joint("elbow", _elbow, above="shoulder", turns="forearm", chain="arm", carrier="upper_arm", bone_from="shoulder",
-          dofs=(Dof("flexion", _ELBOW_AXIS, -5.0, 155.0),), offset_m=0.012),
+          dofs=(Dof("flexion", ELBOW_AXIS, -5.0, 155.0),), offset_m=0.012),
     Joint("wrist", lambda d: _elbow(d) + d.forearm * ARM, above="elbow", chain="arm", carrier="forearm",
           bone_from="elbow", offset_m=0.013),
 )  # fmt: skip

@@ -31,6 +31,8 @@ from numpy.typing import ArrayLike, NDArray
 from tk.kernels.kinematics import ARM_UP
 from tk.model.body.anthropometry import FRACTIONS, RAISED_SHOULDERS, BodyDimensions
 from tk.model.body.joints import (
+    ARM,
+    ARM_POLE,
     CHAINS,
     HIPS,
     JOINTS,
@@ -234,11 +236,8 @@ class Skeleton:
 
 def shoulder_angles(direction: Float) -> tuple[float, float]:
     """Yaw and pitch of the shoulder that point the arm along ``direction`` (3,): forward, outward, up."""
-    arm = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
-    pole = np.array([-1.0, 1.0, 1.0]) / np.sqrt(3)
-    third = np.cross(pole, arm)
-    pitch = float(np.arcsin(np.clip(direction @ pole, -1, 1)))
-    return float(np.arctan2(direction @ third, direction @ arm)), pitch
+    pitch = float(np.arcsin(np.clip(direction @ ARM_POLE, -1, 1)))
+    return float(np.arctan2(direction @ np.cross(ARM_POLE, ARM), direction @ ARM)), pitch
 
 
 def arm_elevation(first: ArrayLike, second: ArrayLike, by: int | None = None) -> Float:
