@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +16,8 @@ from tests.conftest import QUICK
 from tests.io.conftest import picture, write_video
 from tk.errors import CaptureError
 from tk.io import settings_file
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def test_import_has_no_side_effects():
@@ -31,6 +36,30 @@ def test_every_public_name_exists():
         assert getattr(tk, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         tk.nonsense  # noqa: B018
+
+
+def test_errors_name_no_options_of_the_command_line() -> None:
+    """Only their hints do, which the command line adds."""
+    option = re.compile(r"(^|[^\w-])--[a-z]")
+    found = []
+    for file in sorted((ROOT / "tk").rglob("*.py")):
+        if file.parts[-2] == "commands":
+            continue
+        for raised in (n for n in ast.walk(ast.parse(file.read_text(encoding="utf-8"))) if isinstance(n, ast.Raise)):
+            hints = [k for k in ast.walk(raised) if isinstance(k, ast.keyword) and k.arg == "hint"]
+            allowed = {id(part) for hint in hints for part in ast.walk(hint)}
+            for text in ast.walk(raised):
+                if isinstance(text, ast.Constant) and isinstance(text.value, str) and id(text) not in allowed:
+                    found += [f"{file.name}:{text.lineno}: {text.value}"] * bool(option.search(text.value))
+    assert found == []
+
+
+def test_a_path_is_tracked_and_the_result_is_described_in_three_lines(tiny, tmp_path) -> None:
+    config = settings_file.from_toml(QUICK)
+    result = tk.track(tiny, tmp_path / "r.h5", config=config, frames=(0, 3), causal=True)
+    lines = repr(result).splitlines()
+    assert len(lines) == 3 and all(len(line) < 120 for line in lines)
+    assert "r.h5" in lines[0] and "3 frames" in lines[1]
 
 
 def test_a_missing_capture_is_reported_in_one_line(tmp_path):

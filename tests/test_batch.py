@@ -135,8 +135,8 @@ def test_exit_codes() -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--workers", "0"], "--workers 0"),
-        (["--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], "leave out --workers or --scheduler"),
+        (["--workers", "0"], "workers = 0"),
+        (["--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], "give workers or a scheduler, not both"),
         (["--body", "nobody.h5"], "nobody.h5: cannot be read"),
         (["--frames", "5"], "--frames 5"),
     ],

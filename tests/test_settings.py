@@ -85,8 +85,8 @@ def test_settings_missing_in_a_file_keep_their_default() -> None:
         ("tracking = 3", ["tracking", "table"]),
         ("segmentation = 1", ["segmentation", "str"]),
         ('segmentation = "magic"', ["magic", "collinearity", "mog2"]),
-        ("voxels = 2", ["--voxels 2", "8 to 512"]),
-        ("seed = -1", ["--seed -1"]),
+        ("voxels = 2", ["voxels = 2", "8 to 512"]),
+        ("seed = -1", ["seed = -1"]),
         ("[tracking]\nprediction = 7.0", ["prediction = 7.0"]),
         ("[tracking]\nprediction = 2", ["prediction = 2"]),
         ("[smd]\nmemory = 0.3", ["unknown setting smd"]),
@@ -104,6 +104,7 @@ def test_settings_missing_in_a_file_keep_their_default() -> None:
         ("[contours]\nviews = 0\n", ["contours.views = 0"]),
         ("[contours]\nthreshold = 1e300\n", ["contours.threshold = 1e+300 is too large"]),
         (f"[contours]\nthreshold = 1{400 * '0'}\n", ["contours.threshold = 1000", "is too large"]),
+        ("[contours]\npairs = 100000\n", ["contours.pairs = 100000 must lie in [1, 100]"]),
         (f"voxels = 1{5000 * '0'}\n", ["invalid TOML"]),
         ("seed = 99999999999999999999", ["seed"]),
     ],
@@ -227,5 +228,5 @@ def test_a_file_wins_over_a_preset(tmp_path: Path) -> None:
 
 
 def test_an_unknown_preset_is_named() -> None:
-    with pytest.raises(ConfigError, match="--preset mine: choose one of kehl2006"):
+    with pytest.raises(ConfigError, match="preset mine: choose one of kehl2006"):
         settings_file.preset("mine")

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict, overload
 
 from tk.io.captures.capture import Capture
-from tk.io.captures.capture import open_capture as _open_capture
+from tk.io.importers import open_recording
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 from tk.run import session
 from tk.run.people import parse_choice
 from tk.run.plan import recording_setup
 from tk.run.reporter import Silent
+from tk.segmenters import Segmenter
 from tk.settings import Settings
 from tk.trackers.protocol import Estimate
 
@@ -35,7 +36,9 @@ class _Logged(Silent):
         _LOG.warning("%s", text)
 
 
-def open_capture(path: PathLike, cameras: Sequence[str] | None = None, masks: str = "auto") -> Capture:
+def open_capture(
+    path: PathLike, cameras: Sequence[str] | None = None, masks: str = "auto", resample: bool = False
+) -> Capture:
     """Open a capture folder.
 
     Args:
@@ -43,11 +46,12 @@ def open_capture(path: PathLike, cameras: Sequence[str] | None = None, masks: st
         cameras: names of the cameras to use; all if None.
         masks: "auto" (those of the capture, if there are any), "none" (segment the videos), "median" (segment against
             the recording's median), or a folder of masks.
+        resample: choose each frame's images by their time stamps, for cameras of different or variable rates.
 
     Raises:
         tk.errors.CaptureError: what is wrong with the folder, in one line that names the file.
     """
-    return _open_capture(Path(path), tuple(cameras) if cameras else None, masks)
+    return open_recording(Path(path), tuple(cameras) if cameras else None, masks, resample)
 
 
 class _Options(TypedDict, total=False):
@@ -60,21 +64,22 @@ class _Options(TypedDict, total=False):
     init_pose: PathLike | None
     body: PathLike | None
     people: str | Sequence[int]
+    segmenter: Segmenter | None
     causal: bool
     resume: bool
     force: bool
 
 
 @overload
-def track(capture: Capture, output: None = None, **options: Unpack[_Options]) -> Iterator[Estimate]: ...
+def track(capture: Capture | PathLike, output: None = None, **options: Unpack[_Options]) -> Iterator[Estimate]: ...
 
 
 @overload
-def track(capture: Capture, output: PathLike, **options: Unpack[_Options]) -> Result: ...
+def track(capture: Capture | PathLike, output: PathLike, **options: Unpack[_Options]) -> Result: ...
 
 
 def track(
-    capture: Capture,
+    capture: Capture | PathLike,
     output: PathLike | None = None,
     *,
     method: str = "region",
@@ -84,6 +89,7 @@ def track(
     init_pose: PathLike | None = None,
     body: PathLike | None = None,
     people: str | Sequence[int] = "auto",
+    segmenter: Segmenter | None = None,
     causal: bool = False,
     resume: bool = False,
     force: bool = False,
@@ -91,7 +97,7 @@ def track(
     """Track the person in a capture.
 
     Args:
-        capture: of :func:`open_capture`.
+        capture: of :func:`open_capture`, or the path of one.
         output: a result file to write; without one the estimates are returned frame by frame.
         method: "region", "silhouette" or "volumetric".
         frames: range of frames to return, end exclusive (None: to the last frame).
@@ -101,6 +107,7 @@ def track(
         body: a result or a TOML file whose body is taken.
         people: "auto" (one person, the first that :func:`tk.model.people.order_people` returns), "all", or numbers in
             that order.
+        segmenter: makes the masks, unless the capture has some, instead of the empty scene or an installed segmenter.
         causal: stop after the first pass. Without ``output`` there is no second one.
         resume: continue where an earlier run with the same ``output`` stopped.
         force: replace an existing ``output``; without it an existing file is an error.
@@ -120,6 +127,10 @@ def track(
     pose_file = Path(init_pose) if init_pose is not None else None
     body_file = Path(body) if body is not None else None
     choice = parse_choice(people if isinstance(people, str) else ",".join(map(str, people)))
+    if not isinstance(capture, Capture):
+        capture = open_capture(capture, resample=chosen.resample)
+    if segmenter is not None:
+        capture = replace(capture, segmenter=segmenter)
     reporter = _Logged()
     if output is None:
         for warning in capture.warnings:

@@ -6,7 +6,6 @@ constants beside the algorithm.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -18,6 +17,8 @@ EFFORTS = {"fast": 0.5, "normal": 1.0, "thorough": 5.0}
 
 #: largest count in a settings file: frames, points, iterations
 MOST_COUNT = 100_000
+#: largest weight, ratio or threshold. Beside it the other terms, whose defaults are 0.1 to 3, no longer count.
+MOST_WEIGHT = 1000
 
 
 def _check(table: str, values: Any, **ranges: tuple[float, float]) -> None:
@@ -25,8 +26,7 @@ def _check(table: str, values: Any, **ranges: tuple[float, float]) -> None:
     for name, (low, high) in ranges.items():
         value = getattr(values, name)
         if not low <= value <= high:
-            expected = f"in [{low:g}, {high:g}]" if math.isfinite(high) else f"at {low:g} or above"
-            raise ConfigError(f"{table}.{name} = {value} must lie {expected}")
+            raise ConfigError(f"{table}.{name} = {value} must lie in [{low:g}, {high:g}]")
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class ForegroundSettings:
 
     def __post_init__(self) -> None:
         for name in (f.name for f in fields(self)):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ConfigError(f"foreground.{name} = {getattr(self, name)} must be finite and positive")
+            if not 0 < getattr(self, name) <= MOST_WEIGHT:
+                raise ConfigError(f"foreground.{name} = {getattr(self, name)} must lie in (0, {MOST_WEIGHT}]")
         if self.shadow_min > 1:
             raise ConfigError(f"foreground.shadow_min = {self.shadow_min} must be at most 1, which means no shadows")
 
@@ -93,7 +93,7 @@ class ObjectiveSettings:
     surface_weight: float = 1.0
 
     def __post_init__(self) -> None:
-        _check("objective", self, coverage_weight=(0, math.inf), surface_weight=(0, math.inf))
+        _check("objective", self, coverage_weight=(0, MOST_WEIGHT), surface_weight=(0, MOST_WEIGHT))
 
 
 @dataclass(frozen=True)
@@ -115,9 +115,8 @@ class ContourSettings:
     hidden: float = 1.0
 
     def __post_init__(self) -> None:
-        positive, at_least_one = (0, math.inf), (1, math.inf)
-        _check("contours", self, edge_weight=positive, threshold=positive, hidden=positive)
-        _check("contours", self, views=at_least_one, pairs=at_least_one)
+        _check("contours", self, edge_weight=(0, MOST_WEIGHT), threshold=(0, 1), hidden=(0, MOST_WEIGHT))
+        _check("contours", self, views=(1, 64), pairs=(1, 100))
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,7 @@ class TrackingSettings:
     lost_ratio: float = 3.0
 
     def __post_init__(self) -> None:
-        _check("tracking", self, prediction=(0, 1.5), lost_ratio=(1, math.inf))
+        _check("tracking", self, prediction=(0, 1.5), lost_ratio=(1, MOST_WEIGHT))
 
 
 @dataclass(frozen=True)
@@ -218,6 +217,8 @@ class Settings:
             paper's numbers of iterations and points (6.4). A number below 1 is the share of the iterations, a number
             above 1 multiplies the points: "thorough" is 5, which the paper compares in its section 7.3.
         refine: whether inconsistent cameras are refined before the second pass.
+        resample: whether each frame's images are chosen by their time stamps, for cameras of different or variable
+            rates. A frame for which a camera has no image within half an interval is blank in this camera.
         foreground: see :class:`ForegroundSettings`.
         appearance: see :class:`AppearanceSettings`.
         body: see :class:`BodySettings`.
@@ -234,6 +235,7 @@ class Settings:
     ahead: int = 4
     effort: str | float = "normal"
     refine: bool = True
+    resample: bool = False
     foreground: ForegroundSettings = field(default_factory=ForegroundSettings)
     appearance: AppearanceSettings = field(default_factory=AppearanceSettings)
     body: BodySettings = field(default_factory=BodySettings)
@@ -245,9 +247,9 @@ class Settings:
 
     def __post_init__(self) -> None:
         if not 8 <= self.voxels <= 512:
-            raise ConfigError(f"--voxels {self.voxels}: choose from 8 to 512")
+            raise ConfigError(f"voxels = {self.voxels}: choose from 8 to 512")
         if not 0 <= self.seed < 2**63:  # the result file stores it as an int64
-            raise ConfigError(f"--seed {self.seed}: choose from 0 to {2**63 - 1}")
+            raise ConfigError(f"seed = {self.seed}: choose from 0 to {2**63 - 1}")
         if self.segmentation not in SEGMENTATIONS:
             raise ConfigError(f'segmentation = "{self.segmentation}": choose one of {", ".join(SEGMENTATIONS)}')
         if not 0 <= self.ahead <= 64:

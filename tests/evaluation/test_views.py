@@ -104,7 +104,7 @@ def test_results_without_a_body_have_pixels_only(tiny: Path, tracked: Path, tmp_
 
 
 def test_unusable_input_is_reported(tk: Tk, tiny: Path, three_views: Path, copy: Path, tmp_path: Path) -> None:
-    tk("evaluate", three_views, tiny / "truth.h5", "--joints", "toe").complaint("--joints toe")
+    tk("evaluate", three_views, tiny / "truth.h5", "--joints", "toe").complaint("joint 'toe' is unknown")
     tk("evaluate", three_views, tiny / "truth.h5", "--capture", tmp_path).complaint(str(tmp_path))
     shutil.rmtree(copy / "videos")
     ran = tk("evaluate", three_views, copy / "truth.h5")

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from tests.conftest import QUICK, Silent, Tk, setup_and_source
 from tests.people import RIG, install, person_mask, truth, write_people
@@ -16,7 +18,7 @@ from tk.errors import CaptureError, ConfigError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.run.mask_folder import write_masks
-from tk.run.prefetch import Ahead
+from tk.run.prefetch import Ahead, open_observations
 from tk.run.segmentation import make_segmenter, mask_source
 from tk.segmenters import load, names
 from tk.segmenters.subject_masks import SubjectMasks
@@ -78,7 +80,7 @@ def test_source_of_masks_depends_on_the_capture(copy: Path, tmp_path: Path, monk
 @pytest.mark.parametrize("command", ["track", "reconstruct"])
 def test_a_capture_without_any_source_of_masks_is_refused(tk: Tk, walk: Path, tmp_path: Path, command: str) -> None:
     ran = tk(command, walk, "-o", tmp_path / "r.h5")
-    ran.complaint(str(walk), "--masks DIR", "background/", "pip install tk-mocap[segmenter]")
+    ran.complaint(str(walk), "give a folder of masks", "background/", "pip install tk-mocap[segmenter]")
     assert not (tmp_path / "r.h5").exists()
 
 
@@ -111,7 +113,7 @@ def test_median_background_of_a_still_person_is_refused(tmp_path: Path, masks: s
     folder = write_people(tmp_path / "still", [standing], 12)
     with pytest.raises(CaptureError, match="hardly moves" if masks == "median" else "no segmenter") as caught:
         make_segmenter(*setup_and_source(open_capture(folder, masks=masks)), Settings(), lambda _: None)
-    assert "--masks DIR" in str(caught.value) and "\n" not in str(caught.value)
+    assert "give a folder of masks" in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_median_background_with_parts_of_the_person_is_reported(tmp_path: Path) -> None:
@@ -203,6 +205,23 @@ def test_masks_of_the_masks_command_are_used(
     tk(*command, "red", "--cameras", "c0,c1").complaint("cameras")
     tk("masks", walk, "-o", walk).complaint(str(walk), "choose another folder")
     tk(*command, "green").complaint("segmenter green", "is not installed")
+
+
+class Scarlet:
+    """A segmenter of a script: what is red is the person."""
+
+    def segment(self, picture: NDArray[np.uint8]) -> NDArray[np.float32]:
+        blue, green, red = np.moveaxis(picture.astype(np.float32), 2, 0)
+        return (red > 1.5 * np.maximum(blue, green) + 20).astype(np.float32)
+
+
+@pytest.mark.usefixtures("alone")
+def test_a_segmenter_may_be_an_object(walk: Path) -> None:
+    capture = replace(open_capture(walk), segmenter=Scarlet())
+    assert mask_source(capture) == "segmenter Scarlet"
+    with open_observations(capture.setup(), capture, Settings(), lambda _: None) as observations:
+        (observation, _), *_ = observations.frames(0, 2)
+    assert observation.masks.any(axis=(1, 2)).all() and (observation.masks == 0).mean() > 0.5
 
 
 @pytest.mark.usefixtures("alone")

@@ -302,7 +302,7 @@ def test_frames_before_the_initial_one_are_left_out(copy: Path, tmp_path: Path) 
     track(open_capture(copy), tmp_path / "r.h5", CONFIG, reporter, frames=(1, 6))
     assert reporter.frames == [3, 4, 5]
     assert any("frames before 3 are left out" in note for note in reporter.notes)
-    with pytest.raises(ConfigError, match=r"--frames 0:2: the subject is found in frame 3"):
+    with pytest.raises(ConfigError, match=r"frames 0:2: the subject is found in frame 3"):
         run(copy, tmp_path / "other.h5", frames=(0, 2))
 
 
@@ -313,7 +313,7 @@ def test_requested_frames_are_tracked(tiny: Path) -> None:
     assert not notes
     assert choose_frames(capture, (3, 70), notes.append) == (3, FRAMES)
     assert "ends with frame 13" in notes[0]
-    with pytest.raises(ConfigError, match=r"--frames 14:: .* has only frames 0 to 13"):
+    with pytest.raises(ConfigError, match=r"frames 14:: .* has only frames 0 to 13"):
         choose_frames(capture, (14, None), notes.append)
 
 
@@ -323,5 +323,5 @@ def test_mog2_segmentation_tracks_the_person(tiny: Path, tmp_path: Path) -> None
 
 
 def test_unknown_method() -> None:
-    with pytest.raises(ConfigError, match=r"--method neural: choose one of .*volumetric"):
+    with pytest.raises(ConfigError, match=r"method neural: choose one of .*volumetric"):
         tracker_class("neural")

@@ -40,6 +40,7 @@ class Rendered:
     frame_count = None
     has_masks = True
     masks_from = "rendered"
+    segmenter = None
 
     @property
     def time_offset_s(self) -> tuple[float, ...]:

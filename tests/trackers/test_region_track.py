@@ -221,7 +221,7 @@ def test_a_result_after_its_second_pass_cannot_be_extended(tk: Tk, tiny: Path, q
     result = tmp_path / "r.h5"
     run(tiny, result, frames=(0, 4))
     before = result.read_bytes()
-    with pytest.raises(ResultError, match=r"a second pass has gone over .* --force .* --causal"):
+    with pytest.raises(ResultError, match=r"a second pass has gone over .* only a causal result"):
         run(tiny, result, frames=(0, 6), resume=True)
     assert result.read_bytes() == before
     # nothing to be done is no mistake, and changes nothing
@@ -328,7 +328,7 @@ def test_results_without_a_cone_body_are_refused(
     older = Path(shutil.copy(tracked, tmp_path / "older.h5"))
     with h5py.File(older, "r+") as file:
         del file["model/parts"]
-    tk(*command, "--body", older).complaint("older.h5", "no body of contours", "--method region")
+    tk(*command, "--body", older).complaint("older.h5", "no body of contours", "the method region")
     tk(*command, "--body", tmp_path / "none.h5").complaint("none.h5")
     tk(*command, "--body", tmp_path / "none.toml").complaint("none.toml")
     damaged = Path(shutil.copy(causal, tmp_path / "damaged.h5"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import fcntl
 import logging
@@ -19,7 +20,7 @@ from tk.batch.work import TOPIC, work
 from tk.errors import ConfigError, ResultError, TkError, WorkerError
 
 #: seconds to wait for a scheduler's answer; a remote one may be slow, an absent one never answers
-_PATIENCE_S = 20.0
+_PATIENCE_S = 8.0
 #: killed workers after which a capture is not tried again: it probably needs too much memory
 _KILLED_AT_MOST = 3
 # Address of the dashboard, reached from this machine only; Dask's usual port, or another if it is taken.
@@ -71,14 +72,15 @@ def run_batch(
         The outcome of each capture, by its name.
 
     Raises:
-        ConfigError: Dask is not installed, a capture is given twice, or the file of the body cannot be read.
+        ConfigError: Dask is not installed, the scheduler does not answer, a capture is given twice, or the file of the
+            body cannot be read.
         ResultError: the folder cannot be written, or contains results with other options.
-        WorkerError: the scheduler does not answer, or has stopped.
+        WorkerError: the scheduler has stopped.
     """
     if workers is not None and scheduler is not None:
-        raise ConfigError("--workers: with --scheduler its own workers are used; leave out --workers or --scheduler")
+        raise ConfigError("workers: a scheduler has its own; give workers or a scheduler, not both")
     if workers is not None and not 1 <= workers <= 1000:
-        raise ConfigError(f"--workers {workers}: choose from 1 to 1000")
+        raise ConfigError(f"workers = {workers}: choose from 1 to 1000")
     options.to_dict()  # fails early if the body cannot be read
     _require_dask(dashboard)
     with _locked(folder):
@@ -144,6 +146,22 @@ def _locked(folder: Path) -> Iterator[None]:
         os.close(handle)
 
 
+async def _check_scheduler(address: str) -> None:
+    """Connect once to a Dask scheduler. A client that cannot connect would leave threads and wait for them.
+
+    Raises:
+        ConfigError: none answers there.
+    """
+    from distributed.comm import connect
+
+    try:
+        comm = await asyncio.wait_for(connect(address, timeout=_PATIENCE_S), _PATIENCE_S + 1)
+    except Exception as error:  # something else may answer, and anything may follow from its answer
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ConfigError(f"scheduler {address}: no Dask scheduler answers there: {reason}") from None
+    await comm.close()
+
+
 @contextlib.contextmanager
 def _cluster(workers: int | None, scheduler: str | None, captures: int, dashboard: bool) -> Iterator[Any]:
     """Yield a client of the scheduler, or of a cluster on this machine that ends with the block."""
@@ -152,12 +170,8 @@ def _cluster(workers: int | None, scheduler: str | None, captures: int, dashboar
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # the outcomes contain what matters
     if scheduler is not None:
-        try:
-            client = Client(scheduler, timeout=_PATIENCE_S, set_as_default=False)
-        except (OSError, TimeoutError, ValueError, TypeError) as error:
-            reason = " ".join(str(error).split())[:200]
-            raise WorkerError(f"--scheduler {scheduler}: no Dask scheduler answers there: {reason}") from None
-        with contextlib.closing(client):
+        asyncio.run(_check_scheduler(scheduler))
+        with Client(scheduler, timeout=_PATIENCE_S, set_as_default=False) as client:
             yield client
         return
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -187,8 +201,8 @@ def _report_workers(client: Any, reporter: BatchReporter, captures: int) -> None
         reporter.note("the scheduler has no workers yet; waiting for them")
     elif threads > len(found):
         reporter.note(
-            f"{len(found)} workers have {threads} threads; a worker tracks one capture at a time: start it with "
-            "--nthreads 1, and as many as there are captures to be tracked at once"
+            f"{len(found)} workers have {threads} threads; a worker tracks one capture at a time: start workers "
+            "of one thread, as many as there are captures to be tracked at once"
         )
 
 

@@ -55,13 +55,13 @@ def work(job: Job) -> Outcome:
 
 
 def _track(job: Job, reporter: _Reporter) -> Outcome:
-    from tk.io.captures.capture import open_capture
+    from tk.io.importers import open_recording
     from tk.io.results.reader import read_result
     from tk.report.after import write_video_and_report
     from tk.run import session  # heavy; the process that starts the batch does not need it
 
     options = job.options
-    capture = open_capture(job.capture, options.cameras, options.masks)
+    capture = open_recording(job.capture, options.cameras, options.masks, options.config.resample)
     deadline = time.monotonic() + _WAIT_S
     while True:
         reporter.notes.clear()

@@ -116,6 +116,9 @@ voxels_option = click.option("--voxels", type=int, help="Voxels along the longes
 no_report_option = click.option("--no-report", is_flag=True, help="Write no overlay video and no report.")
 config_option = click.option("--config", "config_file", type=PATH, help="Settings file (TOML).")
 preset_option = click.option("--preset", metavar="NAME", help="Settings to start from: kehl2006, the first paper's.")
+resample_option = click.option(
+    "--resample", is_flag=True, default=None, help="Choose images by time stamps: cameras of different rates."
+)
 resume_option = click.option("--resume", is_flag=True, help="Continue an interrupted run of the same command.")
 force_option = click.option("--force", is_flag=True, help="Replace existing output.")
 quiet_option = click.option("-q", "--quiet", is_flag=True, help="Show no progress, only notes and errors.")
@@ -135,12 +138,13 @@ class TrackingOptions:
     body: Path | None
     causal: bool
     store_hull: bool
+    resample: bool | None
     preset: str | None
     config_file: Path | None
 
     def settings(self) -> Settings:
         """Return the settings that the options describe."""
-        return load_settings(self.config_file, self.preset, voxels=self.voxels, seed=self.seed)
+        return load_settings(self.config_file, self.preset, voxels=self.voxels, seed=self.seed, resample=self.resample)
 
 
 _TRACKING_OPTIONS = (
@@ -157,6 +161,7 @@ _TRACKING_OPTIONS = (
     click.option("--body", type=PATH, metavar="FILE", help="Use the body of a result (.h5) or of a TOML file."),
     click.option("--causal", is_flag=True, help="Run the first pass only: no frame depends on later frames."),
     click.option("--store-hull", is_flag=True, help="Store the coloured surface of the visual hull in the result."),
+    resample_option,
     preset_option,
     config_option,
 )  # fmt: skip

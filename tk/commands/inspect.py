@@ -16,10 +16,17 @@ from tk.commands import base
 )
 @base.cameras_option
 @base.masks_option
+@base.resample_option
 @base.config_option
 @base.json_option
 def inspect(
-    capture: Path, output: Path | None, cameras: str | None, masks: str, config_file: Path | None, as_json: bool
+    capture: Path,
+    output: Path | None,
+    cameras: str | None,
+    masks: str,
+    resample: bool | None,
+    config_file: Path | None,
+    as_json: bool,
 ) -> None:
     """Check CAPTURE before tracking: masks, inconsistent or unsynchronised cameras, working volume, floor, up."""
     sheet, plan = (None, None) if output is None else (output / "inspect.png", output / "people.png")
@@ -27,14 +34,15 @@ def inspect(
         from tk.inspection.checks import inspect as check
         from tk.inspection.floor_plan import write_floor_plan
         from tk.inspection.pictures import write_sheet
-        from tk.io.captures.capture import open_capture
+        from tk.io.importers import open_recording
         from tk.io.paths import check_not_input
 
         for picture in (sheet, plan):
             if picture is not None:
                 check_not_input(picture, capture=capture)
-        opened = open_capture(capture, base.split_names(cameras), masks)
-        found, shown = check(opened, base.load_settings(config_file))
+        settings = base.load_settings(config_file, resample=resample)
+        opened = open_recording(capture, base.split_names(cameras), masks, settings.resample)
+        found, shown = check(opened, settings)
         if sheet is not None and plan is not None:
             write_sheet(sheet, opened, found, shown)
             write_floor_plan(plan, opened, found.people)

@@ -27,10 +27,10 @@ def masks(
     span = base.parse_frames(frames)
     with ConsoleReporter(quiet) as reporter:
         reporter.stage("loading")
-        from tk.io.captures.capture import open_capture
+        from tk.io.importers import open_recording
         from tk.run import mask_folder
 
-        opened = open_capture(capture, base.split_names(cameras), "none")
+        opened = open_recording(capture, base.split_names(cameras), "none")
         written = mask_folder.write_masks(opened, output, reporter, segmenter, span)
     if not quiet:
         click.echo(f"masks of {written.frames} frames in {output}, {written.now} of them new", err=True)

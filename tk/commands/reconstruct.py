@@ -20,6 +20,7 @@ from tk.commands.console import ConsoleReporter
 @base.cameras_option
 @base.frames_option
 @base.masks_option
+@base.resample_option
 @base.force_option
 @base.config_option
 @base.quiet_option
@@ -33,6 +34,7 @@ def reconstruct(
     cameras: str | None,
     frames: str | None,
     masks: str,
+    resample: bool | None,
     force: bool,
     config_file: Path | None,
     quiet: bool,
@@ -43,12 +45,12 @@ def reconstruct(
     started = time.perf_counter()
     with ConsoleReporter(quiet) as reporter:
         reporter.stage("loading")
-        from tk.io.captures.capture import open_capture
+        from tk.io.importers import open_recording
         from tk.run import reconstruction
 
-        settings = base.load_settings(config_file, voxels=voxels)
+        settings = base.load_settings(config_file, voxels=voxels, resample=resample)
         reporter.stage(f"opening {capture}")
-        opened = open_capture(capture, base.split_names(cameras), masks)
+        opened = open_recording(capture, base.split_names(cameras), masks, settings.resample)
         count = reconstruction.reconstruct(opened, output, settings, reporter, span, ply, mesh, force)
     if as_json:
         base.print_json(result=str(output), frames=count, seconds=round(time.perf_counter() - started, 3))

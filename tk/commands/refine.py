@@ -41,14 +41,15 @@ def refine(
     """Refine the calibration and the time offsets of CAPTURE with RESULT.h5, a result tracked from CAPTURE."""
     with ConsoleReporter(quiet) as reporter:
         reporter.stage("loading")
-        from tk.io.captures.capture import open_capture
+        from tk.io.importers import open_recording
+        from tk.io.results.reader import read_result
         from tk.model.cameras.refinement import RefinementSettings
         from tk.run.refinement import refine_capture
 
         refinement = RefinementSettings(focal=focal, offsets=offsets, trust=trust)
         settings = base.load_settings(config_file)
         reporter.stage(f"opening {capture}")
-        opened = open_capture(capture, base.split_names(cameras), masks)
+        opened = open_recording(capture, base.split_names(cameras), masks, read_result(result).resampled)
         for warning in opened.warnings:
             reporter.note(warning)
         reporter.stage("refining the cameras")

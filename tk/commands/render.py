@@ -71,7 +71,7 @@ def _render(
         raise ResultError(f"{result_path}: has no frames")
     chosen = _parse_frames(frames, result.frames.tolist())
     view = view or ("overlay" if capture_path else "3d")
-    capture = None if capture_path is None else open_capture(capture_path, cameras, masks="none")
+    capture = None if capture_path is None else open_capture(capture_path, cameras, "none", result.resampled)
     if png is not None:
         if view != "overlay" or capture is None:
             raise ConfigError("--png: contact sheets need images; give RESULT.h5 CAPTURE and no other --view")

@@ -65,7 +65,7 @@ def track(
     span = base.parse_frames(options.frames)
     with ConsoleReporter(quiet, later=later_stages(options.causal, no_report)) as reporter:
         reporter.stage("loading")
-        from tk.io.captures.capture import open_capture
+        from tk.io.importers import open_recording
         from tk.io.results.files import check_result_path
         from tk.run import session
         from tk.run.people import parse_choice
@@ -73,7 +73,7 @@ def track(
         settings, choice = options.settings(), parse_choice(people)
         check_result_path(output, force, resume)
         reporter.stage(f"opening {capture}")
-        opened = open_capture(capture, base.split_names(options.cameras), options.masks)
+        opened = open_recording(capture, base.split_names(options.cameras), options.masks, settings.resample)
         summary = session.track(
             opened, output, settings, reporter, options.method, span, init_pose, resume, options.store_hull,
             options.body, options.causal, force, choice,

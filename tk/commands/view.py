@@ -40,7 +40,7 @@ def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path
     rig = loaded.cameras.rig if loaded.cameras else None
     truth = None
     if capture is not None:
-        opened = open_capture(capture, masks="none")
+        opened = open_capture(capture, None, "none", loaded.resampled)
         rig, truth = rig or opened.rig, truth_of(loaded, opened.truth_file)
     require_display()
     window, row = Window(Contents(loaded, rig, truth)), 0 if frame is None else known.index(frame)

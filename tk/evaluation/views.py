@@ -129,10 +129,13 @@ def evaluate_views(
         ConfigError: an unknown joint.
         CaptureError: the capture cannot be read, or shows another recording.
     """
+    if not joints:
+        raise ConfigError(f"joints: name at least one of {', '.join(JOINTS)}")
     for name in joints:
         if name not in JOINTS:
-            raise ConfigError(f"--joints {name}: choose from {', '.join(JOINTS)}")
-    found, true, opened = read_result(result), read_joints(truth), open_capture(capture, masks=masks)
+            raise ConfigError(f"joint {name!r} is unknown: choose from {', '.join(JOINTS)}")
+    found, true = read_result(result), read_joints(truth)
+    opened = open_capture(capture, None, masks, found.resampled)
     common, rows, true_rows = np.intersect1d(found.frames, true.frames, return_indices=True)
     if len(common) == 0 or common[-1] >= opened.frame_count:
         raise CaptureError(f"{capture}: {found.path} is of frames that this capture and {truth} do not share")

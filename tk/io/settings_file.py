@@ -45,7 +45,7 @@ def preset(name: str) -> Settings:
         ConfigError: there is no preset of this name.
     """
     if name not in PRESETS:
-        raise ConfigError(f"--preset {name}: choose one of {', '.join(PRESETS)}")
+        raise ConfigError(f"preset {name}: choose one of {', '.join(PRESETS)}")
     text = (resources.files("tk") / "data" / "presets" / f"{name}.toml").read_text(encoding="utf-8")
     return from_toml(text, f"preset {name}")
 

@@ -115,7 +115,7 @@ class Scene:
 
     def __init__(self, result: Result, rig: Rig | None = None, hull: bool = False) -> None:
         if hull and result.hull is None:
-            raise ResultError(f"{result.path}: holds no hull; track with --method volumetric --store-hull")
+            raise ResultError(f"{result.path}: holds no hull", hint="track with --method volumetric --store-hull")
         self.result, self.hull = result, result.hull if hull else None
         self.figure = figure_of(result)
         self._legend = Legend(result, self.figure, WIDTH)

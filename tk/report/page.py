@@ -83,7 +83,7 @@ def report(result_path: Path, capture_path: Path | None, output: Path | None, fo
     shown: list[dict[str, Any]] = []
     rig = truth = None
     if capture_path is not None:
-        overlay = Overlay(open_capture(capture_path, masks="none"), result)
+        overlay = Overlay(open_capture(capture_path, None, "none", result.resampled), result)
         choices, rig, truth = choose_rows(result), overlay.rig, overlay.capture.truth_file
         frames = [int(result.frames[choice.row]) for choice in choices]
         shots = {overlay.row_of[frame]: shot(overlay, frame, images) for frame, images in overlay.pictures(frames)}

@@ -71,9 +71,9 @@ def choose_frames(source: Source, frames: tuple[int, int | None], note: Callable
     assert count is not None
     if start >= count:
         asked = f"{start}:" if stop is None else f"{start}:{stop}"
-        raise ConfigError(f"--frames {asked}: {source.where} has only frames 0 to {count - 1}")
+        raise ConfigError(f"frames {asked}: {source.where} has only frames 0 to {count - 1}")
     if stop is not None and stop > count:
-        note(f"--frames {start}:{stop}: {source.where} ends with frame {count - 1}")
+        note(f"frames {start}:{stop}: {source.where} ends with frame {count - 1}")
     return max(start, source.first_frame), count if stop is None else min(stop, count)
 
 
@@ -175,8 +175,9 @@ def open_plan(
             first = max(first, frames[0])  # no frame is better than another
         if stop is not None and first >= stop:
             raise ConfigError(
-                f"--frames {start}:{stop}: the subject is found in frame {first} and followed forwards; "
-                f"end after frame {first}, or start elsewhere with --init-pose FILE"
+                f"frames {start}:{stop}: the subject is found in frame {first} and followed forwards; "
+                f"end after frame {first}, or give an initial pose in another frame",
+                hint="with --init-pose FILE",
             )
         if start < first:
             note(f"frames before {first} are left out: the subject is found in frame {first} and followed forwards")

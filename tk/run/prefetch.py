@@ -15,6 +15,7 @@ import contextlib
 import math
 import mmap
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -39,6 +40,7 @@ from tk.io.captures.source import Source
 from tk.model.cameras.camera import Rig
 from tk.model.setup import Setup
 from tk.run.segmentation import Labeller, make_labeller, mask_source
+from tk.segmenters import Segmenter
 from tk.settings import Settings
 from tk.trackers.protocol import Observation, Stopwatch
 
@@ -95,9 +97,18 @@ def open_observations(
         CaptureError: there is nothing to make masks from.
     """
     mask_source(source)  # before a process is started
-    if settings.ahead == 0 or _cores() < 2 or not sys.executable:
+    if settings.ahead == 0 or _cores() < 2 or not sys.executable or not _can_be_sent(source.segmenter):
         return Serial(setup, source, settings, note, keep_images)
     return Ahead(setup, source, settings, note, keep_images)
+
+
+def _can_be_sent(segmenter: Segmenter | None) -> bool:
+    """Return whether another process can receive a segmenter that a script has made."""
+    try:
+        # what the script itself defines is unknown to the other process
+        return segmenter is None or (type(segmenter).__module__ != "__main__" and bool(pickle.dumps(segmenter)))
+    except Exception:  # pickling calls methods of the object, which may raise anything
+        return False
 
 
 def _cores() -> int:

@@ -73,7 +73,9 @@ class Refinement:
                 "calibration; record a person who walks about and turns"
             )
         if (r.offset_sigma_frames > _UNKNOWN_FRAMES).any():
-            lines.append("the person moves too little to estimate the time offsets; use --no-offsets, or faster motion")
+            lines.append(
+                "the person moves too little to estimate the time offsets; leave them out, or use faster motion"
+            )
         return lines
 
     def format_table(self) -> str:
@@ -112,12 +114,13 @@ def refine_capture(
     found = read_result(result)
     tracked = body_and_poses(found)
     if tracked is None:
-        raise ConfigError(f"{result}: has no body with contours; track with --method region")
+        raise ConfigError(f"{result}: has no body with contours; track with the method region")
     if not len(found.frames) or found.frames.max() >= capture.frame_count or found.meta.up != capture.up:
         raise ResultError(f"{result}: is not a result of {capture.path}")
     if found.cameras is not None and found.cameras.rig.names != capture.rig.names:
         raise ResultError(
-            f"{result}: was tracked with the cameras {', '.join(found.cameras.rig.names)}; name them with --cameras"
+            f"{result}: was tracked with the cameras {', '.join(found.cameras.rig.names)}; open the same",
+            hint="name them with --cameras",
         )
     world, store = TrackerFrame.of(capture.rig, capture.up), MaskStore()
     with open_observations(capture.setup(), capture, config, note, keep_images=False) as observations:

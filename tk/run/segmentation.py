@@ -37,7 +37,7 @@ _LONG, _MANY = 0.4, 0.6
 _LEAST_LITRES = 40.0
 
 _WAYS_OUT = (
-    f"give masks (--masks DIR), a clip of the empty scene (background/<camera>.mp4), or install a segmenter ({INSTALL})"
+    f"give a folder of masks, a clip of the empty scene (background/<camera>.mp4), or install a segmenter ({INSTALL})"
 )
 #: why `tk masks` cannot begin
 NO_SEGMENTER = f"no segmenter is installed; {INSTALL} brings one"
@@ -51,11 +51,16 @@ def mask_source(source: Source) -> str:
     """
     if source.has_masks:
         return _GIVEN
+    if source.segmenter is not None:
+        return _SEGMENTER + type(source.segmenter).__name__
     if source.masks_from:
         return source.masks_from
     installed = names()
     if not installed:
-        raise CaptureError(f"{source.where}: no masks, no empty scene and no segmenter; {_WAYS_OUT}")
+        raise CaptureError(
+            f"{source.where}: no masks, no empty scene and no segmenter; {_WAYS_OUT}",
+            hint="--masks DIR names a folder of masks",
+        )
     return _SEGMENTER + installed[0]
 
 
@@ -88,7 +93,7 @@ def _labeller(setup: Setup, source: Source, settings: Settings, note: Callable[[
         note(f"{source.where}: no masks and no background/; the segmenter {name} makes the masks")
         from tk.segmenters.subject_masks import SubjectMasks  # SciPy, which takes a second to import
 
-        made = SubjectMasks(load(name), name, setup.rig, setup.volume)
+        made = SubjectMasks(source.segmenter or load(name), name, setup.rig, setup.volume)
         return lambda frame: made.label(frame.images)
     foreground = _learn_median(setup, source, settings, note) if origin == _MEDIAN else None
     if foreground is None:
@@ -112,7 +117,7 @@ def _learn_median(setup: Setup, source: Source, settings: Settings, note: Callab
         CaptureError: no person differs from the median, or the length of the source is unknown.
     """
     if source.frame_count is None:
-        raise CaptureError(f"{source.where}: --masks median needs a recording; {_WAYS_OUT}")
+        raise CaptureError(f"{source.where}: the median needs a recording; {_WAYS_OUT}")
     step = -(-source.frame_count // PLATE_FRAMES)
     with source.frames() as frames:
         samples = [frame.images.copy() for frame in frames if frame.index % step == 0]
@@ -124,7 +129,7 @@ def _learn_median(setup: Setup, source: Source, settings: Settings, note: Callab
     litres = float(np.median([hull.litres(hull.subject(each.view(np.uint8))) for each in masks]))
     if litres < _LEAST_LITRES:
         raise CaptureError(
-            f"{source.where}: --masks median cannot work: what differs from the median of {len(samples)} frames "
+            f"{source.where}: the median cannot work: what differs from the median of {len(samples)} frames "
             f"makes a hull of {litres:.0f} litres, so the person hardly moves and is in the median; {_WAYS_OUT}"
         )
     long = np.count_nonzero(masks.mean(axis=0) > _LONG, axis=(1, 2))

@@ -99,6 +99,7 @@ def track(
     """
     masks = Path(capture.masks) if capture.masks not in ("auto", "none", "median") else None
     check_result_path(output, force, resume, [init_pose, capture.init_keypoints, body, masks], capture.path)
+    settings = replace(settings, resample=capture.resampled)  # who opens the capture again must know
     setup = recording_setup(capture, init_pose, body, frames[0])
     notes = capture.warnings
     return track_source(
@@ -244,13 +245,14 @@ class _Output:
             found = self.writer.state.get(_ORIGIN + name)
             if found != value:
                 raise ResultError(
-                    f"{self.writer.path}: was made differently: {name}: {found}, not {value}; "
-                    "start again with --force instead of --resume"
+                    f"{self.writer.path}: was made differently: {name}: {found}, not {value}",
+                    hint="start again with --force instead of --resume",
                 )
         if REFINED in self.writer.model:
             raise ResultError(
-                f"{self.writer.path}: a second pass has gone over its frames, so no more can be added; start again "
-                "with --force instead of --resume; a result of --causal can be continued"
+                f"{self.writer.path}: a second pass has gone over its frames, so no more can be added; only a causal "
+                "result can be continued",
+                hint="start again with --force instead of --resume",
             )
 
 

@@ -30,10 +30,14 @@ def read_body(path: Path, up: str) -> ConeBody:
     if path.suffix.lower() != ".toml":
         model = read_result(path).model
         if "parts/shape" not in model or "body" not in model:
-            raise ConfigError(f"{path}: holds no body of contours; give a result of --method region or a TOML file")
+            raise ConfigError(f"{path}: holds no body of contours; give a result of the method region or a TOML file")
         with as_damage_error(path, "the body"):
             return restore_body(model, up)
     values = parse_toml(read_text(path, ConfigError), str(path), ConfigError)
+    unknown = sorted(set(values) - {"dimensions", "stature"})
+    if unknown or not values:
+        what = f"unknown entry {unknown[0]}" if unknown else "is empty"
+        raise ConfigError(f"{path}: {what}; a body has stature, or [dimensions], in metres")
     given = values.get("dimensions", {})
     known = {field.name for field in fields(BodyDimensions)}
     stature = values.get("stature", 1.75)

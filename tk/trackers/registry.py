@@ -20,5 +20,5 @@ def tracker_class(method: str) -> type[Tracker]:
         ConfigError: there is no method of this name.
     """
     if method not in METHODS:
-        raise ConfigError(f"--method {method}: choose one of {', '.join(METHODS)}")
+        raise ConfigError(f"method {method}: choose one of {', '.join(METHODS)}")
     return METHODS[method]

@@ -161,7 +161,7 @@ class VolumetricTracker:
             ConfigError: ``body`` has no hands or feet.
         """
         if body is not None and body.preset != "full":
-            raise ConfigError(f'the body given is "{body.preset}": --method {self.method} needs a full one')
+            raise ConfigError(f'the body given is "{body.preset}": the method {self.method} needs a full one')
         # without images: colours inside the silhouettes are a cue of the region tracker only
         blind = [Observation(f.index, f.images[:0], f.masks) for f in frames]
         pose = self._finder.find(blind, height_m, init, body)

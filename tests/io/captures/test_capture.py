@@ -153,7 +153,7 @@ def test_masks_auto_none_and_from_elsewhere(make_capture: MakeCapture, tmp_path:
                 np.testing.assert_array_equal(
                     np.argwhere(frame_set.masks == 255), [(c, frame_set.index, c) for c in range(3)]
                 )
-    with pytest.raises(CaptureError, match="--masks nowhere: is not a folder"):
+    with pytest.raises(CaptureError, match="masks nowhere: is not a folder"):
         open_capture(folder, masks="nowhere")
 
 

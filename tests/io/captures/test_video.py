@@ -9,7 +9,9 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import av
 import numpy as np
 import pytest
 
@@ -175,7 +177,7 @@ def test_a_video_that_ends_early_is_reported_at_its_last_frame(tmp_path: Path) -
     clip = dataclasses.replace(probe_video(tmp_path / "a.mp4"), frame_count=20)
     reader = FrameReader([clip, clip], None, (HEIGHT, WIDTH), 0, 20)
     seen = []
-    with pytest.raises(VideoError, match=r"a\.mp4: ends after 12 of its 20 frames; .*--frames 0:12"):
+    with pytest.raises(VideoError, match=r"a\.mp4: image 12 of 20 cannot be decoded: .*copy it again"):
         for frame_set in reader:
             seen.append(read_tag(frame_set.images[1])[1])
     assert seen == list(range(12))
@@ -192,6 +194,24 @@ def test_files_that_are_no_video_are_refused(tmp_path: Path) -> None:
     path.unlink()
     with pytest.raises(VideoError, match=r"cam\.mp4: cannot be read"):
         probe(path)
+
+
+def test_a_file_with_sound_only_is_named_so(tmp_path: Path) -> None:
+    path = tmp_path / "cam.mp4"
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream("aac", rate=8000)
+        sound = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+        sound.sample_rate = 8000
+        container.mux(stream.encode(sound))
+        container.mux(stream.encode(None))
+    with pytest.raises(VideoError, match=r"cam\.mp4: holds sound, but no video"):
+        probe(path)
+
+
+def test_a_folder_with_the_name_of_a_video_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "cam2.mp4").mkdir()
+    with pytest.raises(VideoError, match=r"cam2\.mp4: is a folder with the name of a video"):
+        list_clips(tmp_path)
 
 
 def test_opencv_and_ffmpeg_print_nothing(tmp_path: Path) -> None:

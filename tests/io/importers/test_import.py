@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.conftest import Tk
+from tests.conftest import Tk, refused
 from tests.io.conftest import write_toml
 from tests.io.importers.conftest import HEIGHT, WIDTH, Import, make_rig, points, renamed, tables, write_clips
 from tests.io.importers.test_xml_formats import write_qca
@@ -45,13 +45,26 @@ def test_capture_as_input_is_refused(folder: Path, tmp_path: Path, tk: Tk) -> No
     tk("import", tmp_path / "capture", "-o", tmp_path / "c").complaint("is a capture already", "tk track")
 
 
-def test_unknown_project_lists_all_formats(folder: Path, check: Import) -> None:
-    (folder / "readme.md").write_text("# Nothing")
-    with pytest.raises(CaptureError) as caught:
+def test_unknown_project_says_what_it_holds_and_what_was_searched(folder: Path, check: Import) -> None:
+    for number in range(9):
+        (folder / f"note{number}.md").write_text("# Nothing")
+    with refused(CaptureError, "note0.md, note1.md", "and 3 more") as caught:
         import_project(folder, check.output)
     for form in FORMATS:
-        assert f"{form.tool}: {form.files}" in str(caught.value)
-    assert "\n" not in str(caught.value)
+        assert form.files.split()[0].rstrip(",") in str(caught.value)
+    assert len(str(caught.value)) - len(str(folder)) < 3 * 120
+
+
+@pytest.mark.parametrize("command", [["track", "-o", "r.h5"], ["inspect"]])
+def test_a_project_of_another_tool_is_refused_with_the_command_that_imports_it(
+    folder: Path, tmp_path: Path, tk: Tk, command: list[str]
+) -> None:
+    write_project(folder)
+    tk(command[0], folder, *command[1:]).complaint("a calibration of Anipose", f"tk import {folder} -o CAPTURE")
+    (folder / "calibration.toml").rename(folder / "my_camera_calibration.toml")
+    tk(command[0], folder, *command[1:]).complaint("a calibration of FreeMoCap", f"tk import {folder} -o CAPTURE")
+    (folder / "my_camera_calibration.toml").unlink()
+    tk(command[0], folder, *command[1:]).complaint(str(folder / "calibration.toml"))
 
 
 @pytest.mark.parametrize(

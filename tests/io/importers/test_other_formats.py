@@ -270,7 +270,7 @@ def test_folder_of_texts_is_not_a_project(folder: Path, check: Import) -> None:
     (folder / "a.txt").write_text("1 2 3")
     (folder / "b.txt").write_text("1 2 3 4 5 6 7 8 9 10 11 nan")
     (folder / "c.npy").write_bytes(pickle.dumps(np.zeros((3, 4))))  # no array file
-    with pytest.raises(CaptureError, match="matches no tool that tk imports from"):
+    with pytest.raises(CaptureError, match=r"has no calibration of a tool .*: it holds .*; searched: "):
         import_project(folder, check.output)
 
 

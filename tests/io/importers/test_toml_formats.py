@@ -74,7 +74,7 @@ def test_trial_uses_the_calibration_of_its_session(folder: Path, check: Import) 
     rig = write_pose2sim(folder)
     for trial in ("walk", "run"):
         write_clips(folder / trial / "videos", ["cam01", "cam02", "cam03", "cam04"])
-    with pytest.raises(VideoError, match=r"several recordings, in run/videos, walk/videos; choose one with --trial"):
+    with pytest.raises(VideoError, match=r"several recordings, in run/videos, walk/videos; choose one"):
         import_project(folder, check.output)
     check(folder, rig, trial="walk")
     check.output = check.output.with_name("from_the_trial")
@@ -186,7 +186,7 @@ def test_anipose_in_millimetres(folder: Path, check: Import, metadata: dict[str,
 def test_table_top_in_millimetres_or_room_in_centimetres_needs_a_unit(folder: Path, check: Import) -> None:
     write_toml(folder / "calibration.toml", tables(make_rig(), unit_m=0.01))
     write_clips(folder / "videos-raw", CAMS)
-    with pytest.raises(CalibrationError, match=r"may be in cm \(.*\) or mm \(.*: give --units cm or --units mm"):
+    with pytest.raises(CalibrationError, match=r"may be in cm \(.*\) or mm \(.*: give the unit"):
         check(folder, make_rig())
     check(folder, make_rig(), unit="cm")
 
@@ -209,7 +209,7 @@ def test_units_option_overrides_the_file(folder: Path, check: Import) -> None:
     rig = make_rig()
     write_toml(folder / "calibration.toml", {**tables(rig, unit_m=0.01), "metadata": {"units": "m"}})
     write_clips(folder, CAMS)
-    check(folder, rig, unit="cm").note("lengths are in cm, as --units says")
+    check(folder, rig, unit="cm").note("lengths are in cm, as requested")
 
 
 def test_masks_and_background_are_imported_if_complete(folder: Path, check: Import) -> None:

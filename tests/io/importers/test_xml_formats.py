@@ -134,7 +134,7 @@ def test_vicon_with_several_trials_in_one_folder(folder: Path, check: Import) ->
     write_xcp(folder / "session.xcp", rig)
     for trial in ("Walk01", "Walk02"):
         write_clips(folder, [f"{trial}.{serial}" for serial in SERIALS], suffix=".avi")
-    with pytest.raises(VideoError, match=r"cannot match videos and cameras .* choose a recording with --trial NAME"):
+    with pytest.raises(VideoError, match=r"cannot match videos and cameras .* rename the videos"):
         import_project(folder, check.output)
     check(folder, rig, trial="Walk02")
 

@@ -26,7 +26,7 @@ def test_empty_volume_is_refused(size):
 
 
 def test_grid_of_one_voxel_is_refused():
-    with pytest.raises(VolumeError, match="--voxels 1"):
+    with pytest.raises(VolumeError, match="voxels = 1"):
         VoxelGrid.cover(Volume((0, 0, 0), (1, 1, 1)), 1)
 
 

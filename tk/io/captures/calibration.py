@@ -59,10 +59,10 @@ class Calibration:
         wanted = known if names is None else [name.strip() for name in names]
         for name in wanted:
             if name not in known:
-                raise CaptureError(f"--cameras: no camera {name!r} in {self.path}, which has {', '.join(known)}")
+                raise CaptureError(f"no camera {name!r} in {self.path}, which has {', '.join(known)}")
         chosen = [index for index, name in enumerate(known) if name in wanted]
         if len(chosen) < 2:
-            source = self.path if names is None else f"--cameras {','.join(wanted)}"
+            source = self.path if names is None else f"cameras {', '.join(wanted)}"
             raise CaptureError(f"{source}: {len(chosen)} camera; a visual hull needs at least 2")
         return replace(
             self,

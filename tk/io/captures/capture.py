@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,9 @@ from tk.model.cameras.mounting import infer_up
 from tk.model.cameras.up import up_vector
 from tk.model.cameras.volume import Volume
 from tk.model.setup import Setup, Subject
+
+if TYPE_CHECKING:
+    from tk.segmenters import Segmenter
 
 __all__ = ["Capture", "FrameReader", "FrameSet", "open_capture"]
 
@@ -67,6 +71,7 @@ class Capture:
         mask_clips: one clip of masks for each camera; None without given masks.
         masks, resampled: arguments of :func:`open_capture`.
         time_offset_s: delay of each camera, seconds, from the calibration; :meth:`frames` corrects whole frames of it.
+        segmenter: makes the masks if none are given; None: the empty scene, or an installed segmenter.
     """
 
     path: Path
@@ -87,6 +92,7 @@ class Capture:
     resampled: bool
     _calibration: Calibration
     time_offset_s: tuple[float, ...]
+    segmenter: Segmenter | None = None
 
     @property
     def late_frames(self) -> tuple[int, ...]:
@@ -268,7 +274,7 @@ def _open_masks(calibration: Calibration, path: Path, masks: str) -> tuple[Clip,
     if not folder.is_dir():
         if masks == "auto":
             return None
-        raise CaptureError(f"--masks {masks}: is not a folder; give auto, none, median or a folder of masks")
+        raise CaptureError(f"masks {masks}: is not a folder; give auto, none, median or a folder of masks")
     clips = _clips_of(calibration, folder, "masks", "mp4", is_mask=True)
     if (folder / MASKS_RECORD).is_file():
         for clip in clips:

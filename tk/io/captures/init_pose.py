@@ -58,7 +58,7 @@ def read_init_pose(path: str | Path, pose_names: tuple[str, ...]) -> InitPose:
     """
     path = Path(path)
     if not path.is_file():
-        raise CaptureError(f"{path}: no such file; --init-pose wants a TOML file with a [joints] or an [angles] table")
+        raise CaptureError(f"{path}: no such file; an initial pose is a TOML file with a [joints] or an [angles] table")
     table = Table(load_toml(path, CaptureError), str(path), CaptureError)
     subject = table.table("subject")
     height = subject.number("height") if "height" in subject else None

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.captures.frames import FrameSet
+
+if TYPE_CHECKING:
+    from tk.segmenters import Segmenter
 
 
 class Source(Protocol):
@@ -49,6 +52,11 @@ class Source(Protocol):
     def masks_from(self) -> str:
         """Name of the given masks if :attr:`has_masks`; else "none" if there is a :meth:`background`, "median" if the
         median of the frames is to replace it, "" if only a segmenter can make masks."""
+        ...
+
+    @property
+    def segmenter(self) -> Segmenter | None:
+        """Makes the masks if none are given; None: the empty scene, or an installed segmenter."""
         ...
 
     def frames(self, start: int = 0, stop: int | None = None) -> AbstractContextManager[Iterator[FrameSet]]:

@@ -29,8 +29,6 @@ _ROUNDED = 0.002
 #: often to milliseconds
 _ROUNDED_INTERVAL = 0.05
 
-_REMEDY = "or choose frames by their time stamps with --resample"
-
 
 @dataclass(frozen=True)
 class Stamps:
@@ -128,11 +126,10 @@ def check_clock(
         count = min(len(first.seconds), len(other.seconds))
         apart = (other.since_start[:count] - first.since_start[:count]) * first.fps
         if abs(apart[-1]) >= _DRIFT_FRAMES:
-            raise ClockError(
+            raise _contradiction(
                 f"{other.path}: {other.fps:.5g} frames/s, and {first.path.name} {first.fps:.5g} frames/s: image "
                 f"{count - 1} is taken {abs(apart[-1]) / first.fps:.3g} s {'later' if apart[-1] > 0 else 'earlier'}; "
                 "record all cameras at one rate",
-                hint=_REMEDY,
             )
         if np.abs(apart).max() >= _DRIFT_FRAMES:
             warn(
@@ -143,9 +140,8 @@ def check_clock(
     if fps is not None:
         drift = (len(first.seconds) - 1) * abs(measured / fps - 1)
         if abs(fps / measured - 1) > _ROUNDED and drift >= _DRIFT_FRAMES:
-            raise ClockError(
+            raise _contradiction(
                 f"{where}: fps = {fps:g}, but {first.path} has {measured:.5g} frames/s; remove fps, or correct it",
-                hint=_REMEDY,
             )
     for each in known:
         if each.irregularity >= _DRIFT_FRAMES:
@@ -154,6 +150,10 @@ def check_clock(
                 f"regular times; the option resample corrects that"
             )
     return fps or measured
+
+
+def _contradiction(message: str) -> ClockError:
+    return ClockError(message, hint="or choose frames by their time stamps with --resample")
 
 
 def _nominal(fps: float, count: int) -> float:

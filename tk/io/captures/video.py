@@ -159,6 +159,8 @@ def list_clips(folder: Path, pictures: bool = False) -> dict[str, Path]:
     for path in sorted(folder.iterdir()):
         if path.name.startswith(".") or not (path.is_dir() or path.suffix.lower() in suffixes):
             continue
+        if path.is_dir() and path.suffix.lower() in VIDEO_SUFFIXES:
+            raise VideoError(f"{path}: is a folder with the name of a video; rename it, or put the video in its place")
         stem = path.name if path.is_dir() else path.stem
         if stem in clips:
             raise VideoError(f"{folder}: holds both {clips[stem].name} and {path.name}; keep the one that is meant")
@@ -204,8 +206,9 @@ class _VideoReader:
     def _fail(self) -> None:
         count = self._clip.frame_count
         raise VideoError(
-            f"{self._clip.path}: ends after {self._index} of its {count} frames; "
-            f"copy it again, or use --frames 0:{self._index}"
+            f"{self._clip.path}: image {self._index} of {count} cannot be decoded: the file is cut off or damaged; "
+            "copy it again, or use the frames before",
+            hint=f"with --frames 0:{self._index}",
         )
 
 
@@ -254,9 +257,22 @@ def _why_unreadable(path: Path) -> str:
         return f"cannot be read ({reason.strerror or reason})"
     if not head:
         return "is an empty file; copy it again"
+    if _has_sound_only(path):
+        return "holds sound, but no video; put the camera's video in its place"
     if head[4:8] in (b"ftyp", b"mdat", b"wide", b"free"):
         return "is cut off: the index at its end is missing; copy it again, or finish the recording"
     return "is not a video that can be decoded; put a video file in its place"
+
+
+def _has_sound_only(path: Path) -> bool:
+    """Return whether a file has streams, but none of images."""
+    import av  # slow to import, and only needed for this message
+
+    try:
+        with av.open(str(path)) as container:
+            return len(container.streams) > 0 and not container.streams.video
+    except (OSError, ValueError):  # base classes of PyAV's errors
+        return False
 
 
 def _packet_times(path: Path) -> NDArray[np.float64]:

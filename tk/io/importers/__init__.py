@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
-from tk.errors import CaptureError
-from tk.io.captures.capture import open_capture
+from tk.errors import CaptureError, ClockError
+from tk.io.captures.capture import Capture, open_capture
 from tk.io.importers import (
     anipose,
     caliscope,
@@ -18,7 +20,7 @@ from tk.io.importers import (
     qualisys,
     vicon,
 )
-from tk.io.importers.project import Project, read_format
+from tk.io.importers.project import Format, Project, read_format
 from tk.io.importers.write import Imported, write_capture
 
 __all__ = ["FORMATS", "Imported", "import_project", "read_project"]
@@ -33,6 +35,8 @@ FORMATS = tuple(
 
 #: folders above the given one that are searched for a calibration: SESSION/recordings/TRIAL
 _LEVELS_UP = 2
+#: files that a message about an unknown folder names; more would not fit into three lines
+_NAMED = 6
 
 
 def import_project(folder: Path, output: Path, unit: str | None = None, trial: str | None = None) -> Imported:
@@ -60,15 +64,50 @@ def read_project(folder: Path, unit: str | None = None, trial: str | None = None
         raise CaptureError(f"{folder}: is not a folder; give the project folder of the tool that calibrated")
     if _is_capture(folder):
         raise CaptureError(f"{folder}: is a capture already; nothing to import: tk track {folder} -o RESULT.h5")
+    found = _find(folder)
+    if found is not None:
+        return read_format(*found, folder, unit, trial)
+    searched = ", ".join(re.split(r" or |, ", form.files)[0] for form in FORMATS)
+    here = sorted(f"{path.name}/" if path.is_dir() else path.name for path in folder.iterdir())
+    names = ", ".join(here[:_NAMED]) + (f" and {len(here) - _NAMED} more" if len(here) > _NAMED else "")
+    raise CaptureError(
+        f"{folder}: has no calibration of a tool that tk imports from: it holds {names or 'nothing'}; "
+        f"searched: {searched}"
+    )
+
+
+def open_recording(
+    path: Path, cameras: Sequence[str] | None = None, masks: str = "auto", resample: bool = False
+) -> Capture:
+    """Open a capture, see :func:`tk.io.captures.capture.open_capture`.
+
+    Raises:
+        CaptureError: the folder cannot be used; if it is a project of another tool, the message says how to convert it.
+    """
+    try:
+        return open_capture(path, cameras, masks, resample)
+    except CaptureError as error:
+        images = (path / "videos").is_dir() or (path / "images").is_dir()
+        if path.is_dir() and not (images and (path / "calibration.toml").exists()):
+            found = _find(path)
+            if found is not None:
+                raise CaptureError(
+                    f"{path}: is no capture, but has a calibration of {found[0].tool}, {found[1][0].name}; import it",
+                    hint=f"tk import {path} -o CAPTURE",
+                ) from None
+        raise error
+
+
+def _find(folder: Path) -> tuple[Format, list[Path]] | None:
+    """Return the format of the calibration in a folder, or in those above it, and its files."""
     root = folder
     for level in range(_LEVELS_UP + 1):
         for form in FORMATS:
             files = form.find(root) if level == 0 or form.nests else []
             if files:
-                return read_format(form, files, folder, unit, trial)
+                return form, files
         root = root.resolve().parent
-    searched = "; ".join(f"{form.tool}: {form.files}" for form in FORMATS)
-    raise CaptureError(f"{folder}: matches no tool that tk imports from. It searched for {searched}")
+    return None
 
 
 def _is_capture(folder: Path) -> bool:
@@ -77,6 +116,8 @@ def _is_capture(folder: Path) -> bool:
         return False
     try:
         open_capture(folder)
+    except ClockError:
+        return True
     except CaptureError:
         return False
     return True

@@ -130,7 +130,7 @@ def _in_metres(cameras: Cameras, requested: str | None, default: str) -> Cameras
         CalibrationError: a table top in millimetres and a room in centimetres are both possible.
     """
     if requested:
-        found, reason = FoundUnit(requested), "as --units says"
+        found, reason = FoundUnit(requested), "as requested"
     elif cameras.unit:
         found, reason = FoundUnit(cameras.unit), f"as {cameras.unit_from} says"
     else:
@@ -139,7 +139,7 @@ def _in_metres(cameras: Cameras, requested: str | None, default: str) -> Cameras
             found = _by_person(cameras)
     rig = scale_world(cameras.rig, found.metres)
     if found.note:
-        note = f"{found.note}; --units m, cm or mm overrides it"
+        note = f"{found.note}; the option units (m, cm or mm) overrides it"
     else:
         note = f"lengths are in {found.name}, {reason}"
         if not LEAST_APART_M <= apart(rig.centers) <= MOST_APART_M:
@@ -164,7 +164,8 @@ def _by_person(cameras: Cameras) -> FoundUnit:
         f"{unit} ({wide * UNITS[unit]:.2g} m apart, views {view * UNITS[unit]:.2g} m high)" for unit in ("cm", "mm")
     ]
     raise CalibrationError(
-        f"{cameras.source}: the cameras may be in {' or '.join(sizes)}: give --units cm or --units mm"
+        f"{cameras.source}: the cameras may be in {' or '.join(sizes)}: give the unit",
+        hint="--units cm or --units mm",
     )
 
 

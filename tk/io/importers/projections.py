@@ -91,7 +91,7 @@ def _matrix(path: Path) -> NDArray[np.float64] | None:
 
 FORMAT = Format(
     tool="projection matrices",
-    files="one .txt or .npy file per camera with a 3×4 projection matrix, in the folder, calibration/ or cameras/",
+    files="*.txt or *.npy, one per camera with a 3×4 projection matrix, in the folder, calibration/ or cameras/",
     find=_find,
     read=_read,
     videos=("videos", "images", "."),

@@ -76,7 +76,8 @@ def find_clips(
         hint = "rename the videos to the cameras' names"
         raise VideoError(
             f"{folder}: cannot match videos and cameras by name: the cameras are {names}, the videos "
-            f"{_some(clips)}; {hint if trial else f'choose a recording with --trial NAME, or {hint}'}"
+            f"{_some(clips)}; {hint}",
+            hint="" if trial else "or choose a recording with --trial NAME",
         )
     notes = []
     stems = [None if stem is None else clips[stem] for stem in order.stems]
@@ -267,8 +268,9 @@ def _one_recording(
         if found:
             names = _some([str(folder.relative_to(root)) for folder in found])
             raise VideoError(
-                f"{root}: holds videos of several recordings, in {names}; choose one with --trial NAME"
-                + (f", {trial!r} is in the path of all of them" if trial else "")
+                f"{root}: holds videos of several recordings, in {names}; choose one"
+                + (f", {trial!r} is in the path of all of them" if trial else ""),
+                hint="with --trial NAME",
             )
         searched.append("the folder itself" if pattern == "." else pattern)
     others = sorted(path.name for path in _regular(root) if path.suffix.lower() in _OTHER_VIDEOS)

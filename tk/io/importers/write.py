@@ -13,7 +13,7 @@ from pathlib import Path
 
 import tomli_w
 
-from tk.errors import CaptureError
+from tk.errors import CaptureError, ClockError
 from tk.io.captures.calibration import camera_table
 from tk.io.captures.capture import open_capture
 from tk.io.captures.video import PICTURE_SUFFIXES, probe
@@ -81,7 +81,7 @@ def write_capture(project: Project, output: Path) -> Imported:
             copied |= _place(project.masks, rig.names, draft, "masks")
         if project.backgrounds:
             copied |= _place(project.backgrounds, rig.names, draft, "background")
-        warnings = open_capture(draft).warnings if volume else ()  # without a volume it cannot be opened yet
+        warnings = _warnings(draft) if volume else ()  # without a volume it cannot be opened yet
         draft.chmod(0o755)
         if output.exists():
             output.rmdir()
@@ -95,6 +95,14 @@ def write_capture(project: Project, output: Path) -> Imported:
     notes.append("the videos were copied" if copied else "the videos are hard links to the originals: no copies")
     notes += [line.replace(str(draft), str(output)) for line in warnings]
     return Imported(output, len(rig), tuple(notes))
+
+
+def _warnings(capture: Path) -> tuple[str, ...]:
+    """Return what is to be said about a new capture; videos of different rates are no reason to refuse it."""
+    try:
+        return open_capture(capture).warnings
+    except ClockError as error:
+        return (error.line,)
 
 
 def calibration_toml(rig: Rig, project: Project) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tk.errors import ResultError
 from tk.io.results.schema import columns_of
-from tk.io.results.status import has_pose
+from tk.io.results.status import Status, has_pose
 from tk.io.toml import parse_toml
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.joints import JOINTS, ROWS, in_joint_order
@@ -239,6 +239,25 @@ class Result:
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    def __repr__(self) -> str:
+        """Return file, frames and quality, in three lines."""
+        counts = ", ".join(
+            f"{int((self.status == s).sum())} {s.name.lower()}" for s in Status if (self.status == s).any()
+        )
+        first = f"{self.frames[0]} to {self.frames[-1]}, " if len(self) else ""
+        known = np.empty(0) if self.sigma is None else self.sigma[self.has_pose & np.isfinite(self.sigma).any(axis=1)]
+        sigma = f"median sigma of a joint {100 * np.nanmedian(known):.1f} cm" if known.size else "no sigma"
+        return (
+            f"Result {self.path.name}: capture {self.meta.capture}, method {self.meta.method}\n"
+            f"{len(self)} frames, {first}{self.meta.fps:g} frames/s, {self.joints.shape[1]} joints\n"
+            f"{counts or 'no status'}; {sigma}"
+        )
+
+    @property
+    def resampled(self) -> bool:
+        """Return whether the images of the recording were chosen by their time stamps."""
+        return parse_toml(self.meta.config_toml, f"{self.path}: config", ResultError).get("resample") is True
 
     @property
     def silhouette_error(self) -> Float | None:

@@ -49,7 +49,7 @@ class VoxelGrid:
     def cover(volume: Volume, voxels: int) -> VoxelGrid:
         """Return the grid with ``voxels`` along the volume's longest side, centred on the volume."""
         if voxels < 2:
-            raise VolumeError(f"--voxels {voxels}: at least 2 along the longest side")
+            raise VolumeError(f"voxels = {voxels}: give at least 2 along the longest side")
         size = np.array(volume.size)
         voxel_m = float(size.max() / voxels)
         shape = np.maximum(np.ceil(size / voxel_m - 1e-9).astype(int), 1)

@@ -85,10 +85,10 @@ def load_or_build(rig: Rig, grid: VoxelGrid, cache_dir: Path | None = None, use_
         ConfigError: more than 31 cameras, or more look-ups than 32-bit offsets reach.
     """
     if len(rig) > MAX_CAMERAS:
-        raise ConfigError(f"{len(rig)} cameras: the visual hull takes up to {MAX_CAMERAS}; choose some with --cameras")
+        raise ConfigError(f"{len(rig)} cameras: the visual hull takes up to {MAX_CAMERAS}; choose some of them")
     plane = 32 * kernels.words_per_column(grid.shape[2]) * grid.shape[0] * grid.shape[1]
     if plane >= 2**28 or len(rig) * plane >= 2**31:  # 29 bits of an entry, 32 of an offset, less the signs
-        raise ConfigError(f"{grid.count} voxels by {len(rig)} cameras are too many look-ups; give fewer --voxels")
+        raise ConfigError(f"{grid.count} voxels by {len(rig)} cameras are too many look-ups; give fewer voxels")
     path: Path | None = None
     if use_cache:
         path = (default_cache_dir() if cache_dir is None else cache_dir) / f"hull-{table_key(rig, grid)}.npz"
