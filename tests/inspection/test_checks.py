@@ -56,6 +56,28 @@ def test_turned_camera_is_named(tk: Tk, copy: Path) -> None:
     assert found["cameras"][1]["shift_px"] > 5 and found["cameras"][1]["outside"] > 0.1
 
 
+def test_inspect_and_track_refuse_the_cameras_of_another_recording(tk: Tk, copy: Path, tmp_path: Path) -> None:
+    for camera, degrees in enumerate((8.0, -9.0, -8.0, 9.0)):
+        turned(copy, camera, degrees)
+    ran = tk("inspect", copy, "--json")
+    (first, *_) = json.loads(ran.out)["findings"]
+    assert first.startswith("the cameras cam1, cam2, cam3 and cam4 do not belong together")
+    tk("track", copy, "-o", tmp_path / "r.h5").complaint(first)
+
+
+def test_inspect_and_track_name_swapped_videos(tk: Tk, copy: Path, tmp_path: Path) -> None:
+    for folder in ("videos", "masks"):
+        one, other = ((copy / folder).glob(f"cam{c}*") for c in (1, 2))
+        (one,), (other,) = one, other
+        between = one.with_name("between")
+        one.rename(between)
+        other.rename(one)
+        between.rename(other)
+    ran = tk("inspect", copy, "--json")
+    assert "the videos of cam1 and cam2 look swapped" in json.loads(ran.out)["findings"][0]
+    tk("track", copy, "-o", tmp_path / "r.h5").complaint("the videos of cam1 and cam2 look swapped")
+
+
 def test_delay_of_a_video_is_found_in_frames(tk: Tk, tmp_path: Path) -> None:
     """The masks are rendered; those of one camera are three frames ahead."""
     rig, count, late = ring_of_cameras(4, 160, 120), 24, 3

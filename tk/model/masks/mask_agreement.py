@@ -46,6 +46,9 @@ INCONSISTENT = 0.06
 _LEFT_OVER, _REFUSED = 0.5, 2.0
 # Share of a mask that may stay outside when it is shifted into the hull of the others: what segmented masks leave.
 _OUTSIDE_SHIFTED = 0.03
+# Without a majority, exchanged videos are looked for among this many cameras, at most: sixteen would take five seconds,
+# and without two of them the others are a majority.
+_SWAPS_OF = 8
 
 _CAUSES = (
     "a camera was turned or moved after the calibration, calibration.toml is of another recording, the videos do not "
@@ -140,9 +143,6 @@ class MaskAgreement:
         tested = np.flatnonzero(np.isfinite(error).any(axis=1)).tolist()
         kept = largest_consistent(error)
         wrong = [c for c in tested if c not in kept] if kept else []
-        swapped = None
-        if len(kept) < len(tested) and (kept or len(tested) <= 4):  # without the swapped ones, five cameras agree
-            swapped = self._swapped(frames, outlines, wrong or tested)
         seen = [self.small(masks) for masks in frames]
         # the person may stand behind others
         hulls = self.hulls([m | self.small(np.uint8(255) * (f == OTHERS)) for m, f in zip(seen, frames, strict=True)])
@@ -156,9 +156,13 @@ class MaskAgreement:
                 break
             wrong.append(odd)
             right.remove(odd)
-        refusal = (
-            self._contradiction(frames, pairs, right, swapped) if refused else self._one_sided(pairs, right, wrong)
-        )
+        suspects = wrong if not refused else tested if C <= _SWAPS_OF else []
+        swapped = self._swapped(frames, outlines, suspects)
+        if refused:
+            wrong, right = [], list(range(C))
+            refusal = self._contradiction(frames, pairs, tested or right, swapped)
+        else:
+            refusal = self._one_sided(pairs, right, wrong)
         outside, shift = np.full(C, np.nan), np.full((C, 2), np.nan)
         for c in range(C):
             others = [k for k in right if k != c]
