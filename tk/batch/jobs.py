@@ -68,7 +68,7 @@ class Outcome:
 
     Attributes:
         state: :data:`WAITING`, :data:`BEGUN`, :data:`DONE` or :data:`FAILED`.
-        frames, lost: number of frames, and of lost frames, in the result.
+        frames, lost, suspect: number of frames, of lost and of suspect frames, in the result.
         tracked_now: frames that the last attempt added; fewer than ``frames`` if it continued an earlier attempt.
         seconds: duration of the last attempt.
         error_cm, limbs_cm: mean joint distance from the ground truth, raw, and of the limbs without constant offsets;
@@ -78,12 +78,12 @@ class Outcome:
         notes: notes of the run.
         failure: reason of a failure, in one line.
         trace: traceback of a defect; empty if the input is the reason.
-        suspect: number of suspect frames.
     """
 
     state: str = WAITING
     frames: int = 0
     lost: int = 0
+    suspect: int = 0
     tracked_now: int = 0
     seconds: float = 0.0
     error_cm: float | None = None
@@ -93,7 +93,6 @@ class Outcome:
     notes: tuple[str, ...] = ()
     failure: str = ""
     trace: str = ""
-    suspect: int = 0
 
     @property
     def failed(self) -> bool:
