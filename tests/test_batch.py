@@ -341,7 +341,6 @@ def test_killed_worker_and_scheduler_lose_nothing_and_repeat_nothing(
     os.kill(records()[victim]["by"]["pid"], signal.SIGKILL)
     done_then = rows(out / f"{victim}.h5")
     assert 2 <= done_then < frames
-    first.until(lambda: f"{victim}: its worker died" in first.said or len(ended()) >= 2)
     first.until(lambda: len(ended()) >= 2)  # the broken one, and one of the worker that lives
     scheduler.process.kill()
     assert first.process.wait(120) == 1, first.said

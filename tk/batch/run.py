@@ -23,7 +23,7 @@ from tk.errors import ConfigError, ResultError, TkError, WorkerError
 _PATIENCE_S = 8.0
 #: killed workers after which a capture is not tried again: it probably needs too much memory
 _KILLED_AT_MOST = 3
-# Address of the dashboard, reached from this machine only; Dask's usual port, or another if it is taken.
+# Address of the dashboard, reached from this machine only; Dask's default port, or another if it is taken.
 _DASHBOARD = "127.0.0.1:8787"
 
 

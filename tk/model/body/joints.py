@@ -67,8 +67,8 @@ class Joint:
         bone_from: the joint at the other end of the bone in drawings; empty at the root.
         optional: whether a simpler body omits its degrees of freedom.
         offset_m: constant offset of the output joint from a ground truth's, root mean square, metres.
-        added: True for an output joint beyond the 15 that every result and ground truth has; where a file lacks it,
-            readers return NaN.
+        added: True for an output joint beyond the 15 that every result and ground truth has; readers return NaN for a
+            file without it.
     """
 
     name: str
