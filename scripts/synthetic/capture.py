@@ -188,10 +188,10 @@ def plan_capture(options: Options) -> Plan:
 def crossings(plan: Plan, step: int = 4) -> int:
     """Return how often two people cross: their silhouettes overlap in two views or more, pelvises less than 1 m apart.
 
-    Silhouettes are drawn in every ``step``-th pixel, as discs of the balls that the bodies consist of.
+    Silhouettes are drawn roughly, in every ``step``-th pixel.
     """
     people = list(plan.people.values())
-    shown = [_discs(plan, person, step) for person in people]
+    shown = [_outlines(plan, person, step) for person in people]
     count = 0
     for (a, one), (b, other) in combinations(zip(people, shown, strict=True), 2):
         apart = np.linalg.norm(a.joints[:, JOINTS.index("pelvis")] - b.joints[:, JOINTS.index("pelvis")], axis=1)
@@ -202,17 +202,20 @@ def crossings(plan: Plan, step: int = 4) -> int:
     return count
 
 
-def _discs(plan: Plan, person: Performer, step: int) -> NDArray[np.bool_]:
-    """Return (F, C, h, w) a person's silhouettes in every ``step``-th pixel, drawn as discs."""
+def _outlines(plan: Plan, person: Performer, step: int) -> NDArray[np.bool_]:
+    """Return (F, C, h, w) a person's silhouettes in every ``step``-th pixel: a thick line for each cone."""
     width, height = (side // step for side in plan.options.size)
     images = np.zeros((plan.frame_count, len(plan.rig), height, width), np.uint8)
     for frame, views in enumerate(images):
         centers, radii = person.body(frame).actor.balls(person.poses[frame : frame + 1])
         for camera, image in zip(plan.rig, views, strict=True):
             pixels, depth = camera.project(centers[0])
-            for xy, r in zip(pixels / step, camera.matrix[0, 0] * radii / depth / step, strict=True):
-                if np.isfinite(xy).all() and np.abs(xy).max() < 1e4:
-                    cv2.circle(image, (round(xy[0]), round(xy[1])), max(round(r), 1), 1, cv2.FILLED)
+            if not np.isfinite(pixels).all():
+                continue  # behind the camera or beside it
+            ends = np.clip(pixels / step, -1e4, 1e4).round().astype(int).reshape(2, -1, 2).swapaxes(0, 1)
+            thick = np.maximum(camera.matrix[0, 0] * 2 * radii / depth / step, 1).round().astype(int).reshape(2, -1)
+            for (a, b), size in zip(ends.tolist(), thick.min(axis=0).tolist(), strict=True):
+                cv2.line(image, a, b, 1, min(size, 255))
     return images.astype(np.bool_)
 
 

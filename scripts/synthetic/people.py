@@ -362,8 +362,8 @@ SCENES: dict[str, tuple[Role, ...]] = {
     "embrace": (Role(_embrace_0), Role(_embrace_1, 1.64, _GREEN)),
     "crouching": (Role(_crouch_0), Role(_crouch_1, 1.83, _GREY)),
     "similar": (Role(_similar_0), Role(_similar_1, 1.75)),
-    "bystander-one": (Role(_subject), Role(_standing(-0.2, 3.6, -90.0), 1.80, _GREY)),
-    "bystander-two": (Role(_subject), Role(_standing(2.3, 2.6, 225.0), 1.70, _WOMAN)),
+    "bystander-one": (Role(_subject), Role(_standing(2.2, -1.0, 155.0), 1.80, _GREY)),
+    "bystander-two": (Role(_subject), Role(_standing(0.0, 2.3, -90.0), 1.70, _WOMAN)),
     "bystander-all": (Role(_subject), Role(_standing(1.35, 0.25, 180.0), 1.70, _GREEN)),
     "bystander-walking": (Role(_subject), Role(_passing, 1.80, _GREY)),
 }  # fmt: skip

@@ -55,6 +55,10 @@ _LEAST_AREA_M2 = 0.3
 _TOGETHER = 0.75
 # Least pixels of a silhouette of a person whom one camera shows, in the reduced image: 20 rows of 5 pixels.
 _LEAST_PIXELS = 100
+# Such a person stands at most so far from the volume, metres: farther feet are not on the floor, but hidden.
+_FAR_M = 4.0
+# Cosine of the angle from up above which a camera looks down so steeply that the lowest pixel need not show the feet.
+_STEEP = 0.7
 # Weight of pixels that a candidate covers beside the masks: furniture may hide a person in several cameras, and the
 # candidate's silhouette is up to twice as large as the person's.
 _CONTRADICTED = 0.25
@@ -222,9 +226,12 @@ class PeopleFinder:
     def _alone(self, masks: Bool, covered: Bool) -> list[LocatedPerson]:
         """Return the people whom one camera shows: parts of masks (C, h, w) that nobody's voxels touch."""
         up = self._to_plan[2]
-        floor = float(min(corner @ up for corner in (self._volume.lower, self._volume.upper)))
+        corners = np.array([self._volume.lower, self._volume.upper])
+        floor, near = float((corners @ up).min()), corners + [[-_FAR_M], [_FAR_M]]
         found = []
         for c, camera in enumerate(self._rig):
+            if abs(camera.rotation[2] @ up) > _STEEP:
+                continue
             count, regions, stats, _ = cv2.connectedComponentsWithStats(masks[c].astype(np.uint8))
             height, width = masks[c].shape
             for k in range(1, count):
@@ -234,21 +241,21 @@ class PeopleFinder:
                 if cut or len(y) < _LEAST_PIXELS or covered[c][y, x].any():
                     continue
                 rays = camera.rays(np.column_stack([x, y]) * self._step + self._step // 2)
+                lowest = rays[y == y.max()].mean(axis=0)
                 with np.errstate(divide="ignore"):
-                    away = (floor - camera.center @ up) / (rays[y == y.max()].mean(axis=0) @ up)
-                feet = camera.center + away * rays[y == y.max()].mean(axis=0)
+                    feet = camera.center + (floor - camera.center @ up) / (lowest @ up) * lowest
                 level = (feet - camera.center) - ((feet - camera.center) @ up) * up
                 # the silhouette stands in the plane through the feet that faces the camera
                 points = camera.center + rays * (level @ level / (rays @ level))[:, None]
                 stature = float(np.ptp(points @ up))
-                if away > 0 and np.isfinite(points).all() and STATURE_M[0] <= stature <= STATURE_M[1]:
+                position = feet + stature / 2 * up
+                if self._holds(position) or not ((near[0] <= feet) & (feet <= near[1])).all():
+                    continue  # in the volume other cameras would show the person
+                if level @ lowest > 0 and STATURE_M[0] <= stature <= STATURE_M[1]:
                     views = np.arange(len(self._rig)) == c
-                    position = feet + stature / 2 * up
                     share = np.where(views, 1.0, np.nan)
                     found.append(
-                        LocatedPerson(
-                            position, stature, np.nan, points, self._grid.voxel_m, views, share, self._holds(position)
-                        )
+                        LocatedPerson(position, stature, np.nan, points, self._grid.voxel_m, views, share, False)
                     )
         return found
 
