@@ -58,6 +58,14 @@ def test_people_are_counted_and_located(places: list[tuple[float, float]]) -> No
     assert all(1.5 < person.height_m < 2.0 and 0.04 < person.volume_m3 < 0.25 for person in found)
 
 
+def test_people_close_together_before_four_cameras_are_told_apart() -> None:
+    """Their hull is one block, larger than one person's."""
+    rig = Rig(ring_of_cameras(5, 240, 240).cameras[:4])
+    places = [(-0.45, 0.0), (0.15, 0.15), (0.1, -0.5)]
+    found = PeopleFinder(rig, VOLUME, "z").find(drawn(places, rig=rig).any(axis=0))
+    assert len(found) == 3 and max(nearest(found, places)) < 0.2
+
+
 def test_nobody_is_found_in_empty_masks_and_specks() -> None:
     masks = np.zeros((5, 240, 240), np.uint8)
     assert FINDER.find(masks) == ()

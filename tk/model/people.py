@@ -46,6 +46,8 @@ _TRUNK_M = 0.5
 _APART_M = 0.3
 # Standard deviation of the smoothed floor plan, metres: half of a trunk's depth.
 _SMOOTH_M = 0.1
+# Radius of a person's column in a block, metres: half the breadth of the shoulders, and a step.
+_BODY_M = 0.35
 # Two columns are two people if the floor plan between them falls to this share of the lower one.
 _SADDLE = 0.7
 # A person costs as much as this area of unexplained pixels, sum over the views, m²: half the silhouette of an adult in
@@ -227,7 +229,7 @@ class PeopleFinder:
         """Return the people whom one camera shows: parts of masks (C, h, w) that nobody's voxels touch."""
         up = self._to_plan[2]
         corners = np.array([self._volume.lower, self._volume.upper])
-        floor, near = float((corners @ up).min()), corners + [[-_FAR_M], [_FAR_M]]
+        floor, near = float((corners @ up).min()), corners + np.array([[-_FAR_M], [_FAR_M]])
         found = []
         for c, camera in enumerate(self._rig):
             if abs(camera.rotation[2] @ up) > _STEEP:
@@ -294,7 +296,8 @@ class PeopleFinder:
                 for k in reversed(above):
                     whole = np.concatenate([wholes.pop(k), whole])
                 wholes.append(whole)
-        return [part for whole in wholes for part in self._split(whole, near) if self._plausible(part)]
+        parts = [part for whole in wholes for part in self._split(whole, near)]
+        return [column for part in parts for column in self._columns(part) if self._plausible(column)]
 
     @property
     def _litres(self) -> float:
@@ -304,7 +307,7 @@ class PeopleFinder:
         """Return whether voxels have a person's volume and extent, lying or standing."""
         extent = float(np.ptp(self._voxels.centers[part] @ self._to_plan.T, axis=0).max()) + self._grid.voxel_m
         litres = len(part) * self._litres
-        return _LITRES[0] <= litres <= _LITRES[1] and EXTENT[0] * STATURE_M[0] <= extent <= EXTENT[1] * STATURE_M[1]
+        return litres >= _LITRES[0] and EXTENT[0] * STATURE_M[0] <= extent <= EXTENT[1] * STATURE_M[1]
 
     def _plan(self, part: NDArray[np.int64]) -> tuple[Float, NDArray[np.int64], Float]:
         """Return the floor plan of voxels: metres of hull by cell, the cell (M, 2) of each voxel, and the first cell.
@@ -337,16 +340,32 @@ class PeopleFinder:
         nearest = np.linalg.norm(cell[:, None] - seeds[None], axis=2).argmin(axis=1)
         return [part[nearest == k] for k in range(len(seeds))]
 
+    def _columns(self, part: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+        """Return the voxels about each maximum of the floor plan, if one person cannot have so many; else all.
+
+        Among people who stand close together before few cameras the hull is one block. Which of its columns are people
+        is decided by the pixels that they explain.
+        """
+        if len(part) * self._litres <= _LITRES[1]:
+            return [part]
+        plan, cell, _ = self._plan(part)
+        seeds = self._maxima(plan, 1.0, self._grid.voxel_m)[:_MOST]
+        away = np.linalg.norm(cell[:, None] - seeds[None], axis=2) * self._grid.voxel_m
+        return [part[near] for near in (away < _BODY_M).T]
+
     def _trunk(self, part: NDArray[np.int64]) -> Float:
         """Return where the tallest column of voxels stands on the floor plan (2,), metres."""
         plan, _, low = self._plan(part)
         smooth = ndimage.gaussian_filter(plan, _SMOOTH_M / self._grid.voxel_m)
         return np.array(np.unravel_index(smooth.argmax(), plan.shape)) * self._grid.voxel_m + low
 
-    def _maxima(self, plan: Float) -> NDArray[np.int64]:
-        """Return the cells (K, 2) of the people's trunks in a floor plan, the tallest column first."""
+    def _maxima(self, plan: Float, saddle: float = _SADDLE, sigma_m: float = _SMOOTH_M) -> NDArray[np.int64]:
+        """Return the cells (K, 2) of the people's trunks in a floor plan smoothed by ``sigma_m``, the tallest first.
+
+        Between two of them the plan falls to the share ``saddle`` of the lower one.
+        """
         edge = self._grid.voxel_m
-        smooth = ndimage.gaussian_filter(plan, _SMOOTH_M / edge)
+        smooth = ndimage.gaussian_filter(plan, sigma_m / edge)
         reach = max(1, round(_APART_M / edge))
         peaks = np.argwhere((smooth == ndimage.maximum_filter(smooth, 2 * reach + 1)) & (smooth >= _TRUNK_M))
         peaks = peaks[np.argsort(-smooth[tuple(peaks.T)], kind="stable")]
@@ -355,7 +374,7 @@ class PeopleFinder:
             height = smooth[tuple(peak)]
             steps = np.linspace(0, 1, 20)[:, None]
             between = [ndimage.map_coordinates(smooth, (peak + steps * (o - peak)).T, order=1).min() for o in kept]
-            if all(lowest < _SADDLE * height for lowest in between):
+            if all(lowest <= saddle * height for lowest in between):
                 kept.append(peak)
         return np.array(kept).reshape(-1, 2)
 
