@@ -193,7 +193,7 @@ class MaskAgreement:
             exchanged = []
             for masks, row in zip(frames, outlines, strict=True):
                 views = list(row)
-                views[a], views[b] = Outline.of(self.rig[a], masks[b]), Outline.of(self.rig[b], masks[a])
+                views[a], views[b] = _outline(self.rig[a], masks[b]), _outline(self.rig[b], masks[a])
                 exchanged.append(views)
             error = excess(tangency(exchanged, self.rig.centers))
             error = error[np.isfinite(error).any(axis=1)]

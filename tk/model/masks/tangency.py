@@ -7,7 +7,7 @@ the line through both centres, is the error. Nothing else can be learned from tw
 is given at the person, as a share of the person's size, so it does not depend on the unit of the calibration.
 
 A pair cannot be tested if the line through the centres passes near the person: cameras that face each other. A
-silhouette that the border of the image or another person cuts is only known to extend at least that far.
+silhouette that the border of the image cuts is only known to extend at least that far.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.mask_values import OTHERS
 from tk.model.cameras.camera import Camera
 
 Float = NDArray[np.float64]
@@ -29,9 +28,6 @@ Masks = NDArray[np.uint8]
 _SPECK_SHARE = 0.1
 # Pixels of a mask's largest part, at least: a smaller one has no shape.
 _LEAST_PIXELS = 20
-# A corner within this many pixels of another person's pixels may be that person's edge: pixels are given to people in
-# cells of up to 10 pixels.
-_NEAR_OTHERS = np.ones((21, 21), np.uint8)
 # A pair is tested if the line through the centres is farther from the middle of the person than this many of the
 # person's greatest extents, as seen from either camera: half an extent would touch the silhouette. On the development
 # captures correct pairs have the same errors from 0.55 to 1; with 1, three times as many pairs cannot be tested.
@@ -46,7 +42,7 @@ class Outline:
 
     Attributes:
         rays: (N, 3) unit vectors in the world frame through its corners.
-        cut: (N,) whether the corner lies at the border of the image or of another person.
+        cut: (N,) whether the corner lies at the border of the image.
         middle: (3,) unit vector, mean of the rays.
         size: rad, greatest angle between two rays.
         pixel: size of a pixel, as a share of ``size``.
@@ -72,9 +68,6 @@ class Outline:
         corners = cv2.convexHull(camera.undistort(pixels).astype(np.float32), returnPoints=False)[:, 0]
         last = np.array([camera.width, camera.height]) - 1.0
         cut = ((pixels[corners] < 1) | (pixels[corners] > last - 1)).any(axis=1)
-        if (others := mask[: camera.height, : camera.width] == OTHERS).any():
-            x, y = pixels[corners].astype(np.int64).T
-            cut |= cv2.dilate(others.view(np.uint8), _NEAR_OTHERS)[y, x] > 0
         rays = camera.rays(pixels[corners])
         middle = rays.mean(axis=0)
         size = float(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0)))
