@@ -186,7 +186,7 @@ def check_hull(file: Hdf5Reader, rows: int, prefix: str = "") -> NDArray[np.int6
     """
     if f"{prefix}hull" not in file:
         return None
-    offsets = _read(file, HULL[2], prefix, {"F+1": rows + 1})
+    offsets = _read(file, f"{prefix}hull/offsets", HULL[2], (rows + 1,))
     shapes = [file.shapes.get(prefix + entry.path) for entry in HULL[:2]]
     if offsets[0] != 0 or (np.diff(offsets) < 0).any() or shapes != [(offsets[-1], 3)] * 2:
         file.fail(f"/{prefix}hull/offsets does not divide the voxels into frames; the file is damaged")
@@ -198,8 +198,8 @@ def read_model(file: Hdf5Reader, prefix: str = "") -> dict[str, Value]:
     return file.values(f"{prefix}model", MAX_NUMBER)
 
 
-def _read(file: Hdf5Reader, entry: Dataset, prefix: str, counts: dict[str, int]) -> NDArray[Any]:
-    return file.array(prefix + entry.path, entry.dtype, entry.lengths(counts), *entry.valid, entry.finite)
+def _read(file: Hdf5Reader, path: str, entry: Dataset, shape: tuple[int | None, ...]) -> NDArray[Any]:
+    return file.array(path, entry.dtype, shape, *entry.valid, entry.finite)
 
 
 def _read_person(file: Hdf5Reader, person: int, shared: dict[str, Any]) -> Result:
@@ -207,13 +207,9 @@ def _read_person(file: Hdf5Reader, person: int, shared: dict[str, Any]) -> Resul
     meta = read_meta(file, prefix)
     rows = count_rows(file, meta, prefix)
     columns = columns_of(meta)
-
-    def read(path: str, entry: Dataset, shape: tuple[int, ...]) -> NDArray[Any]:
-        return file.array(prefix + path, entry.dtype, (rows, *shape), *entry.valid, entry.finite)
-
     found: dict[str, Any] = {"timing": {}, "angles": {}}
     for path, column in columns.items():
-        values = read(path, column.entry, column.shape)
+        values = _read(file, prefix + path, column.entry, (rows, *column.shape))
         if column.key:
             found[column.entry.field][column.key] = values
         else:
@@ -221,11 +217,10 @@ def _read_person(file: Hdf5Reader, person: int, shared: dict[str, Any]) -> Resul
     _check_frames(file, prefix, found["frames"])
     smoothed = None
     if f"{prefix}smoothed" in file:
-        copies = {f"smoothed/{path}": column for path, column in smoothed_columns(columns).items()}
         smoothed = {
-            path.removeprefix("smoothed/"): read(path, column.entry, column.shape)
-            for path, column in copies.items()
-            if prefix + path in file or path == "smoothed/bridged"
+            path: _read(file, f"{prefix}smoothed/{path}", column.entry, (rows, *column.shape))
+            for path, column in smoothed_columns(columns).items()
+            if f"{prefix}smoothed/{path}" in file or path == "bridged"
         }
     return Result(
         meta=meta,
@@ -242,7 +237,7 @@ def _read_hull(file: Hdf5Reader, rows: int, prefix: str) -> Hull | None:
     offsets = check_hull(file, rows, prefix)
     if offsets is None:
         return None
-    positions, colors = (_read(file, entry, prefix, {"N": int(offsets[-1])}) for entry in HULL[:2])
+    positions, colors = (_read(file, prefix + entry.path, entry, (int(offsets[-1]), 3)) for entry in HULL[:2])
     return Hull(positions, colors, offsets)
 
 
@@ -252,25 +247,24 @@ def _read_track(file: Hdf5Reader, prefix: str) -> JointTrack:
     for name in (listed, f"{prefix}joints/position"):
         if name not in file.shapes:
             file.fail(f"has no /{name}; it is neither a tk result nor a capture's truth")
-    entry = _ENTRIES["frames"]
-    frames = file.array(listed, entry.dtype, (None,), *entry.valid)
+    frames = _read(file, listed, _ENTRIES["frames"], (None,))
     _check_frames(file, prefix, frames)
     names = file.names(f"{prefix}joints/position", "names")
     missing = [joint for joint in REQUIRED_JOINTS if joint not in names]
     if missing:
         file.fail(f"/{prefix}joints/position has no joint {missing[0]} in its attribute names")
-    counts = {"F": len(frames), "J": len(names)}
 
-    def read(name: str) -> NDArray[Any] | None:
-        return _read(file, _ENTRIES[name], prefix, counts) if prefix + name in file else None
+    def read(name: str, *shape: int) -> NDArray[Any] | None:
+        path = prefix + name
+        return _read(file, path, _ENTRIES[name], (len(frames), *shape)) if path in file else None
 
-    positions, status, sigma = (read(name) for name in ("joints/position", "status", "joints/sigma"))
+    positions, status = read("joints/position", len(names), 3), read("status")
+    sigma = read("joints/sigma", len(names))
     assert positions is not None
     positions = in_joint_order(positions, names)
     positions[~np.isfinite(positions)] = np.nan
-    stages = [name for name in file.below(f"{prefix}timing") if "/" not in name]
-    entry = _ENTRIES["timing/<stage>"]
-    timing = {name: file.array(f"{prefix}timing/{name}", entry.dtype, (len(frames),), *entry.valid) for name in stages}
+    entry, group = _ENTRIES["timing/<stage>"], f"{prefix}timing"
+    timing = {stage: _read(file, f"{group}/{stage}", entry, (len(frames),)) for stage in file.below(group)}
     seconds: Float | None = None
     if timing:
         seconds = timing["total"] if "total" in timing else np.sum(list(timing.values()), axis=0)
@@ -288,7 +282,8 @@ def _read_cameras(file: Hdf5Reader) -> UsedCameras | None:
     if "cameras" not in file:
         return None
     names = file.names("cameras", "names")
-    found = {entry.path.split("/")[1]: _read(file, entry, "", {"C": len(names)}) for entry in CAMERAS}
+    counts = {"C": len(names)}
+    found = {entry.path.split("/")[1]: _read(file, entry.path, entry, entry.lengths(counts)) for entry in CAMERAS}
     if (found["size"] < 1).any():
         file.fail("/cameras/size holds an image without pixels; the file is damaged")
     cameras = [
