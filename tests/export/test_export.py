@@ -133,6 +133,12 @@ def test_each_person_has_files_with_a_number(write: Write) -> None:
     unknown = np.isnan(one).all(axis=(1, 2))
     assert {*np.flatnonzero(unknown) + first} == {*away, *LOST}
     np.testing.assert_array_equal(one[~unknown], zero[first:][~unknown])
+    with h5py.File(single, "r+") as file:
+        for person in (file, file["people/1"]):
+            person["smoothed/joints/position"] = person["joints/position"][()]
+            person["smoothed/bridged"] = np.ones(len(person["frames"]), dtype=bool)
+    smoothed = read_trc(export(single, ["trc"], smoothed=True).files[1]).points
+    assert {*np.flatnonzero(np.isnan(smoothed).all(axis=(1, 2))) + first} == {*away}
 
 
 def test_unusable_requests_are_refused(write: Write, tmp_path: Path) -> None:

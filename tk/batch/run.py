@@ -8,6 +8,7 @@ import fcntl
 import logging
 import os
 import queue
+import socket
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
@@ -23,8 +24,6 @@ from tk.errors import ConfigError, ResultError, TkError, WorkerError
 _PATIENCE_S = 8.0
 #: killed workers after which a capture is not tried again: it probably needs too much memory
 _KILLED_AT_MOST = 3
-# Address of the dashboard, reached from this machine only; Dask's default port, or another if it is taken.
-_DASHBOARD = "127.0.0.1:8787"
 
 
 class BatchReporter(Protocol):
@@ -186,11 +185,17 @@ def _cluster(workers: int | None, scheduler: str | None, captures: int, dashboar
     with dask.config.set(settings):
         cluster = LocalCluster(
             n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", memory_limit=None,
-            dashboard_address=_DASHBOARD if dashboard else None, silence_logs=logging.CRITICAL,
+            dashboard_address=f"127.0.0.1:{_free_port()}" if dashboard else None, silence_logs=logging.CRITICAL,
             env={"TK_THREADS": threads},
         )  # fmt: skip
         with cluster, Client(cluster, set_as_default=False) as client:
             yield client
+
+
+def _free_port() -> int:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return int(found.getsockname()[1])
 
 
 def _report_workers(client: Any, reporter: BatchReporter, captures: int) -> None:

@@ -47,7 +47,7 @@ class Motion:
     """A person's motion over F frames. An unknown frame has the values of the last known frame before it.
 
     Attributes:
-        name: the result's file name without suffix; of several people with `_0`, `_1`, …
+        name: of the files, without suffix: that of the result, `_0`, `_1`, … of several people, `_smoothed`.
         fps: frames per second.
         frames, time: (F,) source frame indices; times, s.
         status: (F,) as in the result.
@@ -128,6 +128,7 @@ def motion_of(result: Result, smoothed: bool = False) -> tuple[Motion, tuple[str
     if result.person or result.others:
         name += f"_{result.person}"
         result = _with_absent_frames(result)
+    name += "_smoothed" * smoothed
     bridged = np.zeros(len(result), dtype=bool)
     is_made_here = smoothed and result.smoothed is None
     if smoothed and result.smoothed is not None:
@@ -215,7 +216,11 @@ def _with_absent_frames(result: Result) -> Result:
         result, **{f.name: filled(getattr(result, f.name)) for f in fields(result) if f.name not in ("model", "state")}
     )
     time = result.time + (frames - result.frames) / result.meta.fps
-    return replace(result, frames=frames, time=time, status=np.where(absent, Status.ABSENT, result.status))
+    smoothed = result.smoothed
+    if smoothed is not None:
+        smoothed = {**smoothed, "bridged": smoothed["bridged"] & ~absent}
+    status = np.where(absent, Status.ABSENT, result.status)
+    return replace(result, frames=frames, time=time, status=status, smoothed=smoothed)
 
 
 def _held(known: NDArray[np.bool_]) -> NDArray[np.int64]:
