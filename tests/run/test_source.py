@@ -148,3 +148,24 @@ def test_the_second_pass_keeps_two_people_apart(tmp_path: Path) -> None:
 def test_a_number_that_nobody_has_is_refused() -> None:
     with refused(CaptureError, "person 2 is asked for, but 2 were found"):
         list(estimates(PAIR, Rendered(MASKS.max(axis=0)), SETTINGS, people=(2,)))
+
+
+def test_somebody_who_enters_gets_a_number_and_who_leaves_is_absent(tmp_path: Path) -> None:
+    """Person 1 is there in frames 3 to 16 of 22."""
+    count, shown = 22, slice(3, 17)
+    poses = np.array([walk(count), walk(count, first=0.4)])
+    poses[:, :, :2] += [[[0.35, -0.05]], [[-0.35, 0.05]]]
+    masks = np.array([draw_silhouettes(BODY, FOUR, own) for own in poses])
+    hidden = np.ones(count, bool)
+    hidden[shown] = False
+    masks[1, hidden] = 0
+    setup = replace(PAIR, fps=4.0, subjects=PAIR.subjects[:1])
+    track_source(setup, Rendered(masks.max(axis=0)), tmp_path / "r.h5", SETTINGS, Silent(), people="all", causal=True)
+    first, second = read_result(tmp_path / "r.h5").people
+    np.testing.assert_array_equal(first.frames, np.arange(count))
+    assert not (first.status == Status.LOST).any()
+    np.testing.assert_array_equal(second.frames, np.arange(second.frames[0], 17))
+    assert 3 < second.frames[0] < 16 and not (second.status == Status.LOST).any()
+    for own, result in zip(poses, (first, second), strict=True):
+        joints = np.array([BODY.skeleton.joints(pose) for pose in own[result.frames]])
+        assert np.median(np.linalg.norm(result.joints - joints, axis=2)) < 0.1  # coarse settings

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from tk.errors import CaptureError, ConfigError
 from tk.kernels.raycast import FAR, Cast
 from tk.model.body.skeleton import up_rotation
+from tk.model.cues.part_colors import color_bins
 from tk.model.cues.ray_costs import RayGrid
 from tk.model.people import LocatedPerson, PeopleFinder, order_people
 from tk.model.setup import Setup, Subject
@@ -31,10 +32,10 @@ Float = NDArray[np.float64]
 Choice = str | tuple[int, ...]
 """Who is tracked: "auto" (one person), "all", or numbers."""
 
-# Seconds between two looks for people who enter; and during which somebody must be seen before a tracker is started.
-LOOK_EVERY_S, SEEN_FOR_S = 0.5, 0.5
+# Seconds between two looks for people who enter.
+LOOK_EVERY_S = 0.5
 # Mean surplus area of the subject's masks, as a share of the person, above which somebody else may have entered: a
-# second person who is seen by all cameras has 1, by two of six cameras 0.3. Poor masks have 0.1 to 0.2.
+# second person who is seen by all cameras has 0.5. Poor masks have 0.1 to 0.2.
 SURPLUS = 0.25
 # Half the width and half the height of the space in which the hull of somebody who is not tracked is carved, metres;
 # how far such a person may move between frames; and the edge of its voxels: a forearm is 0.08 m wide.
@@ -43,10 +44,16 @@ _HALF_M, _HALF_HEIGHT_M, _STEP_M, _VOXEL_M = 0.9, 1.1, 0.4, 0.06
 _SAME_M = 0.6
 # Voxels of somebody who is not tracked, at least: 5 litres, a head's volume.
 _LEAST_VOXELS = 25
-# Frames of somebody who enters from which the body is fitted.
+# Frames of somebody who enters from which the body is fitted: half a second at 15 Hz.
 _HISTORY = 8
+# Least share of the area of a person who is tracked that must be unexplained in two views before people are looked for.
+_UNEXPLAINED = 0.25
+# Mean logarithm of the likelihood of a person's pixels by the colours of the segments, above which somebody who enters
+# is a person who has left. On pair: -4.1 and -4.4 by the own colours, -7.6 and -8.9 by the other person's.
+_SAME_COLORS = -6.0
 
 
+_DRAWN = "drawn"
 _WATCH, _LOST, _ABSENT, _PEOPLE, _BYSTANDERS = "watch/", "lost", "absent", "people/", "bystanders/"
 
 
@@ -59,6 +66,7 @@ class Member:
         subject: what is known of the person.
         lost: whether the last frame is lost.
         absent: whether nobody was seen in the last frame who could be this person.
+        drawn: (C, h, w) bool, the body in the last frame that is not lost, see :class:`~tk.trackers.protocol.Estimate`.
     """
 
     number: int
@@ -67,6 +75,7 @@ class Member:
     monitor: CameraMonitor
     lost: bool = False
     absent: bool = False
+    drawn: NDArray[np.bool_] | None = None
 
 
 @dataclass
@@ -76,13 +85,11 @@ class Bystander:
     Attributes:
         position: (3,) m, centre of the trunk.
         shape: the hull on the grid of the trackers.
-        since: frame in which the person was found.
         history: the person's own observations of the last frames, if a tracker may be started.
     """
 
     position: Float
     shape: Cast
-    since: int
     history: list[Observation] = field(default_factory=list)
 
 
@@ -122,6 +129,12 @@ class People:
         return Member(number, subject, tracker, CameraMonitor(tracker, self._setup, subject))
 
     @property
+    def several(self) -> bool:
+        """Whether the result may have several people: each then has rows only for frames in which the person is
+        present."""
+        return self._choice == "all" or len(self.members) > 1
+
+    @property
     def alone(self) -> bool:
         """Whether nobody but one tracked person has been seen."""
         return len(self.members) == 1 and not self._bystanders
@@ -153,7 +166,7 @@ class People:
             self._begin(self.members[0], opening)
             return
         order = [*numbers, *(n for n in range(len(found)) if n not in numbers)]
-        shown = [Bystander(found[n].position, self._hull(found[n]), opening[0].index) for n in order]
+        shown = [Bystander(found[n].position, self._hull(found[n])) for n in order]
         shares: list[list[Observation]] = [[] for _ in numbers]
         for frame in opening:
             owners = self._owners([b.shape for b in shown])
@@ -164,7 +177,7 @@ class People:
                 own.append(owners.share(frame, k, False))
         for member, frames in zip(self.members, shares, strict=True):
             self._begin(member, frames)
-        first = [Bystander(found[n].position, self._hull(found[n]), opening[0].index) for n in order]
+        first = [Bystander(found[n].position, self._hull(found[n])) for n in order]
         self._bystanders = first[len(numbers) :]
 
     def _begin(self, member: Member, frames: Sequence[Observation]) -> None:
@@ -206,14 +219,17 @@ class People:
         if self.alone:
             (member,) = self.members
             tracked = self._step(member, frame)
-            self._look(frame, {0: tracked})
-            return {0: tracked}
+            answers = {member.number: tracked}
+            self._look(frame, answers)
+            return self._with_absent(answers)
         before = [self._state_of(m) for m in self.members]
         shown = [*(self._shape(m, True) for m in self.members), *(b.shape for b in self._bystanders)]
         owners = self._owners(shown)
         self._follow(self._bystanders, frame, owners, len(self.members))
         owners = self._owners([*shown[: len(self.members)], *(b.shape for b in self._bystanders)])
-        answers = {m.number: self._step(m, owners.share(frame, k, m.lost)) for k, m in enumerate(self.members)}
+        answers = {}
+        for k, member in enumerate(self.members):
+            answers[member.number] = self._step(member, owners.share(frame, k, member.lost and not member.absent))
         now = self._owners([*(self._shape(m, False) for m in self.members), *(b.shape for b in self._bystanders)])
         for k, member in enumerate(self.members):
             if not member.lost and now.changed(owners, frame.masks, k):
@@ -222,14 +238,23 @@ class People:
                 tracker.rewind(before[k])
                 self._restore(member, before[k])
                 answers[member.number] = self._step(member, now.share(frame, k, False))
-        for k, bystander in enumerate(self._bystanders, len(self.members)):
-            bystander.history = [*bystander.history[1 - _HISTORY :], now.share(frame, k, False)]
+        if self._choice == "all":
+            for k, bystander in enumerate(self._bystanders, len(self.members)):
+                bystander.history = [*bystander.history[1 - _HISTORY :], now.share(frame, k, False)]
         self._look(frame, answers, now)
+        return self._with_absent(answers)
+
+    def _with_absent(self, answers: dict[int, Tracked]) -> dict[int, Tracked]:
+        """Return the answers, with the status of those who are absent."""
+        for number in (m.number for m in self.members if m.absent):
+            answers[number] = replace(answers[number], estimate=replace(answers[number].estimate, status="absent"))
         return answers
 
     def _step(self, member: Member, share: Observation) -> Tracked:
         estimate, used = member.monitor.step(share)
         member.lost = estimate.status == "lost"
+        if not member.lost:
+            member.drawn = estimate.drawn
         return Tracked(estimate, share, used)
 
     def _shape(self, member: Member, ahead: bool) -> Cast | None:
@@ -271,7 +296,7 @@ class People:
             state |= {prefix + name: value for name, value in self._state_of(member).items()}
         for k, b in enumerate(self._bystanders):
             prefix = f"{_BYSTANDERS}{k}/"
-            state |= {prefix + "position": b.position, prefix + "since": b.since, prefix + "depth": b.shape.depth}
+            state |= {prefix + "position": b.position, prefix + "depth": b.shape.depth}
         return state
 
     def restore(self, models: Sequence[Mapping[str, Any]], state: Mapping[str, Any]) -> None:
@@ -294,43 +319,101 @@ class People:
         while found := below(f"{_BYSTANDERS}{k}/", state):
             depth = np.asarray(found["depth"], np.float32)
             shape = Cast((depth < FAR).astype(np.uint8), depth)
-            self._bystanders.append(Bystander(np.array(found["position"]), shape, int(found["since"])))
+            self._bystanders.append(Bystander(np.array(found["position"]), shape))
             k += 1
 
     def _state_of(self, member: Member) -> dict[str, Any]:
         watch = {_WATCH + name: value for name, value in member.monitor.state().items()}
-        return {**member.tracker.state(), **watch, _LOST: member.lost, _ABSENT: member.absent}
+        drawn = {} if member.drawn is None else {_DRAWN: member.drawn}
+        return {**member.tracker.state(), **watch, **drawn, _LOST: member.lost, _ABSENT: member.absent}
 
     def _restore(self, member: Member, state: Mapping[str, Any]) -> None:
         member.monitor.restore(below(_WATCH, state))
         member.lost, member.absent = bool(state[_LOST]), bool(state[_ABSENT])
+        member.drawn = np.array(state[_DRAWN], np.bool_) if _DRAWN in state else None
 
     # --- who enters and leaves ----------------------------------------------------------------------------------------
 
-    def _look(self, frame: Observation, answers: Mapping[int, Tracked], owners: PixelOwners | None = None) -> None:
-        """Look for people in the pixels that nobody explains, at intervals; note who is absent."""
+    def _look(self, frame: Observation, answers: dict[int, Tracked], owners: PixelOwners | None = None) -> None:
+        """Find those who enter, and those who are absent, in the pixels that nobody explains."""
         lost = [m for m in self.members if m.lost]
         for member in self.members:
             member.absent &= member.lost
-        if self._grid is None or frame.index % self._every:
+        if self._grid is None:
             return
+        self._admit()
+        due = frame.index % self._every == 0 or any(not m.absent for m in lost)
         if owners is None:
             residual = answers[self.members[0].number].estimate.residual
-            if not lost and (residual is None or not np.nanmean(residual[:, 1]) > SURPLUS):
+            known = residual is not None and bool(np.isfinite(residual).any())
+            surplus = float(np.nanmean(residual[:, 1])) if residual is not None and known else 0.0
+            due = (due and bool(lost)) or (
+                surplus > SURPLUS and frame.index % 2 == 0
+            )  # at once: it misleads the tracker
+            if not due:
                 return
             owners = self._owners([self._shape(m, False) for m in self.members])
+        if not due:
+            return
         free = owners.unexplained(frame.masks)
-        found = [p for p in self._find(free) if p.inside] if free.any() else []
+        found = [p for p in self._find(free) if p.inside] if self._much(free, owners, frame) else []
         for member in lost:
-            member.absent = not found
-        known = [b.position for b in self._bystanders]
+            if not found and self._gone(member, frame):
+                member.absent = True
+        if any(not m.absent for m in lost):
+            return  # the tracker looks for the person
+        places = [b.position for b in self._bystanders]
         for person in found:
-            if lost or any(np.linalg.norm(person.position - other) < _SAME_M for other in known):
-                continue  # a lost person is searched for by the tracker
-            self._bystanders.append(Bystander(person.position, self._hull(person), frame.index))
-            x, y, z = person.position
-            self._note(f"frame {frame.index}: another person is in view, at ({x:.1f}, {y:.1f}, {z:.1f}) m")
+            if all(np.linalg.norm(person.position - other) > _SAME_M for other in places):
+                self._bystanders.append(Bystander(person.position, self._hull(person)))
+                x, y, z = person.position
+                self._note(f"frame {frame.index}: another person is in view, at ({x:.1f}, {y:.1f}, {z:.1f}) m")
         self._bystanders = [b for b in self._bystanders if self._seen(b, frame)]
+
+    def _much(self, free: NDArray[np.uint8], owners: PixelOwners, frame: Observation) -> bool:
+        """Return whether the pixels that nobody explains may be a person's."""
+        shown = owners.grid.sample(frame.masks) >= 128
+        areas = [np.count_nonzero(shown & (owners.owner == k), axis=(1, 2)) for k in range(len(self.members))]
+        person = max(float(np.median(area)) for area in areas)
+        left = np.count_nonzero(owners.grid.sample(free), axis=(1, 2))
+        return bool(np.count_nonzero(left > _UNEXPLAINED * person) >= 2)
+
+    def _gone(self, member: Member, frame: Observation) -> bool:
+        """Return whether a lost person is nowhere near the last place: most of the body would be on background."""
+        body = member.drawn
+        if body is None:
+            return False
+        step = frame.masks.shape[1] // body.shape[1]
+        masks = frame.masks[:, step // 2 :: step, step // 2 :: step][:, : body.shape[1], : body.shape[2]]
+        return bool(np.count_nonzero(body & (masks < 128)) > 0.5 * np.count_nonzero(body))
+
+    def _admit(self) -> None:
+        """Start trackers for people who have entered, or let the tracker of an absent person find the person again."""
+        for bystander in list(self._bystanders):
+            if len(bystander.history) < _HISTORY or not self._inside(bystander.position):
+                continue
+            self._bystanders.remove(bystander)
+            shares, bystander.history = bystander.history[::-1], []
+            away = [m for m in self.members if m.absent]
+            alike = [_likelihood(m.tracker, shares[0]) for m in away]
+            if alike and max(alike) > _SAME_COLORS:
+                member = away[int(np.argmax(alike))]
+                member.absent = False  # lost: the pixels that nobody explains are this person's
+                continue
+            number = len(self.members)
+            member = self._member(number, _unknown(Subject(in_init_pose=False)), self._make())
+            try:
+                self._begin(member, shares)
+            except CaptureError as reason:
+                _LOG.info("nobody can be tracked there: %s", reason)
+                self._bystanders.append(bystander)
+                continue
+            self.members.append(member)
+            self._note(f"frame {shares[0].index}: person {number} has entered")
+
+    def _inside(self, position: Float) -> bool:
+        volume = self._setup.volume
+        return bool(((volume.lower <= position) & (position <= volume.upper)).all())
 
     def _seen(self, bystander: Bystander, frame: Observation) -> bool:
         """Return whether a person who is not tracked is still in view."""
@@ -362,6 +445,15 @@ def describe(choice: Choice) -> str:
 def below(prefix: str, state: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entries of a state whose names begin with a prefix, without it."""
     return {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
+
+
+def _likelihood(tracker: Tracker, share: Observation) -> float:
+    """Return the mean logarithm of the likelihood of a person's pixels by the colours of a tracker's segments."""
+    colors = getattr(tracker, "colors", None)
+    if colors is None or colors.log_likelihood is None or not share.images.size:
+        return 0.0  # nothing contradicts it
+    bins = color_bins(share.images[share.masks >= 128])
+    return float(colors.log_likelihood.max(axis=0)[bins].mean()) if len(bins) else -np.inf
 
 
 def _position(subject: Subject) -> Float | None:

@@ -209,7 +209,8 @@ def estimates(
         for estimate in chain.from_iterable(run.frames()):
             if estimate.status == "suspect":
                 suspect.append(estimate.frame)
-            if estimate.status != "lost" and estimate.sigma is not None and np.isnan(estimate.sigma).all():
+            found = estimate.status not in ("lost", "absent")
+            if found and estimate.sigma is not None and np.isnan(estimate.sigma).all():
                 unknown.append(estimate.frame)
             yield estimate
         for line in run.people.report():
@@ -365,6 +366,8 @@ class _Run:
         present = []
         for number, answer in answers.items():
             estimate = answer.estimate
+            if estimate.status == "absent" and self.people.several:
+                continue
             if self.masks is not None:
                 self.masks[number].put(observation.index, self._kept(answer))
             # masks are large, and a view into the ring of frames: an estimate must not keep them

@@ -52,7 +52,8 @@ class Estimate:
     Attributes:
         pose: (D,) pose vector, radians and metres, in the order of the tracker's ``pose_names``.
         joints: (15, 3) joint centres, metres.
-        status: "tracked", "initialised", "recovered", "lost", or "suspect" (by the camera monitor).
+        status: "tracked", "initialised", "recovered", "lost", "suspect" (by the camera monitor), or "absent" (by the
+            run: nobody is there).
         objective: the objective's final value.
         iterations: (S,) optimiser iterations a stage.
         timing: seconds a stage.

@@ -44,10 +44,12 @@ class PixelOwners:
     Attributes:
         grid: the cells, one ray each.
         owner: (V, h, w) int8, the number of a person, :data:`NOBODY` if nobody is near, or :data:`UNCLEAR`.
+        beside: (V, h, w) m, distance from the nearest person, in the image.
     """
 
     grid: RayGrid
     owner: NDArray[np.int8]
+    beside: NDArray[np.float32]
 
     def share(self, frame: Observation, person: int, unknown: bool) -> Observation:
         """Return the observation of a person, with the pixels of others as :data:`~tk.kernels.mask_values.OTHERS`.
@@ -74,8 +76,8 @@ class PixelOwners:
         return bool(np.count_nonzero(now != then) > CHANGED * int(np.count_nonzero(then)))
 
     def unexplained(self, masks: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the masks (V, H, W) without the pixels of known people, else 0."""
-        return np.where(self._selected(masks, self.owner == NOBODY) == 255, np.uint8(255), np.uint8(0))
+        """Return the masks (V, H, W) without pixels within twice :data:`MARGIN_M` of known people."""
+        return np.where(self._selected(masks, self.beside > 2 * MARGIN_M) == 255, np.uint8(255), np.uint8(0))
 
 
 def assign(rig: Rig, grid: RayGrid, shapes: Sequence[Cast | None]) -> PixelOwners:
@@ -99,8 +101,9 @@ def assign(rig: Rig, grid: RayGrid, shapes: Sequence[Cast | None]) -> PixelOwner
                 beside[p, v] = cv2.distanceTransform((~covered).view(np.uint8), cv2.DIST_L2, 3)
                 beside[p, v] *= grid.step * middle / float(rig[v].matrix[0, 0])
     if not shapes:
-        return PixelOwners(grid, np.full((V, h, w), NOBODY, np.int8))
-    owner = np.where(beside.min(axis=0) <= REACH_M, beside.argmin(axis=0), NOBODY).astype(np.int8)
+        return PixelOwners(grid, np.full((V, h, w), NOBODY, np.int8), np.full((V, h, w), np.inf, np.float32))
+    nearest = beside.min(axis=0)
+    owner = np.where(nearest <= REACH_M, beside.argmin(axis=0), NOBODY).astype(np.int8)
     if len(shapes) > 1:
         least, second = np.partition(beside, 1, axis=0)[:2]
         front, behind = np.partition(depth, 1, axis=0)[:2]
@@ -108,7 +111,7 @@ def assign(rig: Rig, grid: RayGrid, shapes: Sequence[Cast | None]) -> PixelOwner
         owner[both] = depth.argmin(axis=0)[both]
         with np.errstate(invalid="ignore"):  # inf - inf
             owner[np.where(both, behind - front, second - least) < MARGIN_M] = UNCLEAR
-    return PixelOwners(grid, owner)
+    return PixelOwners(grid, owner, nearest)
 
 
 def cast_points(rig: Rig, grid: RayGrid, points: Float, voxel_m: float) -> Cast:
