@@ -52,9 +52,9 @@ _AVERAGE_M = 1.7
 # A pose with a higher residual explains nothing: twice what an average body of the right stature leaves. Without a
 # better one in any of the frames the person is not found.
 UNEXPLAINED = 0.6
-# Further hypotheses that are followed through the opening, the most likely of all frames: each may take seconds where
-# nothing fits.
-FOLLOWED = 6
+# Alternatives that are followed through the opening, the likeliest of each anchor first: where nothing fits, each takes
+# seconds. Sensitivity not measured.
+FOLLOWED = 8
 # A search that finds a better pose is repeated, at most this often.
 _SEARCHES = 2
 
@@ -97,7 +97,7 @@ def find_person(
         return [_follow(tracker, frames, pyramids, _searched(tracker, frames[0], pyramids[0], pose), 0)]
     skeleton = tracker.body.skeleton
     hypotheses: list[TrajectoryHypothesis] = []
-    alternatives: list[tuple[int, Float, float]] = []
+    alternatives: list[tuple[int, int, Float, float]] = []  # rank in its anchor, anchor, pose, handicap
     least = np.inf
     for anchor in np.unique(np.linspace(0, len(frames) - 1, ANCHORS).astype(int)):
         try:
@@ -109,9 +109,9 @@ def find_person(
         least = min(least, residual)
         if residual > UNEXPLAINED:
             continue
-        for pose in poses[1:]:
+        for rank, pose in enumerate(poses[1:]):
             turned = _turned(skeleton, pose[None], poses[0])[0]
-            alternatives.append((int(anchor), pose, 1.0 if turned else HANDICAP))
+            alternatives.append((rank, int(anchor), pose, 1.0 if turned else HANDICAP))
         if _contains(skeleton, hypotheses, anchor, poses[0]):
             break  # found from two frames
         hypotheses.append(_follow(tracker, frames, pyramids, poses[0], anchor))
@@ -122,7 +122,9 @@ def find_person(
             f"no pose of a person explains the masks: the best one leaves {least:.0%} of their pixels unexplained; "
             "check that the masks show one whole person, and the calibration"
         )
-    for anchor, pose, handicap in alternatives[:FOLLOWED]:
+    likeliest = sorted(range(len(alternatives)), key=lambda i: alternatives[i][0])[:FOLLOWED]
+    for i in sorted(likeliest):
+        _, anchor, pose, handicap = alternatives[i]
         if not _contains(skeleton, hypotheses, anchor, pose):
             hypotheses.append(_follow(tracker, frames, pyramids, pose, anchor)._replace(handicap=handicap))
     hypotheses.sort(key=lambda hypothesis: hypothesis.cost)
