@@ -102,9 +102,19 @@ def test_damaged_body_is_named(complete: Path, tmp_path: Path, name: str, value:
         figure_of(read_result(path))
 
 
-def test_unknown_time_is_named(complete: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["time", "timing/total"])
+def test_unknown_time_is_named(complete: Path, tmp_path: Path, name: str) -> None:
     path = Path(shutil.copy(complete, tmp_path / "damaged.h5"))
     with h5py.File(path, "r+") as file:
-        file["time"][3] = np.nan
-    with pytest.raises(ResultError, match=r"damaged\.h5: /time holds NaN"):
+        file[name][3] = np.nan
+    with pytest.raises(ResultError, match=rf"damaged\.h5: /{name} holds NaN"):
         read_result(path)
+
+
+def test_infinite_pose_is_read_as_unknown(complete: Path, tmp_path: Path) -> None:
+    path = Path(shutil.copy(complete, tmp_path / "damaged.h5"))
+    with h5py.File(path, "r+") as file:
+        file["pose"][3, 5] = np.inf
+        file["objective"][3] = np.inf
+    result = read_result(path)
+    assert np.isnan(result.pose[3, 5]) and np.isinf(result.objective[3])

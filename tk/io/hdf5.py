@@ -87,8 +87,8 @@ class Hdf5Reader:
             name: name of the dataset.
             dtype: numpy's name of the requested type.
             shape: requested shape; None stands for any length.
-            low, high: range of valid numbers.
-            finite: refuse NaN and infinity, which are valid otherwise.
+            low, high: range of valid numbers. Infinity is read as NaN unless the range contains it.
+            finite: refuse NaN and infinity.
 
         Raises:
             ResultError: the dataset is missing, has another shape, or numbers that do not fit the type or the range.
@@ -114,6 +114,8 @@ class Hdf5Reader:
         outside = known[(known < low) | (known > high)]
         if len(outside):
             self.fail(f"/{name} holds {outside[0]:g}, which is out of range; the file is damaged")
+        if len(known) < values.size and high < math.inf:
+            values = np.where(np.isinf(values), np.asarray(np.nan, values.dtype), values)
         return values.astype(wanted)
 
     def values(self, group: str, limit: float) -> dict[str, Any]:

@@ -52,7 +52,7 @@ class Dataset:
         each: field of ResultMeta that lists the names of a family.
         optional: field of ResultMeta that is false or empty if the file has no such dataset.
         smoothed: True if `/smoothed` may have a copy.
-        valid: range of valid numbers.
+        valid: range of valid numbers; infinity is read as NaN unless the range contains it.
         finite: True if NaN and infinity are not valid.
     """
 
@@ -127,7 +127,7 @@ ROWS = (
     Dataset("iterations", "F T", "int32", "optimiser iterations by stage", {"stages": "stages"}, field="iterations"),
     Dataset(
         "timing/<stage>", "F", "float64", "seconds by stage; `total` is the frame's share of the wall time",
-        field="timing", each="timing_stages",
+        field="timing", each="timing_stages", finite=True,
     ),
 )  # fmt: skip
 
