@@ -90,7 +90,12 @@ def open_recording(
         images = (path / "videos").is_dir() or (path / "images").is_dir()
         if path.is_dir() and not (images and (path / "calibration.toml").exists()):
             found = _find(path)
-            if found is not None:
+            # calibration.toml is a capture's file, too; then it is the videos' folder that tells
+            own = ("videos", "images", ".")
+            if found is not None and (
+                found[1][0] != path / "calibration.toml"
+                or any(list(path.glob(pattern)) for pattern in found[0].videos if pattern not in own)
+            ):
                 raise CaptureError(
                     f"{path}: is no capture, but has a calibration of {found[0].tool}, {found[1][0].name}; import it",
                     hint=f"tk import {path} -o CAPTURE",
