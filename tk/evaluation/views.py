@@ -141,16 +141,15 @@ def evaluate_views(
         raise CaptureError(f"{capture}: {found.path} is of frames that this capture and {truth} do not share")
     estimate, position = found.joints[rows], true.positions[true_rows]
     used = found.state.get("run/cameras")
-    names = None if used is None else [name.strip() for name in str(used).split(",")]
+    names = {name.strip() for name in str(used).split(",")}
+    known = bool(names & set(opened.rig.names))  # not in a damaged state, or without one
     with as_damage_error(found.path, "the body or a pose"):
         error, note = _silhouette_errors(found, opened)
     views = []
     for v, camera in enumerate(opened.rig):
         px, share = _pixel_error(Rig((camera,)), estimate, position, joints)
         views.append(
-            ViewScore(
-                camera.name, None if names is None else camera.name in names, px, share, error[v] if error else None
-            )
+            ViewScore(camera.name, camera.name in names if known else None, px, share, error[v] if error else None)
         )
     return ViewEvaluation(tuple(joints), len(common), tuple(views), note)
 
