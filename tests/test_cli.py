@@ -170,6 +170,7 @@ def test_demo_tracks_and_prints_the_accuracy(
         (["trak"], ["trak", "tk --help"]),
         (["--verbose"], ["--verbose", "tk --help"]),
         (["evaluate", "r.h5"], ["TRUTH"]),
+        (["view", 300 * "x"], ["xxx", "name too long"]),
     ],
 )
 def test_bad_usage_is_one_line(tk: Tk, arguments: list[str], parts: list[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import io
 import json
@@ -23,6 +24,12 @@ if TYPE_CHECKING:
     from tk.settings import Settings
 
 
+#: errors of the system about a path that no file can have: whatever uses it first fails
+_IMPOSSIBLE_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
+#: characters of such a path that a message shows
+_SHOWN = 100
+
+
 @contextmanager
 def errors_in_one_line() -> Iterator[None]:
     """Print a user's mistake as one line and exit with 2; with 1 after an interruption or if a disk is full."""
@@ -32,6 +39,11 @@ def errors_in_one_line() -> Iterator[None]:
     except TkError as error:
         click.echo(f"tk: {error.line}", err=True)
         raise click.exceptions.Exit(error.exit_code) from None
+    except OSError as error:
+        if error.errno not in _IMPOSSIBLE_NAMES:
+            raise
+        click.echo(f"tk: {str(error.filename)[:_SHOWN]}: {error.strerror}", err=True)
+        raise click.exceptions.Exit(2) from None
     except KeyboardInterrupt as reason:
         click.echo(f"tk: interrupted{f'; {reason}' if str(reason) else ''}", err=True)
         raise click.exceptions.Exit(1) from None

@@ -150,7 +150,7 @@ class Hdf5Reader:
             if found.get_type().get_class() not in (*_NUMBERS, h5py.h5t.STRING) or size > MAX_ATTRIBUTE_BYTES:
                 self.fail(f"the attribute {name} of /{holder} is neither text nor numbers; the file is damaged")
             value = held.attrs[name]
-            return value.decode() if isinstance(value, bytes) else value
+            return _readable(value) if isinstance(value, (bytes, str)) else value
 
     def is_format(self, name: str) -> bool:
         """Return True if the attribute `format` of the file has this value."""
@@ -176,7 +176,7 @@ class Hdf5Reader:
     def names(self, holder: str, name: str) -> tuple[str, ...]:
         """Return an attribute that is a list of texts."""
         value = self.attribute(holder, name)
-        listed = [item.decode("utf-8", "replace") if isinstance(item, bytes) else item for item in np.atleast_1d(value)]
+        listed = [_readable(item) if isinstance(item, (bytes, str)) else item for item in np.atleast_1d(value)]
         if value is None or np.ndim(value) > 1 or not all(isinstance(item, str) for item in listed):
             self._no_attribute(holder, name, "a list of texts")
         return tuple(str(item) for item in listed)
@@ -259,6 +259,11 @@ class Hdf5Reader:
         if stored > self._bytes or declared > limit:
             self.fail(f"/{name} declares {declared} bytes, and {stored} are stored; the file is damaged")
         return shape
+
+
+def _readable(text: bytes | str) -> str:
+    """Return a text with bytes that are not UTF-8 replaced; h5py returns them in a form that cannot be written."""
+    return (text if isinstance(text, bytes) else text.encode("utf-8", "surrogateescape")).decode("utf-8", "replace")
 
 
 def _check_text_heaps(path: Path, file: h5py.File) -> None:

@@ -56,7 +56,7 @@ def write_page(path: Path, page: str) -> None:
         ExportError: the file cannot be written.
     """
     with replacing(path) as part:
-        part.write_text(page, encoding="utf-8")
+        part.write_text(page, encoding="utf-8", errors="replace")  # a path may be no UTF-8
 
 
 def made_here(path: Path) -> bool:
