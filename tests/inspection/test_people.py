@@ -13,10 +13,13 @@ from scripts.synthetic.capture import write_calibration
 from tests.conftest import Tk
 from tests.io.conftest import write_picture
 from tests.model.ring import ring_of_cameras
+from tk.inspection.people import PeopleWatch
+from tk.io.captures.capture import open_capture
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.masks.silhouettes import draw_silhouettes
+from tk.model.people import LocatedPerson, PeopleFinder
 
 FRAMES = 24
 RIG = ring_of_cameras(4, 160, 120)
@@ -75,3 +78,20 @@ def test_one_person_is_listed_without_a_finding(tk: Tk, tmp_path: Path) -> None:
     assert ran.code == 0, ran.err
     assert "person 0: frames 0 to " in ran.out and "person 1:" not in ran.out
     assert "people are in view" not in ran.out
+
+
+def test_numbers_of_the_first_frame_stay_when_a_ghost_is_left_out(
+    crossing: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`tk track` counts everybody who is found in the first frame."""
+
+    def person(x: float) -> LocatedPerson:
+        position = np.array([x, 0.0, 0.9])
+        return LocatedPerson(position, 1.7, 0.08, position[None], 0.06, np.ones(4, bool), np.ones(4), True)
+
+    looks = iter([(person(0.1), person(0.3), person(1.0))] + 20 * [(person(0.1), person(1.0))])
+    monkeypatch.setattr(PeopleFinder, "find", lambda *_: next(looks))
+    watch = PeopleWatch(open_capture(crossing), FRAMES)
+    for index in filter(watch.wants, range(FRAMES)):
+        watch.look(index, np.zeros((4, 120, 160), np.uint8), None)
+    assert [(p.number, p.path[0][0]) for p in watch.people()] == [(0, 0.1), (2, 1.0)]

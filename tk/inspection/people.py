@@ -86,7 +86,7 @@ class PeopleWatch:
         self._every = max(1, round(capture.fps / _LOOKS_HZ), -(-(span - self._start) // _MOST_LOOKS))
         self._paths: list[_Path] = []
         self._open: list[_Path] = []
-        self._looks = 0
+        self._looks, self._first = 0, 0  # number of looks, and frame of the first in which somebody was found
 
     def wants(self, index: int) -> bool:
         """Return whether to :meth:`look` at a frame."""
@@ -103,7 +103,7 @@ class PeopleWatch:
         near = [person for at, person in (path.last for path in self._open) if at == index - self._every]
         found = self._finder.find(masks, uncertain, near)
         if not self._paths:
-            capture = self._capture
+            capture, self._first = self._capture, index
             found = order_people(found, capture.volume, capture.subject_height_m)
         before = np.array([path.last[1].position for path in self._open]).reshape(-1, 3)
         now = np.array([person.position for person in found]).reshape(-1, 3)
@@ -121,10 +121,13 @@ class PeopleWatch:
             taken[k].found.append((index, person))
 
     def people(self) -> tuple[PersonReport, ...]:
-        """Return the people: those of the first look in the order of :func:`order_people`, then as they came."""
+        """Return the people: those of the first look in the order of :func:`order_people`, then as they came.
+
+        Somebody who was seen only for a moment is left out, and keeps the number if it is one of the first look.
+        """
         least = min(1 + round(_SEEN_S * self._capture.fps / self._every), self._looks)
-        kept = [path for path in self._paths if len(path.found) >= least]
-        return tuple(self._report(number, path.found) for number, path in enumerate(kept))
+        kept = [path for path in self._paths if path.found[0][0] == self._first or len(path.found) >= least]
+        return tuple(self._report(k, path.found) for k, path in enumerate(kept) if len(path.found) >= least)
 
     def _report(self, number: int, found: Sequence[tuple[int, LocatedPerson]]) -> PersonReport:
         people = [person for _, person in found]
