@@ -119,6 +119,12 @@ def test_joint_that_no_view_shows_is_as_uncertain_as_a_bone_is_long() -> None:
     assert variance[5] == pytest.approx(REACH_M**2, rel=0.01) and (np.delete(variance, 5) < VIEW_M**2).all()
 
 
+def test_joint_without_a_finite_position_has_no_variance() -> None:
+    seen = rays(0, 90)
+    seen[:, 3] = np.nan
+    assert np.flatnonzero(np.isnan(view_variance(seen, np.ones((2, 15))))).tolist() == [3]
+
+
 def test_variance_grows_with_the_loss_of_a_view() -> None:
     shares = np.ones((3, 15))
     before = view_variance(rays(0, 60, 160), shares)

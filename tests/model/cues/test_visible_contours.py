@@ -40,3 +40,11 @@ def test_stretched_arm_shows_its_contours_and_hidden_arm_does_not() -> None:
 
 def test_head_is_visible_from_all_sides() -> None:
     assert (shares((0.0, 1.0, 0.0))[:, JOINTS.index("head_top")] > 0.9).all()
+
+
+def test_camera_shows_no_joint_behind_it() -> None:
+    label = np.full(GRID.rays.shape[:3], 1, np.uint8)
+    label[:, ::2] = 0
+    behind = np.repeat(RIG.centers[:1] - 2 * RIG[0].rotation[2], len(JOINTS), axis=0)
+    found = contour_shares(BODY, GRID, label, behind)
+    assert not found[0].any() and np.isfinite(found).all()

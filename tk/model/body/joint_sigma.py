@@ -60,7 +60,8 @@ def contour_variance(skeleton: Skeleton, pose: Float, precision: Float, free: ND
 
 
 def view_variance(rays: Float, shares: Float) -> Float:
-    """Return (15,) variance of the joints' positions along the direction that the views determine least, metres².
+    """Return (15,) variance of the joints' positions along the direction that the views determine least, metres²; NaN
+    for a joint whose rays are not finite.
 
     A view measures a joint's position across its ray only, and only as far as it shows the joint's bones. Priors and
     motion are no evidence of a position, so they do not count. This is the covariance of triangulation with weights
@@ -73,8 +74,9 @@ def view_variance(rays: Float, shares: Float) -> Float:
     """
     across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
     information = (shares[..., None, None] * across).sum(axis=0) + (VIEW_M / REACH_M) ** 2 * np.eye(3)
-    least = np.linalg.eigvalsh(information)[:, 0]
-    return np.asarray(VIEW_M**2 * np.maximum(1.0 / least - 1.0, 0.0))
+    known = np.isfinite(information).all(axis=(1, 2))
+    least = np.linalg.eigvalsh(np.where(known[:, None, None], information, np.eye(3)))[:, 0]
+    return np.where(known, VIEW_M**2 * np.maximum(1.0 / least - 1.0, 0.0), np.nan)
 
 
 def directions(skeleton: Skeleton, poses: Float) -> Float:

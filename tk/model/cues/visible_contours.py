@@ -45,5 +45,6 @@ def contour_shares(body: ConeBody, grid: RayGrid, label: NDArray[np.uint8], join
     found = np.bincount(view * S + segment[view, row, column], minlength=V * S).reshape(V, S)
     pixels = np.array([camera.project(joints)[0] for camera in grid.rig])
     length = np.linalg.norm(pixels[:, _ENDS[:, 0]] - pixels[:, _ENDS[:, 1]], axis=2) / grid.step
-    # two rays: a bone along the view is a disc of about this width
-    return np.asarray(np.minimum(found / np.maximum(length, 2.0), 1.0) @ _OF_JOINT.T)
+    # two rays: a bone along the view is a disc of about this width; a view does not show what is behind the camera
+    shown = np.where(np.isfinite(length), np.minimum(found / np.maximum(length, 2.0), 1.0), 0.0)
+    return np.asarray(shown @ _OF_JOINT.T)
