@@ -13,6 +13,7 @@ import pytest
 import tomli_w
 
 from tests.conftest import FRAMES, QUICK, Silent, Tk
+from tests.model.ring import ring_of_cameras
 from tk.io import settings_file
 from tk.io.captures.calibration import read_calibration
 from tk.io.captures.capture import open_capture
@@ -20,12 +21,16 @@ from tk.io.captures.mask_store import MaskStore
 from tk.io.results.reader import read_result
 from tk.io.results.status import Status
 from tk.io.toml import load_toml
+from tk.model.body import gait_poses as gait
+from tk.model.body.anthropometry import BodyDimensions
+from tk.model.body.cone_body import build_cone_body
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import turn_between
+from tk.model.masks.silhouettes import draw_silhouettes
 from tk.run import offline as finish
 from tk.run import plan
 from tk.run.prefetch import open_observations
-from tk.run.refinement import retimed
+from tk.run.refinement import retimed, whole_delays
 from tk.run.session import track
 
 TURNED = 1.0  # degrees, of cam2; a camera with a larger error is excluded
@@ -119,6 +124,18 @@ def test_result_without_a_body_and_bad_options_are_refused(tiny: Path, tracked: 
     tk("refine", tiny, bare, "-o", output).complaint(str(bare), "no body with contours")
     tk("refine", tiny, tracked, "-o", output, "--trust", "0").complaint("trust = 0")
     assert not output.exists()
+
+
+@pytest.mark.parametrize("late", [[0, 0, 0, 0], [0, 2, 0, 0], [0, 0, -3, 0]])
+def test_videos_that_are_late_by_more_than_edges_reach_are_found(late: list[int]) -> None:
+    rig, body = ring_of_cameras(4, 160, 120), build_cone_body(BodyDimensions.from_stature(1.75), "z", "full")
+    frames = np.arange(24)
+    poses = np.array([gait.walking_pose(body.skeleton, i / 12 % 1) for i in frames])
+    poses[:, :3] = np.column_stack([0.08 * frames - 1.0, 0 * frames, 0 * frames + 0.95])
+    drawn = draw_silhouettes(body, rig, poses)  # frame k of a late video shows frame k + late of the others
+    seen = np.array([[drawn[min(max(k + n, 0), 23), c] for c, n in enumerate(late)] for k in frames])
+    found = whole_delays(body, rig, seen.__getitem__, frames, poses, np.ones(24, bool))
+    assert found.tolist() == late
 
 
 def test_masks_of_late_cameras_come_from_other_frames() -> None:

@@ -23,11 +23,13 @@ from tk.model.cameras.bundle import choose_frames
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import Refined, RefinementSettings, refine_cameras
 from tk.model.cameras.tracker_frame import TrackerFrame
+from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Views
 from tk.run.prefetch import open_observations
 from tk.settings import Settings
 from tk.threads import one_thread
 from tk.trackers.bodies import body_and_poses
+from tk.trackers.contour_tracker import SCREEN_ROWS
 from tk.trackers.protocol import TwoPassTracker
 
 Float = NDArray[np.float64]
@@ -43,6 +45,11 @@ _WORTHWHILE = 0.95
 _SHIFTS = 3
 # A delay counts as unknown if its standard deviation exceeds this, frames.
 _UNKNOWN_FRAMES = 0.25
+# Whole frames of a video's delay that are looked for before the refinement, whose edges reach some pixels only; and the
+# frames in which they are looked for. A video is late if its share of wrong pixels is above the median camera's by the
+# first factor, and falls below the second without the delay. Two frames late at 15 Hz gave no delay without this.
+LARGEST_DELAY, DELAY_FRAMES = 5, 12
+_WORSE, _MENDED = 1.3, 0.8
 
 
 @dataclass(frozen=True)
@@ -147,6 +154,7 @@ def refine_rig(
     poses: Float,
     usable: NDArray[np.bool_],
     how: RefinementSettings | None = None,
+    late: NDArray[np.int64] | None = None,
 ) -> Refinement | None:
     """Refine cameras by poses (F, D) of frames (F,) whose masks are in the store; None if too few are usable.
 
@@ -155,7 +163,7 @@ def refine_rig(
     """
     how = how or RefinementSettings()
     masks = lru_cache(16)(store.get)
-    late = np.zeros(len(rig), np.int64)
+    late = np.zeros(len(rig), np.int64) if late is None else late
     done: Refined | None = None
     count = 0
     for _ in range(_SHIFTS):
@@ -215,15 +223,16 @@ def refine_if_inconsistent(
     )
     if len(chosen) < FEWEST:
         return None
+    late = whole_delays(tracker.body, world.rig, masks, frames, poses, usable)
     agreement = camera_agreement(tracker.body, world.rig, chosen)
-    if not (agreement.inconsistent.any() or agreement.late.any()):
+    if not (late.any() or agreement.inconsistent.any() or agreement.late.any()):
         return None
-    done = refine_rig(tracker.body, world.rig, store, frames, poses, usable)
+    done = refine_rig(tracker.body, world.rig, store, frames, poses, usable, late=late)
     if done is None:
         return None
     refined = done.refined
     before, after = float(np.mean(refined.before_px)), float(np.mean(refined.after_px))
-    if not after < _WORTHWHILE * before:
+    if not (late.any() or after < _WORTHWHILE * before):
         return None
     names, worst = world.rig.names, int(np.argmax(refined.turn_deg))
     late = [f"{name} is {n:+.2f} frames late" for name, n in zip(names, refined.offset_frames, strict=True)
@@ -235,6 +244,41 @@ def refine_if_inconsistent(
     )
     fresh = tracker.with_cameras(world.rig_out(refined.rig))
     return fresh, retimed(store, frames, np.round(refined.offset_frames).astype(np.int64)), refined.offset_frames
+
+
+def whole_delays(
+    body: ConeBody,
+    rig: Rig,
+    masks: Callable[[int], NDArray[np.uint8]],
+    frames: NDArray[np.int64],
+    poses: Float,
+    usable: NDArray[np.bool_],
+) -> NDArray[np.int64]:
+    """Return (C,) whole frames by which each video is late: with the masks of so many frames before, the body explains
+    a camera that it otherwise explains worse than the others. Arguments as of :func:`refine_rig`."""
+    none = np.zeros(len(rig), np.int64)
+    known = set(frames.tolist())
+    shifts = range(-LARGEST_DELAY, LARGEST_DELAY + 1)
+    rows = np.flatnonzero(usable & [all(frame - n in known for n in shifts) for frame in frames.tolist()])
+    if not len(rows):
+        return none
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, DELAY_FRAMES).round().astype(int))]
+    grid, group = RayGrid(rig, SCREEN_ROWS), np.zeros(len(body.parts), np.int32)
+
+    def wrong(n: int) -> Float:
+        """Return (C,) the mean share of wrong pixels with masks of n frames before."""
+        shown = [Evidence.of(grid, masks(int(frames[i]) - n)) for i in rows]
+        cast = [e.cast(body, group, poses[i][None], export=True)[1] for e, i in zip(shown, rows, strict=True)]
+        shares = [e.residual(met.label[0]).sum(axis=1) for e, met in zip(shown, cast, strict=True) if met is not None]
+        return np.nan_to_num(np.mean(shares, axis=0), nan=0.0)
+
+    now = wrong(0)
+    if not (now > _WORSE * np.median(now)).any():
+        return none
+    shares = np.array([wrong(n) for n in shifts])
+    best = np.argmin(shares, axis=0)
+    mended = (now > _WORSE * np.median(now)) & (shares.min(axis=0) < _MENDED * now)
+    return np.where(mended, np.array(shifts)[best], 0)
 
 
 def retimed(store: MaskStore, frames: NDArray[np.int64], late: NDArray[np.int64]) -> MaskStore:
