@@ -235,11 +235,11 @@ def refine_if_inconsistent(
     if not (late.any() or after < _WORTHWHILE * before):
         return None
     names, worst = world.rig.names, int(np.argmax(refined.turn_deg))
-    late = [f"{name} is {n:+.2f} frames late" for name, n in zip(names, refined.offset_frames, strict=True)
+    delays = [f"{name} is {n:+.2f} frames late" for name, n in zip(names, refined.offset_frames, strict=True)
             if abs(n) > LATE_FRAMES]  # fmt: skip
     note(
         f"the cameras disagreed and are refined from {done.frames} frames: contours {before:.2f} px off, now "
-        f"{after:.2f}; {', '.join([f'{names[worst]} is turned most, by {refined.turn_deg[worst]:.2f}°', *late])} "
+        f"{after:.2f}; {', '.join([f'{names[worst]} is turned most, by {refined.turn_deg[worst]:.2f}°', *delays])} "
         "(refine = false keeps them)"
     )
     fresh = tracker.with_cameras(world.rig_out(refined.rig))
