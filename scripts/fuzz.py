@@ -393,7 +393,8 @@ def make_base(folder: Path) -> Base:
     capture = folder / "base"
     write_capture(plan_capture(Options(frames=6, cameras=4, size=(96, 72), seed=3)), capture, masks=True)
     settings = settings_file.from_toml(SETTINGS)
-    track(open_capture(capture), folder / "base.h5", settings, Silent(), frames=(0, 4))
+    # a causal result can be resumed
+    track(open_capture(capture), folder / "base.h5", settings, Silent(), frames=(0, 4), causal=True)
     return Base(capture, folder / "base.h5")
 
 
