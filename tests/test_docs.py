@@ -150,7 +150,8 @@ def test_capture_examples_are_accepted(tmp_path: Path) -> None:
     for text, height in zip(examples, (1.78, 1.75), strict=True):
         (tmp_path / "capture.toml").write_text(text, encoding="utf-8")
         settings = read_settings(tmp_path / "capture.toml")
-        assert settings.unknown == () and settings.volume is not None and settings.subject_height_m == height
+        assert settings.unknown == () and settings.volume is not None
+        assert settings.subjects[0].height_m == height
     (tmp_path / "calibration.toml").write_text(toml_block("[metadata]"), encoding="utf-8")
     (camera,) = read_calibration(tmp_path / "calibration.toml").rig
     assert (camera.width, camera.height) == (640, 480)

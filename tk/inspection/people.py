@@ -104,7 +104,8 @@ class PeopleWatch:
         found = self._finder.find(masks, uncertain, near)
         if not self._paths:
             capture, self._first = self._capture, index
-            found = order_people(found, capture.volume, capture.subject_height_m)
+            subject = capture.setup().subjects[0]
+            found = order_people(found, capture.volume, subject.height_m, subject.position)
         before = np.array([path.last[1].position for path in self._open]).reshape(-1, 3)
         now = np.array([person.position for person in found]).reshape(-1, 3)
         distance = np.linalg.norm(before[:, None] - now[None], axis=2)

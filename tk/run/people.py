@@ -149,12 +149,12 @@ class People:
         """
         found = self._find(opening[0].masks, opening[0].uncertain)
         subjects = self._setup.subjects
-        found = order_people(found, self._setup.volume, subjects[0].height_m, _position(subjects[0]))
-        if len(found) <= 1 and len(subjects) == 1 and self._choice in ("auto", "all", (0,)):
+        found = order_people(found, self._setup.volume, subjects[0].height_m, subjects[0].position)
+        if len(found) <= 1 and self._choice in ("auto", "all", (0,)):
             self._begin(self.members[0], opening)
             return
         numbers = self._chosen(found)
-        known = _matched(subjects, [found[n] for n in numbers])
+        known = _matched(subjects[:1] if self._choice == "auto" else subjects, [found[n] for n in numbers])
         self.members = [self._member(0, known[0], self.members[0].tracker)]
         for k, subject in enumerate(known[1:], 1):
             tracker = self._make()
@@ -204,13 +204,17 @@ class People:
             return self._choice
         if self._choice == "all":
             return tuple(present) or (0,)
+        number = 0
+        place = _position(self._setup.subjects[0])
+        if place is not None and found:
+            number = int(np.argmin([np.linalg.norm(person.position - place) for person in found]))
         if len(found) > 1:
-            x, y, z = found[0].position
+            x, y, z = found[number].position
             self._note(
-                f"{len(found)} people are in view, and number 0 is tracked, at ({x:.1f}, {y:.1f}, {z:.1f}) m; the "
-                "option people chooses others by the numbers that tk inspect prints, or all"
+                f"{len(found)} people are in view, and number {number} is tracked, at ({x:.1f}, {y:.1f}, {z:.1f}) m; "
+                "the option people chooses others by the numbers that tk inspect prints, or all"
             )
-        return (0,)
+        return (number,)
 
     # --- one frame ----------------------------------------------------------------------------------------------------
 
@@ -225,8 +229,9 @@ class People:
         before = [self._state_of(m) for m in self.members]
         shown = [*(self._shape(m, True) for m in self.members), *(b.shape for b in self._bystanders)]
         owners = self._owners(shown)
-        self._follow(self._bystanders, frame, owners, len(self.members))
-        owners = self._owners([*shown[: len(self.members)], *(b.shape for b in self._bystanders)])
+        if self._bystanders:
+            self._follow(self._bystanders, frame, owners, len(self.members))
+            owners = self._owners([*shown[: len(self.members)], *(b.shape for b in self._bystanders)])
         answers = {}
         for k, member in enumerate(self.members):
             answers[member.number] = self._step(member, owners.share(frame, k, member.lost and not member.absent))

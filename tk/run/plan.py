@@ -18,7 +18,7 @@ from tk.io.settings_file import to_toml
 from tk.model.body.angles import ANGLES
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import OPTIONAL, SEGMENTS, build_skeleton
-from tk.model.setup import Setup
+from tk.model.setup import Setup, Subject
 from tk.run.prefetch import TIMING_STAGES, Observations, open_observations
 from tk.run.segmentation import mask_source
 from tk.settings import Settings
@@ -43,22 +43,30 @@ def recording_setup(capture: Capture, init_pose: Path | None, body: Path | None,
         TkError: a file cannot be used, or the pose is not in the recording.
     """
     setup = capture.setup()
-    (subject,) = setup.subjects
+    subjects: list[Subject] = []
     names = build_skeleton(BodyDimensions.from_stature(1.7), optional=OPTIONAL).names
-    init = first_pose(capture, names, init_pose, first_frame)
-    frame = subject.init_frame
-    if init is not None:
-        where = init_pose or capture.init_keypoints
-        if not ((setup.volume.lower <= init.center) & (init.center <= setup.volume.upper)).all():
-            raise CaptureError(
-                f"{where}: the body is at {init.center.round(2).tolist()}, outside the working volume "
-                f"{setup.volume.lower.round(2).tolist()} to {setup.volume.upper.round(2).tolist()}; give metres"
-            )
-        frame = first_frame if init.frame is None else init.frame
-        if init.frame is not None and init.frame >= capture.frame_count:
-            raise CaptureError(f"{where}: frame = {frame} is past the capture's last, {capture.frame_count - 1}")
-    given = read_body(body, setup.up) if body else None
-    return replace(setup, subjects=(replace(subject, init_frame=frame, init=init, body=given),))
+    for subject, given in zip(setup.subjects, capture.subjects, strict=True):
+        first = not subjects
+        pose_file = init_pose if first and init_pose else capture.path / given.init if given.init else None
+        init = first_pose(capture, names, pose_file, first_frame) if first or pose_file else None
+        frame = subject.init_frame
+        if init is not None:
+            where = pose_file or capture.init_keypoints
+            if not ((setup.volume.lower <= init.center) & (init.center <= setup.volume.upper)).all():
+                raise CaptureError(
+                    f"{where}: the body is at {init.center.round(2).tolist()}, outside the working volume "
+                    f"{setup.volume.lower.round(2).tolist()} to {setup.volume.upper.round(2).tolist()}; give metres"
+                )
+            frame = first_frame if init.frame is None else init.frame
+            if init.frame is not None and init.frame >= capture.frame_count:
+                raise CaptureError(f"{where}: frame = {frame} is past the capture's last, {capture.frame_count - 1}")
+        body_file = body if first and body else capture.path / given.body if given.body else None
+        known = read_body(body_file, setup.up) if body_file else None
+        subjects.append(replace(subject, init_frame=frame, init=init, body=known))
+    frames = {s.init_frame for s in subjects if s.init is not None}
+    if len(frames) > 1:
+        raise CaptureError(f"{capture.path}: the initial poses are of the frames {sorted(frames)}; give one frame")
+    return replace(setup, subjects=tuple(subjects))
 
 
 def choose_frames(source: Source, frames: tuple[int, int | None], note: Callable[[str], None]) -> tuple[int, int]:

@@ -60,13 +60,17 @@ class PixelOwners:
         return replace(frame, masks=self._selected(frame.masks, own))
 
     def _selected(self, masks: NDArray[np.uint8], own: NDArray[np.bool_]) -> NDArray[np.uint8]:
-        step, (_, height, width) = self.grid.step, masks.shape
+        """Return the masks (V, H, W), with :data:`~tk.kernels.mask_values.OTHERS` where cells are not own."""
+        _, height, width = masks.shape
         selected = np.empty_like(masks)
         for v, cells in enumerate(np.where(own, np.uint8(255), np.uint8(OTHERS))):
-            full = cells.repeat(step, axis=0).repeat(step, axis=1)
-            below, right = max(height - full.shape[0], 0), max(width - full.shape[1], 0)
-            full = cv2.copyMakeBorder(full[:height, :width], 0, below, 0, right, cv2.BORDER_REPLICATE)
-            np.copyto(selected[v], np.where(masks[v] >= 128, full, np.uint8(0)))
+            size = (cells.shape[1] * self.grid.step, cells.shape[0] * self.grid.step)
+            full = cv2.resize(cells, size, interpolation=cv2.INTER_NEAREST)[:height, :width]
+            below, right = height - full.shape[0], width - full.shape[1]
+            if below or right:
+                full = cv2.copyMakeBorder(full, 0, below, 0, right, cv2.BORDER_REPLICATE)
+            _, shown = cv2.threshold(masks[v], 127, 255, cv2.THRESH_BINARY)
+            cv2.bitwise_and(shown, full, dst=selected[v])
         return selected
 
     def changed(self, before: PixelOwners, masks: NDArray[np.uint8], person: int) -> bool:
@@ -105,13 +109,17 @@ def assign(rig: Rig, grid: RayGrid, shapes: Sequence[Cast | None]) -> PixelOwner
     nearest = beside.min(axis=0)
     owner = np.where(nearest <= REACH_M, beside.argmin(axis=0), NOBODY).astype(np.int8)
     if len(shapes) > 1:
-        least, second = np.partition(beside, 1, axis=0)[:2]
-        front, behind = np.partition(depth, 1, axis=0)[:2]
+        second, front, behind = _second(beside), depth.min(axis=0), _second(depth)
         both = np.isfinite(behind)
         owner[both] = depth.argmin(axis=0)[both]
         with np.errstate(invalid="ignore"):  # inf - inf
-            owner[np.where(both, behind - front, second - least) < MARGIN_M] = UNCLEAR
+            owner[np.where(both, behind - front, second - nearest) < MARGIN_M] = UNCLEAR
     return PixelOwners(grid, owner, nearest)
+
+
+def _second(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the second least of values along the first axis."""
+    return values.max(axis=0) if len(values) == 2 else np.partition(values, 1, axis=0)[1]
 
 
 def cast_points(rig: Rig, grid: RayGrid, points: Float, voxel_m: float) -> Cast:

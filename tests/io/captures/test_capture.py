@@ -296,6 +296,8 @@ def test_a_text_file_named_mp4_is_refused(make_capture: MakeCapture) -> None:
         ({"up": [0.0, 1.0]}, CaptureError, "up must be 3 numbers, and is 2"),
         ({"up": [0.0, 0.0, 0.0]}, CaptureError, "up = [0.0, 0.0, 0.0] has no direction"),
         ({"name": 3}, CaptureError, "name = 3 must be a text"),
+        ({"subject": [{"height": 1.7}, {"height": 178}]}, CaptureError, "[[subject]] 1: height = 178 must be between"),
+        ({"subject": [3]}, CaptureError, "subject must be a table [subject], or several [[subject]]"),
         ({"subject": {"height": 178}}, CaptureError, "[subject]: height = 178 must be between 0.3 and 3 metres"),
         ({"init": {"frame": -1}}, CaptureError, "[init]: frame = -1"),
         ({"init": {"frame": 12}}, CaptureError, "[init]: frame = 12 is past the last frame, 11"),
@@ -433,3 +435,15 @@ def test_every_number_of_a_camera_has_a_bound(
     write_toml(folder / "calibration.toml", tables)
     with pytest.raises(CalibrationError, match=rf"calibration\.toml: camera 'cam2': .*{complaint}"):
         open_capture(folder)
+
+
+def test_several_subjects_are_read(make_capture: MakeCapture) -> None:
+    folder = make_capture()
+    text = '[[subject]]\nheight = 1.8\n[[subject]]\nheight = 1.6\nposition = [1, 0, 0.9]\nbody = "b.toml"\nsize = 3\n'
+    (folder / "capture.toml").write_text(text)
+    capture = open_capture(folder)
+    assert any("subject.size" in warning for warning in capture.warnings)
+    first, second = capture.setup().subjects
+    assert (first.height_m, first.position, second.height_m) == (1.8, None, 1.6) and capture.subject_height_m == 1.8
+    assert second.position is not None and second.position.tolist() == [1.0, 0.0, 0.9]
+    assert [s.body for s in capture.subjects] == [None, "b.toml"]

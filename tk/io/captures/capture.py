@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError, VideoError, VolumeError
 from tk.io.captures.calibration import Calibration, match_camera, read_calibration
-from tk.io.captures.capture_toml import CaptureSettings, read_settings
+from tk.io.captures.capture_toml import CaptureSettings, GivenSubject, read_settings
 from tk.io.captures.frames import FrameReader, FrameSet
 from tk.io.captures.mobo import SETTINGS as MOBO_SETTINGS
 from tk.io.captures.mobo import find_walk, read_cameras
@@ -62,7 +62,7 @@ class Capture:
         rig: the cameras, in the calibration file's order.
         volume: the working volume, world frame, metres; inferred from the rig if `capture.toml` has none.
         frame_count: number of frames that all cameras (and masks) have.
-        subject_height_m: height of the subject, metres; None if unknown.
+        subject_height_m: height of the first subject, metres; None if unknown.
         init_frame: the frame in which the subject stands in the initialisation pose.
         init_pose: "da-vinci", or "any" if the subject may begin in any pose.
         init_keypoints: folder of 2D keypoints of the first pose; None if there is none.
@@ -72,6 +72,7 @@ class Capture:
         masks, resampled: arguments of :func:`open_capture`.
         time_offset_s: delay of each camera, seconds, from the calibration; :meth:`frames` corrects whole frames of it.
         segmenter: makes the masks if none are given; None: the empty scene, or an installed segmenter.
+        subjects: what `capture.toml` says about the people, at least one.
     """
 
     path: Path
@@ -93,6 +94,7 @@ class Capture:
     _calibration: Calibration
     time_offset_s: tuple[float, ...]
     segmenter: Segmenter | None = None
+    subjects: tuple[GivenSubject, ...] = (GivenSubject(),)
 
     @property
     def late_frames(self) -> tuple[int, ...]:
@@ -140,8 +142,14 @@ class Capture:
 
     def setup(self) -> Setup:
         """Return what `calibration.toml` and `capture.toml` say about the scene."""
-        subject = Subject(self.subject_height_m, self.init_frame, in_init_pose=self.init_pose != "any")
-        return Setup(self.rig, self.volume, self.up, self.fps, (subject,))
+        first = Subject(self.subject_height_m, self.init_frame, in_init_pose=self.init_pose != "any")
+        subjects = [replace(first, height_m=given.height_m) for given in self.subjects]
+        subjects[0] = first
+        placed = tuple(
+            replace(s, position=None if given.position is None else np.array(given.position))
+            for s, given in zip(subjects, self.subjects, strict=True)
+        )
+        return Setup(self.rig, self.volume, self.up, self.fps, placed)
 
     def shifted(self, time_offset_s: Sequence[float]) -> Capture:
         """Return the capture with other time offsets (C,); it ends with the first video."""
@@ -246,7 +254,8 @@ def open_capture(
         rig=rig,
         volume=_working_volume(settings, rig, path, warnings.append),
         frame_count=frame_count,
-        subject_height_m=settings.subject_height_m,
+        subject_height_m=settings.subjects[0].height_m,
+        subjects=settings.subjects,
         init_frame=settings.init_frame,
         init_pose=settings.init_pose,
         init_keypoints=path / settings.init_keypoints if settings.init_keypoints else None,

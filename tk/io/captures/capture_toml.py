@@ -24,10 +24,26 @@ _MOST_VOLUME_M, _FARTHEST_M = 1000.0, 1e6
 
 _KEYS: dict[str, tuple[str, ...]] = {
     "volume": ("center", "size"),
-    "subject": ("height",),
+    "subject": ("height", "position", "body", "init"),
     "init": ("frame", "pose", "keypoints"),
 }
 _TOP_KEYS = ("name", "fps", "up", *_KEYS)
+
+
+@dataclass(frozen=True)
+class GivenSubject:
+    """A person as `capture.toml` describes one: the table `[subject]`, or one of several `[[subject]]`.
+
+    Attributes:
+        height_m: height without shoes, metres.
+        position: (x, y, z) metres, rough position in the frame of the initialisation.
+        body, init: files with a body and with a rough pose, relative to the capture's folder.
+    """
+
+    height_m: float | None = None
+    position: tuple[float, float, float] | None = None
+    body: str | None = None
+    init: str | None = None
 
 
 @dataclass(frozen=True)
@@ -40,7 +56,7 @@ class CaptureSettings:
         up: axis that points up in the world, as :func:`tk.model.cameras.up.up_text` writes it: "z", or a unit vector.
             None: inferred from the cameras.
         volume: the working volume, metres.
-        subject_height_m: the subject's height without shoes, metres.
+        subjects: the people, at least one.
         init_frame: the frame in which the subject stands in the initialisation pose.
         init_pose: one of :data:`INIT_POSES`.
         init_keypoints: folder of 2D keypoints of the first pose, relative to the capture's; None if there is none.
@@ -51,7 +67,7 @@ class CaptureSettings:
     fps: float | None = None
     up: str | None = None
     volume: Volume | None = None
-    subject_height_m: float | None = None
+    subjects: tuple[GivenSubject, ...] = (GivenSubject(),)
     init_frame: int = 0
     init_pose: str = "da-vinci"
     init_keypoints: str | None = None
@@ -77,11 +93,6 @@ def read_settings(path: Path) -> CaptureSettings:
 
     up = _up(document) if "up" in document else None
 
-    subject = document.table("subject")
-    height_m = subject.number("height") if "height" in subject else None
-    if height_m is not None and not 0.3 <= height_m <= 3.0:
-        subject.fail(f"height = {height_m:g} must be between 0.3 and 3 metres")
-
     init = document.table("init")
     init_frame = init.integer("frame", 0)
     if init_frame < 0:
@@ -95,11 +106,34 @@ def read_settings(path: Path) -> CaptureSettings:
         fps=fps,
         up=up,
         volume=_volume(document.table("volume")) if "volume" in document else None,
-        subject_height_m=height_m,
+        subjects=_subjects(document),
         init_frame=init_frame,
         init_pose=init_pose,
         init_keypoints=init.text("keypoints", "") if "keypoints" in init else None,
         unknown=_unknown_keys(document.values),
+    )
+
+
+def _subjects(document: Table) -> tuple[GivenSubject, ...]:
+    listed = document.values.get("subject")
+    if not isinstance(listed, list):
+        return (_subject(document.table("subject")),)
+    if not listed or not all(isinstance(values, dict) for values in listed):
+        document.fail("subject must be a table [subject], or several [[subject]]")
+    return tuple(
+        _subject(Table(values, f"{document.where}: [[subject]] {n}", document.error)) for n, values in enumerate(listed)
+    )
+
+
+def _subject(table: Table) -> GivenSubject:
+    height_m = table.number("height") if "height" in table else None
+    if height_m is not None and not 0.3 <= height_m <= 3.0:
+        table.fail(f"height = {height_m:g} must be between 0.3 and 3 metres")
+    return GivenSubject(
+        height_m=height_m,
+        position=_triple(table.array("position", (3,))) if "position" in table else None,
+        body=table.text("body", "") if "body" in table else None,
+        init=table.text("init", "") if "init" in table else None,
     )
 
 
@@ -126,7 +160,9 @@ def _volume(table: Table) -> Volume:
 def _unknown_keys(document: Any) -> tuple[str, ...]:
     unknown = [key for key in document if key not in _TOP_KEYS]
     for table, keys in _KEYS.items():
-        unknown += [f"{table}.{key}" for key in document.get(table, {}) if key not in keys]
+        found = document.get(table, {})
+        for values in found if isinstance(found, list) else [found]:
+            unknown += [f"{table}.{key}" for key in values if key not in keys]
     return tuple(unknown)
 
 

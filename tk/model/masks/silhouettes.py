@@ -139,11 +139,15 @@ def _marked(level: Masks, others: NDArray[np.bool_], step: int) -> Masks:
 
     ``step``: pixels of the full image along a side of the scale's pixel.
     """
-    V, h, w = level.shape
-    padded = np.zeros((V, h * step, w * step), np.bool_)
-    padded[:, : others.shape[1], : others.shape[2]] = others
-    hidden = padded.reshape(V, h, step, w, step).any(axis=(2, 4))
-    return np.where(hidden, np.uint8(OTHERS), level)
+    _, h, w = level.shape
+    marked = level.copy()
+    for out, own in zip(marked, others.view(np.uint8), strict=True):
+        if step > 1:  # the mean over a pixel is positive if it contains one of the others'
+            below, right = h * step - own.shape[0], w * step - own.shape[1]
+            padded = cv2.copyMakeBorder(255 * own, 0, below, 0, right, cv2.BORDER_CONSTANT)
+            own = cv2.resize(padded, (w, h), interpolation=cv2.INTER_AREA)
+        np.copyto(out, np.uint8(OTHERS), where=own > 0)
+    return marked
 
 
 def pack_rig(rig: Rig) -> Float:
