@@ -33,7 +33,7 @@ Bool = NDArray[np.bool_]
 # cameras reach 0.003 with exact masks and 0.012 with segmented ones; a camera turned by 2° has 0.02 to 0.11 with most
 # partners, swapped videos 0.04 to 0.6, another recording's calibration 0.08 to 0.28. Below 0.01, cameras are excluded
 # that the refinement would mend; with 0.03, a camera turned by 3° about its upright axis stays.
-TOLERANCE = 0.015
+TOLERANCE = 0.012
 # Voxels along the working volume's longest side; those near the person are divided by two.
 _COARSE = 36
 # Rows of an image that are used for hulls, approximately.
