@@ -29,7 +29,7 @@ from tk.model.masks.silhouettes import draw_silhouettes
 from tk.render.canvas import View, dots, draw_body, draw_joints
 from tk.render.figure import Figure, Outline, solids_of
 from tk.render.overlay import Grid, Overlay, write_sheets
-from tk.render.palette import BONE, LOST, SEGMENT_COLORS, sigma_colors
+from tk.render.palette import BONE, LOST, SEGMENT_COLORS, person_color, sigma_colors
 from tk.run.session import track
 from tk.settings import Settings
 from tk.trackers.bodies import body_and_poses
@@ -58,18 +58,10 @@ def result(tmp_path: Path) -> Path:
     path = tmp_path / "result.h5"
     skeleton, truth = SKELETON, read_joints(DEMO / "truth.h5")
     pose = neutral_pose(skeleton)
+    config = settings_file.to_toml(Settings())
     meta = ResultMeta(
-        skeleton.names,
-        skeleton.units,
-        ("all",),
-        ("total",),
-        15.0,
-        "z",
-        "demo",
-        "made",
-        0,
-        settings_file.to_toml(Settings()),
-    )
+        "demo", "made", 0, 15.0, "z", config, skeleton.names, skeleton.units, ("all",), ("total",)
+    )  # fmt: skip
     with ResultWriter.create(path, meta) as writer:
         writer.write_model({f"dimensions/{name}": value for name, value in asdict(BODY.dimensions).items()})
         for frame in range(3):
@@ -217,6 +209,19 @@ def test_lost_frames_are_marked_red(result: Path) -> None:
     assert not (pictures[0][height + 2, 2] == LOST).all() and not (pictures[0][2, 300] == LOST).all()
     bar = pictures[0][-1]
     assert (bar[-100] == LOST).all() and not (bar[300] == LOST).all(), "the bar of time has the lost third in red"
+
+
+def test_second_person_is_drawn_in_one_colour(result: Path) -> None:
+    one = read_result(result)
+    aside = np.zeros(one.pose.shape[1])
+    aside[0] = 0.5
+    other = replace(one, person=1, pose=one.pose + aside, joints=one.joints + aside[:3])
+    colored = []
+    for shown in (one, replace(one, others=(other,))):
+        overlay = Overlay(open_capture(DEMO), shown, full=True)
+        ((frame, images),) = overlay.pictures([0])
+        colored.append(np.count_nonzero((overlay.mosaic(frame, images) == person_color(1)).all(axis=2)))
+    assert colored[1] > colored[0] + 100
 
 
 def test_videos_show_where_the_person_moves(result: Path) -> None:

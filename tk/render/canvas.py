@@ -80,8 +80,11 @@ class View:
         return np.asarray((xy + 0.5 - self.origin) * self.scale - 0.5)
 
 
-def draw_body(tile: Image, view: View, outlines: Sequence[Outline], lost: bool = False) -> None:
-    """Draw the segments, translucent, with their contours, near ones over far ones; grey if ``lost``."""
+def draw_body(
+    tile: Image, view: View, outlines: Sequence[Outline], lost: bool = False, color: Color | None = None
+) -> None:
+    """Draw the segments, translucent, with their contours, near ones over far ones; grey if ``lost``, in one color if
+    it is given."""
     solids = [points for outline in outlines for points in outline.points]
     if not solids:
         return
@@ -94,7 +97,7 @@ def draw_body(tile: Image, view: View, outlines: Sequence[Outline], lost: bool =
     layer, end = np.zeros((height, width), np.uint8), 0
     colors = np.zeros((256, 1, 3), np.uint8)
     for rank, outline in enumerate(outlines, 1):
-        colors[rank] = LOST_BODY if lost else SEGMENT_COLORS[outline.segment]
+        colors[rank] = LOST_BODY if lost else color or SEGMENT_COLORS[outline.segment]
         for points in outline.points:
             begin, end = end, end + len(points)
             cv2.fillConvexPoly(layer, cv2.convexHull(placed[begin:end]), (rank,), cv2.LINE_8, SUBPIXEL_BITS)

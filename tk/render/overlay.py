@@ -2,7 +2,8 @@
 
 Filled outlines show the fitted body (left limbs warm, right limbs cool, trunk and head green), lines and dots its
 joints; a dot's colour shows the joint's standard deviation. A result without a body shows joints only. Lost frames are
-grey with a red border. On contact sheets, white crosses show the ground truth, if the capture has it.
+grey with a red border. People after the first have one colour each. On contact sheets, white crosses show the ground
+truth, if the capture has it.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from tk.model.cameras.camera import Camera, Rig
 from tk.render.canvas import Image, View, dots, draw_body, draw_joints, draw_truth, text_width, write
 from tk.render.figure import Figure, figure_of
 from tk.render.legend import LEGEND_HEIGHT, Legend
-from tk.render.palette import LOST, TEXT, Color
+from tk.render.palette import LOST, TEXT, Color, person_color
 
 Float = NDArray[np.float64]
 
@@ -50,6 +51,9 @@ class Overlay:
 
     def __init__(self, capture: Capture, result: Result, widest: int = WIDEST, full: bool = False) -> None:
         self.figure: Figure = figure_of(result)
+        self._others = [
+            (one.person, figure_of(one), _rows(one)) for one in result.people if one.person != result.person
+        ]
         last = int(result.frames.max())
         if last >= capture.frame_count:
             raise ResultError(
@@ -63,7 +67,7 @@ class Overlay:
         self._legend = Legend(result, self.figure, self.grid.width)
         self._colors: dict[int, Sequence[Color | None]] = {}
         self._views = [self._steady_view(camera, full) for camera in self.rig]
-        self.row_of = {int(frame): row for row, frame in enumerate(result.frames)}
+        self.row_of = _rows(result)
         truth = truth_of(result, capture.truth_file)
         self._truth = {} if truth is None else dict(zip(result.frames.tolist(), truth, strict=True))
 
@@ -117,6 +121,10 @@ class Overlay:
         """Fill a tile with a camera's image, and draw body and joints over it."""
         lost = self.figure.lost(row)
         view.cut(image[: camera.height, : camera.width], tile)
+        for person, figure, rows in self._others:
+            other = rows.get(int(self.result.frames[row]))
+            if other is not None and not figure.lost(other):
+                draw_body(tile, view, figure.seen(other, camera)[0], color=person_color(person))
         outlines, joints = self.figure.seen(row, camera)
         draw_body(tile, view, outlines, lost)
         draw_joints(tile, view.place(joints), self._dots(row), lost)
@@ -148,12 +156,13 @@ class Overlay:
         return canvas
 
     def _steady_view(self, camera: Camera, full: bool) -> View:
-        """Return the view of a tile that contains the person in all frames that are not lost."""
+        """Return the view of a tile that contains the people in all frames that are not lost."""
         width, height = (max(int(size * self.grid.scale), 1) for size in (camera.width, camera.height))
         whole = View(np.zeros(2), self.grid.scale, width, height)
-        good = has_pose(self.figure.status)
-        points, _ = camera.project(self.figure.joints[good].reshape(-1, 3))
-        if full or not camera.sees(self.figure.joints[good].reshape(-1, 3)).any():
+        figures = (self.figure, *(figure for _, figure, _ in self._others))
+        shown = np.concatenate([figure.joints[has_pose(figure.status)].reshape(-1, 3) for figure in figures])
+        points, _ = camera.project(shown)
+        if full or not camera.sees(shown).any():
             return whole
         near = View.around(points, camera, width, height)
         return near if near.scale > self.grid.scale else whole
@@ -168,6 +177,11 @@ class Overlay:
         label = tile[:18, : text_width(text) + 12]
         label[...] = label // 3
         write(tile, text, 6, 13)
+
+
+def _rows(result: Result) -> dict[int, int]:
+    """Return the row of each frame."""
+    return {int(frame): row for row, frame in enumerate(result.frames)}
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,10 @@ Color = tuple[int, int, int]
 _HUES_DEG = {"": 135.0, "arm_l": 25.0, "leg_l": 5.0, "arm_r": 215.0, "leg_r": 280.0}
 
 
+# Hues of the people after the first, who are drawn in one colour each, degrees. Appearance only.
+_PEOPLE_DEG = (50.0, 320.0, 180.0, 100.0)
+
+
 def _shades(hue_deg: float, segments: Sequence[str]) -> dict[str, Color]:
     """Return the colours of segments, dark ones beside light ones."""
     colors = {}
@@ -72,3 +76,9 @@ def hexadecimal(color: Color) -> str:
     """Return a colour in HTML notation."""
     b, g, r = color
     return f"#{r:02x}{g:02x}{b:02x}"
+
+
+def person_color(person: int) -> Color:
+    """Return the colour of a person after the first."""
+    r, g, b = hls_to_rgb(_PEOPLE_DEG[(person - 1) % len(_PEOPLE_DEG)] / 360, 0.5, 0.8)
+    return round(255 * b), round(255 * g), round(255 * r)
