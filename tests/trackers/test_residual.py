@@ -60,15 +60,6 @@ def test_median_of_the_first_frame_is_the_first_baseline_of_all_views() -> None:
     assert baseline.excess(np.full(VIEWS, 0.3 + START_SPREAD))[3] == pytest.approx(1.0)
 
 
-def test_first_residual_of_a_trusted_view_is_its_baseline() -> None:
-    baseline = ResidualBaseline(VIEWS, 0.02)
-    baseline.trusted[3] = True
-    error = np.array([0.08, 0.08, 0.08, 0.4])
-    assert baseline.excess(error)[3] == 0.0
-    baseline.learn(error)
-    assert baseline.mean[3] == 0.4 and baseline.excess(np.full(VIEWS, 0.08))[0] == pytest.approx(0.0)
-
-
 def test_view_with_another_level_gets_its_own_baseline_soon() -> None:
     baseline = ResidualBaseline(VIEWS, 0.02)
     for _ in range(15):

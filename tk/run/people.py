@@ -23,7 +23,7 @@ from tk.model.cues.part_colors import color_bins
 from tk.model.cues.ray_costs import RayGrid
 from tk.model.people import LocatedPerson, PeopleFinder, order_people
 from tk.model.setup import Setup, Subject
-from tk.trackers.camera_monitor import CameraMonitor
+from tk.trackers.camera_monitor import CameraMonitor, opening_agreement
 from tk.trackers.protocol import Estimate, Observation, Tracker, sharing
 from tk.trackers.sharing import PixelOwners, assign, cast_points
 
@@ -175,16 +175,21 @@ class People:
                 owners = self._owners([b.shape for b in shown])
             for k, own in enumerate(shares):
                 own.append(owners.share(frame, k, False))
+        refusal = opening_agreement(self._setup, opening).refusal
         for member, frames in zip(self.members, shares, strict=True):
-            self._begin(member, frames)
+            self._begin(member, frames, refusal)
         first = [Bystander(found[n].position, self._hull(found[n])) for n in order]
         self._bystanders = first[len(numbers) :]
 
-    def _begin(self, member: Member, frames: Sequence[Observation]) -> None:
+    def _begin(self, member: Member, frames: Sequence[Observation], refusal: str | None = None) -> None:
+        """Start a tracker. ``refusal``: why the whole masks contradict each other, which counts if those of the person
+        alone cannot be compared: cameras that do not belong together show several people where one is."""
         subject = member.subject
         seen = member.monitor.start(frames)
+        if refusal and not member.monitor.tested:
+            raise CaptureError(refusal)
         member.tracker.start(seen, subject.height_m, subject.init, subject.body)
-        member.monitor.after_start()
+        member.monitor.check_body()
 
     def _find(self, masks: NDArray[np.uint8], uncertain: NDArray[np.bool_] | None = None) -> tuple[LocatedPerson, ...]:
         if self._finder is None:

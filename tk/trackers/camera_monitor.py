@@ -32,7 +32,7 @@ from tk.model.body.plausibility import Plausibility, check_extent, check_stature
 from tk.model.body.skeleton import JOINTS
 from tk.model.cues.ray_costs import residual_of
 from tk.model.masks.image_health import ImageHealth, described
-from tk.model.masks.mask_agreement import MaskAgreement
+from tk.model.masks.mask_agreement import Agreement, MaskAgreement
 from tk.model.setup import Setup, Subject
 from tk.trackers.contour_tracker import ContourTracker
 from tk.trackers.protocol import Estimate, Observation, Tracker, shows_person
@@ -64,6 +64,12 @@ Span = tuple[int, int, int]
 """Frames: the first, the last, and their number."""
 
 
+def opening_agreement(setup: Setup, frames: Sequence[Observation]) -> Agreement:
+    """Return whether the silhouettes of the opening frames agree; a few frames, spread over them, are compared."""
+    chosen = np.unique(np.linspace(0, len(frames) - 1, _OPENING).round().astype(int))
+    return MaskAgreement(setup.rig, setup.volume).compare([frames[i].masks for i in chosen])
+
+
 class CameraMonitor:
     """Steps a tracker; excludes cameras that are wrong.
 
@@ -80,7 +86,7 @@ class CameraMonitor:
         self._plausibility = Plausibility(setup.up, setup.fps)
         C = len(self._names)
         self._excluded = np.zeros(C, bool)
-        self._agree = np.zeros(C, bool)  # with the others before the start
+        self._tested = False
         self._torn = np.zeros(C, bool)  # excluded because of a torn mask
         self._normal_for = np.zeros(C, np.int64)  # consecutive frames with a normal residual
         self._since_test = np.full(C, _PAUSE)
@@ -102,11 +108,10 @@ class CameraMonitor:
         health = ImageHealth()
         bad = np.array([self._bad(health.look(f.images, f.masks)) for f in frames])
         shown = [_without(f, b) for f, b in zip(frames, bad, strict=True)]
-        chosen = np.unique(np.linspace(0, len(shown) - 1, _OPENING).round().astype(int))
-        agreement = MaskAgreement(self._setup.rig, self._setup.volume).compare([shown[i].masks for i in chosen])
+        agreement = opening_agreement(self._setup, shown)
         if agreement.refusal:
             raise CaptureError(agreement.refusal)
-        self._agree = agreement.tested_right
+        self._tested = int(agreement.tested_right.sum()) >= 2
         for camera in agreement.wrong:
             self._excluded[camera] = True
             self._opening_reasons[camera] = agreement.reason(camera)
@@ -120,16 +125,19 @@ class CameraMonitor:
             check_extent(agreement.extent_m, self._subject.height_m)
         return [_without(f, self._excluded) for f in shown]
 
-    def after_start(self) -> None:
-        """Refuse a body of an impossible size, after the tracker's start; trust the cameras that agreed before it.
+    @property
+    def tested(self) -> bool:
+        """Whether the silhouettes of two cameras or more could be compared before the start, and agreed."""
+        return self._tested
+
+    def check_body(self) -> None:
+        """Refuse a body of an impossible size, after the tracker's start.
 
         Raises:
             CaptureError: with the size and its likely causes.
         """
         if self._subject.height_m is None:
             check_stature(self.tracker.body.dimensions.stature)
-        if isinstance(self.tracker, RegionTracker):
-            self.tracker.residuals.trusted = self._agree
 
     def step(self, frame: Observation) -> tuple[Estimate, Observation]:
         """Return the estimate for the next frame, and the observation without the excluded cameras."""

@@ -93,13 +93,11 @@ class ResidualBaseline:
     Attributes:
         threshold: the excess, in spreads, that a normal variable exceeds with this probability.
         mean, spread: (V,) of E_S; the mean is NaN for a view that has seen nobody yet.
-        trusted: (V,) views whose silhouettes agreed with the others before the start: their first E_S is their mean.
     """
 
     def __init__(self, views: int, false_alarm: float) -> None:
         self.threshold = NormalDist().inv_cdf(1.0 - false_alarm)
         self.mean, self.spread = np.full(views, np.nan), np.full(views, START_SPREAD)
-        self.trusted = np.zeros(views, np.bool_)
         self._frames = np.zeros(views, np.int64)  # without a high residual, by view
 
     def excess(self, error: Float) -> Float:
@@ -107,14 +105,13 @@ class ResidualBaseline:
         return np.asarray((error - self._means(error)) / self.spread)
 
     def _means(self, error: Float) -> Float:
-        """Return (V,) the means. A view without a baseline that is not trusted has the median of the others, in the
-        first frame of all: a camera that is wrong from the start must not become its own baseline."""
+        """Return (V,) the means; of a view without a baseline the median of the others, in the first frame of all: a
+        camera that is wrong from the start must not become its own baseline."""
         known = np.isfinite(self.mean)
         if known.all():
             return self.mean
         others = self.mean[known] if known.any() else error[np.isfinite(error)]
-        first = np.where(self.trusted, error, np.median(others) if len(others) else np.nan)
-        return np.where(known, self.mean, first)
+        return np.where(known, self.mean, np.median(others) if len(others) else np.nan)
 
     def mean_excess(self, error: Float) -> float:
         """Return the mean excess of the views that see anybody, each at most :data:`OUTLIER`; inf if none does."""
