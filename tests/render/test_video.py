@@ -132,4 +132,4 @@ def test_render_writes_the_requested_views_and_frames(tracked: Path, tiny: Path,
     assert (tmp_path / "3d.mp4").read_bytes() == before
     assert tk("render", tracked, "-o", tmp_path / "3d.mp4", "--frames", "1", "--force").code == 0
     assert (tmp_path / "3d.mp4").read_bytes() != before
-    tk("render", tracked, "-o", tmp_path / "3d.avi").complaint("a video must end in .mp4")
+    tk("render", tracked, "-o", tmp_path / "3d.avi").complaint("a video of tk must end in .mp4")

@@ -194,7 +194,7 @@ def test_only_the_same_command_is_resumed(
 ) -> None:
     before = begun.read_bytes()
     ran = tk("track", tiny, "--method", "volumetric", "-o", begun, "--config", quick, "--resume", *options)
-    ran.complaint(str(begun), difference, "--force in")
+    ran.complaint(str(begun), difference, "start again")
     assert begun.read_bytes() == before
 
 

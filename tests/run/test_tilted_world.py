@@ -76,7 +76,7 @@ def test_results_do_not_depend_on_the_worlds_rotation(tiny: Path, tmp_path: Path
         up=up_text(TURN @ capture.up_axis),
     )
     results = []
-    for name, one in (("as it is", capture), ("turned", turned)):
+    for name, one in (("as it is.h5", capture), ("turned.h5", turned)):
         track(one, tmp_path / name, settings_file.from_toml(QUICK_SILHOUETTE), Silent(), method, (0, 6))
         results.append(read_result(tmp_path / name))
     expected, found = results

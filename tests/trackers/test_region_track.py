@@ -238,17 +238,17 @@ def test_a_causal_result_can_be_extended(tiny: Path, causal: Path, tmp_path: Pat
     assert_same(tmp_path / "r.h5", causal)
 
 
-def test_the_second_pass_does_not_change_lost_frames(copy: Path, tmp_path: Path) -> None:
+def test_the_second_pass_does_not_change_frames_without_anybody(copy: Path, tmp_path: Path) -> None:
     for camera in (copy / "masks").iterdir():
         for index in (3, 4):
             write_picture(camera / f"{index:06d}.png", np.zeros((120, 160), np.uint8))
     summary = run(copy, tmp_path / "r.h5", frames=(0, 8))
-    assert (summary.frames, summary.lost) == (8, 2)
+    assert (summary.frames, summary.present, summary.lost) == (8, 6, 0)
     result = read_result(tmp_path / "r.h5")
-    assert result.status.tolist() == [1, 0, 0, Status.LOST, Status.LOST, Status.RECOVERED, 0, 0]
+    assert result.status.tolist() == [1, 0, 0, Status.ABSENT, Status.ABSENT, Status.RECOVERED, 0, 0]
     assert result.sigma is not None and result.residual is not None
-    np.testing.assert_array_equal(np.isnan(result.sigma).all(axis=1), result.status == Status.LOST)
-    np.testing.assert_array_equal(np.isnan(result.residual).all(axis=(1, 2)), result.status == Status.LOST)
+    np.testing.assert_array_equal(np.isnan(result.sigma).all(axis=1), ~result.has_pose)
+    np.testing.assert_array_equal(np.isnan(result.residual).all(axis=(1, 2)), ~result.has_pose)
     assert np.isfinite(result.joints).all()
     assert "fewer than two cameras see anybody: lost, frames 3 to 4" in result.notes
 

@@ -21,7 +21,7 @@ def test_a_body_without_hands_and_feet_is_refused() -> None:
     rig = ring_of_cameras(2, width=48, height=60)
     tracker = VolumetricTracker(rig, Volume((0, 0, 1), (2, 2, 2)), "z", Settings(voxels=16))
     walker = build_cone_body(BodyDimensions.from_stature(1.7), preset="walker")
-    with pytest.raises(ConfigError, match=r'the body given is "walker": --method volumetric needs a full one'):
+    with pytest.raises(ConfigError, match=r'the body given is "walker": the method volumetric needs a full one'):
         tracker.start([], None, None, walker)
 
 

@@ -127,6 +127,7 @@ def end(output: Path, summary: Summary, quiet: bool, as_json: bool) -> None:
             frames=summary.frames,
             lost=summary.lost,
             suspect=summary.suspect,
+            absent=summary.frames - summary.present,
             tracked_now=summary.tracked_now,
             seconds=round(summary.seconds, 3),
             frames_per_second=round(rate, 3),
@@ -134,7 +135,8 @@ def end(output: Path, summary: Summary, quiet: bool, as_json: bool) -> None:
         )
     wrong = summary.lost + summary.suspect
     if summary.frames and not quiet:
-        counts = [f"{summary.lost} lost", *([f"{summary.suspect} suspect"] if summary.suspect else [])]
+        rare = {"suspect": summary.suspect, "with nobody in view": summary.frames - summary.present}
+        counts = [f"{summary.lost} lost", *(f"{count} {what}" for what, count in rare.items() if count)]
         parts = [f"{summary.frames} frames in {output}", *counts, *_expected_error(output)]
         click.echo(", ".join([*parts, f"{rate:.1f} frames/s"]), err=True)
     if summary.interrupted:

@@ -389,13 +389,17 @@ class People:
         return bool(np.count_nonzero(left > _UNEXPLAINED * person) >= 2)
 
     def _gone(self, member: Member, frame: Observation) -> bool:
-        """Return whether a lost person is nowhere near the last place: most of the body would be on background."""
+        """Return whether a lost person has left the last place: in every view most of the body would be on background.
+
+        One view that still shows the person says that the others' masks fail.
+        """
         body = member.drawn
         if body is None:
             return False
         step = frame.masks.shape[1] // body.shape[1]
         masks = frame.masks[:, step // 2 :: step, step // 2 :: step][:, : body.shape[1], : body.shape[2]]
-        return bool(np.count_nonzero(body & (masks < 128)) > 0.5 * np.count_nonzero(body))
+        covered = np.count_nonzero(body, axis=(1, 2))
+        return bool((np.count_nonzero(body & (masks < 128), axis=(1, 2)) >= 0.5 * covered).all())
 
     def _admit(self) -> None:
         """Start trackers for people who have entered, or let the tracker of an absent person find the person again."""

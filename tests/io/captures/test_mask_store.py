@@ -11,16 +11,17 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from tk.errors import TkError
 from tk.io.captures import mask_store
 from tk.io.captures.mask_store import MaskStore
+from tk.kernels.mask_values import OTHERS
 
 
 @given(masks=array_shapes(min_dims=3, max_dims=3, max_side=13).flatmap(lambda s: arrays(np.uint8, s)))
 @settings(max_examples=60, deadline=None)
-def test_stored_masks_are_returned_as_0_and_255(masks):
+def test_stored_masks_are_returned_as_0_255_and_other_people(masks):
     store = MaskStore()
     store.put(7, masks)
     found = store.get(7)
     assert found.dtype == np.uint8
-    np.testing.assert_array_equal(found, np.where(masks >= 128, 255, 0))
+    np.testing.assert_array_equal(found, np.where(masks >= 128, 255, np.where(masks == OTHERS, OTHERS, 0)))
     store.put(7, found)
     np.testing.assert_array_equal(store.get(7), found)
 

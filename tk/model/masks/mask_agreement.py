@@ -106,7 +106,7 @@ class Agreement:
             return f"its video and that of {self.names[other]} look swapped"
         error = self.tangency.error[camera, self.right]
         error, tolerance = error[np.isfinite(error)], TOLERANCE + 2 * self.tangency.pixel[camera]
-        if self.outside[camera] < INCONSISTENT / 2 and not (error > tolerance).any():
+        if self.outside[camera] < INCONSISTENT / 2 and not extends(self.tangency, camera):
             return "its masks miss a part of the person"
         off = np.hypot(*self.shift_px[camera])
         if not off > 0 and (error < -tolerance).any():
@@ -142,7 +142,8 @@ class MaskAgreement:
         error = excess(pairs)
         tested = np.flatnonzero(np.isfinite(error).any(axis=1)).tolist()
         kept = largest_consistent(error)
-        wrong = [c for c in tested if c not in kept] if kept else []
+        # a silhouette that extends beyond no other is no contradiction: the mask misses a part, or others have a shadow
+        wrong = [c for c in tested if c not in kept and extends(pairs, c)] if kept else []
         seen = [self.small(masks) for masks in frames]
         # the person may stand behind others
         hulls = self.hulls([m | self.small(np.uint8(255) * (f == OTHERS)) for m, f in zip(seen, frames, strict=True)])
@@ -173,7 +174,7 @@ class MaskAgreement:
         return Agreement(
             names=self.rig.names,
             tangency=pairs,
-            wrong=tuple(wrong),
+            wrong=tuple(sorted(wrong)),
             swapped=swapped,
             refusal=refusal,
             outside=outside,
@@ -187,7 +188,7 @@ class MaskAgreement:
     ) -> tuple[int, int] | None:
         """Return the two suspects whose exchanged videos make all cameras consistent; None if no two do."""
         found: list[tuple[float, tuple[int, int]]] = []
-        for a, b in combinations(suspects, 2):
+        for a, b in combinations(sorted(suspects), 2):
             if (self.rig[a].width, self.rig[a].height) != (self.rig[b].width, self.rig[b].height):
                 continue
             exchanged = []
@@ -321,6 +322,12 @@ def _share_outside(pairs: Sequence[tuple[Bool, Bool]]) -> float:
 def excess(pairs: Tangency) -> Float:
     """Return (C, C) the errors of all pairs in tolerances; NaN where a pair cannot be tested."""
     return np.asarray(pairs.worst / (TOLERANCE + pairs.pixel[:, None] + pairs.pixel[None]))
+
+
+def extends(pairs: Tangency, camera: int) -> bool:
+    """Return whether a camera's silhouette extends beyond that of another one."""
+    tolerance = TOLERANCE + pairs.pixel[camera] + pairs.pixel
+    return bool((pairs.error[camera] > tolerance[:, None]).any())
 
 
 def largest_consistent(error: Float) -> list[int]:
