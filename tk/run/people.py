@@ -49,8 +49,9 @@ _HISTORY = 8
 # Least share of the area of a person who is tracked that must be unexplained in two views before people are looked for.
 _UNEXPLAINED = 0.25
 # Mean logarithm of the likelihood of a person's pixels by the colours of the segments, above which somebody who enters
-# is a person who has left. On pair: -4.1 and -4.4 by the own colours, -7.6 and -8.9 by the other person's.
-_SAME_COLORS = -6.0
+# is a person who has left. On pair and a rendered crossing, three frames each: -3.5 to -4.2 by the own colours, -4.8 to
+# -7.1 by the other person's.
+_SAME_COLORS = -4.5
 
 
 _DRAWN = "drawn"
