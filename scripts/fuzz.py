@@ -463,6 +463,8 @@ def main() -> int:
         # every process is a fork with one thread; Taichi must not have run in a process that is forked
         given.base = given.base or folder
         given.base.mkdir(parents=True, exist_ok=True)
+        if (given.base / "calibration.toml").exists():
+            raise SystemExit(f"{given.base}: is a capture; --base is a folder for the script's own files")
         if not (given.base / "base.h5").exists() and _in_fork(lambda: make_base(given.base)) != 0:
             return 1
         pids = [_fork(lambda job=job: _run_share(given, folder, job)) for job in range(given.jobs)]  # type: ignore[misc]

@@ -353,7 +353,7 @@ class People:
         if self._grid is None:
             return
         self._admit()
-        due = frame.index % self._every == 0 or any(not m.absent for m in lost)
+        due = frame.index % self._every == 0 or bool(lost)
         if owners is None:
             residual = answers[self.members[0].number].estimate.residual
             known = residual is not None and bool(np.isfinite(residual).any())
@@ -371,6 +371,8 @@ class People:
         for member in lost:
             if not found and self._gone(member, frame):
                 member.absent = True
+            elif found and self._choice != "all":
+                member.absent = False  # no newcomer is tracked: who appears may be this person, and the tracker looks
         if any(not m.absent for m in lost):
             return  # the tracker looks for the person
         places = [b.position for b in self._bystanders]
