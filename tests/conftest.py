@@ -19,6 +19,7 @@ import hypothesis
 import pytest
 
 from scripts.synthetic.capture import Options, plan_capture, write_capture
+from tk.errors import TkError
 from tk.io import settings_file
 from tk.io.captures.capture import Capture
 from tk.model.setup import Setup
@@ -35,7 +36,7 @@ FRAMES = 14
 
 
 @contextmanager
-def refused(error: type[Exception], *parts: object) -> Iterator[pytest.ExceptionInfo[Exception]]:
+def refused(error: type[TkError], *parts: object) -> Iterator[pytest.ExceptionInfo[TkError]]:
     """Check that the block raises an error whose message is one line and contains these parts."""
     with pytest.raises(error) as caught:
         yield caught

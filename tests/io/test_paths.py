@@ -77,7 +77,7 @@ def test_only_files_of_the_kind_are_replaced_and_only_with_force(tmp_path: Path)
     assert check_output(new, TEXT) == new.resolve()
     with refused(ExportError, "own.txt: exists; choose another name") as caught:
         check_output(own, TEXT)
-    assert caught.value.hint == "or replace it with --force"  # type: ignore[attr-defined]
+    assert caught.value.hint == "or replace it with --force"
     assert check_output(own, TEXT, force=True) == own.resolve()
     with refused(ExportError, "other.text", "is not a text of mine", "not overwritten"):
         check_output(other, TEXT, force=True)

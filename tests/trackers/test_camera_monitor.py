@@ -151,7 +151,7 @@ def test_absent_person_is_lost_and_recovered_on_return(scene: Scene, cameras: li
     assert all(e.sigma is not None and np.isnan(e.sigma).all() for e in estimates[5:8])
     found = range(status.index("recovered"), FRAMES)
     assert scene.error(estimates, found) < 0.10
-    assert "fewer than two cameras see anybody: lost, frames 5 to 7" in monitor.report()
+    assert "fewer than two cameras see anybody: no pose, frames 5 to 7" in monitor.report()
 
 
 @pytest.mark.parametrize("part", [(0.0, 0.5), (0.5, 1.0)], ids=["the head's half", "the feet's half"])

@@ -259,7 +259,7 @@ def test_the_second_pass_does_not_change_frames_without_anybody(copy: Path, tmp_
     np.testing.assert_array_equal(np.isnan(result.sigma).all(axis=1), ~result.has_pose)
     np.testing.assert_array_equal(np.isnan(result.residual).all(axis=(1, 2)), ~result.has_pose)
     assert np.isfinite(result.joints).all()
-    assert "fewer than two cameras see anybody: lost, frames 3 to 4" in result.notes
+    assert "fewer than two cameras see anybody: no pose, frames 3 to 4" in result.notes
 
 
 @pytest.mark.parametrize("causal", [False, True])

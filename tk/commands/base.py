@@ -74,7 +74,7 @@ def _terminated_as_interrupted() -> Iterator[None]:
 
 
 def print_any_text() -> None:
-    """Let stdout and stderr print text that their encoding lacks, such as a path, as escape sequences."""
+    """Let stdout and stderr print text that is not in their encoding, such as a path, as escape sequences."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")

@@ -32,6 +32,7 @@ from tk.errors import ResultError
 from tk.evaluation.joints import Evaluation, evaluate, plain_values
 from tk.io.results.data import JointTrack
 from tk.io.results.status import has_pose
+from tk.model.body.joints import JOINTS
 
 Float = NDArray[np.float64]
 
@@ -99,7 +100,7 @@ class PeopleEvaluation:
     def format_table(self) -> str:
         """Return the table that ``tk evaluate`` prints; lines have at most 100 characters."""
         head = f"{'':10}{'result':>8}{'frames':>8}{'missed':>8}{'switches':>10}"
-        lines = [f"{head}{'limbs raw':>12}{'without offset':>16}{'all 15 raw':>12}{'knees':>8}"]
+        lines = [f"{head}{'limbs raw':>12}{'without offset':>16}{f'all {len(JOINTS)} raw':>12}{'knees':>8}"]
         lines.append(f"{'':44}{'[cm]':>12}{'[cm]':>16}{'[cm]':>12}{'[°]':>8}")
         for score in self.people:
             found = ", ".join(map(str, score.matched_with)) or "-"

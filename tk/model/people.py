@@ -34,7 +34,7 @@ Bool = NDArray[np.bool_]
 _VOXEL_M = 0.06
 # Rows of the images that are used, approximately: a voxel has then about two pixels at 4 m.
 _ROWS = 240
-# How far outside the working volume people are looked for, metres, where two cameras see: operators stand about there.
+# How far outside the working volume people are searched for, metres, where two cameras see: operators stand there.
 _BEYOND_M = 2.0
 # Volume of a person's hull, litres: a child of six weighs 20 kg (WHO growth reference), and a part of it may be hidden;
 # a man of 125 kg, whose hull may be twice as large. Smaller components than a head (4 litres) are ignored.
@@ -48,7 +48,8 @@ _APART_M = 0.3
 _SMOOTH_M = 0.1
 # Radius of a person's column in a block, metres: half the breadth of the shoulders, and a step.
 _BODY_M = 0.35
-# Two columns are two people if the floor plan between them falls to this share of the lower one.
+# Two columns are two people if the floor plan between them falls to this share of the lower one. Chosen on drawn
+# silhouettes of two people; sensitivity not measured. This holds for the prices of candidates below, too.
 _SADDLE = 0.7
 # A person costs as much as this area of unexplained pixels, sum over the views, m²: half the silhouette of an adult in
 # one view. A ghost explains less than 0.1, a person half hidden in four views explains 1.
@@ -69,9 +70,9 @@ _STEEP = 0.7
 # Weight of pixels that a candidate covers beside the masks: furniture may hide a person in several cameras, and the
 # candidate's silhouette is up to twice as large as the person's.
 _CONTRADICTED = 0.25
-# Area that the people leave unexplained in a camera before others are looked for, m²: a quarter of a person.
+# Area that the people leave unexplained in a camera before a search for others, m²: a quarter of a person.
 _LEFT_M2 = 0.15
-# The heights of two people are told apart in steps of this, metres: hair, shoes and half a voxel at both ends.
+# The heights of two people are compared in steps of this, metres: hair, shoes and half a voxel at both ends.
 _HEIGHT_STEP_M = 0.1
 # Most candidates that are compared, by volume: all 2^12 subsets take 10 ms.
 _MOST = 12

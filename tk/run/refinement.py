@@ -45,8 +45,8 @@ _WORTHWHILE = 0.95
 _SHIFTS = 3
 # A delay counts as unknown if its standard deviation exceeds this, frames.
 _UNKNOWN_FRAMES = 0.25
-# Whole frames of a video's delay that are looked for before the refinement, whose edges reach some pixels only; and the
-# frames in which they are looked for. A video is late if its share of wrong pixels is above the median camera's by the
+# Whole frames of a video's delay that are tried before the refinement, whose edges reach some pixels only; and the
+# frames in which they are tried. A video is late if its share of wrong pixels is above the median camera's by the
 # first factor, and falls below the second without the delay. Two frames late at 15 Hz gave no delay without this.
 LARGEST_DELAY, DELAY_FRAMES = 5, 12
 _WORSE, _MENDED = 1.3, 0.8

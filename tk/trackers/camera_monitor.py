@@ -305,7 +305,9 @@ class CameraMonitor:
             because = self._opening_reasons.get(int(camera)) if reason == _DISAGREES else None
             more = f" ({because})" if because else ""
             lines.append(f"camera {self._names[int(camera)]} {reason}{more}: left out of {described(*span)}")
-        return lines + [f"{reason}: lost, {described(*span)}" for reason, span in self._lost.items()]
+        # without two views the person may also be absent, which the monitor does not know
+        status = {reason: "no pose" if reason == _TOO_FEW else "lost" for reason in self._lost}
+        return lines + [f"{reason}: {status[reason]}, {described(*span)}" for reason, span in self._lost.items()]
 
     def state(self) -> Mapping[str, Any]:
         """Return what :meth:`restore` needs beside the tracker's own state."""

@@ -69,7 +69,7 @@ def test_cameras_of_different_rates_are_refused(mixed: Path) -> None:
     with refused(ClockError, mixed / "videos" / "cam2.mp4", "30 frames/s", "cam1.mp4 15 frames/s") as caught:
         open_capture(mixed)
     assert "--" not in str(caught.value)
-    assert "--resample" in caught.value.hint  # type: ignore[attr-defined]
+    assert "--resample" in caught.value.hint
 
 
 def test_resampling_takes_the_nearest_images_at_the_slowest_rate(mixed: Path) -> None:

@@ -90,7 +90,7 @@ def open_recording(
         images = (path / "videos").is_dir() or (path / "images").is_dir()
         if path.is_dir() and not (images and (path / "calibration.toml").exists()):
             found = _find(path)
-            # calibration.toml is a capture's file, too; then it is the videos' folder that tells
+            # calibration.toml is a capture's file, too; then the videos' folder decides
             own = ("videos", "images", ".")
             if found is not None and (
                 found[1][0] != path / "calibration.toml"

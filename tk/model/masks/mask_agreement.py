@@ -46,7 +46,7 @@ INCONSISTENT = 0.06
 _LEFT_OVER, _REFUSED = 0.5, 2.0
 # Share of a mask that may stay outside when it is shifted into the hull of the others: what segmented masks leave.
 _OUTSIDE_SHIFTED = 0.03
-# Without a majority, exchanged videos are looked for among this many cameras, at most: sixteen would take five seconds,
+# Without a majority, exchanged videos are searched for among at most this many cameras: sixteen would take five s,
 # and without two of them the others are a majority.
 _SWAPS_OF = 8
 
@@ -112,7 +112,7 @@ class Agreement:
         if not off > 0 and (error < -tolerance).any():
             off = np.abs(error).max() / self.tangency.pixel[camera]
         if off > 0:
-            return f"off by {off:.0f} px or more: turned, moved or late"
+            return f"off by {off:.0f} px or more: turned, moved, late, or another camera's video"
         return "its masks show something else beside the person, or are wrong"
 
 
