@@ -65,6 +65,12 @@ class DiskFullError(ResultError):
     exit_code = 1
 
 
+def unwritable(path: object, error: OSError, kind: type[TkError] = ResultError) -> TkError:
+    """Return the error of a file that the system cannot write: DiskFullError without space, else ``kind``."""
+    reason = error.strerror or " ".join(str(error).split())
+    return (DiskFullError if error.errno in FULL else kind)(f"{path}: cannot be written: {reason}")
+
+
 class ExportError(TkError):
     """A result cannot be written in another format."""
 

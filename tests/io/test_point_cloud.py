@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import builtins
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.io.conftest import MakeCapture
-from tk.errors import CaptureError, ResultError
+from tk.errors import CaptureError, DiskFullError, ResultError
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.point_cloud import write_hulls, write_ply
 from tk.io.results.data import HullPoints
@@ -107,6 +108,22 @@ def test_an_older_file_stays_until_a_frame_is_finished(capture: Capture, tmp_pat
         write_hulls(path, capture, grid(capture), none())
     assert path.read_bytes() == before
     assert not [file for file in tmp_path.iterdir() if file.name.endswith(".tmp")]
+
+
+def test_a_full_disk_is_one_line_and_leaves_the_older_file(
+    capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> int:
+        raise OSError(28, "No space left on device")
+
+    path = tmp_path / "h.h5"
+    write_hulls(path, capture, grid(capture), [(0, points(4))])
+    before = path.read_bytes()
+    monkeypatch.setattr(os, "pwrite", full)
+    with pytest.raises(DiskFullError, match=r"h\.h5: cannot be written: No space left on device$"):
+        write_hulls(path, capture, grid(capture), ((k, points(4000, k)) for k in range(9)))
+    assert path.read_bytes() == before
+    assert [file for file in tmp_path.iterdir() if file.suffix != ""] == [path]
 
 
 def test_files_of_others_are_left_alone(capture: Capture, tmp_path: Path) -> None:

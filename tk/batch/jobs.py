@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from tk.errors import ConfigError, ResultError
+from tk.errors import ConfigError, ResultError, unwritable
 from tk.io.paths import check_not_input, resolved
 from tk.io.settings_file import to_toml
 from tk.settings import Settings
@@ -245,7 +245,7 @@ def replace_file(path: Path, text: str) -> None:
         os.replace(part, path)
     except OSError as error:
         part.unlink(missing_ok=True)
-        raise ResultError(f"{path}: cannot be written: {error.strerror or error}") from None
+        raise unwritable(path, error) from None
 
 
 def _damaged(path: Path) -> ResultError:

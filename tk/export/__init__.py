@@ -12,7 +12,7 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
-from tk.errors import ExportError, ResultError, TkError
+from tk.errors import ExportError, ResultError, TkError, unwritable
 from tk.export.bvh import BVH_UNITS, write_bvh
 from tk.export.c3d import write_c3d
 from tk.export.csv import write_angles_csv, write_points_csv
@@ -167,7 +167,7 @@ def _write(motion: Motion, target: Path, write: Writer) -> None:
             _remove(target)
         os.replace(part, target)
     except OSError as error:
-        raise ExportError(f"{target}: cannot be written: {error.strerror or error}") from error
+        raise unwritable(target, error, ExportError) from error
     finally:
         with contextlib.suppress(OSError):
             shutil.rmtree(part) if part.is_dir() else part.unlink()

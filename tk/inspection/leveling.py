@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import CaptureError
+from tk.errors import CaptureError, unwritable
 from tk.io.toml import parse_toml, read_text
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.mounting import infer_up
@@ -131,7 +131,7 @@ def write_up(capture: Path, leveling: Leveling) -> None:
         draft.write_text(new, encoding="utf-8")
         draft.replace(path)
     except OSError as reason:
-        raise CaptureError(f"{path}: cannot be written ({reason.strerror or reason})") from None
+        raise unwritable(path, reason, CaptureError) from None
 
 
 def _split_at_first_table(text: str) -> tuple[str, str]:

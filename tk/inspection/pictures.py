@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import CaptureError
+from tk.errors import CaptureError, unwritable
 from tk.inspection.checks import Inspection, Sample
 from tk.io.captures.capture import Capture
 from tk.model.cameras.camera import Camera
@@ -62,7 +62,7 @@ def write_png(path: Path, image: Image) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(coded.tobytes())
     except OSError as reason:
-        raise CaptureError(f"{path}: cannot be written ({reason.strerror or reason})") from None
+        raise unwritable(path, reason, CaptureError) from None
 
 
 def _text(inspection: Inspection, width: int) -> Image:

@@ -7,16 +7,15 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from tk import __version__
-from tk.errors import ResultError
+from tk.errors import ResultError, unwritable
 from tk.io.captures.capture import Capture
 from tk.io.paths import Kind, c_name, check_output, looks_like
 from tk.io.results.data import HullPoints
-from tk.io.results.files import SUFFIXES, is_hdf5_of
+from tk.io.results.files import SUFFIXES, SafeFile, is_hdf5_of
 from tk.model.cameras.volume import VoxelGrid
 
 HULL_FORMAT = "tk-hull"
@@ -89,7 +88,7 @@ def create_empty_ply(path: Path, faces: bool = False) -> None:
     try:
         path.write_text(f"{_PLY_VERTICES}{_PLY_FACES if faces else ''}end_header\n", encoding="ascii", newline="\n")
     except OSError as error:
-        raise ResultError(f"{path}: cannot be written: {error.strerror}") from None
+        raise unwritable(path, error) from None
 
 
 def ply_error(path: Path) -> ResultError:
@@ -116,7 +115,8 @@ def write_hulls(path: Path, capture: Capture, grid: VoxelGrid, frames: Iterable[
     temporary = path.with_name(f".{path.name}.tmp")
     count = 0
     try:
-        with h5py.File(temporary, "w") as file:
+        with SafeFile(temporary, "w") as disk:
+            file = disk.file
             file.attrs.update(
                 {
                     "format": HULL_FORMAT,
@@ -149,13 +149,14 @@ def write_hulls(path: Path, capture: Capture, grid: VoxelGrid, frames: Iterable[
                     offsets.resize(count + 2, axis=0)
                     offsets[count + 1] = stop
                     count, voxels = count + 1, stop
+                    disk.flush_to_disk()  # a full disk ends the run here, not after the last frame
             finally:  # Ctrl-C may interrupt a frame
                 for dataset, rows in ((positions, voxels), (colors, voxels), (index, count), (seconds, count)):
                     dataset.resize(rows, axis=0)
                 offsets.resize(count + 1, axis=0)
     except OSError as error:
         temporary.unlink(missing_ok=True)
-        raise ResultError(f"{path}: cannot be written: {' '.join(str(error).split())}") from None
+        raise unwritable(path, error) from None
     except BaseException:
         _publish(temporary, path, count)
         raise

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from tk.errors import ExportError
+from tk.errors import ExportError, unwritable
 
 
 @contextlib.contextmanager
@@ -23,7 +23,7 @@ def replacing(path: Path) -> Iterator[Path]:
         if part.exists():
             os.replace(part, path)
     except OSError as error:
-        raise ExportError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise unwritable(path, error, ExportError) from error
     finally:
         with contextlib.suppress(OSError):
             part.unlink()

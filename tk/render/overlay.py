@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import ExportError, ResultError
+from tk.errors import ExportError, ResultError, unwritable
 from tk.io.captures.capture import Capture
 from tk.io.results.data import Result
 from tk.io.results.status import STATUS_MEANING, has_pose
@@ -289,7 +289,7 @@ def write_sheets(
             try:
                 path.write_bytes(coded.tobytes())
             except OSError as error:
-                raise ExportError(f"{path}: cannot be written: {error.strerror or error}") from None
+                raise unwritable(path, error, ExportError) from None
             written.append(path)
             sheet = []
     return written

@@ -11,7 +11,7 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from tk.errors import CaptureError, ConfigError
+from tk.errors import CaptureError, ConfigError, unwritable
 from tk.io.captures.capture import MASKS_RECORD, Capture
 from tk.io.paths import check_not_input, resolved
 from tk.io.toml import load_toml
@@ -122,7 +122,7 @@ def _claim(folder: Path, origin: dict[str, str | list[str]]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         record.write_text(tomli_w.dumps(origin), encoding="utf-8")
     except OSError as error:
-        raise ConfigError(f"{folder}: cannot be written: {error.strerror}") from None
+        raise unwritable(folder, error, ConfigError) from None
 
 
 def _write(path: Path, mask: NDArray[np.uint8]) -> None:
@@ -134,4 +134,4 @@ def _write(path: Path, mask: NDArray[np.uint8]) -> None:
         part.write_bytes(coded.tobytes())
         os.replace(part, path)
     except OSError as error:
-        raise CaptureError(f"{path}: cannot be written: {error.strerror}") from None
+        raise unwritable(path, error, CaptureError) from None

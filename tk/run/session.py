@@ -296,7 +296,7 @@ class _Run:
             with one_thread():
                 self.people.start([o for o, _ in opening])
         except CaptureError as error:
-            raise CaptureError(f"{plan.source.where}: {error}") from None
+            raise CaptureError(f"{plan.source.where}: {error}", error.hint) from None
         yield from self._step_through(chain(_emptied(opening), broken or observations))
 
     def restore_unfinished(self, path: Path, causal: bool) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from tk.errors import CalibrationError, CaptureError
+from tk.errors import CalibrationError, CaptureError, unwritable
 from tk.io.captures.units import UNITS, FoundUnit, infer_unit
 from tk.io.paths import Kind
 from tk.io.toml import Table, load_toml
@@ -191,7 +191,7 @@ def write_calibration(path: Path, source: Calibration, rig: Rig, time_offset_s: 
     try:
         path.write_text(tomli_w.dumps(document), encoding="utf-8")
     except OSError as reason:
-        raise CalibrationError(f"{path}: cannot be written ({reason.strerror or reason})") from None
+        raise unwritable(path, reason, CalibrationError) from None
 
 
 def _time_offset(name: str, values: Mapping[str, object], path: Path) -> float:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import tomli_w
 
-from tk.errors import CaptureError, ClockError
+from tk.errors import CaptureError, ClockError, unwritable
 from tk.io.captures.calibration import camera_table
 from tk.io.captures.capture import open_capture
 from tk.io.captures.video import PICTURE_SUFFIXES, probe
@@ -69,7 +69,7 @@ def write_capture(project: Project, output: Path) -> Imported:
         output.parent.mkdir(parents=True, exist_ok=True)
         draft = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
     except OSError as reason:
-        raise CaptureError(f"{output}: cannot be written ({reason.strerror or reason})") from None
+        raise unwritable(output, reason, CaptureError) from None
     try:
         document = calibration_toml(rig, project)
         (draft / "calibration.toml").write_text(document, encoding="utf-8")
@@ -87,7 +87,7 @@ def write_capture(project: Project, output: Path) -> Imported:
             output.rmdir()
         draft.rename(output)
     except OSError as reason:
-        raise CaptureError(f"{output}: cannot be written ({reason.strerror or reason})") from None
+        raise unwritable(output, reason, CaptureError) from None
     except CaptureError as reason:  # name the output, not the draft
         raise type(reason)(str(reason).replace(str(draft), str(output))) from None
     finally:
