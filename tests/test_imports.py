@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -74,3 +76,14 @@ def test_no_module_imports_itself_through_others() -> None:
 
     for name in IMPORTS:
         visit(name, ())
+
+
+def test_a_run_imports_no_part_of_scipy_before_its_first_use() -> None:
+    """SciPy would take as long to import as all of tk."""
+    code = (
+        "import sys, tk.cli; assert 'numpy' not in sys.modules;"
+        "import tk.run.session, tk.io.importers, tk.trackers.region;"
+        "print(*(name for name in sys.modules if name.startswith('scipy.') and name.count('.') == 1))"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert {"scipy.linalg", "scipy.ndimage", "scipy.optimize", "scipy.spatial"} & set(found) == set()

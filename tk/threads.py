@@ -8,6 +8,7 @@ matrices and images are small, so `tk refine` takes 2.3 times the processor time
 from __future__ import annotations
 
 import functools
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -24,14 +25,13 @@ def one_thread() -> Iterator[None]:
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        with _pools().limit(limits=1, user_api="blas"):
+        with _pools("scipy.linalg" in sys.modules).limit(limits=1, user_api="blas"):
             yield
     finally:
         cv2.setNumThreads(before)
 
 
 @functools.cache
-def _pools() -> ThreadpoolController:
-    import scipy.linalg  # noqa: F401  (so that its pool is found)
-
+def _pools(with_scipy: bool) -> ThreadpoolController:
+    """Return the pools of the libraries that are loaded; ``with_scipy``: SciPy's BLAS, which loads late, is one."""
     return ThreadpoolController()

@@ -28,6 +28,26 @@ def _affine(
             y[i, j] = times * (slope[0] * x[i, j] + offset)
 
 
+@ti.data_oriented
+class _Counter:
+    @ti.func
+    def half(self) -> ti.i32:
+        return 3
+
+    @ti.kernel
+    def count(self) -> ti.i32:
+        return 2 * self.half()
+
+
+def test_a_class_still_contains_its_kernels_and_functions():
+    ensure_runtime()
+    assert _Counter().count() == 6
+
+
+def test_decorators_of_an_unknown_taichi_are_not_changed():
+    assert not taichi_internals.quick_decorators(SimpleNamespace())
+
+
 def launcher():
     ensure_runtime()
     return Launcher(_affine, np.array([2.0], np.float32))

@@ -9,7 +9,6 @@ import click
 
 from tk.commands import base
 from tk.errors import CaptureError
-from tk.model.body.joints import ANKLE_JOINTS
 
 if TYPE_CHECKING:
     from tk.evaluation.joints import Evaluation
@@ -23,10 +22,10 @@ if TYPE_CHECKING:
     "--capture", type=base.PATH, metavar="DIR",
     help="Also compare in the images: pixels and silhouettes.  [default: the folder of TRUTH, if it is a capture]",
 )  # fmt: skip
-@click.option("--joints", default=",".join(ANKLE_JOINTS), show_default=True, help="Joints to compare in pixels.")
+@click.option("--joints", show_default="both ankles", help="Joints to compare in pixels.")
 @base.masks_option
 @base.json_option
-def evaluate(result: Path, truth: Path, capture: Path | None, joints: str, masks: str, as_json: bool) -> None:
+def evaluate(result: Path, truth: Path, capture: Path | None, joints: str | None, masks: str, as_json: bool) -> None:
     """Compare RESULT with TRUTH: joint distances, PCK, lost frames, frames/s; pixels and silhouettes by view.
 
     If a file has several people: misses, false positives, identity switches, MOTA, IDF1, and errors by person.
@@ -38,6 +37,7 @@ def evaluate(result: Path, truth: Path, capture: Path | None, joints: str, masks
         from tk.evaluation.people import evaluate_people
         from tk.evaluation.views import capture_of, evaluate_views
         from tk.io.results.reader import read_people
+        from tk.model.body.joints import ANKLE_JOINTS
 
         people, true = read_people(result), read_people(truth)
         several = len(people) > 1 or len(true) > 1
@@ -49,7 +49,11 @@ def evaluate(result: Path, truth: Path, capture: Path | None, joints: str, masks
             notes.append("no comparison in the images: a file has several people")
             folder = None
         try:
-            views = evaluate_views(result, truth, folder, base.split_names(joints) or (), masks) if folder else None
+            views = (
+                evaluate_views(result, truth, folder, base.split_names(joints) or ANKLE_JOINTS, masks)
+                if folder
+                else None
+            )
         except CaptureError as error:
             if capture is not None:
                 raise

@@ -19,7 +19,7 @@ import time
 import warnings
 from pathlib import Path
 
-from tk.kernels.taichi_internals import program, shorten_notes
+from tk.kernels.taichi_internals import program, quick_decorators, quick_import, shorten_notes
 
 _LOG = logging.getLogger(__name__)
 
@@ -53,9 +53,11 @@ def _is_usable(folder: Path) -> bool:
 
 _choose_cache()
 
-with warnings.catch_warnings():
+with warnings.catch_warnings(), quick_import():
     warnings.simplefilter("ignore")  # deprecation notices inside Taichi
     import taichi as ti
+
+quick_decorators(getattr(ti.lang, "kernel_impl", None))
 
 __all__ = ["ensure_runtime", "spread_of", "ti"]
 

@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import scipy  # its packages are imported when they are first used
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from tk.model.body.plausibility import EXTENT, STATURE_M
 from tk.model.body.skeleton import up_rotation
@@ -159,7 +159,7 @@ def person_pixels(people: Sequence[LocatedPerson], rig: Rig, masks: NDArray) -> 
             within = regions == region
             known = within & (owner >= 0)
             if known.any():
-                nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+                nearest = scipy.ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
                 owner[within] = owner[tuple(nearest)][within]
         for k in range(len(people)):
             pixels[k, c] = owner == k
@@ -302,7 +302,7 @@ class PeopleFinder:
         hull = (allowed[cameras] | ~self._voxels.sees[cameras]).all(axis=0) & (inside[cameras].sum(axis=0) >= 2)
         dense = np.zeros(self._grid.count, np.bool_)
         dense[self._flat[hull]] = True
-        labels, count = ndimage.label(dense.reshape(self._grid.shape))  # by faces
+        labels, count = scipy.ndimage.label(dense.reshape(self._grid.shape))  # by faces
         label = labels.reshape(-1)[self._flat]
         order = np.argsort(label, kind="stable")
         sizes = np.bincount(label, minlength=count + 1)
@@ -375,7 +375,7 @@ class PeopleFinder:
     def _trunk(self, part: NDArray[np.int64]) -> Float:
         """Return where the tallest column of voxels stands on the floor plan (2,), metres."""
         plan, _, low = self._plan(part)
-        smooth = ndimage.gaussian_filter(plan, _SMOOTH_M / self._grid.voxel_m)
+        smooth = scipy.ndimage.gaussian_filter(plan, _SMOOTH_M / self._grid.voxel_m)
         return np.array(np.unravel_index(smooth.argmax(), plan.shape)) * self._grid.voxel_m + low
 
     def _maxima(self, plan: Float, saddle: float = _SADDLE, sigma_m: float = _SMOOTH_M) -> NDArray[np.int64]:
@@ -384,15 +384,17 @@ class PeopleFinder:
         Between two of them the plan falls to the share ``saddle`` of the lower one.
         """
         edge = self._grid.voxel_m
-        smooth = ndimage.gaussian_filter(plan, sigma_m / edge)
+        smooth = scipy.ndimage.gaussian_filter(plan, sigma_m / edge)
         reach = max(1, round(_APART_M / edge))
-        peaks = np.argwhere((smooth == ndimage.maximum_filter(smooth, 2 * reach + 1)) & (smooth >= _TRUNK_M))
+        peaks = np.argwhere((smooth == scipy.ndimage.maximum_filter(smooth, 2 * reach + 1)) & (smooth >= _TRUNK_M))
         peaks = peaks[np.argsort(-smooth[tuple(peaks.T)], kind="stable")]
         kept: list[NDArray[np.int64]] = []
         for peak in peaks:
             height = smooth[tuple(peak)]
             steps = np.linspace(0, 1, 20)[:, None]
-            between = [ndimage.map_coordinates(smooth, (peak + steps * (o - peak)).T, order=1).min() for o in kept]
+            between = [
+                scipy.ndimage.map_coordinates(smooth, (peak + steps * (o - peak)).T, order=1).min() for o in kept
+            ]
             if all(lowest <= saddle * height for lowest in between):
                 kept.append(peak)
         return np.array(kept).reshape(-1, 2)

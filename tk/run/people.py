@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import scipy  # its packages are imported when they are first used
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from tk.errors import CaptureError, ConfigError
 from tk.kernels.raycast import FAR, Cast
@@ -493,7 +493,7 @@ def _matched(subjects: Sequence[Subject], people: Sequence[LocatedPerson]) -> li
             if subject.height_m is not None:
                 cost[p, s] += abs(person.height_m - subject.height_m)
             cost[p, s] += 1e-6 * abs(p - s)
-    who = dict(zip(*linear_sum_assignment(cost), strict=True))
+    who = dict(zip(*scipy.optimize.linear_sum_assignment(cost), strict=True))
     return [subjects[who[p]] if p in who else _unknown(subjects[0]) for p in range(len(people))]
 
 

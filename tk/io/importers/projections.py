@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import scipy  # its packages are imported when they are first used
 from numpy.typing import NDArray
-from scipy.linalg import rq
 
 from tk.errors import CalibrationError
 from tk.io.importers.files import check_file, matching
@@ -57,7 +57,7 @@ def factorise(P: NDArray[np.float64], where: str) -> tuple[NDArray[np.float64], 
     if not scale > 0 or abs(np.linalg.det(left / scale)) < 1e-12:
         raise CalibrationError(f"{where}: the left 3×3 part is singular: this is not the projection of a camera")
     P = P * np.sign(np.linalg.det(left / scale)) / scale
-    K, R = rq(P[:, :3])
+    K, R = scipy.linalg.rq(P[:, :3])
     signs = np.diag(np.where(np.diag(K) < 0, -1.0, 1.0))
     K, R = K @ signs, signs @ R
     return K / K[2, 2], R, np.linalg.solve(K, P[:, 3])

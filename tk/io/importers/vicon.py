@@ -18,8 +18,8 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
+import scipy  # its packages are imported when they are first used
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from tk.errors import CalibrationError
 from tk.io.importers.files import matching, only, read_xml
@@ -79,7 +79,7 @@ def _camera(item: Element, name: str, path: Path) -> tuple[Camera, float]:
     quaternion = np.array(key_frame.numbers("ORIENTATION", 4)[:4])
     if np.linalg.norm(quaternion) < 1e-6:
         raise CalibrationError(f"{where}: ORIENTATION is not a rotation: its four numbers are zero")
-    rotation = Rotation.from_quat(quaternion).as_matrix()
+    rotation = scipy.spatial.transform.Rotation.from_quat(quaternion).as_matrix()
     center = np.array(key_frame.numbers("POSITION", 3)[:3])
     reach_px = max(float(np.hypot(x - cx, y - cy)) for x in (0, width) for y in (0, height))
     try:

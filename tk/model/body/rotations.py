@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy  # its packages are imported when they are first used
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 Float = NDArray[np.float64]
 
@@ -20,14 +20,14 @@ _DAMPED_STEPS = 20
 
 def to_quaternions(R: Float) -> Float:
     """(..., 4) unit quaternions (w, x, y, z) of rotations (..., 3, 3); w is not negative."""
-    q = Rotation.from_matrix(np.reshape(R, (-1, 3, 3))).as_quat()[:, [3, 0, 1, 2]]
+    q = scipy.spatial.transform.Rotation.from_matrix(np.reshape(R, (-1, 3, 3))).as_quat()[:, [3, 0, 1, 2]]
     return np.where(q[:, :1] < 0, -q, q).reshape(*np.shape(R)[:-2], 4)
 
 
 def to_matrices(quaternions: Float) -> Float:
     """(..., 3, 3) rotations of quaternions (..., 4), w first; they need not have length 1, but must not be zero."""
     q = np.reshape(quaternions, (-1, 4))[:, [1, 2, 3, 0]]
-    return Rotation.from_quat(q).as_matrix().reshape(*np.shape(quaternions)[:-1], 3, 3)
+    return scipy.spatial.transform.Rotation.from_quat(q).as_matrix().reshape(*np.shape(quaternions)[:-1], 3, 3)
 
 
 def continuous(quaternions: Float) -> Float:
@@ -122,7 +122,7 @@ def follow_rotations(sequence: str, R: Float) -> Float:
             for _ in range(_DAMPED_STEPS):
                 third, second = turn(sequence[2], angles[2]), turn(sequence[1], angles[1])
                 J = np.column_stack([third.T @ second.T @ axes[0], third.T @ axes[1], axes[2]])
-                error = Rotation.from_matrix(compose(sequence, angles).T @ R[f]).as_rotvec()
+                error = scipy.spatial.transform.Rotation.from_matrix(compose(sequence, angles).T @ R[f]).as_rotvec()
                 H = J.T @ J + damping * np.eye(3)
                 angles = angles + np.linalg.solve(H, J.T @ error - damping * (angles - last))
         result[f] = last = angles

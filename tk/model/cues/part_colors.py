@@ -9,11 +9,12 @@ never seen on it.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
+import scipy  # its packages are imported when they are first used
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from tk.kernels.line_search import COLOR_BINS, Regions
 from tk.model.body.anthropometry import BodyDimensions
@@ -25,7 +26,6 @@ Float = NDArray[np.float64]
 # Standard deviation of the smoothing over bins, in bins: gain and white balance differ a little between cameras. Chosen
 # on the development captures, as the following constants; sensitivity not measured.
 _SMOOTHING = 0.7
-_SMOOTH = gaussian_filter1d(np.eye(16, dtype=np.float32), _SMOOTHING, axis=0, mode="nearest").T
 # Share of a part's pixels that may have any colour: outlines, shadows, carried objects.
 _ANYTHING = 0.02
 # Share of the histograms that a frame replaces: they follow a change of light within about 20 frames.
@@ -121,5 +121,12 @@ def _smooth(counts: Float) -> NDArray[np.float32]:
     """Return histograms (N, COLOR_BINS), each smoothed over neighbouring bins."""
     cubes = counts.reshape(-1, 16, 16, 16).astype(np.float32)
     for _ in range(3):  # along the last axis, which then becomes the first of the three
-        cubes = np.moveaxis(cubes @ _SMOOTH, 3, 1)
+        cubes = np.moveaxis(cubes @ _smoothing(), 3, 1)
     return cubes.reshape(counts.shape)
+
+
+@functools.cache
+def _smoothing() -> NDArray[np.float32]:
+    """Return the matrix (16, 16) that smooths a histogram of 16 bins, a row, from the right."""
+    one_bin = np.eye(16, dtype=np.float32)
+    return np.asarray(scipy.ndimage.gaussian_filter1d(one_bin, _SMOOTHING, axis=0, mode="nearest").T)

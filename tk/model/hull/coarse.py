@@ -12,8 +12,8 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+import scipy  # its packages are imported when they are first used
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume, VoxelGrid
@@ -165,7 +165,7 @@ class CoarseHull:
         seeing = sees.sum(axis=0)
         agreeing = (self._voxels.inside(masks) & sees).sum(axis=0)
         hull = (seeing >= 2) & (agreeing >= np.where(seeing >= _ENOUGH, seeing - wrong, seeing))
-        objects, count = ndimage.label(hull.reshape(self._grid.shape), np.ones((3, 3, 3)))
+        objects, count = scipy.ndimage.label(hull.reshape(self._grid.shape), np.ones((3, 3, 3)))
         if count == 0:
             return hull
         label = objects.reshape(-1)
