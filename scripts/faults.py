@@ -9,7 +9,8 @@ process of its own. Columns:
 - mean, worst: distance of all joints from the ground truth, mean over a frame, over frames that are neither lost nor
   suspect, cm.
 - lost, suspect: number of such frames.
-- bad: frames more than 10 cm off that are neither lost nor suspect.
+- bad: frames more than 10 cm off that are neither lost nor suspect; "unflagged": those of them whose sigma, the mean
+  of the joints, is at most 5 cm.
 - silent: joints more than 15 cm off without a warning (their frame is neither lost nor suspect, their sigma is at most
   5 cm), % of all joints.
 - alarm: frames less than 6 cm off that are lost, suspect or have a joint without sigma, % of all frames.
@@ -369,13 +370,15 @@ class Outcome:
 
     def row(self, name: str) -> str:
         F = len(self.status)
-        cm = 100 * self.error_m.mean(axis=1)[~(self.lost | self.suspect)]
+        tracked = ~(self.lost | self.suspect)
+        cm, sure = 100 * self.error_m.mean(axis=1)[tracked], self.sigma_m.mean(axis=1)[tracked] <= SIGMA_M
+        bad = cm > 100 * OFF_M
         figures = f"{cm.mean():6.2f} {cm.max():6.2f}" if len(cm) else "     -      -"
         shares = f"{100 * self.silent.mean():6.2f} {100 * self.alarm.mean():5.1f}" if F else "     -     -"
         code = "hang" if self.code is None else str(self.code)
         return (
             f"{name:20} {code:>4} {figures} {self.lost.sum():4}/{F:<4} {self.suspect.sum():7} "
-            f"{(cm > 100 * OFF_M).sum():4} {shares}  {' | '.join(self.messages)}"
+            f"{bad.sum():4} {(bad & sure).sum():9} {shares}  {' | '.join(self.messages)}"
         )
 
 
@@ -465,7 +468,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     names = given.only.split(",")
     if unknown := set(names) - set(FAULTS):
         parser.error(f"no such fault: {', '.join(sorted(unknown))}; there are {', '.join(FAULTS)}")
-    print(f"{'fault':20} exit   mean  worst   lost     suspect  bad silent alarm  messages")
+    print(f"{'fault':20} exit   mean  worst   lost     suspect  bad unflagged silent alarm  messages")
     with tempfile.TemporaryDirectory() as scratch:
         work = given.work or Path(scratch)
         truth = given.capture / "truth.h5"
