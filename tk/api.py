@@ -15,7 +15,7 @@ from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 from tk.run import session
 from tk.run.people import parse_choice
-from tk.run.plan import recording_setup
+from tk.run.plan import recording_setup, reduce_images
 from tk.run.reporter import Silent
 from tk.segmenters import Segmenter
 from tk.settings import Settings
@@ -133,9 +133,10 @@ def track(
         capture = replace(capture, segmenter=segmenter)
     reporter = _Logged()
     if output is None:
+        setup = recording_setup(capture, pose_file, body_file, frames[0])
+        setup, capture = reduce_images(setup, capture, chosen.person_pixels)
         for warning in capture.warnings:
             reporter.note(warning)
-        setup = recording_setup(capture, pose_file, body_file, frames[0])
         return session.estimates(setup, capture, chosen, reporter.note, method, frames, choice)
     summary = session.track(
         capture,

@@ -219,6 +219,8 @@ class Settings:
         refine: whether inconsistent cameras are refined before the second pass.
         resample: whether each frame's images are chosen by their time stamps, for cameras of different or variable
             rates. A frame for which a camera has no image within half an interval is blank in this camera.
+        person_pixels: least height in pixels at which a person is tracked. The images of a camera that shows the person
+            at n times this height are read at 1/n of their size; 0: all at full size.
         foreground: see :class:`ForegroundSettings`.
         appearance: see :class:`AppearanceSettings`.
         body: see :class:`BodySettings`.
@@ -236,6 +238,7 @@ class Settings:
     effort: str | float = "normal"
     refine: bool = True
     resample: bool = False
+    person_pixels: int = 240
     foreground: ForegroundSettings = field(default_factory=ForegroundSettings)
     appearance: AppearanceSettings = field(default_factory=AppearanceSettings)
     body: BodySettings = field(default_factory=BodySettings)
@@ -254,6 +257,8 @@ class Settings:
             raise ConfigError(f'segmentation = "{self.segmentation}": choose one of {", ".join(SEGMENTATIONS)}')
         if not 0 <= self.ahead <= 64:
             raise ConfigError(f"ahead = {self.ahead}: choose from 0 to 64 frames")
+        if not 0 <= self.person_pixels <= MOST_COUNT:
+            raise ConfigError(f"person_pixels = {self.person_pixels}: choose from 0 (full size) to {MOST_COUNT}")
         if isinstance(self.effort, str) and self.effort not in EFFORTS:
             raise ConfigError(f'effort = "{self.effort}": choose one of {", ".join(EFFORTS)}, or a number')
         if not 0.05 <= self.effort_factor <= 20:

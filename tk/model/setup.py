@@ -13,6 +13,9 @@ if TYPE_CHECKING:  # the process that decodes and segments needs no body
     from tk.model.cameras.camera import Rig
     from tk.model.cameras.volume import Volume
 
+#: metres, assumed of a person of unknown height; affects only the size at which images are read
+_STATURE_M = 1.7
+
 #: entries of the pose vector that place the pelvis, metres
 TRANSLATIONS = ("torso_x", "torso_y", "torso_z")
 
@@ -85,3 +88,9 @@ class Setup:
     def __post_init__(self) -> None:
         if not self.subjects:
             raise ValueError("a setup has at least one subject")
+
+    def person_pixels(self) -> NDArray[np.float64]:
+        """Return (C,) pixels that the first subject's height measures in each camera's image, upright and across the view
+        at the centre of the working volume."""
+        height_m = self.subjects[0].height_m or _STATURE_M
+        return np.array([height_m * camera.pixels_per_metre(self.volume.center) for camera in self.rig])

@@ -123,7 +123,7 @@ def _finish(
     columns |= {name: values for name, values in _columns(body, poses).items() if name not in kept}
     filtered = smooth(body.skeleton, poses, ~lost, fps)
     smoothed = {**_columns(body, filtered.poses), "bridged": filtered.bridged}
-    revise_result(output, columns, smoothed=smoothed, model=model, cameras=cameras, person=member.number)
+    revise_result(output, columns, smoothed=smoothed, model=model, cameras=cameras.recorded(), person=member.number)
     return cameras
 
 

@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from tk.errors import CaptureError, ConfigError
 from tk.io.captures.capture import Capture
 from tk.io.captures.keypoints import first_pose
@@ -67,6 +69,25 @@ def recording_setup(capture: Capture, init_pose: Path | None, body: Path | None,
     if len(frames) > 1:
         raise CaptureError(f"{capture.path}: the initial poses are of the frames {sorted(frames)}; give one frame")
     return replace(setup, subjects=tuple(subjects))
+
+
+def reduce_images(setup: Setup, capture: Capture, person_pixels: int) -> tuple[Setup, Capture]:
+    """Return a capture whose images are reduced where the person is larger than ``person_pixels``, and the setup with
+    its cameras; see :attr:`tk.settings.Settings.person_pixels`. A warning of the capture reports it."""
+    heights = setup.person_pixels()
+    factors = np.maximum(heights // person_pixels, 1).astype(int) if person_pixels else np.ones(len(heights), int)
+    if factors.max() == 1:
+        return setup, capture
+    names, sizes = np.array(setup.rig.names), []
+    for factor in np.unique(factors[factors > 1]):
+        chosen = factors == factor
+        who = "all cameras" if chosen.all() else ", ".join(names[chosen])
+        low, high = np.unique(heights[chosen].round(-1).astype(int))[[0, -1]]
+        tall = f"{low} px" if low == high else f"{low} to {high} px"
+        sizes.append(f"{who} at 1/{factor} of their size, because the person is about {tall} tall")
+    line = f"{capture.path}: images are read of {'; of '.join(sizes)} (person_pixels = 0 reads them at full size)"
+    small = replace(capture.reduced(factors.tolist()), warnings=(*capture.warnings, line))
+    return replace(setup, rig=small.rig), small
 
 
 def choose_frames(source: Source, frames: tuple[int, int | None], note: Callable[[str], None]) -> tuple[int, int]:
@@ -150,6 +171,7 @@ class Plan:
             "frame of the initial pose": str(self.first),
             "given body (its hash)": hashed([s.body for s in subjects]),
             "cameras": ", ".join(self.setup.rig.names),
+            "size of the images": ", ".join("full" if k == 1 else f"1/{k}" for k in self.setup.rig.reductions),
             "masks": source.masks_from if source.has_masks else mask_source(source),
             "initial pose (its hash)": hashed([s.init for s in subjects]),
             "stored hull": "yes" if store_hull else "no",

@@ -231,7 +231,8 @@ def refine_if_inconsistent(
     if done is None:
         return None
     refined = done.refined
-    before, after = float(np.mean(refined.before_px)), float(np.mean(refined.after_px))
+    recorded = np.array(world.rig.reductions)
+    before, after = (float(np.mean(recorded * px)) for px in (refined.before_px, refined.after_px))
     if not (late.any() or after < _WORTHWHILE * before):
         return None
     names, worst = world.rig.names, int(np.argmax(refined.turn_deg))

@@ -26,7 +26,7 @@ from tk.model.hull.hull import HullSurface
 from tk.model.setup import Setup
 from tk.run.offline import REFINED, finish, report_suspect, report_unknown
 from tk.run.people import Choice, People, Tracked, describe
-from tk.run.plan import Plan, open_plan, recording_setup
+from tk.run.plan import Plan, open_plan, recording_setup, reduce_images
 from tk.run.prefetch import Observed
 from tk.run.reporter import Reporter
 from tk.settings import Settings
@@ -101,6 +101,7 @@ def track(
     check_result_path(output, force, resume, [init_pose, capture.init_keypoints, body, masks], capture.path)
     settings = replace(settings, resample=capture.resampled)  # who opens the capture again must know
     setup = recording_setup(capture, init_pose, body, frames[0])
+    setup, capture = reduce_images(setup, capture, settings.person_pixels)
     notes = capture.warnings
     return track_source(
         setup, capture, output, settings, reporter, method, frames, resume, store_hull, causal, force, notes, people

@@ -162,6 +162,16 @@ class Capture:
         """(3,) unit vector that points up, world frame."""
         return up_vector(self.up)
 
+    def reduced(self, factors: Sequence[int]) -> Capture:
+        """Return the capture with images, masks and cameras reduced by a factor for each camera (C,), see
+        :meth:`tk.model.cameras.camera.Camera.reduced`."""
+
+        def smaller(clips: tuple[Clip, ...]) -> tuple[Clip, ...]:
+            return tuple(clip.reduced(factor) for clip, factor in zip(clips, factors, strict=True))
+
+        masks = None if self.mask_clips is None else smaller(self.mask_clips)
+        return replace(self, rig=self.rig.reduced(factors), clips=smaller(self.clips), mask_clips=masks)
+
     def frames(self, start: int = 0, stop: int | None = None) -> FrameReader:
         """Return the frames ``start`` … ``stop - 1``, decoded ahead; up to the capture's end by default.
 
@@ -192,7 +202,8 @@ class Capture:
         clips = _clips_of(self._calibration, folder, "background", "png", pictures=True)
         pixels = sum(camera.width * camera.height for camera in self.rig)
         most = min(_BACKGROUND_FRAMES, max(2, _BACKGROUND_BYTES // (3 * pixels)))
-        return tuple(_read_some(clip, most) for clip in clips)
+        reductions = self.rig.reductions
+        return tuple(_read_some(clip.reduced(k), most) for clip, k in zip(clips, reductions, strict=True))
 
 
 def open_capture(

@@ -7,7 +7,7 @@ same moment as frame k of the others, so different rates are an error, unless th
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -254,6 +254,9 @@ class Resampled:
 
     def open(self) -> Reader:
         return _ResampledReader(self)
+
+    def reduced(self, factor: int) -> Resampled:
+        return replace(self, clip=self.clip.reduced(factor))
 
 
 class _ResampledReader:

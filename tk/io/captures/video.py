@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -45,7 +45,7 @@ class Clip(Protocol):
 
     Attributes:
         path: the file or folder, as messages name it.
-        width, height: pixels.
+        width, height: pixels; of a video or folder that is reduced, ``recorded_size`` is its own (width, height).
         frame_count: number of images.
         times_s: (N,) times of the images, seconds, increasing; None if the clip gives none.
     """
@@ -64,6 +64,10 @@ class Clip(Protocol):
     def open(self) -> Reader:
         """Return a reader at the first image."""
 
+    def reduced(self, factor: int) -> Clip:
+        """Return the same images, reduced as :meth:`tk.model.cameras.camera.Camera.reduced` says. A mask's pixel shows
+        the person if at least half of its square does."""
+
 
 @dataclass(frozen=True)
 class VideoClip:
@@ -75,9 +79,13 @@ class VideoClip:
     frame_count: int
     times_s: NDArray[np.float64] | None = field(compare=False)
     is_mask: bool = False
+    recorded_size: tuple[int, int] | None = None
 
     def open(self) -> Reader:
         return _VideoReader(self)
+
+    def reduced(self, factor: int) -> VideoClip:
+        return replace(self, **_reduced_size(self, factor))
 
 
 @dataclass(frozen=True)
@@ -90,6 +98,7 @@ class PictureClip:
     files: tuple[Path, ...]
     is_mask: bool = False
     times_s: None = None
+    recorded_size: tuple[int, int] | None = None
 
     @property
     def frame_count(self) -> int:
@@ -97,6 +106,9 @@ class PictureClip:
 
     def open(self) -> Reader:
         return _PictureReader(self)
+
+    def reduced(self, factor: int) -> PictureClip:
+        return replace(self, **_reduced_size(self, factor))
 
 
 def probe(path: Path, is_mask: bool = False) -> Clip:
@@ -179,6 +191,7 @@ class _VideoReader:
         self._clip = clip
         self._index = 0
         self._capture = _open_video(clip.path)
+        self._whole: NDArray[Any] | None = None  # memory of the last recorded image
 
     def skip(self) -> None:
         # no seeking: depending on codec and FFmpeg version it lands on key frames, or is off by one
@@ -189,16 +202,14 @@ class _VideoReader:
     def read(self, out: Image) -> None:
         clip = self._clip
         # OpenCV decodes directly into a suitable array, and allocates its own otherwise
-        fits = not clip.is_mask and out.flags.c_contiguous
-        ok, picture = self._capture.read(out) if fits else self._capture.read()
+        whole = self._whole if clip.is_mask or clip.recorded_size or not out.flags.c_contiguous else out
+        ok, picture = self._capture.read(whole)
         if not ok:
             self._fail()
         self._index += 1
-        _check_size(clip, picture, clip.path)
-        if clip.is_mask:
-            _binarise(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), out)
-        elif not np.may_share_memory(picture, out):
-            out[...] = picture
+        if whole is not out:
+            self._whole = picture
+        _deliver(clip, picture, clip.path, out)
 
     def close(self) -> None:
         self._capture.release()
@@ -227,13 +238,9 @@ class _PictureReader:
         path = clip.files[self._index]
         picture = _read_picture(path, clip.is_mask)
         self._index += 1
-        _check_size(clip, picture, path)
-        if clip.is_mask:
-            if picture.max(initial=0) == 1:
-                raise VideoError(f"{path}: holds the values 0 and 1; a mask's person is white, 255")
-            _binarise(picture, out)
-        else:
-            out[...] = picture
+        if clip.is_mask and picture.max(initial=0) == 1:
+            raise VideoError(f"{path}: holds the values 0 and 1; a mask's person is white, 255")
+        _deliver(clip, picture, path, out)
 
     def close(self) -> None:
         pass
@@ -334,12 +341,35 @@ def _has_end(coded: bytes) -> bool:
     return not coded.startswith(b"\xff\xd8") or b"\xff\xd9" in coded
 
 
-def _check_size(clip: VideoClip | PictureClip, picture: NDArray[Any], path: Path) -> None:
+def _deliver(clip: VideoClip | PictureClip, picture: NDArray[Any], path: Path, out: Image) -> None:
+    """Write a recorded image into ``out``, reduced as the clip says.
+
+    Raises:
+        VideoError: the image has another size than the clip.
+    """
+    expected = clip.recorded_size or (clip.width, clip.height)
     height, width = picture.shape[:2]
-    if (width, height) != (clip.width, clip.height):
-        raise VideoError(f"{path}: is {width}×{height}; the pictures before it are {clip.width}×{clip.height}")
+    if (width, height) != expected:
+        raise VideoError(f"{path}: is {width}×{height}; the pictures before it are {expected[0]}×{expected[1]}")
+    if clip.is_mask:
+        picture = _binarised(picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
+    if clip.recorded_size:
+        factor = width // clip.width
+        whole = picture[: factor * clip.height, : factor * clip.width]
+        picture = np.asarray(cv2.resize(whole, (clip.width, clip.height), interpolation=cv2.INTER_AREA))
+        if clip.is_mask:
+            picture = _binarised(picture)
+    if not np.may_share_memory(picture, out):
+        out[...] = picture
 
 
-def _binarise(grey: NDArray[Any], out: Image) -> None:
-    np.greater_equal(grey, MASK_THRESHOLD, out=out.view(np.bool_))
-    np.multiply(out, 255, out=out)
+def _reduced_size(clip: VideoClip | PictureClip, factor: int) -> dict[str, Any]:
+    """Return what changes in a clip whose images are reduced, see :meth:`Clip.reduced`."""
+    if factor == 1:
+        return {}
+    size = {"width": clip.width // factor, "height": clip.height // factor}
+    return {**size, "recorded_size": (clip.width, clip.height)}
+
+
+def _binarised(grey: NDArray[Any]) -> Image:
+    return np.asarray(cv2.threshold(grey, MASK_THRESHOLD - 1, 255, cv2.THRESH_BINARY)[1], np.uint8)

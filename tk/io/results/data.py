@@ -181,6 +181,10 @@ class UsedCameras:
         if np.shape(self.time_offset_s) != (len(self.rig),) or not np.isfinite(self.time_offset_s).all():
             raise ValueError(f"time offsets {self.time_offset_s} are not {len(self.rig)} finite numbers")
 
+    def recorded(self) -> UsedCameras:
+        """Return the cameras of the recorded images, which a result stores, see :meth:`Camera.recorded`."""
+        return replace(self, rig=self.rig.recorded())
+
 
 @dataclass(frozen=True)
 class Hull:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -40,6 +40,7 @@ class Camera:
         rotation: (3, 3) rotation from world to camera.
         translation: (3,) metres, of the world's origin in the camera frame.
         fisheye: True for OpenCV's fisheye (equidistant) model.
+        recorded_size: (width, height) of the recorded image, pixels, if this camera's image is a reduced one; else None.
     """
 
     name: str
@@ -50,6 +51,35 @@ class Camera:
     rotation: Float
     translation: Float
     fisheye: bool = False
+    recorded_size: tuple[int, int] | None = None
+
+    @property
+    def reduction(self) -> int:
+        """Recorded pixels along a side of the square whose mean is a pixel of this camera's image; 1 if not reduced."""
+        return 1 if self.recorded_size is None else self.recorded_size[0] // self.width
+
+    def reduced(self, factor: int) -> Camera:
+        """Return the camera of the image whose pixels are means over squares of ``factor`` pixels a side.
+
+        Remaining columns and rows at the right and bottom are dropped.
+        """
+        if factor == 1:
+            return self
+        width, height = self.width // factor, self.height // factor
+        matrix = _scaled(self.matrix, 1 / factor)
+        return replace(self, width=width, height=height, matrix=matrix, recorded_size=(self.width, self.height))
+
+    def recorded(self) -> Camera:
+        """Return the camera of the recorded image: the inverse of :meth:`reduced`."""
+        if self.recorded_size is None:
+            return self
+        width, height = self.recorded_size
+        matrix = _scaled(self.matrix, self.reduction)
+        return replace(self, width=width, height=height, matrix=matrix, recorded_size=None)
+
+    def pixels_per_metre(self, point: ArrayLike) -> float:
+        """Return the length in pixels of a metre across the view at a world point (3,)."""
+        return float(self.matrix[0, 0] / np.linalg.norm(self.center - np.asarray(point)))
 
     @property
     def center(self) -> Float:
@@ -139,6 +169,14 @@ class Camera:
             )
 
 
+def _scaled(matrix: Float, scale: float) -> Float:
+    """Return the intrinsic matrix (3, 3) of an enlarged image; the image's corner, not a pixel's centre, stays at -0.5."""
+    scaled = matrix.copy()
+    scaled[:2] *= scale
+    scaled[:2, 2] += (scale - 1) / 2
+    return scaled
+
+
 @dataclass(frozen=True)
 class Rig:
     """The cameras of a capture, in a fixed order."""
@@ -170,5 +208,17 @@ class Rig:
 
     def pixels_per_metre(self, point: ArrayLike) -> float:
         """Return the length in pixels of a metre across the view at a world point (3,); the median of the cameras."""
-        focal = np.array([c.matrix[0, 0] for c in self.cameras])
-        return float(np.median(focal / np.linalg.norm(self.centers - np.asarray(point), axis=1)))
+        return float(np.median([camera.pixels_per_metre(point) for camera in self.cameras]))
+
+    @property
+    def reductions(self) -> tuple[int, ...]:
+        """(C,) each camera's :attr:`Camera.reduction`."""
+        return tuple(camera.reduction for camera in self.cameras)
+
+    def reduced(self, factors: Sequence[int]) -> Rig:
+        """Return the cameras, each reduced by its factor (C,)."""
+        return Rig(tuple(camera.reduced(factor) for camera, factor in zip(self.cameras, factors, strict=True)))
+
+    def recorded(self) -> Rig:
+        """Return the cameras of the recorded images."""
+        return Rig(tuple(camera.recorded() for camera in self.cameras))

@@ -69,10 +69,11 @@ class Agreement:
         refusal: why the cameras cannot be used together, one line; empty if they can.
         outside: (C,) share of each camera's mask that lies outside the hull of the right cameras; NaN if it shows
             nobody.
-        shift_px: (C, 2) smallest shift, x and y, pixels of the full image, that moves each camera's mask into that
+        shift_px: (C, 2) smallest shift, x and y, pixels of the recorded image, that moves each camera's mask into that
             hull; NaN if none does.
         closes: (F,) whether each frame has a hull of all cameras.
         extent_m: greatest extent of the right cameras' hull, median of the frames; NaN without a hull.
+        reductions: (C,) recorded pixels along a side of a mask's pixel.
     """
 
     names: tuple[str, ...]
@@ -84,6 +85,7 @@ class Agreement:
     shift_px: Float
     closes: Bool
     extent_m: float
+    reductions: tuple[int, ...]
 
     @property
     def disagreement(self) -> float:
@@ -111,7 +113,7 @@ class Agreement:
             return "its masks miss a part of the person"
         off = np.hypot(*self.shift_px[camera])
         if not off > 0 and (error < -tolerance).any():
-            off = np.abs(error).max() / self.tangency.pixel[camera]
+            off = self.reductions[camera] * np.abs(error).max() / self.tangency.pixel[camera]
         if off > 0:
             return f"off by {off:.0f} px or more: turned, moved, late, or another camera's video"
         return "its masks show something else beside the person, or are wrong"
@@ -170,7 +172,8 @@ class MaskAgreement:
             others = [k for k in right if k != c]
             if others:
                 shown = [(masks[c], hull.silhouette(hull.carve(others), c)) for masks, hull in views]
-                outside[c], shift[c] = _share_outside(shown), self._least_shift(shown)
+                outside[c] = _share_outside(shown)
+                shift[c] = self.rig[c].reduction * self._least_shift(shown)
         extents = [extent for _, hull in views if (extent := hull.extent(right)) > 0]
         return Agreement(
             names=self.rig.names,
@@ -182,6 +185,7 @@ class MaskAgreement:
             shift_px=shift,
             closes=np.array([hull is not None and hull.carve(range(C)).any() for hull in hulls], bool),
             extent_m=float(np.median(extents)) if extents else np.nan,
+            reductions=self.rig.reductions,
         )
 
     def _swapped(
