@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -196,6 +197,24 @@ def test_only_the_same_command_is_resumed(
     ran = tk("track", tiny, "--method", "volumetric", "-o", begun, "--config", quick, "--resume", *options)
     ran.complaint(str(begun), difference, "start again")
     assert begun.read_bytes() == before
+
+
+def test_large_images_are_reduced_and_the_result_has_the_recorded_cameras(tiny: Path, tmp_path: Path) -> None:
+    capture, half = open_capture(tiny), tmp_path / "half.h5"
+    tall = capture.setup().person_pixels()
+    config = replace(CONFIG, person_pixels=int(tall.min() / 2))
+    reporter = Silent()
+    session.track(capture, half, config, reporter, frames=(0, 2), causal=True)
+    (line,) = [note for note in reporter.notes if "of their size" in note]
+    assert "all cameras at 1/2 of their size, because the person is about" in line
+    session.track(capture, tmp_path / "full.h5", CONFIG, Silent(), frames=(0, 2), causal=True)
+    found, full = read_result(half), read_result(tmp_path / "full.h5")
+    assert found.cameras is not None
+    for camera, expected in zip(found.cameras.rig, capture.rig, strict=True):
+        assert (camera.width, camera.height, camera.reduction) == (expected.width, expected.height, 1)
+        np.testing.assert_allclose(camera.matrix, expected.matrix, rtol=1e-12)
+    assert np.linalg.norm(found.joints - full.joints, axis=2).mean() < 0.05
+    assert np.abs(found.joints - full.joints).max() > 0  # it is another computation
 
 
 @pytest.fixture(scope="module")

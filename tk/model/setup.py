@@ -90,7 +90,7 @@ class Setup:
             raise ValueError("a setup has at least one subject")
 
     def person_pixels(self) -> NDArray[np.float64]:
-        """Return (C,) pixels that the first subject's height measures in each camera's image, upright and across the view
-        at the centre of the working volume."""
+        """Return (C,) the first subject's height in pixels of each camera's image, across the view at the volume's
+        centre."""
         height_m = self.subjects[0].height_m or _STATURE_M
         return np.array([height_m * camera.pixels_per_metre(self.volume.center) for camera in self.rig])

@@ -119,6 +119,45 @@ def test_masks_are_binarised_at_128(tmp_path: Path) -> None:
     assert np.mean(mask != blob[..., 0]) < 0.03  # coding blurs the outline
 
 
+def test_a_pixel_of_a_reduced_image_is_the_mean_of_a_square(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (9, 15, 3), dtype=np.uint8)
+    write_picture(tmp_path / "cam" / "0.png", image)
+    clip = probe(tmp_path / "cam").reduced(2)
+    (small,) = read_all(clip)
+    assert small.shape == (4, 7, 3)
+    squares = image[:8, :14].reshape(4, 2, 7, 2, 3)
+    np.testing.assert_allclose(small, squares.mean(axis=(1, 3)), atol=0.51)
+    write_picture(tmp_path / "cam" / "1.png", image[:8])
+    with pytest.raises(VideoError, match=r"1\.png: is 15×8; the pictures before it are 15×9"):
+        read_all(probe(tmp_path / "cam").reduced(2))
+
+
+def test_a_pixel_of_a_reduced_mask_shows_the_person_if_half_of_its_square_does(tmp_path: Path) -> None:
+    grey = np.array([[0, 255, 255, 255, 0, 0], [0, 0, 0, 255, 255, 255]], np.uint8)
+    write_picture(tmp_path / "cam" / "0.png", grey)
+    with closing(probe(tmp_path / "cam", is_mask=True).reduced(2).open()) as reader:
+        mask = np.zeros((1, 3), np.uint8)
+        reader.read(mask)
+    np.testing.assert_array_equal(mask, [[0, 255, 255]])
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "avi"])
+@pytest.mark.parametrize("size", [(64, 48), (66, 50), (62, 46)])
+def test_a_reduced_video_equals_the_reduced_images_of_the_video(
+    tmp_path: Path, suffix: str, size: tuple[int, int]
+) -> None:
+    y, x = np.mgrid[: size[1], : size[0]]
+    shades = [np.stack([255 * x // size[0], 255 * y // size[1], 40 * k + 0 * x], axis=2) for k in range(4)]
+    write_video(tmp_path / f"a.{suffix}", [image.astype(np.uint8) for image in shades])
+    clip = probe(tmp_path / f"a.{suffix}")
+    small = clip.reduced(2)
+    for whole, read in zip(read_all(clip, start=1), read_all(small, start=1), strict=True):
+        assert read.shape == (size[1] // 2, size[0] // 2, 3)
+        squares = whole[: 2 * small.height, : 2 * small.width].reshape(small.height, 2, small.width, 2, 3)
+        difference = read - squares.mean(axis=(1, 3))
+        assert np.abs(difference).mean() < 2 and np.abs(difference).max() < 12  # colours of neighbours mix
+
+
 def test_a_mask_of_zeros_and_ones_is_refused(tmp_path: Path) -> None:
     write_picture(tmp_path / "cam" / "000000.png", np.eye(8, dtype=np.uint8))
     with closing(probe(tmp_path / "cam", is_mask=True).open()) as reader, pytest.raises(VideoError, match="255"):

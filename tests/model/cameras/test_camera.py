@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -150,3 +152,23 @@ def test_rig_lists_its_cameras_and_the_largest_image() -> None:
     assert rig.names == ("cam", "tall") and len(rig) == 2 and list(rig)[1] is rig[1]
     assert rig.frame_shape == (700, 640)
     np.testing.assert_allclose(rig.centers[1], [0, 0, -2])
+
+
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+@pytest.mark.parametrize("factor", [2, 3])
+def test_a_point_is_in_the_same_place_of_the_reduced_image(lens: Camera, factor: int) -> None:
+    points = np.random.default_rng(0).uniform(-0.8, 0.8, (50, 3))
+    whole, small = lens.project(points)[0], lens.reduced(factor).project(points)[0]
+    # pixel 0 of the reduced image is the mean of pixels 0 … factor - 1, whose middle is (factor - 1) / 2
+    np.testing.assert_allclose(small, (whole - (factor - 1) / 2) / factor, atol=1e-9)
+
+
+def test_a_reduced_camera_remembers_the_recorded_image() -> None:
+    odd = replace(LENSES["barrel"], width=643, height=481)
+    small = odd.reduced(2)
+    assert (small.width, small.height, small.reduction) == (321, 240, 2)
+    whole = replace(small, translation=small.translation + 1).recorded()
+    assert (whole.width, whole.height, whole.reduction) == (643, 481, 1)
+    np.testing.assert_allclose(whole.matrix, odd.matrix, rtol=1e-15)
+    np.testing.assert_array_equal(whole.translation, odd.translation + 1)
+    assert odd.reduced(1) is odd and odd.recorded() is odd

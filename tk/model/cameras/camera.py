@@ -40,7 +40,7 @@ class Camera:
         rotation: (3, 3) rotation from world to camera.
         translation: (3,) metres, of the world's origin in the camera frame.
         fisheye: True for OpenCV's fisheye (equidistant) model.
-        recorded_size: (width, height) of the recorded image, pixels, if this camera's image is a reduced one; else None.
+        recorded_size: (width, height) of the recorded image, pixels, if this image is a reduced one; else None.
     """
 
     name: str
@@ -170,7 +170,7 @@ class Camera:
 
 
 def _scaled(matrix: Float, scale: float) -> Float:
-    """Return the intrinsic matrix (3, 3) of an enlarged image; the image's corner, not a pixel's centre, stays at -0.5."""
+    """Return the intrinsic matrix (3, 3) of an enlarged image, whose corner (not a pixel's centre) stays at -0.5."""
     scaled = matrix.copy()
     scaled[:2] *= scale
     scaled[:2, 2] += (scale - 1) / 2
