@@ -29,7 +29,7 @@ from tk.model.masks.silhouettes import draw_silhouettes
 from tk.render.canvas import View, dots, draw_body, draw_joints
 from tk.render.figure import Figure, Outline, solids_of
 from tk.render.overlay import Grid, Overlay, write_sheets
-from tk.render.palette import BONE, LOST, SEGMENT_COLORS, person_color, sigma_colors
+from tk.render.palette import BONE, LOST, LOST_BODY, SEGMENT_COLORS, person_color, sigma_colors
 from tk.run.session import track
 from tk.settings import Settings
 from tk.trackers.bodies import body_and_poses
@@ -140,23 +140,25 @@ def test_near_segment_hides_far_segment() -> None:
     square = (np.array([[5.0, 5.0], [35.0, 5.0], [35.0, 35.0], [5.0, 35.0]]),)
     view = View(np.zeros(2), 1.0, 40, 40)
     near = np.array(SEGMENT_COLORS["calf_l"])
-    draw_body(tile, view, [Outline("thigh_r", 5.0, square), Outline("calf_l", 2.0, square)])
+    draw_body(tile, view, [Outline("thigh_r", 5.0, square), Outline("calf_l", 2.0, square)], SEGMENT_COLORS.__getitem__)
     assert (tile[0, 0] == 200).all()
     share = (tile[20, 20].astype(float) - 200) / (near - 200.0)
     assert share.min() > 0.2 and share.max() < 0.6, "the near one's colour, and the picture shines through"
     np.testing.assert_allclose(share, share.mean(), atol=0.02)
     np.testing.assert_array_equal(tile[4, 20], near, err_msg="the contour is opaque")
     grey = np.full((40, 40, 3), 200, np.uint8)
-    draw_body(grey, view, [Outline("calf_l", 2.0, square)], lost=True)
+    draw_body(grey, view, [Outline("calf_l", 2.0, square)], lambda _: LOST_BODY)
     assert len(set(grey[20, 20].tolist())) == 1, "a lost body has no colour"
 
 
 def test_body_is_clipped_at_the_tile() -> None:
     whole, part = (np.full((60, 60, 3), 90, np.uint8) for _ in range(2))
     polygon = np.array([[-20.0, 10.0], [80.0, 10.0], [80.0, 200.0], [-20.0, 200.0]])
-    draw_body(whole, View(np.zeros(2), 1.0, 60, 60), [Outline("torso", 1.0, (polygon,))])
+    draw_body(whole, View(np.zeros(2), 1.0, 60, 60), [Outline("torso", 1.0, (polygon,))], SEGMENT_COLORS.__getitem__)
     assert (whole[5] == 90).all() and (whole[15:, 1:-1] != 90).any(axis=2).all()
-    draw_body(part, View(np.zeros(2), 1.0, 60, 60), [Outline("torso", 1.0, (polygon + 500,))])
+    draw_body(
+        part, View(np.zeros(2), 1.0, 60, 60), [Outline("torso", 1.0, (polygon + 500,))], SEGMENT_COLORS.__getitem__
+    )
     assert (part == 90).all()
 
 
@@ -230,7 +232,7 @@ def test_videos_show_where_the_person_moves(result: Path) -> None:
     for camera, view, all_of_it in zip(near.rig, near._views, whole._views, strict=True):
         assert (view.width, view.height) == (all_of_it.width, all_of_it.height)
         assert view.scale >= all_of_it.scale == near.grid.scale
-        xy = view.place(camera.project(near.figure.joints[:2].reshape(-1, 3))[0])
+        xy = view.place(camera.project(near.figures[0].joints[:2].reshape(-1, 3))[0])
         assert (xy > 0).all() and (xy < (view.width, view.height)).all()
     assert max(view.scale for view in near._views) > 1.1 * near.grid.scale
 
@@ -253,7 +255,7 @@ def test_overlay_uses_cameras_and_time_offsets_of_the_run(result: Path) -> None:
         np.testing.assert_array_equal(shown[k][1], pictures[k][1])
     drawn, view = overlay.mosaic(0, shown[0]), overlay._views[0]
     old, new = (
-        np.rint(view.place(c.project(overlay.figure.joints[0])[0])).astype(int) for c in (capture.rig[0], turned)
+        np.rint(view.place(c.project(overlay.figures[0].joints[0])[0])).astype(int) for c in (capture.rig[0], turned)
     )
     assert (drawn[new[:, 1], new[:, 0]] == BONE).all()
     assert (drawn[old[:, 1], old[:, 0]] == BONE).all(axis=1).mean() < 0.5

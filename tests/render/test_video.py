@@ -92,7 +92,7 @@ def test_3d_view_shows_the_nearest_solid_in_each_pixel(tracked: Path) -> None:
     scene = Scene(read_result(tracked))
     eye, figure = scene._camera(0), scene.figure
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    scene._draw_body(image, eye, 0, lost=False)
+    scene._draw_bodies(image, eye, 0)
     own = [eye.to_camera(points) for points in np.split(figure.placed(0), figure.starts[1:-1])]
     triangles = np.concatenate([points[s.triangles] for s, points in zip(figure.solids, own, strict=True)])
     owner = np.repeat([s.segment for s in figure.solids], [len(s.triangles) for s in figure.solids])

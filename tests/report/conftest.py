@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -12,7 +13,7 @@ import pytest
 from tests.conftest import FRAMES
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
-from tk.io.results.data import FrameResult, JointAngles, ResultMeta
+from tk.io.results.data import FrameResult, JointAngles, Result, ResultMeta
 from tk.io.results.reader import read_joints
 from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
@@ -67,6 +68,23 @@ def complete_result(path: Path, capture_path: Path, count: int = FRAMES) -> Path
             )  # fmt: skip
     revise_result(path, notes=["first", NOTE])
     return path
+
+
+def with_partner(result: Result) -> Result:
+    """Return a result with a second person half a metre aside, who enters in frame 4 and is lost in frame 5."""
+    columns = {
+        name: getattr(result, name)[4:]
+        for name in ("frames", "time", "pose", "joints", "sigma", "residual", "feet", "segments_rotation", "status",
+                     "objective", "iterations")
+    }  # fmt: skip
+    aside = np.array([0.5, 0, 0])
+    columns["pose"] = columns["pose"] + np.pad(aside, (0, columns["pose"].shape[1] - 3))
+    columns["joints"] = columns["joints"] + aside
+    columns["status"] = np.full(len(columns["frames"]), np.uint8(Status.TRACKED))
+    columns["status"][1] = Status.LOST
+    angles = {joint: values[4:] for joint, values in result.angles.items()}
+    timing = {stage: values[4:] for stage, values in result.timing.items()}
+    return replace(result, others=(replace(result, person=1, angles=angles, timing=timing, **columns),))
 
 
 @pytest.fixture(scope="session")

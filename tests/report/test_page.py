@@ -16,7 +16,7 @@ import pytest
 
 from scripts.browser import Page, browser_page, find_browser
 from tests.conftest import FRAMES, Tk
-from tests.report.conftest import LOST, NOTE
+from tests.report.conftest import LOST, NOTE, with_partner
 from tk.evaluation.joints import evaluate_files
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
@@ -44,7 +44,7 @@ def test_page_contains_the_result(complete: Path) -> None:
     page = build_page(result, [])
     data = data_of(page)
     assert data["frames"] == list(range(FRAMES)) and data["capture"] == "made <up>" and data["notes"] == ["first", NOTE]
-    joints = unpacked(data["scene"]["joints"])
+    joints = unpacked(data["people"][0]["positions"])
     # the scene is the world moved: distances stay, and up is z
     flat = joints.reshape(-1, 3).astype(float)
     world = result.joints.reshape(-1, 3)
@@ -54,9 +54,9 @@ def test_page_contains_the_result(complete: Path) -> None:
         np.linalg.norm(flat[i] - flat[j], axis=1), np.linalg.norm(world[i] - world[j], axis=1), atol=1e-5
     )
     np.testing.assert_allclose(flat[i, 2] - flat[j, 2], world[i, 2] - world[j, 2], atol=1e-5)
-    np.testing.assert_allclose(unpacked(data["sigma"]), result.sigma, rtol=1e-6)
-    assert np.isnan(unpacked(data["sigma"])[3, 8])
-    (knee,) = (panel for panel in data["angles"] if panel["title"] == "Knee flexion")
+    np.testing.assert_allclose(unpacked(data["people"][0]["sigma"]), result.sigma, rtol=1e-6)
+    assert np.isnan(unpacked(data["people"][0]["sigma"])[3, 8])
+    (knee,) = (panel for panel in data["people"][0]["angles"] if panel["title"] == "Knee flexion")
     assert [line["side"] for line in knee["lines"]] == ["left", "right"]
     np.testing.assert_allclose(unpacked(knee["lines"][0]["values"]), result.angles["knee_l"][:, 0], atol=1e-4)
     assert "sigma" in knee["lines"][0]
@@ -65,18 +65,18 @@ def test_page_contains_the_result(complete: Path) -> None:
 
 def test_body_points_match_the_overlay(complete: Path) -> None:
     result = read_result(complete)
-    scene = data_of(build_page(result, []))["scene"]
+    person = data_of(build_page(result, []))["people"][0]
     figure = figure_of(result)
     row = 5
-    transforms = unpacked(scene["transforms"])[row]
+    transforms = unpacked(person["transforms"])[row]
     ours, theirs = [], []
-    for solid, handed in zip(figure.solids, scene["solids"], strict=True):
+    for solid, handed in zip(figure.solids, person["solids"], strict=True):
         T = transforms[handed["segment"]]
         ours.append(unpacked(handed["rings"])[0] @ T[:, :3].T + T[:, 3])
         there = figure.transforms[row, solid.segment]
         theirs.append(solid.rings[0] @ there[:3, :3].T + there[:3, 3])
     a, b = np.concatenate(ours), np.concatenate(theirs)
-    joints = unpacked(scene["joints"])[row]
+    joints = unpacked(person["positions"])[row]
     for k in range(15):
         np.testing.assert_allclose(
             np.linalg.norm(a - joints[k], axis=1), np.linalg.norm(b - figure.joints[row, k], axis=1), atol=1e-4
@@ -86,7 +86,7 @@ def test_body_points_match_the_overlay(complete: Path) -> None:
 def test_expected_error_adds_the_offset_of_a_joint_to_sigma(complete: Path) -> None:
     result = read_result(complete)
     assert result.sigma is not None and result.expected_error is not None
-    expected = unpacked(data_of(build_page(result, []))["expected"])
+    expected = unpacked(data_of(build_page(result, []))["people"][0]["expected"])
     knee, hip = JOINTS.index("knee_l"), JOINTS.index("hip_r")
     for joint, offset in ((knee, ROWS["knee_l"].offset_m), (hip, ROWS["hip_l"].offset_m)):
         assert offset > 0
@@ -98,9 +98,9 @@ def test_expected_error_adds_the_offset_of_a_joint_to_sigma(complete: Path) -> N
 
 def test_page_has_errors_only_with_a_truth(complete: Path, tiny: Path, tmp_path: Path) -> None:
     result = read_result(complete)
-    assert data_of(build_page(result, []))["truth"] is None
-    assert data_of(build_page(result, [], truth=tmp_path / "none.h5"))["truth"] is None
-    errors = data_of(build_page(result, [], truth=tiny / "truth.h5"))["truth"]
+    assert data_of(build_page(result, []))["people"][0]["truth"] is None
+    assert data_of(build_page(result, [], truth=tmp_path / "none.h5"))["people"][0]["truth"] is None
+    errors = data_of(build_page(result, [], truth=tiny / "truth.h5"))["people"][0]["truth"]
     found = evaluate_files(complete, tiny / "truth.h5")
     assert errors["rows"][1] == ["12 limb joints", found.raw.limbs.mean_cm, found.corrected.limbs.mean_cm]
     assert unpacked(errors["frames"]).mean() == pytest.approx(found.raw.all.mean_cm, rel=1e-4)
@@ -274,6 +274,33 @@ def test_page_compares_with_the_truth(opened: Page) -> None:
     assert len(rows) == 1 + 2 + len(JOINTS) and rows[1].startswith("all 15") and rows[3].startswith("pelvis")
     assert opened.run("document.getElementById('truth').hidden") is False
     assert opened.run("document.querySelectorAll('#truth-charts path.line').length") == 1
+
+
+@chromium
+def test_page_has_a_block_for_each_person(complete: Path, page: Page, tmp_path: Path) -> None:
+    target = tmp_path / "two.html"
+    target.write_text(build_page(with_partner(read_result(complete)), []), encoding="utf-8")
+    page.said.clear()
+    page.open(target)
+    rows = page.run("[...document.querySelectorAll('#people tr')].map((row) => row.textContent)")
+    assert len(rows) == 3 and "Person 1" in rows[2] and f"1 of {FRAMES - 4}" in rows[2]
+    assert page.run("document.querySelector(document.querySelectorAll('#people a')[1].hash).id") == "person-1"
+    assert page.run("document.querySelectorAll('#angle-charts-1 .chart').length") > 15
+    for row, status, alone in ((0, "absent", True), (5, "lost", False), (8, "tracked", True)):
+        page.run(f"report.show({row})")
+        assert page.run("document.getElementById('status-1').textContent") == status
+        assert page.run("document.getElementById('badge').hidden") is alone
+    assert page.run("document.documentElement.scrollWidth <= window.innerWidth") is True, "nothing sticks out"
+    assert page.said == []
+
+
+def test_people_with_different_frames_are_aligned(complete: Path) -> None:
+    result = read_result(complete)
+    first, second = with_partner(result).aligned()
+    np.testing.assert_array_equal(first.joints, result.joints)
+    assert second.frames.tolist() == result.frames.tolist() and (second.status[:4] == Status.ABSENT).all()
+    assert np.isnan(second.joints[:4]).all() and np.isfinite(second.joints[4:]).all()
+    assert choose_rows(with_partner(result))[0].row == 5, "the first frame in which anybody is lost"
 
 
 @chromium

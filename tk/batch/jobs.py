@@ -41,6 +41,7 @@ class TrackOptions:
     body: Path | None = None
     causal: bool = False
     store_hull: bool = False
+    people: str = "auto"
     config: Settings = field(default_factory=Settings)
 
     def to_dict(self) -> dict[str, str]:
@@ -58,6 +59,7 @@ class TrackOptions:
             "body": "none" if self.body is None else _hash(_content(self.body)),
             "causal": "yes" if self.causal else "no",
             "stored hull": "yes" if self.store_hull else "no",
+            "people": self.people,
             "settings": _hash(to_toml(self.config).encode()),
         }
 

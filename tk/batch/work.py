@@ -6,7 +6,7 @@ import math
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -59,6 +59,7 @@ def _track(job: Job, reporter: _Reporter) -> Outcome:
     from tk.io.results.reader import read_result
     from tk.report.after import write_video_and_report
     from tk.run import session  # heavy; the process that starts the batch does not need it
+    from tk.run.people import parse_choice
 
     options = job.options
     capture = open_recording(job.capture, options.cameras, options.masks, options.config.resample)
@@ -69,6 +70,7 @@ def _track(job: Job, reporter: _Reporter) -> Outcome:
             summary = session.track(
                 capture, job.output, options.config, reporter, options.method, options.frames,
                 resume=True, store_hull=options.store_hull, body=options.body, causal=options.causal,
+                people=parse_choice(options.people),
             )  # fmt: skip
             break
         except ResultBusyError:
@@ -77,8 +79,8 @@ def _track(job: Job, reporter: _Reporter) -> Outcome:
             time.sleep(_RETRY_S)
     if job.pictures:
         write_video_and_report(capture, job.output, reporter.note)
-    result = read_result(job.output)
-    known = result.has_pose
+    people = read_result(job.output).people
+    known = np.concatenate([person.has_pose for person in people])
     error_cm, limbs_cm = _errors(job, reporter.note)
     return Outcome(
         DONE,
@@ -88,25 +90,35 @@ def _track(job: Job, reporter: _Reporter) -> Outcome:
         tracked_now=summary.tracked_now,
         error_cm=error_cm,
         limbs_cm=limbs_cm,
-        silhouette_error=_typical(np.mean, result.silhouette_error, known),
-        sigma_cm=_typical(np.median, result.sigma, known, 100),
+        silhouette_error=_typical(np.mean, [person.silhouette_error for person in people], known),
+        sigma_cm=_typical(np.median, [person.sigma for person in people], known, 100),
     )
 
 
 def _errors(job: Job, note: Callable[[str], None]) -> tuple[float | None, float | None]:
-    """Return the mean distances from the ground truth, cm: of all joints, and of the limbs without offsets."""
-    from tk.evaluation.joints import evaluate_files
+    """Return the mean distances from the ground truth, cm: of all joints, and of the limbs without offsets; of several
+    people, those of the people who were found."""
+    from tk.evaluation.joints import evaluate
+    from tk.evaluation.people import evaluate_people
+    from tk.io.results.reader import read_people
 
     truth = job.capture / "truth.h5"
     if not truth.exists():
         return None, None
     try:
-        found = evaluate_files(job.output, truth)
+        people, true = read_people(job.output), read_people(truth)
+        if len(people) == len(true) == 1:
+            found = [evaluate(people[0], true[0])]
+        else:
+            found = [score.errors for score in evaluate_people(people, true).people if score.errors is not None]
         moved_cm = _movement_cm(job, truth)
     except TkError as error:
         note(f"no comparison with the ground truth: {error}")
         return None, None
-    error_cm, limbs_cm = (float(score.mean_cm) for score in (found.raw.all, found.corrected.limbs))
+    if not found:
+        return None, None
+    error_cm = float(np.mean([each.raw.all.mean_cm for each in found]))
+    limbs_cm = float(np.mean([each.corrected.limbs.mean_cm for each in found]))
     if moved_cm < _MOVEMENT_CM:
         note(
             f"no error without offsets: the limbs move by {moved_cm:.1f} cm about the trunk, less than "
@@ -132,12 +144,16 @@ def _movement_cm(job: Job, truth: Path) -> float:
 
 
 def _typical(
-    typical: Callable[[Any], Any], values: NDArray[np.float64] | None, known: NDArray[np.bool_], scale: float = 1.0
+    typical: Callable[[Any], Any],
+    values: Sequence[NDArray[np.float64] | None],
+    known: NDArray[np.bool_],
+    scale: float = 1.0,
 ) -> float | None:
-    """Return the mean or median of finite values (F, …) in known frames (F,); None without any."""
-    if values is None:
+    """Return the mean or median of finite values, by person (F, …), in known frames of all people; None without any."""
+    arrays = [array for array in values if array is not None]
+    if not arrays:
         return None
-    numbers = values[known]
+    numbers = np.concatenate(arrays)[known]
     numbers = numbers[np.isfinite(numbers)]
     return scale * float(typical(numbers)) if numbers.size else None
 

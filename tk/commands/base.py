@@ -131,6 +131,10 @@ preset_option = click.option("--preset", metavar="NAME", help="Settings to start
 resample_option = click.option(
     "--resample", is_flag=True, default=None, help="Choose images by time stamps: cameras of different rates."
 )
+people_option = click.option(
+    "--people", default="auto", show_default=True, metavar="auto|all|N,M",
+    help="Whom to track: auto: one person; all: everybody; N,M: by the numbers of tk inspect.",
+)  # fmt: skip
 resume_option = click.option("--resume", is_flag=True, help="Continue an interrupted run of the same command.")
 force_option = click.option("--force", is_flag=True, help="Replace existing output.")
 quiet_option = click.option("-q", "--quiet", is_flag=True, help="Show no progress, only notes and errors.")

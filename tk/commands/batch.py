@@ -22,6 +22,7 @@ from tk.errors import WorkerError
 @click.option("--scheduler", metavar="ADDRESS", help="Use the workers of this Dask scheduler: tcp://host:8786.")
 @click.option("--dashboard", is_flag=True, help="Serve Dask's page about workers and tasks.")
 @base.tracking_options
+@base.people_option
 @base.no_report_option
 @base.quiet_option
 def batch(
@@ -31,12 +32,15 @@ def batch(
     scheduler: str | None,
     dashboard: bool,
     options: base.TrackingOptions,
+    people: str,
     no_report: bool,
     quiet: bool,
 ) -> None:
     """Track many captures into FOLDER and write a summary; after an interruption, the same command continues."""
     from tk.batch import TrackOptions, exit_code, run_batch
+    from tk.run.people import parse_choice
 
+    parse_choice(people)  # a mistake ends the command before the first capture
     track_options = TrackOptions(
         options.method,
         base.parse_frames(options.frames),
@@ -45,6 +49,7 @@ def batch(
         options.body and options.body.resolve(),
         options.causal,
         options.store_hull,
+        people,
         options.settings(),
     )
     with BatchConsoleReporter(quiet) as reporter:

@@ -67,9 +67,9 @@ def _render(
     from tk.render.video import VIDEO, check_encoder, video_writer
 
     result = read_result(result_path)
-    if not len(result):
+    if not any(map(len, result.people)):
         raise ResultError(f"{result_path}: has no frames")
-    chosen = _parse_frames(frames, result.frames.tolist())
+    chosen = _parse_frames(frames, result.aligned()[0].frames.tolist())
     view = view or ("overlay" if capture_path else "3d")
     capture = None if capture_path is None else open_capture(capture_path, cameras, "none", result.resampled)
     if png is not None:
@@ -90,7 +90,7 @@ def _render(
         raise ConfigError(f"--view overlay: needs the images: tk render {result_path} CAPTURE")
     else:
         overlay = Overlay(capture, result, full=full)
-        shown = choose_frames(result, chosen, len(result))
+        shown = choose_frames(overlay.people[0], chosen, len(overlay.row_of))
         with video_writer(output, capture.fps) as add:
             for frame, images in overlay.pictures(shown):
                 add(overlay.mosaic(frame, images))

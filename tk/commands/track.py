@@ -37,10 +37,7 @@ WARN_SHARE = 0.2
     "--init-pose", type=base.PATH, metavar="FILE",
     help="Start from the approximate pose in this TOML file, or from this folder of 2D keypoints.",
 )  # fmt: skip
-@click.option(
-    "--people", default="auto", show_default=True, metavar="auto|all|N,M",
-    help="Whom to track: auto: one person; all: everybody; N,M: by the numbers of tk inspect.",
-)  # fmt: skip
+@base.people_option
 @base.resume_option
 @base.force_option
 @base.no_report_option

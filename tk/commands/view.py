@@ -17,7 +17,7 @@ from tk.errors import ConfigError, ResultError
 @click.option("--screenshot", type=base.PATH, metavar="FILE.png", help="Write an image of the frame, and close.")
 @base.force_option
 def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path | None, force: bool) -> None:
-    """Show RESULT.h5 in a window: body, joints, hull, cameras. Keys move through time and switch parts on and off.
+    """Show RESULT.h5 in a window: bodies, joints, hull, cameras. Keys move through time and switch parts on and off.
 
     CAPTURE adds its cameras, if the result has none, and its ground truth, if it has one.
     """
@@ -28,7 +28,8 @@ def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path
     from tk.view.contents import Contents
     from tk.view.window import Window, require_display
 
-    loaded = read_result(result)
+    people = read_result(result).aligned()
+    loaded = people[0]
     if not len(loaded):
         raise ResultError(f"{result}: has no frames")
     known = loaded.frames.tolist()
@@ -43,7 +44,7 @@ def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path
         opened = open_capture(capture, None, "none", loaded.resampled)
         rig, truth = rig or opened.rig, truth_of(loaded, opened.truth_file)
     require_display()
-    window, row = Window(Contents(loaded, rig, truth)), 0 if frame is None else known.index(frame)
+    window, row = Window(Contents(people, rig, truth)), 0 if frame is None else known.index(frame)
     if screenshot is not None:
         window.save(row, screenshot)
     else:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -13,7 +13,7 @@ from tk.model.body.joints import BONES
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Camera
 from tk.render.figure import Outline
-from tk.render.palette import BONE, INK, LOST_BODY, SEGMENT_COLORS, TEXT, Color, sigma_colors
+from tk.render.palette import BONE, INK, LOST_BODY, TEXT, Color, sigma_colors
 
 Float = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -80,11 +80,8 @@ class View:
         return np.asarray((xy + 0.5 - self.origin) * self.scale - 0.5)
 
 
-def draw_body(
-    tile: Image, view: View, outlines: Sequence[Outline], lost: bool = False, color: Color | None = None
-) -> None:
-    """Draw the segments, translucent, with their contours, near ones over far ones; grey if ``lost``, in one color if
-    it is given."""
+def draw_body(tile: Image, view: View, outlines: Sequence[Outline], color: Callable[[str], Color]) -> None:
+    """Draw the segments, translucent, with their contours, near ones over far ones; ``color`` is that of a segment."""
     solids = [points for outline in outlines for points in outline.points]
     if not solids:
         return
@@ -97,7 +94,7 @@ def draw_body(
     layer, end = np.zeros((height, width), np.uint8), 0
     colors = np.zeros((256, 1, 3), np.uint8)
     for rank, outline in enumerate(outlines, 1):
-        colors[rank] = LOST_BODY if lost else color or SEGMENT_COLORS[outline.segment]
+        colors[rank] = color(outline.segment)
         for points in outline.points:
             begin, end = end, end + len(points)
             cv2.fillConvexPoly(layer, cv2.convexHull(placed[begin:end]), (rank,), cv2.LINE_8, SUBPIXEL_BITS)

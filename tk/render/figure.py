@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -15,6 +16,7 @@ from tk.kernels.cones import ELLIPSOID
 from tk.model.body.cone_body import ConeBody, ConePart
 from tk.model.body.joints import SEGMENTS
 from tk.model.cameras.camera import Camera
+from tk.render.palette import LOST_BODY, SEGMENT_COLORS, Color, person_color
 from tk.trackers.bodies import body_and_poses
 
 Float = NDArray[np.float64]
@@ -86,6 +88,7 @@ class Figure:
         status: (F,) as in the result.
         solids: the body; empty if the result has no body.
         transforms: (F, S, 4, 4) of the segments, zero configuration to world.
+        person: number in the result.
     """
 
     frames: NDArray[np.int64]
@@ -94,11 +97,22 @@ class Figure:
     status: NDArray[np.uint8]
     solids: tuple[Solid, ...]
     transforms: Float
+    person: int = 0
     _placed: dict[int, Float] = field(default_factory=dict, repr=False, compare=False)
 
     def lost(self, row: int) -> bool:
         """Return whether the frame has no pose: the person is lost or absent."""
         return not has_pose(self.status[row])
+
+    def there(self, row: int) -> bool:
+        """Return whether any joint is known in a frame."""
+        return bool(np.isfinite(self.joints[row]).any())
+
+    def color(self, row: int, segment: str) -> Color:
+        """Return the colour of a segment: each person after the first has one colour; lost people are grey."""
+        if self.lost(row):
+            return LOST_BODY
+        return person_color(self.person) if self.person else SEGMENT_COLORS[segment]
 
     def placed(self, row: int) -> Float:
         """Return the points (N, 3) of all circles in a frame, solid by solid; metres, world frame."""
@@ -122,7 +136,7 @@ class Figure:
         less than a pixel over a limb). Solids that are partly behind the camera are left out; such joints are NaN.
         """
         joints = self.joints[row]
-        if not self.solids:
+        if not self.solids or not self.there(row):
             return [], camera.project(joints)[0]
         xy, depth = camera.project(np.concatenate([self.placed(row), joints]))
         xy, depth, joints_xy = xy[: -len(joints)], depth[: -len(joints)], xy[-len(joints) :]
@@ -144,6 +158,11 @@ class Figure:
         return sorted(found, key=lambda outline: -outline.depth), joints_xy
 
 
+def lost_in(figures: Sequence[Figure], row: int) -> bool:
+    """Return whether anybody is lost in a frame."""
+    return any(figure.lost(row) and figure.there(row) for figure in figures)
+
+
 def figure_of(result: Result) -> Figure:
     """Return the person of a result, joints in the order of :data:`~tk.model.body.skeleton.JOINTS`.
 
@@ -159,7 +178,7 @@ def figure_of(result: Result) -> Figure:
     if restored is not None:
         body, poses = restored
         solids, transforms = solids_of(body), body.skeleton.segment_transforms(poses)
-    return Figure(result.frames, result.joints, result.sigma, result.status, solids, transforms)
+    return Figure(result.frames, result.joints, result.sigma, result.status, solids, transforms, result.person)
 
 
 def solids_of(body: ConeBody) -> tuple[Solid, ...]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -23,9 +24,9 @@ from tk.io.results.status import STATUS_MEANING, has_pose
 from tk.io.results.truth import truth_of
 from tk.model.cameras.camera import Camera, Rig
 from tk.render.canvas import Image, View, dots, draw_body, draw_joints, draw_truth, text_width, write
-from tk.render.figure import Figure, figure_of
+from tk.render.figure import Figure, figure_of, lost_in
 from tk.render.legend import LEGEND_HEIGHT, Legend
-from tk.render.palette import LOST, TEXT, Color, person_color
+from tk.render.palette import LOST, TEXT, Color
 
 Float = NDArray[np.float64]
 
@@ -50,10 +51,11 @@ class Overlay:
     """
 
     def __init__(self, capture: Capture, result: Result, widest: int = WIDEST, full: bool = False) -> None:
-        self.figure: Figure = figure_of(result)
-        self._others = [
-            (one.person, figure_of(one), _rows(one)) for one in result.people if one.person != result.person
-        ]
+        if not len(result.frames):
+            raise ResultError(f"{result.path}: has no frames")
+        self.people = result.aligned()
+        self.figures = tuple(figure_of(person) for person in self.people)
+        result = self.people[0]
         last = int(result.frames.max())
         if last >= capture.frame_count:
             raise ResultError(
@@ -62,14 +64,16 @@ class Overlay:
             )
         self.capture, self.result = as_tracked(capture, result), result
         self.rig = self.capture.rig
+        self._errors = [e for person in self.people if (e := person.silhouette_error) is not None]
         self.grid = Grid.of(self.rig, widest)
         self._canvas = np.full((self.grid.height + LEGEND_HEIGHT, self.grid.width, 3), 24, np.uint8)
-        self._legend = Legend(result, self.figure, self.grid.width)
-        self._colors: dict[int, Sequence[Color | None]] = {}
+        self._legend = Legend(result, self.figures, self.grid.width)
+        self._colors: dict[tuple[int, int], Sequence[Color | None]] = {}
         self._views = [self._steady_view(camera, full) for camera in self.rig]
-        self.row_of = _rows(result)
+        self.row_of = {int(frame): row for row, frame in enumerate(result.frames)}
         truth = truth_of(result, capture.truth_file)
-        self._truth = {} if truth is None else dict(zip(result.frames.tolist(), truth, strict=True))
+        by_frame = () if truth is None else truth.swapaxes(0, 1).reshape(len(result), -1, 3)
+        self._truth = dict(zip(result.frames.tolist(), by_frame, strict=False))
 
     def pictures(self, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """Yield these frames, ascending, and their images (C, H, W, 3); decoding starts immediately."""
@@ -97,45 +101,45 @@ class Overlay:
         for camera, image in zip(self.rig, images, strict=True):
             view = View.whole(camera, tile_height)
             if not full:
-                outlines, joints = self.figure.seen(row, camera)
-                body = [points for outline in outlines for points in outline.points]
-                shown = np.concatenate([joints, *body, *self._true(frame, camera)])
+                seen = [figure.seen(row, camera) for figure in self.figures]
+                body = [points for outlines, _ in seen for outline in outlines for points in outline.points]
+                shown = np.concatenate([*(joints for _, joints in seen), *body, *self._true(frame, camera)])
                 view = View.around(shown, camera, round(0.75 * tile_height), tile_height)
             tile = np.empty((view.height, view.width, 3), np.uint8)
             self._draw(tile, row, camera, image, view)
             for xy in self._true(frame, camera) if truth else ():
                 draw_truth(tile, view.place(xy))
-            state = STATUS_MEANING[self.figure.status[row]]
+            state = ", ".join(STATUS_MEANING[figure.status[row]] for figure in self.figures)
             tile[:20] = tile[:20] // 3
             write(
                 tile,
                 f"{camera.name}  frame {frame}  {state}",
                 6,
                 14,
-                (120, 120, 255) if self.figure.lost(row) else TEXT,
+                (120, 120, 255) if lost_in(self.figures, row) else TEXT,
             )
             tiles.append(tile)
         return joined(tiles, axis=1)
 
     def _draw(self, tile: Image, row: int, camera: Camera, image: Image, view: View) -> None:
         """Fill a tile with a camera's image, and draw body and joints over it."""
-        lost = self.figure.lost(row)
         view.cut(image[: camera.height, : camera.width], tile)
-        for person, figure, rows in self._others:
-            other = rows.get(int(self.result.frames[row]))
-            if other is not None and not figure.lost(other):
-                draw_body(tile, view, figure.seen(other, camera)[0], color=person_color(person))
-        outlines, joints = self.figure.seen(row, camera)
-        draw_body(tile, view, outlines, lost)
-        draw_joints(tile, view.place(joints), self._dots(row), lost)
-        if lost:
+        there = [figure for figure in self.figures if figure.there(row)]
+        far = [np.nanmean(np.linalg.norm(figure.joints[row] - camera.center, axis=1)) for figure in there]
+        for k in np.argsort(far)[::-1]:
+            figure = there[k]
+            outlines, joints = figure.seen(row, camera)
+            draw_body(tile, view, outlines, partial(figure.color, row))
+            draw_joints(tile, view.place(joints), self._dots(row, figure), figure.lost(row))
+        if lost_in(self.figures, row):
             cv2.rectangle(tile, (0, 0), (view.width - 1, view.height - 1), LOST, 5)
 
-    def _dots(self, row: int) -> Sequence[Color | None]:
-        if row not in self._colors:  # the same for all cameras
-            sigma = None if self.figure.sigma is None else self.figure.sigma[row]
-            self._colors = {row: dots(sigma, self.figure.lost(row))}
-        return self._colors[row]
+    def _dots(self, row: int, figure: Figure) -> Sequence[Color | None]:
+        if (row, figure.person) not in self._colors:  # the same for all cameras
+            sigma = None if figure.sigma is None else figure.sigma[row]
+            self._colors = {key: colors for key, colors in self._colors.items() if key[0] == row}
+            self._colors[row, figure.person] = dots(sigma, figure.lost(row))
+        return self._colors[row, figure.person]
 
     def _true(self, frame: int, camera: Camera) -> list[Float]:
         return [camera.project(self._truth[frame])[0]] if frame in self._truth else []
@@ -159,8 +163,7 @@ class Overlay:
         """Return the view of a tile that contains the people in all frames that are not lost."""
         width, height = (max(int(size * self.grid.scale), 1) for size in (camera.width, camera.height))
         whole = View(np.zeros(2), self.grid.scale, width, height)
-        figures = (self.figure, *(figure for _, figure, _ in self._others))
-        shown = np.concatenate([figure.joints[has_pose(figure.status)].reshape(-1, 3) for figure in figures])
+        shown = np.concatenate([figure.joints[has_pose(figure.status)].reshape(-1, 3) for figure in self.figures])
         points, _ = camera.project(shown)
         if full or not camera.sees(shown).any():
             return whole
@@ -170,18 +173,13 @@ class Overlay:
     def _name(self, tile: Image, row: int, camera: Camera) -> None:
         """Write the camera's name and E_S into a corner."""
         text = camera.name
-        names, errors = self.result.meta.residual_cameras, self.result.silhouette_error
-        if errors is not None and camera.name in names:
-            error = float(errors[row, names.index(camera.name)])
-            text += f"  E_S {100 * error:.0f} %" if np.isfinite(error) else ""
+        names = self.result.meta.residual_cameras
+        errors = [e[row, names.index(camera.name)] for e in self._errors if camera.name in names]
+        known = [f"{100 * error:.0f}" for error in errors if np.isfinite(error)]
+        text += f"  E_S {', '.join(known)} %" if known else ""
         label = tile[:18, : text_width(text) + 12]
         label[...] = label // 3
         write(tile, text, 6, 13)
-
-
-def _rows(result: Result) -> dict[int, int]:
-    """Return the row of each frame."""
-    return {int(frame): row for row, frame in enumerate(result.frames)}
 
 
 @dataclass(frozen=True)
@@ -274,7 +272,7 @@ def write_sheets(
         ResultError: a frame is not in the result.
         ExportError: a sheet cannot be written.
     """
-    chosen = choose_frames(overlay.result, frames, count=8)
+    chosen = choose_frames(overlay.people[0], frames, count=8)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

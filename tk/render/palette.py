@@ -79,6 +79,8 @@ def hexadecimal(color: Color) -> str:
 
 
 def person_color(person: int) -> Color:
-    """Return the colour of a person after the first."""
+    """Return the colour of a person; the first person's segments have colours of their own, and this is the trunk's."""
+    if person == 0:
+        return SEGMENT_COLORS[_TRUNK[0]]
     r, g, b = hls_to_rgb(_PEOPLE_DEG[(person - 1) % len(_PEOPLE_DEG)] / 360, 0.5, 0.8)
     return round(255 * b), round(255 * g), round(255 * r)

@@ -1,4 +1,4 @@
-"""Draw a result in 3D from a camera that turns around the person: body or hull, skeleton, cameras, floor."""
+"""Draw a result in 3D from a camera that turns around the people: bodies or hull, skeleton, cameras, floor."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from scipy.ndimage import gaussian_filter1d
 
 from tk.errors import ResultError
 from tk.io.results.data import Result
+from tk.io.results.status import has_pose
 from tk.model.body.skeleton import SEGMENTS
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.up import up_vector
 from tk.render.canvas import SUBPIXEL_BITS, Image, dots, draw_joints, fixed, write
-from tk.render.figure import Figure, figure_of
+from tk.render.figure import Figure, figure_of, lost_in
 from tk.render.legend import LEGEND_HEIGHT, Legend
 from tk.render.overlay import choose_frames
-from tk.render.palette import BACKGROUND, ELEVATION_DEG, FLOOR, LOST, LOST_BODY, SEGMENT_COLORS, WIRE
+from tk.render.palette import BACKGROUND, ELEVATION_DEG, FLOOR, LOST, WIRE
 
 Float = NDArray[np.float64]
 
@@ -54,11 +55,14 @@ class Stage:
     floor: float
 
     @staticmethod
-    def of(result: Result, figure: Figure) -> Stage:
+    def of(people: Sequence[Result], figures: Sequence[Figure]) -> Stage:
         """Return the stage of the frames that are not lost (all, if all are). The lowest feet stand on the floor."""
+        result = people[0]
         up = up_vector(result.meta.up)
-        good = [row for row in range(len(result)) if not figure.lost(row)] or list(range(len(result)))
-        points = figure.joints[good].reshape(-1, 3)
+        good = [has_pose(figure.status) for figure in figures]
+        if not any(rows.any() for rows in good):
+            good = [~rows for rows in good]
+        points = np.concatenate([f.joints[rows].reshape(-1, 3) for f, rows in zip(figures, good, strict=True)])
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
             raise ResultError(f"{result.path}: has no joints to draw")
@@ -67,8 +71,9 @@ class Stage:
         east /= np.linalg.norm(east)
         low, high = points.min(axis=0), points.max(axis=0)
         middle = (low + high) / 2
-        feet = figure.joints[good] if result.feet is None else result.feet[good]
-        heights = (feet @ up).min(axis=1)
+        feet = [f.joints if person.feet is None else person.feet for person, f in zip(people, figures, strict=True)]
+        lowest = [(points[rows] @ up).min(axis=1) for points, rows in zip(feet, good, strict=True)]
+        heights = np.concatenate(lowest)
         heights = heights[np.isfinite(heights)]
         # the 10th percentile, because feet may be below the floor in single frames
         floor = float(np.percentile(heights, 10)) if len(heights) else float((points @ up).min())
@@ -116,12 +121,14 @@ class Scene:
     def __init__(self, result: Result, rig: Rig | None = None, hull: bool = False) -> None:
         if hull and result.hull is None:
             raise ResultError(f"{result.path}: holds no hull", hint="track with --method volumetric --store-hull")
-        self.result, self.hull = result, result.hull if hull else None
-        self.figure = figure_of(result)
-        self._legend = Legend(result, self.figure, WIDTH)
-        self.stage = Stage.of(result, self.figure)
+        self.hull = result.hull if hull else None
+        people = (result,) if hull else result.aligned()
+        self.result = people[0]
+        self.figures = tuple(figure_of(person) for person in people)
+        self._legend = Legend(self.result, self.figures, WIDTH)
+        self.stage = Stage.of(people, self.figures)
         self.rig = rig or (result.cameras.rig if result.cameras else None)
-        self._middles, reach = _followed(self.figure, result.meta.fps)
+        self._middles, reach = _followed(self.figures, result.meta.fps)
         self._distance = reach / np.sin(np.radians(_FIELD_OF_VIEW_DEG / 2))
 
     def rows(self, frames: Sequence[int] = ()) -> list[int]:
@@ -136,28 +143,28 @@ class Scene:
     def picture(self, row: int) -> Image:
         """Return an image (HEIGHT + LEGEND_HEIGHT, WIDTH, 3).
 
-        The camera follows the person and turns once in 16 s of the recording.
+        The camera follows the people and turns once in 16 s of the recording.
         """
         canvas = np.full((HEIGHT + LEGEND_HEIGHT, WIDTH, 3), BACKGROUND, np.uint8)
         tile = canvas[:HEIGHT]
         eye = self._camera(row)
         self._draw_floor(tile, eye)
         self._draw_cameras(tile, eye)
-        lost = self.figure.lost(row)
         if self.hull is not None:
             positions, colors = self.hull[row].positions, self.hull[row].colors
             _splat(tile, eye, positions.astype(np.float64), colors[:, ::-1])
         else:
-            self._draw_body(tile, eye, row, lost)
-        sigma = None if self.figure.sigma is None else self.figure.sigma[row]
-        draw_joints(tile, eye.project(self.figure.joints[row])[0], dots(sigma, lost), lost)
-        if lost:
+            self._draw_bodies(tile, eye, row)
+        for figure in self.figures:
+            sigma, lost = None if figure.sigma is None else figure.sigma[row], figure.lost(row)
+            draw_joints(tile, eye.project(figure.joints[row])[0], dots(sigma, lost), lost)
+        if lost_in(self.figures, row):
             cv2.rectangle(tile, (0, 0), (WIDTH - 1, HEIGHT - 1), LOST, 5)
         self._legend.draw(canvas[HEIGHT:], row)
         return canvas
 
     def _camera(self, row: int) -> Camera:
-        """Return the camera, which turns about the vertical with time and looks at the middle of the person."""
+        """Return the camera, which turns about the vertical with time and looks at the middle of the people."""
         turn = 2 * np.pi * (self.result.time[row] - self.result.time[0]) / _TURN_S
         up = self.stage.axes[:, 2]
         elevation = np.radians(ELEVATION_DEG)
@@ -186,12 +193,12 @@ class Scene:
             if depth[0] > _NEAREST_M and np.isfinite(xy).all() and (np.abs(xy[0]) < 4 * WIDTH).all():
                 write(tile, camera.name, int(xy[0, 0]) + 8, int(xy[0, 1]) - 8, WIRE)
 
-    def _draw_body(self, tile: Image, eye: Camera, row: int, lost: bool) -> None:
-        """Draw the body, lit from the viewer: each pixel is the mean of rays through its quarters."""
-        if not self.figure.solids or not np.isfinite(self.figure.transforms[row]).all():
+    def _draw_bodies(self, tile: Image, eye: Camera, row: int) -> None:
+        """Draw the bodies, lit from the viewer: each pixel is the mean of rays through its quarters."""
+        shown = [f for f in self.figures if f.solids and np.isfinite(f.transforms[row]).all()]
+        if not shown:
             return
-        points = self.figure.placed(row)
-        xy, depth = eye.project(points)
+        xy, depth = eye.project(np.concatenate([figure.placed(row) for figure in shown]))
         low = np.clip(np.floor(np.nanmin(xy, axis=0)), 0, (WIDTH, HEIGHT)).astype(int)
         high = np.clip(np.ceil(np.nanmax(xy, axis=0)) + 1, 0, (WIDTH, HEIGHT)).astype(int)
         if (depth < _NEAREST_M).any() or (low >= high).any():
@@ -200,8 +207,11 @@ class Scene:
         from open3d.t.geometry import RaycastingScene
 
         tensor, scene = Tensor.from_numpy, RaycastingScene()
-        for solid, own in zip(self.figure.solids, np.split(points, self.figure.starts[1:-1]), strict=True):
-            scene.add_triangles(tensor(own.astype(np.float32)), tensor(solid.triangles.astype(np.uint32)))
+        colors = []
+        for figure in shown:
+            for solid, own in zip(figure.solids, np.split(figure.placed(row), figure.starts[1:-1]), strict=True):
+                scene.add_triangles(tensor(own.astype(np.float32)), tensor(solid.triangles.astype(np.uint32)))
+                colors.append(figure.color(row, SEGMENTS[solid.segment]))
         columns, rows = (np.arange(2 * a, 2 * b) / 2 - 0.25 for a, b in zip(low, high, strict=True))
         pixels = np.stack([*np.meshgrid(columns, rows), np.ones((len(rows), len(columns)))], axis=-1)
         rays = pixels @ np.linalg.inv(eye.matrix).T @ eye.rotation
@@ -210,28 +220,28 @@ class Scene:
         hit = scene.cast_rays(tensor(cast.astype(np.float32)))
         facing = np.abs((hit["primitive_normals"].numpy() * rays).sum(axis=-1))
         solids = hit["geometry_ids"].numpy().astype(np.int64)
-        seen = solids < len(self.figure.solids)
-        base = np.array([LOST_BODY if lost else SEGMENT_COLORS[SEGMENTS[s.segment]] for s in self.figure.solids])
+        seen = solids < len(colors)
+        base = np.array(colors)
         part = tile[low[1] : high[1], low[0] : high[0]]
         drawn = np.repeat(np.repeat(part, 2, axis=0), 2, axis=1).astype(np.float64)
         drawn[seen] = base[solids[seen]] * (0.35 + 0.65 * facing[seen, None])
         part[...] = drawn.reshape(len(part), 2, -1, 2, 3).mean(axis=(1, 3)).round()
 
 
-def _followed(figure: Figure, fps: float) -> tuple[Float, float]:
+def _followed(figures: Sequence[Figure], fps: float) -> tuple[Float, float]:
     """Return the point (F, 3) that the camera looks at in each frame, and the radius of a ball around it, metres.
 
-    The point is the middle of the joints, smoothed over time. The ball contains the person in every frame.
+    The point is the middle of the joints, smoothed over time. The ball contains the people in every frame.
     """
-    joints = figure.joints
-    known = np.isfinite(joints).all(axis=(1, 2))
+    joints = np.concatenate([figure.joints for figure in figures], axis=1)
+    known = np.isfinite(joints).any(axis=(1, 2))
     if not known.any():
         return np.zeros((len(joints), 3)), 1.0
     frames = np.arange(len(joints))
-    middles = (joints[known].min(axis=1) + joints[known].max(axis=1)) / 2
+    middles = (np.nanmin(joints[known], axis=1) + np.nanmax(joints[known], axis=1)) / 2
     filled = np.stack([np.interp(frames, frames[known], axis) for axis in middles.T], axis=1)
     smooth = gaussian_filter1d(filled, _FOLLOW_S * fps, axis=0, mode="nearest")
-    reach = np.linalg.norm(joints[known] - smooth[known, None], axis=-1).max()
+    reach = np.nanmax(np.linalg.norm(joints[known] - smooth[known, None], axis=-1))
     return smooth, float(reach) + _MARGIN_M
 
 

@@ -47,7 +47,7 @@ def _write(capture: Capture, result_path: Path) -> list[Path]:
     overlay = Overlay(capture, result, _WIDEST)
     choices = choose_rows(result)
     wanted = {choice.row for choice in choices}
-    pictures = overlay.pictures(result.frames.tolist())
+    pictures = overlay.pictures(list(overlay.row_of))
     check_encoder()  # slow; decoding has already begun in the background
     shots: dict[int, bytes] = {}
     with video_writer(video, capture.fps) as add:

@@ -10,14 +10,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tk.evaluation.joints import evaluate_files, plain_values
+from tk.evaluation.joints import Evaluation, evaluate_files, plain_values
+from tk.evaluation.people import evaluate_people
 from tk.io.results.data import Result
+from tk.io.results.reader import read_people
 from tk.io.results.status import STATUS_MEANING, Status
 from tk.io.results.truth import truth_of
 from tk.model.body.joints import BONES, HINGES, JOINTS, LIMB_JOINTS, SEGMENTS
 from tk.model.cameras.camera import Rig
 from tk.render.figure import AROUND, Figure, figure_of
-from tk.render.palette import BONE, LOST, LOST_BODY, SEGMENT_COLORS, SIGMA_MOST_M, hexadecimal, sigma_colors
+from tk.render.palette import (
+    BONE,
+    LOST,
+    LOST_BODY,
+    SEGMENT_COLORS,
+    SIGMA_MOST_M,
+    hexadecimal,
+    person_color,
+    sigma_colors,
+)
 from tk.render.scene import Stage, camera_pyramid
 
 Float = NDArray[np.float64]
@@ -38,7 +49,11 @@ def describe(result: Result, rig: Rig | None = None, truth: Path | None = None) 
         ResultError: there are no frames or joints, or the body cannot be used.
     """
     meta = result.meta
-    figure = figure_of(result)
+    people = result.aligned()
+    figures = [figure_of(person) for person in people]
+    first = people[0]
+    stage = Stage.of(people, figures)
+    errors = _errors(first, people, truth)
     return {
         "capture": meta.capture,
         "method": meta.method,
@@ -48,24 +63,20 @@ def describe(result: Result, rig: Rig | None = None, truth: Path | None = None) 
         "seed": meta.seed,
         "settings": meta.config_toml,
         "notes": list(result.notes),
-        "frames": result.frames.tolist(),
-        "time": result.time.round(4).tolist(),
-        "status": result.status.tolist(),
+        "frames": first.frames.tolist(),
+        "time": first.time.round(4).tolist(),
         "statusWords": list(STATUS_MEANING),
         "withoutPose": [int(Status.LOST), int(Status.ABSENT)],
-        "scene": _scene(result, figure, rig),
+        "scene": _scene(stage, result.cameras.rig if result.cameras else rig),
         "joints": list(JOINTS),
-        "sigma": None if figure.sigma is None else packed(figure.sigma),
-        "expected": None if (expected := result.in_joint_order().expected_error) is None else packed(expected),
         "cameras": list(meta.residual_cameras),
-        "silhouetteError": None if (error := result.silhouette_error) is None else packed(error),
-        "truth": None if truth is None else _errors(result, truth),
-        "objective": packed(result.objective),
         "objectiveKind": meta.objective_kind,
-        "angles": _angles(result, figure),
-        "timing": _timing(result),
+        "people": [
+            _person(person, figure, stage, error) for person, figure, error in zip(people, figures, errors, strict=True)
+        ],
         "colors": {
             "segments": {name: hexadecimal(color) for name, color in SEGMENT_COLORS.items()},
+            "people": [hexadecimal(person_color(person.person)) for person in people],
             "lost": hexadecimal(LOST),
             "lostBody": hexadecimal(LOST_BODY),
             "bone": hexadecimal(BONE),
@@ -82,26 +93,47 @@ def packed(values: ArrayLike) -> dict[str, Any]:
     return {"shape": list(array.shape), "data": base64.b64encode(array.tobytes()).decode("ascii")}
 
 
-def _scene(result: Result, figure: Figure, rig: Rig | None) -> dict[str, Any]:
-    """Return joints, body and cameras in a frame on the floor: z up, the middle of the motion above the origin."""
-    stage = Stage.of(result, figure)
-    T = np.eye(4)
-    T[:3, :3] = stage.axes.T
-    T[:3, 3] = -stage.axes.T @ stage.origin
-    cameras = result.cameras.rig if result.cameras else rig
+def _person(result: Result, figure: Figure, stage: Stage, truth: dict[str, Any] | None) -> dict[str, Any]:
+    """Return the data of one person; joints and body in the frame of :func:`_on_floor`."""
+    T = _on_floor(stage)
     carrying = sorted({solid.segment for solid in figure.solids})
     return {
-        "joints": packed(figure.joints @ T[:3, :3].T + T[:3, 3]),
-        "bones": [[JOINTS.index(a), JOINTS.index(b)] for a, b in BONES],
-        "around": AROUND,
+        "number": result.person,
+        "status": result.status.tolist(),
+        "positions": packed(figure.joints @ T[:3, :3].T + T[:3, 3]),
         "segments": [SEGMENTS[k] for k in carrying],
         "transforms": packed((T @ figure.transforms[:, carrying])[:, :, :3]),
         "solids": [
             {"segment": carrying.index(solid.segment), "rings": packed(solid.divided.rings)} for solid in figure.solids
         ],
+        "sigma": None if figure.sigma is None else packed(figure.sigma),
+        "expected": None if (expected := result.in_joint_order().expected_error) is None else packed(expected),
+        "silhouetteError": None if (error := result.silhouette_error) is None else packed(error),
+        "truth": truth,
+        "objective": packed(result.objective),
+        "angles": _angles(result, figure),
+        "timing": _timing(result),
+    }
+
+
+def _on_floor(stage: Stage) -> Float:
+    """Return the transform (4, 4) from the world to a frame on the floor: z up, the middle of the motion above the
+    origin."""
+    T = np.eye(4)
+    T[:3, :3] = stage.axes.T
+    T[:3, 3] = -stage.axes.T @ stage.origin
+    return T
+
+
+def _scene(stage: Stage, rig: Rig | None) -> dict[str, Any]:
+    """Return what does not move."""
+    T = _on_floor(stage)
+    return {
+        "bones": [[JOINTS.index(a), JOINTS.index(b)] for a, b in BONES],
+        "around": AROUND,
         "cameras": [
             {"name": camera.name, "points": packed(camera_pyramid(camera) @ T[:3, :3].T + T[:3, 3])}
-            for camera in cameras or ()
+            for camera in rig or ()
         ],
         "radius": stage.radius,
         "height": float((stage.middle - stage.origin) @ stage.axes[:, 2]),
@@ -149,17 +181,28 @@ def hinge_sigma_deg(figure: Figure, joints: Sequence[str]) -> Float:
         return np.asarray(np.degrees(np.sqrt((a / p) ** 2 + (c / q) ** 2 + b**2 * middle)))
 
 
-def _errors(result: Result, truth: Path) -> dict[str, Any] | None:
-    """Return the errors against the ground truth, cm: by joint, and the mean of each frame; None without a truth."""
-    positions = truth_of(result, truth)
-    if positions is None or not np.isfinite(positions).any():
-        return None
-    found = evaluate_files(result.path, truth)
+def _errors(result: Result, people: Sequence[Result], truth: Path | None) -> list[dict[str, Any] | None]:
+    """Return the errors of each person against the ground truth, cm: by joint, and the mean of each frame; None
+    without a truth."""
+    positions = None if truth is None else truth_of(result, truth)
+    if truth is None or positions is None or not np.isfinite(positions).any():
+        return [None] * len(people)
+    if len(people) == len(positions) == 1:
+        return [_error_data(evaluate_files(result.path, truth), people[0], positions[0])]
+    errors: list[dict[str, Any] | None] = [None] * len(people)
+    for score in evaluate_people(read_people(result.path), read_people(truth)).people:
+        for k, person in enumerate(people):
+            if score.errors is not None and score.matched_with[0] == person.person:
+                errors[k] = _error_data(score.errors, person, positions[score.person])
+    return errors
+
+
+def _error_data(found: Evaluation, person: Result, positions: Float) -> dict[str, Any]:
     groups = {f"all {len(JOINTS)}": (found.raw.all, found.corrected.all)}
     groups |= {f"{len(LIMB_JOINTS)} limb joints": (found.raw.limbs, found.corrected.limbs)}
     groups |= {name: (found.raw.joints[name], found.corrected.joints[name]) for name in JOINTS}
     rows = [[name, *plain_values([raw.mean_cm, corrected.mean_cm])] for name, (raw, corrected) in groups.items()]
-    distances = np.linalg.norm(result.joints - positions, axis=-1)
+    distances = np.linalg.norm(person.joints - positions, axis=-1)
     known = np.isfinite(distances)
     means = np.where(known, distances, 0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
     return {"rows": rows, "frames": packed(np.where(known.any(axis=1), 100 * means, np.nan))}

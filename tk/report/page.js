@@ -1,15 +1,11 @@
 "use strict";
-// Fills the page from the data, and shows the same frame in all its parts.
+// Fills the page from the data, and shows the same frame in all its parts. Each person has a block; all have the same
+// frames. The block of person n > 0 is a copy whose ids end in -n.
 
 (function () {
   const data = JSON.parse(document.getElementById("data").textContent);
-  const get = (id) => document.getElementById(id);
-  const count = data.frames.length;
-  const lost = data.status.map((status) => data.withoutPose.includes(status));
-  const lostCount = lost.filter(Boolean).length;
-  const silhouetteError = data.silhouetteError && unpack(data.silhouetteError);
-  const sigma = data.sigma && unpack(data.sigma), expected = data.expected && unpack(data.expected);
-  const objective = unpack(data.objective);
+  const get = (id, n = 0) => document.getElementById(n ? `${id}-${n}` : id);
+  const count = data.frames.length, several = data.people.length > 1;
   const C = data.cameras.length, J = data.joints.length;
   const segments = data.colors.segments;
   const root = document.documentElement.style;
@@ -29,34 +25,75 @@
     return sorted.length ? sorted[Math.min(sorted.length - 1, Math.floor(share * sorted.length))] : NaN;
   };
   const column = (values, width, k) => Array.from({ length: values.length / width }, (_, row) => values[row * width + k]);
-  const rows = (values, width) => Array.from(values).filter((_, k) => !lost[Math.floor(k / width)]);
-  const good = (values) => values.filter((_, row) => !lost[row]);
   const joint = (name) => name.replace(/^(.*)_([lr])$/, (_, part, side) => `${side === "l" ? "left" : "right"} ${part}`).replace("_", " ");
 
   // --- header
   get("title").textContent = data.capture;
   const when = data.created.slice(0, 16).replace("T", " ");
   get("subtitle").textContent = `${data.file} · ${count} frames at ${short(data.fps)} Hz · method ${data.method} · ${data.software}${when ? ` · ${when} UTC` : ""}`;
-  const addFigure = (name, value, unit = "", bad = false) => {
-    const box = make("div", "", bad ? "bad" : "");
-    const number = make("dd", value);
-    if (unit) number.append(" ", make("small", unit));
-    box.append(make("dt", name), number);
-    get("figures").append(box);
+  const line = (cells, kind = "td") => {
+    const made = make("tr");
+    cells.forEach((cell, k) => {
+      const box = make(kind, typeof cell === "string" ? cell : "", k && typeof cell === "string" ? "number" : "");
+      if (typeof cell !== "string") box.append(cell);
+      made.append(box);
+    });
+    return made;
   };
+  for (const id of ["now-person", "person"]) {
+    const original = get(id), copies = data.people.slice(1).map((_, k) => {
+      const copy = original.cloneNode(true);
+      for (const part of [copy, ...copy.querySelectorAll("[id]")]) part.id += `-${k + 1}`;
+      return copy;
+    });
+    original.after(...copies);
+  }
+  const mean = (values) => (values.length ? values.reduce((a, b) => a + b) / values.length : NaN);
   const suspect = data.statusWords.indexOf("suspect");
-  const suspectCount = data.status.filter((status) => status === suspect).length;
-  if (lostCount + suspectCount > 0.2 * count) get("title").textContent += `: ${lostCount + suspectCount} of ${count} frames are lost or suspect`;
-  addFigure("lost frames", String(lostCount), `of ${count}`, lostCount > 0);
-  if (suspectCount) addFigure("suspect frames", String(suspectCount), `of ${count}`, true);
-  const meanError = silhouetteError && Array.from({ length: count }, (_, row) => {
-    const known = Array.from(silhouetteError.subarray(row * C, row * C + C)).filter(isFinite);
-    return known.length ? known.reduce((a, b) => a + b) / known.length : NaN;
+  const people = data.people.map((person, n) => {
+    const positions = unpack(person.positions);
+    const there = Array.from({ length: count }, (_, row) => positions.subarray(3 * J * row, 3 * J * (row + 1)).some(isFinite));
+    const lost = person.status.map((status, row) => there[row] && data.withoutPose.includes(status));
+    const silhouetteError = person.silhouetteError && unpack(person.silhouetteError);
+    const good = (values) => values.filter((_, row) => there[row] && !lost[row]);
+    return {
+      ...person, n, name: `Person ${person.number}`, color: data.colors.people[n], there, lost, good,
+      silhouetteError, sigma: person.sigma && unpack(person.sigma), expected: person.expected && unpack(person.expected),
+      meanError: silhouetteError && Array.from({ length: count }, (_, row) => mean(Array.from(silhouetteError.subarray(row * C, row * C + C)).filter(isFinite))),
+      present: there.filter(Boolean).length, lostCount: lost.filter(Boolean).length,
+      suspectCount: person.status.filter((status) => status === suspect).length,
+    };
   });
-  if (meanError) addFigure("E_S, median frame", short(100 * quantile(good(meanError), 0.5)), "%");
-  if (expected) addFigure("expected error of a joint, median", short(100 * quantile(rows(expected, J), 0.5)), "cm");
-  const total = data.timing.find(({ stage }) => stage === "total");
-  if (total) addFigure("time per frame, mean", short(total.ms), "ms");
+  const sum = (values) => values.reduce((a, b) => a + b, 0);
+  const bad = sum(people.map((person) => person.lostCount + person.suspectCount)), all = sum(people.map((person) => person.present));
+  if (bad > 0.2 * all) get("title").textContent += `: ${bad} of ${all} frames are lost or suspect`;
+  const figuresOf = (person) => [
+    ["lost frames", String(person.lostCount), `of ${person.present}`, person.lostCount > 0],
+    ["suspect frames", String(person.suspectCount), `of ${person.present}`, person.suspectCount > 0],
+    ["E_S, median frame", person.meanError ? short(100 * quantile(person.good(person.meanError), 0.5)) : "", "%"],
+    ["expected error of a joint, median", person.expected ? short(100 * quantile(person.expected.filter((_, k) => person.there[Math.floor(k / J)] && !person.lost[Math.floor(k / J)]), 0.5)) : "", "cm"],
+  ];
+  if (several) {
+    get("figures").remove();
+    get("people").hidden = false;
+    get("people").append(line(["", ...figuresOf(people[0]).map(([name]) => name)], "th"));
+    for (const person of people) {
+      const link = make("a", person.name);
+      link.href = `#person${person.n ? `-${person.n}` : ""}`;
+      link.style.setProperty("--color", person.color);
+      get("people").append(line([link, ...figuresOf(person).map(([, value, unit]) => (value ? `${value} ${unit}` : ""))]));
+    }
+  } else {
+    const [person] = people, total = person.timing.find(({ stage }) => stage === "total");
+    const figures = figuresOf(person).filter(([name, value]) => value && (value !== "0" || name !== "suspect frames"));
+    if (total) figures.push(["time per frame, mean", short(total.ms), "ms"]);
+    for (const [name, value, unit, isBad] of figures) {
+      const box = make("div", "", isBad ? "bad" : ""), number = make("dd", value);
+      number.append(" ", make("small", unit));
+      box.append(make("dt", name), number);
+      get("figures").append(box);
+    }
+  }
 
   // --- current frame
   const viewer = new Viewer(get("view"), data);
@@ -75,13 +112,22 @@
         number.textContent = isFinite(value) ? `${listed(value)} ${unit}` : "–";
       };
     });
-    get(holder).append(box);
+    holder.append(box);
     return made;
   };
-  const errorBars = silhouetteError ? bars("now-cameras", "E_S of each camera", data.cameras, "%") : [];
-  const sigmaBars = sigma ? bars("now-joints", "σ of each joint", data.joints.map(joint), "mm") : [];
-  if (!silhouetteError && !sigma) get("now-joints").append(make("p", "This result has neither E_S nor σ.", "muted"));
-  const mostError = silhouetteError ? Math.max(quantile(silhouetteError, 0.99) * 100, 1) : 1;
+  for (const person of people) {
+    const { n, silhouetteError, sigma } = person;
+    person.errorBars = silhouetteError ? bars(get("now-cameras", n), "E_S of each camera", data.cameras, "%") : [];
+    person.sigmaBars = sigma ? bars(get("now-joints", n), "σ of each joint", data.joints.map(joint), "mm") : [];
+    person.mostError = silhouetteError ? Math.max(quantile(silhouetteError, 0.99) * 100, 1) : 1;
+    if (!silhouetteError && !sigma) get("now-joints", n).append(make("p", "This result has neither E_S nor σ.", "muted"));
+    get("now-person", n).open = !n;
+    for (const id of several ? ["now-who", "who"] : []) {
+      get(id, n).textContent = person.name;
+      get(id, n).style.setProperty("--color", person.color);
+      get(id, n).hidden = false;
+    }
+  }
 
   function show(wanted) {
     const next = Math.min(Math.max(wanted, 0), count - 1);
@@ -89,17 +135,23 @@
     row = next;
     viewer.show(row);
     get("scrubber").value = row;
-    get("scrubber").setAttribute("aria-valuetext", `frame ${data.frames[row]}, ${data.statusWords[data.status[row]]}`);
+    const words = people.map(({ status }) => data.statusWords[status[row]]);
+    get("scrubber").setAttribute("aria-valuetext", `frame ${data.frames[row]}, ${words.join(", ")}`);
     get("clock").textContent = `frame ${data.frames[row]} · ${data.time[row].toFixed(2)} s`;
-    get("status").textContent = data.statusWords[data.status[row]];
-    get("status").dataset.status = data.status[row];
-    get("badge").hidden = !lost[row];
-    document.querySelector(".stage").classList.toggle("lost", lost[row]);
-    errorBars.forEach((set, k) => set(100 * silhouetteError[row * C + k], mostError));
-    sigmaBars.forEach((set, k) => {
-      const value = sigma[row * J + k];
-      set(1000 * value, 1000 * data.colors.sigmaMost, isFinite(value) ? sigmaColor(data.colors, value) : "");
-    });
+    for (const person of people) {
+      get("status", person.n).textContent = words[person.n];
+      if (several) get("now-who", person.n).textContent = `${person.name}: ${words[person.n]}`;
+      get("status", person.n).dataset.status = person.status[row];
+      person.errorBars.forEach((set, k) => set(100 * person.silhouetteError[row * C + k], person.mostError));
+      person.sigmaBars.forEach((set, k) => {
+        const value = person.sigma[row * J + k];
+        set(1000 * value, 1000 * data.colors.sigmaMost, isFinite(value) ? sigmaColor(data.colors, value) : "");
+      });
+    }
+    const missing = people.filter(({ lost }) => lost[row]);
+    get("badge").hidden = !missing.length;
+    get("badge").textContent = several ? `lost: ${missing.map(({ name }) => name.toLowerCase()).join(", ")}` : "lost: do not use this pose";
+    document.querySelector(".stage").classList.toggle("lost", missing.length > 0);
     for (const chart of charts) chart.show(row);
     drawStrip();
   }
@@ -145,7 +197,7 @@
   for (const [id, part] of [["show-body", "body"], ["show-bones", "bones"], ["show-cameras", "cameras"]]) {
     get(id).addEventListener("change", (event) => { viewer.shown[part] = event.target.checked; viewer.draw(); });
   }
-  if (!viewer.solids.length) get("show-body").parentElement.remove();
+  if (!viewer.people.some(({ solids }) => solids.length)) get("show-body").parentElement.remove();
   if (!viewer.cameras.length) get("show-cameras").parentElement.remove();
 
   function drawStrip() {
@@ -153,51 +205,18 @@
     const style = getComputedStyle(document.documentElement);
     const colors = ["--ok", "--initialised", "--recovered", "--lost", "--suspect", "--wire"].map((name) => style.getPropertyValue(name).trim());
     // lost frames last and at least a pixel wide: one in ten thousand must stay visible
+    const high = strip.height / people.length;
     for (const wanted of [false, true]) {
-      data.status.forEach((status, k) => {
-        if (lost[k] !== wanted) return;
-        pen.fillStyle = colors[status];
-        pen.fillRect(Math.floor(k / count * width), 0, Math.max(Math.ceil(width / count), 1), 8);
-      });
+      for (const { status, lost, n } of people) {
+        status.forEach((value, k) => {
+          if (lost[k] !== wanted) return;
+          pen.fillStyle = colors[value];
+          pen.fillRect(Math.floor(k / count * width), n * high, Math.max(Math.ceil(width / count), 1), high);
+        });
+      }
     }
   }
   new ResizeObserver(drawStrip).observe(get("strip"));
-
-  // --- curves
-  const common = { time: data.time, lost, seek };
-  const wide = innerWidth > 560 ? 1240 : 400; // of charts over the whole page, so that their text has the same size as elsewhere
-  const hues = Array.from({ length: 9 }, (_, k) => `var(--hue-${k})`);
-  if (meanError) {
-    get("quality-text").textContent = "E_S is the share of wrong pixels: body outside the mask, or mask outside the body. Lower is better. Red: lost frames. Click a curve to go to a frame.";
-    charts.push(new Chart(get("quality-charts"), {
-      ...common, title: "E_S of each camera", unit: " %", width: wide, height: 190, zero: true, digits: 1,
-      lines: data.cameras.map((name, k) => ({ name, color: hues[k % hues.length], values: column(silhouetteError, C, k).map((v) => 100 * v) })),
-    }));
-  } else {
-    get("quality-text").textContent = "This result has no E_S. Red: lost frames. Click a curve to go to a frame.";
-  }
-  const kind = data.objectiveKind ? ` (${data.objectiveKind})` : "";
-  charts.push(new Chart(get("quality-charts"), {
-    ...common, title: `Objective${kind}`, unit: "", width: wide, height: 110, zero: true,
-    lines: [{ name: "", color: "var(--accent)", values: Array.from(objective) }],
-  }));
-  const tints = { left: "var(--left)", right: "var(--right)", middle: "var(--middle)" };
-  if (data.angles.length) {
-    const banded = data.angles.some(({ lines }) => lines.some((line) => line.sigma));
-    get("angles-text").textContent = "Degrees. Left warm, right cool. Point at a title to read its convention (ISB where it defines one). "
-      + (banded ? "Bands: ± one σ, computed from independent positions of the three joints; other angles have no σ." : "No σ is available.");
-    for (const panel of data.angles) {
-      charts.push(new Chart(get("angle-charts"), {
-        ...common, title: panel.title, unit: "°", hint: panel.convention, wraps: true, least: 20, digits: 1,
-        lines: panel.lines.map((line) => ({
-          name: line.side === "middle" ? "" : line.side, color: tints[line.side],
-          values: Array.from(unpack(line.values)), sigma: line.sigma && Array.from(unpack(line.sigma)),
-        })),
-      }));
-    }
-  } else {
-    get("angles-text").textContent = "This result has no joint angles.";
-  }
 
   // --- pictures
   get("pictures-text").textContent = data.pictures.length
@@ -217,49 +236,78 @@
     get("shots").append(figure);
   }
 
-  // --- tables
-  const line = (cells, kind = "td") => {
-    const made = make("tr");
-    cells.forEach((cell, k) => {
-      const box = make(kind, typeof cell === "string" ? cell : "", k && typeof cell === "string" ? "number" : "");
-      if (typeof cell !== "string") box.append(cell);
-      made.append(box);
-    });
-    return made;
-  };
-  if (sigma) {
-    get("sigma-text").textContent = "One standard deviation of a joint position along one axis, mm; frames that are not lost. "
-      + "Expected error: distance to the true position, median, mm; it adds the constant offset that a joint of this kind had on rendered recordings.";
-    get("sigma-table").append(line(["joint", "median", "90 %", "largest", "expected error"], "th"));
-    data.joints.forEach((name, k) => {
-      const values = good(column(sigma, J, k));
-      get("sigma-table").append(line([
-        joint(name), ...[0.5, 0.9, 1].map((share) => listed(1000 * quantile(values, share))),
-        listed(1000 * quantile(good(column(expected, J, k)), 0.5)),
-      ]));
-    });
-  } else {
-    get("sigma-text").textContent = "This result has no σ.";
-  }
-  if (data.truth) {
-    get("truth").hidden = false;
-    charts.push(new Chart(get("truth-charts"), {
-      ...common, title: "Mean error of the joints", unit: " cm", width: wide, height: 110, zero: true, digits: 1,
-      lines: [{ name: "", color: "var(--accent)", values: Array.from(unpack(data.truth.frames)) }],
-    }));
-    get("truth-table").append(line(["joint", "mean", "without offset"], "th"));
-    for (const [name, ...errors] of data.truth.rows) {
-      get("truth-table").append(line([joint(name), ...errors.map((error) => error === null ? "–" : error.toFixed(2))]));
+  // --- a block for each person
+  const wide = innerWidth > 560 ? 1240 : 400; // of charts over the whole page, so that their text has the same size as elsewhere
+  const hues = Array.from({ length: 9 }, (_, k) => `var(--hue-${k})`);
+  const tints = { left: "var(--left)", right: "var(--right)", middle: "var(--middle)" };
+  for (const person of people) {
+    const { n, lost, good, silhouetteError, meanError, sigma, expected } = person;
+    const objective = unpack(person.objective), common = { time: data.time, lost, seek };
+    if (meanError) {
+      get("quality-text", n).textContent = "E_S is the share of wrong pixels: body outside the mask, or mask outside the body. Lower is better. Red: lost frames. Click a curve to go to a frame.";
+      charts.push(new Chart(get("quality-charts", n), {
+        ...common, title: "E_S of each camera", unit: " %", width: wide, height: 190, zero: true, digits: 1,
+        lines: data.cameras.map((name, k) => ({ name, color: hues[k % hues.length], values: column(silhouetteError, C, k).map((v) => 100 * v) })),
+      }));
+    } else {
+      get("quality-text", n).textContent = "This result has no E_S. Red: lost frames. Click a curve to go to a frame.";
     }
-  }
-  get("times-text").textContent = "Mean, ms. Decoding and segmentation run in a separate process and are not part of the total.";
-  get("times-table").append(line(["stage", "", "ms"], "th"));
-  const longest = Math.max(...data.timing.map(({ ms }) => ms), 1e-9);
-  for (const { stage, ms } of data.timing) {
-    const track = make("div", "", "track"), fill = make("i");
-    fill.style.width = `${100 * ms / longest}%`;
-    track.append(fill);
-    get("times-table").append(line([stage.replace("_", " "), track, listed(ms)]));
+    const kind = data.objectiveKind ? ` (${data.objectiveKind})` : "";
+    charts.push(new Chart(get("quality-charts", n), {
+      ...common, title: `Objective${kind}`, unit: "", width: wide, height: 110, zero: true,
+      lines: [{ name: "", color: "var(--accent)", values: Array.from(objective) }],
+    }));
+    if (person.angles.length) {
+      const banded = person.angles.some(({ lines }) => lines.some((line) => line.sigma));
+      get("angles-text", n).textContent = "Degrees. Left warm, right cool. Point at a title to read its convention (ISB where it defines one). "
+        + (banded ? "Bands: ± one σ, computed from independent positions of the three joints; other angles have no σ." : "No σ is available.");
+      for (const panel of person.angles) {
+        charts.push(new Chart(get("angle-charts", n), {
+          ...common, title: panel.title, unit: "°", hint: panel.convention, wraps: true, least: 20, digits: 1,
+          lines: panel.lines.map((line) => ({
+            name: line.side === "middle" ? "" : line.side, color: tints[line.side],
+            values: Array.from(unpack(line.values)), sigma: line.sigma && Array.from(unpack(line.sigma)),
+          })),
+        }));
+      }
+    } else {
+      get("angles-text", n).textContent = "This result has no joint angles.";
+    }
+
+    if (sigma) {
+      get("sigma-text", n).textContent = "One standard deviation of a joint position along one axis, mm; frames that are not lost. "
+        + "Expected error: distance to the true position, median, mm; it adds the constant offset that a joint of this kind had on rendered recordings.";
+      get("sigma-table", n).append(line(["joint", "median", "90 %", "largest", "expected error"], "th"));
+      data.joints.forEach((name, k) => {
+        const values = good(column(sigma, J, k));
+        get("sigma-table", n).append(line([
+          joint(name), ...[0.5, 0.9, 1].map((share) => listed(1000 * quantile(values, share))),
+          listed(1000 * quantile(good(column(expected, J, k)), 0.5)),
+        ]));
+      });
+    } else {
+      get("sigma-text", n).textContent = "This result has no σ.";
+    }
+    if (person.truth) {
+      get("truth", n).hidden = false;
+      charts.push(new Chart(get("truth-charts", n), {
+        ...common, title: "Mean error of the joints", unit: " cm", width: wide, height: 110, zero: true, digits: 1,
+        lines: [{ name: "", color: "var(--accent)", values: Array.from(unpack(person.truth.frames)) }],
+      }));
+      get("truth-table", n).append(line(["joint", "mean", "without offset"], "th"));
+      for (const [name, ...errors] of person.truth.rows) {
+        get("truth-table", n).append(line([joint(name), ...errors.map((error) => error === null ? "–" : error.toFixed(2))]));
+      }
+    }
+    get("times-text", n).textContent = "Mean, ms. Decoding and segmentation run in a separate process and are not part of the total.";
+    get("times-table", n).append(line(["stage", "", "ms"], "th"));
+    const longest = Math.max(...person.timing.map(({ ms }) => ms), 1e-9);
+    for (const { stage, ms } of person.timing) {
+      const track = make("div", "", "track"), fill = make("i");
+      fill.style.width = `${100 * ms / longest}%`;
+      track.append(fill);
+      get("times-table", n).append(line([stage.replace("_", " "), track, listed(ms)]));
+    }
   }
 
   // --- notes and settings

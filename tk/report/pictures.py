@@ -30,14 +30,16 @@ class Choice:
 
 
 def choose_rows(result: Result) -> list[Choice]:
-    """Return the first lost frame, the worst and typical frames; without E_S, frames spread over the result."""
-    count = len(result)
-    lost = ~result.has_pose
+    """Return the first frame in which anybody is lost, the worst and typical frames; without E_S, frames spread over
+    the result. Rows are those of :meth:`~tk.io.results.data.Result.aligned`."""
+    people = result.aligned()
+    count = len(people[0])
+    there = [np.isfinite(person.joints).any(axis=(1, 2)) for person in people]
+    lost = np.any([~person.has_pose & known for person, known in zip(people, there, strict=True)], axis=0)
     error = np.full(count, np.nan)
-    by_view = result.silhouette_error
-    if by_view is not None and by_view.size:
-        known = np.isfinite(by_view).any(axis=1)
-        error[known] = np.nanmean(by_view[known], axis=1)
+    by_view = np.concatenate([np.zeros((count, 0)), *(e for p in people if (e := p.silhouette_error) is not None)], 1)
+    known = np.isfinite(by_view).any(axis=1)
+    error[known] = np.nanmean(by_view[known], axis=1)
     chosen: dict[int, str] = {}
     spacing = max(2, count // 20)
 
@@ -63,7 +65,7 @@ def choose_rows(result: Result) -> list[Choice]:
 
 
 def shot(overlay: Overlay, frame: int, images: NDArray[np.uint8]) -> bytes:
-    """Return a JPEG of a frame with the person in all cameras."""
+    """Return a JPEG of a frame with the people in all cameras."""
     height = int(np.clip(_WIDTH / (0.75 * len(overlay.rig)), 160, 300))
     _, data = cv2.imencode(
         ".jpg", overlay.sheet_row(frame, images, height, truth=False), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]

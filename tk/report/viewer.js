@@ -1,5 +1,5 @@
 "use strict";
-// Draws the person in 3D on a 2D canvas: faces sorted by depth, no GPU. Metres; z is up, the floor is at z = 0.
+// Draws the people in 3D on a 2D canvas: faces sorted by depth, no GPU. Metres; z is up, the floor is at z = 0.
 
 /** The numbers of an array that Python packed: a Float32Array with its shape. */
 function unpack(packed) {
@@ -20,17 +20,19 @@ class Viewer {
     this.scene = data.scene;
     this.colors = data.colors;
     this.names = data.joints;
-    this.status = data.status;
     this.withoutPose = data.withoutPose;
-    this.joints = unpack(data.scene.joints);
-    this.transforms = unpack(data.scene.transforms);
-    this.sigma = data.sigma && unpack(data.sigma);
     this.cameras = data.scene.cameras.map((c) => ({ name: c.name, points: unpack(c.points) }));
-    this.solids = data.scene.solids.map((solid) => {
-      const rings = unpack(solid.rings);
-      const color = rgbOf(data.colors.segments[data.scene.segments[solid.segment]]);
-      return { segment: solid.segment, points: rings, faces: facesOf(rings.shape[0], data.scene.around), color };
-    });
+    this.people = data.people.map((person, n) => ({
+      status: person.status,
+      joints: unpack(person.positions),
+      transforms: unpack(person.transforms),
+      sigma: person.sigma && unpack(person.sigma),
+      solids: person.solids.map((solid) => {
+        const rings = unpack(solid.rings);
+        const color = rgbOf(n ? data.colors.people[n] : data.colors.segments[person.segments[solid.segment]]);
+        return { segment: solid.segment, points: rings, faces: facesOf(rings.shape[0], data.scene.around), color };
+      }),
+    }));
     this.shown = { body: true, bones: true, cameras: true };
     this.frame = 0;
     this.reset();
@@ -46,10 +48,11 @@ class Viewer {
     this.draw();
   }
 
-  /** The angle from which the person is seen in front, in the middle of the recording. */
+  /** The angle from which the first person is seen in front, in the middle of the recording. */
   facing() {
-    const count = this.joints.shape[1], middle = Math.floor(this.joints.shape[0] / 2) * count;
-    const of = (name, axis) => this.joints[3 * (middle + this.names.indexOf(name)) + axis];
+    const { joints } = this.people[0];
+    const count = joints.shape[1], middle = Math.floor(joints.shape[0] / 2) * count;
+    const of = (name, axis) => joints[3 * (middle + this.names.indexOf(name)) + axis];
     const left = [0, 1].map((axis) => of("hip_l", axis) - of("hip_r", axis));
     const turn = Math.atan2(left[1], left[0]);
     return isFinite(turn) ? turn : 0;
@@ -109,11 +112,14 @@ class Viewer {
       cos: Math.cos(this.turn), sin: Math.sin(this.turn), cosLift: Math.cos(this.lift), sinLift: Math.sin(this.lift),
       focal: 1.25 * height, x: width / 2, y: height / 2,
     };
-    const lost = this.withoutPose.includes(this.status[this.frame]);
     this.drawFloor(color("--floor"));
     if (this.shown.cameras) this.drawCameras(color("--wire"));
-    if (this.shown.body) this.drawBody(lost);
-    if (this.shown.bones) this.drawSkeleton(lost);
+    if (this.shown.body) this.drawBodies();
+    if (this.shown.bones) this.people.forEach((person) => this.drawSkeleton(person));
+  }
+
+  lost(person) {
+    return this.withoutPose.includes(person.status[this.frame]);
   }
 
   line(a, b) {
@@ -155,10 +161,25 @@ class Viewer {
     }
   }
 
-  drawBody(lost) {
-    const T = this.transforms, perFrame = T.shape[1] * 12, faces = [];
+  drawBodies() {
+    const faces = this.people.flatMap((person) => this.facesOfBody(person));
+    faces.sort((a, b) => b.depth - a.depth);
+    const { pen } = this;
+    pen.lineWidth = 0.7;
+    for (const { corners, base, shade } of faces) {
+      pen.fillStyle = pen.strokeStyle = `rgb(${base.map((value) => Math.min(255, Math.round(value * shade))).join(",")})`;
+      pen.beginPath();
+      corners.forEach((p, k) => (k ? pen.lineTo(p[0], p[1]) : pen.moveTo(p[0], p[1])));
+      pen.closePath();
+      pen.fill();
+      pen.stroke(); // closes gaps between neighbouring faces
+    }
+  }
+
+  facesOfBody(person) {
+    const T = person.transforms, perFrame = T.shape[1] * 12, lost = this.lost(person), faces = [];
     const light = 1 / Math.hypot(0.35, 0.4, 0.85);
-    for (const solid of this.solids) {
+    for (const solid of person.solids) {
       const m = this.frame * perFrame + solid.segment * 12;
       const points = solid.points, count = points.length / 3;
       const world = new Float32Array(points.length), seen = new Array(count);
@@ -184,24 +205,14 @@ class Viewer {
         faces.push({ depth: a[2] + b[2] + c[2] + d[2], corners: [a, b, c, d], base, shade: 0.76 + 0.32 * along });
       }
     }
-    faces.sort((a, b) => b.depth - a.depth);
-    const { pen } = this;
-    pen.lineWidth = 0.7;
-    for (const { corners, base, shade } of faces) {
-      pen.fillStyle = pen.strokeStyle = `rgb(${base.map((value) => Math.min(255, Math.round(value * shade))).join(",")})`;
-      pen.beginPath();
-      corners.forEach((p, k) => (k ? pen.lineTo(p[0], p[1]) : pen.moveTo(p[0], p[1])));
-      pen.closePath();
-      pen.fill();
-      pen.stroke(); // closes gaps between neighbouring faces
-    }
+    return faces;
   }
 
-  drawSkeleton(lost) {
-    const { pen } = this, count = this.joints.shape[1], at = [];
+  drawSkeleton(person) {
+    const { pen } = this, { joints } = person, count = joints.shape[1], lost = this.lost(person), at = [];
     for (let j = 0; j < count; j++) {
       const p = 3 * (this.frame * count + j);
-      const point = this.place(this.joints[p], this.joints[p + 1], this.joints[p + 2]);
+      const point = this.place(joints[p], joints[p + 1], joints[p + 2]);
       at.push(point && isFinite(point[0]) ? point : null);
     }
     const plain = lost ? this.colors.lostBody : this.colors.bone;
@@ -219,7 +230,7 @@ class Viewer {
     }
     at.forEach((point, j) => {
       if (!point) return;
-      const sigma = this.sigma ? this.sigma[this.frame * count + j] : null;
+      const sigma = person.sigma ? person.sigma[this.frame * count + j] : null;
       pen.beginPath();
       pen.arc(point[0], point[1], 4.2, 0, 2 * Math.PI);
       pen.fillStyle = lost || sigma === null ? plain : Number.isNaN(sigma) ? "#141414" : sigmaColor(this.colors, sigma);

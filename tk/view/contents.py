@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -27,25 +28,32 @@ _AZIMUTH = 0.6  # radians
 
 @dataclass(frozen=True)
 class Contents:
-    """A result, its cameras if they are known, and the ground truth (F, 15, 3) if there is one."""
+    """The people of a result, the cameras if they are known, and the ground truth (T, F, 15, 3) if there is one.
 
-    result: Result
+    People have the same frames, see :meth:`~tk.io.results.data.Result.aligned`.
+    """
+
+    people: Sequence[Result]
     rig: Rig | None
     truth: Float | None
 
+    @property
+    def result(self) -> Result:
+        return self.people[0]
+
     @cached_property
-    def figure(self) -> Figure:
-        return figure_of(self.result)
+    def figures(self) -> tuple[Figure, ...]:
+        return tuple(figure_of(person) for person in self.people)
 
     @cached_property
     def stage(self) -> Stage:
-        return Stage.of(self.result, self.figure)
+        return Stage.of(self.people, self.figures)
 
     @property
     def names(self) -> list[str]:
         """Parts that can be shown and hidden."""
         there = {
-            "body": bool(self.figure.solids),
+            "body": any(figure.solids for figure in self.figures),
             "joints": True,
             "hull": self.result.hull is not None,
             "truth": self.truth is not None,
@@ -56,17 +64,18 @@ class Contents:
 
     def geometry(self, name: str, row: int) -> list[Any]:
         """Return Open3D's coloured geometries of one of :attr:`names` in a frame, without empty ones."""
-        figure, found = self.figure, list[Any]()
+        found = list[Any]()
         if name == "body":
-            found.append(shapes.body_mesh(figure, row))
+            found += [shapes.body_mesh(figure, row) for figure in self.figures]
         elif name == "joints":
-            joints = figure.joints[row]
-            found.append(shapes.skeleton_lines(joints).paint_uniform_color(unit_rgb(BONE)))
-            found.append(shapes.joint_spheres(joints, None if figure.sigma is None else figure.sigma[row]))
+            for figure in self.figures:
+                joints = figure.joints[row]
+                found.append(shapes.skeleton_lines(joints).paint_uniform_color(unit_rgb(BONE)))
+                found.append(shapes.joint_spheres(joints, None if figure.sigma is None else figure.sigma[row]))
         elif name == "hull" and self.result.hull is not None:
             found.append(shapes.hull_cloud(self.result.hull[row]))
         elif name == "truth" and self.truth is not None:
-            found.append(shapes.truth_spheres(self.truth[row]))
+            found.append(shapes.truth_spheres(self.truth[:, row].reshape(-1, 3)))
         elif name == "cameras" and self.rig is not None:
             found.append(shapes.camera_lines(self.rig).paint_uniform_color(unit_rgb(WIRE)))
         elif name == "floor":
@@ -84,12 +93,14 @@ class Contents:
         return np.asarray(stage.middle + distance * direction)
 
     def line(self, row: int) -> str:
-        """Return a line about a frame: time, status, residual, uncertainty."""
-        result = self.result
-        parts = [f"frame {result.frames[row]}", f"{result.time[row]:.2f} s", STATUS_MEANING[result.status[row]]]
-        error = result.silhouette_error
-        if error is not None and np.isfinite(error[row]).any():
-            parts.append(f"E_S {100 * np.nanmean(error[row]):.1f} %")
-        if result.sigma is not None and np.isfinite(result.sigma[row]).any():
-            parts.append(f"median sigma {100 * np.nanmedian(result.sigma[row]):.1f} cm")
+        """Return a line about a frame: time, and each person's status, residual and uncertainty."""
+        parts = [f"frame {self.result.frames[row]}", f"{self.result.time[row]:.2f} s"]
+        for person in self.people:
+            who = f"person {person.person} " if len(self.people) > 1 else ""
+            parts.append(who + STATUS_MEANING[person.status[row]])
+            error = person.silhouette_error
+            if error is not None and np.isfinite(error[row]).any():
+                parts.append(f"E_S {100 * np.nanmean(error[row]):.1f} %")
+            if person.sigma is not None and np.isfinite(person.sigma[row]).any():
+                parts.append(f"median sigma {100 * np.nanmedian(person.sigma[row]):.1f} cm")
         return "    ".join(parts)

@@ -12,7 +12,7 @@ from tk.model.body.joints import BONES
 from tk.model.body.skeleton import JOINTS, SEGMENTS
 from tk.model.cameras.camera import Rig
 from tk.render.figure import Figure
-from tk.render.palette import LOST_BODY, SEGMENT_COLORS, sigma_colors
+from tk.render.palette import sigma_colors
 from tk.render.scene import PYRAMID_EDGES, Stage, camera_pyramid
 
 Float = NDArray[np.float64]
@@ -32,8 +32,7 @@ def body_mesh(figure: Figure, row: int) -> Any:
     mesh = o3d.geometry.TriangleMesh()
     if not figure.solids or not np.isfinite(figure.transforms[row]).all():
         return mesh
-    lost = figure.lost(row)
-    bgr = [LOST_BODY if lost else SEGMENT_COLORS[SEGMENTS[solid.segment]] for solid in figure.solids]
+    bgr = [figure.color(row, SEGMENTS[solid.segment]) for solid in figure.solids]
     counts = [solid.rings.shape[0] * solid.rings.shape[1] for solid in figure.solids]
     starts = np.cumsum([0, *counts[:-1]])
     faces = np.concatenate([solid.mantle + start for solid, start in zip(figure.solids, starts, strict=True)])

@@ -324,6 +324,39 @@ class Result:
             raise ResultError(f"{self.path}: /joints/position has no joint {error.args[0]}; track anew") from None
         return replace(self, meta=replace(self.meta, joint_names=JOINTS), joints=joints, sigma=sigma)
 
+    def aligned(self) -> tuple[Result, ...]:
+        """Return the results of all people, of several without smoothed copy and hull, with a row for each frame of
+        anybody. Added rows have the status ABSENT and NaN.
+        """
+        if not self.others:
+            return (self,)
+        frames = np.unique(np.concatenate([person.frames for person in self.people]))
+        time = np.empty(len(frames))
+        for person in self.people:
+            time[np.searchsorted(frames, person.frames)] = person.time
+        return tuple(person._on(frames, time) for person in self.people)
+
+    def _on(self, frames: NDArray[np.int64], time: Float) -> Result:
+        row = np.searchsorted(frames, self.frames)
+
+        def spread(values: NDArray[Any]) -> NDArray[Any]:
+            whole = np.zeros((len(frames), *values.shape[1:]), values.dtype)
+            if values.dtype.kind == "f":
+                whole[...] = np.nan
+            whole[row] = values
+            return whole
+
+        columns: dict[str, Any] = {
+            name: spread(getattr(self, name))
+            for name in ("pose", "joints", "objective", "iterations", "sigma", "residual", "segments_rotation", "feet")
+            if getattr(self, name) is not None
+        }
+        for name in ("timing", "angles"):
+            columns[name] = {key: spread(values) for key, values in getattr(self, name).items()}
+        status = np.full(len(frames), np.uint8(Status.ABSENT))
+        status[row] = self.status
+        return replace(self, frames=frames, time=time, status=status, smoothed=None, hull=None, others=(), **columns)
+
     def with_smoothed(self) -> Result:
         """Return the result with each dataset replaced by its smoothed copy, if `/smoothed` has one."""
         changed: dict[str, Any] = {"angles": dict(self.angles)}

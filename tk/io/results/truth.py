@@ -8,17 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.io.results.data import Result
-from tk.io.results.reader import read_joints
+from tk.io.results.reader import read_people
 
 Float = NDArray[np.float64]
 
 
 def truth_of(result: Result, path: Path) -> Float | None:
-    """Return the ground-truth joints (F, 15, 3) in the result's frames, NaN if missing; None without the file."""
+    """Return the ground-truth joints (P, F, 15, 3) of each person in the result's frames, NaN if missing; None without
+    the file."""
     if not path.exists():
         return None
-    truth = read_joints(path)
-    places = np.full((len(result), *truth.positions.shape[1:]), np.nan)
-    _, mine, theirs = np.intersect1d(result.frames, truth.frames, return_indices=True)
-    places[mine] = truth.positions[theirs]
+    people = read_people(path)
+    places = np.full((len(people), len(result), *people[0].positions.shape[1:]), np.nan)
+    for person, track in zip(places, people, strict=True):
+        _, mine, theirs = np.intersect1d(result.frames, track.frames, return_indices=True)
+        person[mine] = track.positions[theirs]
     return places
