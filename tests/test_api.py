@@ -14,7 +14,7 @@ import pytest
 import tk
 from tests.conftest import QUICK
 from tests.io.conftest import picture, write_video
-from tk.errors import CaptureError
+from tk.errors import CaptureError, ConfigError
 from tk.io import settings_file
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -36,6 +36,11 @@ def test_every_public_name_exists():
         assert getattr(tk, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         tk.nonsense  # noqa: B018
+
+
+def test_resume_without_an_output_is_refused(tiny: Path) -> None:
+    with pytest.raises(ConfigError, match="resume and force need an output file"):
+        tk.track(tiny, resume=True)
 
 
 def test_errors_name_no_options_of_the_command_line() -> None:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict, overload
 
+from tk.errors import ConfigError
 from tk.io.captures.capture import Capture
 from tk.io.importers import open_recording
 from tk.io.results.data import Result
@@ -94,7 +95,7 @@ def track(
     resume: bool = False,
     force: bool = False,
 ) -> Iterator[Estimate] | Result:
-    """Track the person in a capture.
+    """Track one or several people in a capture.
 
     Args:
         capture: of :func:`open_capture`, or the path of one.
@@ -105,11 +106,11 @@ def track(
         seed: seed of the random generator, instead of the one in ``config``.
         init_pose: a file with a rough initial pose, or a folder of 2D keypoints.
         body: a result or a TOML file whose body is taken.
-        people: "auto" (one person, the first that :func:`tk.model.people.order_people` returns), "all", or numbers in
-            that order.
+        people: "auto" (one person: the nearest to the initial pose if one is given, else the first that
+            :func:`tk.model.people.order_people` returns), "all", or numbers in that order.
         segmenter: makes the masks, unless the capture has some, instead of the empty scene or an installed segmenter.
         causal: stop after the first pass. Without ``output`` there is no second one.
-        resume: continue where an earlier run with the same ``output`` stopped.
+        resume: continue an earlier run with the same ``output``.
         force: replace an existing ``output``; without it an existing file is an error.
 
     Returns:
@@ -118,7 +119,8 @@ def track(
         :class:`~tk.io.results.data.Result`.
 
     Raises:
-        tk.errors.TkError: bad input, in one line; every frame finished before it is in the file.
+        tk.errors.TkError: bad input, in one line, or ``resume`` or ``force`` without ``output``; every frame finished
+            before it is in the file.
         KeyboardInterrupt: the user stopped the run; with ``output`` the finished frames are in the file.
     """
     chosen = config or Settings()
@@ -133,6 +135,8 @@ def track(
         capture = replace(capture, segmenter=segmenter)
     reporter = _Logged()
     if output is None:
+        if resume or force:
+            raise ConfigError("resume and force need an output file")
         setup = recording_setup(capture, pose_file, body_file, frames[0])
         setup, capture = reduce_images(setup, capture, chosen.person_pixels)
         for warning in capture.warnings:

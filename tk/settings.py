@@ -36,9 +36,9 @@ class ForegroundSettings:
     Attributes:
         threshold: least difference between a person's pixel and the scene, in noise variances; pure noise gives 0.5. A
             lower value finds more of the person and more false pixels. Measured on rendered captures with exact masks.
-        shadow_min: brightness of the darkest shadow, as a share of the lit scene; 1 if there are no shadows. A darker
-            pixel is taken for the person; other cameras can correct that, but a hole in one mask cuts through the
-            visual hull. Measured under two lamps: 0.76.
+        shadow_min: brightness of the darkest shadow, as a share of the lit scene; 1 if there are no shadows. A lower
+            value accepts darker shadows, but makes holes in dark clothes, which cut through the visual hull. Measured
+            under two lamps: 0.76.
     """
 
     threshold: float = 3.0
@@ -54,7 +54,7 @@ class ForegroundSettings:
 
 @dataclass(frozen=True)
 class AppearanceSettings:
-    """Colour models, of --method volumetric, as all up to [tracking].
+    """Colour models, of --method volumetric, as [body], [objective], [contours] and [tracking].
 
     Attributes:
         enabled: whether colour confines the nearest-neighbour search.
@@ -82,7 +82,7 @@ class BodySettings:
 
 @dataclass(frozen=True)
 class ObjectiveSettings:
-    """The objective (section 6.1).
+    """The objective of --method volumetric (Kehl, section 6.1).
 
     Attributes:
         coverage_weight: w_c of the coverage term, from data to model; 0 leaves it out, as the paper does.
@@ -98,7 +98,7 @@ class ObjectiveSettings:
 
 @dataclass(frozen=True)
 class ContourSettings:
-    """The edge term of the objective (section 6.1.2).
+    """The edge term of --method volumetric (Kehl, section 6.1.2).
 
     Attributes:
         edge_weight: w_e (eq. 8) beside the surface term's w_s; 0 leaves the term out. The paper prints neither.
@@ -121,7 +121,7 @@ class ContourSettings:
 
 @dataclass(frozen=True)
 class TrackingSettings:
-    """Tracking from frame to frame.
+    """Prediction and loss, of --method volumetric.
 
     Attributes:
         prediction: share of the last frame's motion that is predicted for the next one. The paper does not say how it
@@ -164,7 +164,7 @@ class SilhouetteSettings:
             it found as good; half of the motion helps when arms and legs swing).
         adapt: whether the body is fitted to the silhouettes.
         init_frames: frames that the initialisation looks at; a stride is about one second.
-        search_every: frames between two limb searches; 0: never.
+        search_every: frames between two routine limb searches, 0: none; --method region also searches on evidence.
         lost_error: a frame is lost if its E_S, averaged over the views, exceeds this.
     """
 

@@ -334,6 +334,10 @@ def test_requested_frames_are_tracked(tiny: Path) -> None:
     assert "ends with frame 13" in notes[0]
     with pytest.raises(ConfigError, match=r"frames 14:: .* has only frames 0 to 13"):
         choose_frames(capture, (14, None), notes.append)
+    late = replace(capture, time_offset_s=(5 / capture.fps, *(0.0 for _ in capture.rig.names[1:])))
+    with pytest.raises(ConfigError, match=r"frames 0:5: the latest camera of .* begins in frame 5"):
+        choose_frames(late, (0, 5), notes.append)
+    assert choose_frames(late, (0, 6), notes.append) == (5, 6)
 
 
 def test_mog2_segmentation_tracks_the_person(tiny: Path, tmp_path: Path) -> None:

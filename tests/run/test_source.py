@@ -7,8 +7,10 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 
 from tests.conftest import QUICK, Silent, refused
 from tests.model.ring import ring_of_cameras
@@ -16,11 +18,15 @@ from tests.trackers.walker import BODY, STATURE, walk
 from tk.errors import CaptureError
 from tk.io import settings_file
 from tk.io.captures.frames import FrameSet
+from tk.io.results.data import UsedCameras
 from tk.io.results.reader import read_result
 from tk.io.results.status import Status
 from tk.model.cameras.volume import Volume
 from tk.model.masks.silhouettes import draw_silhouettes
 from tk.model.setup import Setup, Subject
+from tk.run import offline
+from tk.run.people import Member
+from tk.run.plan import Plan
 from tk.run.session import estimates, track_source
 
 SETTINGS = settings_file.from_toml(QUICK)
@@ -143,6 +149,30 @@ def test_the_second_pass_keeps_two_people_apart(tmp_path: Path) -> None:
     track_source(PAIR, Rendered(MASKS.max(axis=0)), tmp_path / "r.h5", SETTINGS, Silent(), people="all")
     found = read_result(tmp_path / "r.h5").people
     assert sorted(person for r in found for person in (0, 1) if far_off(r.joints, person) < 0.03) == [0, 1]
+
+
+def test_a_run_stopped_between_two_people_s_second_passes_is_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def track(name: str, resume: bool = False) -> Path:
+        path = tmp_path / name
+        source, span = Rendered(MASKS.max(axis=0)), (0, COUNT)
+        track_source(PAIR, source, path, SETTINGS, Silent(), frames=span, people="all", resume=resume)
+        return path
+
+    def stop_at_person_1(output: Path, plan: Plan, member: Member, *rest: Any) -> UsedCameras:
+        if member.number == 1:
+            raise KeyboardInterrupt
+        return finish_one(output, plan, member, *rest)
+
+    whole, finish_one = read_result(track("whole.h5")).people, offline._finish
+    with monkeypatch.context() as patch:
+        patch.setattr(offline, "_finish", stop_at_person_1)
+        stopped = read_result(track("r.h5")).people
+    assert stopped[0].smoothed is not None and stopped[1].smoothed is None
+    for a, b in zip(read_result(track("r.h5", resume=True)).people, whole, strict=True):
+        np.testing.assert_allclose(a.pose, b.pose, atol=1e-9)  # the file has rounded rotations of the cameras
+        assert a.smoothed is not None
 
 
 def test_the_subject_position_chooses_the_person() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,10 +38,21 @@ REFINED = "refined"
 _LESS_SURE = 2.0
 
 
-def finish(output: Path, plan: Plan, people: Sequence[Member], masks: MaskStores | None, note: Note) -> None:
-    """Write what needs all frames, see :func:`_finish`. Person 0 decides whether the cameras are refined."""
+def finish(
+    output: Path,
+    plan: Plan,
+    people: Sequence[Member],
+    masks: MaskStores | None,
+    note: Note,
+    finished: Container[int] = (),
+) -> None:
+    """Write what needs all frames, see :func:`_finish`, for the people who are not ``finished``. Person 0 decides
+    whether the cameras are refined."""
     cameras = UsedCameras(plan.setup.rig, np.array(plan.source.time_offset_s))
     for member in people:
+        if member.number in finished:
+            cameras = read_result(output).cameras or cameras
+            continue
         store = None if masks is None else masks[member.number]
         cameras = _finish(output, plan, member, store, note, cameras, len(people) == 1)
 

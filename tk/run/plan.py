@@ -91,10 +91,11 @@ def reduce_images(setup: Setup, capture: Capture, person_pixels: int) -> tuple[S
 
 
 def choose_frames(source: Source, frames: tuple[int, int | None], note: Callable[[str], None]) -> tuple[int, int]:
-    """Return the first frame of ``--frames`` and the end, exclusive, within a source of known length.
+    """Return the first frame that is asked for and that all cameras have, and the end, exclusive. The length of the
+    source must be known.
 
     Raises:
-        ConfigError: the source ends before the first frame.
+        ConfigError: there is no such frame.
     """
     (start, stop), count = frames, source.frame_count
     assert count is not None
@@ -103,6 +104,10 @@ def choose_frames(source: Source, frames: tuple[int, int | None], note: Callable
         raise ConfigError(f"frames {asked}: {source.where} has only frames 0 to {count - 1}")
     if stop is not None and stop > count:
         note(f"frames {start}:{stop}: {source.where} ends with frame {count - 1}")
+    if stop is not None and stop <= source.first_frame:
+        raise ConfigError(
+            f"frames {start}:{stop}: the latest camera of {source.where} begins in frame {source.first_frame}"
+        )
     return max(start, source.first_frame), count if stop is None else min(stop, count)
 
 
@@ -202,7 +207,7 @@ def open_plan(
             start, stop = choose_frames(source, frames, note)
         first = min(s.init_frame for s in setup.subjects)
         if not any(s.init or s.in_init_pose for s in setup.subjects):
-            first = max(first, frames[0])  # no frame is better than another
+            first = max(first, start)  # no pose is given, so any frame may serve
         if stop is not None and first >= stop:
             raise ConfigError(
                 f"frames {start}:{stop}: the subject is found in frame {first} and followed forwards; "

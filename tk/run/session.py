@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -54,7 +55,7 @@ class Summary:
 
     @property
     def frames(self) -> int:
-        """Number of frames."""
+        """Number of frames, summed over the people."""
         return len(self.status)
 
     @property
@@ -99,7 +100,7 @@ def track(
     """
     masks = Path(capture.masks) if capture.masks not in ("auto", "none", "median") else None
     check_result_path(output, force, resume, [init_pose, capture.init_keypoints, body, masks], capture.path)
-    settings = replace(settings, resample=capture.resampled)  # who opens the capture again must know
+    settings = replace(settings, resample=capture.resampled)  # stored, so that the capture is opened in the same way
     setup = recording_setup(capture, init_pose, body, frames[0])
     setup, capture = reduce_images(setup, capture, settings.person_pixels)
     notes = capture.warnings
@@ -177,7 +178,7 @@ def track_source(
                 for line in run.people.report():
                     note(line)
                 with one_thread():
-                    finish(output, plan, run.people.members, masks, note)
+                    finish(output, plan, run.people.members, masks, note, run.finished)
                 if said:
                     revise_result(output, notes=said)
             stores.remove()
@@ -205,19 +206,20 @@ def estimates(
     """
     with open_plan(setup, source, settings, note, method, frames) as plan:
         run = _Run(plan, people, note)
-        unknown: list[int] = []
-        suspect: list[int] = []
+        unknown: defaultdict[int, list[int]] = defaultdict(list)  # by person
+        suspect: defaultdict[int, list[int]] = defaultdict(list)
         for estimate in chain.from_iterable(run.frames()):
             if estimate.status == "suspect":
-                suspect.append(estimate.frame)
+                suspect[estimate.person].append(estimate.frame)
             found = estimate.status not in ("lost", "absent")
             if found and estimate.sigma is not None and np.isnan(estimate.sigma).all():
-                unknown.append(estimate.frame)
+                unknown[estimate.person].append(estimate.frame)
             yield estimate
         for line in run.people.report():
             note(line)
-        report_unknown(unknown, note)
-        report_suspect(suspect, note)
+        for person in range(len(run.people.members)):
+            report_unknown(unknown[person], note)
+            report_suspect(suspect[person], note)
 
 
 # Seconds between two writes to the file; frames finished within this time are written and reported together. A shorter
@@ -242,7 +244,7 @@ class _Output:
     store_hull: bool
 
     def check(self) -> None:
-        """Raise ResultError if the earlier run was another one."""
+        """Raise ResultError if the earlier run had other inputs or settings."""
         for name, value in self.origin.items():
             found = self.writer.state.get(_ORIGIN + name)
             if found != value:
@@ -250,7 +252,10 @@ class _Output:
                     f"{self.writer.path}: was made differently: {name}: {found}, not {value}",
                     hint="start again with --force instead of --resume",
                 )
-        if REFINED in self.writer.model:
+
+    def check_open(self) -> None:
+        """Raise ResultError if no frames can be added, because the second pass has changed the earlier ones."""
+        if any(REFINED in model for model in self.writer.models):
             raise ResultError(
                 f"{self.writer.path}: a second pass has gone over its frames, so no more can be added; only a causal "
                 "result can be continued",
@@ -259,7 +264,8 @@ class _Output:
 
 
 class _Run:
-    """One run of trackers through a source. ``tracked`` counts frames, even if the run is interrupted."""
+    """One run of trackers through a source. ``tracked`` counts frames, even if the run is interrupted; ``finished`` are
+    the people whose result an earlier run has finished."""
 
     def __init__(
         self,
@@ -271,6 +277,7 @@ class _Run:
     ) -> None:
         self.plan, self.output, self.masks = plan, output, masks
         self.tracked = 0
+        self.finished: Container[int] = ()
         self.people = People(plan.setup, plan.tracker, plan.another_tracker, people, note)
 
     def frames(self) -> Iterator[tuple[Estimate, ...]]:
@@ -282,6 +289,7 @@ class _Run:
             return
         if output and done:
             output.check()
+            output.check_open()
             self._restore(output)
             yield from self._step_through(plan.observations.frames(plan.begin + done, plan.stop))
             return
@@ -301,13 +309,17 @@ class _Run:
         yield from self._step_through(chain(_emptied(opening), broken or observations))
 
     def restore_unfinished(self, path: Path, causal: bool) -> bool:
-        """Restore the trackers if an earlier run wrote the last frame, but did not finish the result; whether it
-        did."""
+        """Restore the trackers if all frames are written but the result is not finished; return whether that is so."""
         output, tracker = self.output, self.plan.tracker
         if output is None or not output.done or not tracker.has_segments:
             return False
-        refined = causal or not tracker.has_second_pass or REFINED in output.writer.model
-        if refined and all(result.smoothed is not None for result in read_result(path).people):
+        one_pass = causal or not tracker.has_second_pass
+        self.finished = {
+            person
+            for person, (model, result) in enumerate(zip(output.writer.models, read_result(path).people, strict=True))
+            if result.smoothed is not None and (one_pass or REFINED in model)
+        }
+        if len(self.finished) == len(output.writer.models):
             return False
         output.check()
         self._restore(output)

@@ -43,8 +43,7 @@ Float = NDArray[np.float64]
 
 # Frames of the opening whose masks are compared.
 _OPENING = 5
-# A camera with a residual (E_S) above this shows something unrelated to the person: the body covers less than a quarter
-# of its mask.
+# A camera with a residual (E_S) above this is excluded whatever its baseline: its mask is unrelated to the body.
 _UNRELATED = 0.75
 # Missing area on uncertain pixels is ignored, unless it is more than this share of the mask: then too little is left.
 _TOO_LITTLE = 0.5
@@ -74,7 +73,7 @@ class CameraMonitor:
     """Steps a tracker; excludes cameras that are wrong.
 
     Args:
-        tracker: started by :meth:`start`, or restored by the caller.
+        tracker: the caller starts it with the frames of :meth:`start`, or restores it.
         setup: rig, working volume, upward direction and rate.
         subject: what is known of the person.
     """

@@ -54,9 +54,9 @@ class Estimate:
         joints: (15, 3) joint centres, metres.
         status: "tracked", "initialised", "recovered", "lost", "suspect" (by the camera monitor), or "absent" (by the
             run: nobody is there).
-        objective: the objective's final value.
-        iterations: (S,) optimiser iterations a stage.
-        timing: seconds a stage.
+        objective: the objective's final value; the region tracker gives the running mean of its cost.
+        iterations: (S,) optimiser iterations by stage; for ``search`` 1 if limbs were searched, else 0.
+        timing: seconds by stage.
         surface: the hull's surface, if the tracker made one.
         sigma: (15,) m, standard deviation of each joint position along one axis; NaN if unknown, None if the tracker
             does not report it.

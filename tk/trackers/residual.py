@@ -27,9 +27,9 @@ START_SPREAD, LEAST_SPREAD, LEAST_SHARE = 0.03, 0.02, 0.2
 # Share of mean and spread that a frame replaces: they follow a change of light or clothes within about 20 frames. The
 # mean of the first frames is a plain mean. Chosen on the development captures; sensitivity not measured.
 RATE = 0.05
-# An excess above this in one view, in spreads, is an outlier: the view is suspect, and counts no further in the mean
-# over the views, so that a torn mask in one of three or more views makes no frame's residual high. In 2 % of the frames
-# of the development captures a view has a larger excess.
+# An excess above this in one view, in spreads, is an outlier. The mean over the views counts it as this value, so
+# that a torn mask in one of three or more views makes no frame's residual high. In 2 % of the frames of the development
+# captures a view has a larger excess.
 OUTLIER = 5.0
 # Displacement in the mean over the views: mean in correct recordings, standard deviation of its logarithm over RECENT
 # frames (0.30 in one frame, 0.20 between recordings), and this number of frames. Measured on walk, dance, fold, cube,
@@ -68,8 +68,8 @@ def contradicted(residual: Float, false_alarm: float) -> NDArray[np.bool_]:
     """Return (F,) whether residuals (F, V, 2) of consecutive frames contradict the poses: the frame is among
     :data:`RECENT` ones whose mean displacement is far above :data:`LEVEL`.
 
-    Half of the logarithm's variance is the recording's own level, and half is the frame's. Both must be improbable, so
-    the probability of a false alarm is the square of ``false_alarm``.
+    Half of the logarithm's variance lies between recordings, so all frames of a recording with a high level would count
+    as contradicted. The limit is therefore set for the probability ``false_alarm`` squared.
     """
     log = np.log(displacement(residual) + _TINY)
     measured = np.flatnonzero(np.isfinite(log))
@@ -105,8 +105,8 @@ class ResidualBaseline:
         return np.asarray((error - self._means(error)) / self.spread)
 
     def _means(self, error: Float) -> Float:
-        """Return (V,) the means; of a view without a baseline the median of the others, in the first frame of all: a
-        camera that is wrong from the start must not become its own baseline."""
+        """Return (V,) the means. A view without a baseline gets the median of the others, and in the first frame the
+        median of E_S, because a camera that is wrong from the start must not become its own baseline."""
         known = np.isfinite(self.mean)
         if known.all():
             return self.mean
@@ -132,7 +132,7 @@ class ResidualBaseline:
 
     @property
     def margin(self) -> float:
-        """The difference in E_S, mean over the views, that is as large as a high residual's to the baseline."""
+        """The rise of E_S above the baseline, mean over the views, that counts as high."""
         return float(self.threshold * self.spread.mean())
 
     def learn(self, error: Float) -> None:
@@ -141,12 +141,12 @@ class ResidualBaseline:
         seen = np.isfinite(error)
         mean = self._means(error)
         deviation = np.minimum(error - mean, self.spread)
-        # the mean absolute deviation of a normal variable is 0.8 standard deviations
         right = seen & (not self.high(error))
         rate = np.where(right, np.maximum(RATE, 1 / (2 + self._frames)), RATE)
         self._frames = self._frames + right
         mean = mean + rate * deviation
-        # a high residual is no sample of what is normal; it would widen the spread until it counts as normal itself
+        # a high residual is no sample of what is normal; it would widen the spread until it counts as normal itself.
+        # 1.25: the mean absolute deviation of a normal variable is 0.8 standard deviations
         spread = self.spread + RATE * (1.25 * np.abs(deviation) - self.spread)
         self.mean = np.where(seen, mean, self.mean)
         self.spread = np.where(right, np.maximum(spread, np.maximum(LEAST_SPREAD, LEAST_SHARE * mean)), self.spread)

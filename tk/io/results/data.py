@@ -270,7 +270,8 @@ class Result:
 
     @property
     def expected_error(self) -> Float | None:
-        """Return the expected distance of each joint from its true position (F, J), metres; None without sigma.
+        """Return the expected distance (root mean square) of each joint from its true position (F, J), metres; None
+        without sigma.
 
         The root of three variances along the axes and the squared constant offset of the joint's kind
         (:class:`tk.model.body.joints.Joint`): sigma alone does not contain the offset.
@@ -311,7 +312,7 @@ class Result:
 
     def in_joint_order(self) -> Result:
         """Return the result with its joints in the order of :data:`~tk.model.body.joints.JOINTS`; NaN where the file
-        has no such joint.
+        has no such joint. ``smoothed`` and ``others`` keep their order: call :meth:`with_smoothed` first.
 
         Raises:
             ResultError: a joint that every result has is missing.
