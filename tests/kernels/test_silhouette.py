@@ -17,13 +17,14 @@ from tk.kernels.line_search import COLOR_BINS, SearchSettings, search_colors
 from tk.kernels.runtime import ensure_runtime, ti
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.body_parameters import pose_rows
+from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.cone_body import build_cone_body
 from tk.model.cameras.camera import Rig
 from tk.model.masks.silhouettes import Views, draw_silhouettes
 
 BODY = build_cone_body(BodyDimensions.from_stature(1.75))
 D = len(BODY.skeleton.names)
+FAMILY = BodyFamily("full", BODY.dimensions, 0.01)
 few = settings(max_examples=30, deadline=None)
 sizes = st.floats(0.03, 0.4)
 
@@ -183,11 +184,17 @@ MASKS = draw_silhouettes(BODY, RIG, POSE[None])[0]
 PLAIN = SearchSettings(tangential=0.0, robust_px=0.0)
 
 
+def rows_at(pose, edgels):
+    first = np.zeros(len(edgels.part), int)
+    linear = FAMILY.linearised(FAMILY.mean, pose[None])
+    return linear.pose_rows(first, edgels, linear.points(first, edgels))
+
+
 def test_equations_are_the_sums_of_the_edgels_rows():
     moved = POSE + np.random.default_rng(0).normal(0, 0.02, D)
     edgels = edgels_of(BODY, MASKS, moved, PLAIN)
     assert len(edgels.view) > 200
-    rows = pose_rows(BODY, moved, edgels)
+    rows = rows_at(moved, edgels)
     total = equations_of(BODY, MASKS, moved[None], PLAIN)
     np.testing.assert_allclose(total.hessian[0], rows.T @ (edgels.weight[:, None] * rows), rtol=1e-9, atol=1e-6)
     np.testing.assert_allclose(total.gradient[0], rows.T @ (edgels.weight * edgels.distance), rtol=1e-9, atol=1e-6)
@@ -210,7 +217,7 @@ def test_rows_are_derivatives_of_the_contour(k):
     """A generator's image is a line; where it meets the old normal moves as the row says."""
     settings = SearchSettings(tangential=0.0, most_samples=3, spacing_px=0.25, window_px=12, interior=True)
     before = edgels_of(BODY, MASKS, POSE, settings)
-    rows = pose_rows(BODY, POSE, before)[:, k]
+    rows = rows_at(POSE, before)[:, k]
     h = 1e-5
     lines = {}
     for sign in (-1, 1):

@@ -45,8 +45,9 @@ class Equations:
             weight: (N,) information of each row.
             residual: (N,) by how much each row's value should grow.
         """
-        weighted = rows * weight[:, None]
-        A, y = weighted.T @ rows, weighted.T @ residual
+        root = np.sqrt(weight)
+        scaled = rows * root[:, None]
+        A, y = scaled.T @ scaled, scaled.T @ (root * residual)  # a symmetric product takes half the time
         ends = np.cumsum([part.stop - part.start for part in columns])
         own = [slice(end - (part.stop - part.start), end) for part, end in zip(columns, ends.tolist(), strict=True)]
         for i, into in zip(own, columns, strict=True):

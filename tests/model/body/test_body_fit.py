@@ -12,7 +12,7 @@ from tk.kernels.silhouette import Edgels
 from tk.model.body import body_fit
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_fit import fit_body
-from tk.model.body.body_parameters import BodyFamily, pose_rows, shape_rows
+from tk.model.body.body_parameters import BodyFamily, shape_rows
 from tk.model.body.cone_body import PRESETS, SHAPE_NUMBERS, build_cone_body
 from tk.model.body.gait_poses import walking_pose
 from tk.model.body.skeleton import SEGMENTS
@@ -61,6 +61,8 @@ def edgels_all_over(body, count=400):
 
 
 EDGELS = edgels_all_over(AVERAGE)
+FAMILY = BodyFamily("full", AVERAGE.dimensions, 0.01)
+FIRST = np.zeros(len(EDGELS.part), int)
 POSE = walk(AVERAGE, 3)[1] + np.random.default_rng(1).normal(0, 0.1, len(AVERAGE.skeleton.names))
 
 
@@ -70,7 +72,9 @@ def along_rows(body, pose):
 
 
 def test_pose_rows_equal_finite_differences():
-    rows = pose_rows(AVERAGE, POSE, EDGELS)
+    linear = FAMILY.linearised(FAMILY.mean, POSE[None])
+    np.testing.assert_allclose(linear.points(FIRST, EDGELS), AVERAGE.place(POSE, EDGELS.part, EDGELS.unscaled))
+    rows = linear.pose_rows(FIRST, EDGELS, linear.points(FIRST, EDGELS))
     for k, step in enumerate(1e-6 * np.eye(len(POSE))):
         expected = (along_rows(AVERAGE, POSE + step) - along_rows(AVERAGE, POSE - step)) / 2e-6
         np.testing.assert_allclose(rows[:, k], expected, atol=1e-7, err_msg=AVERAGE.skeleton.names[k])
@@ -78,7 +82,8 @@ def test_pose_rows_equal_finite_differences():
 
 def test_shape_rows_equal_finite_differences():
     groups = AVERAGE.shape_groups
-    rows = shape_rows(AVERAGE, AVERAGE.skeleton.segment_transforms(POSE), EDGELS)
+    T = AVERAGE.part_transforms(AVERAGE.skeleton.segment_transforms(POSE))[EDGELS.part]
+    rows = shape_rows(AVERAGE, T, EDGELS)
     for k in range(len(groups) * SHAPE_NUMBERS):
         step = np.zeros(len(groups) * SHAPE_NUMBERS)
         step[k] = 1e-6
@@ -92,14 +97,14 @@ def test_shape_rows_equal_finite_differences():
 
 def test_camera_without_edgels_has_no_rows():
     none = Edgels(*(values[:0] for values in EDGELS))
-    rows = shape_rows(AVERAGE, AVERAGE.skeleton.segment_transforms(POSE), none)
+    rows = shape_rows(AVERAGE, np.zeros((0, 4, 4)), none)
     assert rows.shape == (0, SHAPE_NUMBERS * len(AVERAGE.shape_groups))
 
 
 def test_dimension_rows_equal_finite_differences():
-    problem = BodyFamily("full", AVERAGE.dimensions, 0.01)
-    shared = problem.mean + np.random.default_rng(2).normal(0, 0.02, len(problem.mean)) * (problem.deviation > 1e-5)
-    (rows,) = problem.dimension_rows(shared, POSE[None], [EDGELS])
+    mean = FAMILY.mean
+    shared = mean + np.random.default_rng(2).normal(0, 0.02, len(mean)) * (FAMILY.deviation > 1e-5)
+    rows = FAMILY.linearised(shared, POSE[None]).dimension_rows(FIRST, EDGELS)
     assert rows.shape == (len(EDGELS.part), len(DIMENSIONS))
     change = shared[len(DIMENSIONS) :].reshape(-1, SHAPE_NUMBERS)
     for k, name in enumerate(DIMENSIONS):
@@ -111,12 +116,12 @@ def test_dimension_rows_equal_finite_differences():
         np.testing.assert_allclose(rows[:, k], (pair[0] - pair[1]) / 2e-5, atol=1e-6, err_msg=name)
 
 
-def test_dimension_rows_use_the_pose_of_their_frame():
-    problem = BodyFamily("full", AVERAGE.dimensions, 0.01)
+def test_rows_use_the_pose_of_their_frame():
     poses = walk(AVERAGE, 2)
-    both = problem.dimension_rows(problem.mean, poses, [EDGELS, EDGELS])
+    linear = FAMILY.linearised(FAMILY.mean, poses)
+    both = [linear.rows(FIRST + i, EDGELS) for i in range(2)]
     for pose, rows in zip(poses, both, strict=True):
-        np.testing.assert_allclose(rows, problem.dimension_rows(problem.mean, pose[None], [EDGELS])[0], atol=1e-9)
+        np.testing.assert_allclose(rows, FAMILY.linearised(FAMILY.mean, pose[None]).rows(FIRST, EDGELS), atol=1e-9)
     assert np.abs(both[0] - both[1]).max() > 0.01
 
 

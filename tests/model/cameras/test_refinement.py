@@ -16,7 +16,7 @@ from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_parameters import BodyFamily, shapes_of
 from tk.model.body.cone_body import SHAPE_NUMBERS, build_cone_body, group_of
 from tk.model.cameras.agreement import camera_agreement
-from tk.model.cameras.bundle import camera_rows, choose_frames
+from tk.model.cameras.bundle import camera_rows, choose_frames, farthest
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.refinement import (
     MOVE_M,
@@ -70,6 +70,7 @@ def frames(store: MaskStore, rig: Rig):
     return choose_frames(
         lambda k, c: store.get(k)[c],
         Views(rig),
+        BODY.skeleton,
         np.arange(FRAMES),
         motion(),
         np.ones(FRAMES, bool),
@@ -247,3 +248,10 @@ def test_agreement_names_the_inconsistent_and_the_late_camera():
 def test_settings_out_of_range_are_refused():
     with pytest.raises(ConfigError, match="trust = 0"):
         RefinementSettings(trust=0.0)
+
+
+def test_chosen_frames_cover_all_positions_of_a_person_who_stands_still_for_long():
+    standing, walking = np.zeros((500, 3)), np.linspace(0, 1, 5)[:, None] * [1.0, 0, 0]
+    chosen = farthest(np.concatenate([standing, walking]), 5)
+    assert np.count_nonzero(chosen >= 500) == 4
+    assert len(farthest(standing, 5)) == 1

@@ -7,8 +7,8 @@ along an occluding contour the surface slides in the image's tangent only.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from tk.kernels.cones import CONE
 from tk.kernels.silhouette import Edgels
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import SHAPE_NUMBERS, ConeBody, ConePart, build_cone_body, group_of
-from tk.model.body.skeleton import SEGMENTS
 
 Float = NDArray[np.float64]
 
@@ -96,37 +95,22 @@ class BodyFamily:
         change = shared[len(_DIMENSIONS) :].reshape(len(self.groups), SHAPE_NUMBERS)
         return build_cone_body(dimensions, preset=self.preset).reshaped(change)
 
-    def rows(self, shared: Float, poses: Float, seen: Sequence[Edgels]) -> list[Float]:
-        """(N, K) derivatives of contours along their normals by the parameters, for each pose (M, D) and its edgels."""
+    def linearised(self, shared: Float, poses: Float) -> LinearisedBody:
+        """The body with parameters (K,) at poses (M, D), and its derivatives by the dimensions: differences of bodies.
+
+        A dimension moves a point in its segment's frame, alike at all poses, and it moves the segment.
+        """
         body = self.build(shared)
-        transforms = body.skeleton.segment_transforms(poses)
-        return [
-            np.hstack([rows, shape_rows(body, T, edgels)])
-            for rows, T, edgels in zip(self.dimension_rows(shared, poses, seen), transforms, seen, strict=True)
-        ]
-
-    def dimension_rows(self, shared: Float, poses: Float, seen: Sequence[Edgels]) -> list[Float]:
-        """(N, 24) derivatives by the dimensions, by differences of surface points, for each pose and its edgels."""
-        counts = [len(edgels.part) for edgels in seen]
-        part = np.concatenate([edgels.part for edgels in seen])
-        unscaled = np.concatenate([edgels.unscaled for edgels in seen])
-        row = np.concatenate([edgels.row for edgels in seen])
-        rows = np.zeros((len(part), len(_DIMENSIONS)))
-        # cameras of a frame may share its pose
-        different, which = np.unique(poses, axis=0, return_inverse=True)
-        frame = np.repeat(which.ravel(), counts)
-
-        def points(values: Float) -> Float:
-            body = self.build(values)
-            placed = body.part_transforms(body.skeleton.segment_transforms(different))
-            return body.placed(placed[frame, part], part, unscaled)
-
-        here = points(shared)
-        for k in range(len(_DIMENSIONS)):
-            step = np.zeros(len(shared))
-            step[k] = _STEP
-            rows[:, k] = np.einsum("na,na->n", row, points(shared + step) - here) / _STEP
-        return np.split(rows, np.cumsum(counts)[:-1])
+        changed = [self.build(shared + step) for step in _STEP * np.eye(len(_DIMENSIONS), len(shared))]
+        s = body.skeleton
+        by_part = np.array([_part_numbers(other) - _part_numbers(body) for other in changed]) / _STEP
+        point, rise = (
+            np.array([getattr(other.skeleton, name) - getattr(s, name) for other in changed]) / _STEP
+            for name in ("point", "rise")
+        )
+        moves = s.segment_moves(poses, point, rise)
+        twists = np.concatenate(s.twists(poses), axis=-1).swapaxes(-1, -2)
+        return LinearisedBody(body, s.segment_transforms(poses), twists, by_part.transpose(1, 2, 0), moves)
 
     def add_prior(self, shared: Float, H: Float, g: Float) -> None:
         """Add the prior at parameters (K,) to their normal equations (K, K), (K,)."""
@@ -141,28 +125,81 @@ class BodyFamily:
         g += row * np.log(self.average.stature / stature) / self.stature_deviation
 
 
-def pose_rows(body: ConeBody, pose: Float, edgels: Edgels, x_world: Float | None = None) -> Float:
-    """Return (N, D) derivatives of the contour's position along its normal by the pose, pixels.
+@dataclass(frozen=True)
+class LinearisedBody:
+    """A body at M poses, with its derivatives by pose and parameters. Methods take N edgels and each one's pose (N,).
 
-    ``x_world`` (N, 3) are the edgels' points on the surface; None: they are computed.
+    Attributes:
+        body: the body.
+        T_world_segment: (M, S, 4, 4) transforms of its segments.
+        twists: (M, 6, D) twist (ω, v) of each degree of freedom.
+        by_part: (P, 17, 24) derivatives of :func:`_part_numbers`.
+        moves: (M, S, 3, 24) derivatives of the segments' places.
     """
-    s = body.skeleton
-    w, v = s.twists(pose)
-    x = body.place(pose, edgels.part, edgels.unscaled) if x_world is None else x_world
-    moves = s.ancestors()[[SEGMENTS.index(part.segment) for part in body.parts]][edgels.part]
-    # n · (ω × x + v) = ω · (x × n) + v · n
-    return np.where(moves, np.cross(x, edgels.row) @ w.T + edgels.row @ v.T, 0.0)
+
+    body: ConeBody
+    T_world_segment: Float
+    twists: Float
+    by_part: Float
+    moves: Float
+
+    @cached_property
+    def _T_world_part(self) -> Float:
+        return self.body.part_transforms(self.T_world_segment)
+
+    def points(self, pose: NDArray[np.integer], edgels: Edgels) -> Float:
+        """(N, 3) the edgels' points on the surface, world."""
+        return self.body.placed(self._T_world_part[pose, edgels.part], edgels.part, edgels.unscaled)
+
+    def pose_rows(self, pose: NDArray[np.integer], edgels: Edgels, x_world: Float) -> Float:
+        """(N, D) derivatives of the contour's position along its normal by the pose, pixels, at points (N, 3)."""
+        # n · (ω × x + v) = ω · (x × n) + v · n
+        wrench = np.hstack([np.cross(x_world, edgels.row), edgels.row])
+        rows = np.empty((len(pose), self.twists.shape[-1]))
+        for m in np.unique(pose):
+            rows[pose == m] = wrench[pose == m] @ self.twists[m]
+        rows[~self.body.skeleton.ancestors()[self.body.frames[0][edgels.part]]] = 0.0
+        return rows
+
+    def rows(self, pose: NDArray[np.integer], edgels: Edgels) -> Float:
+        """(N, K) derivatives by all parameters of the body."""
+        shape = shape_rows(self.body, self._T_world_part[pose, edgels.part], edgels)
+        return np.hstack([self.dimension_rows(pose, edgels), shape])
+
+    def dimension_rows(self, pose: NDArray[np.integer], edgels: Edgels) -> Float:
+        """(N, 24) derivatives by the dimensions."""
+        part, u = edgels.part, edgels.unscaled
+        segments, inside = self.body.frames
+        segment = segments[part]
+        n = (edgels.row[:, None, :] @ self.T_world_segment[pose, segment, :3, :3])[:, 0]
+        local = np.column_stack([self.body.local(part, u)[2], np.ones(len(part))])
+        a, b, h = ((n[:, None, :] @ inside[part, :3, :3])[:, 0] * u).T
+        numbers = np.column_stack(
+            [(n[:, :, None] * local[:, None, :]).reshape(-1, 12), a, a * u[:, 2], b, b * u[:, 2], h]
+        )
+        rows = np.einsum("na,nak->nk", edgels.row, self.moves[pose, segment])
+        for p, by_number in enumerate(self.by_part):
+            rows[part == p] += numbers[part == p] @ by_number
+        return rows
 
 
-def shape_rows(body: ConeBody, T_world_segment: Float, edgels: Edgels) -> Float:
+def _part_numbers(body: ConeBody) -> Float:
+    """Return (P, 17) the numbers on which a point of each part depends linearly: the part's place in its segment
+    (12), and with z = z / h the factors of x / a r, z x / a r, y / b r, z y / b r and z."""
+    a, b, h, m = np.array([part.shape for part in body.parts]).T
+    _, inside = body.frames
+    return np.column_stack([inside[:, :3].reshape(-1, 12), a, a * (m - 1), b, b * (m - 1), h])
+
+
+def shape_rows(body: ConeBody, T_world_part: Float, edgels: Edgels) -> Float:
     """Return (N, 8 G) derivatives by the changes of :meth:`ConeBody.reshaped` at no change, to first order.
 
-    An axis whose ends move apart tilts, and the cross-sections tilt with it.
+    An axis whose ends move apart tilts, and the cross-sections tilt with it. ``T_world_part`` (N, 4, 4) belongs to each
+    edgel's part.
     """
     groups = body.shape_groups
     part = edgels.part
-    T = body.part_transforms(T_world_segment)[part]
-    n = np.einsum("nab,na->nb", T[:, :3, :3], edgels.row)  # the row in the part's frame
+    n = (edgels.row[:, None, :] @ T_world_part[:, :3, :3])[:, 0]  # the row in the part's frame
     shape, _, local = body.local(part, edgels.unscaled)
     cone = np.array([p.kind == CONE for p in body.parts])[part]
     mirror = np.array([-1.0 if p.name.endswith("_r") else 1.0 for p in body.parts])[part]

@@ -147,7 +147,7 @@ class ConeBody:
         if len(self.parts) > MOST_PARTS:
             raise ConfigError(f"a body has {len(self.parts)} parts; {MOST_PARTS} are the most")
         s = self.skeleton
-        segments, inside = self._frames
+        segments, inside = self.frames
         curves: list[tuple[int, int]] = []
         for p, part in enumerate(self.parts):
             if part.kind == ELLIPSOID:
@@ -204,7 +204,7 @@ class ConeBody:
 
     def part_transforms(self, T_world_segment: Float) -> Float:
         """Return (..., P, 4, 4) from each part to the world, from the segments' (..., S, 4, 4)."""
-        segments, inside = self._frames
+        segments, inside = self.frames
         return np.asarray(T_world_segment[..., segments, :, :] @ inside)
 
     def local(self, part: NDArray[np.integer], unscaled: Float) -> tuple[Float, Float, Float]:
@@ -215,8 +215,8 @@ class ConeBody:
         return shape, r, unscaled * np.column_stack([shape[:, 0] * r, shape[:, 1] * r, shape[:, 2]])
 
     @cached_property
-    def _frames(self) -> tuple[NDArray[np.int64], Float]:
-        """(P,) segment of each part, and (P, 4, 4) from the part to its segment."""
+    def frames(self) -> tuple[NDArray[np.int64], Float]:
+        """Return (P,) the segment of each part, and (P, 4, 4) from the part to its segment."""
         B = np.eye(4)
         B[:3, :3] = self.skeleton.T_world_body
         segments = np.array([SEGMENTS.index(part.segment) for part in self.parts])

@@ -174,6 +174,20 @@ class Skeleton:
             result[..., level, :, :] = result[..., self.parent[level], :, :] @ steps[..., level, :, :]
         return result
 
+    def segment_moves(self, poses: Float, point: Float, rise: Float) -> Float:
+        """Return (M, S, 3, K) derivatives of the segments' places at poses (M, D) by K changes, given as derivatives
+        (K, D, 3) of :attr:`point` and :attr:`rise`."""
+        K, squares = self._generators
+        turn = np.sin(poses)[..., None, None] * K + (1 - np.cos(poses))[..., None, None] * squares  # R - 1
+        result = -turn @ np.where(self.prismatic[:, None], 0.0, point).transpose(1, 2, 0)
+        for k in self._raised:
+            result[:, k] += arm_elevation(poses[:, k], poses[:, k + 1])[:, None, None] * rise[:, k].T
+        below = self.parent >= 0
+        result[:, below] = self.transforms(poses)[:, self.parent[below], :3, :3] @ result[:, below]
+        for level in self._levels[1:]:
+            result[:, level] += result[:, self.parent[level]]
+        return np.asarray(result[:, self.segment_dof])
+
     @property
     def anchor(self) -> Float:
         """(D, 6) point and rise, as the kernels take them (:func:`tk.kernels.kinematics.forward`)."""

@@ -23,7 +23,7 @@ from tk.model.cameras.camera import Rig
 
 Float = NDArray[np.float64]
 
-# Prior standard deviations of a camera's shift, pixels, and delay, frames: wide, so that 24 frames outweigh them.
+# Prior standard deviations of a camera's shift, pixels, and delay, frames: wide, so that 20 frames outweigh them.
 _SIGMA = {"shift": 5.0, "offset": 2.0}
 # Half the difference of points for a derivative, metres.
 _STEP_M = 1e-4
@@ -83,7 +83,7 @@ def camera_agreement(body: ConeBody, rig: Rig, frames: Sequence[BundleFrame]) ->
     Args:
         body: the tracked body, in a world in which z is up.
         rig: C cameras.
-        frames: of :func:`tk.model.cameras.bundle.choose_frames`; 24, spread over the recording, are enough.
+        frames: of :func:`tk.model.cameras.bundle.choose_frames`; 20 are enough.
 
     Raises:
         ValueError: no frames.

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from tk.kernels.line_search import SearchSettings
 from tk.kernels.silhouette import Edgels
 from tk.model.block_least_squares import Equations
-from tk.model.body.body_parameters import BodyFamily, pose_rows
-from tk.model.body.skeleton import SEGMENTS
+from tk.model.body.body_parameters import BodyFamily
+from tk.model.body.skeleton import SEGMENTS, Skeleton
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.masks.silhouettes import Pyramid, Views
 
@@ -174,34 +174,36 @@ class ContourBundle:
 
         A block holds a frame's pose and, unless segments are fixed, the displacement (3,) of every segment.
         """
-        body = self.family.build(state.body)
-        s = body.skeleton
-        segment = np.array([SEGMENTS.index(part.segment) for part in body.parts])
+        linear = self.family.linearised(state.body, np.array([view.pose for view in contours]))
+        s = linear.body.skeleton
         P, L, k, K = len(s.names), 3 * len(SEGMENTS), len(self.sigma), len(state.body)
         if self._segment_m is None:
             L = 0
         D, S = P + L, self.cameras.stop + K
-        found = Equations(len(self.frames), np.concatenate([body.free, np.ones(L, bool)]), S)
-        poses = np.array([view.pose for view in contours])
-        by_body = self.family.rows(state.body, poses, [view.edgels for view in contours])
-        transforms = s.segment_transforms(poses)
-        for view, body_rows, T in zip(contours, by_body, transforms, strict=True):
-            edgels = view.edgels
-            x = body.place(view.pose, edgels.part, edgels.unscaled, T)
-            by_pose = pose_rows(body, view.pose, edgels, x)
-            by_camera = [
-                (by_pose @ self.frames[view.frame].velocity)[:, None]
-                if name == "offset"
-                else camera_rows(state.rig[view.camera], x, edgels, name)
-                for name in self.parameters
-            ]
-            by_segment = np.zeros((len(x), L // 3, 3))
+        found = Equations(len(self.frames), np.concatenate([linear.body.free, np.ones(L, bool)]), S)
+        first = np.flatnonzero(np.diff([-1, *(view.frame for view in contours)])).tolist()
+        for begin, end in zip(first, [*first[1:], len(contours)], strict=True):  # small arrays are faster: by frame
+            views = contours[begin:end]
+            edgels = Edgels(*map(np.concatenate, zip(*(view.edgels for view in views), strict=True)))
+            ends = np.cumsum([len(view.edgels.part) for view in views]).tolist()
+            at = np.repeat(np.arange(begin, end), np.diff(ends, prepend=0))
+            x = linear.points(at, edgels)
+            by_segment = np.zeros((len(x), len(SEGMENTS) if L else 0, 3))
             if L:
-                by_segment[np.arange(len(x)), segment[edgels.part]] = edgels.row
-            rows = np.hstack([by_pose, by_segment.reshape(len(x), L), *by_camera, body_rows])
-            first = D + view.camera * k
-            columns = [slice(0, D), slice(first, first + k), slice(D + S - K, D + S)]
-            found.add(view.frame, columns, rows, self._information * edgels.weight, edgels.distance)
+                by_segment[np.arange(len(x)), linear.body.frames[0][edgels.part]] = edgels.row
+            by_pose = np.hstack([linear.pose_rows(at, edgels, x), by_segment.reshape(len(x), L)])
+            by_body = linear.rows(at, edgels)
+            for view, i, j in zip(views, [0, *ends], ends, strict=False):
+                by_camera = [
+                    (by_pose[i:j, :P] @ self.frames[view.frame].velocity)[:, None]
+                    if name == "offset"
+                    else camera_rows(state.rig[view.camera], x[i:j], view.edgels, name)
+                    for name in self.parameters
+                ]
+                own = D + view.camera * k
+                columns = [slice(0, D), slice(own, own + k), slice(D + S - K, D + S)]
+                rows = np.hstack([by_pose[i:j], *by_camera, by_body[i:j]])
+                found.add(view.frame, columns, rows, self._information * view.edgels.weight, view.edgels.distance)
         precision = np.full(D, POSE_DEVIATION**-2.0)
         precision[P:] = (self._segment_m or 1.0) ** -2.0
         for f, (frame, pose) in enumerate(zip(self.frames, state.poses, strict=True)):
@@ -273,6 +275,7 @@ def residual_px(contours: Sequence[Contours], count: int) -> Float:
 def choose_frames(
     masks: Callable[[int, int], NDArray[np.uint8]],
     views: Views,
+    skeleton: Skeleton,
     frames: NDArray[np.int64],
     poses: Float,
     usable: NDArray[np.bool_],
@@ -281,11 +284,13 @@ def choose_frames(
     cleaning: bool,
     late: NDArray[np.int64] | None = None,
 ) -> list[BundleFrame]:
-    """Choose frames spread evenly over a recording, whose neighbours are usable, too: velocities need them.
+    """Choose frames whose joints lie as far apart as possible and whose neighbours are usable, too: velocities need
+    them.
 
     Args:
         masks: (H, W) of a frame and a camera.
         views: the C cameras.
+        skeleton: of the body.
         frames: (F,) source frame of each row.
         poses: (F, D).
         usable: (F,) bool, rows with a reliable pose.
@@ -302,10 +307,23 @@ def choose_frames(
     inner[1:-1] = usable[:-2] & usable[1:-1] & usable[2:] & (frames[2:] - frames[:-2] == 2)
     inner &= [all(int(frame) - int(n) in known for n in late) for frame in frames]
     rows = np.flatnonzero(inner)
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(int))]
+    rows = rows[farthest(skeleton.joints(poses[rows]).reshape(len(rows), -1), count)]
     chosen = []
     for i in rows:
         frame_set = np.stack([masks(int(frames[i] - late[c]), c) for c in range(C)])
         velocity = 0.5 * (poses[i + 1] - poses[i - 1])
         chosen.append(BundleFrame(views.pyramid(frame_set, scales, cleaning), poses[i], velocity))
     return chosen
+
+
+def farthest(points: Float, count: int) -> NDArray[np.intp]:
+    """Return the indices, ascending, of at most ``count`` of the points (N, K) that cover all of them: first the point
+    nearest to the median, then always the one farthest from those chosen (Gonzalez 1985)."""
+    if not len(points):
+        return np.zeros(0, np.intp)
+    chosen = [int(np.argmin(np.linalg.norm(points - np.median(points, axis=0), axis=1)))]
+    distance = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < count and distance.max() > 0:
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.sort(chosen)
