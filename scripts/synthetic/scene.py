@@ -283,7 +283,7 @@ def _room_kernel(
                 if facing > 0.0:
                     start = p + 1e-3 * n
                     for k in range(boxes.shape[0]):
-                        blocked, _ = _hit_box(start, to_light, k, boxes)
+                        blocked, _face = _hit_box(start, to_light, k, boxes)
                         if blocked < distance:
                             facing = 0.0
                 for c in ti.static(range(3)):

@@ -85,6 +85,9 @@ def ensure_runtime() -> None:
         "default_fp": ti.f32,
         "offline_cache": True,
         "log_level": ti.ERROR,
+        # Taichi's own optimisations: LLVM's, which follow, make them superfluous. Launches take as long as with 1, the
+        # default, and the tracker's kernels compile in 3 s instead of 32.
+        "opt_level": 0,
         "debug": os.environ.get("TK_DEBUG") == "1",
     }
     threads = os.environ.get("TK_THREADS")
