@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +31,9 @@ from tk.model.masks.silhouettes import draw_silhouettes
 from tk.run import offline as finish
 from tk.run import plan
 from tk.run.prefetch import open_observations
-from tk.run.refinement import retimed, whole_delays
+from tk.run.refinement import refine_capture, retimed, whole_delays
 from tk.run.session import track
+from tk.settings import Settings
 
 TURNED = 1.0  # degrees, of cam2; a camera with a larger error is excluded
 
@@ -85,6 +87,15 @@ def test_refine_writes_a_calibration(
     assert turns(refined.rig, true).max() < 0.75 * turns(given, true).max()
     assert len(refined.time_offset_s) == len(given)
     tk("refine", turned, path, "-o", output).complaint(str(output), "--force")
+
+
+def test_reduced_images_refine_the_recorded_cameras(run: tuple[Path, Silent], turned: Path, tmp_path: Path) -> None:
+    capture = open_capture(turned)
+    config = replace(Settings(), ahead=0, person_pixels=int(capture.setup().person_pixels().min() / 2))
+    refine_capture(capture, run[0], tmp_path / "refined.toml", config, lambda _: None)
+    for refined, given in zip(read_calibration(tmp_path / "refined.toml").rig, capture.rig, strict=True):
+        assert (refined.width, refined.height) == (given.width, given.height)
+        np.testing.assert_allclose(refined.matrix, given.matrix, rtol=0.02)
 
 
 def test_late_videos_are_tracked_again(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,6 +25,7 @@ from tk.model.cameras.refinement import Refined, RefinementSettings, refine_came
 from tk.model.cameras.tracker_frame import TrackerFrame
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Views
+from tk.run.plan import reduce_images
 from tk.run.prefetch import open_observations
 from tk.settings import Settings
 from tk.threads import one_thread
@@ -129,8 +130,9 @@ def refine_capture(
             f"{result}: was tracked with the cameras {', '.join(found.cameras.rig.names)}; open the same",
             hint="name them with --cameras",
         )
-    world, store = TrackerFrame.of(capture.rig, capture.up), MaskStore()
-    with open_observations(capture.setup(), capture, config, note, keep_images=False) as observations:
+    setup, source = reduce_images(capture.setup(), capture, config.person_pixels)
+    world, store = TrackerFrame.of(setup.rig, capture.up), MaskStore()
+    with open_observations(setup, source, config, note, keep_images=False) as observations:
         for observation, _ in observations.frames(int(found.frames.min()), int(found.frames.max()) + 1):
             store.put(observation.index, observation.masks)
     body, poses = tracked[0].standing("z"), world.poses_in(tracked[1])
@@ -142,7 +144,7 @@ def refine_capture(
         )
     read = np.array(capture.late_frames) / capture.fps
     late = read + done.refined.offset_frames / capture.fps
-    write_calibration(output, capture.calibration, world.rig_out(done.refined.rig), late.tolist())
+    write_calibration(output, capture.calibration, world.rig_out(done.refined.rig.recorded()), late.tolist())
     return done
 
 
@@ -232,8 +234,7 @@ def refine_if_inconsistent(
     if done is None:
         return None
     refined = done.refined
-    recorded = np.array(world.rig.reductions)
-    before, after = (float(np.mean(recorded * px)) for px in (refined.before_px, refined.after_px))
+    before, after = float(np.mean(refined.before_px)), float(np.mean(refined.after_px))
     if not (late.any() or after < _WORTHWHILE * before):
         return None
     names, worst = world.rig.names, int(np.argmax(refined.turn_deg))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -39,8 +40,9 @@ MASKS_RECORD = "masks.toml"
 #: frame rate, 1/s, if neither `capture.toml` nor the videos give one; a note says so
 DEFAULT_FPS = 30.0
 
-#: most images of the empty scene for each camera, and most bytes of all of them. Enough for a mean and a variance.
-_BACKGROUND_FRAMES = 50
+#: most images of the empty scene for each camera, the first frames of a clip from which they are taken (a longer clip
+#: only takes longer to decode), and most bytes of all of them. Enough for a mean and a variance.
+_BACKGROUND_FRAMES, _BACKGROUND_LENGTH = 50, 100
 _BACKGROUND_BYTES = 384 * 2**20
 
 #: axis that points up if `capture.toml` gives none, unless the cameras' mounting differs by more than _UP_DEG degrees
@@ -190,8 +192,8 @@ class Capture:
     def background(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return the empty scene: an array (T, h, w, 3) uint8 BGR for each camera; None without a `background/` folder.
 
-        T is 1 for an image. Of a clip at most 50 frames are used, spread evenly over it, and fewer of large images
-        (384 MiB over all cameras).
+        T is 1 for an image. Of a clip at most 50 frames are used, spread evenly over its first 100, and fewer of large
+        images (384 MiB over all cameras).
 
         Raises:
             VideoError: a camera has no background, or it cannot be read, or has another size.
@@ -202,8 +204,9 @@ class Capture:
         clips = _clips_of(self._calibration, folder, "background", "png", pictures=True)
         pixels = sum(camera.width * camera.height for camera in self.rig)
         most = min(_BACKGROUND_FRAMES, max(2, _BACKGROUND_BYTES // (3 * pixels)))
-        reductions = self.rig.reductions
-        return tuple(_read_some(clip.reduced(k), most) for clip, k in zip(clips, reductions, strict=True))
+        small = [clip.reduced(camera.reduction) for clip, camera in zip(clips, self.rig, strict=True)]
+        with ThreadPoolExecutor(os.cpu_count()) as threads:
+            return tuple(threads.map(lambda clip: _read_some(clip, most), small))
 
 
 def open_capture(
@@ -394,9 +397,10 @@ def _warn_of_units(calibration: Calibration, warn: Callable[[str], None]) -> Non
 
 
 def _read_some(clip: Clip, most: int) -> Image:
-    """(T, h, w, 3): at most ``most`` frames, spread evenly over the clip."""
-    count = min(clip.frame_count, most)
-    chosen = (np.arange(count) * clip.frame_count) // count
+    """(T, h, w, 3): at most ``most`` frames, spread evenly over the clip, or over the start of a long one."""
+    length = min(clip.frame_count, _BACKGROUND_LENGTH)
+    count = min(length, most)
+    chosen = (np.arange(count) * length) // count
     result = np.empty((count, clip.height, clip.width, 3), np.uint8)
     position = 0
     with closing(clip.open()) as reader:

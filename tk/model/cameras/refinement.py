@@ -78,7 +78,8 @@ class Refined:
         turn_sigma_deg, move_sigma_m, focal_sigma, offset_sigma_frames: (C,) one standard deviation; of turn and move
             the vector's length.
         observed: (C,) bool, whether the recording determines a camera's placement better than the prior.
-        before_px, after_px: (C,) pixels, root mean square distance of contours from the mask's edges.
+        before_px, after_px: (C,) pixels of the recorded image, root mean square distance of contours from the mask's
+            edges.
         rounds: number of iterations.
         stop: why the iteration ended.
     """
@@ -144,8 +145,8 @@ def refine_cameras(
         focal_sigma=posterior.get("focal", np.zeros(C)),
         offset_sigma_frames=posterior.get("offset", np.zeros(C)),
         observed=(posterior["turn"] < _OBSERVED * prior["turn"]) & (posterior["move"] < _OBSERVED * prior["move"]),
-        before_px=residual_px(bundle.contours(bundle.start, 0), C),
-        after_px=residual_px(bundle.contours(final, 0), C),
+        before_px=residual_px(bundle.contours(bundle.start, 0), C) * rig.reductions,
+        after_px=residual_px(bundle.contours(final, 0), C) * rig.reductions,
         rounds=solution.iterations,
         stop=solution.reason,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import cv2
@@ -138,12 +138,12 @@ def _medians(values: Float, count: NDArray[np.int_]) -> Float:
 
 def mean_scene(clip: Images) -> Float:
     """Return the mean (h, w, 3) of a clip of the empty scene, corrected for flicker."""
-    total = np.zeros(clip.shape[1:], np.float32)
+    total = np.zeros((len(clip[0]), clip[0, 0].size), np.float32)
     scaled = np.empty_like(total)
-    for frame, gain in zip(clip, _flicker(clip), strict=True):
-        np.multiply(frame, 1 / gain, out=scaled)
+    for frame, gain in _rows(clip, 1 / _flicker(clip)):
+        np.multiply(frame, gain, out=scaled)
         total += scaled
-    return total / np.float32(len(clip))
+    return (total / np.float32(len(clip))).reshape(clip.shape[1:])
 
 
 def learn_scene(clip: Images) -> tuple[Float, Float | None]:
@@ -151,16 +151,24 @@ def learn_scene(clip: Images) -> tuple[Float, Float | None]:
     reference = clip[0].astype(np.float32)
     if len(clip) == 1:
         return reference, None
-    total = np.zeros_like(reference)
-    squares = np.zeros_like(reference)
-    for frame, gain in zip(clip, _flicker(clip), strict=True):
+    first = reference.reshape(len(reference), -1)
+    total, squares, difference = np.zeros_like(first), np.zeros_like(first), np.empty_like(first)
+    for frame, gain in _rows(clip, _flicker(clip)):
         # differences from the first frame avoid cancellation in float32
-        difference = frame / gain - reference
+        np.divide(frame, gain, out=difference)
+        difference -= first
         total += difference
-        squares += difference * difference
+        difference *= difference
+        squares += difference
     mean = total / len(clip)
-    variance = (squares - total * mean) / (len(clip) - 1)
-    return reference + mean, np.maximum(variance, 0)
+    variance = np.maximum((squares - total * mean) / (len(clip) - 1), 0)
+    return reference + mean.reshape(reference.shape), variance.reshape(reference.shape)
+
+
+def _rows(clip: Images, factors: Float) -> Iterator[tuple[NDArray[np.uint8], Float]]:
+    """Yield each frame as (h, 3 w), and its factors (T, 3) as (3 w,): three times as fast as (h, w, 3) with (3,)."""
+    frames = np.ascontiguousarray(clip).reshape(len(clip), clip.shape[1], -1)
+    return zip(frames, np.tile(factors, clip.shape[2]), strict=True)
 
 
 def _flicker(clip: Images) -> Float:
