@@ -23,6 +23,8 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pbm", ".pgm", ".ppm")
 #: least grey value of the foreground in a mask: half of 255, because video coding blurs edges
 MASK_THRESHOLD = 128
 
+_FULL_RANGE = 2  # FFmpeg's AVCOL_RANGE_JPEG
+
 
 class Reader(Protocol):
     """Reads the images of a clip in order. One thread at a time."""
@@ -80,9 +82,10 @@ class VideoClip:
     times_s: NDArray[np.float64] | None = field(compare=False)
     is_mask: bool = False
     recorded_size: tuple[int, int] | None = None
+    turned: bool = False  # whether the file asks for its coded images to be turned
 
     def open(self) -> Reader:
-        return _VideoReader(self)
+        return _open_planes(self) or _VideoReader(self)
 
     def reduced(self, factor: int) -> VideoClip:
         return replace(self, **_reduced_size(self, factor))
@@ -130,6 +133,7 @@ def probe_video(path: Path, is_mask: bool = False) -> VideoClip:
     capture = _open_video(path)
     try:
         promised = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        turned = capture.get(cv2.CAP_PROP_ORIENTATION_META) != 0
         ok, picture = capture.read()
     finally:
         capture.release()
@@ -144,7 +148,8 @@ def probe_video(path: Path, is_mask: bool = False) -> VideoClip:
         )
     height, width = picture.shape[:2]
     increasing = bool((np.diff(times_s) > 0).all())
-    return VideoClip(path, width, height, frame_count, times_s if increasing else None, is_mask)
+    times = times_s if increasing else None
+    return VideoClip(path, width, height, frame_count, times, is_mask, turned=turned)
 
 
 def probe_pictures(path: Path, is_mask: bool = False) -> PictureClip:
@@ -215,12 +220,82 @@ class _VideoReader:
         self._capture.release()
 
     def _fail(self) -> None:
-        count = self._clip.frame_count
-        raise VideoError(
-            f"{self._clip.path}: image {self._index} of {count} cannot be decoded: the file is cut off or damaged; "
-            "copy it again, or use the frames before",
-            hint=f"with --frames 0:{self._index}",
-        )
+        raise _undecodable(self._clip, self._index)
+
+
+def _open_planes(clip: VideoClip) -> _PlaneReader | None:
+    """Return a reader of the planes of a reduced video, None for a video that is left to OpenCV.
+
+    These are: full size, masks, turned images, and, because they are rare, colours at full size, more than 8 bits, and
+    sizes that the reduction divides with a remainder.
+    """
+    if not clip.recorded_size or clip.is_mask or clip.turned:
+        return None
+    import av  # slow to import, and small videos do without
+
+    container = av.open(c_name(clip.path, VideoError))
+    context = container.streams.video[0].codec_context
+    context.thread_count = 1  # as in _open_video
+    factor = clip.recorded_size[0] // clip.width
+    divided = (factor * clip.width, factor * clip.height) == clip.recorded_size
+    if divided and clip.width % 2 == clip.height % 2 == 0 and context.pix_fmt in ("yuv420p", "yuvj420p"):
+        return _PlaneReader(clip, container)
+    container.close()
+    return None
+
+
+class _PlaneReader:
+    """Reads a reduced video. The planes of brightness and colour are reduced before they become BGR.
+
+    Measured on 1920×1080, read at half the size: 3.8 ms an image, of which decoding is 3.3. OpenCV at full size and a
+    reduction after it take 5.2 ms.
+    """
+
+    def __init__(self, clip: VideoClip, container: Any) -> None:
+        self._clip = clip
+        self._index = 0
+        self._container = container
+        self._images = container.decode(video=0)
+        # brightness, and below it the two colours, as COLOR_YUV2BGR_I420 expects them
+        self._planes = np.empty((clip.height * 3 // 2, clip.width), np.uint8)
+        colors = self._planes[clip.height :].reshape(2, clip.height // 2, clip.width // 2)
+        self._small = (self._planes[: clip.height], *colors)
+
+    def _next(self) -> Any:
+        import av.error
+
+        try:
+            image = next(self._images)
+        except (av.error.FFmpegError, StopIteration):
+            raise _undecodable(self._clip, self._index) from None
+        self._index += 1
+        return image
+
+    def skip(self) -> None:
+        self._next()
+
+    def read(self, out: Image) -> None:
+        image = self._next()
+        _check_size(self._clip, image.width, image.height, self._clip.path)
+        full_range = image.color_range == _FULL_RANGE or image.format.name == "yuvj420p"
+        for k, (plane, small) in enumerate(zip(image.planes, self._small, strict=True)):
+            whole = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)[:, : plane.width]
+            cv2.resize(whole, small.shape[::-1], dst=small, interpolation=cv2.INTER_AREA)
+            if full_range:  # to the range that the conversion expects: 16 to 235, and 16 to 240 about 128
+                scale = (219 if k == 0 else 224) / 255
+                cv2.convertScaleAbs(small, dst=small, alpha=scale, beta=16 if k == 0 else 128 * (1 - scale))
+        cv2.cvtColor(self._planes, cv2.COLOR_YUV2BGR_I420, dst=out)
+
+    def close(self) -> None:
+        self._container.close()
+
+
+def _undecodable(clip: Clip, index: int) -> VideoError:
+    return VideoError(
+        f"{clip.path}: image {index} of {clip.frame_count} cannot be decoded: the file is cut off or damaged; "
+        "copy it again, or use the frames before",
+        hint=f"with --frames 0:{index}",
+    )
 
 
 class _PictureReader:
@@ -347,10 +422,8 @@ def _deliver(clip: VideoClip | PictureClip, picture: NDArray[Any], path: Path, o
     Raises:
         VideoError: the image has another size than the clip.
     """
-    expected = clip.recorded_size or (clip.width, clip.height)
     height, width = picture.shape[:2]
-    if (width, height) != expected:
-        raise VideoError(f"{path}: is {width}×{height}; the pictures before it are {expected[0]}×{expected[1]}")
+    _check_size(clip, width, height, path)
     if clip.is_mask:
         picture = _binarised(picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
     if clip.recorded_size:
@@ -361,6 +434,12 @@ def _deliver(clip: VideoClip | PictureClip, picture: NDArray[Any], path: Path, o
             picture = _binarised(picture)
     if not np.may_share_memory(picture, out):
         out[...] = picture
+
+
+def _check_size(clip: VideoClip | PictureClip, width: int, height: int, path: Path) -> None:
+    expected = clip.recorded_size or (clip.width, clip.height)
+    if (width, height) != expected:
+        raise VideoError(f"{path}: is {width}×{height}; the pictures before it are {expected[0]}×{expected[1]}")
 
 
 def _reduced_size(clip: VideoClip | PictureClip, factor: int) -> dict[str, Any]:

@@ -140,7 +140,7 @@ def mean_scene(clip: Images) -> Float:
     """Return the mean (h, w, 3) of a clip of the empty scene, corrected for flicker."""
     total = np.zeros((len(clip[0]), clip[0, 0].size), np.float32)
     scaled = np.empty_like(total)
-    for frame, gain in _rows(clip, 1 / _flicker(clip)):
+    for frame, gain in _rows(clip, np.float32(1) / _flicker(clip)):
         np.multiply(frame, gain, out=scaled)
         total += scaled
     return (total / np.float32(len(clip))).reshape(clip.shape[1:])
