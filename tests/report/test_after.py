@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import av
 import pytest
 
 from tests.conftest import Tk
@@ -21,6 +22,19 @@ def test_track_writes_a_video_and_a_report(tk: Tk, tiny: Path, quick: Path, tmp_
     assert f"wrote {tmp_path / 'r.mp4'}, {tmp_path / 'r.html'}" in ran.err.splitlines()
     assert {path.name for path in tmp_path.iterdir()} == {"r.h5", "r.mp4", "r.html"}
     assert is_our_video(tmp_path / "r.mp4") and is_our_page(tmp_path / "r.html")
+
+
+def test_a_long_recording_has_a_video_of_some_images_and_of_its_duration(
+    complete: Path, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = tmp_path / "r.h5"
+    result.write_bytes(complete.read_bytes())
+    monkeypatch.setattr(after, "_MOST", 5)
+    write_video_and_report(open_capture(tiny), result, pytest.fail)
+    with av.open(str(tmp_path / "r.mp4")) as video:
+        stream = video.streams.video[0]
+        assert stream.frames == 5  # 14 frames, every third one
+        assert stream.average_rate == 5  # 15 Hz
 
 
 def test_files_of_other_programs_are_not_replaced(complete: Path, tiny: Path, tmp_path: Path) -> None:

@@ -134,6 +134,18 @@ def test_page_of_1000_frames_is_below_4_megabytes(complete: Path) -> None:
     assert len(page) < 4e6  # and five pictures of some 100 kB
 
 
+def test_page_of_ten_minutes_shows_some_frames_and_counts_all(complete: Path) -> None:
+    result = longer(read_result(complete), 36_000)
+    pictures = [{"row": 35_999, "why": "the last", "jpeg": ""}]
+    page = build_page(result, pictures)
+    assert len(page) < 9.4e6  # 10 MB with five pictures of some 100 kB
+    data = data_of(page)
+    assert data["frameCount"] == 36_000 and len(data["frames"]) == 36_000 / data["step"] <= 4000
+    assert data["frames"][1] == data["step"] and data["pictures"][0]["frame"] == 35_999
+    (person,) = data["people"]
+    assert person["lostCount"] == (result.status == Status.LOST).sum() and len(person["status"]) == len(data["frames"])
+
+
 def test_sigma_of_flexion_matches_random_positions(complete: Path) -> None:
     figure = figure_of(read_result(complete))
     rng = np.random.default_rng(2)

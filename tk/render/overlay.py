@@ -77,14 +77,12 @@ class Overlay:
 
     def pictures(self, frames: Sequence[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """Yield these frames, ascending, and their images (C, H, W, 3); decoding starts immediately."""
-        wanted = set(frames)
-        reader = self.capture.frames(min(wanted), max(wanted) + 1)
+        reader = self.capture.some_frames(sorted(set(frames)))
 
         def taken() -> Iterator[tuple[int, NDArray[np.uint8]]]:
             with reader:
                 for frame in reader:
-                    if frame.index in wanted:
-                        yield frame.index, frame.images
+                    yield frame.index, frame.images
 
         return taken()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,8 +16,9 @@ from tk.report.page import PAGE, build_page, write_page
 from tk.report.pictures import choose_rows, embedded, shot
 from tk.threads import one_thread
 
-# Width of the video, pixels. Every run pays the time for it; `tk render` makes a larger one.
-_WIDEST = 960
+# Width of the video, pixels; most images for a second, and in all. Every run pays the time for it; `tk render` makes a
+# video of all images, and a larger one.
+_WIDEST, _MOST_PER_S, _MOST = 960, 15.0, 3000
 
 
 def write_video_and_report(
@@ -47,12 +49,16 @@ def _write(capture: Capture, result_path: Path) -> list[Path]:
     overlay = Overlay(capture, result, _WIDEST)
     choices = choose_rows(result)
     wanted = {choice.row for choice in choices}
-    pictures = overlay.pictures(list(overlay.row_of))
+    frames = list(overlay.row_of)
+    step = max(math.ceil(capture.fps / _MOST_PER_S - 0.01), -(-len(frames) // _MOST))
+    filmed = set(frames[::step])
+    pictures = overlay.pictures([frame for frame in frames if frame in filmed or overlay.row_of[frame] in wanted])
     check_encoder()  # slow; decoding has already begun in the background
     shots: dict[int, bytes] = {}
-    with video_writer(video, capture.fps) as add:
+    with video_writer(video, capture.fps / step) as add:
         for frame, images in pictures:
-            add(overlay.mosaic(frame, images))
+            if frame in filmed:
+                add(overlay.mosaic(frame, images))
             row = overlay.row_of[frame]
             if row in wanted:
                 shots[row] = shot(overlay, frame, images)

@@ -33,6 +33,9 @@ from tk.render.scene import Stage, camera_pyramid
 
 Float = NDArray[np.float64]
 
+# Most rows of all people in a page: a row takes 1.7 kB, so a page has at most 8 MB with its images. Of longer
+# recordings every second, third, … frame is shown.
+_MOST_ROWS = 4000
 #: stops of the colour scale of σ; the page interpolates between them
 _SIGMA_STOPS = 9
 
@@ -49,7 +52,9 @@ def describe(result: Result, rig: Rig | None = None, truth: Path | None = None) 
         ResultError: there are no frames or joints, or the body cannot be used.
     """
     meta = result.meta
-    people = result.aligned()
+    whole = result.aligned()
+    step = -(-len(whole) * len(whole[0]) // _MOST_ROWS)
+    people = [person.thinned(step) for person in whole]
     figures = [figure_of(person) for person in people]
     first = people[0]
     stage = Stage.of(people, figures)
@@ -64,6 +69,8 @@ def describe(result: Result, rig: Rig | None = None, truth: Path | None = None) 
         "settings": meta.config_toml,
         "notes": list(result.notes),
         "frames": first.frames.tolist(),
+        "frameCount": len(whole[0]),
+        "step": step,
         "time": first.time.round(4).tolist(),
         "statusWords": list(STATUS_MEANING),
         "withoutPose": [int(Status.LOST), int(Status.ABSENT)],
@@ -72,7 +79,8 @@ def describe(result: Result, rig: Rig | None = None, truth: Path | None = None) 
         "cameras": list(meta.residual_cameras),
         "objectiveKind": meta.objective_kind,
         "people": [
-            _person(person, figure, stage, error) for person, figure, error in zip(people, figures, errors, strict=True)
+            _person(person, figure, stage, error) | _counts(all_rows)
+            for person, all_rows, figure, error in zip(people, whole, figures, errors, strict=True)
         ],
         "colors": {
             "segments": {name: hexadecimal(color) for name, color in SEGMENT_COLORS.items()},
@@ -114,6 +122,13 @@ def _person(result: Result, figure: Figure, stage: Stage, truth: dict[str, Any] 
         "angles": _angles(result, figure),
         "timing": _timing(result),
     }
+
+
+def _counts(person: Result) -> dict[str, int]:
+    """Return in how many frames a person is present, lost and suspect."""
+    present = np.isfinite(person.joints).any(axis=(1, 2))
+    lost, suspect = present & ~person.has_pose, person.status == Status.SUSPECT
+    return {"present": int(present.sum()), "lostCount": int(lost.sum()), "suspectCount": int(suspect.sum())}
 
 
 def _on_floor(stage: Stage) -> Float:

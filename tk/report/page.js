@@ -30,7 +30,7 @@
   // --- header
   get("title").textContent = data.capture;
   const when = data.created.slice(0, 16).replace("T", " ");
-  get("subtitle").textContent = `${data.file} · ${count} frames at ${short(data.fps)} Hz · method ${data.method} · ${data.software}${when ? ` · ${when} UTC` : ""}`;
+  get("subtitle").textContent = `${data.file} · ${data.frameCount} frames at ${short(data.fps)} Hz${data.step > 1 ? `, one of ${data.step} is shown` : ""} · method ${data.method} · ${data.software}${when ? ` · ${when} UTC` : ""}`;
   const line = (cells, kind = "td") => {
     const made = make("tr");
     cells.forEach((cell, k) => {
@@ -49,7 +49,6 @@
     original.after(...copies);
   }
   const mean = (values) => (values.length ? values.reduce((a, b) => a + b) / values.length : NaN);
-  const suspect = data.statusWords.indexOf("suspect");
   const people = data.people.map((person, n) => {
     const positions = unpack(person.positions);
     const there = Array.from({ length: count }, (_, row) => positions.subarray(3 * J * row, 3 * J * (row + 1)).some(isFinite));
@@ -60,8 +59,6 @@
       ...person, n, name: `Person ${person.number}`, color: data.colors.people[n], there, lost, good,
       silhouetteError, sigma: person.sigma && unpack(person.sigma), expected: person.expected && unpack(person.expected),
       meanError: silhouetteError && Array.from({ length: count }, (_, row) => mean(Array.from(silhouetteError.subarray(row * C, row * C + C)).filter(isFinite))),
-      present: there.filter(Boolean).length, lostCount: lost.filter(Boolean).length,
-      suspectCount: person.status.filter((status) => status === suspect).length,
     };
   });
   const sum = (values) => values.reduce((a, b) => a + b, 0);
@@ -224,7 +221,7 @@
     : "No images: the report was made without the capture. tk report RESULT.h5 CAPTURE adds them.";
   for (const picture of data.pictures) {
     const figure = make("figure"), caption = make("figcaption"), button = make("button"), image = make("img");
-    const at = `frame ${data.frames[picture.row]}, ${data.time[picture.row].toFixed(2)} s`;
+    const at = `frame ${picture.frame}, ${picture.time.toFixed(2)} s`;
     caption.append(make("b", at), ` · ${picture.why}`);
     image.alt = `Overlay of ${at}, all cameras`;
     image.src = `data:image/jpeg;base64,${picture.jpeg}`;

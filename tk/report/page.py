@@ -35,7 +35,17 @@ def build_page(
     Raises:
         ResultError: the result cannot be drawn.
     """
-    data = describe(result, rig, truth) | {"file": result.path.name, "pictures": pictures}
+    data, rows = describe(result, rig, truth), result.aligned()[0]
+    shown = [
+        {
+            **picture,
+            "row": picture["row"] // data["step"],
+            "frame": int(rows.frames[picture["row"]]),
+            "time": float(rows.time[picture["row"]]),
+        }
+        for picture in pictures
+    ]
+    data |= {"file": result.path.name, "pictures": shown}
     # "<" could close the script element
     text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     page = _read("page.html")

@@ -51,7 +51,8 @@ def finish(
     cameras = UsedCameras(plan.setup.rig, np.array(plan.source.time_offset_s))
     for member in people:
         if member.number in finished:
-            cameras = read_result(output).cameras or cameras
+            stored = read_result(output).cameras or cameras
+            cameras = replace(stored, rig=stored.rig.recorded().reduced(plan.setup.rig.reductions))
             continue
         store = None if masks is None else masks[member.number]
         cameras = _finish(output, plan, member, store, note, cameras, len(people) == 1)

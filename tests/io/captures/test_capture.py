@@ -246,10 +246,19 @@ def test_time_offsets_select_the_images_of_a_frame(make_capture: MakeCapture, la
                 assert [read_tag(image) for image in seen.images] == [(0, seen.index), (1, own), (2, seen.index)]
 
 
+def test_some_frames_are_the_same_as_in_all(make_capture: MakeCapture) -> None:
+    capture = open_capture(make_capture())
+    with capture.some_frames([1, 2, 6, 11]) as frames:
+        assert len(frames) == 4
+        for index, seen in zip((1, 2, 6, 11), frames, strict=True):
+            assert seen.index == index and seen.time == pytest.approx(index / capture.fps)
+            assert [read_tag(image) for image in seen.images] == [(c, index) for c in range(3)]
+
+
 @pytest.mark.parametrize("start", [0, 8, 11])
 def test_after_its_end_a_video_repeats_its_last_image(make_capture: MakeCapture, start: int) -> None:
     clips = open_capture(make_capture()).clips
-    with FrameReader(clips, None, (clips[0].height, clips[0].width), start, 14, (2, -3, 2)) as frames:
+    with FrameReader(clips, None, (clips[0].height, clips[0].width), range(start, 14), (2, -3, 2)) as frames:
         for seen in frames:
             early, late = min(seen.index + 3, 11), max(seen.index - 2, 0)
             assert [read_tag(image) for image in seen.images] == [(0, late), (1, early), (2, late)]

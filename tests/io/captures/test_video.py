@@ -259,7 +259,7 @@ def test_a_truncated_video_is_refused(tmp_path: Path) -> None:
 def test_a_video_that_ends_early_is_reported_at_its_last_frame(tmp_path: Path) -> None:
     write_video(tmp_path / "a.mp4", [picture(0, k) for k in range(12)])
     clip = dataclasses.replace(probe_video(tmp_path / "a.mp4"), frame_count=20)
-    reader = FrameReader([clip, clip], None, (HEIGHT, WIDTH), 0, 20)
+    reader = FrameReader([clip, clip], None, (HEIGHT, WIDTH), range(20))
     seen = []
     with pytest.raises(VideoError, match=r"a\.mp4: image 12 of 20 cannot be decoded: .*copy it again"):
         for frame_set in reader:
@@ -370,7 +370,7 @@ class FakeClip:
 def reader_of(
     clips: list[FakeClip], start: int = 0, stop: int = 100, masks: list[FakeClip] | None = None
 ) -> FrameReader:
-    return FrameReader(clips, masks, (4, 6), start, stop)
+    return FrameReader(clips, masks, (4, 6), range(start, stop))
 
 
 def test_frame_sets_are_packed_and_padded() -> None:
@@ -468,7 +468,7 @@ def test_an_open_reader_does_not_block_the_exit(tmp_path: Path) -> None:
         "from tk.io.captures.video import probe\n"
         "from tk.io.captures.frames import FrameReader\n"
         "clip = probe(pathlib.Path(sys.argv[1]))\n"
-        "reader = FrameReader([clip, clip], None, (clip.height, clip.width), 0, 30)\n"
+        "reader = FrameReader([clip, clip], None, (clip.height, clip.width), range(30))\n"
         "print(next(reader).index)\n"
     )
     done = subprocess.run(

@@ -187,7 +187,11 @@ class Capture:
             raise CaptureError(
                 f"{self.path}: no frames from {start} to {stop}; it has frames 0 to {self.frame_count - 1}"
             )
-        return FrameReader(self.clips, self.mask_clips, self.rig.frame_shape, start, stop, self.late_frames, self.fps)
+        return self.some_frames(range(start, stop))
+
+    def some_frames(self, wanted: Sequence[int]) -> FrameReader:
+        """Return the frames with these indices, ascending, decoded ahead."""
+        return FrameReader(self.clips, self.mask_clips, self.rig.frame_shape, wanted, self.late_frames, self.fps)
 
     def background(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return the empty scene: an array (T, h, w, 3) uint8 BGR for each camera; None without a `background/` folder.

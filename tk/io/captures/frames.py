@@ -39,7 +39,7 @@ class FrameSet:
 
 
 class FrameReader(Iterator[FrameSet]):
-    """Iterates over the frames ``start`` … ``stop - 1``, one decoding thread a camera.
+    """Iterates over frames in ascending order, one decoding thread a camera.
 
     Every thread decodes directly into its layer of a shared stack, up to 8 frames (128 MiB) ahead. The threads end with
     the context manager, with the iteration, or when the reader is no longer referenced.
@@ -52,18 +52,16 @@ class FrameReader(Iterator[FrameSet]):
         clips: Sequence[Clip],
         mask_clips: Sequence[Clip] | None,
         frame_shape: tuple[int, int],
-        start: int,
-        stop: int,
+        wanted: Sequence[int],
         late: Sequence[int] = (),
         fps: float = 1.0,
     ) -> None:
-        """``late``: delay of each clip in frames; frame k holds image k - late. The first image is repeated before the
-        clip's start, the last one after its end. ``fps``: frame rate, for the time stamps.
+        """``wanted``: indices of the frames, ascending; images between them are not converted. ``late``: delay of each
+        clip in frames; frame k holds image k - late. The first image is repeated before the clip's start, the last one
+        after its end. ``fps``: frame rate, for the time stamps.
         """
         late = tuple(late) or (0,) * len(clips)
-        self.start = start
-        self.stop = stop
-        self._index = start
+        self._left = len(wanted)
         count = len(clips)
 
         set_bytes = count * frame_shape[0] * frame_shape[1] * (4 if mask_clips else 3)
@@ -71,17 +69,18 @@ class FrameReader(Iterator[FrameSet]):
         images = _Stacks((count, *frame_shape, 3), ahead)
         masks = _Stacks((count, *frame_shape), ahead) if mask_clips else None
 
-        def blank(index: int) -> FrameSet:
+        def blank(place: int) -> FrameSet:
+            index = wanted[place]
             return FrameSet(index, index / fps, images.take(), masks.take() if masks else None)
 
-        window = _Window(blank, count, start, ahead)
+        window = _Window(blank, count, ahead)
         self._window = window
         # The threads know the window, not this reader: dropping the reader closes the window. Daemons, so that a
         # reader that is still referenced when the interpreter ends does not hold it up.
         self._threads = [
             threading.Thread(
                 target=_decode,
-                args=(window, camera, clip, mask_clips[camera] if mask_clips else None, start, stop, late[camera]),
+                args=(window, camera, clip, mask_clips[camera] if mask_clips else None, wanted, late[camera]),
                 name=f"tk-decode-{camera}",
                 daemon=True,
             )
@@ -93,21 +92,21 @@ class FrameReader(Iterator[FrameSet]):
 
     def __len__(self) -> int:
         """Frames still to come."""
-        return self.stop - self._index
+        return self._left
 
     def __iter__(self) -> FrameReader:
         return self
 
     def __next__(self) -> FrameSet:
         try:
-            frame_set = self._window.take() if self._index < self.stop else None
+            frame_set = self._window.take() if self._left else None
         except BaseException:
             self.close()
             raise
         if frame_set is None:
             self.close()
             raise StopIteration
-        self._index += 1
+        self._left -= 1
         return frame_set
 
     def __enter__(self) -> FrameReader:
@@ -157,26 +156,27 @@ class _Slot:
 
 
 class _Window:
-    """The frame sets between the consumer and the fastest camera, shared by the threads."""
+    """The frame sets between the consumer and the fastest camera, shared by the threads; by their place in the
+    reader's order."""
 
-    def __init__(self, blank: Callable[[int], FrameSet], cameras: int, start: int, ahead: int) -> None:
+    def __init__(self, blank: Callable[[int], FrameSet], cameras: int, ahead: int) -> None:
         self._blank = blank
         self._cameras = cameras
-        self._next = start  # the consumer's frame
+        self._next = 0  # the consumer's frame
         self._ahead = ahead
         self._slots: dict[int, _Slot] = {}
         self.closed = False
         self._changed = threading.Condition()
 
-    def claim(self, index: int) -> _Slot | None:
-        """Wait until frame ``index`` may be decoded and return its slot; None after the reader was closed."""
+    def claim(self, place: int) -> _Slot | None:
+        """Wait until a frame may be decoded and return its slot; None after the reader was closed."""
         with self._changed:
-            self._changed.wait_for(lambda: self.closed or index < self._next + self._ahead)
+            self._changed.wait_for(lambda: self.closed or place < self._next + self._ahead)
             if self.closed:
                 return None
-            if index not in self._slots:
-                self._slots[index] = _Slot(self._blank(index), self._cameras)
-            return self._slots[index]
+            if place not in self._slots:
+                self._slots[place] = _Slot(self._blank(place), self._cameras)
+            return self._slots[place]
 
     def finish(self, slot: _Slot, camera: int, failure: BaseException | None = None) -> None:
         with self._changed:
@@ -210,34 +210,33 @@ class _Window:
             self._changed.notify_all()
 
 
-def _decode(window: _Window, camera: int, clip: Clip, mask_clip: Clip | None, start: int, stop: int, late: int) -> None:
+def _decode(window: _Window, camera: int, clip: Clip, mask_clip: Clip | None, wanted: Sequence[int], late: int) -> None:
     """Decode one camera's images; runs in its own thread."""
-    index = start
+    place = 0
     slot: _Slot | None = None
     last = clip.frame_count - 1 if mask_clip is None else min(clip.frame_count, mask_clip.frame_count) - 1
+    # the first or last image may stand for several frames
+    numbers = np.clip(np.asarray(wanted) - late, 0, last).tolist()
     kept, kept_mask = np.empty((2, 0), np.uint8)  # an image that several frames show
-
-    def picture_of(index: int) -> int:
-        return min(max(index - late, 0), last)
-
+    following = 0  # number of the next image in the clip
     try:
         with ExitStack() as stack:
             pictures = stack.enter_context(closing(clip.open()))
             masks = stack.enter_context(closing(mask_clip.open())) if mask_clip else None
-            for _ in range(picture_of(start)):
-                if window.closed:
-                    return
-                pictures.skip()
-                if masks is not None:
-                    masks.skip()
-            for index in range(start, stop):
-                slot = window.claim(index)
+            for place, number in enumerate(numbers):
+                stands_in = number < following
+                while following < number:
+                    if window.closed:
+                        return
+                    pictures.skip()
+                    if masks is not None:
+                        masks.skip()
+                    following += 1
+                slot = window.claim(place)
                 if slot is None:
                     return
+                again = place + 1 < len(numbers) and numbers[place + 1] == number
                 layer = slot.frame_set.images[camera, : clip.height, : clip.width]
-                # the first or last image may stand for several frames
-                stands_in = index > start and picture_of(index) == picture_of(index - 1)
-                again = picture_of(index) == picture_of(index + 1)
                 if stands_in:
                     layer[...] = kept
                 else:
@@ -252,10 +251,11 @@ def _decode(window: _Window, camera: int, clip: Clip, mask_clip: Clip | None, st
                         kept_mask = mask_layer.copy()
                 if again:
                     kept = layer.copy()
+                following = number + 1
                 window.finish(slot, camera)
                 slot = None
     except BaseException as failure:
-        slot = slot or window.claim(index)
+        slot = slot or window.claim(place)
         if slot is not None:
             window.finish(slot, camera, failure)
 

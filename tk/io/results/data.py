@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -347,16 +347,26 @@ class Result:
             whole[row] = values
             return whole
 
+        status = np.full(len(frames), np.uint8(Status.ABSENT))
+        status[row] = self.status
+        return replace(self._each(spread), frames=frames, time=time, status=status)
+
+    def thinned(self, step: int) -> Result:
+        """Return every ``step``-th row of this person, without smoothed copy and hull."""
+        every = slice(None, None, step)
+        frames, time, status = self.frames[every], self.time[every], self.status[every]
+        return replace(self._each(lambda values: values[every]), frames=frames, time=time, status=status)
+
+    def _each(self, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Result:
+        """Return the result of this person with changed values of all rows, but for frame, time and status."""
         columns: dict[str, Any] = {
-            name: spread(getattr(self, name))
+            name: change(getattr(self, name))
             for name in ("pose", "joints", "objective", "iterations", "sigma", "residual", "segments_rotation", "feet")
             if getattr(self, name) is not None
         }
         for name in ("timing", "angles"):
-            columns[name] = {key: spread(values) for key, values in getattr(self, name).items()}
-        status = np.full(len(frames), np.uint8(Status.ABSENT))
-        status[row] = self.status
-        return replace(self, frames=frames, time=time, status=status, smoothed=None, hull=None, others=(), **columns)
+            columns[name] = {key: change(values) for key, values in getattr(self, name).items()}
+        return replace(self, smoothed=None, hull=None, others=(), **columns)
 
     def with_smoothed(self) -> Result:
         """Return the result with each dataset replaced by its smoothed copy, if `/smoothed` has one."""
