@@ -158,7 +158,7 @@ class SilhouetteSettings:
     are searched.
 
     Attributes:
-        body: "full" (14 segments, 31 degrees of freedom), "limbs" (10 segments, the paper's 24) or "walker" (the
+        body: "full" (13 segments, 31 degrees of freedom), "limbs" (10 segments, the paper's 24) or "walker" (the
             silhouette paper's 6 segments and 7 degrees of freedom).
         prediction: share of the last frame's motion that is predicted for the next one (the silhouette paper: 0, which
             it found as good; half of the motion helps when arms and legs swing).

@@ -45,14 +45,15 @@ from tk.settings import Settings
 from tk.trackers.protocol import Observation, Stopwatch
 
 Note = Callable[[str], None]
-#: a frame, and seconds spent in "decode" and "masks", and in which the tracker had to "wait" for it
+#: a frame, and its seconds: "decode", "masks", and "wait", the time that the tracker waited for it
 Observed = tuple[Observation, Mapping[str, float]]
 
 TIMING_STAGES = ("decode", "masks", "wait")
 
 #: frames that the tracker may hold without a copy: the current one, and the one before while it asks for the next
 _HELD = 2
-#: most bytes of the ring: a few frames of eight full-HD cameras. Fewer would make the process wait.
+#: most bytes of the frames made ahead, beside the held ones: a few of eight full-HD cameras. Fewer would make the
+#: process wait.
 _RING_BYTES = 384 * 2**20
 #: seconds in which the process may end by itself. A shorter time would lose kernels that it has compiled.
 _PATIENCE_S = 5.0
@@ -91,7 +92,7 @@ def open_observations(
         source: the images.
         settings: how frames are segmented, and how many frames ahead.
         note: called with each line that the user should read.
-        keep_images: False leaves the images empty, (C, 0, 0, 3), for a tracker that needs masks alone.
+        keep_images: False leaves the images empty, (C, 0, 0, 3), and no uncertain pixels, for a tracker of masks alone.
 
     Raises:
         CaptureError: there is nothing to make masks from.
@@ -227,7 +228,7 @@ def _nameless_file(size: int) -> int:
 class Ahead:
     """Observations that a separate process makes. It starts at once and learns the background.
 
-    An array does not change while a reference to it exists; then its slot of the ring is used again.
+    The arrays of a frame stay as they are while they are referenced; then their place in the ring is used again.
     """
 
     def __init__(self, setup: Setup, source: Source, settings: Settings, note: Note, keep_images: bool = True) -> None:

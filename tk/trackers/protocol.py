@@ -209,7 +209,7 @@ class TwoPassTracker(Tracker, Protocol):
         ...
 
     def start_at(self, pose: Float) -> None:
-        """Continue at a pose (D,) with no memory of the frames before it."""
+        """Continue at a pose (D,); forget residuals and hypotheses, keep the body and its colours."""
         ...
 
     def second_pass(

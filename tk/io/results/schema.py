@@ -87,12 +87,12 @@ ROWS = (
         {"names": "pose_names", "units": "pose_units"}, field="pose", smoothed=True,
     ),
     Dataset(
-        "joints/position", "F J 3", "float64", "joint positions",
+        "joints/position", "F J 3", "float64", "joint positions, metres",
         _NAMES, field="joints", smoothed=True, valid=_METRES,
     ),
     Dataset(
         "joints/sigma", "F J", "float64",
-        "one standard deviation of a joint's position along each axis; NaN without evidence",
+        "one standard deviation of a joint's position along each axis, metres; NaN without evidence",
         _NAMES, field="sigma", optional="sigma", smoothed=True, valid=(0, MAX_DISTANCE_M),
     ),
     Dataset(
@@ -152,7 +152,12 @@ CAMERAS = tuple(
         ("translation", "C 3", "float64", "world to camera"),
         ("size", "C 2", "int64", "width and height, pixels"),
         ("fisheye", "C", "uint8", "1 for a fisheye camera"),
-        ("time_offset", "C", "float64", "seconds; frame k was taken at k / fps + `time_offset`"),
+        (
+            "time_offset",
+            "C",
+            "float64",
+            "seconds by which the video began late: image k was taken at k / fps + `time_offset`",
+        ),
     )
 )
 

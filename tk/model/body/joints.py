@@ -182,7 +182,7 @@ _LIMB_ROWS = (_ARM_ROWS, _LEG_ROWS)
 
 
 def _on_side(rows: tuple[Joint, ...], side: str) -> tuple[Joint, ...]:
-    """The rows of one limb; an axis of the right side is the negative mirrored one, a mirrored rotation's."""
+    """Return a limb's rows on one side. A mirrored rotation turns the other way: right axes are negated."""
     sided_names = {row.name for limb in _LIMB_ROWS for row in limb}
     sided_segments = {row.turns for limb in _LIMB_ROWS for row in limb if row.turns}
     mirror = np.diag([1.0, -1.0, 1.0])

@@ -67,8 +67,8 @@ class Agreement:
         wrong: cameras that contradict the others; empty if the cameras are refused.
         swapped: two cameras whose videos look swapped; None if none do.
         refusal: why the cameras cannot be used together, one line; empty if they can.
-        outside: (C,) share of each camera's mask that lies outside the hull of the right cameras; NaN if it shows
-            nobody.
+        outside: (C,) share of each camera's mask that lies outside the hull of the other right cameras; NaN if it
+            shows nobody.
         shift_px: (C, 2) smallest shift, x and y, pixels of the recorded image, that moves each camera's mask into that
             hull; NaN if none does.
         closes: (F,) whether each frame has a hull of all cameras.
@@ -339,8 +339,8 @@ def largest_consistent(error: Float) -> list[int]:
     """Return the largest majority of the tested cameras in which every camera agrees with most of its tested partners.
 
     Most, not all, because a mask with a fault disagrees with one or two partners, and a wrong camera with most. Of
-    several such sets the one with the least errors is returned, and none if a set of the same size could be right that
-    has an untested camera: then nobody can be blamed.
+    several such sets the one with the least errors is returned. None is returned if another set of this size is
+    possible in which no pair tests one of the cameras: then none can be blamed.
 
     Args:
         error: (C, C) in tolerances; NaN where a pair cannot be tested.
