@@ -18,7 +18,7 @@ from tk.kernels.cone_arrays import NEAREST_M, PART_DOF, ConeArrays, kind_of, pla
 from tk.kernels.cones import capsule, enter_unit, extent, interior_point
 from tk.kernels.kinematics import JOINT_NUMBERS, TREE_PARENT, forward_chain, load_rotation, load_translation
 from tk.kernels.projection import camera_center, project
-from tk.kernels.runtime import ensure_runtime, spread_of, ti
+from tk.kernels.runtime import ensure_runtime, runs_alone, spread_of, ti
 from tk.kernels.taichi_internals import Launcher
 from tk.kernels.vectors import norm2, norm_sqr, times
 
@@ -338,7 +338,7 @@ def cast(
     label, depth = np.empty(shape, np.uint8), np.empty(shape, np.float32)
     if export:
         label[:], depth[:] = before.label, before.depth
-    _cast_kernel(ti.f64 if dtype == np.float64 else ti.f32, B == 1)(
+    _cast_kernel(ti.f64 if dtype == np.float64 else ti.f32, runs_alone(__name__, B))(
         body.tree,
         body.parts,
         group,

@@ -143,10 +143,9 @@ class ContourTracker:
         body = build_cone_body(BodyDimensions.from_stature(1.7), preset=self.contours.body)
         empty = np.zeros((len(self.views.rig), *self.views.rig.frame_shape), np.uint8)
         seen = self.views.pyramid(empty, 1, False)
-        for poses in (1, 2):  # one pose, and several at once
-            pose = np.zeros((poses, len(body.skeleton.names)))
-            self.views.equations(body.arrays, seen, pose, 0, self.line_search)
-            Evidence.of(self.screen, empty).cast(body, np.zeros(len(body.parts), np.int32), pose)
+        pose = np.zeros((1, len(body.skeleton.names)))
+        self.views.equations(body.arrays, seen, pose, 0, self.line_search)
+        Evidence.of(self.screen, empty).cast(body, np.zeros(len(body.parts), np.int32), pose)
 
     # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
 
