@@ -63,7 +63,7 @@ class Recorded:
         label = make_labeller(self.capture.setup(), self.capture, Settings(), lambda _: None)
         with self.capture.frames() as frames:
             self.frames = [
-                Observation(frame.index, np.array(frame.images), *(np.array(layer) for layer in label(frame)))
+                Observation(frame.index, np.array(frame.images), *(np.array(layer) for layer in label(frame)[:2]))
                 for frame in frames
             ]
         self.truth = read_joints(path / "truth.h5").positions

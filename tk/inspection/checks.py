@@ -189,7 +189,7 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
             compared = frame.index in near or frame.index in frames
             if not compared and not watch.wants(frame.index):
                 continue
-            labels, uncertain = label(frame)
+            labels, uncertain, _ = label(frame)
             if watch.wants(frame.index):
                 watch.look(frame.index, labels, uncertain)
             if not compared:

@@ -81,13 +81,13 @@ def _relaxed(planes: ti.template(), i: ti.i32, stride: ti.i32, level: ti.i32, pe
 
 
 @ti.func
-def _clamped(dd: ti.f32, db: ti.f32, bb: ti.f32, shadow_min: ti.f32) -> ti.f32:
-    """The least ``|a - s b|² / (1 + s²)`` for s in [shadow_min, 1], from d·d, d·b and b·b with d = a - b."""
+def _clamped(dd: ti.f32, db: ti.f32, bb: ti.f32, shadow_min: ti.f32, light_max: ti.f32) -> ti.f32:
+    """The least ``|a - s b|² / (1 + s²)`` for s in [shadow_min, light_max], from d·d, d·b and b·b with d = a - b."""
     # every product follows from these without cancellation
     excess = dd + 2.0 * db  # a·a - b·b
     cross = bb + db  # a·b, positive thanks to the offset
     s = (excess + ti.sqrt(excess * excess + 4.0 * cross * cross)) / (2.0 * cross)
-    s = ti.min(ti.max(s, shadow_min), 1.0)
+    s = ti.min(ti.max(s, shadow_min), light_max)
     t = 1.0 - s
     return (dd + 2.0 * t * db + t * t * bb) / (1.0 + s * s)
 
@@ -128,6 +128,7 @@ def _label_kernel(
     # settings
     offset_squared: ti.i32,
     shadow_min: ti.f32,
+    light_max: ti.f32,
     difference_min: ti.f32,  # noise variances, summed over the window
     threshold: ti.i32,  # level
     per_neighbour: ti.i32,  # levels
@@ -192,7 +193,7 @@ def _label_kernel(
                         slid = x
                         sums = column_0 + column_1 + column_2
                         db, bb = ti.cast(sums[0], ti.f32), ti.cast(sums[1] + offset_squared, ti.f32)
-                        residual = _clamped(dd, db, bb, shadow_min)
+                        residual = _clamped(dd, db, bb, shadow_min, light_max)
                         i = to + x
                         planes[DIFFERENCE * plane + i] = _level(plain * (precision[c] / 54.0))
                         level = ti.cast(_level(residual * weights[pixel] * (precision[c] / 27.0)), ti.i32)
@@ -240,6 +241,7 @@ class Statistic:
         *,
         darkness_offset: float,
         shadow_min: float,
+        light_max: float = 1.0,
         difference_min: float,
         threshold: float,
         octaves_per_neighbour: float,
@@ -260,6 +262,7 @@ class Statistic:
             shape: (height, width) of the mosaic.
             darkness_offset: the constant component, grey levels, > 0.
             shadow_min: the darkest shadow, as a factor of the plate, in (0, 1].
+            light_max: the brightest light, likewise; above 1 where the plate may lie in a shadow.
             difference_min: below this many noise variances of plain difference a pixel is background for certain.
         """
         ensure_runtime()
@@ -280,6 +283,7 @@ class Statistic:
             self._spread,
             max(round(darkness_offset**2), 1),
             shadow_min,
+            light_max,
             54.0 * difference_min,
             level_of(threshold),
             round(octaves_per_neighbour * STEPS_PER_OCTAVE),

@@ -22,7 +22,7 @@ from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import OPTIONAL, SEGMENTS, build_skeleton
 from tk.model.setup import Setup, Subject
 from tk.run.prefetch import TIMING_STAGES, Observations, open_observations
-from tk.run.segmentation import mask_source
+from tk.run.segmentation import mask_source, sources_of_masks
 from tk.settings import Settings
 from tk.trackers.bodies import read_body
 from tk.trackers.protocol import Tracker
@@ -153,6 +153,7 @@ class Plan:
             config_toml=to_toml(self.settings),
             sigma=tracker.reports_sigma,
             residual_cameras=setup.rig.names if tracker.reports_sigma else (),
+            mask_sources=sources_of_masks(self.source) if tracker.reports_sigma else (),
             segment_names=SEGMENTS if tracker.has_segments else (),
             feet=tracker.has_segments,
             angles=tuple(JointAngles(a.joint, a.names, a.convention) for a in ANGLES) if tracker.has_segments else (),

@@ -134,10 +134,13 @@ def observe(
             if frame is None:
                 return
             watch.lap("decode")
-            masks, uncertain = label(frame)
+            masks, uncertain, sources = label(frame)
             images = frame.images if keep_images else np.empty((len(masks), 0, 0, 3), np.uint8)
             watch.lap("masks")
-            yield Observation(frame.index, images, masks, uncertain if keep_images else None, time=frame.time), watch
+            yield (
+                Observation(frame.index, images, masks, uncertain if keep_images else None, frame.time, sources),
+                watch,
+            )
 
 
 @dataclass(frozen=True)
@@ -184,6 +187,7 @@ class _Ready:
     index: int
     time: float
     uncertain: bool
+    sources: NDArray[np.uint8] | None
     laps: Mapping[str, float]
 
 
@@ -282,7 +286,9 @@ class Ahead:
             slot = slot.copy()
             self._send([ready.slot])
         images, masks, uncertain = self._layout.layers(slot)
-        return Observation(ready.index, images, masks, uncertain if ready.uncertain else None, time=ready.time)
+        return Observation(
+            ready.index, images, masks, uncertain if ready.uncertain else None, ready.time, ready.sources
+        )
 
     def _give_back(self) -> None:
         slots = [self._returned.popleft() for _ in range(len(self._returned))]
@@ -361,7 +367,14 @@ class _Ring:
         if observation.uncertain is not None:
             uncertain[...] = observation.uncertain
         self._tracker.send(
-            _Ready(number, observation.index, observation.time, observation.uncertain is not None, watch.laps)
+            _Ready(
+                number,
+                observation.index,
+                observation.time,
+                observation.uncertain is not None,
+                observation.sources,
+                watch.laps,
+            )
         )
 
 

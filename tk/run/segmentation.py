@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +15,28 @@ from tk.model.masks.background import median_plate
 from tk.model.masks.foreground import CollinearityForeground, Foreground
 from tk.model.masks.mog2 import Mog2Foreground
 from tk.model.setup import Setup
+from tk.run.learned_masks import MASK_SOURCES, LearnedMasks
 from tk.segmenters import INSTALL, load, names
 from tk.settings import Settings
 from tk.threads import one_thread
 
 Segmenter = Callable[[FrameSet], NDArray[np.uint8]]
-#: returns masks, and the uncertain pixels; None if unknown
-Labeller = Callable[[FrameSet], tuple[NDArray[np.uint8], NDArray[np.bool_] | None]]
+
+
+class Labels(NamedTuple):
+    """The masks of a frame set.
+
+    Attributes:
+        masks, uncertain: as an :class:`~tk.trackers.protocol.Observation` has them.
+        sources: (C,) uint8, where a segmenter's masks come from, see :mod:`tk.run.learned_masks`; None for others.
+    """
+
+    masks: NDArray[np.uint8]
+    uncertain: NDArray[np.bool_] | None = None
+    sources: NDArray[np.uint8] | None = None
+
+
+Labeller = Callable[[FrameSet], Labels]
 
 # what :func:`mask_source` returns; "none": no masks are given, they are made from the empty scene
 _GIVEN, _SCENE, _MEDIAN, _SEGMENTER = "given", "none", "median", "segmenter "
@@ -64,15 +80,19 @@ def mask_source(source: Source) -> str:
     return _SEGMENTER + installed[0]
 
 
+def sources_of_masks(source: Source) -> tuple[str, ...]:
+    """Return the meanings of :attr:`Labels.sources`; none if no segmenter makes the masks."""
+    return MASK_SOURCES if mask_source(source).startswith(_SEGMENTER) else ()
+
+
 def make_segmenter(setup: Setup, source: Source, settings: Settings, note: Callable[[str], None]) -> Segmenter:
     """Return a function from a frame set to its masks, from where :func:`mask_source` says."""
     label = make_labeller(setup, source, settings, note)
-    return lambda frame: label(frame)[0]
+    return lambda frame: label(frame).masks
 
 
 def make_labeller(setup: Setup, source: Source, settings: Settings, note: Callable[[str], None]) -> Labeller:
-    """Return a function from a frame set to its masks and uncertain pixels, as an
-    :class:`~tk.trackers.protocol.Observation` has them.
+    """Return a function from a frame set to its masks, their uncertain pixels, and their sources.
 
     Raises:
         CaptureError: there is nothing to make masks from, or the median is not the empty scene.
@@ -94,13 +114,14 @@ def _labeller(setup: Setup, source: Source, settings: Settings, note: Callable[[
         from tk.segmenters.subject_masks import SubjectMasks  # SciPy, which takes a second to import
 
         made = SubjectMasks(source.segmenter or load(name), name, setup.rig, setup.volume)
-        return lambda frame: made.label(frame.images)
+        learned = LearnedMasks(setup, source, settings, made)
+        return lambda frame: Labels(*learned.label(frame))
     foreground = _learn_median(setup, source, settings, note) if origin == _MEDIAN else None
     if foreground is None:
         clips = source.background()
         assert clips is not None
         foreground = _learn(setup, settings, clips)
-    return lambda frame: foreground.label(frame.images)
+    return lambda frame: Labels(*foreground.label(frame.images))
 
 
 def _learn(setup: Setup, settings: Settings, clips: Sequence[NDArray[np.uint8]]) -> Foreground:
@@ -144,6 +165,6 @@ def _learn_median(setup: Setup, source: Source, settings: Settings, note: Callab
     return foreground
 
 
-def _given_masks(frame: FrameSet) -> tuple[NDArray[np.uint8], None]:
+def _given_masks(frame: FrameSet) -> Labels:
     assert frame.masks is not None
-    return frame.masks, None
+    return Labels(frame.masks)

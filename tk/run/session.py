@@ -385,7 +385,7 @@ class _Run:
                 self.masks[number].put(observation.index, self._kept(answer))
             # masks are large, and a view into the ring of frames: an estimate must not keep them
             whole = replace(estimate, frame=observation.index, time=observation.time, person=number)
-            present.append(replace(whole, masks=None, drawn=None))
+            present.append(replace(whole, masks=None, drawn=None, mask_source=observation.sources))
         return tuple(present)
 
     def _kept(self, answer: Tracked) -> NDArray[np.uint8]:
@@ -445,6 +445,7 @@ def _row(estimate: Estimate, store_hull: bool) -> FrameResult:
         joints=estimate.joints,
         sigma=estimate.sigma,
         residual=estimate.residual,
+        mask_source=estimate.mask_source,
         status=int(Status[estimate.status.upper()]),
         objective=estimate.objective,
         iterations=estimate.iterations,

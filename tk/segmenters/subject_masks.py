@@ -16,6 +16,7 @@ No state is kept between frames, so a resumed run sees the same masks.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -75,6 +76,13 @@ class SubjectMasks:
         for c in range(len(self._rig)):
             masks[c] = self._hull.only(subject, c, masks[c])
         return masks, uncertain
+
+    def only_subject(self, masks: Images) -> Images:
+        """Return masks (C, H, W) without parts far from the hull of all masks; other people, for example."""
+        if all(cv2.connectedComponents(mask)[0] <= 2 for mask in masks):  # the scene and one part
+            return masks
+        subject = self._hull.subject(masks)
+        return np.stack([self._hull.only(subject, c, mask) for c, mask in enumerate(masks)])
 
     def _patches(self, images: Images) -> list[Patch]:
         if not isinstance(self._segmenter, Finder):

@@ -36,6 +36,7 @@ class Observation:
         uncertain: (C, H, W) bool, pixels whose mask is 0 although they may show the subject: a shadow, or clothes of
             the scene's colour. A body part there costs half. None if unknown.
         time: time stamp of the source, seconds.
+        sources: (C,) uint8, where a segmenter's masks come from, see :mod:`tk.run.learned_masks`; None for others.
     """
 
     index: int
@@ -43,6 +44,7 @@ class Observation:
     masks: NDArray[np.uint8]
     uncertain: NDArray[np.bool_] | None = None
     time: float = 0.0
+    sources: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,7 @@ class Estimate:
         masks: (C, H, W) uint8, what the tracker took for the person, cleaned; None where that is the observation's, and
             in what :func:`tk.track` hands out. drawn: (C, h, w) bool, where the body is on the tracker's grid of rays,
             cameras left out included; None likewise.
+        mask_source: (C,) uint8, as ``Observation.sources``.
         frame, time: the frame's number in the capture, and seconds; whoever steps the tracker knows them.
         person: the person's number in the run.
     """
@@ -80,6 +83,7 @@ class Estimate:
     residual: Float | None = None
     masks: NDArray[np.uint8] | None = None
     drawn: NDArray[np.bool_] | None = None
+    mask_source: NDArray[np.uint8] | None = None
     frame: int = -1
     time: float = 0.0
     person: int = 0

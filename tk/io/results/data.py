@@ -63,7 +63,8 @@ class ResultMeta:
         timing_stages: names of the timed stages. The stage ``total``, if present, is the frame's wall time.
         joint_names: J names in the order of `/joints/position`.
         sigma: True if `/joints/sigma` exists.
-        residual_cameras: names of the C cameras of `/residual`.
+        residual_cameras: names of the C cameras of `/residual` and `/mask_source`.
+        mask_sources: meanings of the values of `/mask_source`; empty if no segmenter makes masks.
         segment_names: names of the segments of `/segments/rotation`.
         feet: True if `/feet/position` exists, the points :data:`~tk.model.body.joints.FOOT_POINTS`.
         angles: the clinical joint angles of `/angles`.
@@ -83,6 +84,7 @@ class ResultMeta:
     joint_names: tuple[str, ...] = JOINTS
     sigma: bool = False
     residual_cameras: tuple[str, ...] = ()
+    mask_sources: tuple[str, ...] = ()
     segment_names: tuple[str, ...] = ()
     feet: bool = False
     angles: tuple[JointAngles, ...] = ()
@@ -144,6 +146,7 @@ class FrameResult:
 
         sigma: (J,) m, standard deviation of each joint position along one axis; NaN for a joint without evidence.
         residual: (C, 2) missing and surplus area by camera, shares of the person's pixels; their sum is E_S.
+        mask_source: (C,) where each camera's mask comes from.
         segments_rotation: (S, 4) quaternions (w, x, y, z), segment to world.
         feet: (4, 3) the :data:`~tk.model.body.joints.FOOT_POINTS`, metres, world frame.
         angles: angles of each joint, degrees; NaN is stored for a joint that is not given.
@@ -160,6 +163,7 @@ class FrameResult:
     hull: HullPoints | None = None
     sigma: Float | None = None
     residual: Float | None = None
+    mask_source: NDArray[np.uint8] | None = None
     segments_rotation: Float | None = None
     feet: Float | None = None
     angles: Mapping[str, Float] = field(default_factory=dict)
@@ -226,6 +230,7 @@ class Result:
     software: str
     created: str
     sigma: Float | None = None  # (F, J) metres, NaN for a joint without evidence
+    mask_source: NDArray[np.uint8] | None = None  # (F, C), meanings in meta.mask_sources
     residual: Float | None = None  # (F, C, 2) missing and surplus area, shares of the person's pixels
     segments_rotation: Float | None = None  # (F, S, 4) w, x, y, z; segment to world
     feet: Float | None = None  # (F, 4, 3) metres

@@ -124,6 +124,13 @@ ROWS = (
         {"cameras": "residual_cameras", "areas": ("missing", "surplus")}, field="residual",
         optional="residual_cameras",
     ),
+    Dataset(
+        "mask_source", "F C", "uint8",
+        "where each camera's mask comes from, if a segmenter makes masks: 0 the learned scene, 1 the same, and the "
+        "segmenter where the scene is unknown, 2 the segmenter",
+        {"cameras": "residual_cameras", "meaning": "mask_sources"}, field="mask_source", optional="mask_sources",
+        valid=(0, 2),
+    ),
     Dataset("iterations", "F T", "int32", "optimiser iterations by stage", {"stages": "stages"}, field="iterations"),
     Dataset(
         "timing/<stage>", "F", "float64", "seconds by stage; `total` is the frame's share of the wall time",

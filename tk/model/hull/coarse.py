@@ -195,13 +195,17 @@ class CoarseHull:
         x, y = self._voxels.xy(c, voxels).T
         if len(x) == 0:
             return mask
-        regions = cv2.connectedComponents(mask, connectivity=8)[1]
+        count, regions = cv2.connectedComponents(mask, connectivity=8)
         away = np.ones(mask.shape, np.uint8)
         inside = (x < mask.shape[1]) & (y < mask.shape[0])
         away[y[inside], x[inside]] = 0
+        kept = np.zeros(count, np.bool_)
+        kept[regions[y[inside], x[inside]]] = True
+        if kept[1:].all():
+            return mask
         distance = cv2.distanceTransform(away, cv2.DIST_L2, 3)
-        kept = np.unique(regions[distance <= _NEAR_VOXELS * self._voxels.pixels_per_voxel[c]])
-        return np.where(np.isin(regions, kept), mask, 0).astype(np.uint8)
+        kept[regions[distance <= _NEAR_VOXELS * self._voxels.pixels_per_voxel[c]]] = True
+        return np.where(kept[regions], mask, 0).astype(np.uint8)
 
 
 def dilated(mask: NDArray, by: int) -> Bool:

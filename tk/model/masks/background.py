@@ -140,7 +140,7 @@ def mean_scene(clip: Images) -> Float:
     """Return the mean (h, w, 3) of a clip of the empty scene, corrected for flicker."""
     total = np.zeros((len(clip[0]), clip[0, 0].size), np.float32)
     scaled = np.empty_like(total)
-    for frame, gain in _rows(clip, np.float32(1) / _flicker(clip)):
+    for frame, gain in _rows(clip, np.float32(1) / flicker(clip)):
         np.multiply(frame, gain, out=scaled)
         total += scaled
     return (total / np.float32(len(clip))).reshape(clip.shape[1:])
@@ -153,7 +153,7 @@ def learn_scene(clip: Images) -> tuple[Float, Float | None]:
         return reference, None
     first = reference.reshape(len(reference), -1)
     total, squares, difference = np.zeros_like(first), np.zeros_like(first), np.empty_like(first)
-    for frame, gain in _rows(clip, _flicker(clip)):
+    for frame, gain in _rows(clip, flicker(clip)):
         # differences from the first frame avoid cancellation in float32
         np.divide(frame, gain, out=difference)
         difference -= first
@@ -171,7 +171,7 @@ def _rows(clip: Images, factors: Float) -> Iterator[tuple[NDArray[np.uint8], Flo
     return zip(frames, np.tile(factors, clip.shape[2]), strict=True)
 
 
-def _flicker(clip: Images) -> Float:
+def flicker(clip: Images) -> Float:
     """Return the gains (T, 3) of a clip's images relative to its first."""
     if len(clip) == 1:
         return np.ones((1, 3), np.float32)

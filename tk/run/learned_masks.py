@@ -1,0 +1,169 @@
+"""Masks of a recording without an empty scene, which is learned from the masks that a segmenter makes of a few frames.
+
+The recording is divided into spans of about ten seconds. In each span the segmenter is asked for frames spread evenly
+over it (:class:`~tk.segmenters.subject_masks.SubjectMasks`), and the empty scene is learned from them
+(:class:`~tk.model.masks.learned_scene.LearnedScene`). All other masks are a segmentation against that scene. Where the
+scene is unknown, the segmenter's masks before and after the frame decide; where they differ, pixels are uncertain. The
+asked frames are also a check: between two of which one disagrees with the segmentation, the segmenter makes all masks.
+
+The masks of a frame depend on the recording alone, so `--resume` and `--frames` see the same masks. A source of unknown
+length cannot be sampled; there the segmenter makes all masks.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.io.captures.frames import FrameSet
+from tk.io.captures.source import Source
+from tk.model.masks.foreground import CollinearityForeground
+from tk.model.masks.learned_scene import LearnedScene
+from tk.model.setup import Setup
+from tk.settings import Settings
+
+if TYPE_CHECKING:  # SciPy, which takes long to import
+    from tk.segmenters.subject_masks import SubjectMasks
+
+Masks = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+
+#: where the masks of a camera come from, as a result stores it
+LEARNED, LEARNED_AND_SEGMENTER, SEGMENTER = range(3)
+MASK_SOURCES = ("learned scene", "learned scene and segmenter", "segmenter")
+
+# Seconds of a span, between asked frames, and least number of asked frames of a span. More often: dance, where the
+# trunk hardly moves, has masks with 2 to 5 % less surplus area at 0.5 s than at 0.67 s; walk has the same at 1 s.
+_SPAN_S, _STEP_S, _LEAST = 10.0, 0.5, 8
+# At most this share of the frames is asked for; a span with fewer than _LEAST such frames is segmented throughout.
+_SHARE = 0.16
+# Most bytes of a span's samples. With fewer samples, more of the scene is unknown.
+_SAMPLE_BYTES = 512 * 2**20
+# Pixels in one of two masks only, as a share of those in any, beyond which the learned scene is not used. The share is
+# 0.05 to 0.2 on walk and dance; from above 0.3 to 0.6 on walk, where the segmenter, not the scene, misses the head.
+_DISAGREE = 0.65
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """The segmenter's masks and uncertain pixels of a frame; ``agrees``: (C,) whether the learned scene agrees."""
+
+    index: int
+    masks: Masks
+    uncertain: Bool
+    agrees: Bool
+
+
+@dataclass(frozen=True)
+class _Span:
+    """A learned span of the recording, frames ``begin`` to ``stop``, exclusive. None: the segmenter makes all masks."""
+
+    begin: int
+    stop: int
+    foreground: CollinearityForeground | None
+    samples: tuple[_Sample, ...]
+
+    def around(self, index: int) -> tuple[_Sample, _Sample]:
+        """Return the samples before and after a frame; twice the same at a sample and beyond the outermost."""
+        after = bisect_left(self.samples, index, key=lambda sample: sample.index)
+        if after == len(self.samples):
+            return self.samples[-1], self.samples[-1]
+        exact = after == 0 or self.samples[after].index == index
+        return self.samples[after if exact else after - 1], self.samples[after]
+
+
+class LearnedMasks:
+    """Segments the subject in the frames of a recording, best in order."""
+
+    def __init__(self, setup: Setup, source: Source, settings: Settings, subject: SubjectMasks) -> None:
+        self._source, self._settings, self._subject = source, settings, subject
+        self._sizes = [(camera.width, camera.height) for camera in setup.rig]
+        self._fps, self._cameras = setup.fps, len(setup.rig)
+        self._edges = _edges(source.first_frame, source.frame_count, setup.fps)
+        self._span = _Span(0, 0, None, ())
+        self._reading: Iterator[FrameSet] = iter(())
+        self._next = -1
+        self._open = ExitStack()
+
+    def label(self, frame: FrameSet) -> tuple[Masks, Bool, NDArray[np.uint8]]:
+        """Return masks (C, H, W), uncertain pixels (C, H, W), and where each camera's mask comes from (C,)."""
+        span = self._span_of(frame.index)
+        if span.foreground is None:
+            return *self._subject.label(frame.images), np.full(self._cameras, SEGMENTER, np.uint8)
+        before, after = span.around(frame.index)
+        asked = before is after and before.index == frame.index
+        masks, uncertain = span.foreground.label(frame.images, _between(before, after))
+        kind = np.full(self._cameras, LEARNED_AND_SEGMENTER if asked else LEARNED, np.uint8)
+        failed = ~(before.agrees & after.agrees)
+        if failed.any():
+            again = (before.masks, before.uncertain) if asked else self._subject.label(frame.images)
+            masks[failed], uncertain[failed] = again[0][failed], again[1][failed]
+            kind[failed] = SEGMENTER
+        return self._subject.only_subject(masks), uncertain, kind
+
+    def _span_of(self, index: int) -> _Span:
+        if not self._span.begin <= index < self._span.stop:
+            stop = next((edge for edge in self._edges[1:] if index < edge), None)
+            if stop is None:  # a source of unknown length, or frames beyond its end
+                return _Span(index, index + 1, None, ())
+            self._span = self._learn(self._edges[self._edges.index(stop) - 1], stop)
+        return self._span
+
+    def _learn(self, begin: int, stop: int) -> _Span:
+        """Ask for the masks of a span's samples and learn its scene."""
+        images, samples = [], []
+        chosen = set(self._chosen(begin, stop))
+        if not chosen:
+            return _Span(begin, stop, None, ())
+        if self._next != begin:
+            self._open.close()
+            self._reading = self._open.enter_context(self._source.frames(begin, self._source.frame_count))
+        for frame in self._reading:
+            if frame.index in chosen:
+                images.append(frame.images.copy())
+                samples.append((frame.index, *self._subject.label(frame.images)))
+            if frame.index + 1 >= stop:
+                break
+        self._next = stop
+        scene = LearnedScene.learn(images, [s[1] for s in samples], [s[2] for s in samples])
+        foreground = CollinearityForeground.of_learned(scene, self._sizes, self._settings.foreground)
+        checked = []
+        for picture, (index, masks, uncertain) in zip(images, samples, strict=True):
+            found = foreground.label(picture, (masks, uncertain))[0]
+            one = np.count_nonzero((found > 0) != (masks > 0), axis=(1, 2))
+            checked.append(
+                _Sample(index, masks, uncertain, one <= _DISAGREE * np.count_nonzero(found | masks, axis=(1, 2)))
+            )
+        return _Span(begin, stop, foreground, tuple(checked))
+
+    def _chosen(self, begin: int, stop: int) -> list[int]:
+        """Return the frames of a span that the segmenter is asked for; none if they would be too many or too few."""
+        frames = stop - begin
+        height, width = np.max([(h, w) for w, h in self._sizes], axis=0)
+        most = min(_SHARE * frames, _SAMPLE_BYTES / (5 * self._cameras * int(height) * int(width)))
+        count = int(min(max(frames / self._fps / _STEP_S, _LEAST), most))
+        if count < _LEAST:
+            return []
+        return [begin + int((k + 0.5) * frames / count) for k in range(count)]
+
+
+def _edges(first: int, count: int | None, fps: float) -> list[int]:
+    """Return the first frames of all spans, and the end of the last one; of a source of unknown length none."""
+    if count is None:
+        return []
+    spans = max(round((count - first) / (_SPAN_S * fps)), 1)
+    return [first + (count - first) * k // spans for k in range(spans + 1)]
+
+
+def _between(before: _Sample, after: _Sample) -> tuple[Masks, Bool]:
+    """Return what two samples say of the pixels between them: those of the person, and those that may be."""
+    if before is after:
+        return before.masks, before.uncertain
+    person = before.masks & after.masks
+    return person, (before.masks > person) | (after.masks > person) | before.uncertain | after.uncertain
