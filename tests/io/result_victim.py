@@ -27,6 +27,7 @@ META = ResultMeta(
     config_toml='method = "volumetric"\n[smd]\nmu = 0.1\n',
     sigma=True,
     residual_cameras=("cam1", "cam2", "cam3"),
+    mask_sources=("scene", "segmenter"),
     segment_names=("torso", "head"),
     feet=True,
     angles=(
@@ -54,6 +55,7 @@ def make_frame(index: int) -> FrameResult:
         hull=hull,
         sigma=None if index % 4 == 3 else np.full(15, 0.01 * index),  # nothing known in some frames
         residual=np.array([[0.1, 0.0], [0.1, 0.1], [0.0, index]]),
+        mask_source=np.array([0, 1, index % 2], np.uint8),
         segments_rotation=np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),
         feet=np.arange(12.0).reshape(4, 3) - index,
         angles={"knee_l": np.array([5.0 * index]), "hip_l": np.array([1.0, 2.0, index])},

@@ -65,6 +65,7 @@ def test_layout_is_the_contract(tmp_path: Path) -> None:
             ("timing/optimise", (2,), "float64"),
             ("joints/sigma", (2, 15), "float64"),
             ("residual", (2, 3, 2), "float64"),
+            ("mask_source", (2, 3), "uint8"),
             ("segments/rotation", (2, 2, 4), "float64"),
             ("feet/position", (2, 4, 3), "float64"),
             ("angles/knee_l", (2, 1), "float64"),
@@ -219,11 +220,15 @@ def test_frame_of_wrong_shape_is_refused_and_earlier_frames_are_kept(tmp_path: P
 
 # --- what a tracker may have or not -----------------------------------------------------------------------------------
 
-PLAIN = replace(META, sigma=False, residual_cameras=(), segment_names=(), feet=False, angles=(), objective_kind="")
+PLAIN = replace(
+    META, sigma=False, residual_cameras=(), mask_sources=(), segment_names=(), feet=False, angles=(), objective_kind=""
+)
 
 
 def plain_frame(index: int) -> FrameResult:
-    return replace(make_frame(index), sigma=None, residual=None, segments_rotation=None, feet=None, angles={})
+    return replace(
+        make_frame(index), sigma=None, residual=None, mask_source=None, segments_rotation=None, feet=None, angles={}
+    )
 
 
 def test_optional_values_are_read_back(tmp_path: Path) -> None:
@@ -235,6 +240,8 @@ def test_optional_values_are_read_back(tmp_path: Path) -> None:
     assert result.segments_rotation is not None and result.feet is not None
     assert result.sigma.shape == (5, 15) and np.isnan(result.sigma).all(axis=1).tolist() == [False] * 3 + [True, False]
     np.testing.assert_array_equal(result.residual[:, 2, 1], range(5))
+    assert result.mask_source is not None and result.mask_source.dtype == np.uint8
+    assert result.meta.mask_sources == ("scene", "segmenter") and result.mask_source[3].tolist() == [0, 1, 1]
     np.testing.assert_array_equal(result.silhouette_error[:, 2], range(5))
     np.testing.assert_array_equal(result.segments_rotation[4], make_frame(4).segments_rotation)
     np.testing.assert_array_equal(result.feet[1], make_frame(1).feet)
