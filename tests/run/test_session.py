@@ -205,8 +205,8 @@ def test_large_images_are_reduced_and_the_result_has_the_recorded_cameras(tiny: 
     config = replace(CONFIG, person_pixels=int(tall.min() / 2))
     reporter = Silent()
     session.track(capture, half, config, reporter, frames=(0, 2), causal=True)
-    (line,) = [note for note in reporter.notes if "of their size" in note]
-    assert "of all cameras at 1/2 of their size, because the person is about" in line
+    (line,) = [note for note in reporter.notes if "reduced size" in note]
+    assert "all cameras at 1/2 (the person is about" in line
     session.track(capture, tmp_path / "full.h5", CONFIG, Silent(), frames=(0, 2), causal=True)
     found, full = read_result(half), read_result(tmp_path / "full.h5")
     assert found.cameras is not None

@@ -36,12 +36,14 @@ def inspect(
         from tk.inspection.pictures import write_sheet
         from tk.io.importers import open_recording
         from tk.io.paths import check_not_input
+        from tk.run.plan import reduce_images
 
         for picture in (sheet, plan):
             if picture is not None:
                 check_not_input(picture, capture=capture)
         settings = base.load_settings(config_file, resample=resample)
         opened = open_recording(capture, base.split_names(cameras), masks, settings.resample)
+        _, opened = reduce_images(opened.setup(), opened, settings.person_pixels)
         found, shown = check(opened, settings)
         if sheet is not None and plan is not None:
             write_sheet(sheet, opened, found, shown)

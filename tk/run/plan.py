@@ -84,8 +84,8 @@ def reduce_images(setup: Setup, capture: Capture, person_pixels: int) -> tuple[S
         who = "all cameras" if chosen.all() else ", ".join(names[chosen])
         low, high = np.unique(heights[chosen].round(-1).astype(int))[[0, -1]]
         tall = f"{low} px" if low == high else f"{low} to {high} px"
-        sizes.append(f"of {who} at 1/{factor} of their size, because the person is about {tall} tall")
-    line = f"{capture.path}: images are read {'; '.join(sizes)} (person_pixels = 0: at full size)"
+        sizes.append(f"{who} at 1/{factor} (the person is about {tall} tall)")
+    line = f"{capture.path}: images are read at a reduced size: {', '.join(sizes)}; person_pixels = 0: at full size"
     small = replace(capture.reduced(factors.tolist()), warnings=(*capture.warnings, line))
     return replace(setup, rig=small.rig), small
 

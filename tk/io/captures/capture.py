@@ -319,7 +319,6 @@ def _clips_of(
     """Return each camera's clip in ``folder``, checked to be of the camera's size."""
     found = list_clips(folder, pictures)
     taken: dict[str, Camera] = {}
-    clips: list[Clip] = []
     for camera, key in zip(calibration.rig, calibration.keys, strict=True):
         try:
             stem = match_camera(camera.name, key, found)
@@ -334,14 +333,15 @@ def _clips_of(
                 f"{found[stem]}: fits both cameras {taken[stem].name!r} and {camera.name!r}; rename it to its camera"
             )
         taken[stem] = camera
-        clip = probe(found[stem], is_mask)
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        clips = tuple(threads.map(lambda stem: probe(found[stem], is_mask), taken))
+    for clip, camera in zip(clips, taken.values(), strict=True):
         if (clip.width, clip.height) != (camera.width, camera.height):
             raise VideoError(
                 f"{clip.path}: is {clip.width}×{clip.height}, but {calibration.path.name} gives camera {camera.name!r} "
                 f"{camera.width}×{camera.height}; calibrate for this size or scale the pictures"
             )
-        clips.append(clip)
-    return tuple(clips)
+    return clips
 
 
 def _common_length(clips: Sequence[Clip], late: Sequence[int], warn: Callable[[str], None]) -> int:
