@@ -63,10 +63,10 @@ def _finish(
 ) -> UsedCameras:
     """Write what needs all frames of a person: the second pass; segments, feet and angles; the smoothed copy; cameras.
 
-    The second pass uses ``masks``; None: no second pass. It optimises every frame again, with the body fitted to frames
-    of the whole recording unless that began with the initialisation pose, and with refined cameras if they disagree and
-    ``settings.refine`` is True. The result is replaced in one step; if this function is interrupted, the result of the
-    first pass stays. Returns the cameras that were used; persons after the first take those that are given.
+    The second pass uses ``masks``; None: no second pass. Its body is fitted to frames of the whole recording unless
+    that began with the initialisation pose, and its cameras are refined if they disagree and ``settings.refine`` is
+    True. The result is replaced in one step; if this function is interrupted, the result of the first pass stays.
+    Returns the cameras that were used; persons after the first take those that are given.
     """
     tracker, subject, fps = member.tracker, member.subject, plan.setup.fps
     if not tracker.has_segments:
@@ -103,18 +103,20 @@ def _finish(
                     poses[rows] = [e.pose for e in estimates]
                     lost[rows] = [e.status == "lost" for e in estimates]
                     columns |= _replaced(result, rows, estimates)
+        assert result.sigma is not None
+        before = columns.get("joints/sigma", result.sigma)
         poses, columns["residual"], precise = again.second_pass(
             masks.sequence(result.frames),
             poses,
             lost,
             columns.get("residual", result.residual),
+            before,
             subject.height_m,
             # in the initialisation pose every limb is visible; other first poses may hide limbs
             keep_body=subject.body is not None or (subject.init is None and subject.in_init_pose),
+            keep_cameras=cameras.rig is plan.setup.rig,
         )
         # a much larger sigma of the first pass, or NaN: it tracked several poses, or did not find a limb
-        assert result.sigma is not None
-        before = columns.get("joints/sigma", result.sigma)
         columns["joints/sigma"] = np.where(before <= _LESS_SURE * precise, precise, before)
         tracker = again
         model = {**tracker.model(), REFINED: 1}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
@@ -222,18 +222,25 @@ class TwoPassTracker(Tracker, Protocol):
         poses: Float,
         lost: NDArray[np.bool_],
         residual: Float,
+        sigma: Float,
         height_m: float | None,
         keep_body: bool = False,
+        keep_cameras: bool = False,
+        report: Callable[[float], None] = lambda _: None,
     ) -> tuple[Float, Float, Float]:
-        """Optimise every frame again with a body fitted to all of them.
+        """Optimise frames again with what all of them show, and with a body fitted to all of them.
 
         Args:
             masks: (C, H, W) of F frames, cleaned.
             poses: (F, D) of the first pass.
             lost: (F,) bool; such frames neither teach nor change.
             residual: (F, C, 2) of the first pass; NaN where a camera was excluded.
+            sigma: (F, 15) of the first pass, metres.
             height_m: the subject's height, if known.
             keep_body: leave the body as it is.
+            keep_cameras: whether the first pass had the same cameras; with the same body, too, its poses are kept,
+                except before a jump.
+            report: receives the share of the work that is done.
 
         Returns:
             Poses (F, D), residuals (F, C, 2), and sigma (F, 15) in metres, 0 in lost frames.

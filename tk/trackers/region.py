@@ -16,20 +16,18 @@ them without a part. Rays measure this directly, at the images' resolution inste
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.body.body_fit import STATURE_DEVIATION
 from tk.model.body.cone_body import ConeBody
 from tk.model.body.joint_sigma import contour_variance, directions, posture_variance, view_variance
 from tk.model.body.limb_candidates import Limb
-from tk.model.body.skeleton import JOINTS, Skeleton
+from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import color_bins
 from tk.model.cues.ray_costs import Evidence, mean_of_views
@@ -37,10 +35,12 @@ from tk.model.cues.visible_contours import contour_shares
 from tk.model.masks.silhouettes import Pyramid
 from tk.model.setup import InitPose, Setup
 from tk.optim.gauss_newton import Prior
-from tk.settings import BodyFitSettings, RegionSettings, Settings, SilhouetteSettings
+from tk.settings import RegionSettings, Settings, SilhouetteSettings
 from tk.trackers.contour_tracker import GAIN, RECOVER_EVERY, SAME_POSE_M, ContourTracker
+from tk.trackers.hypotheses import MARGIN, PATIENCE, RENEWAL, Hypothesis, disagreement
 from tk.trackers.protocol import Estimate, Observation, Stopwatch
 from tk.trackers.residual import ResidualBaseline, variance_factor
+from tk.trackers.second_pass import POSTURE_FRAMES, SecondPass
 
 Float = NDArray[np.float64]
 
@@ -51,10 +51,6 @@ FEWEST = 2
 # Standard deviations of the priors about the predicted pose (tk.model.body.joints has those about zero). Chosen on the
 # development captures; sensitivity not measured.
 ANGLE_DEG, TRANSLATION_M = 40.0, 0.3
-# Frames during which a hypothesis is tracked beside the best one, and the share of its running cost that a frame
-# replaces. A hypothesis that costs MARGIN more than the best one, as a share of the person's pixels, is dropped. Chosen
-# on the development captures; sensitivity not measured.
-PATIENCE, RENEWAL, MARGIN = 6, 0.4, 0.02
 # After this many consecutive frames with a high residual, and two failed searches for the person, sigma is set to NaN.
 UNKNOWN_AFTER = 2 * RECOVER_EVERY
 # Masks are searched for carried objects if this share of their pixels has colours that are not the person's; objects
@@ -64,36 +60,6 @@ _OBJECT = np.ones((5, 5), np.uint8)
 # A limb is misplaced if its rays cost more than this, on average. In the development captures no limb within 15 cm of
 # the ground truth costs 0.25, and most others cost 0.3 to 0.4.
 MISPLACED = 0.25
-# Second pass: settings of the body fit, and how far a frame may move from its pose in the first pass.
-SECOND_FIT = BodyFitSettings(frames=24, rounds=4)
-SECOND_ANGLE_DEG = 15.0
-# Standard deviation of the logarithm of the stature about that of the first fit, where no height was given.
-SECOND_STATURE_DEVIATION = 0.03
-# Frames of the second pass that are refined in one launch.
-AT_ONCE = 8
-# A step of a joint that is longer than those before and after it by this is a jump, metres.
-JUMP_M = 2 * SAME_POSE_M
-# Frames over which the mean posture of the first pass is a plain mean; then the oldest are forgotten.
-POSTURE_FRAMES = 200
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """A pose that is tracked.
-
-    Attributes:
-        pose, previous: (D,) in this frame and the one before.
-        cost: running mean of its cost.
-        age: frames since it was proposed.
-        jumped: whether a limb search has just found it. ``previous`` is then that of the pose it replaces, so that the
-            two may differ by a fast motion or by a jump.
-    """
-
-    pose: Float
-    previous: Float
-    cost: float
-    age: int = 0
-    jumped: bool = False
 
 
 class RegionTracker(ContourTracker):
@@ -159,7 +125,7 @@ class RegionTracker(ContourTracker):
         watch.lap("masks_clean")
         self._alive += [replace(h, previous=h.pose, jumped=False) for h in self._alive if h.jumped]
         starts = np.array([h.pose + contours.prediction * (h.pose - h.previous) for h in self._alive])
-        poses, hessian, iterations = self.settle(pyramid, starts, self._levels(), images, self._prior(starts))
+        poses, hessian, iterations = self.settle(pyramid, starts, self._levels(), images, self.prior(starts))
         watch.lap("optimise")
         evidence = self.evidence(self.screen, frame, pyramid)
         by_view, met = evidence.cast(self.body, self.colors.group, poses, export=True)
@@ -278,7 +244,7 @@ class RegionTracker(ContourTracker):
                 first -= 1
         return list(range(first, -1, -1))
 
-    def _prior(self, mean: Float, angle_deg: float = ANGLE_DEG) -> Prior:
+    def prior(self, mean: Float, angle_deg: float = ANGLE_DEG) -> Prior:
         """Return the prior: straight joints about zero, all other degrees of freedom about ``mean`` (..., D)."""
         skeleton = self.body.skeleton
         deviation = np.where(skeleton.prismatic, TRANSLATION_M, np.radians(angle_deg))
@@ -383,18 +349,16 @@ class RegionTracker(ContourTracker):
         """Return (15,) one standard deviation of each joint's position along an axis, metres: from the evidence of this
         frame, the difference to the mean posture until now, and the spread of the hypotheses."""
         skeleton = self.body.skeleton
-        variance = self._variance(pose, curvature, self._prior(pose), label, residual)
+        variance = self.variance(pose, curvature, self.prior(pose), label, residual)
         self._postures = min(self._postures + 1, POSTURE_FRAMES)
         self._mean_posture += (directions(skeleton, pose) - self._mean_posture) / self._postures
         variance += posture_variance(skeleton, pose, self._mean_posture)
         if len(self._alive) > 1:
             poses, cost = (np.array(column) for column in zip(*((h.pose, h.cost) for h in self._alive), strict=True))
-            variance += _disagreement(skeleton, poses, cost)
+            variance += disagreement(skeleton, poses, cost)
         return np.asarray(np.sqrt(variance))
 
-    def _variance(
-        self, pose: Float, curvature: Float, prior: Prior, label: NDArray[np.uint8], residual: Float
-    ) -> Float:
+    def variance(self, pose: Float, curvature: Float, prior: Prior, label: NDArray[np.uint8], residual: Float) -> Float:
         """Return (15,) variance of the joints' positions along an axis, metres², from the contours' noise and the
         directions of the views, scaled by the residual.
 
@@ -420,107 +384,23 @@ class RegionTracker(ContourTracker):
         poses: Float,
         lost: NDArray[np.bool_],
         residual: Float,
+        sigma: Float,
         height_m: float | None,
         keep_body: bool = False,
+        keep_cameras: bool = False,
+        report: Callable[[float], None] = lambda _: None,
     ) -> tuple[Float, Float, Float]:
-        """Fit the body to frames of the whole recording, and refine every frame with it.
-
-        Frames of different poses show what an opening without the initialisation pose may hide: only a bent knee or
-        elbow shows where it is. Each frame stays near its pose of the first pass, because that has used colours to
-        locate limbs inside the silhouette. Where a search has moved a limb, the new pose is also tracked backwards: it
-        replaces earlier poses where its cost is lower, and σ includes the spread of the two.
-
-        Args:
-            masks: (C, H, W) of F frames, cleaned, as in the estimates.
-            poses: (F, D) of the first pass, in the capture's world.
-            lost: (F,) bool; such frames are not used and do not change.
-            residual: (F, C, 2) of the first pass; a camera whose residual is NaN in a frame is not used in it.
-            height_m: the subject's height, if known.
-            keep_body: do not fit the body.
-
-        Returns:
-            Poses (F, D) in the capture's world, residuals (F, C, 2), and one standard deviation (F, 15) of the joints'
-            positions along an axis, metres, 0 in lost frames. The tracker has the new body.
-        """
-        given, poses = poses, self.world.poses_in(poses)
-        tracked = np.flatnonzero(~lost)
-        variance = np.zeros((len(poses), len(JOINTS)))
-        if not len(tracked):
-            return given, residual, variance
-
-        def used(i: int) -> NDArray[np.uint8]:
-            shown, out = masks[i], np.isnan(residual[i, :, 0])
-            return np.where(out[:, None, None], np.uint8(0), shown) if out.any() else shown
-
-        if not keep_body and self.contours.adapt:
-            opening = tracked[: self.contours.init_frames : 3]
-            spread = _spread(
-                tracked, np.nanmean(residual[tracked].sum(axis=2), axis=1), SECOND_FIT.frames - len(opening)
-            )
-            chosen = np.union1d(opening, spread)
-            seen = [self.views.pyramid(used(int(i)), 1, False) for i in chosen]
-            stature = height_m or self.body.dimensions.stature
-            deviation = STATURE_DEVIATION if height_m else SECOND_STATURE_DEVIATION
-            body, _ = self.fit(seen, poses[chosen], np.arange(len(chosen)), stature, SECOND_FIT, deviation)
-            self.take_body(body)
-        result, residuals = poses.copy(), np.array(residual)
-        body = self.body
-        for chunk in np.array_split(tracked, -(-len(tracked) // AT_ONCE)):
-            seen = [self.views.pyramid(used(int(i)), 1, False) for i in chunk]
-            prior = self._prior(poses[chunk], SECOND_ANGLE_DEG)
-            settled = self.settle(Pyramid.of_all(seen), poses[chunk], (0,), prior=prior)
-            result[chunk] = settled.states
-            for i, pyramid, curvature in zip(chunk, seen, settled.hessian, strict=True):
-                _, (residuals[i],), (label,) = self._costs(pyramid, result[i][None])
-                variance[i] = self._variance(result[i], curvature, prior, label, residuals[i])
-        jumps = _jumps(body.skeleton, poses)
-        later: Hypothesis | None = None
-        for i in tracked[::-1]:
-            if i + 1 == len(poses) or lost[i + 1]:
-                later = None
-            elif later is None and jumps[i + 1]:
-                later = Hypothesis(result[i + 1], result[i + 1], 0.0)
-            if later is None:
-                continue
-            pyramid = self.views.pyramid(used(int(i)), 1, False)
-            prior = self._prior(later.pose[None], SECOND_ANGLE_DEG)
-            settled = self.settle(pyramid, later.pose[None], (0,), prior=prior)
-            both = np.stack([result[i], settled.states[0]])
-            costs, of_both, labels = self._costs(pyramid, both)
-            later = self._backwards(later, both, costs)
-            if later is None:
-                continue
-            if later.cost < -GAIN:
-                result[i], residuals[i] = both[1], of_both[1]
-                variance[i] = self._variance(result[i], settled.hessian[0], prior, labels[1], residuals[i])
-            variance[i] += _disagreement(body.skeleton, both, np.array([0.0, later.cost]))
-        posture = np.median(directions(self.body.skeleton, result[tracked]), axis=0)
-        variance[tracked] += posture_variance(self.body.skeleton, result[tracked], posture)
-        return np.where(lost[:, None], given, self.world.poses_out(result)), residuals, np.sqrt(variance)
-
-    def _costs(self, pyramid: Pyramid, poses: Float) -> tuple[Float, Float, NDArray[np.uint8]]:
-        """Return the costs (B,) of poses (B, D) by masks alone, mean over the views, their residuals (B, V, 2), and the
-        parts that the grid's rays meet (B, V, h, w)."""
-        evidence = Evidence.of(self.screen, pyramid.masks[0])
-        by_view, met = evidence.cast(self.body, self.colors.group, poses, export=True)
-        assert met is not None
-        return mean_of_views(by_view), np.array([evidence.residual(label) for label in met.label]), met.label
-
-    def _backwards(self, later: Hypothesis, poses: Float, cost: Float) -> Hypothesis | None:
-        """Return the hypothesis from the next frame, tracked back by one, with its cost relative to this frame's pose;
-        None if it has reached the same pose or costs too much.
-
-        Args:
-            later: the hypothesis in the next frame.
-            poses, cost: (2, D), (2,) this frame's pose, then the hypothesis's.
-        """
-        more = float(cost[1] - cost[0])
-        if later.age:
-            more = later.cost + RENEWAL * (more - later.cost)
-        skeleton = self.body.skeleton
-        if more > MARGIN or skeleton.apart(poses[1], skeleton.joints(poses[0])) <= SAME_POSE_M:
-            return None
-        return Hypothesis(poses[1], later.pose, more, later.age + 1)
+        """See :class:`~tk.trackers.protocol.TwoPassTracker` and :mod:`tk.trackers.second_pass`."""
+        if lost.all():
+            return poses, residual, np.zeros((len(poses), len(JOINTS)))
+        again = SecondPass(self, masks, self.world.poses_in(poses), lost, residual, sigma, report)
+        keep_body |= not self.contours.adapt
+        if not keep_body:
+            again.fit_body(height_m)
+        if not (keep_body and keep_cameras):
+            again.optimise()
+        again.track_backwards()
+        return np.where(lost[:, None], poses, self.world.poses_out(again.poses)), again.residual, again.sigma
 
     def _nobody(self, frame: Observation, watch: Stopwatch) -> Estimate:
         """Return the estimate of a frame without a person: the last pose, lost."""
@@ -576,26 +456,3 @@ class RegionTracker(ContourTracker):
         fresh.take_body(self.body)
         fresh.colors.restore(self.colors.state())
         return fresh
-
-
-def _disagreement(skeleton: Skeleton, poses: Float, cost: Float) -> Float:
-    """Return (J,) variance of the joints' positions along an axis, metres², over poses (H, D) with costs (H,)."""
-    weight = np.exp((cost.min() - cost) / GAIN)
-    weight /= weight.sum()
-    joints = skeleton.joints(poses)
-    mean = np.einsum("h,hja->ja", weight, joints)
-    return np.asarray(np.einsum("h,hja->j", weight, (joints - mean) ** 2) / 3)
-
-
-def _jumps(skeleton: Skeleton, poses: Float) -> NDArray[np.bool_]:
-    """Return (F,) whether a joint's step to a frame, of poses (F, D), is longer than those before and after it by
-    :data:`JUMP_M`."""
-    steps = np.pad(np.linalg.norm(np.diff(skeleton.joints(poses), axis=0), axis=2), ((1, 1), (0, 0)))
-    beside = np.maximum(steps[:-2], steps[2:])
-    return np.concatenate([[False], (steps[1:-1] > beside + JUMP_M).any(axis=1)])
-
-
-def _spread(frames: NDArray[np.int64], error: Float, count: int) -> NDArray[np.int64]:
-    """Return the frame of the lowest E_S (N,) in each of ``count`` stretches of the frames (N,)."""
-    edges = np.linspace(0, len(frames), min(count, len(frames)) + 1).round().astype(int)
-    return np.array([frames[a + int(np.argmin(error[a:b]))] for a, b in pairwise(edges)])

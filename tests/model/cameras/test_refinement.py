@@ -251,7 +251,7 @@ def test_settings_out_of_range_are_refused():
 
 
 def test_chosen_frames_cover_all_positions_of_a_person_who_stands_still_for_long():
-    standing, walking = np.zeros((500, 3)), np.linspace(0, 1, 5)[:, None] * [1.0, 0, 0]
+    standing, walking = np.zeros((500, 15, 3)), np.linspace(0, 1, 5)[:, None, None] * np.ones((15, 3))
     chosen = farthest(np.concatenate([standing, walking]), 5)
     assert np.count_nonzero(chosen >= 500) == 4
-    assert len(farthest(standing, 5)) == 1
+    assert len(farthest(standing, 5)) == 1 and len(farthest(standing[:0], 5)) == 0

@@ -307,7 +307,7 @@ def choose_frames(
     inner[1:-1] = usable[:-2] & usable[1:-1] & usable[2:] & (frames[2:] - frames[:-2] == 2)
     inner &= [all(int(frame) - int(n) in known for n in late) for frame in frames]
     rows = np.flatnonzero(inner)
-    rows = rows[farthest(skeleton.joints(poses[rows]).reshape(len(rows), -1), count)]
+    rows = rows[farthest(skeleton.joints(poses[rows]), count)]
     chosen = []
     for i in rows:
         frame_set = np.stack([masks(int(frames[i] - late[c]), c) for c in range(C)])
@@ -316,14 +316,14 @@ def choose_frames(
     return chosen
 
 
-def farthest(points: Float, count: int) -> NDArray[np.intp]:
-    """Return the indices, ascending, of at most ``count`` of the points (N, K) that cover all of them: first the point
-    nearest to the median, then always the one farthest from those chosen (Gonzalez 1985)."""
-    if not len(points):
+def farthest(joints: Float, count: int) -> NDArray[np.intp]:
+    """Return the indices, ascending, of at most ``count`` of the joints (N, J, 3) that cover all of them: first those
+    nearest to the median, then always those farthest from the chosen ones (Gonzalez 1985)."""
+    if not len(joints):
         return np.zeros(0, np.intp)
-    chosen = [int(np.argmin(np.linalg.norm(points - np.median(points, axis=0), axis=1)))]
-    distance = np.linalg.norm(points - points[chosen[0]], axis=1)
+    chosen = [int(np.argmin(np.linalg.norm(joints - np.median(joints, axis=0), axis=(1, 2))))]
+    distance = np.linalg.norm(joints - joints[chosen[0]], axis=(1, 2))
     while len(chosen) < count and distance.max() > 0:
         chosen.append(int(np.argmax(distance)))
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+        distance = np.minimum(distance, np.linalg.norm(joints - joints[chosen[-1]], axis=(1, 2)))
     return np.sort(chosen)
