@@ -18,6 +18,7 @@ from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
 from tk.model.body.cone_body import ConeBody
 from tk.model.masks.image_health import described
+from tk.model.masks.silhouettes import pack_rig
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
 from tk.run.people import Member
@@ -33,6 +34,8 @@ Note = Callable[[str], None]
 
 #: entry in `/model` of a result after the second pass
 REFINED = "refined"
+# Differences of cameras that a result file rounds, in the units of a calibration; a refinement changes more.
+_ROUNDED = 1e-7
 # A joint keeps its sigma of the first pass where that exceeds the sigma of the second pass by this factor. Sensitivity
 # not measured.
 _LESS_SURE = 2.0
@@ -52,7 +55,9 @@ def finish(
     for member in people:
         if member.number in finished:
             stored = read_result(output).cameras or cameras
-            cameras = replace(stored, rig=stored.rig.recorded().reduced(plan.setup.rig.reductions))
+            used = stored.rig.recorded().reduced(plan.setup.rig.reductions)
+            if not np.allclose(pack_rig(used), pack_rig(plan.setup.rig), rtol=_ROUNDED, atol=_ROUNDED):
+                cameras = replace(stored, rig=used)
             continue
         store = None if masks is None else masks[member.number]
         cameras = _finish(output, plan, member, store, note, cameras, len(people) == 1)
