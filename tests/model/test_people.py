@@ -66,6 +66,21 @@ def test_people_close_together_before_four_cameras_are_told_apart() -> None:
     assert len(found) == 3 and max(nearest(found, places)) < 0.2
 
 
+@pytest.mark.parametrize("bend", [0.0, -0.3])
+def test_people_are_the_same_if_all_voxels_are_looked_at(bend: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig(tuple(replace(camera, distortions=np.array([bend, 0.0, 0.0, 0.0, 0.0])) for camera in RIG))
+    masks = drawn([(-0.9, -0.5), (0.8, 0.9)], rig=rig).any(axis=0)
+    masks[1, 100:140] = False
+    uncertain = masks | np.roll(masks, 6, axis=2)
+    some = PeopleFinder(rig, VOLUME, "z").find(masks, uncertain)
+    monkeypatch.setattr("tk.model.people._touched", lambda mask, center, radius: np.ones(len(center), np.bool_))
+    every = PeopleFinder(rig, VOLUME, "z").find(masks, uncertain)
+    assert len(some) == len(every) > 0
+    for a, b in zip(some, every, strict=True):
+        np.testing.assert_array_equal(a.points, b.points)
+        np.testing.assert_array_equal(a.share, b.share)
+
+
 def test_nobody_is_found_in_empty_masks_and_specks() -> None:
     masks = np.zeros((5, 240, 240), np.uint8)
     assert FINDER.find(masks) == ()
