@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -74,6 +75,9 @@ _CONTRADICTED = 0.25
 _LEFT_M2 = 0.15
 # The heights of two people are compared in steps of this, metres: hair, shoes and half a voxel at both ends.
 _HEIGHT_STEP_M = 0.1
+# Half the width and half the height of the space in which one person is followed, metres; and how far this person may
+# move between frames.
+_HALF_M, _HALF_HEIGHT_M, _STEP_M = 0.9, 1.1, 0.4
 # Most candidates that are compared, by volume: all 2^12 subsets take 10 ms.
 _MOST = 12
 # Voxels along the edge of a block. Blocks that the hull cannot contain are not looked at. Affects speed only.
@@ -233,6 +237,42 @@ class PeopleFinder:
             chosen = self._explaining([*found, *self._candidates(small, allowed, missed, near)], small)
         chosen = [*self._on_one_floor(chosen), *self._alone(small, self._covered(chosen))]
         return tuple(sorted(chosen, key=lambda person: (not person.inside, -np.nan_to_num(person.volume_m3))))
+
+    def around(self, position: Float, masks: NDArray[np.uint8]) -> tuple[Float, Float]:
+        """Return the hull of one person who was at a position (3,) a frame ago, and the new position.
+
+        Args:
+            position: m, centre of the trunk.
+            masks: (C, H, W) 128 or more where the person is, 0 where the person is not, other values where the person
+                may be hidden.
+
+        Returns:
+            (N, 3) m, centres of the voxels that no mask contradicts and that two masks show; and (3,) m, ``position``
+            if there is no trunk near it.
+        """
+        at = self._to_plan @ position
+        near = np.flatnonzero((np.abs(self._in_plan - at) <= (_HALF_M, _HALF_M, _HALF_HEIGHT_M)).all(axis=1))
+        offset = self._step // 2
+        small = masks[:, offset :: self._step, offset :: self._step].reshape(len(masks), -1)
+        values = np.take_along_axis(small, self._voxels.pixels[:, near], axis=1)
+        sees = self._voxels.sees[:, near]
+        hull = near[((values > 0) | ~sees).all(axis=0) & (((values >= 128) & sees).sum(axis=0) >= 2)]
+        moved = self._in_plan[hull] - at
+        trunk = moved[np.linalg.norm(moved[:, :2], axis=1) < _STEP_M]
+        if len(trunk):
+            x, y = np.median(trunk[:, :2], axis=0)
+            position = position + [x, y, (trunk[:, 2].min() + trunk[:, 2].max()) / 2] @ self._to_plan
+        return self._voxels.centers[hull], np.asarray(position)
+
+    @cached_property
+    def _in_plan(self) -> NDArray[np.float32]:
+        """(N, 3) m, centres of the voxels: two directions on the floor, and up."""
+        return (self._voxels.centers @ self._to_plan.T).astype(np.float32)
+
+    @property
+    def voxel_m(self) -> float:
+        """Edge of a voxel, metres."""
+        return self._grid.voxel_m
 
     def _on_one_floor(self, people: Sequence[LocatedPerson]) -> list[LocatedPerson]:
         """Return people with their heights measured from their median floor, which is known better than each one's."""

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ConfigError
 from tk.kernels.raycast import FAR, Cast
-from tk.model.body.skeleton import up_rotation
 from tk.model.cues.part_colors import color_bins
 from tk.model.cues.ray_costs import RayGrid
 from tk.model.people import LocatedPerson, PeopleFinder, order_people
@@ -37,9 +36,6 @@ LOOK_EVERY_S = 0.5
 # Mean surplus area of the subject's masks, as a share of the person, above which somebody else may have entered: a
 # second person adds 1 in every camera, if not hidden. No frame of the development captures has more than 0.11.
 SURPLUS = 0.25
-# Half the width and half the height of the space in which the hull of somebody who is not tracked is carved, metres;
-# how far such a person may move between frames; and the edge of its voxels: a forearm is 0.08 m wide.
-_HALF_M, _HALF_HEIGHT_M, _STEP_M, _VOXEL_M = 0.9, 1.1, 0.4, 0.06
 # Somebody who is seen so far from a person who is tracked is somebody else, metres: half a stride, and a hull's error.
 _SAME_M = 0.6
 # Voxels of somebody who is not tracked, at least: 5 litres, a head's volume.
@@ -121,8 +117,7 @@ class People:
         self.members = [self._member(0, setup.subjects[0], first)]
         self._bystanders: list[Bystander] = []
         self._every = max(1, round(LOOK_EVERY_S * setup.fps))
-        self._finder: PeopleFinder | None = None
-        self._carver = _LocalHull(setup)
+        self._known_finder: PeopleFinder | None = None
         share = sharing(first)
         self._grid: RayGrid | None = None if share is None else share.choice
 
@@ -148,19 +143,31 @@ class People:
         Raises:
             CaptureError: a chosen person is not there, or too few cameras see the person.
         """
+        subject = self._setup.subjects[0]
         found = self._find(opening[0].masks, opening[0].uncertain)
-        subjects = self._setup.subjects
-        found = order_people(found, self._setup.volume, subjects[0].height_m, subjects[0].position)
+        found = order_people(found, self._setup.volume, subject.height_m, subject.position)
         if len(found) <= 1 and self._choice in ("auto", "all", (0,)):
-            self._begin(self.members[0], opening)
+            try:
+                self._begin(self.members[0], opening)
+            except CaptureError as refusal:
+                # somebody may pass close to a camera, where no hull shows him or her: the person's own pixels may do
+                if not found or self._grid is None:
+                    raise
+                try:
+                    self._begin_among(found, opening)
+                except CaptureError:
+                    raise refusal from None
             return
+        self._begin_among(found, opening)
+
+    def _begin_among(self, found: Sequence[LocatedPerson], opening: Sequence[Observation]) -> None:
+        """Start the trackers of those who are chosen among the people found in the first frame."""
+        subjects = self._setup.subjects
         numbers = self._chosen(found)
         known = _matched(subjects[:1] if self._choice == "auto" else subjects, [found[n] for n in numbers])
         self.members = [self._member(0, known[0], self.members[0].tracker)]
         for k, subject in enumerate(known[1:], 1):
-            tracker = self._make()
-            tracker.prepare()
-            self.members.append(self._member(k, subject, tracker))
+            self.members.append(self._member(k, subject, self._make()))  # its kernels are compiled
         if self._grid is None:
             if len(self.members) > 1 or len(found) > 1:
                 raise ConfigError(f"the method {self.members[0].tracker.method} tracks one person who is alone in view")
@@ -193,9 +200,13 @@ class People:
         member.monitor.check_body()
 
     def _find(self, masks: NDArray[np.uint8], uncertain: NDArray[np.bool_] | None = None) -> tuple[LocatedPerson, ...]:
-        if self._finder is None:
-            self._finder = PeopleFinder(self._setup.rig, self._setup.volume, self._setup.up)
         return self._finder.find(masks, uncertain)
+
+    @property
+    def _finder(self) -> PeopleFinder:
+        if self._known_finder is None:
+            self._known_finder = PeopleFinder(self._setup.rig, self._setup.volume, self._setup.up)
+        return self._known_finder
 
     def _chosen(self, found: Sequence[LocatedPerson]) -> tuple[int, ...]:
         """Return the numbers of the people to be tracked."""
@@ -286,10 +297,10 @@ class People:
         assert self._grid is not None
         for k, bystander in enumerate(bystanders, first):
             free = owners.share(frame, k, True).masks
-            points = self._carver.carve(bystander.position, free)
+            points, position = self._finder.around(bystander.position, free)
             if len(points) >= _LEAST_VOXELS:
-                bystander.position = self._carver.centre(bystander.position, points)
-                bystander.shape = cast_points(self._setup.rig, self._grid, points, _VOXEL_M)
+                bystander.position = position
+                bystander.shape = cast_points(self._setup.rig, self._grid, points, self._finder.voxel_m)
 
     # --- what a result keeps ------------------------------------------------------------------------------------------
 
@@ -378,6 +389,7 @@ class People:
         places = [b.position for b in self._bystanders]
         for person in found:
             if all(np.linalg.norm(person.position - other) > _SAME_M for other in places):
+                places.append(person.position)
                 self._bystanders.append(Bystander(person.position, self._hull(person)))
                 x, y, z = person.position
                 self._note(f"frame {frame.index}: another person is in view, at ({x:.1f}, {y:.1f}, {z:.1f}) m")
@@ -495,37 +507,3 @@ def _matched(subjects: Sequence[Subject], people: Sequence[LocatedPerson]) -> li
             cost[p, s] += 1e-6 * abs(p - s)
     who = dict(zip(*scipy.optimize.linear_sum_assignment(cost), strict=True))
     return [subjects[who[p]] if p in who else _unknown(subjects[0]) for p in range(len(people))]
-
-
-class _LocalHull:
-    """The visual hull in a small space around a person."""
-
-    def __init__(self, setup: Setup) -> None:
-        self._rig = setup.rig
-        self._to_plan = up_rotation(setup.up).T  # rows: two directions on the floor, and up
-        sides = [np.arange(-h, h + _VOXEL_M / 2, _VOXEL_M) for h in (_HALF_M, _HALF_M, _HALF_HEIGHT_M)]
-        self._offsets = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3) @ self._to_plan
-
-    def carve(self, position: Float, masks: NDArray[np.uint8]) -> Float:
-        """Return (N, 3) the centres of the voxels around a position (3,) that are in all masks (C, H, W) that see them,
-        and visibly in two."""
-        centers = self._offsets + position
-        inside = np.ones(len(centers), np.bool_)
-        visible = np.zeros(len(centers), np.int64)
-        for c, camera in enumerate(self._rig):
-            pixels, depth = camera.project(centers)
-            seen = camera.sees(centers) & (depth > 0)
-            x, y = np.rint(pixels[seen]).astype(np.int64).T
-            value = masks[c][np.clip(y, 0, camera.height - 1), np.clip(x, 0, camera.width - 1)]
-            inside[seen] &= value > 0
-            visible[seen] += value >= 128
-        return np.asarray(centers[inside & (visible >= 2)])
-
-    def centre(self, position: Float, points: Float) -> Float:
-        """Return the centre (3,) of the trunk of points (N, 3), near its last position (3,)."""
-        moved = (points - position) @ self._to_plan.T
-        near = moved[np.linalg.norm(moved[:, :2], axis=1) < _STEP_M]
-        if not len(near):
-            return position
-        x, y = np.median(near[:, :2], axis=0)
-        return np.asarray(position + [x, y, (near[:, 2].min() + near[:, 2].max()) / 2] @ self._to_plan)
