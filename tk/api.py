@@ -15,7 +15,7 @@ from tk.io.importers import open_recording
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 from tk.run import session
-from tk.run.people import parse_choice
+from tk.run.choice import parse_choice
 from tk.run.plan import recording_setup, reduce_images
 from tk.run.reporter import Silent
 from tk.segmenters import Segmenter

@@ -59,7 +59,7 @@ def _track(job: Job, reporter: _Reporter) -> Outcome:
     from tk.io.results.reader import read_result
     from tk.report.after import write_video_and_report
     from tk.run import session  # heavy; the process that starts the batch does not need it
-    from tk.run.people import parse_choice
+    from tk.run.choice import parse_choice
 
     options = job.options
     capture = open_recording(job.capture, options.cameras, options.masks, options.config.resample)

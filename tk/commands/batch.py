@@ -38,7 +38,7 @@ def batch(
 ) -> None:
     """Track many captures into FOLDER and write a summary; after an interruption, the same command continues."""
     from tk.batch import TrackOptions, exit_code, run_batch
-    from tk.run.people import parse_choice
+    from tk.run.choice import parse_choice
 
     parse_choice(people)  # a mistake ends the command before the first capture
     track_options = TrackOptions(

@@ -65,7 +65,7 @@ def track(
         from tk.io.importers import open_recording
         from tk.io.results.files import check_result_path
         from tk.run import session
-        from tk.run.people import parse_choice
+        from tk.run.choice import parse_choice
 
         settings, choice = options.settings(), parse_choice(people)
         check_result_path(output, force, resume)

@@ -21,6 +21,7 @@ from tk.model.masks.image_health import described
 from tk.model.masks.silhouettes import pack_rig
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
+from tk.run.identity import COLUMNS, EXCHANGED, UNCLEAR, Contact, doubtful, exchange_masks, exchanged, report
 from tk.run.people import Member
 from tk.run.plan import Plan
 from tk.run.prefetch import open_observations
@@ -45,13 +46,23 @@ def finish(
     output: Path,
     plan: Plan,
     people: Sequence[Member],
+    contacts: Sequence[Contact],
     masks: MaskStores | None,
     note: Note,
     finished: Container[int] = (),
 ) -> None:
-    """Write what needs all frames, see :func:`_finish`, for the people who are not ``finished``. Person 0 decides
-    whether the cameras are refined."""
+    """Write what needs all frames, see :func:`_finish`, for the people who are not ``finished``, after people who were
+    mixed up are exchanged. Person 0 decides whether the cameras are refined."""
     cameras = UsedCameras(plan.setup.rig, np.array(plan.source.time_offset_s))
+    if finished:  # the first pass of a finished person is gone
+        contacts = [replace(c, outcome=UNCLEAR) if c.outcome == EXCHANGED else c for c in contacts]
+    found = read_result(output).people
+    results = exchanged(found, contacts)
+    for contact in contacts:
+        if contact.outcome == EXCHANGED and masks is not None:
+            exchange_masks(contact, [masks[number] for number in contact.people])
+    for line in report(contacts):
+        note(line)
     for member in people:
         if member.number in finished:
             stored = read_result(output).cameras or cameras
@@ -59,27 +70,37 @@ def finish(
             if not np.allclose(pack_rig(used), pack_rig(plan.setup.rig), rtol=_ROUNDED, atol=_ROUNDED):
                 cameras = replace(stored, rig=used)
             continue
-        store = None if masks is None else masks[member.number]
-        cameras = _finish(output, plan, member, store, note, cameras, len(people) == 1)
+        store, result = None if masks is None else masks[member.number], results[member.number]
+        changed = [] if result is found[member.number] else list(COLUMNS)
+        cameras = _finish(output, plan, member, result, changed, contacts, store, note, cameras, len(people) == 1)
 
 
 def _finish(
-    output: Path, plan: Plan, member: Member, masks: MaskStore | None, note: Note, cameras: UsedCameras, alone: bool
+    output: Path,
+    plan: Plan,
+    member: Member,
+    result: Result,
+    changed: Sequence[str],
+    contacts: Sequence[Contact],
+    masks: MaskStore | None,
+    note: Note,
+    cameras: UsedCameras,
+    alone: bool,
 ) -> UsedCameras:
     """Write what needs all frames of a person: the second pass; segments, feet and angles; the smoothed copy; cameras.
 
     The second pass uses ``masks``; None: no second pass. Its body is fitted to frames of the whole recording unless
     that began with the initialisation pose, and its cameras are refined if they disagree and ``settings.refine`` is
     True. The result is replaced in one step; if this function is interrupted, the result of the first pass stays.
-    Returns the cameras that were used; persons after the first take those that are given.
+    ``changed`` are columns of the result that differ from the file. Returns the cameras that were used; persons after
+    the first take those that are given.
     """
     tracker, subject, fps = member.tracker, member.subject, plan.setup.fps
     if not tracker.has_segments:
         return cameras
-    result = read_result(output).people[member.number]
     poses = result.pose.copy()
     lost = ~result.has_pose
-    columns: dict[str, NDArray[Any]] = {}
+    columns: dict[str, NDArray[Any]] = {name: getattr(result, COLUMNS[name]) for name in changed}
     model: Mapping[str, Value] | None = None
     again = two_pass(tracker)
     missing = [] if masks is None else [int(f) for f in result.frames if int(f) not in masks]
@@ -129,15 +150,16 @@ def _finish(
     if sigma is not None and residual is not None:
         suspect = ~lost
         suspect[suspect] = contradicted(residual[suspect], plan.settings.region.false_alarm)
+        mixed = ~lost & doubtful(result, contacts)
         status = columns.get("status", result.status)
         status = np.where(status == Status.SUSPECT, np.uint8(Status.TRACKED), status)
-        columns["status"] = np.where(suspect, np.uint8(Status.SUSPECT), status)
-        columns["joints/sigma"] = np.where(suspect[:, None], np.nan, sigma)
+        columns["status"] = np.where(suspect | mixed, np.uint8(Status.SUSPECT), status)
+        columns["joints/sigma"] = np.where((suspect | mixed)[:, None], np.nan, sigma)
         report_unknown(result.frames[np.isnan(sigma).all(axis=1) & ~lost & ~suspect], note)
         report_suspect(result.frames[suspect], note)
     _LOG.info("angles, feet, and the smoothed copy")
     # poses of the first pass stay as they are
-    kept = ("pose", "joints/position") if model is None else ()
+    kept = ("pose", "joints/position") if model is None and not changed else ()
     body = tracker.body.standing(plan.setup.up)
     columns |= {name: values for name, values in _columns(body, poses).items() if name not in kept}
     filtered = smooth(body.skeleton, poses, ~lost, fps)

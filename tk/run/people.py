@@ -13,23 +13,22 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import scipy  # its packages are imported when they are first used
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ConfigError
 from tk.kernels.raycast import FAR, Cast
-from tk.model.cues.part_colors import color_bins
+from tk.model.body.skeleton import JOINTS
 from tk.model.cues.ray_costs import RayGrid
 from tk.model.people import LocatedPerson, PeopleFinder, order_people
 from tk.model.setup import Setup, Subject
+from tk.run.choice import Choice, chosen, matched, unknown
+from tk.run.identity import EXCHANGED, Contact, Contacts, outcome_of
 from tk.trackers.camera_monitor import CameraMonitor, opening_agreement
-from tk.trackers.protocol import Estimate, Observation, Tracker, sharing
+from tk.trackers.protocol import Estimate, Observation, SharingTracker, Tracker, sharing
 from tk.trackers.sharing import PixelOwners, assign, cast_points
 
 _LOG = logging.getLogger(__name__)
 Float = NDArray[np.float64]
-Choice = str | tuple[int, ...]
-"""Who is tracked: "auto" (one person), "all", or numbers."""
 
 # Seconds between two looks for people who enter.
 LOOK_EVERY_S = 0.5
@@ -44,14 +43,13 @@ _LEAST_VOXELS = 25
 _HISTORY = 8
 # Least share of the area of a person who is tracked that must be unexplained in two views before a search.
 _UNEXPLAINED = 0.25
-# Mean logarithm of the likelihood of a person's pixels by the colours of the segments, above which somebody who enters
-# is a person who has left. On pair and a rendered crossing, three frames each: -3.5 to -4.2 by the own colours, -4.8 to
-# -7.1 by the other person's.
-_SAME_COLORS = -4.5
-
+# Likeness by the colours above which somebody who enters is a person who has left. On pair and a rendered crossing, by
+# colours and body: -0.1 to -0.7 for the same person, -1.6 to -3.7 for the other one.
+_SAME_COLORS = -1.1
 
 _DRAWN = "drawn"
 _WATCH, _LOST, _ABSENT, _PEOPLE, _BYSTANDERS = "watch/", "lost", "absent", "people/", "bystanders/"
+_MODEL, _CONTACTS = "body/", "contacts/"
 
 
 @dataclass
@@ -61,6 +59,8 @@ class Member:
     Attributes:
         number: number in the result.
         subject: what is known of the person.
+        written: whether the person is in the result. Others are tracked because a body explains their pixels better
+            than a hull does.
         lost: whether the last frame is lost.
         absent: whether nobody was seen in the last frame who could be this person.
         drawn: (C, h, w) bool, the body in the last frame that is not lost, see :class:`~tk.trackers.protocol.Estimate`.
@@ -70,6 +70,7 @@ class Member:
     subject: Subject
     tracker: Tracker
     monitor: CameraMonitor
+    written: bool = True
     lost: bool = False
     absent: bool = False
     drawn: NDArray[np.bool_] | None = None
@@ -83,11 +84,13 @@ class Bystander:
         position: (3,) m, centre of the trunk.
         shape: the hull on the grid of the trackers.
         history: the person's own observations of the last frames, if a tracker may be started.
+        refused: whether no tracker could be started.
     """
 
     position: Float
     shape: Cast
     history: list[Observation] = field(default_factory=list)
+    refused: bool = False
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,8 @@ class People:
         self, setup: Setup, first: Tracker, make: Callable[[], Tracker], choice: Choice, note: Callable[[str], None]
     ) -> None:
         self._setup, self._make, self._choice, self._note = setup, make, choice, note
-        self.members = [self._member(0, setup.subjects[0], first)]
+        self._tracked = [self._member(0, setup.subjects[0], first)]
+        self._contacts = Contacts()
         self._bystanders: list[Bystander] = []
         self._every = max(1, round(LOOK_EVERY_S * setup.fps))
         self._known_finder: PeopleFinder | None = None
@@ -125,6 +129,17 @@ class People:
         return Member(number, subject, tracker, CameraMonitor(tracker, self._setup, subject))
 
     @property
+    def members(self) -> list[Member]:
+        """The people in the result."""
+        return [member for member in self._tracked if member.written]
+
+    @property
+    def contacts(self) -> list[Contact]:
+        """The contacts between the people in the result."""
+        numbers = {member.number for member in self.members}
+        return [contact for contact in self._contacts.all if numbers.issuperset(contact.people)]
+
+    @property
     def several(self) -> bool:
         """Whether the result may have several people: each then has rows only for frames in which the person is
         present."""
@@ -133,7 +148,7 @@ class People:
     @property
     def alone(self) -> bool:
         """Whether nobody but one tracked person has been seen."""
-        return len(self.members) == 1 and not self._bystanders
+        return len(self._tracked) == 1 and not self._bystanders
 
     # --- the first frames ---------------------------------------------------------------------------------------------
 
@@ -143,35 +158,23 @@ class People:
         Raises:
             CaptureError: a chosen person is not there, or too few cameras see the person.
         """
-        subject = self._setup.subjects[0]
-        found = self._find(opening[0].masks, opening[0].uncertain)
-        found = order_people(found, self._setup.volume, subject.height_m, subject.position)
-        if len(found) <= 1 and self._choice in ("auto", "all", (0,)):
-            try:
-                self._begin(self.members[0], opening)
-            except CaptureError as refusal:
-                # somebody may pass close to a camera, where no hull shows him or her: the person's own pixels may do
-                if not found or self._grid is None:
-                    raise
-                try:
-                    self._begin_among(found, opening)
-                except CaptureError:
-                    raise refusal from None
-            return
-        self._begin_among(found, opening)
-
-    def _begin_among(self, found: Sequence[LocatedPerson], opening: Sequence[Observation]) -> None:
-        """Start the trackers of those who are chosen among the people found in the first frame."""
         subjects = self._setup.subjects
-        numbers = self._chosen(found)
-        known = _matched(subjects[:1] if self._choice == "auto" else subjects, [found[n] for n in numbers])
-        self.members = [self._member(0, known[0], self.members[0].tracker)]
+        found = self._find(opening[0].masks, opening[0].uncertain)
+        found = order_people(found, self._setup.volume, subjects[0].height_m, subjects[0].position)
+        if len(found) <= 1 and self._choice in ("auto", "all", (0,)):
+            self._begin(self._tracked[0], opening)
+            return
+        numbers = chosen(self._choice, found, subjects[0], self._note)
+        known = matched(subjects[:1] if self._choice == "auto" else subjects, [found[n] for n in numbers])
+        self._tracked = [self._member(0, known[0], self._tracked[0].tracker)]
         for k, subject in enumerate(known[1:], 1):
-            self.members.append(self._member(k, subject, self._make()))  # its kernels are compiled
+            self._tracked.append(self._member(k, subject, self._make()))  # its kernels are compiled
         if self._grid is None:
-            if len(self.members) > 1 or len(found) > 1:
-                raise ConfigError(f"the method {self.members[0].tracker.method} tracks one person who is alone in view")
-            self._begin(self.members[0], opening)
+            if len(self._tracked) > 1 or len(found) > 1:
+                raise ConfigError(
+                    f"the method {self._tracked[0].tracker.method} tracks one person who is alone in view"
+                )
+            self._begin(self._tracked[0], opening)
             return
         order = [*numbers, *(n for n in range(len(found)) if n not in numbers)]
         shown = [Bystander(found[n].position, self._hull(found[n])) for n in order]
@@ -184,7 +187,7 @@ class People:
             for k, own in enumerate(shares):
                 own.append(owners.share(frame, k, False))
         refusal = opening_agreement(self._setup, opening).refusal
-        for member, frames in zip(self.members, shares, strict=True):
+        for member, frames in zip(self._tracked, shares, strict=True):
             self._begin(member, frames, refusal)
         first = [Bystander(found[n].position, self._hull(found[n])) for n in order]
         self._bystanders = first[len(numbers) :]
@@ -208,69 +211,64 @@ class People:
             self._known_finder = PeopleFinder(self._setup.rig, self._setup.volume, self._setup.up)
         return self._known_finder
 
-    def _chosen(self, found: Sequence[LocatedPerson]) -> tuple[int, ...]:
-        """Return the numbers of the people to be tracked."""
-        present = [n for n, person in enumerate(found) if person.inside]
-        if isinstance(self._choice, tuple):
-            missing = [n for n in self._choice if n >= len(found)]
-            if missing:
-                raise CaptureError(
-                    f"person {missing[0]} is asked for, but {len(found)} were found in the first frame; the numbers "
-                    "start at 0, see tk inspect"
-                )
-            return self._choice
-        if self._choice == "all":
-            return tuple(present) or (0,)
-        number = 0
-        place = _position(self._setup.subjects[0])
-        if place is not None and found:
-            number = int(np.argmin([np.linalg.norm(person.position - place) for person in found]))
-        if len(found) > 1:
-            x, y, z = found[number].position
-            self._note(
-                f"{len(found)} people are in view, and number {number} is tracked, at ({x:.1f}, {y:.1f}, {z:.1f}) m; "
-                "the option people chooses others by the numbers that tk inspect prints, or all"
-            )
-        return (number,)
-
     # --- one frame ----------------------------------------------------------------------------------------------------
 
     def step(self, frame: Observation) -> dict[int, Tracked]:
         """Return the answers of the members for a frame, by number."""
         if self.alone:
-            (member,) = self.members
+            (member,) = self._tracked
             tracked = self._step(member, frame)
             answers = {member.number: tracked}
             self._look(frame, answers)
             return self._with_absent(answers)
-        before = [self._state_of(m) for m in self.members]
-        shown = [*(self._shape(m, True) for m in self.members), *(b.shape for b in self._bystanders)]
+        before = [self._state_of(m) for m in self._tracked]
+        shown = [*(self._shape(m, True) for m in self._tracked), *(b.shape for b in self._bystanders)]
         owners = self._owners(shown)
         if self._bystanders:
-            self._follow(self._bystanders, frame, owners, len(self.members))
-            owners = self._owners([*shown[: len(self.members)], *(b.shape for b in self._bystanders)])
+            self._follow(self._bystanders, frame, owners, len(self._tracked))
+            owners = self._owners([*shown[: len(self._tracked)], *(b.shape for b in self._bystanders)])
         answers = {}
-        for k, member in enumerate(self.members):
+        for k, member in enumerate(self._tracked):
             answers[member.number] = self._step(member, owners.share(frame, k, member.lost and not member.absent))
-        now = self._owners([*(self._shape(m, False) for m in self.members), *(b.shape for b in self._bystanders)])
-        for k, member in enumerate(self.members):
+        now = self._owners([*(self._shape(m, False) for m in self._tracked), *(b.shape for b in self._bystanders)])
+        for k, member in enumerate(self._tracked):
             if not member.lost and now.changed(owners, frame.masks, k):
-                tracker = sharing(member.tracker)
-                assert tracker is not None
-                tracker.rewind(before[k])
+                _sharing(member).rewind(before[k])
                 self._restore(member, before[k])
                 answers[member.number] = self._step(member, now.share(frame, k, False))
-        if self._choice == "all":
-            for k, bystander in enumerate(self._bystanders, len(self.members)):
+        for k, bystander in enumerate(self._bystanders, len(self._tracked)):
+            if not bystander.refused:
                 bystander.history = [*bystander.history[1 - _HISTORY :], now.share(frame, k, False)]
+        self._judge(frame, answers)
         self._look(frame, answers, now)
         return self._with_absent(answers)
 
+    def _judge(self, frame: Observation, answers: Mapping[int, Tracked]) -> None:
+        """Compare people whose contact has ended with those before it; exchange their trackers if they were mixed
+        up."""
+        here = [m for m in self._tracked if not m.lost]
+        pelvis = {m.number: answers[m.number].estimate.joints[JOINTS.index("pelvis")] for m in here}
+        for contact in self._contacts.update(frame.index, pelvis, {m.number: _sharing(m).learned() for m in here}):
+            pair = [self._tracked[number] for number in contact.people]
+            likeness = np.zeros((2, 2))
+            for i, one in enumerate(pair):
+                for j, other in enumerate(pair):
+                    share, pose = answers[one.number].used, _sharing(one).last_poses()[0]
+                    likeness[i, j] = _sharing(other).likeness(share, contact.learned[j], pose)
+            contact.outcome = outcome_of(likeness)
+            _LOG.debug("contact of %s, frames %d to %d: %s", contact.people, contact.first, contact.last, likeness)
+            if contact.outcome == EXCHANGED:
+                states = [self._state_of(member) for member in pair]
+                for member, state, colors in zip(pair, states[::-1], contact.learned, strict=True):
+                    _sharing(member).rewind({**state, **colors})
+                    self._restore(member, state)
+            contact.learned = ()
+
     def _with_absent(self, answers: dict[int, Tracked]) -> dict[int, Tracked]:
-        """Return the answers, with the status of those who are absent."""
-        for number in (m.number for m in self.members if m.absent):
+        """Return the answers of the people in the result, with the status of those who are absent."""
+        for number in (m.number for m in self._tracked if m.absent):
             answers[number] = replace(answers[number], estimate=replace(answers[number].estimate, status="absent"))
-        return answers
+        return {m.number: answers[m.number] for m in self.members if m.number in answers}
 
     def _step(self, member: Member, share: Observation) -> Tracked:
         estimate, used = member.monitor.step(share)
@@ -280,9 +278,7 @@ class People:
         return Tracked(estimate, share, used)
 
     def _shape(self, member: Member, ahead: bool) -> Cast | None:
-        tracker = sharing(member.tracker)
-        assert tracker is not None
-        return None if member.lost else tracker.rendered(ahead)
+        return None if member.lost else _sharing(member).rendered(ahead)
 
     def _hull(self, person: LocatedPerson) -> Cast:
         assert self._grid is not None
@@ -313,13 +309,15 @@ class People:
     def state(self) -> dict[str, Any]:
         """Return what :meth:`restore` needs beside the bodies. Person 0's entries have no prefix."""
         state: dict[str, Any] = {}
-        for member in self.members:
+        for member in self._tracked:
             prefix = f"{_PEOPLE}{member.number}/" if member.number else ""
             state |= {prefix + name: value for name, value in self._state_of(member).items()}
+            if not member.written:
+                state |= {f"{prefix}{_MODEL}{name}": value for name, value in member.tracker.model().items()}
         for k, b in enumerate(self._bystanders):
             prefix = f"{_BYSTANDERS}{k}/"
             state |= {prefix + "position": b.position, prefix + "depth": b.shape.depth}
-        return state
+        return state | {_CONTACTS + name: value for name, value in self._contacts.state().items()}
 
     def restore(self, models: Sequence[Mapping[str, Any]], state: Mapping[str, Any]) -> None:
         """Continue a run.
@@ -329,14 +327,17 @@ class People:
             state: of :meth:`state`.
         """
         subjects = self._setup.subjects
-        for number, model in enumerate(models):
-            own = below(f"{_PEOPLE}{number}/", state) if number else state
+        number = 0
+        while own := below(f"{_PEOPLE}{number}/", state) if number else state:
             if number:
-                known = subjects[number] if number < len(subjects) else _unknown(subjects[0])
-                self.members.append(self._member(number, known, self._make()))
-            member = self.members[number]
-            member.tracker.restore(model, own)
+                known = subjects[number] if number < len(subjects) else unknown(subjects[0])
+                self._tracked.append(self._member(number, known, self._make()))
+            member = self._tracked[number]
+            member.written = number < len(models)
+            member.tracker.restore(models[number] if member.written else below(_MODEL, own), own)
             self._restore(member, own)
+            number += 1
+        self._contacts.restore(below(_CONTACTS, state))
         k = 0
         while found := below(f"{_BYSTANDERS}{k}/", state):
             depth = np.asarray(found["depth"], np.float32)
@@ -358,15 +359,15 @@ class People:
 
     def _look(self, frame: Observation, answers: dict[int, Tracked], owners: PixelOwners | None = None) -> None:
         """Find those who enter, and those who are absent, in the pixels that nobody explains."""
-        lost = [m for m in self.members if m.lost]
-        for member in self.members:
+        lost = [m for m in self._tracked if m.lost]
+        for member in self._tracked:
             member.absent &= member.lost
         if self._grid is None:
             return
         self._admit()
         due = frame.index % self._every == 0 or bool(lost)
         if owners is None:
-            residual = answers[self.members[0].number].estimate.residual
+            residual = answers[self._tracked[0].number].estimate.residual
             known = residual is not None and bool(np.isfinite(residual).any())
             surplus = float(np.nanmean(residual[:, 1])) if residual is not None and known else 0.0
             due = (due and bool(lost)) or (
@@ -374,7 +375,7 @@ class People:
             )  # at once: it misleads the tracker
             if not due:
                 return
-            owners = self._owners([self._shape(m, False) for m in self.members])
+            owners = self._owners([self._shape(m, False) for m in self._tracked])
         if not due:
             return
         free = owners.unexplained(frame.masks)
@@ -398,7 +399,7 @@ class People:
     def _much(self, free: NDArray[np.uint8], owners: PixelOwners, frame: Observation) -> bool:
         """Return whether the pixels that nobody explains may be a person's."""
         shown = owners.grid.sample(frame.masks) >= 128
-        areas = [np.count_nonzero(shown & (owners.owner == k), axis=(1, 2)) for k in range(len(self.members))]
+        areas = [np.count_nonzero(shown & (owners.owner == k), axis=(1, 2)) for k in range(len(self._tracked))]
         person = max(float(np.median(area)) for area in areas)
         left = np.count_nonzero(owners.grid.sample(free), axis=(1, 2))
         return bool(np.count_nonzero(left > _UNEXPLAINED * person) >= 2)
@@ -423,22 +424,25 @@ class People:
                 continue
             self._bystanders.remove(bystander)
             shares, bystander.history = bystander.history[::-1], []
-            away = [m for m in self.members if m.absent]
-            alike = [_likelihood(m.tracker, shares[0]) for m in away]
+            away = [m for m in self._tracked if m.absent and m.written]
+            alike = [_sharing(m).likeness(shares[0]) for m in away]
             if alike and max(alike) > _SAME_COLORS:
                 member = away[int(np.argmax(alike))]
                 member.absent = False  # lost: the pixels that nobody explains are this person's
                 continue
-            number = len(self.members)
-            member = self._member(number, _unknown(Subject(in_init_pose=False)), self._make())
+            number = len(self._tracked)
+            member = self._member(number, unknown(Subject(in_init_pose=False)), self._make())
+            member.written = self._choice == "all"
             try:
                 self._begin(member, shares)
             except CaptureError as reason:
                 _LOG.info("nobody can be tracked there: %s", reason)
+                bystander.refused = True
                 self._bystanders.append(bystander)
                 continue
-            self.members.append(member)
-            self._note(f"frame {shares[0].index}: person {number} has entered")
+            self._tracked.append(member)
+            if member.written:
+                self._note(f"frame {shares[0].index}: person {number} has entered")
 
     def _inside(self, position: Float) -> bool:
         volume = self._setup.volume
@@ -452,58 +456,12 @@ class People:
         return bool(np.count_nonzero(shown) > 0.3 * np.count_nonzero(covered))
 
 
-def parse_choice(text: str) -> Choice:
-    """Return the choice that a user gives as "auto", "all" or numbers, such as "0,2".
-
-    Raises:
-        ConfigError: it is none of these.
-    """
-    if text in ("auto", "all"):
-        return text
-    numbers = [part.strip() for part in text.split(",")]
-    if not all(part.isdecimal() for part in numbers) or len(set(numbers)) < len(numbers):
-        raise ConfigError(f"people {text!r}: give auto, all, or different numbers from 0 on, such as 0,2")
-    return tuple(map(int, numbers))
-
-
-def describe(choice: Choice) -> str:
-    """Return a choice as the user gives it."""
-    return choice if isinstance(choice, str) else ",".join(map(str, choice))
-
-
 def below(prefix: str, state: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entries of a state whose names begin with a prefix, without it."""
     return {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
 
 
-def _likelihood(tracker: Tracker, share: Observation) -> float:
-    """Return the mean logarithm of the likelihood of a person's pixels by the colours of a tracker's segments."""
-    colors = getattr(tracker, "colors", None)
-    if colors is None or colors.log_likelihood is None or not share.images.size:
-        return 0.0  # nothing contradicts it
-    bins = color_bins(share.images[share.masks >= 128])
-    return float(colors.log_likelihood.max(axis=0)[bins].mean()) if len(bins) else -np.inf
-
-
-def _position(subject: Subject) -> Float | None:
-    return subject.init.center if subject.init is not None else subject.position
-
-
-def _unknown(first: Subject) -> Subject:
-    """Return a subject of whom nothing is known but how the recording begins."""
-    return Subject(in_init_pose=first.in_init_pose)
-
-
-def _matched(subjects: Sequence[Subject], people: Sequence[LocatedPerson]) -> list[Subject]:
-    """Return the subject of each of the people: by position, else by height; nothing is known of the others."""
-    cost = np.zeros((len(people), len(subjects)))
-    for p, person in enumerate(people):
-        for s, subject in enumerate(subjects):
-            place = _position(subject)
-            if place is not None:
-                cost[p, s] += float(np.linalg.norm(person.position[:2] - place[:2]))
-            if subject.height_m is not None:
-                cost[p, s] += abs(person.height_m - subject.height_m)
-            cost[p, s] += 1e-6 * abs(p - s)
-    who = dict(zip(*scipy.optimize.linear_sum_assignment(cost), strict=True))
-    return [subjects[who[p]] if p in who else _unknown(subjects[0]) for p in range(len(people))]
+def _sharing(member: Member) -> SharingTracker:
+    tracker = sharing(member.tracker)
+    assert tracker is not None
+    return tracker

@@ -25,8 +25,9 @@ from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 from tk.model.hull.hull import HullSurface
 from tk.model.setup import Setup
+from tk.run.choice import Choice, describe
 from tk.run.offline import REFINED, finish, report_suspect, report_unknown
-from tk.run.people import Choice, People, Tracked, describe
+from tk.run.people import People, Tracked
 from tk.run.plan import Plan, open_plan, recording_setup, reduce_images
 from tk.run.prefetch import Observed
 from tk.run.reporter import Reporter
@@ -178,7 +179,7 @@ def track_source(
                 for line in run.people.report():
                     note(line)
                 with one_thread():
-                    finish(output, plan, run.people.members, masks, note, run.finished)
+                    finish(output, plan, run.people.members, run.people.contacts, masks, note, run.finished)
                 if said:
                     revise_result(output, notes=said)
             stores.remove()

@@ -26,7 +26,7 @@ from tk.model.body.limb_candidates import Limb, distinct, limbs_of, pairs
 from tk.model.body.skeleton import OPTIONAL, SEGMENTS, build_skeleton, convert_poses
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.tracker_frame import TrackerFrame
-from tk.model.cues.part_colors import PartColors
+from tk.model.cues.part_colors import PartColors, color_bins
 from tk.model.cues.ray_costs import Evidence, RayGrid, mean_of_views
 from tk.model.masks.silhouettes import Pyramid, Views
 from tk.model.setup import InitPose
@@ -68,6 +68,8 @@ SAME_POSE_M = 0.05
 FACING = 0.04
 # Rows of the grid of rays: to screen many candidates of a limb, and to choose among few poses.
 SCREEN_ROWS, CHOICE_ROWS = 54, 96
+# Probability that a ray contradicts the person's own body: the residual (E_S) of the development captures.
+WRONG = 0.1
 
 LINE_SEARCH = SearchSettings()
 # Half this tolerance, or none, leaves the mean joint error on eight captures unchanged to 0.02 cm; twice as much makes
@@ -279,6 +281,35 @@ class ContourTracker:
         _, met = cast(arrays, group, grid.cameras, grid.step, grid.rays, free, pose[None], export=True)
         assert met is not None
         return Cast(met.label[0], met.depth[0])
+
+    def learned(self) -> Mapping[str, Any]:
+        """Return the learned colours, a part of the state."""
+        return self.colors.state()
+
+    def likeness(
+        self, frame: Observation, learned: Mapping[str, Any] | None = None, pose: Float | None = None
+    ) -> float:
+        """Return the log-likelihood, mean per pixel, that a frame shows this person; about 0 or less.
+
+        Args:
+            frame: the observation of a person.
+            learned: colours of this person, see :meth:`PartColors.state`; None: the present ones.
+            pose: (D,) the person's pose, in the tracker's frame. With it, the body counts, too: a pixel is wrong with
+                the probability :data:`WRONG`.
+        """
+        colors = self.colors
+        if learned is not None:
+            colors = PartColors(self.body)
+            colors.restore(learned)
+        by_color = 0.0
+        if frame.images.size:
+            bins = color_bins(self.choice.sample(frame.images))
+            by_color = colors.likeness(bins[self.choice.sample(frame.masks) >= 128])
+        if pose is None:
+            return by_color
+        pyramid = self.pyramid(frame)
+        residual = self.mean_residual(pyramid, self.settle(pyramid, pose[None]).states, frame.uncertain)[0]
+        return by_color - float(np.log(1 / WRONG - 1) * min(residual, 1.0))
 
     # --- one frame ----------------------------------------------------------------------------------------------
 

@@ -184,6 +184,21 @@ class SharingTracker(Tracker, Protocol):
         """Return the body on the grid: at the last pose, or at the one expected in the next frame."""
         ...
 
+    def last_poses(self) -> tuple[Float, Float]:
+        """Return the poses (D,) of the last frame and of the frame before, in the tracker's frame."""
+        ...
+
+    def learned(self) -> Mapping[str, Any]:
+        """Return the learned colours, a part of the state; empty before any are known."""
+        ...
+
+    def likeness(
+        self, frame: Observation, learned: Mapping[str, Any] | None = None, pose: Float | None = None
+    ) -> float:
+        """Return the log-likelihood, mean per pixel, that a frame shows this person: by the colours, and by the body if
+        a pose (D,) is given."""
+        ...
+
     def lose(self) -> None:
         """Take the last frame for lost: the person is searched for in the next one."""
         ...

@@ -106,20 +106,26 @@ def assign(rig: Rig, grid: RayGrid, shapes: Sequence[Cast | None]) -> PixelOwner
                 beside[p, v] *= grid.step * middle / float(rig[v].matrix[0, 0])
     if not shapes:
         return PixelOwners(grid, np.full((V, h, w), NOBODY, np.int8), np.full((V, h, w), np.inf, np.float32))
-    nearest = beside.min(axis=0)
-    owner = np.where(nearest <= REACH_M, beside.argmin(axis=0), NOBODY).astype(np.int8)
+    who, nearest, second = _two_least(beside)
+    owner = np.where(nearest <= REACH_M, who, np.int8(NOBODY))
     if len(shapes) > 1:
-        second, front, behind = _second(beside), depth.min(axis=0), _second(depth)
+        who, front, behind = _two_least(depth)
         both = np.isfinite(behind)
-        owner[both] = depth.argmin(axis=0)[both]
+        owner[both] = who[both]
         with np.errstate(invalid="ignore"):  # inf - inf
             owner[np.where(both, behind - front, second - nearest) < MARGIN_M] = UNCLEAR
     return PixelOwners(grid, owner, nearest)
 
 
-def _second(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the second least of values along the first axis."""
-    return values.max(axis=0) if len(values) == 2 else np.partition(values, 1, axis=0)[1]
+def _two_least(values: NDArray[np.float32]) -> tuple[NDArray[np.int8], NDArray[np.float32], NDArray[np.float32]]:
+    """Return the index of the least of values along the first axis, the least and the second."""
+    least, second = values[0].copy(), np.full(values.shape[1:], np.inf, np.float32)
+    index = np.zeros(values.shape[1:], np.int8)
+    for k, value in enumerate(values[1:], 1):
+        index[value < least] = k
+        second = np.minimum(second, np.maximum(value, least))
+        least = np.minimum(least, value)
+    return index, least, second
 
 
 def cast_points(rig: Rig, grid: RayGrid, points: Float, voxel_m: float) -> Cast:

@@ -99,6 +99,14 @@ class PartColors:
             return None
         return Regions(np.ascontiguousarray(images), self.log_likelihood, self.group, _CONTOUR_WEIGHT)
 
+    def likeness(self, bins: NDArray[np.int32]) -> float:
+        """Return the mean log-likelihood of colours (N,), relative to that of the learned colours: about 0 if they are
+        the person's, less otherwise. 0 before any colours are learned."""
+        if self.log_likelihood is None or not len(bins):
+            return 0.0
+        likeliest, seen = self.log_likelihood.max(axis=0), self._counts.sum(axis=0)
+        return float(likeliest[bins].mean() - seen @ likeliest / seen.sum())
+
     def state(self) -> dict[str, Any]:
         """Return what :meth:`restore` needs."""
         return {"colors": self._counts, "colors_outside": self._outside} if self.known else {}

@@ -1,0 +1,91 @@
+"""Who is tracked: the user's choice, and what is known of each person."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import scipy  # its packages are imported when they are first used
+from numpy.typing import NDArray
+
+from tk.errors import CaptureError, ConfigError
+from tk.model.people import LocatedPerson
+from tk.model.setup import Subject
+
+Choice = str | tuple[int, ...]
+"""Who is tracked: "auto" (one person), "all", or numbers."""
+
+
+def parse_choice(text: str) -> Choice:
+    """Return the choice that a user gives as "auto", "all" or numbers, such as "0,2".
+
+    Raises:
+        ConfigError: it is none of these.
+    """
+    if text in ("auto", "all"):
+        return text
+    numbers = [part.strip() for part in text.split(",")]
+    if not all(part.isdecimal() for part in numbers) or len(set(numbers)) < len(numbers):
+        raise ConfigError(f"people {text!r}: give auto, all, or different numbers from 0 on, such as 0,2")
+    return tuple(map(int, numbers))
+
+
+def describe(choice: Choice) -> str:
+    """Return a choice as the user gives it."""
+    return choice if isinstance(choice, str) else ",".join(map(str, choice))
+
+
+def chosen(
+    choice: Choice, found: Sequence[LocatedPerson], subject: Subject, note: Callable[[str], None]
+) -> tuple[int, ...]:
+    """Return the numbers of the people to be tracked among those found in the first frame.
+
+    Raises:
+        CaptureError: a chosen person is not there.
+    """
+    present = [n for n, person in enumerate(found) if person.inside]
+    if isinstance(choice, tuple):
+        missing = [n for n in choice if n >= len(found)]
+        if missing:
+            raise CaptureError(
+                f"person {missing[0]} is asked for, but {len(found)} were found in the first frame; the numbers "
+                "start at 0, see tk inspect"
+            )
+        return choice
+    if choice == "all":
+        return tuple(present) or (0,)
+    number = 0
+    place = _position(subject)
+    if place is not None and found:
+        number = int(np.argmin([np.linalg.norm(person.position - place) for person in found]))
+    if len(found) > 1:
+        x, y, z = found[number].position
+        note(
+            f"{len(found)} people are in view, and number {number} is tracked, at ({x:.1f}, {y:.1f}, {z:.1f}) m; "
+            "the option people chooses others by the numbers that tk inspect prints, or all"
+        )
+    return (number,)
+
+
+def unknown(first: Subject) -> Subject:
+    """Return a subject of whom nothing is known but how the recording begins."""
+    return Subject(in_init_pose=first.in_init_pose)
+
+
+def matched(subjects: Sequence[Subject], people: Sequence[LocatedPerson]) -> list[Subject]:
+    """Return the subject of each of the people: by position, else by height; nothing is known of the others."""
+    cost = np.zeros((len(people), len(subjects)))
+    for p, person in enumerate(people):
+        for s, subject in enumerate(subjects):
+            place = _position(subject)
+            if place is not None:
+                cost[p, s] += float(np.linalg.norm(person.position[:2] - place[:2]))
+            if subject.height_m is not None:
+                cost[p, s] += abs(person.height_m - subject.height_m)
+            cost[p, s] += 1e-6 * abs(p - s)
+    who = dict(zip(*scipy.optimize.linear_sum_assignment(cost), strict=True))
+    return [subjects[who[p]] if p in who else unknown(subjects[0]) for p in range(len(people))]
+
+
+def _position(subject: Subject) -> NDArray[np.float64] | None:
+    return subject.init.center if subject.init is not None else subject.position

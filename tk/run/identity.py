@@ -1,0 +1,187 @@
+"""Identity: people who come close to each other may be exchanged by their trackers.
+
+While two people are in contact their pixels are assigned by position alone. After it, the colours and the body of each
+trajectory are compared with those of both people before it: a log-likelihood for each pair, and the assignment with the
+largest sum. If it is the exchanged one, the trackers are exchanged, and the frames in which they were mixed up are
+exchanged when the run is finished. If neither is clearly better, the frames of the contact are suspect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.io.captures.mask_store import MaskStore
+from tk.io.results.data import Result
+from tk.io.results.status import Status
+from tk.model.masks.image_health import described
+
+Float = NDArray[np.float64]
+
+# People are in contact if their pelvises are closer than this, metres: arms reach so far.
+CONTACT_M = 1.0
+# An assignment is clear if its log-likelihood, mean per pixel and summed over both people, exceeds that of the other by
+# this. At the ends of 6 contacts of the rendered captures (pair, a crossing) the right one exceeds it by 4.2 to 5.7.
+CLEAR = 0.3
+
+OPEN, KEPT, EXCHANGED, UNCLEAR = range(4)
+
+
+@dataclass
+class Contact:
+    """A time during which two people are close to each other.
+
+    Attributes:
+        people: their numbers.
+        first, last: frames.
+        moment: the frame from which on an exchange is likeliest, because it makes the steps of the pelvises shortest.
+        shorter_m: by how much an exchange in this frame makes them shorter, metres; negative in most cases.
+        pelvis: (2, 3) m, in the last frame.
+        outcome: :data:`OPEN`, :data:`KEPT`, :data:`EXCHANGED` or :data:`UNCLEAR`.
+        learned: the colours of both before the contact.
+    """
+
+    people: tuple[int, int]
+    first: int
+    last: int
+    moment: int
+    pelvis: Float
+    shorter_m: float = -np.inf
+    outcome: int = OPEN
+    learned: tuple[Mapping[str, Any], ...] = field(default=(), repr=False)
+
+
+class Contacts:
+    """The contacts of a run."""
+
+    def __init__(self) -> None:
+        self.all: list[Contact] = []
+
+    def update(
+        self, frame: int, pelvis: Mapping[int, Float], learned: Mapping[int, Mapping[str, Any]]
+    ) -> list[Contact]:
+        """Return the contacts that have ended.
+
+        Args:
+            frame: number of the frame.
+            pelvis: (3,) m, of each person who is tracked in it.
+            learned: colours of each person.
+        """
+        now = {c.people: c for c in self.all if c.outcome == OPEN}
+        ended = []
+        numbers = sorted(pelvis)
+        for i, a in enumerate(numbers):
+            for b in numbers[i + 1 :]:
+                both = np.array([pelvis[a], pelvis[b]])
+                distance_m = float(np.linalg.norm(both[0] - both[1]))
+                contact = now.get((a, b))
+                if contact is None and distance_m < CONTACT_M and learned[a] and learned[b]:
+                    colors = (learned[a], learned[b])
+                    self.all.append(Contact((a, b), frame, frame, frame, both, learned=colors))
+                elif contact is not None:
+                    kept, crossed = (
+                        np.linalg.norm(order - contact.pelvis, axis=1).sum() for order in (both, both[::-1])
+                    )
+                    if kept - crossed > contact.shorter_m:
+                        contact.moment, contact.shorter_m = frame, float(kept - crossed)
+                    contact.last, contact.pelvis = frame, both
+                    if distance_m >= CONTACT_M:
+                        ended.append(contact)
+        return ended
+
+    def state(self) -> dict[str, Any]:
+        """Return what :meth:`restore` needs."""
+        rows = [(*c.people, c.first, c.last, c.moment, c.outcome, c.shorter_m, *c.pelvis.flat) for c in self.all]
+        state: dict[str, Any] = {"table": np.array(rows, np.float64).reshape(-1, 13)}
+        for k, contact in enumerate(self.all):
+            for n, learned in enumerate(contact.learned if contact.outcome == OPEN else ()):
+                state |= {f"{k}/{n}/{name}": value for name, value in learned.items()}
+        return state
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state."""
+        self.all = []
+        for k, row in enumerate(np.asarray(state["table"])):
+            a, b, first, last, moment, outcome = row[:6].astype(int).tolist()
+            prefixes = [f"{k}/{n}/" for n in (0, 1)]
+            learned = tuple(
+                {name.removeprefix(p): value for name, value in state.items() if name.startswith(p)} for p in prefixes
+            )
+            pelvis = row[7:].reshape(2, 3)
+            self.all.append(Contact((a, b), first, last, moment, pelvis, float(row[6]), outcome, learned))
+
+
+def outcome_of(likeness: Float) -> int:
+    """Return the outcome of a contact from log-likelihoods (2, 2): of trajectory i as person j."""
+    kept, exchanged = np.trace(likeness), np.trace(likeness[::-1])
+    return KEPT if kept - exchanged > CLEAR else EXCHANGED if exchanged - kept > CLEAR else UNCLEAR
+
+
+def exchanged(people: Sequence[Result], contacts: Sequence[Contact]) -> tuple[Result, ...]:
+    """Return the people with the frames exchanged that the contacts name; lengths of the people do not change."""
+    found = list(people)
+    for contact in contacts:
+        if contact.outcome != EXCHANGED:
+            continue
+        a, b = contact.people
+        frames = np.intersect1d(found[a].frames, found[b].frames)
+        frames = frames[(frames >= contact.moment) & (frames <= contact.last)]
+        rows = {n: np.searchsorted(found[n].frames, frames) for n in (a, b)}
+        of_a, of_b = found[a], found[b]
+        found[a], found[b] = _with_rows(of_a, rows[a], of_b, rows[b]), _with_rows(of_b, rows[b], of_a, rows[a])
+    return tuple(found)
+
+
+def doubtful(person: Result, contacts: Sequence[Contact]) -> NDArray[np.bool_]:
+    """Return (F,) the frames of a person in which it is unclear who is who."""
+    found = np.zeros(len(person), np.bool_)
+    for contact in contacts:
+        if contact.outcome == UNCLEAR and person.person in contact.people:
+            found |= (person.frames >= contact.first) & (person.frames <= contact.last)
+    return found
+
+
+def report(contacts: Sequence[Contact]) -> list[str]:
+    """Return a line on each contact after which people were exchanged or may have been."""
+    lines = []
+    for contact in contacts:
+        a, b = contact.people
+        if contact.outcome == EXCHANGED:
+            lines.append(f"persons {a} and {b} were mixed up in frame {contact.moment}; this is undone")
+        elif contact.outcome == UNCLEAR:
+            which = described(contact.first, contact.last, contact.last - contact.first + 1)
+            lines.append(f"persons {a} and {b} look alike and may have been mixed up when they met: suspect, {which}")
+    return lines
+
+
+def exchange_masks(contact: Contact, masks: Sequence[MaskStore]) -> None:
+    """Exchange the masks of two people in the frames that :func:`exchanged` exchanges."""
+    one, other = masks
+    for frame in range(contact.moment, contact.last + 1):
+        if frame in one and frame in other:
+            of_one, of_other = one.get(frame), other.get(frame)
+            one.put(frame, of_other)
+            other.put(frame, of_one)
+
+
+def _with_rows(to: Result, rows: NDArray[np.int64], source: Result, other: NDArray[np.int64]) -> Result:
+    columns: dict[str, Any] = {}
+    for name in COLUMNS.values():
+        values = getattr(to, name)
+        if values is not None:
+            columns[name] = values.copy()
+            columns[name][rows] = getattr(source, name)[other]
+    status = columns["status"]
+    status[rows[status[rows] == Status.INITIALISED]] = Status.TRACKED
+    return replace(to, **columns)
+
+
+#: the columns of a result that are exchanged, by dataset
+COLUMNS = {
+    "pose": "pose", "joints/position": "joints", "joints/sigma": "sigma", "residual": "residual", "status": "status",
+    "objective": "objective",
+}  # fmt: skip
