@@ -24,7 +24,7 @@ from tk.errors import ConfigError, VideoError, WorkerError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.reader import read_result
-from tk.run import session
+from tk.run import session, worker
 from tk.run.prefetch import Ahead, Observations, Serial, open_observations
 from tk.settings import Settings
 
@@ -205,11 +205,28 @@ def test_ctrl_c_and_sigterm_of_the_command_line(tiny: Path, tmp_path: Path, numb
 def test_one_core_needs_no_further_process(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = open_capture(tiny)
     assert isinstance(open_observations(capture.setup(), capture, Settings(ahead=0), nobody), Serial)
-    monkeypatch.setattr("tk.run.prefetch._cores", lambda: 1)
+    monkeypatch.setattr("tk.run.worker.cores", lambda: 1)
     assert isinstance(open_observations(capture.setup(), capture, Settings(), nobody), Serial)
-    monkeypatch.setattr("tk.run.prefetch._cores", lambda: 2)
+    monkeypatch.setattr("tk.run.worker.cores", lambda: 2)
     with open_observations(capture.setup(), capture, Settings(), nobody) as source:
         assert isinstance(source, Ahead)
+
+
+def test_process_that_was_started_early_is_used_once_and_else_ended(tiny: Path) -> None:
+    capture = open_capture(tiny)
+    expected = arrays(Serial(capture.setup(), capture, AHEAD, nobody), 0, 2)
+    with worker.started_early():
+        (early,) = worker._ready
+        time.sleep(1.0)  # it prepares
+        with Ahead(capture.setup(), capture, AHEAD, nobody) as source:
+            assert source._process is early.process
+            found = arrays(source, 0, 2)
+        assert not worker._ready
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(a[2], b[2], strict=True)
+    with worker.started_early():
+        (early,) = worker._ready
+    assert early.process.returncode is not None
 
 
 def test_setting_out_of_range() -> None:

@@ -10,6 +10,7 @@ import click
 
 from tk.commands import base
 from tk.commands.console import ConsoleReporter
+from tk.run.worker import started_early
 
 if TYPE_CHECKING:
     from tk.io.captures.capture import Capture
@@ -60,7 +61,8 @@ def track(
     An overlay video (RESULT.mp4) and a report (RESULT.html) are written next to it.
     """
     span = base.parse_frames(options.frames)
-    with ConsoleReporter(quiet, later=later_stages(options.causal, no_report)) as reporter:
+    reporter = ConsoleReporter(quiet, later=later_stages(options.causal, no_report))
+    with reporter, started_early():
         reporter.stage("loading")
         from tk.io.importers import open_recording
         from tk.io.results.files import check_result_path

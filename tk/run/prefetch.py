@@ -16,7 +16,9 @@ import math
 import mmap
 import os
 import pickle
+import select
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -26,7 +28,6 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Protocol
@@ -37,9 +38,11 @@ from numpy.typing import NDArray
 
 from tk.errors import TkError, WorkerError
 from tk.io.captures.source import Source
+from tk.kernels.runtime import ensure_runtime
 from tk.model.cameras.camera import Rig
 from tk.model.setup import Setup
-from tk.run.segmentation import Labeller, make_labeller, mask_source
+from tk.run import worker
+from tk.run.segmentation import Labeller, make_labeller, mask_source, prepare_kernels
 from tk.segmenters import Segmenter
 from tk.settings import Settings
 from tk.trackers.protocol import Observation, Stopwatch
@@ -55,13 +58,9 @@ _HELD = 2
 #: most bytes of the frames made ahead, beside the held ones: a few of eight full-HD cameras. Fewer would make the
 #: process wait.
 _RING_BYTES = 384 * 2**20
+_HANDLE = b"memory"  # goes with the descriptor of the memory that both processes share
 #: seconds in which the process may end by itself. A shorter time would lose kernels that it has compiled.
 _PATIENCE_S = 5.0
-
-_START = (
-    "import sys; sys.path[:] = sys.argv[3:]; from tk.run.prefetch import serve; "
-    "serve(int(sys.argv[1]), int(sys.argv[2]))"
-)
 
 
 class Observations(Protocol):
@@ -98,7 +97,7 @@ def open_observations(
         CaptureError: there is nothing to make masks from.
     """
     mask_source(source)  # before a process is started
-    if settings.ahead == 0 or _cores() < 2 or not sys.executable or not _can_be_sent(source.segmenter):
+    if settings.ahead == 0 or worker.cores() < 2 or not sys.executable or not _can_be_sent(source.segmenter):
         return Serial(setup, source, settings, note, keep_images)
     return Ahead(setup, source, settings, note, keep_images)
 
@@ -110,17 +109,6 @@ def _can_be_sent(segmenter: Segmenter | None) -> bool:
         return segmenter is None or (type(segmenter).__module__ != "__main__" and bool(pickle.dumps(segmenter)))
     except Exception:  # pickling calls methods of the object, which may raise anything
         return False
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _threads() -> str:
-    """Threads of the process's kernels: half the cores, because the tracker should not wait; at most TK_THREADS."""
-    asked = os.environ.get("TK_THREADS")
-    half = max(_cores() // 2, 1)
-    return str(min(half, int(asked)) if asked else half)
 
 
 def observe(
@@ -244,19 +232,14 @@ class Ahead:
         self._held = 0
         self._returned: deque[int] = deque()
         self._begun = False
-        self._connection, theirs = Pipe()
         try:
-            self._process = subprocess.Popen(
-                [sys.executable, "-c", _START, str(theirs.fileno()), str(handle), *sys.path],
-                env={**os.environ, "TK_THREADS": _threads()},
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                pass_fds=(theirs.fileno(), handle),
-                start_new_session=True,  # Ctrl-C is for the tracker, which then ends this process
-            )
+            started = worker.take()
+            self._process = started.process
+            with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+                socket.send_fds(started.end, [_HANDLE], [handle])
         finally:
-            theirs.close()
             os.close(handle)
+        self._connection = Connection(started.end.detach())
         self._send(_Task(setup, source, settings, keep_images, slots))
 
     def frames(self, start: int, stop: int | None) -> Iterator[Observed]:
@@ -378,16 +361,22 @@ class _Ring:
         )
 
 
-def serve(socket: int, handle: int) -> None:
+def serve(descriptor: int) -> None:
     """Run the process: take a task, pass frames until the last one, or until the tracker has ended.
 
     Args:
-        socket, handle: descriptors of the socket to the tracker and of the memory that both share.
+        descriptor: of the socket to the tracker.
     """
     cv2.setNumThreads(1)  # the cameras are segmented in parallel already
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # may be sent to all processes of a job; the tracker ends this one
-    with Connection(socket) as tracker, mmap.mmap(handle, 0) as memory:
-        os.close(handle)
+    with socket.socket(fileno=descriptor) as end:
+        _warm_up(end)
+        _, handles, _, _ = socket.recv_fds(end, len(_HANDLE), 1)
+        if not handles:
+            return  # the tracker has ended
+        connection = end.detach()
+    with Connection(connection) as tracker, mmap.mmap(handles[0], 0) as memory:
+        os.close(handles[0])
         # the tracker closed its end of the socket
         with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
             try:
@@ -398,6 +387,14 @@ def serve(socket: int, handle: int) -> None:
                 tracker.send(_Failed(error, ""))
             except Exception:
                 tracker.send(_Failed(None, traceback.format_exc()))
+
+
+def _warm_up(end: socket.socket) -> None:
+    """Compile the kernels of the masks until the task arrives: the tracker's process imports meanwhile."""
+    for step in (ensure_runtime, prepare_kernels):
+        if select.select([end], [], [], 0)[0]:
+            return
+        step()
 
 
 def _serve(tracker: Connection, memory: mmap.mmap) -> None:

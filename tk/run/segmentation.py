@@ -104,6 +104,12 @@ def make_labeller(setup: Setup, source: Source, settings: Settings, note: Callab
         return one_thread()(_labeller(setup, source, settings, note))
 
 
+def prepare_kernels() -> None:
+    """Compile the kernels of the masks; otherwise each is compiled when it is first called."""
+    empty = np.zeros((1, 64, 64, 3), np.uint8)
+    CollinearityForeground.learn([empty], (64, 64), [(64, 64)]).label(empty)
+
+
 def _labeller(setup: Setup, source: Source, settings: Settings, note: Callable[[str], None]) -> Labeller:
     origin = mask_source(source)
     if origin == _GIVEN:
