@@ -72,13 +72,19 @@ def test_people_are_the_same_if_all_voxels_are_looked_at(bend: float, monkeypatc
     masks = drawn([(-0.9, -0.5), (0.8, 0.9)], rig=rig).any(axis=0)
     masks[1, 100:140] = False
     uncertain = masks | np.roll(masks, 6, axis=2)
-    some = PeopleFinder(rig, VOLUME, "z").find(masks, uncertain)
+    finder = PeopleFinder(rig, VOLUME, "z")
+    some = finder.find(masks, uncertain)
+    points, _ = finder.around(np.array([0.8, 0.9, 0.9]), 255 * masks.astype(np.uint8))
     monkeypatch.setattr("tk.model.people._touched", lambda mask, center, radius: np.ones(len(center), np.bool_))
     every = PeopleFinder(rig, VOLUME, "z").find(masks, uncertain)
     assert len(some) == len(every) > 0
     for a, b in zip(some, every, strict=True):
         np.testing.assert_array_equal(a.points, b.points)
         np.testing.assert_array_equal(a.share, b.share)
+    # without a search before: the voxels around a position do not depend on what was found
+    fresh, _ = PeopleFinder(rig, VOLUME, "z").around(np.array([0.8, 0.9, 0.9]), 255 * masks.astype(np.uint8))
+    assert len(points) > 100
+    np.testing.assert_array_equal(points, fresh)
 
 
 def test_nobody_is_found_in_empty_masks_and_specks() -> None:

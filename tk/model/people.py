@@ -254,20 +254,20 @@ class PeopleFinder:
         near = np.flatnonzero((np.abs(self._in_plan - at) <= (_HALF_M, _HALF_M, _HALF_HEIGHT_M)).all(axis=1))
         offset = self._step // 2
         small = masks[:, offset :: self._step, offset :: self._step].reshape(len(masks), -1)
-        values = np.take_along_axis(small, self._voxels.pixels[:, near], axis=1)
-        sees = self._voxels.sees[:, near]
-        hull = near[((values > 0) | ~sees).all(axis=0) & (((values >= 128) & sees).sum(axis=0) >= 2)]
-        moved = self._in_plan[hull] - at
+        flat, voxels = self._table.voxels(near)
+        values, sees = np.take_along_axis(small, voxels.pixels, axis=1), voxels.sees
+        hull = ((values > 0) | ~sees).all(axis=0) & (((values >= 128) & sees).sum(axis=0) >= 2)
+        moved = self._in_plan[flat[hull]] - at
         trunk = moved[np.linalg.norm(moved[:, :2], axis=1) < _STEP_M]
         if len(trunk):
             x, y = np.median(trunk[:, :2], axis=0)
             position = position + [x, y, (trunk[:, 2].min() + trunk[:, 2].max()) / 2] @ self._to_plan
-        return self._voxels.centers[hull], np.asarray(position)
+        return voxels.centers[hull], np.asarray(position)
 
     @cached_property
     def _in_plan(self) -> NDArray[np.float32]:
-        """(N, 3) m, centres of the voxels: two directions on the floor, and up."""
-        return (self._voxels.centers @ self._to_plan.T).astype(np.float32)
+        """(N, 3) m, centres of the grid's voxels: two directions on the floor, and up."""
+        return (self._grid.centers() @ self._to_plan.T).astype(np.float32)
 
     @property
     def voxel_m(self) -> float:
@@ -526,6 +526,8 @@ class _Table:
         self._sees = np.zeros((len(rig), grid.count), np.bool_)
         self._pixels = np.zeros((len(rig), grid.count), np.int32)
         self._known = np.zeros(grid.count, np.bool_)
+        height, width = (len(range(step // 2, side, step)) for side in rig.frame_shape)
+        self._shape = height, width  # of a reduced image
         self._blocks = tuple(-(-side // _BLOCK) for side in grid.shape)
         corner = np.array(grid.origin) + grid.voxel_m * (_BLOCK - 1) / 2
         centers = corner + grid.voxel_m * _BLOCK * np.indices(self._blocks).reshape(3, -1).T
@@ -548,9 +550,7 @@ class _Table:
             self._whole.append(known & (border > radius_px))
 
     def near_hull(self, shown: Bool, allowed: Bool, cameras: Sequence[int]) -> tuple[NDArray[np.int64], Voxels]:
-        """Return the flat indices (M,) of voxels in blocks that the cameras' hull may contain, and the voxels.
-
-        Voxels that fewer than two cameras see are left out.
+        """Return the voxels in blocks that the cameras' hull may contain, see :meth:`voxels`.
 
         Args:
             shown, allowed: (C, h, w) the masks without and with the uncertain pixels.
@@ -565,16 +565,18 @@ class _Table:
         blocks = ((count >= 2) & possible).reshape(self._blocks)
         for axis, side in enumerate(self._grid.shape):
             blocks = np.repeat(blocks, _BLOCK, axis=axis).take(range(side), axis=axis)
-        flat = np.flatnonzero(blocks)
+        return self.voxels(np.flatnonzero(blocks))
+
+    def voxels(self, flat: NDArray[np.int64]) -> tuple[NDArray[np.int64], Voxels]:
+        """Return those of the voxels with flat indices (N,) that two cameras or more see: indices (M,) and voxels."""
         new = flat[~self._known[flat]]
         if len(new):
             projected = Voxels.of(self._rig, self._grid.centers(new), self._grid.voxel_m, self._step)
             self._sees[:, new], self._pixels[:, new] = projected.sees, projected.pixels
             self._known[new] = True
         flat = flat[self._sees[:, flat].sum(axis=0) >= 2]
-        scale = np.zeros(len(self._rig))
         sees, pixels = self._sees[:, flat], self._pixels[:, flat]
-        return flat, Voxels(self._grid.centers(flat), sees, pixels, scale, (shown.shape[1], shown.shape[2]))
+        return flat, Voxels(self._grid.centers(flat), sees, pixels, np.zeros(len(self._rig)), self._shape)
 
 
 def _touched(mask: Bool, center: Float, radius: Float) -> Bool:
