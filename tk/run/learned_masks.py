@@ -150,7 +150,8 @@ class LearnedMasks:
         count = int(min(max(frames / self._fps / _STEP_S, _LEAST), most))
         if count < _LEAST:
             return []
-        return [begin + int((k + 0.5) * frames / count) for k in range(count)]
+        # both ends, because unknown pixels between two samples are safer than beyond the outermost
+        return [begin + (frames - 1) * k // (count - 1) for k in range(count)]
 
 
 def _edges(first: int, count: int | None, fps: float) -> list[int]:
