@@ -6,14 +6,16 @@ over it (:class:`~tk.segmenters.subject_masks.SubjectMasks`), and the empty scen
 scene is unknown, the segmenter's masks before and after the frame decide; where they differ, pixels are uncertain. The
 asked frames are also a check: between two of which one disagrees with the segmentation, the segmenter makes all masks.
 
-The masks of a frame depend on the recording alone, so `--resume` and `--frames` see the same masks. A source of unknown
-length cannot be sampled; there the segmenter makes all masks.
+The masks of a frame depend on the recording alone, so `--resume` and `--frames` see the same masks. In a source of
+unknown length the scene is learned from the frames asked for so far; until they are enough, the segmenter makes all
+masks.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left
-from collections.abc import Iterator
+from bisect import bisect_left, bisect_right
+from collections import deque
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -33,6 +35,8 @@ if TYPE_CHECKING:  # SciPy, which takes long to import
 
 Masks = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
+#: a frame's number, and the segmenter's masks and uncertain pixels
+_Asked = tuple[int, Masks, Bool]
 
 #: where the masks of a camera come from, as a result stores it
 LEARNED, LEARNED_AND_SEGMENTER, SEGMENTER = range(3)
@@ -41,6 +45,8 @@ MASK_SOURCES = ("learned scene", "learned scene and segmenter", "segmenter")
 # Seconds of a span, between asked frames, and least number of asked frames of a span. More often: dance, where the
 # trunk hardly moves, has masks with 2 to 5 % less surplus area at 0.5 s than at 0.67 s; walk has the same at 1 s.
 _SPAN_S, _STEP_S, _LEAST = 10.0, 0.5, 8
+# Asked frames that a source of unknown length is learned from, and how many come between two times of learning.
+_PAST, _EVERY = 16, 4
 # At most this share of the frames is asked for; a span with fewer than _LEAST such frames is segmented throughout.
 _SHARE = 0.16
 # Most bytes of a span's samples. With fewer samples, more of the scene is unknown.
@@ -90,14 +96,17 @@ class LearnedMasks:
         self._reading: Iterator[FrameSet] = iter(())
         self._next = -1
         self._open = ExitStack()
+        self._past: deque[tuple[Masks, _Asked]] = deque(maxlen=_PAST)
+        self._asked = 0
 
     def label(self, frame: FrameSet) -> tuple[Masks, Bool, NDArray[np.uint8]]:
         """Return masks (C, H, W), uncertain pixels (C, H, W), and where each camera's mask comes from (C,)."""
-        span = self._span_of(frame.index)
-        if span.foreground is None:
-            return *self._subject.label(frame.images), np.full(self._cameras, SEGMENTER, np.uint8)
-        before, after = span.around(frame.index)
-        asked = before is after and before.index == frame.index
+        span = self._follow(frame) if self._source.frame_count is None else self._span_of(frame.index)
+        before, after = span.around(frame.index) if span.samples else (None, None)
+        asked = before is not None and before is after and before.index == frame.index
+        if span.foreground is None or before is None or after is None:
+            found = (before.masks, before.uncertain) if before and asked else self._subject.label(frame.images)
+            return *found, np.full(self._cameras, SEGMENTER, np.uint8)
         masks, uncertain = span.foreground.label(frame.images, _between(before, after))
         kind = np.full(self._cameras, LEARNED_AND_SEGMENTER if asked else LEARNED, np.uint8)
         failed = ~(before.agrees & after.agrees)
@@ -108,16 +117,16 @@ class LearnedMasks:
         return self._subject.only_subject(masks), uncertain, kind
 
     def _span_of(self, index: int) -> _Span:
-        if not self._span.begin <= index < self._span.stop:
-            stop = next((edge for edge in self._edges[1:] if index < edge), None)
-            if stop is None:  # a source of unknown length, or frames beyond its end
-                return _Span(index, index + 1, None, ())
-            self._span = self._learn(self._edges[self._edges.index(stop) - 1], stop)
+        within = min(max(index, self._edges[0]), self._edges[-1] - 1)
+        if not self._span.begin <= within < self._span.stop:
+            k = bisect_right(self._edges, within)
+            self._span = self._learn(self._edges[k - 1], self._edges[k])
         return self._span
 
     def _learn(self, begin: int, stop: int) -> _Span:
         """Ask for the masks of a span's samples and learn its scene."""
-        images, samples = [], []
+        images: list[Masks] = []
+        samples: list[_Asked] = []
         chosen = set(self._chosen(begin, stop))
         if not chosen:
             return _Span(begin, stop, None, ())
@@ -131,16 +140,28 @@ class LearnedMasks:
             if frame.index + 1 >= stop:
                 break
         self._next = stop
+        foreground = self._foreground(images, samples)
+        checked = tuple(_checked(foreground, *pair) for pair in zip(images, samples, strict=True))
+        return _Span(begin, stop, foreground, checked)
+
+    def _follow(self, frame: FrameSet) -> _Span:
+        """Ask for the masks of a frame of a source of unknown length if the last time is long ago; return what is
+        learned so far, with the last sample."""
+        if frame.index < self._span.stop:
+            return self._span
+        sample = (frame.index, *self._subject.label(frame.images))
+        self._past.append((frame.images.copy(), sample))
+        self._asked += 1
+        foreground = self._span.foreground
+        if self._asked >= _LEAST and self._asked % _EVERY == 0:
+            foreground = self._foreground([image for image, _ in self._past], [each for _, each in self._past])
+        checked = _checked(foreground, frame.images, sample)
+        self._span = _Span(frame.index, frame.index + max(round(_STEP_S * self._fps), 1), foreground, (checked,))
+        return self._span
+
+    def _foreground(self, images: Sequence[Masks], samples: Sequence[_Asked]) -> CollinearityForeground:
         scene = LearnedScene.learn(images, [s[1] for s in samples], [s[2] for s in samples])
-        foreground = CollinearityForeground.of_learned(scene, self._sizes, self._settings.foreground)
-        checked = []
-        for picture, (index, masks, uncertain) in zip(images, samples, strict=True):
-            found = foreground.label(picture, (masks, uncertain))[0]
-            one = np.count_nonzero((found > 0) != (masks > 0), axis=(1, 2))
-            checked.append(
-                _Sample(index, masks, uncertain, one <= _DISAGREE * np.count_nonzero(found | masks, axis=(1, 2)))
-            )
-        return _Span(begin, stop, foreground, tuple(checked))
+        return CollinearityForeground.of_learned(scene, self._sizes, self._settings.foreground)
 
     def _chosen(self, begin: int, stop: int) -> list[int]:
         """Return the frames of a span that the segmenter is asked for; none if they would be too many or too few."""
@@ -152,6 +173,16 @@ class LearnedMasks:
             return []
         # both ends, because unknown pixels between two samples are safer than beyond the outermost
         return [begin + (frames - 1) * k // (count - 1) for k in range(count)]
+
+
+def _checked(foreground: CollinearityForeground | None, images: Masks, asked: _Asked) -> _Sample:
+    """Return a sample, compared with the segmentation of its images against the learned scene."""
+    index, masks, uncertain = asked
+    if foreground is None:
+        return _Sample(index, masks, uncertain, np.zeros(len(masks), np.bool_))
+    found = foreground.label(images, (masks, uncertain))[0]
+    one, either = (np.count_nonzero(pixels, axis=(1, 2)) for pixels in (found ^ masks, found | masks))
+    return _Sample(index, masks, uncertain, one <= _DISAGREE * either)
 
 
 def _edges(first: int, count: int | None, fps: float) -> list[int]:
