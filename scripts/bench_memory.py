@@ -1,16 +1,19 @@
 """Whether memory stays flat over a long recording.
 
-    python -m scripts.bench_memory [--frames 10000] [--every 1000] [--causal]
+    python -m scripts.bench_memory [--capture CAPTURE] [--frames 10000] [--every 1000] [--scale 0.375] [--causal]
 
-The demo's videos, made small, run forwards and backwards until there are as many frames. They are tracked, and what
-the tracker and the process ahead of it hold is reported every so many frames, and after the second pass. Linux only.
+A capture's videos (the demo's by default), made small, run forwards and backwards until there are as many frames. They
+are tracked, and what the tracker and the process ahead of it hold is reported every so many frames, and with the time
+at the begin of each later stage. Linux only. A capture with [init] pose = "any" shows the whole second pass.
 """
 
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import tempfile
+import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -30,14 +33,12 @@ from tk.settings import Settings
 from tk.trackers.protocol import Estimate
 
 DEMO = Path(__file__).resolve().parents[1] / "tk" / "data" / "demo"
-#: of the demo's pictures, along each side
-SCALE = 0.375
 
 
-def _smaller(camera: Camera) -> Camera:
-    width, height = round(SCALE * camera.width), round(SCALE * camera.height)
+def _smaller(camera: Camera, scale: float) -> Camera:
+    width, height = round(scale * camera.width), round(scale * camera.height)
     half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # pixel centres lie at integers
-    matrix = np.linalg.inv(half) @ np.diag([SCALE, SCALE, 1.0]) @ half @ camera.matrix
+    matrix = np.linalg.inv(half) @ np.diag([scale, scale, 1.0]) @ half @ camera.matrix
     return replace(camera, width=width, height=height, matrix=matrix)
 
 
@@ -47,12 +48,12 @@ def _shrink(pictures: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
     return np.array([cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in pictures])
 
 
-def make_loop(folder: Path, count: int) -> Capture:
-    """A capture of ``count`` frames."""
-    demo = open_capture(DEMO, masks="none")
-    rig = Rig(tuple(_smaller(camera) for camera in demo.rig))
+def make_loop(folder: Path, count: int, source: Path = DEMO, scale: float = 0.375) -> Capture:
+    """A capture of ``count`` frames, made of another one's, each side of an image ``scale`` times as long."""
+    demo = open_capture(source, masks="none")
+    rig = Rig(tuple(_smaller(camera, scale) for camera in demo.rig))
     write_calibration(rig, folder / "calibration.toml")
-    (folder / "capture.toml").write_bytes((DEMO / "capture.toml").read_bytes())
+    (folder / "capture.toml").write_bytes((source / "capture.toml").read_bytes())
     with demo.frames() as frames:
         sets = np.array([[_shrink(image[None], c)[0] for image, c in zip(f.images, rig, strict=True)] for f in frames])
     there = np.arange(len(sets))
@@ -74,6 +75,12 @@ def make_loop(folder: Path, count: int) -> Capture:
     return open_capture(folder)
 
 
+def peak_mib() -> float:
+    """The most that this process has held in memory, MiB."""
+    fields = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return int(fields["VmHWM"].split()[0]) / 1024
+
+
 def held_mib(process: int | str = "self") -> float:
     """What a process holds, MiB: in memory, and the part that the system has swapped out."""
     fields = dict(line.split(":", 1) for line in Path(f"/proc/{process}/status").read_text().splitlines())
@@ -85,11 +92,17 @@ def _children() -> list[int]:
     return sorted(int(pid) for task in tasks for pid in (task / "children").read_text().split())
 
 
-class MemoryReport(Silent):
-    """Report the memory held."""
+class MemoryReport(Silent, logging.Handler):
+    """Report the memory held, and the time of each stage."""
 
     def __init__(self, every: int) -> None:
-        self._every, self._count = every, 0
+        logging.Handler.__init__(self, logging.INFO)
+        self._every, self._count, self._begun = every, 0, time.perf_counter()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        passed = time.perf_counter() - self._begun
+        held = f"{held_mib():.1f} MiB, at most {peak_mib():.1f} until now"
+        print(f"[{passed:6.1f} s] {record.getMessage()}: tracker {held}", flush=True)
 
     def advance(self, frame: int, estimate: Estimate | None) -> None:
         self._count += 1
@@ -100,18 +113,26 @@ class MemoryReport(Silent):
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--capture", type=Path, default=DEMO)
+    parser.add_argument("--scale", type=float, default=0.375)
     parser.add_argument("--frames", type=int, default=10000)
     parser.add_argument("--every", type=int, default=1000)
     parser.add_argument("--causal", action="store_true", help="without the second pass")
     chosen = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as scratch:
         os.mkdir(folder := Path(scratch) / "loop")
-        capture = make_loop(folder, chosen.frames)
+        capture = make_loop(folder, chosen.frames, chosen.capture, chosen.scale)
         print(f"{len(capture.rig)} cameras of {capture.rig[0].width}×{capture.rig[0].height}", flush=True)
-        done = session.track(
-            capture, Path(scratch) / "loop.h5", Settings(), MemoryReport(chosen.every), causal=chosen.causal
+        Path("/proc/self/clear_refs").write_text("5")  # the peak begins here
+        report, log = MemoryReport(chosen.every), logging.getLogger("tk")
+        log.addHandler(report)
+        log.setLevel(logging.INFO)
+        done = session.track(capture, Path(scratch) / "loop.h5", Settings(), report, causal=chosen.causal)
+        log.removeHandler(report)
+        print(
+            f"{done.frames} frames in {done.seconds:.0f} s, {done.lost} lost; at the end {held_mib():.1f} MiB, at most "
+            f"{peak_mib():.1f}"
         )
-        print(f"{done.frames} frames in {done.seconds:.0f} s, {done.lost} lost; at the end {held_mib():.1f} MiB")
 
 
 if __name__ == "__main__":

@@ -89,6 +89,17 @@ def test_time_left_includes_later_stages() -> None:
         assert 0.5 * 25 * each < left < 1.5 * 25 * each, "five frames and twice ten"
 
 
+def test_time_left_follows_from_the_share_of_a_stage_that_is_done() -> None:
+    with ConsoleReporter(console=terminal()) as reporter:
+        reporter.stage("second pass")
+        begin = time.perf_counter()
+        time.sleep(0.05)
+        reporter.within(0.2)
+        left, passed = reporter.seconds_left(), time.perf_counter() - begin
+        assert left is not None
+        assert 0.5 * 4 * passed < left <= 4 * passed, "a fifth is done"
+
+
 def test_long_stage_shows_that_it_goes_on(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tk.commands.console._PERIOD_S", 0.05)
     with ConsoleReporter() as reporter:

@@ -181,6 +181,9 @@ class _Reporter:
         if time.monotonic() - self._sent > _PERIOD_S or self._done == self._total:
             self._send()
 
+    def within(self, share: float) -> None:
+        pass
+
     def _send(self, begins: bool = False) -> None:
         self._sent = time.monotonic()
         self._send_message({"name": self._name, "done": self._done, "total": self._total, "begins": begins})

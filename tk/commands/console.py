@@ -72,9 +72,12 @@ class ConsoleReporter(_Notes):
         quiet: print notes only, no progress.
         console: where to print; stderr by default.
         later: duration of the stages after the last frame, as a multiple of the duration of all frames.
+        last: the part of ``later`` of the stages whose progress is not reported.
     """
 
-    def __init__(self, quiet: bool = False, console: Console | None = None, later: float = 0.0) -> None:
+    def __init__(
+        self, quiet: bool = False, console: Console | None = None, later: float = 0.0, last: float = 0.0
+    ) -> None:
         super().__init__(console)
         self._quiet = quiet
         self._handler = logging.Handler(logging.INFO)
@@ -82,8 +85,9 @@ class ConsoleReporter(_Notes):
         self._live: Progress | None = None
         self._lost = self._count = self._done = self._total = 0
         self._begun = self._started = self._last = time.perf_counter()
-        self._later, self._end = later, float("-inf")
-        self._stage = ""
+        self._later, self._last_stages, self._last_s = later, last, 0.0
+        self._end = float("-inf")
+        self._stage, self._stage_begun = "", self._begun
         self._closed = threading.Event()
 
     def __enter__(self) -> ConsoleReporter:
@@ -127,7 +131,7 @@ class ConsoleReporter(_Notes):
         """Show what is being done from now on."""
         if self._quiet:
             return
-        self._stage = text
+        self._stage, self._stage_begun = text, time.perf_counter()
         if not self._console.is_terminal:
             self._print(text)
             return
@@ -163,6 +167,7 @@ class ConsoleReporter(_Notes):
             rate = f"{speed:.1f} frames/s"
             if self._total:
                 self._end = now + (self._total - made + self._later * self._total) / speed
+                self._last_s = self._last_stages * self._total / speed
         lost = f"{self._lost} lost" if self._lost else ""
         if self._console.is_terminal:
             if self._count == 1:
@@ -175,6 +180,11 @@ class ConsoleReporter(_Notes):
             left = "" if seconds is None else f"about {seconds:.0f} s left"
             progress = ", ".join(part for part in (rate, left, lost) if part)
             click.echo(f"frame {frame}: {made}/{self._total}, {progress}", err=True)
+
+    def within(self, share: float) -> None:
+        """Estimate the time left from the share of the current stage that is done."""
+        now = time.perf_counter()
+        self._end = now + (now - self._stage_begun) * (1 / share - 1) + self._last_s
 
     def _start_bar(self) -> None:
         self._stop()

@@ -23,7 +23,7 @@ def demo(output: Path, voxels: int | None, resume: bool, force: bool, no_report:
     from importlib.resources import as_file, files
 
     with as_file(files("tk") / "data" / "demo") as folder:
-        with ConsoleReporter(quiet, later=later_stages(causal=False, no_report=no_report)) as reporter:
+        with ConsoleReporter(quiet, None, *later_stages(causal=False, no_report=no_report)) as reporter:
             reporter.stage("loading")
             from tk.evaluation.joints import evaluate_files
             from tk.io.captures.capture import open_capture

@@ -61,7 +61,7 @@ def track(
     An overlay video (RESULT.mp4) and a report (RESULT.html) are written next to it.
     """
     span = base.parse_frames(options.frames)
-    reporter = ConsoleReporter(quiet, later=later_stages(options.causal, no_report))
+    reporter = ConsoleReporter(quiet, None, *later_stages(options.causal, no_report))
     with reporter, started_early():
         reporter.stage("loading")
         from tk.io.importers import open_recording
@@ -82,9 +82,10 @@ def track(
     end(output, summary, quiet, as_json)
 
 
-def later_stages(causal: bool, no_report: bool) -> float:
-    """Return the duration of what follows the first pass as a multiple of its duration."""
-    return (0.0 if causal else _SECOND_PASS) + (0.0 if no_report else _PICTURES)
+def later_stages(causal: bool, no_report: bool) -> tuple[float, float]:
+    """Return the duration of what follows the first pass, and of the pictures, as multiples of its duration."""
+    pictures = 0.0 if no_report else _PICTURES
+    return (0.0 if causal else _SECOND_PASS) + pictures, pictures
 
 
 def draw_video_and_report(

@@ -49,10 +49,12 @@ def finish(
     contacts: Sequence[Contact],
     masks: MaskStores | None,
     note: Note,
+    within: Callable[[float], None],
     finished: Container[int] = (),
 ) -> None:
     """Write what needs all frames, see :func:`_finish`, for the people who are not ``finished``, after people who were
-    mixed up are exchanged. Person 0 decides whether the cameras are refined."""
+    mixed up are exchanged. Person 0 decides whether the cameras are refined. ``within`` receives the share of a long
+    stage that is done."""
     cameras = UsedCameras(plan.setup.rig, np.array(plan.source.time_offset_s))
     if finished:  # the first pass of a finished person is gone
         contacts = [replace(c, outcome=UNCLEAR) if c.outcome == EXCHANGED else c for c in contacts]
@@ -72,7 +74,8 @@ def finish(
             continue
         store, result = None if masks is None else masks[member.number], results[member.number]
         changed = [] if result is found[member.number] else list(COLUMNS)
-        cameras = _finish(output, plan, member, result, changed, contacts, store, note, cameras, len(people) == 1)
+        alone = len(people) == 1
+        cameras = _finish(output, plan, member, result, changed, contacts, store, note, cameras, alone, within)
 
 
 def _finish(
@@ -86,6 +89,7 @@ def _finish(
     note: Note,
     cameras: UsedCameras,
     alone: bool,
+    within: Callable[[float], None],
 ) -> UsedCameras:
     """Write what needs all frames of a person: the second pass; segments, feet and angles; the smoothed copy; cameras.
 
@@ -107,7 +111,6 @@ def _finish(
     if again is not None and missing and not alone:
         note(f"person {member.number}: the second pass is omitted, because an earlier run kept no masks of each person")
     elif again is not None and masks is not None:
-        _LOG.info("second pass")
         assert result.residual is not None
         if missing:  # frames that an earlier run has tracked
             with open_observations(plan.setup, plan.source, plan.settings, lambda _: None) as observations:
@@ -117,18 +120,20 @@ def _finish(
             late = np.round((cameras.time_offset_s - plan.source.time_offset_s) * fps).astype(np.int64)
             again, masks = again.with_cameras(cameras.rig), retimed(masks, result.frames, late)
         elif plan.settings.refine:
+            _LOG.info("second pass: comparing the cameras")
             refined = refine_if_inconsistent(again, masks, result.frames, poses, ~lost, note)
             if refined is not None:
                 again, masks, offsets = refined
                 cameras = UsedCameras(again.rig, cameras.time_offset_s + offsets / fps)
                 if np.round(offsets).any() and alone:
                     note("tracking again: the images of the first pass were not synchronised")
-                    found = _track_again(plan, again, cameras, result.frames, poses)
+                    found = _track_again(plan, again, cameras, result.frames, poses, within)
                     rows = np.flatnonzero(np.isin(result.frames, list(found)))
                     estimates = [found[int(frame)] for frame in result.frames[rows]]
                     poses[rows] = [e.pose for e in estimates]
                     lost[rows] = [e.status == "lost" for e in estimates]
                     columns |= _replaced(result, rows, estimates)
+        _LOG.info("second pass")
         assert result.sigma is not None
         before = columns.get("joints/sigma", result.sigma)
         poses, columns["residual"], precise = again.second_pass(
@@ -141,6 +146,7 @@ def _finish(
             # in the initialisation pose every limb is visible; other first poses may hide limbs
             keep_body=subject.body is not None or (subject.init is None and subject.in_init_pose),
             keep_cameras=cameras.rig is plan.setup.rig,
+            report=within,
         )
         # a much larger sigma of the first pass, or NaN: it tracked several poses, or did not find a limb
         columns["joints/sigma"] = np.where(before <= _LESS_SURE * precise, precise, before)
@@ -186,7 +192,12 @@ def report_suspect(frames: Sequence[int] | NDArray[np.int64], note: Callable[[st
 
 
 def _track_again(
-    plan: Plan, tracker: TwoPassTracker, cameras: UsedCameras, frames: NDArray[np.int64], poses: Float
+    plan: Plan,
+    tracker: TwoPassTracker,
+    cameras: UsedCameras,
+    frames: NDArray[np.int64],
+    poses: Float,
+    within: Callable[[float], None],
 ) -> dict[int, Estimate]:
     """Return estimates, by frame, of the frames (F,) of which every synchronised camera has an image; none if the
     source cannot be read again.
@@ -202,8 +213,12 @@ def _track_again(
         return {}
     tracker.start_at(poses[np.searchsorted(frames, begin)])
     setup = replace(plan.setup, rig=cameras.rig)
+    found = {}
     with open_observations(setup, source, plan.settings, lambda _: None) as observations:
-        return {observation.index: tracker.step(observation) for observation, _ in observations.frames(begin, stop)}
+        for o, _ in observations.frames(begin, stop):
+            found[o.index] = replace(tracker.step(o), masks=None, drawn=None)  # these are large
+            within((o.index + 1 - begin) / (stop - begin))
+    return found
 
 
 def _replaced(result: Result, rows: NDArray[np.int64], estimates: Sequence[Estimate]) -> dict[str, NDArray[Any]]:

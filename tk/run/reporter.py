@@ -22,6 +22,10 @@ class Reporter(Protocol):
         """Receive a finished frame; ``estimate`` is None if the run estimates no pose."""
         ...
 
+    def within(self, share: float) -> None:
+        """Receive the share of the current stage, after the last frame, that is done."""
+        ...
+
 
 class Silent:
     """A reporter that ignores everything; others derive from it."""
@@ -33,4 +37,7 @@ class Silent:
         pass
 
     def advance(self, frame: int, estimate: Estimate | None) -> None:
+        pass
+
+    def within(self, share: float) -> None:
         pass

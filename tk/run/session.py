@@ -179,7 +179,8 @@ def track_source(
                 for line in run.people.report():
                     note(line)
                 with one_thread():
-                    finish(output, plan, run.people.members, run.people.contacts, masks, note, run.finished)
+                    contacts = run.people.contacts
+                    finish(output, plan, run.people.members, contacts, masks, note, reporter.within, run.finished)
                 if said:
                     revise_result(output, notes=said)
             stores.remove()

@@ -463,3 +463,11 @@ def test_z_is_the_default_and_leaves_the_body_frame():
 def test_unknown_up_is_named(up):
     with pytest.raises(ConfigError, match="must be one of x, y, z"):
         up_rotation(up)
+
+
+def test_poses_of_a_long_recording_are_placed_like_single_ones(monkeypatch):
+    poses = np.array([random_pose(seed) for seed in range(7)])
+    joints, transforms = SKELETON.joints(poses), SKELETON.segment_transforms(poses)
+    monkeypatch.setattr("tk.model.body.skeleton._BLOCK", 3)
+    np.testing.assert_array_equal(SKELETON.joints(poses), joints)
+    np.testing.assert_array_equal(SKELETON.segment_transforms(poses), transforms)

@@ -56,6 +56,14 @@ def test_noise_of_a_still_person_is_reduced() -> None:
     assert np.sqrt(((found.poses - true) ** 2).mean()) < 0.5 * NOISE
 
 
+@pytest.mark.parametrize("block", [1, 7, 400])
+def test_result_does_not_depend_on_the_frames_kept_at_once(monkeypatch: pytest.MonkeyPatch, block: int) -> None:
+    poses, known = noisy(motion(60)), np.arange(60) % 11 > 0
+    whole = smooth(SKELETON, poses, known, FPS)
+    monkeypatch.setattr(smoothing, "_BLOCK", block)
+    np.testing.assert_array_equal(smooth(SKELETON, poses, known, FPS).poses, whole.poses)
+
+
 def test_short_gaps_are_bridged_and_long_ones_left() -> None:
     true = motion()
     known = np.ones(len(true), bool)

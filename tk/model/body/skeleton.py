@@ -53,6 +53,8 @@ Float = NDArray[np.float64]
 
 # Single poses whose transforms are kept.
 REMEMBERED = 8
+# Poses of a recording that are placed at once: a pose needs 16 kB of temporary memory.
+_BLOCK = 1024
 
 
 @dataclass(frozen=True)
@@ -219,10 +221,14 @@ class Skeleton:
 
     def segment_transforms(self, pose: Float) -> Float:
         """(..., S, 4, 4) transforms of the segments."""
+        if np.ndim(pose) == 2 and len(pose) > _BLOCK:
+            return np.concatenate([self.segment_transforms(block) for block in blocks(pose)])
         return self.transforms(pose)[..., self.segment_dof, :, :]
 
     def joints(self, pose: Float) -> Float:
         """(..., J, 3) joint centres in the world frame at poses (..., D), metres, in the order of :data:`JOINTS`."""
+        if np.ndim(pose) == 2 and len(pose) > _BLOCK:
+            return np.concatenate([self.joints(block) for block in blocks(pose)])
         T = self.segment_transforms(pose)[..., self.joint_segment, :, :]
         return np.asarray((T[..., :3, :3] @ self.joint_position[:, :, None])[..., 0] + T[..., :3, 3])
 
@@ -246,6 +252,11 @@ class Skeleton:
     def chain_dofs(self, chain: str) -> NDArray[np.bool_]:
         """(D,) True for the degrees of freedom of one of :data:`CHAINS`; the torso's are in none of them."""
         return np.isin(self.names, [name for row in TABLE if row.chain == chain for name in row.dof_names])
+
+
+def blocks(poses: Float) -> list[Float]:
+    """Return poses (F, D) in pieces of at most :data:`_BLOCK`."""
+    return [poses[i : i + _BLOCK] for i in range(0, max(len(poses), 1), _BLOCK)]
 
 
 def shoulder_angles(direction: Float) -> tuple[float, float]:

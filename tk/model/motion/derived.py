@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tk.model.body.angles import joint_angles, standing_rotations
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.rotations import to_quaternions
-from tk.model.body.skeleton import Skeleton
+from tk.model.body.skeleton import Skeleton, blocks
 from tk.model.motion.segments import foot_points, joint_positions
 
 Float = NDArray[np.float64]
@@ -38,6 +38,16 @@ class Derived:
 
 def derive(skeleton: Skeleton, dimensions: BodyDimensions, poses: Float) -> Derived:
     """Return the quantities derived from finite poses (F, D)."""
+    pieces = [_derive(skeleton, dimensions, block) for block in blocks(poses)]
+    return Derived(
+        joints=np.concatenate([piece.joints for piece in pieces]),
+        rotations=np.concatenate([piece.rotations for piece in pieces]),
+        feet=np.concatenate([piece.feet for piece in pieces]),
+        angles={name: np.concatenate([piece.angles[name] for piece in pieces]) for name in pieces[0].angles},
+    )
+
+
+def _derive(skeleton: Skeleton, dimensions: BodyDimensions, poses: Float) -> Derived:
     T = skeleton.segment_transforms(poses)
     R = standing_rotations(skeleton, T)
     return Derived(

@@ -33,6 +33,8 @@ _RATIOS = np.geomspace(1e-3, 10.0, 17)
 MOTION_HZ = 6.0
 # Standard deviation of the unknown initial velocity, in units of the measurement noise per frame; in effect infinite.
 _UNKNOWN = 1e3
+# Frames whose filter states are kept at once, 2.5 kB each: of the others those at the begin of every block are.
+_BLOCK = 512
 # Frames. Shorter sections have too few measurements to estimate noise; they stay unchanged.
 SHORTEST = 8
 
@@ -119,7 +121,7 @@ def _noise(pieces: list[tuple[Float, Bool]]) -> tuple[Float, Float]:
     squares, logs, count = np.zeros(len(ratio)), np.zeros(len(ratio)), 0
     for values, seen in pieces:
         judged = np.flatnonzero(seen)[2:]  # the first two initialise the filter
-        for f, step in enumerate(_filter(np.tile(values, len(_RATIOS)), seen, ratio)):
+        for f, step in enumerate(_filter(values, seen, ratio)):
             if seen[f] and f >= judged[0]:
                 squares += step.innovation**2 / step.variance
                 logs += np.log(step.variance)
@@ -142,36 +144,51 @@ class _Step:
     variance: Float  # (N,) expected square of innovation
 
 
-def _filter(values: Float, seen: Bool, ratio: Float) -> Iterator[_Step]:
-    """Filter values (F, N) forward, with the noise ratio (N,) of each series."""
-    series = values.shape[1]
+def _filter(values: Float, seen: Bool, ratio: Float, before: _Step | None = None) -> Iterator[_Step]:
+    """Filter values (F, N) forward, with noise ratios (R N,): R for each series, all of the first ratio come first.
+
+    ``before``: the step of the frame before the first; None: the filter begins here.
+    """
+    copies = len(ratio) // values.shape[1]
     q = ratio**2 * np.array([[1 / 3], [1 / 2], [1.0]])  # covariance of white acceleration over one frame: xx, xv, vv
-    x, v = values[0], np.zeros(series)
-    xx, xv, vv = np.ones(series), np.zeros(series), np.full(series, _UNKNOWN**2)
-    for f in range(len(values)):
-        if f:
+    for f, row in enumerate(values):
+        measured = np.tile(row, copies)
+        if before is None:
+            x, v = measured, np.zeros(len(ratio))
+            xx, xv, vv = np.ones(len(ratio)), np.zeros(len(ratio)), np.full(len(ratio), _UNKNOWN**2)
+        else:
+            (x, v), (xx, xv, vv) = before.state, before.covariance
             x, (xx, xv, vv) = x + v, (xx + 2 * xv + vv + q[0], xv + vv + q[1], vv + q[2])
         predicted, predicted_covariance = np.array([x, v]), np.array([xx, xv, vv])
-        innovation, variance = values[f] - x, xx + 1
-        if seen[f] and f:
+        innovation, variance = measured - x, xx + 1
+        if seen[f] and before is not None:
             x, v = x + xx / variance * innovation, v + xv / variance * innovation
             xx, xv, vv = xx / variance, xv / variance, vv - xv**2 / variance
-        yield _Step(predicted, predicted_covariance, np.array([x, v]), np.array([xx, xv, vv]), innovation, variance)
+        before = _Step(predicted, predicted_covariance, np.array([x, v]), np.array([xx, xv, vv]), innovation, variance)
+        yield before
 
 
 def _smooth(values: Float, seen: Bool, ratio: Float) -> Float:
     """Return the smoothed values (F, N): filter forward, then smooth backward with the Rauch-Tung-Striebel gain."""
-    steps = list(_filter(values, seen, ratio))
-    x, v = steps[-1].state
-    smoothed = [x]
-    for step, after in zip(steps[-2::-1], steps[:0:-1], strict=True):
-        xx, xv, vv = step.covariance
-        pxx, pxv, pvv = after.predicted_covariance
-        dx, dv = x - after.predicted[0], v - after.predicted[1]
-        # the gain P Fᵀ P⁻¹ with F = [[1, 1], [0, 1]]: first P⁻¹ (…), then P Fᵀ
-        determinant = pxx * pvv - pxv**2
-        a, b = (pvv * dx - pxv * dv) / determinant, (pxx * dv - pxv * dx) / determinant
-        x = step.state[0] + (xx + xv) * a + xv * b
-        v = step.state[1] + (xv + vv) * a + vv * b
-        smoothed.append(x)
-    return np.array(smoothed[::-1])
+    begins = range(0, len(values), _BLOCK)
+    # the last step of every block; its blocks are filtered again on the way back
+    ends = [
+        step for f, step in enumerate(_filter(values, seen, ratio)) if (f + 1) % _BLOCK == 0 or f + 1 == len(values)
+    ]
+    x, v = ends[-1].state
+    smoothed, after = np.empty(values.shape), None
+    for begin, before in zip(reversed(begins), [*ends[-2::-1], None], strict=True):
+        block = slice(begin, begin + _BLOCK)
+        steps = list(_filter(values[block], seen[block], ratio, before))
+        for f, step in zip(range(begin + len(steps) - 1, begin - 1, -1), reversed(steps), strict=True):
+            if after is not None:
+                xx, xv, vv = step.covariance
+                pxx, pxv, pvv = after.predicted_covariance
+                dx, dv = x - after.predicted[0], v - after.predicted[1]
+                # the gain P Fᵀ P⁻¹ with F = [[1, 1], [0, 1]]: first P⁻¹ (…), then P Fᵀ
+                determinant = pxx * pvv - pxv**2
+                a, b = (pvv * dx - pxv * dv) / determinant, (pxx * dv - pxv * dx) / determinant
+                x = step.state[0] + (xx + xv) * a + xv * b
+                v = step.state[1] + (xv + vv) * a + vv * b
+            smoothed[f], after = x, step
+    return smoothed
