@@ -91,8 +91,8 @@ def test_time_left_includes_later_stages() -> None:
 
 def test_time_left_follows_from_the_share_of_a_stage_that_is_done() -> None:
     with ConsoleReporter(console=terminal()) as reporter:
-        reporter.stage("second pass")
         begin = time.perf_counter()
+        reporter.stage("second pass")
         time.sleep(0.05)
         reporter.within(0.2)
         left, passed = reporter.seconds_left(), time.perf_counter() - begin

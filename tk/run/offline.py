@@ -145,7 +145,8 @@ def _finish(
             subject.height_m,
             # in the initialisation pose every limb is visible; other first poses may hide limbs
             keep_body=subject.body is not None or (subject.init is None and subject.in_init_pose),
-            keep_cameras=cameras.rig is plan.setup.rig,
+            # people who were exchanged have poses of another body
+            keep_cameras=cameras.rig is plan.setup.rig and not changed,
             report=within,
         )
         # a much larger sigma of the first pass, or NaN: it tracked several poses, or did not find a limb
