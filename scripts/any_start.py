@@ -23,6 +23,7 @@ from scripts.synthetic.keypoints import write_keypoints
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.results.reader import read_joints, read_result
 from tk.io.results.status import Status
+from tk.run.reporter import Silent
 from tk.run.session import track
 from tk.settings import Settings
 
@@ -33,7 +34,7 @@ FROM = 22
 STARTS = ("normal", "cut", "cut, no height", "cut, keypoints")
 
 
-class Quiet:
+class Quiet(Silent):
     """A reporter that records the notes."""
 
     def __init__(self) -> None:
@@ -41,12 +42,6 @@ class Quiet:
 
     def note(self, text: str) -> None:
         self.notes.append(text)
-
-    def begin(self, total: int, done: int) -> None:
-        pass
-
-    def advance(self, frame: int, estimate: object) -> None:
-        pass
 
 
 def starts(capture: Capture, keypoints: Path) -> dict[str, Capture]:

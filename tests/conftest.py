@@ -196,3 +196,6 @@ class Silent:
 
     def advance(self, frame: int, estimate: object) -> None:
         self.frames.append(frame)
+
+    def within(self, share: float) -> None:
+        assert 0 < share <= 1
