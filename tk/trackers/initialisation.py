@@ -9,6 +9,8 @@ person faces: feet, knees and elbows bend one way, and people walk forwards.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
+from operator import itemgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -94,10 +96,11 @@ def find_person(
         CaptureError: fewer than two cameras see anybody in the first frame, or no pose explains what they see.
     """
     if pose is not None:
-        return [_follow(tracker, frames, pyramids, _searched(tracker, frames[0], pyramids[0], pose), 0)]
+        return _follow(tracker, frames, pyramids, [_searched(tracker, frames[0], pyramids[0], pose)], 0)
     skeleton = tracker.body.skeleton
     hypotheses: list[TrajectoryHypothesis] = []
     alternatives: list[tuple[int, int, Float, float]] = []  # rank in its anchor, anchor, pose, handicap
+    clear: list[tuple[int, Float, float]] = []  # anchor, pose, handicap
     least = np.inf
     for anchor in np.unique(np.linspace(0, len(frames) - 1, ANCHORS).astype(int)):
         try:
@@ -114,19 +117,22 @@ def find_person(
             alternatives.append((rank, int(anchor), pose, 1.0 if turned else HANDICAP))
         if _contains(skeleton, hypotheses, anchor, poses[0]):
             break  # found from two frames
-        hypotheses.append(_follow(tracker, frames, pyramids, poses[0], anchor))
+        if residual < CLEAR and not hypotheses:
+            clear = [(int(anchor), poses[0], 1.0)]  # followed with its alternatives: no other anchor is needed
+            break
+        hypotheses += _follow(tracker, frames, pyramids, poses[:1], anchor)
         if residual < CLEAR:
             break
-    if not hypotheses:
+    if not hypotheses and not clear:
         raise CaptureError(
             f"no pose of a person explains the masks: the best one leaves {least:.0%} of their pixels unexplained; "
             "check that the masks show one whole person, and the calibration"
         )
     likeliest = sorted(range(len(alternatives)), key=lambda i: alternatives[i][0])[:FOLLOWED]
-    for i in sorted(likeliest):
-        _, anchor, pose, handicap = alternatives[i]
-        if not _contains(skeleton, hypotheses, anchor, pose):
-            hypotheses.append(_follow(tracker, frames, pyramids, pose, anchor)._replace(handicap=handicap))
+    for anchor, group in groupby([*clear, *(alternatives[i][1:] for i in sorted(likeliest))], itemgetter(0)):
+        new = [(pose, handicap) for _, pose, handicap in group if not _contains(skeleton, hypotheses, anchor, pose)]
+        followed = _follow(tracker, frames, pyramids, [pose for pose, _ in new], anchor)
+        hypotheses += [one._replace(handicap=handicap) for one, (_, handicap) in zip(followed, new, strict=True)]
     hypotheses.sort(key=lambda hypothesis: hypothesis.cost)
     least = min(hypothesis.residual for hypothesis in hypotheses)
     kept: list[TrajectoryHypothesis] = []
@@ -165,32 +171,40 @@ def _find(tracker: ContourTracker, frame: Observation, pyramid: Pyramid) -> tupl
 
 
 def _follow(
-    tracker: ContourTracker, frames: Sequence[Observation], pyramids: Sequence[Pyramid], pose: Float, anchor: int
-) -> TrajectoryHypothesis:
-    """Return the trajectory that follows from a pose (D,) in frame ``anchor``, tracked to both ends of the frames."""
+    tracker: ContourTracker,
+    frames: Sequence[Observation],
+    pyramids: Sequence[Pyramid],
+    starts: Sequence[Float],
+    anchor: int,
+) -> list[TrajectoryHypothesis]:
+    """Return the trajectories that follow from poses (D,) in frame ``anchor``, tracked to both ends of the frames."""
+    if not starts:
+        return []
     F = len(frames)
-    poses = np.tile(pose, (F, 1))
-    residuals = np.full(F, np.nan)
+    poses = np.tile(np.array(starts)[:, None], (1, F, 1))
+    residuals = np.full((len(starts), F), np.nan)
 
-    def residual_of(i: int, pose: Float) -> float:
-        return float(tracker.mean_residual(pyramids[i], pose[None], frames[i].uncertain)[0])
+    def residual_of(i: int, poses: Float) -> Float:
+        return tracker.mean_residual(pyramids[i], poses, frames[i].uncertain)
 
-    residuals[anchor] = residual_of(anchor, pose)
+    residuals[:, anchor] = residual_of(anchor, poses[:, anchor])
     every = tracker.contours.search_every
     for step, end in ((1, F), (-1, -1)):
         for i in range(anchor + step, end, step):
-            before = poses[i - 2 * step] if abs(i - anchor) > 1 else poses[anchor]
-            expected = poses[i - step] + tracker.contours.prediction * (poses[i - step] - before)
-            now = tracker.settle(pyramids[i], expected[None]).states[0]
+            last = poses[:, i - step]
+            before = poses[:, i - 2 * step] if abs(i - anchor) > 1 else poses[:, anchor]
+            now = tracker.settle(pyramids[i], last + tracker.contours.prediction * (last - before)).states
             residual = residual_of(i, now)
-            if not np.isfinite(residual):  # no camera sees anybody
-                poses[i] = poses[i - step]
+            if not np.isfinite(residual).any():  # no camera sees anybody
+                poses[:, i] = last
                 continue
-            if every and (residual > WORSE * residuals[anchor] or abs(i - anchor) % every == 0):
-                now = tracker.improved(frames[i], pyramids[i], now)
-                residual = residual_of(i, now)
-            poses[i], residuals[i] = now, residual
-    return TrajectoryHypothesis(poses, float(np.nanmean(residuals)))
+            high = residual > WORSE * residuals[:, anchor]
+            for b in np.flatnonzero(high | (abs(i - anchor) % every == 0)) if every else ():
+                now[b] = tracker.improved(frames[i], pyramids[i], now[b])
+                residual[b] = residual_of(i, now[b : b + 1])[0]
+            poses[:, i], residuals[:, i] = now, residual
+    means = np.nanmean(residuals, axis=1)
+    return [TrajectoryHypothesis(one, float(mean)) for one, mean in zip(poses, means, strict=True)]
 
 
 def _searched(tracker: ContourTracker, frame: Observation, pyramid: Pyramid, pose: Float) -> Float:
