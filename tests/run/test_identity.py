@@ -104,7 +104,7 @@ def test_frames_of_people_who_were_mixed_up_are_exchanged(people: tuple[Result, 
     np.testing.assert_array_equal(first.joints[inside], people[1].joints[inside[4:]])
     np.testing.assert_array_equal(second.status[inside[4:]], people[0].status[inside])
     assert exchanged(people, [Contact((0, 1), 3, 9, 7, AT, outcome=KEPT)]) == people
-    assert report([contact]) == ["persons 0 and 1 were mixed up in frame 7; this is undone"]
+    assert report([contact]) == ["people 0 and 1 were mixed up in frame 7; this is undone"]
 
 
 def test_frames_in_which_it_is_unclear_who_is_who_are_doubtful(people: tuple[Result, ...]) -> None:

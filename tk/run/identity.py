@@ -151,10 +151,10 @@ def report(contacts: Sequence[Contact]) -> list[str]:
     for contact in contacts:
         a, b = contact.people
         if contact.outcome == EXCHANGED:
-            lines.append(f"persons {a} and {b} were mixed up in frame {contact.moment}; this is undone")
+            lines.append(f"people {a} and {b} were mixed up in frame {contact.moment}; this is undone")
         elif contact.outcome == UNCLEAR:
             which = described(contact.first, contact.last, contact.last - contact.first + 1)
-            lines.append(f"persons {a} and {b} look alike and may have been mixed up when they met: suspect, {which}")
+            lines.append(f"people {a} and {b} may have been mixed up when they met: suspect, {which}")
     return lines
 
 

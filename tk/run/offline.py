@@ -143,8 +143,8 @@ def _finish(
             columns.get("residual", result.residual),
             before,
             subject.height_m,
-            # in the initialisation pose every limb is visible; other first poses may hide limbs
-            keep_body=subject.body is not None or (subject.init is None and subject.in_init_pose),
+            # in the initialisation pose every limb is visible; other first poses may hide limbs, and so may others
+            keep_body=subject.body is not None or (alone and subject.init is None and subject.in_init_pose),
             # people who were exchanged have poses of another body
             keep_cameras=cameras.rig is plan.setup.rig and not changed,
             report=within,

@@ -22,7 +22,7 @@ from tk.model.cues.ray_costs import RayGrid
 from tk.model.people import LocatedPerson, PeopleFinder, order_people
 from tk.model.setup import Setup, Subject
 from tk.run.choice import Choice, chosen, matched, unknown
-from tk.run.identity import EXCHANGED, Contact, Contacts, outcome_of
+from tk.run.identity import EXCHANGED, UNCLEAR, Contact, Contacts, outcome_of
 from tk.trackers.camera_monitor import CameraMonitor, opening_agreement
 from tk.trackers.protocol import Estimate, Observation, SharingTracker, Tracker, sharing
 from tk.trackers.sharing import PixelOwners, assign, cast_points
@@ -135,9 +135,14 @@ class People:
 
     @property
     def contacts(self) -> list[Contact]:
-        """The contacts between the people in the result."""
-        numbers = {member.number for member in self.members}
-        return [contact for contact in self._contacts.all if numbers.issuperset(contact.people)]
+        """The contacts of the people in the result. With somebody who is not in it, frames cannot be exchanged."""
+        numbers, found = {member.number for member in self.members}, []
+        for contact in self._contacts.all:
+            if numbers.issuperset(contact.people):
+                found.append(contact)
+            elif not numbers.isdisjoint(contact.people):
+                found.append(replace(contact, outcome=UNCLEAR) if contact.outcome == EXCHANGED else contact)
+        return found
 
     @property
     def several(self) -> bool:
@@ -221,7 +226,6 @@ class People:
             answers = {member.number: tracked}
             self._look(frame, answers)
             return self._with_absent(answers)
-        before = [self._state_of(m) for m in self._tracked]
         shown = [*(self._shape(m, True) for m in self._tracked), *(b.shape for b in self._bystanders)]
         owners = self._owners(shown)
         if self._bystanders:
@@ -230,17 +234,11 @@ class People:
         answers = {}
         for k, member in enumerate(self._tracked):
             answers[member.number] = self._step(member, owners.share(frame, k, member.lost and not member.absent))
-        now = self._owners([*(self._shape(m, False) for m in self._tracked), *(b.shape for b in self._bystanders)])
-        for k, member in enumerate(self._tracked):
-            if not member.lost and now.changed(owners, frame.masks, k):
-                _sharing(member).rewind(before[k])
-                self._restore(member, before[k])
-                answers[member.number] = self._step(member, now.share(frame, k, False))
         for k, bystander in enumerate(self._bystanders, len(self._tracked)):
             if not bystander.refused:
-                bystander.history = [*bystander.history[1 - _HISTORY :], now.share(frame, k, False)]
+                bystander.history = [*bystander.history[1 - _HISTORY :], owners.share(frame, k, False)]
         self._judge(frame, answers)
-        self._look(frame, answers, now)
+        self._look(frame, answers)
         return self._with_absent(answers)
 
     def _judge(self, frame: Observation, answers: Mapping[int, Tracked]) -> None:
@@ -357,27 +355,24 @@ class People:
 
     # --- who enters and leaves ----------------------------------------------------------------------------------------
 
-    def _look(self, frame: Observation, answers: dict[int, Tracked], owners: PixelOwners | None = None) -> None:
+    def _look(self, frame: Observation, answers: dict[int, Tracked]) -> None:
         """Find those who enter, and those who are absent, in the pixels that nobody explains."""
         lost = [m for m in self._tracked if m.lost]
         for member in self._tracked:
             member.absent &= member.lost
         if self._grid is None:
             return
-        self._admit()
         due = frame.index % self._every == 0 or bool(lost)
-        if owners is None:
+        if self.alone:
             residual = answers[self._tracked[0].number].estimate.residual
             known = residual is not None and bool(np.isfinite(residual).any())
             surplus = float(np.nanmean(residual[:, 1])) if residual is not None and known else 0.0
-            due = (due and bool(lost)) or (
-                surplus > SURPLUS and frame.index % 2 == 0
-            )  # at once: it misleads the tracker
-            if not due:
-                return
-            owners = self._owners([self._shape(m, False) for m in self._tracked])
+            # at once: it misleads the tracker
+            due = (due and bool(lost)) or (surplus > SURPLUS and frame.index % 2 == 0)
+        self._admit()
         if not due:
             return
+        owners = self._owners([*(self._shape(m, False) for m in self._tracked), *(b.shape for b in self._bystanders)])
         free = owners.unexplained(frame.masks)
         found = [p for p in self._find(free) if p.inside] if self._much(free, owners, frame) else []
         for member in lost:
