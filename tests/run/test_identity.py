@@ -74,15 +74,18 @@ def test_people_of_unknown_colours_have_no_contact() -> None:
 
 
 @pytest.mark.parametrize(
-    ("likeness", "outcome"),
+    ("likeness", "shorter_m", "outcome"),
     [
-        ([[-0.2, -3.0], [-1.9, -0.3]], KEPT),
-        ([[-3.0, -0.2], [-0.3, -1.9]], EXCHANGED),
-        ([[-0.2, -0.3], [-0.3, -0.3]], UNCLEAR),
+        ([[-0.2, -3.0], [-1.9, -0.3]], -0.5, KEPT),
+        ([[-3.0, -0.2], [-0.3, -1.9]], -0.5, EXCHANGED),
+        ([[-0.2, -0.3], [-0.3, -0.3]], -0.5, UNCLEAR),
+        ([[-0.2, -0.3], [-0.3, -0.3]], -1.5, KEPT),  # they were never so close
     ],
 )
-def test_assignment_with_the_larger_likelihood_wins(likeness: list[list[float]], outcome: int) -> None:
-    assert outcome_of(np.array(likeness)) == outcome
+def test_assignment_with_the_larger_likelihood_wins(
+    likeness: list[list[float]], shorter_m: float, outcome: int
+) -> None:
+    assert outcome_of(np.array(likeness), shorter_m) == outcome
 
 
 def test_likeness_is_zero_for_the_colours_that_were_learned() -> None:

@@ -25,8 +25,11 @@ Float = NDArray[np.float64]
 # People are in contact if their pelvises are closer than this, metres: arms reach so far.
 CONTACT_M = 1.0
 # An assignment is clear if its log-likelihood, mean per pixel and summed over both people, exceeds that of the other by
-# this. At the ends of 6 contacts of the rendered captures (pair, a crossing) the right one exceeds it by 4.2 to 5.7.
+# this. At the ends of six contacts (pair, a crossing, a handshake, an embrace) the right one exceeds it by 4.2 to 5.7.
 CLEAR = 0.3
+# Without a clear assignment the people are kept if an exchange would lengthen the steps of the two pelvises by this in
+# any frame, metres: people whose pelvises stay half a metre apart are not mixed up.
+APART_M = 1.0
 
 OPEN, KEPT, EXCHANGED, UNCLEAR = range(4)
 
@@ -115,10 +118,17 @@ class Contacts:
             self.all.append(Contact((a, b), first, last, moment, pelvis, float(row[6]), outcome, learned))
 
 
-def outcome_of(likeness: Float) -> int:
-    """Return the outcome of a contact from log-likelihoods (2, 2): of trajectory i as person j."""
+def outcome_of(likeness: Float, shorter_m: float) -> int:
+    """Return the outcome of a contact.
+
+    Args:
+        likeness: (2, 2) log-likelihood of trajectory i as person j.
+        shorter_m: see :class:`Contact`.
+    """
     kept, exchanged = np.trace(likeness), np.trace(likeness[::-1])
-    return KEPT if kept - exchanged > CLEAR else EXCHANGED if exchanged - kept > CLEAR else UNCLEAR
+    if abs(kept - exchanged) > CLEAR:
+        return KEPT if kept > exchanged else EXCHANGED
+    return UNCLEAR if shorter_m > -APART_M else KEPT
 
 
 def exchanged(people: Sequence[Result], contacts: Sequence[Contact]) -> tuple[Result, ...]:

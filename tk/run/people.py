@@ -253,7 +253,7 @@ class People:
                 for j, other in enumerate(pair):
                     share, pose = answers[one.number].used, _sharing(one).last_poses()[0]
                     likeness[i, j] = _sharing(other).likeness(share, contact.learned[j], pose)
-            contact.outcome = outcome_of(likeness)
+            contact.outcome = outcome_of(likeness, contact.shorter_m)
             _LOG.debug("contact of %s, frames %d to %d: %s", contact.people, contact.first, contact.last, likeness)
             if contact.outcome == EXCHANGED:
                 states = [self._state_of(member) for member in pair]
