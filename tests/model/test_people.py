@@ -14,7 +14,7 @@ from tk.model.body.cone_body import build_cone_body
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume
 from tk.model.masks.silhouettes import draw_silhouettes
-from tk.model.people import LocatedPerson, PeopleFinder, order_people, person_pixels
+from tk.model.people import LocatedPerson, PeopleFinder, order_people
 
 RIG = ring_of_cameras(5, 240, 240)
 VOLUME = Volume((0.0, 0.0, 1.0), (2.4, 2.4, 2.2))
@@ -155,27 +155,6 @@ def test_person_in_one_image_stands_where_the_feet_meet_the_floor() -> None:
     assert np.flatnonzero(found[1].views).tolist() == [0] and not found[1].inside
     assert nearest(found[1:], [(float(behind[0]), float(behind[1]))])[0] < 0.5
     assert found[1].height_m == pytest.approx(1.75, abs=0.15)
-    pixels = person_pixels(found, RIG, alone.any(axis=0))
-    assert (pixels[1, 0] & alone[1, 0]).sum() > 0.95 * alone[1, 0].sum()
-
-
-def test_pixels_go_to_the_person_in_front() -> None:
-    places = [(-0.6, 0.0), (0.6, 0.1)]
-    alone = drawn(places)
-    masks = alone.any(axis=0)
-    found = sorted(FINDER.find(masks), key=lambda person: person.position[0])
-    pixels = person_pixels(found, RIG, masks)
-    assert pixels.shape == (2, *masks.shape)
-    assert not (pixels[0] & pixels[1]).any()
-    assert (pixels.any(axis=0) & ~masks).sum() == 0
-    for k in range(2):
-        only = alone[k] & ~alone[1 - k]
-        assert (pixels[k] & only).sum() > 0.9 * only.sum()
-    for c, camera in enumerate(RIG):
-        both = alone[0, c] & alone[1, c]
-        if both.sum() > 100:
-            depth = [camera.to_camera(np.array([[x, y, 0.9]]))[0, 2] for x, y in places]
-            assert pixels[int(np.argmin(depth)), c][both].mean() > 0.8
 
 
 def test_numbers_follow_height_then_views_then_distance_to_the_centre() -> None:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from tk.model.body.plausibility import EXTENT, STATURE_M
 from tk.model.body.skeleton import up_rotation
-from tk.model.cameras.camera import Camera, Rig
+from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume, VoxelGrid
 from tk.model.hull.coarse import Voxels, dilated
 
@@ -112,18 +112,6 @@ class LocatedPerson:
     inside: bool
 
 
-def locate_people(
-    rig: Rig,
-    volume: Volume,
-    up: str,
-    masks: NDArray,
-    uncertain: Bool | None = None,
-    near: Sequence[LocatedPerson] = (),
-) -> tuple[LocatedPerson, ...]:
-    """Return the people in one frame set, see :meth:`PeopleFinder.find`."""
-    return PeopleFinder(rig, volume, up).find(masks, uncertain, near)
-
-
 def order_people(
     people: Sequence[LocatedPerson], volume: Volume, height_m: float | None = None, position: Float | None = None
 ) -> tuple[LocatedPerson, ...]:
@@ -147,45 +135,6 @@ def order_people(
         return not person.inside, away, misfit, -int(person.views.sum()), off
 
     return tuple(sorted(people, key=rank))
-
-
-def person_pixels(people: Sequence[LocatedPerson], rig: Rig, masks: NDArray) -> Bool:
-    """Return (P, C, H, W) the pixels of masks (C, H, W) that show each person.
-
-    A pixel that several people cover belongs to the nearest of them. A pixel that nobody covers, such as one of a thin
-    limb, belongs to the person with the nearest pixel in its connected part of the mask. Parts of the mask without
-    people belong to nobody.
-    """
-    pixels = np.zeros((len(people), *masks.shape), np.bool_)
-    if not people:
-        return pixels
-    for c, camera in enumerate(rig):
-        mask = np.asarray(masks[c] > 0)
-        depths = np.stack([_depth(person, camera, mask.shape) for person in people])
-        owner = np.where(np.isfinite(depths).any(axis=0) & mask, depths.argmin(axis=0), -1)
-        _, regions = cv2.connectedComponents(mask.astype(np.uint8))
-        for region in np.unique(regions[mask & (owner < 0)]):
-            within = regions == region
-            known = within & (owner >= 0)
-            if known.any():
-                nearest = scipy.ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-                owner[within] = owner[tuple(nearest)][within]
-        for k in range(len(people)):
-            pixels[k, c] = owner == k
-    return pixels
-
-
-def _depth(person: LocatedPerson, camera: Camera, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return the depth (h, w) of a person's voxels in a camera, metres; infinite beside them."""
-    depth = np.full(shape, np.inf, np.float32)
-    pixels, distance = camera.project(person.points)
-    seen = camera.sees(person.points)
-    if seen.any():
-        x, y = np.rint(pixels[seen]).astype(np.int64).T
-        np.minimum.at(depth, (y, x), distance[seen].astype(np.float32))
-        size = int(np.ceil(person.voxel_m * camera.matrix[0, 0] / float(np.median(distance[seen])))) | 1
-        depth = np.asarray(cv2.erode(depth, np.ones((size + 2, size + 2), np.uint8)), np.float32)
-    return depth
 
 
 class PeopleFinder:
