@@ -64,6 +64,10 @@ class Pyramid:
         """Join the pyramids of several frames."""
         return Pyramid(tuple(map(np.concatenate, zip(*(f.masks for f in frames), strict=True))), frames[0].sizes)
 
+    def of_views(self, views: NDArray[np.intp]) -> Pyramid:
+        """Return the scales of some views."""
+        return Pyramid(tuple(masks[views] for masks in self.masks), tuple(sizes[views] for sizes in self.sizes))
+
 
 class Views:
     """The cameras of a rig, packed for the kernels.
