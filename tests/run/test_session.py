@@ -21,11 +21,12 @@ import tomli_w
 
 from tests.conftest import FRAMES, QUICK, Silent, Tk
 from tests.io.conftest import write_picture
-from tk.errors import ConfigError
+from tk.errors import ConfigError, ResultError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.reader import read_joints, read_result
 from tk.io.results.status import Status
+from tk.io.toml import load_toml
 from tk.model.body.skeleton import JOINTS
 from tk.run import session
 from tk.run.plan import choose_frames
@@ -215,6 +216,15 @@ def test_large_images_are_reduced_and_the_result_has_the_recorded_cameras(tiny: 
         np.testing.assert_allclose(camera.matrix, expected.matrix, rtol=1e-12)
     assert np.linalg.norm(found.joints - full.joints, axis=2).mean() < 0.05
     assert np.abs(found.joints - full.joints).max() > 0  # it is another computation
+
+
+def test_resumed_run_must_read_images_at_the_same_size(copy: Path, tmp_path: Path) -> None:
+    config = replace(CONFIG, person_pixels=int(open_capture(copy).setup().person_pixels().min() / 2))
+    run(copy, tmp_path / "r.h5", frames=(0, 1), config=config)
+    settings = tomli_w.dumps({**load_toml(copy / "capture.toml"), "subject": {"height": 1.2}})
+    (copy / "capture.toml").write_text(settings, encoding="utf-8")
+    with pytest.raises(ResultError, match="size of the images: 1/2, 1/2, 1/2, 1/2, not full, full, full, full"):
+        run(copy, tmp_path / "r.h5", resume=True, config=config)
 
 
 @pytest.fixture(scope="module")
