@@ -45,7 +45,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial import cKDTree
 
-from scripts import bench_hull, bench_pictures, bench_speed
+from scripts import bench_hull, bench_pictures, bench_speed, bench_start
 from scripts.bench_stages import Stage, contour_stages, median_ms, silhouette_stages
 from tk import __version__
 from tk.errors import TkError
@@ -474,6 +474,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--init-pose", type=Path, metavar="FILE", help="as of tk track")
     parser.add_argument("--growth", type=Path, metavar="CAPTURE", help="with masks of up to nine cameras: table 1")
     parser.add_argument("--speed", action="store_true", help="only a whole run of the default beside decoding alone")
+    parser.add_argument("--start", action="store_true", help="only what the first pose takes, piece by piece")
     parser.add_argument("--pictures", action="store_true", help="only what the overlay video and the report cost")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here too")
     given = parser.parse_args(arguments)
@@ -485,6 +486,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     if given.speed:
         console.print(bench_speed.measure(given.capture, given.masks, given.repeat))
+        return
+    if given.start:
+        console.print(bench_start.measure(given.capture, given.masks))
         return
     if given.pictures:
         console.print(bench_pictures.measure(given.capture, given.masks, given.frames, given.repeat))

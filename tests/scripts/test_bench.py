@@ -82,3 +82,10 @@ def test_the_silhouette_tracker_has_stages_of_its_own(
 def test_a_capture_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="nowhere"):
         main([str(tmp_path / "nowhere"), "--repeat", "1"])
+
+
+def test_the_pieces_of_the_start_are_measured(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main([str(tiny), "--start", "--masks", "auto"])
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.strip()]
+    assert lines[0].startswith("imports") and any(line.startswith("body fit") for line in lines)
+    assert all(line.endswith(" ms") and float(line.split()[-2]) >= 0 for line in lines)
