@@ -226,7 +226,8 @@ def test_process_that_was_started_early_is_used_once_and_else_ended(tiny: Path) 
         np.testing.assert_array_equal(a[2], b[2], strict=True)
     with worker.started_early():
         (early,) = worker._ready
-    assert early.process.returncode is not None
+        assert isinstance(open_observations(capture.setup(), capture, Settings(ahead=0), nobody), Serial)
+        assert early.process.returncode is not None
 
 
 def test_setting_out_of_range() -> None:

@@ -10,7 +10,7 @@ import click
 
 from tk.commands import base
 from tk.commands.console import ConsoleReporter
-from tk.run.worker import started_early
+from tk.run.worker import dismiss, started_early
 
 if TYPE_CHECKING:
     from tk.io.captures.capture import Capture
@@ -70,6 +70,8 @@ def track(
         from tk.run.choice import parse_choice
 
         settings, choice = options.settings(), parse_choice(people)
+        if settings.ahead == 0:
+            dismiss()
         check_result_path(output, force, resume)
         reporter.stage(f"opening {capture}")
         opened = open_recording(capture, base.split_names(options.cameras), options.masks, settings.resample)

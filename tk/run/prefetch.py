@@ -98,6 +98,7 @@ def open_observations(
     """
     mask_source(source)  # before a process is started
     if settings.ahead == 0 or worker.cores() < 2 or not sys.executable or not _can_be_sent(source.segmenter):
+        worker.dismiss()
         return Serial(setup, source, settings, note, keep_images)
     return Ahead(setup, source, settings, note, keep_images)
 

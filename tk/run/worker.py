@@ -56,8 +56,13 @@ def started_early() -> Iterator[None]:
     try:
         yield
     finally:
-        while _ready:
-            _ready.pop().close()
+        dismiss()
+
+
+def dismiss() -> None:
+    """End a process that was started early and that nobody has taken."""
+    while _ready:
+        _ready.pop().close()
 
 
 def take() -> Worker:
