@@ -232,8 +232,15 @@ class People:
             self._follow(self._bystanders, frame, owners, len(self._tracked))
             owners = self._owners([*shown[: len(self._tracked)], *(b.shape for b in self._bystanders)])
         answers = {}
+        before = [self._state_of(m) for m in self._tracked]
         for k, member in enumerate(self._tracked):
             answers[member.number] = self._step(member, owners.share(frame, k, member.lost and not member.absent))
+        now = self._owners([*(self._shape(m, False) for m in self._tracked), *(b.shape for b in self._bystanders)])
+        for k, member in enumerate(self._tracked):
+            if not member.lost and now.changed(owners, frame.masks, k):
+                _sharing(member).rewind(before[k])
+                self._restore(member, before[k])
+                answers[member.number] = self._step(member, now.share(frame, k, False))
         for k, bystander in enumerate(self._bystanders, len(self._tracked)):
             if not bystander.refused:
                 bystander.history = [*bystander.history[1 - _HISTORY :], owners.share(frame, k, False)]
