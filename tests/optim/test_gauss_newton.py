@@ -1,6 +1,7 @@
 """Damped Gauss-Newton on small problems with known answers."""
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -159,26 +160,20 @@ def test_states_of_a_batch_are_independent(tolerance):
 
 @given(st.integers(0, 10**6))
 @settings(max_examples=30, deadline=None)
-def test_scale_ends_once_the_decrement_falls_below_the_tolerance(seed):
+def test_scale_ends_once_no_parameter_moves_by_more_than_the_tolerance(seed):
     A, y, start = problem(seed)
-    tolerance, made = 0.01, []
+    made = []
 
     def watched(states, scale):
         made.append(states.copy())
         return linear(A, y)(states, scale)
 
-    config = GaussNewtonSettings(scales=2, iterations=30, damping=0.5, longest_step=100.0, tolerance=tolerance)
+    config = GaussNewtonSettings(scales=2, iterations=30, damping=0.5, longest_step=100.0, tolerance=0.01)
     found = gauss_newton.minimise(watched, start, ALL, *NONE, config)
     assert found.iterations.sum() == len(made)
-    # without limits H is A.T @ A with half its diagonal added
-    H = A.T @ A + 0.5 * np.diag(np.diag(A.T @ A))
+    steps = [np.abs(after - before).max() for before, after in pairwise([*made, found.states])]
     last = found.iterations.cumsum() - 1
-    for i, states in enumerate(made):
-        gradient = (y - states @ A.T) @ A
-        decrement = np.einsum("bi,bi->b", gradient, np.linalg.solve(H, gradient.T).T).max()
-        allowed = tolerance * (8 if i <= last[0] else 1) * A.shape[1]
-        if abs(decrement / allowed - 1) > 0.01 and found.iterations.max() < 30:
-            assert (decrement <= allowed) == (i in last)
+    assert all((step <= 0.01) == (i in last) for i, step in enumerate(steps)) or found.iterations.max() == 30
     plain = gauss_newton.minimise(linear(A, y), start, ALL, *NONE, replace(config, tolerance=0.0))
     assert plain.iterations.tolist() == [30, 30]
 

@@ -229,7 +229,7 @@ def test_person_who_is_elsewhere_after_a_cut_is_found_again() -> None:
 def test_person_is_searched_for_if_the_residual_stays_high(monkeypatch: pytest.MonkeyPatch) -> None:
     """A wrong heading, from which no limb search leads out, with a residual below the limit of a loss."""
     tracker = tracker_at(POSES[0])
-    for _ in range(20):  # the baseline is known
+    for _ in range(3):
         tracker.step(observe(MASKS[0]))
     state = dict(tracker.state())
     wrong = tracker.world.poses_in(POSES[0])
@@ -260,14 +260,12 @@ def test_person_is_searched_for_if_the_residual_stays_high(monkeypatch: pytest.M
 
 def test_first_scale_reaches_as_far_as_the_prediction_may_err() -> None:
     tracker = tracker_at(POSES[0])
-    tracker.solver = replace(tracker.solver, tolerance=0.0)  # all iterations of a scale are made
     tracker.step(observe(MASKS[0]))
     state = dict(tracker.state())
     still = state["poses"][:1]
     step_px = tracker.line_search.window_px * 2 / abs(1 - tracker.contours.prediction)  # the second scale's reach
     step_m = step_px / tracker.views.rig.pixels_per_metre(tracker.body.skeleton.joints(still)[0, 0])
-    near, far = ((0.2, 4, {}), (0.3, 7, {}), (0.9, 7, {})), ((1.1, 10, {}),)
-    for share, steps, more in (*near, *far, (0.0, 10, {"high_for": 1}), (0.0, 10, {"lost_for": 1})):
+    for share, steps, more in ((0.9, 7, {}), (1.1, 10, {}), (0.0, 10, {"high_for": 1}), (0.0, 10, {"lost_for": 1})):
         before = still.copy()
         before[0, 0] -= share * step_m
         tracker.rewind({**state, "poses": still, "previous": before, **more})
@@ -384,8 +382,8 @@ def test_second_pass_corrects_the_frames_before_a_limb_was_found(converged: bool
     assert (told(np.arange(6) == 3) > 0.25).tolist() == [True] * 4 + [False] * 2
 
 
-@pytest.mark.parametrize(("converged", "least"), [(False, 0.1), (True, 0.09)])
-def test_sigma_is_large_if_two_poses_have_similar_costs(converged: bool, least: float) -> None:
+@pytest.mark.parametrize("converged", [False, True])
+def test_sigma_is_large_if_two_poses_have_similar_costs(converged: bool) -> None:
     """The masks show an arm at both of its places; frames before and after tell of one each."""
     hanging = np.repeat(POSES[:1], 3, axis=0)
     raised = np.array([with_arm(pose, "l", (0.1, 1.0, 0.3), 15.0) for pose in hanging])
@@ -397,7 +395,7 @@ def test_sigma_is_large_if_two_poses_have_similar_costs(converged: bool, least: 
         return tracker.second_pass(*arguments)[2][:2, wrist]
 
     there = draw_silhouettes(BODY, RIG, raised[:1])[0]
-    assert (sigma(np.array([half, half, there]), np.concatenate([hanging[:2], raised[2:]])) > least).all()
+    assert (sigma(np.array([half, half, there]), np.concatenate([hanging[:2], raised[2:]])) > 0.1).all()
     assert (sigma(np.array([half, half, half]), hanging) < 0.05).all()
 
 

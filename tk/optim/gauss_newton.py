@@ -2,8 +2,7 @@
 
 The silhouette paper's solver (eqs. 9-11 and section 4.5): a fixed number of iterations at each scale and no line
 search, because the correspondences are found anew in every iteration. Not in the paper: a scale ends once its steps are
-small beside the noise; damping, without which a limb hidden in every view makes its equations singular; and
-over-relaxation.
+short; damping, without which a limb hidden in every view makes its equations singular; and over-relaxation.
 Correspondences found anew move less than their equations predict: an edgel far off has little weight, the next edge
 along a normal may belong to another limb, and a border between colours is determined by the few pixels about it. A full
 step therefore leaves a share of the error, and the next step the same share again. Longer steps leave less; a plain one
@@ -54,11 +53,8 @@ class GaussNewtonSettings:
         limit_weight: weight of the squared excess over a limit, as a share of the same mean (section 4.5, which gives
             no number).
         longest_step: largest change of a parameter in one iteration; steps are shortened to it as a whole.
-        tolerance: a state's iteration at a scale ends once the Newton decrement gᵀH⁻¹g of a step falls below this for
-            each free parameter, times 8 for each coarser scale; 0 (the paper): all iterations are made. The decrement
-            is the squared length of the step in standard deviations (Boyd and Vandenberghe, *Convex Optimization*,
-            section 9.5.1), in the units of the equations. A coarser pixel is twice as wide, its edges err by twice as
-            much, and twice as many err together.
+        tolerance: a state's iteration at a scale ends once no parameter changes by more, radians or metres; 0 (the
+            paper): all iterations are made.
     """
 
     scales: int = 2
@@ -149,11 +145,11 @@ def minimise(
         moving = np.ones(len(state), np.bool_)  # states do not depend on each other
         for share in config.steps(scale):
             here = equations(state, scale)
-            step, decrement = parameters.step(here.hessian, here.gradient, state)
-            state[:, parameters.index] += np.where(moving[:, None], share * step, 0.0)
+            step = share * parameters.step(here.hessian, here.gradient, state)
+            state[:, parameters.index] += np.where(moving[:, None], step, 0.0)
             hessian[moving] = here.hessian[moving]
             iterations[i] += 1
-            moving &= decrement > config.tolerance * 8.0**scale * len(parameters.index)
+            moving &= np.abs(step).max(axis=1, initial=0.0) > config.tolerance
             if not moving.any():
                 break
     return BatchSolution(state, hessian, iterations)
@@ -171,8 +167,8 @@ class _FreeParameters:
         self._config = config
         self._known = None if prior is None else (prior.mean[..., index], prior.precision[index])
 
-    def step(self, hessian: Float, gradient: Float, state: Float) -> tuple[Float, Float]:
-        """Return one damped step (B, n) of each state (B, D), limits included, and its Newton decrement (B,)."""
+    def step(self, hessian: Float, gradient: Float, state: Float) -> Float:
+        """Return one damped step (B, n) of each state (B, D), limits included."""
         config = self._config
         H = hessian[:, self._rows, self.index]
         g = gradient[:, self.index]
@@ -192,6 +188,5 @@ class _FreeParameters:
             g += precision * (mean - p)
         diagonal += added
         delta = np.linalg.solve(H, g[:, :, None])[:, :, 0]
-        decrement = np.einsum("bi,bi->b", g, delta)
         longest = np.maximum(delta.max(axis=1, initial=0.0), -delta.min(axis=1, initial=0.0))
-        return delta * np.minimum(1.0, config.longest_step / np.maximum(longest, 1e-12))[:, None], decrement
+        return np.asarray(delta * np.minimum(1.0, config.longest_step / np.maximum(longest, 1e-12))[:, None])

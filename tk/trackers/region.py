@@ -36,7 +36,7 @@ from tk.model.masks.silhouettes import Pyramid
 from tk.model.setup import InitPose, Setup
 from tk.optim.gauss_newton import Prior
 from tk.settings import RegionSettings, Settings, SilhouetteSettings
-from tk.trackers.contour_tracker import GAIN, INFORMATION, RECOVER_EVERY, SAME_POSE_M, ContourTracker
+from tk.trackers.contour_tracker import GAIN, RECOVER_EVERY, SAME_POSE_M, ContourTracker
 from tk.trackers.hypotheses import MARGIN, PATIENCE, RENEWAL, Hypothesis, disagreement
 from tk.trackers.protocol import Estimate, Observation, Stopwatch
 from tk.trackers.residual import ResidualBaseline, variance_factor
@@ -44,9 +44,10 @@ from tk.trackers.second_pass import POSTURE_FRAMES, SecondPass
 
 Float = NDArray[np.float64]
 
-# Share of its window that the finest scale alone reaches: its iterations are too few for more. With 0, 0.25 and 0.5 the
-# limbs' errors on walk, dance and treadmill-slow differ by less than 0.05 cm.
-FINEST_REACH = 0.5
+# Information of one pixel of contour, 1/px²: edgels err by 2 px, and together along 10 px.
+INFORMATION = 1.0 / (2.0**2 * 10.0)
+# Scales of a frame, at least: from the finest alone Gauss-Newton does not converge.
+FEWEST = 2
 # Standard deviations of the priors about the predicted pose (tk.model.body.joints has those about zero). Chosen on the
 # development captures; sensitivity not measured.
 ANGLE_DEG, TRANSLATION_M = 40.0, 0.3
@@ -239,8 +240,7 @@ class RegionTracker(ContourTracker):
             step_m = max(skeleton.apart(h.pose, skeleton.joints(h.previous)) for h in self._alive)
             error_m = abs(1 - contours.prediction) * step_m
             error_px = error_m * self.views.rig.pixels_per_metre(skeleton.joints(self._best.pose)[0])
-            reach_px = [self.line_search.window_px * (2**k if k else FINEST_REACH) for k in range(first)]
-            while first > 0 and reach_px[first - 1] >= error_px:
+            while first > FEWEST - 1 and self.line_search.window_px * 2 ** (first - 1) >= error_px:
                 first -= 1
         return list(range(first, -1, -1))
 
