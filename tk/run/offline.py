@@ -26,7 +26,7 @@ from tk.run.people import Member
 from tk.run.plan import Plan
 from tk.run.prefetch import open_observations
 from tk.run.refinement import refine_if_inconsistent, retimed
-from tk.trackers.protocol import Estimate, TwoPassTracker, two_pass
+from tk.trackers.protocol import Estimate, Observation, TwoPassTracker, two_pass
 from tk.trackers.residual import contradicted
 
 _LOG = logging.getLogger(__name__)
@@ -127,7 +127,7 @@ def _finish(
                 cameras = UsedCameras(again.rig, cameras.time_offset_s + offsets / fps)
                 if np.round(offsets).any() and alone:
                     note("tracking again: the images of the first pass were not synchronised")
-                    found = _track_again(plan, again, cameras, result.frames, poses, within)
+                    found = _track_again(plan, again, cameras, masks, result.frames, poses, within)
                     rows = np.flatnonzero(np.isin(result.frames, list(found)))
                     estimates = [found[int(frame)] for frame in result.frames[rows]]
                     poses[rows] = [e.pose for e in estimates]
@@ -196,6 +196,7 @@ def _track_again(
     plan: Plan,
     tracker: TwoPassTracker,
     cameras: UsedCameras,
+    masks: MaskStore,
     frames: NDArray[np.int64],
     poses: Float,
     within: Callable[[float], None],
@@ -203,7 +204,7 @@ def _track_again(
     """Return estimates, by frame, of the frames (F,) of which every synchronised camera has an image; none if the
     source cannot be read again.
 
-    Tracking begins at the first pass's pose.
+    Tracking begins at the first pass's pose. ``masks``: the synchronised masks, which are not made again.
     """
     source = plan.source.shifted(cameras.time_offset_s.tolist())
     if source is None or source.frame_count is None:
@@ -213,12 +214,13 @@ def _track_again(
     if begin >= stop:
         return {}
     tracker.start_at(poses[np.searchsorted(frames, begin)])
-    setup = replace(plan.setup, rig=cameras.rig)
     found = {}
-    with open_observations(setup, source, plan.settings, lambda _: None) as observations:
-        for o, _ in observations.frames(begin, stop):
-            found[o.index] = replace(tracker.step(o), masks=None, drawn=None)  # these are large
-            within((o.index + 1 - begin) / (stop - begin))
+    with source.frames(begin, stop) as images:
+        for frame in images:
+            if frame.index in masks:
+                observation = Observation(frame.index, frame.images, masks.get(frame.index), time=frame.time)
+                found[frame.index] = replace(tracker.step(observation), masks=None, drawn=None)  # these are large
+            within((frame.index + 1 - begin) / (stop - begin))
     return found
 
 
