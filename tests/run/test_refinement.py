@@ -17,7 +17,7 @@ from tests.conftest import FRAMES, QUICK, Silent, Tk
 from tests.model.ring import ring_of_cameras
 from tk.io import settings_file
 from tk.io.captures.calibration import read_calibration
-from tk.io.captures.capture import open_capture
+from tk.io.captures.capture import Capture, open_capture
 from tk.io.captures.mask_store import MaskStore
 from tk.io.results.reader import read_result
 from tk.io.results.status import Status
@@ -29,8 +29,6 @@ from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import turn_between
 from tk.model.masks.silhouettes import draw_silhouettes
 from tk.run import offline as finish
-from tk.run import plan
-from tk.run.prefetch import open_observations
 from tk.run.refinement import refine_capture, retimed, whole_delays
 from tk.run.session import track
 from tk.settings import Settings
@@ -106,13 +104,14 @@ def test_late_videos_are_tracked_again(tiny: Path, tmp_path: Path, monkeypatch: 
         late = np.array([0, 0, 1, -1])
         return tracker, retimed(store, frames, late), late.astype(float)
 
-    def remember(setup: Any, capture: Any, *more: Any, **options: Any) -> Any:
+    read = Capture.frames
+
+    def remember(capture: Capture, *more: Any) -> Any:
         asked.append(np.array(capture.late_frames))
-        return open_observations(setup, capture, *more, **options)
+        return read(capture, *more)
 
     monkeypatch.setattr(finish, "refine_if_inconsistent", made_up)
-    for module in (plan, finish):
-        monkeypatch.setattr(module, "open_observations", remember)
+    monkeypatch.setattr(Capture, "frames", remember)
     path, reporter = tmp_path / "again.h5", Silent()
     assert track(open_capture(tiny), path, settings_file.from_toml(QUICK), reporter, frames=(2, None)).lost == 0
     assert [late.tolist() for late in asked] == [[0, 0, 0, 0], [0, 0, 1, -1]]
