@@ -9,6 +9,7 @@ import scipy  # its packages are imported when they are first used
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ConfigError
+from tk.model.cameras.up import up_vector
 from tk.model.people import LocatedPerson
 from tk.model.setup import Subject
 
@@ -67,21 +68,29 @@ def chosen(
     return (number,)
 
 
+# A subject of whom nothing is known fits as well as one who is this far off, metres: half a stride, and more than the
+# error of a height.
+_UNKNOWN_M = 0.5
+
+
 def unknown(first: Subject) -> Subject:
     """Return a subject of whom nothing is known but how the recording begins."""
     return Subject(in_init_pose=first.in_init_pose)
 
 
-def matched(subjects: Sequence[Subject], people: Sequence[LocatedPerson]) -> list[Subject]:
-    """Return the subject of each of the people: by position, else by height; nothing is known of the others."""
-    cost = np.zeros((len(people), len(subjects)))
+def matched(subjects: Sequence[Subject], people: Sequence[LocatedPerson], up: str) -> list[Subject]:
+    """Return the subject of each of the people, by the least sum of distances on the floor and differences of height;
+    nothing is known of the others."""
+    cost, upward = np.zeros((len(people), len(subjects))), up_vector(up)
     for p, person in enumerate(people):
         for s, subject in enumerate(subjects):
             place = _position(subject)
             if place is not None:
-                cost[p, s] += float(np.linalg.norm(person.position[:2] - place[:2]))
+                cost[p, s] += float(np.linalg.norm(np.cross(person.position - place, upward)))
             if subject.height_m is not None:
                 cost[p, s] += abs(person.height_m - subject.height_m)
+            if place is None and subject.height_m is None:
+                cost[p, s] += _UNKNOWN_M
             cost[p, s] += 1e-6 * abs(p - s)
     who = dict(zip(*scipy.optimize.linear_sum_assignment(cost), strict=True))
     return [subjects[who[p]] if p in who else unknown(subjects[0]) for p in range(len(people))]

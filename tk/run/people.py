@@ -49,6 +49,7 @@ _SAME_COLORS = -1.1
 
 _DRAWN = "drawn"
 _WATCH, _LOST, _ABSENT, _PEOPLE, _BYSTANDERS = "watch/", "lost", "absent", "people/", "bystanders/"
+_SUBJECT, _IN_INIT_POSE = "subject", "in_init_pose"  # the number of the subject, -1: unknown
 _MODEL, _CONTACTS = "body/", "contacts/"
 
 
@@ -170,7 +171,9 @@ class People:
             self._begin(self._tracked[0], opening)
             return
         numbers = chosen(self._choice, found, subjects[0], self._note)
-        known = matched(subjects[:1] if self._choice == "auto" else subjects, [found[n] for n in numbers])
+        known = matched(
+            subjects[:1] if self._choice == "auto" else subjects, [found[n] for n in numbers], self._setup.up
+        )
         self._tracked = [self._member(0, known[0], self._tracked[0].tracker)]
         for k, subject in enumerate(known[1:], 1):
             self._tracked.append(self._member(k, subject, self._make()))  # its kernels are compiled
@@ -325,19 +328,18 @@ class People:
         return state | {_CONTACTS + name: value for name, value in self._contacts.state().items()}
 
     def restore(self, models: Sequence[Mapping[str, Any]], state: Mapping[str, Any]) -> None:
-        """Continue a run.
+        """Continue a run. Frames of bystanders are not stored, so who has just entered may be tracked later.
 
         Args:
             models: bodies of the people who are tracked.
             state: of :meth:`state`.
         """
-        subjects = self._setup.subjects
         number = 0
         while own := below(f"{_PEOPLE}{number}/", state) if number else state:
-            if number:
-                known = subjects[number] if number < len(subjects) else unknown(subjects[0])
-                self._tracked.append(self._member(number, known, self._make()))
-            member = self._tracked[number]
+            subject = int(own[_SUBJECT])
+            known = self._setup.subjects[subject] if subject >= 0 else Subject(in_init_pose=bool(own[_IN_INIT_POSE]))
+            member = self._member(number, known, self._make() if number else self._tracked[0].tracker)
+            self._tracked[number:] = [member]
             member.written = number < len(models)
             member.tracker.restore(models[number] if member.written else below(_MODEL, own), own)
             self._restore(member, own)
@@ -353,7 +355,9 @@ class People:
     def _state_of(self, member: Member) -> dict[str, Any]:
         watch = {_WATCH + name: value for name, value in member.monitor.state().items()}
         drawn = {} if member.drawn is None else {_DRAWN: member.drawn}
-        return {**member.tracker.state(), **watch, **drawn, _LOST: member.lost, _ABSENT: member.absent}
+        number = next((k for k, known in enumerate(self._setup.subjects) if known is member.subject), -1)
+        known = {_SUBJECT: number, _IN_INIT_POSE: member.subject.in_init_pose}
+        return {**member.tracker.state(), **watch, **drawn, **known, _LOST: member.lost, _ABSENT: member.absent}
 
     def _restore(self, member: Member, state: Mapping[str, Any]) -> None:
         member.monitor.restore(below(_WATCH, state))
@@ -414,8 +418,7 @@ class People:
         body = member.drawn
         if body is None:
             return False
-        step = frame.masks.shape[1] // body.shape[1]
-        masks = frame.masks[:, step // 2 :: step, step // 2 :: step][:, : body.shape[1], : body.shape[2]]
+        masks = _sharing(member).screen.sample(frame.masks)
         covered = np.count_nonzero(body, axis=(1, 2))
         return bool((np.count_nonzero(body & (masks < 128), axis=(1, 2)) >= 0.5 * covered).all())
 

@@ -176,9 +176,11 @@ class SharingTracker(Tracker, Protocol):
 
     Attributes:
         choice: the grid on which its body is rendered.
+        screen: the coarse grid of :attr:`Estimate.drawn`.
     """
 
     choice: RayGrid
+    screen: RayGrid
 
     def rendered(self, ahead: bool) -> Cast:
         """Return the body on the grid: at the last pose, or at the one expected in the next frame."""
