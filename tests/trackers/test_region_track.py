@@ -75,17 +75,15 @@ def refined(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 # --- the passes -------------------------------------------------------------------------------------------------------
 
 
-def test_the_second_pass_keeps_poses_of_the_same_body_and_cameras(tiny: Path, causal: Path, refined: Path) -> None:
+def test_the_second_pass_replaces_poses(tiny: Path, causal: Path, refined: Path) -> None:
     first, second = read_result(causal), read_result(refined)
     assert first.meta.method == second.meta.method == "region"
     assert REFINED not in first.model and second.model[REFINED] == 1
     for name in ("frames", "time", "status"):
         np.testing.assert_array_equal(getattr(second, name), getattr(first, name), err_msg=name)
     assert first.residual is not None and second.residual is not None
-    np.testing.assert_array_equal(second.residual, first.residual)
-    np.testing.assert_allclose(second.pose, first.pose, atol=1e-12)
-    assert first.sigma is not None and second.sigma is not None
-    assert 0 < np.abs(second.sigma - first.sigma).max() < 0.02  # the posture differs from that of all frames
+    assert second.residual.mean() < 1.03 * first.residual.mean()
+    assert np.abs(second.pose - first.pose).max() > 1e-3
     # the initialisation pose has shown the body
     np.testing.assert_array_equal(second.model["parts/shape"], first.model["parts/shape"])
     # pictures 160 pixels wide and a hasty fit: the person is found, and no limb is elsewhere

@@ -135,19 +135,15 @@ def _finish(
                     columns |= _replaced(result, rows, estimates)
         _LOG.info("second pass")
         assert result.sigma is not None
-        as_given = cameras.rig is plan.setup.rig and np.array_equal(cameras.time_offset_s, plan.source.time_offset_s)
         before = columns.get("joints/sigma", result.sigma)
         poses, columns["residual"], precise = again.second_pass(
             masks.sequence(result.frames),
             poses,
             lost,
             columns.get("residual", result.residual),
-            before,
             subject.height_m,
             # in the initialisation pose every limb is visible; other first poses may hide limbs, and so may others
             keep_body=subject.body is not None or (alone and subject.init is None and subject.in_init_pose),
-            # people who were exchanged have poses of another body
-            keep_cameras=as_given and not changed,
             report=within,
         )
         # a much larger sigma of the first pass, or NaN: it tracked several poses, or did not find a limb

@@ -239,10 +239,8 @@ class TwoPassTracker(Tracker, Protocol):
         poses: Float,
         lost: NDArray[np.bool_],
         residual: Float,
-        sigma: Float,
         height_m: float | None,
         keep_body: bool = False,
-        keep_cameras: bool = False,
         report: Callable[[float], None] = lambda _: None,
     ) -> tuple[Float, Float, Float]:
         """Optimise frames again with what all of them show, and with a body fitted to all of them.
@@ -250,13 +248,10 @@ class TwoPassTracker(Tracker, Protocol):
         Args:
             masks: (C, H, W) of F frames, cleaned.
             poses: (F, D) of the first pass.
-            lost: (F,) bool; such frames neither teach nor change.
+            lost: (F,) bool; such frames are not used and do not change.
             residual: (F, C, 2) of the first pass; NaN where a camera was excluded.
-            sigma: (F, 15) of the first pass, metres.
             height_m: the subject's height, if known.
             keep_body: leave the body as it is.
-            keep_cameras: whether the first pass had the same cameras; with the same body, too, its poses are kept,
-                except before a jump.
             report: receives the share of the work that is done.
 
         Returns:

@@ -40,9 +40,12 @@ from tk.trackers.contour_tracker import GAIN, RECOVER_EVERY, SAME_POSE_M, Contou
 from tk.trackers.hypotheses import MARGIN, PATIENCE, RENEWAL, Hypothesis, disagreement
 from tk.trackers.protocol import Estimate, Observation, Stopwatch
 from tk.trackers.residual import ResidualBaseline, variance_factor
-from tk.trackers.second_pass import POSTURE_FRAMES, SecondPass
+from tk.trackers.second_pass import SecondPass
 
 Float = NDArray[np.float64]
+
+# Frames over which the mean posture is a plain mean; then the oldest are forgotten.
+_POSTURE_FRAMES = 200
 
 # Information of one pixel of contour, 1/px²: edgels err by 2 px, and together along 10 px.
 INFORMATION = 1.0 / (2.0**2 * 10.0)
@@ -350,7 +353,7 @@ class RegionTracker(ContourTracker):
         frame, the difference to the mean posture until now, and the spread of the hypotheses."""
         skeleton = self.body.skeleton
         variance = self.variance(pose, curvature, self.prior(pose), label, residual)
-        self._postures = min(self._postures + 1, POSTURE_FRAMES)
+        self._postures = min(self._postures + 1, _POSTURE_FRAMES)
         self._mean_posture += (directions(skeleton, pose) - self._mean_posture) / self._postures
         variance += posture_variance(skeleton, pose, self._mean_posture)
         if len(self._alive) > 1:
@@ -384,21 +387,17 @@ class RegionTracker(ContourTracker):
         poses: Float,
         lost: NDArray[np.bool_],
         residual: Float,
-        sigma: Float,
         height_m: float | None,
         keep_body: bool = False,
-        keep_cameras: bool = False,
         report: Callable[[float], None] = lambda _: None,
     ) -> tuple[Float, Float, Float]:
         """See :class:`~tk.trackers.protocol.TwoPassTracker` and :mod:`tk.trackers.second_pass`."""
         if lost.all():
             return poses, residual, np.zeros((len(poses), len(JOINTS)))
-        again = SecondPass(self, masks, self.world.poses_in(poses), lost, residual, sigma, report)
-        keep_body |= not self.contours.adapt
-        if not keep_body:
+        again = SecondPass(self, masks, self.world.poses_in(poses), lost, residual, report)
+        if self.contours.adapt and not keep_body:
             again.fit_body(height_m)
-        if not (keep_body and keep_cameras):
-            again.optimise()
+        again.optimise()
         again.track_backwards()
         return np.where(lost[:, None], poses, self.world.poses_out(again.poses)), again.residual, again.sigma
 

@@ -3,7 +3,8 @@
 Frames of different poses show what an opening without the initialisation pose may hide: only a bent knee or elbow shows
 where it is. So the body is fitted to frames of the whole recording, and every frame is optimised again with it. Each
 frame stays near its pose of the first pass, because that has used colours to locate limbs inside the silhouette.
-Frames of the first pass that had this body and these cameras are at their optimum already and stay as they are.
+This matters with the same body and cameras, too: without it, the limbs' mean error on the eight captures is 0.03 cm
+larger, with two cameras 0.1 cm, and more limbs stay more than 10 cm off.
 
 Where a search has moved a limb, the new pose is also tracked backwards: it replaces earlier poses where its cost is
 lower, and σ includes the spread of the two.
@@ -41,8 +42,6 @@ STATURE = 0.03
 AT_ONCE = 8
 # A step of a joint that is longer than those before and after it by this is a jump, metres.
 JUMP_M = 2 * SAME_POSE_M
-# Frames over which the mean posture of the first pass is a plain mean; then the oldest are forgotten.
-POSTURE_FRAMES = 200
 
 
 class SecondPass:
@@ -54,7 +53,6 @@ class SecondPass:
         poses: (F, D) of the first pass.
         lost: (F,) bool; such frames are not used and do not change.
         residual: (F, C, 2) of the first pass; a camera whose residual is NaN in a frame is not used in it.
-        sigma: (F, 15) of the first pass, metres.
         report: receives the share of the work that is done.
 
     Attributes:
@@ -68,15 +66,12 @@ class SecondPass:
         poses: Float,
         lost: NDArray[np.bool_],
         residual: Float,
-        sigma: Float,
         report: Callable[[float], None],
     ) -> None:
         self.tracker, self._masks, self._first, self._lost, self._report = tracker, masks, poses, lost, report
         self.tracked = np.flatnonzero(~lost)
         self.poses, self.residual = poses.copy(), np.array(residual)
-        before = _running_posture_variance(tracker.body.skeleton, poses[self.tracked])
         self.variance = np.zeros((len(poses), len(JOINTS)))
-        self.variance[self.tracked] = np.maximum(sigma[self.tracked] ** 2 - before, 0.0)
 
     @property
     def sigma(self) -> Float:
@@ -170,15 +165,6 @@ class SecondPass:
         if more > MARGIN or skeleton.apart(poses[1], skeleton.joints(poses[0])) <= SAME_POSE_M:
             return None
         return Hypothesis(poses[1], later.pose, more, later.age + 1)
-
-
-def _running_posture_variance(skeleton: Skeleton, poses: Float) -> Float:
-    """Return (F, 15) the variance of the posture that the first pass has added to poses (F, D) of consecutive frames:
-    about the mean until each frame."""
-    mean = directions(skeleton, poses)
-    for i in range(1, len(mean)):
-        mean[i] = mean[i - 1] + (mean[i] - mean[i - 1]) / min(i + 1, POSTURE_FRAMES)
-    return posture_variance(skeleton, poses, mean)
 
 
 def _jumps(skeleton: Skeleton, poses: Float) -> NDArray[np.bool_]:
