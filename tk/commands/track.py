@@ -139,7 +139,8 @@ def end(output: Path, summary: Summary, quiet: bool, as_json: bool) -> None:
     if summary.frames and not quiet:
         rare = {"suspect": summary.suspect, "with nobody in view": summary.frames - summary.present}
         counts = [f"{summary.lost} lost", *(f"{count} {what}" for what, count in rare.items() if count)]
-        parts = [f"{summary.frames} frames in {output}", *counts, *_expected_error(output)]
+        several = f" of {summary.people} people" if summary.people > 1 else ""
+        parts = [f"{summary.frames} frames{several} in {output}", *counts, *_expected_error(output)]
         click.echo(", ".join([*parts, f"{rate:.1f} frames/s"]), err=True)
     if summary.interrupted:
         next_step = "continue with the same command and --resume" if summary.frames else "no frame was finished"

@@ -47,12 +47,14 @@ class Summary:
         seconds: duration of this run.
         tracked_now: number of frames that this run added.
         interrupted: whether Ctrl-C stopped it.
+        people: number of people in the result.
     """
 
     status: NDArray[np.uint8]
     seconds: float
     tracked_now: int
     interrupted: bool = False
+    people: int = 1
 
     @property
     def frames(self) -> int:
@@ -189,7 +191,7 @@ def track_source(
             interrupted = True
         tracks = read_people(output) if done + run.tracked else ()
         status = [track.status for track in tracks if track.status is not None] or [np.zeros(0, np.uint8)]
-        return Summary(np.concatenate(status), time.perf_counter() - started, run.tracked, interrupted)
+        return Summary(np.concatenate(status), time.perf_counter() - started, run.tracked, interrupted, len(status))
 
 
 def estimates(
