@@ -147,6 +147,46 @@ def export_sample(samples: ti.template(), c: int, i: int, x_unscaled, pixel, g, 
         samples[c, i, 11 + a] = n[a]
 
 
+@ti.func
+def prepare_pose(
+    tree: ti.template(), parts: ti.template(), curves: ti.template(), cameras: ti.template(), pose: ti.template(), b: int,
+    joints: ti.template(), placed: ti.template(), hiders: ti.template(), outlines: ti.template(), sums: ti.template(),
+):  # fmt: skip
+    """Place the body of pose b, trace its contours in every view, and set its sums to 0; arguments as in the kernel."""
+    V, Q = cameras.shape[0], curves.shape[0]
+    forward_tree(tree, pose, b, b, joints)
+    place_parts(joints, parts, b, placed)
+    find_hiders(placed, cameras, b, hiders)
+    for task in range(V * Q):
+        v, q = task // Q, task % Q
+        trace_curve(parts, placed, cameras, b, v, curves[q, 0], curves[q, 1], b * V * Q + task, outlines)
+    for i in range(GRADIENT):
+        sums[b, i] = 0.0
+    for k in range(tree.shape[0]):
+        for i in range(INERTIA_NUMBERS + PULL_NUMBERS):
+            joints[b, k, INERTIA + i] = 0.0
+
+
+@ti.func
+def weigh_edgel(
+    parts: ti.template(), curves: ti.template(), outlines: ti.template(), numbers: ti.template(), first: int, p: int,
+    edgel, n, d, weight,
+):  # fmt: skip
+    """Return the weight of an edgel at distance d: less near the edge of another part, and less for a large d.
+
+    ``first``: row of the view's first contour in ``outlines``. ``weight``: the weight of a sample without either.
+    """
+    scaled = weight
+    scale = numbers[SCALE]
+    if numbers[AMBIGUOUS] > 0.0:
+        near, square = nearest_rival(parts, curves, outlines, first, p, edgel, n, (numbers[AMBIGUOUS] * scale) ** 2)
+        if near:
+            scaled *= shared_weight(d, square)
+    if numbers[ROBUST] > 0.0:
+        scaled *= robust_weight(d, numbers[ROBUST] * scale)
+    return scaled
+
+
 @functools.cache
 def _equations_kernel(real, alone):
     @ti.kernel
@@ -186,17 +226,7 @@ def _equations_kernel(real, alone):
             if turn % spread != 0:
                 continue
             b = turn // spread
-            forward_tree(tree, pose, b, b, joints)
-            place_parts(joints, parts, b, placed)
-            find_hiders(placed, cameras, b, hiders)
-            for task in range(V * Q):
-                v, q = task // Q, task % Q
-                trace_curve(parts, placed, cameras, b, v, curves[q, 0], curves[q, 1], b * V * Q + task, outlines)
-            for i in range(GRADIENT):
-                sums[b, i] = 0.0
-            for k in range(tree.shape[0]):
-                for i in range(INERTIA_NUMBERS + PULL_NUMBERS):
-                    joints[b, k, INERTIA + i] = 0.0
+            prepare_pose(tree, parts, curves, cameras, pose, b, joints, placed, hiders, outlines, sums)
             origin = load_translation(placed, b, 0)
             for task in range(V * Q):
                 c, v, q = b * V * Q + task, task // Q, task % Q
@@ -251,15 +281,8 @@ def _equations_kernel(real, alone):
                             if found == 0:
                                 cost += share * numbers[LOST] * numbers[LOST]
                             elif found > 0:
-                                if numbers[AMBIGUOUS] > 0.0:
-                                    reach_sqr = (numbers[AMBIGUOUS] * scale) ** 2
-                                    near, square = nearest_rival(
-                                        parts, curves, outlines, c - q, p, pixel + d * n, n, reach_sqr
-                                    )
-                                    if near:
-                                        weight *= shared_weight(d, square)
-                                if numbers[ROBUST] > 0.0:
-                                    weight *= robust_weight(d, numbers[ROBUST] * scale)
+                                at_edgel = pixel + d * n
+                                weight = weigh_edgel(parts, curves, outlines, numbers, c - q, p, at_edgel, n, d, share)
                                 cost += share * ti.min(d * d, numbers[LOST] * numbers[LOST])
                                 met += share
                         if found > 0 and weight > 0.0:
