@@ -149,8 +149,9 @@ def export_sample(samples: ti.template(), c: int, i: int, x_unscaled, pixel, g, 
 
 @ti.func
 def prepare_pose(
-    tree: ti.template(), parts: ti.template(), curves: ti.template(), cameras: ti.template(), pose: ti.template(), b: int,
-    joints: ti.template(), placed: ti.template(), hiders: ti.template(), outlines: ti.template(), sums: ti.template(),
+    tree: ti.template(), parts: ti.template(), curves: ti.template(), cameras: ti.template(), pose: ti.template(),
+    b: int, joints: ti.template(), placed: ti.template(), hiders: ti.template(), outlines: ti.template(),
+    sums: ti.template(),
 ):  # fmt: skip
     """Place the body of pose b, trace its contours in every view, and set its sums to 0; arguments as in the kernel."""
     V, Q = cameras.shape[0], curves.shape[0]
