@@ -1,8 +1,6 @@
-"""Meshes of voxels: closed, turned outwards, where the voxels are; read back by Open3D."""
+"""Meshes of voxels: closed, turned outwards, where the voxels are."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import open3d
@@ -10,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tk.errors import ResultError
-from tk.io.mesh import Mesh, hull_mesh, write_mesh
+from tk.io.mesh import Mesh, hull_mesh
 from tk.io.results.data import HullPoints
 from tk.model.cameras.volume import VoxelGrid
 
@@ -61,27 +58,6 @@ def test_any_voxels_have_a_closed_surface(seed: int, share: float) -> None:
     assert (counts % 2 == 0).all(), "an edge with a triangle on one side only is a hole"
 
 
-def test_no_voxels_no_triangles(tmp_path: Path) -> None:
+def test_no_voxels_no_triangles() -> None:
     empty = np.zeros(GRID.shape, bool)
-    mesh = hull_mesh(empty, GRID, surface_of(empty))
-    write_mesh(tmp_path / "a" / "none.ply", mesh)
-    assert len(open3d.io.read_triangle_mesh(tmp_path / "a" / "none.ply").triangles) == 0
-
-
-def test_ply_round_trip(tmp_path: Path) -> None:
-    rng = np.random.default_rng(3)
-    mesh = Mesh(
-        rng.normal(size=(40, 3)),
-        rng.permutation(39).reshape(13, 3).astype(np.int32),
-        rng.integers(0, 256, (40, 3), dtype=np.uint8),
-    )
-    write_mesh(tmp_path / "m.ply", mesh)
-    back = open3d.io.read_triangle_mesh(tmp_path / "m.ply")
-    np.testing.assert_array_equal(np.asarray(back.vertices), mesh.vertices)
-    np.testing.assert_array_equal(np.asarray(back.triangles), mesh.triangles)
-    np.testing.assert_allclose(np.asarray(back.vertex_colors) * 255, mesh.colors, atol=0.51)
-
-
-def test_a_mesh_that_cannot_be_written(tmp_path: Path) -> None:
-    with pytest.raises(ResultError, match="cannot be written"):
-        write_mesh(tmp_path, Mesh(np.eye(3), np.array([[0, 1, 2]], np.int32), np.zeros((3, 3), np.uint8)))
+    assert len(hull_mesh(empty, GRID, surface_of(empty)).triangles) == 0

@@ -112,7 +112,7 @@ def _taichi() -> Check:
 
 def _open3d() -> Check:
     out, why = _try("import open3d; print(open3d.__version__)")
-    return Check(out, f"{why}; without it no tk view, no PLY, no views in 3D: pip install open3d" if why else "")
+    return Check(out, f"{why}; without it no tk view, hull meshes, 3D views: pip install open3d" if why else "")
 
 
 def _display() -> Check:

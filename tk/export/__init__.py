@@ -39,8 +39,8 @@ FORMATS: dict[str, tuple[tuple[str, Writer], ...]] = {
     "gltf": ((".glb", write_glb),),
     "ply": (("_ply", write_body_meshes),),
 }
-# Packages that a format needs beyond those of tk itself, and the command that installs each.
-_PACKAGES = {"c3d": ("ezc3d", "pip install 'tk-mocap[export]'"), "ply": ("open3d", "pip install open3d")}
+# Packages that a format needs beyond those of tk itself, and the command that installs it.
+_PACKAGES = {"c3d": ("ezc3d", "pip install 'tk-mocap[export]'")}
 #: how a file of each format begins
 _SIGNATURES = {
     ".trc": looks_like(rb"PathFileType\t"),

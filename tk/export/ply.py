@@ -12,7 +12,7 @@ import numpy as np
 
 from tk.errors import ExportError
 from tk.export.motion import Motion
-from tk.io.mesh import Mesh, write_mesh
+from tk.io.point_cloud import ply_path, write_ply
 from tk.model.body.skeleton import SEGMENTS
 from tk.render.figure import figure_of
 from tk.render.palette import SEGMENT_COLORS
@@ -23,7 +23,7 @@ def write_body_meshes(motion: Motion, folder: Path) -> None:
 
     Raises:
         ExportError: the result has no body.
-        ResultError: Open3D cannot be loaded, or a file cannot be written.
+        ResultError: a file cannot be written.
     """
     figure = figure_of(motion.result)
     if not figure.solids:
@@ -35,4 +35,4 @@ def write_body_meshes(motion: Motion, folder: Path) -> None:
     colors = np.repeat(np.array(bgr, np.uint8)[:, ::-1], counts, axis=0)
     triangles = np.concatenate(faces).astype(np.int32)
     for frame, row in zip(motion.frames, motion.held, strict=True):
-        write_mesh(folder / f"{frame:06d}.ply", Mesh(figure.placed(int(row)), triangles, colors))
+        write_ply(ply_path(folder, frame), figure.placed(int(row)), colors, triangles)

@@ -1,19 +1,19 @@
-"""Point clouds: PLY files, with Open3D imported only when needed, and the HDF5 file of `tk reconstruct`."""
+"""Point clouds and meshes: PLY files, and the HDF5 file of `tk reconstruct`."""
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Iterable
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tk import __version__
 from tk.errors import ResultError, unwritable
 from tk.io.captures.capture import Capture
-from tk.io.paths import Kind, c_name, check_output, looks_like
+from tk.io.paths import Kind, check_output, looks_like
 from tk.io.results.data import HullPoints
 from tk.io.results.files import SUFFIXES, SafeFile, is_hdf5_of
 from tk.model.cameras.volume import VoxelGrid
@@ -22,78 +22,42 @@ HULL_FORMAT = "tk-hull"
 
 PLY = Kind("a PLY file", (".ply",), looks_like(rb"ply\n|ply\r"))
 
-_PLY_VERTICES = """ply
-format binary_little_endian 1.0
-element vertex 0
-property double x
-property double y
-property double z
-property uchar red
-property uchar green
-property uchar blue
-"""
-_PLY_FACES = """element face 0
-property list uchar uint vertex_indices
-"""
+#: datasets of a hull file: shape of a row and type
+_HULL_ROWS = {
+    "frames": ((), "i8"), "time": ((), "f8"), "hull/offsets": ((), "i8"),
+    "hull/positions": ((3,), "f4"), "hull/colors": ((3,), "u1"),
+}  # fmt: skip
 
 
-def write_ply(path: Path, positions: NDArray[np.floating], colors_rgb: NDArray[np.uint8]) -> None:
-    """Write one coloured point cloud.
+def write_ply(path: Path, positions: ArrayLike, colors: NDArray[np.uint8], triangles: ArrayLike | None = None) -> None:
+    """Write coloured points, or a mesh, as binary PLY; missing folders are created.
 
     Args:
-        path: the file; missing folders are created.
-        positions: (N, 3) metres; colors_rgb: (N, 3) uint8.
+        path: the file.
+        positions: (N, 3) metres.
+        colors: (N, 3) RGB.
+        triangles: (M, 3) indices of the corners; None for points without faces.
 
     Raises:
-        ResultError: Open3D cannot be loaded, or the file cannot be written.
+        ResultError: the file cannot be written.
     """
-    open3d = load_open3d(path)
-    create_empty_ply(path)
-    if len(positions) == 0:
-        return
-    cloud = open3d.geometry.PointCloud()
-    cloud.points = open3d.utility.Vector3dVector(np.asarray(positions, np.float64))
-    cloud.colors = open3d.utility.Vector3dVector(np.asarray(colors_rgb, np.float64) / 255)
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        written = open3d.io.write_point_cloud(c_name(path, ResultError), cloud)
-    if not written:
-        raise ply_error(path)
-
-
-def load_open3d(path: Path) -> Any:
-    """Return Open3D, to write ``path``.
-
-    Raises:
-        ResultError: it cannot be loaded.
-    """
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise ResultError(f"{path}: PLY files need Open3D, which does not load: {error}") from None
-    return open3d
-
-
-def create_empty_ply(path: Path, faces: bool = False) -> None:
-    """Write a PLY without points and, if ``faces`` is set, without faces.
-
-    Open3D does not report why it cannot write, and cannot write an empty file.
-
-    Raises:
-        ResultError: with the reason.
-    """
+    points = np.empty(len(colors), [("xyz", "<f8", 3), ("rgb", "u1", 3)])
+    points["xyz"], points["rgb"] = positions, colors
+    channels = ("double x", "double y", "double z", "uchar red", "uchar green", "uchar blue")
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    header += [f"property {channel}" for channel in channels]
+    content = points.tobytes()
+    if triangles is not None:
+        corners = np.asarray(triangles)
+        faces = np.empty(len(corners), [("count", "u1"), ("corners", "<u4", 3)])
+        faces["count"], faces["corners"] = 3, corners
+        header += [f"element face {len(faces)}", "property list uchar uint vertex_indices"]
+        content += faces.tobytes()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ResultError(f"{path.parent}: cannot be created: {error.strerror}") from None
-    try:
-        path.write_text(f"{_PLY_VERTICES}{_PLY_FACES if faces else ''}end_header\n", encoding="ascii", newline="\n")
+        path.write_bytes("\n".join([*header, "end_header\n"]).encode() + content)
     except OSError as error:
         raise unwritable(path, error) from None
-
-
-def ply_error(path: Path) -> ResultError:
-    """Return the error for a file that Open3D could not finish."""
-    return ResultError(f"{path}: cannot be written completely; check the free disk space")
 
 
 def write_hulls(path: Path, capture: Capture, grid: VoxelGrid, frames: Iterable[tuple[int, HullPoints]]) -> int:
@@ -113,11 +77,10 @@ def write_hulls(path: Path, capture: Capture, grid: VoxelGrid, frames: Iterable[
     """
     check_hull_path(path)
     temporary = path.with_name(f".{path.name}.tmp")
-    count = 0
+    count = voxels = 0
     try:
         with SafeFile(temporary, "w") as disk:
-            file = disk.file
-            file.attrs.update(
+            disk.file.attrs.update(
                 {
                     "format": HULL_FORMAT,
                     "format_version": 1,
@@ -127,48 +90,36 @@ def write_hulls(path: Path, capture: Capture, grid: VoxelGrid, frames: Iterable[
                     "capture": capture.name,
                     "voxel_m": grid.voxel_m,
                     "software": f"tk-mocap {__version__}",
-                    "created": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
+                    "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),
                 }
             )
-            group = file.create_group("hull")
-            index = file.create_dataset("frames", (0,), np.int64, maxshape=(None,))
-            seconds = file.create_dataset("time", (0,), np.float64, maxshape=(None,))
-            offsets = group.create_dataset("offsets", (1,), np.int64, maxshape=(None,))
-            positions = group.create_dataset("positions", (0, 3), np.float32, maxshape=(None, 3), chunks=(16384, 3))
-            colors = group.create_dataset("colors", (0, 3), np.uint8, maxshape=(None, 3), chunks=(16384, 3))
-            voxels = 0
+            data = {
+                name: disk.file.create_dataset(
+                    name, (0, *shape), dtype, maxshape=(None, *shape), chunks=(16384, 3) if shape else True
+                )
+                for name, (shape, dtype) in _HULL_ROWS.items()
+            }
+            data["hull/offsets"].resize(1, axis=0)
             try:
                 for frame, points in frames:
                     stop = voxels + len(points.positions)
-                    for dataset, values in ((positions, points.positions), (colors, points.colors)):
-                        dataset.resize(stop, axis=0)
-                        dataset[voxels:stop] = values
-                    for dataset, value in ((index, frame), (seconds, frame / capture.fps)):
-                        dataset.resize(count + 1, axis=0)
-                        dataset[count] = value
-                    offsets.resize(count + 2, axis=0)
-                    offsets[count + 1] = stop
+                    rows: tuple[Any, ...] = ([frame], [frame / capture.fps], [stop], points.positions, points.colors)
+                    for dataset, values in zip(data.values(), rows, strict=True):
+                        dataset.resize(len(dataset) + len(values), axis=0)
+                        dataset[len(dataset) - len(values) :] = values
                     count, voxels = count + 1, stop
                     disk.flush_to_disk()  # a full disk ends the run here, not after the last frame
             finally:  # Ctrl-C may interrupt a frame
-                for dataset, rows in ((positions, voxels), (colors, voxels), (index, count), (seconds, count)):
-                    dataset.resize(rows, axis=0)
-                offsets.resize(count + 1, axis=0)
+                for dataset, length in zip(data.values(), (count, count, count + 1, voxels, voxels), strict=True):
+                    dataset.resize(length, axis=0)
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise unwritable(path, error) from None
-    except BaseException:
-        _publish(temporary, path, count)
-        raise
-    _publish(temporary, path, count)
+    finally:
+        if count and temporary.exists():
+            temporary.replace(path)
+        temporary.unlink(missing_ok=True)  # no frame is finished: an older file stays
     return count
-
-
-def _publish(temporary: Path, path: Path, count: int) -> None:
-    if count:
-        temporary.replace(path)
-    else:  # no frame is finished: an older file stays
-        temporary.unlink(missing_ok=True)
 
 
 def check_hull_path(path: Path, force: bool = True, capture: Path | None = None) -> None:

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
 from tk.errors import ConfigError, ResultError
 from tk.io.captures.capture import Capture
-from tk.io.mesh import hull_mesh, write_mesh
+from tk.io.mesh import hull_mesh
 from tk.io.paths import check_not_input, check_output
 from tk.io.point_cloud import PLY, check_hull_path, ply_path, write_hulls, write_ply
 from tk.io.results.data import HullPoints
@@ -40,7 +38,7 @@ def reconstruct(
         config: settings of the segmentation and the resolution.
         reporter: who hears of the progress.
         frames: first frame and the one to stop before (None: the last).
-        ply: folder for a point cloud a frame, PLY; needs Open3D.
+        ply: folder for a point cloud a frame, PLY.
         mesh: folder for a closed mesh of the hull's surface a frame, PLY; needs Open3D.
         force: replace files that exist.
 
@@ -73,9 +71,10 @@ def reconstruct(
                 hull.update(segment(frame))
                 points: HullPoints = points_of(hull.surface(frame.images))
                 if ply is not None:
-                    write_ply(ply_path(ply, frame.index), np.asarray(points.positions), points.colors)
+                    write_ply(ply_path(ply, frame.index), points.positions, points.colors)
                 if mesh is not None:
-                    write_mesh(ply_path(mesh, frame.index), hull_mesh(hull.occupancy, hull.grid, points))
+                    surface = hull_mesh(hull.occupancy, hull.grid, points)
+                    write_ply(ply_path(mesh, frame.index), surface.vertices, surface.colors, surface.triangles)
                 yield frame.index, points
                 reporter.advance(frame.index, None)
 
