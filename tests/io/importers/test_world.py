@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tests.io.importers.conftest import make_rig, points
-from tk.io.importers.world import find_volume
+from tk.io.importers.write import find_volume
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.mounting import infer_up
 from tk.model.cameras.up import UP_AXES, up_vector

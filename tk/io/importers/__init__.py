@@ -1,4 +1,4 @@
-"""Convert projects of other tools to captures: `tk import`. A format is one module and one line in :data:`FORMATS`."""
+"""Convert projects of other tools to captures: `tk import`. A format is a :class:`Format` in :data:`FORMATS`."""
 
 from __future__ import annotations
 
@@ -8,29 +8,16 @@ from pathlib import Path
 
 from tk.errors import CaptureError, ClockError
 from tk.io.captures.capture import Capture, open_capture
-from tk.io.importers import (
-    anipose,
-    caliscope,
-    easymocap,
-    freemocap,
-    opencap,
-    panoptic,
-    pose2sim,
-    projections,
-    qualisys,
-    vicon,
-)
+from tk.io.importers import easymocap, opencap, panoptic, projections, qualisys, toml_tools, vicon
 from tk.io.importers.project import Format, Project, read_format
 from tk.io.importers.write import Imported, write_capture
 
 __all__ = ["FORMATS", "Imported", "import_project", "read_project"]
 
 #: in the order in which they are tried: formats with more specific file names first
-FORMATS = tuple(
-    module.FORMAT
-    for module in (
-        panoptic, easymocap, freemocap, caliscope, pose2sim, qualisys, vicon, anipose, opencap, projections,
-    )
+FORMATS = (
+    panoptic.FORMAT, easymocap.FORMAT, toml_tools.FREEMOCAP, toml_tools.CALISCOPE, toml_tools.POSE2SIM, qualisys.FORMAT,
+    vicon.FORMAT, toml_tools.ANIPOSE, opencap.FORMAT, projections.FORMAT,
 )  # fmt: skip
 
 #: folders above the given one that are searched for a calibration: SESSION/recordings/TRIAL

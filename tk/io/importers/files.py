@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import re
 import stat
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -88,3 +90,43 @@ def only(files: Sequence[Path]) -> Path:
         names = ", ".join(file.name for file in files)
         raise CalibrationError(f"{files[0].parent}: holds several calibrations: {names}; keep only the right one")
     return files[0]
+
+
+@dataclass(frozen=True)
+class Attributes:
+    """An element's attributes; ``where`` is the beginning of every error message."""
+
+    element: ElementTree.Element
+    where: str
+
+    @staticmethod
+    def child(parent: ElementTree.Element, path: str, where: str) -> Attributes:
+        """Return the first child at ``path``. Raises CalibrationError if there is none."""
+        found = parent.find(path)
+        if found is None:
+            raise CalibrationError(f"{where}: has no <{path.rpartition('/')[2]}>")
+        return Attributes(found, f"{where}: <{found.tag}>")
+
+    def numbers(self, key: str, count: int, default: list[float] | None = None, skip: int = 0) -> list[float]:
+        """Return the finite numbers of an attribute after ``skip`` words: ``count`` or more; ``default`` if missing.
+
+        Raises:
+            CalibrationError: it is missing without a default, or does not hold such numbers.
+        """
+        text = self.element.get(key)
+        if text is None:
+            if default is not None:
+                return default
+            raise CalibrationError(f"{self.where}: {key} is missing")
+        try:
+            values = [float(word) for word in text.split()[skip:]]
+        except ValueError:
+            values = []
+        if len(values) < count or not all(math.isfinite(value) for value in values):
+            wanted = "a finite number" if count == 1 else f"{count} finite numbers"
+            raise CalibrationError(f"{self.where}: {key} = {text[:60]!r} must be {wanted}")
+        return values
+
+    def number(self, key: str, default: float | None = None) -> float:
+        """Return the one finite number of an attribute. Raises as :meth:`numbers` does."""
+        return self.numbers(key, 1, None if default is None else [default])[0]

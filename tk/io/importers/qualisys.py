@@ -17,9 +17,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from tk.errors import CalibrationError
-from tk.io.importers.files import matching, only, read_xml
+from tk.io.importers.files import Attributes, matching, only, read_xml
 from tk.io.importers.project import Cameras, Format, check_camera
-from tk.io.importers.xml_values import Attributes
 from tk.model.cameras.camera import Camera, Rig
 
 #: QTM's units per pixel

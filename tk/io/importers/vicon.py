@@ -22,9 +22,8 @@ import scipy  # its packages are imported when they are first used
 from numpy.typing import NDArray
 
 from tk.errors import CalibrationError
-from tk.io.importers.files import matching, only, read_xml
+from tk.io.importers.files import Attributes, matching, only, read_xml
 from tk.io.importers.project import Cameras, Format, check_camera
-from tk.io.importers.xml_values import Attributes
 from tk.model.cameras.camera import Camera, Rig
 
 #: words of VICON_RADIAL2 before the coefficients: the model's name and the centre of distortion

@@ -11,19 +11,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import tomli_w
 
-from tk.errors import CaptureError, ClockError, unwritable
+from tk.errors import CalibrationError, CaptureError, ClockError, VolumeError, unwritable
 from tk.io.captures.calibration import camera_table
 from tk.io.captures.capture import open_capture
 from tk.io.captures.video import PICTURE_SUFFIXES, probe
 from tk.io.importers.project import Project
-from tk.io.importers.sizes import fit_size
-from tk.io.importers.world import find_volume
 from tk.model.cameras.camera import Camera, Rig
+from tk.model.cameras.common_view import closest_to_axes, common_boxes
 from tk.model.cameras.mounting import FoundUp, infer_up
 from tk.model.cameras.up import up_text
 from tk.model.cameras.volume import Volume
+
+#: least side of a working volume, metres: a person with arms spread needs more
+_ROOM_M = 1.5
+#: codecs pad images to blocks of 16 pixels: a smaller difference in size is padding, removed or kept
+_BLOCK = 16
 
 
 @dataclass(frozen=True)
@@ -105,6 +110,33 @@ def _warnings(capture: Path) -> tuple[str, ...]:
         return (error.line,)
 
 
+def find_volume(rig: Rig) -> tuple[Volume | None, str]:
+    """Return the working volume, around the point nearest to all optical axes, and how it was found.
+
+    It is the box that all cameras see, if a person fits into it; else the box that all but one see, and so on.
+    """
+    try:
+        middle = closest_to_axes(rig)
+        boxes = list(common_boxes(rig))
+    except VolumeError as reason:
+        return None, f"no [volume] could be inferred: {reason}; give one"
+    behind = [camera.name for camera in rig if camera.to_camera(middle)[0, 2] <= 0]
+    looks = f"; {', '.join(behind)} look away from it: check the calibration" if behind else ""
+    if not boxes:
+        return None, f"no [volume] could be inferred: no two cameras see the point nearest to all axes{looks}; give one"
+    roomy = [(views, box) for views, box in boxes if min(box.size) >= _ROOM_M]
+    views, box = roomy[0] if roomy else boxes[0]
+    who = "all cameras see" if views == len(rig) else f"{views} of the {len(rig)} cameras see"
+    return _rounded(box), f"the box that {who} around the point nearest to their axes{looks}"
+
+
+def _rounded(volume: Volume) -> Volume:
+    """Round to centimetres, for people to read and edit."""
+    center = [round(x, 2) for x in volume.center]
+    size = [max(round(x, 2), 0.01) for x in volume.size]
+    return Volume((center[0], center[1], center[2]), (size[0], size[1], size[2]))
+
+
 def calibration_toml(rig: Rig, project: Project) -> str:
     """Return the text of `calibration.toml`, metres."""
     metadata = {"units": "m", "imported_from": f"{project.tool}, {project.source.name}"}
@@ -170,6 +202,47 @@ def _fitted(rig: Rig, clips: Sequence[Path], notes: list[str]) -> Rig:
             notes.append(note)
         cameras.append(fitted)
     return Rig(tuple(cameras))
+
+
+def fit_size(camera: Camera, width: int, height: int, clip: Path) -> tuple[Camera, str | None]:
+    """Return the camera of a video of ``width`` × ``height`` pixels, and a note about the change.
+
+    - A calibration without a size (0 × 0) takes the video's size.
+    - A difference of a few pixels (1088 rows against 1080) is a codec's padding at the right and the bottom: the matrix
+      stays the same.
+    - One exact ratio in both directions is a scaled image: the matrix is scaled. Pixel centres are integers, so a pixel
+      x maps to s (x + ½) - ½.
+
+    Raises:
+        CalibrationError: none of these rules applies.
+    """
+    calibrated = (camera.width, camera.height)
+    if calibrated in ((width, height), (0, 0)):
+        return replace(camera, width=width, height=height), None
+    sizes = f"camera {camera.name!r}: calibrated at {camera.width}×{camera.height}, video {width}×{height}"
+    if abs(width - camera.width) < _BLOCK and abs(height - camera.height) < _BLOCK:
+        return (
+            replace(camera, width=width, height=height),
+            f"{sizes}: a codec's padding at the right and the bottom; the matrix stays as it is",
+        )
+    if width * camera.height == height * camera.width:
+        scale = width / camera.width
+        matrix = np.diag([scale, scale, 1.0]) @ camera.matrix
+        matrix[:2, 2] = scale * (camera.matrix[:2, 2] + 0.5) - 0.5
+        return (
+            replace(camera, matrix=matrix, width=width, height=height),
+            f"{sizes}: the video is scaled by {scale:g}, and so is the matrix",
+        )
+    turned = (
+        "; is the video turned by 90°?"
+        if abs(width - camera.height) < _BLOCK and abs(height - camera.width) < _BLOCK
+        else ""
+    )
+    ratios = f"{width / camera.width:.4g} and {height / camera.height:.4g}"
+    raise CalibrationError(
+        f"{clip}: {sizes}: neither a few pixels of padding nor one scale in both directions ({ratios}){turned}; "
+        "calibrate at the video's size, or export the video at the calibration's"
+    )
 
 
 def _place(clips: Sequence[Path], names: Sequence[str], draft: Path, folder: str) -> bool:
