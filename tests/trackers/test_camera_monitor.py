@@ -15,6 +15,7 @@ from tk.errors import CaptureError
 from tk.io import settings_file
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.results.reader import read_joints
+from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
 from tk.model.setup import Subject
 from tk.trackers.camera_monitor import CameraMonitor
 from tk.trackers.protocol import Estimate, Observation
@@ -124,6 +125,17 @@ def test_turned_camera_is_excluded_and_included_again(scene: Scene) -> None:
     assert "camera cam2 disagrees with the others" in line and "frames 5 to 10" in line
     # the residual of an excluded camera is unknown
     assert estimates[6].residual is not None and np.isnan(estimates[6].residual[1]).all()
+
+
+def test_two_cameras_that_face_each_other_contradict_no_third(scene: Scene) -> None:
+    centers = scene.setup.rig.centers - scene.truth[0].mean(axis=0)
+    rays = centers / np.linalg.norm(centers, axis=1, keepdims=True)
+    assert depth_information(rays[[0, 2]]) < LEAST_INFORMATION < depth_information(rays[[0, 3]])
+    for unseen, excluded in ((3, False), (2, True)):
+        monitor = scene.monitor()
+        for frame in scene.frames[:8]:
+            _, used = monitor.step(moved(1, range(5, 10))(blind([unseen], range(FRAMES))(frame)))
+        assert bool(used.masks[1].any()) is not excluded
 
 
 def test_frozen_and_black_cameras_are_excluded_and_reported(scene: Scene) -> None:

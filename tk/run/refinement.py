@@ -271,18 +271,25 @@ def whole_delays(
     grid, group = RayGrid(rig, SCREEN_ROWS), np.zeros(len(body.parts), np.int32)
 
     def wrong(n: int) -> Float:
-        """Return (C,) the mean share of wrong pixels with masks of n frames before."""
+        """Return (R, C) the shares of wrong pixels with masks of n frames before; NaN where they show nobody."""
         shown = [Evidence.of(grid, masks(int(frames[i]) - n)) for i in rows]
         cast = [e.cast(body, group, poses[i][None], export=True)[1] for e, i in zip(shown, rows, strict=True)]
         shares = [e.residual(met.label[0]).sum(axis=1) for e, met in zip(shown, cast, strict=True) if met is not None]
-        return np.nan_to_num(np.mean(shares, axis=0), nan=0.0)
+        return np.array(shares)
 
-    now = wrong(0)
-    if not (now > _WORSE * np.median(now)).any():
+    def mean(shares: Float) -> Float:
+        """Return (..., C) means over the frames in which shares (..., R, C) are known for every delay; 0 without."""
+        known = np.isfinite(shares).reshape(-1, *shares.shape[-2:]).all(axis=0)
+        return np.asarray(np.where(known, shares, 0.0).sum(axis=-2) / np.maximum(known.sum(axis=0), 1))
+
+    def worse(error: Float) -> NDArray[np.bool_]:
+        return np.asarray(error > _WORSE * np.median(error))
+
+    if not worse(mean(wrong(0))).any():
         return none
-    shares = np.array([wrong(n) for n in shifts])
-    best = np.argmin(shares, axis=0)
-    mended = (now > _WORSE * np.median(now)) & (shares.min(axis=0) < _MENDED * now)
+    errors = mean(np.array([wrong(n) for n in shifts]))
+    now, best = errors[LARGEST_DELAY], np.argmin(errors, axis=0)
+    mended = worse(now) & (errors.min(axis=0) < _MENDED * now)
     return np.where(mended, np.array(shifts)[best], 0)
 
 

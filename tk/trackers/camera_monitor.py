@@ -30,6 +30,7 @@ from tk.errors import CaptureError
 from tk.kernels.mask_values import OTHERS
 from tk.model.body.plausibility import Plausibility, check_extent, check_stature
 from tk.model.body.skeleton import JOINTS
+from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
 from tk.model.cues.ray_costs import residual_of
 from tk.model.masks.image_health import ImageHealth, described
 from tk.model.masks.mask_agreement import Agreement, MaskAgreement
@@ -199,7 +200,7 @@ class CameraMonitor:
             second = tracker.step(fewer)
             residual = self._residual(frame, second)
             again = residual.sum(axis=1)
-            if self._is_wrong(worst, residual, error, others):
+            if self._is_wrong(worst, residual, error, others, second.joints):
                 self._excluded[worst] = True
                 self._torn[worst] = residual[worst, 1] < _TORN * residual[worst, 0]
                 estimate, used, kept = replace(second, status=first.status), fewer, others
@@ -211,14 +212,19 @@ class CameraMonitor:
         self._excluded &= ~back
         return estimate, used, np.where(kept, offset, np.nan)
 
-    def _is_wrong(self, camera: int, residual: Float, before: Float, others: NDArray[np.bool_]) -> bool:
-        """Return whether a camera is wrong, by the residual (C, 2) of the pose without it.
+    def _is_wrong(self, camera: int, residual: Float, before: Float, others: NDArray[np.bool_], joints: Float) -> bool:
+        """Return whether a camera is wrong, by the joints (15, 3) and the residual (C, 2) of the pose without it.
 
+        Cameras that see the person from the same or from opposite sides contradict no other camera, because they do not
+        determine a pose.
         If the other cameras have a high residual too, the pose is wrong instead. Surplus area alone, such as a second
         person in the mask, hardly misleads contours: it counts only if the others' E_S falls without the camera, from
         ``before`` (C,), by one spread. A pose from two cameras is uncertain, so a third must have twice the excess.
         """
         assert isinstance(self.tracker, RegionTracker)
+        rays = joints.mean(axis=0) - self._setup.rig.centers[others]
+        if depth_information(rays / np.linalg.norm(rays, axis=1, keepdims=True)) < LEAST_INFORMATION:
+            return False
         baseline, error = self.tracker.residuals, residual.sum(axis=1)
         excess_of_others = baseline.mean_excess(np.where(others, error, np.nan))
         if excess_of_others > baseline.threshold:
