@@ -371,9 +371,9 @@ def test_evaluate_refuses_damaged_results(tk: Tk, tracked: Path, tiny: Path, tmp
     [
         (
             ["--method", "volumetric"],
-            [("resume/state/pose", None), ("resume/state/baseline", "text"), ("model/patches", None)],
+            [("resume", np.zeros(9, np.uint8)), ("resume", "text"), ("model/patches", None)],
         ),
-        (["--causal"], [("resume/state/poses", None), ("resume/state/residual_mean", "text"), ("model/parts", None)]),
+        (["--causal"], [("resume", np.zeros(9, np.uint8)), ("model/parts", None)]),
     ],
 )
 def test_resume_refuses_a_damaged_state(

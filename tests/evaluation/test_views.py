@@ -109,8 +109,6 @@ def test_unusable_input_is_reported(tk: Tk, tiny: Path, three_views: Path, copy:
     shutil.rmtree(copy / "videos")
     ran = tk("evaluate", three_views, copy / "truth.h5")
     assert ran.code == 0 and "no comparison in the images" in ran.err and "PCK5" in ran.out
-    with h5py.File(three_views) as file:
-        assert "state" in file["resume"]
 
 
 def is_ankle(skeleton: Skeleton) -> np.ndarray:

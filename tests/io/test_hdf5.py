@@ -132,7 +132,7 @@ def test_whatever_the_damage(
 
 DATASETS = [
     "frames", "pose", "joints/position", "joints/sigma", "status", "timing/total", "angles/hip_l", "cameras/size",
-    "smoothed/bridged", "hull/offsets", "hull/positions", "model/height_m", "resume/rows", "resume/state/mean",
+    "smoothed/bridged", "hull/offsets", "hull/positions", "model/height_m", "resume",
 ]  # fmt: skip
 VALUES = [
     np.float64(1e300), np.full((COUNT, 24), np.inf), np.full(COUNT, -1), np.full((COUNT, 15, 3), 1e300), "text",

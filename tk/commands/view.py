@@ -23,8 +23,7 @@ def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path
     """
     from tk.io.captures.capture import open_capture
     from tk.io.paths import Kind, check_output, looks_like
-    from tk.io.results.reader import read_result
-    from tk.io.results.truth import truth_of
+    from tk.io.results.reader import read_result, truth_of
     from tk.view.contents import Contents
     from tk.view.window import Window, require_display
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -206,19 +204,12 @@ def _with_absent_frames(result: Result) -> Result:
     frames = np.arange(result.frames[0], result.frames[-1] + 1)
     rows = np.searchsorted(result.frames, frames, side="right") - 1
     absent = result.frames[rows] != frames
-
-    def filled(values: Any) -> Any:
-        if isinstance(values, np.ndarray) and values.ndim and len(values) == len(result):
-            return values[rows]
-        return {name: filled(value) for name, value in values.items()} if isinstance(values, Mapping) else values
-
-    result = replace(
-        result, **{f.name: filled(getattr(result, f.name)) for f in fields(result) if f.name not in ("model", "state")}
-    )
-    time = result.time + (frames - result.frames) / result.meta.fps
+    time = result.time[rows] + (frames - result.frames[rows]) / result.meta.fps
     smoothed = result.smoothed
     if smoothed is not None:
-        smoothed = {**smoothed, "bridged": smoothed["bridged"] & ~absent}
+        smoothed = {name: values[rows] for name, values in smoothed.items()}
+        smoothed["bridged"] &= ~absent
+    result = result.at_rows(rows)
     status = np.where(absent, Status.ABSENT, result.status)
     return replace(result, frames=frames, time=time, status=status, smoothed=smoothed)
 

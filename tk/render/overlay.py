@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from tk.errors import ExportError, ResultError, unwritable
 from tk.io.captures.capture import Capture
 from tk.io.results.data import Result
+from tk.io.results.reader import truth_of
 from tk.io.results.status import STATUS_MEANING, has_pose
-from tk.io.results.truth import truth_of
 from tk.model.cameras.camera import Camera, Rig
 from tk.render.canvas import Image, View, dots, draw_body, draw_joints, draw_truth, text_width, write
 from tk.render.figure import Figure, figure_of, lost_in

@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from tk.evaluation.joints import Evaluation, evaluate_files, plain_values
 from tk.evaluation.people import evaluate_people
 from tk.io.results.data import Result
-from tk.io.results.reader import read_people
+from tk.io.results.reader import read_people, truth_of
 from tk.io.results.status import STATUS_MEANING, Status
-from tk.io.results.truth import truth_of
 from tk.model.body.joints import BONES, HINGES, JOINTS, LIMB_JOINTS, SEGMENTS
 from tk.model.cameras.camera import Rig
 from tk.render.figure import AROUND, Figure, figure_of
@@ -54,7 +53,7 @@ def describe(result: Result, rig: Rig | None = None, truth: Path | None = None) 
     meta = result.meta
     whole = result.aligned()
     step = -(-len(whole) * len(whole[0]) // _MOST_ROWS)
-    people = [person.thinned(step) for person in whole]
+    people = [person.at_rows(np.arange(0, len(person), step)) for person in whole]
     figures = [figure_of(person) for person in people]
     first = people[0]
     stage = Stage.of(people, figures)

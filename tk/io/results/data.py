@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ResultError
+from tk.io.results.schema import ROWS as DATASETS
 from tk.io.results.schema import columns_of
 from tk.io.results.status import Status, has_pose
 from tk.io.toml import parse_toml
@@ -340,37 +341,29 @@ class Result:
         time = np.empty(len(frames))
         for person in self.people:
             time[np.searchsorted(frames, person.frames)] = person.time
-        return tuple(person._on(frames, time) for person in self.people)
+        found = []
+        for person in self.people:
+            rows = np.full(len(frames), -1)
+            rows[np.searchsorted(frames, person.frames)] = np.arange(len(person))
+            found.append(replace(person.at_rows(rows), frames=frames, time=time))
+        return tuple(found)
 
-    def _on(self, frames: NDArray[np.int64], time: Float) -> Result:
-        row = np.searchsorted(frames, self.frames)
+    def at_rows(self, rows: NDArray[np.int64]) -> Result:
+        """Return these rows of this person, without smoothed copy and hull; -1 gives a row with the status ABSENT, and
+        NaN in it."""
+        there = rows >= 0
 
-        def spread(values: NDArray[Any]) -> NDArray[Any]:
-            whole = np.zeros((len(frames), *values.shape[1:]), values.dtype)
-            if values.dtype.kind == "f":
-                whole[...] = np.nan
-            whole[row] = values
-            return whole
+        def take(values: NDArray[Any]) -> NDArray[Any]:
+            taken = np.full((len(rows), *values.shape[1:]), np.nan if values.dtype.kind == "f" else 0, values.dtype)
+            taken[there] = values[rows[there]]
+            return taken
 
-        status = np.full(len(frames), np.uint8(Status.ABSENT))
-        status[row] = self.status
-        return replace(self._each(spread), frames=frames, time=time, status=status)
-
-    def thinned(self, step: int) -> Result:
-        """Return every ``step``-th row of this person, without smoothed copy and hull."""
-        every = slice(None, None, step)
-        frames, time, status = self.frames[every], self.time[every], self.status[every]
-        return replace(self._each(lambda values: values[every]), frames=frames, time=time, status=status)
-
-    def _each(self, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Result:
-        """Return the result of this person with changed values of all rows, but for frame, time and status."""
-        columns: dict[str, Any] = {
-            name: change(getattr(self, name))
-            for name in ("pose", "joints", "objective", "iterations", "sigma", "residual", "segments_rotation", "feet")
-            if getattr(self, name) is not None
-        }
-        for name in ("timing", "angles"):
-            columns[name] = {key: change(values) for key, values in getattr(self, name).items()}
+        columns: dict[str, Any] = {}
+        for entry in DATASETS:
+            values = getattr(self, entry.field)
+            if values is not None:
+                columns[entry.field] = {k: take(v) for k, v in values.items()} if entry.each else take(values)
+        columns["status"][~there] = Status.ABSENT
         return replace(self, smoothed=None, hull=None, others=(), **columns)
 
     def with_smoothed(self) -> Result:

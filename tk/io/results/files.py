@@ -18,7 +18,7 @@ import h5py
 
 from tk.errors import FULL, ConfigError, DiskFullError, ResultBusyError, ResultError
 from tk.io.hdf5 import open_hdf5
-from tk.io.paths import Kind, check_output, resolved
+from tk.io.paths import Kind, check_output
 from tk.io.results.schema import FORMAT
 
 
@@ -209,22 +209,6 @@ def _signals_deferred() -> Iterator[None]:
             signal.raise_signal(caught)
 
 
-def writable(path: Path) -> Path:
-    """Return the path with links resolved, so that a rename does not replace the link.
-
-    Raises:
-        ResultError: no file can be written there.
-    """
-    target = resolved(path, ResultError)
-    if target.is_dir():
-        raise ResultError(f"{path}: is a folder; name a file in it")
-    if not target.parent.is_dir():
-        raise ResultError(f"{path}: the folder {target.parent} does not exist; make it first")
-    if target.is_symlink() or (target.exists() and not (target.is_file() and os.access(target, os.W_OK))):
-        raise ResultError(f"{path}: cannot be written; choose another name")
-    return target
-
-
 def is_hdf5_of(path: Path, name: str) -> bool:
     """Return whether a file is HDF5 with this value of the attribute `format`, of any version."""
     try:
@@ -239,10 +223,8 @@ SUFFIXES = (".h5", ".hdf5")
 RESULT = Kind(f"a {FORMAT}", SUFFIXES, lambda path: is_hdf5_of(path, FORMAT))
 
 
-def check_is_result(target: Path) -> None:
-    """Raise ResultError if the file is not a tk result of any version."""
-    if not RESULT.is_one(target):
-        raise ResultError(f"{target}: exists and is not {RESULT.name}; it is not overwritten: choose another name")
+#: for files whose content is checked later
+ANY_HDF5 = replace(RESULT, is_one=lambda _: True)
 
 
 def check_result_path(
@@ -267,9 +249,7 @@ def check_result_path(
     if force and resume:
         raise ConfigError("force replaces a result and resume continues it: choose one of them")
     try:
-        # resuming reports by itself what is wrong with a file
-        kind = replace(RESULT, is_one=lambda _: True) if resume else RESULT
-        check_output(path, kind, force or resume, inputs, capture, ResultError)
+        check_output(path, ANY_HDF5 if resume else RESULT, force or resume, inputs, capture, ResultError)
     except ResultError as error:
         if error.hint:
             error.hint = "continue it with --resume, or replace it with --force"

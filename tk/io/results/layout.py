@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -77,12 +78,10 @@ class Twin:
         self._rows = [int(file[f"{prefix_of(person)}frames"].shape[0]) for person in range(len(models))]
         self.count = self._rows[0]
         self._open: dict[str, h5py.h5d.DatasetID] = {}
-        self._written: dict[str, NDArray[Any]] = {}  # content of `/resume`; most of it is the same in every frame
         self._smoothed = {prefix for person in range(len(models)) if f"{(prefix := prefix_of(person))}smoothed" in file}
         self._relink = False
         if "resume" in file:
             self._drop_rows_without_state()
-            file["resume"].visititems(self._take_up)
 
     def append(self, new: Sequence[FrameSet]) -> None:
         """Append frame sets and the latest state, without flushing. `/smoothed` is deleted: it is now incomplete."""
@@ -107,13 +106,8 @@ class Twin:
                 self._relink = True
         self.models = list(models)
 
-    def _take_up(self, name: str, item: h5py.Dataset | h5py.Group) -> None:
-        if isinstance(item, h5py.Dataset):
-            self._written[name] = np.asarray(item[()])
-
     def _drop_rows_without_state(self) -> None:
-        self.count = int(self.file["resume/rows"][()])
-        counts = self.file["resume/people"][()].tolist()
+        self.count, counts, _ = unpack_state(self.file["resume"][()])
         for person in range(len(self._rows)):
             prefix, rows = prefix_of(person), counts[person] if person < len(counts) else 0
             if rows == self._rows[person]:
@@ -173,20 +167,12 @@ class Twin:
 
     def _put_state(self, state: State) -> None:
         """Overwrite `/resume` with the state after the last frame set."""
-        content = {"rows": encode(self.count), "people": encode(np.array(self._rows))}
-        content |= {f"state/{name}": encode(value) for name, value in state.items()}
-        content["checksum"] = encode(checksum(content))
-        for name, before in list(self._written.items()):
-            array = content.get(name)
-            if array is None or (array.dtype, array.shape) != (before.dtype, before.shape):
-                del self.file[f"resume/{name}"], self._written[name]
-                self._open.pop(f"resume/{name}", None)
-        for name, array in content.items():
-            if name not in self._written:
-                self.file[f"resume/{name}"] = array
-            elif self._written[name].tobytes() != array.tobytes():
-                self._dataset(f"resume/{name}").write(h5py.h5s.ALL, h5py.h5s.ALL, np.ascontiguousarray(array))
-            self._written[name] = array
+        packed = pack_state(self.count, self._rows, state)
+        if "resume" not in self.file:
+            _create_growing(self.file, "resume", (), "uint8", len(packed))
+        dataset = self._dataset("resume")
+        dataset.set_extent(packed.shape)
+        dataset.write(h5py.h5s.ALL, h5py.h5s.ALL, packed)
 
     def _extend(self, name: str, values: NDArray[Any], rows: int | None = None) -> None:
         """Append values to a dataset. ``rows`` is its current number of rows; None: ask HDF5.
@@ -284,19 +270,34 @@ def put_attributes(holder: h5py.Dataset | h5py.Group, attributes: Mapping[str, s
         holder.attrs[name] = value if isinstance(value, str) else _strings(value)
 
 
-def encode(value: Value) -> NDArray[Any]:
-    """Return a value as the array that `/resume` holds: a text as its UTF-8 bytes."""
-    return np.asarray(value.encode() if isinstance(value, str) else value)
+def pack_state(rows: int, people: Sequence[int], state: State) -> NDArray[np.uint8]:
+    """Return the content of `/resume`: a NumPy archive (npz) and its CRC-32.
+
+    Args:
+        rows: number of finished frame sets.
+        people: number of rows of each person.
+        state: state of the run after these rows.
+    """
+    archive = io.BytesIO()
+    content: dict[str, Any] = {f"state/{name}": value for name, value in state.items()}
+    np.savez(archive, rows=rows, people=people, **content)
+    data = archive.getvalue()
+    return np.frombuffer(data + zlib.crc32(data).to_bytes(4, "little"), np.uint8)
 
 
-def checksum(content: Mapping[str, Value]) -> int:
-    """Return the CRC-32 of names, types, shapes and values; the order and the bits of a NaN make no difference."""
-    total = 0
-    for name, array in sorted((name, encode(value)) for name, value in content.items()):
-        if array.dtype.kind == "f":
-            array = np.where(np.isnan(array), np.asarray(np.nan, array.dtype), array)
-        total = zlib.crc32(f"{name} {array.dtype.str} {array.shape}".encode() + array.tobytes(), total)
-    return total
+def unpack_state(packed: NDArray[np.uint8]) -> tuple[int, list[int], dict[str, Value]]:
+    """Return the arguments of :func:`pack_state`.
+
+    Raises:
+        ValueError: the content is damaged.
+    """
+    data, crc = packed[:-4].tobytes(), packed[-4:].tobytes()
+    if not data or zlib.crc32(data).to_bytes(4, "little") != crc:
+        raise ValueError("the state of the run is damaged")
+    with np.load(io.BytesIO(data)) as archive:
+        content = {name.removeprefix("state/"): archive[name][()] for name in archive.files}
+    state = {name: str(value) if isinstance(value, str) else value for name, value in content.items()}
+    return int(state.pop("rows")), list(state.pop("people")), state
 
 
 def _create_growing(file: h5py.File, name: str, shape: tuple[int, ...], dtype: str, rows: int) -> h5py.Dataset:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tk.errors import ConfigError, ResultError
 from tk.io.hdf5 import Hdf5Reader, open_hdf5
 from tk.io.results.data import Float, Hull, JointAngles, JointTrack, Result, ResultMeta, UsedCameras, Value
+from tk.io.results.layout import unpack_state
 from tk.io.results.schema import (
     ATTRIBUTES,
     CAMERAS,
@@ -48,7 +49,7 @@ def read_result(path: str | os.PathLike[str]) -> Result:
         shared = {
             "path": path,
             "cameras": _read_cameras(file),
-            "state": file.values("resume/state", MAX_NUMBER),
+            "state": read_state(file)[1],
             "software": file.text("", "software", ""),
             "created": file.text("", "created", ""),
             "notes": file.names("", "notes") if file.attribute("", "notes") is not None else (),
@@ -79,6 +80,19 @@ def read_people(path: str | os.PathLike[str]) -> tuple[JointTrack, ...]:
 def read_joints(path: str | os.PathLike[str]) -> JointTrack:
     """Read the joints of the first person; see :func:`read_people`."""
     return read_people(path)[0]
+
+
+def truth_of(result: Result, path: Path) -> Float | None:
+    """Return the ground-truth joints (P, F, 15, 3) of each person in the result's frames, NaN if missing; None without
+    the file."""
+    if not path.exists():
+        return None
+    people = read_people(path)
+    places = np.full((len(people), len(result), *people[0].positions.shape[1:]), np.nan)
+    for person, track in zip(places, people, strict=True):
+        _, mine, theirs = np.intersect1d(result.frames, track.frames, return_indices=True)
+        person[mine] = track.positions[theirs]
+    return places
 
 
 _UNUSABLE = (
@@ -196,6 +210,17 @@ def check_hull(file: Hdf5Reader, rows: int, prefix: str = "") -> NDArray[np.int6
 def read_model(file: Hdf5Reader, prefix: str = "") -> dict[str, Value]:
     """Return the fitted body of a person; {} if there is none."""
     return file.values(f"{prefix}model", MAX_NUMBER)
+
+
+def read_state(file: Hdf5Reader) -> tuple[list[int], dict[str, Value]]:
+    """Return the number of rows of each person that have a state, and the state of the run; [] and {} without one."""
+    if "resume" not in file.shapes:
+        return [], {}
+    try:
+        _, people, state = unpack_state(file.array("resume", "uint8", (None,)))
+    except ValueError as error:
+        file.fail(str(error))
+    return people, state
 
 
 def _read(file: Hdf5Reader, path: str, entry: Dataset, shape: tuple[int | None, ...]) -> NDArray[Any]:

@@ -14,9 +14,11 @@ from typing import Any
 
 from numpy.typing import ArrayLike, NDArray
 
+from tk.errors import ResultError
 from tk.io.hdf5 import open_hdf5
+from tk.io.paths import check_output
 from tk.io.results.data import ResultMeta, UsedCameras, Value
-from tk.io.results.files import SafeFile, TwinFolder, writable, writing
+from tk.io.results.files import ANY_HDF5, SafeFile, TwinFolder, writing
 from tk.io.results.layout import link_first_person, put_attributes, put_cameras, put_model
 from tk.io.results.reader import check_format, count_people, count_rows, read_meta
 from tk.io.results.schema import Column, columns_of, prefix_of, smoothed_columns
@@ -53,7 +55,8 @@ def revise_result(
         ResultError: the file is no result, another run is writing it, or it cannot be written. It is unchanged.
         ValueError: a dataset or the person is unknown, or a dataset has the wrong shape.
     """
-    target, prefix = writable(Path(path)), prefix_of(person)
+    target = check_output(Path(path), ANY_HDF5, force=True, error=ResultError)
+    prefix = prefix_of(person)
     with open_hdf5(target) as file:
         check_format(file)
         if not 0 <= person < count_people(file):

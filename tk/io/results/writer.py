@@ -19,13 +19,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 
-import numpy as np
-
 from tk.errors import ResultError
 from tk.io.hdf5 import Hdf5Reader, open_hdf5
+from tk.io.paths import check_output
 from tk.io.results.data import FrameResult, ResultMeta, Value
-from tk.io.results.files import SafeFile, TwinFolder, check_is_result, writable, writing
-from tk.io.results.layout import FrameSet, Twin, checksum, write_layout
+from tk.io.results.files import ANY_HDF5, RESULT, SafeFile, TwinFolder, writing
+from tk.io.results.layout import FrameSet, Twin, write_layout
 from tk.io.results.reader import (
     check_format,
     check_hull,
@@ -33,8 +32,9 @@ from tk.io.results.reader import (
     count_rows,
     read_meta,
     read_model,
+    read_state,
 )
-from tk.io.results.schema import MAX_NUMBER, columns_of, prefix_of
+from tk.io.results.schema import columns_of, prefix_of
 
 Model = Mapping[str, Value]
 
@@ -78,9 +78,7 @@ class ResultWriter:
             ResultError: the file cannot be written, another run is writing it, or a file of that name exists and is
                 not a tk result.
         """
-        target = writable(Path(path))
-        if target.exists():
-            check_is_result(target)
+        target = check_output(Path(path), RESULT, force=True, error=ResultError)
         return cls._opened(target, meta, [{} for _ in range(people)], None)
 
     @classmethod
@@ -95,13 +93,15 @@ class ResultWriter:
             ResultError: as in :meth:`create`, or the file was made from another capture or configuration, or its state
                 is damaged.
         """
-        target = writable(Path(path))
+        target = check_output(Path(path), ANY_HDF5, force=True, error=ResultError)
         if not target.exists():
             return cls.create(path, meta), 0
         with open_hdf5(target) as done:
             check_format(done)
             rows = [_check_resumable(done, meta, person) for person in range(count_people(done))]
-            state = _read_state(done, rows)
+            finished, state = read_state(done)
+            if len(finished) > len(rows) or any(a > b for a, b in zip(finished, rows, strict=False)):
+                done.fail(f"the state of the run is damaged; {_REMEDY}")
             models: list[Model] = [read_model(done, prefix_of(person)) for person in range(len(rows))]
         writer = cls._opened(target, meta, models, target)
         writer.state = state
@@ -247,20 +247,3 @@ def _check_resumable(file: Hdf5Reader, meta: ResultMeta, person: int) -> int:
     rows = count_rows(file, meta, prefix)
     check_hull(file, rows, prefix)
     return rows
-
-
-def _read_state(file: Hdf5Reader, rows: list[int]) -> dict[str, Value]:
-    """Return the state of the run; {} if there is none.
-
-    Raises:
-        ResultError: it is not what was written.
-    """
-    content = file.values("resume", MAX_NUMBER)
-    if not content:
-        return {}
-    stored = content.pop("checksum", None)
-    intact = np.ndim(stored) == 0 and stored == checksum(content)
-    counts = np.atleast_1d(content["people"]).tolist() if intact else []
-    if not intact or len(counts) > len(rows) or any(count > here for count, here in zip(counts, rows, strict=False)):
-        file.fail(f"the state of the run is damaged; {_REMEDY}")
-    return {name.removeprefix("state/"): value for name, value in content.items() if name.startswith("state/")}
