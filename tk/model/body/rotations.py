@@ -20,14 +20,30 @@ _DAMPED_STEPS = 20
 
 def to_quaternions(R: Float) -> Float:
     """(..., 4) unit quaternions (w, x, y, z) of rotations (..., 3, 3); w is not negative."""
-    q = scipy.spatial.transform.Rotation.from_matrix(np.reshape(R, (-1, 3, 3))).as_quat()[:, [3, 0, 1, 2]]
-    return np.where(q[:, :1] < 0, -q, q).reshape(*np.shape(R)[:-2], 4)
+    R = np.asarray(R)
+    diagonal = np.diagonal(R, axis1=-2, axis2=-1)
+    # 4 q qᵀ: each row is a multiple of the quaternion, that with the largest diagonal entry is the most exact
+    q = np.empty((*R.shape[:-2], 4, 4))
+    q[..., 0, 0] = 1 + diagonal.sum(axis=-1)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[..., 1 + i, 1 + i] = 1 + diagonal[..., i] - diagonal[..., j] - diagonal[..., k]
+        q[..., 0, 1 + i] = q[..., 1 + i, 0] = R[..., k, j] - R[..., j, k]
+        q[..., 1 + i, 1 + j] = q[..., 1 + j, 1 + i] = R[..., i, j] + R[..., j, i]
+    largest = np.diagonal(q, axis1=-2, axis2=-1).argmax(axis=-1)
+    q = np.take_along_axis(q, largest[..., None, None], axis=-2)[..., 0, :]
+    q /= np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., :1] < 0, -q, q)
 
 
 def to_matrices(quaternions: Float) -> Float:
     """(..., 3, 3) rotations of quaternions (..., 4), w first; they need not have length 1, but must not be zero."""
-    q = np.reshape(quaternions, (-1, 4))[:, [1, 2, 3, 0]]
-    return scipy.spatial.transform.Rotation.from_quat(q).as_matrix().reshape(*np.shape(quaternions)[:-1], 3, 3)
+    q = np.asarray(quaternions)
+    w, v = q[..., 0, None, None], q[..., 1:]
+    squares = q[..., None, :] @ q[..., None]
+    across = np.cross(v[..., None, :], np.eye(3)).swapaxes(-1, -2)  # v × e, by columns
+    R = (w * w - v[..., None, :] @ v[..., None]) * np.eye(3) + 2 * (v[..., None] * v[..., None, :] + w * across)
+    return np.asarray(R / squares)
 
 
 def continuous(quaternions: Float) -> Float:

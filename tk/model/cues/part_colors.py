@@ -12,8 +12,8 @@ from __future__ import annotations
 import functools
 from typing import Any
 
+import cv2
 import numpy as np
-import scipy  # its packages are imported when they are first used
 from numpy.typing import NDArray
 
 from tk.kernels.line_search import COLOR_BINS, Regions
@@ -136,5 +136,6 @@ def _smooth(counts: Float) -> NDArray[np.float32]:
 @functools.cache
 def _smoothing() -> NDArray[np.float32]:
     """Return the matrix (16, 16) that smooths a histogram of 16 bins, a row, from the right."""
-    one_bin = np.eye(16, dtype=np.float32)
-    return np.asarray(scipy.ndimage.gaussian_filter1d(one_bin, _SMOOTHING, axis=0, mode="nearest").T)
+    across = 2 * int(4 * _SMOOTHING + 0.5) + 1
+    weights = cv2.GaussianBlur(np.eye(16), (1, across), _SMOOTHING, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(weights.T, np.float32)
