@@ -43,13 +43,13 @@ def pieces(path: str, masks: str) -> None:
     from tk.kernels.runtime import ensure_runtime, ti
     from tk.model.people import PeopleFinder
     from tk.run.people import People
-    from tk.run.plan import open_plan, recording_setup
+    from tk.run.plan import open_plan, recording_setup, reduce_images
     from tk.settings import Settings
     from tk.threads import one_thread
     from tk.trackers import contour_tracker
 
     recording = tk.io.importers.open_recording(Path(path), None, masks)
-    setup = recording_setup(recording, None, None, 0)
+    setup, recording = reduce_images(recording_setup(recording, None, None, 0), recording, Settings().person_pixels)
     done("opening the recording")
     ensure_runtime()
     done("starting Taichi")

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.ndimage
 
 from tests.model.ring import ring_of_cameras
 from tk.model.body import gait_poses as gait
@@ -14,7 +15,7 @@ from tk.model.body.cone_body import build_cone_body
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume
 from tk.model.masks.silhouettes import draw_silhouettes
-from tk.model.people import LocatedPerson, PeopleFinder, order_people
+from tk.model.people import LocatedPerson, PeopleFinder, components, order_people
 
 RIG = ring_of_cameras(5, 240, 240)
 VOLUME = Volume((0.0, 0.0, 1.0), (2.4, 2.4, 2.2))
@@ -169,3 +170,9 @@ def test_numbers_follow_height_then_views_then_distance_to_the_centre() -> None:
     assert first(position=np.array([-0.6, 0.0, 0.9])) < 0
     fewer = [replace(p, views=p.views & (np.arange(5) > 0)) if p.position[0] > 0 else p for p in found]
     assert order_people(fewer, VOLUME)[0].position[0] < 0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.35, 0.6])
+def test_components_are_numbered_as_by_scipy(share: float) -> None:
+    shown = np.random.default_rng(3).random((12, 9, 11)) < share
+    np.testing.assert_array_equal(components(shown), scipy.ndimage.label(shown)[0])

@@ -24,7 +24,7 @@ from tk.errors import ConfigError, VideoError, WorkerError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.reader import read_result
-from tk.run import session, worker
+from tk.run import prefetch, session, worker
 from tk.run.prefetch import Ahead, Observations, Serial, open_observations
 from tk.settings import Settings
 
@@ -65,8 +65,10 @@ def test_prefetched_frames_equal_direct_ones(tiny: Path, masks: str, keep_images
             np.testing.assert_array_equal(a[3], b[3], strict=True)
 
 
-def test_held_frames_are_not_overwritten(tiny: Path) -> None:
+@pytest.mark.parametrize("spare", [2, 40])
+def test_held_frames_are_not_overwritten(tiny: Path, monkeypatch: pytest.MonkeyPatch, spare: int) -> None:
     """More of them than the ring has slots, some dropped in between, and views after their frame."""
+    monkeypatch.setattr(prefetch, "_SPARE", spare)
     capture = open_capture(tiny)
     expected = arrays(Serial(capture.setup(), capture, AHEAD, nobody), 0, FRAMES)
     with Ahead(capture.setup(), capture, AHEAD, nobody) as source:

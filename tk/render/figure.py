@@ -102,7 +102,11 @@ class Figure:
 
     def lost(self, row: int) -> bool:
         """Return whether the frame has no pose: the person is lost or absent."""
-        return not has_pose(self.status[row])
+        return self._lost[row]
+
+    @cached_property
+    def _lost(self) -> list[bool]:
+        return [not has for has in has_pose(self.status).tolist()]
 
     def there(self, row: int) -> bool:
         """Return whether any joint is known in a frame."""

@@ -62,7 +62,10 @@ class Overlay:
                 f"{result.path}: has frame {last}, but {capture.path} ends with frame {capture.frame_count - 1}; "
                 "name the capture that was tracked"
             )
-        self.capture, self.result = as_tracked(capture, result), result
+        tracked = as_tracked(capture, result)
+        # no tile is wider than the video; a smaller image takes less time to decode and to cut
+        self.capture = tracked.reduced([max(camera.width // widest, 1) for camera in tracked.rig])
+        self.result = result
         self.rig = self.capture.rig
         self._errors = [e for person in self.people if (e := person.silhouette_error) is not None]
         self.grid = Grid.of(self.rig, widest)

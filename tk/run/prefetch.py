@@ -53,8 +53,11 @@ Observed = tuple[Observation, Mapping[str, float]]
 
 TIMING_STAGES = ("decode", "masks", "wait")
 
-#: frames that the tracker may hold without a copy: the current one, and the one before while it asks for the next
+#: frames that the tracker usually holds: the current one, and the one before while it asks for the next
 _HELD = 2
+#: further frames that the tracker may hold without a copy, more than an opening has. Their memory is given back to the
+#: system when they are dropped.
+_SPARE = 40
 #: most bytes of the frames made ahead, beside the held ones: a few of eight full-HD cameras. Fewer would make the
 #: process wait.
 _RING_BYTES = 384 * 2**20
@@ -194,13 +197,14 @@ class _Layout:
     def __init__(self, rig: Rig, keep_images: bool) -> None:
         self.masks = (len(rig), *rig.frame_shape)
         self.images = (*self.masks, 3) if keep_images else (len(rig), 0, 0, 3)
-        self.bytes = math.prod(self.images) + 2 * math.prod(self.masks)
+        page = mmap.ALLOCATIONGRANULARITY
+        self.bytes = -(-(math.prod(self.images) + 2 * math.prod(self.masks)) // page) * page
 
     def layers(self, slot: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.bool_]]:
         """Views of a slot (bytes,): images (C, H, W, 3), masks (C, H, W), uncertain (C, H, W)."""
         a = math.prod(self.images)
         b = a + math.prod(self.masks)
-        images, masks, uncertain = slot[:a], slot[a:b], slot[b:].view(np.bool_)
+        images, masks, uncertain = slot[:a], slot[a:b], slot[b : 2 * b - a].view(np.bool_)
         return images.reshape(self.images), masks.reshape(self.masks), uncertain.reshape(self.masks)
 
 
@@ -228,9 +232,11 @@ class Ahead:
         self._where, self._note = source.where, note
         self._layout = _Layout(setup.rig, keep_images)
         slots = max(min(settings.ahead, _RING_BYTES // self._layout.bytes), 1) + _HELD
-        handle = _nameless_file(slots * self._layout.bytes)
-        self._memory = mmap.mmap(handle, slots * self._layout.bytes)
+        size = (slots + _SPARE) * self._layout.bytes  # the system provides memory where it is written
+        handle = _nameless_file(size)
+        self._memory = mmap.mmap(handle, size)
         self._held = 0
+        self._spare = list(range(slots, slots + _SPARE))
         self._returned: deque[int] = deque()
         self._begun = False
         try:
@@ -262,9 +268,11 @@ class Ahead:
     def _take(self, ready: _Ready) -> Observation:
         size = self._layout.bytes
         slot = np.frombuffer(self._memory, np.uint8, size, ready.slot * size)
-        if self._held < _HELD:
+        if self._held < _HELD or self._spare:
             # every view has this array for its base, so it goes with the last of them
             weakref.finalize(slot, self._returned.append, ready.slot).atexit = False
+            if self._held >= _HELD:
+                self._send([self._spare.pop()])
             self._held += 1
         else:
             slot = slot.copy()
@@ -276,9 +284,14 @@ class Ahead:
 
     def _give_back(self) -> None:
         slots = [self._returned.popleft() for _ in range(len(self._returned))]
+        more = max(min(self._held - _HELD, len(slots)), 0)  # as many as the process was given in their place
         self._held -= len(slots)
-        if slots:
-            self._send(slots)
+        for slot in slots[:more]:
+            if hasattr(mmap, "MADV_REMOVE"):  # Linux
+                self._memory.madvise(mmap.MADV_REMOVE, slot * self._layout.bytes, self._layout.bytes)
+        self._spare += slots[:more]
+        if slots[more:]:
+            self._send(slots[more:])
 
     def _send(self, message: object) -> None:
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # its last messages are still to be read

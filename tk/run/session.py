@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections import defaultdict
 from collections.abc import Callable, Container, Iterator, Mapping
@@ -230,6 +231,10 @@ def estimates(
 # time costs more writes; a longer one loses more frames when the process is killed.
 WRITE_EVERY_S = 0.5
 
+# Most bytes of the frames that are held at the start, and least number of these frames: of eight 4K cameras at full
+# size 12 instead of 24. Fewer frames make the body less certain, see tk.model.body.body_fit.
+_OPENING_BYTES, _LEAST_OPENING = 4 * 2**30, 8
+
 _ORIGIN = "run/"
 
 
@@ -279,7 +284,7 @@ class _Run:
         output: _Output | None = None,
         masks: MaskStores | None = None,
     ) -> None:
-        self.plan, self.output, self.masks = plan, output, masks
+        self.plan, self.output, self.masks, self._note = plan, output, masks, note
         self.tracked = 0
         self.finished: Container[int] = ()
         self.people = People(plan.setup, plan.tracker, plan.another_tracker, people, note)
@@ -298,7 +303,7 @@ class _Run:
             yield from self._step_through(plan.observations.frames(plan.begin + done, plan.stop))
             return
         # The body is fitted to the same frames however few are asked for, so that --resume may extend a run.
-        count = plan.tracker.opening_frames
+        count = self._opening_frames()
         stop = None if plan.stop is None else max(plan.stop, plan.first + count)
         observations = plan.observations.frames(plan.first, stop)
         _LOG.info("reading the first frames and learning what the scene looks like")
@@ -311,6 +316,18 @@ class _Run:
         except CaptureError as error:
             raise CaptureError(f"{plan.source.where}: {error}", error.hint) from None
         yield from self._step_through(chain(_emptied(opening), broken or observations))
+
+    def _opening_frames(self) -> int:
+        """Return the number of frames that the body is fitted to: fewer where the images are large."""
+        plan = self.plan
+        count, rig = plan.tracker.opening_frames, plan.setup.rig
+        held = 5 * len(rig) * math.prod(rig.frame_shape)  # bytes of a frame: image, mask and uncertain pixels
+        fewer = min(count, max(_OPENING_BYTES // held, _LEAST_OPENING))
+        if fewer < count:
+            self._note(
+                f"{plan.source.where}: the images are large; the body is fitted to {fewer} frames instead of {count}"
+            )
+        return fewer
 
     def restore_unfinished(self, path: Path, causal: bool) -> bool:
         """Restore the trackers if all frames are written but the result is not finished; return whether that is so."""
