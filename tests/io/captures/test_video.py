@@ -354,6 +354,9 @@ class FakeClip:
         self.opened += 1
         return self
 
+    def shown(self, frames: np.ndarray) -> np.ndarray:
+        return np.clip(frames, 0, self.frame_count - 1)
+
     def skip(self) -> None:
         self.position += 1
 

@@ -6,19 +6,21 @@ import math
 import threading
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.captures.video import Clip
+from tk.io.captures.video import Clip, Image, Reader
 
 #: most frames decoded ahead, and most bytes of them. Fewer make the consumer wait for a slow image.
 _AHEAD = 8
 _AHEAD_BYTES = 128 * 2**20
+
+_THREAD = "tk-decode-"  # names of the threads begin with it
 
 
 @dataclass(frozen=True)
@@ -60,54 +62,59 @@ class FrameReader(Iterator[FrameSet]):
         clip in frames; frame k holds image k - late. The first image is repeated before the clip's start, the last one
         after its end. ``fps``: frame rate, for the time stamps.
         """
-        late = tuple(late) or (0,) * len(clips)
-        self._left = len(wanted)
         count = len(clips)
-
-        set_bytes = count * frame_shape[0] * frame_shape[1] * (4 if mask_clips else 3)
-        ahead = max(2, min(_AHEAD, _AHEAD_BYTES // set_bytes))
-        images = _Stacks((count, *frame_shape, 3), ahead)
-        masks = _Stacks((count, *frame_shape), ahead) if mask_clips else None
-
-        def blank(place: int) -> FrameSet:
-            index = wanted[place]
-            return FrameSet(index, index / fps, images.take(), masks.take() if masks else None)
-
-        window = _Window(blank, count, ahead)
-        self._window = window
-        # The threads know the window, not this reader: dropping the reader closes the window. Daemons, so that a
-        # reader that is still referenced when the interpreter ends does not hold it up.
-        self._threads = [
-            threading.Thread(
-                target=_decode,
-                args=(window, camera, clip, mask_clips[camera] if mask_clips else None, wanted, late[camera]),
-                name=f"tk-decode-{camera}",
-                daemon=True,
-            )
-            for camera, clip in enumerate(clips)
-        ]
-        self._finalizer = weakref.finalize(self, _shut, window, self._threads)
-        for thread in self._threads:
-            thread.start()
+        self._wanted, self._fps, self._scheduled = wanted, fps, 0
+        ahead = max(2, min(_AHEAD, _AHEAD_BYTES // (count * math.prod(frame_shape) * (4 if mask_clips else 3))))
+        self._images = _Stacks((count, *frame_shape, 3), ahead)
+        self._masks = _Stacks((count, *frame_shape), ahead) if mask_clips else None
+        stop = threading.Event()
+        self._cameras = []
+        for camera, clip in enumerate(clips):
+            own = [clip] if mask_clips is None else [clip, mask_clips[camera]]
+            frames = np.asarray(wanted) - (late[camera] if late else 0)
+            self._cameras.append([_Film(each, each.shown(frames), stop) for each in own])
+        # a thread knows its films, not this reader: dropping the reader ends the threads
+        self._threads = [ThreadPoolExecutor(1, f"{_THREAD}{camera}") for camera in range(count)]
+        films = [film for camera in self._cameras for film in camera]
+        self._finalizer = weakref.finalize(self, _shut, stop, self._threads, films)
+        self._coming: deque[tuple[FrameSet, list[Future[None]]]] = deque()
+        for _ in range(ahead):
+            self._schedule()
 
     def __len__(self) -> int:
         """Frames still to come."""
-        return self._left
+        return len(self._wanted) - self._scheduled + len(self._coming)
 
     def __iter__(self) -> FrameReader:
         return self
 
     def __next__(self) -> FrameSet:
         try:
-            frame_set = self._window.take() if self._left else None
+            if not self._coming:
+                raise StopIteration
+            frame_set, decoded = self._coming.popleft()
+            self._schedule()
+            for camera in decoded:
+                camera.result()
         except BaseException:
             self.close()
             raise
-        if frame_set is None:
-            self.close()
-            raise StopIteration
-        self._left -= 1
         return frame_set
+
+    def _schedule(self) -> None:
+        """Let the threads decode the next frame."""
+        place = self._scheduled
+        if place >= len(self._wanted) or not self._finalizer.alive:
+            return
+        self._scheduled += 1
+        index = self._wanted[place]
+        frame_set = FrameSet(index, index / self._fps, self._images.take(), self._masks.take() if self._masks else None)
+        stacks = [frame_set.images] if frame_set.masks is None else [frame_set.images, frame_set.masks]
+        decoded = [
+            thread.submit(_decode, films, place, [stack[camera] for stack in stacks])
+            for camera, (thread, films) in enumerate(zip(self._threads, self._cameras, strict=True))
+        ]
+        self._coming.append((frame_set, decoded))
 
     def __enter__(self) -> FrameReader:
         return self
@@ -119,6 +126,8 @@ class FrameReader(Iterator[FrameSet]):
 
     def close(self) -> None:
         """Stop decoding and wait for the threads to end. Closing twice is fine."""
+        self._coming.clear()
+        self._scheduled = len(self._wanted)
         self._finalizer()
 
 
@@ -146,125 +155,56 @@ class _Stacks:
         return stack.reshape(self._shape)
 
 
-class _Slot:
-    """A frame set that is not complete yet."""
+class _Film:
+    """The images of a clip in the order in which the frames show them. One thread at a time.
 
-    def __init__(self, frame_set: FrameSet, cameras: int) -> None:
-        self.frame_set = frame_set
-        self.pending = cameras
-        self.failures: dict[int, BaseException] = {}
+    Args:
+        clip: the images.
+        numbers: (F,) number of each frame's image, ascending; -1: the frame is blank.
+        stop: once it is set, no further image is read.
+    """
 
+    def __init__(self, clip: Clip, numbers: NDArray[np.int64], stop: threading.Event) -> None:
+        self._clip, self._numbers, self._stop = clip, numbers.tolist(), stop
+        self._reader: Reader | None = None
+        self._following = 0  # number of the next image in the clip
+        self._kept: Image | None = None  # an image that several frames show
 
-class _Window:
-    """The frame sets between the consumer and the fastest camera, shared by the threads; by their place in the
-    reader's order."""
-
-    def __init__(self, blank: Callable[[int], FrameSet], cameras: int, ahead: int) -> None:
-        self._blank = blank
-        self._cameras = cameras
-        self._next = 0  # the consumer's frame
-        self._ahead = ahead
-        self._slots: dict[int, _Slot] = {}
-        self.closed = False
-        self._changed = threading.Condition()
-
-    def claim(self, place: int) -> _Slot | None:
-        """Wait until a frame may be decoded and return its slot; None after the reader was closed."""
-        with self._changed:
-            self._changed.wait_for(lambda: self.closed or place < self._next + self._ahead)
-            if self.closed:
-                return None
-            if place not in self._slots:
-                self._slots[place] = _Slot(self._blank(place), self._cameras)
-            return self._slots[place]
-
-    def finish(self, slot: _Slot, camera: int, failure: BaseException | None = None) -> None:
-        with self._changed:
-            slot.pending -= 1
-            if failure is not None:
-                slot.failures[camera] = failure
-            if slot.pending == 0:
-                self._changed.notify_all()
-
-    def take(self) -> FrameSet | None:
-        """Return the consumer's next frame set, None after closing. Waits for all cameras; raises the first failure."""
-        with self._changed:
-            self._changed.wait_for(self._ready)
-            if self.closed:
-                return None
-            slot = self._slots.pop(self._next)
-            self._next += 1
-            self._changed.notify_all()
-        if slot.failures:
-            raise slot.failures[min(slot.failures)]
-        return slot.frame_set
-
-    def _ready(self) -> bool:
-        slot = self._slots.get(self._next)
-        return self.closed or (slot is not None and slot.pending == 0)
+    def read(self, place: int, stack: Image) -> None:
+        """Write the image of a frame into the upper left of (H, W, 3), or (H, W) for a mask."""
+        out, number = stack[: self._clip.height, : self._clip.width], self._numbers[place]
+        if number < 0:
+            out[...] = 0
+        elif number < self._following and self._kept is not None:
+            out[...] = self._kept
+        else:
+            reader = self._reader = self._reader or self._clip.open()
+            while self._following < number:
+                if self._stop.is_set():
+                    return
+                reader.skip()
+                self._following += 1
+            reader.read(out)
+            self._following += 1
+            again = number in self._numbers[place + 1 : place + 2]
+            self._kept = out.copy() if again else None
 
     def close(self) -> None:
-        with self._changed:
-            self.closed = True
-            self._slots.clear()
-            self._changed.notify_all()
+        if self._reader is not None:
+            self._reader.close()
 
 
-def _decode(window: _Window, camera: int, clip: Clip, mask_clip: Clip | None, wanted: Sequence[int], late: int) -> None:
-    """Decode one camera's images; runs in its own thread."""
-    place = 0
-    slot: _Slot | None = None
-    last = clip.frame_count - 1 if mask_clip is None else min(clip.frame_count, mask_clip.frame_count) - 1
-    # the first or last image may stand for several frames
-    numbers = np.clip(np.asarray(wanted) - late, 0, last).tolist()
-    kept, kept_mask = np.empty((2, 0), np.uint8)  # an image that several frames show
-    following = 0  # number of the next image in the clip
-    try:
-        with ExitStack() as stack:
-            pictures = stack.enter_context(closing(clip.open()))
-            masks = stack.enter_context(closing(mask_clip.open())) if mask_clip else None
-            for place, number in enumerate(numbers):
-                stands_in = number < following
-                while following < number:
-                    if window.closed:
-                        return
-                    pictures.skip()
-                    if masks is not None:
-                        masks.skip()
-                    following += 1
-                slot = window.claim(place)
-                if slot is None:
-                    return
-                again = place + 1 < len(numbers) and numbers[place + 1] == number
-                layer = slot.frame_set.images[camera, : clip.height, : clip.width]
-                if stands_in:
-                    layer[...] = kept
-                else:
-                    pictures.read(layer)
-                if masks is not None and slot.frame_set.masks is not None:
-                    mask_layer = slot.frame_set.masks[camera, : clip.height, : clip.width]
-                    if stands_in:
-                        mask_layer[...] = kept_mask
-                    else:
-                        masks.read(mask_layer)
-                    if again:
-                        kept_mask = mask_layer.copy()
-                if again:
-                    kept = layer.copy()
-                following = number + 1
-                window.finish(slot, camera)
-                slot = None
-    except BaseException as failure:
-        slot = slot or window.claim(place)
-        if slot is not None:
-            window.finish(slot, camera, failure)
+def _decode(films: Sequence[_Film], place: int, layers: Sequence[Image]) -> None:
+    """Decode one camera's images of a frame; runs in the camera's thread."""
+    for film, layer in zip(films, layers, strict=True):
+        film.read(place, layer)
 
 
-def _shut(window: _Window, threads: Sequence[threading.Thread]) -> None:
-    window.close()
-    # The garbage collector may call this from a decoding thread, which cannot wait for itself or its siblings.
-    if threading.current_thread() in threads:
-        return
+def _shut(stop: threading.Event, threads: Sequence[ThreadPoolExecutor], films: Sequence[_Film]) -> None:
+    stop.set()
+    # the garbage collector may call this from a decoding thread, which cannot wait for itself
+    wait = not threading.current_thread().name.startswith(_THREAD)
     for thread in threads:
-        if thread.ident is not None:
-            thread.join()
+        thread.shutdown(wait, cancel_futures=True)
+    for film in films if wait else ():
+        film.close()

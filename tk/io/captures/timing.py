@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ClockError
 from tk.io.captures.calibration import Calibration, match_camera
-from tk.io.captures.video import Clip, Image, Reader
+from tk.io.captures.video import Clip, Reader
 from tk.io.toml import read_text, shown
 
 Float = NDArray[np.float64]
@@ -253,40 +253,10 @@ class Resampled:
         return None
 
     def open(self) -> Reader:
-        return _ResampledReader(self)
+        return self.clip.open()
+
+    def shown(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
+        return self.pictures[np.clip(frames, 0, self.frame_count - 1)]
 
     def reduced(self, factor: int) -> Resampled:
         return replace(self, clip=self.clip.reduced(factor))
-
-
-class _ResampledReader:
-    """Reads the images in order; an image that several frames show is read once."""
-
-    def __init__(self, clip: Resampled) -> None:
-        self._pictures = clip.pictures
-        self._reader = clip.clip.open()
-        self._frame = 0
-        self._position = 0  # image that the reader returns next
-        self._kept: Image | None = None
-
-    def skip(self) -> None:
-        self._frame += 1
-
-    def read(self, out: Image) -> None:
-        wanted = int(self._pictures[self._frame])
-        self._frame += 1
-        if wanted < 0:
-            out[...] = 0
-        elif wanted < self._position and self._kept is not None:
-            out[...] = self._kept
-        else:
-            while self._position < wanted:
-                self._reader.skip()
-                self._position += 1
-            self._reader.read(out)
-            self._position += 1
-            again = self._frame < len(self._pictures) and self._pictures[self._frame] == wanted
-            self._kept = out.copy() if again else None
-
-    def close(self) -> None:
-        self._reader.close()

@@ -66,6 +66,10 @@ class Clip(Protocol):
     def open(self) -> Reader:
         """Return a reader at the first image."""
 
+    def shown(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the number of the image that each frame shows, the nearest before the start and after the end; -1 if
+        the frame is blank."""
+
     def reduced(self, factor: int) -> Clip:
         """Return the same images, reduced as :meth:`tk.model.cameras.camera.Camera.reduced` says. A mask's pixel shows
         the person if at least half of its square does."""
@@ -86,6 +90,9 @@ class VideoClip:
 
     def open(self) -> Reader:
         return _open_planes(self) or _VideoReader(self)
+
+    def shown(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.clip(frames, 0, self.frame_count - 1)
 
     def reduced(self, factor: int) -> VideoClip:
         return replace(self, **_reduced_size(self, factor))
@@ -109,6 +116,9 @@ class PictureClip:
 
     def open(self) -> Reader:
         return _PictureReader(self)
+
+    def shown(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.clip(frames, 0, self.frame_count - 1)
 
     def reduced(self, factor: int) -> PictureClip:
         return replace(self, **_reduced_size(self, factor))
