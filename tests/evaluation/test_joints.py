@@ -152,7 +152,7 @@ def test_one_nan_joint_is_not_averaged_away() -> None:
         assert scores.joints["wrist_r"].mean_cm == pytest.approx(0, abs=1e-10)
         assert scores.all.median_cm == pytest.approx(0, abs=1e-10)
     assert found.nan_frames == 1
-    plain = json.loads(found.to_json())
+    plain = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert plain["raw"]["all"]["mean_cm"] is None
     assert plain["nan_share"] == pytest.approx(0.05)
     assert "inf" in found.format_table()
@@ -164,7 +164,9 @@ def test_result_of_nan_has_zero_pck() -> None:
     found = evaluate(as_result(truth, positions=np.full_like(truth.positions, np.nan)), truth)
     assert found.corrected.all.median_cm == found.raw.all.median_cm == np.inf
     assert found.raw.all.pck == found.corrected.all.pck == {5: 0.0, 10: 0.0, 15: 0.0}
-    json.loads(found.to_json(), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    json.loads(
+        json.dumps(found.to_dict(), allow_nan=False), parse_constant=lambda name: pytest.fail(f"{name} is not JSON")
+    )
 
 
 def test_a_lost_frame_counts_as_miss_at_any_distance() -> None:
@@ -188,7 +190,7 @@ def test_corrected_figures_are_nan_if_all_frames_are_lost() -> None:
     found = evaluate(as_result(truth, status=np.full(20, Status.LOST, dtype=np.uint8)), truth)
     assert found.corrected.all.mean_cm == np.inf
     assert found.raw.all.pck[15] == 0
-    assert json.loads(found.to_json())["offsets_cm"]["neck"] == [None, None, None]
+    assert json.loads(json.dumps(found.to_dict(), allow_nan=False))["offsets_cm"]["neck"] == [None, None, None]
 
 
 def test_missing_frames_inside_the_range_count_and_others_are_reported() -> None:
@@ -255,7 +257,7 @@ def test_table_and_json_hold_the_same(tmp_path: Path) -> None:
             file["joints/position"] = values
             file["joints/position"].attrs["names"] = list(JOINTS)
     found = evaluate_files(tmp_path / "result.h5", tmp_path / "truth.h5")
-    plain = json.loads(found.to_json())
+    plain = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert plain["raw"]["all"]["mean_cm"] == pytest.approx(4 * np.sqrt(3))
     assert plain["raw"]["joints"]["ankle_r"]["pck"] == {"5": 0.0, "10": 1.0, "15": 1.0}
     assert plain["frames_per_second"] is None
@@ -399,7 +401,7 @@ def test_joints_without_sigma_are_excluded_and_failures_count() -> None:
     nothing = evaluate(as_result(truth, sigma=np.full((20, 15), np.nan)), truth).sigma
     assert nothing is not None and np.isnan(nothing["all"].raw[1]) and nothing["all"].judged == 0
     assert evaluate(as_result(truth), truth).sigma is None
-    plain = json.loads(evaluate(result, truth).to_json())
+    plain = json.loads(json.dumps(evaluate(result, truth).to_dict(), allow_nan=False))
     assert plain["sigma"]["limbs"]["expected"]["1"] == pytest.approx(0.1987, abs=1e-4)
     assert plain["longest_limb_error"] == {"frames": 1, "first": 5, "last": 5}
     assert plain["flexion"]["elbow_l"]["mean_deg"] is None

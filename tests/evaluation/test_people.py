@@ -102,7 +102,7 @@ def test_one_tracked_person_among_two_leaves_the_other_missed() -> None:
     first, second = found.people
     assert first.errors is None and first.matches == 0 and first.frames == second.frames == second.matches == 12
     assert "person 0" in found.format_table() and max(map(len, found.format_table().splitlines())) <= 100
-    json.loads(found.to_json())
+    json.loads(json.dumps(found.to_dict(), allow_nan=False))
 
 
 def test_files_without_common_frames_are_refused() -> None:

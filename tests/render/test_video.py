@@ -9,9 +9,9 @@ import pytest
 
 from tests.conftest import Tk
 from tk.errors import ExportError
+from tk.io.paths import replacing
 from tk.io.results.reader import read_result
 from tk.model.body.joints import SEGMENTS
-from tk.render.files import replacing
 from tk.render.palette import SEGMENT_COLORS
 from tk.render.scene import HEIGHT, WIDTH, Scene
 from tk.render.video import made_here, video_writer

@@ -15,8 +15,8 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from tk.errors import ConfigError, ResultError, unwritable
-from tk.io.paths import check_not_input, resolved
+from tk.errors import ConfigError, ResultError
+from tk.io.paths import check_not_input, replacing, resolved
 from tk.io.settings_file import to_toml
 from tk.settings import Settings
 
@@ -153,7 +153,8 @@ class Job:
         """
         worker = {"host": socket.gethostname(), "pid": os.getpid()}
         record = {"capture": str(self.capture), "options": self.options.to_dict(), "by": worker, **asdict(outcome)}
-        replace_file(self.record, json.dumps(record, indent=2))
+        with replacing(self.record, ResultError) as part:
+            part.write_text(json.dumps(record, indent=2), encoding="utf-8")
 
     def read(self) -> Outcome:
         """Return the outcome in the record; a waiting one without a record.
@@ -233,21 +234,6 @@ def _read_record(path: Path) -> dict[str, Any]:
     if not isinstance(record, dict):
         raise _damaged(path)
     return record
-
-
-def replace_file(path: Path, text: str) -> None:
-    """Replace a file atomically.
-
-    Raises:
-        ResultError: it cannot be written.
-    """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise unwritable(path, error) from None
 
 
 def _damaged(path: Path) -> ResultError:

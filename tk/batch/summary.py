@@ -10,7 +10,9 @@ from datetime import datetime
 from pathlib import Path
 from urllib.parse import quote
 
-from tk.batch.jobs import BEGUN, DONE, FAILED, WAITING, Job, Outcome, replace_file
+from tk.batch.jobs import BEGUN, DONE, FAILED, WAITING, Job, Outcome
+from tk.errors import ResultError
+from tk.io.paths import replacing
 
 COLUMNS = (
     "name", "capture", "state", "frames", "lost", "lost_percent", "error_cm", "limbs_cm", "silhouette_error",
@@ -51,8 +53,9 @@ def write_summary(folder: Path, jobs: Sequence[Job], outcomes: Mapping[str, Outc
     writer = csv.DictWriter(table, COLUMNS, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    replace_file(folder / "summary.csv", table.getvalue())
-    replace_file(folder / "summary.html", _page(folder, jobs, outcomes))
+    for name, text in (("summary.csv", table.getvalue()), ("summary.html", _page(folder, jobs, outcomes))):
+        with replacing(folder / name, ResultError) as part:
+            part.write_text(text, encoding="utf-8")
 
 
 def _row(job: Job, outcome: Outcome) -> dict[str, object]:

@@ -21,7 +21,6 @@ Flexion, the longest run and σ are defined in :mod:`tk.evaluation.details`.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Iterable, Mapping
@@ -125,12 +124,7 @@ class Evaluation:
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON, with shares added; infinity and NaN become None."""
         values = asdict(self) | {"lost_share": self.lost_share, "nan_share": self.nan_frames / self.judged}
-        plain = plain_values(values)
-        assert isinstance(plain, dict)
-        return plain
-
-    def to_json(self) -> str:
-        return json.dumps(self.to_dict(), indent=2, allow_nan=False)
+        return dict(plain_values(values))
 
     def format_table(self) -> str:
         """Return the table that ``tk evaluate`` prints; lines have at most 100 characters."""

@@ -19,7 +19,6 @@ apart. Only frames of the ground truth between the first and the last frame of t
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -90,12 +89,7 @@ class PeopleEvaluation:
         values = {**vars(self), "match_cm": 100 * MATCH_M, "people": [vars(person) for person in self.people]}
         for person in values["people"]:
             person["errors"] = person["errors"] and person["errors"].to_dict()
-        plain = plain_values(values)
-        assert isinstance(plain, dict)
-        return plain
-
-    def to_json(self) -> str:
-        return json.dumps(self.to_dict(), indent=2, allow_nan=False)
+        return dict(plain_values(values))
 
     def format_table(self) -> str:
         """Return the table that ``tk evaluate`` prints; lines have at most 100 characters."""

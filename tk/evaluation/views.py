@@ -89,9 +89,7 @@ class ViewEvaluation:
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON; infinity and NaN become None."""
         means = {"joint_px": self.joint_px, "joint_share": self.joint_share, "silhouette_error": self.silhouette_error}
-        plain = plain_values(asdict(self) | means)
-        assert isinstance(plain, dict)
-        return plain
+        return dict(plain_values(asdict(self) | means))
 
     def format_table(self) -> str:
         """Return the table that ``tk evaluate`` prints."""

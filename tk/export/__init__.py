@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import shutil
@@ -12,7 +11,7 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
-from tk.errors import ExportError, ResultError, TkError, unwritable
+from tk.errors import ExportError, ResultError, TkError
 from tk.export.bvh import BVH_UNITS, write_bvh
 from tk.export.c3d import write_c3d
 from tk.export.csv import write_angles_csv, write_points_csv
@@ -21,7 +20,7 @@ from tk.export.mot import write_mot
 from tk.export.motion import Motion, motion_of, read_motion
 from tk.export.ply import write_body_meshes
 from tk.export.trc import write_trc
-from tk.io.paths import Kind, check_not_input, check_output, looks_like
+from tk.io.paths import Kind, check_not_input, check_output, looks_like, replacing
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 
@@ -159,18 +158,11 @@ def _number(person: Result, people: Sequence[Result]) -> str:
 
 def _write(motion: Motion, target: Path, write: Writer) -> None:
     """Write to a temporary file and rename it, so that a file with the final name is complete."""
-    part = target.with_name(f".{target.stem}.part{target.suffix}")  # keep the suffix: ezc3d would add a missing one
-    try:
+    with replacing(target) as part:
         target.parent.mkdir(parents=True, exist_ok=True)
         write(motion, part)
         if target.is_dir():  # a rename does not replace a folder
             _remove(target)
-        os.replace(part, target)
-    except OSError as error:
-        raise unwritable(target, error, ExportError) from error
-    finally:
-        with contextlib.suppress(OSError):
-            shutil.rmtree(part) if part.is_dir() else part.unlink()
 
 
 def _remove(folder: Path) -> None:

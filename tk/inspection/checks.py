@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.evaluation.joints import plain_values
 from tk.inspection.leveling import Leveling, find_up
 from tk.inspection.people import PeopleWatch, PersonReport, many_people
 from tk.io.captures.capture import Capture
@@ -110,7 +111,7 @@ class Inspection:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the values for JSON, NaN as None."""
-        return _finite(asdict(self))
+        return dict(plain_values(asdict(self)))
 
     def format_table(self) -> str:
         """Return the text for the terminal."""
@@ -369,14 +370,3 @@ def _findings(found: Inspection, capture: Capture, agreement: Agreement) -> list
             "tk level writes the estimate to capture.toml"
         )
     return lines
-
-
-def _finite(value: Any) -> Any:
-    """Return the value with None for infinities and NaN, which JSON does not have."""
-    if isinstance(value, dict):
-        return {key: _finite(v) for key, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value

@@ -10,10 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.errors import CaptureError
 from tk.inspection.people import PersonReport
-from tk.inspection.pictures import write_png
 from tk.io.captures.capture import Capture
 from tk.model.body.skeleton import up_rotation
+from tk.render.canvas import write_png
 
 Float = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -82,4 +83,4 @@ def write_floor_plan(path: Path, capture: Capture, people: Sequence[PersonReport
     Raises:
         CaptureError: the file cannot be written.
     """
-    write_png(path, floor_plan(capture, people))
+    write_png(path, floor_plan(capture, people), CaptureError)

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import CaptureError, unwritable
+from tk.errors import CaptureError
+from tk.io.paths import replacing
 from tk.io.toml import parse_toml, read_text
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.mounting import infer_up
@@ -126,12 +127,8 @@ def write_up(capture: Path, leveling: Leveling) -> None:
     new = head + tables
     if parse_toml(new, str(path)).get("up") is None:
         raise CaptureError(f"{path}: cannot be changed automatically; add {line!r} yourself")
-    try:
-        draft = path.with_suffix(".toml.new")
-        draft.write_text(new, encoding="utf-8")
-        draft.replace(path)
-    except OSError as reason:
-        raise unwritable(path, reason, CaptureError) from None
+    with replacing(path, CaptureError) as part:
+        part.write_text(new, encoding="utf-8")
 
 
 def _split_at_first_table(text: str) -> tuple[str, str]:

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import CaptureError, unwritable
+from tk.errors import CaptureError
 from tk.inspection.checks import Inspection, Sample
 from tk.io.captures.capture import Capture
 from tk.model.cameras.camera import Camera
 from tk.model.cameras.up import up_vector
-from tk.render.canvas import text_width, write
+from tk.render.canvas import text_width, write, write_png
 from tk.render.overlay import joined
 
 Image = NDArray[np.uint8]
@@ -46,23 +46,7 @@ def write_sheet(path: Path, capture: Capture, inspection: Inspection, samples: S
     cameras = range(len(capture.rig))
     rows = [joined([_tile(capture, inspection, frame, c) for c in cameras], axis=1) for frame in samples]
     width = max([row.shape[1] for row in rows], default=900)
-    write_png(path, joined([_text(inspection, width), *rows], axis=0))
-
-
-def write_png(path: Path, image: Image) -> None:
-    """Write an image (h, w, 3) BGR, and the folder if there is none.
-
-    Raises:
-        CaptureError: the file cannot be written.
-    """
-    ok, coded = cv2.imencode(".png", image)
-    try:
-        if not ok:
-            raise OSError("the image is too large")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(coded.tobytes())
-    except OSError as reason:
-        raise unwritable(path, reason, CaptureError) from None
+    write_png(path, joined([_text(inspection, width), *rows], axis=0), CaptureError)
 
 
 def _text(inspection: Inspection, width: int) -> Image:

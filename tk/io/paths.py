@@ -6,13 +6,15 @@ replaces only a file of the kind that the command writes.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+import shutil
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from tk.errors import ConfigError, ExportError, TkError
+from tk.errors import ConfigError, ExportError, TkError, unwritable
 
 #: files and folders of a capture that tk reads; the last pattern is that of MoBo's images
 _CAPTURE_PARTS = (
@@ -114,6 +116,25 @@ def check_not_input(path: Path, inputs: Iterable[Path | None] = (), capture: Pat
             if _identity(file) == identity:
                 raise ConfigError(f"{path}: is the same file as an input of this command, {file}; choose another name")
     return target
+
+
+@contextlib.contextmanager
+def replacing(path: Path, kind: type[TkError] = ExportError) -> Iterator[Path]:
+    """Yield a temporary path for a file or folder, which is renamed to ``path`` when the block ends without an error.
+
+    Raises:
+        TkError: ``kind``: it cannot be written.
+    """
+    part = path.with_name(f".{path.stem}.part{path.suffix}")  # some writers add a missing suffix
+    try:
+        yield part
+        if part.exists():
+            os.replace(part, path)
+    except OSError as error:
+        raise unwritable(path, error, kind) from error
+    finally:
+        with contextlib.suppress(OSError):
+            shutil.rmtree(part) if part.is_dir() else part.unlink()
 
 
 def resolved(path: Path, error: type[TkError] = ConfigError) -> Path:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.errors import ExportError, TkError
+from tk.io.paths import replacing
 from tk.model.body.joints import BONES
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Camera
@@ -151,6 +154,20 @@ def write(tile: Image, text: str, left: int, baseline: int, color: Color = TEXT,
     """Write a line of text (ASCII); return its right end, pixels."""
     cv2.putText(tile, text, (left, baseline), _FONT, size, color, 1, cv2.LINE_AA)
     return left + text_width(text, size)
+
+
+def write_png(path: Path, image: Image, kind: type[TkError] = ExportError) -> None:
+    """Write an image (h, w, 3) BGR, and the folder if there is none.
+
+    Raises:
+        TkError: ``kind``: the file cannot be written.
+    """
+    with replacing(path, kind) as part:
+        ok, coded = cv2.imencode(".png", image)
+        if not ok:
+            raise OSError("the image is too large")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(coded.tobytes())
 
 
 def text_width(text: str, size: float = 0.42) -> int:

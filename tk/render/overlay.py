@@ -17,13 +17,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import ExportError, ResultError, unwritable
+from tk.errors import ResultError
 from tk.io.captures.capture import Capture
 from tk.io.results.data import Result
 from tk.io.results.reader import truth_of
 from tk.io.results.status import STATUS_MEANING, has_pose
 from tk.model.cameras.camera import Camera, Rig
-from tk.render.canvas import Image, View, dots, draw_body, draw_joints, draw_truth, text_width, write
+from tk.render.canvas import Image, View, dots, draw_body, draw_joints, draw_truth, text_width, write, write_png
 from tk.render.figure import Figure, figure_of, lost_in
 from tk.render.legend import LEGEND_HEIGHT, Legend
 from tk.render.palette import LOST, TEXT, Color
@@ -274,21 +274,13 @@ def write_sheets(
         ExportError: a sheet cannot be written.
     """
     chosen = choose_frames(overlay.people[0], frames, count=8)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ExportError(f"{folder}: cannot be created: {error.strerror or error}") from None
     written: list[Path] = []
     sheet: list[tuple[int, Image]] = []
     for frame, images in overlay.pictures(chosen):
         sheet.append((frame, overlay.sheet_row(frame, images, tile_height, full)))
         if len(sheet) == rows or frame == chosen[-1]:
             path = folder / f"overlay-{sheet[0][0]:06d}-{sheet[-1][0]:06d}.png"
-            _, coded = cv2.imencode(".png", joined([image for _, image in sheet], axis=0))
-            try:
-                path.write_bytes(coded.tobytes())
-            except OSError as error:
-                raise unwritable(path, error, ExportError) from None
+            write_png(path, joined([image for _, image in sheet], axis=0))
             written.append(path)
             sheet = []
     return written

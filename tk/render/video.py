@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ExportError
-from tk.io.paths import Kind
-from tk.render.files import replacing
+from tk.io.paths import Kind, replacing
 
 Image = NDArray[np.uint8]
 

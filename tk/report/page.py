@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from tk.io.captures.capture import open_capture
-from tk.io.paths import Kind, check_output
+from tk.io.paths import Kind, check_output, replacing
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 from tk.model.cameras.camera import Rig
-from tk.render.files import replacing
 from tk.render.overlay import Overlay
 from tk.report.data import describe
 from tk.report.pictures import choose_rows, embedded, shot

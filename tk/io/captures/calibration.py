@@ -12,9 +12,9 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from tk.errors import CalibrationError, CaptureError, unwritable
+from tk.errors import CalibrationError, CaptureError
 from tk.io.captures.units import UNITS, FoundUnit, infer_unit
-from tk.io.paths import Kind
+from tk.io.paths import Kind, replacing
 from tk.io.toml import Table, load_toml
 from tk.model.cameras.camera import Camera, Rig
 
@@ -188,10 +188,8 @@ def write_calibration(path: Path, source: Calibration, rig: Rig, time_offset_s: 
         table["translation"] = (camera.translation / source.metres).tolist()
         table["time_offset"] = float(late)
         (document if key in document else document["cameras"])[key] = table
-    try:
-        path.write_text(tomli_w.dumps(document), encoding="utf-8")
-    except OSError as reason:
-        raise unwritable(path, reason, CalibrationError) from None
+    with replacing(path, CalibrationError) as part:
+        part.write_text(tomli_w.dumps(document), encoding="utf-8")
 
 
 def _time_offset(name: str, values: Mapping[str, object], path: Path) -> float:

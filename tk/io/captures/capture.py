@@ -72,6 +72,7 @@ class Capture:
         clips: one clip for each camera.
         mask_clips: one clip of masks for each camera; None without given masks.
         masks, resampled: arguments of :func:`open_capture`.
+        calibration: of the cameras that are used.
         time_offset_s: delay of each camera, seconds, from the calibration; :meth:`frames` corrects whole frames of it.
         segmenter: makes the masks if none are given; None: the empty scene, or an installed segmenter.
         subjects: what `capture.toml` says about the people, at least one.
@@ -93,7 +94,7 @@ class Capture:
     mask_clips: tuple[Clip, ...] | None
     masks: str
     resampled: bool
-    _calibration: Calibration
+    calibration: Calibration
     time_offset_s: tuple[float, ...]
     segmenter: Segmenter | None = None
     subjects: tuple[GivenSubject, ...] = (GivenSubject(),)
@@ -112,11 +113,6 @@ class Capture:
         """Return the capture without its time offsets: frame k holds image k of every camera."""
         clips = (*self.clips, *(self.mask_clips or ()))
         return replace(self, time_offset_s=(0.0,) * len(self.rig), frame_count=min(clip.frame_count for clip in clips))
-
-    @property
-    def calibration(self) -> Calibration:
-        """The calibration of the cameras that are used."""
-        return self._calibration
 
     @property
     def truth_file(self) -> Path:
@@ -205,7 +201,7 @@ class Capture:
         folder = self.path / "background"
         if not folder.is_dir():
             return None
-        clips = _clips_of(self._calibration, folder, "background", "png", pictures=True)
+        clips = _clips_of(self.calibration, folder, "background", "png", pictures=True)
         pixels = sum(camera.width * camera.height for camera in self.rig)
         most = min(_BACKGROUND_FRAMES, max(2, _BACKGROUND_BYTES // (3 * pixels)))
         small = [clip.reduced(camera.reduction) for clip, camera in zip(clips, self.rig, strict=True)]
@@ -282,7 +278,7 @@ def open_capture(
         mask_clips=mask_clips,
         masks=masks_asked,
         resampled=resample,
-        _calibration=calibration,
+        calibration=calibration,
         time_offset_s=offsets,
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,9 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-import tk.io.captures.quiet  # noqa: F401  (silences OpenCV and FFmpeg)
 from tk.errors import VideoError
 from tk.io.paths import c_name
+
+# OpenCV and FFmpeg write nothing to the terminal, unless the user sets these variables: errors here name the file.
+# FFmpeg's level is read when the first video is opened; -8 is its AV_LOG_QUIET. OpenCV reads its own on import.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+if "OPENCV_LOG_LEVEL" not in os.environ:
+    (getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel)(0)  # OpenCV 4, OpenCV 5
 
 Image = NDArray[np.uint8]
 
