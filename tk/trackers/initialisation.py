@@ -199,7 +199,9 @@ def _follow(
                 poses[:, i] = last
                 continue
             high = residual > WORSE * residuals[:, anchor]
-            for b in np.flatnonzero(high | (abs(i - anchor) % every == 0)) if every else ():
+            means = np.nanmean(residuals, axis=1)  # no search brings back a trajectory that is worse by far
+            searched = (high | (abs(i - anchor) % every == 0)) & (means <= AMBIGUOUS * means.min()) if every else []
+            for b in np.flatnonzero(searched):
                 now[b] = tracker.improved(frames[i], pyramids[i], now[b])
                 residual[b] = residual_of(i, now[b : b + 1])[0]
             poses[:, i], residuals[:, i] = now, residual
