@@ -364,11 +364,11 @@ def test_a_volume_that_cannot_be_inferred_is_reported(make_capture: MakeCapture)
 @pytest.mark.parametrize(
     ("name", "cameras", "frames", "masks", "background"),
     [
-        ("walk", 5, 80, True, 25),
-        ("dance", 5, 120, True, 25),
-        ("punch", 5, 150, False, 25),
+        ("walk", 5, 80, True, 16),
+        ("dance", 5, 120, True, 16),
+        ("punch", 5, 150, False, 16),
         ("treadmill-slow", 6, 340, True, None),
-        ("rig9", 9, 40, True, 25),
+        ("rig9", 9, 40, True, 16),
         ("balance", 4, 100, False, 1),
     ],
 )
