@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,10 @@ from tk.io import settings_file
 from tk.io.captures.calibration import read_calibration
 from tk.io.captures.capture_toml import read_settings
 from tk.io.captures.init_pose import read_init_pose
+from tk.io.toml import parse_toml
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import JOINTS, build_skeleton
 from tk.settings import Settings
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -129,7 +124,7 @@ def test_settings_example_is_accepted() -> None:
 
 def test_named_settings_exist() -> None:
     """On every page but the changelog, which names settings that are gone."""
-    tree = tomllib.loads(settings_file.to_toml(Settings()))
+    tree = parse_toml(settings_file.to_toml(Settings()), "settings")
     found = 0
     for page in PAGES:
         for path in re.findall(r"`(\w+\.[\w.]+)(?: = [^`]*)?`", page.read_text(encoding="utf-8")):

@@ -72,19 +72,13 @@ def complete_result(path: Path, capture_path: Path, count: int = FRAMES) -> Path
 
 def with_partner(result: Result) -> Result:
     """Return a result with a second person half a metre aside, who enters in frame 4 and is lost in frame 5."""
-    columns = {
-        name: getattr(result, name)[4:]
-        for name in ("frames", "time", "pose", "joints", "sigma", "residual", "feet", "segments_rotation", "status",
-                     "objective", "iterations")
-    }  # fmt: skip
+    second = result.at_rows(np.arange(4, len(result)))
     aside = np.array([0.5, 0, 0])
-    columns["pose"] = columns["pose"] + np.pad(aside, (0, columns["pose"].shape[1] - 3))
-    columns["joints"] = columns["joints"] + aside
-    columns["status"] = np.full(len(columns["frames"]), np.uint8(Status.TRACKED))
-    columns["status"][1] = Status.LOST
-    angles = {joint: values[4:] for joint, values in result.angles.items()}
-    timing = {stage: values[4:] for stage, values in result.timing.items()}
-    return replace(result, others=(replace(result, person=1, angles=angles, timing=timing, **columns),))
+    second.pose[:, :3] += aside
+    second.joints[...] += aside
+    second.status[:] = Status.TRACKED
+    second.status[1] = Status.LOST
+    return replace(result, others=(replace(second, person=1),))
 
 
 @pytest.fixture(scope="session")

@@ -117,16 +117,8 @@ def test_page_loads_nothing_and_escapes_text(complete: Path) -> None:
 
 def longer(result: Result, count: int) -> Result:
     """Return a result that repeats the same frames."""
-    rows = np.arange(count) % len(result)
-    columns = {
-        name: getattr(result, name)[rows]
-        for name in ("pose", "joints", "sigma", "residual", "feet", "segments_rotation", "status",
-                     "objective", "iterations")
-    }  # fmt: skip
-    angles = {joint: values[rows] for joint, values in result.angles.items()}
-    timing = {stage: values[rows] for stage, values in result.timing.items()}
     frames = np.arange(count)
-    return replace(result, **columns, angles=angles, timing=timing, frames=frames, time=frames / 15, smoothed=None)
+    return replace(result.at_rows(frames % len(result)), frames=frames, time=frames / 15)
 
 
 def test_page_of_1000_frames_is_below_4_megabytes(complete: Path) -> None:

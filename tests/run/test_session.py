@@ -186,8 +186,8 @@ def test_ctrl_c_before_the_first_frame_leaves_an_older_result(tiny: Path, tmp_pa
         (["--frames", "1:"], "first frame: 0, not 1"),
         (["--cameras", "cam1,cam2,cam3"], "cameras: cam1, cam2, cam3, cam4, not cam1, cam2, cam3"),
         (["--masks", "none"], "masks: masks, not none"),
-        (["--seed", "8"], "seed is 0, not 8"),
-        (["--voxels", "40"], "config voxels is 32, not 40"),
+        (["--seed", "8"], "seed: 0, not 8"),
+        (["--voxels", "40"], "config.voxels: 32, not 40"),
         (["--store-hull"], "stored hull: no, not yes"),
     ],
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,12 +20,8 @@ from scripts.synthetic.motion import HOLD, KNEE_RADIUS, MOTIONS
 from scripts.synthetic.render import CLOSE_M, Body, distances
 from scripts.synthetic.rig import RIGS
 from scripts.synthetic.skeleton import JOINTS, LIMITS_DEG, forward, make_skeleton, sole_points
+from tk.io.toml import load_toml
 from tk.model.cameras.camera import Camera
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 DEMO = Path(__file__).resolve().parents[2] / "tk" / "data" / "demo"
 DEMO_BYTES = 5_000_000
@@ -297,8 +292,8 @@ def test_command_refuses_odd_sizes(tmp_path: Path) -> None:
 def test_shipped_capture_is_small_and_agrees_with_itself() -> None:
     files = [path for path in DEMO.rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) <= DEMO_BYTES
-    calibration = tomllib.loads((DEMO / "calibration.toml").read_text(encoding="utf-8"))
-    settings = tomllib.loads((DEMO / "capture.toml").read_text(encoding="utf-8"))
+    calibration = load_toml(DEMO / "calibration.toml")
+    settings = load_toml(DEMO / "capture.toml")
     names = [name for name in calibration if name != "metadata"]
     with h5py.File(DEMO / "truth.h5") as truth:
         position, frames = truth["joints/position"][:], truth["frames"][:]

@@ -5,7 +5,6 @@ What may abort the process or hang is tried in a process of its own, with a time
 
 from __future__ import annotations
 
-import ctypes.util
 import os
 import platform
 import re
@@ -120,15 +119,6 @@ def _display() -> Check:
     return Check(os.environ.get("DISPLAY", "present"), why.split("tk view: ")[-1])
 
 
-def _vulkan() -> Check:
-    return Check("found" if ctypes.util.find_library("vulkan") else "not found; nothing in tk needs it")
-
-
-def _chromium() -> Check:
-    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    return Check(found or "not found; only tests of the report need it")
-
-
 def _codecs() -> Check:
     reads, why = _try("import cv2; print(cv2.CAP_FFMPEG in cv2.videoio_registry.getBackends())")
     if why or reads != "True":
@@ -196,8 +186,6 @@ CHECKS: dict[str, Callable[[], Check]] = {
     "Taichi": _taichi,
     "Open3D": _open3d,
     "display": _display,
-    "Vulkan": _vulkan,
-    "Chromium": _chromium,
     "codecs": _codecs,
     "cache": _cache,
     "cores": _cores,

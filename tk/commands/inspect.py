@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from tk.commands import base
+from tk.errors import CaptureError
 
 
 @click.command(epilog=base.example("tk inspect CAPTURE -o sheets"))
@@ -32,10 +33,11 @@ def inspect(
     sheet, plan = (None, None) if output is None else (output / "inspect.png", output / "people.png")
     with base.working(f"inspecting {capture}"):
         from tk.inspection.checks import inspect as check
-        from tk.inspection.floor_plan import write_floor_plan
+        from tk.inspection.floor_plan import floor_plan
         from tk.inspection.pictures import write_sheet
         from tk.io.importers import open_recording
         from tk.io.paths import check_not_input
+        from tk.render.canvas import write_png
         from tk.run.plan import reduce_images
 
         for picture in (sheet, plan):
@@ -47,7 +49,7 @@ def inspect(
         found, shown = check(opened, settings)
         if sheet is not None and plan is not None:
             write_sheet(sheet, opened, found, shown)
-            write_floor_plan(plan, opened, found.people)
+            write_png(plan, floor_plan(opened, found.people), CaptureError)
             click.echo(f"wrote {sheet} and {plan}", err=True)
     if as_json:
         base.print_json(**found.to_dict())

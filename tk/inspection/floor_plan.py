@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import CaptureError
 from tk.inspection.people import PersonReport
 from tk.io.captures.capture import Capture
 from tk.model.body.skeleton import up_rotation
-from tk.render.canvas import write_png
 
 Float = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -75,12 +72,3 @@ def floor_plan(capture: Capture, people: Sequence[PersonReport]) -> Image:
         color = _COLORS[person.number % len(_COLORS)]
         cv2.putText(image, text, (10, height + _LINE * (k + 1)), _FONT, 0.42, color, 1, cv2.LINE_AA)
     return np.asarray(image, np.uint8)
-
-
-def write_floor_plan(path: Path, capture: Capture, people: Sequence[PersonReport]) -> None:
-    """Write :func:`floor_plan` as a PNG.
-
-    Raises:
-        CaptureError: the file cannot be written.
-    """
-    write_png(path, floor_plan(capture, people), CaptureError)

@@ -46,6 +46,9 @@ class JointAngles:
         if not self.joint or "/" in self.joint or not self.names:
             raise ValueError(f"angles of {self.joint!r}: the name must have no slash, and at least one angle is needed")
 
+    def __str__(self) -> str:
+        return f"{self.joint} ({', '.join(self.names)}: {self.convention})"
+
 
 @dataclass(frozen=True)
 class ResultMeta:
@@ -100,23 +103,33 @@ class ResultMeta:
             raise ValueError("two sets of angles have the same name")
 
     def difference(self, other: ResultMeta) -> str | None:
-        """Return the first difference, such as ``seed is 1, not 2``; None if the two are equal."""
-        sizes = len(self.pose_names), len(other.pose_names)
-        if sizes[0] != sizes[1]:
-            return f"the pose has {sizes[0]} entries, not {sizes[1]}"
-        for name in (item.name for item in fields(self) if item.name != "config_toml"):
-            values = getattr(self, name), getattr(other, name)
-            if values[0] == values[1]:
-                continue
-            if not isinstance(values[0], tuple):
-                both = ["none" if value == "" else str(value) for value in values]
-                return f"{name} is {both[0]}, not {both[1]}"
-            both = [", ".join(getattr(item, "joint", item) for item in value) or "none" for value in values]
-            return (
-                f"{name} are {both[0]}; not {both[1]}" if both[0] != both[1] else f"{name} differ in their convention"
-            )
-        mine, others = (parse_toml(meta.config_toml, "config", ResultError) for meta in (self, other))
-        return _config_difference(mine, others)
+        """Return the first difference, such as ``seed: 1, not 2``; None if the two are equal."""
+        if len(self.pose_names) != len(other.pose_names):
+            return f"the pose has {len(self.pose_names)} entries, not {len(other.pose_names)}"
+        mine, others = (_settled(meta) for meta in (self, other))
+        for name in [*mine, *(name for name in others if name not in mine)]:
+            a, b = mine.get(name, "not set"), others.get(name, "not set")
+            if a != b:
+                return f"{name}: {a}, not {b}"
+        return None
+
+
+def _settled(meta: ResultMeta) -> dict[str, str]:
+    """Return everything that is constant during a run as texts by name, the configuration entry by entry."""
+    texts: dict[str, str] = {}
+
+    def put(name: str, value: object) -> None:
+        if isinstance(value, Mapping):
+            for key, item in value.items():
+                put(f"{name}.{key}", item)
+        else:
+            listed = value if isinstance(value, tuple) else (value,)
+            texts[name] = ", ".join(map(str, listed)) or "none"
+
+    for item in fields(meta):
+        put(item.name, getattr(meta, item.name))
+    put("config", parse_toml(texts.pop("config_toml"), "config", ResultError))
+    return texts
 
 
 @dataclass(frozen=True)
@@ -398,16 +411,3 @@ class JointTrack:
     status: NDArray[np.uint8] | None = None
     seconds: Float | None = None
     sigma: Float | None = None
-
-
-def _config_difference(mine: Mapping[str, Any], other: Mapping[str, Any], prefix: str = "") -> str | None:
-    for key in [*mine, *(key for key in other if key not in mine)]:
-        a, b = mine.get(key), other.get(key)
-        if isinstance(a, dict) and isinstance(b, dict):
-            found = _config_difference(a, b, f"{prefix}{key}.")
-            if found:
-                return found
-        elif a != b:
-            shown = ["not set" if value is None else str(value) for value in (a, b)]
-            return f"config {prefix}{key} is {shown[0]}, not {shown[1]}"
-    return None
