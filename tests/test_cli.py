@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import FRAMES, QUICK, Tk
-from tests.io.conftest import picture, write_picture, write_video
+from tests.io.conftest import write_picture
 from tk import __version__
 from tk.io import settings_file
 from tk.model.body.skeleton import JOINTS
@@ -122,11 +121,8 @@ def test_options_override_the_settings_file(tk: Tk, quick: Path, tiny: Path, tmp
     assert (config.voxels, config.seed, config.tracking.prediction) == (32, 3, 0.0)
 
 
-def test_help_and_version(tk: Tk) -> None:
+def test_version(tk: Tk) -> None:
     assert tk("--version").out.strip().endswith(__version__)
-    for command in ("track", "reconstruct", "evaluate", "demo"):
-        ran = tk(command, "--help")
-        assert ran.code == 0 and f"tk {command}" in ran.out and ran.err == ""
 
 
 def test_demo_tracks_and_prints_the_accuracy(
@@ -232,21 +228,6 @@ def test_error_of_a_bad_capture_is_one_line_with_the_file(
     assert list(tmp_path.iterdir()) == [copy]
 
 
-def test_missing_capture_is_reported(tk: Tk, tmp_path: Path) -> None:
-    for command in ("track", "reconstruct"):
-        tk(command, tmp_path / "nowhere", "-o", tmp_path / "r.h5").complaint("nowhere", "not a folder")
-
-
-def test_shortest_video_limits_the_frames(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:
-    write_video(copy / "videos" / "cam2.mp4", [picture(1, k, SIZE) for k in range(6)])
-    ran = tk("track", copy, "-o", tmp_path / "r.h5", "--config", quick)
-    assert ran.code == 0
-    warning = ran.messages[0]
-    assert "cam2.mp4" in warning and "only the first 6 are used" in warning
-    with h5py.File(tmp_path / "r.h5", "r") as file:
-        assert len(file["frames"]) == 6
-
-
 @pytest.mark.parametrize("broken", [2, 7])
 def test_finished_frames_are_kept_when_a_file_is_damaged(
     tk: Tk, quick: Path, copy: Path, tmp_path: Path, broken: int
@@ -267,38 +248,7 @@ def test_finished_frames_are_kept_when_a_file_is_damaged(
             assert len(file["frames"]) == FRAMES
 
 
-# --- results that cannot be written -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("command", ["track", "reconstruct"])
-def test_output_that_cannot_be_written_is_refused(
-    tk: Tk, quick: Path, tiny: Path, tmp_path: Path, command: str
-) -> None:
-    def run(output: Path) -> Any:
-        return tk(command, tiny, "-o", output, "--config", quick, "--frames", ":1")
-
-    run(tmp_path / "missing" / "r.h5").complaint("r.h5", "does not exist")
-    run(tmp_path).complaint(str(tmp_path), "is a folder")
-    (tmp_path / "file.h5").write_text("mine")
-    run(tmp_path / "file.h5" / "r.h5").complaint("r.h5")
-    run(tmp_path / "file.h5").complaint("not overwritten")
-    with h5py.File(tmp_path / "other.h5", "w") as file:
-        file["data"] = 1
-    run(tmp_path / "other.h5").complaint("other.h5", "not overwritten")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["file.h5", "other.h5"]
-    assert (tmp_path / "file.h5").read_text() == "mine"
-    if os.path.isdir("/proc"):  # not even root may create a file there
-        run(Path("/proc/r.h5")).complaint("/proc/r.h5", "cannot be written")
-
-
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="permissions do not bind root")
-@pytest.mark.parametrize("command", ["track", "reconstruct"])
-def test_output_folder_without_permission_is_refused(
-    tk: Tk, quick: Path, tiny: Path, tmp_path: Path, command: str
-) -> None:
-    locked = tmp_path / "locked"
-    locked.mkdir(mode=0o500)
-    tk(command, tiny, "-o", locked / "r.h5", "--config", quick).complaint("r.h5")
+# --- damaged results --------------------------------------------------------------------------------------------------
 
 
 def spoil(path: Path, name: str, value: Any) -> None:
@@ -307,24 +257,6 @@ def spoil(path: Path, name: str, value: Any) -> None:
         del file[name]
         if value is not None:
             file[name] = value
-
-
-def test_evaluate_refuses_damaged_results(tk: Tk, tracked: Path, tiny: Path, tmp_path: Path) -> None:
-    pipe = tmp_path / "pipe.h5"
-    os.mkfifo(pipe)
-    tk("evaluate", pipe, tiny / "truth.h5").complaint("pipe.h5", "not a file")
-    tk("evaluate", tracked, pipe).complaint("pipe.h5", "not a file")
-    for name, value in [
-        ("joints/position", np.zeros(3)),
-        ("frames", h5py.SoftLink("/nowhere")),
-        ("status", "good"),
-        ("pose", np.zeros((FRAMES, 3))),
-        ("model/dimensions/trunk", "tall"),
-        ("model/dimensions/trunk", np.zeros(7)),
-    ]:
-        path = Path(shutil.copy(tracked, tmp_path / "r.h5"))
-        spoil(path, name, value)
-        tk("evaluate", path, tiny / "truth.h5").complaint("r.h5")
 
 
 @pytest.mark.parametrize(

@@ -28,11 +28,9 @@ def write_body_meshes(motion: Motion, folder: Path) -> None:
     figure = figure_of(motion.result)
     if not figure.solids:
         raise ExportError(f"{motion.result.path}: has no body and thus no surface; track the capture again")
-    counts = [len(solid.rings) * solid.rings.shape[1] for solid in figure.solids]
-    starts = np.cumsum([0, *counts[:-1]])
-    faces = [solid.triangles + start for solid, start in zip(figure.solids, starts, strict=True)]
+    faces = [solid.triangles + start for solid, start in zip(figure.solids, figure.starts[:-1], strict=True)]
     bgr = [SEGMENT_COLORS[SEGMENTS[solid.segment]] for solid in figure.solids]
-    colors = np.repeat(np.array(bgr, np.uint8)[:, ::-1], counts, axis=0)
+    colors = np.repeat(np.array(bgr, np.uint8)[:, ::-1], np.diff(figure.starts), axis=0)
     triangles = np.concatenate(faces).astype(np.int32)
     for frame, row in zip(motion.frames, motion.held, strict=True):
         write_ply(ply_path(folder, frame), figure.placed(int(row)), colors, triangles)

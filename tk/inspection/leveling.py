@@ -34,6 +34,8 @@ _AGREE_DEG = 25.0
 #: percentile of the voxels' heights that is the floor; lower voxels come from specks in the masks
 _FLOOR_PERCENTILE = 0.5
 
+_UP = re.compile(r"^[ \t]*(up|\"up\"|'up')[ \t]*=[ \t]*(\[[^\]]*\]|\"[^\"\n]*\"|'[^'\n]*')[ \t]*(#[^\n]*)?$", re.M)
+
 
 @dataclass(frozen=True)
 class Leveling:
@@ -115,31 +117,11 @@ def write_up(capture: Path, leveling: Leveling) -> None:
     """
     path = capture / "capture.toml"
     text = read_text(path, CaptureError) if path.exists() else ""
-    parse_toml(text, str(path))
+    before = parse_toml(text, str(path))
     value = f'"{leveling.up}"' if leveling.up in UP_AXES else leveling.up
     line = f"up = {value}  # {leveling.how}"
-    head, tables = _split_at_first_table(text)
-    old = re.compile(r"^[ \t]*(up|\"up\"|'up')[ \t]*=[ \t]*(\[[^\]]*\]|\"[^\"\n]*\"|'[^'\n]*')[ \t]*(#[^\n]*)?$", re.M)
-    if old.search(head):
-        head = old.sub(lambda _: line, head, count=1)
-    else:
-        head = f"{head.rstrip()}\n{line}\n".lstrip() + ("\n" if tables else "")
-    new = head + tables
-    if parse_toml(new, str(path)).get("up") is None:
+    new = _UP.sub(lambda _: line, text, count=1) if "up" in before else f"{line}\n{text}"
+    if parse_toml(new, str(path)) != {**before, **parse_toml(line, str(path))}:
         raise CaptureError(f"{path}: cannot be changed automatically; add {line!r} yourself")
     with replacing(path, CaptureError) as part:
         part.write_text(new, encoding="utf-8")
-
-
-def _split_at_first_table(text: str) -> tuple[str, str]:
-    """Return the text before the first table, and the rest."""
-    found = re.search(r"^[ \t]*\[", text, re.M)
-    # a line of an array may also begin with a bracket, but it does not match a table's name in brackets
-    while found is not None and not re.match(r"[ \t]*\[\[?[A-Za-z0-9_\"'. -]+\]\]?[ \t]*(#.*)?$", _line(text, found)):
-        found = re.compile(r"^[ \t]*\[", re.M).search(text, found.end())
-    stop = len(text) if found is None else found.start()
-    return text[:stop], text[stop:]
-
-
-def _line(text: str, found: re.Match[str]) -> str:
-    return text[found.start() :].split("\n", 1)[0]

@@ -106,6 +106,17 @@ def camera_pyramid(camera: Camera) -> Float:
     return np.vstack([camera.center, camera.center + _PYRAMID_M * rays])
 
 
+def camera_towards(center: Float, forward: Float, up: Float, size: tuple[int, int], view_deg: float) -> Camera:
+    """Return a camera at ``center`` (3,) that looks along the unit vector ``forward`` (3,); field of view: vertical."""
+    width, height = size
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    R = np.stack([right, np.cross(forward, right), forward])
+    focal = 0.5 * height / np.tan(np.radians(view_deg / 2))
+    matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return Camera("view", width, height, matrix, np.zeros(5), R, -R @ center)
+
+
 class Scene:
     """Draws a result in 3D.
 
@@ -170,13 +181,9 @@ class Scene:
         elevation = np.radians(ELEVATION_DEG)
         level = self.stage.axes @ np.array([np.cos(turn), np.sin(turn), 0.0])
         forward = -(np.cos(elevation) * level + np.sin(elevation) * up)
-        right = np.cross(forward, up)
-        right /= np.linalg.norm(right)
-        R = np.stack([right, np.cross(forward, right), forward])
-        center = self._middles[row] - self._distance * forward
-        focal = 0.5 * HEIGHT / np.tan(np.radians(_FIELD_OF_VIEW_DEG / 2))
-        matrix = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
-        return Camera("view", WIDTH, HEIGHT, matrix, np.zeros(5), R, -R @ center)
+        return camera_towards(
+            self._middles[row] - self._distance * forward, forward, up, (WIDTH, HEIGHT), _FIELD_OF_VIEW_DEG
+        )
 
     def _draw_floor(self, tile: Image, eye: Camera) -> None:
         for a, b in self.stage.floor_lines():

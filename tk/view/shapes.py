@@ -33,9 +33,10 @@ def body_mesh(figure: Figure, row: int) -> Any:
     if not figure.solids or not np.isfinite(figure.transforms[row]).all():
         return mesh
     bgr = [figure.color(row, SEGMENTS[solid.segment]) for solid in figure.solids]
-    counts = [solid.rings.shape[0] * solid.rings.shape[1] for solid in figure.solids]
-    starts = np.cumsum([0, *counts[:-1]])
-    faces = np.concatenate([solid.mantle + start for solid, start in zip(figure.solids, starts, strict=True)])
+    counts = np.diff(figure.starts)
+    faces = np.concatenate(
+        [solid.mantle + start for solid, start in zip(figure.solids, figure.starts[:-1], strict=True)]
+    )
     mesh.vertices = o3d.utility.Vector3dVector(figure.placed(row))
     mesh.triangles = o3d.utility.Vector3iVector(faces[:, ::-1].astype(np.int32))
     mesh.vertex_colors = o3d.utility.Vector3dVector(np.repeat(np.array(bgr)[:, ::-1] / 255, counts, axis=0))

@@ -15,6 +15,7 @@ import numpy as np
 
 from tk.errors import DisplayError, ExportError
 from tk.render.palette import BACKGROUND, unit_rgb
+from tk.render.scene import camera_towards
 from tk.view.contents import FIELD_OF_VIEW_DEG, SIZE, Contents
 
 _ALTERNATIVE = "tk report RESULT.h5 writes an HTML page to look at instead"
@@ -147,17 +148,14 @@ def _pinhole(contents: Contents) -> Any:
     """Return Open3D's camera at :attr:`Contents.eye` that looks at the middle of the motion."""
     import open3d as o3d
 
-    up = contents.stage.axes[:, 2]
-    forward = contents.stage.middle - contents.eye
+    stage = contents.stage
+    forward = stage.middle - contents.eye
     forward /= np.linalg.norm(forward)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    width, height = SIZE
-    focal = height / 2 / np.tan(np.radians(FIELD_OF_VIEW_DEG / 2))
+    seen = camera_towards(contents.eye, forward, stage.axes[:, 2], SIZE, FIELD_OF_VIEW_DEG)
+    focal, (width, height) = seen.matrix[0, 0], SIZE
     camera = o3d.camera.PinholeCameraParameters()
     camera.intrinsic = o3d.camera.PinholeCameraIntrinsic(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
     T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    T[:3, 3] = -T[:3, :3] @ contents.eye
+    T[:3, :3], T[:3, 3] = seen.rotation, seen.translation
     camera.extrinsic = T
     return camera

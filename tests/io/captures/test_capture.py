@@ -274,13 +274,6 @@ def test_impossible_time_offsets_are_refused(make_capture: MakeCapture) -> None:
             open_capture(folder)
 
 
-def test_a_text_file_named_mp4_is_refused(make_capture: MakeCapture) -> None:
-    folder = make_capture()
-    (folder / "videos" / "cam1.mp4").write_text("a shopping list\n" * 30)
-    with refused(VideoError, str(folder / "videos" / "cam1.mp4"), "not a video"):
-        open_capture(folder)
-
-
 @pytest.mark.parametrize(
     ("settings", "error", "complaint"),
     [
