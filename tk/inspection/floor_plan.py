@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tk.inspection.people import PersonReport
 from tk.io.captures.capture import Capture
 from tk.model.body.skeleton import up_rotation
+from tk.render.palette import INK, PAPER, VOLUME, WIRE, person_color
 
 Float = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -19,9 +20,6 @@ Image = NDArray[np.uint8]
 #: layout of the floor plan, pixels: longest side, margin, height of a line of text. Appearance only.
 _SIDE, _MARGIN, _LINE = 900, 60, 24
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-_PAPER, _INK, _GREY, _BOX = (255, 255, 255), (40, 40, 40), (170, 170, 170), (230, 190, 90)
-#: colours of the people, BGR: Okabe and Ito's palette, which people with colour-blindness can tell apart
-_COLORS = ((178, 114, 0), (0, 94, 213), (115, 158, 0), (167, 121, 204), (0, 159, 230), (233, 180, 86))
 
 
 def floor_plan(capture: Capture, people: Sequence[PersonReport]) -> Image:
@@ -37,22 +35,22 @@ def floor_plan(capture: Capture, people: Sequence[PersonReport]) -> Image:
     low, high = shown.min(axis=0), shown.max(axis=0)
     scale = _SIDE / float((high - low).max())
     width, height = (round(float(side)) for side in (high - low) * scale + 2 * _MARGIN)
-    image = np.full((height + _LINE * (len(people) + 2), max(width, _SIDE), 3), _PAPER, np.uint8)
+    image = np.full((height + _LINE * (len(people) + 2), max(width, _SIDE), 3), PAPER, np.uint8)
 
     def pixel(point: Float) -> tuple[int, int]:
         x, y = (point - low) * scale + _MARGIN
         return round(float(x)), height - round(float(y))
 
     corners = cv2.convexHull(np.array([pixel(corner) for corner in box @ to_plan.T]))
-    cv2.polylines(image, [corners], True, _BOX, 2, cv2.LINE_AA)
+    cv2.polylines(image, [corners], True, VOLUME, 2, cv2.LINE_AA)
     for camera, center in zip(capture.rig, centers, strict=True):
         ahead = camera.rotation[2] @ to_plan.T
         x, y = pixel(center)
-        cv2.circle(image, (x, y), 6, _GREY, cv2.FILLED, cv2.LINE_AA)
-        cv2.line(image, (x, y), pixel(center + 0.3 * ahead), _GREY, 2, cv2.LINE_AA)
-        cv2.putText(image, camera.name, (x + 9, y - 6), _FONT, 0.45, _GREY, 1, cv2.LINE_AA)
+        cv2.circle(image, (x, y), 6, WIRE, cv2.FILLED, cv2.LINE_AA)
+        cv2.line(image, (x, y), pixel(center + 0.3 * ahead), WIRE, 2, cv2.LINE_AA)
+        cv2.putText(image, camera.name, (x + 9, y - 6), _FONT, 0.45, WIRE, 1, cv2.LINE_AA)
     for person, path in zip(people, paths, strict=True):
-        color = _COLORS[person.number % len(_COLORS)]
+        color = person_color(person.number)
         pixels = [pixel(point) for point in path]
         for start, stop in pairwise(pixels):
             cv2.line(image, start, stop, color, 2, cv2.LINE_AA)
@@ -61,14 +59,14 @@ def floor_plan(capture: Capture, people: Sequence[PersonReport]) -> Image:
         if len(pixels) > 1 and pixels[-1] != pixels[-2]:
             cv2.arrowedLine(image, pixels[-2], pixels[-1], color, 3, cv2.LINE_AA, tipLength=0.9)
         cv2.circle(image, pixels[0], 12, color, cv2.FILLED, cv2.LINE_AA)
-        cv2.putText(image, str(person.number), (pixels[0][0] - 5, pixels[0][1] + 5), _FONT, 0.5, _PAPER, 2, cv2.LINE_AA)
+        cv2.putText(image, str(person.number), (pixels[0][0] - 5, pixels[0][1] + 5), _FONT, 0.5, PAPER, 2, cv2.LINE_AA)
     metre = round(scale)
-    cv2.line(image, (_MARGIN, height - 14), (_MARGIN + metre, height - 14), _INK, 2)
-    cv2.putText(image, "1 m", (_MARGIN + metre + 8, height - 10), _FONT, 0.45, _INK, 1, cv2.LINE_AA)
+    cv2.line(image, (_MARGIN, height - 14), (_MARGIN + metre, height - 14), INK, 2)
+    cv2.putText(image, "1 m", (_MARGIN + metre + 8, height - 10), _FONT, 0.45, INK, 1, cv2.LINE_AA)
     x, y = corners.reshape(-1, 2).min(axis=0).tolist()
-    cv2.putText(image, "working volume", (x, y - 8), _FONT, 0.45, _BOX, 1, cv2.LINE_AA)
+    cv2.putText(image, "working volume", (x, y - 8), _FONT, 0.45, VOLUME, 1, cv2.LINE_AA)
     for k, person in enumerate(people):
         text = person.line(len(capture.rig))
-        color = _COLORS[person.number % len(_COLORS)]
+        color = person_color(person.number)
         cv2.putText(image, text, (10, height + _LINE * (k + 1)), _FONT, 0.42, color, 1, cv2.LINE_AA)
     return np.asarray(image, np.uint8)

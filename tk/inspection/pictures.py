@@ -18,6 +18,7 @@ from tk.model.cameras.camera import Camera
 from tk.model.cameras.up import up_vector
 from tk.render.canvas import text_width, write, write_png
 from tk.render.overlay import joined
+from tk.render.palette import INK, LOST, PAPER, VOLUME, of_hue
 
 Image = NDArray[np.uint8]
 Float = NDArray[np.float64]
@@ -25,14 +26,12 @@ Float = NDArray[np.float64]
 #: layout, pixels: height of a tile, height of a line of text, width of a column of a terminal
 _TILE, _LINE, _COLUMN = 300, 20, 9
 _SIZE = 0.45  # of the letters
-_PAPER, _INK, _BAD = (255, 255, 255), (40, 40, 40), (40, 40, 200)
-#: BGR
-_MASK, _HULL, _OUTSIDE, _BOX, _UP = (80, 220, 80), (230, 120, 230), (40, 40, 255), (230, 190, 90), (60, 190, 250)
+_MASK, _HULL, _UP = of_hue(120.0), of_hue(300.0), of_hue(45.0)
 _LEGEND = (
     ("mask", _MASK),
     ("hull of the others", _HULL),
-    ("mask outside the hull", _OUTSIDE),
-    ("volume", _BOX),
+    ("mask outside the hull", LOST),
+    ("volume", VOLUME),
     ("up", _UP),
 )
 
@@ -51,9 +50,9 @@ def write_sheet(path: Path, capture: Capture, inspection: Inspection, samples: S
 
 def _text(inspection: Inspection, width: int) -> Image:
     last = len(inspection.notes) + max(len(inspection.findings), 1)
-    lines = [(line, _INK) for line in inspection.format_table().split("\n")[:-last]]
-    lines += [(line, _BAD) for line in inspection.findings] or [("No problems found.", (60, 140, 60))]
-    lines += [(f"note: {line}", _INK) for line in inspection.notes]
+    lines = [(line, INK) for line in inspection.format_table().split("\n")[:-last]]
+    lines += [(line, LOST) for line in inspection.findings] or [("No problems found.", of_hue(120.0, 0.4))]
+    lines += [(f"note: {line}", INK) for line in inspection.notes]
     wrapped = [(part, color) for line, color in lines for part in _wrapped(line, width - 20)]
     image = np.full(((len(wrapped) + 2) * _LINE, width, 3), 255, np.uint8)
     for i, (line, color) in enumerate(wrapped):
@@ -61,7 +60,7 @@ def _text(inspection: Inspection, width: int) -> Image:
     x, y = 10, (len(wrapped) + 1) * _LINE
     for name, color in _LEGEND:
         cv2.line(image, (x, y - 5), (x + 24, y - 5), color, 3, cv2.LINE_AA)
-        x = write(image, name, x + 30, y, _INK, _SIZE) + 20
+        x = write(image, name, x + 30, y, INK, _SIZE) + 20
     return image
 
 
@@ -99,7 +98,7 @@ def _tile(capture: Capture, inspection: Inspection, frame: Sample, c: int) -> Im
         hull = np.pad(hull, [(0, max(0, n - m)) for n, m in zip(mask.shape, hull.shape, strict=True)])
         hull = np.ascontiguousarray(hull[: camera.height, : camera.width])
         outside = (mask > 0) & (hull == 0)
-        picture[outside] = (0.4 * picture[outside] + 0.6 * np.array(_OUTSIDE)).astype(np.uint8)
+        picture[outside] = (0.4 * picture[outside] + 0.6 * np.array(LOST)).astype(np.uint8)
         _outline(picture, hull, _HULL, thick)
     _outline(picture, mask, _MASK, thick)
     volume = capture.volume
@@ -107,7 +106,7 @@ def _tile(capture: Capture, inspection: Inspection, frame: Sample, c: int) -> Im
     for i in range(8):
         for bit in (1, 2, 4):
             if not i & bit:
-                _segment(picture, camera, corners[i], corners[i | bit], _BOX, thick)
+                _segment(picture, camera, corners[i], corners[i | bit], VOLUME, thick)
     up = up_vector(inspection.leveling.up)
     foot = np.array(volume.center)
     if np.isfinite(inspection.leveling.floor_m):
@@ -117,10 +116,10 @@ def _tile(capture: Capture, inspection: Inspection, frame: Sample, c: int) -> Im
     tile = cv2.resize(picture, (round(camera.width * scale), _TILE), interpolation=cv2.INTER_AREA)
     report = inspection.cameras[c]
     name = f"{camera.name}  frame {frame.index}"
-    cv2.rectangle(tile, (0, 0), (text_width(name, 0.5) + 14, 24), _INK, cv2.FILLED)
-    write(tile, name, 7, 17, _PAPER, 0.5)
+    cv2.rectangle(tile, (0, 0), (text_width(name, 0.5) + 14, 24), INK, cv2.FILLED)
+    write(tile, name, 7, 17, PAPER, 0.5)
     if report.verdict:
-        cv2.rectangle(tile, (0, 0), (tile.shape[1] - 1, _TILE - 1), _BAD, 4)
+        cv2.rectangle(tile, (0, 0), (tile.shape[1] - 1, _TILE - 1), LOST, 4)
     return np.asarray(tile, np.uint8)
 
 

@@ -16,7 +16,7 @@ from tk.model.body.joints import BONES
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Camera
 from tk.render.figure import Outline
-from tk.render.palette import BONE, INK, LOST_BODY, TEXT, Color, sigma_colors
+from tk.render.palette import BACKGROUND, BONE, INK, LOST_BODY, TEXT, Color, sigma_colors
 
 Float = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -24,7 +24,6 @@ Image = NDArray[np.uint8]
 # Appearance only; no measurement depends on these values.
 _FILL = 0.35  # opacity of the body
 _SQUARE = np.ones((3, 3), np.uint8)  # makes contours two pixels wide
-_BEYOND: Color = (24, 24, 24)  # outside the image
 #: fractional bits of OpenCV's drawing coordinates
 SUBPIXEL_BITS = 4
 _BONES = np.array([(JOINTS.index(a), JOINTS.index(b)) for a, b in BONES])
@@ -76,7 +75,7 @@ class View:
             return
         shift = 0.5 * self.scale - 0.5 - self.scale * self.origin
         M = np.column_stack([self.scale * np.eye(2), shift])
-        cv2.warpAffine(picture, M, (self.width, self.height), tile, cv2.INTER_LINEAR, borderValue=_BEYOND)
+        cv2.warpAffine(picture, M, (self.width, self.height), tile, cv2.INTER_LINEAR, borderValue=BACKGROUND)
 
     def place(self, xy: Float) -> Float:
         """Convert pixels of the image (N, 2) to pixels of the tile."""

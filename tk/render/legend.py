@@ -12,21 +12,31 @@ from tk.io.results.data import Result
 from tk.io.results.status import STATUS_MEANING, Status
 from tk.render.canvas import Image, write
 from tk.render.figure import Figure, lost_in
-from tk.render.palette import INK, LOST, SEGMENT_COLORS, SIGMA_MOST_M, TEXT, Color, sigma_colors
+from tk.render.palette import (
+    BACKGROUND,
+    INK,
+    LOST,
+    PAPER,
+    SEGMENT_COLORS,
+    SIGMA_MOST_M,
+    TEXT,
+    grey,
+    of_hue,
+    sigma_colors,
+)
 
 # Sizes in pixels: of the text's strip and of the bar below it; of the text of a frame that is lost or not; of the key.
 _STRIP, _BAR = 30, 6
 _TEXT_WIDTH, _KEY_WIDTH = {False: 280, True: 360}, 330
 #: height of the legend, pixels
 LEGEND_HEIGHT = _STRIP + _BAR
-_BACKGROUND = 24
-_STATUS_COLORS: dict[int, Color] = {
-    Status.TRACKED: (120, 150, 90),
-    Status.INITIALISED: (190, 170, 110),
-    Status.RECOVERED: (60, 190, 240),
+_STATUS_COLORS = {
+    Status.TRACKED: of_hue(150.0, saturation=0.25),
+    Status.INITIALISED: of_hue(200.0),
+    Status.RECOVERED: of_hue(50.0),
     Status.LOST: LOST,
-    Status.SUSPECT: (0, 140, 255),
-    Status.ABSENT: (60, 60, 60),
+    Status.SUSPECT: of_hue(30.0),
+    Status.ABSENT: grey(0.25),
 }
 
 
@@ -44,7 +54,7 @@ class Legend:
         strip, bar = canvas[:_STRIP], canvas[_STRIP:]
         lost = lost_in(self._figures, row)
         if lost not in self._keys:
-            key = self._keys[lost] = np.full_like(strip, LOST if lost else _BACKGROUND)
+            key = self._keys[lost] = np.full_like(strip, LOST if lost else BACKGROUND)
             if strip.shape[1] > _TEXT_WIDTH[lost] + _KEY_WIDTH:
                 _draw_key(key, strip.shape[1] - _KEY_WIDTH + 20, self._figures[0].sigma is not None)
         strip[...] = self._keys[lost]
@@ -55,7 +65,7 @@ class Legend:
         write(strip, text, 10, 20, TEXT, 0.5)
         bar[...] = self._timeline
         now = round((row + 0.5) / len(self._result) * bar.shape[1])
-        bar[:, max(now - 2, 0) : now + 2] = (255, 255, 255)
+        bar[:, max(now - 2, 0) : now + 2] = PAPER
 
 
 def _draw_key(strip: Image, left: int, sigma: bool) -> None:

@@ -20,18 +20,26 @@ Color = tuple[int, int, int]
 _HUES_DEG = {"": 135.0, "arm_l": 25.0, "leg_l": 5.0, "arm_r": 215.0, "leg_r": 280.0}
 
 
-# Hues of the people after the first, who are drawn in one colour each, degrees. Appearance only.
-_PEOPLE_DEG = (50.0, 320.0, 180.0, 100.0)
+# Hue of the second person, and the angle to the next one's, degrees: the golden angle, which keeps any number of hues
+# apart. People after the first are drawn in one colour each.
+_SECOND_DEG, _NEXT_DEG = 50.0, 180.0 * (3.0 - np.sqrt(5.0))
+
+
+def of_hue(hue_deg: float, lightness: float = 0.5, saturation: float = 0.8) -> Color:
+    """Return a colour from its hue (0 red, 120 green, 240 blue), lightness and saturation in [0, 1]."""
+    r, g, b = hls_to_rgb(hue_deg / 360 % 1.0, lightness, saturation)
+    return round(255 * b), round(255 * g), round(255 * r)
+
+
+def grey(lightness: float) -> Color:
+    """Return a grey; 0 is black, 1 is white."""
+    return of_hue(0.0, lightness, 0.0)
 
 
 def _shades(hue_deg: float, segments: Sequence[str]) -> dict[str, Color]:
     """Return the colours of segments, dark ones beside light ones."""
-    colors = {}
-    for k, segment in enumerate((*segments[::2], *segments[1::2])):
-        rgb = hls_to_rgb(hue_deg / 360, 0.45 + 0.1 * k, 0.7)
-        r, g, b = (round(255 * value) for value in rgb)
-        colors[segment] = (b, g, r)
-    return colors
+    order = (*segments[::2], *segments[1::2])
+    return {segment: of_hue(hue_deg, 0.45 + 0.1 * k, 0.7) for k, segment in enumerate(order)}
 
 
 _TRUNK = tuple(segment for segment in SEGMENTS if not side_of(segment))
@@ -40,16 +48,19 @@ SEGMENT_COLORS = {
     for limb, hue_deg in _HUES_DEG.items()
     for segment, color in _shades(hue_deg, CHAINS.get(limb, _TRUNK)).items()
 }
-#: border of a lost frame, and the body in it
-LOST: Color = (50, 50, 225)
-LOST_BODY: Color = (150, 150, 150)
-TEXT: Color = (240, 240, 240)
-BONE: Color = (245, 245, 245)
-INK: Color = (20, 20, 20)
-#: background, floor grid and cameras of the views in three dimensions
-BACKGROUND: Color = (34, 30, 28)
-FLOOR: Color = (78, 70, 66)
-WIRE: Color = (190, 170, 150)
+# The other colours, by what they show. Appearance only.
+#: whatever is wrong: the border of a lost frame, a finding, a mask outside the hull
+LOST = of_hue(0.0)
+#: the body in a lost frame, and the cameras
+LOST_BODY = WIRE = grey(0.6)
+#: light letters and bones; white paper
+TEXT = BONE = grey(0.95)
+PAPER = grey(1.0)
+#: dark letters and borders; the background of dark pictures
+INK = BACKGROUND = grey(0.1)
+FLOOR = grey(0.28)
+#: the working volume
+VOLUME = of_hue(210.0, 0.6)
 #: elevation of the viewer in these views, degrees
 ELEVATION_DEG = 14.0
 
@@ -82,5 +93,4 @@ def person_color(person: int) -> Color:
     """Return the colour of a person; the first person's segments have colours of their own, and this is the trunk's."""
     if person == 0:
         return SEGMENT_COLORS[_TRUNK[0]]
-    r, g, b = hls_to_rgb(_PEOPLE_DEG[(person - 1) % len(_PEOPLE_DEG)] / 360, 0.5, 0.8)
-    return round(255 * b), round(255 * g), round(255 * r)
+    return of_hue(_SECOND_DEG + (person - 1) * _NEXT_DEG)

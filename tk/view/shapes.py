@@ -12,13 +12,12 @@ from tk.model.body.joints import BONES
 from tk.model.body.skeleton import JOINTS, SEGMENTS
 from tk.model.cameras.camera import Rig
 from tk.render.figure import Figure
-from tk.render.palette import sigma_colors
+from tk.render.palette import BONE, sigma_colors, unit_rgb
 from tk.render.scene import PYRAMID_EDGES, Stage, camera_pyramid
 
 Float = NDArray[np.float64]
 
 _JOINT_M, _TRUTH_M = 0.022, 0.018  # radii of the spheres, metres; appearance only
-_PLAIN_JOINT = (0.96, 0.94, 0.65)
 
 
 def body_mesh(figure: Figure, row: int) -> Any:
@@ -53,7 +52,7 @@ def skeleton_lines(joints: Float) -> Any:
 def joint_spheres(joints: Float, sigma: Float | None) -> Any:
     """Return a mesh of one sphere per joint (15, 3), coloured by the standard deviation (15,), metres."""
     known = np.isfinite(joints).all(axis=1)
-    colors = np.tile(_PLAIN_JOINT, (len(joints), 1))
+    colors = np.tile(unit_rgb(BONE), (len(joints), 1))
     if sigma is not None:
         finite = np.isfinite(sigma)
         colors[finite] = sigma_colors(sigma[finite])[:, ::-1] / 255
