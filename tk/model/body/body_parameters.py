@@ -56,9 +56,6 @@ _SHAPES = {"hand_": _END, "foot_": _END, "head": _HEAD}
 # Difference of a dimension's logarithm for its derivative: curvature then changes the derivative by 1e-6, float64's
 # rounding by less.
 _STEP = 1e-6
-# Derivatives are used again until a dimension has changed by this share, because they change by about the same share,
-# and they take three quarters of a body fit.
-_REUSED = 0.05
 _DIMENSIONS = tuple(field.name for field in fields(BodyDimensions))
 
 
@@ -83,8 +80,6 @@ class BodyFamily:
         self.mean = np.concatenate([logs, np.zeros(SHAPE_NUMBERS * len(self.groups))])
         self.deviation = np.concatenate([[_LENGTHS.get(name, _RADII) for name in _DIMENSIONS], np.ravel(shapes)])
         self.start = self.mean.copy()
-        # parameters (K,), and the derivatives of parts and skeletons there
-        self._derivatives: tuple[Float | None, tuple[Float, ...]] = None, ()
 
     @staticmethod
     def around(body: ConeBody, stature_deviation: float) -> BodyFamily:
@@ -107,16 +102,12 @@ class BodyFamily:
         """
         body = self.build(shared)
         s = body.skeleton
-        at, derivatives = self._derivatives
-        if at is None or np.abs(shared - at)[: len(_DIMENSIONS)].max() > _REUSED:
-            changed = [self.build(shared + step) for step in _STEP * np.eye(len(_DIMENSIONS), len(shared))]
-            derivatives = (
-                np.array([_part_numbers(other) - _part_numbers(body) for other in changed]) / _STEP,
-                np.array([other.skeleton.point - s.point for other in changed]) / _STEP,
-                np.array([other.skeleton.rise - s.rise for other in changed]) / _STEP,
-            )
-            self._derivatives = shared, derivatives
-        by_part, point, rise = derivatives
+        changed = [self.build(shared + step) for step in _STEP * np.eye(len(_DIMENSIONS), len(shared))]
+        by_part = np.array([_part_numbers(other) - _part_numbers(body) for other in changed]) / _STEP
+        point, rise = (
+            np.array([getattr(other.skeleton, name) - getattr(s, name) for other in changed]) / _STEP
+            for name in ("point", "rise")
+        )
         moves = s.segment_moves(poses, point, rise)
         twists = np.concatenate(s.twists(poses), axis=-1).swapaxes(-1, -2)
         return LinearisedBody(body, s.segment_transforms(poses), twists, by_part.transpose(1, 2, 0), moves)

@@ -180,10 +180,31 @@ class ConeBody:
                 two numbers at its beginning (a cone's z = 0, an ellipsoid's lower pole), two at its end. The right
                 side is the left's mirror image.
         """
-        rows = dict(zip(self.shape_groups, change, strict=True))
+        groups = self.shape_groups
+        rows = change[[groups.index(group_of(part.name)) for part in self.parts]]
+        shape, T = np.array([part.shape for part in self.parts]), np.array([part.T_body_part for part in self.parts])
+        cone = np.array([part.kind == CONE for part in self.parts])
+        side = np.array([-1.0 if part.name.endswith("_r") else 1.0 for part in self.parts])
+        h = shape[:, 2]
+        # both ends of the axis in the part's frame, then in the body's
+        low = np.column_stack([rows[:, 4], side * rows[:, 5], np.where(cone, 0.0, -h)])
+        high = np.column_stack([rows[:, 6], side * rows[:, 7], h])
+        begin, end = ((T[:, :3, :3] @ point[:, :, None])[:, :, 0] + T[:, :3, 3] for point in (low, high))
+        frames = np.tile(np.eye(4), (len(T), 1, 1))
+        axis = _unit(end - begin)
+        front = T[:, :3, 0]
+        frames[:, :3, 0] = _unit(front - (front * axis).sum(axis=1, keepdims=True) * axis)
+        frames[:, :3, 1] = np.cross(axis, frames[:, :3, 0])
+        frames[:, :3, 2] = axis
+        frames[:, :3, 3] = np.where(cone[:, None], begin, 0.5 * (begin + end))
+        growth = np.exp(rows[:, [0, 1, 3, 2]])
+        growth[~cone, 3] = 1.0
         return replace(
             self,
-            parts=tuple(_reshape(part, rows[group_of(part.name)], part.name.endswith("_r")) for part in self.parts),
+            parts=tuple(
+                replace(part, shape=tuple(sizes), T_body_part=frame)
+                for part, sizes, frame in zip(self.parts, (shape * growth).tolist(), frames, strict=True)
+            ),
         )
 
     def place(
@@ -224,22 +245,9 @@ class ConeBody:
         return segments, B @ np.array([part.T_body_part for part in self.parts])
 
 
-def _reshape(part: ConePart, row: Float, right: bool) -> ConePart:
-    """Change a part by a row (8,) of :meth:`ConeBody.reshaped`."""
-    by_a, by_b, by_m, by_h = np.exp(row[:4]).tolist()
-    a, b, h, m = part.shape
-    side = -1.0 if right else 1.0
-    T = part.T_body_part
-    low = 0.0 if part.kind == CONE else -h
-    begin = T[:3, :3] @ [row[4], side * row[5], low] + T[:3, 3]
-    end = T[:3, :3] @ [row[6], side * row[7], h] + T[:3, 3]
-    axis = (end - begin) / np.linalg.norm(end - begin)
-    front = T[:3, 0] - (T[:3, 0] @ axis) * axis
-    return replace(
-        part,
-        shape=(a * by_a, b * by_b, h * by_h, m * by_m if part.kind == CONE else m),
-        T_body_part=_frame(begin if part.kind == CONE else 0.5 * (begin + end), axis, front / np.linalg.norm(front)),
-    )
+def _unit(vectors: Float) -> Float:
+    """Return vectors (N, 3) of length 1."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
 def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "full") -> ConeBody:
