@@ -25,7 +25,7 @@ from tk.commands import base
 _LIMIT_S = 120.0
 # Memory below which there is a warning, bytes: a run of five small videos takes 0.4 GB (docs/robustness.md); images of
 # full size and the process that decodes ahead take the rest.
-_MEMORY = 2 * 10**9
+_MEMORY = 2_000_000_000
 
 
 @dataclass(frozen=True)

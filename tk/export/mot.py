@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.export.motion import Motion
-from tk.model.body.angles import FORWARD_UP_RIGHT
+from tk.model.body.angles import FORWARD_UP_RIGHT, MIRROR
 from tk.model.body.rotations import follow_rotations
 
 Float = NDArray[np.float64]
 
 # The model's right hip centre in its pelvis frame (forward, up, right), metres: joint hip_r of Rajagopal2016.osim.
 _HIP_IN_PELVIS = np.array([-0.056276, -0.078490, 0.077260])
-_MIRROR = np.diag([1.0, 1.0, -1.0])
 
 # Parent, child, and the coordinates for the rotations about Z, X, Y (None: not written; minus: opposite sign).
 _TRUNK = (("pelvis", "torso", ("lumbar_extension", "lumbar_bending", "lumbar_rotation")),)
@@ -65,7 +64,7 @@ def coordinates(motion: Motion) -> dict[str, Float]:
     for parent, child, names, side in joints:
         above, below = (name if name in ("pelvis", "torso") else name + side for name in (parent, child))
         R = FORWARD_UP_RIGHT @ np.swapaxes(motion.rotation(above), -1, -2) @ motion.rotation(below) @ FORWARD_UP_RIGHT.T
-        turns = _turns(_MIRROR @ R @ _MIRROR if side == "_l" else R)
+        turns = _turns(MIRROR @ R @ MIRROR if side == "_l" else R)
         for k, name in enumerate(names):
             if name is not None:
                 found[name.lstrip("-") + side] = -turns[:, k] if name.startswith("-") else turns[:, k]

@@ -23,14 +23,14 @@ from numpy.typing import NDArray
 from tk.errors import ResultError, TkError
 
 #: limits of groups and datasets in a file, nested groups, bytes of an attribute: far more than a result has
-MAX_OBJECTS, MAX_DEPTH, MAX_ATTRIBUTE_BYTES = 10_000, 12, 2**20
+MAX_OBJECTS, MAX_DEPTH, MAX_ATTRIBUTE_BYTES = 10_000, 12, 1_000_000
 
 #: filters that only compress or check: deflate, shuffle, Fletcher's checksum, and h5py's LZF
 FILTERS = (1, 2, 3, 32000)
 
 #: limits of the compression ratio, and of the declared bytes of a dataset without stored data (HDF5 does not store
 #: chunks that were never written)
-MAX_COMPRESSION, MAX_UNWRITTEN_BYTES = 100, 2**16
+MAX_COMPRESSION, MAX_UNWRITTEN_BYTES = 100, 65_536
 
 _HEAP = b"GCOL\x01\x00\x00\x00"  # start of a heap of texts: signature, version, reserved
 

@@ -23,7 +23,7 @@ from tk.kernels.wrench import MOTION, WRENCH, add_direction, add_wrench, load_wr
 POINT_A, POINT_B, LAST_DOF, CAMERA, TARGET, NORMAL = 0, 3, 6, 7, 8, 10
 INV_SIGMA2, STATE, SCALE, NU, ENTRY_NUMBERS = 12, 13, 14, 15, 16  # 1/σ² in 1/px²; SCALE: the entry's share of f
 # States of an entry: padding, assigned, and a contour point that can have no edge.
-ABSENT, ASSIGNED, UNASSIGNABLE = 0, 1, 2
+ABSENT, ASSIGNED, UNASSIGNABLE = range(3)
 
 
 @ti.func

@@ -14,9 +14,9 @@ A curve is one of these pieces; u in [0, 1] runs along it.
 from tk.kernels.runtime import ti
 from tk.kernels.vectors import cross, dot, norm_sqr
 
-CONE, ELLIPSOID = 0, 1
+CONE, ELLIPSOID = range(2)
 # kinds of curves: the two generators, the rims at z = 0 and z = h, the outline of an ellipsoid
-SIDE_A, SIDE_B, END_NEAR, END_FAR, OUTLINE = 0, 1, 2, 3, 4
+SIDE_A, SIDE_B, END_NEAR, END_FAR, OUTLINE = range(5)
 
 
 @ti.func

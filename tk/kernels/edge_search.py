@@ -20,7 +20,7 @@ import numpy as np
 from tk.kernels.edges import EdgeSettings, rgb_gradient_at
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
-PAIR, SINGLE = 0, 1
+PAIR, SINGLE = range(2)
 # Columns of a line: kind, camera, the pixels a and b (b = a unless PAIR), the outward unit normals at a and b, and the
 # reach of the search beyond the points, pixels.
 LINE_NUMBERS = 11

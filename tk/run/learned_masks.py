@@ -50,7 +50,7 @@ _PAST, _EVERY = 16, 4
 # At most this share of the frames is asked for; a span with fewer than _LEAST such frames is segmented throughout.
 _SHARE = 0.16
 # Most bytes of a span's samples. With fewer samples, more of the scene is unknown.
-_SAMPLE_BYTES = 512 * 2**20
+_SAMPLE_BYTES = 512_000_000
 # Pixels in one of two masks only, as a share of those in any, beyond which the learned scene is not used. The share is
 # 0.05 to 0.2 on walk and dance; from above 0.3 to 0.6 on walk, where the segmenter, not the scene, misses the head.
 _DISAGREE = 0.65

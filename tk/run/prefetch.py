@@ -60,7 +60,7 @@ _HELD = 2
 _SPARE = 40
 #: most bytes of the frames made ahead, beside the held ones: a few of eight full-HD cameras. Fewer would make the
 #: process wait.
-_RING_BYTES = 384 * 2**20
+_RING_BYTES = 400_000_000
 _HANDLE = b"memory"  # goes with the descriptor of the memory that both processes share
 #: seconds in which the process may end by itself. A shorter time would lose kernels that it has compiled.
 _PATIENCE_S = 5.0

@@ -233,7 +233,7 @@ WRITE_EVERY_S = 0.5
 
 # Most bytes of the frames that are held at the start, and least number of these frames: of eight 4K cameras at full
 # size 12 instead of 24. Fewer frames make the body less certain, see tk.model.body.body_fit.
-_OPENING_BYTES, _LEAST_OPENING = 4 * 2**30, 8
+_OPENING_BYTES, _LEAST_OPENING = 4_000_000_000, 8
 
 _ORIGIN = "run/"
 

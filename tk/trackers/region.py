@@ -32,6 +32,7 @@ from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import color_bins
 from tk.model.cues.ray_costs import Evidence, mean_of_views
 from tk.model.cues.visible_contours import contour_shares
+from tk.model.masks.regions import SQUARE5
 from tk.model.masks.silhouettes import Pyramid
 from tk.model.setup import InitPose, Setup
 from tk.optim.gauss_newton import Prior
@@ -59,7 +60,6 @@ UNKNOWN_AFTER = 2 * RECOVER_EVERY
 # Masks are searched for carried objects if this share of their pixels has colours that are not the person's; objects
 # narrower than the structuring element, pixels, are ignored.
 FOREIGN_SHARE = 0.01
-_OBJECT = np.ones((5, 5), np.uint8)
 # A limb is misplaced if its rays cost more than this, on average. In the development captures no limb within 15 cm of
 # the ground truth costs 0.25, and most others cost 0.3 to 0.4.
 MISPLACED = 0.25
@@ -217,7 +217,7 @@ class RegionTracker(ContourTracker):
             colors = frame.images[c][box].reshape(-1, 3).take(shown, axis=0)
             foreign_pixels = np.zeros((h, w), np.uint8)
             foreign_pixels.ravel()[shown] = foreign[color_bins(colors)]
-            carried = cv2.morphologyEx(foreign_pixels, cv2.MORPH_OPEN, _OBJECT).view(np.bool_)
+            carried = cv2.morphologyEx(foreign_pixels, cv2.MORPH_OPEN, SQUARE5).view(np.bool_)
             masks[c][box][carried] = 0
             uncertain[c][box][carried] = True
         return replace(frame, masks=masks, uncertain=uncertain)

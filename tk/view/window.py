@@ -24,7 +24,8 @@ _KEYS = (
     "B body, J joints, H hull, T truth, C cameras, F floor: show or hide   Q: close"
 )
 # key codes of GLFW
-_SPACE, _RIGHT, _LEFT, _PAGE_UP, _PAGE_DOWN, _HOME, _END = 32, 262, 263, 266, 267, 268, 269
+_SPACE = ord(" ")
+_RIGHT, _LEFT, _, _, _PAGE_UP, _PAGE_DOWN, _HOME, _END = range(262, 270)
 _PAGE_FRAMES = 10
 _IDLE_S = 0.01  # sleep between two events; longer ones would delay frames, shorter ones load the processor
 

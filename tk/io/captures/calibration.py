@@ -22,7 +22,7 @@ from tk.model.cameras.camera import Camera, Rig
 _SINGULAR = 1e-9
 
 #: most pixels of a side of an image; a larger number is a mistake in the file
-_MOST_PIXELS = 2**16
+_MOST_PIXELS = 65_536
 #: largest delay of a video, seconds; a larger number is a mistake in the file
 _MOST_OFFSET_S = 3600.0
 #: largest element of R Rᵀ - 1 of a rotation: files have six digits and more

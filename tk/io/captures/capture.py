@@ -44,7 +44,7 @@ DEFAULT_FPS = 30.0
 #: delays the first pose. With 25 the errors on walk, dance, fold, cube, treadmill-slow, hd and rig9 differ by at most
 #: 0.04 cm.
 _BACKGROUND_FRAMES = 16
-_BACKGROUND_BYTES = 384 * 2**20
+_BACKGROUND_BYTES = 400_000_000
 
 #: axis that points up if `capture.toml` gives none, unless the cameras' mounting differs by more than _UP_DEG degrees
 DEFAULT_UP, _UP_DEG = "z", 25.0

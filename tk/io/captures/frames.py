@@ -18,7 +18,7 @@ from tk.io.captures.video import Clip, Image, Reader
 
 #: most frames decoded ahead, and most bytes of them. Fewer make the consumer wait for a slow image.
 _AHEAD = 8
-_AHEAD_BYTES = 128 * 2**20
+_AHEAD_BYTES = 128_000_000
 
 _THREAD = "tk-decode-"  # names of the threads begin with it
 

@@ -25,7 +25,7 @@ from tk.kernels.mask_values import OTHERS
 Masks = NDArray[np.uint8]
 
 #: most bytes in memory; larger stores are on disk
-IN_MEMORY = 32 * 2**20
+IN_MEMORY = 32_000_000
 
 
 #: header of each frame: its number (~number for the pixels of other people), the number of bytes that follow, and the

@@ -21,7 +21,7 @@ from tk.io.importers.project import Cameras, Format, check_camera
 from tk.model.cameras.camera import Camera, Rig
 
 #: largest file, bytes; twelve numbers take 1 kB
-_LARGEST = 2**16
+_LARGEST = 65_536
 
 #: a larger skew, as a share of the focal length, is reported; a smaller one is rounding of the file's numbers
 _SKEW = 1e-6

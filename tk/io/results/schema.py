@@ -20,7 +20,7 @@ FORMAT_VERSION = 3
 
 #: Largest valid values: distance from the world's origin in metres, any other number, frame index. They are far above
 #: what a capture holds; a larger value means a damaged file.
-MAX_DISTANCE_M, MAX_NUMBER, MAX_FRAME = 1e6, 1e12, 10**9
+MAX_DISTANCE_M, MAX_NUMBER, MAX_FRAME = 1e6, 1e12, 1_000_000_000
 
 #: root attributes: field of ResultMeta and type
 ATTRIBUTES = {

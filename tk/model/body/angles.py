@@ -25,11 +25,12 @@ from tk.model.body.skeleton import SEGMENTS, Skeleton
 
 Float = NDArray[np.float64]
 
+_FORWARD, _LEFT, _UP = np.eye(3)
 #: axes of ISB and OpenSim (forward, up, right) as rows in tk's axes (forward, left, up)
-FORWARD_UP_RIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+FORWARD_UP_RIGHT = np.array([_FORWARD, _UP, 0.0 - _LEFT])
 _ISB = FORWARD_UP_RIGHT.T
-# Mirrors a rotation R of a left limb in ISB axes: M R M.
-_MIRROR = np.diag([1.0, 1.0, -1.0])
+#: mirrors a rotation R of a left limb in ISB axes: M R M.
+MIRROR = np.diag([1.0, 1.0, -1.0])
 
 # The axes of the left arm in the zero configuration, body frame: up along the arm, and forward, where the forearm goes
 # when the elbow bends (see tk.model.body.skeleton).
@@ -188,11 +189,11 @@ def joint_rotation(angles: AngleSet, degrees: Float) -> Float:
     for column, (_, k, sign) in enumerate(angles.columns):
         turns[..., k] = sign * np.radians(degrees[..., column])
     R = compose(angles.sequence, turns)
-    R = _MIRROR @ R @ _MIRROR if angles.mirrored else R
+    R = MIRROR @ R @ MIRROR if angles.mirrored else R
     return _ISB @ R @ _ISB.T
 
 
 def _in_isb(R: Float, mirrored: bool) -> Float:
     """Return a rotation (..., 3, 3) between two segments in ISB axes, mirrored if requested."""
     R = _ISB.T @ R @ _ISB
-    return _MIRROR @ R @ _MIRROR if mirrored else R
+    return MIRROR @ R @ MIRROR if mirrored else R

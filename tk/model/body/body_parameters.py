@@ -24,20 +24,12 @@ Float = NDArray[np.float64]
 # by 4 to 5 % at a given stature (Drillis & Contini 1966). Radii vary with girth and clothes; so do the ends of the body
 # and the shoulder's drop, which both sources define loosely. Mean errors of walk and dance (60 frames) change by less
 # than 0.1 cm with radii of half and twice the value and with half the values of the lengths; twice these costs 0.3 cm.
-_LENGTHS = {
-    "trunk": 0.05,
-    "head": 0.05,
-    "upper_arm": 0.05,
-    "forearm": 0.05,
-    "thigh": 0.05,
-    "calf": 0.05,
-    "foot": 0.06,
-    "hand": 0.1,
-    "shoulder_drop": 0.25,
-    "shoulder_half_width": 0.06,
-    "hip_half_width": 0.06,
-    "ankle_height": 0.1,
-}
+_LENGTHS = (
+    dict.fromkeys(("trunk", "head", "upper_arm", "forearm", "thigh", "calf"), 0.05)
+    | dict.fromkeys(("foot", "shoulder_half_width", "hip_half_width"), 0.06)
+    | dict.fromkeys(("hand", "ankle_height"), 0.1)
+    | {"shoulder_drop": 0.25}
+)
 _RADII = 0.2
 _STATURE = ("head", "trunk", "thigh", "calf", "ankle_height")  # dimensions that add up to the stature
 
@@ -47,10 +39,11 @@ _STATURE = ("head", "trunk", "thigh", "calf", "ankle_height")  # dimensions that
 # plane are symmetric. Half and twice the values of the limbs change the mean errors of walk and dance (60 frames)
 # by less than 0.1 cm; the other values' sensitivity is not measured.
 _FIXED = 1e-6
-_LIMB = (0.15, 0.15, 0.15, _FIXED, 0.005, 0.005, 0.005, 0.005)
-_TRUNK = (0.15, 0.15, 0.15, _FIXED, 0.01, _FIXED, 0.01, _FIXED)
-_END = (0.15, 0.15, 0.15, 0.1, 0.005, 0.005, 0.02, 0.01)
-_HEAD = (0.15, 0.15, 0.15, 0.1, 0.005, _FIXED, 0.02, _FIXED)
+_WIDTHS = 3 * (0.15,)
+_LIMB = (*_WIDTHS, _FIXED, *4 * (0.005,))
+_TRUNK = (*_WIDTHS, _FIXED, *2 * (0.01, _FIXED))
+_END = (*_WIDTHS, 0.1, 0.005, 0.005, 0.02, 0.01)
+_HEAD = (*_WIDTHS, 0.1, 0.005, _FIXED, 0.02, _FIXED)
 _SHAPES = {"hand_": _END, "foot_": _END, "head": _HEAD}
 
 # Difference of a dimension's logarithm for its derivative: curvature then changes the derivative by 1e-6, float64's

@@ -43,7 +43,7 @@ CALF_BELLY = 1.1
 # half and twice of it change the mean errors of walk (32 frames) by 0.01 cm at most.
 SKULL_TILT_DEG = 15.0
 
-_FORWARD = np.array([1.0, 0.0, 0.0])
+_FORWARD = np.eye(3)[0]
 
 # Numbers of a part that :meth:`ConeBody.reshaped` changes: logarithms of a, b, m and h; x and y of either end.
 SHAPE_NUMBERS = 8

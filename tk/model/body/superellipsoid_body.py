@@ -26,14 +26,8 @@ Float = NDArray[np.float64]
 
 # ε₁ and ε₂ by group of parts, (1, 1) for the others: trunks are flatter than ellipses; hands and feet, at the end of a
 # limb, are closed boxes with round edges. Estimates: the paper gives no numbers.
-EXPONENTS: dict[str, tuple[float, float]] = {
-    "abdomen": (1.0, 0.8),
-    "belly": (1.0, 0.8),
-    "chest": (1.0, 0.8),
-    "shoulders": (1.0, 0.8),
-    "hand_": (0.6, 1.0),
-    "foot_": (0.6, 0.9),
-}
+_TRUNK = dict.fromkeys(("abdomen", "belly", "chest", "shoulders"), (1.0, 0.8))
+EXPONENTS: dict[str, tuple[float, float]] = {**_TRUNK, "hand_": (0.6, 1.0), "foot_": (0.6, 0.9)}
 # Length of the ellipsoid from which a tapered piece is cut, as a factor of the piece's: its sides are then nearly
 # straight, as a cone's.
 SLENDER = 4.0

@@ -24,8 +24,8 @@ __all__ = ["MAX_CAMERAS", "HullTables", "default_cache_dir", "load_or_build", "m
 
 MAX_CAMERAS = 31  # one bit each in a positive int32
 _FORMAT = 1  # part of the key: raise it when the tables' meaning changes
-_CACHE_BYTES = 1 << 30  # maximum size of the folder; the oldest tables are deleted
-_BLOCK = 1 << 15  # voxels projected at a time: the intermediate arrays stay in the processor's cache
+_CACHE_BYTES = 1_000_000_000  # maximum size of the folder; the oldest tables are deleted
+_BLOCK = 32_768  # voxels projected at a time: the intermediate arrays stay in the processor's cache
 
 
 @dataclass(frozen=True)

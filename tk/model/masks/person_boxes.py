@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.masks.background import Images, reduced
+from tk.model.masks.regions import SQUARE3
 
 _DEVIATIONS = 3.0  # a coarse pixel differs from the scene by this many standard deviations of a reduced pixel's noise
 _WHOLE = 128  # fixed-point value of the share 1 of the scene's light, so that twice the light fits into a byte
@@ -24,8 +25,6 @@ _SHARE = 0.02
 # Margin of a box, share of the image height. In 535 images of five rendered captures a margin of 20 of 240 pixels cuts
 # nothing off; one of 12 pixels cuts a hand off in five of them.
 _MARGIN = 0.085
-
-_SQUARE3 = np.ones((3, 3), np.uint8)
 
 
 class PersonBoxes:
@@ -89,7 +88,7 @@ def _largest(differs: Images, cells: Images) -> tuple[int, ...]:
 
     ``differs`` (h, w) is 0 or 1; ``cells`` counts the pixels of each cell that differ.
     """
-    grown = cv2.dilate(np.minimum(cells, 1), _SQUARE3)
+    grown = cv2.dilate(np.minimum(cells, 1), SQUARE3)
     count, regions = cv2.connectedComponents(grown)
     if count <= 2:  # the scene and one region
         return tuple(cv2.boundingRect(differs))

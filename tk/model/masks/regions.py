@@ -17,8 +17,8 @@ from tk.kernels.background import STEPS_PER_OCTAVE, level_of
 Mask = NDArray[np.bool_]
 Images = NDArray[np.uint8]
 
-_SQUARE3 = np.ones((3, 3), np.uint8)
-_SQUARE5 = np.ones((5, 5), np.uint8)
+SQUARE3 = np.ones((3, 3), np.uint8)
+SQUARE5 = np.ones((5, 5), np.uint8)
 _CROSS3 = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 # Pixels of strong statistic that a part of the person needs, if it is not the largest: more than noise gives by chance.
@@ -33,9 +33,9 @@ def without_penumbrae(labels: Mask, difference: Images, collinearity: Images, pe
     ``penumbra`` of the plain difference nearby.
     """
     strong = labels & (collinearity >= level_of(core))
-    thick = cv2.morphologyEx(strong.view(np.uint8), cv2.MORPH_OPEN, _SQUARE5).view(np.bool_)
+    thick = cv2.morphologyEx(strong.view(np.uint8), cv2.MORPH_OPEN, SQUARE5).view(np.bool_)
     levels = round(-STEPS_PER_OCTAVE * np.log2(penumbra))
-    blurred = cv2.add(collinearity, levels) < cv2.dilate(difference, _SQUARE5)
+    blurred = cv2.add(collinearity, levels) < cv2.dilate(difference, SQUARE5)
     return np.asarray(labels & (thick | ~blurred))
 
 
@@ -163,5 +163,5 @@ def trim_rim(mask: Images, contrast: Images, share: float, layers: int) -> Mask:
     largest = cv2.dilate(contrast, np.ones((size, size), np.uint8))
     strong = (contrast >= cv2.convertScaleAbs(largest, alpha=share)).view(np.uint8) & mask
     for _ in range(layers):
-        mask = np.asarray(cv2.max(cv2.erode(mask, _SQUARE3, borderValue=1), strong), np.uint8)
+        mask = np.asarray(cv2.max(cv2.erode(mask, SQUARE3, borderValue=1), strong), np.uint8)
     return mask.view(np.bool_)
