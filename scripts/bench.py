@@ -336,7 +336,7 @@ def _search_stages(
             "objective: one launch, five chains",
             rows,
             SAMPLING.chain,
-            SAMPLING.chain_voxels,
+            SAMPLING.voxels // len(CHAINS),
         ),
     ):
         chosen = np.resize(samples, (B, M)).astype(np.int32)

@@ -122,7 +122,7 @@ def _annotated(node: ast.stmt) -> bool:
     return isinstance(node, ast.AnnAssign)
 
 
-if _VARIABLE in os.environ:  # here, and not in a function: processes that tk starts import this file again
+if _VARIABLE in os.environ:
     sys.meta_path.insert(0, _Scaling(*json.loads(os.environ[_VARIABLE])))
 
 
@@ -136,6 +136,7 @@ def track_errors(run: Run, capture: Path, args: argparse.Namespace) -> tuple[flo
     from tk.settings import Settings
 
     settings = settings_file.read(args.config) if args.config else Settings()
+    settings = dataclasses.replace(settings, ahead=0)  # a process of its own for the masks would not scale constants
     environment = {name: value for name, value in os.environ.items() if name != _VARIABLE}
     if run.name is not None and ":" in run.name:
         environment[_VARIABLE] = json.dumps([run.name, run.factor])

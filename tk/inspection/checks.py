@@ -147,7 +147,7 @@ class Inspection:
 
 @dataclass(frozen=True)
 class Sample:
-    """A frame of the sheet of images.
+    """What the sheet of `tk inspect` shows of a frame.
 
     Attributes:
         index: frame index. images: (C, H, W, 3) uint8. masks: (C, H, W) uint8.

@@ -38,7 +38,6 @@ class SearchSettings:
         robust_px: distance at which the Geman-McClure weights (1 + (d/s)²)⁻² are a quarter, in pixels of the scale; 0:
             the paper's least squares, which shadows at the feet distort. 8, the window, was chosen on the treadmill and
             dance captures.
-        lost_px: cost, as a distance, of a sample without an edge. It only affects the comparison of poses.
         interior: whether contours in front of another part are searched, too, as in the paper. No silhouette edge is
             expected there, and most edges found belong to other contours. Sharing ambiguous edgels (4.4) corrects this
             in part; excluding these contours corrects more.
@@ -53,7 +52,6 @@ class SearchSettings:
     ambiguous_px: float = 0.0
     tangential: float = 0.3
     robust_px: float = 8.0
-    lost_px: float = 16.0
     interior: bool = False
 
     def __post_init__(self) -> None:
@@ -64,10 +62,14 @@ class SearchSettings:
             ("ambiguous_px", self.ambiguous_px, 0 <= self.ambiguous_px <= 64, "in [0, 64]"),
             ("tangential", self.tangential, 0 <= self.tangential <= 1, "in [0, 1]"),
             ("robust_px", self.robust_px, 0 <= self.robust_px <= 1000, "in [0, 1000]"),
-            ("lost_px", self.lost_px, 0 <= self.lost_px <= 1000, "in [0, 1000]"),
         ):
             if not valid:
                 raise ConfigError(f"silhouette search: {name} = {value} must lie {expected}")
+
+    @property
+    def lost_px(self) -> float:
+        """Cost, as a distance, of a sample without an edge: twice the window. It only affects the comparison of poses."""
+        return 2 * self.window_px
 
 
 class Regions(NamedTuple):

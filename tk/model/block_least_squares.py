@@ -99,7 +99,7 @@ class Reduced:
     response: Float
 
     def step(self) -> tuple[Float, Float]:
-        """Steps (B, D) of the blocks and (S,) of the shared unknowns."""
+        """Solve the equations: return the steps (B, D) of the blocks and (S,) of the shared unknowns."""
         shared = np.asarray(np.linalg.solve(self.hessian, self.gradient), np.float64)
         return self.plain - self.response @ shared, shared
 

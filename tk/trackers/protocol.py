@@ -144,7 +144,7 @@ class Tracker(Protocol):
         init: InitPose | None,
         body: ConeBody | None = None,
     ) -> None:
-        """Find the subject in the first of the frames. :meth:`step` begins with that frame again.
+        """Find the subject in the first of ``frames`` and fit the body. The first :meth:`step` is for that frame, too.
 
         Args:
             frames: consecutive observations.

@@ -54,7 +54,7 @@ def require_display() -> None:
 
 
 class Window:
-    """The window. The keys, and a line about each frame, are printed on stderr.
+    """The window of `tk view`. It prints its keys, and a line about each frame, on stderr.
 
     Raises:
         DisplayError: it cannot be opened.

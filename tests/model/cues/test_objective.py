@@ -96,7 +96,7 @@ def test_pick_and_even(count):
         assert len(chosen) == min(count, 10) == len(set(chosen)) and set(chosen) <= set(samples)
 
 
-@pytest.mark.parametrize("bad", [{"torso": 0}, {"chain": -1}, {"voxels": 0}, {"chain_voxels": 0}, {"sigma_m": -0.1}])
+@pytest.mark.parametrize("bad", [{"torso": 0}, {"chain": -1}, {"voxels": 4}, {"sigma_m": -0.1}])
 def test_bad_sampling_is_refused(bad):
     with pytest.raises(ConfigError, match="sampling"):
         SamplingSettings(**bad)

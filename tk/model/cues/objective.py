@@ -81,8 +81,7 @@ class SamplingSettings:
     Attributes:
         torso: surface samples on the torso.
         chain: surface samples on the head and on each limb.
-        voxels: voxels of the coverage term in the optimisation of all degrees of freedom.
-        chain_voxels: voxels of the coverage term in the optimisation of one chain.
+        voxels: voxels of the coverage term in the optimisation of all degrees of freedom; each chain has its share.
         sigma_m: σ of eq. 10 for every sample, metres; 0 takes the limb's diameter, as the paper does. Distances on the
             trunk and on an arm are equally uncertain: both come from the same voxels. In units of the diameter the
             trunk, five times as thick, weighs a twenty-fifth and follows the arms.
@@ -92,12 +91,11 @@ class SamplingSettings:
     torso: int = 60
     chain: int = 20
     voxels: int = 150
-    chain_voxels: int = 30
     sigma_m: float = 0.1
     scale: int = 1
 
     def __post_init__(self) -> None:
-        if min(self.torso, self.chain, self.voxels, self.chain_voxels, self.scale) < 1 or self.sigma_m < 0:
+        if min(self.torso, self.chain, self.voxels // len(CHAINS), self.scale) < 1 or self.sigma_m < 0:
             raise ConfigError("sampling: numbers of points and scale must be at least 1, sigma_m at least 0")
 
 
@@ -406,19 +404,22 @@ class FrameObjective:
         self._pools = [pool if len(pool) else fit.voxels for pool in pools]
 
     def draw_all(self) -> tuple[Ints, Ints]:
-        """Draw samples (M,) on the whole body and voxels (Q,)."""
+        """Draw at random: return indices (M,) of samples on the whole body and (Q,) of surface voxels."""
         s = self.objective.sampling
         voxels = self.rng.integers(self.voxel_count, size=s.scale * s.voxels).astype(np.int32)
         return self.objective.draw(self.rng, s.scale), voxels
 
     def draw_chain(self, chain: int) -> tuple[Ints, Ints]:
-        """Draw samples (M,) of a chain and voxels (Q,) that it may have to cover, see :meth:`assign_voxels`."""
+        """Draw at random: return indices (M,) of a chain's samples and (Q,) of voxels that it may have to cover.
+
+        See :meth:`assign_voxels`.
+        """
         s = self.objective.sampling
         # a chain with fewer samples repeats some: all rows have one length
         count = s.scale * s.chain
         samples = np.resize(pick(self.rng, self.objective.chain_samples[chain], count), count)
         pool = self._pools[chain]
-        return samples, pool[self.rng.integers(len(pool), size=s.scale * s.chain_voxels)]
+        return samples, pool[self.rng.integers(len(pool), size=s.scale * s.voxels // len(CHAINS))]
 
     def _draw_chains(self, owner: NDArray[np.intp]) -> tuple[Ints, Ints]:
         samples, voxels = zip(*(self.draw_chain(c) for c in range(len(CHAINS))), strict=True)

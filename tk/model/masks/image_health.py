@@ -36,10 +36,10 @@ class ImageHealth:
         self._masks: NDArray[np.bool_] | None = None  # (C, C, h, w): at camera c's reference frame those of all
 
     def look(self, images: NDArray[np.uint8], masks: NDArray[np.uint8]) -> list[str | None]:
-        """Return for each camera :data:`BLANK`, :data:`FROZEN` or None.
+        """Return for each camera :data:`BLANK`, :data:`FROZEN` or, if nothing is wrong, None.
 
         Args:
-            images: (C, H, W, 3) BGR, or without pixels: then the masks are compared.
+            images: (C, H, W, 3) BGR; if it is empty, frozen cameras are found from the masks alone.
             masks: (C, H, W), 128 and more where the person is.
         """
         C = len(masks)
