@@ -68,7 +68,7 @@ class SearchSettings:
 
     @property
     def lost_px(self) -> float:
-        """Cost, as a distance, of a sample without an edge: twice the window. It only affects the comparison of poses."""
+        """Cost, as a distance, of a sample without an edge. It only affects the comparison of poses."""
         return 2 * self.window_px
 
 

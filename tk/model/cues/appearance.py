@@ -22,11 +22,13 @@ from tk.settings import AppearanceSettings
 
 Float = NDArray[np.float64]
 
-# ITU-R BT.601 luma and colour differences, from B, G, R: U and V are B - Y and R - Y, scaled to a maximum.
+# ITU-R BT.601 luma and colour differences, from B, G, R: U and V are B - Y and R - Y, scaled to a maximum. Three
+# decimals, as the standard is printed.
 _LUMA = np.array([0.114, 0.587, 0.299])
 _BLUE, _, _RED = np.eye(3)
 _MOST = ((_BLUE, 0.436), (_RED, 0.615))
-_YUV_FROM_BGR = np.array([_LUMA, *(most * (color - _LUMA) / (1 - color @ _LUMA) for color, most in _MOST)])
+_COLORS = [most * (color - _LUMA) / (1 - color @ _LUMA) for color, most in _MOST]
+_YUV_FROM_BGR = np.round([_LUMA, *_COLORS], 3)
 
 # Minimum standard deviations of Y, U, V, levels of 255: shading changes Y more than U and V. Chosen; sensitivity not
 # measured. Far below, noise rejects voxels of the right colour.
