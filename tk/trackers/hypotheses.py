@@ -13,8 +13,8 @@ from tk.trackers.contour_tracker import GAIN
 Float = NDArray[np.float64]
 
 # Frames during which a hypothesis is tracked beside the best one, and the share of its running cost that a frame
-# replaces. A hypothesis that costs MARGIN more than the best one, as a share of the person's pixels, is dropped. Chosen
-# on the development captures; sensitivity not measured.
+# replaces. A hypothesis that costs MARGIN more than the best one, as a share of the person's pixels, is dropped. Half
+# and twice of each change the mean errors of dance and cube (50 frames) by less than 0.1 cm.
 PATIENCE, RENEWAL, MARGIN = 6, 0.4, 0.02
 
 
