@@ -33,7 +33,7 @@ _ANYTHING = 0.02
 _RATE = 0.05
 # Logarithm of the largest likelihood ratio that one pixel may give. Chosen; sensitivity not measured.
 _MOST_LOG_RATIO = 5.0
-# Weight of a contour between two parts of different colours, relative to a silhouette's edge. Chosen; sensitivity not measured.
+# Weight of a contour between two parts of different colours, relative to a silhouette's edge. Chosen; not measured.
 _CONTOUR_WEIGHT = 0.5
 
 
