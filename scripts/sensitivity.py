@@ -114,7 +114,7 @@ class _Scaling(MetaPathFinder):
                 change = f"from scripts.sensitivity import scaled as _scaled\n{self.constant} = _scaled("
                 change += f"{self.constant}, {self.factor!r}, {self.path!r})"
                 tree.body[position + 1 : position + 1] = ast.parse(change).body
-                return compile(ast.fix_missing_locations(tree), file, "exec")
+                return compile(ast.fix_missing_locations(tree), file, "exec", dont_inherit=True)
         raise ImportError(f"{self.module} defines no {self.constant}")
 
 

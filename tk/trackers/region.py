@@ -53,7 +53,8 @@ INFORMATION = 1.0 / (2.0**2 * 10.0)
 # Scales of a frame, at least: from the finest alone Gauss-Newton does not converge.
 FEWEST = 2
 # Standard deviations of the priors about the predicted pose (tk.model.body.joints has those about zero). Chosen on the
-# development captures; sensitivity not measured.
+# development captures; half and twice the angle change the mean errors of dance and cube (50 frames) by 0.04 cm at
+# most, the translation's sensitivity is not measured.
 ANGLE_DEG, TRANSLATION_M = 40.0, 0.3
 # After this many consecutive frames with a high residual, and two failed searches for the person, sigma is set to NaN.
 UNKNOWN_AFTER = 2 * RECOVER_EVERY

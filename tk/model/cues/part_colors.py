@@ -31,7 +31,7 @@ _SMOOTHING = 0.7
 _ANYTHING = 0.02
 # Share of the histograms that a frame replaces: they follow a change of light within about 20 frames.
 _RATE = 0.05
-# Logarithm of the largest likelihood ratio that one pixel may give. Chosen; sensitivity not measured.
+# Logarithm of the largest likelihood ratio that one pixel may give. Half and twice: 0.02 cm at most.
 _MOST_LOG_RATIO = 5.0
 # Weight of a contour between two parts of different colours, relative to a silhouette's edge. Chosen; not measured.
 _CONTOUR_WEIGHT = 0.5
