@@ -13,8 +13,8 @@ if TYPE_CHECKING:  # the process that decodes and segments needs no body
     from tk.model.cameras.camera import Rig
     from tk.model.cameras.volume import Volume
 
-#: metres, assumed of a person of unknown height; affects only the size at which images are read
-_STATURE_M = 1.7
+#: stature of a person of whom nothing is known, metres: the mean of adults
+AVERAGE_STATURE_M = 1.7
 
 #: entries of the pose vector that place the pelvis, metres
 TRANSLATIONS = ("torso_x", "torso_y", "torso_z")
@@ -92,5 +92,5 @@ class Setup:
     def person_pixels(self) -> NDArray[np.float64]:
         """Return (C,) the first subject's height in pixels of each camera's image, across the view at the volume's
         centre."""
-        height_m = self.subjects[0].height_m or _STATURE_M
+        height_m = self.subjects[0].height_m or AVERAGE_STATURE_M
         return np.array([height_m * camera.pixels_per_metre(self.volume.center) for camera in self.rig])

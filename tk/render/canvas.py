@@ -15,6 +15,7 @@ from tk.io.paths import replacing
 from tk.model.body.joints import BONES
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Camera
+from tk.model.masks.regions import SQUARE3
 from tk.render.figure import Outline
 from tk.render.palette import BACKGROUND, BONE, INK, LOST_BODY, TEXT, Color, sigma_colors
 
@@ -23,7 +24,6 @@ Image = NDArray[np.uint8]
 
 # Appearance only; no measurement depends on these values.
 _FILL = 0.35  # opacity of the body
-_SQUARE = np.ones((3, 3), np.uint8)  # makes contours two pixels wide
 #: fractional bits of OpenCV's drawing coordinates
 SUBPIXEL_BITS = 4
 _BONES = np.array([(JOINTS.index(a), JOINTS.index(b)) for a, b in BONES])
@@ -100,8 +100,8 @@ def draw_body(tile: Image, view: View, outlines: Sequence[Outline], color: Calla
         for points in outline.points:
             begin, end = end, end + len(points)
             cv2.fillConvexPoly(layer, cv2.convexHull(placed[begin:end]), (rank,), cv2.LINE_8, SUBPIXEL_BITS)
-    near = cv2.dilate(layer, _SQUARE)
-    contour = near != cv2.erode(layer, _SQUARE)
+    near = cv2.dilate(layer, SQUARE3)
+    contour = near != cv2.erode(layer, SQUARE3)
     over, under = cv2.applyColorMap(near, colors), tile[y : y + height, x : x + width]
     cv2.copyTo(cv2.addWeighted(over, _FILL, under, 1 - _FILL, 0), near, under)
     cv2.copyTo(over, contour.view(np.uint8), under)

@@ -20,10 +20,12 @@ from tk.errors import CaptureError
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import ConeBody, build_cone_body
+from tk.model.body.initial_pose import GREATEST_STATURE, LEAST_STATURE
 from tk.model.body.skeleton import Skeleton
 from tk.model.cameras.camera import Rig
 from tk.model.cues.ray_costs import Evidence
 from tk.model.masks.silhouettes import Pyramid
+from tk.model.setup import AVERAGE_STATURE_M
 from tk.trackers.protocol import Observation
 
 if TYPE_CHECKING:
@@ -50,8 +52,6 @@ ANCHORS, CLEAR = 4, 0.2
 # noise. In a single frame the opposite heading is kept within NEARLY, and a frame above WORSE times the anchor's
 # residual triggers a limb search. Chosen on the development captures; sensitivity not measured.
 AMBIGUOUS, HANDICAP, NEARLY, WORSE = 1.1, 1.1, 1.4, 1.2
-# Stature of the body that the first estimate of the stature renders, metres.
-_AVERAGE_M = 1.7
 # A pose with a higher residual explains nothing: twice what an average body of the right stature leaves. Without a
 # better one in any of the frames the person is not found.
 UNEXPLAINED = 0.6
@@ -269,7 +269,7 @@ def stature_of(tracker: ContourTracker, pyramids: Sequence[Pyramid]) -> float:
     The area hardly changes when a person bends or raises the arms; the silhouette's height does. Girth and clothes
     cause an error of about 6 %. Median over the views of all frames, against the mean area of hanging and spread arms.
     """
-    body: ConeBody = build_cone_body(BodyDimensions.from_stature(_AVERAGE_M), preset=tracker.contours.body)
+    body: ConeBody = build_cone_body(BodyDimensions.from_stature(AVERAGE_STATURE_M), preset=tracker.contours.body)
     group = np.zeros(len(body.parts), np.int32)
     ratios: list[Float] = []
     for pyramid in pyramids:
@@ -287,4 +287,4 @@ def stature_of(tracker: ContourTracker, pyramids: Sequence[Pyramid]) -> float:
         known = (covered > 0) & (seen > 0)
         ratios.append(seen[known] / covered[known])
     ratio = float(np.median(np.concatenate(ratios))) if ratios else 1.0
-    return float(np.clip(_AVERAGE_M * np.sqrt(ratio), 0.8, 2.4))
+    return float(np.clip(AVERAGE_STATURE_M * np.sqrt(ratio), LEAST_STATURE, GREATEST_STATURE))

@@ -13,13 +13,12 @@ from tk.model.body.gait_poses import neutral_pose
 from tk.model.body.joints import HIPS, LIMBS, OPTIONAL, SHOULDERS
 from tk.model.body.skeleton import JOINTS, Skeleton, build_skeleton, shoulder_angles
 from tk.model.cameras.tracker_frame import TrackerFrame
+from tk.model.setup import AVERAGE_STATURE_M
 
 Float = NDArray[np.float64]
 
 # Statures of people, metres; no number written for a joint makes the body taller or shorter.
 LEAST_STATURE, GREATEST_STATURE = 0.8, 2.4
-# Stature without any evidence, metres: the mean of adults.
-_STATURE_M = 1.72
 # Standard deviation of a written joint, metres.
 _JOINT_M = 0.02
 # Standard deviation of an angle about that of standing, radians: wide, for what the joints leave open.
@@ -45,7 +44,7 @@ def rough_pose(
     Returns:
         Dimensions, a skeleton of these, and its pose (D,).
     """
-    dimensions = BodyDimensions.from_stature(height_m or _stature_of(joints) or _STATURE_M)
+    dimensions = BodyDimensions.from_stature(height_m or _stature_of(joints) or AVERAGE_STATURE_M)
     if angles:
         skeleton = build_skeleton(dimensions, optional=OPTIONAL)
         pose = neutral_pose(skeleton)
