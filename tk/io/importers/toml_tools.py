@@ -1,4 +1,4 @@
-"""Anipose, Caliscope, FreeMoCap and Pose2Sim: one TOML table per camera, told apart by the files' names and folders.
+"""Anipose, Caliscope, FreeMoCap and Pose2Sim: one TOML table per camera, distinguished by the files' names and folders.
 
 Anipose: lengths are in the unit in which the size of the board's squares was given, often millimetres; no file says so.
 
