@@ -180,8 +180,8 @@ def test_background_is_read_from_clips_and_images(make_capture: MakeCapture) -> 
     write_picture(folder / "background" / "cam2.png", picture(1, 7))
     background = open_capture(folder).background()
     assert background is not None
-    assert [clip.shape for clip in background] == [(16, HEIGHT, WIDTH, 3), (1, HEIGHT, WIDTH, 3)]
-    assert [read_tag(image)[1] for image in background[0]] == list(range(16))
+    assert [clip.shape for clip in background] == [(32, HEIGHT, WIDTH, 3), (1, HEIGHT, WIDTH, 3)]
+    assert [read_tag(image)[1] for image in background[0]] == [k % 32 for k in range(32)]
     assert read_tag(background[1][0]) == (1, 7)
     write_picture(folder / "background" / "cam2.png", picture(1, 7, (32, 32)))
     with pytest.raises(VideoError, match=r"cam2\.png: is 32×32"):
@@ -357,11 +357,11 @@ def test_a_volume_that_cannot_be_inferred_is_reported(make_capture: MakeCapture)
 @pytest.mark.parametrize(
     ("name", "cameras", "frames", "masks", "background"),
     [
-        ("walk", 5, 80, True, 16),
-        ("dance", 5, 120, True, 16),
-        ("punch", 5, 150, False, 16),
+        ("walk", 5, 80, True, 25),
+        ("dance", 5, 120, True, 25),
+        ("punch", 5, 150, False, 25),
         ("treadmill-slow", 6, 340, True, None),
-        ("rig9", 9, 40, True, 16),
+        ("rig9", 9, 40, True, 25),
         ("balance", 4, 100, False, 1),
     ],
 )

@@ -41,9 +41,9 @@ MASKS_RECORD = "masks.toml"
 DEFAULT_FPS = 30.0
 
 #: most images of the empty scene for each camera, the first of a clip, and most bytes of all of them. Decoding more
-#: delays the first pose. With 25 the errors on walk, dance, fold, cube, treadmill-slow, hd and rig9 differ by at most
-#: 0.04 cm.
-_BACKGROUND_FRAMES = 16
+#: delays the first pose. With 16 or 25 the errors on walk, dance, fold, cube, treadmill-slow, hd and rig9 differ by at
+#: most 0.04 cm, but with 16 the masks of three cameras of 160x120 contradict each other.
+_BACKGROUND_FRAMES = 32
 _BACKGROUND_BYTES = 400_000_000
 
 #: axis that points up if `capture.toml` gives none, unless the cameras' mounting differs by more than _UP_DEG degrees
@@ -193,7 +193,7 @@ class Capture:
     def background(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return the empty scene: an array (T, h, w, 3) uint8 BGR for each camera; None without a `background/` folder.
 
-        T is 1 for an image. Of a clip the first 16 frames are used, and fewer of large images (384 MiB over all
+        T is 1 for an image. Of a clip the first 32 frames are used, and fewer of large images (384 MiB over all
         cameras).
 
         Raises:
