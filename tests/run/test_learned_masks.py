@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
@@ -66,6 +67,19 @@ def test_few_frames_are_asked_for_and_all_masks_show_the_person(folder: Path) ->
     assert (sources != LEARNED).mean() <= 0.2
     assert segmenter.asked[0] <= 2 * (sources != LEARNED).sum()  # an image may be asked for twice
     assert max(wrong(labels.masks, truth(folder, k)) for k, labels in enumerate(found)) < 0.1
+
+
+def test_a_note_says_why_the_segmenter_makes_all_masks(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture, _ = capture_of(folder)
+    said: list[str] = []
+    short = replace(capture, frame_count=40)
+    make_labeller(short.setup(), short, Settings(), said.append)
+    assert "fewer than 50 frames are too few" in said[-1]
+    make_labeller(capture.setup(), capture, Settings(), said.append)
+    assert "every frame" not in said[-1]
+    monkeypatch.setattr("tk.run.learned_masks._SAMPLE_BYTES", 7 * 5 * math.prod(capture.setup().rig.frame_shape) * 4)
+    make_labeller(capture.setup(), capture, Settings(), said.append)
+    assert "images are too large" in said[-1]
 
 
 def test_masks_do_not_depend_on_the_first_frame(folder: Path) -> None:

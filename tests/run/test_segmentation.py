@@ -137,7 +137,7 @@ def test_the_subject_is_the_person_in_the_volume(
     capture = open_capture(walk)
     notes: list[str] = []
     segment = make_segmenter(capture.setup(), capture, Settings(), notes.append)
-    assert len(notes) == 1 and "the segmenter red makes the masks" in notes[0]
+    assert "the segmenter red makes the masks" in notes[0] and "every frame" in notes[1] and len(notes) == 2
     with capture.frames() as frames:
         for frame in frames:
             true = truth(walk, frame.index)

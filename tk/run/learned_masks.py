@@ -13,6 +13,7 @@ masks.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -99,6 +100,19 @@ class LearnedMasks:
         self._past: deque[tuple[Masks, _Asked]] = deque(maxlen=_PAST)
         self._asked = 0
 
+    def why_throughout(self) -> str | None:
+        """Return why the segmenter makes all masks of a recording; None if it makes some of them."""
+        if len(self._edges) < 2 or self._chosen(*self._edges[:2]):
+            return None
+        if self._most_samples < _LEAST:
+            return "the images are too large to keep samples of the scene"
+        return f"fewer than {math.ceil(_LEAST / _SHARE)} frames are too few to learn the empty scene from"
+
+    @property
+    def _most_samples(self) -> int:
+        height, width = np.max([(h, w) for w, h in self._sizes], axis=0)
+        return _SAMPLE_BYTES // (5 * self._cameras * int(height) * int(width))
+
     def label(self, frame: FrameSet) -> tuple[Masks, Bool, NDArray[np.uint8]]:
         """Return masks (C, H, W), uncertain pixels (C, H, W), and where each camera's mask comes from (C,)."""
         span = self._follow(frame) if self._source.frame_count is None else self._span_of(frame.index)
@@ -166,8 +180,7 @@ class LearnedMasks:
     def _chosen(self, begin: int, stop: int) -> list[int]:
         """Return the frames of a span that the segmenter is asked for; none if they would be too many or too few."""
         frames = stop - begin
-        height, width = np.max([(h, w) for w, h in self._sizes], axis=0)
-        most = min(_SHARE * frames, _SAMPLE_BYTES / (5 * self._cameras * int(height) * int(width)))
+        most = min(_SHARE * frames, self._most_samples)
         count = int(min(max(frames / self._fps / _STEP_S, _LEAST), most))
         if count < _LEAST:
             return []

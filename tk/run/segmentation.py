@@ -123,6 +123,8 @@ def _labeller(setup: Setup, source: Source, settings: Settings, note: Callable[[
 
         made = SubjectMasks(source.segmenter or load(name), name, setup.rig, setup.volume)
         learned = LearnedMasks(setup, source, settings, made)
+        if reason := learned.why_throughout():
+            note(f"{source.where}: the segmenter makes the masks of every frame, which takes long: {reason}")
         return lambda frame: Labels(*learned.label(frame))
     foreground = _learn_median(setup, source, settings, note) if origin == _MEDIAN else None
     if foreground is None:
