@@ -4,7 +4,8 @@
 
 A capture's videos (the demo's by default), made small, run forwards and backwards until there are as many frames. They
 are tracked, and what the tracker and the process ahead of it hold is reported every so many frames, and with the time
-at the begin of each later stage. Linux only. A capture with [init] pose = "any" shows the whole second pass.
+at the begin of each later stage; the overlay video and the report follow. Linux only. A capture with [init] pose =
+"any" shows the whole second pass.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from scripts.synthetic.capture import write_calibration
 from tk.io.captures.capture import Capture, open_capture
 from tk.model.cameras.camera import Camera, Rig
 from tk.render.video import video_writer
+from tk.report.after import write_video_and_report
 from tk.run import session
 from tk.run.reporter import Silent
 from tk.settings import Settings
@@ -108,7 +110,10 @@ class MemoryReport(Silent, logging.Handler):
         self._count += 1
         if self._count % self._every == 0 or self._count == 100:
             ahead = ", ".join(f"{held_mib(child):.1f}" for child in _children())
-            print(f"{self._count} frames: tracker {held_mib():.1f} MiB, ahead {ahead} MiB", flush=True)
+            passed = time.perf_counter() - self._begun
+            print(
+                f"[{passed:6.1f} s] {self._count} frames: tracker {held_mib():.1f} MiB, ahead {ahead} MiB", flush=True
+            )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -127,12 +132,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         report, log = MemoryReport(chosen.every), logging.getLogger("tk")
         log.addHandler(report)
         log.setLevel(logging.INFO)
+        begun = time.perf_counter()
         done = session.track(capture, Path(scratch) / "loop.h5", Settings(), report, causal=chosen.causal)
         log.removeHandler(report)
         print(
             f"{done.frames} frames in {done.seconds:.0f} s, {done.lost} lost; at the end {held_mib():.1f} MiB, at most "
             f"{peak_mib():.1f}"
         )
+        written = write_video_and_report(capture, Path(scratch) / "loop.h5", print)
+        sizes = ", ".join(f"{path.suffix[1:]} {path.stat().st_size / 1e6:.1f} MB" for path in written)
+        print(f"{sizes}, after {time.perf_counter() - begun:.0f} s; at most {peak_mib():.1f} MiB")
 
 
 if __name__ == "__main__":
