@@ -22,8 +22,8 @@ from tk.batch import Job, Outcome, TrackOptions, exit_code
 from tk.batch.jobs import DONE, FAILED, make_jobs
 from tk.batch.run import _finished
 from tk.batch.summary import write_summary
-from tk.batch.work import _errors
-from tk.errors import ConfigError, ResultBusyError, ResultError
+from tk.batch.work import _errors, work
+from tk.errors import CaptureError, ConfigError, ResultBusyError, ResultError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.io.results.files import TwinFolder
@@ -234,6 +234,16 @@ def test_two_batches_in_one_folder_are_refused(tk: Tk, tiny: Path, tmp_path: Pat
 def test_result_that_another_run_writes_is_busy(tmp_path: Path) -> None:
     with TwinFolder(tmp_path / "r.h5"), pytest.raises(ResultBusyError):
         TwinFolder(tmp_path / "r.h5")
+
+
+def test_failure_of_a_capture_has_the_hint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise CaptureError("rec: is a Pose2Sim project", hint="tk import rec -o CAPTURE")
+
+    monkeypatch.setattr("tk.io.importers.open_recording", refuse)
+    (tmp_path / "jobs").mkdir()
+    outcome = work(Job("rec", tmp_path / "rec", tmp_path, TrackOptions()))
+    assert outcome.failure == "rec: is a Pose2Sim project; tk import rec -o CAPTURE"
 
 
 # --- a real cluster ---------------------------------------------------------------------------------------------------

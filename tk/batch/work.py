@@ -42,7 +42,7 @@ def work(job: Job) -> Outcome:
             job.write(Outcome(BEGUN))
             outcome = _track(job, reporter)
         except TkError as error:
-            outcome = Outcome(FAILED, failure=" ".join(str(error).split()))
+            outcome = Outcome(FAILED, failure=error.line)
         except Exception as error:
             what = f"a defect of tk: {type(error).__name__}: {' '.join(str(error).split())[:200]}"
             outcome = Outcome(FAILED, failure=f"{what} (traceback in {job.record})", trace=traceback.format_exc())
