@@ -32,6 +32,7 @@ from tk.run import offline as finish
 from tk.run.refinement import refine_capture, retimed, whole_delays
 from tk.run.session import track
 from tk.settings import Settings
+from tk.trackers.region import UNKNOWN_AFTER
 
 TURNED = 1.0  # degrees, of cam2; a camera with a larger error is excluded
 
@@ -100,7 +101,7 @@ def test_late_videos_are_tracked_again(tiny: Path, tmp_path: Path, monkeypatch: 
     """With invented delays: which frames are tracked again, and that every frame keeps its row."""
     asked: list[np.ndarray] = []
 
-    def made_up(tracker: Any, store: Any, frames: Any, *_: Any) -> Any:
+    def made_up(tracker: Any, agreement: Any, store: Any, frames: Any, *_: Any) -> Any:
         late = np.array([0, 0, 1, -1])
         return tracker, retimed(store, frames, late), late.astype(float)
 
@@ -160,3 +161,10 @@ def test_masks_of_late_cameras_come_from_other_frames() -> None:
         shown = [np.flatnonzero(mask[0]).tolist() for mask in late.get(frame)]
         assert shown == [[frame], [frame - 1] if frame >= 1 else [], [frame + 2] if frame < 2 else []]
     assert retimed(store, np.arange(4), np.zeros(3, np.int64)) is store
+
+
+def test_sigma_is_unknown_from_the_first_frame_with_a_high_residual_on() -> None:
+    """The first pass knows only after some frames that the residual stays high."""
+    unknown = np.zeros(20, bool)
+    unknown[[12, 13]] = True
+    assert np.flatnonzero(finish.high_residual(unknown)).tolist() == list(range(13 - UNKNOWN_AFTER, 14))

@@ -277,12 +277,13 @@ def test_frames_without_known_joints_are_reported(
     assert run(tiny, tmp_path / "r.h5", reporter, frames=(0, 5), causal=causal).lost == 0
     result = read_result(tmp_path / "r.h5")
     assert result.sigma is not None
-    assert np.isnan(result.sigma).all(axis=1).tolist() == [False, False, True, True, False]
+    first = 2 if causal else 0  # the second pass knows that the residual was high before
+    assert np.flatnonzero(np.isnan(result.sigma).all(axis=1)).tolist() == list(range(first, 4))
     (line,) = (note for note in result.notes if "σ is unknown" in note)
-    assert line.endswith("σ is unknown, frames 2 to 3") and line in reporter.notes
+    assert line.endswith(f"σ is unknown, frames {first} to 3") and line in reporter.notes
     notes: list[str] = []
     assert len(list(estimates(*setup_and_source(open_capture(tiny)), CONFIG, notes.append, frames=(0, 5)))) == 5
-    assert line in notes
+    assert any(note.endswith("σ is unknown, frames 2 to 3") for note in notes)
 
 
 # --- bodies from files ------------------------------------------------------------------------------------------------

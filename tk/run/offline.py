@@ -25,8 +25,9 @@ from tk.run.identity import COLUMNS, EXCHANGED, UNCLEAR, Contact, doubtful, exch
 from tk.run.people import Member
 from tk.run.plan import Plan
 from tk.run.prefetch import open_observations
-from tk.run.refinement import refine_if_inconsistent, retimed
+from tk.run.refinement import compare_cameras, refine_if_inconsistent, retimed
 from tk.trackers.protocol import Estimate, Observation, TwoPassTracker, two_pass
+from tk.trackers.region import UNKNOWN_AFTER
 from tk.trackers.residual import contradicted
 
 _LOG = logging.getLogger(__name__)
@@ -104,6 +105,7 @@ def _finish(
         return cameras
     poses = result.pose.copy()
     lost = ~result.has_pose
+    unclear = ~lost & doubtful(result, contacts)
     columns: dict[str, NDArray[Any]] = {name: getattr(result, COLUMNS[name]) for name in changed}
     model: Mapping[str, Value] | None = None
     again = two_pass(tracker)
@@ -116,12 +118,16 @@ def _finish(
             with open_observations(plan.setup, plan.source, plan.settings, lambda _: None) as observations:
                 for observation, _ in observations.frames(min(missing), max(missing) + 1):
                     masks.put(observation.index, again.cleaned(again.without_foreign(observation).masks))
+        _LOG.info("second pass: comparing the cameras")
+        agreement = compare_cameras(again, masks, result.frames, poses, ~lost)
+        if apart := "" if agreement is None else agreement.contradiction:
+            note(f"{apart}: all frames are suspect")
+            unclear = ~lost
         if member.number:
             late = np.round((cameras.time_offset_s - plan.source.time_offset_s) * fps).astype(np.int64)
             again, masks = again.with_cameras(cameras.rig), retimed(masks, result.frames, late)
-        elif plan.settings.refine:
-            _LOG.info("second pass: comparing the cameras")
-            refined = refine_if_inconsistent(again, masks, result.frames, poses, ~lost, note)
+        elif agreement is not None and plan.settings.refine and not apart:
+            refined = refine_if_inconsistent(again, agreement, masks, result.frames, poses, ~lost, note)
             if refined is not None:
                 again, masks, offsets = refined
                 cameras = UsedCameras(again.rig, cameras.time_offset_s + offsets / fps)
@@ -154,12 +160,15 @@ def _finish(
     if sigma is not None and residual is not None:
         suspect = ~lost
         suspect[suspect] = contradicted(residual[suspect], plan.settings.region.false_alarm)
-        mixed = ~lost & doubtful(result, contacts)
+        unclear &= ~lost  # tracking again may have lost frames
+        unknown = ~lost & np.isnan(sigma).all(axis=1)
+        if model is not None:  # without a second pass, no frame depends on later ones
+            unknown = ~lost & high_residual(unknown)
         status = columns.get("status", result.status)
         status = np.where(status == Status.SUSPECT, np.uint8(Status.TRACKED), status)
-        columns["status"] = np.where(suspect | mixed, np.uint8(Status.SUSPECT), status)
-        columns["joints/sigma"] = np.where((suspect | mixed)[:, None], np.nan, sigma)
-        report_unknown(result.frames[np.isnan(sigma).all(axis=1) & ~lost & ~suspect], note)
+        columns["status"] = np.where(suspect | unclear, np.uint8(Status.SUSPECT), status)
+        columns["joints/sigma"] = np.where((suspect | unclear | unknown)[:, None], np.nan, sigma)
+        report_unknown(result.frames[unknown & ~suspect & ~unclear], note)
         report_suspect(result.frames[suspect], note)
     _LOG.info("angles, feet, and the smoothed copy")
     # poses of the first pass stay as they are
@@ -170,6 +179,12 @@ def _finish(
     smoothed = {**_columns(body, filtered.poses), "bridged": filtered.bridged}
     revise_result(output, columns, smoothed=smoothed, model=model, cameras=cameras.recorded(), person=member.number)
     return cameras
+
+
+def high_residual(unknown: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return (F,) the frames of stretches with a high residual. The first pass makes sigma unknown, (F,), only after
+    :data:`~tk.trackers.region.UNKNOWN_AFTER` of them."""
+    return np.array([unknown[i : i + UNKNOWN_AFTER].any() for i in range(len(unknown))], np.bool_)
 
 
 def report_unknown(frames: Sequence[int] | NDArray[np.int64], note: Callable[[str], None]) -> None:

@@ -18,7 +18,7 @@ from tk.io.paths import check_output
 from tk.io.results.reader import read_result
 from tk.model.block_least_squares import Stop
 from tk.model.body.cone_body import ConeBody
-from tk.model.cameras.agreement import LATE_FRAMES, camera_agreement
+from tk.model.cameras.agreement import LATE_FRAMES, CameraAgreement, camera_agreement
 from tk.model.cameras.bundle import choose_frames
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import Refined, RefinementSettings, refine_cameras
@@ -192,8 +192,33 @@ def refine_rig(
     return None if done is None else Refinement(done, rig.names, count)
 
 
+def compare_cameras(
+    tracker: TwoPassTracker,
+    store: MaskStore,
+    frames: NDArray[np.int64],
+    poses: Float,
+    usable: NDArray[np.bool_],
+) -> CameraAgreement | None:
+    """Return how the cameras differ about the tracked person; None if too few frames are usable. Arguments as of
+    :func:`refine_if_inconsistent`."""
+    masks = lru_cache(16)(store.get)
+    chosen = choose_frames(
+        lambda frame, camera: masks(frame)[camera],
+        tracker.views,
+        tracker.body.skeleton,
+        frames,
+        tracker.world.poses_in(poses),
+        usable,
+        AGREEMENT_FRAMES,
+        1,
+        False,
+    )
+    return camera_agreement(tracker.body, tracker.world.rig, chosen) if len(chosen) >= FEWEST else None
+
+
 def refine_if_inconsistent(
     tracker: TwoPassTracker,
+    agreement: CameraAgreement,
     store: MaskStore,
     frames: NDArray[np.int64],
     poses: Float,
@@ -204,6 +229,7 @@ def refine_if_inconsistent(
 
     Args:
         tracker: after the first pass over the frames.
+        agreement: of :func:`compare_cameras`.
         store: the frames' masks.
         frames, poses, usable: (F,), (F, D), (F,) of :func:`refine_rig`; the poses are in the capture's world.
         note: receives a message about the refined cameras.
@@ -214,22 +240,7 @@ def refine_if_inconsistent(
     """
     world = tracker.world
     poses = world.poses_in(poses)
-    masks = lru_cache(16)(store.get)
-    chosen = choose_frames(
-        lambda frame, camera: masks(frame)[camera],
-        tracker.views,
-        tracker.body.skeleton,
-        frames,
-        poses,
-        usable,
-        AGREEMENT_FRAMES,
-        1,
-        False,
-    )
-    if len(chosen) < FEWEST:
-        return None
-    late = whole_delays(tracker.body, world.rig, masks, frames, poses, usable)
-    agreement = camera_agreement(tracker.body, world.rig, chosen)
+    late = whole_delays(tracker.body, world.rig, lru_cache(16)(store.get), frames, poses, usable)
     if not (late.any() or agreement.inconsistent.any() or agreement.late.any()):
         return None
     done = refine_rig(tracker.body, world.rig, store, frames, poses, usable, late=late)

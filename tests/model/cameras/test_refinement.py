@@ -18,6 +18,7 @@ from tk.model.body.cone_body import SHAPE_NUMBERS, build_cone_body, group_of
 from tk.model.cameras.agreement import camera_agreement
 from tk.model.cameras.bundle import camera_rows, choose_frames, farthest
 from tk.model.cameras.camera import Camera, Rig
+from tk.model.cameras.common_view import closest_to_lines
 from tk.model.cameras.refinement import (
     MOVE_M,
     TURN_DEG,
@@ -243,6 +244,26 @@ def test_agreement_names_the_inconsistent_and_the_late_camera():
     assert found.inconsistent[1] and np.linalg.norm(found.shift_px, axis=1).argmax() == 1
     late = camera_agreement(BODY, RIG, frames(rendered((0, 0, 0, 1)), RIG))
     assert late.late.tolist() == [False, False, False, True]
+
+
+@pytest.mark.parametrize("turned_deg", [-3.0, 0.0, 3.0])
+def test_two_cameras_of_which_one_is_turned_sideways_contradict_each_other(turned_deg: float):
+    """The tracked person stands where the rays of both cameras meet, so only the person's size is wrong."""
+    rig = Rig(tuple(RIG)[:2])
+    turn = np.asarray(cv2.Rodrigues(np.radians([0.0, turned_deg, 0.0]))[0])
+    wrong = Rig((rig[0], replace(rig[1], rotation=turn @ rig[1].rotation, translation=turn @ rig[1].translation)))
+    place = BODY.skeleton.joints(motion())[:, 0]
+    pixels = [camera.project(place)[0] for camera in rig]
+    rays = [camera.rays(seen) for camera, seen in zip(wrong, pixels, strict=True)]
+    met = [closest_to_lines(wrong.centers, np.array(pair)) for pair in zip(*rays, strict=True)]
+    poses = motion().copy()
+    poses[:, [BODY.skeleton.names.index(f"torso_{axis}") for axis in "xyz"]] += np.array(met) - place
+    seen = choose_frames(
+        lambda k, c: in_time().get(k)[c],
+        Views(wrong), BODY.skeleton, np.arange(FRAMES), poses, np.ones(FRAMES, bool), FRAMES, 1, True,
+    )  # fmt: skip
+    contradiction = camera_agreement(BODY, wrong, seen).contradiction
+    assert ("larger than" in contradiction) == (turned_deg != 0), contradiction
 
 
 def test_settings_out_of_range_are_refused():

@@ -24,13 +24,20 @@ from tk.model.cameras.camera import Rig
 Float = NDArray[np.float64]
 
 # Prior standard deviations of a camera's shift, pixels, and delay, frames: wide, so that 20 frames outweigh them.
+# If one of two cameras is turned sideways, the person seems to be elsewhere, and only the person's size contradicts
+# that. So two cameras have an unknown focal length, too (its logarithm).
 _SIGMA = {"shift": 5.0, "offset": 2.0}
+_SIGMA_OF_TWO = {"shift": 5.0, "focal": 0.05, "offset": 2.0}
 # Half the difference of points for a derivative, metres.
 _STEP_M = 1e-4
 # Cameras disagree if a shift exceeds this angle, degrees, or a delay this part of a frame, and either exceeds this many
 # standard deviations (three: one false alarm in 370). Captures with exact cameras (walk, dance) show 0.02° and 0.01
 # frames; lower limits refine cameras that are right.
 INCONSISTENT_DEG, LATE_FRAMES, SIGNIFICANT = 0.06, 0.2, 3.0
+# Two cameras contradict each other if they show the person larger and smaller by more than this share, significantly.
+# 24 pairs of correct cameras of the development captures: at most 0.002. One of them turned by 3°: 0.008 to 0.018 where
+# the start finds no contradiction.
+SIZE = 0.005
 # An edge's weight falls to a quarter at robust_px: less than in the tracker's search, because a camera can do without
 # the edges of folds, shadows and hands.
 CAMERA_SEARCH = SearchSettings(spacing_px=SPACING_PX, robust_px=3.0)
@@ -50,6 +57,9 @@ class CameraAgreement:
         shift_sigma_px: (C, 2) pixels, one standard deviation.
         offset_frames: (C,) frames by which a camera's images are taken later than the others'; NaN if nobody moves.
         offset_sigma_frames: (C,) frames, one standard deviation.
+        size: (2,) by which share of its size each of two cameras shows the person larger than the other one expects;
+            empty unless there are two.
+        size_sigma: (2,) one standard deviation.
         residual_px: (C,) pixels, root mean square distance of contours from the mask's edges.
         focal_px: (C,) pixels, focal lengths: they turn a shift into an angle.
     """
@@ -59,6 +69,8 @@ class CameraAgreement:
     shift_sigma_px: Float
     offset_frames: Float
     offset_sigma_frames: Float
+    size: Float
+    size_sigma: Float
     residual_px: Float
     focal_px: Float
 
@@ -76,6 +88,17 @@ class CameraAgreement:
             size = np.abs(self.offset_frames)
             return (size > LATE_FRAMES) & (size > SIGNIFICANT * self.offset_sigma_frames)
 
+    @property
+    def contradiction(self) -> str:
+        """Why two cameras cannot be used together, one line; empty if they can, or if there are more."""
+        if not (np.abs(self.size) > np.maximum(SIZE, SIGNIFICANT * self.size_sigma)).any():
+            return ""
+        large, small = (self.names[i] for i in (int(np.argmax(self.size)), int(np.argmin(self.size))))
+        return (
+            f"{large} shows the person {np.ptp(self.size):.1%} larger than {small} does at the same place, and two "
+            "cameras do not show which one is wrong: one was turned or moved after the calibration"
+        )
+
 
 def camera_agreement(body: ConeBody, rig: Rig, frames: Sequence[BundleFrame]) -> CameraAgreement:
     """Measure how the cameras disagree over F frames of a tracked body, see the module.
@@ -92,35 +115,40 @@ def camera_agreement(body: ConeBody, rig: Rig, frames: Sequence[BundleFrame]) ->
         raise ValueError("no frames to compare the cameras in")
     C = len(rig)
     family = BodyFamily.around(body, SCALE_DEVIATION)
-    bundle = ContourBundle(family, rig, frames, CAMERA_SEARCH, _SIGMA)
+    bundle = ContourBundle(family, rig, frames, CAMERA_SEARCH, _SIGMA_OF_TWO if C == 2 else _SIGMA)
     contours = bundle.contours(bundle.start, 0)
     found = bundle.equations(bundle.start, contours).reduced()
-    project = gauge_projection(_gauge_modes(rig, body.skeleton.joints(frames[0].pose)[0]), np.tile(bundle.sigma**-2, C))
+    modes = _gauge_modes(rig, body.skeleton.joints(frames[0].pose)[0], len(bundle.sigma))
+    project = gauge_projection(modes, np.tile(bundle.sigma**-2, C))
     inverse = project @ np.linalg.inv(found.hessian)[bundle.cameras]
-    step = (inverse @ found.gradient).reshape(C, 3)
+    step = (inverse @ found.gradient).reshape(C, -1)
     # a frame counts as one observation, because errors within a frame are correlated (the sandwich estimator)
     scatter = (found.by_block - found.by_block.mean(axis=0)) @ inverse.T
     curvature = np.diag(inverse[:, bundle.cameras] @ project.T)
-    deviation = np.sqrt(np.maximum((scatter**2).sum(axis=0), curvature)).reshape(C, 3)
+    spread = (scatter**2).sum(axis=0)
+    deviation = np.sqrt(np.maximum(spread, curvature)).reshape(C, -1)
     moves = any(np.abs(frame.velocity).max() > 0 for frame in frames)
     return CameraAgreement(
         names=rig.names,
         shift_px=step[:, :2],
         shift_sigma_px=deviation[:, :2],
-        offset_frames=step[:, 2] if moves else np.full(C, np.nan),
-        offset_sigma_frames=deviation[:, 2] if moves else np.full(C, np.nan),
+        offset_frames=step[:, -1] if moves else np.full(C, np.nan),
+        offset_sigma_frames=deviation[:, -1] if moves else np.full(C, np.nan),
+        size=step[:, 2:-1].ravel(),
+        size_sigma=np.sqrt(spread).reshape(C, -1)[:, 2:-1].ravel(),
         residual_px=residual_px(contours, C),
         focal_px=np.array([camera.matrix[0, 0] for camera in rig]),
     )
 
 
-def _gauge_modes(rig: Rig, p_world: Float) -> Float:
-    """(3 C, 4) changes of shifts and delays by motions of the world near a point along x, y, z, and by a common
-    delay."""
-    C = len(rig)
-    modes = np.zeros((C, 3, 4))
+def _gauge_modes(rig: Rig, p_world: Float, parameters: int) -> Float:
+    """(k C, m) changes of the k parameters of C cameras by motions of the world near a point along x, y, z, by a common
+    delay and, of two cameras, by another size of the person."""
+    C, more = len(rig), parameters - 3
+    modes = np.zeros((C, parameters, 4 + more))
     steps = np.concatenate([_STEP_M * np.eye(3), -_STEP_M * np.eye(3)])
     pixels = np.array([camera.project(p_world + steps)[0] for camera in rig])
     modes[:, :2, :3] = np.nan_to_num(pixels[:, :3] - pixels[:, 3:]).transpose(0, 2, 1) / (2 * _STEP_M)
-    modes[:, 2, 3] = 1.0
-    return modes.reshape(3 * C, 4)
+    modes[:, -1, 3] = 1.0
+    modes[:, 2:-1, 4:] = 1.0
+    return modes.reshape(parameters * C, -1)
