@@ -15,6 +15,7 @@ from tk.errors import CaptureError
 from tk.io import settings_file
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.results.reader import read_joints
+from tk.model.body.joint_sigma import VIEW_M
 from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
 from tk.model.setup import Subject
 from tk.trackers.camera_monitor import CameraMonitor
@@ -201,6 +202,11 @@ def test_inconsistent_camera_is_excluded_from_the_opening(scene: Scene) -> None:
         assert not used.masks[2].any() and estimate.status != "lost"
     (line,) = monitor.report()
     assert "camera cam3 disagrees" in line and f"frames 0 to {FRAMES - 1}" in line
+    # the calibration of the other cameras is doubtful, too
+    assert isinstance(monitor.tracker, RegionTracker) and monitor.tracker.view_m > 1.5 * VIEW_M
+    sound = scene.monitor()
+    sound.start(scene.frames[:3])
+    assert isinstance(sound.tracker, RegionTracker) and sound.tracker.view_m == VIEW_M
 
 
 def test_person_whose_size_contradicts_the_given_height_is_refused(scene: Scene) -> None:

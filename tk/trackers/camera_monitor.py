@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError
 from tk.kernels.mask_values import OTHERS
+from tk.model.body.joint_sigma import VIEW_M
 from tk.model.body.plausibility import Plausibility, check_extent, check_stature
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
@@ -112,6 +113,8 @@ class CameraMonitor:
         if agreement.refusal:
             raise CaptureError(agreement.refusal)
         self._tested = int(agreement.tested_right.sum()) >= 2
+        if isinstance(self.tracker, RegionTracker) and agreement.undetected_m > 0:
+            self.tracker.view_m = float(np.hypot(VIEW_M, agreement.undetected_m))
         for camera in agreement.wrong:
             self._excluded[camera] = True
             self._opening_reasons[camera] = agreement.reason(camera)

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.body.cone_body import ConeBody
-from tk.model.body.joint_sigma import contour_variance, directions, posture_variance, view_variance
+from tk.model.body.joint_sigma import VIEW_M, contour_variance, directions, posture_variance, view_variance
 from tk.model.body.limb_candidates import Limb
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Rig
@@ -67,7 +67,11 @@ MISPLACED = 0.25
 
 
 class RegionTracker(ContourTracker):
-    """Tracks one person. :meth:`start` once, then :meth:`step` for every frame, the first included."""
+    """Tracks one person. :meth:`start` once, then :meth:`step` for every frame, the first included.
+
+    Attributes:
+        view_m: displacement of a bone's contours in one view, metres; larger if the calibration is doubtful.
+    """
 
     method = "region"
     stages: tuple[str, ...] = ("contours", "search")
@@ -90,6 +94,7 @@ class RegionTracker(ContourTracker):
         self._mean_posture: Float = np.zeros((len(JOINTS), 3))
         self._postures = 0
         self._fresh = True
+        self.view_m = VIEW_M
         self._reset()
 
     def _reset(self) -> None:
@@ -379,7 +384,7 @@ class RegionTracker(ContourTracker):
         noise = contour_variance(body.skeleton, pose, precision, body.free)
         rays = joints - self.world.rig.centers[used, None]
         shares = contour_shares(body, self.screen, label, joints)[used]
-        views = view_variance(rays / np.linalg.norm(rays, axis=-1, keepdims=True), shares)
+        views = view_variance(rays / np.linalg.norm(rays, axis=-1, keepdims=True), shares, self.view_m)
         return np.asarray((noise + views) * variance_factor(residual))
 
     def second_pass(
@@ -434,6 +439,7 @@ class RegionTracker(ContourTracker):
             "lost_for": self._lost_for,
             "high_for": self._high_for,
             "search_failed": self._search_failed,
+            "view_m": self.view_m,
             **self.colors.state(),
         }
 
@@ -447,6 +453,7 @@ class RegionTracker(ContourTracker):
         self._lost_for = int(state["lost_for"])
         self._high_for = int(state["high_for"])
         self._search_failed = bool(state["search_failed"])
+        self.view_m = float(state["view_m"])
         self.colors.restore(state)
         self._fresh = False
 
@@ -454,5 +461,6 @@ class RegionTracker(ContourTracker):
         """Return a tracker of the same body and colours with other cameras."""
         fresh = RegionTracker(rig, self.up, self.contours, self.config)
         fresh.take_body(self.body)
+        fresh.view_m = self.view_m
         fresh.colors.restore(self.colors.state())
         return fresh

@@ -59,7 +59,7 @@ def contour_variance(skeleton: Skeleton, pose: Float, precision: Float, free: ND
     return np.asarray((J * (J @ covariance[..., None, :, :])).sum(axis=(-1, -2)) / 3)
 
 
-def view_variance(rays: Float, shares: Float) -> Float:
+def view_variance(rays: Float, shares: Float, view_m: float = VIEW_M) -> Float:
     """Return (15,) variance of the joints' positions along the direction that the views determine least, metres²; NaN
     for a joint whose rays are not finite.
 
@@ -71,9 +71,11 @@ def view_variance(rays: Float, shares: Float) -> Float:
     Args:
         rays: (V, 15, 3) unit vectors between the cameras and the joints.
         shares: (V, 15) how much of the joint's bones a view shows, 0 to 1; 0 for a view that was not used.
+        view_m: displacement of a bone's contours in one view, metres, :data:`VIEW_M` if the cameras are correct.
     """
     across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
-    information = (shares[..., None, None] * across).sum(axis=0) + (VIEW_M / REACH_M) ** 2 * np.eye(3)
+    information = (VIEW_M / view_m) ** 2 * (shares[..., None, None] * across).sum(axis=0)
+    information += (VIEW_M / REACH_M) ** 2 * np.eye(3)
     known = np.isfinite(information).all(axis=(1, 2))
     least = np.linalg.eigvalsh(np.where(known[:, None, None], information, np.eye(3)))[:, 0]
     return np.where(known, VIEW_M**2 * np.maximum(1.0 / least - 1.0, 0.0), np.nan)

@@ -93,6 +93,14 @@ class Agreement:
         return float(np.nanmean(self.outside)) if np.isfinite(self.outside).any() else float("nan")
 
     @property
+    def undetected_m(self) -> float:
+        """By how much the contours of a right camera may be displaced, metres: if a camera is wrong, the calibration of
+        the others is only as good as the test of their masks; 0 if none is wrong."""
+        if not self.wrong:
+            return 0.0
+        return float(self.extent_m * (TOLERANCE + 2 * np.nanmedian(self.tangency.pixel)))
+
+    @property
     def right(self) -> list[int]:
         """The cameras that are not wrong."""
         return [c for c in range(len(self.names)) if c not in self.wrong]
