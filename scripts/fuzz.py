@@ -106,7 +106,7 @@ def judge(code: int, out: str, err: str, seconds: float, limit_s: float) -> Outc
         problem = f"exit code {code}"
     elif code == 2 and (len(complaints) != 1 or err.splitlines()[-1] != complaints[0]):
         problem = "no single line"
-    elif code == 1 and not complaints:
+    elif code == 1 and not complaints and not out:  # tk doctor prints a table
         problem = "no reason"
     elif "Warning: " in err:
         problem = "warning"
