@@ -324,6 +324,16 @@ def test_an_initial_pose_in_millimetres(tk: Tk, quick: Path, tiny: Path, tmp_pat
     ran.complaint("pose.toml", "outside the working volume", "metres")
 
 
+def test_masks_that_never_change_are_refused(tk: Tk, copy: Path, tmp_path: Path) -> None:
+    for folder in (copy / "masks").iterdir():
+        first, *others = sorted(folder.iterdir())
+        for path in others:
+            path.write_bytes(first.read_bytes())
+    slow = tmp_path / "c.toml"  # the person stands still at first
+    slow.write_text(QUICK.replace("init_frames = 3", f"init_frames = {FRAMES}"))
+    tk("track", copy, "-o", tmp_path / "r.h5", "--config", slow).complaint(str(copy), "the masks never change")
+
+
 def test_frames_before_the_initial_one_are_left_out(copy: Path, tmp_path: Path) -> None:
     settings = (copy / "capture.toml").read_text(encoding="utf-8").replace("frame = 0", "frame = 3")
     (copy / "capture.toml").write_text(settings, encoding="utf-8")

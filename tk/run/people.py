@@ -19,6 +19,7 @@ from tk.errors import CaptureError, ConfigError
 from tk.kernels.raycast import FAR, Cast
 from tk.model.body.skeleton import JOINTS
 from tk.model.cues.ray_costs import RayGrid
+from tk.model.masks.image_health import masks_stand_still
 from tk.model.people import LocatedPerson, PeopleFinder, order_people
 from tk.model.setup import Setup, Subject
 from tk.run.choice import Choice, chosen, matched, unknown
@@ -162,8 +163,10 @@ class People:
         """Find the people in the first frame, and start a tracker for each who is chosen.
 
         Raises:
-            CaptureError: a chosen person is not there, or too few cameras see the person.
+            CaptureError: a chosen person is not there, too few cameras see the person, or the masks never change.
         """
+        if masks_stand_still([f.images for f in opening], [f.masks for f in opening]):
+            raise CaptureError("the masks never change, but the images do: the masks do not show who moves")
         subjects = self._setup.subjects
         found = self._find(opening[0].masks, opening[0].uncertain)
         found = order_people(found, self._setup.volume, subjects[0].height_m, subjects[0].position)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tk.model.masks.image_health import BLANK, FROZEN, ImageHealth, described
+from tk.model.masks.image_health import BLANK, FROZEN, ImageHealth, described, masks_stand_still
 
 C, H, W = 4, 96, 128
 
@@ -22,6 +22,17 @@ def frame(t: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 def test_healthy_images_have_no_reason() -> None:
     rng, health = np.random.default_rng(0), ImageHealth()
     assert all(health.look(*frame(t, rng)) == [None] * C for t in range(12))
+
+
+def test_masks_that_never_change_stand_still_only_if_somebody_moves() -> None:
+    rng = np.random.default_rng(0)
+    images, masks = zip(*(frame(t, rng) for t in range(6)), strict=True)
+    still = [frame(0, rng)[0] for _ in range(6)]
+    same = [masks[0]] * 6
+    assert masks_stand_still(images, same)
+    assert not masks_stand_still(images, masks)  # the person moves
+    assert not masks_stand_still(still, same)  # nobody does
+    assert not masks_stand_still([np.zeros((C, 0, 0, 3), np.uint8)] * 6, same)
 
 
 def test_frozen_camera_is_found_once_the_others_have_moved_until_it_moves_again() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,10 @@ _SAME_LEVELS, _SAME_SHARE = 6, 0.001
 # Change of another camera's mask, as a share of its area, that shows movement.
 # It must lie above the noise of segmented masks. Sensitivity not measured.
 _MOVED = 0.15
+
+# Something moves in the images of a camera if at least this share of the pixels differs by more than this many levels:
+# the first is a quarter of a small person, the second more than the noise of 24 frames. Sensitivity not measured.
+_MOVED_LEVELS, _MOVED_SHARE = 40, 0.005
 
 BLANK, FROZEN = "shows nothing", "stands still"
 
@@ -82,6 +86,23 @@ class ImageHealth:
         C, h, w = self._references.shape
         bits = np.unpackbits(np.asarray(state["masks"], np.uint8), count=C * C * h * w)
         self._masks = bits.reshape(C, C, h, w).astype(bool)
+
+
+def masks_stand_still(images: Sequence[NDArray[np.uint8]], masks: Sequence[NDArray[np.uint8]]) -> bool:
+    """Return whether no mask changes although most cameras' images do: the masks do not show who moves.
+
+    Args:
+        images: (C, H, W, 3) BGR of each frame; empty arrays change nothing.
+        masks: (C, H, W) of each frame.
+    """
+    if any((other != masks[0]).any() for other in masks[1:]):
+        return False
+    step = max(1, masks[0].shape[1] // _ROWS)
+    shown = np.array([image[:, step // 2 :: step, step // 2 :: step, 1] for image in images if image.size], np.int16)
+    if not shown.size:
+        return False
+    differs = (np.ptp(shown, axis=0) > _MOVED_LEVELS).mean(axis=(1, 2))
+    return bool(np.median(differs) > _MOVED_SHARE)
 
 
 def _changed(before: NDArray[np.bool_], now: NDArray[np.bool_]) -> float:
