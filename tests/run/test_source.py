@@ -66,6 +66,9 @@ class Rendered:
     def shifted(self, time_offset_s: Sequence[float]) -> None:
         return None
 
+    def damaged(self, stop: int) -> tuple[()]:
+        return ()
+
 
 ONE = Rendered(draw_silhouettes(BODY, RIG, POSES))
 

@@ -179,7 +179,9 @@ def track_source(
                 for frame, estimates in enumerate(run.frames(), plan.begin + done):
                     reporter.advance(frame, estimates[0] if estimates else None)
             if run.tracked or run.restore_unfinished(output, causal):
-                for line in run.people.report():
+                if lines := run.people.report():  # a damaged image may be the cause
+                    lines = [*source.damaged(plan.begin + done + run.tracked), *lines]
+                for line in lines:
                     note(line)
                 with one_thread():
                     contacts = run.people.contacts
@@ -314,7 +316,8 @@ class _Run:
             with one_thread():
                 self.people.start([o for o, _ in opening])
         except CaptureError as error:
-            raise CaptureError(f"{plan.source.where}: {error}", error.hint) from None
+            reasons = "; ".join([str(error), *plan.source.damaged(plan.first + len(opening))])
+            raise CaptureError(f"{plan.source.where}: {reasons}", error.hint) from None
         yield from self._step_through(chain(_emptied(opening), broken or observations))
 
     def _opening_frames(self) -> int:

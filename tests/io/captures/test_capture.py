@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.conftest import development_capture, refused
+from tests.conftest import FRAMES, development_capture, refused
 from tests.io.conftest import (
     CENTER,
     HEIGHT,
@@ -449,3 +449,17 @@ def test_several_subjects_are_read(make_capture: MakeCapture) -> None:
     assert (first.height_m, first.position, second.height_m) == (1.8, None, 1.6) and capture.subject_height_m == 1.8
     assert second.position is not None and second.position.tolist() == [1.0, 0.0, 0.9]
     assert [s.body for s in capture.subjects] == [None, "b.toml"]
+
+
+def test_damaged_images_are_found_after_opening(copy: Path) -> None:
+    """FFmpeg fills up what it cannot decode, so the capture opens without an error."""
+    assert open_capture(copy).damaged(FRAMES) == []
+    path = sorted((copy / "videos").iterdir())[1]
+    content = bytearray(path.read_bytes())
+    start = content.find(b"mdat") + 4
+    for place in np.random.default_rng(0).integers(start + (len(content) - start) // 3, len(content) * 2 // 3, 20):
+        content[place] ^= 0xFF
+    path.unlink()
+    path.write_bytes(content)
+    (line,) = open_capture(copy).damaged(FRAMES)
+    assert line.startswith(f"{path}: is damaged in ") and "copy it again" in line

@@ -21,12 +21,22 @@ from tk.io.captures.mobo import SETTINGS as MOBO_SETTINGS
 from tk.io.captures.mobo import find_walk, read_cameras
 from tk.io.captures.timing import check_clock, read_stamps
 from tk.io.captures.timing import resample as resampled
-from tk.io.captures.video import Clip, Image, PictureClip, list_clips, picture_number, probe
+from tk.io.captures.video import (
+    Clip,
+    Image,
+    PictureClip,
+    VideoClip,
+    damaged_images,
+    list_clips,
+    picture_number,
+    probe,
+)
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import infer_volume, sample_box, views_of
 from tk.model.cameras.mounting import infer_up
 from tk.model.cameras.up import up_vector
 from tk.model.cameras.volume import Volume
+from tk.model.masks.image_health import described
 from tk.model.setup import Setup, Subject
 
 if TYPE_CHECKING:
@@ -45,6 +55,9 @@ DEFAULT_FPS = 30.0
 #: most 0.04 cm, but with 16 the masks of three cameras of 160x120 contradict each other.
 _BACKGROUND_FRAMES = 32
 _BACKGROUND_BYTES = 400_000_000
+
+#: most images of a video that are checked for damage after a camera has disagreed: about a millisecond each
+_CHECKED_IMAGES = 3000
 
 #: axis that points up if `capture.toml` gives none, unless the cameras' mounting differs by more than _UP_DEG degrees
 DEFAULT_UP, _UP_DEG = "z", 25.0
@@ -155,6 +168,15 @@ class Capture:
         moved = replace(self, time_offset_s=tuple(time_offset_s))
         ends = [clip.frame_count + late for clip, late in zip(self.clips, moved.late_frames, strict=True)]
         return replace(moved, frame_count=min(self.frame_count, *ends))
+
+    def damaged(self, stop: int) -> list[str]:
+        """Return a line on each video with images before frame ``stop`` that cannot be decoded completely."""
+        lines = []
+        for clip, late in zip(self.clips, self.late_frames, strict=True):
+            if isinstance(clip, VideoClip) and (bad := damaged_images(clip.path, min(stop - late, _CHECKED_IMAGES))):
+                which = described(bad[0] + late, bad[-1] + late, len(bad))
+                lines.append(f"{clip.path}: is damaged in {which}; copy it again, or re-encode the original")
+        return lines
 
     @property
     def up_axis(self) -> NDArray[np.float64]:

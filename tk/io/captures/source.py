@@ -74,3 +74,7 @@ class Source(Protocol):
     def shifted(self, time_offset_s: Sequence[float]) -> Source | None:
         """Return the same frames with other delays (C,); None if they cannot be read a second time."""
         ...
+
+    def damaged(self, stop: int) -> Sequence[str]:
+        """Return a line on each camera some of whose images before frame ``stop`` are damaged."""
+        ...

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -179,6 +180,24 @@ def probe_pictures(path: Path, is_mask: bool = False) -> PictureClip:
     files = _numbered_pictures(path) if path.is_dir() else (path,)
     height, width = _read_picture(files[0], is_mask).shape[:2]
     return PictureClip(path, width, height, files, is_mask)
+
+
+def damaged_images(path: Path, stop: int) -> list[int]:
+    """Return the images of a video before ``stop`` that FFmpeg decodes in part only. It fills them up without an error,
+    so no reader notices."""
+    import av  # slow to import, and only needed for a message
+    import av.error
+
+    found = []
+    with av.open(c_name(path, VideoError)) as container:
+        container.streams.video[0].thread_type = "AUTO"
+        try:
+            for i, image in enumerate(islice(container.decode(video=0), stop)):
+                if image.is_corrupt:
+                    found.append(i)
+        except av.error.FFmpegError:
+            pass  # a reader fails here, too
+    return found
 
 
 def list_clips(folder: Path, pictures: bool = False) -> dict[str, Path]:
