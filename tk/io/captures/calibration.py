@@ -133,8 +133,8 @@ def calibration_of(path: Path, tables: Mapping[str, Mapping[str, object]], unit:
     cameras: list[Camera] = []
     late: list[float] = []
     for key, values in tables.items():
-        camera = _camera(key, values, path)
-        late.append(_time_offset(camera.name, values, path))
+        camera, late_s = _camera(key, values, path)
+        late.append(late_s)
         if camera.name in [other.name for other in cameras]:
             raise CalibrationError(f"{path}: two cameras have the name {camera.name!r}; give each its own")
         cameras.append(camera)
@@ -192,21 +192,13 @@ def write_calibration(path: Path, source: Calibration, rig: Rig, time_offset_s: 
         part.write_text(tomli_w.dumps(document), encoding="utf-8")
 
 
-def _time_offset(name: str, values: Mapping[str, object], path: Path) -> float:
-    table = Table(values, f"{path}: camera {name!r}", CalibrationError)
-    late = table.number("time_offset", 0.0)
-    if abs(late) > _MOST_OFFSET_S:
-        table.fail(f"time_offset = {late:g} must be seconds, {_MOST_OFFSET_S:g} at most")
-    return late
-
-
 def scale_world(rig: Rig, metres: float) -> Rig:
     """Return the rig with translations multiplied by ``metres``; its projections do not change."""
     return Rig(tuple(replace(camera, translation=camera.translation * metres) for camera in rig))
 
 
-def _camera(key: str, values: Mapping[str, object], path: Path) -> Camera:
-    """Return the camera of a table, with its translation in the file's unit."""
+def _camera(key: str, values: Mapping[str, object], path: Path) -> tuple[Camera, float]:
+    """Return the camera of a table, with its translation in the file's unit, and its delay, seconds."""
     name = Table(values, f"{path}: camera {key!r}", CalibrationError).text("name", key)
     table = Table(values, f"{path}: camera {name!r}", CalibrationError)
 
@@ -229,7 +221,11 @@ def _camera(key: str, values: Mapping[str, object], path: Path) -> Camera:
             table.fail("distortions has 5 numbers; a fisheye lens has 4 (k1 k2 k3 k4)")
         distortions = distortions[:4]
 
-    return Camera(
+    late_s = table.number("time_offset", 0.0)
+    if abs(late_s) > _MOST_OFFSET_S:
+        table.fail(f"time_offset = {late_s:g} must be seconds, {_MOST_OFFSET_S:g} at most")
+
+    camera = Camera(
         name=name,
         width=int(size[0]),
         height=int(size[1]),
@@ -239,6 +235,7 @@ def _camera(key: str, values: Mapping[str, object], path: Path) -> Camera:
         translation=table.array("translation", (3,)),
         fisheye=fisheye,
     )
+    return camera, late_s
 
 
 def _rotation(table: Table) -> NDArray[np.float64]:

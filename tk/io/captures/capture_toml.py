@@ -125,12 +125,17 @@ def _subjects(document: Table) -> tuple[GivenSubject, ...]:
     )
 
 
-def _subject(table: Table) -> GivenSubject:
+def given_height(table: Table) -> float | None:
+    """Return the height in a table `[subject]`, metres; None without one."""
     height_m = table.number("height") if "height" in table else None
     if height_m is not None and not 0.3 <= height_m <= 3.0:
         table.fail(f"height = {height_m:g} must be between 0.3 and 3 metres")
+    return height_m
+
+
+def _subject(table: Table) -> GivenSubject:
     return GivenSubject(
-        height_m=height_m,
+        height_m=given_height(table),
         position=_triple(table.array("position", (3,))) if "position" in table else None,
         body=table.text("body", "") if "body" in table else None,
         init=table.text("init", "") if "init" in table else None,

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError
+from tk.io.captures.capture_toml import given_height
 from tk.io.toml import Table, load_toml
 from tk.model.body.skeleton import JOINTS
 from tk.model.setup import TRANSLATIONS, InitPose
@@ -35,9 +36,6 @@ LEAST_JOINTS = 6
 
 # across the line that fits the joints best, root of the sum of squares
 LEAST_SPREAD_M = 0.05
-
-# metres; the same for a height in capture.toml
-HEIGHT_RANGE_M = (0.3, 3.0)
 
 
 def spread_m(joints: Mapping[str, NDArray[np.float64]]) -> float:
@@ -60,10 +58,7 @@ def read_init_pose(path: str | Path, pose_names: tuple[str, ...]) -> InitPose:
     if not path.is_file():
         raise CaptureError(f"{path}: no such file; an initial pose is a TOML file with a [joints] or an [angles] table")
     table = Table(load_toml(path, CaptureError), str(path), CaptureError)
-    subject = table.table("subject")
-    height = subject.number("height") if "height" in subject else None
-    if height is not None and not HEIGHT_RANGE_M[0] <= height <= HEIGHT_RANGE_M[1]:
-        subject.fail(f"height = {height:g} must be between {HEIGHT_RANGE_M[0]:g} and {HEIGHT_RANGE_M[1]:g} metres")
+    height = given_height(table.table("subject"))
     frame = table.integer("frame", 0) if "frame" in table else None
     if frame is not None and frame < 0:
         table.fail(f"frame = {frame} must not be negative")

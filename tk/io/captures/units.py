@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,10 +68,7 @@ def infer_unit(centers: ArrayLike, default: str = "m") -> FoundUnit:
     others = [f"in {unit} it would be {distance * UNITS[unit]:.3g} m" for unit in possible if unit != name]
     return FoundUnit(
         name,
-        f"lengths are taken for {name}: the cameras are then up to {distance * UNITS[name]:.3g} m apart"
-        + _in_brackets([f"in {default} it would be {distance * UNITS[default]:.3g} m", *others]),
+        f"lengths are taken for {name}: the cameras are then up to {distance * UNITS[name]:.3g} m apart ("
+        + "; ".join([f"in {default} it would be {distance * UNITS[default]:.3g} m", *others])
+        + ")",
     )
-
-
-def _in_brackets(texts: Sequence[str]) -> str:
-    return f" ({'; '.join(texts)})" if texts else ""
