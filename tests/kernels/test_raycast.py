@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from tests.model.ring import ring_of_cameras
-from tk.kernels import runtime
 from tk.kernels.cones import CONE
 from tk.kernels.raycast import FAR, Cast, cast, nothing
 from tk.model.body import gait_poses as gait
@@ -154,9 +153,7 @@ def test_the_rest_may_be_cast_before():
             np.testing.assert_array_equal(before.label, rest.label[0], err_msg="what was before is not changed")
 
 
-@pytest.mark.parametrize("least", [0, 10**9], ids=["alone", "by threads"])
-def test_without_export_the_costs_are_the_same_and_in_any_batch(least, monkeypatch):
-    monkeypatch.setattr(runtime, "_LAUNCHES_ALONE", least)
+def test_without_export_the_costs_are_the_same_and_in_any_batch():
     with_labels, _ = cast_all(BODY, POSES, np.float32, export=True)
     without, nothing_else = cast_all(BODY, POSES, np.float32)
     assert nothing_else is None

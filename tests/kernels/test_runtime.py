@@ -4,12 +4,10 @@ import os
 import subprocess
 import sys
 import textwrap
-from collections import Counter
 
 import numpy as np
 import pytest
 
-from tk.kernels import runtime
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
 
@@ -141,13 +139,6 @@ def test_nan_and_infinity_keep_their_meaning():
 def test_importing_starts_nothing(module):
     code = f"import {module}; from tk.kernels.runtime import ti; print(ti.lang.impl.get_runtime().prog is None)"
     assert run(code) == ["True"]
-
-
-def test_a_variant_without_threads_is_made_after_many_launches_of_one_task(monkeypatch):
-    monkeypatch.setattr(runtime, "_LAUNCHES_ALONE", 2)
-    monkeypatch.setattr(runtime, "_alone", Counter())
-    assert [runtime.runs_alone("a", tasks) for tasks in (1, 7, 1, 1, 7, 1)] == [False, False, False, True, False, True]
-    assert not runtime.runs_alone("b", 1)
 
 
 @ti.kernel

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 
 from tests.model.ring import ring_of_cameras
 from tk.errors import ConfigError
-from tk.kernels import runtime, silhouette
+from tk.kernels import silhouette
 from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A, SIDE_B, curve_of, enter, point_on
 from tk.kernels.line_search import COLOR_BINS, SearchSettings, search_colors
 from tk.kernels.runtime import ensure_runtime, ti
@@ -304,9 +304,7 @@ def test_robust_weights_fall_with_the_distance():
     np.testing.assert_allclose(robust.weight, plain.weight / (1 + (plain.distance / 2) ** 2) ** 2, rtol=1e-9)
 
 
-@pytest.mark.parametrize("least", [0, 10**9], ids=["alone", "by threads"])
-def test_equations_are_the_same_every_time_and_in_any_batch(least, monkeypatch):
-    monkeypatch.setattr(runtime, "_LAUNCHES_ALONE", least)
+def test_equations_are_the_same_every_time_and_in_any_batch():
     poses = POSE + np.random.default_rng(1).normal(0, 0.03, (5, D))
     first = equations_of(BODY, MASKS, poses, SearchSettings(), np.float32)
     again = equations_of(BODY, MASKS, poses, SearchSettings(), np.float32)

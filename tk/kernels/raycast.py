@@ -18,7 +18,7 @@ from tk.kernels.cone_arrays import NEAREST_M, PART_DOF, ConeArrays, kind_of, pla
 from tk.kernels.cones import capsule, enter_unit, extent, interior_point
 from tk.kernels.kinematics import JOINT_NUMBERS, TREE_PARENT, forward_chain, load_rotation, load_translation
 from tk.kernels.projection import camera_center, project
-from tk.kernels.runtime import ensure_runtime, runs_alone, spread_of, ti
+from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.taichi_internals import Launcher
 from tk.kernels.vectors import norm2, norm_sqr, times
 
@@ -201,7 +201,7 @@ def first_part(
 
 
 @functools.cache
-def _cast_kernel(real, alone):
+def _cast_kernel(real):
     @ti.kernel
     def cast_rows(
         # the body
@@ -233,7 +233,6 @@ def _cast_kernel(real, alone):
     ):
         B, V, K, H, W = pose.shape[0], rays.shape[0], drawn.shape[0], rays.shape[1], rays.shape[2]
         # one thread handles a pose from end to end, see tk.kernels.silhouette
-        ti.loop_config(serialize=alone)
         for turn in range(spread * B):
             if turn % spread != 0:
                 continue
@@ -338,7 +337,7 @@ def cast(
     label, depth = np.empty(shape, np.uint8), np.empty(shape, np.float32)
     if export:
         label[:], depth[:] = before.label, before.depth
-    _cast_kernel(ti.f64 if dtype == np.float64 else ti.f32, runs_alone(__name__, B))(
+    _cast_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
         body.tree,
         body.parts,
         group,

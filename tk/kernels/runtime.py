@@ -17,7 +17,6 @@ import os
 import tempfile
 import time
 import warnings
-from collections import Counter
 from pathlib import Path
 
 from tk.kernels.taichi_internals import program, quick_decorators, quick_import, shorten_notes
@@ -60,7 +59,7 @@ with warnings.catch_warnings(), quick_import():
 
 quick_decorators(getattr(ti.lang, "kernel_impl", None))
 
-__all__ = ["ensure_runtime", "runs_alone", "spread_of", "ti"]
+__all__ = ["ensure_runtime", "spread_of", "ti"]
 
 # Turns of a loop that Taichi gives to a CPU thread at once; block_dim of loop_config does not change it (measured).
 _LEAST_TURNS = 512
@@ -70,11 +69,6 @@ _SHARES = 8
 # Age above which the lock on Taichi's cache of compiled kernels is stale, seconds: Taichi holds it for milliseconds, so
 # an older lock was left by a killed process.
 _STALE_S = 60.0
-# Launches of one task after which a variant without threads is compiled, per kernel. It takes 0.8 s for the tracker's
-# two kernels and saves up to 0.1 ms a launch. A lower number delays the first pose, a higher one moves the pause from
-# the first seconds of a live session to later ones. Affects speed only.
-_LAUNCHES_ALONE = 1000
-_alone: Counter[str] = Counter()
 
 
 def ensure_runtime() -> None:
@@ -135,16 +129,6 @@ def spread_of(tasks: int) -> int:
             task = turn // spread
     """
     return max(-(-_LEAST_TURNS * min(_SHARES * _threads(), tasks) // max(tasks, 1)), 1)
-
-
-def runs_alone(kernel: str, tasks: int) -> bool:
-    """Return whether a launch uses the kernel's variant that runs on the calling thread: if there is one task, and the
-    kernel has had many such launches. Waking the other threads takes 0.1 ms, compiling another variant 0.4 s.
-    """
-    if tasks > 1:
-        return False
-    _alone[kernel] += 1
-    return _alone[kernel] > _LAUNCHES_ALONE
 
 
 @functools.cache

@@ -31,7 +31,7 @@ from tk.kernels.cones import point_on, unscaled
 from tk.kernels.kinematics import forward_tree, load_rotation, load_translation
 from tk.kernels.line_search import COLOR_BINS, Regions, SearchSettings, in_picture, search_colors, search_mask
 from tk.kernels.projection import camera_center, project
-from tk.kernels.runtime import ensure_runtime, runs_alone, spread_of, ti
+from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.taichi_internals import Launcher
 from tk.kernels.vectors import cross, norm2, pulled, times, transposed_times
 from tk.kernels.wrench import (
@@ -189,7 +189,7 @@ def weigh_edgel(
 
 
 @functools.cache
-def _equations_kernel(real, alone):
+def _equations_kernel(real):
     @ti.kernel
     def silhouette_equations(
         # the body
@@ -221,8 +221,7 @@ def _equations_kernel(real, alone):
     ):
         B, V, Q = pose.shape[0], cameras.shape[0], curves.shape[0]
 
-        # one thread handles a pose from end to end: waking the threads takes 0.1 ms, a sixth of a pose's work
-        ti.loop_config(serialize=alone)
+        # one thread handles a pose from end to end; a variant without threads costs 0.4 s to compile and saves nothing
         for turn in range(spread * B):
             if turn % spread != 0:
                 continue
@@ -328,7 +327,7 @@ def _launch(
         raise ValueError(f"{len(masks)} masks of {V} views: one set, or one for each of {B} poses")
     sums, hessian = np.empty((B, GRADIENT + D)), np.zeros((B, D, D))
     samples = np.zeros((B * V * Q, settings.most_samples, _EXPORT) if export else (1, 1, _EXPORT), dtype)
-    _equations_kernel(ti.f64 if dtype == np.float64 else ti.f32, runs_alone(__name__, B))(
+    _equations_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
         *body,
         np.ascontiguousarray(cameras, dtype),
         np.ascontiguousarray(sizes, np.int32),
