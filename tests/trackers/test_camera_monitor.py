@@ -17,6 +17,7 @@ from tk.io.captures.capture import Capture, open_capture
 from tk.io.results.reader import read_joints
 from tk.model.body.joint_sigma import VIEW_M
 from tk.model.cameras.common_view import LEAST_INFORMATION, depth_information
+from tk.model.masks.mask_agreement import Agreement
 from tk.model.setup import Subject
 from tk.trackers.camera_monitor import CameraMonitor
 from tk.trackers.protocol import Estimate, Observation
@@ -202,11 +203,19 @@ def test_inconsistent_camera_is_excluded_from_the_opening(scene: Scene) -> None:
         assert not used.masks[2].any() and estimate.status != "lost"
     (line,) = monitor.report()
     assert "camera cam3 disagrees" in line and f"frames 0 to {FRAMES - 1}" in line
-    # the calibration of the other cameras is doubtful, too
-    assert isinstance(monitor.tracker, RegionTracker) and monitor.tracker.view_m > 1.5 * VIEW_M
-    sound = scene.monitor()
-    sound.start(scene.frames[:3])
-    assert isinstance(sound.tracker, RegionTracker) and sound.tracker.view_m == VIEW_M
+    assert isinstance(monitor.tracker, RegionTracker) and monitor.tracker.view_m == VIEW_M
+
+
+def test_sigma_counts_what_the_test_of_the_opening_tolerates(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    sigma = []
+    for undetected_m in (0.0, 0.04):
+        monkeypatch.setattr(Agreement, "undetected_m", undetected_m)
+        monitor = scene.monitor()
+        monitor.start(scene.frames[:3])
+        estimate, _ = monitor.step(blind([2, 3], range(FRAMES))(scene.frames[0]))
+        assert estimate.sigma is not None
+        sigma.append(np.median(estimate.sigma))
+    assert sigma[1] > 1.5 * sigma[0]
 
 
 def test_person_whose_size_contradicts_the_given_height_is_refused(scene: Scene) -> None:

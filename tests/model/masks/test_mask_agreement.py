@@ -21,6 +21,7 @@ from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume
 from tk.model.masks.mask_agreement import INCONSISTENT, Agreement, MaskAgreement, excess, largest_consistent
 from tk.model.masks.silhouettes import draw_silhouettes
+from tk.model.masks.tangency import Tangency
 
 
 def rig_of_heights(*heights_m: float) -> Rig:
@@ -109,10 +110,34 @@ def test_two_turned_cameras_of_five_are_both_wrong(masks: np.ndarray) -> None:
     assert sorted(found.wrong) == [0, 3] and found.refusal == ""
 
 
+def test_right_camera_with_a_single_partner_may_be_wrong_unnoticed(masks: np.ndarray) -> None:
+    found = compare(masks, turned(RIG, 2, 6.0))
+    assert found.wrong == (2,) and found.undetected_m == 0
+    error = found.tangency.error.copy()
+    error[1, [3, 4]] = error[[3, 4], 1] = np.nan
+    single = replace(found, tangency=replace(found.tangency, error=error))
+    assert 0.02 < single.undetected_m < 0.08
+    assert replace(single, wrong=()).undetected_m == 0
+
+
 def test_swapped_videos_are_named(masks: np.ndarray) -> None:
     found = compare(masks[:, [0, 3, 2, 1, 4]])
     assert sorted(found.wrong) == [1, 3] and found.swapped == (1, 3)
     assert found.reason(1) == "its video and that of c3 look swapped"
+
+
+@pytest.mark.parametrize(("facing", "expected"), [(False, (0, 1)), (True, None)])
+def test_swap_needs_two_tested_partners_of_each_camera(
+    monkeypatch: pytest.MonkeyPatch, facing: bool, expected: tuple[int, int] | None
+) -> None:
+    """Of three cameras, two of which face each other, exchanged videos agree by chance."""
+    error = np.zeros((3, 3, 2))
+    error[range(3), range(3)] = np.nan
+    if facing:
+        error[[0, 2], [2, 0]] = np.nan
+    exchanged = Tangency(error, np.full(3, 0.004), np.eye(3))
+    monkeypatch.setattr("tk.model.masks.mask_agreement.tangency", lambda *_: exchanged)
+    assert MaskAgreement(Rig(tuple(RIG)[:3]), VOLUME)._swapped([], [], [0, 1, 2]) == expected
 
 
 def test_two_cameras_that_contradict_each_other_are_refused(masks: np.ndarray) -> None:

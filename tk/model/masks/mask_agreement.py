@@ -94,9 +94,10 @@ class Agreement:
 
     @property
     def undetected_m(self) -> float:
-        """By how much the contours of a right camera may be displaced, metres: if a camera is wrong, the calibration of
-        the others is only as good as the test of their masks; 0 if none is wrong."""
-        if not self.wrong:
+        """By how much the contours of a right camera may be displaced, metres: if a camera is wrong, others may be too,
+        and one with a single tested partner may be wrong by what the test tolerates. 0 if there is none."""
+        partners = np.isfinite(self.tangency.worst[np.ix_(self.right, self.right)]).sum(axis=1)
+        if not self.wrong or not (partners == 1).any():
             return 0.0
         return float(self.extent_m * (TOLERANCE + 2 * np.nanmedian(self.tangency.pixel)))
 
@@ -210,8 +211,10 @@ class MaskAgreement:
                 views[a], views[b] = _outline(self.rig[a], masks[b]), _outline(self.rig[b], masks[a])
                 exchanged.append(views)
             error = excess(tangency(exchanged, self.rig.centers))
-            error = error[np.isfinite(error).any(axis=1)]
-            if len(error) > 2 and np.nanmedian(error, axis=1).max() <= 1.0:
+            known = np.isfinite(error)
+            error = error[known.any(axis=1)]
+            # one partner agrees by chance
+            if known[[a, b]].sum(axis=1).min() >= 2 and np.nanmedian(error, axis=1).max() <= 1.0:
                 found.append((float(np.nanmean(error)), (a, b)))
         return min(found)[1] if found else None
 
