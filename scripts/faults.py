@@ -37,6 +37,7 @@ import av
 import cv2
 import numpy as np
 import tomli_w
+import tomllib
 from numpy.typing import NDArray
 
 from scripts.synthetic.capture import write_calibration
@@ -105,12 +106,12 @@ class Faulty:
                 images.append(image)
         return images
 
-    def write(self, camera: int, images: Sequence[NDArray[np.uint8]]) -> None:
-        """Replace the camera's video by these images."""
+    def write(self, camera: int, images: Sequence[NDArray[np.uint8]], faster: int = 1) -> None:
+        """Replace the camera's video by these images, at ``faster`` times its rate."""
         path = self.video(camera)
         path.unlink()
         with av.open(str(path), "w") as container:
-            stream = container.add_stream("libx264", rate=Fraction(self.original.fps).limit_denominator(1000))
+            stream = container.add_stream("libx264", rate=faster * Fraction(self.original.fps).limit_denominator(1000))
             stream.height, stream.width = images[0].shape[:2]
             stream.pix_fmt = "yuv420p"
             stream.options = {"crf": "18", "preset": "veryfast"}
@@ -198,6 +199,20 @@ def cut(faulty: Faulty) -> None:
     for camera in range(len(faulty.original.rig)):
         video = faulty.images(camera)
         faulty.write(camera, video[: faulty.begin] + video[faulty.begin + CUT :])
+
+
+def wrong_fps(faulty: Faulty) -> None:
+    """Give twice the videos' rate in `capture.toml`."""
+    path = faulty.folder / "capture.toml"
+    settings = tomllib.loads(path.read_text(encoding="utf-8")) | {"fps": 2 * faulty.original.fps}
+    path.unlink()
+    path.write_text(tomli_w.dumps(settings), encoding="utf-8")
+
+
+def other_rate(faulty: Faulty) -> None:
+    """Record one camera at twice the rate of the others."""
+    images = faulty.images(faulty.camera)
+    faulty.write(faulty.camera, [image for image in images for _ in range(2)], faster=2)
 
 
 def bump(faulty: Faulty, angle_deg: float) -> None:
@@ -321,6 +336,8 @@ FAULTS: dict[str, Callable[[Faulty], None]] = {
     "facing cameras": facing_cameras,
     "swapped videos": swapped_videos,
     "cut": cut,
+    "wrong fps": wrong_fps,
+    "other rate": other_rate,
     "camera excluded": camera_excluded,
 }
 
