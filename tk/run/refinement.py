@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from tk.io.captures.capture import Capture
 from tk.io.captures.mask_store import MaskStore
 from tk.io.paths import check_output
 from tk.io.results.reader import read_result
+from tk.kernels.mask_values import OTHERS
 from tk.model.block_least_squares import Stop
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.agreement import LATE_FRAMES, CameraAgreement, camera_agreement
@@ -23,7 +24,7 @@ from tk.model.cameras.bundle import choose_frames
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.refinement import Refined, RefinementSettings, refine_cameras
 from tk.model.cameras.tracker_frame import TrackerFrame
-from tk.model.cues.ray_costs import Evidence, RayGrid
+from tk.model.cues.ray_costs import Evidence, RayGrid, residual_of
 from tk.model.masks.silhouettes import Views
 from tk.run.plan import reduce_images
 from tk.run.prefetch import open_observations
@@ -280,13 +281,18 @@ def whole_delays(
         return none
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, DELAY_FRAMES).round().astype(int))]
     grid, group = RayGrid(rig, SCREEN_ROWS), np.zeros(len(body.parts), np.int32)
+    sampled = cache(lambda frame: grid.sample(masks(frame)).copy())
+    bodies = []
+    for i in rows:
+        _, met = Evidence.of(grid, masks(int(frames[i]))).cast(body, group, poses[i][None], export=True)
+        assert met is not None
+        bodies.append(met.label[0] > 0)
 
     def wrong(n: int) -> Float:
         """Return (R, C) the shares of wrong pixels with masks of n frames before; NaN where they show nobody."""
-        shown = [Evidence.of(grid, masks(int(frames[i]) - n)) for i in rows]
-        cast = [e.cast(body, group, poses[i][None], export=True)[1] for e, i in zip(shown, rows, strict=True)]
-        shares = [e.residual(met.label[0]).sum(axis=1) for e, met in zip(shown, cast, strict=True) if met is not None]
-        return np.array(shares)
+        shown = [sampled(int(frames[i]) - n) for i in rows]
+        both = zip(bodies, shown, strict=True)
+        return np.array([residual_of(drawn, m >= 128, m == OTHERS).sum(axis=1) for drawn, m in both])
 
     def mean(shares: Float) -> Float:
         """Return (..., C) means over the frames in which shares (..., R, C) are known for every delay; 0 without."""
