@@ -127,7 +127,7 @@ def silhouette_stages(
 
     def fit(start: Float, pyramid: Pyramid) -> Float:
         return gauss_newton.minimise(
-            lambda states, scale: views.equations(body.arrays, pyramid, states, scale, LINE_SEARCH),
+            lambda states, scale, _: views.equations(body.arrays, pyramid, states, scale, LINE_SEARCH),
             start[None], *limits, SOLVER,
         )  # fmt: skip
 

@@ -323,7 +323,7 @@ def test_poses_may_each_have_a_frame_of_their_own():
         for several, one in zip(together, alone, strict=True):
             np.testing.assert_array_equal(several[k], one[0])
     assert not np.array_equal(together.gradient[:1], equations_of(BODY, masks[2], poses[:1], SearchSettings()).gradient)
-    with pytest.raises(ValueError, match="6 masks of 3 views: one set, or one for each of 3 poses"):
+    with pytest.raises(ValueError, match="6 masks of 3 views: one set, or one for each frame of the 3 poses"):
         equations_of(BODY, np.concatenate(masks[:2]), poses, SearchSettings())
 
 

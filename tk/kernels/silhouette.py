@@ -315,6 +315,7 @@ def _launch(
     settings: SearchSettings,
     export: bool,
     regions: Regions | None,
+    frames: NDArray[np.intp] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.floating]]:
     """Return sums (B, 3 + D), Hessian (B, D, D) and samples, see the kernel."""
     ensure_runtime()
@@ -323,8 +324,9 @@ def _launch(
     B, D = poses.shape
     V, Q, P = len(cameras), len(body.curves), len(body.parts)
     regions = regions or _no_regions(P)
-    if len(masks) not in (V, B * V):
-        raise ValueError(f"{len(masks)} masks of {V} views: one set, or one for each of {B} poses")
+    frames = np.zeros(B, np.int32) if len(masks) == V else np.arange(B) if frames is None else frames
+    if frames.max() >= len(masks) // V:
+        raise ValueError(f"{len(masks)} masks of {V} views: one set, or one for each frame of the {B} poses")
     sums, hessian = np.empty((B, GRADIENT + D)), np.zeros((B, D, D))
     samples = np.zeros((B * V * Q, settings.most_samples, _EXPORT) if export else (1, 1, _EXPORT), dtype)
     _equations_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
@@ -332,7 +334,7 @@ def _launch(
         np.ascontiguousarray(cameras, dtype),
         np.ascontiguousarray(sizes, np.int32),
         np.ascontiguousarray(masks),
-        _all_of(B) if len(masks) > V else _zeros(B),
+        frames.astype(np.int32),
         regions.image,
         regions.log_likelihood,
         regions.group,
@@ -347,16 +349,6 @@ def _launch(
     return sums, hessian, samples
 
 
-@functools.cache
-def _all_of(count: int) -> NDArray[np.int32]:
-    return np.arange(count, dtype=np.int32)
-
-
-@functools.cache
-def _zeros(count: int) -> NDArray[np.int32]:
-    return np.zeros(count, dtype=np.int32)
-
-
 @functools.lru_cache(64)
 def _numbers(s: SearchSettings, scale: float, weight: float, export: bool, dtype: np.dtype) -> NDArray[np.floating]:
     """Pack the settings in the order from SCALE to EXPORT."""
@@ -364,7 +356,7 @@ def _numbers(s: SearchSettings, scale: float, weight: float, export: bool, dtype
     return np.array((*pixels, weight, s.most_samples, s.interior, export), dtype)
 
 
-@functools.lru_cache(8)
+@functools.lru_cache(32)
 def _scratch(B: int, V: int, Q: int, D: int, P: int, dtype: np.dtype) -> tuple[NDArray, ...]:
     return (
         np.empty((B, D, PULL + PULL_NUMBERS), dtype),
@@ -390,6 +382,7 @@ def normal_equations(
     poses: np.ndarray,
     settings: SearchSettings,
     regions: Regions | None = None,
+    frames: NDArray[np.intp] | None = None,
 ) -> NormalEquations:
     """Search the silhouettes from B poses and return the normal equations (eqs. 9-11 of the silhouette paper).
 
@@ -398,17 +391,17 @@ def normal_equations(
         cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_camera`, of the full picture.
         sizes: (V, 2) width and height of each camera's mask at this scale.
         masks: (V, H, W) uint8 at this scale, values between 0 and 255 where a pixel is partly covered,
-            :data:`~tk.kernels.mask_values.OTHERS` where it shows another person; or (B V, H, W), one frame for each
-            pose.
+            :data:`~tk.kernels.mask_values.OTHERS` where it shows another person; or (F V, H, W) of F frames.
         scale: pixels of the full picture in one of this scale (1, 2, …).
         poses: (B, D).
         settings: see :class:`SearchSettings`.
         regions: colours of the parts, for contours inside the silhouette; None ignores colours.
+        frames: (B,) which of the F frames each pose is in; None: pose b is in frame b.
 
     Raises:
-        ValueError: the number of masks fits neither.
+        ValueError: a pose is in a frame that has no masks.
     """
-    sums, hessian, _ = _launch(body, cameras, sizes, masks, scale, poses, settings, False, regions)
+    sums, hessian, _ = _launch(body, cameras, sizes, masks, scale, poses, settings, False, regions, frames)
     weight = sums[:, ALL]
     seen = weight > 0
     safe = np.where(seen, weight, 1.0)

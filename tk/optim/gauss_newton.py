@@ -115,7 +115,7 @@ class BatchSolution(NamedTuple):
 
 
 def minimise(
-    equations: Callable[[Float, int], Equations],
+    equations: Callable[[Float, int, NDArray[np.intp]], Equations],
     start: Float,
     free: NDArray[np.bool_],
     lower: Float,
@@ -127,7 +127,8 @@ def minimise(
     """Iterate from B states at once; each state's result is independent of the others.
 
     Args:
-        equations: the normal equations at states (B, D) and a scale's index, 0 the finest.
+        equations: the normal equations at states (N, D), a scale's index, 0 the finest, and the rows (N,) of ``start``
+            that these states come from: states that have converged at a scale are left out.
         start: (B, D).
         free: (D,) parameters that may change.
         lower, upper: (D,) limits; infinite without a limit.
@@ -142,15 +143,15 @@ def minimise(
     scales = range(config.scales - 1, -1, -1) if levels is None else levels
     iterations = np.zeros(len(scales), np.int32)
     for i, scale in enumerate(scales):
-        moving = np.ones(len(state), np.bool_)  # states do not depend on each other
+        rows = np.arange(len(state))  # states do not depend on each other
         for share in config.steps(scale):
-            here = equations(state, scale)
-            step = share * parameters.step(here.hessian, here.gradient, state)
-            state[:, parameters.index] += np.where(moving[:, None], step, 0.0)
-            hessian[moving] = here.hessian[moving]
+            here = equations(state[rows], scale, rows)
+            step = share * parameters.step(here.hessian, here.gradient, state, rows)
+            state[rows[:, None], parameters.index] += step
+            hessian[rows] = here.hessian
             iterations[i] += 1
-            moving &= np.abs(step).max(axis=1, initial=0.0) > config.tolerance
-            if not moving.any():
+            rows = rows[np.abs(step).max(axis=1, initial=0.0) > config.tolerance]
+            if not len(rows):
                 break
     return BatchSolution(state, hessian, iterations)
 
@@ -165,14 +166,14 @@ class _FreeParameters:
         self._rows = index[:, None]
         self._lower, self._upper = lower[index], upper[index]
         self._config = config
-        self._known = None if prior is None else (prior.mean[..., index], prior.precision[index])
+        self._known = None if prior is None else (np.atleast_2d(prior.mean)[:, index], prior.precision[index])
 
-    def step(self, hessian: Float, gradient: Float, state: Float) -> Float:
-        """Return one damped step (B, n) of each state (B, D), limits included."""
+    def step(self, hessian: Float, gradient: Float, states: Float, rows: NDArray[np.intp]) -> Float:
+        """Return one damped step (N, n) of rows (N,) of the states (B, D), limits included."""
         config = self._config
         H = hessian[:, self._rows, self.index]
         g = gradient[:, self.index]
-        p = state[:, self.index]
+        p = states[rows[:, None], self.index]
         diagonal = np.einsum("bii->bi", H)  # a view
         count = np.count_nonzero(diagonal > 0, axis=1)
         unit = diagonal.sum(axis=1) / np.maximum(count, 1)
@@ -184,6 +185,7 @@ class _FreeParameters:
         added = config.damping * diagonal + (config.stiffness + 1e-9) * unit + pull * (excess != 0)
         if self._known is not None:
             mean, precision = self._known
+            mean = mean if len(mean) == 1 else mean[rows]
             added += precision
             g += precision * (mean - p)
         diagonal += added

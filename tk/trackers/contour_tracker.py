@@ -374,7 +374,7 @@ class ContourTracker:
         arrays, free = (limb.arrays, limb.free) if limb else (body.arrays, body.free)
         regions = None if images is None else self.colors.regions(images)
         return gauss_newton.minimise(
-            lambda states, scale: self.views.equations(arrays, pyramid, states, scale, self.line_search, regions),
+            lambda *at: self.views.equations(arrays, pyramid, at[0], at[1], self.line_search, regions, at[2]),
             poses,
             free,
             body.skeleton.lower,

@@ -118,8 +118,10 @@ class Views:
         scale: int,
         settings: SearchSettings,
         regions: Regions | None = None,
+        frames: NDArray[np.intp] | None = None,
     ) -> NormalEquations:
-        """Return normal equations of poses (B, D) at a scale's index, all in one frame or one frame each."""
+        """Return normal equations of poses (B, D) at a scale's index. The pyramid is of one frame, or of several, of
+        which ``frames`` (B,) are the poses'; None: each pose has its own."""
         return kernels.normal_equations(
             body,
             self._cameras32,
@@ -129,6 +131,7 @@ class Views:
             poses,
             settings,
             regions,
+            frames,
         )
 
     def edgels(self, body: ConeBody, pyramid: Pyramid, pose: Float, scale: int, settings: SearchSettings) -> Edgels:
