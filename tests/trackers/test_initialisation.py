@@ -125,6 +125,7 @@ def test_poses_with_similar_residuals_in_one_frame_all_become_hypotheses(monkeyp
         tracker, "settle", lambda _, starts, *__: BatchSolution(np.array(starts), np.zeros(0), np.zeros(3, np.int32))
     )
     monkeypatch.setattr("tk.trackers.initialisation.gait.hypotheses", lambda *_: np.array([wrong, right]))
+    monkeypatch.setattr("tk.trackers.initialisation.REFINED", 1)
     monkeypatch.setattr("tk.trackers.initialisation._searched", lambda _, __, ___, pose: pose)
     residuals = {False: 0.21, True: 0.22}
     monkeypatch.setattr(
