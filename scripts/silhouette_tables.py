@@ -49,7 +49,7 @@ class Variant:
 
 OURS = Variant(SilhouetteSettings(), LINE_SEARCH, SOLVER)
 PAPER = Variant(
-    SilhouetteSettings(prediction=0.0, search_every=0),
+    SilhouetteSettings(prediction=0.0, search_every=0.0),
     SearchSettings(interior=True, ambiguous_px=8.0, tangential=1.0, spacing_px=1.0, robust_px=0.0),
     GaussNewtonSettings(scales=2),
 )

@@ -164,7 +164,7 @@ class SilhouetteSettings:
             it found as good; half of the motion helps when arms and legs swing).
         adapt: whether the body is fitted to the silhouettes.
         init_frames: frames that the initialisation looks at; a stride is about one second.
-        search_every: frames between two routine limb searches, 0: none; --method region also searches on evidence.
+        search_every: seconds between two routine limb searches, 0: none; --method region also searches on evidence.
         lost_error: a frame is lost if its E_S, averaged over the views, exceeds this.
     """
 
@@ -172,14 +172,14 @@ class SilhouetteSettings:
     prediction: float = 0.5
     adapt: bool = True
     init_frames: int = 24
-    search_every: int = 10
+    search_every: float = 0.7
     lost_error: float = 0.6
     fit: BodyFitSettings = field(default_factory=BodyFitSettings)
 
     def __post_init__(self) -> None:
         if self.body not in BODIES:
             raise ConfigError(f'silhouette.body = "{self.body}": choose one of {", ".join(BODIES)}')
-        _check("silhouette", self, init_frames=(1, 1000), search_every=(0, 1e6), prediction=(0, 1.5))
+        _check("silhouette", self, init_frames=(1, 1000), search_every=(0, 5), prediction=(0, 1.5))
         if not 0 < self.lost_error <= 10:
             raise ConfigError(f"silhouette.lost_error = {self.lost_error} must lie in (0, 10]")
 

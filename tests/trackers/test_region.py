@@ -27,7 +27,7 @@ RIG = ring_of_cameras(3, width=160, height=200)
 SKELETON = BODY.skeleton
 # A pixel is 1.4 cm wide at the subject; a joint rests on dozens of edgels in three views.
 CLOSE_M = 0.025
-SETTINGS = SilhouetteSettings(adapt=False, search_every=0)
+SETTINGS = SilhouetteSettings(adapt=False, search_every=0.0)
 
 
 def with_arm(pose: np.ndarray, side: str, direction: tuple[float, float, float], elbow_deg: float) -> np.ndarray:
@@ -64,7 +64,7 @@ def tracker_at(
 
 
 def test_walk_is_tracked_and_a_resumed_run_is_the_same() -> None:
-    tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=3))
+    tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=0.2))
     estimates = []
     for i, masks in enumerate(MASKS):
         estimates.append(tracker.step(observe(masks, i)))
@@ -114,7 +114,7 @@ def test_limb_search_finds_an_arm_that_has_jumped() -> None:
     for every in (0, 1):
         # without the search the arm stays in its old pose
         config = RegionSettings(false_alarm=0.4 if every else 1e-9)
-        tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=every), config=config)
+        tracker = tracker_at(POSES[0], contours=replace(SETTINGS, search_every=every / 15), config=config)
         tracker.step(observe(MASKS[0]))
         for i in range(1, 4):
             found[every] = tracker.step(observe(masks[i], i))

@@ -40,7 +40,7 @@ def test_limb_search_recovers_a_displaced_arm(angles: tuple[float, ...], tmp_pat
     names = ("shoulder_l_yaw", "shoulder_l_pitch", "shoulder_l_roll", "elbow_l_flexion")
     wrong[[tracker.skin.skeleton.index(name) for name in names]] = angles
     off = {}
-    due = config.silhouette.search_every
+    due = tracker._finder.search_frames
     for index in (due, due + 1):
         tracker.restore(model, {**state, "pose": wrong, "previous": wrong})
         off[index] = errors(tracker.step(observe(masks, index, images)), pose)[JOINTS.index("wrist_l")]

@@ -92,6 +92,7 @@ class ContourTracker:
         rig: the cameras.
         up: the upward direction of their world, see :func:`tk.model.cameras.up.up_vector`.
         config: see :class:`~tk.settings.SilhouetteSettings`.
+        fps: frames per second.
         line_search: how edges are searched along the contours' normals.
         solver: scales and iterations of Gauss-Newton.
     """
@@ -109,11 +110,12 @@ class ContourTracker:
         rig: Rig,
         up: str,
         config: SilhouetteSettings,
+        fps: float = 15.0,
         line_search: SearchSettings = LINE_SEARCH,
         solver: GaussNewtonSettings = SOLVER,
     ) -> None:
         self.contours, self.line_search, self.solver = config, line_search, solver
-        self.rig, self.up = rig, up
+        self.rig, self.up, self.fps = rig, up, fps
         self.world = TrackerFrame.of(rig, up)
         self.views = Views(self.world.rig)
         self.screen, self.choice = (RayGrid(self.world.rig, rows) for rows in (SCREEN_ROWS, CHOICE_ROWS))
@@ -124,6 +126,12 @@ class ContourTracker:
         self._lost_for = 0
         self.colors: PartColors
         self.limbs: tuple[Limb, ...]
+
+    @property
+    def search_frames(self) -> int:
+        """Frames between two routine limb searches; 0: none."""
+        seconds = self.contours.search_every
+        return max(int(seconds * self.fps), 1) if seconds else 0
 
     @property
     def opening_frames(self) -> int:

@@ -202,7 +202,7 @@ def _follow(
         return tracker.mean_residual(pyramids[i], poses, frames[i].uncertain)
 
     residuals[:, anchor] = residual_of(anchor, poses[:, anchor])
-    every = tracker.contours.search_every
+    every = tracker.search_frames
     for step, end in ((1, F), (-1, -1)):
         for i in range(anchor + step, end, step):
             last = poses[:, i - step]

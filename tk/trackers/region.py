@@ -84,12 +84,17 @@ class RegionTracker(ContourTracker):
     @classmethod
     def of(cls, setup: Setup, settings: Settings) -> RegionTracker:
         """Return a new tracker with the settings of this method."""
-        return cls(setup.rig, setup.up, settings.silhouette, settings.region)
+        return cls(setup.rig, setup.up, settings.silhouette, settings.region, setup.fps)
 
     def __init__(
-        self, rig: Rig, up: str, contours: SilhouetteSettings | None = None, config: RegionSettings | None = None
+        self,
+        rig: Rig,
+        up: str,
+        contours: SilhouetteSettings | None = None,
+        config: RegionSettings | None = None,
+        fps: float = 15.0,
     ) -> None:
-        super().__init__(rig, up, contours or SilhouetteSettings())
+        super().__init__(rig, up, contours or SilhouetteSettings(), fps)
         self.config = config or RegionSettings()
         self._alive: list[Hypothesis] = []
         self._mean_posture: Float = np.zeros((len(JOINTS), 3))
@@ -287,7 +292,7 @@ class RegionTracker(ContourTracker):
 
     def _needs_search(self, frame: Observation, high: bool, misplaced: Sequence[Limb]) -> bool:
         """Return whether the limbs are searched for: at intervals, if the residual is high or a limb is misplaced."""
-        every = self.contours.search_every
+        every = self.search_frames
         due = every > 0 and frame.index % every == 0
         return self.contours.body != "walker" and (due or high or bool(misplaced))
 
@@ -460,7 +465,7 @@ class RegionTracker(ContourTracker):
 
     def with_cameras(self, rig: Rig) -> RegionTracker:
         """Return a tracker of the same body and colours with other cameras."""
-        fresh = RegionTracker(rig, self.up, self.contours, self.config)
+        fresh = RegionTracker(rig, self.up, self.contours, self.config, self.fps)
         fresh.take_body(self.body)
         fresh.view_m = self.view_m
         fresh.colors.restore(self.colors.state())

@@ -38,7 +38,7 @@ class SilhouetteTracker(ContourTracker):
     @classmethod
     def of(cls, setup: Setup, settings: Settings) -> SilhouetteTracker:
         """Return a new tracker with the settings of this method."""
-        return cls(setup.rig, setup.up, settings.silhouette)
+        return cls(setup.rig, setup.up, settings.silhouette, fps=setup.fps)
 
     def __init__(
         self,
@@ -47,8 +47,9 @@ class SilhouetteTracker(ContourTracker):
         config: SilhouetteSettings | None = None,
         line_search: SearchSettings = LINE_SEARCH,
         solver: GaussNewtonSettings = SOLVER,
+        fps: float = 15.0,
     ) -> None:
-        super().__init__(rig, up, config or SilhouetteSettings(), line_search, solver)
+        super().__init__(rig, up, config or SilhouetteSettings(), fps, line_search, solver)
         self.stages = tuple(f"scale_{i}" for i in reversed(range(solver.scales)))
         self._pose = self._previous = np.zeros(len(self.pose_names))
         self._lost_for = 0
@@ -76,7 +77,7 @@ class SilhouetteTracker(ContourTracker):
         settled = self.settle(pyramid, start[None])
         pose = settled.states[0]
         watch.lap("optimise")
-        if config.search_every and frame.index % config.search_every == 0:
+        if self.search_frames and frame.index % self.search_frames == 0:
             pose = self.improved(_blind(frame), pyramid, pose)
         error = float(self.mean_residual(pyramid, pose[None], frame.uncertain)[0])
         # after a loss a pose near the last one may fit by chance

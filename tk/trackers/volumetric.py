@@ -122,15 +122,17 @@ class VolumetricTracker:
     @classmethod
     def of(cls, setup: Setup, settings: Settings) -> VolumetricTracker:
         """Return a new tracker with the settings of this method."""
-        return cls(setup.rig, setup.volume, setup.up, settings)
+        return cls(setup.rig, setup.volume, setup.up, settings, fps=setup.fps)
 
-    def __init__(self, rig: Rig, volume: Volume, up: str, config: Settings, cache_dir: Path | None = None) -> None:
+    def __init__(
+        self, rig: Rig, volume: Volume, up: str, config: Settings, cache_dir: Path | None = None, fps: float = 15.0
+    ) -> None:
         self.config = config
         self.effort = Effort.of(config.effort_factor)
         self.up = up
         self.rig = rig
         self.hull = VisualHull(rig, VoxelGrid.cover(volume, config.voxels), cache_dir)
-        self._finder = ContourTracker(rig, up, replace(config.silhouette, body="full"))
+        self._finder = ContourTracker(rig, up, replace(config.silhouette, body="full"), fps)
         skeleton = build_skeleton(BodyDimensions.from_stature(1.7), up, (WAIST,) if config.body.waist else ())
         self.pose_names, self.pose_units = skeleton.names, skeleton.units
         self.skin: SuperellipsoidBody
@@ -214,7 +216,7 @@ class VolumetricTracker:
         problem = FrameObjective(self._objective, index, rng, images=frame.images)
         # (2) all degrees of freedom at ε₁, (3) five chains at ε₂ (section 6.4)
         result = self.optimise(problem, self._starts(surface))
-        every = config.silhouette.search_every
+        every = self._finder.search_frames
         if every and frame.index % every == 0:
             result = self._search_limbs(frame, problem, result)
         fit = problem.fit(result.pose)
