@@ -120,17 +120,21 @@ def _area(outline: NDArray[Any]) -> float:
     return cv2.contourArea(outline) + len(outline) / 2 + 1
 
 
-def clean_by_area(mask: Mask, speck: float, hole: float) -> Images:
+def clean_by_area(mask: Mask, speck: float, hole: float, relative: bool = False) -> Images:
     """Remove parts (8-connected) of less than ``speck`` pixels and fill holes (4-connected) of less than ``hole``.
 
-    A part is removed with everything inside its outline.
+    A part is removed with everything inside its outline. ``relative``: the sizes are shares of the largest part's area.
 
     Returns:
         (h, w) uint8, 0 or 255.
     """
     clean = mask.view(np.uint8) * np.uint8(255)
     outer, inner = _outlines(clean)
-    _mend(clean, inner, hole, [outline for outline in outer if _area(outline) < speck], 255)
+    areas = [_area(outline) for outline in outer]
+    unit = max(areas, default=1.0) if relative else 1.0
+    _mend(
+        clean, inner, hole * unit, [each for each, area in zip(outer, areas, strict=True) if area < speck * unit], 255
+    )
     return clean
 
 

@@ -36,13 +36,9 @@ def clean(mask: Masks) -> Masks:
     if box[2] == 0:
         return mask
     x, y, width, height = box
-    part = mask[y : y + height, x : x + width] >= 128
-    contours, _ = cv2.findContours(part.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    if not contours:
-        return np.zeros_like(mask)
-    largest = max(cv2.contourArea(contour) + len(contour) / 2 + 1 for contour in contours)
     result = np.zeros_like(mask)
-    result[y : y + height, x : x + width] = clean_by_area(part, SPECK_SHARE * largest, HOLE_SHARE * largest)
+    part = mask[y : y + height, x : x + width] >= 128
+    result[y : y + height, x : x + width] = clean_by_area(part, SPECK_SHARE, HOLE_SHARE, relative=True)
     return result
 
 
