@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,16 +52,15 @@ class ImageHealth:
         small = masks[:, step // 2 :: step, step // 2 :: step] >= 128
         given = images.size > 0
         # the green channel suffices
-        shown = images[:, step // 2 :: step, step // 2 :: step, 1] if given else small * np.uint8(255)
+        shown = images[:, step // 2 :: step, step // 2 :: step, 1].copy() if given else small * np.uint8(255)
         found: list[str | None] = [None] * C
         if given:
-            for c in range(C):
-                if shown[c].std() < _BLANK_LEVELS:
-                    found[c] = BLANK
+            for c in np.flatnonzero(shown.reshape(C, -1).std(axis=1) < _BLANK_LEVELS).tolist():
+                found[c] = BLANK
         if self._references is None or self._masks is None or self._references.shape != shown.shape:
-            self._references, self._masks = shown.copy(), np.repeat(small[None], C, axis=0)
+            self._references, self._masks = shown, np.repeat(small[None], C, axis=0)
             return found
-        differs = np.abs(shown.astype(np.int16) - self._references) > _SAME_LEVELS
+        differs = cv2.absdiff(shown, self._references) > _SAME_LEVELS
         still = differs.reshape(C, -1).mean(axis=1) <= _SAME_SHARE
         for c in range(C):
             if not still[c]:
