@@ -78,7 +78,7 @@ class Member:
     drawn: NDArray[np.bool_] | None = None
 
 
-@dataclass
+@dataclass(eq=False)  # a hull is an array: bystanders are compared by identity
 class Bystander:
     """A person who is not tracked, or not yet.
 
