@@ -9,6 +9,7 @@ import fcntl
 import os
 import re
 import shutil
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -31,6 +32,9 @@ hypothesis.settings.load_profile("same")
 if "PYTEST_XDIST_WORKER" in os.environ:  # set before any kernel runs; results do not depend on the number of threads
     _cores = len(os.sched_getaffinity(0))
     os.environ.setdefault("TK_THREADS", str(max(_cores // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]), 1)))
+
+# a shell that starts the tests in the background makes them ignore Ctrl-C, and their child processes, too
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 FRAMES = 14
 
