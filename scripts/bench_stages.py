@@ -123,7 +123,7 @@ def silhouette_stages(
     assert rest is not None
     others = Cast(rest.label[0], rest.depth[0])
     here = views.equations(body.arrays, last, pose, 0, LINE_SEARCH)
-    limits = body.free, body.skeleton.lower, body.skeleton.upper
+    limits = None, body.skeleton.lower, body.skeleton.upper
 
     def fit(start: Float, pyramid: Pyramid) -> Float:
         return gauss_newton.minimise(

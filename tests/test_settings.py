@@ -99,7 +99,6 @@ def test_settings_missing_in_a_file_keep_their_default() -> None:
         ("tracking = " + 3000 * "[", ["invalid TOML"]),
         ("[silhouette]\ninit_frames = 1000000000\n", ["silhouette.init_frames = 1000000000 is too large"]),
         ("[foreground]\nshadow_min = 1.5", ["foreground.shadow_min = 1.5"]),
-        ("[silhouette]\nbody = 'robot'\n", ["silhouette.body", "robot", "full, limbs, walker"]),
         ("[objective]\nsurface_weight = -1.0\n", ["objective.surface_weight = -1"]),
         ("[contours]\nviews = 0\n", ["contours.views = 0"]),
         ("[contours]\nthreshold = 1e300\n", ["contours.threshold = 1e+300 is too large"]),

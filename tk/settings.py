@@ -12,7 +12,6 @@ from typing import Any
 from tk.errors import ConfigError
 
 SEGMENTATIONS = ("collinearity", "mog2")
-BODIES = ("full", "limbs", "walker")
 EFFORTS = {"fast": 0.5, "normal": 1.0, "thorough": 5.0}
 
 #: largest count in a settings file: frames, points, iterations
@@ -158,8 +157,6 @@ class SilhouetteSettings:
     are searched.
 
     Attributes:
-        body: "full" (13 segments, 31 degrees of freedom), "limbs" (10 segments, the paper's 24) or "walker" (the
-            silhouette paper's 6 segments and 7 degrees of freedom).
         prediction: share of the last frame's motion that is predicted for the next one (the silhouette paper: 0, which
             it found as good; half of the motion helps when arms and legs swing).
         adapt: whether the body is fitted to the silhouettes.
@@ -168,7 +165,6 @@ class SilhouetteSettings:
         lost_error: a frame is lost if its E_S, averaged over the views, exceeds this.
     """
 
-    body: str = "full"
     prediction: float = 0.5
     adapt: bool = True
     init_frames: int = 24
@@ -177,8 +173,6 @@ class SilhouetteSettings:
     fit: BodyFitSettings = field(default_factory=BodyFitSettings)
 
     def __post_init__(self) -> None:
-        if self.body not in BODIES:
-            raise ConfigError(f'silhouette.body = "{self.body}": choose one of {", ".join(BODIES)}')
         _check("silhouette", self, init_frames=(1, 1000), search_every=(0, 5), prediction=(0, 1.5))
         if not 0 < self.lost_error <= 10:
             raise ConfigError(f"silhouette.lost_error = {self.lost_error} must lie in (0, 10]")

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from tests.export.conftest import FPS, FRAMES, LOST, Write
+from tests.model.figures import surface_points
 from tk.export import export, read_motion
 from tk.io.results.reader import read_result
 from tk.kernels.cones import CONE
@@ -106,7 +107,7 @@ def test_the_skinned_mesh_lies_on_the_body(write: Write) -> None:
     angle, z = np.meshgrid(np.linspace(-np.pi, np.pi, 60), np.linspace(0, 1, 9))
     unscaled = np.stack([np.cos(angle), np.sin(angle), z], axis=-1).reshape(-1, 3)
     cones = [p for p, part in enumerate(body.parts) if part.kind == CONE]
-    sampled = {p: body.place(tracked[f], np.full(len(unscaled), p), unscaled) for p in cones}
+    sampled = {p: surface_points(body, tracked[f], np.full(len(unscaled), p), unscaled) for p in cones}
     file = load(export(path, ["gltf"]).files[0])
     T = frame_transforms(file, f)
     (skin,), (mesh,) = file.skins, file.meshes

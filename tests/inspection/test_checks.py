@@ -81,7 +81,7 @@ def test_inspect_and_track_name_swapped_videos(tk: Tk, copy: Path, tmp_path: Pat
 def test_delay_of_a_video_is_found_in_frames(tk: Tk, tmp_path: Path) -> None:
     """The masks are rendered; those of one camera are three frames ahead."""
     rig, count, late = ring_of_cameras(4, 160, 120), 24, 3
-    body = build_cone_body(BodyDimensions.from_stature(1.75), "z", "full")
+    body = build_cone_body(BodyDimensions.from_stature(1.75))
     poses = []
     for i in range(count + late):
         pose = gait.walking_pose(body.skeleton, i / 15 % 1)

@@ -27,7 +27,7 @@ RIG = ring_of_cameras(4, 160, 120)
 
 def write_walkers(folder: Path, ways: list[list[tuple[float, float]]]) -> None:
     """Write a capture of people who walk from the first to the last point of their ways."""
-    body = build_cone_body(BodyDimensions.from_stature(1.75), "z", "full")
+    body = build_cone_body(BodyDimensions.from_stature(1.75))
     masks = np.zeros((FRAMES, len(RIG), 120, 160), bool)
     for way in ways:
         poses = []

@@ -61,7 +61,7 @@ def place(local, segment, poses):
     s, dtype = SKELETON, poses.dtype
     world = np.empty((len(poses), len(local), 3), dtype)
     _place_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
-        kinematics.pack_tree(s.axis, s.anchor, s.prismatic, s.parent).astype(dtype),
+        s.tree.astype(dtype),
         np.ascontiguousarray(local, dtype),
         s.segment_dof[segment].astype(np.int32),
         np.ascontiguousarray(poses),
@@ -159,17 +159,17 @@ def test_velocity_of_a_point_is_the_derivative_of_its_place(seed):
     pose, (local, segment) = poses_of(rng, 1)[0], points_of(rng, 12)
     s = SKELETON
     joints = np.empty((1, D, kinematics.JOINT_NUMBERS))
-    tree = kinematics.pack_tree(s.axis, s.anchor, s.prismatic, s.parent)
+    tree = s.tree
     _twists(tree, np.arange(D, dtype=np.int32), pose[None], joints)
     w, v = np.split(joints[0, :, kinematics.TWIST :], 2, axis=1)
     velocities = np.cross(w, place(local, segment, pose[None])[0][:, None]) + v
     h = 1e-6
     steps = h * np.eye(D)
     numeric = (place(local, segment, pose + steps) - place(local, segment, pose - steps)) / (2 * h)
-    above = s.ancestors()[segment]
+    above = s.ancestors[segment]
     np.testing.assert_allclose(velocities[above], numeric.transpose(1, 0, 2)[above], rtol=0, atol=1e-8)
     np.testing.assert_array_equal(numeric.transpose(1, 0, 2)[~above], 0)
-    chain = np.flatnonzero(s.ancestors()[segment[0]]).astype(np.int32)
+    chain = np.flatnonzero(s.ancestors[segment[0]]).astype(np.int32)
     some = np.full_like(joints, np.nan)
     _twists(tree, chain, pose[None], some)
     np.testing.assert_array_equal(some[:, chain], joints[:, chain])

@@ -5,18 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.model.figures import BODY
 from tests.model.ring import ring_of_cameras
 from tk.kernels.cones import CONE
 from tk.kernels.raycast import FAR, Cast, cast, nothing
 from tk.model.body import gait_poses as gait
-from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.cone_body import ConeBody, build_cone_body
+from tk.model.body.cone_body import ConeBody
 from tk.model.body.skeleton import CHAINS, SEGMENTS
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import GROUPS, PartColors
 from tk.model.masks.silhouettes import pack_rig, pixel_rays
 
-BODY = build_cone_body(BodyDimensions.from_stature(1.75))
 GROUP = PartColors(BODY).group
 RIG = ring_of_cameras(3, width=160, height=200)
 STEP = 4

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
+from tests.model.figures import BODY, scaled, surface_points
 from tests.model.ring import ring_of_cameras
 from tk.errors import ConfigError
 from tk.kernels import silhouette
@@ -16,15 +17,13 @@ from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A
 from tk.kernels.line_search import COLOR_BINS, SearchSettings, search_colors
 from tk.kernels.runtime import ensure_runtime, ti
 from tk.model.body import gait_poses as gait
-from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.cone_body import build_cone_body
 from tk.model.cameras.camera import Rig
 from tk.model.masks.silhouettes import Views, draw_silhouettes
 
-BODY = build_cone_body(BodyDimensions.from_stature(1.75))
 D = len(BODY.skeleton.names)
-FAMILY = BodyFamily("full", BODY.dimensions, 0.01)
+FAMILY = BodyFamily(BODY.dimensions, 0.01)
 few = settings(max_examples=30, deadline=None)
 sizes = st.floats(0.03, 0.4)
 
@@ -204,7 +203,7 @@ def test_equations_are_the_sums_of_the_edgels_rows():
 def test_rows_are_the_normals_of_the_picture_in_the_world():
     edgels = edgels_of(BODY, MASKS, POSE, PLAIN)
     np.testing.assert_allclose(np.linalg.norm(edgels.normal, axis=1), 1.0, atol=1e-9)
-    x = BODY.place(POSE, edgels.part, edgels.unscaled)
+    x = surface_points(BODY, POSE, edgels.part, edgels.unscaled)
     for v, camera in enumerate(RIG):
         here = edgels.view == v
         moved = [camera.project(x[here] + s * step)[0] for step in np.eye(3) for s in (1e-6, -1e-6)]
@@ -254,7 +253,7 @@ def test_search_goes_one_way_and_knows_its_window():
     edgels = edgels_of(BODY, np.full_like(MASKS, 255), POSE, PLAIN)
     assert len(edgels.view) == 0  # no background anywhere
     grown = np.zeros_like(MASKS)
-    body = build_cone_body(BODY.dimensions.scaled(head_radius=1.3))
+    body = build_cone_body(scaled(BODY.dimensions, head_radius=1.3))
     grown[:] = draw_silhouettes(body, RIG, POSE[None])[0]
     head = next(i for i, part in enumerate(BODY.parts) if part.name == "head")
     outward = edgels_of(BODY, grown, POSE, PLAIN)
@@ -346,7 +345,7 @@ def test_drawn_silhouettes_are_the_hulls_of_the_parts():
             x, y, z = cloud(part.kind, part.shape)[::7].T
             r = 1 + (m - 1) * z / h if part.kind == CONE else np.ones(len(z))
             unscaled = np.column_stack([x / (a * r), y / (b * r), z / h])
-            pixels, _ = camera.project(BODY.place(POSE, np.full(len(unscaled), p), unscaled))
+            pixels, _ = camera.project(surface_points(BODY, POSE, np.full(len(unscaled), p), unscaled))
             alone = np.zeros_like(picture)
             cv2.fillConvexPoly(alone, cv2.convexHull((pixels * 256).round().astype(np.int32)), 255, shift=8)
             around |= alone

@@ -1,14 +1,30 @@
-"""Superellipsoid bodies of average shape, and their voxels, which stand for a hull in tests."""
+"""Average bodies for tests: the cone body, the superellipsoid body, and its voxels in place of a hull."""
+
+from dataclasses import replace
 
 import numpy as np
 from scipy import ndimage
 
 from tk.kernels.nearest import SurfaceIndex
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.cone_body import build_cone_body
+from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.skeleton import SEGMENTS
 from tk.model.body.superellipsoid_body import SPACING_M, SuperellipsoidBody, build_superellipsoid_body
 from tk.model.cameras.volume import Volume, VoxelGrid
+
+DIMENSIONS = BodyDimensions.from_stature(1.75)
+BODY = build_cone_body(DIMENSIONS)
+
+
+def scaled(dimensions: BodyDimensions, **factors: float) -> BodyDimensions:
+    """Return dimensions of which the named ones are multiplied by factors."""
+    return replace(dimensions, **{name: getattr(dimensions, name) * factor for name, factor in factors.items()})
+
+
+def surface_points(body: ConeBody, pose: np.ndarray, part: np.ndarray, unscaled: np.ndarray) -> np.ndarray:
+    """Return world points (N, 3) on the surface of parts (N,), see :meth:`ConeBody.local`."""
+    T = body.part_transforms(body.skeleton.segment_transforms(pose))[part]
+    return (T[:, :3, :3] @ body.local(part, unscaled)[:, :, None])[:, :, 0] + T[:, :3, 3]
 
 
 def skin_of(
@@ -21,12 +37,10 @@ def skin_of(
 def voxelise(body: SuperellipsoidBody, pose: np.ndarray, grid: VoxelGrid) -> np.ndarray:
     """(nx, ny, nz) bool: voxels in one of the body's pieces."""
     T_world_segment = body.skeleton.segment_transforms(pose)
-    B = np.eye(4)
-    B[:3, :3] = body.skeleton.T_world_body
     centers = grid.centers()
     occupied = np.zeros(grid.count, bool)
     for piece in body.pieces:
-        T = np.linalg.inv(T_world_segment[SEGMENTS.index(piece.segment)] @ B @ piece.T_body_piece)
+        T = np.linalg.inv(T_world_segment[SEGMENTS.index(piece.segment)] @ body.skeleton.in_world(piece.T_body_piece))
         near = np.flatnonzero(np.linalg.norm(centers - np.linalg.inv(T)[:3, 3], axis=1) < 1.8 * max(piece.radii))
         occupied[near] |= piece.contains(centers[near] @ T[:3, :3].T + T[:3, 3])
     return occupied.reshape(grid.shape)

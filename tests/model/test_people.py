@@ -28,7 +28,7 @@ def drawn(places: list[tuple[float, float]], statures: list[float] | None = None
     alone = []
     for k, (x, y) in enumerate(places):
         stature = statures[k] if statures else 1.75
-        body = build_cone_body(BodyDimensions.from_stature(stature), "z", "full")
+        body = build_cone_body(BodyDimensions.from_stature(stature))
         pose = gait.walking_pose(body.skeleton, 0.3 * k)
         pose[:3] = x, y, 0.54 * stature
         alone.append(draw_silhouettes(body, rig, pose[None])[0] > 0)

@@ -165,13 +165,13 @@ def test_stops_when_the_moving_average_stands_still(
     result = minimise(scripted(-steps), np.zeros((2, 2)), 1.0, tolerance, anywhere, config=config)
     for b in range(2):
         states = np.vstack([np.zeros((1, 2)), np.cumsum(steps[:, b], axis=0)])
-        stop, converged = 12, False
+        stop = 12
         for i in range(window - 1, 12):
             change = np.mean(states[i - window + 1 : i + 1], 0) - np.mean(states[i - window + 2 : i + 2], 0)
             if np.all(np.abs(change) <= tolerance):
-                stop, converged = i + 1, True
+                stop = i + 1
                 break
-        assert (result.iterations[b], result.converged[b]) == (stop, converged)
+        assert result.iterations[b] == stop
         np.testing.assert_array_equal(result.pose[b], states[stop])
 
 
@@ -180,8 +180,7 @@ def test_a_change_of_the_tolerance_itself_is_small_enough() -> None:
     config = SmdSettings(meta_step=0, memory=0, window=1, max_iterations=10)
     exact = minimise(scripted(gradients), [[0.0]], 1.0, np.array([0.25]), anywhere, config=config)
     less = minimise(scripted(gradients), [[0.0]], 1.0, np.array([0.25 - 1e-12]), anywhere, config=config)
-    assert (exact.iterations[0], bool(exact.converged[0])) == (1, True)
-    assert (less.iterations[0], bool(less.converged[0])) == (10, False)
+    assert (exact.iterations[0], less.iterations[0]) == (1, 10)
 
 
 @pytest.mark.parametrize("window", [1, 3, 50])
@@ -211,7 +210,7 @@ def test_a_row_does_not_depend_on_other_rows() -> None:
             rippled(phases[:, [b]]), start[[b]], 0.05, tolerance, box(-4, 4), config=config, keep_path=True
         )
         n = alone.iterations[0]
-        assert alone.path is not None and n == company.iterations[b] and alone.converged[0] == company.converged[b]
+        assert alone.path is not None and n == company.iterations[b]
         np.testing.assert_allclose(alone.path[: n + 1, 0], company.path[: n + 1, b], rtol=1e-12)
         np.testing.assert_array_equal(np.ptp(company.path[n:, b], axis=0), 0)
         np.testing.assert_allclose(alone.pose[0], company.pose[b], rtol=1e-12)
@@ -291,7 +290,7 @@ def test_a_round_bowl(shuffle: bool) -> None:
     centre = np.array([3.0, -2.0, 0.1])
     config = SmdSettings(max_iterations=100, shuffle=shuffle)
     result = minimise(bowl(hessian, centre), np.zeros((1, 3)), 0.5, np.full(3, 1e-9), anywhere, config=config)
-    assert result.converged[0]
+    assert result.iterations[0] < config.max_iterations
     np.testing.assert_allclose(result.pose[0], centre, atol=1e-6)
     assert result.value[0] < 1e-12
 
@@ -308,7 +307,7 @@ def test_a_whitening_basis_makes_any_bowl_round() -> None:
     whitening = np.linalg.inv(np.linalg.cholesky(hessian)).T
     round_ = minimise(bowl(hessian, centre), start, 1.0, tolerance, anywhere, whitening[None], config)
     plain = minimise(bowl(hessian, centre), start, 1 / np.linalg.norm(hessian, 2), tolerance, anywhere, None, config)
-    assert round_.converged[0] and round_.iterations[0] < 30
+    assert round_.iterations[0] < 30
     np.testing.assert_allclose(round_.pose[0], centre, atol=1e-7)
     assert np.linalg.norm(plain.pose[0] - centre) > 0.1
 
@@ -386,7 +385,7 @@ def test_leclerc_regression_ignores_outliers() -> None:
 
     start = np.array([[0.0, 0.0], [1.5, 0.2], [0.3, -0.8]])
     result = minimise(evaluate, start, 0.1, np.full(2, 1e-3), anywhere, config=SmdSettings(max_iterations=80))
-    assert result.converged.all()
+    assert (result.iterations < 80).all()
     np.testing.assert_allclose(result.pose, np.broadcast_to(truth, (3, 2)), atol=0.02)
     least_squares = np.linalg.lstsq(design, y, rcond=None)[0]
     assert np.abs(least_squares - truth).max() > 0.5
@@ -404,7 +403,7 @@ def test_an_explosion_is_an_error_and_a_bound_prevents_it() -> None:
         minimise(cliff, start, 1.0, np.full(2, 1e-3), anywhere)
     config = SmdSettings(max_iterations=400)
     result = minimise(cliff, start, 1.0, np.full(2, 1e-3), anywhere, None, config, max_step=np.array([0.5, 0.4]))
-    assert result.converged[0]
+    assert result.iterations[0] < config.max_iterations
     np.testing.assert_allclose(result.pose[0], 0, atol=0.1)
 
 

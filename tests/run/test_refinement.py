@@ -140,7 +140,7 @@ def test_result_without_a_body_and_bad_options_are_refused(tiny: Path, tracked: 
 @pytest.mark.parametrize("away", [range(0), range(10, 14)])
 @pytest.mark.parametrize("late", [[0, 0, 0, 0], [0, 2, 0, 0], [0, 0, -3, 0]])
 def test_videos_that_are_late_by_more_than_edges_reach_are_found(late: list[int], away: range) -> None:
-    rig, body = ring_of_cameras(4, 160, 120), build_cone_body(BodyDimensions.from_stature(1.75), "z", "full")
+    rig, body = ring_of_cameras(4, 160, 120), build_cone_body(BodyDimensions.from_stature(1.75))
     frames = np.arange(24)
     poses = np.array([gait.walking_pose(body.skeleton, i / 12 % 1) for i in frames])
     poses[:, :3] = np.column_stack([0.08 * frames - 1.0, 0 * frames, 0 * frames + 0.95])

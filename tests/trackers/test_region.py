@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.model.figures import scaled
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, EMPTY, NAMES, STATURE, errors, find_again_elsewhere, observe, walk
 from tk.errors import CaptureError
@@ -339,7 +340,7 @@ def error_of(body: ConeBody, poses: np.ndarray, masks: np.ndarray) -> float:
 
 def test_second_pass_corrects_a_wrong_body() -> None:
     """A first pass with a body that is too thin; the second fits it to all frames."""
-    thin = build_cone_body(BODY.dimensions.scaled(thigh_radius=0.75, chest_half_width=0.85, upper_arm_radius=0.75))
+    thin = build_cone_body(scaled(BODY.dimensions, thigh_radius=0.75, chest_half_width=0.85, upper_arm_radius=0.75))
     tracker = RegionTracker(RIG, "z", replace(SETTINGS, adapt=True))
     tracker.start([observe(MASKS[0])], STATURE, init_of(POSES[0]), thin)
     first = [tracker.step(observe(m, i)) for i, m in enumerate(MASKS)]

@@ -7,22 +7,11 @@ import pytest
 
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, STATURE, errors, observe, walk
-from tk.errors import ConfigError
-from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.cone_body import build_cone_body
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.volume import Volume
 from tk.model.masks.silhouettes import draw_silhouettes
 from tk.settings import ContourSettings, Settings
 from tk.trackers.volumetric import VolumetricTracker
-
-
-def test_a_body_without_hands_and_feet_is_refused() -> None:
-    rig = ring_of_cameras(2, width=48, height=60)
-    tracker = VolumetricTracker(rig, Volume((0, 0, 1), (2, 2, 2)), "z", Settings(voxels=16))
-    walker = build_cone_body(BodyDimensions.from_stature(1.7), preset="walker")
-    with pytest.raises(ConfigError, match=r'the body given is "walker": the method volumetric needs a full one'):
-        tracker.start([], None, None, walker)
 
 
 # level, somewhat forward; hanging, with the forearm folded up against the upper arm

@@ -28,7 +28,6 @@ __all__ = [
     "SHARES",
     "carve",
     "look_up_lists",
-    "missing_at_most_one",
     "pack",
     "places",
     "shade_surface",
@@ -200,17 +199,6 @@ def carve(
     cameras = len(current)
     flat = (current.reshape(-1), previous.reshape(-1), planes.reshape(-1))
     _carve_kernel(row_offsets, entries, cameras, spread_of(cameras * SHARES), enough, *flat, occupied)
-
-
-def missing_at_most_one(planes: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Return the voxels (W,) that at most one camera carves, from ``planes`` (2C, W)."""
-    once = np.zeros(planes.shape[1], np.uint32)
-    twice = np.zeros(planes.shape[1], np.uint32)
-    for shares in planes.reshape(-1, SHARES, planes.shape[1]):
-        carved = ~np.bitwise_or.reduce(shares, axis=0)
-        twice |= once & carved
-        once |= carved
-    return ~twice
 
 
 # --- surface -----------------------------------------------------------------------------------------------------

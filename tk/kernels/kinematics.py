@@ -18,26 +18,24 @@ from tk.kernels.vectors import cross, norm_sqr, product, times
 # u = ARM_UP[0] cos(second) sin(first) + ARM_UP[1] sin(second).
 ARM_UP = (-np.sqrt(2 / 3), np.sqrt(1 / 3))
 # Columns of a tree: axis (from 0), point, rise, 1 where prismatic, parent. A launch pays up to 6 µs for each array.
-TREE_POINT, TREE_RISE, TREE_PRISMATIC, TREE_PARENT, TREE_NUMBERS = 3, 6, 9, 10, 11
+TREE_POINT, TREE_RISE, TREE_PRISMATIC, TREE_PARENT = 3, 6, 9, 10
 # Columns of ``joints``: frame (from 0) and twist.
 TWIST, JOINT_NUMBERS = 12, 18
 
 
-def pack_tree(axis: np.ndarray, point: np.ndarray, prismatic: np.ndarray, parent: np.ndarray) -> np.ndarray:
+def pack_tree(
+    axis: np.ndarray, point: np.ndarray, rise: np.ndarray, prismatic: np.ndarray, parent: np.ndarray
+) -> np.ndarray:
     """Pack a tree into one array (D, 11), float64.
 
     Args:
         axis: (D, 3) of the twists in the zero configuration.
-        point: (D, 3) on the axes, metres; or (D, 6), point and rise.
+        point: (D, 3) on the axes, metres.
+        rise: (D, 3) metres, see the module.
         prismatic: (D,) 1 for a translation along the axis.
         parent: (D,) index of the degree of freedom above, -1 at the root.
     """
-    tree = np.zeros((len(axis), TREE_NUMBERS))
-    tree[:, :TREE_POINT] = axis
-    tree[:, TREE_POINT : TREE_POINT + point.shape[1]] = point
-    tree[:, TREE_PRISMATIC] = prismatic
-    tree[:, TREE_PARENT] = parent
-    return tree
+    return np.column_stack([axis, point, rise, prismatic, parent]).astype(np.float64)
 
 
 @ti.func

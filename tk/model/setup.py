@@ -50,7 +50,6 @@ class Subject:
 
     Attributes:
         height_m: height without shoes, metres; None if unknown.
-        position: (3,) m, rough position in the frame of the initialisation; None if unknown.
         init_frame: frame of the initialisation.
         init: rough pose in that frame; None if the tracker finds the person by itself.
         body: the body, from an earlier recording; None if it is to be fitted.

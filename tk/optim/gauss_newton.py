@@ -117,7 +117,7 @@ class BatchSolution(NamedTuple):
 def minimise(
     equations: Callable[[Float, int, NDArray[np.intp]], Equations],
     start: Float,
-    free: NDArray[np.bool_],
+    free: NDArray[np.intp] | None,
     lower: Float,
     upper: Float,
     config: GaussNewtonSettings | None = None,
@@ -130,7 +130,7 @@ def minimise(
         equations: the normal equations at states (N, D), a scale's index, 0 the finest, and the rows (N,) of ``start``
             that these states come from: states that have converged at a scale are left out.
         start: (B, D).
-        free: (D,) parameters that may change.
+        free: (n,) indices of the parameters that may change; None: all.
         lower, upper: (D,) limits; infinite without a limit.
         config: see :class:`GaussNewtonSettings`.
         prior: of the states.
@@ -139,7 +139,7 @@ def minimise(
     config = config or GaussNewtonSettings()
     state = np.array(start, np.float64)
     hessian = np.zeros((*state.shape, state.shape[1]))
-    parameters = _FreeParameters(np.flatnonzero(free), lower, upper, config, prior)
+    parameters = _FreeParameters(np.arange(len(lower)) if free is None else free, lower, upper, config, prior)
     scales = range(config.scales - 1, -1, -1) if levels is None else levels
     iterations = np.zeros(len(scales), np.int32)
     for i, scale in enumerate(scales):

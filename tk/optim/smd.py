@@ -84,14 +84,12 @@ class SmdResult:
         pose: (B, D).
         value: (B,) the objective of the last evaluation, on that iteration's samples.
         iterations: (B,) number of iterations.
-        converged: (B,) True if eq. 20 stopped the row, False if eq. 21 did.
         path: (I + 1, B, D) all states with ``keep_path``, else None; a finished row repeats its last state.
     """
 
     pose: Float
     value: Float
     iterations: NDArray[np.int32]
-    converged: NDArray[np.bool_]
     path: Float | None = None
 
 
@@ -145,7 +143,6 @@ def minimise(
     history = [p]
     value = np.full(B, np.nan)
     iterations = np.zeros(B, np.int32)
-    converged = np.zeros(B, bool)
     active = np.ones(B, bool)
     for i in range(config.max_iterations):
         now = objective(p, _times(W, v), i if config.shuffle else 0)
@@ -169,9 +166,7 @@ def minimise(
         iterations += active
         if len(history) > config.window:
             moved = np.abs(history[-1] - history[-1 - config.window]) / config.window
-            done = active & np.all(moved <= tolerance, axis=1)
-            converged |= done
-            active &= ~done
+            active &= ~np.all(moved <= tolerance, axis=1)
             if not active.any():
                 break
     pose = p
@@ -179,7 +174,7 @@ def minimise(
         first = np.maximum(iterations - config.window + 1, 0)
         pose = np.stack([np.mean([h[b] for h in history[first[b] : n + 1]], axis=0) for b, n in enumerate(iterations)])
         pose = constrain(pose)  # a mean of states on a limit can round to beyond it
-    return SmdResult(pose, value, iterations, converged, np.stack(history) if keep_path else None)
+    return SmdResult(pose, value, iterations, np.stack(history) if keep_path else None)
 
 
 def _bounded(W: Float, a: Float, adapted: Float, g: Float, bound: Float) -> tuple[Float, Float]:

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from tk.errors import ResultError
 from tk.io.results.data import Result
 from tk.io.results.status import has_pose
-from tk.kernels.cones import ELLIPSOID
-from tk.model.body.cone_body import ConeBody, ConePart
+from tk.model.body.cone_body import ConeBody
 from tk.model.body.joints import SEGMENTS
 from tk.model.cameras.camera import Camera
 from tk.render.palette import LOST_BODY, SEGMENT_COLORS, Color, person_color
@@ -187,18 +186,16 @@ def figure_of(result: Result) -> Figure:
 
 def solids_of(body: ConeBody) -> tuple[Solid, ...]:
     """Return the solids of a body in the frames of their segments."""
-    T_body = np.eye(4)
-    T_body[:3, :3] = body.skeleton.T_world_body
-    found = [(part.segment, T_body @ part.T_body_part, _part_rings(part)) for part in body.parts]
-    return tuple(Solid(SEGMENTS.index(name), rings @ T[:3, :3].T + T[:3, 3]) for name, T, rings in found)
+    found = [(*place, _part_rings(body, p)) for p, place in enumerate(zip(*body.frames, strict=True))]
+    return tuple(Solid(int(segment), rings @ T[:3, :3].T + T[:3, 3]) for segment, T, rings in found)
 
 
-def _part_rings(part: ConePart) -> Float:
-    """Return the circles (R, AROUND, 3) of a frustum or an ellipsoid in its own frame."""
+def _part_rings(body: ConeBody, p: int) -> Float:
+    """Return the circles (R, AROUND, 3) of part p, a frustum or an ellipsoid, in its own frame."""
     around = np.linspace(-np.pi, np.pi, AROUND, endpoint=False)
-    angle, z = np.meshgrid(around, np.linspace(0, 1, _ALONG if part.kind == ELLIPSOID else 2))
+    angle, z = np.meshgrid(around, np.linspace(0, 1, 2 if body.is_cone[p] else _ALONG))
     radius = np.ones_like(z)
-    if part.kind == ELLIPSOID:
+    if not body.is_cone[p]:
         radius, z = np.sin(np.pi * z), -np.cos(np.pi * z)
     unscaled = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)
-    return part.surface(unscaled.reshape(-1, 3)).reshape(unscaled.shape)
+    return body.local(np.full(z.size, p), unscaled.reshape(-1, 3)).reshape(unscaled.shape)

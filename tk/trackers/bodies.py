@@ -29,7 +29,7 @@ def read_body(path: Path, up: str) -> ConeBody:
     """
     if path.suffix.lower() != ".toml":
         model = read_result(path).model
-        if "parts/shape" not in model or "body" not in model:
+        if "parts/shape" not in model:
             raise ConfigError(f"{path}: holds no body of contours; give a result of the method region or a TOML file")
         with as_damage_error(path, "the body"):
             return restore_body(model, up)

@@ -119,8 +119,7 @@ class ContourTracker:
         self.world = TrackerFrame.of(rig, up)
         self.views = Views(self.world.rig)
         self.screen, self.choice = (RayGrid(self.world.rig, rows) for rows in (SCREEN_ROWS, CHOICE_ROWS))
-        optional = OPTIONAL if config.body == "full" else ()
-        skeleton = build_skeleton(BodyDimensions.from_stature(1.7), optional=optional)
+        skeleton = build_skeleton(BodyDimensions.from_stature(1.7), optional=OPTIONAL)
         self.pose_names, self.pose_units = skeleton.names, skeleton.units
         self._body: ConeBody | None = None
         self._lost_for = 0
@@ -155,7 +154,7 @@ class ContourTracker:
 
     def prepare(self) -> None:
         """Compile the kernels; otherwise each is compiled when it is first called."""
-        body = build_cone_body(BodyDimensions.from_stature(1.7), preset=self.contours.body)
+        body = build_cone_body(BodyDimensions.from_stature(1.7))
         empty = np.zeros((len(self.views.rig), *self.views.rig.frame_shape), np.uint8)
         seen = self.views.pyramid(empty, 1, False)
         pose = np.zeros((1, len(body.skeleton.names)))
@@ -180,7 +179,6 @@ class ContourTracker:
             CaptureError: fewer than two cameras see anybody in the first frame.
         """
         pyramids = [self.pyramid(frame) for frame in frames]
-        preset = self.contours.body
         rough: Float | None = None
         stature = (init and init.height_m) or height_m
         if init is None:
@@ -188,7 +186,7 @@ class ContourTracker:
             average = BodyDimensions.from_stature(stature or stature_of(self, pyramids))
         else:
             average, given, angles = rough_pose(init.joints, init.angles, stature, self.world)
-        self.take_body(body or build_cone_body(average, preset=preset))
+        self.take_body(body or build_cone_body(average))
         if init is not None:
             rough = self.settle(pyramids[0], convert_poses(angles, given, self.body.skeleton)[None]).states[0]
         with self._opening_cameras(frames, pyramids) as seen:
@@ -270,9 +268,7 @@ class ContourTracker:
     ) -> tuple[ConeBody, Float]:
         """Fit the body to the chosen ones of several frames; return it, and its poses in them."""
         seen = [pyramids[i] for i in chosen]
-        return fit_body(
-            self.contours.body, self.views, seen, poses[chosen], self.line_search, stature, config, stature_deviation
-        )
+        return fit_body(self.views, seen, poses[chosen], self.line_search, stature, config, stature_deviation)
 
     def start(
         self,
@@ -379,7 +375,7 @@ class ContourTracker:
             limb: only this limb moves.
         """
         body = self.body
-        arrays, free = (limb.arrays, limb.free) if limb else (body.arrays, body.free)
+        arrays, free = (limb.arrays, limb.dofs) if limb else (body.arrays, None)
         regions = None if images is None else self.colors.regions(images)
         return gauss_newton.minimise(
             lambda *at: self.views.equations(arrays, pyramid, at[0], at[1], self.line_search, regions, at[2]),
@@ -453,10 +449,10 @@ class ContourTracker:
                 if not in_pairs:
                     cost[cost > PROPOSED * own] = np.inf
                 count = MORE_CANDIDATES if in_pairs or limb in misplaced else CANDIDATES
-                chosen = limb.distinct(skeleton, tried, cost, count)
+                chosen = limb.distinct(tried, cost, count)
                 if len(chosen):
                     chosen = self.settle(pyramid, chosen, level, images, limb=limb).states
-                settled = limb.combined(settled, np.concatenate([pose[None], chosen]))
+                settled = limb.combined(settled, np.concatenate([pose[None], chosen])[:, limb.dofs])
             cost = mean_of_views(evidence.cast(self.body, group, settled, moved, before)[0])
             order = np.argsort(cost, kind="stable")
             settled, cost = settled[order], cost[order]
@@ -530,7 +526,6 @@ class ContourTracker:
         body = self.body
         return {
             **{f"dimensions/{name}": value for name, value in asdict(body.dimensions).items()},
-            "body": body.preset,
             "parts/name": json.dumps([part.name for part in body.parts]),
             "parts/segment": json.dumps([part.segment for part in body.parts]),
             "parts/kind": np.array([part.kind for part in body.parts]),
@@ -563,7 +558,7 @@ def restore_body(model: Mapping[str, Any], up: str = "z") -> ConeBody:
     Raises:
         ConfigError, LookupError, TypeError, ValueError: the model is incomplete, or describes no body.
     """
-    body = build_cone_body(restore_dimensions(model), up, str(model["body"]))
+    body = build_cone_body(restore_dimensions(model), up)
     # the stored parts, because another version of the program may divide the body differently
     names, segments = (json.loads(str(model[f"parts/{name}"])) for name in ("name", "segment"))
     kinds = np.asarray(model["parts/kind"])

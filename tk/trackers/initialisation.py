@@ -282,7 +282,7 @@ def stature_of(tracker: ContourTracker, pyramids: Sequence[Pyramid]) -> float:
     The area hardly changes when a person bends or raises the arms; the silhouette's height does. Girth and clothes
     cause an error of about 6 %. Median over the views of all frames, against the mean area of hanging and spread arms.
     """
-    body: ConeBody = build_cone_body(BodyDimensions.from_stature(AVERAGE_STATURE_M), preset=tracker.contours.body)
+    body: ConeBody = build_cone_body(BodyDimensions.from_stature(AVERAGE_STATURE_M))
     group = np.zeros(len(body.parts), np.int32)
     ratios: list[Float] = []
     for pyramid in pyramids:

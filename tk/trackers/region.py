@@ -294,7 +294,7 @@ class RegionTracker(ContourTracker):
         """Return whether the limbs are searched for: at intervals, if the residual is high or a limb is misplaced."""
         every = self.search_frames
         due = every > 0 and frame.index % every == 0
-        return self.contours.body != "walker" and (due or high or bool(misplaced))
+        return due or high or bool(misplaced)
 
     def _propose(
         self,
@@ -387,7 +387,7 @@ class RegionTracker(ContourTracker):
         body, used = self.body, np.isfinite(residual[:, 0])
         joints = body.skeleton.joints(pose)
         precision = INFORMATION * (curvature + np.diag(prior.precision))
-        noise = contour_variance(body.skeleton, pose, precision, body.free)
+        noise = contour_variance(body.skeleton, pose, precision)
         rays = joints - self.world.rig.centers[used, None]
         shares = contour_shares(body, self.screen, label, joints)[used]
         views = view_variance(rays / np.linalg.norm(rays, axis=-1, keepdims=True), shares, self.view_m)

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import CaptureError, ConfigError
+from tk.errors import CaptureError
 from tk.kernels.nearest import SurfaceIndex
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import ConeBody
@@ -132,7 +132,7 @@ class VolumetricTracker:
         self.up = up
         self.rig = rig
         self.hull = VisualHull(rig, VoxelGrid.cover(volume, config.voxels), cache_dir)
-        self._finder = ContourTracker(rig, up, replace(config.silhouette, body="full"), fps)
+        self._finder = ContourTracker(rig, up, config.silhouette, fps)
         skeleton = build_skeleton(BodyDimensions.from_stature(1.7), up, (WAIST,) if config.body.waist else ())
         self.pose_names, self.pose_units = skeleton.names, skeleton.units
         self.skin: SuperellipsoidBody
@@ -160,10 +160,7 @@ class VolumetricTracker:
 
         Raises:
             CaptureError: the volume is empty.
-            ConfigError: ``body`` has no hands or feet.
         """
-        if body is not None and body.preset != "full":
-            raise ConfigError(f'the body given is "{body.preset}": the method {self.method} needs a full one')
         # without images: colours inside the silhouettes are a cue of the region tracker only
         blind = [Observation(f.index, f.images[:0], f.masks) for f in frames]
         pose = self._finder.find(blind, height_m, init, body)

@@ -4,6 +4,7 @@ from dataclasses import fields
 
 import pytest
 
+from tests.model.figures import scaled
 from tk.errors import ConfigError
 from tk.model.body.anthropometry import FRACTIONS, BodyDimensions
 
@@ -40,14 +41,7 @@ def test_table_agrees_with_drillis_and_contini():
         assert value - 0.01 < FRACTIONS[name] < value + 0.01 + shoe, name
 
 
-def test_scaled_changes_only_the_named_dimensions():
-    d = BodyDimensions.from_stature(1.75)
-    e = d.scaled(thigh=1.1, wrist_radius=0.5)
-    assert e.thigh == pytest.approx(1.1 * d.thigh) and e.wrist_radius == pytest.approx(0.5 * d.wrist_radius)
-    assert all(getattr(d, n) == getattr(e, n) for n in NAMES if n not in ("thigh", "wrist_radius"))
-
-
 @pytest.mark.parametrize("factor", [0.0, -1.0, 100.0, float("nan"), float("inf")])
 def test_impossible_dimensions_are_refused_by_name(factor):
     with pytest.raises(ConfigError, match=r"body dimension calf = .* must lie between 0 and 3 m"):
-        BodyDimensions.from_stature(1.75).scaled(calf=factor)
+        scaled(BodyDimensions.from_stature(1.75), calf=factor)

@@ -1,19 +1,18 @@
-"""The cone body: its parts, presets and symmetry."""
+"""The cone body: its parts and symmetry."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.model.figures import BODY, DIMENSIONS, surface_points
 from tk.errors import ConfigError
 from tk.kernels.cone_arrays import MOST_PARTS, PART_DOF, PART_FRAME
 from tk.kernels.cones import CONE, ELLIPSOID
-from tk.model.body.anthropometry import HAIR, BodyDimensions
-from tk.model.body.cone_body import PRESETS, ConePart, build_cone_body
+from tk.model.body.anthropometry import HAIR
+from tk.model.body.cone_body import ConePart, build_cone_body
 from tk.model.body.gait_poses import standing_pose, walking_pose
 from tk.model.body.skeleton import JOINTS, up_rotation
-
-DIMENSIONS = BodyDimensions.from_stature(1.75)
 
 
 def surface_of(part: ConePart) -> np.ndarray:
@@ -28,49 +27,33 @@ def surface_of(part: ConePart) -> np.ndarray:
 def points_of(body, pose):
     pieces = [surface_of(part) for part in body.parts]
     owner = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
-    return owner, body.place(pose, owner, np.concatenate(pieces))
+    return owner, surface_points(body, pose, owner, np.concatenate(pieces))
 
 
-@pytest.mark.parametrize(("preset", "components"), [("full", 15), ("limbs", 10), ("walker", 6)])
-def test_presets_have_the_papers_components(preset, components):
-    """The full body has one more: the pelvis."""
-    body = build_cone_body(DIMENSIONS, preset=preset)
-    assert len({part.component for part in body.parts}) == components
-    assert [part.component for part in body.parts if part.kind == ELLIPSOID] == ["head"]
+def test_components_are_those_of_the_paper_and_the_pelvis():
+    assert len({part.component for part in BODY.parts}) == 15
+    assert [part.component for part in BODY.parts if part.kind == ELLIPSOID] == ["head"]
 
 
-def test_walker_has_the_papers_seven_degrees_of_freedom():
-    body = build_cone_body(DIMENSIONS, preset="walker")
-    free = {name for name, is_free in zip(body.skeleton.names, body.free, strict=True) if is_free}
-    legs = {f"{joint}_{side}_{axis}" for joint, axis in (("hip", "pitch"), ("knee", "flexion")) for side in "lr"}
-    assert free == {"torso_x", "torso_y", "torso_z", *legs}
-    assert build_cone_body(DIMENSIONS).free.all()
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_standing_body_has_the_stature_of_its_dimensions(preset):
-    body = build_cone_body(DIMENSIONS, preset=preset)
-    pose = standing_pose(body.skeleton)
+def test_standing_body_has_the_stature_of_its_dimensions():
+    pose = standing_pose(BODY.skeleton)
     for name in ("knee_l_flexion", "knee_r_flexion"):
-        pose[body.skeleton.index(name)] = 0.0
-    z = points_of(body, pose)[1][:, 2]
-    hair = HAIR * 1.75 if preset == "full" else 0.0
-    assert np.ptp(z) == pytest.approx(DIMENSIONS.stature + hair, abs=0.01)
+        pose[BODY.skeleton.index(name)] = 0.0
+    z = points_of(BODY, pose)[1][:, 2]
+    assert np.ptp(z) == pytest.approx(DIMENSIONS.stature + HAIR * 1.75, abs=0.01)
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-def test_frames_of_parts_are_rotations(preset):
-    for part in build_cone_body(DIMENSIONS, preset=preset).parts:
+def test_frames_of_parts_are_rotations():
+    for part in BODY.parts:
         R = part.T_body_part[:3, :3]
         np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12, err_msg=part.name)
         assert np.linalg.det(R) > 0
 
 
 def test_left_and_right_are_mirror_images():
-    body = build_cone_body(DIMENSIONS)
-    owner, points = points_of(body, walking_pose(body.skeleton, 0.3))
-    _, other = points_of(body, walking_pose(body.skeleton, 0.8))
-    names = [part.name for part in body.parts]
+    owner, points = points_of(BODY, walking_pose(BODY.skeleton, 0.3))
+    _, other = points_of(BODY, walking_pose(BODY.skeleton, 0.8))
+    names = [part.name for part in BODY.parts]
     for p, name in enumerate(names):
         twin = names.index(name.replace("_l", "_?").replace("_r", "_l").replace("_?", "_r"))
         a = points[owner == p] * [1, -1, 1]
@@ -81,14 +64,13 @@ def test_left_and_right_are_mirror_images():
 
 
 def test_axes_of_limbs_end_near_joints():
-    body = build_cone_body(DIMENSIONS)
-    pose = walking_pose(body.skeleton, 0.6)
-    joints = dict(zip(JOINTS, body.skeleton.joints(pose), strict=True))
+    pose = walking_pose(BODY.skeleton, 0.6)
+    joints = dict(zip(JOINTS, BODY.skeleton.joints(pose), strict=True))
     ends = {"upper_arm": ("shoulder", "elbow"), "forearm": ("elbow", "wrist"), "thigh": ("hip", "knee")}
-    for p, part in enumerate(body.parts):
+    for p, part in enumerate(BODY.parts):
         limb, _, side = part.name.rpartition("_")
         if limb in ends:
-            axis = body.place(pose, np.array([p, p]), np.array([[0, 0, 0.0], [0, 0, 1.0]]))
+            axis = surface_points(BODY, pose, np.array([p, p]), np.array([[0, 0, 0.0], [0, 0, 1.0]]))
             expected = [joints[f"{joint}_{side}"] for joint in ends[limb]]
             # a thigh's surface lies in front of the hip and behind the knee, an arm's in the elbow's crook
             offset = (0.02 if limb == "thigh" else 0.003) * DIMENSIONS.stature
@@ -104,28 +86,26 @@ def test_body_turns_with_the_up_direction():
 
 
 def test_packed_frames_place_parts_like_the_body():
-    body = build_cone_body(DIMENSIONS)
-    packed = body.pack(np.float64)
-    pose = walking_pose(body.skeleton, 0.1)
-    T = body.skeleton.transforms(pose)
-    for p, part in enumerate(body.parts):
-        local = part.surface(surface_of(part))
+    packed = BODY.pack(np.float64)
+    pose = walking_pose(BODY.skeleton, 0.1)
+    T = BODY.skeleton.transforms(pose)
+    for p, part in enumerate(BODY.parts):
+        unscaled = surface_of(part)
+        owner = np.full(len(unscaled), p)
+        local = BODY.local(owner, unscaled)
         own = packed.parts[p, PART_FRAME : PART_FRAME + 12].reshape(3, 4)
         frame = T[int(packed.parts[p, PART_DOF])] @ np.vstack([own, [0, 0, 0, 1]])
-        expected = body.place(pose, np.full(len(local), p), surface_of(part))
+        expected = surface_points(BODY, pose, owner, unscaled)
         np.testing.assert_allclose(local @ frame[:3, :3].T + frame[:3, 3], expected, atol=1e-12)
 
 
-def test_unknown_preset_and_impossible_size_are_refused():
-    with pytest.raises(ConfigError, match="choose one of full, limbs, walker"):
-        build_cone_body(DIMENSIONS, preset="stick")
+def test_impossible_size_is_refused():
     with pytest.raises(ConfigError, match="part spike"):
         ConePart("spike", "torso", CONE, (0.1, 0.1, -1.0, 1.0), np.eye(4))
 
 
 def test_body_with_too_many_parts_for_the_kernels_is_refused():
-    body = build_cone_body(DIMENSIONS)
-    parts = body.parts * (MOST_PARTS // len(body.parts) + 1)
+    parts = BODY.parts * (MOST_PARTS // len(BODY.parts) + 1)
     with pytest.raises(ConfigError, match=f"{len(parts)} parts"):
-        replace(body, parts=parts).pack(np.float32)
-    assert len(replace(body, parts=parts[:MOST_PARTS]).pack(np.float32).parts) == MOST_PARTS
+        replace(BODY, parts=parts).pack(np.float32)
+    assert len(replace(BODY, parts=parts[:MOST_PARTS]).pack(np.float32).parts) == MOST_PARTS

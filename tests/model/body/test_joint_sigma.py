@@ -33,27 +33,17 @@ def test_contour_variance_equals_that_of_poses_sampled_from_the_information() ->
     D = len(pose)
     root = rng.normal(size=(D, D)) / np.sqrt(D)
     precision = (root @ root.T + np.eye(D)) * 1e6  # deviations of about a thousandth: joints move as the pose does
-    free = np.ones(D, bool)
     drawn = pose + rng.multivariate_normal(np.zeros(D), np.linalg.inv(precision), 4000)
     moved = SKELETON.joints(drawn) - SKELETON.joints(pose)
-    np.testing.assert_allclose(
-        contour_variance(SKELETON, pose, precision, free), (moved**2).mean(axis=(0, 2)), rtol=0.1
-    )
-
-
-def test_fixed_degrees_of_freedom_have_no_variance() -> None:
-    free = np.zeros(len(NAMES), bool)
-    free[SKELETON.index("elbow_l_flexion")] = True
-    variance = contour_variance(SKELETON, poses(1)[0], 1e4 * np.eye(len(NAMES)), free)
-    assert [JOINTS[j] for j in np.flatnonzero(variance > 1e-12)] == ["wrist_l"]
+    np.testing.assert_allclose(contour_variance(SKELETON, pose, precision), (moved**2).mean(axis=(0, 2)), rtol=0.1)
 
 
 def test_batched_variances_equal_single_ones() -> None:
     D = len(NAMES)
     root = np.random.default_rng(4).normal(size=(6, D, D))
-    precision, free = root @ root.swapaxes(1, 2) + np.eye(D), ~SKELETON.is_straight
-    many = contour_variance(SKELETON, poses(6).reshape(2, 3, D), precision.reshape(2, 3, D, D), free)
-    each = [contour_variance(SKELETON, pose, p, free) for pose, p in zip(poses(6), precision, strict=True)]
+    precision = root @ root.swapaxes(1, 2) + np.eye(D)
+    many = contour_variance(SKELETON, poses(6).reshape(2, 3, D), precision.reshape(2, 3, D, D))
+    each = [contour_variance(SKELETON, pose, p) for pose, p in zip(poses(6), precision, strict=True)]
     np.testing.assert_allclose(many.reshape(6, -1), each, rtol=1e-9)
 
 

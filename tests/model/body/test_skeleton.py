@@ -102,7 +102,7 @@ def test_a_waist_is_three_more_degrees_of_freedom_between_trunk_and_pelvis():
     assert tuple(np.array(WAISTED.names)[~WAISTED.is_waist]) == SKELETON.names
     assert tuple(np.array(WAISTED.names)[WAISTED.is_waist]) == ROWS[WAIST].dof_names
     assert (WAISTED.parent < np.arange(27)).all()
-    moved = WAISTED.ancestors()[:, WAISTED.is_waist]
+    moved = WAISTED.ancestors[:, WAISTED.is_waist]
     below = {SEGMENTS[s] for s in np.flatnonzero(moved.all(axis=1))}
     assert (
         below == {"pelvis", "thigh_l", "calf_l", "foot_l", "thigh_r", "calf_r", "foot_r"}
@@ -134,7 +134,7 @@ def test_ankles_are_two_more_degrees_of_freedom_a_side_that_move_the_foot_only()
     assert len(skeleton.names) == 31 and OPTIONAL == (WAIST, "ankle")
     assert tuple(np.array(skeleton.names)[~skeleton.is_straight]) == SKELETON.names
     for side in "lr":
-        moved = skeleton.ancestors()[:, [skeleton.index(f"ankle_{side}_{n}") for n in ("flexion", "inversion")]]
+        moved = skeleton.ancestors[:, [skeleton.index(f"ankle_{side}_{n}") for n in ("flexion", "inversion")]]
         assert [s for s, m in zip(SEGMENTS, moved.any(axis=1), strict=True) if m] == [f"foot_{side}"]
         assert moved[SEGMENTS.index(f"foot_{side}")].all()
     pose = np.random.default_rng(0).uniform(-0.5, 0.5, 31)
@@ -233,7 +233,7 @@ def test_chains_and_torso_share_out_the_degrees_of_freedom():
     ]
     for chain, moved in zip(CHAINS, free, strict=True):
         # a chain's degrees of freedom move its own segments and no others
-        affected = SKELETON.ancestors()[:, moved].any(axis=1)
+        affected = SKELETON.ancestors[:, moved].any(axis=1)
         assert {s for s, a in zip(SEGMENTS, affected, strict=True) if a} == set(CHAINS[chain])
 
 
@@ -242,7 +242,7 @@ def test_ancestors_are_what_moves_a_segment():
     before = SKELETON.segment_transforms(pose)
     for k in range(D):
         moved = np.abs(SKELETON.segment_transforms(pose + 0.1 * np.eye(D)[k]) - before).max(axis=(1, 2)) > 1e-9
-        np.testing.assert_array_equal(moved, SKELETON.ancestors()[:, k])
+        np.testing.assert_array_equal(moved, SKELETON.ancestors[:, k])
 
 
 @given(seeds)
@@ -282,7 +282,7 @@ def test_twists_are_derivatives(seed):
     for k in range(D):
         step = h * np.eye(D)[k]
         numeric = (SKELETON.joints(pose + step) - SKELETON.joints(pose - step)) / (2 * h)
-        moves = SKELETON.ancestors()[SKELETON.joint_segment, k]
+        moves = SKELETON.ancestors[SKELETON.joint_segment, k]
         np.testing.assert_allclose((np.cross(w[k], x) + v[k])[moves], numeric[moves], atol=1e-8)
         np.testing.assert_array_equal(numeric[~moves], 0)
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from tests.model.body.test_body_fit import edgels_all_over, walk
+from tests.model.figures import BODY, surface_points
 from tests.model.ring import ring_of_cameras
 from tk.errors import ConfigError
 from tk.io.captures.mask_store import MaskStore
 from tk.kernels.cones import CONE
-from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_parameters import BodyFamily, shapes_of
-from tk.model.body.cone_body import SHAPE_NUMBERS, build_cone_body, group_of
+from tk.model.body.cone_body import SHAPE_NUMBERS, group_of
 from tk.model.cameras.agreement import camera_agreement
 from tk.model.cameras.bundle import camera_rows, choose_frames, farthest
 from tk.model.cameras.camera import Camera, Rig
@@ -32,7 +32,6 @@ from tk.model.masks.silhouettes import Views, draw_silhouettes
 from tk.run.refinement import refine_rig
 
 RIG = ring_of_cameras(4, width=320, height=400)
-BODY = build_cone_body(BodyDimensions.from_stature(1.75))
 FRAMES = 12
 QUICK = RefinementSettings(rounds=4, scales=1)
 
@@ -116,7 +115,7 @@ def test_camera_rows_equal_finite_differences(kind):
     camera = replace(RIG[1], distortions=np.array([-0.08, 0.01, 0.001, -0.002, 0.0]))
     rng = np.random.default_rng(3)
     edgels = edgels_all_over(BODY, 60)
-    x = BODY.place(motion()[3], edgels.part, edgels.unscaled)
+    x = surface_points(BODY, motion()[3], edgels.part, edgels.unscaled)
     pixel, _ = camera.project(x)
     normal = rng.normal(size=(len(x), 2))
     J = np.stack([(camera.project(x + s)[0] - camera.project(x - s)[0]) / 2e-6 for s in 1e-6 * np.eye(3)], axis=2)

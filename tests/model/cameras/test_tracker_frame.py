@@ -10,14 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from tests.model.figures import BODY
 from tests.model.ring import ring_of_cameras
-from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.cone_body import build_cone_body
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.tracker_frame import TrackerFrame, seen_from
 from tk.model.cameras.up import UP_AXES, up_text, up_vector
 
-BODY = build_cone_body(BodyDimensions.from_stature(1.75))
 seeds = st.integers(0, 2**32 - 1)
 
 

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.model.figures import BODY
 from tests.model.ring import ring_of_cameras
-from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.cone_body import build_cone_body
 from tk.model.body.gait_poses import walking_pose
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import PartColors
@@ -15,7 +14,6 @@ from tk.model.cues.ray_costs import COLOR_COST, UNCERTAIN_COST, Evidence, RayGri
 from tk.model.masks.silhouettes import draw_silhouettes, share_wrong
 
 RIG = ring_of_cameras(3, width=120, height=160)
-BODY = build_cone_body(BodyDimensions.from_stature(1.75))
 COLORS = PartColors(BODY)
 FINE = RayGrid(RIG, 160)
 POSE = walking_pose(BODY.skeleton, 0.2)

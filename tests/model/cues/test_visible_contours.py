@@ -2,9 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from tests.model.figures import BODY
 from tests.model.ring import ring_of_cameras
-from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.cone_body import build_cone_body
 from tk.model.body.gait_poses import neutral_pose
 from tk.model.body.skeleton import JOINTS, shoulder_angles
 from tk.model.cues.part_colors import PartColors
@@ -12,7 +11,6 @@ from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.cues.visible_contours import contour_shares
 
 RIG = ring_of_cameras(4, width=240, height=320)
-BODY = build_cone_body(BodyDimensions.from_stature(1.75))
 GRID = RayGrid(RIG, 54)
 
 

@@ -41,7 +41,7 @@ VOLUME = Volume((0.0, 0.0, 1.0), (2.4, 2.4, 2.2))
 @pytest.fixture(scope="module")
 def masks() -> np.ndarray:
     """(3, 5, 240, 240): a walker who goes along y."""
-    body = build_cone_body(BodyDimensions.from_stature(1.75), "z", "full")
+    body = build_cone_body(BodyDimensions.from_stature(1.75))
     poses = []
     for i in range(3):
         pose = gait.walking_pose(body.skeleton, i / 3)

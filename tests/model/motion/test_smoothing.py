@@ -41,7 +41,6 @@ def test_error_falls_and_nothing_lags() -> None:
     lag = -(error * velocity).sum(axis=0) / (velocity**2).sum(axis=0)
     assert np.abs(lag).max() < 0.1
     assert not found.bridged.any()
-    np.testing.assert_allclose(found.noise, NOISE, rtol=0.35)
 
 
 def test_exact_motion_is_not_changed() -> None:
@@ -67,23 +66,22 @@ def test_result_does_not_depend_on_the_frames_kept_at_once(monkeypatch: pytest.M
 def test_short_gaps_are_bridged_and_long_ones_left() -> None:
     true = motion()
     known = np.ones(len(true), bool)
-    known[:3] = known[60:68] = known[150:180] = False
+    known[:3] = known[60:68] = known[150:190] = False
     poses = noisy(true)
     poses[~known] = np.nan  # never looked at
-    found = smooth(SKELETON, poses, known, FPS, longest_gap_s=0.4)
+    found = smooth(SKELETON, poses, known, FPS)
     np.testing.assert_array_equal(np.flatnonzero(found.bridged), np.arange(60, 68))
     assert np.sqrt(((found.poses - true)[60:68] ** 2).mean()) < 0.1
-    assert np.isnan(found.poses[150:180]).all() and np.isnan(found.poses[:3]).all()
+    assert np.isnan(found.poses[150:190]).all() and np.isnan(found.poses[:3]).all()
     assert np.isfinite(found.poses[known]).all()
     assert np.sqrt(((found.poses - true)[known] ** 2).mean()) < 0.7 * NOISE
 
 
-def test_a_gap_just_as_long_as_allowed_is_bridged() -> None:
+@pytest.mark.parametrize(("fps", "bridged"), [(20.0, 10), (19.9, 0)])
+def test_a_gap_just_as_long_as_allowed_is_bridged(fps: float, bridged: int) -> None:
     known = np.ones(60, bool)
     known[20:30] = False
-    poses = np.zeros((60, D))
-    assert smooth(SKELETON, poses, known, 10.0, longest_gap_s=1.0).bridged.sum() == 10
-    assert smooth(SKELETON, poses, known, 10.0, longest_gap_s=0.9).bridged.sum() == 0
+    assert smooth(SKELETON, np.zeros((60, D)), known, fps).bridged.sum() == bridged
 
 
 def test_smoothed_angles_stay_within_joint_limits() -> None:
@@ -122,7 +120,6 @@ def test_short_sequences_are_not_changed() -> None:
     poses = noisy(motion(SHORTEST - 1))
     found = smooth(SKELETON, poses, np.ones(len(poses), bool), FPS)
     np.testing.assert_array_equal(found.poses, poses)
-    assert np.isnan(found.noise).all()
     nothing = smooth(SKELETON, poses, np.zeros(len(poses), bool), FPS)
     np.testing.assert_array_equal(nothing.poses, poses)
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.body.joints import ARM, CROOK
-from tk.model.body.rotations import compose, decompose, to_quaternions
+from tk.model.body.rotations import decompose
 from tk.model.body.skeleton import SEGMENTS, Skeleton
 
 Float = NDArray[np.float64]
@@ -148,11 +148,6 @@ def standing_rotations(skeleton: Skeleton, transforms: Float) -> Float:
     return transforms[..., :3, :3] @ skeleton.T_world_body @ standing_axes()
 
 
-def segment_quaternions(skeleton: Skeleton, poses: Float) -> Float:
-    """Return the rotations as quaternions (F, S, 4) with order (w, x, y, z) and w ≥ 0, as in `/segments/rotation`."""
-    return to_quaternions(segment_rotations(skeleton, poses))
-
-
 def standing_axes() -> Float:
     """Return the segments' axes (S, 3, 3) in the zero configuration, body frame; identity except for the arms."""
     mirror = np.diag([1.0, -1.0, 1.0])
@@ -178,19 +173,6 @@ def joint_angles(rotations: Float, T_world_body: Float, segments: Sequence[str] 
         turns = decompose(angles.sequence, _in_isb(np.swapaxes(parent, -1, -2) @ child, angles.mirrored))
         result[angles.joint] = np.degrees(np.stack([sign * turns[..., k] for _, k, sign in angles.columns], axis=-1))
     return result
-
-
-def joint_rotation(angles: AngleSet, degrees: Float) -> Float:
-    """Return the child's axes in the parent's (..., 3, 3) from degrees (..., k): the inverse of :func:`joint_angles`.
-
-    An angle of the sequence that is no column, such as the rotation of a knee, is 0.
-    """
-    turns = np.zeros((*np.shape(degrees)[:-1], 3))
-    for column, (_, k, sign) in enumerate(angles.columns):
-        turns[..., k] = sign * np.radians(degrees[..., column])
-    R = compose(angles.sequence, turns)
-    R = MIRROR @ R @ MIRROR if angles.mirrored else R
-    return _ISB @ R @ _ISB.T
 
 
 def _in_isb(R: Float, mirrored: bool) -> Float:

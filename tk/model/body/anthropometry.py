@@ -9,7 +9,7 @@ between them. The body fit then changes each length within its scatter (:mod:`tk
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 from tk.errors import ConfigError
 
@@ -99,10 +99,6 @@ class BodyDimensions:
     def from_stature(stature_m: float) -> BodyDimensions:
         """Return the dimensions of the average body of a stature (crown to sole), metres."""
         return BodyDimensions(**{name: fraction * stature_m for name, fraction in FRACTIONS.items()})
-
-    def scaled(self, **factors: float) -> BodyDimensions:
-        """Return a copy with the named dimensions multiplied by factors."""
-        return replace(self, **{name: getattr(self, name) * factor for name, factor in factors.items()})
 
     @property
     def stature(self) -> float:

@@ -34,7 +34,6 @@ STATURE_DEVIATION = 0.01
 
 
 def fit_body(
-    preset: str,
     views: Views,
     pyramids: Sequence[Pyramid],
     poses: Float,
@@ -46,7 +45,6 @@ def fit_body(
     """Fit a body and poses to several frames.
 
     Args:
-        preset: of :data:`~tk.model.body.cone_body.PRESETS`.
         views: the cameras.
         pyramids: silhouettes of F frames.
         poses: (F, D) initial poses, close enough for the edge search to find the right edges.
@@ -59,7 +57,7 @@ def fit_body(
         The body, and poses (F, D).
     """
     bundle = ContourBundle(
-        BodyFamily(preset, BodyDimensions.from_stature(stature_m), stature_deviation),
+        BodyFamily(BodyDimensions.from_stature(stature_m), stature_deviation),
         views.rig,
         [BundleFrame(pyramid, pose, np.zeros_like(pose)) for pyramid, pose in zip(pyramids, poses, strict=True)],
         replace(settings, spacing_px=SPACING_PX),

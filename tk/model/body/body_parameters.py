@@ -53,10 +53,9 @@ _DIMENSIONS = tuple(field.name for field in fields(BodyDimensions))
 
 
 class BodyFamily:
-    """The bodies of a preset: K = 24 logarithms of dimensions, then 8 numbers for each of G groups of parts.
+    """Bodies by their K parameters: 24 logarithms of dimensions, then 8 numbers for each of G groups of parts.
 
     Attributes:
-        preset: of :data:`~tk.model.body.cone_body.PRESETS`.
         average: dimensions at the prior's mean.
         stature_deviation: prior standard deviation of the stature's logarithm.
         groups: (G,) names of the groups of parts.
@@ -64,10 +63,9 @@ class BodyFamily:
         start: (K,) parameters to begin with.
     """
 
-    def __init__(self, preset: str, average: BodyDimensions, stature_deviation: float) -> None:
-        self.preset, self.average = preset, average
-        self.stature_deviation = stature_deviation
-        self.groups = build_cone_body(average, preset=preset).shape_groups
+    def __init__(self, average: BodyDimensions, stature_deviation: float) -> None:
+        self.average, self.stature_deviation = average, stature_deviation
+        self.groups = build_cone_body(average).shape_groups
         shapes = [_SHAPES.get(name, _LIMB if name.endswith("_") else _TRUNK) for name in self.groups]
         logs = np.log([getattr(average, name) for name in _DIMENSIONS])
         self.mean = np.concatenate([logs, np.zeros(SHAPE_NUMBERS * len(self.groups))])
@@ -77,7 +75,7 @@ class BodyFamily:
     @staticmethod
     def around(body: ConeBody, stature_deviation: float) -> BodyFamily:
         """The family whose prior is about a body's dimensions and which begins at the body."""
-        family = BodyFamily(body.preset, body.dimensions, stature_deviation)
+        family = BodyFamily(body.dimensions, stature_deviation)
         family.start[len(_DIMENSIONS) :] = shapes_of(body).ravel()
         return family
 
@@ -86,7 +84,7 @@ class BodyFamily:
         values = np.exp(shared[: len(_DIMENSIONS)])
         dimensions = BodyDimensions(**dict(zip(_DIMENSIONS, values.tolist(), strict=True)))
         change = shared[len(_DIMENSIONS) :].reshape(len(self.groups), SHAPE_NUMBERS)
-        return build_cone_body(dimensions, preset=self.preset).reshaped(change)
+        return build_cone_body(dimensions).reshaped(change)
 
     def linearised(self, shared: Float, poses: Float) -> LinearisedBody:
         """The body with parameters (K,) at poses (M, D), and its derivatives by the dimensions: differences of bodies.
@@ -142,7 +140,9 @@ class LinearisedBody:
 
     def points(self, pose: NDArray[np.integer], edgels: Edgels) -> Float:
         """(N, 3) the edgels' points on the surface, world."""
-        return self.body.placed(self._T_world_part[pose, edgels.part], edgels.part, edgels.unscaled)
+        T = self._T_world_part[pose, edgels.part]
+        local = self.body.local(edgels.part, edgels.unscaled)
+        return np.asarray((T[:, :3, :3] @ local[:, :, None])[:, :, 0] + T[:, :3, 3])
 
     def pose_rows(self, pose: NDArray[np.integer], edgels: Edgels, x_world: Float) -> Float:
         """(N, D) derivatives of the contour's position along its normal by the pose, pixels, at points (N, 3)."""
@@ -151,7 +151,7 @@ class LinearisedBody:
         rows = np.empty((len(pose), self.twists.shape[-1]))
         for m in np.unique(pose):
             rows[pose == m] = wrench[pose == m] @ self.twists[m]
-        rows[~self.body.skeleton.ancestors()[self.body.frames[0][edgels.part]]] = 0.0
+        rows[~self.body.skeleton.ancestors[self.body.frames[0][edgels.part]]] = 0.0
         return rows
 
     def rows(self, pose: NDArray[np.integer], edgels: Edgels) -> Float:
@@ -165,7 +165,7 @@ class LinearisedBody:
         segments, inside = self.body.frames
         segment = segments[part]
         n = (edgels.row[:, None, :] @ self.T_world_segment[pose, segment, :3, :3])[:, 0]
-        local = np.column_stack([self.body.local(part, u)[2], np.ones(len(part))])
+        local = np.column_stack([self.body.local(part, u), np.ones(len(part))])
         a, b, h = ((n[:, None, :] @ inside[part, :3, :3])[:, 0] * u).T
         numbers = np.column_stack(
             [(n[:, :, None] * local[:, None, :]).reshape(-1, 12), a, a * u[:, 2], b, b * u[:, 2], h]
@@ -179,7 +179,7 @@ class LinearisedBody:
 def _part_numbers(body: ConeBody) -> Float:
     """Return (P, 17) the numbers on which a point of each part depends linearly: the part's place in its segment
     (12), and with z = z / h the factors of x / a r, z x / a r, y / b r, z y / b r and z."""
-    a, b, h, m = np.array([part.shape for part in body.parts]).T
+    a, b, h, m = body.shape.T
     _, inside = body.frames
     return np.column_stack([inside[:, :3].reshape(-1, 12), a, a * (m - 1), b, b * (m - 1), h])
 
@@ -190,13 +190,9 @@ def shape_rows(body: ConeBody, T_world_part: Float, edgels: Edgels) -> Float:
     An axis whose ends move apart tilts, and the cross-sections tilt with it. ``T_world_part`` (N, 4, 4) belongs to each
     edgel's part.
     """
-    groups = body.shape_groups
-    part = edgels.part
+    part, u = edgels.part, edgels.unscaled
     n = (edgels.row[:, None, :] @ T_world_part[:, :3, :3])[:, 0]  # the row in the part's frame
-    shape, _, local = body.local(part, edgels.unscaled)
-    cone = np.array([p.kind == CONE for p in body.parts])[part]
-    mirror = np.array([-1.0 if p.name.endswith("_r") else 1.0 for p in body.parts])[part]
-    u = edgels.unscaled
+    shape, cone, local = body.shape[part], body.is_cone[part], body.local(part, u)
     along = np.where(cone, u[:, 2], 0.5 * (u[:, 2] + 1))  # 0 at the beginning of the axis, 1 at its end
     length = np.where(cone, shape[:, 2], 2 * shape[:, 2])
     grown = np.where(cone, shape[:, 3] * u[:, 2], 0.0)  # derivative of the radius factor by log m
@@ -206,14 +202,13 @@ def shape_rows(body: ConeBody, T_world_part: Float, edgels: Edgels) -> Float:
     rows[:, 2] = grown * (n[:, 0] * shape[:, 0] * u[:, 0] + n[:, 1] * shape[:, 1] * u[:, 1])
     rows[:, 3] = n[:, 2] * local[:, 2]
     for axis in range(2):
-        side = mirror if axis == 1 else 1.0
+        side = body.mirror[part] if axis == 1 else 1.0
         tilt = n[:, 2] * local[:, axis] / length
         rows[:, 4 + axis] = side * ((1 - along) * n[:, axis] + tilt)
         rows[:, 6 + axis] = side * (along * n[:, axis] - tilt)
-    result = np.zeros((len(part), len(groups), SHAPE_NUMBERS))
-    column = np.array([groups.index(group_of(p.name)) for p in body.parts])[part]
-    result[np.arange(len(part)), column] = rows
-    return result.reshape(len(part), SHAPE_NUMBERS * len(groups))
+    result = np.zeros((len(part), len(body.shape_groups), SHAPE_NUMBERS))
+    result[np.arange(len(part)), body.group[part]] = rows
+    return result.reshape(len(part), SHAPE_NUMBERS * len(body.shape_groups))
 
 
 def shapes_of(body: ConeBody) -> Float:
@@ -221,7 +216,7 @@ def shapes_of(body: ConeBody) -> Float:
 
     A group is zero if the body of these dimensions has no such part.
     """
-    average = {part.name: part for part in build_cone_body(body.dimensions, preset=body.preset).parts}
+    average = {part.name: part for part in build_cone_body(body.dimensions).parts}
     result = np.zeros((len(body.shape_groups), SHAPE_NUMBERS))
     for g, group in enumerate(body.shape_groups):
         # the right side is the left's mirror image

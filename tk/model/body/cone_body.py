@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from tk.errors import ConfigError
 from tk.kernels.cone_arrays import MOST_PARTS, ConeArrays, pack_parts
 from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A, SIDE_B
-from tk.kernels.kinematics import pack_tree
 from tk.model.body.anthropometry import (
     ANKLE_OUTWARD,
     CROTCH_DROP,
@@ -27,13 +26,10 @@ from tk.model.body.anthropometry import (
     PELVIS_FORWARD,
     BodyDimensions,
 )
-from tk.model.body.joints import ARM, CHAINS, CROOK, ELBOW_AXIS, LIMBS, OPTIONAL, ROWS
-from tk.model.body.skeleton import SEGMENTS, Skeleton, build_skeleton, up_rotation
+from tk.model.body.joints import ARM, CHAIN_OF_SEGMENT, CROOK, ELBOW_AXIS, LIMBS, OPTIONAL, ROWS, SEGMENTS
+from tk.model.body.skeleton import Skeleton, build_skeleton, up_rotation
 
 Float = NDArray[np.float64]
-
-# All segments; without hands and feet; the paper's six-part walker.
-PRESETS = ("full", "limbs", "walker")
 
 # Radius of the calf at its thickest, as a factor of the straight line from knee to ankle. An estimate that the
 # body fit changes. With 1.05 the mean errors of walk (32 frames) change by 0.01 cm, with 1.2 by 0.13 cm.
@@ -47,19 +43,6 @@ _FORWARD = np.eye(3)[0]
 
 # Numbers of a part that :meth:`ConeBody.reshaped` changes: logarithms of a, b, m and h; x and y of either end.
 SHAPE_NUMBERS = 8
-
-# Limb of each segment: an edge of one limb can be mistaken for that of another (section 4.4).
-_LIMBS = {segment: 2 + k for k, chain in enumerate(LIMBS) for segment in CHAINS[chain]} | {
-    "torso": 0,
-    "pelvis": 0,
-    "head": 1,
-}
-
-# The seven degrees of freedom of the paper's experiments (section 6): translation, hips and knees.
-_WALKER_DOFS = (
-    *ROWS["torso"].dof_names[:3],
-    *(ROWS[joint].dof_names[0] for leg in ("leg_l", "leg_r") for joint in LIMBS[leg][:2]),
-)
 
 
 @dataclass(frozen=True)
@@ -94,14 +77,6 @@ class ConePart:
         if not all(0 < value < 3 for value in self.shape):
             raise ConfigError(f"part {self.name}: sizes {self.shape} must lie between 0 and 3")
 
-    def surface(self, unscaled: Float) -> Float:
-        """Return surface points (N, 3) in the part's frame from x / (a r), y / (b r), z / h; r is the radius at z
-        relative to that at z = 0."""
-        a, b, h, m = self.shape
-        z = unscaled[:, 2]
-        r = 1 + (m - 1) * z if self.kind == CONE else np.ones_like(z)
-        return np.column_stack([a * r * unscaled[:, 0], b * r * unscaled[:, 1], h * z])
-
 
 @dataclass(frozen=True)
 class ConeBody:
@@ -111,28 +86,17 @@ class ConeBody:
         dimensions: lengths and radii, metres.
         skeleton: the kinematic tree.
         parts: the cones and the ellipsoid.
-        preset: one of :data:`PRESETS`.
     """
 
     dimensions: BodyDimensions
     skeleton: Skeleton
     parts: tuple[ConePart, ...]
-    preset: str = "full"
 
     def standing(self, up: str) -> ConeBody:
         """Return the same body in a world in which ``up`` (see :func:`tk.model.cameras.up.up_vector`) points up."""
         if np.array_equal(self.skeleton.T_world_body, up_rotation(up)):
             return self
-        return replace(self, skeleton=_skeleton(self.dimensions, up, self.preset))
-
-    @cached_property
-    def free(self) -> NDArray[np.bool_]:
-        """(D,) bool, tracked degrees of freedom: those that move a part, or the walker's seven."""
-        names = self.skeleton.names
-        if self.preset == "walker":
-            return np.array([name in _WALKER_DOFS for name in names])
-        carried = [SEGMENTS.index(part.segment) for part in self.parts]
-        return np.asarray(self.skeleton.ancestors()[carried].any(axis=0))
+        return replace(self, skeleton=build_skeleton(self.dimensions, up, OPTIONAL))
 
     @cached_property
     def arrays(self) -> ConeArrays:
@@ -147,29 +111,46 @@ class ConeBody:
         """
         if len(self.parts) > MOST_PARTS:
             raise ConfigError(f"a body has {len(self.parts)} parts; {MOST_PARTS} are the most")
-        s = self.skeleton
         segments, inside = self.frames
         curves: list[tuple[int, int]] = []
         for p, part in enumerate(self.parts):
-            if part.kind == ELLIPSOID:
-                curves.append((p, OUTLINE))
-                continue
-            curves += [(p, SIDE_A), (p, SIDE_B)]
-            curves += [(p, kind) for kind, tracked in zip((END_NEAR, END_FAR), part.ends, strict=True) if tracked]
+            sides = (SIDE_A, SIDE_B) if part.kind == CONE else (OUTLINE,)
+            rims = [rim for rim, tracked in zip((END_NEAR, END_FAR), part.ends, strict=True) if tracked]
+            curves += [(p, kind) for kind in (*sides, *rims)]
         parts = pack_parts(
-            shape=np.array([part.shape for part in self.parts]),
+            shape=self.shape,
             frame=inside[:, :3],
             kind=np.array([part.kind for part in self.parts]),
-            dof=s.segment_dof[segments],
-            limb=np.array([_LIMBS[part.segment] for part in self.parts]),
+            dof=self.skeleton.segment_dof[segments],
+            limb=CHAIN_OF_SEGMENT[segments],
         )
-        tree = pack_tree(s.axis, s.anchor, s.prismatic, s.parent)
-        return ConeArrays(tree.astype(dtype), parts.astype(dtype), np.array(curves, np.int32))
+        return ConeArrays(self.skeleton.tree.astype(dtype), parts.astype(dtype), np.array(curves, np.int32))
+
+    @cached_property
+    def shape(self) -> Float:
+        """(P, 4) shapes of the parts."""
+        return np.array([part.shape for part in self.parts])
+
+    @cached_property
+    def is_cone(self) -> NDArray[np.bool_]:
+        """(P,) True for a frustum, False for an ellipsoid."""
+        return np.array([part.kind == CONE for part in self.parts])
+
+    @cached_property
+    def mirror(self) -> Float:
+        """(P,) -1 for a part of the right side, which is the left one's mirror image, else 1."""
+        return np.array([-1.0 if part.name.endswith("_r") else 1.0 for part in self.parts])
 
     @property
     def shape_groups(self) -> tuple[str, ...]:
         """(G,) names of the groups of parts with one shape: "thigh_" for the left and right thigh."""
         return tuple(dict.fromkeys(group_of(part.name) for part in self.parts))
+
+    @cached_property
+    def group(self) -> NDArray[np.int64]:
+        """(P,) index of each part's group."""
+        groups = self.shape_groups
+        return np.array([groups.index(group_of(part.name)) for part in self.parts])
 
     def reshaped(self, change: Float) -> ConeBody:
         """Return a body whose parts have other sizes and lie elsewhere about their bones; the skeleton stays.
@@ -180,11 +161,9 @@ class ConeBody:
                 two numbers at its beginning (a cone's z = 0, an ellipsoid's lower pole), two at its end. The right
                 side is the left's mirror image.
         """
-        groups = self.shape_groups
-        rows = change[[groups.index(group_of(part.name)) for part in self.parts]]
-        shape, T = np.array([part.shape for part in self.parts]), np.array([part.T_body_part for part in self.parts])
-        cone = np.array([part.kind == CONE for part in self.parts])
-        side = np.array([-1.0 if part.name.endswith("_r") else 1.0 for part in self.parts])
+        rows = change[self.group]
+        shape, cone, side = self.shape, self.is_cone, self.mirror
+        T = np.array([part.T_body_part for part in self.parts])
         h = shape[:, 2]
         # both ends of the axis in the part's frame, then in the body's
         low = np.column_stack([rows[:, 4], side * rows[:, 5], np.where(cone, 0.0, -h)])
@@ -207,42 +186,25 @@ class ConeBody:
             ),
         )
 
-    def place(
-        self, pose: Float, part: NDArray[np.integer], unscaled: Float, T_world_segment: Float | None = None
-    ) -> Float:
-        """Return world points (N, 3) on the surface of parts (N,) from coordinates of :meth:`ConePart.surface`.
-
-        ``T_world_segment`` are the segments' transforms at the pose; None: they are computed.
-        """
-        if T_world_segment is None:
-            T_world_segment = self.skeleton.segment_transforms(pose)
-        T = self.part_transforms(T_world_segment)[part]
-        return self.placed(T, part, unscaled)
-
-    def placed(self, T_world_part: Float, part: NDArray[np.integer], unscaled: Float) -> Float:
-        """Return the same from the transform (N, 4, 4) of each point's part."""
-        local = self.local(part, unscaled)[2]
-        return np.asarray((T_world_part[:, :3, :3] @ local[:, :, None])[:, :, 0] + T_world_part[:, :3, 3])
-
     def part_transforms(self, T_world_segment: Float) -> Float:
         """Return (..., P, 4, 4) from each part to the world, from the segments' (..., S, 4, 4)."""
         segments, inside = self.frames
         return np.asarray(T_world_segment[..., segments, :, :] @ inside)
 
-    def local(self, part: NDArray[np.integer], unscaled: Float) -> tuple[Float, Float, Float]:
-        """Return shape (N, 4) and radius factor (N,) of the parts, and points (N, 3) in their frames."""
-        shape = np.array([p.shape for p in self.parts])[part]
-        cone = np.array([p.kind == CONE for p in self.parts])[part]
-        r = np.where(cone, 1 + (shape[:, 3] - 1) * unscaled[:, 2], 1.0)
-        return shape, r, unscaled * np.column_stack([shape[:, 0] * r, shape[:, 1] * r, shape[:, 2]])
+    def local(self, part: NDArray[np.integer], unscaled: Float) -> Float:
+        """Return points (N, 3) on the surface of parts (N,), in the parts' frames.
+
+        ``unscaled`` (N, 3) are x / (a r), y / (b r), z / h; r is the radius at z relative to that at z = 0.
+        """
+        a, b, h, m = self.shape[part].T
+        r = np.where(self.is_cone[part], 1 + (m - 1) * unscaled[:, 2], 1.0)
+        return np.asarray(unscaled * np.column_stack([a * r, b * r, h]))
 
     @cached_property
     def frames(self) -> tuple[NDArray[np.int64], Float]:
         """Return (P,) the segment of each part, and (P, 4, 4) from the part to its segment."""
-        B = np.eye(4)
-        B[:3, :3] = self.skeleton.T_world_body
         segments = np.array([SEGMENTS.index(part.segment) for part in self.parts])
-        return segments, B @ np.array([part.T_body_part for part in self.parts])
+        return segments, self.skeleton.in_world(np.array([part.T_body_part for part in self.parts]))
 
 
 def _unit(vectors: Float) -> Float:
@@ -250,59 +212,40 @@ def _unit(vectors: Float) -> Float:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
-def build_cone_body(dimensions: BodyDimensions, up: str = "z", preset: str = "full") -> ConeBody:
+def build_cone_body(dimensions: BodyDimensions, up: str = "z") -> ConeBody:
     """Build the cone body of these dimensions.
+
+    The torso consists of four frusta, the calf of two; the head has a neck, the foot an instep ("variable resolution",
+    silhouette paper, section 3).
 
     Args:
         dimensions: lengths and radii, metres.
         up: the world axis that points up.
-        preset: "full" (torso, pelvis, head, upper and lower arms, hands, thighs, calves, feet), "limbs"
-            (10, without hands and feet), or "walker" (6: torso, head, thighs, calves; seven degrees of freedom are
-            free). In the full body the torso consists of four frusta, the calf of two, the head has a neck and the foot
-            an instep ("variable resolution", section 3); in the others every component is one solid.
-
-    Raises:
-        ConfigError: an unknown preset.
     """
-    if preset not in PRESETS:
-        raise ConfigError(f'cone body "{preset}": choose one of {", ".join(PRESETS)}')
     d = dimensions
     x, y, z = np.eye(3)
-    parts = _trunk_and_head(d) if preset == "full" else [_torso(d), _head(d)]
+    parts = _trunk_and_head(d)
     for side, sign in (("l", 1.0), ("r", -1.0)):
         M = np.diag([1.0, sign, 1.0])
-        if preset != "walker":
-            shoulder, elbow, wrist = (ROWS[name].place(d) for name in LIMBS[f"arm_{side}"])
-            # the muscles lie on the side to which the elbow bends
-            crook = elbow + ELBOW_FRONT * d.stature * (M @ CROOK) if preset == "full" else elbow
-            for segment, begin, end, r0, r1 in (
-                ("upper_arm", shoulder, crook, d.upper_arm_radius, d.elbow_radius),
-                ("forearm", crook, wrist, d.elbow_radius, d.wrist_radius),
-            ):
-                parts.append(_between(f"{segment}_{side}", f"{segment}_{side}", begin, end, r0, r1, z))
-        if preset == "full":
-            # half open: a little shorter than the stretched hand, wider than the wrist across the palm; the thumb's
-            # side is that to which the elbow bends
-            shape = (0.9 * d.wrist_radius, 1.4 * d.wrist_radius, 0.95 * d.hand, 0.6)
-            frame = _frame(wrist, M @ ARM, M @ ELBOW_AXIS)
-            parts.append(ConePart(f"hand_{side}", f"forearm_{side}", CONE, shape, frame, ends=(False, True)))
+        shoulder, elbow, wrist = (ROWS[name].place(d) for name in LIMBS[f"arm_{side}"])
+        # the muscles lie on the side to which the elbow bends
+        crook = elbow + ELBOW_FRONT * d.stature * (M @ CROOK)
+        upper_arm, forearm = f"upper_arm_{side}", f"forearm_{side}"
+        parts.append(_between(upper_arm, upper_arm, shoulder, crook, d.upper_arm_radius, d.elbow_radius, z))
+        parts.append(_between(forearm, forearm, crook, wrist, d.elbow_radius, d.wrist_radius, z))
+        # half open: a little shorter than the stretched hand, wider than the wrist across the palm; the thumb's
+        # side is the one to which the elbow bends
+        shape = (0.9 * d.wrist_radius, 1.4 * d.wrist_radius, 0.95 * d.hand, 0.6)
+        frame = _frame(wrist, M @ ARM, M @ ELBOW_AXIS)
+        parts.append(ConePart(f"hand_{side}", forearm, CONE, shape, frame, ends=(False, True)))
         hip, knee, ankle = (ROWS[name].place(d) for name in LIMBS[f"leg_{side}"])
-        if preset == "full":
-            # the surface lies in front of the hip, behind the knee and outside of the ankle
-            top = hip + PELVIS_FORWARD * d.stature * x
-            hollow = knee - KNEE_BACK * d.stature * x
-            low = ankle + ANKLE_OUTWARD * d.stature * (M @ y)
-            parts.append(_between(f"thigh_{side}", f"thigh_{side}", top, hollow, d.thigh_radius, d.knee_radius))
-            parts += _calf(side, hollow, low, d) + _foot(side, ankle, d)
-        else:  # without a foot the calf reaches the ground
-            parts.append(_limb(f"thigh_{side}", hip, -z, d.thigh, d.thigh_radius, d.knee_radius, x))
-            reach = d.calf + d.ankle_height
-            parts.append(_limb(f"calf_{side}", knee, -z, reach, d.knee_radius, d.ankle_radius, x, (False, True)))
-    return ConeBody(d, _skeleton(d, up, preset), tuple(parts), preset)
-
-
-def _skeleton(dimensions: BodyDimensions, up: str, preset: str) -> Skeleton:
-    return build_skeleton(dimensions, up, OPTIONAL if preset == "full" else ())
+        # the surface lies in front of the hip, behind the knee and outside of the ankle
+        top = hip + PELVIS_FORWARD * d.stature * x
+        hollow = knee - KNEE_BACK * d.stature * x
+        low = ankle + ANKLE_OUTWARD * d.stature * (M @ y)
+        parts.append(_between(f"thigh_{side}", f"thigh_{side}", top, hollow, d.thigh_radius, d.knee_radius))
+        parts += _calf(side, hollow, low, d) + _foot(side, ankle, d)
+    return ConeBody(d, build_skeleton(d, up, OPTIONAL), tuple(parts))
 
 
 def _calf(side: str, knee: Float, ankle: Float, d: BodyDimensions) -> list[ConePart]:
@@ -345,17 +288,6 @@ def _foot(side: str, ankle: Float, d: BodyDimensions) -> list[ConePart]:
         between("foot", heel, toes, (thick, 0.17 * d.foot), 0.8, True),
         between("instep", ankle, ball, (d.ankle_radius, d.ankle_radius), 0.6, False),
     ]
-
-
-def _torso(d: BodyDimensions) -> ConePart:
-    """From the crotch to the root of the neck; one magnification for width and depth, as in the paper."""
-    x, _, z = np.eye(3)
-    bottom = -0.9 * CROTCH_DROP / FRACTIONS["hip_half_width"] * d.hip_half_width
-    top = 0.94 * d.trunk
-    m = d.chest_half_width / d.hips_half_width
-    depth = 0.5 * (d.hips_half_depth + d.chest_half_depth / m)
-    shape = (depth, d.hips_half_width, top - bottom, m)
-    return ConePart("torso", "torso", CONE, shape, _frame(bottom * z, z, x), ends=(False, True))
 
 
 def _trunk_and_head(d: BodyDimensions) -> list[ConePart]:
@@ -408,34 +340,9 @@ def _trunk_and_head(d: BodyDimensions) -> list[ConePart]:
     ]
 
 
-def _head(d: BodyDimensions) -> ConePart:
-    """An ellipsoid that reaches from the crown into the torso: it represents the neck, too.
-
-    C7 lies at the back of the neck and the crown behind the middle of the head: its centre is in front of their line.
-    """
-    x, _, z = np.eye(3)
-    half = 0.58 * d.head
-    shape = (1.12 * d.head_radius, d.head_radius, half, 1.0)
-    center = (d.trunk + d.head - half) * z + 0.1 * d.head * x
-    return ConePart("head", "head", ELLIPSOID, shape, _frame(center, z, x))
-
-
 def group_of(name: str) -> str:
     """Return a part's name without its side; it ends with an underscore if there are two sides."""
     return name[:-1] if name.endswith(("_l", "_r")) else name
-
-
-def _limb(
-    segment: str,
-    origin: Float,
-    axis: Float,
-    length: float,
-    r0: float,
-    r1: float,
-    front: Float,
-    ends: tuple[bool, bool] = (False, False),
-) -> ConePart:
-    return ConePart(segment, segment, CONE, (r0, r0, length, r1 / r0), _frame(origin, axis, front), ends)
 
 
 def _frame(origin: Float, axis: Float, front: Float) -> Float:

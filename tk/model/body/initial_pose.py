@@ -69,17 +69,15 @@ def _fitted(skeleton: Skeleton, rows: NDArray[np.int64], targets: Float) -> Floa
     for pose in start:
         pose[:3] = targets.mean(axis=0) - skeleton.joints(rest)[rows].mean(axis=0)
     free = np.ones(len(rest), bool)
-    moves = skeleton.ancestors()[skeleton.joint_segment][rows]
     precision = np.where(skeleton.prismatic, 0.0, _ANGLE**-2.0)
     weight = np.full(3 * len(rows), _JOINT_M**-2.0)
 
     def linearise(poses: Float, _: int) -> Equations:
         found = Equations(len(poses), free, 0)
         for b, pose in enumerate(poses):
-            w, v = skeleton.twists(pose)
-            x = skeleton.joints(pose)[rows]
-            J = np.where(moves[:, :, None], np.cross(w[None], x[:, None]) + v, 0.0).swapaxes(1, 2)
-            found.add(b, [slice(0, len(rest))], J.reshape(-1, len(rest)), weight, (targets - x).ravel())
+            J = skeleton.joint_jacobian(pose)[rows].reshape(-1, len(rest))
+            missing = targets - skeleton.joints(pose)[rows]
+            found.add(b, [slice(0, len(rest))], J, weight, missing.ravel())
             found.add_block_prior(b, precision, start[b] - pose)
             excess = skeleton.clip(pose) - pose
             found.add_block_prior(b, np.where(excess != 0, _LIMIT, 0.0), excess)

@@ -40,22 +40,16 @@ _TO = np.array([JOINTS.index(end) for _, end in _BONES.values()])
 _TRUNK = SEGMENTS.index("torso")
 
 
-def contour_variance(skeleton: Skeleton, pose: Float, precision: Float, free: NDArray[np.bool_]) -> Float:
+def contour_variance(skeleton: Skeleton, pose: Float, precision: Float) -> Float:
     """Return (..., 15) variance of the joints' positions along an axis, metres², from the contours' noise.
 
     Args:
         skeleton: of D degrees of freedom.
         pose: (..., D).
         precision: (..., D, D) information of contours and priors about the pose.
-        free: (D,) bool, degrees of freedom that were optimised.
     """
-    index = np.flatnonzero(free)
-    covariance = np.linalg.inv(precision[..., index[:, None], index])
-    w, v = skeleton.twists(pose)
-    moves = skeleton.ancestors()[skeleton.joint_segment][:, index]
-    w, v = w[..., None, index, :], v[..., None, index, :]
-    J = np.where(moves[:, :, None], np.cross(w, skeleton.joints(pose)[..., None, :]) + v, 0.0)  # (..., 15, free, 3)
-    J = np.swapaxes(J, -1, -2)
+    J = skeleton.joint_jacobian(pose)
+    covariance = np.linalg.inv(precision)
     return np.asarray((J * (J @ covariance[..., None, :, :])).sum(axis=(-1, -2)) / 3)
 
 

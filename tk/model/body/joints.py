@@ -221,6 +221,10 @@ CHAINS: dict[str, tuple[str, ...]] = {
     chain: tuple(row.turns for row in TABLE if row.chain == chain and row.turns)
     for chain in dict.fromkeys(row.chain for row in TABLE if row.chain)
 }
+#: (S,) index of the chain of each segment, -1 for torso and pelvis
+CHAIN_OF_SEGMENT = np.array(
+    [next((c for c, chain in enumerate(CHAINS.values()) if name in chain), -1) for name in SEGMENTS]
+)
 #: the joints at the start, in the middle and at the end of each limb: arm_l, arm_r, leg_l, leg_r
 LIMBS: dict[str, tuple[str, str, str]] = {}
 for _chain in CHAINS:

@@ -43,47 +43,42 @@ class Limb:
 
     Attributes:
         name: of :data:`LIMBS`.
+        skeleton: of the body.
         dofs: (L,) its degrees of freedom.
-        free: (D,) bool, those degrees of freedom.
         parts: (K,) int32 its parts.
         arrays: the body for the kernels, with the contours of these parts only.
         joints: elbow and wrist, or knee and ankle, as indices into the skeleton's joints.
         grid: (N, L) candidates.
-        lower, upper: (L,) limits.
     """
 
     name: str
+    skeleton: Skeleton
     dofs: NDArray[np.int64]
-    free: NDArray[np.bool_]
     parts: NDArray[np.int32]
     arrays: ConeArrays
-    joints: tuple[int, int]
+    joints: list[int]
     grid: Float
-    lower: Float
-    upper: Float
 
     def candidates(self, pose: Float, near: int, rng: np.random.Generator) -> Float:
         """Return (B, D) copies of a pose with the limb in all candidates of the grid, and in ``near`` random ones."""
         turned = pose[self.dofs] + rng.normal(scale=np.radians(_NEAR_DEG), size=(near, len(self.dofs)))
-        angles = np.concatenate([self.grid, np.clip(turned, self.lower, self.upper)])
-        result = np.repeat(pose[None], len(angles), axis=0)
-        result[:, self.dofs] = angles
+        near_angles = np.clip(turned, self.skeleton.lower[self.dofs], self.skeleton.upper[self.dofs])
+        return self.combined(pose[None], np.concatenate([self.grid, near_angles]))
+
+    def combined(self, poses: Float, angles: Float) -> Float:
+        """Return (B·N, D) each of the poses (B, D) with each of the limb's angles (N, L)."""
+        result = np.repeat(poses, len(angles), axis=0)
+        result[:, self.dofs] = np.tile(angles, (len(poses), 1))
         return result
 
-    def combined(self, poses: Float, others: Float) -> Float:
-        """Return (B·N, D) each of the poses (B, D) with the limb as in each of the others (N, D)."""
-        result = np.repeat(poses, len(others), axis=0)
-        result[:, self.dofs] = np.tile(others[:, self.dofs], (len(poses), 1))
-        return result
-
-    def distinct(self, skeleton: Skeleton, poses: Float, cost: Float, count: int) -> Float:
+    def distinct(self, poses: Float, cost: Float, count: int) -> Float:
         """Return (C, D) the cheapest different poses of the limb (:data:`DISTINCT_M`), at most ``count``."""
         best = np.argsort(cost, kind="stable")
         best = best[np.isfinite(cost[best])]
         chosen: list[int] = []
         for many in (5 * count, 20 * count):  # the cheapest are mostly neighbours of each other
             if len(chosen) < count:
-                chosen = distinct(skeleton.joints(poses[best[:many]])[:, list(self.joints)], count)
+                chosen = distinct(self.skeleton.joints(poses[best[:many]])[:, self.joints], count)
         return np.asarray(poses[best[chosen]])
 
 
@@ -103,33 +98,21 @@ def distinct(joints: Float, count: int, current: Float | None = None) -> list[in
 
 def limbs_of(body: ConeBody) -> tuple[Limb, ...]:
     """Return the limbs of a body."""
-    skeleton = body.skeleton
+    skeleton, arrays = body.skeleton, body.arrays
     result = []
     for name in LIMBS:
-        parts = np.array([p.segment in CHAINS[name] for p in body.parts])
-        if not parts.any():
-            continue
-        chain = np.flatnonzero(skeleton.chain_dofs(name))
-        dofs = chain[body.free[chain]]
-        lower, upper = skeleton.lower[dofs], skeleton.upper[dofs]
-        arm = name.startswith("arm")
-        grid = _arm_grid() if arm else _leg_grid(len(chain))
-        if len(dofs) < len(chain):  # the walker's hips turn about one axis only
-            grid = np.unique(grid[:, body.free[chain]], axis=0)
-        own = parts[body.arrays.curves[:, 0]]
-        free = np.zeros(len(skeleton.names), bool)
-        free[dofs] = True
+        parts = np.array([part.segment in CHAINS[name] for part in body.parts])
+        dofs = np.flatnonzero(skeleton.chain_dofs(name))
+        grid = _arm_grid() if name.startswith("arm") else _leg_grid(len(dofs))
         result.append(
             Limb(
                 name=name,
+                skeleton=skeleton,
                 dofs=dofs,
-                free=free,
                 parts=np.flatnonzero(parts).astype(np.int32),
-                arrays=body.arrays._replace(curves=body.arrays.curves[own]),
-                joints=(JOINTS.index(LIMBS[name][1]), JOINTS.index(LIMBS[name][2])),
-                grid=np.clip(grid, lower, upper),
-                lower=lower,
-                upper=upper,
+                arrays=arrays._replace(curves=arrays.curves[parts[arrays.curves[:, 0]]]),
+                joints=[JOINTS.index(joint) for joint in LIMBS[name][1:]],
+                grid=np.clip(grid, skeleton.lower[dofs], skeleton.upper[dofs]),
             )
         )
     return tuple(result)

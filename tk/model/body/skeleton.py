@@ -28,7 +28,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tk.kernels.kinematics import ARM_UP
+from tk.kernels.kinematics import ARM_UP, pack_tree
 from tk.model.body.anthropometry import FRACTIONS, RAISED_SHOULDERS, BodyDimensions
 from tk.model.body.joints import (
     ARM,
@@ -66,11 +66,10 @@ class Skeleton:
 
     Attributes:
         names: (D,) names of the degrees of freedom; translations first.
-        units: (D,) "m" or "rad".
         axis: (D, 3) unit axes in the zero configuration, world frame.
         point: (D, 3) a point on each axis, metres; unused for translations.
         rise: (D, 3) how far a level arm that is raised upright lifts its shoulder, metres, in the first degree of
-            freedom of each shoulder; zero elsewhere. See :attr:`anchor`.
+            freedom of each shoulder; zero elsewhere.
         prismatic: (D,) True for translations.
         parent: (D,) index of the degree of freedom before, -1 at the root.
         lower, upper: (D,) limits, radians; infinite where there is none.
@@ -84,7 +83,6 @@ class Skeleton:
     """
 
     names: tuple[str, ...]
-    units: tuple[str, ...]
     axis: Float
     point: Float
     rise: Float
@@ -98,6 +96,11 @@ class Skeleton:
     joint_segment: NDArray[np.int32]
     joint_position: Float
     T_world_body: Float
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """(D,) "m" or "rad"."""
+        return tuple("m" if p else "rad" for p in self.prismatic)
 
     @cached_property
     def is_waist(self) -> NDArray[np.bool_]:
@@ -190,10 +193,16 @@ class Skeleton:
             result[:, level] += result[:, self.parent[level]]
         return np.asarray(result[:, self.segment_dof])
 
-    @property
-    def anchor(self) -> Float:
-        """(D, 6) point and rise, as the kernels take them (:func:`tk.kernels.kinematics.forward`)."""
-        return np.concatenate([self.point, self.rise], axis=1)
+    @cached_property
+    def tree(self) -> Float:
+        """(D, 11) the tree for the kernels, see :func:`tk.kernels.kinematics.pack_tree`."""
+        return pack_tree(self.axis, self.point, self.rise, self.prismatic, self.parent)
+
+    def in_world(self, T_body: Float) -> Float:
+        """Transforms (..., 4, 4) or (..., 3, 4) to the body frame as transforms to the world, zero configuration."""
+        B = np.eye(4)
+        B[:3, :3] = self.T_world_body
+        return B[: np.shape(T_body)[-2], : np.shape(T_body)[-2]] @ T_body
 
     def twists(self, pose: Float) -> tuple[Float, Float]:
         """World twists (ω, v), each (..., D, 3), at poses (..., D): a point x below degree of freedom k moves at
@@ -236,12 +245,15 @@ class Skeleton:
         """(...) how far the joints of poses (..., D) lie at most from others (J, 3), metres."""
         return np.asarray(np.linalg.norm(self.joints(poses) - joints, axis=-1).max(axis=-1))
 
-    def ancestors(self) -> NDArray[np.bool_]:
-        """(S, D): True where a degree of freedom moves a segment."""
-        return self._ancestors
+    def joint_jacobian(self, poses: Float) -> Float:
+        """(..., J, 3, D) derivatives of :meth:`joints` at poses (..., D)."""
+        w, v = self.twists(poses)
+        moved = np.cross(w[..., None, :, :], self.joints(poses)[..., None, :]) + v[..., None, :, :]
+        return np.swapaxes(np.where(self.ancestors[self.joint_segment][:, :, None], moved, 0.0), -1, -2)
 
     @cached_property
-    def _ancestors(self) -> NDArray[np.bool_]:
+    def ancestors(self) -> NDArray[np.bool_]:
+        """(S, D): True where a degree of freedom moves a segment."""
         result = np.zeros((len(SEGMENTS), len(self.names)), dtype=bool)
         for s, k in enumerate(self.segment_dof):
             while k >= 0:
@@ -352,7 +364,6 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z", optional: Collecti
     joints = [ROWS[name] for name in JOINTS]
     return Skeleton(
         names=tuple(name for _, _, name in dofs),
-        units=tuple("m" if p else "rad" for p in prismatic),
         axis=axis,
         point=np.array([row.place(dimensions) for row, _, _ in dofs]) @ B.T,
         rise=np.array([lift * (name in lifting) for _, _, name in dofs]) @ B.T,

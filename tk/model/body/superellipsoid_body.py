@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.cones import CONE
-from tk.kernels.kinematics import pack_tree
 from tk.kernels.piece_arrays import PieceArrays, pack_pieces
 from tk.model.body.cone_body import ConeBody, ConePart, group_of
 from tk.model.body.gait_poses import neutral_pose
@@ -63,15 +62,12 @@ class SuperellipsoidBody:
     def arrays(self) -> PieceArrays:
         """The body for the kernels."""
         skeleton = self.skeleton
-        T_world_body = np.eye(4)
-        T_world_body[:3, :3] = skeleton.T_world_body
         pieces = pack_pieces(
-            frame=np.array([(T_world_body @ p.T_body_piece)[:3] for p in self.pieces]),
+            frame=skeleton.in_world(np.array([p.T_body_piece for p in self.pieces]))[:, :3],
             shape=np.array([[*p.radii, p.e1, p.e2, p.z_lower, p.z_upper] for p in self.pieces]),
             dof=skeleton.segment_dof[[SEGMENTS.index(p.segment) for p in self.pieces]],
         )
-        tree = pack_tree(skeleton.axis, skeleton.anchor, skeleton.prismatic, skeleton.parent)
-        return PieceArrays(tree, pieces)
+        return PieceArrays(skeleton.tree, pieces)
 
     def place(self, pose: Float) -> Float:
         """Return surface samples (N, 3) at a pose, world frame, metres. Float64 reference for the kernels."""
@@ -151,12 +147,10 @@ def _buried(
 ) -> NDArray[np.bool_]:
     """(N,) bool, samples inside another piece in the Da Vinci pose: armpits, the crotch, the inside of joints."""
     T = skeleton.segment_transforms(neutral_pose(skeleton))
-    B = np.eye(4)
-    B[:3, :3] = skeleton.T_world_body
     p_world = np.einsum("nab,nb->na", T[segment][:, :3, :3], points) + T[segment][:, :3, 3]
     buried = np.zeros(len(points), dtype=bool)
     for index, other in enumerate(pieces):
-        T_piece_world = np.linalg.inv(T[SEGMENTS.index(other.segment)] @ B @ other.T_body_piece)
+        T_piece_world = np.linalg.inv(T[SEGMENTS.index(other.segment)] @ skeleton.in_world(other.T_body_piece))
         p_piece = p_world @ T_piece_world[:3, :3].T + T_piece_world[:3, 3]
         buried |= other.contains(p_piece) & (piece != index)
     return buried

@@ -18,7 +18,7 @@ from tk.kernels.line_search import SearchSettings
 from tk.model.block_least_squares import gauge_projection
 from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.cone_body import ConeBody
-from tk.model.cameras.bundle import SPACING_PX, BundleFrame, ContourBundle, residual_px
+from tk.model.cameras.bundle import SPACING_PX, BundleFrame, ContourBundle
 from tk.model.cameras.camera import Rig
 
 Float = NDArray[np.float64]
@@ -60,7 +60,6 @@ class CameraAgreement:
         size: (2,) by which share of its size each of two cameras shows the person larger than the other one expects;
             empty unless there are two.
         size_sigma: (2,) one standard deviation.
-        residual_px: (C,) pixels, root mean square distance of contours from the mask's edges.
         focal_px: (C,) pixels, focal lengths: they turn a shift into an angle.
     """
 
@@ -71,7 +70,6 @@ class CameraAgreement:
     offset_sigma_frames: Float
     size: Float
     size_sigma: Float
-    residual_px: Float
     focal_px: Float
 
     @property
@@ -116,8 +114,7 @@ def camera_agreement(body: ConeBody, rig: Rig, frames: Sequence[BundleFrame]) ->
     C = len(rig)
     family = BodyFamily.around(body, SCALE_DEVIATION)
     bundle = ContourBundle(family, rig, frames, CAMERA_SEARCH, _SIGMA_OF_TWO if C == 2 else _SIGMA)
-    contours = bundle.contours(bundle.start, 0)
-    found = bundle.equations(bundle.start, contours).reduced()
+    found = bundle.linearise(bundle.start, 0).reduced()
     modes = _gauge_modes(rig, body.skeleton.joints(frames[0].pose)[0], len(bundle.sigma))
     project = gauge_projection(modes, np.tile(bundle.sigma**-2, C))
     inverse = project @ np.linalg.inv(found.hessian)[bundle.cameras]
@@ -136,7 +133,6 @@ def camera_agreement(body: ConeBody, rig: Rig, frames: Sequence[BundleFrame]) ->
         offset_sigma_frames=deviation[:, -1] if moves else np.full(C, np.nan),
         size=step[:, 2:-1].ravel(),
         size_sigma=np.sqrt(spread).reshape(C, -1)[:, 2:-1].ravel(),
-        residual_px=residual_px(contours, C),
         focal_px=np.array([camera.matrix[0, 0] for camera in rig]),
     )
 

@@ -17,7 +17,7 @@ from tk.errors import ConfigError
 from tk.kernels.linearisation import Linearisation
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective import Held, ObjectiveKernel, ObjectiveParameters
-from tk.model.body.skeleton import CHAINS, SEGMENTS
+from tk.model.body.joints import CHAIN_OF_SEGMENT, CHAINS, SEGMENTS
 from tk.model.body.superellipsoid_body import SuperellipsoidBody
 from tk.model.cues.edge_term import RENEW, ContourTerm
 from tk.settings import ObjectiveSettings
@@ -26,10 +26,6 @@ Float = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 CHAIN_NAMES = tuple(CHAINS)
-# index of the chain of each segment, -1 for the torso
-CHAIN_OF_SEGMENT = np.array(
-    [next((c for c, chain in enumerate(CHAINS.values()) if name in chain), -1) for name in SEGMENTS]
-)
 
 
 def _barred() -> Ints:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from tk.kernels import hull as kernels
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import VoxelGrid
-from tk.model.hull.boundary import hull_boundary
 from tk.model.hull.tables import HullTables, load_or_build, mask_words
 
 __all__ = ["HullSurface", "VisualHull"]
@@ -27,7 +26,6 @@ class HullSurface:
         normals: (N, 3) float32 outward unit normals; zero where undefined (symmetric neighbours).
         colors: (N, 3) float32, 0..255 in the images' channel order (BGR); zero where ``seen`` is 0.
         seen: (N,) int32, bit c set where camera c sees the voxel frontally and nothing of the hull hides it.
-        boundary: (N, 3) float32 metres, each voxel moved along its normal to the hull's boundary, if requested.
     """
 
     voxels: NDArray[np.int32]
@@ -35,7 +33,6 @@ class HullSurface:
     normals: NDArray[np.float32]
     colors: NDArray[np.float32]
     seen: NDArray[np.int32]
-    boundary: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.voxels)
@@ -52,17 +49,16 @@ class VisualHull:
         grid: the voxels.
         cache_dir: folder of the look-up tables between runs; by default the platform's cache folder. A cache that
             cannot be read or written is ignored.
-        use_cache: False builds the tables again and writes nothing.
 
     Raises:
         VolumeError: no voxel is seen by two cameras.
         ConfigError: too many cameras or voxels for 32-bit look-up tables.
     """
 
-    def __init__(self, rig: Rig, grid: VoxelGrid, cache_dir: Path | None = None, use_cache: bool = True) -> None:
+    def __init__(self, rig: Rig, grid: VoxelGrid, cache_dir: Path | None = None) -> None:
         self.rig = rig
         self.grid = grid
-        self._tables: HullTables = load_or_build(rig, grid, cache_dir, use_cache)
+        self._tables: HullTables = load_or_build(rig, grid, cache_dir)
         self._mask_shape = (len(rig), *rig.frame_shape)
         self._pixel_count = int(np.prod(rig.frame_shape))
         self._eyes = ((rig.centers - np.asarray(grid.origin)) / grid.voxel_m).astype(np.float32)
@@ -92,14 +88,13 @@ class VisualHull:
         Args:
             masks: (C, H, W) uint8 with (H, W) = ``rig.frame_shape``, foreground where not 0.
         """
-        words = self._as_words(masks)
         tables = self._tables
         self._clean = False
         kernels.carve(
             tables.row_offsets,
             tables.entries,
             tables.enough,
-            words,
+            self._as_words(masks),
             self._previous,
             self._planes,
             self._occupied,
@@ -110,26 +105,16 @@ class VisualHull:
         """(nx, ny, nz) bool, the active voxels; a copy."""
         return kernels.unpack(self._occupied, self.grid.shape)
 
-    @property
-    def camera_bits(self) -> NDArray[np.int32]:
-        """(nx, ny, nz) int32, the paper's bit masks: bit c is set where camera c does not carve the voxel; a copy."""
-        bits = np.zeros(self.grid.shape, dtype=np.int32)
-        for row, plane in enumerate(self._planes):
-            bits |= kernels.unpack(plane, self.grid.shape).astype(np.int32) << (row // kernels.SHARES)
-        return bits
-
-    def surface(self, images: NDArray[np.uint8] | None = None, boundary: bool = False) -> HullSurface:
+    def surface(self, images: NDArray[np.uint8] | None = None) -> HullSurface:
         """Return the surface voxels of the current hull.
 
         Args:
             images: (C, H, W, 3) uint8 BGR of the same frame as the masks; None for no colours.
-            boundary: also compute :attr:`HullSurface.boundary`; takes a few milliseconds.
         """
         channels = (*self._mask_shape, 3)
         if images is not None and (images.shape != channels or images.dtype != np.uint8):
             raise ValueError(f"images are {images.dtype} {images.shape}, expected uint8 {channels}")
         voxels, box = kernels.surface_voxels(self._occupied, self.grid.shape, self._found)
-        masks = self._previous.view(np.uint8)
         normals, colors, seen = kernels.shade_surface(
             self._occupied,
             self.grid.shape,
@@ -137,16 +122,11 @@ class VisualHull:
             self._eyes,
             self._spacing,
             None if images is None else np.ascontiguousarray(images),
-            masks,
+            self._previous.view(np.uint8),
             voxels,
             box,
         )
-        positions = self.grid.centers(voxels).astype(np.float32)
-        ends = None
-        if boundary:
-            pictures = masks[:, : self._pixel_count].reshape(self._mask_shape)
-            ends = hull_boundary(self.rig, pictures, positions, normals, self.grid.voxel_m)
-        return HullSurface(voxels, positions, normals, colors, seen, ends)
+        return HullSurface(voxels, self.grid.centers(voxels).astype(np.float32), normals, colors, seen)
 
     def _as_words(self, masks: NDArray[np.uint8]) -> NDArray[np.int64]:
         """Return the masks as int64 words (C, M): a view if aligned, else a zero-padded copy."""

@@ -77,7 +77,7 @@ class HullTables:
         return kernels.pack(_holders(self.pixels.T).reshape(self.shape) >= 2)
 
 
-def load_or_build(rig: Rig, grid: VoxelGrid, cache_dir: Path | None = None, use_cache: bool = True) -> HullTables:
+def load_or_build(rig: Rig, grid: VoxelGrid, cache_dir: Path | None = None) -> HullTables:
     """Return the tables of this rig and grid from the cache, or build and cache them.
 
     Raises:
@@ -89,14 +89,10 @@ def load_or_build(rig: Rig, grid: VoxelGrid, cache_dir: Path | None = None, use_
     plane = 32 * kernels.words_per_column(grid.shape[2]) * grid.shape[0] * grid.shape[1]
     if plane >= 2**28 or len(rig) * plane >= 2**31:  # 29 bits of an entry, 32 of an offset, less the signs
         raise ConfigError(f"{grid.count} voxels by {len(rig)} cameras are too many look-ups; give fewer voxels")
-    path: Path | None = None
-    if use_cache:
-        path = (default_cache_dir() if cache_dir is None else cache_dir) / f"hull-{table_key(rig, grid)}.npz"
-        tables = _load(path, rig, grid)
-        if tables is not None:
-            return tables
-    tables = _build(rig, grid)
-    if path is not None:
+    path = (cache_dir or default_cache_dir()) / f"hull-{table_key(rig, grid)}.npz"
+    tables = _load(path, rig, grid)
+    if tables is None:
+        tables = _build(rig, grid)
         _save(path, tables)
     return tables
 

@@ -35,6 +35,9 @@ MOTION_HZ = 6.0
 _UNKNOWN = 1e3
 # Frames whose filter states are kept at once, 2.5 kB each: of the others those at the begin of every block are.
 _BLOCK = 512
+# Longest gap that is bridged, seconds; a longer one divides the recording. Half a step: the person may do anything in
+# between.
+LONGEST_GAP_S = 0.5
 # Frames. Shorter sections have too few measurements to estimate noise; they stay unchanged.
 SHORTEST = 8
 
@@ -46,15 +49,13 @@ class Smoothed:
     Attributes:
         poses: (F, D) radians and metres; unchanged in frames that are neither known nor bridged.
         bridged: (F,) True where the pose was unknown and has been filled in.
-        noise: (D,) estimated standard deviation of the measurement noise, radians or metres; NaN with too few frames.
     """
 
     poses: Float
     bridged: Bool
-    noise: Float
 
 
-def smooth(skeleton: Skeleton, poses: Float, known: Bool, fps: float, longest_gap_s: float = 0.5) -> Smoothed:
+def smooth(skeleton: Skeleton, poses: Float, known: Bool, fps: float) -> Smoothed:
     """Smooth the poses of a recording.
 
     Args:
@@ -62,26 +63,24 @@ def smooth(skeleton: Skeleton, poses: Float, known: Bool, fps: float, longest_ga
         poses: (F, D) tracked poses at equal time steps.
         known: (F,) False where the person was lost; these poses are ignored.
         fps: frames per second.
-        longest_gap_s: s, longest gap that is bridged; a longer gap divides the recording.
     """
     poses = np.asarray(poses, dtype=np.float64)
     result, bridged = poses.copy(), np.zeros(len(poses), dtype=bool)
-    sections = [section for section in _sections(known, longest_gap_s * fps) if known[section].sum() >= SHORTEST]
+    sections = [section for section in _sections(known, LONGEST_GAP_S * fps) if known[section].sum() >= SHORTEST]
     if not sections:
-        return Smoothed(result, bridged, np.full(poses.shape[1], np.nan))
+        return Smoothed(result, bridged)
     turning = np.array([unit == "rad" for unit in skeleton.units])
     pieces = []
     for section in sections:
         values, seen = poses[section].copy(), known[section]
         values[np.ix_(seen, turning)] = np.unwrap(values[np.ix_(seen, turning)], axis=0)
         pieces.append((values, seen))
-    ratio, noise = _noise(pieces)
-    ratio = np.maximum(ratio, _ratio_of(MOTION_HZ / fps))
+    ratio = np.maximum(_noise(pieces)[0], _ratio_of(MOTION_HZ / fps))
     for section, (values, seen) in zip(sections, pieces, strict=True):
         smoothed = _smooth(values, seen, ratio)
         result[section] = skeleton.clip(_into_limits(skeleton, smoothed, turning))
         bridged[section] = ~seen
-    return Smoothed(result, bridged, noise)
+    return Smoothed(result, bridged)
 
 
 def _ratio_of(cutoff: float) -> float:
