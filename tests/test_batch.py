@@ -26,7 +26,7 @@ from tk.batch.work import _errors, work
 from tk.errors import CaptureError, ConfigError, ResultBusyError, ResultError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
-from tk.io.results.files import TwinFolder
+from tk.io.hdf5_writer import Hdf5Writer
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import JOINTS, build_skeleton
 from tk.run.session import track
@@ -232,8 +232,8 @@ def test_two_batches_in_one_folder_are_refused(tk: Tk, tiny: Path, tmp_path: Pat
 
 
 def test_result_that_another_run_writes_is_busy(tmp_path: Path) -> None:
-    with TwinFolder(tmp_path / "r.h5"), pytest.raises(ResultBusyError):
-        TwinFolder(tmp_path / "r.h5")
+    with Hdf5Writer(tmp_path / "r.h5"), pytest.raises(ResultBusyError):
+        Hdf5Writer(tmp_path / "r.h5")
 
 
 def test_failure_of_a_capture_has_the_hint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from pathlib import Path
 
 import h5py
 import numpy as np
+import pytest
 
 from tests.io.result_victim import META, make_frame, make_state
+from tk.io import hdf5_writer
 from tk.io.results.data import ResultMeta, UsedCameras, Value
 from tk.io.results.reader import read_result
 from tk.io.results.writer import ResultWriter
@@ -103,3 +106,17 @@ def write_truth(path: Path, frames: list[int], names: tuple[str, ...] = JOINTS, 
         values = np.arange(len(frames) * len(names) * 3, dtype=float).reshape(len(frames), len(names), 3)
         file["joints/position"] = values
         file["joints/position"].attrs["names"] = list(names)
+
+
+def fail_after(writes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the disk be full after this number of writes."""
+    left, original = [writes], hdf5_writer._write
+
+    def write(file: io.FileIO | io.BytesIO, place: int, data: bytes) -> None:
+        if isinstance(file, io.FileIO):
+            left[0] -= 1
+            if left[0] < 0:
+                raise OSError(28, "No space left on device")
+        original(file, place, data)
+
+    monkeypatch.setattr(hdf5_writer, "_write", write)

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.io.conftest import MakeCapture
+from tests.io.result_files import fail_after
 from tk.errors import CaptureError, DiskFullError, ResultError
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.point_cloud import write_hulls, write_ply
@@ -102,13 +102,10 @@ def test_an_older_file_stays_until_a_frame_is_finished(capture: Capture, tmp_pat
 def test_a_full_disk_is_one_line_and_leaves_the_older_file(
     capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: object) -> int:
-        raise OSError(28, "No space left on device")
-
     path = tmp_path / "h.h5"
     write_hulls(path, capture, grid(capture), [(0, points(4))])
     before = path.read_bytes()
-    monkeypatch.setattr(os, "pwrite", full)
+    fail_after(0, monkeypatch)
     with pytest.raises(DiskFullError, match=r"h\.h5: cannot be written: No space left on device$"):
         write_hulls(path, capture, grid(capture), ((k, points(4000, k)) for k in range(9)))
     assert path.read_bytes() == before
@@ -118,7 +115,7 @@ def test_a_full_disk_is_one_line_and_leaves_the_older_file(
 def test_files_of_others_are_left_alone(capture: Capture, tmp_path: Path) -> None:
     path = tmp_path / "notes.h5"
     path.write_text("mine")
-    with pytest.raises(ResultError, match=r"notes\.h5: exists and is not a tk-hull file"):
+    with pytest.raises(ResultError, match=r"notes\.h5: exists and is not a tk-hull"):
         write_hulls(path, capture, grid(capture), [(0, points(4))])
     assert path.read_text() == "mine"
     with pytest.raises(ResultError, match="is a folder"):

@@ -3,30 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tk import __version__
 from tk.errors import ResultError, unwritable
 from tk.io.captures.capture import Capture
+from tk.io.hdf5_writer import Hdf5Writer, writing
 from tk.io.paths import Kind, check_output, looks_like
 from tk.io.results.data import HullPoints
-from tk.io.results.files import SUFFIXES, SafeFile, is_hdf5_of
+from tk.io.results.files import hdf5_kind
+from tk.io.results.layout import create_growing, file_attributes
 from tk.model.cameras.volume import VoxelGrid
 
 HULL_FORMAT = "tk-hull"
 
 PLY = Kind("a PLY file", (".ply",), looks_like(rb"ply\n|ply\r"))
 
-#: datasets of a hull file: shape of a row and type
+#: datasets of a hull file: shape of a row, type, and rows per chunk
 _HULL_ROWS = {
-    "frames": ((), "i8"), "time": ((), "f8"), "hull/offsets": ((), "i8"),
-    "hull/positions": ((3,), "f4"), "hull/colors": ((3,), "u1"),
+    "frames": ((), "i8", 1024), "time": ((), "f8", 1024), "hull/offsets": ((), "i8", 1024),
+    "hull/positions": ((3,), "f4", 16384), "hull/colors": ((3,), "u1", 16384),
 }  # fmt: skip
+_SPACE = "make space"
 
 
 def write_ply(path: Path, positions: ArrayLike, colors: NDArray[np.uint8], triangles: ArrayLike | None = None) -> None:
@@ -76,49 +77,27 @@ def write_hulls(path: Path, capture: Capture, grid: VoxelGrid, frames: Iterable[
         ResultError: the file cannot be written, or a file of that name is not a hull file (it is not changed).
     """
     check_hull_path(path)
-    temporary = path.with_name(f".{path.name}.tmp")
-    count = voxels = 0
+    count = 0
+    with writing(path, _SPACE):
+        disk = Hdf5Writer(path)
     try:
-        with SafeFile(temporary, "w") as disk:
-            disk.file.attrs.update(
-                {
-                    "format": HULL_FORMAT,
-                    "format_version": 1,
-                    "fps": capture.fps,
-                    "units": "m",
-                    "up": capture.up,
-                    "capture": capture.name,
-                    "voxel_m": grid.voxel_m,
-                    "software": f"tk-mocap {__version__}",
-                    "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-                }
-            )
-            data = {
-                name: disk.file.create_dataset(
-                    name, (0, *shape), dtype, maxshape=(None, *shape), chunks=(16384, 3) if shape else True
-                )
-                for name, (shape, dtype) in _HULL_ROWS.items()
-            }
+        with writing(path, _SPACE):
+            disk.file.attrs.update(file_attributes(HULL_FORMAT, 1))
+            disk.file.attrs.update(fps=capture.fps, up=capture.up, capture=capture.name, voxel_m=grid.voxel_m)
+            data = {name: create_growing(disk.file, name, *row) for name, row in _HULL_ROWS.items()}
             data["hull/offsets"].resize(1, axis=0)
-            try:
-                for frame, points in frames:
-                    stop = voxels + len(points.positions)
-                    rows: tuple[Any, ...] = ([frame], [frame / capture.fps], [stop], points.positions, points.colors)
-                    for dataset, values in zip(data.values(), rows, strict=True):
-                        dataset.resize(len(dataset) + len(values), axis=0)
-                        dataset[len(dataset) - len(values) :] = values
-                    count, voxels = count + 1, stop
-                    disk.flush_to_disk()  # a full disk ends the run here, not after the last frame
-            finally:  # Ctrl-C may interrupt a frame
-                for dataset, length in zip(data.values(), (count, count, count + 1, voxels, voxels), strict=True):
-                    dataset.resize(length, axis=0)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise unwritable(path, error) from None
+        for frame, points in frames:
+            with writing(path, _SPACE):
+                stop = len(data["hull/positions"]) + len(points.positions)
+                rows: tuple[Any, ...] = ([frame], [frame / capture.fps], [stop], points.positions, points.colors)
+                for dataset, values in zip(data.values(), rows, strict=True):
+                    dataset.resize(len(dataset) + len(values), axis=0)
+                    dataset[len(dataset) - len(values) :] = values
+                disk.flush()  # a full disk ends the run here, not after the last frame
+            count += 1
     finally:
-        if count and temporary.exists():
-            temporary.replace(path)
-        temporary.unlink(missing_ok=True)  # no frame is finished: an older file stays
+        with writing(path, _SPACE):
+            disk.close(publish=count > 0)  # no frame is finished: an older file stays
     return count
 
 
@@ -128,8 +107,7 @@ def check_hull_path(path: Path, force: bool = True, capture: Path | None = None)
     Raises:
         TkError: with the remedy, see :func:`tk.io.paths.check_output`.
     """
-    kind = Kind(f"a {HULL_FORMAT} file", SUFFIXES, lambda found: is_hdf5_of(found, HULL_FORMAT))
-    check_output(path, kind, force, capture=capture, error=ResultError)
+    check_output(path, hdf5_kind(HULL_FORMAT), force, capture=capture, error=ResultError)
 
 
 def ply_path(folder: Path, frame: int) -> Path:

@@ -16,9 +16,10 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.io.result_files import assert_complete, write
+from tests.io.result_files import assert_complete, fail_after, write
 from tests.io.result_victim import META, make_frame, make_state
 from tk.errors import ResultError, TkError
+from tk.io import hdf5_writer
 from tk.io.results.reader import read_joints, read_result
 from tk.io.results.writer import ResultWriter
 
@@ -221,28 +222,13 @@ def test_full_disk_gives_one_line_and_keeps_finished_frames(tmp_path: Path) -> N
     assert assert_complete(tmp_path / "kept.h5", appended) == appended
 
 
-def fail_after(writes: int, monkeypatch: pytest.MonkeyPatch, failure: Callable[[], int]) -> None:
-    """Let all writes to disk after the first ``writes`` call ``failure``."""
-    left, pwrite = [writes], os.pwrite
-
-    def write(handle: int, data: memoryview, place: int) -> int:
-        left[0] -= 1
-        return failure() if left[0] < 0 else pwrite(handle, data, place)
-
-    monkeypatch.setattr(os, "pwrite", write)
-
-
-def no_space() -> int:
-    raise OSError(28, "No space left on device")
-
-
 @pytest.mark.parametrize("writes", [0, 1, 2, 3, 5, 10, 20, 50, 100, 150, 200, 300, 400])
 def test_run_is_resumable_whenever_a_write_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writes: int) -> None:
     path = tmp_path / "result.h5"
     write(path, 3)
     appended = 3
     with monkeypatch.context() as patch:
-        fail_after(writes, patch, no_space)
+        fail_after(writes, patch)
         with pytest.raises(ResultError, match=r"result\.h5: cannot be written: No space left on device"):
             writer, _ = ResultWriter.resume(path, META)
             with writer:
@@ -261,14 +247,14 @@ def test_interruption_while_hdf5_writes_takes_effect_afterwards(
 ) -> None:
     path = tmp_path / "result.h5"
 
-    def interrupt(*arguments: Any) -> int:
+    def interrupt(*arguments: Any) -> None:
         os.kill(os.getpid(), signal.SIGINT)
-        return pwrite(*arguments)
+        original(*arguments)
 
-    pwrite = os.pwrite
+    original = hdf5_writer._write
     with pytest.raises(KeyboardInterrupt), ResultWriter.create(path, META) as writer:
         writer.append(make_frame(0), make_state(0))
-        monkeypatch.setattr(os, "pwrite", interrupt)
+        monkeypatch.setattr(hdf5_writer, "_write", interrupt)
         writer.append(make_frame(1), make_state(1))
     assert assert_complete(path, 2) == 2
 

@@ -106,30 +106,28 @@ class ResultMeta:
         """Return the first difference, such as ``seed: 1, not 2``; None if the two are equal."""
         if len(self.pose_names) != len(other.pose_names):
             return f"the pose has {len(self.pose_names)} entries, not {len(other.pose_names)}"
-        mine, others = (_settled(meta) for meta in (self, other))
-        for name in [*mine, *(name for name in others if name not in mine)]:
+        mine, others = self._texts(), other._texts()
+        for name in mine | others:
             a, b = mine.get(name, "not set"), others.get(name, "not set")
             if a != b:
                 return f"{name}: {a}, not {b}"
         return None
 
+    def _texts(self) -> dict[str, str]:
+        """Return all values as texts by name, the configuration entry by entry."""
+        texts: dict[str, str] = {}
 
-def _settled(meta: ResultMeta) -> dict[str, str]:
-    """Return everything that is constant during a run as texts by name, the configuration entry by entry."""
-    texts: dict[str, str] = {}
+        def put(name: str, value: object) -> None:
+            if isinstance(value, Mapping):
+                for key, item in value.items():
+                    put(f"{name}.{key}", item)
+            else:
+                texts[name] = ", ".join(map(str, value if isinstance(value, tuple) else (value,))) or "none"
 
-    def put(name: str, value: object) -> None:
-        if isinstance(value, Mapping):
-            for key, item in value.items():
-                put(f"{name}.{key}", item)
-        else:
-            listed = value if isinstance(value, tuple) else (value,)
-            texts[name] = ", ".join(map(str, listed)) or "none"
-
-    for item in fields(meta):
-        put(item.name, getattr(meta, item.name))
-    put("config", parse_toml(texts.pop("config_toml"), "config", ResultError))
-    return texts
+        for item in fields(self):
+            put(item.name, getattr(self, item.name))
+        put("config", parse_toml(texts.pop("config_toml"), "config", ResultError))
+        return texts
 
 
 @dataclass(frozen=True)
@@ -142,27 +140,16 @@ class HullPoints:
 
 @dataclass(frozen=True)
 class FrameResult:
-    """One finished frame.
+    """One finished frame: values as in :class:`Result`, without the axis of the frames.
+
+    None stands for a value that is unknown in this frame; the file then has NaN. :class:`ResultMeta` declares values.
 
     Attributes:
         frame: index of the source frame.
         time: time of the frame, s.
-        pose: (D,) configuration vector, radians and metres.
-        joints: (J, 3) joint centres, metres, world frame.
-        status: a :class:`Status`.
-        objective: final value of the objective.
-        iterations: (T,) number of optimiser iterations per stage.
+        status: a :class:`~tk.io.results.status.Status`.
         timing: duration of each stage, s; 0 is stored for a stage that is not given.
         hull: surface voxels; None to store none.
-
-    The following fields may be None if the value is unknown in this frame; the file then has NaN. A value that
-    :class:`ResultMeta` does not declare is refused.
-
-        sigma: (J,) m, standard deviation of each joint position along one axis; NaN for a joint without evidence.
-        residual: (C, 2) missing and surplus area by camera, shares of the person's pixels; their sum is E_S.
-        mask_source: (C,) where each camera's mask comes from.
-        segments_rotation: (S, 4) quaternions (w, x, y, z), segment to world.
-        feet: (4, 3) the :data:`~tk.model.body.joints.FOOT_POINTS`, metres, world frame.
         angles: angles of each joint, degrees; NaN is stored for a joint that is not given.
     """
 

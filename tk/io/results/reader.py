@@ -30,7 +30,7 @@ from tk.io.results.schema import (
     prefix_of,
     smoothed_columns,
 )
-from tk.model.body.joints import REQUIRED_JOINTS, in_joint_order
+from tk.model.body.joints import in_joint_order
 from tk.model.cameras.camera import Camera, Rig
 
 _ENTRIES = {entry.path: entry for entry in ROWS}
@@ -44,18 +44,18 @@ def read_result(path: str | os.PathLike[str]) -> Result:
         ResultError: the file does not exist, is not a result of this format version, or is incomplete or damaged.
     """
     path = Path(path)
-    with open_hdf5(path) as file:
-        check_format(file)
-        shared = {
+    with open_result(path) as (file, people):
+        stored = read_state(file)
+        shared: dict[str, Any] = {
             "path": path,
             "cameras": _read_cameras(file),
-            "state": read_state(file)[1],
+            "state": stored[2] if stored else {},
             "software": file.text("", "software", ""),
             "created": file.text("", "created", ""),
             "notes": file.names("", "notes") if file.attribute("", "notes") is not None else (),
         }
-        others = [_read_person(file, person, shared) for person in range(1, count_people(file))]
-        return _read_person(file, 0, {**shared, "others": tuple(others)})
+        others = tuple(person.result(shared) for person in people[1:])
+        return people[0].result({**shared, "others": others})
 
 
 def read_people(path: str | os.PathLike[str]) -> tuple[JointTrack, ...]:
@@ -67,14 +67,13 @@ def read_people(path: str | os.PathLike[str]) -> tuple[JointTrack, ...]:
     """
     path = Path(path)
     with open_hdf5(path) as file:
-        if file.attribute("", "format") is not None:
-            check_format(file)
-        units = file.text("", "units", "m")
-        if units != "m":
-            file.fail(f"units = {units}; joint positions must be in metres (m)")
-        if "people" not in file:
-            return (_read_track(file, ""),)
-        return tuple(_read_track(file, f"people/{person}/") for person in range(count_people(file)))
+        if file.attribute("", "format") is None:
+            units = file.text("", "units", "m")
+            if units != "m":
+                file.fail(f"units = {units}; joint positions must be in metres (m)")
+            prefixes = [f"people/{person}/" for person in range(_count_people(file))] if "people" in file else [""]
+            return tuple(_read_truth(file, prefix) for prefix in prefixes)
+    return tuple(_track_of(person) for person in read_result(path).people)
 
 
 def read_joints(path: str | os.PathLike[str]) -> JointTrack:
@@ -117,8 +116,129 @@ def as_damage_error(path: Path, what: str) -> Iterator[None]:
 # --- shared with the writer -------------------------------------------------------------------------------------------
 
 
-def check_format(file: Hdf5Reader) -> None:
-    """Raise ResultError unless the file is a result of the format that this version of tk writes."""
+@contextlib.contextmanager
+def open_result(path: Path) -> Iterator[tuple[Hdf5Reader, list[StoredPerson]]]:
+    """Open a result and check its format and the shapes of its datasets.
+
+    Raises:
+        ResultError: the file is not a result of the format that this version of tk writes, or it is damaged.
+    """
+    with open_hdf5(path) as file:
+        _check_format(file)
+        yield file, [StoredPerson(file, number) for number in range(_count_people(file))]
+
+
+def read_state(file: Hdf5Reader) -> tuple[int, list[int], dict[str, Value]] | None:
+    """Return the number of frame sets, the rows of each person and the state of the run; None if no state is stored."""
+    if "resume" not in file:
+        return None
+    try:
+        return unpack_state(file.array("resume", "uint8", (None,)))
+    except ValueError as error:
+        file.fail(str(error))
+
+
+class StoredPerson:
+    """One person of an open result.
+
+    Attributes:
+        meta: the metadata.
+        count: number of frames.
+
+    Raises:
+        ResultError: a dataset or attribute is missing or has the wrong shape.
+    """
+
+    def __init__(self, file: Hdf5Reader, number: int) -> None:
+        self._file, self._number, self._prefix = file, number, prefix_of(number)
+        self.meta = self._read_meta()
+        self._columns = columns_of(self.meta)
+        if len(file.shapes.get(f"{self._prefix}frames", ())) != 1:
+            file.fail(f"has no /{self._prefix}frames with one number per frame; the file is damaged")
+        self.count = file.shapes[f"{self._prefix}frames"][0]
+        for name, column in self._columns.items():
+            expected, path = (self.count, *column.shape), self._prefix + name
+            if file.shapes.get(path) != expected:
+                found = f"has shape {file.shapes[path]}" if path in file.shapes else "is missing"
+                file.fail(f"/{path} {found}; {expected} is expected for {self.count} frames")
+        self._offsets = self._read_offsets()
+
+    def model(self) -> dict[str, Value]:
+        """Return the fitted body; {} if there is none."""
+        return self._file.values(f"{self._prefix}model", MAX_NUMBER)
+
+    def result(self, shared: dict[str, Any]) -> Result:
+        """Return the whole content; ``shared`` are the fields of Result that belong to the file."""
+        found: dict[str, Any] = {"timing": {}, "angles": {}}
+        for path, column in self._columns.items():
+            values = self._read(path, column.entry, *column.shape)
+            if column.key:
+                found[column.entry.field][column.key] = values
+            else:
+                found[column.entry.field] = values
+        _check_frames(self._file, self._prefix, found["frames"])
+        smoothed = None
+        if f"{self._prefix}smoothed" in self._file:
+            smoothed = {
+                path: self._read(f"smoothed/{path}", column.entry, *column.shape)
+                for path, column in smoothed_columns(self._columns).items()
+                if f"{self._prefix}smoothed/{path}" in self._file or path == "bridged"
+            }
+        hull = None
+        if self._offsets is not None:
+            voxels = int(self._offsets[-1])
+            positions, colors = (_read(self._file, self._prefix + e.path, e, (voxels, 3)) for e in HULL[:2])
+            hull = Hull(positions, colors, self._offsets)
+        return Result(
+            meta=self.meta, person=self._number, smoothed=smoothed, model=self.model(), hull=hull, **found, **shared
+        )
+
+    def _read(self, path: str, entry: Dataset, *shape: int) -> NDArray[Any]:
+        return _read(self._file, self._prefix + path, entry, (self.count, *shape))
+
+    def _read_meta(self) -> ResultMeta:
+        file, prefix = self._file, self._prefix
+        found: dict[str, Any] = {}
+        for name, (source, kind) in ATTRIBUTES.items():
+            found[source] = file.text("", name) if kind is str else kind(file.number("", name))
+        found["timing_stages"] = file.names(f"{prefix}timing", "stages") if f"{prefix}timing" in file else ()
+        angles = file.names(f"{prefix}angles", "joints") if f"{prefix}angles" in file else ()
+        for entry in (entry for entry in ROWS if not entry.each):
+            path = prefix + entry.path
+            exists = path in file.shapes
+            if not exists and not entry.optional:
+                file.fail(f"has no /{path}; the file is damaged")
+            for attribute, item in entry.attributes.items():
+                if item in _TEXTS:
+                    found[str(item)] = file.text(path, attribute, "")
+                elif isinstance(item, str) and item not in found:
+                    found[item] = file.names(path, attribute) if exists else ()
+            if entry.optional:
+                found.setdefault(entry.optional, exists)
+        try:
+            found["angles"] = tuple(
+                JointAngles(joint, file.names(path, "names"), file.text(path, "convention"))
+                for joint, path in ((joint, f"{prefix}angles/{joint}") for joint in angles)
+            )
+            return ResultMeta(**found)
+        except ValueError as error:
+            file.fail(f"{error}; the file is damaged")
+
+    def _read_offsets(self) -> NDArray[np.int64] | None:
+        """Return `/hull/offsets`, if they match the positions and colours; None without hull."""
+        if f"{self._prefix}hull" not in self._file:
+            return None
+        offsets = _read(self._file, f"{self._prefix}hull/offsets", HULL[2], (self.count + 1,))
+        shapes = [self._file.shapes.get(self._prefix + entry.path) for entry in HULL[:2]]
+        if offsets[0] != 0 or (np.diff(offsets) < 0).any() or shapes != [(offsets[-1], 3)] * 2:
+            self._file.fail(f"/{self._prefix}hull/offsets does not divide the voxels into frames; the file is damaged")
+        return offsets
+
+
+# --- parts of a file --------------------------------------------------------------------------------------------------
+
+
+def _check_format(file: Hdf5Reader) -> None:
     if not file.is_format(FORMAT):
         file.fail(f"an HDF5 file of other software, not a {FORMAT}; name another file")
     found = file.attribute("", "format_version")
@@ -128,12 +248,8 @@ def check_format(file: Hdf5Reader) -> None:
         file.fail(f"format_version is {found}; this version of tk reads and resumes version {FORMAT_VERSION}: {remedy}")
 
 
-def count_people(file: Hdf5Reader) -> int:
-    """Return the number of people in the file.
-
-    Raises:
-        ResultError: the people are not numbered 0, 1, …
-    """
+def _count_people(file: Hdf5Reader) -> int:
+    """Return the number of people, who must be numbered 0, 1, …"""
     if "people" not in file:
         return 1
     names = {name.split("/")[1] for name in (*file.groups, *file.shapes) if name.startswith("people/")}
@@ -142,132 +258,12 @@ def count_people(file: Hdf5Reader) -> int:
     return len(names)
 
 
-def read_meta(file: Hdf5Reader, prefix: str = "") -> ResultMeta:
-    """Return the metadata of a person in an open result."""
-    found: dict[str, Any] = {}
-    for name, (source, kind) in ATTRIBUTES.items():
-        found[source] = file.text("", name) if kind is str else kind(file.number("", name))
-    found["timing_stages"] = file.names(f"{prefix}timing", "stages") if f"{prefix}timing" in file else ()
-    angles = file.names(f"{prefix}angles", "joints") if f"{prefix}angles" in file else ()
-    for entry in (entry for entry in ROWS if not entry.each):
-        path = prefix + entry.path
-        exists = path in file.shapes
-        if not exists and not entry.optional:
-            file.fail(f"has no /{path}; the file is damaged")
-        for attribute, item in entry.attributes.items():
-            if item in _TEXTS:
-                found[str(item)] = file.text(path, attribute, "")
-            elif isinstance(item, str) and item not in found:
-                found[item] = file.names(path, attribute) if exists else ()
-        if entry.optional:
-            found.setdefault(entry.optional, exists)
-    try:
-        found["angles"] = tuple(
-            JointAngles(
-                joint,
-                file.names(f"{prefix}angles/{joint}", "names"),
-                file.text(f"{prefix}angles/{joint}", "convention"),
-            )
-            for joint in angles
-        )
-        return ResultMeta(**found)
-    except ValueError as error:
-        file.fail(f"{error}; the file is damaged")
-
-
-def count_rows(file: Hdf5Reader, meta: ResultMeta, prefix: str = "") -> int:
-    """Return the number of a person's frames, after checking the shape of every dataset with one row per frame.
-
-    Raises:
-        ResultError: a dataset is missing or has the wrong shape.
-    """
-    if len(file.shapes.get(f"{prefix}frames", ())) != 1:
-        file.fail(f"has no /{prefix}frames with one number per frame; the file is damaged")
-    rows = file.shapes[f"{prefix}frames"][0]
-    for name, column in columns_of(meta).items():
-        expected, path = (rows, *column.shape), prefix + name
-        if file.shapes.get(path) != expected:
-            found = f"has shape {file.shapes[path]}" if path in file.shapes else "is missing"
-            file.fail(f"/{path} {found}; {expected} is expected for {rows} frames")
-    return rows
-
-
-def check_hull(file: Hdf5Reader, rows: int, prefix: str = "") -> NDArray[np.int64] | None:
-    """Return `/hull/offsets`; None if there is no hull.
-
-    Raises:
-        ResultError: the offsets do not match the positions and colours.
-    """
-    if f"{prefix}hull" not in file:
-        return None
-    offsets = _read(file, f"{prefix}hull/offsets", HULL[2], (rows + 1,))
-    shapes = [file.shapes.get(prefix + entry.path) for entry in HULL[:2]]
-    if offsets[0] != 0 or (np.diff(offsets) < 0).any() or shapes != [(offsets[-1], 3)] * 2:
-        file.fail(f"/{prefix}hull/offsets does not divide the voxels into frames; the file is damaged")
-    return offsets
-
-
-def read_model(file: Hdf5Reader, prefix: str = "") -> dict[str, Value]:
-    """Return the fitted body of a person; {} if there is none."""
-    return file.values(f"{prefix}model", MAX_NUMBER)
-
-
-def read_state(file: Hdf5Reader) -> tuple[list[int], dict[str, Value]]:
-    """Return the number of rows of each person that have a state, and the state of the run; [] and {} without one."""
-    if "resume" not in file.shapes:
-        return [], {}
-    try:
-        _, people, state = unpack_state(file.array("resume", "uint8", (None,)))
-    except ValueError as error:
-        file.fail(str(error))
-    return people, state
-
-
 def _read(file: Hdf5Reader, path: str, entry: Dataset, shape: tuple[int | None, ...]) -> NDArray[Any]:
     return file.array(path, entry.dtype, shape, *entry.valid, entry.finite)
 
 
-def _read_person(file: Hdf5Reader, person: int, shared: dict[str, Any]) -> Result:
-    prefix = prefix_of(person)
-    meta = read_meta(file, prefix)
-    rows = count_rows(file, meta, prefix)
-    columns = columns_of(meta)
-    found: dict[str, Any] = {"timing": {}, "angles": {}}
-    for path, column in columns.items():
-        values = _read(file, prefix + path, column.entry, (rows, *column.shape))
-        if column.key:
-            found[column.entry.field][column.key] = values
-        else:
-            found[column.entry.field] = values
-    _check_frames(file, prefix, found["frames"])
-    smoothed = None
-    if f"{prefix}smoothed" in file:
-        smoothed = {
-            path: _read(file, f"{prefix}smoothed/{path}", column.entry, (rows, *column.shape))
-            for path, column in smoothed_columns(columns).items()
-            if f"{prefix}smoothed/{path}" in file or path == "bridged"
-        }
-    return Result(
-        meta=meta,
-        person=person,
-        smoothed=smoothed,
-        model=read_model(file, prefix),
-        hull=_read_hull(file, rows, prefix),
-        **found,
-        **shared,
-    )
-
-
-def _read_hull(file: Hdf5Reader, rows: int, prefix: str) -> Hull | None:
-    offsets = check_hull(file, rows, prefix)
-    if offsets is None:
-        return None
-    positions, colors = (_read(file, prefix + entry.path, entry, (int(offsets[-1]), 3)) for entry in HULL[:2])
-    return Hull(positions, colors, offsets)
-
-
-def _read_track(file: Hdf5Reader, prefix: str) -> JointTrack:
-    """Return the joints of a person. Ground truth has no other datasets, and may list the frames for all people."""
+def _read_truth(file: Hdf5Reader, prefix: str) -> JointTrack:
+    """Return the joints of a person in a file of ground truth, which may list the frames for all people."""
     listed = f"{prefix}frames" if f"{prefix}frames" in file.shapes else "frames"
     for name in (listed, f"{prefix}joints/position"):
         if name not in file.shapes:
@@ -275,26 +271,21 @@ def _read_track(file: Hdf5Reader, prefix: str) -> JointTrack:
     frames = _read(file, listed, _ENTRIES["frames"], (None,))
     _check_frames(file, prefix, frames)
     names = file.names(f"{prefix}joints/position", "names")
-    missing = [joint for joint in REQUIRED_JOINTS if joint not in names]
-    if missing:
-        file.fail(f"/{prefix}joints/position has no joint {missing[0]} in its attribute names")
+    positions = _read(file, f"{prefix}joints/position", _ENTRIES["joints/position"], (len(frames), len(names), 3))
+    try:
+        return JointTrack(file.path, frames, in_joint_order(positions, names))
+    except KeyError as error:
+        file.fail(f"/{prefix}joints/position has no joint {error.args[0]} in its attribute names")
 
-    def read(name: str, *shape: int) -> NDArray[Any] | None:
-        path = prefix + name
-        return _read(file, path, _ENTRIES[name], (len(frames), *shape)) if path in file else None
 
-    positions, status = read("joints/position", len(names), 3), read("status")
-    sigma = read("joints/sigma", len(names))
-    assert positions is not None
-    positions = in_joint_order(positions, names)
-    positions[~np.isfinite(positions)] = np.nan
-    entry, group = _ENTRIES["timing/<stage>"], f"{prefix}timing"
-    timing = {stage: _read(file, f"{group}/{stage}", entry, (len(frames),)) for stage in file.below(group)}
-    seconds: Float | None = None
-    if timing:
-        seconds = timing["total"] if "total" in timing else np.sum(list(timing.values()), axis=0)
-    sigma = None if sigma is None else in_joint_order(sigma, names)
-    return JointTrack(file.path, frames, positions, status, seconds, sigma)
+def _track_of(result: Result) -> JointTrack:
+    """Return the joints of a result."""
+    seconds = None
+    if result.timing:
+        stages = list(result.timing.values())
+        seconds = result.timing["total"] if "total" in result.timing else np.sum(stages, axis=0)
+    result = result.in_joint_order()
+    return JointTrack(result.path, result.frames, result.joints, result.status, seconds, result.sigma)
 
 
 def _check_frames(file: Hdf5Reader, prefix: str, frames: NDArray[np.int64]) -> None:
@@ -307,8 +298,9 @@ def _read_cameras(file: Hdf5Reader) -> UsedCameras | None:
     if "cameras" not in file:
         return None
     names = file.names("cameras", "names")
-    counts = {"C": len(names)}
-    found = {entry.path.split("/")[1]: _read(file, entry.path, entry, entry.lengths(counts)) for entry in CAMERAS}
+    found = {
+        entry.path.split("/")[1]: _read(file, entry.path, entry, entry.lengths({"C": len(names)})) for entry in CAMERAS
+    }
     if (found["size"] < 1).any():
         file.fail("/cameras/size holds an image without pixels; the file is damaged")
     cameras = [

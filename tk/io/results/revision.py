@@ -1,13 +1,11 @@
 """Change a finished result: the columns of a second pass, smoothed copies, body, cameras, notes.
 
-The change is made in a copy beside the result. The copy is synced to the disk and takes the result's name in one
-rename, so at any time the name refers to the complete old file or to the complete new one.
+At any time the name refers to the complete old file or to the complete new one, see :mod:`tk.io.hdf5_writer`.
 """
 
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,13 +13,13 @@ from typing import Any
 from numpy.typing import ArrayLike, NDArray
 
 from tk.errors import ResultError
-from tk.io.hdf5 import open_hdf5
+from tk.io.hdf5_writer import Hdf5Writer, writing
 from tk.io.paths import check_output
 from tk.io.results.data import ResultMeta, UsedCameras, Value
-from tk.io.results.files import ANY_HDF5, SafeFile, TwinFolder, writing
-from tk.io.results.layout import link_first_person, put_attributes, put_cameras, put_model
-from tk.io.results.reader import check_format, count_people, count_rows, read_meta
-from tk.io.results.schema import Column, columns_of, prefix_of, smoothed_columns
+from tk.io.results.files import ANY_HDF5
+from tk.io.results.layout import Layout, put_attributes
+from tk.io.results.reader import open_result
+from tk.io.results.schema import Column, columns_of, smoothed_columns
 
 
 def revise_result(
@@ -56,41 +54,25 @@ def revise_result(
         ValueError: a dataset or the person is unknown, or a dataset has the wrong shape.
     """
     target = check_output(Path(path), ANY_HDF5, force=True, error=ResultError)
-    prefix = prefix_of(person)
-    with open_hdf5(target) as file:
-        check_format(file)
-        if not 0 <= person < count_people(file):
+    with open_result(target) as (_, people):
+        if not 0 <= person < len(people):
             raise ValueError(f"{path}: has no person {person}")
-        meta = read_meta(file, prefix)
-        rows = count_rows(file, meta, prefix)
+        meta, rows = people[person].meta, people[person].count
     known = columns_of(meta)
-    copies = smoothed_columns(known)
     changed = _checked(known, columns or {}, rows)
     if smoothed is not None and "bridged" not in smoothed:
         raise ValueError("/smoothed needs bridged, which is missing")
-    filtered = _checked(copies, smoothed or {}, rows)
-    with writing(target), TwinFolder(target) as twin_folder:
-        revised = twin_folder.twin_paths[0]
-        shutil.copyfile(target, revised)
-        with SafeFile(revised, "r+") as disk:
-            copy = disk.file
-            for name, values in changed.items():
-                copy[prefix + name][...] = values
-            if (changed or filtered) and f"{prefix}smoothed" in copy:
-                del copy[f"{prefix}smoothed"]
-            for name, values in filtered.items():
-                dataset = copy.create_dataset(f"{prefix}smoothed/{name}", data=values)
-                put_attributes(dataset, copies[name].attributes)
-            if model is not None:
-                put_model(copy, model, person)
-            if cameras is not None:
-                put_cameras(copy, cameras)
-            if notes is not None:
-                put_attributes(copy, {"notes": notes})
-            link_first_person(copy)
-        with revised.open("rb") as stream:
-            os.fsync(stream.fileno())
-        twin_folder.publish(revised)
+    filtered = _checked(smoothed_columns(known), smoothed or {}, rows)
+    with writing(target), Hdf5Writer(target, target) as disk:
+        layout = Layout(disk.file, meta)
+        layout.replace(person, changed, filtered)
+        if model is not None:
+            layout.put_model(person, model)
+        if cameras is not None:
+            layout.put_cameras(cameras)
+        if notes is not None:
+            put_attributes(disk.file, {"notes": notes})
+        layout.link_first_person()
     return meta
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -150,23 +150,21 @@ HULL = (
 )
 
 #: cameras as used, after refinement; the group's attribute `names` gives their order
-CAMERAS = tuple(
-    Dataset(f"cameras/{name}", shape, dtype, meaning, finite=True)
-    for name, shape, dtype, meaning in (
-        ("matrix", "C 3 3", "float64", "camera matrix, pixels"),
-        ("distortions", "C 5", "float64", "OpenCV's order, padded with zeros; a fisheye camera uses the first four"),
-        ("rotation", "C 3", "float64", "Rodrigues vector, world to camera"),
-        ("translation", "C 3", "float64", "world to camera"),
-        ("size", "C 2", "int64", "width and height, pixels"),
-        ("fisheye", "C", "uint8", "1 for a fisheye camera"),
-        (
-            "time_offset",
-            "C",
-            "float64",
-            "seconds by which the video began late: image k was taken at k / fps + `time_offset`",
-        ),
-    )
-)
+CAMERAS = (
+    Dataset("cameras/matrix", "C 3 3", "float64", "camera matrix, pixels", finite=True),
+    Dataset(
+        "cameras/distortions", "C 5", "float64",
+        "OpenCV's order, padded with zeros; a fisheye camera uses the first four", finite=True,
+    ),
+    Dataset("cameras/rotation", "C 3", "float64", "Rodrigues vector, world to camera", finite=True),
+    Dataset("cameras/translation", "C 3", "float64", "world to camera", finite=True),
+    Dataset("cameras/size", "C 2", "int64", "width and height, pixels"),
+    Dataset("cameras/fisheye", "C", "uint8", "1 for a fisheye camera"),
+    Dataset(
+        "cameras/time_offset", "C", "float64",
+        "seconds by which the video began late: image k was taken at k / fps + `time_offset`", finite=True,
+    ),
+)  # fmt: skip
 
 SCHEMA = (*ROWS, BRIDGED, *HULL, *CAMERAS)
 
@@ -210,25 +208,20 @@ def prefix_of(person: int) -> str:
 
 def columns_of(meta: ResultMeta) -> dict[str, Column]:
     """Return the columns of a result by path."""
-
-    def columns() -> Iterator[tuple[str, Column]]:
-        for entry in ROWS:
-            if entry.optional and not getattr(meta, entry.optional):
-                continue
-            for item in getattr(meta, entry.each) if entry.each else (meta,):
-                key = "" if item is meta else str(getattr(item, "joint", item))
-                counts = {letter: len(getattr(item, name, ())) for letter, name in COUNTED.items()} | {"F": 0}
-                attributes = {
-                    name: getattr(item, source) if isinstance(source, str) else source
-                    for name, source in entry.attributes.items()
-                }
-                path = f"{entry.path.split('<')[0]}{key}"
-                yield (
-                    path,
-                    Column(entry, key, entry.lengths(counts)[1:], {k: v for k, v in attributes.items() if v != ""}),
-                )
-
-    return dict(columns())
+    columns = {}
+    for entry in ROWS:
+        if entry.optional and not getattr(meta, entry.optional):
+            continue
+        members = {str(getattr(i, "joint", i)): i for i in getattr(meta, entry.each)} if entry.each else {"": meta}
+        for key, member in members.items():
+            counts = {letter: len(getattr(member, name, ())) for letter, name in COUNTED.items()} | {"F": 0}
+            attributes = {
+                name: getattr(member, source) if isinstance(source, str) else source
+                for name, source in entry.attributes.items()
+            }
+            known = {name: value for name, value in attributes.items() if value != ""}
+            columns[entry.path.split("<")[0] + key] = Column(entry, key, entry.lengths(counts)[1:], known)
+    return columns
 
 
 def smoothed_columns(columns: Mapping[str, Column]) -> dict[str, Column]:
@@ -238,7 +231,8 @@ def smoothed_columns(columns: Mapping[str, Column]) -> dict[str, Column]:
 
 
 def row_of(frame: FrameResult, columns: Mapping[str, Column]) -> dict[str, NDArray[Any]]:
-    """Return the frame's row of each column, as copies; NaN for optional values that the frame does not have.
+    """Return the frame's row of each column, and its voxels if it has a hull, as copies by path; NaN for optional
+    values that the frame does not have.
 
     Raises:
         ValueError: a shape or the status is invalid, or the frame has a value that no column takes.
@@ -256,17 +250,9 @@ def row_of(frame: FrameResult, columns: Mapping[str, Column]) -> dict[str, NDArr
     for path, column in columns.items():
         value = values.get(path)
         if value is None:  # a stage that did not run took no time
-            row[path] = np.full(column.shape, 0.0 if column.entry.field == "timing" else np.nan)
-        else:
-            row[path] = column.checked(path, value)
+            value = np.full(column.shape, 0.0 if column.entry.field == "timing" else np.nan)
+        row[path] = column.checked(path, value)
+    if frame.hull is not None:
+        for entry, array in ((HULL[0], frame.hull.positions), (HULL[1], frame.hull.colors)):
+            row[entry.path] = Column(entry, "", (3,), {}).checked(entry.path, array, len(frame.hull.positions))
     return row
-
-
-def docs_rows() -> list[str]:
-    """Return the rows of the table of datasets in docs/result-file.md."""
-    return [
-        f"| `/{entry.path}` | {'×'.join(entry.shape.split())} {entry.dtype} | {entry.meaning}"
-        + (f"; {', '.join(f'`{name}`' for name in entry.attributes)}" if entry.attributes else "")
-        + " |"
-        for entry in SCHEMA
-    ]

@@ -1,40 +1,22 @@
-"""Write a result file frame by frame; it can be read at any time, and an interrupted run can be resumed.
-
-HDF5 rewrites its metadata (dataset sizes, chunk trees, superblock) in place and in several steps, so a process that is
-killed during a flush can leave a file that does not open. A published result is therefore never modified. Two copies of
-it, the twins, are in a hidden folder beside it. Each finished frame is written to the twin that is *not* published;
-this twin is flushed and takes the result's name in one rename. The other twin gets the frame together with the next
-one. After ``kill -9`` at any time, the name refers to a complete file with every appended frame, and the stored state
-belongs to its last frame. A power cut is not covered: only the closed file is synced to the disk.
-
-On a file system without hard links, the twin is copied for each frame: as safe, but slower.
-"""
+"""Write a result frame by frame; it can be read at any time, and an interrupted run can be resumed."""
 
 from __future__ import annotations
 
 import contextlib
 import os
-import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
+
+import numpy as np
 
 from tk.errors import ResultError
-from tk.io.hdf5 import Hdf5Reader, open_hdf5
+from tk.io.hdf5_writer import Hdf5Writer, writing
 from tk.io.paths import check_output
 from tk.io.results.data import FrameResult, ResultMeta, Value
-from tk.io.results.files import ANY_HDF5, RESULT, SafeFile, TwinFolder, writing
-from tk.io.results.layout import FrameSet, Twin, write_layout
-from tk.io.results.reader import (
-    check_format,
-    check_hull,
-    count_people,
-    count_rows,
-    read_meta,
-    read_model,
-    read_state,
-)
-from tk.io.results.schema import columns_of, prefix_of
+from tk.io.results.files import ANY_HDF5, RESULT
+from tk.io.results.layout import Layout, Values, pack_state
+from tk.io.results.reader import open_result, read_state
+from tk.io.results.schema import row_of
 
 Model = Mapping[str, Value]
 
@@ -46,23 +28,32 @@ class ResultWriter:
     exists until the first frame is written. After an exception in the ``with`` block all finished frames are kept.
 
     Attributes:
-        state: the last state given to :meth:`append`.
+        state: the state from which a resumed run continues.
         models: the fitted body of each person, as given to :meth:`write_model`.
     """
 
     def __init__(
-        self, path: Path, meta: ResultMeta, twin_folder: TwinFolder, twins: list[Twin], models: list[Model]
+        self,
+        path: Path,
+        meta: ResultMeta,
+        disk: Hdf5Writer,
+        models: Sequence[Model],
+        frames: int = 0,
+        rows: Sequence[int] = (),
+        state: Mapping[str, Value] | None = None,
     ) -> None:
         self.path = path
         self.meta = meta
-        self.state: Mapping[str, Value] = {}
-        self.models = models
-        self._columns = columns_of(meta)
-        self._folder = twin_folder
-        self._twins = twins  # [0] is written next, [1] is published (neither at first)
-        self._recent: list[FrameSet] = []  # frame sets that are not yet in both twins
-        self._published = False
-        self._intact = True
+        self.state = state or {}
+        self.models = list(models)
+        self._disk = disk
+        self._layout = Layout(disk.file, meta)
+        self._frames = frames  # frame sets, those that wait included
+        self._rows = [*rows, *(0 for _ in self.models[len(rows) :])]  # the same by person
+        self._waiting: list[dict[int, Values]] = []  # by person
+        self._waiting_models: dict[int, Model] = {}
+        self._waiting_state: tuple[int, list[int], Model] | None = None
+        self._written = False
         self._failure: ResultError | None = None
 
     @classmethod
@@ -79,7 +70,10 @@ class ResultWriter:
                 not a tk result.
         """
         target = check_output(Path(path), RESULT, force=True, error=ResultError)
-        return cls._opened(target, meta, [{} for _ in range(people)], None)
+        with writing(target):
+            writer = cls(target, meta, Hdf5Writer(target), [{} for _ in range(people)])
+            writer._layout.put_root_attributes()
+        return writer
 
     @classmethod
     def resume(cls, path: str | os.PathLike[str], meta: ResultMeta) -> tuple[ResultWriter, int]:
@@ -96,32 +90,28 @@ class ResultWriter:
         target = check_output(Path(path), ANY_HDF5, force=True, error=ResultError)
         if not target.exists():
             return cls.create(path, meta), 0
-        with open_hdf5(target) as done:
-            check_format(done)
-            rows = [_check_resumable(done, meta, person) for person in range(count_people(done))]
-            finished, state = read_state(done)
-            if len(finished) > len(rows) or any(a > b for a, b in zip(finished, rows, strict=False)):
-                done.fail(f"the state of the run is damaged; {_REMEDY}")
-            models: list[Model] = [read_model(done, prefix_of(person)) for person in range(len(rows))]
-        writer = cls._opened(target, meta, models, target)
-        writer.state = state
-        return writer, writer._twins[0].count
-
-    @classmethod
-    def _opened(cls, target: Path, meta: ResultMeta, models: list[Model], source: Path | None) -> ResultWriter:
-        """Return a writer with two twins, copies of ``source`` or empty."""
+        remedy = "it cannot be resumed: start again, or choose another name"
+        with open_result(target) as (file, people):
+            for person in people:
+                try:
+                    difference = person.meta.difference(meta)
+                except ResultError as reason:
+                    file.fail(f"{reason}; {remedy}")
+                if difference:
+                    file.fail(f"was made differently: {difference}; {remedy}")
+            written = [person.count for person in people]
+            frames, rows, state = read_state(file) or (written[0], written, {})
+            if len(rows) > len(written) or any(a > b for a, b in zip(rows, written, strict=False)):
+                file.fail(f"the state of the run is damaged; {remedy}")
+            models = [person.model() for person in people]
         with writing(target), contextlib.ExitStack() as undo:
-            folder = undo.enter_context(TwinFolder(target))
-            twins = []
-            for path in folder.twin_paths:
-                if source:
-                    shutil.copyfile(source, path)
-                disk = undo.enter_context(SafeFile(path, "r+" if source else "w"))
-                if not source:
-                    write_layout(disk.file, meta, len(models))
-                twins.append(Twin(disk, meta, models))
+            disk = Hdf5Writer(target, target)
+            undo.callback(disk.close, publish=False)
+            writer = cls(target, meta, disk, models, frames, rows, state)
+            for number, count in enumerate(writer._rows):
+                writer._layout.keep_rows(number, count)
             undo.pop_all()
-        return cls(target, meta, folder, twins, models)
+        return writer, frames
 
     @property
     def model(self) -> Model:
@@ -133,8 +123,9 @@ class ResultWriter:
 
         A name may contain slashes: ``{"torso/radii_m": ...}``.
         """
+        self._require_open()
         self._add_people(person + 1)
-        self.models[person] = dict(model)
+        self.models[person] = self._waiting_models[person] = dict(model)
 
     def append(
         self,
@@ -157,93 +148,76 @@ class ResultWriter:
         """
         self._require_open()
         people = {0: results} if isinstance(results, FrameResult) else results
-        count = self._recent[-1].index + 1 if self._recent else self._twins[1].count
-        frame_set = FrameSet.of(count, people, state, self._columns)
+        rows: dict[int, Values] = {person: row_of(frame, self._layout.columns) for person, frame in people.items()}
         self._add_people(1 + max(people, default=0))
-        self._recent.append(frame_set)
+        self._waiting.append(rows)
+        self._frames += 1
+        for person in people:
+            self._rows[person] += 1
+        if state is not None:  # a copy: a tracker may reuse its arrays
+            copy = {name: value if isinstance(value, str) else np.array(value) for name, value in state.items()}
+            self._waiting_state = (self._frames, self._rows.copy(), copy)
         if flush:
             self.flush()
 
     def flush(self) -> None:
         """Write all appended frames to the file."""
         self._require_open()
-        self._intact = False
         try:
             with writing(self.path):
-                self._update(self._twins[0])
-                self._publish(self._twins[0])
-                self._twins.reverse()
-                self._intact = True
+                self._write_waiting()
+                self._disk.publish()
+                self._written = True
         except ResultError as error:
             self._failure = error
             raise
-        behind = self._twins[0].count
-        self._recent = [frame_set for frame_set in self._recent if frame_set.index >= behind]
 
     def close(self) -> None:
-        """Close the file and remove the hidden folder. A second call does nothing."""
-        if not self._twins:
-            return
-        (twin, other), self._twins = self._twins, []
-        with writing(self.path), self._folder, other.disk:
-            with twin.disk:  # HDF5 modifies a file while closing it: close it, then publish it
-                if self._intact:
-                    self._update(twin)
-            if self._intact:
-                with twin.disk.path.open("rb") as stream:
-                    os.fsync(stream.fileno())
-                self._publish(twin)
+        """Write all appended frames, close the file, and remove the hidden folder. A second call does nothing."""
+        self._close(publish=True)
 
     def __enter__(self) -> ResultWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is not None and not (self._published or self._recent):
-            self._intact = False  # no frame was finished: an older result stays
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
-            self.close()
+            self._close(publish=True)
+        else:
+            with contextlib.suppress(ResultError):  # report the first error
+                # if no frame is finished, an older result stays
+                self._close(publish=self._written or bool(self._waiting))
+
+    def _close(self, publish: bool) -> None:
+        if not self._disk.file:
             return
-        with contextlib.suppress(ResultError):  # report the first error
-            self.close()
+        with writing(self.path), self._disk:  # publishes what is written if no error occurs
+            if publish and self._failure is None:
+                self._write_waiting()
+            else:
+                self._disk.close(publish=False)
 
     def _require_open(self) -> None:
-        if not self._twins:
+        if not self._disk.file:
             raise ValueError(f"{self.path} is closed")
-        if not self._intact:
-            raise self._failure or ValueError(f"{self.path}: an earlier write failed")
+        if self._failure is not None:
+            raise self._failure
 
     def _add_people(self, count: int) -> None:
         if count > len(self.models) + 1:
             raise ValueError(f"person {count - 1} is not the next one: the file has {len(self.models)}")
         if count > len(self.models):
             self.models.append({})
+            self._rows.append(0)
 
-    def _update(self, twin: Twin) -> None:
-        """Write the bodies and the frame sets that this twin does not have yet."""
-        twin.put_models(self.models)
-        twin.append([frame_set for frame_set in self._recent if frame_set.index >= twin.count])
-        twin.disk.flush_to_disk()
-
-    def _publish(self, twin: Twin) -> None:
-        self._folder.publish(twin.disk.path)
-        self._published = True
-
-
-_REMEDY = "it cannot be resumed: start again, or choose another name"
-
-
-def _check_resumable(file: Hdf5Reader, meta: ResultMeta, person: int) -> int:
-    """Return a person's number of rows, or raise ResultError if they cannot be continued with this metadata."""
-    prefix = prefix_of(person)
-    found = read_meta(file, prefix)
-    try:
-        difference = found.difference(meta)
-    except ResultError as reason:
-        file.fail(f"{reason}; {_REMEDY}")
-    if difference:
-        file.fail(f"was made differently: {difference}; {_REMEDY}")
-    rows = count_rows(file, meta, prefix)
-    check_hull(file, rows, prefix)
-    return rows
+    def _write_waiting(self) -> None:
+        """Pass bodies, frames and state on to HDF5."""
+        for person in range(len(self.models)):
+            self._layout.add_person(person)
+            if person in self._waiting_models:
+                self._layout.put_model(person, self._waiting_models[person])
+            if rows := [frame_set[person] for frame_set in self._waiting if person in frame_set]:
+                self._layout.append(person, rows)
+        if self._waiting_state is not None:
+            self._layout.put_state(pack_state(*self._waiting_state))
+        self._layout.link_first_person()
+        self._waiting, self._waiting_models, self._waiting_state = [], {}, None
