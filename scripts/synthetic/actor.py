@@ -98,17 +98,26 @@ class Actor:
         rotation, origin = pose.rotation[:, self.bones], pose.origin[:, self.bones]
         return np.concatenate([origin + np.einsum("tnij,nj->tni", rotation, end) for end in ends], axis=1), radii
 
+    def capsules(self, pose: Pose) -> Float:
+        """Return (N, 8) a capsule around each primitive at the first of T poses, metres, world.
+
+        Columns: the ends (3, 3), the radius, and how far any point of the primitive moves from there in the other
+        poses. Blending and wrinkles are inside.
+        """
+        ends, radii = self.balls(pose)
+        ends = ends.reshape(len(ends), 2, -1, 3)
+        radius = radii.reshape(2, -1).max(axis=0) + self.shape[:, COL_BLEND] + self.shape[:, COL_WRINKLE]
+        turned = np.linalg.norm(pose.rotation - pose.rotation[0], axis=(2, 3))[:, self.bones] / np.sqrt(2)
+        moved = np.linalg.norm(ends - ends[0], axis=-1).max(axis=1) + turned * radius
+        return np.column_stack([ends[0, 0], ends[0, 1], radius, moved.max(axis=0)])
+
     def frames(self, pose: Pose) -> Float:
-        """(T, N, 16): each primitive's bone rotation row by row, bone origin, bounding sphere's centre and radius."""
-        rotation, origin = pose.rotation[:, self.bones], pose.origin[:, self.bones]
-        count = len(rotation)
-        parts = [
-            rotation.reshape(count, -1, 9),
-            origin,
-            self.spheres(pose),
-            np.tile(self.radii[:, None], (count, 1, 1)),
-        ]
-        return np.concatenate(parts, axis=-1)
+        """Return (T, N, 16): row by row the matrix (3, 4) from the world to each primitive's bone; bounding sphere."""
+        inverse = pose.rotation[:, self.bones].swapaxes(-1, -2)
+        shift = -inverse @ pose.origin[:, self.bones, :, None]
+        matrix = np.concatenate([inverse, shift], axis=-1).reshape(*shift.shape[:2], 12)
+        radii = np.broadcast_to(self.radii[:, None], (*shift.shape[:2], 1))
+        return np.concatenate([matrix, self.spheres(pose), radii], axis=-1)
 
 
 def make_actor(skeleton: Skeleton, *, cube_bone: str | None = None) -> Actor:

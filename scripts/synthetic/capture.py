@@ -37,7 +37,7 @@ VOLUME_MARGIN_M = 0.15
 EXPOSURE_FRAMES = 0.25
 """Shutter time, in frames: 1/60 s at 15 frames a second, 1/120 s at 30."""
 # Four samples a pixel: a rotated grid in space, in an order of moments that has no drift across the pixel.
-_OFFSETS = np.array([[-0.125, -0.375], [0.375, -0.125], [-0.375, 0.125], [0.125, 0.375]])
+OFFSETS = np.array([[-0.125, -0.375], [0.375, -0.125], [-0.375, 0.125], [0.125, 0.375]])
 _MOMENTS = EXPOSURE_FRAMES * np.array([-0.375, 0.125, 0.375, -0.125])
 _AMBIENT_BONES = ("ankle_l", "ankle_r", "knee_l", "knee_r", "hip_l", "hip_r", "lumbar", "chest", "head")
 _AMBIENT_RADII_M = (0.07, 0.07, 0.07, 0.07, 0.11, 0.11, 0.15, 0.15, 0.11)
@@ -243,7 +243,7 @@ class CameraRenderer:
         self.plan, self.camera = plan, plan.rig[index]
         self.sensor = Sensor.draw(np.random.default_rng([plan.options.seed, 2, index]), self.camera.width)
         self._noise_seed = [plan.options.seed, 3, index]
-        self._rays = sample_rays(self.camera, _OFFSETS)
+        self._rays = sample_rays(self.camera, OFFSETS)
         self._room: RoomView = view_room(self.camera, plan.lamps)
 
     def frame(self, frame: int, shadow: NDArray[np.float32] | None = None) -> Picture:

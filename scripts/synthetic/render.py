@@ -1,10 +1,13 @@
 # No `from __future__ import annotations` here: Taichi reads the annotations of kernels.
-"""Sphere tracing of the actor, shadow maps, and compositing over the room. Taichi kernels and their host functions.
+"""Render the actor by sphere tracing: images, shadow maps, compositing over the room. Taichi kernels and their hosts.
 
-The picture is cut into tiles of 8 pixels; each tile traces only the primitives whose bounding spheres it can see
-(a bounding sphere includes the blending radius, so the rest cannot change the distance there). Each pixel has a few
-samples; sample s has its own place inside the pixel and its own moment of the exposure, which gives antialiasing,
-coverage and motion blur at once.
+Rays are traced in bundles. A tile of 16 pixels keeps the primitives that its beam of rays can meet, a block of 4 pixels
+those of the tile that its own beam can meet. The beam of a block, and then of a pixel, advances as one ray for as long
+as the body is farther away than the beam is wide; only then each ray advances alone. A beam is as wide as its rays and
+as the body's motion during the exposure.
+
+A pixel has a few samples. Each sample has its own place in the pixel and its own moment of the exposure: this gives
+antialiasing, coverage and motion blur. A pixel that the body fills is lit once, and coloured at each sample.
 """
 
 from collections.abc import Sequence
@@ -21,12 +24,15 @@ from scripts.synthetic.skeleton import Pose
 from tk.kernels.runtime import ensure_runtime, ti
 from tk.model.cameras.camera import Camera
 
-TILE = 8
+TILE, BLOCK = 16, 4  # pixels
 MAX_STEPS = 120
+STEP = 0.85  # squeezed and wrinkled space is not quite 1-Lipschitz
 HIT_M = 0.0008
 CLOSE_M = 0.02
 GRAZE_M = 0.004
 """A ray that has used up its steps this near to the body counts as a hit."""
+FLAT_M = 0.03
+"""Light is computed once for a pixel whose samples differ by less than this in depth, metres."""
 SHADOW_BIAS_M = 0.035
 FAR_M = 1.0e4
 PENUMBRA_PX = 2.5
@@ -36,52 +42,8 @@ vec3 = ti.types.vector(3, ti.f32)
 Array = ti.types.ndarray
 
 
-@dataclass(frozen=True)
-class Tiles:
-    """``first`` (K, 2) int32 first column and row of each tile, ``start`` (K+1,) and ``primitive`` the primitives it
-    sees, ``near_far`` (K, 2) float32 metres along the ray between which they lie."""
-
-    first: NDArray[np.int32]
-    start: NDArray[np.int32]
-    primitive: NDArray[np.int32]
-    near_far: NDArray[np.float32]
-
-
-def make_tiles(camera: Camera, actor: Actor, pose: Pose) -> Tiles:
-    """The tiles that can see the actor in any of these poses (the moments of one exposure)."""
-    centers = actor.spheres(pose)  # (S, N, 3)
-    samples, count = centers.shape[:2]
-    pixels, depth = camera.project(centers.reshape(-1, 3))
-    reach = actor.radii[None, :]
-    focal = max(camera.matrix[0, 0], camera.matrix[1, 1])
-    depth = depth.reshape(samples, count)
-    # 1.25: distortion and obliqueness stretch a sphere's picture a little
-    spread = 1.25 * focal * reach / np.maximum(depth - reach, 0.1) + 2.0
-    pixels = pixels.reshape(samples, count, 2)
-    # a sphere behind the camera has no pixels
-    low = np.nan_to_num(pixels - spread[..., None], nan=np.inf).min(axis=0)
-    high = np.nan_to_num(pixels + spread[..., None], nan=-np.inf).max(axis=0)
-    columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
-    x, y = np.arange(columns) * TILE, np.arange(rows) * TILE
-    in_x = (low[:, None, 0] < x + TILE) & (high[:, None, 0] > x - 1)  # (N, columns)
-    in_y = (low[:, None, 1] < y + TILE) & (high[:, None, 1] > y - 1)
-    seen = (in_y[:, :, None] & in_x[:, None, :]).reshape(count, -1).T  # (tiles, N)
-    tiles = np.flatnonzero(seen.any(axis=1))
-    seen = seen[tiles]
-    distance = np.linalg.norm(centers - camera.center, axis=-1)
-    near, far = (distance - reach).min(axis=0), (distance + reach).max(axis=0)
-    return Tiles(
-        np.stack([tiles % columns, tiles // columns], axis=1).astype(np.int32) * TILE,
-        np.concatenate([[0], np.cumsum(seen.sum(axis=1))]).astype(np.int32),
-        np.nonzero(seen)[1].astype(np.int32),
-        np.stack([np.where(seen, near, np.inf).min(axis=1), np.where(seen, far, -np.inf).max(axis=1)], axis=1).astype(
-            np.float32
-        ),
-    )
-
-
 def sample_rays(camera: Camera, offsets: NDArray[np.float64]) -> NDArray[np.float32]:
-    """(S, H, W, 3) unit directions in the world through each pixel's centre plus ``offsets`` (S, 2) pixels."""
+    """Return (S, H, W, 3) unit directions in the world through each pixel's centre plus ``offsets`` (S, 2) pixels."""
     y, x = np.mgrid[: camera.height, : camera.width]
     grid = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
     rays = [camera.rays(grid + offset) for offset in offsets]
@@ -89,49 +51,54 @@ def sample_rays(camera: Camera, offsets: NDArray[np.float64]) -> NDArray[np.floa
 
 
 @ti.func
-def _primitive(p, frame, i, frames: ti.template(), shape: ti.template(), material):
-    """Signed distance to primitive i at the moment ``frame``, and the point in the bone frame."""
-    d = vec3(p[0] - frames[frame, i, 9], p[1] - frames[frame, i, 10], p[2] - frames[frame, i, 11])
+def _in_bone(p, moment, i, frames: ti.template()):
+    """The point in the frame of primitive i's bone."""
     q = vec3(0.0)
-    for r in ti.static(range(3)):  # transposed: world to bone
-        q[r] = frames[frame, i, r] * d[0] + frames[frame, i, 3 + r] * d[1] + frames[frame, i, 6 + r] * d[2]
-    a = vec3(shape[i, 0], shape[i, 1], shape[i, 2])
-    b = vec3(shape[i, 4], shape[i, 5], shape[i, 6])
-    ra, rb = shape[i, 3], shape[i, 7]
-    result = 0.0
-    if material % 6 == 5:  # a box with rounded edges
-        edge = 0.006
-        e = ti.abs(q - a) - (ra - edge)
-        result = ti.max(e, 0.0).norm() + ti.min(e.max(), 0.0) - edge
-    else:
-        scale = vec3(shape[i, 8], shape[i, 9], shape[i, 10])
-        u = q / scale
-        axis = b - a
-        length = ti.max(axis.norm(), 1e-6)
-        axis /= length
-        y = (u - a).dot(axis)
-        across = (u - a - y * axis).norm()
-        slope = ti.math.clamp((ra - rb) / length, -0.95, 0.95)
-        # the sphere of the family that is nearest to u
-        h = ti.math.clamp(y - across * slope / ti.sqrt(1.0 - slope * slope), 0.0, length)
-        spoke = u - a - h * axis
-        result = spoke.norm() - (ra - slope * h)
-        # back from squeezed space: divide by the gradient there
-        result /= ti.max((spoke.normalized(1e-9) / scale).norm(), 1e-6)
-    wrinkle = shape[i, 16]
-    if wrinkle > 0.0 and result < 0.02:
-        # folds: warped waves, mostly across the bone
-        w = ti.sin(23.0 * q[2] + 9.0 * q[0] + 2.5 * ti.sin(17.0 * q[1] + 11.0 * q[0] + 1.7 * shape[i, 17]))
-        w += 0.6 * ti.sin(47.0 * q[2] - 21.0 * q[1] + 2.0 * ti.sin(31.0 * q[0] + 1.3 * shape[i, 17]))
-        result -= 0.6 * wrinkle * w
-    cut = shape[i, 11] * q[0] + shape[i, 12] * q[1] + shape[i, 13] * q[2] - shape[i, 14]
-    return ti.max(result, -cut), q
+    for r in ti.static(range(3)):
+        q[r] = frames[moment, i, 4 * r + 3]
+        for c in ti.static(range(3)):
+            q[r] += frames[moment, i, 4 * r + c] * p[c]
+    return q
 
 
 @ti.func
-def _body(p, frame, begin, end, primitives: ti.template(), frames: ti.template(), shape: ti.template(),
-          materials: ti.template()):  # fmt: skip
-    """Distance to the body, and the nearest primitive's index. Materials are blended within, not between."""
+def _primitive(p, moment, i, frames: ti.template(), shape: ti.template(), material):
+    """Signed distance to primitive i."""
+    q = _in_bone(p, moment, i, frames)
+    a, size = vec3(shape[i, 0], shape[i, 1], shape[i, 2]), shape[i, 3]
+    result = 0.0
+    if material % 6 == 5:  # a box with rounded edges
+        edge = 0.006
+        e = ti.abs(q - a) - (size - edge)
+        result = ti.max(e, 0.0).norm() + ti.min(e.max(), 0.0) - edge
+    else:
+        inverse = vec3(shape[i, 4], shape[i, 5], shape[i, 6])
+        axis = vec3(shape[i, 7], shape[i, 8], shape[i, 9])
+        u = inverse * q - a
+        along = u.dot(axis)
+        across = ti.sqrt(ti.max(u.norm_sqr() - along * along, 0.0))
+        # the sphere of the family that is nearest to u
+        h = ti.math.clamp(along - across * shape[i, 12], 0.0, shape[i, 10])
+        spoke = u - h * axis
+        length = spoke.norm(1e-12)
+        # back from squeezed space: divide by the gradient there
+        result = (length - (size - shape[i, 11] * h)) * length / (inverse * spoke).norm(1e-12)
+    wrinkle = shape[i, 18]
+    if wrinkle > 0.0 and result < 0.02:
+        # folds: warped waves, mostly across the bone
+        w = ti.sin(23.0 * q[2] + 9.0 * q[0] + 2.5 * ti.sin(17.0 * q[1] + 11.0 * q[0] + 1.7 * shape[i, 19]))
+        w += 0.6 * ti.sin(47.0 * q[2] - 21.0 * q[1] + 2.0 * ti.sin(31.0 * q[0] + 1.3 * shape[i, 19]))
+        result -= 0.6 * wrinkle * w
+    cut = shape[i, 13] * q[0] + shape[i, 14] * q[1] + shape[i, 15] * q[2] - shape[i, 16]
+    return ti.max(result, -cut)
+
+
+@ti.func
+def _body(p, moment, tile, count, near: ti.template(), frames: ti.template(), shape: ti.template()):
+    """Distance to the body, and the nearest primitive's index. Materials are blended within, not between.
+
+    The body consists of the first ``count`` primitives of ``near[tile, 1]``.
+    """
     best = 1e9
     best_i = -1
     group = 1e9
@@ -139,22 +106,22 @@ def _body(p, frame, begin, end, primitives: ti.template(), frames: ti.template()
     group_nearest = 1e9
     current = -1
     outside = 1e9
-    for k in range(begin, end):
-        i = primitives[k]
-        m = materials[i]
+    for k in range(count):
+        i = near[tile, 1, k]
+        m = ti.cast(shape[i, 20], ti.i32)
         if m != current:
             if group < best:
                 best, best_i = group, group_i
             group, group_i, group_nearest, current = 1e9, -1, 1e9, m
-        c = vec3(frames[frame, i, 12], frames[frame, i, 13], frames[frame, i, 14])
-        bound = (p - c).norm() - frames[frame, i, 15]
+        c = vec3(frames[moment, i, 12], frames[moment, i, 13], frames[moment, i, 14])
+        bound = (p - c).norm() - frames[moment, i, 15]
         if bound > CLOSE_M:  # too far to blend: its bounding sphere will do for the next step
             outside = ti.min(outside, bound)
         else:
-            d, _ = _primitive(p, frame, i, frames, shape, m)
+            d = _primitive(p, moment, i, frames, shape, m)
             if d < group_nearest:
                 group_nearest, group_i = d, i
-            blend = shape[i, 15]
+            blend = shape[i, 17]
             h = ti.max(blend - ti.abs(d - group), 0.0)
             group = ti.min(d, group)
             if blend > 0.0:
@@ -165,21 +132,118 @@ def _body(p, frame, begin, end, primitives: ti.template(), frames: ti.template()
 
 
 @ti.func
-def _trace(origin, ray, near, far, frame, begin, end, primitives: ti.template(), frames: ti.template(),
-           shape: ti.template(), materials: ti.template()):  # fmt: skip
-    """Distance along the ray to the body (FAR_M for a miss) and the primitive that was hit."""
-    t = near
+def _advance(origin, axis, t, far, width, spread, tile, count, near: ti.template(), frames: ti.template(),
+             shape: ti.template()):  # fmt: skip
+    """Distance up to which a beam with the radius ``width + spread * t`` is empty; FAR_M if it is empty up to ``far``.
+
+    The body is the one at the first moment.
+    """
+    reached = FAR_M
+    for _ in range(MAX_STEPS):
+        d, _i = _body(origin + t * axis, 0, tile, count, near, frames, shape)
+        radius = width + spread * t
+        room = STEP * d - radius
+        if room < 0.25 * radius:
+            reached = t
+            break
+        t += room
+        if t > far:
+            break
+    return reached
+
+
+@ti.func
+def _trace(origin, ray, t, far, moment, tile, count, near: ti.template(), frames: ti.template(),
+           shape: ti.template()):  # fmt: skip
+    """Distance along a ray from ``t`` to the body (FAR_M for a miss) and the primitive that was hit."""
     hit = FAR_M
     hit_i = -1
-    for step in range(MAX_STEPS):
-        d, i = _body(origin + t * ray, frame, begin, end, primitives, frames, shape, materials)
-        if d < HIT_M or (step == MAX_STEPS - 1 and d < GRAZE_M):
+    before, step = 0.0, 0.0
+    for k in range(MAX_STEPS):
+        d, i = _body(origin + t * ray, moment, tile, count, near, frames, shape)
+        if d < HIT_M or (k == MAX_STEPS - 1 and d < GRAZE_M):
             hit, hit_i = t, i
+            if d < 0.0:  # between the last two points
+                hit += step * d / (before - d)
             break
-        t += 0.85 * d  # squeezed and wrinkled space is not quite 1-Lipschitz
+        # near the surface the distance is nearly linear
+        step = d / ti.math.clamp((before - d) / step, 0.5, 1.0) if step > 0.0 and d < CLOSE_M else STEP * d
+        before = d
+        t += step
         if t > far:
             break
     return hit, hit_i
+
+
+@ti.func
+def _meets(origin, axis, spread, i, capsules: ti.template()):
+    """Whether a beam can meet primitive i, and the distances along the beam between which the primitive lies."""
+    a = vec3(capsules[i, 0], capsules[i, 1], capsules[i, 2]) - origin
+    b = vec3(capsules[i, 3], capsules[i, 4], capsules[i, 5]) - origin
+    radius = capsules[i, 6] + capsules[i, 7]
+    ta, tb = a.dot(axis), b.dot(axis)
+    a -= ta * axis
+    b -= tb * axis
+    along = b - a
+    s = ti.math.clamp(-a.dot(along) / ti.max(along.dot(along), 1e-12), 0.0, 1.0)
+    reach = 1.02 * (radius + spread * ti.max(ta, tb))
+    return (a + s * along).norm() < reach and ti.max(ta, tb) > -radius, ti.min(ta, tb) - reach, ti.max(ta, tb) + reach
+
+
+@ti.func
+def _beam(rays: ti.template(), x, y, size):
+    """Axis and spread of the beam of rays through a square of pixels whose first one is (x, y)."""
+    right, low = ti.min(x + size, rays.shape[2]) - 1, ti.min(y + size, rays.shape[1]) - 1
+    axis = vec3(0.0)
+    for corner in ti.static(range(4)):
+        u, v = (right if corner & 1 else x), (low if corner & 2 else y)
+        for s in range(rays.shape[0]):
+            axis += vec3(rays[s, v, u, 0], rays[s, v, u, 1], rays[s, v, u, 2])
+    axis = axis.normalized()
+    spread = 0.0
+    for corner in ti.static(range(4)):
+        u, v = (right if corner & 1 else x), (low if corner & 2 else y)
+        for s in range(rays.shape[0]):
+            spread = ti.max(spread, (vec3(rays[s, v, u, 0], rays[s, v, u, 1], rays[s, v, u, 2]) - axis).norm())
+    return axis, spread
+
+
+@ti.func
+def _tile(origin, rays: ti.template(), tile, x, y, capsules: ti.template(), near: ti.template()):
+    """Fill ``near[tile, 0]`` with the primitives that a tile can show; return their number."""
+    axis, spread = _beam(rays, x, y, TILE)
+    count = 0
+    for i in range(capsules.shape[0]):
+        met, _, _ = _meets(origin, axis, spread, i, capsules)
+        if met:
+            near[tile, 0, count] = i
+            count += 1
+    return count
+
+
+@ti.func
+def _block(origin, rays: ti.template(), tile, count, x, y, capsules: ti.template(), near: ti.template(),
+           frames: ti.template(), shape: ti.template()):  # fmt: skip
+    """Fill ``near[tile, 1]`` with the primitives of the tile that a block can show.
+
+    Return their number, 0 if the block shows nothing; the distances along the rays between which the body lies; and how
+    far it moves during the exposure.
+    """
+    axis, spread = _beam(rays, x, y, BLOCK)
+    found = 0
+    begin, end, moved = FAR_M, 0.0, 0.0
+    for k in range(count):
+        i = near[tile, 0, k]
+        met, first, last = _meets(origin, axis, spread, i, capsules)
+        if met:
+            near[tile, 1, found] = i
+            found += 1
+            begin, end, moved = ti.min(begin, first), ti.max(end, last), ti.max(moved, capsules[i, 7])
+    if found > 0:
+        begin = _advance(origin, axis, ti.max(begin, 0.0), end, moved, spread, tile, found, near, frames, shape)
+        if begin == FAR_M:
+            found = 0
+    return found, begin, end, moved
 
 
 @ti.func
@@ -266,64 +330,90 @@ def _albedo(i, person_m, q, colors: ti.template(), stripes):
     return c
 
 
+@ti.func
+def _light(p, moment, tile, count, near: ti.template(), frames: ti.template(), shape: ti.template(),
+           light: ti.template(), axes: ti.template(), shadow: ti.template(),
+           ambient: ti.template()):  # fmt: skip
+    """Light that falls on a point of the body, RGB."""
+    normal = vec3(0.0)
+    for e in ti.static(range(4)):  # gradient from the corners of a tetrahedron
+        corner = vec3(CORNERS[e][0], CORNERS[e][1], CORNERS[e][2])
+        d, _ = _body(p + 0.002 * corner, moment, tile, count, near, frames, shape)
+        normal += corner * d
+    normal = normal.normalized(1e-9)
+    # light bounced by the floor from below, by the room from above
+    radiance = (0.72 + 0.28 * normal[2]) * vec3(ambient[0], ambient[1], ambient[2])
+    for lamp in range(light.shape[0]):
+        to_light = (vec3(light[lamp, 0], light[lamp, 1], light[lamp, 2]) - p).normalized(1e-9)
+        facing = normal.dot(to_light)
+        if facing > 0.0:
+            lit = facing * _visibility(p, light, axes, shadow, lamp, SHADOW_BIAS_M)
+            radiance += lit * vec3(light[lamp, 3], light[lamp, 4], light[lamp, 5])
+    return radiance
+
+
 @ti.kernel
 def _render_kernel(
     stripes: ti.i32,
     origin: Array(dtype=ti.f32, ndim=1),  # (3,)
     rays: Array(dtype=ti.f32, ndim=4),  # (S, H, W, 3)
     frames: Array(dtype=ti.f32, ndim=3),  # (S, N, 16)
-    shape: Array(dtype=ti.f32, ndim=2),  # (N, 18)
-    materials: Array(dtype=ti.i32, ndim=1),  # (N,)
+    capsules: Array(dtype=ti.f32, ndim=2),  # (N, 8)
+    shape: Array(dtype=ti.f32, ndim=2),  # (N, 21) see `_table`
     colors: Array(dtype=ti.f32, ndim=2),  # (6 P, 3)
-    first: Array(dtype=ti.i32, ndim=2),  # (K, 2)
-    start: Array(dtype=ti.i32, ndim=1),  # (K+1,)
-    primitives: Array(dtype=ti.i32, ndim=1),
-    near_far: Array(dtype=ti.f32, ndim=2),  # (K, 2)
     light: Array(dtype=ti.f32, ndim=2),  # (L, 7) position, colour, focal length of the shadow map
     axes: Array(dtype=ti.f32, ndim=3),  # (L, 3, 3)
     shadow: Array(dtype=ti.f32, ndim=3),  # (L, Z, Z)
     ambient: Array(dtype=ti.f32, ndim=1),  # (3,)
+    near: Array(dtype=ti.i32, ndim=3),  # (tiles, 2, N) scratch
     out: Array(dtype=ti.f32, ndim=3),  # (H, W, 4) premultiplied colour and coverage, zero before
 ):
-    for flat in range(first.shape[0] * TILE * TILE):
-        k = flat // (TILE * TILE)
-        x = first[k, 0] + flat % TILE
-        y = first[k, 1] + (flat // TILE) % TILE
-        if x < rays.shape[2] and y < rays.shape[1]:
-            o = vec3(origin[0], origin[1], origin[2])
-            total = vec3(0.0)
-            covered = 0.0
-            begin, end = start[k], start[k + 1]
-            for s in range(rays.shape[0]):
-                ray = vec3(rays[s, y, x, 0], rays[s, y, x, 1], rays[s, y, x, 2])
-                t, i = _trace(
-                    o, ray, near_far[k, 0], near_far[k, 1], s, begin, end, primitives, frames, shape, materials
-                )
-                if i >= 0:
-                    p = o + t * ray
-                    normal = vec3(0.0)
-                    for e in ti.static(range(4)):  # gradient from the corners of a tetrahedron
-                        corner = vec3(CORNERS[e][0], CORNERS[e][1], CORNERS[e][2])
-                        d, _ = _body(p + 0.002 * corner, s, begin, end, primitives, frames, shape, materials)
-                        normal += corner * d
-                    normal = normal.normalized(1e-9)
-                    m = materials[i]
-                    _, q = _primitive(p, s, i, frames, shape, m)
-                    # light bounced by the floor from below, by the room from above
-                    sky = 0.72 + 0.28 * normal[2]
-                    radiance = sky * vec3(ambient[0], ambient[1], ambient[2])
-                    for lamp in range(light.shape[0]):
-                        to_light = (vec3(light[lamp, 0], light[lamp, 1], light[lamp, 2]) - p).normalized(1e-9)
-                        facing = ti.max(normal.dot(to_light), 0.0)
-                        if facing > 0.0:
-                            lit = facing * _visibility(p, light, axes, shadow, lamp, SHADOW_BIAS_M)
-                            radiance += lit * vec3(light[lamp, 3], light[lamp, 4], light[lamp, 5])
-                    total += _albedo(ti.cast(shape[i, 17], ti.i32), m, q, colors, stripes) * radiance
-                    covered += 1.0
-            count = ti.cast(rays.shape[0], ti.f32)
-            for c in ti.static(range(3)):
-                out[y, x, c] = total[c] / count
-            out[y, x, 3] = covered / count
+    for tile in range(near.shape[0]):
+        o = vec3(origin[0], origin[1], origin[2])
+        samples = rays.shape[0]
+        columns = (rays.shape[2] + TILE - 1) // TILE
+        left, top = tile % columns * TILE, tile // columns * TILE
+        right, low = ti.min(left + TILE, rays.shape[2]), ti.min(top + TILE, rays.shape[1])
+        seen = _tile(o, rays, tile, left, top, capsules, near)
+        for block in range((TILE // BLOCK) ** 2 if seen > 0 else 0):
+            x0, y0 = left + block % (TILE // BLOCK) * BLOCK, top + block // (TILE // BLOCK) * BLOCK
+            count, begin, end, moved = 0, FAR_M, 0.0, 0.0
+            if x0 < right and y0 < low:
+                count, begin, end, moved = _block(o, rays, tile, seen, x0, y0, capsules, near, frames, shape)
+            for pixel in range(BLOCK * BLOCK if count > 0 else 0):
+                x, y = x0 + pixel % BLOCK, y0 + pixel // BLOCK
+                if x >= right or y >= low:
+                    continue
+                axis, spread = _beam(rays, x, y, 1)
+                start = _advance(o, axis, begin, end, moved, spread, tile, count, near, frames, shape)
+                if start == FAR_M:
+                    continue
+                hits, hit = ti.Vector([0.0, 0.0, 0.0, 0.0]), ti.Vector([-1, -1, -1, -1])
+                covered = 0
+                first, last = FAR_M, 0.0
+                for s in range(samples):
+                    ray = vec3(rays[s, y, x, 0], rays[s, y, x, 1], rays[s, y, x, 2])
+                    t, i = _trace(o, ray, start, end, s, tile, count, near, frames, shape)
+                    hits[s], hit[s] = t, i
+                    if i >= 0:
+                        covered += 1
+                        first, last = ti.min(first, t), ti.max(last, t)
+                flat = covered == samples and last - first < FLAT_M
+                total, radiance = vec3(0.0), vec3(0.0)
+                for s in range(samples):
+                    if hit[s] >= 0:
+                        p = o + hits[s] * vec3(rays[s, y, x, 0], rays[s, y, x, 1], rays[s, y, x, 2])
+                        if s == 0 or not flat:
+                            radiance = _light(p, s, tile, count, near, frames, shape, light, axes, shadow,
+                                              ambient)  # fmt: skip
+                        i = hit[s]
+                        q = _in_bone(p, s, i, frames)
+                        number = ti.cast(shape[i, 19], ti.i32)
+                        total += _albedo(number, ti.cast(shape[i, 20], ti.i32), q, colors, stripes) * radiance
+                share = 1.0 / samples
+                for c in ti.static(range(3)):
+                    out[y, x, c] = share * total[c]
+                out[y, x, 3] = share * covered
 
 
 @ti.kernel
@@ -331,38 +421,37 @@ def _depth_kernel(
     origin: Array(dtype=ti.f32, ndim=1),
     rays: Array(dtype=ti.f32, ndim=4),  # (1, Z, Z, 3)
     frames: Array(dtype=ti.f32, ndim=3),
+    capsules: Array(dtype=ti.f32, ndim=2),
     shape: Array(dtype=ti.f32, ndim=2),
-    materials: Array(dtype=ti.i32, ndim=1),
-    first: Array(dtype=ti.i32, ndim=2),
-    start: Array(dtype=ti.i32, ndim=1),
-    primitives: Array(dtype=ti.i32, ndim=1),
-    near_far: Array(dtype=ti.f32, ndim=2),
+    near: Array(dtype=ti.i32, ndim=3),
     out: Array(dtype=ti.f32, ndim=2),  # (Z, Z) metres along the ray, FAR_M before
 ):
-    for flat in range(first.shape[0] * TILE * TILE):
-        k = flat // (TILE * TILE)
-        x = first[k, 0] + flat % TILE
-        y = first[k, 1] + (flat // TILE) % TILE
-        if x < rays.shape[2] and y < rays.shape[1]:
-            o = vec3(origin[0], origin[1], origin[2])
-            ray = vec3(rays[0, y, x, 0], rays[0, y, x, 1], rays[0, y, x, 2])
-            t, _ = _trace(o, ray, near_far[k, 0], near_far[k, 1], 0, start[k], start[k + 1], primitives, frames, shape,
-                          materials)  # fmt: skip
-            out[y, x] = t
+    for tile in range(near.shape[0]):
+        o = vec3(origin[0], origin[1], origin[2])
+        columns = (rays.shape[2] + TILE - 1) // TILE
+        left, top = tile % columns * TILE, tile // columns * TILE
+        seen = _tile(o, rays, tile, left, top, capsules, near)
+        for block in range((TILE // BLOCK) ** 2 if seen > 0 else 0):
+            x0, y0 = left + block % (TILE // BLOCK) * BLOCK, top + block // (TILE // BLOCK) * BLOCK
+            count, begin, end, _ = _block(o, rays, tile, seen, x0, y0, capsules, near, frames, shape)
+            for pixel in range(BLOCK * BLOCK if count > 0 else 0):
+                x, y = x0 + pixel % BLOCK, y0 + pixel // BLOCK
+                ray = vec3(rays[0, y, x, 0], rays[0, y, x, 1], rays[0, y, x, 2])
+                t, _ = _trace(o, ray, begin, end, 0, tile, count, near, frames, shape)
+                out[y, x] = t
 
 
 @ti.kernel
 def _distance_kernel(
     points: Array(dtype=ti.f32, ndim=2),  # (P, 3)
-    primitives: Array(dtype=ti.i32, ndim=1),
+    every: Array(dtype=ti.i32, ndim=3),  # (1, 2, N) all primitives
     frames: Array(dtype=ti.f32, ndim=3),
     shape: Array(dtype=ti.f32, ndim=2),
-    materials: Array(dtype=ti.i32, ndim=1),
     out: Array(dtype=ti.f32, ndim=1),
 ):
     for n in range(points.shape[0]):
         p = vec3(points[n, 0], points[n, 1], points[n, 2])
-        d, _ = _body(p, 0, 0, primitives.shape[0], primitives, frames, shape, materials)
+        d, _ = _body(p, 0, 0, every.shape[2], every, frames, shape)
         out[n] = d
 
 
@@ -401,6 +490,21 @@ def _f32(a: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.ascontiguousarray(a, dtype=np.float32)
 
 
+def _table(actor: Actor) -> NDArray[np.float32]:
+    """Return (N, 21) what the kernels need of each primitive, lengths in squeezed units.
+
+    Columns: first end a (3), its radius, 1 / scale (3), unit vector from a to b (3), length, decrease of the radius per
+    unit of length, tangent of the angle with this sine, cut (4), blend, wrinkle, number, material.
+    """
+    shape = actor.shape
+    a, b, ra, rb = shape[:, :3], shape[:, 4:7], shape[:, 3:4], shape[:, 7:8]
+    length = np.maximum(np.linalg.norm(b - a, axis=1, keepdims=True), 1e-6)
+    slope = np.clip((ra - rb) / length, -0.95, 0.95)
+    tangent = slope / np.sqrt(1 - slope**2)
+    axis, inverse = (b - a) / length, 1 / shape[:, 8:11]
+    return _f32(np.column_stack([a, ra, inverse, axis, length, slope, tangent, shape[:, 11:], actor.material]))
+
+
 @dataclass(frozen=True)
 class Body:
     """Actors as kernel arguments: everything that does not change from frame to frame. Bit k of ``stripes`` is actor
@@ -408,55 +512,59 @@ class Body:
 
     actor: Actor
     shape: NDArray[np.float32]
-    materials: NDArray[np.int32]
     colors: NDArray[np.float32]
     stripes: int
 
     @staticmethod
     def of(actor: Actor, colors: NDArray[np.float64], stripes: bool) -> "Body":
-        return Body(actor, _f32(actor.shape), actor.material.astype(np.int32), _f32(colors), int(stripes))
+        """Return one actor as a body."""
+        return Body(actor, _table(actor), _f32(colors), int(stripes))
 
     @staticmethod
     def join(bodies: Sequence["Body"]) -> "Body":
         """Return several actors as one body; its poses are those of :meth:`Pose.join`."""
         actor, colors = join([body.actor for body in bodies]), np.concatenate([body.colors for body in bodies])
         stripes = sum(body.stripes << k for k, body in enumerate(bodies))
-        return Body(actor, _f32(actor.shape), actor.material.astype(np.int32), colors, stripes)
+        return Body(actor, _table(actor), colors, stripes)
 
 
 def shadow_maps(body: Body, pose: Pose, lamps: Lamps) -> NDArray[np.float32]:
-    """(L, Z, Z) distance from each lamp to the actor, metres, at one moment (``pose`` holds one)."""
+    """Return (L, Z, Z) distance from each lamp to the actor, metres, at one moment (``pose`` holds one)."""
     ensure_runtime()
-    frames = _f32(body.actor.frames(pose))
-    maps = []
-    for camera, rays in zip(lamps.cameras, lamps.rays, strict=True):
-        tiles = make_tiles(camera, body.actor, pose)
-        out = np.full((camera.height, camera.width), FAR_M, dtype=np.float32)
-        _depth_kernel(_f32(camera.center), rays, frames, body.shape, body.materials, tiles.first, tiles.start,
-                      tiles.primitive, tiles.near_far, out)  # fmt: skip
-        maps.append(out)
-    return np.array(maps)
+    frames, capsules = _f32(body.actor.frames(pose)), _f32(body.actor.capsules(pose))
+    maps = np.full((len(lamps.cameras), lamps.cameras[0].height, lamps.cameras[0].width), FAR_M, dtype=np.float32)
+    for camera, rays, out in zip(lamps.cameras, lamps.rays, maps, strict=True):
+        _depth_kernel(_f32(camera.center), rays, frames, capsules, body.shape,
+                      _scratch(camera, capsules), out)  # fmt: skip
+    return maps
 
 
 def render_actor(
     camera: Camera, rays: NDArray[np.float32], body: Body, poses: Pose, lamps: Lamps, shadow: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """(H, W, 4) linear RGB, premultiplied, and coverage; ``poses`` holds one pose for each of the S sample rays."""
+    """Return (H, W, 4) linear RGB, premultiplied, and coverage; ``poses`` has one pose for each of the four sample
+    rays."""
     ensure_runtime()
     out = np.zeros((camera.height, camera.width, 4), dtype=np.float32)
-    tiles = make_tiles(camera, body.actor, poses)
-    _render_kernel(body.stripes, _f32(camera.center), rays, _f32(body.actor.frames(poses)), body.shape,
-                   body.materials, body.colors, tiles.first, tiles.start, tiles.primitive, tiles.near_far,
-                   lamps.light, lamps.axes, shadow, lamps.ambient, out)  # fmt: skip
+    capsules = _f32(body.actor.capsules(poses))
+    _render_kernel(body.stripes, _f32(camera.center), rays, _f32(body.actor.frames(poses)), capsules, body.shape,
+                   body.colors, lamps.light, lamps.axes, shadow, lamps.ambient,
+                   _scratch(camera, capsules), out)  # fmt: skip
     return out
 
 
+def _scratch(camera: Camera, capsules: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Return room for the primitives of each tile and block."""
+    tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
+    return np.empty((tiles, 2, len(capsules)), np.int32)
+
+
 def distances(body: Body, pose: Pose, points: NDArray[np.floating]) -> NDArray[np.float32]:
-    """(P,) signed distance from (P, 3) world points to the actor in one pose, metres."""
+    """Return (P,) signed distances from (P, 3) world points to the actor in one pose, metres."""
     ensure_runtime()
     out = np.empty(len(points), dtype=np.float32)
-    every = np.arange(len(body.materials), dtype=np.int32)
-    _distance_kernel(_f32(points), every, _f32(body.actor.frames(pose)), body.shape, body.materials, out)
+    every = np.tile(np.arange(len(body.shape), dtype=np.int32), (1, 2, 1))
+    _distance_kernel(_f32(points), every, _f32(body.actor.frames(pose)), body.shape, out)
     return out
 
 

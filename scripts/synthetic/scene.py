@@ -107,7 +107,7 @@ def _rays(camera: Camera, offset: tuple[float, float] = (0.0, 0.0)) -> NDArray[n
     return camera.rays(grid).astype(np.float32).reshape(camera.height, camera.width, 3)
 
 
-def view_room(camera: Camera, lamps: Lamps, samples: int = 6) -> RoomView:
+def view_room(camera: Camera, lamps: Lamps, samples: int = 4) -> RoomView:
     """Render the empty room, ``samples`` x ``samples`` rays a pixel within the kernel."""
     ensure_runtime()
     height, width = camera.height, camera.width
@@ -283,8 +283,9 @@ def _room_kernel(
                 if facing > 0.0:
                     start = p + 1e-3 * n
                     for k in range(boxes.shape[0]):
-                        blocked, _face = _hit_box(start, to_light, k, boxes)
-                        if blocked < distance:
-                            facing = 0.0
+                        if facing > 0.0:
+                            blocked, _face = _hit_box(start, to_light, k, boxes)
+                            if blocked < distance:
+                                facing = 0.0
                 for c in ti.static(range(3)):
                     direct[lamp, y, x, c] += share * facing * color[c] * light[lamp, 3 + c]

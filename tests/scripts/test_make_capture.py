@@ -15,11 +15,11 @@ from click.testing import CliRunner
 
 from scripts.make_capture import main
 from scripts.synthetic.actor import Look, make_actor
-from scripts.synthetic.capture import BACKGROUND_FRAMES, CameraRenderer, Options, Plan, plan_capture
+from scripts.synthetic.capture import BACKGROUND_FRAMES, OFFSETS, CameraRenderer, Options, Plan, plan_capture
 from scripts.synthetic.motion import HOLD, KNEE_RADIUS, MOTIONS
-from scripts.synthetic.render import CLOSE_M, Body, distances
+from scripts.synthetic.render import CLOSE_M, Body, distances, render_actor, sample_rays
 from scripts.synthetic.rig import RIGS
-from scripts.synthetic.skeleton import JOINTS, LIMITS_DEG, forward, make_skeleton, sole_points
+from scripts.synthetic.skeleton import JOINTS, LIMITS_DEG, Pose, forward, make_skeleton, sole_points
 from tk.io.toml import load_toml
 from tk.model.cameras.camera import Camera
 
@@ -224,6 +224,23 @@ def test_distance_kernel_agrees_with_a_plain_union(tiny: Plan) -> None:
     assert near.sum() > 50
     np.testing.assert_allclose(found[near], expected[near], atol=2e-4)  # the oracle samples 400 spheres a cone
     assert (found <= expected + 2e-4).all()
+
+
+def test_traced_beams_find_the_same_body_as_dense_samples_of_each_ray(tiny: Plan) -> None:
+    """At rest, the coverage is the share of a pixel's rays that have a point inside the body."""
+    camera, body, pose = tiny.rig[0], tiny.subject.body(0), tiny.subject.poses[:1]
+    rays = sample_rays(camera, OFFSETS)
+    still = Pose(pose.rotation.repeat(4, axis=0), pose.origin.repeat(4, axis=0))
+    found = render_actor(camera, rays, body, still, tiny.lamps, tiny.shadow(0))[::2, ::2, 3]
+    rays = rays[:, ::2, ::2]  # every second row and column, to save time
+    clear = np.full(rays.shape[:3], np.inf)
+    for depth in np.linalg.norm(pose.origin[0, 0] - camera.center) + np.arange(-1.0, 1.0, 0.02):
+        points = camera.center + depth * rays.reshape(-1, 3)
+        clear = np.minimum(clear, distances(body, pose, points).reshape(clear.shape))
+    # the points of a ray are 2 cm apart: the body may be nearer between them
+    assert (found[(clear < 0).all(axis=0)] == 1).all()
+    assert (found[(clear > 0.01).all(axis=0)] == 0).all()
+    assert np.abs(found - (clear < 0.001).mean(axis=0)).mean() < 0.002
 
 
 def test_render_shows_the_actor_where_the_truth_is(tiny: Plan) -> None:
