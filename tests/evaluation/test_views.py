@@ -86,7 +86,7 @@ def test_results_of_both_body_models_are_evaluated(tk: Tk, tiny: Path, tracked: 
 def test_of_older_volumetric_results_the_dimensions_are_taken(tiny: Path, tracked: Path, tmp_path: Path) -> None:
     older = Path(shutil.copy(tracked, tmp_path / "older.h5"))
     with h5py.File(older, "a") as file:
-        del file["model/parts"], file["model/body"]
+        del file["model/parts"]
     restored = body_and_poses(read_result(older))
     assert restored is not None
     body, poses = restored

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tk.io.results.data import FrameResult, ResultMeta
+from tk.io.results.data import ResultMeta
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 from tk.model.body.anthropometry import BodyDimensions
@@ -80,17 +80,10 @@ def write(tmp_path: Path) -> Write:
                 writer.write_model({f"dimensions/{key}": value for key, value in asdict(BODY).items()}, person=person)
             for f, pose in enumerate(poses(skeleton)):
                 index = FIRST + f if frames is None else int(frames[f])
-                row = FrameResult(
-                    frame=index,
-                    time=index / FPS,
-                    pose=pose,
-                    joints=skeleton.joints(pose),
-                    status=int(states[f]),
-                    objective=0.0,
-                    iterations=np.zeros(1, int),
-                    timing={},
-                    **rows(f),
-                )
+                row = {
+                    "frames": index, "time": index / FPS, "pose": pose, "joints/position": skeleton.joints(pose),
+                    "status": states[f], "objective": 0.0, "iterations": [0], **rows(f),
+                }  # fmt: skip
                 writer.append({person: row for person in range(people) if person == 0 or f in second})
         return path
 

@@ -59,7 +59,7 @@ def test_missing_points_have_residual_minus_one(write: Write) -> None:
 def test_residual_is_the_standard_deviation(write: Write) -> None:
     sigma = np.full(15, 0.012)
     sigma[3], sigma[4] = np.nan, 0.3
-    path = write(meta={"sigma": True}, rows=lambda f: {"sigma": sigma})
+    path = write(meta={"sigma": True}, rows=lambda f: {"joints/sigma": sigma})
     file = ezc3d.c3d(str(export(path, ["c3d"]).files[0]))
     residuals = file["data"]["meta_points"]["residuals"][0]
     assert residuals[0, 0] == 12 and residuals[3, 0] == 0 and residuals[0, LOST[0]] == -1

@@ -29,7 +29,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 def test_csv_of_points(write: Write) -> None:
     sigma = np.full(15, 0.02)
-    points, _ = export(write(meta={"sigma": True}, rows=lambda f: {"sigma": sigma}), ["csv"]).files
+    points, _ = export(write(meta={"sigma": True}, rows=lambda f: {"joints/sigma": sigma}), ["csv"]).files
     rows = rows_of(points)
     assert list(rows[0]) == ["frame", "time", "status", "point", "x", "y", "z", "sigma"]
     assert len(rows) == FRAMES * (len(JOINTS) + 4)
@@ -72,7 +72,7 @@ def test_stored_quantities_are_exported_rather_than_recomputed(write: Write) -> 
     q[4, 2] = 0  # no rotation
 
     def rows(f: int) -> dict[str, np.ndarray]:
-        return {} if f in LOST else {"segments_rotation": q[f], "feet": feet}
+        return {} if f in LOST else {"segments/rotation": q[f], "feet/position": feet}
 
     motion, _ = read_motion(write("new.h5", meta=meta, rows=rows))
     old, _ = read_motion(write("old.h5"))

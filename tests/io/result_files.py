@@ -1,4 +1,4 @@
-"""Results as :mod:`tests.io.result_victim` makes them: written, looked at, compared."""
+"""Write and compare results with the frames of :mod:`tests.io.result_victim`."""
 
 from __future__ import annotations
 
@@ -14,45 +14,46 @@ from tests.io.result_victim import META, make_frame, make_state
 from tk.io import hdf5_writer
 from tk.io.results.data import ResultMeta, UsedCameras, Value
 from tk.io.results.reader import read_result
+from tk.io.results.schema import checked_row, columns_of
 from tk.io.results.writer import ResultWriter
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Camera, Rig
 
 
-def write(path: Path, count: int, meta: ResultMeta = META, start: int = 0) -> None:
+def append(writer: ResultWriter, *indices: int, state: bool = True, flush: bool = True) -> None:
+    """Append frames of one person."""
+    for index in indices:
+        writer.append({0: make_frame(index)}, make_state(index) if state else None, flush)
+
+
+def write(path: Path, count: int, meta: ResultMeta = META) -> None:
     with ResultWriter.create(path, meta) as writer:
-        for index in range(start, start + count):
-            writer.append(make_frame(index), make_state(index))
+        append(writer, *range(count))
+
+
+def resume(path: Path, stop: int) -> int:
+    """Continue a result up to frame ``stop``; return the number of frames that it had."""
+    writer, done = ResultWriter.resume(path, META)
+    with writer:
+        append(writer, *range(done, stop))
+    return done
 
 
 def assert_complete(path: Path, at_least: int) -> int:
-    """The file opens, is of one length throughout, and holds what the victim wrote; returns its frames."""
+    """Check that the file has all values of its frames and the state of the last one; return the number of frames."""
+    columns = columns_of(META)
     with h5py.File(path, "r") as file:  # as any user would open it
         count = len(file["frames"])
         assert count >= at_least
-        expected = [make_frame(index) for index in range(count)]
-        for name in ("frame", "time", "status", "objective", "pose", "iterations"):
-            dataset = file["frames" if name == "frame" else name]
-            np.testing.assert_array_equal(dataset[()], [getattr(frame, name) for frame in expected])
-        np.testing.assert_array_equal(file["joints/position"][()], [frame.joints for frame in expected])
-        np.testing.assert_array_equal(file["timing/total"][()], [frame.timing["total"] for frame in expected])
-        for name, field in (("residual", "residual"), ("feet/position", "feet")):
-            np.testing.assert_array_equal(file[name][()], [getattr(frame, field) for frame in expected])
-        sigma = [np.full(15, np.nan) if frame.sigma is None else frame.sigma for frame in expected]
-        np.testing.assert_array_equal(file["joints/sigma"][()], np.reshape(sigma, (count, 15)))
-        np.testing.assert_array_equal(file["angles/hip_l"][()], [frame.angles["hip_l"] for frame in expected])
-        assert file["segments/rotation"].shape == (count, 2, 4)
-        assert file["timing/hull"].shape == file["timing/optimise"].shape == (count,)
+        rows = [checked_row(make_frame(index), columns) for index in range(count)]
+        for name, column in columns.items():
+            np.testing.assert_array_equal(file[name][()], np.reshape([row[name] for row in rows], (-1, *column.shape)))
         if count > 1:
-            offsets = file["hull/offsets"][()]
-            counts = [0 if frame.hull is None else len(frame.hull.positions) for frame in expected]
-            np.testing.assert_array_equal(np.diff(offsets), counts)
-            np.testing.assert_array_equal(
-                file["hull/positions"][()], np.concatenate([f.hull.positions for f in expected if f.hull])
-            )
-            np.testing.assert_array_equal(
-                file["hull/colors"][()], np.concatenate([f.hull.colors for f in expected if f.hull])
-            )
+            voxels = [row for row in rows if "hull/positions" in row]
+            counts = [len(row.get("hull/positions", ())) for row in rows]
+            np.testing.assert_array_equal(np.diff(file["hull/offsets"][()]), counts)
+            for name in ("hull/positions", "hull/colors"):
+                np.testing.assert_array_equal(file[name][()], np.concatenate([row[name] for row in voxels]))
     if count:
         assert_equal_values(read_result(path).state, make_state(count - 1))
     return count

@@ -1,16 +1,17 @@
-"""Writes a result as fast as it can until somebody kills it: ``python -m tests.io.result_victim RESULT FRAMES``.
+"""Write a result as fast as possible until the process is killed: ``python -m tests.io.result_victim RESULT FRAMES``.
 
-Prints the number of finished frames after each one. Everything in a frame follows from its index, so that whoever
-finds the file can check it.
+Prints the number of finished frames after each one. All values of a frame follow from its index, so that a test can
+check the file.
 """
 
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 import numpy as np
 
-from tk.io.results.data import FrameResult, HullPoints, JointAngles, ResultMeta
+from tk.io.results.data import JointAngles, ResultMeta
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 
@@ -38,28 +39,32 @@ META = ResultMeta(
 )
 
 
-def make_frame(index: int) -> FrameResult:
-    hull = None
-    if index % 5:  # some frames without voxels
+def make_frame(index: int) -> dict[str, Any]:
+    """Return the values of frame ``index`` by path; some frames have no voxels and some no sigma."""
+    frame: dict[str, Any] = {
+        "frames": index + 3,
+        "time": index / 15,
+        "pose": np.arange(24) + 100.0 * index,
+        "joints/position": np.arange(45.0).reshape(15, 3) + index,
+        "status": Status.INITIALISED if index == 0 else Status.TRACKED,
+        "objective": index / 2,
+        "iterations": np.array([index, index + 1]),
+        "timing/hull": 0.01,
+        "timing/total": 0.05 + index,
+        "residual": np.array([[0.1, 0.0], [0.1, 0.1], [0.0, index]]),
+        "mask_source": np.array([0, 1, index % 2], np.uint8),
+        "segments/rotation": np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),
+        "feet/position": np.arange(12.0).reshape(4, 3) - index,
+        "angles/knee_l": np.array([5.0 * index]),
+        "angles/hip_l": np.array([1.0, 2.0, index]),
+    }
+    if index % 4 != 3:
+        frame["joints/sigma"] = np.full(15, 0.01 * index)
+    if index % 5:
         count = 200 + index % 37
-        hull = HullPoints(np.full((count, 3), index / 8), np.full((count, 3), index % 256, dtype=np.uint8))
-    return FrameResult(
-        frame=index + 3,
-        time=index / 15,
-        pose=np.arange(24) + 100.0 * index,
-        joints=np.arange(45.0).reshape(15, 3) + index,
-        status=Status.INITIALISED if index == 0 else Status.TRACKED,
-        objective=index / 2,
-        iterations=np.array([index, index + 1]),
-        timing={"hull": 0.01, "total": 0.05 + index},
-        hull=hull,
-        sigma=None if index % 4 == 3 else np.full(15, 0.01 * index),  # nothing known in some frames
-        residual=np.array([[0.1, 0.0], [0.1, 0.1], [0.0, index]]),
-        mask_source=np.array([0, 1, index % 2], np.uint8),
-        segments_rotation=np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),
-        feet=np.arange(12.0).reshape(4, 3) - index,
-        angles={"knee_l": np.array([5.0 * index]), "hip_l": np.array([1.0, 2.0, index])},
-    )
+        frame["hull/positions"] = np.full((count, 3), index / 8)
+        frame["hull/colors"] = np.full((count, 3), index % 256, dtype=np.uint8)
+    return frame
 
 
 def make_state(index: int) -> dict[str, np.ndarray | str]:
@@ -72,7 +77,7 @@ def main() -> None:
         if done == 0:
             writer.write_model({"torso/radii_m": np.array([0.1, 0.2]), "sex": "any"})
         for index in range(done, int(sys.argv[2])):
-            writer.append(make_frame(index), make_state(index))
+            writer.append({0: make_frame(index)}, make_state(index))
             print(index + 1, flush=True)
 
 

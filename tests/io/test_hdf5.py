@@ -13,8 +13,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.io.result_files import make_cameras, make_smoothed, write_truth
-from tests.io.result_victim import META, make_frame, make_state
+from tests.io.result_files import append, make_cameras, make_smoothed, resume, write_truth
+from tests.io.result_victim import META
 from tk.errors import ResultError, TkError
 from tk.evaluation.joints import evaluate_files
 from tk.io.hdf5 import MAX_DEPTH, open_hdf5
@@ -32,8 +32,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("hdf5")
     with ResultWriter.create(folder / "result.h5", META) as writer:
         writer.write_model({"torso/radii_m": np.arange(4.0), "height_m": 1.78, "sex": "any", "count": 3})
-        for index in range(COUNT):
-            writer.append(make_frame(index), make_state(index))
+        append(writer, *range(COUNT))
     revise_result(folder / "result.h5", smoothed=make_smoothed(COUNT), cameras=make_cameras())
     write_truth(folder / "truth.h5", list(range(3, 3 + COUNT)))
     return folder
@@ -54,16 +53,11 @@ def read_in_every_way(path: Path, folder: Path) -> list[str]:
     """Read a file as everything that tk reads; returns the complaints, each of one line that names the file."""
     complaints = []
 
-    def resume() -> None:
-        writer, done = ResultWriter.resume(path, META)
-        with writer:
-            writer.append(make_frame(done), make_state(done))
-
     ways: list[Callable[[], object]] = [
         lambda: read_result(path),
         lambda: evaluate_files(path, folder / "truth.h5"),
         lambda: evaluate_files(folder / "result.h5", path),
-        resume,
+        lambda: resume(path, COUNT + 1),
     ]
     for way in ways:
         try:

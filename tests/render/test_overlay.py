@@ -14,7 +14,7 @@ from tests.conftest import QUICK, Silent, Tk
 from tk.errors import ResultError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
-from tk.io.results.data import FrameResult, ResultMeta, UsedCameras
+from tk.io.results.data import ResultMeta, UsedCameras
 from tk.io.results.reader import read_joints, read_result
 from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
@@ -67,8 +67,11 @@ def result(tmp_path: Path) -> Path:
         for frame in range(3):
             pose[:3] = truth.positions[frame, 0]
             status = Status.LOST if frame == 2 else Status.TRACKED
-            joints = skeleton.joints(pose)
-            writer.append(FrameResult(frame, frame / 15, pose, joints, status, 0.1, np.array([1]), {"total": 0.1}))
+            row = {
+                "frames": frame, "time": frame / 15, "pose": pose, "joints/position": skeleton.joints(pose),
+                "status": status, "objective": 0.1, "iterations": [1], "timing/total": 0.1,
+            }  # fmt: skip
+            writer.append({0: row})
     return path
 
 

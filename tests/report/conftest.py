@@ -13,7 +13,7 @@ import pytest
 from tests.conftest import FRAMES
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
-from tk.io.results.data import FrameResult, JointAngles, Result, ResultMeta
+from tk.io.results.data import JointAngles, Result, ResultMeta
 from tk.io.results.reader import read_joints
 from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
@@ -57,15 +57,15 @@ def complete_result(path: Path, capture_path: Path, count: int = FRAMES) -> Path
             sigma = rng.uniform(0.005, 0.03, 15)
             sigma[8] = np.nan if f == 3 else sigma[8]
             status = Status.LOST if f in LOST else Status.INITIALISED if f == 0 else Status.TRACKED
-            writer.append(
-                FrameResult(
-                    f, f / capture.fps, poses[f], derived.joints[f], status, 0.1 + 0.01 * f, np.array([9]),
-                    {"decode": 0.01, "optimise": 0.12, "total": 0.15}, sigma=sigma,
-                    residual=np.full((len(capture.rig), 2), 0.05 + (0.1 if f == 11 else 0.0005 * f)),
-                    segments_rotation=derived.rotations[f], feet=derived.feet[f],
-                    angles={joint: values[f] for joint, values in derived.angles.items()},
-                )
-            )  # fmt: skip
+            row = {
+                "frames": f, "time": f / capture.fps, "pose": poses[f], "joints/position": derived.joints[f],
+                "status": status, "objective": 0.1 + 0.01 * f, "iterations": [9], "timing/decode": 0.01,
+                "timing/optimise": 0.12, "timing/total": 0.15, "joints/sigma": sigma,
+                "residual": np.full((len(capture.rig), 2), 0.05 + (0.1 if f == 11 else 0.0005 * f)),
+                "segments/rotation": derived.rotations[f], "feet/position": derived.feet[f],
+                **{f"angles/{joint}": values[f] for joint, values in derived.angles.items()},
+            }  # fmt: skip
+            writer.append({0: row})
     revise_result(path, notes=["first", NOTE])
     return path
 

@@ -86,7 +86,7 @@ def test_whatever_the_damage_readers_give_one_line(complete: Path, tmp_path: Pat
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("model/parts/name", None), ("model/parts/segment", None), ("model/parts/kind", None), ("model/body", None),
+        ("model/parts/name", None), ("model/parts/segment", None), ("model/parts/kind", None),
         ("model/parts/segment", '["nowhere"]'), ("model/parts/name", "{}"), ("model/parts/name", "[" * 9000),
         ("model/parts/kind", 7.5), ("model/parts/shape", np.nan), ("model/dimensions/trunk", -1.0),
     ],

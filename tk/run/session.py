@@ -12,13 +12,13 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tk.errors import CaptureError, ResultError, TkError
 from tk.io.captures.capture import Capture
 from tk.io.captures.mask_store import MaskStores
 from tk.io.captures.source import Source
-from tk.io.results.data import FrameResult, HullPoints, Value
+from tk.io.results.data import HullPoints, Value
 from tk.io.results.files import check_result_path
 from tk.io.results.reader import as_damage_error, read_people, read_result
 from tk.io.results.revision import revise_result
@@ -461,21 +461,25 @@ def _raising(error: TkError) -> Iterator[Observed]:
     yield
 
 
-def _row(estimate: Estimate, store_hull: bool) -> FrameResult:
-    return FrameResult(
-        frame=estimate.frame,
-        time=estimate.time,
-        pose=estimate.pose,
-        joints=estimate.joints,
-        sigma=estimate.sigma,
-        residual=estimate.residual,
-        mask_source=estimate.mask_source,
-        status=int(Status[estimate.status.upper()]),
-        objective=estimate.objective,
-        iterations=estimate.iterations,
-        timing=estimate.timing,
-        hull=points_of(estimate.surface) if store_hull and estimate.surface is not None else None,
-    )
+def _row(estimate: Estimate, store_hull: bool) -> dict[str, ArrayLike]:
+    """Return an estimate's row of the result file."""
+    row: dict[str, ArrayLike | None] = {
+        "frames": estimate.frame,
+        "time": estimate.time,
+        "pose": estimate.pose,
+        "joints/position": estimate.joints,
+        "joints/sigma": estimate.sigma,
+        "residual": estimate.residual,
+        "mask_source": estimate.mask_source,
+        "status": int(Status[estimate.status.upper()]),
+        "objective": estimate.objective,
+        "iterations": estimate.iterations,
+        **{f"timing/{stage}": seconds for stage, seconds in estimate.timing.items()},
+    }
+    if store_hull and estimate.surface is not None:
+        points = points_of(estimate.surface)
+        row |= {"hull/positions": points.positions, "hull/colors": points.colors}
+    return {path: value for path, value in row.items() if value is not None}
 
 
 def points_of(surface: HullSurface) -> HullPoints:

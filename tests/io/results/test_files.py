@@ -16,8 +16,8 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.io.result_files import assert_complete, fail_after, write
-from tests.io.result_victim import META, make_frame, make_state
+from tests.io.result_files import append, assert_complete, fail_after, resume, write
+from tests.io.result_victim import META
 from tk.errors import ResultError, TkError
 from tk.io import hdf5_writer
 from tk.io.results.reader import read_joints, read_result
@@ -82,27 +82,29 @@ def test_unusable_files_are_named(tmp_path: Path, make, message: str, read) -> N
     assert "\n" not in str(caught.value)
 
 
-def test_older_results_are_not_resumed(tmp_path: Path) -> None:
-    path = tmp_path / "some.h5"
-    of_version(2)(path)
-    before = path.read_bytes()
-    with pytest.raises(ResultError, match=r"some\.h5: format_version is 2.*track the capture again"):
-        ResultWriter.resume(path, META)
-    assert path.read_bytes() == before
-    write(path, 1)  # but they may be replaced
-
-
-@pytest.mark.parametrize("make", [other_software, not_hdf5])
-def test_files_of_other_software_are_neither_overwritten_nor_resumed(tmp_path: Path, make) -> None:
+@pytest.mark.parametrize(
+    ("make", "create", "resume"),
+    [
+        (other_software, "not overwritten", "not a tk-result"),
+        (not_hdf5, "not overwritten", "not an HDF5 file"),
+        (of_version(2), None, "format_version is 2.*track the capture again"),
+    ],
+)
+def test_files_of_others_and_of_older_versions_are_not_continued(
+    tmp_path: Path, make: Callable[[Path], None], create: str | None, resume: str
+) -> None:
     path = tmp_path / "some.h5"
     make(path)
     before = path.read_bytes()
-    with pytest.raises(ResultError, match=r"some\.h5: .*not overwritten"):
-        ResultWriter.create(path, META)
-    with pytest.raises(ResultError, match=r"some\.h5: .*not an? (HDF5|tk-result)"):
+    with pytest.raises(ResultError, match=rf"some\.h5: .*{resume}"):
         ResultWriter.resume(path, META)
+    if create:
+        with pytest.raises(ResultError, match=rf"some\.h5: .*{create}"):
+            ResultWriter.create(path, META)
     assert path.read_bytes() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["some.h5"]
+    if not create:
+        write(path, 1)
 
 
 def test_paths_that_cannot_be_written(tmp_path: Path) -> None:
@@ -135,7 +137,7 @@ def test_an_old_result_stays_until_the_first_new_frame(tmp_path: Path) -> None:
         raise KeyboardInterrupt
     assert path.read_bytes() == before
     with pytest.raises(KeyboardInterrupt), ResultWriter.create(path, META) as writer:
-        writer.append(make_frame(0), make_state(0))
+        append(writer, 0)
         raise KeyboardInterrupt
     assert assert_complete(path, 1) == 1
 
@@ -165,7 +167,7 @@ def test_two_runs_cannot_write_the_same_file(tmp_path: Path) -> None:
     with ResultWriter.create(path, META) as writer:
         with pytest.raises(ResultError, match=r"result\.h5: another run"):
             ResultWriter.create(path, META)
-        writer.append(make_frame(0), make_state(0))
+        append(writer, 0)
     assert assert_complete(path, 1) == 1
 
 
@@ -182,8 +184,8 @@ def test_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 FULL = """
 import sys
 from pathlib import Path
-from tests.io.result_files import make_smoothed
-from tests.io.result_victim import META, make_frame, make_state
+from tests.io.result_files import append, make_smoothed
+from tests.io.result_victim import META
 from tk.errors import ResultError, TkError
 from tk.io.results.reader import read_result
 from tk.io.results.revision import revise_result
@@ -192,7 +194,7 @@ path = Path(sys.argv[1])
 try:
     with ResultWriter.create(path, META) as writer:
         for index in range(2000):
-            writer.append(make_frame(index), make_state(index))
+            append(writer, index)
             print(index + 1)
 except ResultError as error:
     print(error, file=sys.stderr)
@@ -233,12 +235,10 @@ def test_run_is_resumable_whenever_a_write_fails(tmp_path: Path, monkeypatch: py
             writer, _ = ResultWriter.resume(path, META)
             with writer:
                 for index in range(3, 40):
-                    writer.append(make_frame(index), make_state(index))
+                    append(writer, index)
                     appended = index + 1
     assert assert_complete(path, appended) == appended
-    writer, done = ResultWriter.resume(path, META)
-    with writer:
-        writer.append(make_frame(done), make_state(done))
+    assert resume(path, appended + 1) == appended
     assert assert_complete(path, appended + 1) == appended + 1
 
 
@@ -253,19 +253,20 @@ def test_interruption_while_hdf5_writes_takes_effect_afterwards(
 
     original = hdf5_writer._write
     with pytest.raises(KeyboardInterrupt), ResultWriter.create(path, META) as writer:
-        writer.append(make_frame(0), make_state(0))
+        append(writer, 0)
         monkeypatch.setattr(hdf5_writer, "_write", interrupt)
-        writer.append(make_frame(1), make_state(1))
+        append(writer, 1)
     assert assert_complete(path, 2) == 2
 
 
 def test_process_ends_normally_with_an_open_writer(tmp_path: Path) -> None:
     script = """
 import sys
-from tests.io.result_victim import META, make_frame, make_state
+from tests.io.result_files import append
+from tests.io.result_victim import META
 from tk.io.results.writer import ResultWriter
 writer = ResultWriter.create(sys.argv[1], META)
-writer.append(make_frame(0), make_state(0))
+append(writer, 0)
 """
     path = tmp_path / "result.h5"
     done = subprocess.run([sys.executable, "-c", script, str(path)], cwd=ROOT, capture_output=True, text=True)
@@ -278,4 +279,4 @@ def test_use_after_close_raises_value_error(tmp_path: Path) -> None:
     writer.close()
     writer.close()
     with pytest.raises(ValueError, match="closed"):
-        writer.append(make_frame(0))
+        append(writer, 0)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -12,19 +12,18 @@ import pytest
 from tests.io.result_files import assert_equal_values, make_cameras, make_smoothed, write
 from tests.io.result_victim import META, make_frame, make_state
 from tk.errors import ResultError
-from tk.io.results.data import FrameResult
 from tk.io.results.reader import read_joints, read_people, read_result
 from tk.io.results.revision import revise_result
 from tk.io.results.writer import ResultWriter
 from tk.model.body.joints import JOINTS
 
 
-def people_at(index: int) -> dict[int, FrameResult]:
+def people_at(index: int) -> dict[int, dict[str, Any]]:
     """Return person 0 in every frame, person 1 in frames 2 to 5, and nobody in frame 7."""
     if index == 7:
         return {}
     frame = make_frame(index)
-    other = replace(frame, joints=frame.joints + 1.0, pose=frame.pose + 1.0)
+    other = frame | {name: frame[name] + 1.0 for name in ("joints/position", "pose")}
     return {0: frame, 1: other} if 2 <= index <= 5 else {0: frame}
 
 
@@ -53,8 +52,8 @@ def test_each_person_has_rows_of_the_frames_in_which_they_are_present(tmp_path: 
     assert (first.person, second.person) == (0, 1) and first is result and second.people == (second,)
     np.testing.assert_array_equal(first.frames - 3, [0, 1, 2, 3, 4, 5, 6, 8, 9])
     np.testing.assert_array_equal(second.frames - 3, [2, 3, 4, 5])
-    np.testing.assert_array_equal(second.joints[0], make_frame(2).joints + 1.0)
-    np.testing.assert_array_equal(second.pose[3], make_frame(5).pose + 1.0)
+    np.testing.assert_array_equal(second.joints[0], make_frame(2)["joints/position"] + 1.0)
+    np.testing.assert_array_equal(second.pose[3], make_frame(5)["pose"] + 1.0)
     assert first.model == {"height_m": 1.7} and second.model == {"height_m": 1.9}
     assert second.meta == META and second.hull is not None and len(second.hull[0].positions) == 202
     assert_linked(path)

@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.io.result_files import assert_complete, assert_equal_values, write
+from tests.io.result_files import append, assert_complete, assert_equal_values, resume, write
 from tests.io.result_victim import META, make_frame, make_state
 from tk.errors import ResultError
 from tk.io.results.layout import pack_state
@@ -74,28 +74,21 @@ def test_a_hundred_and_twenty_kills(tmp_path: Path) -> None:
 # --- resuming ---------------------------------------------------------------------------------------------------------
 
 
-def test_resumed_equals_uninterrupted(tmp_path: Path) -> None:
+def test_resumed_run_knows_state_and_body_and_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
-    write(path, 7)
+    model = {"height_m": 1.7, "torso/radii_m": np.arange(3.0), "names": '["torso"]'}
+    with ResultWriter.create(path, META) as writer:
+        writer.write_model(model)
+        append(writer, *range(7))
     created = read_result(path).created
     writer, done = ResultWriter.resume(path, META)
     with writer:
         assert done == 7
         assert_equal_values(writer.state, make_state(6))
-        for index in range(done, 12):
-            writer.append(make_frame(index), make_state(index))
+        assert_equal_values(writer.model, model)
+        append(writer, *range(done, 12))
     assert assert_complete(path, 12) == 12
     assert read_result(path).created == created
-
-
-def test_a_resumed_writer_knows_the_model(tmp_path: Path) -> None:
-    path = tmp_path / "result.h5"
-    model = {"height_m": 1.7, "torso/radii_m": np.arange(3.0), "names": '["torso"]'}
-    with ResultWriter.create(path, META) as writer:
-        writer.write_model(model)
-        writer.append(make_frame(0), make_state(0))
-    with ResultWriter.resume(path, META)[0] as writer:
-        assert_equal_values(writer.model, model)
     assert_equal_values(read_result(path).model, model)
 
 
@@ -109,14 +102,13 @@ def test_resume_without_a_file_starts_one(tmp_path: Path) -> None:
 def test_frames_after_the_last_state_are_written_again(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
     with ResultWriter.create(path, META) as writer:
-        for index in range(9):
-            writer.append(make_frame(index), make_state(index) if index <= 5 else None)
+        append(writer, *range(6))
+        append(writer, *range(6, 9), state=False)
     writer, done = ResultWriter.resume(path, META)
     with writer:
         assert done == 6
         assert_equal_values(writer.state, make_state(5))
-        for index in range(6, 10):
-            writer.append(make_frame(index), make_state(index))
+        append(writer, *range(6, 10))
     assert assert_complete(path, 10) == 10
 
 
@@ -154,11 +146,8 @@ def test_resuming_another_run_is_refused(tmp_path: Path, change: dict[str, Any],
 
 def test_equal_settings_in_different_notation_can_be_resumed(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
-    write(path, 1)
-    same = '# a comment\nmethod = "volumetric"\nsmd = { mu = 0.10 }\n'
-    writer, done = ResultWriter.resume(path, replace(META, config_toml=same))
-    writer.close()
-    assert done == 1
+    write(path, 1, replace(META, config_toml='# a comment\nmethod = "volumetric"\nsmd = { mu = 0.10 }\n'))
+    assert resume(path, 1) == 1
 
 
 @pytest.mark.parametrize(
@@ -189,7 +178,7 @@ def test_state_is_intact_after_the_result_was_copied_and_revised(tmp_path: Path)
     path = tmp_path / "result.h5"
     state = {**make_state(3), "unknown": np.array([np.nan, -np.nan]), "none": "", "umlaut": "ä", "flag": True}
     with ResultWriter.create(path, META) as writer:
-        writer.append(make_frame(0), state)
+        writer.append({0: make_frame(0)}, state)
     revise_result(path, notes=["a note"])
     writer, done = ResultWriter.resume(path, META)
     writer.close()

@@ -10,8 +10,16 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.io.result_files import assert_equal_values, assert_same_cameras, make_cameras, make_smoothed, write
-from tests.io.result_victim import META, make_frame, make_state
+from tests.io.result_files import (
+    append,
+    assert_equal_values,
+    assert_same_cameras,
+    make_cameras,
+    make_smoothed,
+    resume,
+    write,
+)
+from tests.io.result_victim import META, make_frame
 from tk.errors import ResultError
 from tk.io.results.reader import read_result
 from tk.io.results.revision import revise_result
@@ -35,8 +43,7 @@ def test_second_pass_replaces_only_the_given_datasets(tmp_path: Path) -> None:
     assert_same_cameras(after.cameras, make_cameras())
     assert_equal_values(after.state, before.state)
     assert [entry.name for entry in tmp_path.iterdir()] == ["result.h5"]
-    with ResultWriter.resume(path, META)[0] as writer:
-        writer.append(make_frame(6), make_state(6))
+    resume(path, 7)
     np.testing.assert_array_equal(read_result(path).pose[:6], pose)
 
 
@@ -50,7 +57,7 @@ def test_smoothed_copy_is_stored_separately_and_can_replace_the_raw_values(tmp_p
     for name, values in smoothed.items():
         np.testing.assert_array_equal(result.smoothed[name], values)
     assert result.smoothed["bridged"].dtype == bool
-    np.testing.assert_array_equal(result.joints[0], make_frame(0).joints)
+    np.testing.assert_array_equal(result.joints[0], make_frame(0)["joints/position"])
     shown = result.with_smoothed()
     np.testing.assert_array_equal(shown.joints, smoothed["joints/position"])
     np.testing.assert_array_equal(shown.angles["knee_l"], smoothed["angles/knee_l"])
@@ -67,11 +74,9 @@ def test_smoothed_copy_is_deleted_when_its_source_changes(tmp_path: Path) -> Non
     path = tmp_path / "result.h5"
     write(path, 4)
     revise_result(path, smoothed=make_smoothed(4))
-    with ResultWriter.resume(path, META)[0]:
-        pass
+    resume(path, 4)
     assert read_result(path).smoothed is not None  # no frame was added
-    with ResultWriter.resume(path, META)[0] as writer:
-        writer.append(make_frame(4), make_state(4))
+    resume(path, 5)
     assert read_result(path).smoothed is None
     revise_result(path, smoothed=make_smoothed(5))
     revise_result(path, {"pose": np.zeros((5, 24))})
@@ -115,7 +120,7 @@ def test_failed_second_pass_changes_nothing(tmp_path: Path, monkeypatch: pytest.
 def test_second_pass_refuses_a_result_that_is_being_written(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
     with ResultWriter.create(path, META) as writer:
-        writer.append(make_frame(0), make_state(0))
+        append(writer, 0)
         with pytest.raises(ResultError, match="another run"):
             revise_result(path, {"pose": np.zeros((1, 24))})
     with pytest.raises(ResultError, match="no such file"):

@@ -54,7 +54,7 @@ class JointAngles:
 class ResultMeta:
     """The values that are constant during a run. A run can be resumed only with equal values.
 
-    The fields from ``sigma`` on declare the optional datasets of the file. A frame without a declared value gets NaN.
+    The fields from ``sigma`` on declare the optional datasets of the file. A declared value that a frame lacks is NaN.
 
     Attributes:
         capture, method: name of the capture, and tracking method.
@@ -136,38 +136,6 @@ class HullPoints:
 
     positions: NDArray[np.floating]
     colors: NDArray[np.uint8]
-
-
-@dataclass(frozen=True)
-class FrameResult:
-    """One finished frame: values as in :class:`Result`, without the axis of the frames.
-
-    None stands for a value that is unknown in this frame; the file then has NaN. :class:`ResultMeta` declares values.
-
-    Attributes:
-        frame: index of the source frame.
-        time: time of the frame, s.
-        status: a :class:`~tk.io.results.status.Status`.
-        timing: duration of each stage, s; 0 is stored for a stage that is not given.
-        hull: surface voxels; None to store none.
-        angles: angles of each joint, degrees; NaN is stored for a joint that is not given.
-    """
-
-    frame: int
-    time: float
-    pose: Float
-    joints: Float
-    status: int
-    objective: float
-    iterations: NDArray[np.integer]
-    timing: Mapping[str, float]
-    hull: HullPoints | None = None
-    sigma: Float | None = None
-    residual: Float | None = None
-    mask_source: NDArray[np.uint8] | None = None
-    segments_rotation: Float | None = None
-    feet: Float | None = None
-    angles: Mapping[str, Float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tk.io.results.status import STATUS_MEANING
 from tk.model.body.joints import FOOT_POINTS
 
 if TYPE_CHECKING:
-    from tk.io.results.data import FrameResult, ResultMeta
+    from tk.io.results.data import ResultMeta
 
 FORMAT = "tk-result"
 FORMAT_VERSION = 3
@@ -67,6 +67,12 @@ class Dataset:
     smoothed: bool = False
     valid: tuple[float, float] = (-MAX_NUMBER, MAX_NUMBER)
     finite: bool = False
+
+    @property
+    def unknown(self) -> float:
+        """Return what stands for an unknown value: NaN, or 0 where that is not valid; a stage that did not run took no
+        time."""
+        return 0 if self.finite or not self.dtype.startswith("float") else np.nan
 
     def lengths(self, counts: Mapping[str, int]) -> tuple[int, ...]:
         """Return the shape in numbers, from the number that each letter stands for."""
@@ -230,29 +236,30 @@ def smoothed_columns(columns: Mapping[str, Column]) -> dict[str, Column]:
     return copies | {"bridged": Column(BRIDGED, "", (), {})}
 
 
-def row_of(frame: FrameResult, columns: Mapping[str, Column]) -> dict[str, NDArray[Any]]:
-    """Return the frame's row of each column, and its voxels if it has a hull, as copies by path; NaN for optional
-    values that the frame does not have.
+def checked_row(values: Mapping[str, ArrayLike], columns: Mapping[str, Column]) -> dict[str, NDArray[Any]]:
+    """Return a copy of a frame's values by path, for all columns; :attr:`Dataset.unknown` for missing optional values.
+
+    Args:
+        values: values by path; with ``hull/positions`` and ``hull/colors`` (N, 3) the frame has a hull.
+        columns: the columns of the result.
 
     Raises:
-        ValueError: a shape or the status is invalid, or the frame has a value that no column takes.
+        ValueError: a shape or the status is invalid, a value is missing, or no column takes a value.
     """
-    if int(frame.status) not in range(len(STATUS_MEANING)):
-        raise ValueError(f"status {frame.status} has no meaning")
-    values: dict[str, Any] = {}
-    for entry in ROWS:
-        value: Any = frame.frame if entry.field == "frames" else getattr(frame, entry.field)
-        values |= {entry.path.split("<")[0] + key: v for key, v in value.items()} if entry.each else {entry.path: value}
-    undeclared = sorted(path for path, value in values.items() if value is not None and path not in columns)
+    hull = {entry.path: entry for entry in HULL[:2] if entry.path in values}
+    undeclared = sorted(values.keys() - columns.keys() - hull.keys())
     if undeclared:
         raise ValueError(f"{', '.join(undeclared)}: not declared for this result")
     row = {}
     for path, column in columns.items():
-        value = values.get(path)
-        if value is None:  # a stage that did not run took no time
-            value = np.full(column.shape, 0.0 if column.entry.field == "timing" else np.nan)
-        row[path] = column.checked(path, value)
-    if frame.hull is not None:
-        for entry, array in ((HULL[0], frame.hull.positions), (HULL[1], frame.hull.colors)):
-            row[entry.path] = Column(entry, "", (3,), {}).checked(entry.path, array, len(frame.hull.positions))
+        if path in values:
+            row[path] = column.checked(path, values[path])
+        elif column.entry.optional or column.entry.each:
+            row[path] = np.full(column.shape, column.entry.unknown, column.entry.dtype)
+        else:
+            raise ValueError(f"{path} is missing")
+    if row["status"] not in range(len(STATUS_MEANING)):
+        raise ValueError(f"status {row['status']} has no meaning")
+    for path, entry in hull.items():
+        row[path] = Column(entry, "", (3,), {}).checked(path, values[path], len(np.asarray(values["hull/positions"])))
     return row

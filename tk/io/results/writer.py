@@ -8,15 +8,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tk.errors import ResultError
 from tk.io.hdf5_writer import Hdf5Writer, writing
 from tk.io.paths import check_output
-from tk.io.results.data import FrameResult, ResultMeta, Value
+from tk.io.results.data import ResultMeta, Value
 from tk.io.results.files import ANY_HDF5, RESULT
 from tk.io.results.layout import Layout, Values, pack_state
 from tk.io.results.reader import open_result, read_state
-from tk.io.results.schema import row_of
+from tk.io.results.schema import checked_row
 
 Model = Mapping[str, Value]
 
@@ -129,14 +130,15 @@ class ResultWriter:
 
     def append(
         self,
-        results: FrameResult | Mapping[int, FrameResult],
+        people: Mapping[int, Mapping[str, ArrayLike]],
         state: Mapping[str, Value] | None = None,
         flush: bool = True,
     ) -> None:
         """Add a finished frame set. With ``flush``, it is in the file on return, even if the process is then killed.
 
         Args:
-            results: the frame, or the frame of each person who is present, by the person's number.
+            people: values of each person who is present, by the person's number: those of one row, by the paths of
+                :data:`~tk.io.results.schema.ROWS`, and optionally of the hull.
             state: state from which the run continues with bit-identical results: a few small arrays, numbers and
                 texts. Only the latest state is kept.
             flush: False keeps the frame set in memory until the next call of :meth:`append`, :meth:`flush` or
@@ -147,14 +149,16 @@ class ResultWriter:
             ValueError: a frame does not match the metadata, or a person's number is not the next one.
         """
         self._require_open()
-        people = {0: results} if isinstance(results, FrameResult) else results
-        rows: dict[int, Values] = {person: row_of(frame, self._layout.columns) for person, frame in people.items()}
+        # copies: a tracker may reuse its arrays
+        rows: dict[int, Values] = {
+            person: checked_row(values, self._layout.columns) for person, values in people.items()
+        }
         self._add_people(1 + max(people, default=0))
         self._waiting.append(rows)
         self._frames += 1
         for person in people:
             self._rows[person] += 1
-        if state is not None:  # a copy: a tracker may reuse its arrays
+        if state is not None:
             copy = {name: value if isinstance(value, str) else np.array(value) for name, value in state.items()}
             self._waiting_state = (self._frames, self._rows.copy(), copy)
         if flush:
