@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tk.kernels import kinematics
-from tk.kernels.kinematics import forward_tree, load_rotation, load_translation, load_vector3
+from tk.kernels.kinematics import forward_tree, load_rotation, load_translation
 from tk.kernels.runtime import ensure_runtime, ti
+from tk.kernels.vectors import triple
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import SEGMENTS, build_skeleton
 
@@ -48,7 +49,7 @@ def _place_kernel(real):
             forward_tree(tree, pose, b, b, joints)
             for n in range(local.shape[0]):
                 k = last_dof[n]
-                x = load_rotation(joints, b, k) @ load_vector3(local, n) + load_translation(joints, b, k)
+                x = load_rotation(joints, b, k) @ triple(local, n, 0) + load_translation(joints, b, k)
                 for i in ti.static(range(3)):
                     world[b, n, i] = x[i]
 
@@ -122,7 +123,7 @@ def _rotate(
     rotations: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (N, 3, 3) out
 ):
     for n in range(angles.shape[0]):
-        R = kinematics.rodrigues(kinematics.load_vector3(axes, n), angles[n])
+        R = kinematics.rodrigues(triple(axes, n, 0), angles[n])
         for i, j in ti.static(ti.ndrange(3, 3)):
             rotations[n, i, j] = R[i, j]
 

@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import pytest
 
-from tk.kernels.projection import pack_camera, project
+from tk.kernels.projection import pack_cameras, project
 from tk.kernels.runtime import ensure_runtime, ti
 from tk.model.cameras.camera import Camera
 
@@ -44,7 +44,7 @@ def project_points(
     """Project points, each by a camera of its own.
 
     Args:
-        cameras: (V, 22) rows of :func:`pack_camera`.
+        cameras: (V, 22) rows of :func:`pack_cameras`.
         view: (N,) which camera.
         p_world: (N, 3) metres, float32 or float64: the precision of the computation.
 
@@ -84,7 +84,7 @@ def camera_of(fisheye: bool, distortions) -> Camera:
 )
 def test_projection_is_opencvs(camera):
     p = np.random.default_rng(3).uniform(-0.9, 0.9, (80, 3))
-    row = pack_camera(camera.matrix, camera.distortions, camera.rotation, camera.translation, camera.fisheye)[None]
+    row = pack_cameras([camera])
     view = np.zeros(len(p), int)
     pixels, jacobian, depth = project_points(row, view, p)
     expected, expected_depth = camera.project(p)
@@ -101,7 +101,7 @@ def test_projection_is_opencvs(camera):
 def test_single_precision_stays_within_a_thousandth_of_a_pixel():
     camera = camera_of(False, [-0.2, 0.05, 1e-3, -2e-3, 0.01])
     p = np.random.default_rng(4).uniform(-0.9, 0.9, (80, 3)).astype(np.float32)
-    row = pack_camera(camera.matrix, camera.distortions, camera.rotation, camera.translation, False)[None]
+    row = pack_cameras([camera])
     pixels, _, _ = project_points(row, np.zeros(len(p), int), p)
     assert pixels.dtype == np.float32
     np.testing.assert_allclose(pixels, camera.project(p)[0], rtol=0, atol=1e-3)

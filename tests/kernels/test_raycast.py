@@ -8,13 +8,14 @@ import pytest
 from tests.model.figures import BODY
 from tests.model.ring import ring_of_cameras
 from tk.kernels.cones import CONE
+from tk.kernels.projection import pack_cameras
 from tk.kernels.raycast import FAR, Cast, cast, nothing
 from tk.model.body import gait_poses as gait
 from tk.model.body.cone_body import ConeBody
 from tk.model.body.skeleton import CHAINS, SEGMENTS
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import GROUPS, PartColors
-from tk.model.masks.silhouettes import pack_rig, pixel_rays
+from tk.model.masks.silhouettes import pixel_rays
 
 GROUP = PartColors(BODY).group
 RIG = ring_of_cameras(3, width=160, height=200)
@@ -86,7 +87,7 @@ def brute_force(
 
 
 def cast_all(body: ConeBody, poses: np.ndarray, dtype: type = np.float64, **options):
-    return cast(body.pack(dtype), GROUP, pack_rig(RIG), STEP, RAYS, COST, poses, **options)
+    return cast(body.pack(dtype), GROUP, pack_cameras(RIG), STEP, RAYS, COST, poses, **options)
 
 
 def cost_of(label: np.ndarray) -> float:
@@ -122,7 +123,7 @@ def test_lenses_that_bend_lines_hide_no_part(fisheye: bool) -> None:
     center = np.array([[0, 0, c] for c in (319.5, 399.5)] + [[0, 0, 0]]) * (1 - focal[0, 0])
     rig = Rig(tuple(replace(c, matrix=focal @ c.matrix + center, distortions=bent, fisheye=fisheye) for c in near))
     rays = pixel_rays(rig, 4 * STEP)
-    _, met = cast(BODY.pack(np.float64), GROUP, pack_rig(rig), 4 * STEP, rays, COST, POSES, export=True)
+    _, met = cast(BODY.pack(np.float64), GROUP, pack_cameras(rig), 4 * STEP, rays, COST, POSES, export=True)
     assert met is not None
     for b, pose in enumerate(POSES):
         label = brute_force(BODY, pose, 1.0, rig, rays)[0]
@@ -176,5 +177,5 @@ def test_a_smaller_picture_has_no_rays_outside():
     rays = pixel_rays(narrow, STEP)
     outside = ~rays.any(axis=-1)
     assert outside[1].any() and not outside[[0, 2]].any()
-    _, met = cast(BODY.arrays, GROUP, pack_rig(narrow), STEP, rays, COST, POSES[:1], export=True)
+    _, met = cast(BODY.arrays, GROUP, pack_cameras(narrow), STEP, rays, COST, POSES[:1], export=True)
     assert not met.label[0][outside].any() and met.label[0][1].any()

@@ -16,19 +16,14 @@ A hidden contour point, or a point without an edge, is an entry with ρ = 1 and 
 from tk.kernels.kinematics import load_rotation, load_translation
 from tk.kernels.projection import project
 from tk.kernels.runtime import ti
-from tk.kernels.vectors import cross, dot, norm_sqr, pulled, times
-from tk.kernels.wrench import MOTION, WRENCH, add_direction, add_wrench, load_wrench
+from tk.kernels.vectors import cross, dot, norm_sqr, pulled, times, triple_in
+from tk.kernels.wrench import MOTION, WRENCH, add_direction, add_wrench
 
 # Columns of an entry. Points a and b are in the zero configuration, metres; target and unit normal in the image.
 POINT_A, POINT_B, LAST_DOF, CAMERA, TARGET, NORMAL = 0, 3, 6, 7, 8, 10
 INV_SIGMA2, STATE, SCALE, NU, ENTRY_NUMBERS = 12, 13, 14, 15, 16  # 1/σ² in 1/px²; SCALE: the entry's share of f
 # States of an entry: padding, assigned, and a contour point that can have no edge.
 ABSENT, ASSIGNED, UNASSIGNABLE = range(3)
-
-
-@ti.func
-def load_entry(entries: ti.template(), b: int, e: int, first: ti.template()):
-    return ti.Vector([entries[b, e, first + a] for a in ti.static(range(3))])
 
 
 @ti.func
@@ -41,12 +36,12 @@ def image_residual(
     v = ti.cast(entries[b, e, CAMERA], ti.i32)
     R, t = load_rotation(frames, c, k), load_translation(frames, c, k)
     target = ti.Vector([entries[b, e, TARGET], entries[b, e, TARGET + 1]])
-    x = times(R, load_entry(entries, b, e, POINT_A)) + t
+    x = times(R, triple_in(entries, b, e, POINT_A)) + t
     pixel, T, z = project(cameras, v, x)
     L = _turned(T, x - origin)
     valid = z > 1e-3
-    if norm_sqr(load_entry(entries, b, e, POINT_A) - load_entry(entries, b, e, POINT_B)) > 0.0:
-        x = times(R, load_entry(entries, b, e, POINT_B)) + t
+    if norm_sqr(triple_in(entries, b, e, POINT_A) - triple_in(entries, b, e, POINT_B)) > 0.0:
+        x = times(R, triple_in(entries, b, e, POINT_B)) + t
         other, J, depth = project(cameras, v, x)
         pixel = 0.5 * (pixel + other)
         L = 0.5 * (L + _turned(J, x - origin))
@@ -89,7 +84,7 @@ def add_alignment(
             sums[c, 0] = sums[c, 0] + scale * (1.0 - decay)
             weight = scale * decay / nu * inv_sigma2
             k = ti.cast(entries[b, e, LAST_DOF], ti.i32)
-            moved = dot(moment, load_wrench(scratch, c, k, MOTION)) + dot(force, load_wrench(scratch, c, k, MOTION + 3))
+            moved = dot(moment, triple_in(scratch, c, k, MOTION)) + dot(force, triple_in(scratch, c, k, MOTION + 3))
             add_wrench(scratch, c, k, WRENCH, weight * r * moment, weight * r * force)
             add_wrench(scratch, c, k, WRENCH + 6, weight * moved * moment, weight * moved * force)
 

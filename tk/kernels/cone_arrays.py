@@ -5,9 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.kinematics import load_rotation, load_translation
+from tk.kernels.kinematics import carried
 from tk.kernels.runtime import ti
-from tk.kernels.vectors import product, times
 
 # Points nearer to a camera than this are not projected, metres. Chosen; sensitivity not measured: bodies stay farther
 # away. At 0 a projection divides by zero; beyond the least distance of a body, parts have no contour.
@@ -16,7 +15,7 @@ NEAREST_M = 0.1
 MOST_PARTS = 64
 # Columns of ``parts``: a, b, h, m of the shape (from 0), the 3×4 frame, CONE or ELLIPSOID, the last degree of freedom
 # above the part, its limb.
-PART_FRAME, PART_KIND, PART_DOF, PART_LIMB, PART_NUMBERS = 4, 16, 17, 18, 19
+PART_FRAME, PART_KIND, PART_DOF, PART_LIMB = 4, 16, 17, 18
 
 
 class ConeArrays(NamedTuple):
@@ -61,17 +60,4 @@ def kind_of(parts: ti.template(), p: int):
 @ti.func
 def place_part(joints: ti.template(), parts: ti.template(), b: int, p: int):
     """Return rotation and translation from part p to the world at pose b."""
-    R0 = ti.Matrix([[parts[p, PART_FRAME + 4 * i + j] for j in ti.static(range(3))] for i in ti.static(range(3))])
-    t0 = ti.Vector([parts[p, PART_FRAME + 4 * i + 3] for i in ti.static(range(3))])
-    k = ti.cast(parts[p, PART_DOF], ti.i32)
-    R = load_rotation(joints, b, k)
-    return product(R, R0), times(R, t0) + load_translation(joints, b, k)
-
-
-@ti.func
-def store_frame(placed: ti.template(), b: int, p: int, R, t):
-    """Store a 3×4 transform in the first 12 columns of a row."""
-    for i in ti.static(range(3)):
-        for j in ti.static(range(3)):
-            placed[b, p, 4 * i + j] = R[i, j]
-        placed[b, p, 4 * i + 3] = t[i]
+    return carried(joints, b, ti.cast(parts[p, PART_DOF], ti.i32), parts, p, PART_FRAME)

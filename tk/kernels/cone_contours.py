@@ -11,12 +11,12 @@ Scratch of B poses, V cameras, P parts and Q curves:
     of its image in pixels, the sign that turns its image's normal outwards, and the corners of a polyline in pixels.
 """
 
-from tk.kernels.cone_arrays import NEAREST_M, PART_LIMB, kind_of, place_part, shape_of, store_frame
+from tk.kernels.cone_arrays import NEAREST_M, PART_LIMB, kind_of, place_part, shape_of
 from tk.kernels.cones import SIDE_B, curve_of, enclosing_radius, enter, interior_point, point_on
-from tk.kernels.kinematics import load_rotation, load_translation
+from tk.kernels.kinematics import load_rotation, load_translation, store_frame
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ti
-from tk.kernels.vectors import cross, dot, norm2, norm_sqr, times, transposed_times
+from tk.kernels.vectors import cross, dot, norm2, norm_sqr, times, transposed_times, triple_in
 
 # Chords that approximate a curve when its length is measured and when edgels are compared with it: 30° each of a
 # circle, at most 3.4 % of its radius off. Straight curves have one.
@@ -46,20 +46,14 @@ def place_parts(joints: ti.template(), parts: ti.template(), b: int, placed: ti.
 
 
 @ti.func
-def ball_center(placed: ti.template(), b: int, p: int):
-    """Return the centre (3,) of the sphere about part p."""
-    return ti.Vector([placed[b, p, BALL + a] for a in ti.static(range(3))])
-
-
-@ti.func
 def may_hide(placed: ti.template(), b: int, p: int, eye):
     """Return the bits of the parts whose spheres overlap the sphere of part p in the image."""
     bits = ti.i64(0)
-    own = ball_center(placed, b, p) - eye
+    own = triple_in(placed, b, p, BALL) - eye
     own_square = norm_sqr(own)
     own_sine = placed[b, p, BALL_SQUARE] / own_square
     for o in range(placed.shape[1]):
-        to = ball_center(placed, b, o) - eye
+        to = triple_in(placed, b, o, BALL) - eye
         square = norm_sqr(to)
         sine = placed[b, o, BALL_SQUARE] / square
         # spheres overlap if the angle between their centres is at most the sum of their angular radii
@@ -97,7 +91,7 @@ def find_hider(parts: ti.template(), placed: ti.template(), b: int, candidates: 
         others >>= 1
         close = False
         if this == 1:
-            to = ball_center(placed, b, o) - eye
+            to = triple_in(placed, b, o, BALL) - eye
             ahead = dot(to, ray)
             close = ahead > 0.0 and norm_sqr(to) * long - ahead * ahead < placed[b, o, BALL_SQUARE] * long
         if close:

@@ -25,22 +25,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tk.kernels.kinematics import JOINT_NUMBERS, forward_tree
-from tk.kernels.occlusion import (
-    PLACED_CAMERA,
-    PLACED_NUMBERS,
-    PLACED_TRANSLATION,
-    is_occluded,
-    load_placed_rotation,
-    load_placed_vector,
-    pieces_beside,
-    place_pieces,
-)
-from tk.kernels.piece_arrays import PIECE_SHAPE, PieceArrays
+from tk.kernels.kinematics import JOINT_NUMBERS, forward_tree, load_rotation, load_translation
+from tk.kernels.occlusion import PLACED_CAMERA, PLACED_NUMBERS, is_occluded, pieces_beside, place_pieces
+from tk.kernels.pieces import PIECE_SHAPE, PieceArrays, to_zero_configuration
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.superellipsoid import power
-from tk.kernels.vectors import times
+from tk.kernels.vectors import times, triple, triple_in
 
 # Strips of one parallel task. Each task has its own forward kinematics, some microseconds. Affects speed only.
 STRIPS_PER_TASK = 10
@@ -114,20 +105,13 @@ def rim_crossings(strips: ti.template(), s: int, camera):  # (S, N + 1, 5), came
 @ti.func
 def rim_point(placed: ti.template(), c: int, pieces: ti.template(), i: int, eta, omega):
     """Return a point of piece i in the piece's frame and in the world, and its unit normal in the world."""
-    radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
+    radii = triple(pieces, i, PIECE_SHAPE)
     e1, e2 = pieces[i, PIECE_SHAPE + 3], pieces[i, PIECE_SHAPE + 4]
-    R = load_placed_rotation(placed, c, i)
+    R = load_rotation(placed, c, i)
     turns = ti.Vector([ti.cos(eta), ti.sin(eta), ti.cos(omega), ti.sin(omega)])
     q = surface_point(turns, radii, e1, e2)
     n = times(R, surface_normal(turns, radii, e1, e2).normalized())
-    return q, times(R, q) + load_placed_vector(placed, c, i, PLACED_TRANSLATION), n
-
-
-@ti.func
-def to_zero_configuration(pieces: ti.template(), i: int, q):
-    """Transform a point from the frame of piece i to the zero configuration, where it is a material point."""
-    R = ti.Matrix([[pieces[i, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
-    return times(R, q) + ti.Vector([pieces[i, 4 * a + 3] for a in ti.static(range(3))])
+    return q, times(R, q) + load_translation(placed, c, i), n
 
 
 @ti.func
@@ -180,7 +164,7 @@ def _contour_kernel(real):
                 i = strip_piece(strips, s)
                 if i != near_to:
                     near, near_to = pieces_beside(placed, c, pieces, i, 0.0), i
-                crossings = rim_crossings(strips, s, load_placed_vector(placed, c, i, PLACED_CAMERA))
+                crossings = rim_crossings(strips, s, triple_in(placed, c, i, PLACED_CAMERA))
                 row = (b * C + v) * K + m
                 for slot in range(2):
                     # a dynamic index into a vector would spill it to memory
@@ -256,7 +240,7 @@ class ContourKernel:
         strip_piece: (S,) the piece of each strip.
         strip_segment: (S,) its segment.
         strip_paired: (S,) True for circles of latitude.
-        cameras: (C, 22) rows of :func:`tk.kernels.projection.pack_camera`.
+        cameras: (C, 22) rows of :func:`tk.kernels.projection.pack_cameras`.
         dtype: np.float32, or np.float64 for checks.
 
     Attributes:

@@ -12,7 +12,7 @@ over the horizontal in the trunk's frame, which follows from its own angle and t
 import numpy as np
 
 from tk.kernels.runtime import ti
-from tk.kernels.vectors import cross, norm_sqr, product, times
+from tk.kernels.vectors import cross, norm_sqr, product, times, triple
 
 # The arm's elevation u from a shoulder's first two angles, the arm being level in the zero configuration:
 # u = ARM_UP[0] cos(second) sin(first) + ARM_UP[1] sin(second).
@@ -55,13 +55,33 @@ def load_translation(frames: ti.template(), c: int, k: int):
 
 
 @ti.func
-def load_vector3(array: ti.template(), i: int):
-    return ti.Vector([array[i, 0], array[i, 1], array[i, 2]])
+def store_frame(frames: ti.template(), c: int, k: int, R, t):
+    """Store rotation and translation of a 3×4 transform in the first 12 columns of row (c, k)."""
+    for i in ti.static(range(3)):
+        for j in ti.static(range(3)):
+            frames[c, k, 4 * i + j] = R[i, j]
+        frames[c, k, 4 * i + 3] = t[i]
 
 
 @ti.func
-def _load_columns(array: ti.template(), i: int, first: ti.template()):
-    return ti.Vector([array[i, first + a] for a in ti.static(range(3))])
+def rotation_of(array: ti.template(), i: int, first: ti.template()):
+    """Rotation (3, 3) of the 3×4 transform in row i, from column ``first`` on."""
+    return ti.Matrix([[array[i, first + 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
+
+
+@ti.func
+def translation_of(array: ti.template(), i: int, first: ti.template()):
+    """Translation (3,) of the same."""
+    return ti.Vector([array[i, first + 4 * a + 3] for a in ti.static(range(3))])
+
+
+@ti.func
+def carried(joints: ti.template(), c: int, k: int, array: ti.template(), i: int, first: ti.template()):
+    """Rotation and translation to the world of what degree of freedom k carries; its transform to the zero
+    configuration is that of :func:`rotation_of`."""
+    R = load_rotation(joints, c, k)
+    t = times(R, translation_of(array, i, first)) + load_translation(joints, c, k)
+    return product(R, rotation_of(array, i, first)), t
 
 
 @ti.func
@@ -94,9 +114,9 @@ def _place_joint(
     up = parent_of(tree, k)
     # the rise of the shoulder that k belongs to, and that shoulder's first degree of freedom
     first = k
-    rise = _load_columns(tree, k, TREE_RISE)
+    rise = triple(tree, k, TREE_RISE)
     if up >= 0:
-        rise_above = _load_columns(tree, up, TREE_RISE)
+        rise_above = triple(tree, up, TREE_RISE)
         if norm_sqr(rise_above) > 0.0:
             first, rise = up, rise_above
     zero = pose[b, k] * 0.0
@@ -105,7 +125,7 @@ def _place_joint(
     if up >= 0:
         R = load_rotation(joints, c, up)
         t = load_translation(joints, c, up)
-    w, q = _load_columns(tree, k, 0), _load_columns(tree, k, TREE_POINT)
+    w, q = triple(tree, k, 0), triple(tree, k, TREE_POINT)
     w_world = times(R, w)
     q_world = times(R, q) + t
     rate = q_world * zero
@@ -132,10 +152,8 @@ def _place_joint(
         R = product(R, rodrigues(w, pose[b, k]))
         t = q_world - times(R, q)
         v_world = cross(q_world, w_world) + rate
+    store_frame(joints, c, k, R, t)
     for i in ti.static(range(3)):
-        for j in ti.static(range(3)):
-            joints[c, k, 4 * i + j] = R[i, j]
-        joints[c, k, 4 * i + 3] = t[i]
         joints[c, k, TWIST + i] = w_world[i]
         joints[c, k, TWIST + 3 + i] = v_world[i]
 

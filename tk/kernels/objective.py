@@ -34,7 +34,7 @@ from tk.kernels.objective_pairs import (
     load_voxel,
     place_pieces,
 )
-from tk.kernels.piece_arrays import PieceArrays
+from tk.kernels.pieces import PieceArrays
 from tk.kernels.projection import CAMERA_NUMBERS
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.taichi_internals import Launcher
@@ -221,7 +221,7 @@ class ObjectiveKernel:
         barred: (N,) bit masks of the parts of the body that a sample may not enter: inside it finds no voxel. No parts
             by default.
         piece_part: (P,) the part, 0 to 23, that each piece belongs to.
-        cameras: (C, 22) rows of :func:`tk.kernels.projection.pack_camera`, for the alignment term.
+        cameras: (C, 22) rows of :func:`tk.kernels.projection.pack_cameras`, for the alignment term.
         dtype: np.float32, or np.float64 for checks of derivatives.
     """
 

@@ -1,12 +1,12 @@
 """Pairs of the objective: surface samples with voxels, voxels with pieces. For :mod:`tk.kernels.objective`."""
 
-from tk.kernels.kinematics import load_rotation, load_translation, load_vector3
+from tk.kernels.kinematics import load_rotation, load_translation, store_frame
 from tk.kernels.nearest import nearest_voxel
-from tk.kernels.piece_arrays import PIECE_DOF, PIECE_NUMBERS, PIECE_SHAPE
+from tk.kernels.pieces import PIECE_DOF, PIECE_NUMBERS, PIECE_SHAPE, place_piece, to_zero_configuration
 from tk.kernels.runtime import ti
 from tk.kernels.superellipsoid import implicit, project
-from tk.kernels.vectors import cross, norm_sqr, product, times, transposed_times
-from tk.kernels.wrench import MOTION, WRENCH, add_wrench, load_wrench
+from tk.kernels.vectors import cross, norm_sqr, times, transposed_times, triple, triple_in
+from tk.kernels.wrench import MOTION, WRENCH, add_wrench
 
 # Columns of a sample, after its position; the weight is 1/σ².
 SAMPLE_DOF, SAMPLE_PATCH, SAMPLE_WEIGHT, SAMPLE_BARRED = range(3, 7)
@@ -32,25 +32,11 @@ def place_pieces(
 ):
     """Store the pieces' frames in the world and their bounding spheres in the scratch."""
     for i in range(pieces.shape[0]):
-        k = ti.cast(pieces[i, PIECE_DOF], ti.i32)
-        R, t = load_rotation(scratch, c, k), load_translation(scratch, c, k)
-        Rp = ti.Matrix([[pieces[i, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
-        tp = ti.Vector([pieces[i, 4 * a + 3] for a in ti.static(range(3))])
-        R_world, t_world = product(R, Rp), times(R, tp) + t
-        low, high = pieces[i, PIECE_SHAPE + 5], pieces[i, PIECE_SHAPE + 6]
-        half = 0.5 * (high - low)
+        R, t, center, radius = place_piece(scratch, c, pieces, i)
+        store_frame(scratch, c, D + i, R, t)
         for a in ti.static(range(3)):
-            for b in ti.static(range(3)):
-                scratch[c, D + i, 4 * a + b] = R_world[a, b]
-            scratch[c, D + i, 4 * a + 3] = t_world[a]
-            scratch[c, D + i, SPHERE + a] = t_world[a] + 0.5 * (low + high) * R_world[a, 2]
-        a1, a2 = pieces[i, PIECE_SHAPE], pieces[i, PIECE_SHAPE + 1]
-        scratch[c, D + i, SPHERE_RADIUS] = ti.sqrt(a1 * a1 + a2 * a2 + half * half)
-
-
-@ti.func
-def sphere(scratch: ti.template(), c: int, row: int):
-    return ti.Vector([scratch[c, row, SPHERE + a] for a in ti.static(range(3))])
+            scratch[c, D + i, SPHERE + a] = center[a]
+        scratch[c, D + i, SPHERE_RADIUS] = radius
 
 
 @ti.func
@@ -82,17 +68,17 @@ def nearest_piece(
     least = y[0] * 0.0 + 1e30
     for i in range(pieces.shape[0]):
         radius = scratch[c, D + i, SPHERE_RADIUS]
-        power = norm_sqr(y - sphere(scratch, c, D + i)) - radius * radius
+        power = norm_sqr(y - triple_in(scratch, c, D + i, SPHERE)) - radius * radius
         if power < least:
             least, likely = power, i
     for turn in range(pieces.shape[0] + 1):
         i = ti.select(turn == 0, likely, turn - 1)
         within = best_d + scratch[c, D + i, SPHERE_RADIUS]
-        if turn > 0 and (i == likely or norm_sqr(y - sphere(scratch, c, D + i)) >= within * within):
+        if turn > 0 and (i == likely or norm_sqr(y - triple_in(scratch, c, D + i, SPHERE)) >= within * within):
             continue
         R = load_rotation(scratch, c, D + i)
         q = transposed_times(R, y - load_translation(scratch, c, D + i))
-        radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
+        radii = triple(pieces, i, PIECE_SHAPE)
         z_lower, z_upper = pieces[i, PIECE_SHAPE + 5], pieces[i, PIECE_SHAPE + 6]
         # a voxel farther outside the piece's box than the best distance has no nearer point on it
         over = ti.Vector(
@@ -112,8 +98,7 @@ def nearest_piece(
                 best_on = on
     best_x = best_on
     if best >= 0:
-        Rp = ti.Matrix([[pieces[best, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
-        best_x = times(Rp, best_on) + ti.Vector([pieces[best, 4 * a + 3] for a in ti.static(range(3))])
+        best_x = to_zero_configuration(pieces, best, best_on)
     return best, best_x
 
 
@@ -133,7 +118,7 @@ def add_residual(
     decay = ti.exp(-0.5 * norm_sqr(r) * inv_sigma2 / nu)
     sums[c, 0] = sums[c, 0] + scale * (1.0 - decay)
     weight = scale * decay / nu * inv_sigma2
-    Jv = cross(load_wrench(scratch, c, k, MOTION), x) + load_wrench(scratch, c, k, MOTION + 3)
+    Jv = cross(triple_in(scratch, c, k, MOTION), x) + triple_in(scratch, c, k, MOTION + 3)
     add_wrench(scratch, c, k, WRENCH, weight * cross(x, r), weight * r)
     add_wrench(scratch, c, k, WRENCH + 6, weight * cross(x, Jv), weight * Jv)
 
@@ -154,10 +139,10 @@ def is_buried(
         radius = scratch[c, D + i, SPHERE_RADIUS]
         if (
             barred >> ti.cast(pieces[i, PIECE_PART], ti.i32) & 1 == 1
-            and norm_sqr(x - sphere(scratch, c, D + i)) < radius * radius
+            and norm_sqr(x - triple_in(scratch, c, D + i, SPHERE)) < radius * radius
         ):
             q = transposed_times(load_rotation(scratch, c, D + i), x - load_translation(scratch, c, D + i))
-            radii = ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))])
+            radii = triple(pieces, i, PIECE_SHAPE)
             # G is at least the greatest of |q| / a
             if (
                 q[2] > pieces[i, PIECE_SHAPE + 5]
@@ -185,7 +170,7 @@ def pair_sample(
     """Return the voxel of surface sample n, or -1."""
     k = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
     R = load_rotation(scratch, c, k)
-    x = times(R, load_vector3(samples, n)) + load_translation(scratch, c, k)
+    x = times(R, triple(samples, n, 0)) + load_translation(scratch, c, k)
     v = -1
     barred = ti.cast(samples[n, SAMPLE_BARRED], ti.i32)
     if barred == 0 or not is_buried(scratch, c, D, pieces, barred, x):
@@ -261,7 +246,7 @@ def load_pair(
         n = chosen[b, m]
         v = assigned[b, m]
         k = ti.cast(samples[n, SAMPLE_DOF], ti.i32)
-        x0 = load_vector3(samples, n)
+        x0 = triple(samples, n, 0)
         inv_sigma2 = samples[n, SAMPLE_WEIGHT]
     else:
         nu, scale = settings[COVERAGE_NU], settings[COVERAGE_SCALE]
@@ -269,6 +254,6 @@ def load_pair(
         if i >= 0:
             v = chosen[b, m]
             k = ti.cast(pieces[i, PIECE_DOF], ti.i32)
-            x0 = ti.Vector([covering[b, m - M, 1 + a] for a in ti.static(range(3))])
+            x0 = triple_in(covering, b, m - M, 1)
             inv_sigma2 = pieces[i, PIECE_WEIGHT]
     return v, k, x0, inv_sigma2, nu, scale

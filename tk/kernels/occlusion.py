@@ -12,69 +12,48 @@ The paper is silent about two cases. Here a point inside another piece (at the j
 only touch do not hide each other, or every seam of the model would flicker.
 """
 
-from tk.kernels.kinematics import load_rotation, load_translation
-from tk.kernels.piece_arrays import PIECE_DOF, PIECE_SHAPE
+from tk.kernels.kinematics import load_rotation, load_translation, store_frame
+from tk.kernels.pieces import PIECE_SHAPE, place_piece
 from tk.kernels.runtime import ti
 from tk.kernels.superellipsoid import implicit, inside_outside, is_quadric, power
-from tk.kernels.vectors import dot, norm_sqr, product, times, transposed_times
+from tk.kernels.vectors import dot, norm_sqr, transposed_times, triple, triple_in
 
 # Rounds of the bisection. A ray undecided after them runs less than 1/4096 of its clipped length inside the piece.
 DEPTH = 12
 # A ray within the outermost thousandth of a piece only touches it. Chosen; at 0 seams flicker by rounding.
 TOUCH = 1e-3
 
-# Columns of a placed piece: rotation (9, row by row) and translation (3) to the world, the camera's centre in the
-# piece's frame (3); direction (3) of the bounding sphere from the camera, cosine of the half angle of its cone, and its
-# least distance from the camera.
-PLACED_TRANSLATION, PLACED_CAMERA, PLACED_CONE, PLACED_NEAR, PLACED_NUMBERS = 9, 12, 15, 19, 20
+# Columns of a placed piece, after its 3×4 transform to the world: the camera's centre in the piece's frame (3);
+# direction (3) of the bounding sphere from the camera, cosine of the half angle of its cone, and its least distance
+# from the camera.
+PLACED_CAMERA, PLACED_CONE, PLACED_NEAR, PLACED_NUMBERS = 12, 15, 19, 20
 # The cone's cosine is lowered by this, for rounding: half a millimetre at the smallest of a body's pieces.
 _SLACK = 1e-6
 
 
 @ti.func
 def place_pieces(
-    frames: ti.template(),  # (T, D, 18) filled by kinematics.forward_tree
+    joints: ti.template(),  # (T, D, 18) filled by kinematics.forward_tree
     c: int,
-    pieces: ti.template(),  # (P, 20 or more) as in tk.kernels.objective
+    pieces: ti.template(),  # (P, 20 or more) as in tk.kernels.pieces
     center,  # camera centre, world
     placed: ti.template(),  # (T, P, 20) out
 ):
     """Fill row c of ``placed`` with the pieces at a pose relative to one camera."""
     for i in range(pieces.shape[0]):
-        k = ti.cast(pieces[i, PIECE_DOF], ti.i32)
-        R = load_rotation(frames, c, k)
-        Rp = ti.Matrix([[pieces[i, 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
-        tp = ti.Vector([pieces[i, 4 * a + 3] for a in ti.static(range(3))])
-        R_world = product(R, Rp)
-        t_world = times(R, tp) + load_translation(frames, c, k)
-        camera = transposed_times(R_world, center - t_world)
-        lower, upper = pieces[i, PIECE_SHAPE + 5], pieces[i, PIECE_SHAPE + 6]
-        half = 0.5 * (upper - lower)
-        middle = 0.5 * (upper + lower)
-        radius = ti.sqrt(pieces[i, PIECE_SHAPE] ** 2 + pieces[i, PIECE_SHAPE + 1] ** 2 + half * half)
-        sphere = t_world + middle * ti.Vector([R_world[a, 2] for a in ti.static(range(3))]) - center
-        distance = ti.max(ti.sqrt(norm_sqr(sphere)), 1e-6)
+        R, t, sphere, radius = place_piece(joints, c, pieces, i)
+        store_frame(placed, c, i, R, t)
+        camera = transposed_times(R, center - t)
+        ray = sphere - center
+        distance = ti.max(ti.sqrt(norm_sqr(ray)), 1e-6)
         for a in ti.static(range(3)):
-            for b in ti.static(range(3)):
-                placed[c, i, 3 * a + b] = R_world[a, b]
-            placed[c, i, PLACED_TRANSLATION + a] = t_world[a]
             placed[c, i, PLACED_CAMERA + a] = camera[a]
-            placed[c, i, PLACED_CONE + a] = sphere[a] / distance
+            placed[c, i, PLACED_CONE + a] = ray[a] / distance
         sine = radius / distance
         placed[c, i, PLACED_CONE + 3] = -2.0
         if sine < 1.0:
             placed[c, i, PLACED_CONE + 3] = ti.sqrt(1.0 - sine * sine) - _SLACK
         placed[c, i, PLACED_NEAR] = distance - radius
-
-
-@ti.func
-def load_placed_rotation(placed: ti.template(), c: int, i: int):
-    return ti.Matrix([[placed[c, i, 3 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
-
-
-@ti.func
-def load_placed_vector(placed: ti.template(), c: int, i: int, first: ti.template()):
-    return ti.Vector([placed[c, i, first + a] for a in ti.static(range(3))])
 
 
 @ti.func
@@ -127,7 +106,7 @@ def pieces_beside(
     All points of a piece share the mask: it has the pieces whose bounding spheres overlap its own in the image.
     """
     beside = ti.cast(0, ti.i64)
-    u = load_placed_vector(placed, c, own, PLACED_CONE)
+    u = triple_in(placed, c, own, PLACED_CONE)
     cosine = placed[c, own, PLACED_CONE + 3]
     sine = ti.sqrt(ti.max(1.0 - cosine * cosine, 0.0))
     # near = distance (1 − sine)
@@ -137,7 +116,7 @@ def pieces_beside(
     for i in range(pieces.shape[0]):
         other = placed[c, i, PLACED_CONE + 3]
         limit = cosine * other - sine * ti.sqrt(ti.max(1.0 - other * other, 0.0)) - _SLACK
-        meets = dot(u, load_placed_vector(placed, c, i, PLACED_CONE)) > limit
+        meets = dot(u, triple_in(placed, c, i, PLACED_CONE)) > limit
         if i != own and (inside or other < 0.0 or meets):
             beside |= ti.cast(1, ti.i64) << ti.cast(i, ti.i64)
     return beside
@@ -162,15 +141,15 @@ def is_occluded(
     while hit == 0 and rest != 0:
         if (
             rest & 1 == 1
-            and dot(ray, load_placed_vector(placed, c, i, PLACED_CONE)) > placed[c, i, PLACED_CONE + 3]
+            and dot(ray, triple_in(placed, c, i, PLACED_CONE)) > placed[c, i, PLACED_CONE + 3]
             and placed[c, i, PLACED_NEAR] < distance
         ):
-            R = load_placed_rotation(placed, c, i)
-            q = transposed_times(R, x - load_placed_vector(placed, c, i, PLACED_TRANSLATION))
+            R = load_rotation(placed, c, i)
+            q = transposed_times(R, x - load_translation(placed, c, i))
             hit = segment_enters(
                 q,
-                load_placed_vector(placed, c, i, PLACED_CAMERA) - q,
-                ti.Vector([pieces[i, PIECE_SHAPE + a] for a in ti.static(range(3))]),
+                triple_in(placed, c, i, PLACED_CAMERA) - q,
+                triple(pieces, i, PIECE_SHAPE),
                 pieces[i, PIECE_SHAPE + 3],
                 pieces[i, PIECE_SHAPE + 4],
                 pieces[i, PIECE_SHAPE + 5],

@@ -1,57 +1,46 @@
 """Perspective projection with lens distortion and its derivative, as a Taichi function: OpenCV's two models.
 
-A camera is a row of 22 numbers: rotation (9, row by row, world to camera), translation (3, metres), fx, fy, cx, cy
-(pixels), five distortion coefficients, and 1 for the fisheye model or 0. Like OpenCV, skew is ignored.
+A camera is a row of 22 numbers: the 3×4 transform from world to camera (metres), fx, fy, cx, cy (pixels), five
+distortion coefficients, and 1 for the fisheye model or 0. Like OpenCV, skew is ignored.
 """
+
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.kinematics import rotation_of, translation_of
 from tk.kernels.runtime import ti
 from tk.kernels.vectors import product, times, transposed_times
 
 CAMERA_NUMBERS = 22
 
 
-def pack_camera(
-    matrix: NDArray[np.float64],
-    distortions: NDArray[np.float64],
-    rotation: NDArray[np.float64],
-    translation: NDArray[np.float64],
-    fisheye: bool,
-) -> NDArray[np.float64]:
-    """Pack a camera into a row (22,).
-
-    Args:
-        matrix: (3, 3) intrinsic matrix, pixels.
-        distortions: (4,) or (5,) k1 k2 p1 p2 [k3]; (4,) k1…k4 when ``fisheye``.
-        rotation: (3, 3) from world to camera.
-        translation: (3,) metres.
-        fisheye: OpenCV's equidistant model.
-    """
-    row = np.zeros(CAMERA_NUMBERS)
-    row[:9] = rotation.ravel()
-    row[9:12] = translation
-    row[12:16] = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
-    row[16 : 16 + len(distortions)] = distortions
-    row[21] = float(fisheye)
-    return row
+def pack_cameras(cameras: Iterable[Any]) -> NDArray[np.float64]:
+    """Pack cameras (:class:`tk.model.cameras.camera.Camera`) into one array (C, 22)."""
+    rows = []
+    for c in cameras:
+        row = np.zeros(CAMERA_NUMBERS)
+        row[:12] = np.column_stack([c.rotation, c.translation]).ravel()
+        row[12:16] = c.matrix[0, 0], c.matrix[1, 1], c.matrix[0, 2], c.matrix[1, 2]
+        row[16 : 16 + len(c.distortions)] = c.distortions
+        row[21] = float(c.fisheye)
+        rows.append(row)
+    return np.array(rows)
 
 
 @ti.func
 def camera_center(camera: ti.template(), v: int):
     """Return the centre of projection (3,) of camera v, world frame."""
-    R = ti.Matrix([[camera[v, 3 * i + j] for j in ti.static(range(3))] for i in ti.static(range(3))])
-    t = ti.Vector([camera[v, 9 + i] for i in ti.static(range(3))])
-    return -transposed_times(R, t)
+    return -transposed_times(rotation_of(camera, v, 0), translation_of(camera, v, 0))
 
 
 @ti.func
 def project(camera: ti.template(), v: int, x):
     """Return pixel (2,), its derivative (2, 3) by the world point, and depth. Behind the camera only depth is valid."""
-    R = ti.Matrix([[camera[v, 3 * i + j] for j in ti.static(range(3))] for i in ti.static(range(3))])
-    t = ti.Vector([camera[v, 9 + i] for i in ti.static(range(3))])
-    p = times(R, x) + t
+    R = rotation_of(camera, v, 0)
+    p = times(R, x) + translation_of(camera, v, 0)
     z = p[2]
     inverse = 1.0 / z
     a, b = p[0] * inverse, p[1] * inverse

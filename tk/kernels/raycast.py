@@ -14,9 +14,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.cone_arrays import NEAREST_M, PART_DOF, ConeArrays, kind_of, place_part, shape_of, store_frame
+from tk.kernels.cone_arrays import NEAREST_M, PART_DOF, ConeArrays, kind_of, place_part, shape_of
 from tk.kernels.cones import capsule, enter_unit, extent, interior_point
-from tk.kernels.kinematics import JOINT_NUMBERS, TREE_PARENT, forward_chain, load_rotation, load_translation
+from tk.kernels.kinematics import (
+    JOINT_NUMBERS,
+    TREE_PARENT,
+    forward_chain,
+    load_rotation,
+    load_translation,
+    store_frame,
+)
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.taichi_internals import Launcher
@@ -308,7 +315,7 @@ def cast(
     Args:
         body: the cone body.
         group: (P,) colour group of each part.
-        cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_camera`.
+        cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_cameras`.
         step: pixels between rays; the first goes through pixel ``step // 2``.
         rays: (V, H, W, 3) float32 viewing directions, world frame; zero where a camera has no pixel.
         cost: (V, H, W, G + 1) float32, see the module.

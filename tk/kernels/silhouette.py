@@ -388,7 +388,7 @@ def normal_equations(
 
     Args:
         body: the cone body; its real type is the precision of the computation.
-        cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_camera`, of the full picture.
+        cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_cameras`, of the full picture.
         sizes: (V, 2) width and height of each camera's mask at this scale.
         masks: (V, H, W) uint8 at this scale, values between 0 and 255 where a pixel is partly covered,
             :data:`~tk.kernels.mask_values.OTHERS` where it shows another person; or (F V, H, W) of F frames.

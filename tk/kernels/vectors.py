@@ -1,4 +1,4 @@
-"""Products of small vectors and matrices, written out.
+"""Small vectors and matrices: loaded from arrays, and their products written out.
 
 Taichi's own operators (``@``, ``.dot``, ``.cross``, ``.norm``, ``.transpose``) are Taichi functions for every shape.
 Taichi transforms each of their calls again, which is half of the time of a kernel's Python transformation at each
@@ -6,6 +6,18 @@ start. The functions below are one line each, for three dimensions, and do the s
 """
 
 from tk.kernels.runtime import ti
+
+
+@ti.func
+def triple(array: ti.template(), i: int, first: ti.template()):
+    """Three numbers of row i, from column ``first`` on."""
+    return ti.Vector([array[i, first + a] for a in ti.static(range(3))])
+
+
+@ti.func
+def triple_in(array: ti.template(), c: int, i: int, first: ti.template()):
+    """Three numbers of row (c, i), from column ``first`` on."""
+    return ti.Vector([array[c, i, first + a] for a in ti.static(range(3))])
 
 
 @ti.func

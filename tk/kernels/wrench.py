@@ -22,7 +22,7 @@ of the inertia, row by row.
 
 from tk.kernels.kinematics import JOINT_NUMBERS, TWIST, parent_of
 from tk.kernels.runtime import ti
-from tk.kernels.vectors import cross, norm_sqr
+from tk.kernels.vectors import cross, norm_sqr, triple_in
 
 MOTION, WRENCH = JOINT_NUMBERS, JOINT_NUMBERS + 6
 INERTIA = JOINT_NUMBERS
@@ -30,12 +30,6 @@ INERTIA_NUMBERS = 21
 SCRATCH_NUMBERS = INERTIA + INERTIA_NUMBERS
 # After the inertia, in the scratch of a kernel that needs both: a wrench about the origin of the inertias.
 PULL, PULL_NUMBERS = SCRATCH_NUMBERS, 6
-
-
-@ti.func
-def load_wrench(scratch: ti.template(), c: int, k: int, first: ti.template()):
-    """Return three numbers of row k from column ``first`` on."""
-    return ti.Vector([scratch[c, k, first + a] for a in ti.static(range(3))])
 
 
 @ti.func
@@ -114,7 +108,7 @@ def add_direction(scratch: ti.template(), c: int, k: int, moment, force, weight)
 
 @ti.func
 def _twist_about(scratch: ti.template(), c: int, k: int, origin):
-    w, v = load_wrench(scratch, c, k, TWIST), load_wrench(scratch, c, k, TWIST + 3)
+    w, v = triple_in(scratch, c, k, TWIST), triple_in(scratch, c, k, TWIST + 3)
     v += cross(w, origin)
     return ti.Vector([w[0], w[1], w[2], v[0], v[1], v[2]])
 

@@ -16,9 +16,9 @@ from tk.io.results.data import Result, UsedCameras, Value
 from tk.io.results.reader import read_result
 from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
+from tk.kernels.projection import pack_cameras
 from tk.model.body.cone_body import ConeBody
 from tk.model.masks.image_health import described
-from tk.model.masks.silhouettes import pack_rig
 from tk.model.motion.derived import derive
 from tk.model.motion.smoothing import smooth
 from tk.run.identity import COLUMNS, EXCHANGED, UNCLEAR, Contact, doubtful, exchange_masks, exchanged, report
@@ -70,7 +70,7 @@ def finish(
         if member.number in finished:
             stored = read_result(output).cameras or cameras
             used = stored.rig.recorded().reduced(plan.setup.rig.reductions)
-            if not np.allclose(pack_rig(used), pack_rig(plan.setup.rig), rtol=_ROUNDED, atol=_ROUNDED):
+            if not np.allclose(pack_cameras(used), pack_cameras(plan.setup.rig), rtol=_ROUNDED, atol=_ROUNDED):
                 cameras = replace(stored, rig=used)
             continue
         store, result = None if masks is None else masks[member.number], results[member.number]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tk.errors import ConfigError
 from tk.kernels.contour import ContourKernel
-from tk.kernels.projection import pack_camera
+from tk.kernels.projection import pack_cameras
 from tk.model.body import joints
 from tk.model.body.skeleton import SEGMENTS
 from tk.model.body.superellipsoid import Superellipsoid
@@ -127,7 +127,7 @@ def contour_kernel(body: SuperellipsoidBody, strips: Strips, rig: Rig, dtype: ty
         strip_piece=strips.piece,
         strip_segment=strips.segment,
         strip_paired=strips.paired,
-        cameras=np.array([pack_camera(c.matrix, c.distortions, c.rotation, c.translation, c.fisheye) for c in rig]),
+        cameras=pack_cameras(rig),
         dtype=dtype,
     )
 

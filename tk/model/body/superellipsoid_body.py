@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.cones import CONE
-from tk.kernels.piece_arrays import PieceArrays, pack_pieces
+from tk.kernels.pieces import PieceArrays, pack_pieces
 from tk.model.body.cone_body import ConeBody, ConePart, group_of
 from tk.model.body.gait_poses import neutral_pose
 from tk.model.body.joints import WAIST

@@ -14,7 +14,7 @@ from tk.kernels import alignment
 from tk.kernels.contour import ContourPoints
 from tk.kernels.edge_search import LINE_NUMBERS, PAIR, SINGLE, search_edges
 from tk.kernels.edges import EdgeSettings
-from tk.kernels.projection import pack_camera
+from tk.kernels.projection import pack_cameras
 from tk.model.body.skeleton import CHAINS
 from tk.model.body.strips import LIMBS, Strips, build_strips, contour_kernel
 from tk.model.body.superellipsoid_body import SuperellipsoidBody
@@ -56,9 +56,7 @@ class ContourTerm:
         self.gradient = EdgeSettings()
         self.strips: Strips = build_strips(body)
         self.kernel = contour_kernel(body, self.strips, rig, dtype)
-        self.cameras = np.array(
-            [pack_camera(c.matrix, c.distortions, c.rotation, c.translation, c.fisheye) for c in rig]
-        )
+        self.cameras = pack_cameras(rig)
         self.sizes = np.array([(c.height, c.width) for c in rig], np.int32)
         self._last_dof = body.skeleton.segment_dof[self.strips.segment]
         self._diameter = np.array([p.diameter_m for p in body.pieces])[self.strips.piece]

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.mask_values import OTHERS
+from tk.kernels.projection import pack_cameras
 from tk.kernels.raycast import Cast, cast
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import GROUPS, PartColors, color_bins
-from tk.model.masks.silhouettes import pack_rig, pixel_rays
+from tk.model.masks.silhouettes import pixel_rays
 
 Float = NDArray[np.float64]
 
@@ -46,7 +47,7 @@ class RayGrid:
         self.rig = rig
         self.step: int = max(1, round(rig.frame_shape[0] / rows))
         self.rays = pixel_rays(rig, self.step)
-        self.cameras = pack_rig(rig).astype(np.float32)
+        self.cameras = pack_cameras(rig).astype(np.float32)
 
     def sample(self, images: NDArray) -> NDArray:
         """Return the grid's pixels (V, h, w, ...) of images (V, H, W, ...)."""

@@ -13,7 +13,7 @@ from tk.kernels import silhouette as kernels
 from tk.kernels.cone_arrays import ConeArrays
 from tk.kernels.line_search import Regions, SearchSettings
 from tk.kernels.mask_values import OTHERS
-from tk.kernels.projection import pack_camera
+from tk.kernels.projection import pack_cameras
 from tk.kernels.raycast import cast
 from tk.kernels.silhouette import Edgels, NormalEquations
 from tk.model.body.cone_body import ConeBody
@@ -74,7 +74,7 @@ class Views:
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
-        self.cameras = pack_rig(rig)
+        self.cameras = pack_cameras(rig)
         self._cameras32 = self.cameras.astype(np.float32)
         self.sizes = np.array([(c.width, c.height) for c in rig], np.int32)
 
@@ -153,11 +153,6 @@ def _marked(level: Masks, others: NDArray[np.bool_], step: int) -> Masks:
     return marked
 
 
-def pack_rig(rig: Rig) -> Float:
-    """Pack the cameras for the kernels (V, 22)."""
-    return np.array([pack_camera(c.matrix, c.distortions, c.rotation, c.translation, c.fisheye) for c in rig])
-
-
 def pixel_rays(rig: Rig, step: int = 1) -> NDArray[np.float32]:
     """Return viewing directions (V, H, W, 3) of every ``step``-th pixel, world frame; zero outside smaller images."""
     height, width = rig.frame_shape
@@ -184,7 +179,7 @@ class SilhouetteRenderer:
 
     def __init__(self, body: ConeBody, rig: Rig) -> None:
         self._arrays = body.arrays
-        self._rays, self._cameras = pixel_rays(rig), pack_rig(rig).astype(np.float32)
+        self._rays, self._cameras = pixel_rays(rig), pack_cameras(rig).astype(np.float32)
         self._group = np.zeros(len(body.parts), np.int32)
         self._cost = np.zeros((*self._rays.shape[:3], 2), np.float32)
 
