@@ -75,8 +75,8 @@ def contour_stages(
         median_ms(lambda: term.kernel(poses, chosen)),
         {},
     )
-    _, lines = term._pairs(term.kernel(poses, chosen))
-    search = partial(search_edges, images, term.sizes, lines, config.contours.threshold, term.gradient)
+    *_, lines = term.pairs(term.kernel(poses, chosen))
+    search = partial(search_edges, images, term.sizes, lines, config.contours.threshold)
     yield Stage(f"colour edges: search on demand along {len(lines)} lines", median_ms(search), {})
     yield Stage(
         "colour edges: contours, pairs, search and entries", median_ms(lambda: term.assign(images, poses, chosen)), {}

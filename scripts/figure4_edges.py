@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 from scripts.paper.edge_maps import follow_edges, rgb_gradient, thin_edges
 from tk.errors import CaptureError, TkError
 from tk.io.captures.capture import open_capture
-from tk.kernels.edges import EdgeSettings
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -57,9 +56,9 @@ def grey_canny(image: Image) -> Detect:
     return lambda low, high: cv2.Canny(dx, dy, low, high, L2gradient=True) > 0
 
 
-def rgb_edges(image: Image, config: EdgeSettings | None = None) -> Detect:
+def rgb_edges(image: Image) -> Detect:
     """The colour edges of :mod:`scripts.paper.edge_maps`; thresholds of its magnitude."""
-    thin = thin_edges(*rgb_gradient(image[None], config))
+    thin = thin_edges(*rgb_gradient(image[None]))
     return lambda low, high: follow_edges(thin, low, high)[0]
 
 

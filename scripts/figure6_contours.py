@@ -1,8 +1,8 @@
 """Figure 6 of Kehl & Van Gool 2006: the model's occluding contours in a few views, and the strips they are found on.
 
 Visible contour green, occluded contour red and thin; white bars join the symmetric pairs that tracking uses by default.
-The last panel shows the strips of surface samples with each piece's bounding box, one circle of latitude and one
-meridian of each limb in bold. Without a capture: a made-up pose in three made-up views on a blank picture.
+The last panel shows circles of latitude and meridians with each piece's bounding box, one of each on each limb in bold.
+Without a capture: a made-up pose in three made-up views on a blank picture.
 
     python -m scripts.figure6_contours -o figure6.png [--capture DIR --result FILE.h5 --frame N] [--cameras cam1 cam5]
 """
@@ -21,14 +21,17 @@ from numpy.typing import NDArray
 from tk.errors import TkError
 from tk.io.captures.capture import open_capture
 from tk.io.results.reader import read_result
-from tk.kernels.contour import ContourPoints
+from tk.kernels.contour import ContourKernel, ContourPoints
+from tk.kernels.projection import pack_cameras
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
 from tk.model.body.gait_poses import neutral_pose
 from tk.model.body.skeleton import SEGMENTS
-from tk.model.body.strips import Strips, build_strips, contour_kernel
+from tk.model.body.strips import Strips, build_strips, limb_pieces
 from tk.model.body.superellipsoid_body import SuperellipsoidBody, build_superellipsoid_body
 from tk.model.cameras.camera import Camera, Rig
+from tk.model.cues.edge_term import ContourTerm
+from tk.settings import ContourSettings
 from tk.trackers.bodies import body_and_poses
 
 Float = NDArray[np.float64]
@@ -79,34 +82,29 @@ def polyline(canvas: Image, xy: Float, color: tuple[int, int, int], thickness: i
 
 
 def draw_contours(canvas: Image, strips: Strips, points: ContourPoints, view: int) -> None:
-    """The contours of all pieces (``points`` of all strips, one pose): circles joined to lines, meridians as dots."""
+    """The contours of all pieces: the ``points`` of all strips at one pose, joined from circle to circle."""
     pixels, found, visible = points.pixels[0, view], points.found[0, view] == 1, points.visible[0, view] == 1
     for seen in (False, True):  # what is visible goes on top
         color, thickness = (VISIBLE, 2) if seen else (HIDDEN, 1)
         wanted = found & (visible == seen)
         for i in range(strips.piece.max() + 1):
-            circles = (strips.piece == i) & strips.paired
+            circles = strips.piece == i
             for slot in (0, 1):
                 polyline(canvas, np.where(wanted[circles, slot, None], pixels[circles, slot], np.nan), color, thickness)
-        for x, y in pixels[wanted & ~strips.paired[:, None]]:
-            cv2.circle(canvas, (round(x * SCALE), round(y * SCALE)), thickness, color, -1, cv2.LINE_AA)
 
 
 def draw_pairs(canvas: Image, points: ContourPoints, view: int) -> None:
     """The pairs of which both points are visible."""
-    for k in np.flatnonzero((points.visible[0, view] == 1).all(axis=1) & points.paired[0]):
+    for k in np.flatnonzero((points.visible[0, view] == 1).all(axis=1)):
         polyline(canvas, points.pixels[0, view, k].astype(float), PAIR, 1)
 
 
-def draw_strips(canvas: Image, body: SuperellipsoidBody, strips: Strips, pose: Float, camera: Camera) -> None:
-    """The panel on the right of figure 6: sampling, bounding boxes, one strip of each kind in bold on each limb."""
-    T_body = np.eye(4)
-    T_body[:3, :3] = body.skeleton.T_world_body
-    T = body.skeleton.segment_transforms(pose)
-    per_piece = strips.circles + strips.meridians
-    bold = {i * per_piece + k for i in strips.limb_piece for k in (strips.circles // 2, strips.circles)}
+def draw_strips(canvas: Image, body: SuperellipsoidBody, pose: Float, camera: Camera) -> None:
+    """The panel on the right of figure 6: sampling, bounding boxes, one line of each kind in bold on each limb."""
+    T, limbs = body.skeleton.segment_transforms(pose), limb_pieces(body)
+    around = np.linspace(-np.pi, np.pi, 65)
     for i, piece in enumerate(body.pieces):
-        M = T[SEGMENTS.index(piece.segment)] @ T_body @ piece.T_body_piece
+        M = T[SEGMENTS.index(piece.segment)] @ body.skeleton.in_world(piece.T_body_piece)
         a1, a2, _ = piece.radii
         corners = np.array([[x, y, z] for x in (-a1, a1) for y in (-a2, a2) for z in (piece.z_lower, piece.z_upper)])
         xy, _ = camera.project(corners @ M[:3, :3].T + M[:3, 3])
@@ -114,25 +112,30 @@ def draw_strips(canvas: Image, body: SuperellipsoidBody, strips: Strips, pose: F
             for b in (a ^ 1, a ^ 2, a ^ 4):
                 if a < b:
                     polyline(canvas, xy[[a, b]], BOX, 1)
-        for s in sorted(np.flatnonzero(strips.piece == i), key=lambda s: s in bold):
-            p = piece.point(strips.angles[s, :, 0], strips.angles[s, :, 1])
-            xy, _ = camera.project(p @ M[:3, :3].T + M[:3, 3])
-            polyline(canvas, xy, BOLD if s in bold else STRIP, 3 if s in bold else 1)
+        along = np.linspace(*piece.eta_range, 33)
+        circles = [(np.full_like(around, eta), around) for eta in along[2:-1:3]]
+        meridians = [(along, np.full_like(along, omega)) for omega in around[::5]]
+        for lines in (circles, meridians):
+            for n, (eta, omega) in enumerate(lines):
+                bold = i in limbs and n == len(lines) // 2
+                xy, _ = camera.project(piece.point(eta, omega) @ M[:3, :3].T + M[:3, 3])
+                polyline(canvas, xy, BOLD if bold else STRIP, 3 if bold else 1)
 
 
 def figure(body: SuperellipsoidBody, pose: Float, rig: Rig, images: Sequence[Image]) -> Image:
     """All panels side by side: a view each, then the strips in the first view."""
-    fine, coarse = build_strips(body, circles=40, meridians=24, samples=64), build_strips(body, 10, 12)
-    tracked = build_strips(body)
-    contours = contour_kernel(body, fine, rig)(pose[None], np.arange(len(fine.piece))[None])
-    pairs = contour_kernel(body, tracked, rig)(pose[None], tracked.even()[None])
+    strips = build_strips(body, range(len(body.pieces)))
+    kernel = ContourKernel(body.arrays, strips.angles, strips.normals, strips.piece, pack_cameras(rig))
+    contours = kernel(pose[None], np.arange(len(strips.piece))[None])
+    term = ContourTerm(body, rig, ContourSettings())
+    pairs = term.kernel(pose[None], term.draw(None)[None])
     canvases = [panel(image) for image in images] + [np.full_like(panel(images[0]), BLANK)]
     for view, (camera, canvas) in enumerate(zip(rig, canvases, strict=False)):
         draw_pairs(canvas, pairs, view)
-        draw_contours(canvas, fine, contours, view)
+        draw_contours(canvas, strips, contours, view)
         text = f"{camera.name}: {pairs.occluded[0, view]} of {pairs.found[0, view].sum()} contour points occluded"
         cv2.putText(canvas, text, (12, 28), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (255, 255, 255), 1, cv2.LINE_AA)
-    draw_strips(canvases[-1], body, coarse, pose, rig[0])
+    draw_strips(canvases[-1], body, pose, rig[0])
     height = max(len(canvas) for canvas in canvases)
     padded = [cv2.copyMakeBorder(c, 0, height - len(c), 0, 0, cv2.BORDER_CONSTANT) for c in canvases]
     return np.asarray(np.concatenate(padded, axis=1), np.uint8)

@@ -14,6 +14,7 @@ from tk.commands.config_text import annotated_toml, meanings
 from tk.errors import ConfigError
 from tk.io import settings_file
 from tk.io.settings_file import PRESETS
+from tk.model.cues.edge_term import PAIRS, VIEWS
 from tk.settings import Settings
 from tk.trackers.volumetric import SAMPLING, SCHEDULE, SMD, Effort
 
@@ -100,10 +101,9 @@ def test_settings_missing_in_a_file_keep_their_default() -> None:
         ("[silhouette]\ninit_frames = 1000000000\n", ["silhouette.init_frames = 1000000000 is too large"]),
         ("[foreground]\nshadow_min = 1.5", ["foreground.shadow_min = 1.5"]),
         ("[objective]\nsurface_weight = -1.0\n", ["objective.surface_weight = -1"]),
-        ("[contours]\nviews = 0\n", ["contours.views = 0"]),
         ("[contours]\nthreshold = 1e300\n", ["contours.threshold = 1e+300 is too large"]),
         (f"[contours]\nthreshold = 1{400 * '0'}\n", ["contours.threshold = 1000", "is too large"]),
-        ("[contours]\npairs = 100000\n", ["contours.pairs = 100000 must lie in [1, 100]"]),
+        ("[region]\nhypotheses = 0\n", ["region.hypotheses = 0"]),
         (f"voxels = 1{5000 * '0'}\n", ["invalid TOML"]),
         ("seed = 99999999999999999999", ["seed"]),
     ],
@@ -165,7 +165,7 @@ def test_presets_are_valid_and_unlike_the_defaults(name: str) -> None:
 def test_the_papers_preset_has_the_papers_numbers() -> None:
     c = settings_file.preset("kehl2006")
     effort = Effort.of(c.effort_factor)
-    assert (c.contours.views, c.contours.pairs, c.contours.hidden) == (3, 5, 1)
+    assert (VIEWS, PAIRS) == (3, 5)
     assert (c.voxels, c.body.waist, c.appearance.rate) == (64, False, 0.3)
     assert (effort.sampling.torso, effort.sampling.chain, effort.sampling.scale) == (60, 20, 1)
     assert SCHEDULE.refine == 0.5
@@ -221,9 +221,9 @@ def test_the_papers_preset_is_the_default_but_for_the_waist_and_the_search() -> 
 
 def test_a_file_wins_over_a_preset(tmp_path: Path) -> None:
     file = tmp_path / "own.toml"
-    file.write_text("voxels = 128\n[contours]\nviews = 2\n")
+    file.write_text("voxels = 128\n[contours]\nthreshold = 0.2\n")
     config = settings_file.read(file, settings_file.preset("kehl2006"))
-    assert (config.voxels, config.contours.views, config.body.waist) == (128, 2, False)
+    assert (config.voxels, config.contours.threshold, config.body.waist) == (128, 0.2, False)
 
 
 def test_an_unknown_preset_is_named() -> None:

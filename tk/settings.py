@@ -101,21 +101,14 @@ class ContourSettings:
 
     Attributes:
         edge_weight: w_e (eq. 8) beside the surface term's w_s; 0 leaves the term out. The paper prints neither.
-        views: number of views in which edges are searched: those with the fewest hidden contour points (paper: 3).
-        pairs: circles of latitude on each limb; the paper takes 10 contour points a limb and view, which are 5 pairs.
         threshold: least colour gradient of an edge, 0…1; the paper tuned its own by hand for each camera.
-        hidden: ρ of a hidden contour point (paper: 1).
     """
 
     edge_weight: float = 0.1
-    views: int = 3
-    pairs: int = 5
     threshold: float = 0.12
-    hidden: float = 1.0
 
     def __post_init__(self) -> None:
-        _check("contours", self, edge_weight=(0, MOST_WEIGHT), threshold=(0, 1), hidden=(0, MOST_WEIGHT))
-        _check("contours", self, views=(1, 64), pairs=(1, 100))
+        _check("contours", self, edge_weight=(0, MOST_WEIGHT), threshold=(0, 1))
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.edges import EdgeSettings, rgb_gradient_at
+from tk.kernels.edges import rgb_gradient_at
 from tk.kernels.runtime import ensure_runtime, ti
 
 # Thresholds of :func:`edge_map` on the magnitude: edges count from the high one on, and are followed down to the low
@@ -14,10 +14,6 @@ LOW, HIGH = 0.08, 0.20
 
 @ti.kernel
 def _gradient_kernel(
-    intensity_offset: ti.f32,
-    intensity_slope: ti.f32,
-    angle_scale: ti.f32,
-    angle_share: ti.f32,
     sizes: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (C, 2) height, width
     images: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (C, H, W, 3)
     magnitude: ti.types.ndarray(dtype=ti.f32, ndim=3),  # (C, H, W) out
@@ -31,9 +27,7 @@ def _gradient_kernel(
         width = sizes[c, 1]
         if y < height:
             for x in range(width):
-                m, dx, dy = rgb_gradient_at(
-                    images, c, y, x, height, width, intensity_offset, intensity_slope, angle_scale, angle_share
-                )
+                m, dx, dy = rgb_gradient_at(images, c, y, x, height, width)
                 magnitude[c, y, x] = m
                 direction[c, y, x, 0] = dx
                 direction[c, y, x, 1] = dy
@@ -76,13 +70,12 @@ def _thin_kernel(
 
 
 def rgb_gradient(
-    images: NDArray[np.uint8], config: EdgeSettings | None = None, sizes: NDArray[np.integer] | None = None
+    images: NDArray[np.uint8], sizes: NDArray[np.integer] | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Colour gradient of whole pictures (Kehl 2006, section 4.2).
 
     Args:
         images: (C, H, W, 3) uint8; the order of the channels does not matter.
-        config: the defaults if None.
         sizes: (C, 2) height and width of each picture in its zero-padded place; (H, W) for all if None.
 
     Returns:
@@ -93,7 +86,6 @@ def rgb_gradient(
     Raises:
         ValueError: ``images`` is no stack of colour pictures.
     """
-    config = config or EdgeSettings()
     if images.ndim != 4 or images.shape[3] != 3 or images.dtype != np.uint8:
         raise ValueError(f"images must be (C, H, W, 3) uint8, not {images.shape} {images.dtype}")
     ensure_runtime()
@@ -103,7 +95,6 @@ def rgb_gradient(
     direction = np.zeros((*images.shape[:3], 2), np.float32)
     direction[..., 0] = 1
     _gradient_kernel(
-        *config.constants,
         np.ascontiguousarray(sizes, np.int32),
         np.ascontiguousarray(images),
         magnitude,
@@ -140,14 +131,11 @@ def follow_edges(thin: NDArray[np.float32], low: float, high: float) -> NDArray[
     return edges
 
 
-def edge_map(
-    images: NDArray[np.uint8], config: EdgeSettings | None = None, sizes: NDArray[np.integer] | None = None
-) -> NDArray[np.bool_]:
+def edge_map(images: NDArray[np.uint8], sizes: NDArray[np.integer] | None = None) -> NDArray[np.bool_]:
     """Thin edges of whole pictures, (C, H, W): colour gradient, non-maximum suppression, hysteresis.
 
     The paper thresholds its gradients and does not say how; these are Canny's steps, so that the two can be compared.
     Arguments as for :func:`rgb_gradient`.
     """
-    config = config or EdgeSettings()
-    magnitude, direction = rgb_gradient(images, config, sizes)
+    magnitude, direction = rgb_gradient(images, sizes)
     return follow_edges(thin_edges(magnitude, direction), LOW, HIGH)

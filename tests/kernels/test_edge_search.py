@@ -5,9 +5,7 @@ import pytest
 
 from scripts.paper.edge_maps import rgb_gradient
 from tk.kernels.edge_search import MOST_EDGES, PAIR, SINGLE, search_edges
-from tk.kernels.edges import EdgeSettings
 
-CONFIG = EdgeSettings()
 THRESHOLD = 0.12
 H, W = 48, 64
 # float32 of pixels below a hundred
@@ -30,7 +28,7 @@ def line(kind, at, other=None, normal=(1.0, 0.0), other_normal=None, reach=8.0, 
 
 def search(images, lines, threshold=THRESHOLD, sizes=None):
     sizes = np.tile([images.shape[1:3]], (len(images), 1)) if sizes is None else sizes
-    return search_edges(images, np.asarray(sizes, np.int32), lines, threshold, CONFIG)
+    return search_edges(images, np.asarray(sizes, np.int32), lines, threshold)
 
 
 def oracle(gradients, sizes, row, threshold=THRESHOLD):
@@ -92,7 +90,7 @@ def test_search_is_the_slow_one(kind):
     far = rng.uniform(3, 15, (count, 1)) if kind == PAIR else 0
     rows[:, 4:6] = rows[:, 2:4] + far * -rows[:, 6:8]
     rows[:, 10] = rng.uniform(2, 9, count)
-    gradient = rgb_gradient(images, CONFIG, sizes)
+    gradient = rgb_gradient(images, sizes)
     found = search(images, rows, sizes=sizes)
     for row, got in zip(rows, found, strict=True):
         expected, close = oracle(gradient, sizes, row)

@@ -7,12 +7,13 @@ import open3d as o3d
 import pytest
 
 from tests.kernels import oracles
-from tests.model.figures import skin_of
+from tests.model.figures import DIMENSIONS, piece_transforms, skin_of
+from tk.kernels.contour import ContourKernel
 from tk.kernels.occlusion import TOUCH, segment_enters
+from tk.kernels.projection import pack_cameras
 from tk.kernels.runtime import ensure_runtime, ti
-from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.skeleton import SEGMENTS
-from tk.model.body.strips import build_strips, contour_kernel
+from tk.model.body.strips import build_strips
 from tk.model.body.superellipsoid import Superellipsoid
 from tk.model.cameras.camera import Camera, Rig
 
@@ -132,12 +133,8 @@ class MeshedBody:
     """The body at one pose as an Open3D scene with a geometry for each piece."""
 
     def __init__(self, body, pose):
-        T_world_body = np.eye(4)
-        T_world_body[:3, :3] = body.skeleton.T_world_body
-        T = body.skeleton.segment_transforms(pose)
         self.scene = o3d.t.geometry.RaycastingScene()
-        for piece in body.pieces:
-            M = T[SEGMENTS.index(piece.segment)] @ T_world_body @ piece.T_body_piece
+        for piece, M in zip(body.pieces, piece_transforms(body, pose), strict=True):
             vertices, faces = mesh(piece)
             self.scene.add_triangles(
                 o3d.core.Tensor((vertices @ M[:3, :3].T + M[:3, 3]).astype(np.float32)),
@@ -188,18 +185,19 @@ def random_pose(skeleton, rng):
 
 
 def test_visible_points_are_those_that_ray_casting_sees():
-    body = skin_of(BodyDimensions.from_stature(1.75))
-    strips = build_strips(body)
+    body = skin_of(DIMENSIONS)
+    strips = build_strips(body, range(len(body.pieces)))
     # one close, one overhead: strong perspective
     rig = Rig(tuple(camera_at(p) for p in ([3, 0, 1.2], [-1, 2.5, 1.8], [-2, -3, 0.6], [0.3, 0.2, 3.2])))
-    kernel = contour_kernel(body, strips, rig)
+    kernel = ContourKernel(body.arrays, strips.angles, strips.normals, strips.piece, pack_cameras(rig))
     rng = np.random.default_rng(7)
     poses = np.array([random_pose(body.skeleton, rng) for _ in range(10)])
-    points = kernel(poses, np.tile(strips.even(10, 8), (len(poses), 1)))
+    points = kernel(poses, np.tile(np.arange(0, len(strips.piece), 2), (len(poses), 1)))
+    segment = np.array([SEGMENTS.index(piece.segment) for piece in body.pieces])
     agree = total = found_in_all = 0
     for b, pose in enumerate(poses):
         meshed = MeshedBody(body, pose)
-        T = body.skeleton.segment_transforms(pose)[points.segment[b]]
+        T = body.skeleton.segment_transforms(pose)[segment[strips.piece[points.strip[b]]]]
         for c, center in enumerate(rig.centers):
             found = points.found[b, c] == 1
             p_world = np.einsum("kij,ksj->ksi", T[:, :3, :3], points.points_zero[b, c]) + T[:, None, :3, 3]

@@ -34,13 +34,18 @@ def skin_of(
     return build_superellipsoid_body(build_cone_body(dimensions, up), up, waist, spacing_m)
 
 
+def piece_transforms(body: SuperellipsoidBody, pose: np.ndarray) -> np.ndarray:
+    """Return (P, 4, 4) from each piece's frame to the world."""
+    T, s = body.skeleton.segment_transforms(pose), body.skeleton
+    return np.array([T[SEGMENTS.index(p.segment)] @ s.in_world(p.T_body_piece) for p in body.pieces])
+
+
 def voxelise(body: SuperellipsoidBody, pose: np.ndarray, grid: VoxelGrid) -> np.ndarray:
     """(nx, ny, nz) bool: voxels in one of the body's pieces."""
-    T_world_segment = body.skeleton.segment_transforms(pose)
     centers = grid.centers()
     occupied = np.zeros(grid.count, bool)
-    for piece in body.pieces:
-        T = np.linalg.inv(T_world_segment[SEGMENTS.index(piece.segment)] @ body.skeleton.in_world(piece.T_body_piece))
+    for piece, T_world_piece in zip(body.pieces, piece_transforms(body, pose), strict=True):
+        T = np.linalg.inv(T_world_piece)
         near = np.flatnonzero(np.linalg.norm(centers - np.linalg.inv(T)[:3, 3], axis=1) < 1.8 * max(piece.radii))
         occupied[near] |= piece.contains(centers[near] @ T[:3, :3].T + T[:3, 3])
     return occupied.reshape(grid.shape)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from scripts.figure6_contours import HIDDEN, SCALE, VISIBLE, main
+from scripts.figure6_contours import SCALE, VISIBLE, main
 
 
 def test_figure_shows_visible_and_occluded_contours(tmp_path: Path) -> None:
@@ -16,7 +16,7 @@ def test_figure_shows_visible_and_occluded_contours(tmp_path: Path) -> None:
     assert sheet is not None and sheet.shape == (480 * SCALE, 4 * 640 * SCALE, 3)
     for panel in np.split(sheet, 4, axis=1)[:3]:
         assert (panel == VISIBLE).all(axis=2).sum() > 1000
-        assert (panel == HIDDEN).all(axis=2).any()
+        assert (panel[..., 2].astype(int) > panel[..., 1] + 30).any(), "thin red lines"
     assert not (np.split(sheet, 4, axis=1)[3] == VISIBLE).all(axis=2).any(), "the strips have a panel of their own"
 
 

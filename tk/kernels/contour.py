@@ -1,7 +1,7 @@
 """The model's occluding contour in the images, batched over poses, in one launch (Kehl 2006, sections 5.2 and 5.3).
 
-A strip is a row of surface points of one superellipsoid along a circle of latitude or a meridian. Where n·v changes its
-sign along it, with n the normal and v the viewing ray, the contour passes (eq. 3). The camera is moved into the piece's
+A strip is a row of surface points of one superellipsoid along a circle of latitude. Where n·v changes its sign along
+it, with n the normal and v the viewing ray, the contour passes (eq. 3). The camera is moved into the piece's
 frame (eq. 4), with full perspective. The normals n_d of eq. 2 satisfy n_d · r = 1 at every surface point r (insert
 eq. 1), so with C the moved camera's centre
 
@@ -13,8 +13,8 @@ extrapolates, and fails where they cancel. Linear interpolation, which must be m
     u_c = (u₁ |t₂| + u₂ |t₁|) / (|t₁| + |t₂|).
 
 A superellipsoid is convex: on a strip n_d · C crosses 1 at most once in each direction. Slot 0 of a strip is the
-crossing from the hidden to the visible side, slot 1 the opposite one, so the two points of a circle of latitude never
-swap: they are a pair symmetric about the limb's axis. On a meridian either slot may be empty; the points are no pair.
+crossing from the hidden to the visible side, slot 1 the opposite one, so the two points never swap: they are a pair
+symmetric about the limb's axis.
 
 A point so far outside an image that the lens model folds back is taken for a point inside; in cameras that see the
 whole volume no pose comes near this.
@@ -161,10 +161,13 @@ def _contour_kernel(real):
             near_to = -1
             for m in range(first, ti.min(first + STRIPS_PER_TASK, K)):
                 s = chosen[b, m]
-                i = strip_piece(strips, s)
-                if i != near_to:
-                    near, near_to = pieces_beside(placed, c, pieces, i, 0.0), i
-                crossings = rim_crossings(strips, s, triple_in(placed, c, i, PLACED_CAMERA))
+                i = -1
+                crossings = ti.Vector([0.0 * center[0] for _ in range(6)])
+                if s >= 0:
+                    i = strip_piece(strips, s)
+                    if i != near_to:
+                        near, near_to = pieces_beside(placed, c, pieces, i), i
+                    crossings = rim_crossings(strips, s, triple_in(placed, c, i, PLACED_CAMERA))
                 row = (b * C + v) * K + m
                 for slot in range(2):
                     # a dynamic index into a vector would spill it to memory
@@ -201,8 +204,6 @@ class ContourPoints:
 
     Attributes:
         strip: (B, K) the strips.
-        segment: (B, K) their body segments.
-        paired: (B, K) True where the two slots are a pair symmetric about the limb's axis (circles of latitude).
         points_zero: (B, C, K, 2, 3) the points in the zero configuration, metres: they move with p as material points.
         pixels: (B, C, K, 2, 2) their projections (x, y), lens distortion included; they may lie outside the image.
         normals: (B, C, K, 2, 2) unit normals of the contour in the image, outward.
@@ -212,8 +213,6 @@ class ContourPoints:
     """
 
     strip: np.ndarray
-    segment: np.ndarray
-    paired: np.ndarray
     points_zero: np.ndarray
     pixels: np.ndarray
     normals: np.ndarray
@@ -230,97 +229,66 @@ class ContourPoints:
         return np.sum(self.found != self.visible, axis=(2, 3))
 
 
+@functools.lru_cache(8)
+def _scratch(tasks: int, degrees: int, pieces: int, dtype: np.dtype) -> tuple[np.ndarray, np.ndarray]:
+    """Return the scratch of T tasks: joints (T, D, 18) and placed pieces (T, P, 20)."""
+    return np.empty((tasks, degrees, JOINT_NUMBERS), dtype), np.empty((tasks, pieces, PLACED_NUMBERS), dtype)
+
+
 class ContourKernel:
     """The contours of one body in a rig's cameras. Constants and scratch are prepared once.
 
     Args:
         body: the body.
-        strip_angles: (S, N, 2) η and ω along each strip, radians; a circle's last sample is its first.
-        strip_normals: (S, N, 3) n_d of eq. 2 there, in the piece's frame, 1/m.
-        strip_piece: (S,) the piece of each strip.
-        strip_segment: (S,) its segment.
-        strip_paired: (S,) True for circles of latitude.
-        cameras: (C, 22) rows of :func:`tk.kernels.projection.pack_cameras`.
+        angles: (S, N, 2) η and ω along each strip, radians; the last sample is the first.
+        normals: (S, N, 3) n_d of eq. 2 there, in the piece's frame, 1/m.
+        piece: (S,) the piece of each strip.
+        cameras: (C, 22) of :func:`tk.kernels.projection.pack_cameras`.
         dtype: np.float32, or np.float64 for checks.
-
-    Attributes:
-        tree: (D, 11), packed for the kernels.
-        pieces: (P, 20).
-        strips: (S, N + 1, 5).
-        cameras: (C, 22).
     """
 
     def __init__(
         self,
         body: PieceArrays,
-        *,
-        strip_angles: np.ndarray,
-        strip_normals: np.ndarray,
-        strip_piece: np.ndarray,
-        strip_segment: np.ndarray,
-        strip_paired: np.ndarray,
+        angles: np.ndarray,
+        normals: np.ndarray,
+        piece: np.ndarray,
         cameras: np.ndarray,
         dtype: type = np.float32,
     ) -> None:
         ensure_runtime()
-        self.dtype = dtype
+        self._dtype = dtype
         self._kernel = _contour_kernel(ti.f64 if dtype == np.float64 else ti.f32)
-
-        def real(array: np.ndarray) -> np.ndarray:
-            return np.ascontiguousarray(array, dtype)
-
-        def whole(array: np.ndarray) -> np.ndarray:
-            return np.ascontiguousarray(array, np.int32)
-
-        self.tree = real(body.tree)
-        self.pieces = real(body.pieces)
-        samples = np.concatenate([strip_angles, strip_normals], axis=2)
-        self.strips = real(np.concatenate([samples, np.zeros_like(samples[:, :1])], axis=1))
-        self.strips[:, -1, 0] = strip_piece
-        self._strip_segment = whole(strip_segment)
-        self._strip_paired = np.asarray(strip_paired, bool)
-        self.cameras = real(cameras)
-        self._scratch: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-
-    def scratch_of(self, tasks: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the scratch of T tasks: joints (T, D, 18) and placed pieces (T, P, 20)."""
-        if tasks not in self._scratch:
-            self._scratch[tasks] = (
-                np.empty((tasks, len(self.tree), JOINT_NUMBERS), self.dtype),
-                np.empty((tasks, len(self.pieces), PLACED_NUMBERS), self.dtype),
-            )
-        return self._scratch[tasks]
-
-    def checked(self, chosen: np.ndarray) -> np.ndarray:
-        """Return strips (B, K) as the kernel takes them; IndexError if a strip does not exist."""
-        chosen = np.ascontiguousarray(chosen, np.int32)
-        if chosen.size and (chosen.min() < 0 or chosen.max() >= len(self.strips)):
-            raise IndexError(f"strips {chosen.min()} to {chosen.max()}: there are 0 to {len(self.strips) - 1}")
-        return chosen
+        last = np.zeros((len(piece), 1, 5))
+        last[:, 0, 0] = piece
+        strips = np.concatenate([np.concatenate([angles, normals], axis=2), last], axis=1)
+        self._constants: tuple[np.ndarray, ...] = tuple(
+            np.ascontiguousarray(a, dtype) for a in (body.tree, body.pieces, strips, cameras)
+        )
 
     def __call__(self, pose: np.ndarray, chosen: np.ndarray) -> ContourPoints:
         """Return the contour points of B poses in all C cameras, occlusion included; one launch.
 
         Args:
             pose: (B, D).
-            chosen: (B, K) strips of each pose.
+            chosen: (B, K) strips of each pose; -1: none.
         """
-        chosen = self.checked(chosen)
+        chosen = np.ascontiguousarray(chosen, np.int32)
+        tree, pieces, strips, cameras = self._constants
+        if chosen.size and not -1 <= chosen.min() <= chosen.max() < len(strips):
+            raise IndexError(f"strips {chosen.min()} to {chosen.max()}: there are 0 to {len(strips) - 1}")
         B, K = chosen.shape
-        C = len(self.cameras)
-        geometry = np.empty((B * C * K, 2, 8), self.dtype)
+        C = len(cameras)
+        geometry = np.empty((B * C * K, 2, 8), self._dtype)
         flags = np.empty((B * C * K, 2), np.uint8)
         if B * C * K:
             tasks = B * C * -(-K // STRIPS_PER_TASK)
             self._kernel(
-                self.tree,
-                self.pieces,
-                self.strips,
-                self.cameras,
+                *self._constants,
                 spread_of(tasks),
                 chosen,
-                np.ascontiguousarray(pose, self.dtype),
-                *self.scratch_of(tasks),
+                np.ascontiguousarray(pose, self._dtype),
+                *_scratch(tasks, len(tree), len(pieces), np.dtype(self._dtype)),
                 geometry,
                 flags,
             )
@@ -328,8 +296,6 @@ class ContourKernel:
         flags = flags.reshape(B, C, K, 2)
         return ContourPoints(
             strip=chosen,
-            segment=self._strip_segment[chosen],
-            paired=self._strip_paired[chosen],
             points_zero=geometry[..., :3],
             pixels=geometry[..., 3:5],
             normals=geometry[..., 5:7],

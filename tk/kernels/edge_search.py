@@ -17,7 +17,7 @@ is exact to about a pixel, so one pixel is added. The paper is silent about the 
 
 import numpy as np
 
-from tk.kernels.edges import EdgeSettings, rgb_gradient_at
+from tk.kernels.edges import rgb_gradient_at
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
 PAIR, SINGLE = range(2)
@@ -30,10 +30,6 @@ MOST_EDGES = 24
 
 @ti.kernel
 def _search_kernel(
-    intensity_offset: ti.f32,
-    intensity_slope: ti.f32,
-    angle_scale: ti.f32,
-    angle_share: ti.f32,
     threshold: ti.f32,
     spread: ti.i32,
     sizes: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (C, 2) height, width
@@ -72,9 +68,7 @@ def _search_kernel(
             y = ti.cast(ti.round(ay + t * uy), ti.i32)
             m, gx, gy = t * 0.0, t * 0.0, t * 0.0
             if i < steps and 0 <= x < width and 0 <= y < height:
-                m, gx, gy = rgb_gradient_at(
-                    images, c, y, x, height, width, intensity_offset, intensity_slope, angle_scale, angle_share
-                )
+                m, gx, gy = rgb_gradient_at(images, c, y, x, height, width)
                 m *= ti.abs(gx * ux + gy * uy)
             if m1 >= threshold and m1 >= m0 and m1 > m and count < MOST_EDGES:
                 # the gradient's part along the line is in m1; the score wants it along the normals
@@ -106,13 +100,7 @@ def _search_kernel(
                             found[r, 3], found[r, 4] = ax + edges[r, j, 0] * ux, ay + edges[r, j, 0] * uy
 
 
-def search_edges(
-    images: np.ndarray,
-    sizes: np.ndarray,
-    lines: np.ndarray,
-    threshold: float,
-    config: EdgeSettings,
-) -> np.ndarray:
+def search_edges(images: np.ndarray, sizes: np.ndarray, lines: np.ndarray, threshold: float) -> np.ndarray:
     """Return the edges assigned to R lines.
 
     Args:
@@ -121,7 +109,6 @@ def search_edges(
         lines: (R, 11) float32: kind, camera, pixel a (x, y), pixel b, outward unit normal at a, at b, reach
             in pixels.
         threshold: minimum colour gradient of an edge, 0…1, along the line.
-        config: settings of the colour gradient.
 
     Returns:
         (R, 5) float32: 1 if found, pixel (x, y) of a's edge, of b's.
@@ -131,7 +118,6 @@ def search_edges(
     found: np.ndarray = np.zeros((R, 5), np.float32)
     if R:
         _search_kernel(
-            *config.constants,
             threshold,
             spread_of(R),
             sizes,

@@ -27,55 +27,19 @@ images.
 """
 
 import math
-from dataclasses import dataclass
 
-from tk.errors import ConfigError
 from tk.kernels.runtime import ti
 
+# Parameters of the gradient, chosen with scripts/figure4_edges.py on two rendered captures: little clutter at equal
+# recall of the person's outline. The paper tuned its own by hand for each camera and prints none.
+# Mean of the channels, 0…255, at which a pixel's sigmoid is one half, and the sigmoid's slope, per level.
+INTENSITY_OFFSET, INTENSITY_SLOPE = 80.0, 0.1
+# Angle between two colours that weighs as much as the step from black to white, radians.
+FULL_ANGLE_RAD = 0.7
+# Weight of the angle between two bright pixels; at 0 only the Euclidean distance counts.
+ANGLE_SHARE = 0.75
 
-@dataclass(frozen=True)
-class EdgeSettings:
-    """Parameters of the colour gradient. The paper tuned them by hand for each camera and prints none of them.
-
-    The defaults were chosen with ``scripts/figure4_edges.py`` (two rendered captures): little clutter at equal recall
-    of the person's outline.
-
-    Attributes:
-        intensity_offset: mean of the channels, 0…255, at which a pixel's sigmoid is one half.
-        intensity_slope: slope of the sigmoid, per level.
-        full_angle_rad: angle between two colours that weighs as much as the step from black to white.
-        angle_share: weight of the angle between two bright pixels; at 0 only the Euclidean distance counts.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
-
-    intensity_offset: float = 80.0
-    intensity_slope: float = 0.1
-    full_angle_rad: float = 0.7
-    angle_share: float = 0.75
-
-    def __post_init__(self) -> None:
-        for name, value, valid, expected in (
-            ("intensity_offset", self.intensity_offset, 0 <= self.intensity_offset <= 255, "[0, 255]"),
-            ("intensity_slope", self.intensity_slope, 0 < self.intensity_slope <= 10, "(0, 10]"),
-            ("full_angle_rad", self.full_angle_rad, 0 < self.full_angle_rad <= math.pi / 2, "(0, π/2]"),
-            ("angle_share", self.angle_share, 0 <= self.angle_share <= 1, "[0, 1]"),
-        ):
-            if not valid:
-                raise ConfigError(f"edges: {name} = {value} must lie in {expected}")
-
-    @property
-    def constants(self) -> tuple[float, float, float, float]:
-        """The last four arguments of :func:`rgb_gradient_at`."""
-        return (
-            self.intensity_offset,
-            self.intensity_slope,
-            1 / (2 * math.sin(self.full_angle_rad / 2)),
-            self.angle_share,
-        )
-
-
+_ANGLE_SCALE = 1 / (2 * math.sin(FULL_ANGLE_RAD / 2))
 _ED_SCALE = 1 / (255 * math.sqrt(3))
 _AXIS_WEIGHT = 10 / 3  # weight of a pair on an axis relative to a pair on a diagonal: Scharr's operator
 _TINY = 1e-12
@@ -94,15 +58,11 @@ def rgb_gradient_at(
     x: ti.i32,
     height: ti.i32,  # of camera c's own image
     width: ti.i32,
-    intensity_offset: ti.f32,
-    intensity_slope: ti.f32,
-    angle_scale: ti.f32,
-    angle_share: ti.f32,
 ):
     """Return (magnitude, dx, dy) of the colour gradient at pixel (y, x) of image c; see the module.
 
     The pixel must lie in the image, which is continued beyond its border by its last row or column. (dx, dy) is
-    a unit vector, (1, 0) where the magnitude is 0. The last four arguments are :attr:`EdgeSettings.constants`.
+    a unit vector, (1, 0) where the magnitude is 0.
     """
     magnitude = ti.f32(-1.0)
     winner = ti.Vector([0.0] * 6, ti.f32)
@@ -118,12 +78,12 @@ def rgb_gradient_at(
         b = _color(images, c, ti.math.clamp(y + dy, 0, height - 1), ti.math.clamp(x + dx, 0, width - 1))
         mean_a = a.sum() / 3
         mean_b = b.sum() / 3
-        weight = angle_share / (
-            (1 + ti.exp(intensity_slope * (intensity_offset - mean_a)))
-            * (1 + ti.exp(intensity_slope * (intensity_offset - mean_b)))
+        weight = ANGLE_SHARE / (
+            (1 + ti.exp(INTENSITY_SLOPE * (INTENSITY_OFFSET - mean_a)))
+            * (1 + ti.exp(INTENSITY_SLOPE * (INTENSITY_OFFSET - mean_b)))
         )
         # black has no direction; its weight is almost zero, so the direction does not matter
-        angle = weight * angle_scale * (b / ti.max(b.norm(), 1.0) - a / ti.max(a.norm(), 1.0))
+        angle = weight * _ANGLE_SCALE * (b / ti.max(b.norm(), 1.0) - a / ti.max(a.norm(), 1.0))
         euclidean = (1 - weight) * _ED_SCALE * (b - a)
         distance = ti.min(angle.norm(), weight) + euclidean.norm()
         for j in ti.static(range(3)):

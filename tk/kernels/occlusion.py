@@ -99,9 +99,8 @@ def pieces_beside(
     c: int,
     pieces: ti.template(),  # (P, 20 or more), at most 63
     own: int,
-    margin_m: float,
 ):
-    """Return a bit mask of the other pieces that rays through piece ``own``, or within the margin of it, may meet.
+    """Return a bit mask of the other pieces that rays through piece ``own`` may meet.
 
     All points of a piece share the mask: it has the pieces whose bounding spheres overlap its own in the image.
     """
@@ -109,10 +108,7 @@ def pieces_beside(
     u = triple_in(placed, c, own, PLACED_CONE)
     cosine = placed[c, own, PLACED_CONE + 3]
     sine = ti.sqrt(ti.max(1.0 - cosine * cosine, 0.0))
-    # near = distance (1 − sine)
-    sine += margin_m * (1.0 - sine) / ti.max(placed[c, own, PLACED_NEAR], 1e-6)
-    inside = cosine < 0.0 or sine >= 1.0
-    cosine = ti.sqrt(ti.max(1.0 - sine * sine, 0.0))
+    inside = cosine < 0.0
     for i in range(pieces.shape[0]):
         other = placed[c, i, PLACED_CONE + 3]
         limit = cosine * other - sine * ti.sqrt(ti.max(1.0 - other * other, 0.0)) - _SLACK

@@ -2,7 +2,7 @@
 
 The limbs' contour points (:mod:`tk.kernels.contour`), in the three views with the fewest hidden points, search edges
 along lines (:mod:`tk.kernels.edge_search`). The results are entries of the objective (:mod:`tk.kernels.alignment`),
-valid until they are assigned again.
+valid until they are assigned again. A hidden point, and a point without an edge, costs 1 and pulls nowhere.
 """
 
 from __future__ import annotations
@@ -11,30 +11,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels import alignment
-from tk.kernels.contour import ContourPoints
+from tk.kernels.contour import ContourKernel, ContourPoints
 from tk.kernels.edge_search import LINE_NUMBERS, PAIR, SINGLE, search_edges
-from tk.kernels.edges import EdgeSettings
+from tk.kernels.pieces import PIECE_DOF
 from tk.kernels.projection import pack_cameras
 from tk.model.body.skeleton import CHAINS
-from tk.model.body.strips import LIMBS, Strips, build_strips, contour_kernel
+from tk.model.body.strips import CIRCLES, LIMBS, build_strips, limb_pieces
 from tk.model.body.superellipsoid_body import SuperellipsoidBody
 from tk.model.cameras.camera import Rig
 from tk.settings import ContourSettings
 
 Float = NDArray[np.float64]
 Ints = NDArray[np.int32]
-Entries = NDArray[np.float32]
+Float32 = NDArray[np.float32]
 
-
+# Views in which edges are searched, and pairs of contour points on each limb in each view: the paper's 3, and 10 points
+# (6.1.2, 7).
+VIEWS, PAIRS = 3, 5
 # Iterations for which assigned edges are kept. The paper assigns edges at every iteration, which takes longer.
 RENEW = 5
-# σ of eqs. 13 and 15, metres at the limb: as SamplingSettings.sigma_m; the paper takes the limb's diameter.
+# σ of eqs. 10, 13 and 15, metres, for every sample and contour point. The paper takes the limb's diameter. Distances on
+# the trunk and on an arm are equally uncertain: both come from the same voxels. In units of the diameter the trunk,
+# five times as thick, weighs a twenty-fifth and follows the arms.
 SIGMA_M = 0.1
-# Leclerc's ν of eq. 9, in units of ½ (d/σ)². The paper prints none; chosen on rendered captures, sensitivity not
-# measured.
+# Leclerc's ν of eq. 9, in units of ½ (d/σ)². The paper prints none. With half and twice the value the mean errors of
+# walk and dance (45 frames) change by 0.09 cm at most.
 EDGE_NU = 0.1
-# How far from the contour edges are searched, metres at the limb. Chosen on rendered captures; sensitivity not
-# measured.
+# How far from the contour edges are searched, metres at the limb. With half and twice the value the mean errors of walk
+# and dance (45 frames) change by 0.06 cm at most.
 REACH_M = 0.08
 
 
@@ -53,122 +57,87 @@ class ContourTerm:
         self, body: SuperellipsoidBody, rig: Rig, config: ContourSettings, scale: int = 1, dtype: type = np.float32
     ) -> None:
         self.config = config
-        self.gradient = EdgeSettings()
-        self.strips: Strips = build_strips(body)
-        self.kernel = contour_kernel(body, self.strips, rig, dtype)
         self.cameras = pack_cameras(rig)
         self.sizes = np.array([(c.height, c.width) for c in rig], np.int32)
-        self._last_dof = body.skeleton.segment_dof[self.strips.segment]
-        self._diameter = np.array([p.diameter_m for p in body.pieces])[self.strips.piece]
-        self._is_limb = np.isin(self.strips.piece, self.strips.limb_piece)
-        self._pairs_a_limb = scale * config.pairs
-        # the circles of latitude of each limb's tapered piece, and of the head
-        head = next(i for i, p in enumerate(body.pieces) if p.segment == "head")
-        pieces = dict(zip((*LIMBS, "head"), (*self.strips.limb_piece, head), strict=True))
-        per_piece, within = self.strips.circles + self.strips.meridians, np.arange(self.strips.circles)
-        self._circles = {segment: piece * per_piece + within for segment, piece in pieces.items()}
+        self.strips = build_strips(body, limb_pieces(body))
+        strips = self.strips.angles, self.strips.normals, self.strips.piece
+        self.kernel = ContourKernel(body.arrays, *strips, self.cameras, dtype)
+        self._last_dof = body.arrays.pieces[self.strips.piece, PIECE_DOF]
+        self._pairs_a_limb = scale * PAIRS
 
     def draw(self, rng: np.random.Generator | None) -> Ints:
         """Draw strips (K,) of all limbs: at random, or evenly spread without a generator."""
-        return np.concatenate([_some(self._circles[s], self._pairs_a_limb, rng) for s in LIMBS])
+        return np.concatenate([self._some(limb, rng) for limb in range(len(LIMBS))])
 
     def draw_chains(self, rng: np.random.Generator | None) -> Ints:
-        """Draw strips (chains, K) of each chain. The head's strips find no edges (6.4); all rows have one length."""
-        chains = [[s for s in chain if s in self._circles] for chain in CHAINS.values()]
-        return np.stack(
-            [
-                np.concatenate([_some(self._circles[s], 2 * self._pairs_a_limb // len(chain), rng) for s in chain])
-                for chain in chains
-            ]
-        )
+        """Draw strips (chains, K) of each chain; the head has none, -1 (6.4)."""
+        found = np.full((len(CHAINS), 2 * self._pairs_a_limb), -1, np.int32)
+        for row, chain in zip(found, CHAINS.values(), strict=True):
+            limbs = [LIMBS.index(segment) for segment in chain if segment in LIMBS]
+            for own, limb in zip(row.reshape(2, -1), limbs, strict=False):
+                own[:] = self._some(limb, rng)
+        return found
 
-    def assign(self, images: NDArray[np.uint8], poses: Float, chosen: Ints) -> Entries:
+    def _some(self, limb: int, rng: np.random.Generator | None) -> Ints:
+        """Return some of a limb's strips; repeated if there are fewer, because all rows have one length."""
+        count = self._pairs_a_limb
+        if rng is None:
+            picked = ((np.arange(count) + 0.5) * CIRCLES / count).astype(np.int32)
+        else:
+            picked = np.sort(np.resize(rng.permutation(CIRCLES), count))
+        return (limb * CIRCLES + picked).astype(np.int32)
+
+    def assign(self, images: NDArray[np.uint8], poses: Float, chosen: Ints) -> Float32:
         """Return entries (B, E, 16) at poses (B, D) from strips (B, K) and images (C, H, W, 3)."""
-        (pose_of, entries), lines = self._pairs(self.kernel(poses, chosen))
-        found = search_edges(images, self.sizes, lines, self.config.threshold, self.gradient)
+        pose_of, entries, lines = self.pairs(self.kernel(poses, chosen))
+        found = search_edges(images, self.sizes, lines, self.config.threshold)
         wanted = entries[:, alignment.STATE] == alignment.ASSIGNED
         entries[:, alignment.TARGET : alignment.TARGET + 2] = 0.5 * (found[:, 1:3] + found[:, 3:5])
         entries[wanted & (found[:, 0] == 0), alignment.STATE] = alignment.UNASSIGNABLE
         return _by_pose(pose_of, entries, len(poses))
 
-    def _pairs(self, points: ContourPoints) -> tuple[tuple[Ints, NDArray[np.float32]], NDArray[np.float32]]:
-        """Return the pose and the entry of each contour point or pair, and the search lines."""
-        c = self.config
+    def pairs(self, points: ContourPoints) -> tuple[NDArray[np.intp], Float32, Float32]:
+        """Return the pose, the entry and the search line of each pair, single point and hidden half of a pair."""
         B, C = points.visible.shape[:2]
-        limb = self._is_limb[points.strip]
-        hidden = np.sum((points.found != points.visible) & limb[:, None, :, None], axis=(2, 3))
-        best = np.argsort(hidden, axis=1, kind="stable")[:, : c.views]
+        best = np.argsort(points.occluded, axis=1, kind="stable")[:, :VIEWS]
         used = np.zeros((B, C), bool)
         used[np.arange(B)[:, None], best] = True
-        b, v, k = np.nonzero((points.found.any(axis=3)) & limb[:, None, :] & used[:, :, None])
+        b, v, k = np.nonzero(points.found.any(axis=3) & used[:, :, None])
         seen = points.visible[b, v, k].astype(bool)
         both, any_seen = seen.all(axis=1), seen.any(axis=1)
         first = np.where(seen[:, 0], 0, 1)
-        second = np.where(both, 1, first)
-        entries, lines, pixels_a_metre = self._rows(points, b, v, k, first, second)
-        lines[:, 0] = np.where(both, PAIR, SINGLE)
-        lines[:, 10] = REACH_M * pixels_a_metre
-        diameter = np.where(
-            both, np.hypot(*(lines[:, 2:4] - lines[:, 4:6]).T), self._diameter[points.strip[b, k]] * pixels_a_metre
-        )
-        sigma = SIGMA_M * pixels_a_metre if SIGMA_M else np.maximum(diameter, 1.0)
-        entries[:, alignment.INV_SIGMA2] = 1 / sigma**2
-        entries[:, alignment.STATE] = np.where(any_seen, alignment.ASSIGNED, alignment.UNASSIGNABLE)
-        entries[:, alignment.NU] = EDGE_NU
-        # every contour point has the same weight, alone or in a pair; the hidden half of a pair has its own entry
-        found = points.found[b, v, k].sum(axis=1)
-        total = np.bincount(b, found, minlength=B)
-        share = c.edge_weight / total[b]
-        entries[:, alignment.SCALE] = share * np.where(any_seen, seen.sum(axis=1), c.hidden * found)
-        half = any_seen & (seen.sum(axis=1) < found)
-        concealed = entries[half]
-        concealed[:, alignment.STATE] = alignment.UNASSIGNABLE
-        concealed[:, alignment.SCALE] = c.hidden * share[half]
-        b = np.concatenate([b, b[half]])
-        entries = np.concatenate([entries, concealed])
-        lines = np.concatenate([lines, lines[half]])
-        return (b.astype(np.int32), entries), lines
+        ends = [(b, v, k, first), (b, v, k, np.where(both, 1, first))]
+        pixels_a_metre = points.scale[ends[0]].astype(np.float32)
 
-    def _rows(
-        self,
-        points: ContourPoints,
-        b: NDArray[np.intp],
-        v: NDArray[np.intp],
-        k: NDArray[np.intp],
-        first: NDArray[np.intp],
-        second: NDArray[np.intp],
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Return entries with points, camera and normal, their search lines, and the pixels a metre there."""
-        entries = np.zeros((len(b), alignment.ENTRY_NUMBERS), np.float32)
         lines = np.zeros((len(b), LINE_NUMBERS), np.float32)
+        lines[:, 0] = np.where(both, PAIR, SINGLE)
+        lines[:, 1] = v
+        lines[:, 2:10] = np.hstack([values[end] for values in (points.pixels, points.normals) for end in ends])
+        lines[:, 10] = REACH_M * pixels_a_metre
+
         a = alignment
-        entries[:, a.POINT_A : a.POINT_A + 3] = points.points_zero[b, v, k, first]
-        entries[:, a.POINT_B : a.POINT_B + 3] = points.points_zero[b, v, k, second]
+        entries = np.zeros((len(b), a.ENTRY_NUMBERS), np.float32)
+        entries[:, a.POINT_A : a.POINT_A + 6] = np.hstack([points.points_zero[end] for end in ends])
         entries[:, a.LAST_DOF] = self._last_dof[points.strip[b, k]]
         entries[:, a.CAMERA] = v
-        entries[:, a.NORMAL : a.NORMAL + 2] = points.normals[b, v, k, first]
-        lines[:, 1] = v
-        lines[:, 2:4] = points.pixels[b, v, k, first]
-        lines[:, 4:6] = points.pixels[b, v, k, second]
-        lines[:, 6:8] = points.normals[b, v, k, first]
-        lines[:, 8:10] = points.normals[b, v, k, second]
-        return entries, lines, points.scale[b, v, k, first].astype(np.float32)
+        entries[:, a.NORMAL : a.NORMAL + 2] = points.normals[ends[0]]
+        entries[:, a.INV_SIGMA2] = 1 / (SIGMA_M * pixels_a_metre) ** 2
+        entries[:, a.STATE] = np.where(any_seen, a.ASSIGNED, a.UNASSIGNABLE)
+        entries[:, a.NU] = EDGE_NU
+        # every contour point has the same weight, alone or in a pair; the hidden half of a pair has its own entry
+        found = points.found[b, v, k].sum(axis=1)
+        share = self.config.edge_weight / np.bincount(b, found, minlength=B)[b]
+        entries[:, a.SCALE] = share * np.where(any_seen, seen.sum(axis=1), found)
+        half = any_seen & (seen.sum(axis=1) < found)
+        concealed = entries[half]
+        concealed[:, a.STATE] = a.UNASSIGNABLE
+        concealed[:, a.SCALE] = share[half]
+        b, entries = np.concatenate([b, b[half]]), np.concatenate([entries, concealed])
+        return b, entries, np.concatenate([lines, lines[half]])
 
 
-def _some(row: NDArray[np.integer], count: int, rng: np.random.Generator | None) -> Ints:
-    """Return ``count`` of the strips, at random or evenly spread."""
-    if rng is None:
-        picked = ((np.arange(count) + 0.5) * len(row) / count).astype(np.int64)
-    else:
-        # repeats strips if there are fewer: all rows have one length
-        picked = np.sort(np.resize(rng.permutation(len(row)), count))
-    return row[picked].astype(np.int32)
-
-
-def _by_pose(pose_of: Ints, entries: NDArray[np.float32], poses: int) -> NDArray[np.float32]:
+def _by_pose(pose_of: NDArray[np.intp], entries: Float32, poses: int) -> Float32:
     """Return entries (B, E, 16), one row a pose, padded with absent entries."""
-    if poses == 1:
-        return entries[None]
     counts = np.bincount(pose_of, minlength=poses)
     order = np.argsort(pose_of, kind="stable")
     place = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
