@@ -122,12 +122,11 @@ def silhouette_stages(
     )
     assert rest is not None
     others = Cast(rest.label[0], rest.depth[0])
-    here = views.equations(body.arrays, last, pose, 0, LINE_SEARCH)
     limits = None, body.skeleton.lower, body.skeleton.upper
 
     def fit(start: Float, pyramid: Pyramid) -> Float:
         return gauss_newton.minimise(
-            lambda states, scale, _: views.equations(body.arrays, pyramid, states, scale, LINE_SEARCH),
+            lambda states, scale, steps: views.descend(body.arrays, pyramid, states, scale, LINE_SEARCH, steps),
             start[None], *limits, SOLVER,
         )  # fmt: skip
 
@@ -136,7 +135,6 @@ def silhouette_stages(
         return median_ms(lambda: views.equations(body.arrays, last, pose, scale, search))
 
     window = LINE_SEARCH.window_px
-    one_step = replace(SOLVER, scales=1, iterations=1)
     found = [Stage("masks cleaned, scales", median_ms(lambda: views.pyramid(masks[-1], scales, True)), {})]
     found += [
         Stage(f"contours, search, equations: 1/{2**scale} scale, one launch", equations(scale, window), {})
@@ -144,11 +142,6 @@ def silhouette_stages(
     ]
     found += [
         Stage("the same in full scale, search one pixel far", equations(0, 1.0), {}),
-        Stage(
-            "damped step",
-            median_ms(lambda: gauss_newton.minimise(lambda *_: here, pose, *limits, one_step)),
-            {},
-        ),
         Stage(
             f"fit: {scales} scales of {SOLVER.iterations} iterations",
             statistics.median(median_ms(partial(fit, *frame), 3) for frame in zip(poses, pyramids, strict=True)),

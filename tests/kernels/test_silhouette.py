@@ -15,6 +15,7 @@ from tk.errors import ConfigError
 from tk.kernels import silhouette
 from tk.kernels.cones import CONE, ELLIPSOID, END_FAR, END_NEAR, OUTLINE, SIDE_A, SIDE_B, curve_of, enter, point_on
 from tk.kernels.line_search import COLOR_BINS, SearchSettings, search_colors
+from tk.kernels.newton import LENGTHS, NewtonSteps
 from tk.kernels.runtime import ensure_runtime, ti
 from tk.model.body import gait_poses as gait
 from tk.model.body.body_parameters import BodyFamily
@@ -198,6 +199,70 @@ def test_equations_are_the_sums_of_the_edgels_rows():
     np.testing.assert_allclose(total.hessian[0], rows.T @ (edgels.weight[:, None] * rows), rtol=1e-9, atol=1e-6)
     np.testing.assert_allclose(total.gradient[0], rows.T @ (edgels.weight * edgels.distance), rtol=1e-9, atol=1e-6)
     assert 0 < total.found[0] <= 1
+
+
+STEPS = NewtonSteps(
+    np.arange(D, dtype=np.int32),
+    np.stack([BODY.skeleton.lower, BODY.skeleton.upper, np.full(D, 0.1)]),
+    np.tile(POSE, (3, 1)),
+    np.array([0.02, 5e-4, 1.0, 0.5, 0.0, 1.6, 1.6, 1.0]),
+)
+
+
+def descent_of(masks, poses, steps):
+    dtype = np.float64
+    return silhouette.descend(BODY.pack(dtype), VIEWS.cameras, VIEWS.sizes, masks, 1.0, poses, PLAIN, steps)
+
+
+def test_descent_is_single_steps_one_after_another():
+    start = POSE + np.random.default_rng(1).normal(0, 0.03, (3, D))
+    two = STEPS._replace(numbers=STEPS.numbers[:-1])
+    whole, poses = descent_of(MASKS, start, two), start
+    for length in two.numbers[LENGTHS:]:
+        before = poses
+        one = STEPS._replace(numbers=np.append(STEPS.numbers[:LENGTHS], length))
+        poses = descent_of(MASKS, before, one).poses
+    np.testing.assert_array_equal(whole.poses, poses)
+    np.testing.assert_array_equal(whole.steps, 2)
+    np.testing.assert_allclose(whole.hessian, equations_of(BODY, MASKS, before, PLAIN).hessian, rtol=1e-9, atol=1e-6)
+    cost = [equations_of(BODY, MASKS, each, PLAIN).cost for each in (start, whole.poses)]
+    assert (cost[1] < 0.7 * cost[0]).all()
+
+
+def test_later_steps_search_the_samples_that_were_visible_in_the_second():
+    """Short steps hide and uncover little: they find nearly the same pose as steps that look anew."""
+    start = POSE + np.random.default_rng(1).normal(0, 0.005, (3, D))
+    whole, poses = descent_of(MASKS, start, STEPS), start
+    for length in STEPS.numbers[LENGTHS:]:
+        one = STEPS._replace(numbers=np.append(STEPS.numbers[:LENGTHS], length))
+        poses = descent_of(MASKS, poses, one).poses
+    joints = BODY.skeleton.joints
+    assert np.linalg.norm(joints(whole.poses) - joints(poses), axis=2).mean() < 0.002
+
+
+def test_step_solves_the_damped_equations():
+    start = POSE + np.random.default_rng(2).normal(0, 0.03, (3, D))
+    here = equations_of(BODY, MASKS, start, PLAIN)
+    numbers = np.array([0.02, 0.0, 0.0, 100.0, 0.0, 1.6])
+    found = descent_of(MASKS, start, STEPS._replace(numbers=numbers)).poses
+    index, precision = STEPS.free, STEPS.limits[2]
+    for b, (H, g) in enumerate(zip(here.hessian, here.gradient, strict=True)):
+        H = H + np.diag(0.02 * np.diag(H) + precision)
+        g = g + precision * (POSE - start[b])
+        expected = np.linalg.solve(H[np.ix_(index, index)], g[index])
+        np.testing.assert_allclose(found[b, index] - start[b, index], 1.6 * expected, rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize(("tolerance", "made"), [(0.0, [4, 4, 4]), (0.012, None), (9.0, [1, 1, 1])])
+def test_each_pose_stops_once_its_steps_are_short(tolerance, made):
+    start = np.stack([POSE, POSE + 0.05, POSE + np.random.default_rng(3).normal(0, 0.03, D)])
+    steps = STEPS._replace(numbers=np.array([0.02, 5e-4, 1.0, 0.5, tolerance, 1.6, 1.6, 1.6, 1.6]))
+    together = descent_of(np.concatenate([MASKS] * 3), start, steps)
+    if made is not None:
+        assert together.steps.tolist() == made
+    for b in range(3):
+        alone = descent_of(MASKS, start[b : b + 1], steps._replace(mean=STEPS.mean[:1]))
+        np.testing.assert_array_equal(alone.poses[0], together.poses[b])
 
 
 def test_rows_are_the_normals_of_the_picture_in_the_world():

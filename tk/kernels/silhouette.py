@@ -30,6 +30,7 @@ from tk.kernels.cone_contours import (
 from tk.kernels.cones import point_on, unscaled
 from tk.kernels.kinematics import forward_tree, load_rotation, load_translation
 from tk.kernels.line_search import COLOR_BINS, Regions, SearchSettings, in_picture, search_colors, search_mask
+from tk.kernels.newton import LENGTHS, TOLERANCE, NewtonSteps, newton_step
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.taichi_internals import Launcher
@@ -48,6 +49,11 @@ _EXPORT = 13
 # Columns of the packed settings. SCALE: pixels of the full picture in one of this scale; the others: SearchSettings.
 _NUMBERS = tuple(range(11))
 SCALE, WINDOW, SPACING, AMBIGUOUS, TANGENTIAL, ROBUST, LOST, COLORS, MOST_SAMPLES, INTERIOR, EXPORT = _NUMBERS
+# First steps of a descent in which hidden samples are looked for, a third of the work; the later steps are short. With
+# one step, walk loses an arm for a frame; with all, no mean error on the development captures changes by 0.1 cm.
+_LOOKS = 2
+# Mark of a sample that is hidden or outside the image.
+_HIDDEN = -2
 # Columns of ``sums``, before the gradient: cost, weight of the samples that found an edge, weight of all.
 COST, FOUND, ALL, GRADIENT = range(4)
 
@@ -150,14 +156,18 @@ def export_sample(samples: ti.template(), c: int, i: int, x_unscaled, pixel, g, 
 @ti.func
 def prepare_pose(
     tree: ti.template(), parts: ti.template(), curves: ti.template(), cameras: ti.template(), pose: ti.template(),
-    b: int, joints: ti.template(), placed: ti.template(), hiders: ti.template(), outlines: ti.template(),
+    b: int, look: bool, joints: ti.template(), placed: ti.template(), hiders: ti.template(), outlines: ti.template(),
     sums: ti.template(),
 ):  # fmt: skip
-    """Place the body of pose b, trace its contours in every view, and set its sums to 0; arguments as in the kernel."""
+    """Place the body of pose b, trace its contours in every view, and set its sums to 0; arguments as in the kernel.
+
+    ``look``: find which parts may hide each other, too.
+    """
     V, Q = cameras.shape[0], curves.shape[0]
     forward_tree(tree, pose, b, b, joints)
     place_parts(joints, parts, b, placed)
-    find_hiders(placed, cameras, b, hiders)
+    if look:
+        find_hiders(placed, cameras, b, hiders)
     for task in range(V * Q):
         v, q = task // Q, task % Q
         trace_curve(parts, placed, cameras, b, v, curves[q, 0], curves[q, 1], b * V * Q + task, outlines)
@@ -188,10 +198,103 @@ def weigh_edgel(
     return scaled
 
 
+@ti.func
+def search_contours(
+    parts: ti.template(), curves: ti.template(), cameras: ti.template(), size: ti.template(), mask: ti.template(),
+    frame: int, image: ti.template(), likelihood: ti.template(), group: ti.template(), numbers: ti.template(), b: int,
+    look: bool, origin, joints: ti.template(), placed: ti.template(), hiders: ti.template(), outlines: ti.template(),
+    seen: ti.template(), samples: ti.template(), sums: ti.template(),
+):  # fmt: skip
+    """Sum the rows of all edgels of pose b, which :func:`prepare_pose` has placed; arguments as in the kernel.
+
+    ``look``: find which samples are visible; else the samples that were visible in the last call are searched.
+    """
+    V, Q = cameras.shape[0], curves.shape[0]
+    for task in range(V * Q):
+        c, v, q = b * V * Q + task, task // Q, task % Q
+        p, kind = curves[q, 0], curves[q, 1]
+        scale, window, most_samples = numbers[SCALE], numbers[WINDOW], ti.cast(numbers[MOST_SAMPLES], ti.i32)
+        cost, met, all_samples = 0.0 * scale, 0.0 * scale, 0.0 * scale
+        pull = ti.Vector([0.0 * scale for _ in range(PULL_NUMBERS)])
+        inertia = ti.Vector([0.0 * scale for _ in range(INERTIA_NUMBERS)])
+        if numbers[EXPORT] == 1.0:
+            for i in range(most_samples):
+                samples[c, i, 0] = 0.0
+        if look:
+            seen[c, 0] = 0
+            if outlines[c, VISIBLE] > 0.0:
+                wanted = ti.cast(ti.ceil(outlines[c, LENGTH] / (numbers[SPACING] * scale)), ti.i32)
+                seen[c, 0] = ti.cast(ti.min(ti.max(wanted, 1), most_samples), ti.i16)
+        count = ti.cast(seen[c, 0], ti.i32)
+        if count > 0 and outlines[c, VISIBLE] > 0.0:
+            shape = shape_of(parts, p)
+            R, t = load_rotation(placed, b, p), load_translation(placed, b, p)
+            eye = camera_center(cameras, v)
+            center = transposed_times(R, eye - t)
+            params = ti.Vector([outlines[c, PARAMETERS], outlines[c, PARAMETERS + 1]])
+            length, sign = outlines[c, LENGTH], outlines[c, SIGN]
+            width, height = size[v, 0], size[v, 1]
+            share = length / count
+            for i in range(count):
+                if not look and seen[c, 1 + i] == _HIDDEN:
+                    continue
+                u = (i + 0.5 + 0.0 * scale) / count
+                x_part, x, pixel, J, n, use = sample_curve(cameras, v, kind, shape, center, params, R, t, sign, u)
+                at = (pixel + 0.5) / scale - 0.5
+                use = use and in_picture(width, height, at)
+                behind = -1
+                if not look:
+                    behind = ti.cast(seen[c, 1 + i], ti.i32)
+                else:
+                    if use:
+                        hidden, behind = find_hider(parts, placed, b, hiders[b, v, p], eye, x - eye)
+                        use = not hidden
+                    seen[c, 1 + i] = ti.cast(behind if use else _HIDDEN, ti.i16)
+                found, d, weight = 0, 0.0 * scale, share
+                if use and behind >= 0 and numbers[INTERIOR] == 0.0:
+                    # in front of another part no edge of the silhouette is expected, but a border of colours
+                    if (
+                        numbers[COLORS] > 0.0
+                        and parts[behind, PART_LIMB] != parts[p, PART_LIMB]
+                        and group[behind] != group[p]
+                    ):
+                        certainty, place = search_colors(
+                            image, likelihood, v, image.shape[2], image.shape[1], pixel, n, window, scale, group[p],
+                            group[behind],
+                        )  # fmt: skip
+                        found, d, weight = 2, place * scale, share * numbers[COLORS] * certainty
+                elif use:
+                    found, d = search_mask(mask, frame * V + v, width, height, at, n, window)
+                    d *= scale
+                    if found >= 0:
+                        all_samples += share
+                    if found == 0:
+                        cost += share * numbers[LOST] * numbers[LOST]
+                    elif found > 0:
+                        at_edgel = pixel + d * n
+                        weight = weigh_edgel(parts, curves, outlines, numbers, c - q, p, at_edgel, n, d, share)
+                        cost += share * ti.min(d * d, numbers[LOST] * numbers[LOST])
+                        met += share
+                if found > 0 and weight > 0.0:
+                    add_row(pull, inertia, x - origin, J, n, d, weight, numbers[TANGENTIAL])
+                    if numbers[EXPORT] == 1.0:
+                        at_unit = unscaled(kind, shape, x_part)
+                        export_sample(samples, c, i, at_unit, pixel, pulled(J, n), n, d, weight)
+        # always in the same order: the same sums every time
+        sums[b, COST] = sums[b, COST] + cost
+        sums[b, FOUND] = sums[b, FOUND] + met
+        sums[b, ALL] = sums[b, ALL] + all_samples
+        k = ti.cast(parts[p, PART_DOF], ti.i32)
+        for a in ti.static(range(INERTIA_NUMBERS)):
+            joints[b, k, INERTIA + a] = joints[b, k, INERTIA + a] + inertia[a]
+        for a in ti.static(range(PULL_NUMBERS)):
+            joints[b, k, PULL + a] = joints[b, k, PULL + a] + pull[a]
+
+
 @functools.cache
-def _equations_kernel(real):
+def _descent_kernel(real):
     @ti.kernel
-    def silhouette_equations(
+    def silhouette_descent(
         # the body
         tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
         parts: ti.types.ndarray(dtype=real, ndim=2),  # (P, 19)
@@ -206,103 +309,69 @@ def _equations_kernel(real):
         group: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,) colour group of each part
         # settings
         numbers: ti.types.ndarray(dtype=real, ndim=1),  # (11,) from SCALE to EXPORT
+        free: ti.types.ndarray(dtype=ti.i32, ndim=1),  # this and the next three: :class:`NewtonSteps`
+        limits: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (3, D)
+        mean: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (B, D)
+        steps: ti.types.ndarray(dtype=ti.f64, ndim=1),  # (5 + S,)
         spread: ti.i32,
         # the poses
+        state: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (B, D) in and out
+        # scratch: joints, inertias and pulls (:mod:`tk.kernels.wrench`), contours (:mod:`tk.kernels.cone_contours`)
         pose: ti.types.ndarray(dtype=real, ndim=2),  # (B, D)
-        # scratch: joints, inertias and pulls (:mod:`tk.kernels.wrench`); the rest :mod:`tk.kernels.cone_contours`
         joints: ti.types.ndarray(dtype=real, ndim=3),  # (B, D, 45)
         placed: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 16)
         hiders: ti.types.ndarray(dtype=ti.i64, ndim=3),  # (B, V, P)
         outlines: ti.types.ndarray(dtype=real, ndim=2),  # (B V Q, 31)
+        seen: ti.types.ndarray(dtype=ti.i16, ndim=2),  # (B V Q, 1 + most_samples) number of samples of a curve,
+        # and of each sample: the part behind it, -1 for none, or _HIDDEN
+        factor: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (B, n, n + 1)
         # out
         samples: ti.types.ndarray(dtype=real, ndim=3),  # (V Q, most_samples, _EXPORT), if EXPORT
-        sums: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (B, 3 + D) from COST to GRADIENT
-        hessian: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (B, D, D) zeroed by the caller
+        sums: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (B, 3 + D) from COST to GRADIENT, before the last step
+        hessian: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (B, D, D) likewise; zeroed by the caller
+        made: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (B,) evaluations of the equations
     ):
-        B, V, Q = pose.shape[0], cameras.shape[0], curves.shape[0]
-
         # one thread handles a pose from end to end; a variant without threads costs 0.4 s to compile and saves nothing
-        for turn in range(spread * B):
+        for turn in range(spread * state.shape[0]):
             if turn % spread != 0:
                 continue
             b = turn // spread
-            prepare_pose(tree, parts, curves, cameras, pose, b, joints, placed, hiders, outlines, sums)
-            origin = load_translation(placed, b, 0)
-            for task in range(V * Q):
-                c, v, q = b * V * Q + task, task // Q, task % Q
-                p, kind = curves[q, 0], curves[q, 1]
-                scale, window, most_samples = numbers[SCALE], numbers[WINDOW], ti.cast(numbers[MOST_SAMPLES], ti.i32)
-                cost, met, all_samples = 0.0 * scale, 0.0 * scale, 0.0 * scale
-                pull = ti.Vector([0.0 * scale for _ in range(PULL_NUMBERS)])
-                inertia = ti.Vector([0.0 * scale for _ in range(INERTIA_NUMBERS)])
-                if numbers[EXPORT] == 1.0:
-                    for i in range(most_samples):
-                        samples[c, i, 0] = 0.0
-                if outlines[c, VISIBLE] > 0.0:
-                    shape = shape_of(parts, p)
-                    R, t = load_rotation(placed, b, p), load_translation(placed, b, p)
-                    eye = camera_center(cameras, v)
-                    center = transposed_times(R, eye - t)
-                    params = ti.Vector([outlines[c, PARAMETERS], outlines[c, PARAMETERS + 1]])
-                    length, sign = outlines[c, LENGTH], outlines[c, SIGN]
-                    width, height = size[v, 0], size[v, 1]
-                    wanted = ti.cast(ti.ceil(length / (numbers[SPACING] * scale)), ti.i32)
-                    count = ti.min(ti.max(wanted, 1), most_samples)
-                    share = length / count
-                    for i in range(count):
-                        u = (i + 0.5 + 0.0 * scale) / count
-                        x_part, x, pixel, J, n, use = sample_curve(
-                            cameras, v, kind, shape, center, params, R, t, sign, u
-                        )
-                        at = (pixel + 0.5) / scale - 0.5
-                        use = use and in_picture(width, height, at)
-                        behind = -1
-                        if use:
-                            hidden, behind = find_hider(parts, placed, b, hiders[b, v, p], eye, x - eye)
-                            use = not hidden
-                        found, d, weight = 0, 0.0 * scale, share
-                        if use and behind >= 0 and numbers[INTERIOR] == 0.0:
-                            # in front of another part no edge of the silhouette is expected, but a border of colours
-                            if (
-                                numbers[COLORS] > 0.0
-                                and parts[behind, PART_LIMB] != parts[p, PART_LIMB]
-                                and group[behind] != group[p]
-                            ):
-                                certainty, place = search_colors(
-                                    image, likelihood, v, image.shape[2], image.shape[1], pixel, n, window, scale,
-                                    group[p], group[behind],
-                                )  # fmt: skip
-                                found, d, weight = 2, place * scale, share * numbers[COLORS] * certainty
-                        elif use:
-                            found, d = search_mask(mask, frame[b] * V + v, width, height, at, n, window)
-                            d *= scale
-                            if found >= 0:
-                                all_samples += share
-                            if found == 0:
-                                cost += share * numbers[LOST] * numbers[LOST]
-                            elif found > 0:
-                                at_edgel = pixel + d * n
-                                weight = weigh_edgel(parts, curves, outlines, numbers, c - q, p, at_edgel, n, d, share)
-                                cost += share * ti.min(d * d, numbers[LOST] * numbers[LOST])
-                                met += share
-                        if found > 0 and weight > 0.0:
-                            add_row(pull, inertia, x - origin, J, n, d, weight, numbers[TANGENTIAL])
-                            if numbers[EXPORT] == 1.0:
-                                at_unit = unscaled(kind, shape, x_part)
-                                export_sample(samples, c, i, at_unit, pixel, pulled(J, n), n, d, weight)
-                # always in the same order: the same sums every time
-                sums[b, COST] = sums[b, COST] + cost
-                sums[b, FOUND] = sums[b, FOUND] + met
-                sums[b, ALL] = sums[b, ALL] + all_samples
-                k = ti.cast(parts[p, PART_DOF], ti.i32)
-                for a in ti.static(range(INERTIA_NUMBERS)):
-                    joints[b, k, INERTIA + a] = joints[b, k, INERTIA + a] + inertia[a]
-                for a in ti.static(range(PULL_NUMBERS)):
-                    joints[b, k, PULL + a] = joints[b, k, PULL + a] + pull[a]
-            collect_pulls(tree, b, joints, origin, sums, GRADIENT)
-            collect_inertias(tree, b, joints, origin, hessian)
+            moves, step = True, 0
+            while moves:
+                look = step < _LOOKS
+                for k in range(tree.shape[0]):
+                    pose[b, k] = ti.cast(state[b, k], real)
+                prepare_pose(tree, parts, curves, cameras, pose, b, look, joints, placed, hiders, outlines, sums)
+                origin = load_translation(placed, b, 0)
+                search_contours(
+                    parts, curves, cameras, size, mask, frame[b], image, likelihood, group, numbers, b, look, origin,
+                    joints, placed, hiders, outlines, seen, samples, sums,
+                )  # fmt: skip
+                collect_pulls(tree, b, joints, origin, sums, GRADIENT)
+                collect_inertias(tree, b, joints, origin, hessian)
+                length = steps[LENGTHS + step]
+                step += 1
+                moves = step < steps.shape[0] - LENGTHS
+                if length > 0.0:
+                    change = newton_step(free, limits, mean, steps, b, length, hessian, sums, GRADIENT, factor, state)
+                    moves = moves and change > steps[TOLERANCE]
+            made[b] = step
 
-    return Launcher(silhouette_equations)
+    return Launcher(silhouette_descent)
+
+
+class Descent(NamedTuple):
+    """B poses after some steps.
+
+    Attributes:
+        poses: (B, D).
+        hessian: (B, D, D) JᵀWJ before each pose's last step.
+        steps: (B,) number of steps made.
+    """
+
+    poses: NDArray[np.float64]
+    hessian: NDArray[np.float64]
+    steps: NDArray[np.int32]
 
 
 def _launch(
@@ -313,40 +382,61 @@ def _launch(
     scale: float,
     poses: NDArray[np.floating],
     settings: SearchSettings,
-    export: bool,
     regions: Regions | None,
-    frames: NDArray[np.intp] | None = None,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.floating]]:
-    """Return sums (B, 3 + D), Hessian (B, D, D) and samples, see the kernel."""
+    newton: NewtonSteps | None = None,
+    export: bool = False,
+) -> tuple[Descent, NDArray[np.float64], NDArray[np.floating]]:
+    """Return the poses after the steps; sums (B, 3 + D) and samples before the last step, see the kernel. Without
+    ``newton`` the poses stay as they are."""
     ensure_runtime()
     dtype = body.tree.dtype
-    poses = np.ascontiguousarray(poses, dtype)
-    B, D = poses.shape
+    state = np.array(poses, np.float64)
+    B, D = state.shape
     V, Q, P = len(cameras), len(body.curves), len(body.parts)
     regions = regions or _no_regions(P)
-    frames = np.zeros(B, np.int32) if len(masks) == V else np.arange(B) if frames is None else frames
-    if frames.max() >= len(masks) // V:
+    frames = len(masks) // V
+    if frames not in (1, B):
         raise ValueError(f"{len(masks)} masks of {V} views: one set, or one for each frame of the {B} poses")
-    sums, hessian = np.empty((B, GRADIENT + D)), np.zeros((B, D, D))
+    free, limits, mean, steps = newton or _no_steps(D)
+    sums, hessian, made = np.empty((B, GRADIENT + D)), np.zeros((B, D, D)), np.empty(B, np.int32)
     samples = np.zeros((B * V * Q, settings.most_samples, _EXPORT) if export else (1, 1, _EXPORT), dtype)
-    _equations_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
+    _descent_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
         *body,
         np.ascontiguousarray(cameras, dtype),
         np.ascontiguousarray(sizes, np.int32),
         np.ascontiguousarray(masks),
-        frames.astype(np.int32),
+        _frames(B, frames),
         regions.image,
         regions.log_likelihood,
         regions.group,
         _numbers(settings, scale, regions.weight, export, dtype),
+        free,
+        limits,
+        mean,
+        steps,
         spread_of(B),
-        poses,
-        *_scratch(B, V, Q, D, P, dtype),
+        state,
+        *_scratch(B, V, Q, D, P, settings.most_samples, dtype),
         samples,
         sums,
         hessian,
+        made,
     )
-    return sums, hessian, samples
+    return Descent(state, hessian, made), sums, samples
+
+
+@functools.lru_cache(32)
+def _frames(poses: int, frames: int) -> NDArray[np.int32]:
+    """Return (B,) the frame of each pose: pose b is in frame b, or all are in the same."""
+    return np.arange(poses, dtype=np.int32) % frames
+
+
+@functools.cache
+def _no_steps(parameters: int) -> NewtonSteps:
+    """Return the arguments of a launch that evaluates the equations only."""
+    return NewtonSteps(
+        np.zeros(1, np.int32), np.zeros((3, parameters)), np.zeros((1, parameters)), np.zeros(LENGTHS + 1)
+    )
 
 
 @functools.lru_cache(64)
@@ -357,12 +447,15 @@ def _numbers(s: SearchSettings, scale: float, weight: float, export: bool, dtype
 
 
 @functools.lru_cache(32)
-def _scratch(B: int, V: int, Q: int, D: int, P: int, dtype: np.dtype) -> tuple[NDArray, ...]:
+def _scratch(B: int, V: int, Q: int, D: int, P: int, most: int, dtype: np.dtype) -> tuple[NDArray, ...]:
     return (
+        np.empty((B, D), dtype),
         np.empty((B, D, PULL + PULL_NUMBERS), dtype),
         np.empty((B, P, PLACED_NUMBERS), dtype),
         np.empty((B, V, P), np.int64),
         np.empty((B * V * Q, OUTLINE_NUMBERS), dtype),
+        np.empty((B * V * Q, 1 + most), np.int16),
+        np.empty((B, D, D + 1)),
     )
 
 
@@ -382,7 +475,6 @@ def normal_equations(
     poses: np.ndarray,
     settings: SearchSettings,
     regions: Regions | None = None,
-    frames: NDArray[np.intp] | None = None,
 ) -> NormalEquations:
     """Search the silhouettes from B poses and return the normal equations (eqs. 9-11 of the silhouette paper).
 
@@ -391,26 +483,46 @@ def normal_equations(
         cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_cameras`, of the full picture.
         sizes: (V, 2) width and height of each camera's mask at this scale.
         masks: (V, H, W) uint8 at this scale, values between 0 and 255 where a pixel is partly covered,
-            :data:`~tk.kernels.mask_values.OTHERS` where it shows another person; or (F V, H, W) of F frames.
+            :data:`~tk.kernels.mask_values.OTHERS` where it shows another person; or (B V, H, W), pose b's own.
         scale: pixels of the full picture in one of this scale (1, 2, …).
         poses: (B, D).
         settings: see :class:`SearchSettings`.
         regions: colours of the parts, for contours inside the silhouette; None ignores colours.
-        frames: (B,) which of the F frames each pose is in; None: pose b is in frame b.
 
     Raises:
-        ValueError: a pose is in a frame that has no masks.
+        ValueError: the masks are neither of one frame nor of one for each pose.
     """
-    sums, hessian, _ = _launch(body, cameras, sizes, masks, scale, poses, settings, False, regions, frames)
+    descent, sums, _ = _launch(body, cameras, sizes, masks, scale, poses, settings, regions)
     weight = sums[:, ALL]
     seen = weight > 0
     safe = np.where(seen, weight, 1.0)
     return NormalEquations(
-        hessian=hessian,
+        hessian=descent.hessian,
         gradient=sums[:, GRADIENT:],
         cost=np.where(seen, sums[:, COST] / safe, np.inf),
         found=np.where(seen, sums[:, FOUND] / safe, 0.0),
     )
+
+
+def descend(
+    body: ConeArrays,
+    cameras: np.ndarray,
+    sizes: np.ndarray,
+    masks: np.ndarray,
+    scale: float,
+    poses: np.ndarray,
+    settings: SearchSettings,
+    newton: NewtonSteps,
+    regions: Regions | None = None,
+) -> Descent:
+    """Move B poses by damped Gauss-Newton steps at one scale: edges and equations are found anew before each step.
+
+    A pose stops once no parameter moves by more than the tolerance. Poses do not depend on each other.
+
+    Args:
+        newton: the steps; other arguments as for :func:`normal_equations`.
+    """
+    return _launch(body, cameras, sizes, masks, scale, poses, settings, regions, newton=newton)[0]
 
 
 def find_edgels(
@@ -423,7 +535,7 @@ def find_edgels(
     settings: SearchSettings,
 ) -> Edgels:
     """Return the edgels that one pose (D,) finds; arguments as for :func:`normal_equations`."""
-    _, _, samples = _launch(body, cameras, sizes, masks, scale, pose[None], settings, True, None)
+    _, _, samples = _launch(body, cameras, sizes, masks, scale, pose[None], settings, None, export=True)
     Q = len(body.curves)
     task, index = np.nonzero(samples[:, :, 0])
     chosen = samples[task, index].astype(np.float64)

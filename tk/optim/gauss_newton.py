@@ -7,35 +7,26 @@ Correspondences found anew move less than their equations predict: an edgel far 
 along a normal may belong to another limb, and a border between colours is determined by the few pixels about it. A full
 step therefore leaves a share of the error, and the next step the same share again. Longer steps leave less; a plain one
 at the end corrects their overshoot where equations are exact.
+
+A problem makes all steps of a scale in one kernel (:func:`tk.kernels.newton.newton_step`), because a launch and NumPy's
+algebra cost a third of a small problem's equations.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
+from tk.kernels.newton import NewtonSteps
+from tk.kernels.silhouette import Descent
 
 Float = NDArray[np.float64]
-
-
-class Equations(Protocol):
-    """Normal equations of B states: ``hessian (B, D, D)`` is JᵀWJ, ``gradient (B, D)`` is JᵀWd."""
-
-    @property
-    def hessian(self) -> Float: ...
-
-    @property
-    def gradient(self) -> Float: ...
-
-    @property
-    def cost(self) -> Float:
-        """(B,) cost of each state."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -115,7 +106,7 @@ class BatchSolution(NamedTuple):
 
 
 def minimise(
-    equations: Callable[[Float, int, NDArray[np.intp]], Equations],
+    descend: Callable[[Float, int, NewtonSteps], Descent],
     start: Float,
     free: NDArray[np.intp] | None,
     lower: Float,
@@ -127,8 +118,7 @@ def minimise(
     """Iterate from B states at once; each state's result is independent of the others.
 
     Args:
-        equations: the normal equations at states (N, D), a scale's index, 0 the finest, and the rows (N,) of ``start``
-            that these states come from: states that have converged at a scale are left out.
+        descend: makes the steps of states (B, D) at a scale's index, 0 the finest.
         start: (B, D).
         free: (n,) indices of the parameters that may change; None: all.
         lower, upper: (D,) limits; infinite without a limit.
@@ -137,58 +127,22 @@ def minimise(
         levels: the scales in order; None: all from the coarsest to the finest.
     """
     config = config or GaussNewtonSettings()
-    state = np.array(start, np.float64)
-    hessian = np.zeros((*state.shape, state.shape[1]))
-    parameters = _FreeParameters(np.arange(len(lower)) if free is None else free, lower, upper, config, prior)
+    states = np.array(start, np.float64)
+    hessian = np.zeros((*states.shape, states.shape[1]))
+    mean, precision = (0.0, 0.0) if prior is None else (prior.mean, prior.precision)
+    limits = np.stack([lower, upper, np.broadcast_to(precision, len(lower))]).astype(np.float64)
+    mean = np.ascontiguousarray(np.broadcast_to(mean, states.shape), np.float64)
+    index = np.arange(len(lower), dtype=np.int32) if free is None else free.astype(np.int32)
     scales = range(config.scales - 1, -1, -1) if levels is None else levels
     iterations = np.zeros(len(scales), np.int32)
     for i, scale in enumerate(scales):
-        rows = np.arange(len(state))  # states do not depend on each other
-        for share in config.steps(scale):
-            here = equations(state[rows], scale, rows)
-            step = share * parameters.step(here.hessian, here.gradient, state, rows)
-            state[rows[:, None], parameters.index] += step
-            hessian[rows] = here.hessian
-            iterations[i] += 1
-            rows = rows[np.abs(step).max(axis=1, initial=0.0) > config.tolerance]
-            if not len(rows):
-                break
-    return BatchSolution(state, hessian, iterations)
+        states, hessian, made = descend(states, scale, NewtonSteps(index, limits, mean, _numbers(config, scale == 0)))
+        iterations[i] = made.max(initial=0)
+    return BatchSolution(states, hessian, iterations)
 
 
-class _FreeParameters:
-    """The free parameters ``index`` (n,), with their limits and prior."""
-
-    def __init__(
-        self, index: NDArray[np.intp], lower: Float, upper: Float, config: GaussNewtonSettings, prior: Prior | None
-    ) -> None:
-        self.index = index
-        self._rows = index[:, None]
-        self._lower, self._upper = lower[index], upper[index]
-        self._config = config
-        self._known = None if prior is None else (np.atleast_2d(prior.mean)[:, index], prior.precision[index])
-
-    def step(self, hessian: Float, gradient: Float, states: Float, rows: NDArray[np.intp]) -> Float:
-        """Return one damped step (N, n) of rows (N,) of the states (B, D), limits included."""
-        config = self._config
-        H = hessian[:, self._rows, self.index]
-        g = gradient[:, self.index]
-        p = states[rows[:, None], self.index]
-        diagonal = np.einsum("bii->bi", H)  # a view
-        count = np.count_nonzero(diagonal > 0, axis=1)
-        unit = diagonal.sum(axis=1) / np.maximum(count, 1)
-        unit[unit <= 0] = 1.0
-        unit = unit[:, None]
-        excess = np.minimum(np.maximum(p, self._lower), self._upper) - p
-        pull = config.limit_weight * unit
-        g += pull * excess
-        added = config.damping * diagonal + (config.stiffness + 1e-9) * unit + pull * (excess != 0)
-        if self._known is not None:
-            mean, precision = self._known
-            mean = mean if len(mean) == 1 else mean[rows]
-            added += precision
-            g += precision * (mean - p)
-        diagonal += added
-        delta = np.linalg.solve(H, g[:, :, None])[:, :, 0]
-        longest = np.maximum(delta.max(axis=1, initial=0.0), -delta.min(axis=1, initial=0.0))
-        return np.asarray(delta * np.minimum(1.0, config.longest_step / np.maximum(longest, 1e-12))[:, None])
+@functools.cache
+def _numbers(config: GaussNewtonSettings, finest: bool) -> Float:
+    """Return the settings of the steps at a scale as a kernel takes them."""
+    settings = config.damping, config.stiffness, config.limit_weight, config.longest_step, config.tolerance
+    return np.array([*settings, *config.steps(0 if finest else 1)])

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError
 from tk.kernels.cones import CONE, ELLIPSOID
 from tk.kernels.line_search import SearchSettings
-from tk.kernels.raycast import Cast, cast
+from tk.kernels.raycast import Cast
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_fit import STATURE_DEVIATION, fit_body
@@ -309,11 +309,7 @@ class ContourTracker:
         pose, before = self.last_poses()
         if ahead:
             pose = pose + self.contours.prediction * (pose - before)
-        grid, group = self.choice, np.zeros(len(self.body.parts), np.int32)
-        free = np.zeros((*grid.rays.shape[:3], 2), np.float32)
-        arrays = self.body.arrays
-        _, met = cast(arrays, group, grid.cameras, grid.step, grid.rays, free, pose[None], export=True)
-        assert met is not None
+        met = self.choice.render(self.body, pose[None])
         return Cast(met.label[0], met.depth[0])
 
     def learned(self) -> Mapping[str, Any]:
@@ -378,7 +374,9 @@ class ContourTracker:
         arrays, free = (limb.arrays, limb.dofs) if limb else (body.arrays, None)
         regions = None if images is None else self.colors.regions(images)
         return gauss_newton.minimise(
-            lambda *at: self.views.equations(arrays, pyramid, at[0], at[1], self.line_search, regions, at[2]),
+            lambda states, scale, steps: self.views.descend(
+                arrays, pyramid, states, scale, self.line_search, steps, regions
+            ),
             poses,
             free,
             body.skeleton.lower,

@@ -374,24 +374,26 @@ class RegionTracker(ContourTracker):
         return np.asarray(np.sqrt(variance))
 
     def variance(self, pose: Float, curvature: Float, prior: Prior, label: NDArray[np.uint8], residual: Float) -> Float:
-        """Return (15,) variance of the joints' positions along an axis, metres², from the contours' noise and the
+        """Return (..., 15) variance of the joints' positions along an axis, metres², from the contours' noise and the
         directions of the views, scaled by the residual.
 
         Args:
-            pose: (D,).
-            curvature: (D, D) JᵀWJ.
+            pose: (..., D).
+            curvature: (..., D, D) JᵀWJ.
             prior: of the pose.
-            label: (V, h, w) the parts that the grid's rays meet.
-            residual: (V, 2); NaN for a view that was not used.
+            label: (..., V, h, w) the parts that the grid's rays meet.
+            residual: (..., V, 2); NaN for a view that was not used.
         """
-        body, used = self.body, np.isfinite(residual[:, 0])
+        body = self.body
         joints = body.skeleton.joints(pose)
         precision = INFORMATION * (curvature + np.diag(prior.precision))
         noise = contour_variance(body.skeleton, pose, precision)
-        rays = joints - self.world.rig.centers[used, None]
-        shares = contour_shares(body, self.screen, label, joints)[used]
-        views = view_variance(rays / np.linalg.norm(rays, axis=-1, keepdims=True), shares, self.view_m)
-        return np.asarray((noise + views) * variance_factor(residual))
+        rays = joints[..., None, :, :] - self.world.rig.centers[:, None]
+        rays /= np.sqrt((rays**2).sum(axis=-1, keepdims=True))
+        shares = contour_shares(body, self.screen, label, joints)
+        shares = np.where(np.isfinite(residual[..., :1]), shares, 0.0)
+        views = view_variance(rays, shares, self.view_m)
+        return np.asarray((noise + views) * variance_factor(residual)[..., None])
 
     def second_pass(
         self,

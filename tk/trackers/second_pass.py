@@ -19,10 +19,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.mask_values import OTHERS
 from tk.model.body.body_fit import STATURE_DEVIATION
 from tk.model.body.joint_sigma import directions, posture_variance
 from tk.model.body.skeleton import JOINTS, Skeleton
-from tk.model.cues.ray_costs import Evidence, mean_of_views
+from tk.model.cues.ray_costs import Evidence, mean_of_views, residual_of
 from tk.model.masks.silhouettes import Pyramid
 from tk.settings import BodyFitSettings
 from tk.trackers.contour_tracker import GAIN, SAME_POSE_M
@@ -39,7 +40,7 @@ ANGLE_DEG = 15.0
 # Standard deviation of the logarithm of the stature about that of the first fit, where no height was given.
 STATURE = 0.03
 # Frames that are refined in one launch.
-AT_ONCE = 8
+AT_ONCE = 16
 # A step of a joint that is longer than those before and after it by this is a jump, metres.
 JUMP_M = 2 * SAME_POSE_M
 
@@ -96,16 +97,18 @@ class SecondPass:
 
     def optimise(self) -> None:
         """Optimise every frame near its pose of the first pass."""
-        tracker, tracked = self.tracker, self.tracked
+        tracker, tracked, grid = self.tracker, self.tracked, self.tracker.screen
         done = 0
         for chunk in np.array_split(tracked, -(-len(tracked) // AT_ONCE)):
-            seen = [self._pyramid(i) for i in chunk]
+            seen = Pyramid.of_all([self._pyramid(i) for i in chunk])
             prior = tracker.prior(self._first[chunk], ANGLE_DEG)
-            settled = tracker.settle(Pyramid.of_all(seen), self._first[chunk], (0,), prior=prior)
+            settled = tracker.settle(seen, self._first[chunk], (0,), prior=prior)
             self.poses[chunk] = settled.states
-            for i, pyramid, pose, curvature in zip(chunk, seen, settled.states, settled.hessian, strict=True):
-                _, (self.residual[i],), (label,) = self._costs(pyramid, pose[None])
-                self.variance[i] = tracker.variance(pose, curvature, prior, label, self.residual[i])
+            label = grid.render(tracker.body, settled.states).label
+            sampled = grid.sample(seen.masks[0]).reshape(label.shape)
+            residual = residual_of(label > 0, sampled >= 128, sampled == OTHERS)
+            self.residual[chunk] = residual
+            self.variance[chunk] = tracker.variance(settled.states, settled.hessian, prior, label, residual)
             done += len(chunk)
             self._report(done / len(tracked))
 

@@ -48,14 +48,15 @@ def contour_variance(skeleton: Skeleton, pose: Float, precision: Float) -> Float
         pose: (..., D).
         precision: (..., D, D) information of contours and priors about the pose.
     """
-    J = skeleton.joint_jacobian(pose)
+    J = skeleton.joint_jacobian(pose)  # (..., 15, 3, D)
+    J = J.reshape(*J.shape[:-3], -1, J.shape[-1])
     covariance = np.linalg.inv(precision)
-    return np.asarray((J * (J @ covariance[..., None, :, :])).sum(axis=(-1, -2)) / 3)
+    return np.asarray(((J @ covariance) * J).reshape(*J.shape[:-2], len(JOINTS), -1).sum(axis=-1) / 3)
 
 
 def view_variance(rays: Float, shares: Float, view_m: float = VIEW_M) -> Float:
-    """Return (15,) variance of the joints' positions along the direction that the views determine least, metres²; NaN
-    for a joint whose rays are not finite.
+    """Return (..., 15) variance of the joints' positions along the direction that the views determine least, metres²;
+    NaN for a joint whose rays are not finite.
 
     A view measures a joint's position across its ray only, and only as far as it shows the joint's bones. Priors and
     motion are no evidence of a position, so they do not count. This is the covariance of triangulation with weights
@@ -63,15 +64,15 @@ def view_variance(rays: Float, shares: Float, view_m: float = VIEW_M) -> Float:
     direction: so much three cameras around the person give, and the contours' noise covers it.
 
     Args:
-        rays: (V, 15, 3) unit vectors between the cameras and the joints.
-        shares: (V, 15) how much of the joint's bones a view shows, 0 to 1; 0 for a view that was not used.
+        rays: (..., V, 15, 3) unit vectors between the cameras and the joints.
+        shares: (..., V, 15) how much of the joint's bones a view shows, 0 to 1; 0 for a view that was not used.
         view_m: displacement of a bone's contours in one view, metres, :data:`VIEW_M` if the cameras are correct.
     """
     across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
-    information = (VIEW_M / view_m) ** 2 * (shares[..., None, None] * across).sum(axis=0)
+    information = (VIEW_M / view_m) ** 2 * (shares[..., None, None] * across).sum(axis=-4)
     information += (VIEW_M / REACH_M) ** 2 * np.eye(3)
-    known = np.isfinite(information).all(axis=(1, 2))
-    least = np.linalg.eigvalsh(np.where(known[:, None, None], information, np.eye(3)))[:, 0]
+    known = np.isfinite(information).all(axis=(-1, -2))
+    least = np.linalg.eigvalsh(np.where(known[..., None, None], information, np.eye(3)))[..., 0]
     return np.where(known, VIEW_M**2 * np.maximum(1.0 / least - 1.0, 0.0), np.nan)
 
 

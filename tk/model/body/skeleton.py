@@ -57,6 +57,9 @@ REMEMBERED = 8
 _BLOCK = 1024
 
 
+_AHEAD, _BEHIND = [1, 2, 0], [2, 0, 1]  # axes after and before each of the three
+
+
 @dataclass(frozen=True)
 class Skeleton:
     """The kinematic tree as plain arrays: D = 24 degrees of freedom, S = 13 segments, J = 15 joints.
@@ -212,7 +215,7 @@ class Skeleton:
         axis = (above[..., :3, :3] @ self.axis[:, :, None])[..., 0]
         # the joint's place, its rise included, does not move when it turns
         q = (T[..., :3, :3] @ self.point[:, :, None])[..., 0] + T[..., :3, 3]
-        v = np.where(self.prismatic[:, None], axis, np.cross(q, axis))
+        v = np.where(self.prismatic[:, None], axis, cross(q, axis))
         for k in self._raised:
             lift = above[..., k, :3, :3] @ self.rise[k]
             for by in (0, 1):
@@ -248,8 +251,8 @@ class Skeleton:
     def joint_jacobian(self, poses: Float) -> Float:
         """(..., J, 3, D) derivatives of :meth:`joints` at poses (..., D)."""
         w, v = self.twists(poses)
-        moved = np.cross(w[..., None, :, :], self.joints(poses)[..., None, :]) + v[..., None, :, :]
-        return np.swapaxes(np.where(self.ancestors[self.joint_segment][:, :, None], moved, 0.0), -1, -2)
+        moved = cross(w[..., None, :, :], self.joints(poses)[..., None, :]) + v[..., None, :, :]
+        return np.swapaxes(moved * self.ancestors[self.joint_segment][:, :, None], -1, -2)
 
     @cached_property
     def ancestors(self) -> NDArray[np.bool_]:
@@ -264,6 +267,11 @@ class Skeleton:
     def chain_dofs(self, chain: str) -> NDArray[np.bool_]:
         """(D,) True for the degrees of freedom of one of :data:`CHAINS`; the torso's are in none of them."""
         return np.isin(self.names, [name for row in TABLE if row.chain == chain for name in row.dof_names])
+
+
+def cross(a: Float, b: Float) -> Float:
+    """Return a × b of vectors (..., 3), as ``np.cross`` does, in a third of its time."""
+    return a[..., _AHEAD] * b[..., _BEHIND] - a[..., _BEHIND] * b[..., _AHEAD]
 
 
 def blocks(poses: Float) -> list[Float]:

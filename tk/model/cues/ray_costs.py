@@ -54,6 +54,13 @@ class RayGrid:
         offset = self.step // 2
         return images[:, offset :: self.step, offset :: self.step]
 
+    def render(self, body: ConeBody, poses: Float) -> Cast:
+        """Return the parts of the body that the rays meet at poses (B, D): labels and depths (B, V, h, w)."""
+        group, free = np.zeros(len(body.parts), np.int32), np.zeros((*self.rays.shape[:3], 2), np.float32)
+        _, met = cast(body.arrays, group, self.cameras, self.step, self.rays, free, poses, export=True)
+        assert met is not None
+        return met
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -151,27 +158,29 @@ class Evidence:
 
 
 def residual_of(body: NDArray[np.bool_], person: NDArray[np.bool_], others: NDArray[np.bool_] | None = None) -> Float:
-    """Return (V, 2) missing area (body outside the mask) and surplus area (mask outside the body), as shares of the
-    person's pixels in each view; their sum is E_S.
+    """Return (..., V, 2) missing area (body outside the mask) and surplus area (mask outside the body), as shares of
+    the person's pixels in each view; their sum is E_S.
 
     Args:
-        body: (V, h, w) pixels that the body covers.
-        person: (V, h, w) pixels of the mask. A view without any has a residual of NaN.
-        others: (V, h, w) pixels of other people, which are no missing area.
+        body: (..., V, h, w) pixels that the body covers.
+        person: (..., V, h, w) pixels of the mask. A view without any has a residual of NaN.
+        others: (..., V, h, w) pixels of other people, which are no missing area.
     """
-    seen = _areas(person, others)[:, None]
-    empty = ~person if others is None else ~(person | others)
-    areas = np.stack([np.count_nonzero(area, axis=(1, 2)) for area in (body & empty, person & ~body)], axis=1)
+    seen = _areas(person, others)[..., None]
+    covered = np.count_nonzero(body & person, axis=(-2, -1))
+    missing = np.count_nonzero(body if others is None else body & ~others, axis=(-2, -1)) - covered
+    areas = np.stack([missing, np.count_nonzero(person, axis=(-2, -1)) - covered], axis=-1)
     return np.where(seen > 0, areas / np.maximum(seen, 1), np.nan)
 
 
 def _areas(person: NDArray[np.bool_], others: NDArray[np.bool_] | None) -> NDArray[np.float64]:
-    """Return (V,) the person's area in each view, rays; 0 without the person, else see :data:`LEAST_SEEN`."""
-    seen = np.count_nonzero(person, axis=(1, 2)).astype(np.float64)
+    """Return (..., V) the person's area in each view, rays; 0 without the person, else see :data:`LEAST_SEEN`."""
+    seen = np.count_nonzero(person, axis=(-2, -1)).astype(np.float64)
     if others is None:
         return seen
-    most = seen + np.count_nonzero(others, axis=(1, 2))
-    return np.where(seen > 0, np.maximum(seen, np.minimum(most, LEAST_SEEN * seen.max())), 0.0)
+    most = seen + np.count_nonzero(others, axis=(-2, -1))
+    least = np.minimum(most, LEAST_SEEN * seen.max(axis=-1, keepdims=True))
+    return np.where(seen > 0, np.maximum(seen, least), 0.0)
 
 
 def mean_of_views(cost: Float) -> Float:

@@ -27,24 +27,33 @@ _OF_JOINT /= _OF_JOINT.sum(axis=1, keepdims=True)
 
 
 def contour_shares(body: ConeBody, grid: RayGrid, label: NDArray[np.uint8], joints: Float) -> Float:
-    """Return (V, 15) how much of the outline of each joint's bones a view shows against the background, 0 to 1: 1 if
-    one side is visible over the bone's whole length, 0 if the bones lie before or behind other parts of the body.
+    """Return (..., V, 15) how much of the outline of each joint's bones a view shows against the background, 0 to 1: 1
+    if one side is visible over the bone's whole length, 0 if the bones lie before or behind other parts of the body.
 
     Args:
         body: the body.
         grid: rays of the V views.
-        label: (V, h, w) 1 + the part that a ray meets, 0 where it meets nothing.
-        joints: (15, 3) m, in the world of the grid's cameras.
+        label: (..., V, h, w) 1 + the part that a ray meets, 0 where it meets nothing.
+        joints: (..., 15, 3) m, in the world of the grid's cameras.
     """
-    V, S = len(label), len(_SEGMENTS)
-    names = ["torso" if part.segment == "pelvis" else part.segment for part in body.parts]
-    segment = np.array([-1, *(_SEGMENTS.index(name) if name in _BONES else -1 for name in names)])[label]
-    empty = np.pad(label == 0, ((0, 0), (1, 1), (1, 1)))
+    h, w = label.shape[-2:]
+    images = label.reshape(-1, h, w)
+    empty = np.zeros((len(images), h + 2, w + 2), np.bool_)  # beyond the image is no background
+    np.equal(images, 0, out=empty[:, 1:-1, 1:-1])
     beside = empty[:, :-2, 1:-1] | empty[:, 2:, 1:-1] | empty[:, 1:-1, :-2] | empty[:, 1:-1, 2:]
-    view, row, column = np.nonzero(beside & (segment >= 0))
-    found = np.bincount(view * S + segment[view, row, column], minlength=V * S).reshape(V, S)
-    pixels = np.array([camera.project(joints)[0] for camera in grid.rig])
-    length = np.linalg.norm(pixels[:, _ENDS[:, 0]] - pixels[:, _ENDS[:, 1]], axis=2) / grid.step
+    outline = np.flatnonzero(beside & (images > 0))
+    S = len(_SEGMENTS)
+    bins = outline // (h * w) * (S + 1) + _segments(body)[images.reshape(-1)[outline]]
+    found = np.bincount(bins, minlength=len(images) * (S + 1)).reshape(*label.shape[:-2], S + 1)[..., :S]
+    pixels = grid.rig.project(joints)
+    bones = pixels[..., _ENDS[:, 0], :] - pixels[..., _ENDS[:, 1], :]
+    length = np.sqrt((bones**2).sum(axis=-1)) / grid.step
     # two rays: a bone along the view is a disc of about this width; a view does not show what is behind the camera
     shown = np.where(np.isfinite(length), np.minimum(found / np.maximum(length, 2.0), 1.0), 0.0)
     return np.asarray(shown @ _OF_JOINT.T)
+
+
+def _segments(body: ConeBody) -> NDArray[np.int64]:
+    """Return (1 + P,) the segment, by :data:`_SEGMENTS`, of each label of a body; their number for other labels."""
+    names = ["torso" if part.segment == "pelvis" else part.segment for part in body.parts]
+    return np.array([len(_BONES), *(_SEGMENTS.index(name) if name in _BONES else len(_BONES) for name in names)])

@@ -13,9 +13,10 @@ from tk.kernels import silhouette as kernels
 from tk.kernels.cone_arrays import ConeArrays
 from tk.kernels.line_search import Regions, SearchSettings
 from tk.kernels.mask_values import OTHERS
+from tk.kernels.newton import NewtonSteps
 from tk.kernels.projection import pack_cameras
 from tk.kernels.raycast import cast
-from tk.kernels.silhouette import Edgels, NormalEquations
+from tk.kernels.silhouette import Descent, Edgels, NormalEquations
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.camera import Rig
 from tk.model.masks.regions import clean_by_area
@@ -114,27 +115,31 @@ class Views:
         scale: int,
         settings: SearchSettings,
         regions: Regions | None = None,
-        frames: NDArray[np.intp] | None = None,
     ) -> NormalEquations:
-        """Return normal equations of poses (B, D) at a scale's index. The pyramid is of one frame, or of several, of
-        which ``frames`` (B,) are the poses'; None: each pose has its own."""
-        return kernels.normal_equations(
-            body,
-            self._cameras32,
-            pyramid.sizes[scale],
-            pyramid.masks[scale],
-            2.0**scale,
-            poses,
-            settings,
-            regions,
-            frames,
-        )
+        """Return normal equations of poses (B, D) at a scale's index. The pyramid is of one frame, or each pose has its
+        own."""
+        return kernels.normal_equations(body, *self._at(pyramid, scale), poses, settings, regions)
+
+    def descend(
+        self,
+        body: ConeArrays,
+        pyramid: Pyramid,
+        poses: Float,
+        scale: int,
+        settings: SearchSettings,
+        newton: NewtonSteps,
+        regions: Regions | None = None,
+    ) -> Descent:
+        """Return poses (B, D) after Gauss-Newton steps at a scale's index; other arguments as of :meth:`equations`."""
+        return kernels.descend(body, *self._at(pyramid, scale), poses, settings, newton, regions)
 
     def edgels(self, body: ConeBody, pyramid: Pyramid, pose: Float, scale: int, settings: SearchSettings) -> Edgels:
         """Return the edgels that a pose (D,) finds at a scale's index."""
-        return kernels.find_edgels(
-            body.arrays, self._cameras32, pyramid.sizes[scale], pyramid.masks[scale], 2.0**scale, pose, settings
-        )
+        return kernels.find_edgels(body.arrays, *self._at(pyramid, scale), pose, settings)
+
+    def _at(self, pyramid: Pyramid, scale: int) -> tuple[NDArray[np.float32], NDArray[np.int32], Masks, float]:
+        """Return the cameras, and the pyramid's scale as the kernels take it."""
+        return self._cameras32, pyramid.sizes[scale], pyramid.masks[scale], 2.0**scale
 
 
 def _marked(level: Masks, others: NDArray[np.bool_], step: int) -> Masks:
