@@ -85,3 +85,5 @@ class ConfigError(TkError):
 
 class WorkerError(TkError):
     """A worker process has been killed."""
+
+    exit_code = 1

@@ -9,11 +9,12 @@ import json
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
@@ -24,10 +25,17 @@ if TYPE_CHECKING:
     from tk.settings import Settings
 
 
-#: errors of the system about a path that no file can have: whatever uses it first fails
+#: errors of the system about a path that no file can have; the first use of such a path fails
 _IMPOSSIBLE_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
 #: characters of such a path that a message shows
 _SHOWN = 100
+
+
+def exit_with(code: int, line: str = "") -> NoReturn:
+    """End the command with this exit code, after a line on stderr if there is one."""
+    if line:
+        click.echo(f"tk: {line}", err=True)
+    raise SystemExit(code) from None
 
 
 @contextmanager
@@ -37,22 +45,18 @@ def errors_in_one_line() -> Iterator[None]:
         with _terminated_as_interrupted():
             yield
     except TkError as error:
-        click.echo(f"tk: {error.line}", err=True)
-        raise click.exceptions.Exit(error.exit_code) from None
+        exit_with(error.exit_code, error.line)
     except OSError as error:
         if error.errno not in _IMPOSSIBLE_NAMES:
             raise
-        click.echo(f"tk: {str(error.filename)[:_SHOWN]}: {error.strerror}", err=True)
-        raise click.exceptions.Exit(2) from None
+        exit_with(2, f"{str(error.filename)[:_SHOWN]}: {error.strerror}")
     except KeyboardInterrupt as reason:
-        click.echo(f"tk: interrupted{f'; {reason}' if str(reason) else ''}", err=True)
-        raise click.exceptions.Exit(1) from None
+        exit_with(1, f"interrupted{f'; {reason}' if str(reason) else ''}")
     except click.UsageError as error:
         if type(error).__name__ == "NoArgsIsHelpError":  # `tk` alone prints the help
             raise
         command = error.ctx.command_path if error.ctx else "tk"
-        click.echo(f"tk: {' '.join(error.format_message().split())} See {command} --help", err=True)
-        raise click.exceptions.Exit(2) from None
+        exit_with(2, f"{' '.join(error.format_message().split())} See {command} --help")
 
 
 @contextmanager
@@ -73,26 +77,13 @@ def _terminated_as_interrupted() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
 
 
-def print_any_text() -> None:
-    """Let stdout and stderr print text that is not in their encoding, such as a path, as escape sequences."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
-
-
-@contextmanager
-def working(stage: str) -> Iterator[None]:
-    """Show on a terminal that work without countable frames goes on."""
-    with ConsoleReporter(quiet=not sys.stderr.isatty()) as reporter:
-        reporter.stage(stage)
-        yield
-
-
 class Commands(click.Group):
     """A group of commands that reports mistakes as :func:`errors_in_one_line` does."""
 
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
-        print_any_text()
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):  # characters that its encoding lacks, as in a path, are escaped
+                stream.reconfigure(errors="backslashreplace")
         with errors_in_one_line():
             return super().make_context(*args, **kwargs)
 
@@ -107,9 +98,50 @@ class Commands(click.Group):
             formatter.write_dl(rows)
 
 
+def working(stage: str) -> ConsoleReporter:
+    """Return a reporter that shows on a terminal that work without countable frames goes on."""
+    return ConsoleReporter(quiet=not sys.stderr.isatty(), stage=stage)
+
+
+def print_json(**values: object) -> None:
+    """Print values as a JSON object on stdout."""
+    click.echo(json.dumps(values, indent=2, allow_nan=False))
+
+
+def print_lines(prefix: str, lines: Iterable[object]) -> None:
+    """Print lines on stderr, each after the prefix."""
+    for line in lines:
+        click.echo(f"{prefix}{line}", err=True)
+
+
 def example(*lines: str) -> str:
     """Return the epilogue of a command's help."""
     return "\b\n" + "\n".join(["Example:" if len(lines) == 1 else "Examples:", *(f"  {line}" for line in lines)])
+
+
+#: names of cameras or joints; None if the option is not given
+Names = tuple[str, ...] | None
+#: first frame, and the one after the last; None: to the end
+Span = tuple[int, int | None]
+
+
+def _split(ctx: click.Context, option: click.Parameter, names: str | None) -> Names:
+    """Return the names in ``A,B,…``; None without any text."""
+    return tuple(name.strip() for name in names.split(",") if name.strip()) if names else None
+
+
+def _span(ctx: click.Context, option: click.Parameter, frames: str | None) -> Span:
+    """Return (A, B) from ``A:B``; (0, None), all frames, from None."""
+    if frames is None:
+        return 0, None
+    first, colon, last = frames.partition(":")
+    try:
+        start, stop = int(first) if first else 0, int(last) if last else None
+        if not colon or start < 0 or (stop is not None and stop <= start):
+            raise ValueError
+    except ValueError:
+        raise ConfigError(f"--frames {frames}: give A:B with 0 ≤ A < B, for example 0:100") from None
+    return start, stop
 
 
 PATH = click.Path(path_type=Path)
@@ -117,8 +149,9 @@ PATH = click.Path(path_type=Path)
 capture_argument = click.argument("capture", type=PATH)
 optional_capture_argument = click.argument("capture", type=PATH, required=False)
 result_argument = click.argument("result", type=PATH, metavar="RESULT.h5")
-cameras_option = click.option("--cameras", metavar="A,B,…", help="Use these cameras only.")
-frames_option = click.option("--frames", metavar="A:B", help="Frames A to B-1; A or B may be omitted.")
+names_option = partial(click.option, metavar="A,B,…", callback=_split)
+cameras_option = names_option("--cameras", help="Use these cameras only.")
+frames_option = click.option("--frames", metavar="A:B", callback=_span, help="Frames A to B-1; A or B may be omitted.")
 masks_option = click.option(
     "--masks", default="auto", show_default=True, metavar="auto|none|median|DIR",
     help="auto: the capture's masks, else its empty scene, else an installed segmenter; none: ignore the capture's "
@@ -147,8 +180,8 @@ class TrackingOptions:
 
     method: str
     voxels: int | None
-    cameras: str | None
-    frames: str | None
+    cameras: Names
+    frames: Span
     seed: int | None
     masks: str
     body: Path | None
@@ -194,36 +227,6 @@ def tracking_options(command: Callable[..., None]) -> Callable[..., None]:
     for option in reversed(_TRACKING_OPTIONS):
         grouped = option(grouped)
     return grouped
-
-
-def print_json(**values: object) -> None:
-    """Print values as a JSON object on stdout."""
-    click.echo(json.dumps(values, indent=2, allow_nan=False))
-
-
-def print_notes(notes: tuple[str, ...] | list[str]) -> None:
-    """Print each note as a line on stderr."""
-    for note in notes:
-        click.echo(f"note: {note}", err=True)
-
-
-def split_names(names: str | None) -> tuple[str, ...] | None:
-    """Return the names in ``A,B,…``; None without any text."""
-    return tuple(name.strip() for name in names.split(",") if name.strip()) if names else None
-
-
-def parse_frames(frames: str | None) -> tuple[int, int | None]:
-    """Return (A, B) from ``A:B``; (0, None), all frames, from None."""
-    if frames is None:
-        return 0, None
-    first, colon, last = frames.partition(":")
-    try:
-        start, stop = int(first) if first else 0, int(last) if last else None
-        if not colon or start < 0 or (stop is not None and stop <= start):
-            raise ValueError
-    except ValueError:
-        raise ConfigError(f"--frames {frames}: give A:B with 0 ≤ A < B, for example 0:100") from None
-    return start, stop
 
 
 def load_settings(file: Path | None, preset: str | None = None, **overrides: Any) -> Settings:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import click
 
 from tk.commands import base
 from tk.commands.console import BatchConsoleReporter
-from tk.errors import WorkerError
 
 
 @click.command(epilog=base.example("tk batch recordings/* -o results --workers 4"))
@@ -43,8 +41,8 @@ def batch(
     parse_choice(people)  # a mistake ends the command before the first capture
     track_options = TrackOptions(
         options.method,
-        base.parse_frames(options.frames),
-        base.split_names(options.cameras),
+        options.frames,
+        options.cameras,
         options.masks,
         options.body and options.body.resolve(),
         options.causal,
@@ -58,11 +56,7 @@ def batch(
                 captures, output, track_options, reporter, workers, scheduler, not no_report, dashboard
             )
         except KeyboardInterrupt:
-            click.echo("tk: interrupted; the same command continues", err=True)
-            sys.exit(1)
-        except WorkerError as error:
-            click.echo(f"tk: {error}", err=True)
-            sys.exit(1)
+            raise KeyboardInterrupt("the same command continues") from None
     if not quiet:
         click.echo(f"the summary is in {output / 'summary.html'}", err=True)
-    sys.exit(exit_code(outcomes))
+    base.exit_with(exit_code(outcomes))

@@ -9,9 +9,9 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Iterable
 from datetime import timedelta
-from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
@@ -43,12 +43,31 @@ _NAMED_CAPTURES = 4
 class _Notes:
     """Prints notes on stderr."""
 
-    def __init__(self, console: Console | None = None) -> None:
+    def __init__(self, quiet: bool, console: Console | None = None) -> None:
         self._console = console or Console(stderr=True, highlight=False, soft_wrap=True)
+        self._quiet = quiet
+        self._bars = self._console.is_terminal and not quiet
+        self._live: Progress | None = None
 
     def note(self, text: str) -> None:
         """Print a line that the user should read."""
         self._console.print(f"note: {text}", style="yellow", markup=False)
+
+    def _show(self, columns: Iterable[ProgressColumn], text: str = "", transient: bool = False, **task: Any) -> None:
+        """Replace the moving line."""
+        self._stop()
+        self._live = Progress(*columns, console=self._console, transient=transient)
+        self._live.add_task(text, **task)
+        self._live.start()
+
+    def _update(self, **task: Any) -> None:
+        if self._live is not None:
+            self._live.update(self._live.task_ids[0], **task)
+
+    def _stop(self) -> None:
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
 
 
 class _TimeLeft(ProgressColumn):
@@ -64,7 +83,7 @@ class _TimeLeft(ProgressColumn):
 
 
 class ConsoleReporter(_Notes):
-    """The reporter of a command, see :class:`tk.run.session.Reporter`; a context manager.
+    """The reporter of a command, see :class:`tk.run.reporter.Reporter`; a context manager.
 
     Without a terminal a line every two seconds shows that a long stage goes on.
 
@@ -73,34 +92,38 @@ class ConsoleReporter(_Notes):
         console: where to print; stderr by default.
         later: duration of the stages after the last frame, as a multiple of the duration of all frames.
         last: the part of ``later`` of the stages whose progress is not reported.
+        stage: the first stage.
     """
 
     def __init__(
-        self, quiet: bool = False, console: Console | None = None, later: float = 0.0, last: float = 0.0
+        self,
+        quiet: bool = False,
+        console: Console | None = None,
+        later: float = 0.0,
+        last: float = 0.0,
+        stage: str = "",
     ) -> None:
-        super().__init__(console)
-        self._quiet = quiet
+        super().__init__(quiet, console)
         self._handler = logging.Handler(logging.INFO)
         self._handler.emit = self._log  # type: ignore[method-assign]
-        self._live: Progress | None = None
         self._lost = self._count = self._done = self._total = 0
         self._begun = self._started = self._last = time.perf_counter()
         self._later, self._last_stages, self._last_s = later, last, 0.0
         self._end = float("-inf")
-        self._stage, self._stage_begun = "", self._begun
+        self._stage, self._stage_begun = stage, self._begun
         self._closed = threading.Event()
 
     def __enter__(self) -> ConsoleReporter:
         self._level_before = _LOG.level
         _LOG.addHandler(self._handler)
         _LOG.setLevel(logging.INFO)
-        if not self._quiet and not self._console.is_terminal:
+        if self._stage:
+            self.stage(self._stage)
+        if not self._quiet and not self._bars:
             threading.Thread(target=self._show_life, daemon=True).start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._closed.set()
         _LOG.removeHandler(self._handler)
         _LOG.setLevel(self._level_before)
@@ -114,8 +137,7 @@ class ConsoleReporter(_Notes):
         """Print a line whenever nothing was printed for two seconds."""
         while not self._closed.wait(_PERIOD_S / 4):
             if self._stage and time.perf_counter() - self._last > _PERIOD_S:
-                left = self.seconds_left()
-                self._print(f"still {self._stage}" + ("" if left is None else f", about {left:.0f} s left"))
+                self._print(", ".join([f"still {self._stage}", *self._left()]))
 
     def _print(self, text: str) -> None:
         """Print a line with the time since the begin."""
@@ -127,21 +149,20 @@ class ConsoleReporter(_Notes):
         left = self._end - time.perf_counter()
         return left if left > 0 else None
 
+    def _left(self) -> list[str]:
+        left = self.seconds_left()
+        return [] if left is None else [f"about {left:.0f} s left"]
+
     def stage(self, text: str) -> None:
         """Show what is being done from now on."""
-        if self._quiet:
-            return
         self._stage, self._stage_begun = text, time.perf_counter()
-        if not self._console.is_terminal:
+        if self._bars:
+            columns = (
+                SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn(), _TimeLeft(self),
+            )  # fmt: skip
+            self._show(columns, text, transient=True, total=None)
+        elif not self._quiet:
             self._print(text)
-            return
-        self._stop()
-        self._live = Progress(
-            SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn(), _TimeLeft(self),
-            console=self._console, transient=True,
-        )  # fmt: skip
-        self._live.add_task(text, total=None)
-        self._live.start()
 
     def begin(self, total: int, done: int) -> None:
         """Start counting: ``done`` of ``total`` frames are finished already."""
@@ -157,50 +178,35 @@ class ConsoleReporter(_Notes):
         if self._quiet:
             return
         now = time.perf_counter()
-        made = self._done + self._count
-        if self._count == 1:
+        made, first = self._done + self._count, self._count == 1
+        if first:
             rate = f"first after {now - self._begun:.1f} s"
-            self._started = self._last = now
-            self._stage = ""
+            self._started, self._stage = now, ""
         else:
             speed = (self._count - 1) / max(now - self._started, 1e-9)
             rate = f"{speed:.1f} frames/s"
             if self._total:
                 self._end = now + (self._total - made + self._later * self._total) / speed
                 self._last_s = self._last_stages * self._total / speed
-        lost = f"{self._lost} lost" if self._lost else ""
-        if self._console.is_terminal:
-            if self._count == 1:
-                self._start_bar()
-            assert self._live is not None
-            self._live.update(self._live.task_ids[0], completed=made, rate=rate, lost=lost)
-        elif self._count == 1 or now - self._last > _PERIOD_S or made == self._total:
-            self._last = now
-            seconds = self.seconds_left()
-            left = "" if seconds is None else f"about {seconds:.0f} s left"
-            progress = ", ".join(part for part in (rate, left, lost) if part)
-            click.echo(f"frame {frame}: {made}/{self._total}, {progress}", err=True)
+        lost = [f"{self._lost} lost"] if self._lost else []
+        if not self._bars:
+            if first or now - self._last > _PERIOD_S or made == self._total:
+                self._last = now
+                progress = ", ".join([rate, *self._left(), *lost])
+                click.echo(f"frame {frame}: {made}/{self._total}, {progress}", err=True)
+            return
+        if first:  # the columns fit into 80 characters with the longest texts
+            columns = (
+                TextColumn("frames"), BarColumn(20), MofNCompleteColumn(),
+                TextColumn("{task.fields[rate]}"), _TimeLeft(self), TextColumn("{task.fields[lost]}"),
+            )  # fmt: skip
+            self._show(columns, total=self._total, completed=self._done, rate="", lost="")
+        self._update(completed=made, rate=rate, lost="".join(lost))
 
     def within(self, share: float) -> None:
         """Estimate the time left from the share of the current stage that is done."""
         now = time.perf_counter()
         self._end = now + (now - self._stage_begun) * (1 / share - 1) + self._last_s
-
-    def _start_bar(self) -> None:
-        self._stop()
-        # fits into 80 columns with the longest texts
-        columns = (
-            TextColumn("frames"), BarColumn(20), MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"), _TimeLeft(self), TextColumn("{task.fields[lost]}"),
-        )  # fmt: skip
-        self._live = Progress(*columns, console=self._console)
-        self._live.add_task("", total=self._total, completed=self._done, rate="", lost="")
-        self._live.start()
-
-    def _stop(self) -> None:
-        if self._live is not None:
-            self._live.stop()
-            self._live = None
 
 
 class BatchConsoleReporter(_Notes):
@@ -211,32 +217,27 @@ class BatchConsoleReporter(_Notes):
     """
 
     def __init__(self, quiet: bool = False) -> None:
-        super().__init__()
-        self._quiet = quiet
+        super().__init__(quiet)
         self._running: dict[str, tuple[int, int]] = {}
         self._last = time.monotonic()
-        columns = (
-            TextColumn("captures"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-            TextColumn("{task.description}"),
-        )  # fmt: skip
-        self._bar = Progress(*columns, console=self._console) if self._console.is_terminal and not quiet else None
-        self._task = self._bar.add_task("", total=None) if self._bar else None
 
     def __enter__(self) -> BatchConsoleReporter:
-        if self._bar:
-            self._bar.start()
+        if self._bars:
+            columns = (
+                TextColumn("captures"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+                TextColumn("{task.description}"),
+            )  # fmt: skip
+            self._show(columns, total=None)
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._bar:
-            self._bar.stop()
+        self._stop()
 
     def progress(self, name: str, done: int, total: int) -> None:
         """Show how many frames of a capture are finished."""
         self._running[name] = (done, total)
-        if self._bar and self._task is not None:
-            self._bar.update(self._task, description=self._running_captures())
-        elif not self._quiet and time.monotonic() - self._last > _BATCH_PERIOD_S:
+        self._update(description=self._running_captures())
+        if not self._bars and not self._quiet and time.monotonic() - self._last > _BATCH_PERIOD_S:
             self._last = time.monotonic()
             self._console.print(self._running_captures(), markup=False)
 
@@ -245,8 +246,7 @@ class BatchConsoleReporter(_Notes):
         self._running.pop(name, None)
         if not self._quiet or outcome.failed or outcome.mostly_lost:
             self._console.print(f"{done}/{total} {name}: {_summary_of(outcome)}", markup=False)
-        if self._bar and self._task is not None:
-            self._bar.update(self._task, completed=done, total=total, description=self._running_captures())
+        self._update(completed=done, total=total, description=self._running_captures())
 
     def _running_captures(self) -> str:
         """Return the progress of the captures that are being tracked."""

@@ -23,8 +23,7 @@ def demo(output: Path, voxels: int | None, resume: bool, force: bool, no_report:
     from importlib.resources import as_file, files
 
     with as_file(files("tk") / "data" / "demo") as folder:
-        with ConsoleReporter(quiet, None, *later_stages(causal=False, no_report=no_report)) as reporter:
-            reporter.stage("loading")
+        with ConsoleReporter(quiet, None, *later_stages(causal=False, no_report=no_report), "loading") as reporter:
             from tk.evaluation.joints import evaluate_files
             from tk.io.captures.capture import open_capture
             from tk.io.results.files import check_result_path

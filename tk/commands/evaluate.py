@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     "--capture", type=base.PATH, metavar="DIR",
     help="Also compare in the images: pixels and silhouettes.  [default: the folder of TRUTH, if it is a capture]",
 )  # fmt: skip
-@click.option("--joints", show_default="both ankles", help="Joints to compare in pixels.")
+@base.names_option("--joints", show_default="both ankles", help="Joints to compare in pixels.")
 @base.masks_option
 @base.json_option
-def evaluate(result: Path, truth: Path, capture: Path | None, joints: str | None, masks: str, as_json: bool) -> None:
+def evaluate(result: Path, truth: Path, capture: Path | None, joints: base.Names, masks: str, as_json: bool) -> None:
     """Compare RESULT with TRUTH: joint distances, PCK, lost frames, frames/s; pixels and silhouettes by view.
 
     If a file has several people: misses, false positives, identity switches, MOTA, IDF1, and errors by person.
@@ -49,16 +49,12 @@ def evaluate(result: Path, truth: Path, capture: Path | None, joints: str | None
             notes.append("no comparison in the images: a file has several people")
             folder = None
         try:
-            views = (
-                evaluate_views(result, truth, folder, base.split_names(joints) or ANKLE_JOINTS, masks)
-                if folder
-                else None
-            )
+            views = evaluate_views(result, truth, folder, joints or ANKLE_JOINTS, masks) if folder else None
         except CaptureError as error:
             if capture is not None:
                 raise
             notes.append(f"no comparison in the images: {error}")
-    base.print_notes(notes)
+    base.print_lines("note: ", notes)
     if as_json:
         base.print_json(**found.to_dict(), **({"views": views.to_dict()} if views else {}))
     else:

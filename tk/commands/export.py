@@ -11,8 +11,8 @@ from tk.commands import base
 
 @click.command(epilog=base.example("tk export walk.h5 --to trc,mot,bvh"))
 @base.result_argument
-@click.option(
-    "--to", "formats", required=True, metavar="A,B,…",
+@base.names_option(
+    "--to", "formats", required=True,
     help="Formats: trc, mot (OpenSim), c3d, bvh, csv, gltf (.glb), ply (a folder); all.",
 )  # fmt: skip
 @click.option(
@@ -21,7 +21,7 @@ from tk.commands import base
 @click.option("-o", "--output", type=base.PATH, metavar="DIR", help="Folder.  [default: the folder of RESULT.h5]")
 @click.option("--smoothed", is_flag=True, help="Export the smoothed motion, with short losses bridged.")
 @base.force_option
-def export(result: Path, formats: str, output: Path | None, bvh_units: str, smoothed: bool, force: bool) -> None:
+def export(result: Path, formats: base.Names, output: Path | None, bvh_units: str, smoothed: bool, force: bool) -> None:
     """Write RESULT.h5 in the formats of other programs: OpenSim, Blender, spreadsheets.
 
     A format that cannot be written is named at the end, with the remedy; the others are written.
@@ -29,11 +29,9 @@ def export(result: Path, formats: str, output: Path | None, bvh_units: str, smoo
     with base.working(f"exporting {result}"):
         from tk.export import export as write
 
-        written = write(result, base.split_names(formats) or (), output, smoothed, force, bvh_units)
-    base.print_notes(written.notes)
-    for file in written.files:
-        click.echo(f"wrote {file}", err=True)
-    for line in written.failed:
-        click.echo(f"tk: not written: {line}", err=True)
+        written = write(result, formats or (), output, smoothed, force, bvh_units)
+    base.print_lines("note: ", written.notes)
+    base.print_lines("wrote ", written.files)
+    base.print_lines("tk: not written: ", written.failed)
     if written.failed:
-        raise click.exceptions.Exit(1)
+        base.exit_with(1)

@@ -22,5 +22,5 @@ def import_(folder: Path, output: Path, units: str | None, trial: str | None) ->
         from tk.io.importers import import_project
 
         done = import_project(folder, output, units, trial)
-    base.print_notes(done.notes)
+    base.print_lines("note: ", done.notes)
     click.echo(f"{done.cameras} cameras in {output}; check {output / 'capture.toml'}", err=True)

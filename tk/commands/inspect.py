@@ -23,7 +23,7 @@ from tk.errors import CaptureError
 def inspect(
     capture: Path,
     output: Path | None,
-    cameras: str | None,
+    cameras: base.Names,
     masks: str,
     resample: bool | None,
     config_file: Path | None,
@@ -44,7 +44,7 @@ def inspect(
             if picture is not None:
                 check_not_input(picture, capture=capture)
         settings = base.load_settings(config_file, resample=resample)
-        opened = open_recording(capture, base.split_names(cameras), masks, settings.resample)
+        opened = open_recording(capture, cameras, masks, settings.resample)
         _, opened = reduce_images(opened.setup(), opened, settings.person_pixels)
         found, shown = check(opened, settings)
         if sheet is not None and plan is not None:

@@ -18,19 +18,22 @@ from tk.commands.console import ConsoleReporter
 @base.frames_option
 @base.quiet_option
 def masks(
-    capture: Path, output: Path, segmenter: str | None, cameras: str | None, frames: str | None, quiet: bool
+    capture: Path,
+    output: Path,
+    segmenter: str | None,
+    cameras: base.Names,
+    frames: base.Span,
+    quiet: bool,
 ) -> None:
     """Segment the videos of CAPTURE with a neural network and write masks to DIR/CAMERA/000000.png.
 
     The person is white. After an interruption, the same command continues.
     """
-    span = base.parse_frames(frames)
-    with ConsoleReporter(quiet) as reporter:
-        reporter.stage("loading")
+    with ConsoleReporter(quiet, stage="loading") as reporter:
         from tk.io.importers import open_recording
         from tk.run import mask_folder
 
-        opened = open_recording(capture, base.split_names(cameras), "none")
-        written = mask_folder.write_masks(opened, output, reporter, segmenter, span)
+        opened = open_recording(capture, cameras, "none")
+        written = mask_folder.write_masks(opened, output, reporter, segmenter, frames)
     if not quiet:
         click.echo(f"masks of {written.frames} frames in {output}, {written.now} of them new", err=True)

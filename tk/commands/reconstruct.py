@@ -31,8 +31,8 @@ def reconstruct(
     ply: Path | None,
     mesh: Path | None,
     voxels: int | None,
-    cameras: str | None,
-    frames: str | None,
+    cameras: base.Names,
+    frames: base.Span,
     masks: str,
     resample: bool | None,
     force: bool,
@@ -41,17 +41,15 @@ def reconstruct(
     as_json: bool,
 ) -> None:
     """Reconstruct the coloured surface of the visual hull in every frame of CAPTURE."""
-    span = base.parse_frames(frames)
     started = time.perf_counter()
-    with ConsoleReporter(quiet) as reporter:
-        reporter.stage("loading")
+    with ConsoleReporter(quiet, stage="loading") as reporter:
         from tk.io.importers import open_recording
         from tk.run import reconstruction
 
         settings = base.load_settings(config_file, voxels=voxels, resample=resample)
         reporter.stage(f"opening {capture}")
-        opened = open_recording(capture, base.split_names(cameras), masks, settings.resample)
-        count = reconstruction.reconstruct(opened, output, settings, reporter, span, ply, mesh, force)
+        opened = open_recording(capture, cameras, masks, settings.resample)
+        count = reconstruction.reconstruct(opened, output, settings, reporter, frames, ply, mesh, force)
     if as_json:
         base.print_json(result=str(output), frames=count, seconds=round(time.perf_counter() - started, 3))
     if not quiet:

@@ -32,15 +32,14 @@ def refine(
     focal: bool,
     offsets: bool,
     trust: float,
-    cameras: str | None,
+    cameras: base.Names,
     masks: str,
     config_file: Path | None,
     force: bool,
     quiet: bool,
 ) -> None:
     """Refine the calibration and the time offsets of CAPTURE with RESULT.h5, a result tracked from CAPTURE."""
-    with ConsoleReporter(quiet) as reporter:
-        reporter.stage("loading")
+    with ConsoleReporter(quiet, stage="loading") as reporter:
         from tk.io.importers import open_recording
         from tk.io.results.reader import read_result
         from tk.model.cameras.refinement import RefinementSettings
@@ -49,7 +48,7 @@ def refine(
         refinement = RefinementSettings(focal=focal, offsets=offsets, trust=trust)
         settings = base.load_settings(config_file)
         reporter.stage(f"opening {capture}")
-        opened = open_recording(capture, base.split_names(cameras), masks, read_result(result).resampled)
+        opened = open_recording(capture, cameras, masks, read_result(result).resampled)
         for warning in opened.warnings:
             reporter.note(warning)
         reporter.stage("refining the cameras")

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from tk.commands import base
 from tk.errors import ConfigError, ResultError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 
 @click.command(epilog=base.example("tk render result.h5 CAPTURE", "tk render result.h5 --view 3d -o turning.mp4"))
@@ -31,7 +36,7 @@ def render(
     capture: Path | None,
     output: Path | None,
     view: str | None,
-    cameras: str | None,
+    cameras: base.Names,
     frames: str | None,
     png: Path | None,
     full: bool,
@@ -39,62 +44,48 @@ def render(
 ) -> None:
     """Draw RESULT.h5 as a video: over the images of CAPTURE, or in 3D."""
     with base.working("drawing"):
+        from tk.io.captures.capture import open_capture
+        from tk.io.paths import check_not_input, check_output
+        from tk.io.results.reader import read_result
+        from tk.render.overlay import Overlay, choose_frames, write_sheets
+        from tk.render.scene import Scene
+        from tk.render.video import VIDEO, check_encoder, video_writer
         from tk.threads import one_thread
 
-        with one_thread():
-            files = _render(result, capture, output, view, base.split_names(cameras), frames, png, full, force)
-    for file in files:
-        click.echo(f"wrote {file}", err=True)
-
-
-def _render(
-    result_path: Path,
-    capture_path: Path | None,
-    output: Path | None,
-    view: str | None,
-    cameras: Sequence[str] | None,
-    frames: str | None,
-    png: Path | None,
-    full: bool,
-    force: bool,
-) -> list[Path]:
-    """Write the files and return their paths."""
-    from tk.io.captures.capture import open_capture
-    from tk.io.paths import check_not_input, check_output
-    from tk.io.results.reader import read_result
-    from tk.render.overlay import Overlay, choose_frames, write_sheets
-    from tk.render.scene import Scene
-    from tk.render.video import VIDEO, check_encoder, video_writer
-
-    result = read_result(result_path)
-    if not any(map(len, result.people)):
-        raise ResultError(f"{result_path}: has no frames")
-    chosen = _parse_frames(frames, result.aligned()[0].frames.tolist())
-    view = view or ("overlay" if capture_path else "3d")
-    capture = None if capture_path is None else open_capture(capture_path, cameras, "none", result.resampled)
-    if png is not None:
-        if view != "overlay" or capture is None:
+        loaded = read_result(result)
+        if not any(map(len, loaded.people)):
+            raise ResultError(f"{result}: has no frames")
+        chosen = _parse_frames(frames, loaded.aligned()[0].frames.tolist())
+        view = view or ("overlay" if capture else "3d")
+        opened = None if capture is None else open_capture(capture, cameras, "none", loaded.resampled)
+        if png is not None and (view != "overlay" or opened is None):
             raise ConfigError("--png: contact sheets need images; give RESULT.h5 CAPTURE and no other --view")
-        check_not_input(png, [result_path], capture_path)
-        return write_sheets(Overlay(capture, result), png, chosen, full=full)
-    output = output or result_path.with_name(result_path.stem + (".mp4" if view == "overlay" else f"-{view}.mp4"))
-    check_output(output, VIDEO, force, [result_path], capture_path)
-    check_encoder()
-    if view != "overlay":
-        scene = Scene(result, capture.rig if capture and not result.cameras else None, hull=view == "hull")
-        rows = scene.rows(chosen)
-        with video_writer(output, result.meta.fps) as add:
-            for row in rows:
-                add(scene.picture(row))
-    elif capture is None:
-        raise ConfigError(f"--view overlay: needs the images: tk render {result_path} CAPTURE")
-    else:
-        overlay = Overlay(capture, result, full=full)
-        shown = choose_frames(overlay.people[0], chosen, len(overlay.row_of))
-        with video_writer(output, capture.fps) as add:
-            for frame, images in overlay.pictures(shown):
-                add(overlay.mosaic(frame, images))
-    return [output]
+        output = output or result.with_name(result.stem + (".mp4" if view == "overlay" else f"-{view}.mp4"))
+        if png is not None:
+            check_not_input(png, [result], capture)
+        else:
+            check_output(output, VIDEO, force, [result], capture)
+            check_encoder()
+        if view == "overlay" and opened is None:
+            raise ConfigError(f"--view overlay: needs the images: tk render {result} CAPTURE")
+        files, fps = [output], loaded.meta.fps
+        images: Iterator[NDArray[np.uint8]] = iter(())
+        with one_thread():
+            if view != "overlay" or opened is None:
+                scene = Scene(loaded, opened.rig if opened and not loaded.cameras else None, hull=view == "hull")
+                images = map(scene.picture, scene.rows(chosen))
+            else:
+                overlay, fps = Overlay(opened, loaded, full=full), opened.fps
+                if png is None:
+                    shown = choose_frames(overlay.people[0], chosen, len(overlay.row_of))
+                    images = (overlay.mosaic(frame, seen) for frame, seen in overlay.pictures(shown))
+                else:
+                    files = write_sheets(overlay, png, chosen, full=full)
+            if png is None:
+                with video_writer(output, fps) as add:
+                    for image in images:
+                        add(image)
+    base.print_lines("wrote ", files)
 
 
 def _parse_frames(text: str | None, known: Sequence[int]) -> list[int]:

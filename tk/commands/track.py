@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -60,10 +59,8 @@ def track(
 
     An overlay video (RESULT.mp4) and a report (RESULT.html) are written next to it.
     """
-    span = base.parse_frames(options.frames)
-    reporter = ConsoleReporter(quiet, None, *later_stages(options.causal, no_report))
+    reporter = ConsoleReporter(quiet, None, *later_stages(options.causal, no_report), "loading")
     with reporter, started_early():
-        reporter.stage("loading")
         from tk.io.importers import open_recording
         from tk.io.results.files import check_result_path
         from tk.run import session
@@ -74,9 +71,9 @@ def track(
             dismiss()
         check_result_path(output, force, resume)
         reporter.stage(f"opening {capture}")
-        opened = open_recording(capture, base.split_names(options.cameras), options.masks, settings.resample)
+        opened = open_recording(capture, options.cameras, options.masks, settings.resample)
         summary = session.track(
-            opened, output, settings, reporter, options.method, span, init_pose, resume, options.store_hull,
+            opened, output, settings, reporter, options.method, options.frames, init_pose, resume, options.store_hull,
             options.body, options.causal, force, choice,
         )  # fmt: skip
         if not no_report:
@@ -144,15 +141,9 @@ def end(output: Path, summary: Summary, quiet: bool, as_json: bool) -> None:
         click.echo(", ".join([*parts, f"{rate:.1f} frames/s"]), err=True)
     if summary.interrupted:
         next_step = "continue with the same command and --resume" if summary.frames else "no frame was finished"
-        click.echo(f"tk: interrupted; {next_step}", err=True)
-        sys.exit(1)
+        base.exit_with(1, f"interrupted; {next_step}")
     if wrong > WARN_SHARE * summary.present:
         most = 2 * wrong > summary.present
         advice = "do not use the result: check" if most else "check"
-        click.echo(
-            f"tk: {output}: {wrong} of {summary.present} frames are lost or suspect; {advice} masks, calibration and "
-            "working volume with tk inspect",
-            err=True,
-        )
-        if most:
-            sys.exit(EXIT_LOST)
+        line = f"{output}: {wrong} of {summary.present} frames are lost or suspect; {advice} masks, calibration and "
+        base.exit_with(EXIT_LOST if most else 0, f"{line}working volume with tk inspect")
