@@ -97,6 +97,11 @@ class Edgels(NamedTuple):
     pixel: NDArray[np.float64]
     normal: NDArray[np.float64]
 
+    def of_view(self, view: int) -> "Edgels":
+        """Return the edgels of one camera; they are in the order of the cameras."""
+        begin, end = np.searchsorted(self.view, [view, view + 1])
+        return Edgels._make(values[begin:end] for values in self)
+
 
 @ti.func
 def sample_curve(cameras: ti.template(), v: int, kind: int, shape, center, params, R, t, sign, u):

@@ -273,12 +273,12 @@ def whole_delays(
 ) -> NDArray[np.int64]:
     """Return (C,) whole frames by which each video is late: with the masks of so many frames before, the body explains
     a camera that it otherwise explains worse than the others. Arguments as of :func:`refine_rig`."""
-    none = np.zeros(len(rig), np.int64)
+    late = np.zeros(len(rig), np.int64)
     known = set(frames.tolist())
     shifts = range(-LARGEST_DELAY, LARGEST_DELAY + 1)
     rows = np.flatnonzero(usable & [all(frame - n in known for n in shifts) for frame in frames.tolist()])
     if not len(rows):
-        return none
+        return late
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, DELAY_FRAMES).round().astype(int))]
     grid, group = RayGrid(rig, SCREEN_ROWS), np.zeros(len(body.parts), np.int32)
     sampled = cache(lambda frame: grid.sample(masks(frame)).copy())
@@ -288,26 +288,26 @@ def whole_delays(
         assert met is not None
         bodies.append(met.label[0] > 0)
 
-    def wrong(n: int) -> Float:
-        """Return (R, C) the shares of wrong pixels with masks of n frames before; NaN where they show nobody."""
-        shown = [sampled(int(frames[i]) - n) for i in rows]
+    def wrong(n: int, cameras: NDArray[np.intp]) -> Float:
+        """Return (R, N) the shares of wrong pixels of N cameras with masks of n frames before; NaN where they show
+        nobody."""
+        shown = [sampled(int(frames[i]) - n)[cameras] for i in rows]
         both = zip(bodies, shown, strict=True)
-        return np.array([residual_of(drawn, m >= 128, m == OTHERS).sum(axis=1) for drawn, m in both])
+        return np.array([residual_of(drawn[cameras], m >= 128, m == OTHERS).sum(axis=1) for drawn, m in both])
 
     def mean(shares: Float) -> Float:
-        """Return (..., C) means over the frames in which shares (..., R, C) are known for every delay; 0 without."""
+        """Return (..., N) means over the frames in which shares (..., R, N) are known for every delay; 0 without."""
         known = np.isfinite(shares).reshape(-1, *shares.shape[-2:]).all(axis=0)
         return np.asarray(np.where(known, shares, 0.0).sum(axis=-2) / np.maximum(known.sum(axis=0), 1))
 
-    def worse(error: Float) -> NDArray[np.bool_]:
-        return np.asarray(error > _WORSE * np.median(error))
-
-    if not worse(mean(wrong(0))).any():
-        return none
-    errors = mean(np.array([wrong(n) for n in shifts]))
-    now, best = errors[LARGEST_DELAY], np.argmin(errors, axis=0)
-    mended = worse(now) & (errors.min(axis=0) < _MENDED * now)
-    return np.where(mended, np.array(shifts)[best], 0)
+    now = mean(wrong(0, np.arange(len(rig))))
+    suspects = np.flatnonzero(now > _WORSE * np.median(now))
+    if not len(suspects):
+        return late
+    errors = mean(np.array([wrong(n, suspects) for n in shifts]))
+    best = np.argmin(errors, axis=0)
+    late[suspects] = np.where(errors.min(axis=0) < _MENDED * errors[LARGEST_DELAY], np.array(shifts)[best], 0)
+    return late
 
 
 def retimed(store: MaskStore, frames: NDArray[np.int64], late: NDArray[np.int64]) -> MaskStore:

@@ -220,19 +220,26 @@ class RegionTracker(ContourTracker):
         seen, odd = (np.bincount(of, minlength=len(person)) for of in (view, view[unknown]))
         if odd.sum() < FOREIGN_SHARE * seen.sum():
             return frame
-        masks = frame.masks.copy()
-        uncertain = np.zeros(masks.shape, np.bool_) if frame.uncertain is None else frame.uncertain.copy()
+        masks, uncertain = frame.masks, np.zeros(0, np.bool_)
         for c in np.flatnonzero(odd >= FOREIGN_SHARE * np.maximum(seen, 1)):
-            x, y, w, h = cv2.boundingRect(masks[c])
-            box = slice(y, y + h), slice(x, x + w)
+            # one ray more on each side: the mask ends between two rays
+            box = tuple(
+                slice(max(rays[0] - 1, 0) * grid.step, (rays[-1] + 2) * grid.step)
+                for rays in (np.flatnonzero(person[c].any(axis=axis)) for axis in (1, 0))
+            )
             # a quarter of the pixels shows objects of this size
             odd_pixels = foreign[color_bins(frame.images[c][box][::2, ::2])] & (masks[c][box][::2, ::2] >= 128)
             opened = np.asarray(cv2.morphologyEx(odd_pixels.view(np.uint8), cv2.MORPH_OPEN, SQUARE3), np.uint8)
-            carried = doubled(opened)[:h, :w].view(np.bool_)
-            carried &= masks[c][box] >= 128
+            if not opened.any():
+                continue
+            if masks is frame.masks:  # the frame's own stay as they are
+                masks = masks.copy()
+                uncertain = np.zeros(masks.shape, np.bool_) if frame.uncertain is None else frame.uncertain.copy()
+            shown = masks[c][box] >= 128
+            carried = doubled(opened)[: len(shown), : shown.shape[1]].view(np.bool_) & shown
             masks[c][box][carried] = 0
             uncertain[c][box][carried] = True
-        return replace(frame, masks=masks, uncertain=uncertain)
+        return frame if masks is frame.masks else replace(frame, masks=masks, uncertain=uncertain)
 
     @property
     def _best(self) -> Hypothesis:

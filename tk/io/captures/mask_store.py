@@ -1,4 +1,4 @@
-"""Masks of a whole recording in little memory: one bit a pixel, compressed; about 10 kB for five images of 640×480.
+"""Masks of a whole recording in little memory: one bit for each pixel of a box around the person, compressed.
 
 Masks of a long recording are stored in a file: a temporary one without a name, or one beside the result, with which a
 killed run can be resumed.
@@ -16,6 +16,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO, overload
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,8 +30,9 @@ IN_MEMORY = 32_000_000
 
 
 #: header of each frame: its number (~number for the pixels of other people), the number of bytes that follow, and the
-#: masks' shape
+#: masks' shape. Compressed bytes follow: left, top, width, height of each camera's box, and the boxes' bits.
 _HEAD = struct.Struct("<qqiii")
+_BOX = np.dtype("<i4")
 
 
 class MaskStore:
@@ -72,12 +74,7 @@ class MaskStore:
             begin = end + _HEAD.size
             if not 0 < size <= whole - begin or min(shape) <= 0 or self._shape not in ((), tuple(shape)):
                 break
-            reader = zlib.decompressobj()
-            count = -(-int(np.prod(shape, dtype=object)) // 8)
-            try:
-                if len(reader.decompress(file.read(size), count + 1)) != count or not reader.eof:
-                    break
-            except zlib.error:
+            if not _is_whole(file.read(size), shape):
                 break
             self._shape, self._places[index], end = tuple(shape), (begin, size), begin + size
         file.truncate(end)
@@ -91,19 +88,23 @@ class MaskStore:
         Raises:
             TkError: the file cannot be written, for example because the disk is full.
         """
-        others = masks == OTHERS
-        if others.any():  # first: a frame whose masks are in the file is whole
-            self._put(~index, others)
-        self._put(index, masks >= 128)
+        boxes = np.array([cv2.boundingRect(mask) for mask in masks], _BOX)
+        crops = [mask[y : y + h, x : x + w] for mask, (x, y, w, h) in zip(masks, boxes, strict=True)]
+        if any((crop == OTHERS).any() for crop in crops):  # first: a frame whose masks are in the file is whole
+            self._put(~index, masks.shape, boxes, [crop == OTHERS for crop in crops])
+        self._put(index, masks.shape, boxes, [crop >= 128 for crop in crops])
 
-    def _put(self, index: int, masks: NDArray[np.bool_]) -> None:
-        self._shape = masks.shape
-        packed = zlib.compress(np.packbits(masks).tobytes(), 1)
+    def _put(
+        self, index: int, shape: tuple[int, ...], boxes: NDArray[np.int32], crops: Sequence[NDArray[np.bool_]]
+    ) -> None:
+        self._shape = shape
+        bits = np.packbits(np.concatenate([crop.ravel() for crop in crops]))
+        packed = zlib.compress(boxes.tobytes() + bits.tobytes(), 1)
         file = self._opened or self._open("w+b")
         try:
             file.seek(0, os.SEEK_END)
             place = file.tell() + _HEAD.size
-            file.write(_HEAD.pack(index, len(packed), *masks.shape) + packed)
+            file.write(_HEAD.pack(index, len(packed), *shape) + packed)
             file.flush()
         except OSError as error:
             raise self._no_room(error) from None
@@ -111,22 +112,44 @@ class MaskStore:
 
     def get(self, index: int) -> Masks:
         """Return the masks (C, H, W) of a stored frame."""
-        masks = self._get(index) * np.uint8(255)
+        masks = np.zeros(self._shape, np.uint8)
+        self._draw(index, masks, 255)
         if ~index in self._places:
-            masks[self._get(~index) > 0] = OTHERS
+            self._draw(~index, masks, OTHERS)
         return masks
 
-    def _get(self, index: int) -> NDArray[np.uint8]:
+    def _draw(self, index: int, masks: Masks, value: int) -> None:
+        """Set the stored pixels of masks (C, H, W) to a value."""
         place, size = self._places[index]
         assert self._opened is not None
         self._opened.seek(place)
-        bits = np.frombuffer(zlib.decompress(self._opened.read(size)), np.uint8)
-        count = int(np.prod(self._shape))
-        return np.unpackbits(bits, count=count).reshape(self._shape)
+        stored = zlib.decompress(self._opened.read(size))
+        boxes = np.frombuffer(stored, _BOX, 4 * len(masks)).reshape(-1, 4)
+        bits = np.unpackbits(np.frombuffer(stored, np.uint8, offset=boxes.nbytes))
+        begin = 0
+        for mask, (x, y, w, h) in zip(masks, boxes.tolist(), strict=True):
+            mask[y : y + h, x : x + w] |= bits[begin : begin + w * h].reshape(h, w) * np.uint8(value)
+            begin += w * h
 
     def sequence(self, indices: NDArray[np.int64]) -> Frames:
         """Return the masks of these frames, unpacked on access."""
         return Frames(self, [int(i) for i in indices])
+
+
+def _is_whole(packed: bytes, shape: Sequence[int]) -> bool:
+    """Return whether a stored frame holds boxes inside masks of a shape (C, H, W), and all of the boxes' bits."""
+    cameras, height, width = shape
+    head = 4 * _BOX.itemsize * cameras
+    reader = zlib.decompressobj()
+    try:
+        stored = reader.decompress(packed, head + cameras * height * width // 8 + 2)
+    except zlib.error:
+        return False
+    if not reader.eof or len(stored) < head:
+        return False
+    x, y, w, h = np.frombuffer(stored, _BOX, 4 * cameras).reshape(-1, 4).T.astype(np.int64)
+    inside = (np.minimum(x, y) >= 0) & (np.minimum(w, h) >= 0) & (x + w <= width) & (y + h <= height)
+    return bool(inside.all()) and len(stored) == head + -(-int((w * h).sum()) // 8)
 
 
 class MaskStores:

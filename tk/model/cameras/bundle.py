@@ -153,16 +153,21 @@ class ContourBundle:
     def contours(self, state: BundleState, scale: int) -> list[Contours]:
         """Find the edgels at an estimate and a scale's index, frame by frame."""
         body, offsets = self.family.build(state.body), self.offsets(state)
-        views = [Views(Rig((camera,))) for camera in state.rig] if self.parameters else [Views(state.rig)]
+        together = not offsets.any()  # one launch for all cameras of a frame
+        views = [Views(state.rig)] if together else [Views(Rig((camera,))) for camera in state.rig]
         found = []
         for f, (frame, pose) in enumerate(zip(self.frames, state.poses, strict=True)):
             for c, view in enumerate(views):
-                own = slice(c, c + 1) if self.parameters else slice(None)
+                own = slice(None) if together else slice(c, c + 1)
                 pyramid = Pyramid(
                     tuple(level[own] for level in frame.pyramid.masks), tuple(s[own] for s in frame.pyramid.sizes)
                 )
                 here = pose + offsets[c] * frame.velocity
-                found.append(Contours(f, c, here, view.edgels(body, pyramid, here, scale, self._settings)))
+                edgels = view.edgels(body, pyramid, here, scale, self._settings)
+                if together and self.parameters:
+                    found += [Contours(f, k, here, edgels.of_view(k)) for k in range(len(state.rig))]
+                else:
+                    found.append(Contours(f, c, here, edgels))
         return found
 
     def linearise(self, state: BundleState, scale: int) -> Equations:

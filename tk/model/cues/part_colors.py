@@ -125,8 +125,8 @@ class PartColors:
 
 def color_bins(images: NDArray[np.uint8]) -> NDArray[np.int32]:
     """Return (...) the bin of each pixel (..., 3) BGR, numbered as in the kernels."""
-    blue, green, red = (images[..., i] >> 4 for i in range(3))
-    return np.asarray((blue.astype(np.int32) << 8) | (green << 4 | red))
+    blue, green, red = images[..., 0], images[..., 1], images[..., 2]
+    return (blue & np.uint8(0xF0)).astype(np.int32) << 4 | (green & np.uint8(0xF0) | red >> 4)
 
 
 def _smooth(counts: Float) -> NDArray[np.float32]:

@@ -33,14 +33,7 @@ SPECK_SHARE, HOLE_SHARE = 0.05, 0.004
 
 def clean(mask: Masks) -> Masks:
     """Return a mask (H, W) without specks and small holes, 0 or 255."""
-    box = cv2.boundingRect(mask)
-    if box[2] == 0:
-        return mask
-    x, y, width, height = box
-    result = np.zeros_like(mask)
-    part = mask[y : y + height, x : x + width] >= 128
-    result[y : y + height, x : x + width] = clean_by_area(part, SPECK_SHARE, HOLE_SHARE, relative=True)
-    return result
+    return clean_by_area(mask >= 128, SPECK_SHARE, HOLE_SHARE, relative=True)
 
 
 @dataclass(frozen=True)
@@ -81,28 +74,25 @@ class Views:
 
     def pyramid(self, masks: Masks, scales: int, cleaning: bool) -> Pyramid:
         """The scales of masks (V, H, W), cleaned if ``cleaning``."""
-        others = masks == OTHERS
-        shared = bool(others.any())
+        # everything happens inside boxes around the people
+        crops = [(slice(y, y + h), slice(x, x + w)) for x, y, w, h in map(cv2.boundingRect, masks)]
+        shared = any((mask[crop] == OTHERS).any() for mask, crop in zip(masks, crops, strict=True))
+        others = masks == OTHERS if shared else None
         if cleaning:
-            cleaned = np.stack([clean(np.where(hidden, 0, mask)) for mask, hidden in zip(masks, others, strict=True)]
-                               if shared else [clean(mask) for mask in masks])  # fmt: skip
-            if shared:  # a region that others cut off may be small: it is no evidence, rather than background
+            cleaned = np.zeros_like(masks)
+            for out, mask, crop in zip(cleaned, masks, crops, strict=True):
+                if mask[crop].size:
+                    out[crop] = clean(mask[crop])
+            if others is not None:  # a region that others cut off may be small: it is no evidence, not background
                 others |= (masks >= 128) & (cleaned == 0)
             masks = cleaned
-        levels, sizes = [masks], [self.sizes]
-        for _ in range(scales - 1):
-            last = levels[-1]
-            height, width = (last.shape[1] + 1) // 2, (last.shape[2] + 1) // 2
-            even = list(last)
-            if last.shape[1] % 2 or last.shape[2] % 2:
-                rest = last.shape[1] % 2, last.shape[2] % 2
-                even = [cv2.copyMakeBorder(m, 0, rest[0], 0, rest[1], cv2.BORDER_CONSTANT) for m in last]
-            half = np.empty((len(last), height, width), np.uint8)
-            for m, out in zip(even, half, strict=True):
-                cv2.resize(m, (width, height), dst=out, interpolation=cv2.INTER_AREA)
-            levels.append(half)
-            sizes.append((sizes[-1] + 1) // 2)
-        if shared:
+        V, H, W = masks.shape
+        levels = [masks, *(np.zeros((V, -(-H // 2**k), -(-W // 2**k)), np.uint8) for k in range(1, scales))]
+        sizes = [-(-self.sizes // 2**k) for k in range(scales)]
+        for v, crop in enumerate(crops):
+            if masks[v][crop].size:
+                _halve([level[v] for level in levels], crop)
+        if others is not None:
             for k, level in enumerate(levels):
                 levels[k] = _marked(level, others, 2**k)
         return Pyramid(tuple(levels), tuple(sizes))
@@ -140,6 +130,21 @@ class Views:
     def _at(self, pyramid: Pyramid, scale: int) -> tuple[NDArray[np.float32], NDArray[np.int32], Masks, float]:
         """Return the cameras, and the pyramid's scale as the kernels take it."""
         return self._cameras32, pyramid.sizes[scale], pyramid.masks[scale], 2.0**scale
+
+
+def _halve(levels: Sequence[Masks], crop: tuple[slice, slice]) -> None:
+    """Fill the coarser ones of a mask's scales, (H, W) and zero before, from the crop that contains the mask."""
+    whole, step = levels[0], 2 ** (len(levels) - 1)
+    (top, bottom), (left, right) = ((s.start // step * step, -(-s.stop // step) * step) for s in crop)
+    part = whole[top:bottom, left:right]
+    below, beside = bottom - top - part.shape[0], right - left - part.shape[1]
+    if below or beside:
+        part = np.asarray(cv2.copyMakeBorder(part, 0, below, 0, beside, cv2.BORDER_CONSTANT), np.uint8)
+    for level in levels[1:]:
+        top, left = top // 2, left // 2
+        part = np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
+        place = level[top : top + part.shape[0], left : left + part.shape[1]]
+        place[...] = part[: place.shape[0], : place.shape[1]]
 
 
 def _marked(level: Masks, others: NDArray[np.bool_], step: int) -> Masks:
