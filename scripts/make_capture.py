@@ -17,8 +17,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # `python scripts/
 from scripts.synthetic.actor import Look
 from scripts.synthetic.capture import Options, crossings, plan_capture, write_capture
 from scripts.synthetic.motion import MOTIONS
-from scripts.synthetic.people import SCENES
 from scripts.synthetic.rig import RIGS
+from scripts.synthetic.scenes import SCENES
 
 
 class SizeType(click.ParamType[tuple[int, int]]):
@@ -63,7 +63,9 @@ class ColorType(click.ParamType[tuple[float, float, float]]):
 @click.command()
 @click.option("--out", required=True, type=click.Path(path_type=Path, file_okay=False), help="Folder of the capture.")
 @click.option("--motion", type=click.Choice([*MOTIONS, *SCENES]), default="demo", show_default=True)
-@click.option("--alone", type=click.IntRange(min=0), metavar="N", help="Render only person N of a scene.")
+@click.option(
+    "--only", type=click.IntRange(min=0), multiple=True, help="Render only this person of a scene (repeatable)."
+)
 @click.option("--frames", type=click.IntRange(min=1), help="Number of frames [default: the motion's own length].")
 @click.option("--cameras", type=click.Choice([str(n) for n in RIGS]), default="5", show_default=True)
 @click.option("--size", type=SizeType(), default="640x480", show_default=True)
@@ -77,7 +79,7 @@ class ColorType(click.ParamType[tuple[float, float, float]]):
 def main(
     out: Path,
     motion: str,
-    alone: int | None,
+    only: tuple[int, ...],
     frames: int | None,
     cameras: str,
     size: tuple[int, int],
@@ -95,14 +97,17 @@ def main(
         look = replace(look, shirt=shirt)
     if trousers is not None:
         look = replace(look, trousers=trousers)
-    options = Options(motion, frames, int(cameras), size, seed, height, look, crf, alone)
+    options = Options(motion, frames, int(cameras), size, seed, height, look, crf, only or None)
     started = time.perf_counter()
 
     def progress(done: int, total: int) -> None:
         if done % 10 == 0 or done == total:
             click.echo(f"{done}/{total} frames, {time.perf_counter() - started:.0f} s", err=True)
 
-    plan = plan_capture(options)
+    try:
+        plan = plan_capture(options)
+    except ValueError as error:  # nobody has this number
+        raise click.UsageError(str(error)) from None
     if len(plan.people) > 1:
         click.echo(f"{crossings(plan)} crossings", err=True)
     write_capture(plan, out, masks=masks, name=out.resolve().name, progress=progress)

@@ -20,10 +20,11 @@ from scipy import ndimage
 from scripts.synthetic.actor import Actor, Look, make_actor
 from scripts.synthetic.motion import MOTIONS, Motion, plan_path, pose_at
 from scripts.synthetic.motion import Path as PelvisPath
-from scripts.synthetic.people import SCENES, STAGE_M, Role
+from scripts.synthetic.people import STAGE_M, walk
 from scripts.synthetic.render import Body, composite, render_actor, sample_rays, shadow_maps
 from scripts.synthetic.rig import make_rig
 from scripts.synthetic.scene import Lamps, RoomView, make_lamps, view_room
+from scripts.synthetic.scenes import SCENES
 from scripts.synthetic.sensor import Sensor
 from scripts.synthetic.skeleton import JOINTS, Pose, Skeleton, joint_positions, make_skeleton
 from tk.io.captures.calibration import camera_table
@@ -50,9 +51,9 @@ class Options:
     Attributes:
         motion: name of a motion, or of a scene with several people.
         size: (width, height) in pixels.
-        stature_m, look: those of the actor; in a scene, of person 0.
+        stature_m, look: those of the actor; in a scene, of people without their own.
         crf: x264's constant rate factor.
-        alone: number of the only person to render in a scene; everything else is as with all of them.
+        only: numbers of the people to render in a scene; everything else is as with all of them.
     """
 
     motion: str = "demo"
@@ -63,7 +64,7 @@ class Options:
     stature_m: float = 1.75
     look: Look = field(default_factory=Look)
     crf: int = 20
-    alone: int | None = None
+    only: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -160,18 +161,11 @@ def plan_capture(options: Options) -> Plan:
 
     The rig sees a single actor all the time; in a scene, everybody who is on the stage.
     """
-    scene = SCENES.get(options.motion)
-    roles = scene or (Role(MOTIONS[options.motion]),)
-    people = []
-    for role in roles:
-        skeleton = make_skeleton(role.stature_m or options.stature_m)
-        motion = role.motion(skeleton)
-        frames = motion.frames if options.frames is None else options.frames
-        people.append(Performer.plan(motion, skeleton, role.look or options.look, frames))
+    people = _cast(options)
     centers, radii = [], []
     for person in people:
         pelvis = person.joints[:, JOINTS.index("pelvis"), :2]
-        c, r = person.balls(np.linalg.norm(pelvis, axis=1) <= (STAGE_M if scene else np.inf))
+        c, r = person.balls(np.linalg.norm(pelvis, axis=1) <= (STAGE_M if options.motion in SCENES else np.inf))
         centers.append(c)
         radii.append(r)
     ball_centers, ball_radii = np.concatenate(centers), np.concatenate(radii)
@@ -179,10 +173,25 @@ def plan_capture(options: Options) -> Plan:
     upper = (ball_centers + ball_radii[:, None]).max(axis=0)
     rng = np.random.default_rng([options.seed, 1])
     rig = make_rig(options.cameras, *options.size, ball_centers, ball_radii, rng)
-    rendered = {k: person for k, person in enumerate(people) if options.alone in (None, k)}
-    if not rendered:
-        raise ValueError(f"{options.motion} has {len(people)} people, and no number {options.alone}")
+    only = range(len(people)) if options.only is None else options.only
+    if not set(only) <= set(range(len(people))):
+        raise ValueError(f"{options.motion} has the people 0 to {len(people) - 1}, not {', '.join(map(str, only))}")
+    rendered = {k: people[k] for k in sorted(set(only))}
     return Plan(options, rendered, rig, _volume(lower, upper), make_lamps(lower, upper))
+
+
+def _cast(options: Options) -> list[Performer]:
+    """Return everybody of a scene, or the single actor of a motion."""
+    if options.motion not in SCENES:
+        skeleton = make_skeleton(options.stature_m)
+        motion = MOTIONS[options.motion](skeleton)
+        return [Performer.plan(motion, skeleton, options.look, options.frames or motion.frames)]
+    scene, people = SCENES[options.motion], []
+    for role in scene.roles:
+        skeleton = make_skeleton(role.stature_m or options.stature_m)
+        motion = walk(skeleton, options.motion, scene.frames, role)
+        people.append(Performer.plan(motion, skeleton, role.look or options.look, options.frames or scene.frames))
+    return people
 
 
 def crossings(plan: Plan, step: int = 4) -> int:
@@ -315,13 +324,15 @@ def write_calibration(rig: Rig, path: Path) -> None:
 
 
 def _write_settings(plan: Plan, name: str, path: Path) -> None:
+    scene = SCENES.get(plan.options.motion)
+    posed = scene is None or scene.roles[min(plan.people)].posed
     settings = {
         "name": name,
         "fps": plan.fps,
         "up": "z",
         "volume": {"center": list(plan.volume.center), "size": list(plan.volume.size)},
         "subject": {"height": plan.subject.skeleton.stature_m},
-        "init": {"frame": 0, "pose": "da-vinci"},
+        "init": {"frame": 0, "pose": "da-vinci" if posed else "any"},
     }
     path.write_text(tomli_w.dumps(settings), encoding="utf-8")
 

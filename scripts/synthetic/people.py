@@ -1,4 +1,4 @@
-"""Scenes with two people: where each walks, which way each faces, and what the arms do.
+"""People who walk and meet: where each walks, which way each faces, and what the arms do.
 
 People walk where a path of the pelvis leads them; their steps follow from it. Positions are metres on the floor, which
 has the cameras around its origin; angles are degrees, 0 along x, counterclockwise.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,8 @@ from scripts.synthetic.steps import Step
 
 Float = NDArray[np.float64]
 Way = Sequence[tuple[float, float, float]]  # frame, x, y
+Act = tuple[str, float, float]  # name in ACTS, first and last frame
+Dip = tuple[float, float, float]  # frame, height of the pelvis and its way back, as shares of the stature
 
 #: bodies whose pelvis is within this distance of the origin are entirely seen by all cameras, metres
 STAGE_M = 1.5
@@ -33,11 +36,32 @@ _SMOOTH = 3.5  # standard deviation of the smoothing of paths and headings, fram
 
 @dataclass(frozen=True)
 class Role:
-    """One person of a scene; without stature or look, those of person 0."""
+    """One person of a scene.
 
-    motion: Callable[[Skeleton], Motion]
+    Attributes:
+        way: the pelvis on the floor.
+        facing: frame and heading, where the person stands.
+        acts: what the person does besides walking.
+        stature_m, look: of the body; None for those of the options.
+        posed: whether the person begins in the initialisation pose.
+        strolling: whether the person looks where he or she walks, instead of to ``facing``.
+    """
+
+    way: Way
+    facing: Sequence[tuple[float, float]] = ((0, 0.0),)
+    acts: Sequence[Act] = ()
     stature_m: float | None = None
     look: Look | None = None
+    posed: bool = True
+    strolling: bool = True
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Several people over ``frames`` frames. The first role is the subject."""
+
+    frames: int
+    roles: tuple[Role, ...]
 
 
 @dataclass(frozen=True)
@@ -90,32 +114,15 @@ def _axes(degrees: float) -> tuple[Float, Float]:
     return np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
 
 
-def walk(
-    skeleton: Skeleton,
-    name: str,
-    frames: int,
-    way: Way,
-    facing: Sequence[tuple[float, float]],
-    gestures: Sequence[Key] = (),
-    dips: Sequence[tuple[float, float, float]] = (),
-    posed: bool = True,
-    strolling: bool = True,
-) -> Motion:
-    """Return a motion along a path.
-
-    Args:
-        skeleton: the person's.
-        name: of the motion.
-        frames: natural length.
-        way: the pelvis on the floor.
-        facing: frame and heading, where the person stands.
-        gestures: keys of the arms and the trunk; the arms swing between them.
-        dips: frame, height of the pelvis and its way back, as shares of the stature, where it is not a walker's.
-        posed: whether the person begins in the initialisation pose.
-        strolling: whether the person looks where he or she walks, instead of to ``facing``.
-    """
+def walk(skeleton: Skeleton, name: str, frames: int, role: Role) -> Motion:
+    """Return the motion of a person of this skeleton in a role, ``frames`` long."""
+    posed, gestures, dips = role.posed, [], []
+    for what, start, stop in sorted(role.acts, key=lambda act: act[1]):
+        keys, dip = ACTS[what](skeleton, start, stop)
+        gestures += keys
+        dips += dip
     h = skeleton.stature_m
-    walked = _Walk.along(way, facing, frames, strolling)
+    walked = _Walk.along(role.way, role.facing, frames, role.strolling)
     pelvis, toes = da_vinci_stand(skeleton)
     start, heading = walked.at(0.0)
     ahead, left = _axes(heading)
@@ -159,8 +166,8 @@ def walk(
         fast = min(float(np.interp(frame, walked.frame, walked.speed)) / 1.2, 1.2)
         root[float(frame)] = (float(x), float(y), (float(z) - _FASTER_LOWER * fast**2) * h)
     first: list[Key] = opening(until=READY) if posed else [(0, STAND)]
-    keys = [(at, {name: value for name, value in values.items() if name != "yaw"}) for at, values in first]
-    keys += [(float(frame), {"yaw": walked.at(frame)[1]}) for frame in grid[::2]]
+    curves = [(at, {name: value for name, value in values.items() if name != "yaw"}) for at, values in first]
+    curves += [(float(frame), {"yaw": walked.at(frame)[1]}) for frame in grid[::2]]
     busy = [at for at, _ in gestures]
 
     def swing(frame: Float) -> dict[str, Float]:
@@ -176,19 +183,8 @@ def walk(
             "spine_turn": -6 * amount * phase,
         }
 
-    motion = Motion(name, tuple(sorted([*keys, *gestures], key=lambda key: key[0])), frames, swing)
+    motion = Motion(name, tuple(sorted([*curves, *gestures], key=lambda key: key[0])), frames, swing)
     return replace(on_feet(motion, skeleton, root, steps), placed=True)
-
-
-def _circle(
-    start: float, stop: float, radii: tuple[float, float], turns: float, phase_deg: float = 0.0, step: float = 2.0
-) -> list[tuple[float, float, float]]:
-    """Return a way around the origin on an ellipse; negative turns are clockwise."""
-    frame = np.arange(start, stop + step, step)
-    angle = np.radians(phase_deg) + 2 * np.pi * turns * (frame - start) / (stop - start)
-    return [
-        (float(f), radii[0] * float(np.cos(a)), radii[1] * float(np.sin(a))) for f, a in zip(frame, angle, strict=True)
-    ]
 
 
 def _rest(until: float) -> Key:
@@ -197,7 +193,7 @@ def _rest(until: float) -> Key:
     return until, arms | {"spine_flex": 0.0, "pitch": 0.0, "neck_flex": 0.0, "spine_turn": 0.0}
 
 
-def _shake(skeleton: Skeleton, start: float, stop: float) -> list[Key]:
+def _shake(skeleton: Skeleton, start: float, stop: float) -> tuple[list[Key], list[Dip]]:
     """Return the keys of a handshake: the right hand half-way to a partner 0.75 m ahead, three pumps."""
     size = skeleton.stature_m / 1.75
     guess = {"shoulder_flex": 30.0, "elbow": 60.0, "shoulder_in": 15.0}
@@ -205,26 +201,27 @@ def _shake(skeleton: Skeleton, start: float, stop: float) -> list[Key]:
     keys = [_rest(start - 8), (start, up | {"spine_flex": 6.0})]
     for k, at in enumerate(np.linspace(start + 3, stop, 6)):
         keys.append((float(at), (down if k % 2 == 0 else up) | {"spine_flex": 6.0}))
-    return [*keys, _rest(stop + 9)]
+    return [*keys, _rest(stop + 9)], []
 
 
-def _hug(skeleton: Skeleton, start: float, stop: float, over: bool) -> list[Key]:
+def _hug(skeleton: Skeleton, start: float, stop: float, over: bool) -> tuple[list[Key], list[Dip]]:
     """Return the keys of an embrace: both arms around a partner 0.4 m ahead, above or below the partner's arms."""
-    size, z = skeleton.stature_m / 1.75, 0.10 if over else -0.10
+    size, z = skeleton.stature_m / 1.75, 0.12 if over else -0.12
     wide, closed = {}, {}
     for side, s in (("_l", 1.0), ("_r", -1.0)):
-        guess = {"shoulder_flex": 55.0, "shoulder_abd": 40.0, "shoulder_in": 30.0, "elbow": 50.0}
-        wide |= arm_angles(skeleton, side, (0.38 * size, s * 0.34 * size, z), guess)
+        guess = {"shoulder_flex": 55.0, "shoulder_abd": 70.0, "shoulder_in": 60.0, "elbow": 50.0}
+        wide |= arm_angles(skeleton, side, (0.38 * size, s * 0.42 * size, z), guess)
         guess = {name: wide[name + side] for name in guess}
-        closed |= arm_angles(skeleton, side, (0.43 * size, s * 0.12 * size, z), guess)
+        closed |= arm_angles(skeleton, side, (0.49 * size, s * 0.235 * size, z), guess)
     near = {"spine_flex": 8.0, "neck_flex": 6.0}
-    return [
+    keys = [
         _rest(start - 18), (start - 8, wide | near), (start, closed | near), (stop, closed | near),
         (stop + 8, wide | near), _rest(stop + 18),
     ]  # fmt: skip
+    return keys, []
 
 
-def _crouch(skeleton: Skeleton, start: float, stop: float) -> tuple[list[Key], list[tuple[float, float, float]]]:
+def _crouch(skeleton: Skeleton, start: float, stop: float) -> tuple[list[Key], list[Dip]]:
     """Return the keys and the dips of a squat between two frames."""
     size = skeleton.stature_m / 1.75
     arms: dict[str, float] = {}
@@ -236,134 +233,10 @@ def _crouch(skeleton: Skeleton, start: float, stop: float) -> tuple[list[Key], l
     return keys, [(start - 12, 0.523, 0.0), (start, 0.27, 0.13), (stop, 0.27, 0.13), (stop + 12, 0.523, 0.0)]
 
 
-# --- the scenes -------------------------------------------------------------------------------------------------------
-
-_WOMAN = Look(hair=(0.20, 0.10, 0.04), shirt=(0.06, 0.22, 0.40), trousers=(0.16, 0.15, 0.14))
-_GREEN = Look(hair=(0.02, 0.015, 0.012), shirt=(0.08, 0.26, 0.07), trousers=(0.22, 0.17, 0.10), stripes=True)
-_GREY = Look(hair=(0.12, 0.11, 0.10), shirt=(0.30, 0.30, 0.31), trousers=(0.05, 0.05, 0.06))
-
-
-def _crossing_0(s: Skeleton) -> Motion:
-    way = [(READY, -1.0, 0.0), *_circle(34, 165, (1.0, 0.85), 1.6, 180)]
-    return walk(s, "crossing", 165, way, [(0, 0.0)])
-
-
-def _crossing_1(s: Skeleton) -> Motion:
-    way = [(READY, 0.6, 0.1), *_circle(32, 165, (0.48, 0.36), -2.2, 10)]
-    return walk(s, "crossing", 165, way, [(0, 180.0)])
-
-
-def _handshake_0(s: Skeleton) -> Motion:
-    way = [
-        (READY, -0.95, -0.2), (46, -0.40, 0.0), (76, -0.40, 0.0), (84, -0.75, -0.1), (100, 0.15, -0.50),
-        (114, 0.85, -0.3), (120, 0.85, -0.1), (134, 0.38, 0.05), (165, 0.38, 0.05),
-    ]  # fmt: skip
-    gestures = [*_shake(s, 54, 70), *_shake(s, 144, 158)]
-    return walk(s, "handshake", 165, way, [(0, 0.0), (95, 0.0), (112, 90.0), (125, 180.0)], gestures)
-
-
-def _handshake_1(s: Skeleton) -> Motion:
-    way = [
-        (READY, 0.9, 0.2), (46, 0.38, 0.0), (76, 0.38, 0.0), (84, 0.75, 0.1), (100, -0.15, 0.30),
-        (114, -0.85, 0.4), (120, -0.88, 0.2), (134, -0.40, 0.05), (165, -0.40, 0.05),
-    ]  # fmt: skip
-    gestures = [*_shake(s, 54, 70), *_shake(s, 144, 158)]
-    return walk(s, "handshake", 165, way, [(0, 180.0), (95, 180.0), (112, 270.0), (125, 360.0)], gestures)
-
-
-def _entering_0(s: Skeleton) -> Motion:
-    way = [(READY, -0.5, 0.0), (60, -0.5, 0.0), *_circle(68, 160, (0.6, 0.6), 1.0, 180)]
-    return walk(s, "entering", 160, way, [(0, 0.0)])
-
-
-def _entering_1(s: Skeleton) -> Motion:
-    way = [
-        (0, 3.6, 2.4), (30, 1.9, 1.25), (46, 0.9, 0.5), (60, 0.25, -0.1), (76, 0.1, -0.8), (92, 0.1, 0.1),
-        (108, -0.8, 0.7), (124, -0.1, 0.2), (142, 1.0, -0.8), (160, 2.2, -1.8),
-    ]  # fmt: skip
-    return walk(s, "entering", 160, way, [(0, 215.0)], posed=False)
-
-
-def _entering_2(s: Skeleton) -> Motion:
-    way = [(0, -4.3, 2.3), (62, -4.2, 2.3), (108, -1.3, 0.9), (124, -0.6, -0.2), (142, 0.3, -0.3), (160, 0.5, 0.6)]
-    return walk(s, "entering", 160, way, [(0, -30.0)], posed=False)
-
-
-def _embrace_0(s: Skeleton) -> Motion:
-    way = [
-        (READY, -0.9, 0.0), (48, -0.20, 0.0), (74, -0.20, 0.0), (92, -0.80, -0.05), (96, -0.80, -0.05),
-        (114, -0.2, 0.02), (136, -0.2, 0.02), (154, -0.75, 0.05), (158, -0.75, 0.05), (172, -0.40, 0.0),
-    ]  # fmt: skip
-    gestures = [*_hug(s, 56, 66, True), *_hug(s, 120, 130, False)]
-    return walk(s, "embrace", 172, way, [(0, 0.0), (172, 0.0)], gestures, strolling=False)
-
-
-def _embrace_1(s: Skeleton) -> Motion:
-    way = [
-        (READY, 0.9, 0.1), (48, 0.20, 0.0), (74, 0.20, 0.0), (92, 0.75, 0.1), (96, 0.75, 0.1),
-        (114, 0.2, 0.0), (136, 0.2, 0.0), (154, 0.8, -0.1), (158, 0.8, -0.1), (172, 0.40, 0.0),
-    ]  # fmt: skip
-    gestures = [*_hug(s, 56, 66, False), *_hug(s, 120, 130, True)]
-    return walk(s, "embrace", 172, way, [(0, 180.0), (172, 180.0)], gestures, strolling=False)
-
-
-def _crouch_0(s: Skeleton) -> Motion:
-    keys, dips = _crouch(s, 66, 88)
-    way = [
-        (READY, -0.9, -0.3), (50, -0.55, 0.35), (100, -0.55, 0.35), (116, 0.3, 0.75), (132, 0.95, 0.1),
-        (148, 0.35, -0.45), (165, -0.5, -0.6),
-    ]  # fmt: skip
-    return walk(s, "crouching", 165, way, [(0, 0.0), (50, 0.0), (60, -20.0), (104, -20.0)], keys, dips)
-
-
-def _crouch_1(s: Skeleton) -> Motion:
-    way = [
-        (READY, 0.75, 0.3), (54, 0.05, 0.1), (92, 0.05, 0.1), (108, 0.75, 0.0), (116, 0.6, -0.2), (132, 0.0, 0.1),
-        (150, -0.3, -0.1), (165, -0.5, 0.3),
-    ]  # fmt: skip
-    return walk(s, "crouching", 165, way, [(0, 180.0), (54, 180.0), (70, 120.0), (90, 200.0)])
-
-
-def _similar_0(s: Skeleton) -> Motion:
-    way = [
-        (READY, -0.9, 0.15), (52, 0.75, 0.15), (64, 0.90, -0.45), (90, -0.75, -0.35), (100, -0.85, -0.1),
-        *_circle(110, 175, (0.45, 0.45), 0.9, 190),
-    ]  # fmt: skip
-    return walk(s, "similar", 175, way, [(0, 0.0)])
-
-
-def _similar_1(s: Skeleton) -> Motion:
-    way = [
-        (READY, 0.9, -0.35), (52, -0.75, -0.35), (64, -0.85, 0.25), (90, 0.70, 0.35), (98, 0.95, 0.1),
-        *_circle(112, 175, (0.95, 0.8), -0.75, -20),
-    ]  # fmt: skip
-    return walk(s, "similar", 175, way, [(0, 180.0)])
-
-
-def _subject(s: Skeleton) -> Motion:
-    way = [(READY, -0.6, 0.0), *_circle(36, 120, (0.6, 0.55), 1.2, 180)]
-    return walk(s, "bystander", 120, way, [(0, 0.0)])
-
-
-def _standing(x: float, y: float, degrees: float) -> Callable[[Skeleton], Motion]:
-    return lambda s: walk(s, "bystander", 120, [(0, x, y), (120, x, y)], [(0, degrees)], posed=False)
-
-
-def _passing(s: Skeleton) -> Motion:
-    way = [(0, 3.6, 2.4), (35, 1.9, 1.3), (60, 0.4, 0.2), (85, -1.1, -0.9), (120, -3.0, -2.3)]
-    return walk(s, "bystander", 120, way, [(0, 215.0)], posed=False)
-
-
-#: scenes by name; the first role is the subject
-SCENES: dict[str, tuple[Role, ...]] = {
-    "crossing": (Role(_crossing_0), Role(_crossing_1, 1.66, _WOMAN)),
-    "handshake": (Role(_handshake_0), Role(_handshake_1, 1.80, _GREY)),
-    "entering": (Role(_entering_0), Role(_entering_1, 1.70, _GREEN), Role(_entering_2, 1.62, _WOMAN)),
-    "embrace": (Role(_embrace_0), Role(_embrace_1, 1.64, _GREEN)),
-    "crouching": (Role(_crouch_0), Role(_crouch_1, 1.83, _GREY)),
-    "similar": (Role(_similar_0), Role(_similar_1, 1.75)),
-    "bystander-one": (Role(_subject), Role(_standing(2.2, -1.0, 155.0), 1.80, _GREY)),
-    "bystander-two": (Role(_subject), Role(_standing(0.0, 2.3, -90.0), 1.70, _WOMAN)),
-    "bystander-all": (Role(_subject), Role(_standing(1.35, 0.25, 180.0), 1.70, _GREEN)),
-    "bystander-walking": (Role(_subject), Role(_passing, 1.80, _GREY)),
-}  # fmt: skip
+ACTS: dict[str, Callable[[Skeleton, float, float], tuple[list[Key], list[Dip]]]] = {
+    "shake hands": _shake,
+    "embrace above": partial(_hug, over=True),
+    "embrace below": partial(_hug, over=False),
+    "crouch": _crouch,
+}
+"""What people do: functions of skeleton, first and last frame, that return the keys of arms and trunk, and the dips."""
