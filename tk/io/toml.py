@@ -132,7 +132,7 @@ class Table:
         if key not in self.values:
             self.fail(f"{key} is missing")
         value = self.values[key]
-        wanted = " or ".join("×".join(map(str, shape)) for shape in shapes)
+        wanted = " or ".join("×".join(map(str, shape)) or "1" for shape in shapes)
         shape = _shape(value)
         if shape is None or shape not in shapes:
             found = "something else" if shape is None else "×".join(map(str, shape)) or "one number"

@@ -1,4 +1,4 @@
-"""Randomly damaged calibrations are read, or refused with one line."""
+"""Damaged calibrations are read, or refused with one line."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.conftest import refused
 from tests.io.conftest import write_toml
 from tests.io.importers.conftest import make_rig, projection_matrix, renamed, tables
 from tests.io.importers.test_other_formats import write_easymocap, write_panoptic
 from tests.io.importers.test_xml_formats import write_qca, write_xcp
-from tk.errors import CaptureError
+from tk.errors import CalibrationError, CaptureError
 from tk.io.importers import read_project
 from tk.model.cameras.mounting import infer_up
 
@@ -35,6 +36,67 @@ FORMATS: dict[str, Callable[[Path], object]] = {
     "vicon": lambda folder: write_xcp(folder / "x.xcp", RIG, (1e-8, 0.0)),
     "projections": write_projections,
 }
+
+
+@pytest.mark.parametrize(
+    ("format_name", "file", "old", "new", "complaint"),
+    [
+        ("toml", "camera_array.toml", "matrix = [", "matrix = [ [1.0], ", "camera '26578': matrix must be 3×3 numbers"),
+        (
+            "toml",
+            "camera_array.toml",
+            "rotation = [",
+            "rotation = [ nan, ",
+            "camera '26578': rotation must be 3",
+        ),
+        ("toml", "camera_array.toml", "    320,", "    0,", "camera '26578': size = [0, 240]"),
+        ("easymocap", "intri.yml", "K_26579:", "L_26579:", "has no K_26579"),
+        ("easymocap", "intri.yml", "names:", "cams:", "has no list `names`"),
+        ("easymocap", "intri.yml", "data: [", "data: [ x{", "K_26578 must be a matrix of 9 finite numbers"),
+        ("easymocap", "intri.yml", '"26579"', '"26578"', "names must be distinct"),
+        ("easymocap", "intri.yml", "W_26580: 320", "W_26580: wide", "W_26580 = 'wide' must be a number of pixels"),
+        ("easymocap", "extri.yml", "data: [", "data: [ .Nan, ", "R_26578 must be a matrix of 3 finite numbers"),
+        ("easymocap", "extri.yml", ":", ";", "is not YAML as OpenCV writes it"),
+        ("easymocap", "intri.yml", "", None, "cannot be read (No such file or directory)"),
+        ("panoptic", "calibration_171204_pose1.json", '"distCoef"', '"distortion"', "distCoef is missing"),
+        ("panoptic", "calibration_171204_pose1.json", '"cameras"', '"kameras"', "has no list of `cameras`"),
+        ("panoptic", "calibration_171204_pose1.json", "{", "{{", "invalid JSON"),
+        ("panoptic", "calibration_171204_pose1.json", '"K": [[', '"K": [["a", ', "K must be 3×3 numbers"),
+        ("panoptic", "calibration_171204_pose1.json", '"K": [[', '"K": [[-', "positive focal lengths"),
+        ("qualisys", "x.qca.txt", "<cameras>", "<cameras", "invalid XML"),
+        ("qualisys", "x.qca.txt", "<calibration", "<!DOCTYPE x [<!ENTITY a 'b'>]><calibration", "a document type"),
+        ("qualisys", "x.qca.txt", "<transform ", "<transformed ", "camera '26578': has no <transform>"),
+        ("qualisys", "x.qca.txt", "focalLengthU=", "U=", "camera '26578': <intrinsic>: focalLengthU is missing"),
+        ("qualisys", "x.qca.txt", 'r11="', 'r11="nan', "camera '26578': <transform>: r11 = 'nan"),
+        ("qualisys", "x.qca.txt", 'r11="', 'r11="7" r="', "camera '26578': rotation is no rotation matrix"),
+        ("qualisys", "x.qca.txt", 'active="1"', 'active="0"', "0 calibrated camera, and a capture needs at least 2"),
+        ("vicon", "x.xcp", "ORIENTATION=", "O=", "camera '26578': <KeyFrame>: ORIENTATION is missing"),
+        ("vicon", "x.xcp", 'POSITION="', 'POSITION="x ', "camera '26578': <KeyFrame>: POSITION must be 3 numbers"),
+        ("vicon", "x.xcp", 'SIZE="320 240"', 'SIZE="320"', "camera '26578': SENSOR_SIZE must be 2 numbers"),
+        ("vicon", "x.xcp", 'FOCAL_LENGTH="', 'FOCAL_LENGTH="-', "must be positive"),
+        ("vicon", "x.xcp", "KeyFrames>", "Frames>", "0 calibrated camera, and a capture needs at least 2"),
+        ("vicon", "x.xcp", "ViconRadial2 ", "ViconRadial2 0 0 -1 0 0 ", "the distortion is not monotonic"),
+    ],
+)
+def test_error_of_a_damaged_calibration_names_file_and_place(
+    folder: Path,
+    capfd: pytest.CaptureFixture[str],
+    format_name: str,
+    file: str,
+    old: str,
+    new: str | None,
+    complaint: str,
+) -> None:
+    FORMATS[format_name](folder)
+    path = folder / file
+    if new is None:
+        path.unlink()
+    else:
+        path.write_text(path.read_text().replace(old, new))
+    capfd.readouterr()
+    with refused(CalibrationError, complaint, path):
+        read_project(folder)
+    assert capfd.readouterr() == ("", "")
 
 
 def damaged(data: bytes, rng: random.Random) -> bytes:

@@ -238,34 +238,13 @@ def test_masks_and_background_are_imported_if_complete(folder: Path, check: Impo
     checked.note("masks: cannot match videos and cameras by name", "masks/ is left out")
 
 
-@pytest.mark.parametrize(
-    ("change", "complaint"),
-    [
-        ({"matrix": [[1.0, 0.0], [0.0, 1.0]]}, "camera 'cam2': matrix must be 3×3 numbers"),
-        ({"rotation": [0.1, float("nan"), 0.0]}, "camera 'cam2': rotation holds nan"),
-        ({"distortions": [0.0] * 8}, "camera 'cam2': distortions must be 4 or 5 numbers, and is 8"),
-        ({"size": [0, 1]}, "camera 'cam2': size = [0, 1]"),
-    ],
-)
-def test_damaged_tables(folder: Path, check: Import, change: dict[str, object], complaint: str) -> None:
-    document = tables(make_rig())
-    document["cam2"] |= change
-    write_toml(folder / "camera_array.toml", {"cameras": document})
-    write_clips(folder / "recordings" / "a", CAMS)
-    with pytest.raises(CalibrationError) as caught:
-        import_project(folder, check.output)
-    text = str(caught.value)
-    assert complaint in text and str(folder / "camera_array.toml") in text and "\n" not in text
-    assert not check.output.exists()
-
-
 def test_too_few_cameras_have_a_pose(folder: Path, check: Import) -> None:
     document = tables(make_rig())
     for name in CAMS[1:]:
         document[name] |= {"rotation": "null"}
     write_toml(folder / "calibration.toml", document)
     write_clips(folder, CAMS)
-    with pytest.raises(CalibrationError, match=r"1 camera with a pose, .*'cam2' has no rotation: left out"):
+    with pytest.raises(CalibrationError, match=r"1 calibrated camera, .*'cam2' has no rotation: left out"):
         import_project(folder, check.output)
 
 

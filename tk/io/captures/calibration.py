@@ -124,8 +124,11 @@ def given_unit(document: Mapping[str, object], path: Path) -> str | None:
     return units
 
 
-def calibration_of(path: Path, tables: Mapping[str, Mapping[str, object]], unit: str | None) -> Calibration:
-    """Return the calibration in these tables; ``unit``: unit of the translations, None to infer it.
+def calibration_of(
+    path: Path, tables: Mapping[str, Mapping[str, object]], unit: str | None, sizes_known: bool = True
+) -> Calibration:
+    """Return the calibration in these tables; ``unit``: unit of the translations, None to infer it. Without
+    ``sizes_known`` a size may be 0×0 or missing.
 
     Raises:
         CalibrationError: with the file, the camera and the key that is wrong.
@@ -133,7 +136,7 @@ def calibration_of(path: Path, tables: Mapping[str, Mapping[str, object]], unit:
     cameras: list[Camera] = []
     late: list[float] = []
     for key, values in tables.items():
-        camera, late_s = _camera(key, values, path)
+        camera, late_s = _camera(key, values, path, sizes_known)
         late.append(late_s)
         if camera.name in [other.name for other in cameras]:
             raise CalibrationError(f"{path}: two cameras have the name {camera.name!r}; give each its own")
@@ -197,13 +200,14 @@ def scale_world(rig: Rig, metres: float) -> Rig:
     return Rig(tuple(replace(camera, translation=camera.translation * metres) for camera in rig))
 
 
-def _camera(key: str, values: Mapping[str, object], path: Path) -> tuple[Camera, float]:
+def _camera(key: str, values: Mapping[str, object], path: Path, sizes_known: bool) -> tuple[Camera, float]:
     """Return the camera of a table, with its translation in the file's unit, and its delay, seconds."""
     name = Table(values, f"{path}: camera {key!r}", CalibrationError).text("name", key)
     table = Table(values, f"{path}: camera {name!r}", CalibrationError)
 
-    size = table.array("size", (2,))
-    if (size <= 0).any() or (size != np.round(size)).any():
+    size = table.array("size", (2,)) if sizes_known or "size" in table else np.zeros(2)
+    unknown = not sizes_known and not size.any()
+    if not unknown and ((size <= 0).any() or (size != np.round(size)).any()):
         table.fail(f"size = {values['size']} must be two positive whole numbers [width, height]")
     if (size > _MOST_PIXELS).any():
         table.fail(f"size = {values['size']} is too large; {_MOST_PIXELS} pixels a side are the most")

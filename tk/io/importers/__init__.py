@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -54,7 +53,7 @@ def read_project(folder: Path, unit: str | None = None, trial: str | None = None
     found = _find(folder)
     if found is not None:
         return read_format(*found, folder, unit, trial)
-    searched = ", ".join(re.split(r" or |, ", form.files)[0] for form in FORMATS)
+    searched = ", ".join(form.patterns[0] for form in FORMATS)
     here = sorted(f"{path.name}/" if path.is_dir() else path.name for path in folder.iterdir())
     names = ", ".join(here[:_NAMED]) + (f" and {len(here) - _NAMED} more" if len(here) > _NAMED else "")
     raise CaptureError(

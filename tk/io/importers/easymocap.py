@@ -14,58 +14,37 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CalibrationError
-from tk.io.importers.files import read_text
-from tk.io.importers.project import Cameras, Format, check_camera
-from tk.model.cameras.camera import Camera, Rig
+from tk.io.importers.project import Format, Tables
+from tk.io.toml import read_text
 
 
-def _find(root: Path) -> list[Path]:
-    for folder in (root, root / "calibration", root / "cameras"):
-        files = [folder / "intri.yml", folder / "extri.yml"]
-        if any(path.exists() for path in files):
-            return files
-    return []
-
-
-def _read(files: Sequence[Path]) -> Cameras:
+def _read(files: Sequence[Path]) -> Tables:
     folder = files[0].parent
-    intrinsic, extrinsic = (_OpenCvYaml(path) for path in files)
-    cameras: list[Camera] = []
-    notes: list[str] = []
+    intrinsic, extrinsic = _OpenCvYaml(folder / "intri.yml"), _OpenCvYaml(folder / "extri.yml")
+    found = Tables(intrinsic.path)
     for name in intrinsic.names():
-        where = f"{folder}: camera {name!r}"
-        rotation = extrinsic.matrix(f"Rot_{name}", 9)
-        if rotation is None:
-            vector = extrinsic.matrix(f"R_{name}", 3)
-            rotation = None if vector is None else np.asarray(cv2.Rodrigues(vector)[0], dtype=np.float64)
+        matrix, rotation = extrinsic.matrix(f"Rot_{name}", 9), extrinsic.matrix(f"R_{name}", 3)
+        rotation = rotation if matrix is None else matrix.reshape(3, 3)
         translation = extrinsic.matrix(f"T_{name}", 3)
         if rotation is None or translation is None:
-            notes.append(f"{extrinsic.path}: has no R_{name} and T_{name}: camera {name!r} is left out")
+            found.leave_out(name, f"has no R_{name} and T_{name} in {extrinsic.path.name}")
             continue
-        matrix = intrinsic.matrix(f"K_{name}", 9)
-        if matrix is None:
+        K, distortions = intrinsic.matrix(f"K_{name}", 9), intrinsic.matrix(f"dist_{name}", 5, 4)
+        if K is None:
             raise CalibrationError(f"{intrinsic.path}: has no K_{name}, the matrix of camera {name!r}")
-        distortions = intrinsic.matrix(f"dist_{name}", 5, 4)
-        camera = Camera(
-            name=name,
-            width=intrinsic.pixels(f"W_{name}"),
-            height=intrinsic.pixels(f"H_{name}"),
-            matrix=matrix.reshape(3, 3),
+        found.add(
+            name,
+            size=[intrinsic.pixels(f"W_{name}"), intrinsic.pixels(f"H_{name}")],
+            matrix=K.reshape(3, 3),
             distortions=np.zeros(5) if distortions is None else distortions,
-            rotation=rotation.reshape(3, 3),
+            rotation=rotation,
             translation=translation,
         )
-        cameras.append(check_camera(camera, where))
-    if len(cameras) < 2:
-        raise CalibrationError(
-            f"{folder}: {len(cameras)} camera in both intri.yml and extri.yml; at least 2 are needed"
-        )
-    return Cameras(folder / "intri.yml", Rig(tuple(cameras)), tuple(camera.name for camera in cameras), tuple(notes))
+    return found
 
 
 class _OpenCvYaml:
@@ -76,7 +55,8 @@ class _OpenCvYaml:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        blocks = re.findall(r"^([^\s:#%-][^:\n]*):(.*?)(?=^[^\s-]|\Z)", f"{read_text(path)}\n", re.M | re.S)
+        text = read_text(path, CalibrationError)
+        blocks = re.findall(r"^([^\s:#%-][^:\n]*):(.*?)(?=^[^\s-]|\Z)", f"{text}\n", re.M | re.S)
         self._blocks = {key.strip(): block.strip() for key, block in blocks}
         if not self._blocks:
             raise CalibrationError(f"{path}: is not YAML as OpenCV writes it: it has no keys")
@@ -122,5 +102,8 @@ class _OpenCvYaml:
 
 
 FORMAT = Format(
-    tool="EasyMocap", files="intri.yml and extri.yml", find=_find, read=_read, videos=("videos", "images", ".")
+    "EasyMocap",
+    tuple(f"{folder}{file}" for folder in ("", "calibration/", "cameras/") for file in ("intri.yml", "extri.yml")),
+    _read,
+    videos=("videos", "images", "."),
 )

@@ -2,68 +2,24 @@
 
 from __future__ import annotations
 
-import math
 import re
-import stat
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 from tk.errors import CalibrationError
-from tk.io.toml import load_toml
-
-#: largest calibration file, bytes. Files of hundreds of cameras have 1 MB; the limit only stops endless reading.
-LARGEST = 16 * 2**20
+from tk.io.toml import Table, read_text
 
 
-def check_file(path: Path, largest: int = LARGEST) -> None:
-    """Check that reading ``path`` ends soon.
-
-    Raises:
-        CalibrationError: it is missing, no regular file (a pipe never ends), or larger than ``largest`` bytes.
-    """
-    try:
-        status = path.stat()
-    except OSError as reason:
-        raise CalibrationError(f"{path}: cannot be read ({reason.strerror or reason})") from None
-    if not stat.S_ISREG(status.st_mode):
-        raise CalibrationError(f"{path}: is no regular file; replace it by the calibration file itself")
-    if status.st_size > largest:
-        raise CalibrationError(
-            f"{path}: has {status.st_size / 2**20:.0f} MiB, too large for a calibration file (at most "
-            f"{largest / 2**20:.0f} MiB); move it out of the folder"
-        )
-
-
-def read_text(path: Path) -> str:
-    """Return the text of a calibration file.
-
-    Raises:
-        CalibrationError: see :func:`check_file`; or it is not UTF-8.
-    """
-    check_file(path)
-    try:
-        return path.read_bytes().decode("utf-8-sig")
-    except OSError as reason:
-        raise CalibrationError(f"{path}: cannot be read ({reason.strerror or reason})") from None
-    except UnicodeDecodeError:
-        raise CalibrationError(f"{path}: is not UTF-8 text") from None
-
-
-def read_toml(path: Path) -> dict[str, object]:
-    """Return a TOML document. Raises CalibrationError as :func:`read_text` does, and when it is not TOML."""
-    check_file(path)
-    return load_toml(path, CalibrationError)
-
-
-def read_xml(path: Path) -> ElementTree.Element:
+def read_xml(path: Path) -> Element:
     """Return the root of an XML document. Entities are refused: they can make a small file endless.
 
     Raises:
-        CalibrationError: see :func:`read_text`; or it is not XML.
+        CalibrationError: it cannot be read, or is not XML.
     """
-    text = read_text(path)
+    text = read_text(path, CalibrationError)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise CalibrationError(f"{path}: declares a document type, which calibrations do not; remove the declaration")
     # the text is decoded already, so the encoding that the file declares does not apply
@@ -72,6 +28,34 @@ def read_xml(path: Path) -> ElementTree.Element:
         return ElementTree.fromstring(text)
     except ElementTree.ParseError as reason:
         raise CalibrationError(f"{path}: invalid XML: {reason}") from None
+
+
+def attributes(element: Element, where: str, words: Mapping[str, slice] = MappingProxyType({})) -> Table:
+    """Return an element's attributes: a number, a list of numbers, or a text.
+
+    Args:
+        element: the element.
+        where: begin of error messages.
+        words: the words that count, of attributes with others.
+    """
+    values = {key: _parsed(text.split()[words.get(key, slice(None))], text) for key, text in element.attrib.items()}
+    return Table(values, where, CalibrationError)
+
+
+def child(parent: Element, path: str, where: str, words: Mapping[str, slice] = MappingProxyType({})) -> Table:
+    """Return the :func:`attributes` of the first child at ``path``. Raises CalibrationError if there is none."""
+    found = parent.find(path)
+    if found is None:
+        raise CalibrationError(f"{where}: has no <{path.rpartition('/')[2]}>")
+    return attributes(found, f"{where}: <{found.tag}>", words)
+
+
+def _parsed(words: Sequence[str], text: str) -> float | list[float] | str:
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        return text
+    return values[0] if len(values) == 1 else values
 
 
 def matching(folder: Path, *patterns: str) -> list[Path]:
@@ -90,43 +74,3 @@ def only(files: Sequence[Path]) -> Path:
         names = ", ".join(file.name for file in files)
         raise CalibrationError(f"{files[0].parent}: holds several calibrations: {names}; keep only the right one")
     return files[0]
-
-
-@dataclass(frozen=True)
-class Attributes:
-    """An element's attributes; ``where`` is the beginning of every error message."""
-
-    element: ElementTree.Element
-    where: str
-
-    @staticmethod
-    def child(parent: ElementTree.Element, path: str, where: str) -> Attributes:
-        """Return the first child at ``path``. Raises CalibrationError if there is none."""
-        found = parent.find(path)
-        if found is None:
-            raise CalibrationError(f"{where}: has no <{path.rpartition('/')[2]}>")
-        return Attributes(found, f"{where}: <{found.tag}>")
-
-    def numbers(self, key: str, count: int, default: list[float] | None = None, skip: int = 0) -> list[float]:
-        """Return the finite numbers of an attribute after ``skip`` words: ``count`` or more; ``default`` if missing.
-
-        Raises:
-            CalibrationError: it is missing without a default, or does not hold such numbers.
-        """
-        text = self.element.get(key)
-        if text is None:
-            if default is not None:
-                return default
-            raise CalibrationError(f"{self.where}: {key} is missing")
-        try:
-            values = [float(word) for word in text.split()[skip:]]
-        except ValueError:
-            values = []
-        if len(values) < count or not all(math.isfinite(value) for value in values):
-            wanted = "a finite number" if count == 1 else f"{count} finite numbers"
-            raise CalibrationError(f"{self.where}: {key} = {text[:60]!r} must be {wanted}")
-        return values
-
-    def number(self, key: str, default: float | None = None) -> float:
-        """Return the one finite number of an attribute. Raises as :meth:`numbers` does."""
-        return self.numbers(key, 1, None if default is None else [default])[0]

@@ -15,53 +15,38 @@ from pathlib import Path
 import numpy as np
 
 from tk.errors import CalibrationError
-from tk.io.importers.files import matching, only, read_text
-from tk.io.importers.project import Cameras, Format, check_camera
-from tk.io.toml import Table
-from tk.model.cameras.camera import Camera, Rig
+from tk.io.importers.files import only
+from tk.io.importers.project import Format, Tables
+from tk.io.toml import Table, read_text
 
 
-def _find(root: Path) -> list[Path]:
-    return matching(root, "calibration_*.json")
-
-
-def _read(files: Sequence[Path]) -> Cameras:
+def _read(files: Sequence[Path]) -> Tables:
     path = only(files)
     try:
-        document = json.loads(read_text(path))
+        document = json.loads(read_text(path, CalibrationError))
     except (json.JSONDecodeError, RecursionError) as reason:
         raise CalibrationError(f"{path}: invalid JSON: {reason}") from None
     listed = document.get("cameras") if isinstance(document, Mapping) else None
     if not isinstance(listed, list) or not all(isinstance(item, Mapping) for item in listed):
         raise CalibrationError(f"{path}: has no list of `cameras`")
-    cameras = [_camera(item, index, path) for index, item in enumerate(listed)]
-    keys = tuple(f"{item.get('type', '')}_{item.get('name', '')}" for item in listed)
-    return Cameras(path, Rig(tuple(cameras)), keys, unit="cm", unit_from="the format")
-
-
-def _camera(values: Mapping[str, object], index: int, path: Path) -> Camera:
-    name = Table(values, f"{path}: camera {index}", CalibrationError).text("name", "")
-    where = f"{path}: camera {name!r}"
-    table = Table(values, where, CalibrationError)
-    size = table.array("resolution", (2,))
-    camera = Camera(
-        name=name,
-        width=int(size[0]),
-        height=int(size[1]),
-        matrix=table.array("K", (3, 3)),
-        distortions=table.array("distCoef", (5,), (4,)),
-        rotation=table.array("R", (3, 3)),
-        translation=np.ravel(table.array("t", (3, 1), (3,), (1, 3))),
-    )
-    return check_camera(camera, where)
+    found = Tables(path, unit="cm", unit_from="the format")
+    for index, item in enumerate(listed):
+        name = Table(item, f"{path}: camera {index}", CalibrationError).text("name", "")
+        table = Table(item, f"{path}: camera {name!r}", CalibrationError)
+        found.add(
+            name,
+            key=f"{item.get('type', '')}_{name}",
+            size=table.array("resolution", (2,)),
+            matrix=table.array("K", (3, 3)),
+            distortions=table.array("distCoef", (5,), (4,)),
+            rotation=table.array("R", (3, 3)),
+            translation=np.ravel(table.array("t", (3, 1), (3,), (1, 3))),
+        )
+    return found
 
 
 FORMAT = Format(
-    tool="CMU Panoptic",
-    files="calibration_*.json",
-    find=_find,
-    read=_read,
+    "CMU Panoptic", ("calibration_*.json",), _read,
     videos=("hdVideos", "hdImgs", "kinectVideos", "kinectImgs", "vgaVideos", "vgaImgs", "videos", "."),
-    up="-y",
-    videos_of_all=False,
-)
+    up="-y", videos_of_all=False,
+)  # fmt: skip

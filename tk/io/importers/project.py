@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tk.errors import CalibrationError, VideoError, VolumeError
-from tk.io.captures.calibration import scale_world
+from tk.io.captures.calibration import calibration_of, scale_world
 from tk.io.captures.units import LEAST_APART_M, MOST_APART_M, UNITS, FoundUnit, apart, infer_unit
+from tk.io.importers.files import matching
 from tk.io.importers.videos import CameraNames, find_clips
-from tk.model.cameras.camera import Camera, Rig
+from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import view_height
 
 #: metres, least height of the views in which a person fits: a child of one metre, and a margin
@@ -44,24 +46,51 @@ class Project:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class Cameras:
-    """The cameras of a calibration.
+class Tables:
+    """The cameras of a calibration file, as tables of `calibration.toml`.
 
     Attributes:
         source: calibration file or folder.
-        rig: cameras, lengths in the file's unit.
-        keys: a second name of each camera, which its video may have.
+        cameras: table of each camera, lengths in the file's unit, by a second name of the camera, which its video may
+            have.
         notes: as in :class:`Project`.
         unit: unit of lengths, None if unknown; unit_from: what specifies it.
     """
 
-    source: Path
-    rig: Rig
-    keys: tuple[str, ...]
-    notes: tuple[str, ...] = ()
-    unit: str | None = None
-    unit_from: str = "the file"
+    def __init__(self, source: Path, unit: str | None = None, unit_from: str = "the file") -> None:
+        self.source, self.unit, self.unit_from = source, unit, unit_from
+        self.cameras: dict[str, Mapping[str, Any]] = {}
+        self.notes: list[str] = []
+
+    def add(
+        self,
+        name: str,
+        size: ArrayLike,
+        matrix: ArrayLike,
+        distortions: ArrayLike,
+        rotation: ArrayLike,
+        translation: ArrayLike,
+        key: str = "",
+    ) -> None:
+        """Add a camera.
+
+        Args:
+            name: its name.
+            size: width and height, pixels; 0 and 0 are unknown: the video's size is used.
+            matrix: (3, 3) intrinsic matrix, pixels.
+            distortions: (4,) or (5,) in OpenCV's order.
+            rotation: (3,) Rodrigues vector or (3, 3), world to camera.
+            translation: (3,) world to camera.
+            key: its second name.
+        """
+        arrays = {"size": size, "matrix": matrix, "distortions": distortions}
+        arrays |= {"rotation": rotation, "translation": translation}
+        values = {name: np.asarray(array).tolist() for name, array in arrays.items()}
+        self.cameras[key if key and key not in self.cameras else name] = {"name": name, **values}
+
+    def leave_out(self, name: str, why: str) -> None:
+        """Note that a camera is left out."""
+        self.notes.append(f"{self.source}: camera {name!r} {why}: left out")
 
 
 @dataclass(frozen=True)
@@ -70,8 +99,7 @@ class Format:
 
     Attributes:
         tool: name of the tool.
-        files: calibration files that ``find`` searches for, for messages.
-        find: returns the calibration files in a folder, [] without any; it opens as few files as possible.
+        patterns: glob patterns of calibration files in a folder; the first one that matches is used.
         read: reads the cameras from these files; raises CalibrationError.
         videos: folders that hold videos, as patterns relative to the project; the first that matches is used.
         unit: unit of lengths in this format, if the file does not say and the distances of the cameras allow it.
@@ -79,18 +107,26 @@ class Format:
         up: the world's up direction if the format fixes it.
         in_order: the tool matches cameras and videos in the order of their names.
         videos_of_all: a camera without a video is worth a note by name.
+        search: returns the calibration files in a folder, where patterns are not enough.
     """
 
     tool: str
-    files: str
-    find: Callable[[Path], list[Path]]
-    read: Callable[[Sequence[Path]], Cameras]
+    patterns: tuple[str, ...]
+    read: Callable[[Sequence[Path]], Tables]
     videos: tuple[str, ...]
     unit: str = "m"
     nests: bool = False
     up: str | None = None
     in_order: bool = False
     videos_of_all: bool = True
+    search: Callable[[Path], list[Path]] | None = None
+
+    def find(self, root: Path) -> list[Path]:
+        """Return the calibration files in a folder; [] without any."""
+        if self.search is not None:
+            return self.search(root)
+        found = (matching(root, pattern) for pattern in self.patterns)
+        return next((files for files in found if files), [])
 
 
 def read_format(form: Format, files: Sequence[Path], folder: Path, unit: str | None, trial: str | None) -> Project:
@@ -100,21 +136,28 @@ def read_format(form: Format, files: Sequence[Path], folder: Path, unit: str | N
         CalibrationError: the calibration cannot be used.
         VideoError: see :func:`tk.io.importers.videos.find_clips`.
     """
-    cameras = _in_metres(form.read(files), unit, form.unit)
-    names = [CameraNames(camera.name, key) for camera, key in zip(cameras.rig, cameras.keys, strict=True)]
+    tables = form.read(files)
+    if len(tables.cameras) < 2:
+        why = "".join(f"; {note.removeprefix(f'{tables.source}: ')}" for note in tables.notes)
+        raise CalibrationError(
+            f"{tables.source}: {len(tables.cameras)} calibrated camera, and a capture needs at least 2{why}"
+        )
+    calibration = calibration_of(tables.source, tables.cameras, "m", sizes_known=False)
+    rig, unit_note = _in_metres(calibration.rig, tables, unit, form.unit)
+    names = [CameraNames(camera.name, key) for camera, key in zip(rig, calibration.keys, strict=True)]
     found = find_clips(folder, form.videos, names, trial, form.in_order)
     chosen = [index for index, clip in enumerate(found.clips) if clip is not None]
-    notes = [*cameras.notes, *found.notes]
+    notes = [*tables.notes, f"{tables.source}: {unit_note}", *found.notes]
     missing = [names[index].name for index, clip in enumerate(found.clips) if clip is None]
     if missing and form.videos_of_all:
         notes.append(f"{found.folder}: no video of {', '.join(missing)}: left out")
     elif missing:
-        notes.append(f"{cameras.source}: {len(missing)} of its {len(names)} cameras have no video here: left out")
+        notes.append(f"{tables.source}: {len(missing)} of its {len(names)} cameras have no video here: left out")
     chosen_names = [names[index] for index in chosen]
     return Project(
         tool=form.tool,
-        source=cameras.source,
-        rig=Rig(tuple(cameras.rig[index] for index in chosen)),
+        source=tables.source,
+        rig=Rig(tuple(rig[index] for index in chosen)),
         clips=tuple(clip for clip in found.clips if clip is not None),
         masks=_beside(folder, found.folder, ("masks", "mask"), chosen_names, notes),
         backgrounds=_beside(folder, found.folder, ("background", "backgrounds"), chosen_names, notes),
@@ -123,7 +166,7 @@ def read_format(form: Format, files: Sequence[Path], folder: Path, unit: str | N
     )
 
 
-def _in_metres(cameras: Cameras, requested: str | None, default: str) -> Cameras:
+def _in_metres(rig: Rig, tables: Tables, requested: str | None, default: str) -> tuple[Rig, str]:
     """Return the cameras with lengths in metres, and a note about the unit: requested, specified, or inferred.
 
     Raises:
@@ -131,64 +174,41 @@ def _in_metres(cameras: Cameras, requested: str | None, default: str) -> Cameras
     """
     if requested:
         found, reason = FoundUnit(requested), "as requested"
-    elif cameras.unit:
-        found, reason = FoundUnit(cameras.unit), f"as {cameras.unit_from} says"
+    elif tables.unit:
+        found, reason = FoundUnit(tables.unit), f"as {tables.unit_from} says"
     else:
-        found, reason = infer_unit(cameras.rig.centers, default), "the default of this format"
-        if found.name == "cm" and apart(cameras.rig.centers) * UNITS["mm"] >= LEAST_APART_M:
-            found = _by_person(cameras)
-    rig = scale_world(cameras.rig, found.metres)
+        found, reason = infer_unit(rig.centers, default), "the default of this format"
+        if found.name == "cm" and apart(rig.centers) * UNITS["mm"] >= LEAST_APART_M:
+            found = _by_person(rig, tables.source)
+    rig = scale_world(rig, found.metres)
     if found.note:
-        note = f"{found.note}; the option units (m, cm or mm) overrides it"
-    else:
-        note = f"lengths are in {found.name}, {reason}"
-        if not LEAST_APART_M <= apart(rig.centers) <= MOST_APART_M:
-            note += f": the cameras are then up to {apart(rig.centers):.3g} m apart, which is unlikely"
-    return replace(cameras, rig=rig, notes=(*cameras.notes, f"{cameras.source}: {note}"))
+        return rig, f"{found.note}; the option units (m, cm or mm) overrides it"
+    note = f"lengths are in {found.name}, {reason}"
+    if not LEAST_APART_M <= apart(rig.centers) <= MOST_APART_M:
+        note += f": the cameras are then up to {apart(rig.centers):.3g} m apart, which is unlikely"
+    return rig, note
 
 
-def _by_person(cameras: Cameras) -> FoundUnit:
+def _by_person(rig: Rig, source: Path) -> FoundUnit:
     """Return millimetres if a person fits into the views then; the same numbers are a larger room in centimetres.
 
     Raises:
         CalibrationError: a person fits in centimetres alone, so the numbers are either those or a table top.
     """
     try:
-        view = view_height(cameras.rig)
+        view = view_height(rig)
     except VolumeError:
         view = 0.0
     if view * UNITS["mm"] >= PERSON_VIEW_M:
         return FoundUnit("mm", "lengths are taken for mm: a person fits into the views")
-    wide = apart(cameras.rig.centers)
+    wide = apart(rig.centers)
     sizes = [
         f"{unit} ({wide * UNITS[unit]:.2g} m apart, views {view * UNITS[unit]:.2g} m high)" for unit in ("cm", "mm")
     ]
     raise CalibrationError(
-        f"{cameras.source}: the cameras may be in {' or '.join(sizes)}: give the unit",
+        f"{source}: the cameras may be in {' or '.join(sizes)}: give the unit",
         hint="--units cm or --units mm",
     )
-
-
-def check_camera(camera: Camera, where: str) -> Camera:
-    """Return the camera with an exactly orthonormal rotation, if it is valid.
-
-    Raises:
-        CalibrationError: a number is not finite, a focal length not positive, or the rotation not orthonormal.
-    """
-    numbers = (camera.matrix, camera.distortions, camera.rotation, camera.translation)
-    if not all(np.isfinite(values).all() for values in numbers):
-        raise CalibrationError(f"{where}: holds a number that is not finite")
-    if not (camera.matrix[0, 0] > 0 and camera.matrix[1, 1] > 0):
-        raise CalibrationError(
-            f"{where}: focal lengths {camera.matrix[0, 0]:g}, {camera.matrix[1, 1]:g} must be positive"
-        )
-    error = float(np.abs(camera.rotation @ camera.rotation.T - np.eye(3)).max())
-    if error > 1e-3 or np.linalg.det(camera.rotation) < 0:
-        raise CalibrationError(
-            f"{where}: the rotation is no rotation matrix (R Rᵀ differs from the identity by {error:.2g})"
-        )
-    nearest = cv2.Rodrigues(cv2.Rodrigues(camera.rotation)[0])[0]
-    return replace(camera, rotation=np.asarray(nearest, dtype=np.float64))
 
 
 def _beside(

@@ -16,9 +16,8 @@ import scipy  # its packages are imported when they are first used
 from numpy.typing import NDArray
 
 from tk.errors import CalibrationError
-from tk.io.importers.files import check_file, matching
-from tk.io.importers.project import Cameras, Format, check_camera
-from tk.model.cameras.camera import Camera, Rig
+from tk.io.importers.files import matching
+from tk.io.importers.project import Format, Tables
 
 #: largest file, bytes; twelve numbers take 1 kB
 _LARGEST = 65_536
@@ -27,23 +26,23 @@ _LARGEST = 65_536
 _SKEW = 1e-6
 
 
-def _read(files: Sequence[Path]) -> Cameras:
-    cameras: list[Camera] = []
-    notes: list[str] = []
+def _read(files: Sequence[Path]) -> Tables:
+    found = Tables(files[0].parent)
     for path in files:
         P = _matrix(path)
         if P is None:
-            notes.append(f"{path}: holds no 3×4 matrix: left out")
+            found.notes.append(f"{path}: holds no 3×4 matrix: left out")
             continue
         K, rotation, translation = factorise(P, str(path))
         if abs(K[0, 1]) > _SKEW * K[0, 0]:
-            notes.append(
+            found.notes.append(
                 f"{path}: has a skew of {K[0, 1]:.3g} px, which is left out: the sides of the image move by about "
                 f"{abs(K[0, 1]) * K[1, 2] / K[1, 1]:.2g} px"
             )
             K[0, 1] = 0.0
-        cameras.append(check_camera(Camera(path.stem, 0, 0, K, np.zeros(5), rotation, translation), str(path)))
-    return Cameras(files[0].parent, Rig(tuple(cameras)), tuple(camera.name for camera in cameras), tuple(notes))
+        K[[1, 2, 2], [0, 0, 1]] = 0.0  # rounding
+        found.add(path.stem, [0, 0], K, np.zeros(5), rotation, translation)
+    return found
 
 
 def factorise(P: NDArray[np.float64], where: str) -> tuple[NDArray[np.float64], ...]:
@@ -75,7 +74,8 @@ def _find(root: Path) -> list[Path]:
 def _matrix(path: Path) -> NDArray[np.float64] | None:
     """Return the matrix (3, 4) of a file; None if the file holds something else."""
     try:
-        check_file(path, _LARGEST)
+        if not path.is_file() or path.stat().st_size > _LARGEST:  # a pipe never ends
+            return None
         content = path.read_bytes()
         if path.suffix == ".npy":
             values = np.load(io.BytesIO(content), allow_pickle=False)
@@ -84,15 +84,9 @@ def _matrix(path: Path) -> NDArray[np.float64] | None:
             words = " ".join(line for line in lines if line.strip() != "CONTOUR").replace(",", " ").split()
             values = np.array([float(word) for word in words])
         P = np.asarray(values, dtype=np.float64)
-    except (CalibrationError, OSError, ValueError, EOFError):
+    except (OSError, ValueError, EOFError):
         return None
     return P.reshape(3, 4) if P.size == 12 and np.isfinite(P).all() else None
 
 
-FORMAT = Format(
-    tool="projection matrices",
-    files="*.txt or *.npy, one per camera with a 3×4 projection matrix, in the folder, calibration/ or cameras/",
-    find=_find,
-    read=_read,
-    videos=("videos", "images", "."),
-)
+FORMAT = Format("projection matrices", ("*.txt", "*.npy"), _read, videos=("videos", "images", "."), search=_find)

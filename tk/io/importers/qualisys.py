@@ -17,9 +17,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from tk.errors import CalibrationError
-from tk.io.importers.files import Attributes, matching, only, read_xml
-from tk.io.importers.project import Cameras, Format, check_camera
-from tk.model.cameras.camera import Camera, Rig
+from tk.io.importers.files import child, only, read_xml
+from tk.io.importers.project import Format, Tables
 
 #: QTM's units per pixel
 _SUBPIXELS = 64.0
@@ -27,33 +26,53 @@ _SUBPIXELS = 64.0
 #: camera frame of QTM (x right, y up, z backwards) to OpenCV's
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 
+_DISTORTIONS = (
+    "radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2", "radialDistortion3"
+)  # fmt: skip
 
-def read_cameras(files: Sequence[Path]) -> Cameras:
+
+def read_tables(files: Sequence[Path]) -> Tables:
     """Read the video cameras of the one file.
 
     Raises:
-        CalibrationError: there are several files, the file is damaged, or it has fewer than two video cameras.
+        CalibrationError: there are several files, or the file is damaged.
     """
     path = only(files)
-    root = read_xml(path)
-    listed = root.findall("cameras/camera")
+    listed = read_xml(path).findall("cameras/camera")
     if not listed:
         raise CalibrationError(f"{path}: has no <cameras> with <camera> in it; export the calibration from QTM again")
     active = [item for item in listed if item.get("active", "1") != "0"]
     videos = [item for item in active if _records_videos(item)] or active
-    cameras = [_camera(item, index, path) for index, item in enumerate(videos)]
-    if len(cameras) < 2:
-        raise CalibrationError(f"{path}: {len(cameras)} active video camera; a capture needs at least 2")
-    notes = []
+    found = Tables(path, unit="mm", unit_from="the format")
     if len(videos) < len(listed):
-        notes.append(f"{path}: {len(listed) - len(videos)} of its {len(listed)} cameras record no videos: left out")
-    turned = [camera.name for camera, item in zip(cameras, videos, strict=True) if item.get("viewrotation", "0") != "0"]
+        left_out = f"{len(listed) - len(videos)} of its {len(listed)} cameras record no videos"
+        found.notes.append(f"{path}: {left_out}: left out")
+    turned = []
+    for index, item in enumerate(videos):
+        name = item.get("serial") or str(index)
+        where = f"{path}: camera {name!r}"
+        view, intrinsic, transform = (child(item, tag, where) for tag in ("fov_video", "intrinsic", "transform"))
+        left, top = view.number("left"), view.number("top")
+        fx, fy, cx, cy = (
+            intrinsic.number(key) / _SUBPIXELS
+            for key in ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV")
+        )
+        rotation = _TO_OPENCV @ [[transform.number(f"r{row}{column}") for column in "123"] for row in "123"]
+        found.add(
+            name,
+            size=[round(view.number("right") - left + 1), round(view.number("bottom") - top + 1)],
+            matrix=[[fx, 0.0, cx - left], [0.0, fy, cy - top], [0.0, 0.0, 1.0]],
+            distortions=[intrinsic.number(key, 0.0) for key in _DISTORTIONS],
+            rotation=rotation,
+            translation=-rotation @ [transform.number(key) for key in "xyz"],
+        )
+        if item.get("viewrotation", "0") != "0":
+            turned.append(name)
     if turned:
-        notes.append(
+        found.notes.append(
             f"{path}: QTM shows {', '.join(turned)} turned (viewrotation); their videos must be as the sensor sees them"
         )
-    keys = tuple(camera.name for camera in cameras)
-    return Cameras(path, Rig(tuple(cameras)), keys, tuple(notes), unit="mm", unit_from="the format")
+    return found
 
 
 def _records_videos(item: Element) -> bool:
@@ -61,38 +80,4 @@ def _records_videos(item: Element) -> bool:
     return "video" in model or model == "none"
 
 
-def _camera(item: Element, index: int, path: Path) -> Camera:
-    name = item.get("serial") or str(index)
-    where = f"{path}: camera {name!r}"
-    view, intrinsic, transform = (Attributes.child(item, tag, where) for tag in ("fov_video", "intrinsic", "transform"))
-    left, top = view.number("left"), view.number("top")
-    fx, fy, cx, cy = (
-        intrinsic.number(key) / _SUBPIXELS for key in ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV")
-    )
-    distortions = [
-        intrinsic.number(key, 0.0)
-        for key in (
-            *("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2"),
-            "radialDistortion3",
-        )
-    ]
-    world_to_qtm = np.array([[transform.number(f"r{row}{column}") for column in "123"] for row in "123"])
-    rotation = _TO_OPENCV @ world_to_qtm
-    center = np.array([transform.number(key) for key in "xyz"])
-    camera = Camera(
-        name=name,
-        width=round(view.number("right") - left + 1),
-        height=round(view.number("bottom") - top + 1),
-        matrix=np.array([[fx, 0.0, cx - left], [0.0, fy, cy - top], [0.0, 0.0, 1.0]]),
-        distortions=np.array(distortions),
-        rotation=rotation,
-        translation=-rotation @ center,
-    )
-    return check_camera(camera, where)
-
-
-def _find(root: Path) -> list[Path]:
-    return matching(root, "*.qca.txt")
-
-
-FORMAT = Format(tool="Qualisys", files="*.qca.txt", find=_find, read=read_cameras, videos=(".", "videos", "Videos"))
+FORMAT = Format("Qualisys", ("*.qca.txt",), read_tables, videos=(".", "videos", "Videos"))

@@ -22,42 +22,35 @@ import scipy  # its packages are imported when they are first used
 from numpy.typing import NDArray
 
 from tk.errors import CalibrationError
-from tk.io.importers.files import Attributes, matching, only, read_xml
-from tk.io.importers.project import Cameras, Format, check_camera
-from tk.model.cameras.camera import Camera, Rig
+from tk.io.importers.files import attributes, child, only, read_xml
+from tk.io.importers.project import Format, Tables
+from tk.io.toml import Table
 
-#: words of VICON_RADIAL2 before the coefficients: the model's name and the centre of distortion
-_BEFORE_RADIAL2 = 3
+#: words of an attribute that are its numbers; of VICON_RADIAL2 the name of the model and the centre come first
+_WORDS = {"VICON_RADIAL2": slice(3, 6)}
 
 #: a note reports a larger error of the fitted distortion, pixels. Masks are accurate to about a pixel.
 _WELL_FITTED_PX = 0.1
 
 
-def _read(files: Sequence[Path]) -> Cameras:
+def _read(files: Sequence[Path]) -> Tables:
     path = only(files)
-    root = read_xml(path)
-    listed = root.findall("Camera")
+    listed = read_xml(path).findall("Camera")
     if not listed:
         raise CalibrationError(f"{path}: has no <Camera>; save the calibration from Vicon's program again")
     videos = [item for item in listed if _records_videos(item)] or listed
-    cameras: list[Camera] = []
-    keys: list[str] = []
-    notes: list[str] = []
+    found = Tables(path, unit="mm", unit_from="the format")
     if len(videos) < len(listed):
-        notes.append(f"{path}: {len(listed) - len(videos)} of its {len(listed)} cameras record no videos: left out")
+        found.notes.append(
+            f"{path}: {len(listed) - len(videos)} of its {len(listed)} cameras record no videos: left out"
+        )
     for index, item in enumerate(videos):
         name = item.get("DEVICEID") or item.get("USERID") or str(index)
         if item.find("KeyFrames/KeyFrame") is None:
-            notes.append(f"{path}: camera {name!r} is not calibrated: left out")
+            found.leave_out(name, "is not calibrated")
             continue
-        camera, error_px = _camera(item, name, path)
-        if error_px > _WELL_FITTED_PX:
-            notes.append(f"{path}: camera {name!r}: OpenCV's distortion is up to {error_px:.2g} px off Vicon's")
-        cameras.append(camera)
-        keys.append(item.get("NAME") or name)
-    if len(cameras) < 2:
-        raise CalibrationError(f"{path}: {len(cameras)} calibrated video camera; a capture needs at least 2")
-    return Cameras(path, Rig(tuple(cameras)), tuple(keys), tuple(notes), unit="mm", unit_from="the format")
+        _add(found, item, name)
+    return found
 
 
 def _records_videos(item: Element) -> bool:
@@ -65,59 +58,53 @@ def _records_videos(item: Element) -> bool:
     return "video" in kind or "vue" in kind
 
 
-def _camera(item: Element, name: str, path: Path) -> tuple[Camera, float]:
-    """Return the camera and the largest error of its distortion, pixels."""
-    where = f"{path}: camera {name!r}"
-    device, key_frame = Attributes(item, where), Attributes.child(item, "KeyFrames/KeyFrame", where)
-    width, height = (round(value) for value in device.numbers("SENSOR_SIZE", 2)[:2])
-    aspect = device.number("PIXEL_ASPECT_RATIO", 1.0)
-    focal = key_frame.number("FOCAL_LENGTH")
-    cx, cy = key_frame.numbers("PRINCIPAL_POINT", 2)[:2]
+def _add(found: Tables, item: Element, name: str) -> None:
+    where = f"{found.source}: camera {name!r}"
+    device, key_frame = attributes(item, where), child(item, "KeyFrames/KeyFrame", where, _WORDS)
+    width, height = device.array("SENSOR_SIZE", (2,))
+    aspect, focal = device.number("PIXEL_ASPECT_RATIO", 1.0), key_frame.number("FOCAL_LENGTH")
+    cx, cy = key_frame.array("PRINCIPAL_POINT", (2,))
     if not aspect > 0 or not focal > 0:
-        raise CalibrationError(f"{where}: FOCAL_LENGTH = {focal:g}, PIXEL_ASPECT_RATIO = {aspect:g} must be positive")
-    quaternion = np.array(key_frame.numbers("ORIENTATION", 4)[:4])
+        device.fail(f"FOCAL_LENGTH = {focal:g}, PIXEL_ASPECT_RATIO = {aspect:g} must be positive")
+    quaternion = key_frame.array("ORIENTATION", (4,))
     if np.linalg.norm(quaternion) < 1e-6:
-        raise CalibrationError(f"{where}: ORIENTATION is not a rotation: its four numbers are zero")
+        key_frame.fail("ORIENTATION is not a rotation: its four numbers are zero")
     rotation = scipy.spatial.transform.Rotation.from_quat(quaternion).as_matrix()
-    center = np.array(key_frame.numbers("POSITION", 3)[:3])
     reach_px = max(float(np.hypot(x - cx, y - cy)) for x in (0, width) for y in (0, height))
-    try:
-        radial, error_px = _opencv_radial(_vicon_radial(key_frame), focal, reach_px)
-    except ValueError as reason:
-        raise CalibrationError(f"{where}: {reason}") from None
-    k1, k2, k3 = radial
-    camera = Camera(
-        name=name,
-        width=width,
-        height=height,
-        matrix=np.array([[focal, 0.0, cx], [0.0, focal / aspect, cy], [0.0, 0.0, 1.0]]),
-        distortions=np.array([k1, k2, 0.0, 0.0, k3]),
+    (k1, k2, k3), error_px = _opencv_radial(_vicon_radial(key_frame), focal, reach_px, key_frame)
+    if error_px > _WELL_FITTED_PX:
+        found.notes.append(f"{where}: OpenCV's distortion is up to {error_px:.2g} px off Vicon's")
+    found.add(
+        name,
+        key=item.get("NAME", ""),
+        size=[round(width), round(height)],
+        matrix=[[focal, 0.0, cx], [0.0, focal / aspect, cy], [0.0, 0.0, 1.0]],
+        distortions=[k1, k2, 0.0, 0.0, k3],
         rotation=rotation,
-        translation=-rotation @ center,
+        translation=-rotation @ key_frame.array("POSITION", (3,)),
     )
-    return check_camera(camera, where), error_px
 
 
-def _vicon_radial(key_frame: Attributes) -> list[float]:
+def _vicon_radial(key_frame: Table) -> list[float]:
     """Return k₁, k₂, k₃ of Vicon's model, pixels to the power of -2, -4, -6."""
-    if "VICON_RADIAL2" in key_frame.element.attrib:
-        values = key_frame.numbers("VICON_RADIAL2", 1, skip=_BEFORE_RADIAL2)
-    else:
-        values = key_frame.numbers("VICON_RADIAL", 1, [0.0])
-    return [*values, 0.0, 0.0][:3]
+    key = "VICON_RADIAL2" if "VICON_RADIAL2" in key_frame else "VICON_RADIAL"
+    found = key_frame.array(key, (), (2,), (3,)) if key in key_frame else np.zeros(1)
+    return [*np.ravel(found), 0.0, 0.0][:3]
 
 
-def _opencv_radial(vicon: list[float], focal_px: float, reach_px: float) -> tuple[NDArray[np.float64], float]:
+def _opencv_radial(
+    vicon: list[float], focal_px: float, reach_px: float, key_frame: Table
+) -> tuple[NDArray[np.float64], float]:
     """Return k1, k2, k3 (3,) of OpenCV's model, fitted within ``reach_px`` of the principal point, and the error, px.
 
     Raises:
-        ValueError: Vicon's model is not monotonic within that distance.
+        CalibrationError: Vicon's model is not monotonic within that distance.
     """
     distorted = np.linspace(0.0, reach_px, 200)[1:]
     squares = distorted**2
     ideal = distorted * (1 + vicon[0] * squares + vicon[1] * squares**2 + vicon[2] * squares**3)
     if not (np.diff(ideal) > 0).all():
-        raise ValueError("the distortion is not monotonic within the image; calibrate again")
+        key_frame.fail("the distortion is not monotonic within the image; calibrate again")
     x, y = ideal / focal_px, distorted / focal_px
     A = np.stack([x**3, x**5, x**7], axis=1)
     scale = np.abs(A).max(axis=0)
@@ -125,10 +112,4 @@ def _opencv_radial(vicon: list[float], focal_px: float, reach_px: float) -> tupl
     return radial, float(np.abs(A @ radial + x - y).max() * focal_px)
 
 
-def _find(root: Path) -> list[Path]:
-    return matching(root, "*.xcp")
-
-
-FORMAT = Format(
-    tool="Vicon", files="*.xcp", find=_find, read=_read, videos=(".", "videos", "Videos"), videos_of_all=False
-)
+FORMAT = Format("Vicon", ("*.xcp",), _read, videos=(".", "videos", "Videos"), videos_of_all=False)
