@@ -30,7 +30,7 @@ SEGMENTER = '''
 import cv2
 import numpy as np
 
-from tk.model.masks.subject import Sighting
+from tk.model.masks.sightings import Sighting
 
 
 class Red:
@@ -83,7 +83,8 @@ def person_mask(camera: Camera, at: tuple[float, float], height_m: float = 1.75)
 
 
 def write_people(folder: Path, people: Sequence[Path2], frames: int = 20, rig: Rig = RIG) -> Path:
-    """Write a capture without masks and background; the first person's true masks go to ``truth/``."""
+    """Write a capture without masks and background. The true masks go to ``truth/``: 255 for the first person, 128 for
+    the others."""
     folder.mkdir(parents=True)
     write_calibration(rig, folder / "calibration.toml")
     settings = {"fps": 15.0, "volume": VOLUME, "init": {"pose": "any"}}
@@ -96,20 +97,22 @@ def write_people(folder: Path, people: Sequence[Path2], frames: int = 20, rig: R
             (folder / kind / camera.name).mkdir(parents=True)
         for k in range(frames):
             picture = cv2.add(room, rng.integers(0, 4, room.shape, np.uint8))
+            true = np.zeros(room.shape[:2], np.uint8)
             for who, path in reversed(list(enumerate(people))):
                 at = path(k)
                 mask = np.zeros(room.shape[:2], np.uint8) if at is None else person_mask(camera, at)
                 picture[mask > 0] = (40, 40, 200)
-                if who == 0:
-                    cv2.imwrite(str(folder / "truth" / camera.name / f"{k:06d}.png"), mask)
+                true[mask > 0] = 128 if who else 255
+            cv2.imwrite(str(folder / "truth" / camera.name / f"{k:06d}.png"), true)
             cv2.imwrite(str(folder / "images" / camera.name / f"{k:06d}.png"), picture)
     return folder
 
 
-def truth(folder: Path, k: int) -> np.ndarray:
-    """Return the true masks (C, H, W) of a frame, bool."""
+def truth(folder: Path, k: int, everybody: bool = False) -> np.ndarray:
+    """Return the true masks (C, H, W) of a frame, bool: of the first person, or of everybody."""
     files = [folder / "truth" / name / f"{k:06d}.png" for name in RIG.names]
-    return np.stack([cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files]) > 0
+    masks = np.stack([cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files])
+    return masks > 0 if everybody else masks == 255
 
 
 def install(folder: Path, monkeypatch: pytest.MonkeyPatch, **classes: str) -> None:

@@ -27,7 +27,7 @@ def masks(
 ) -> None:
     """Segment the videos of CAPTURE with a neural network and write masks to DIR/CAMERA/000000.png.
 
-    The person is white. After an interruption, the same command continues.
+    People are white. After an interruption, the same command continues.
     """
     with ConsoleReporter(quiet, stage="loading") as reporter:
         from tk.io.importers import open_recording

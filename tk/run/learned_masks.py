@@ -1,7 +1,7 @@
 """Masks of a recording without an empty scene, which is learned from the masks that a segmenter makes of a few frames.
 
 The recording is divided into spans of about ten seconds. In each span the segmenter is asked for frames spread evenly
-over it (:class:`~tk.segmenters.subject_masks.SubjectMasks`), and the empty scene is learned from them
+over it (:class:`~tk.segmenters.people_masks.PeopleMasks`), and the empty scene is learned from them
 (:class:`~tk.model.masks.learned_scene.LearnedScene`). All other masks are a segmentation against that scene. Where the
 scene is unknown, the segmenter's masks before and after the frame decide; where they differ, pixels are uncertain. The
 asked frames are also a check: between two of which one disagrees with the segmentation, the segmenter makes all masks.
@@ -32,7 +32,7 @@ from tk.model.setup import Setup
 from tk.settings import Settings
 
 if TYPE_CHECKING:  # SciPy, which takes long to import
-    from tk.segmenters.subject_masks import SubjectMasks
+    from tk.segmenters.people_masks import PeopleMasks
 
 Masks = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
@@ -86,10 +86,10 @@ class _Span:
 
 
 class LearnedMasks:
-    """Segments the subject in the frames of a recording, best in order."""
+    """Segments the people in the frames of a recording, best in order."""
 
-    def __init__(self, setup: Setup, source: Source, settings: Settings, subject: SubjectMasks) -> None:
-        self._source, self._settings, self._subject = source, settings, subject
+    def __init__(self, setup: Setup, source: Source, settings: Settings, people: PeopleMasks) -> None:
+        self._source, self._settings, self._people = source, settings, people
         self._sizes = [(camera.width, camera.height) for camera in setup.rig]
         self._fps, self._cameras = setup.fps, len(setup.rig)
         self._edges = _edges(source.first_frame, source.frame_count, setup.fps)
@@ -119,16 +119,16 @@ class LearnedMasks:
         before, after = span.around(frame.index) if span.samples else (None, None)
         asked = before is not None and before is after and before.index == frame.index
         if span.foreground is None or before is None or after is None:
-            found = (before.masks, before.uncertain) if before and asked else self._subject.label(frame.images)
+            found = (before.masks, before.uncertain) if before and asked else self._people.label(frame.images)
             return *found, np.full(self._cameras, SEGMENTER, np.uint8)
         masks, uncertain = span.foreground.label(frame.images, _between(before, after))
         kind = np.full(self._cameras, LEARNED_AND_SEGMENTER if asked else LEARNED, np.uint8)
         failed = ~(before.agrees & after.agrees)
         if failed.any():
-            again = (before.masks, before.uncertain) if asked else self._subject.label(frame.images)
+            again = (before.masks, before.uncertain) if asked else self._people.label(frame.images)
             masks[failed], uncertain[failed] = again[0][failed], again[1][failed]
             kind[failed] = SEGMENTER
-        return self._subject.only_subject(masks), uncertain, kind
+        return masks, uncertain, kind
 
     def _span_of(self, index: int) -> _Span:
         within = min(max(index, self._edges[0]), self._edges[-1] - 1)
@@ -150,7 +150,7 @@ class LearnedMasks:
         for frame in self._reading:
             if frame.index in chosen:
                 images.append(frame.images.copy())
-                samples.append((frame.index, *self._subject.label(frame.images)))
+                samples.append((frame.index, *self._people.label(frame.images)))
             if frame.index + 1 >= stop:
                 break
         self._next = stop
@@ -163,7 +163,7 @@ class LearnedMasks:
         learned so far, with the last sample."""
         if frame.index < self._span.stop:
             return self._span
-        sample = (frame.index, *self._subject.label(frame.images))
+        sample = (frame.index, *self._people.label(frame.images))
         self._past.append((frame.images.copy(), sample))
         self._asked += 1
         foreground = self._span.foreground

@@ -19,7 +19,7 @@ from tk.run.plan import choose_frames
 from tk.run.reporter import Reporter
 from tk.run.segmentation import NO_SEGMENTER
 from tk.segmenters import load, names
-from tk.segmenters.subject_masks import SubjectMasks
+from tk.segmenters.people_masks import PeopleMasks
 from tk.threads import one_thread
 
 
@@ -46,7 +46,7 @@ def write_masks(
     segmenter: str | None = None,
     frames: tuple[int, int | None] = (0, None),
 ) -> Written:
-    """Write ``folder/<camera>/000000.png`` …: 8 bits, 255 where the segmenter sees the subject, else 0.
+    """Write ``folder/<camera>/000000.png`` …: 8 bits, 255 where the segmenter sees people, else 0.
 
     Frames that are there already are left as they are, so the same command goes on where an earlier run stopped.
 
@@ -71,7 +71,7 @@ def write_masks(
             raise CaptureError(f"{capture.path}: {NO_SEGMENTER}")
         segmenter = installed[0]
     _check_folder(capture, folder)
-    made = SubjectMasks(load(segmenter), segmenter, capture.rig, capture.volume)
+    made = PeopleMasks(load(segmenter), segmenter, capture.rig, capture.volume)
     _claim(folder, {"capture": capture.name, "segmenter": segmenter, "cameras": list(capture.rig.names)})
     missing = [k for k in range(start, stop) if not all(_file(folder, n, k).exists() for n in capture.rig.names)]
     reporter.begin(stop - start, stop - start - len(missing))

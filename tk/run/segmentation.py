@@ -119,9 +119,9 @@ def _labeller(setup: Setup, source: Source, settings: Settings, note: Callable[[
     if origin.startswith(_SEGMENTER):
         name = origin.removeprefix(_SEGMENTER)
         note(f"{source.where}: no masks and no background/; the segmenter {name} makes the masks")
-        from tk.segmenters.subject_masks import SubjectMasks  # SciPy, which takes a second to import
+        from tk.segmenters.people_masks import PeopleMasks  # SciPy, which takes a second to import
 
-        made = SubjectMasks(source.segmenter or load(name), name, setup.rig, setup.volume)
+        made = PeopleMasks(source.segmenter or load(name), name, setup.rig, setup.volume)
         learned = LearnedMasks(setup, source, settings, made)
         if reason := learned.why_throughout():
             note(f"{source.where}: the segmenter makes the masks of every frame, which takes long: {reason}")

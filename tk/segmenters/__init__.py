@@ -1,4 +1,4 @@
-"""Segmenters: networks that find the pixels of a person in an image without an image of the empty scene.
+"""Segmenters: networks that find the pixels of people in an image without an image of the empty scene.
 
 :class:`~tk.segmenters.blazepose.BlazePose` is built in. A package adds another one with an entry point of the group
 ``tk.segmenters``: a name, and a callable without arguments that returns a :class:`Segmenter`.
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tk.errors import ConfigError
 
 if TYPE_CHECKING:
-    from tk.model.masks.subject import Sighting
+    from tk.model.masks.sightings import Sighting
 
 GROUP = "tk.segmenters"
 
@@ -29,8 +29,9 @@ class Segmenter(Protocol):
     """Estimates which pixels show a person."""
 
     def segment(self, picture: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Return the probability (h, w) that each pixel shows the person near the middle of the image (h, w, 3) BGR.
+        """Return the probability (h, w) that each pixel of an image (h, w, 3) BGR shows a person.
 
+        A :class:`Finder` may segment the person in the middle only.
         The same image must give the same result, so that a resumed run sees the same masks.
         """
         ...

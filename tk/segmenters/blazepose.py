@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.model.masks.subject import Sighting
+from tk.model.masks.sightings import Sighting
 from tk.segmenters.weights import weights
 
 _DETECTOR_SIDE, _POSE_SIDE = 224, 256

@@ -192,20 +192,22 @@ class CoarseHull:
 
     def only(self, voxels: Bool, c: int, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the regions of a mask (h, w) that are near voxels (N,); all of it if the image shows none of them."""
-        x, y = self._voxels.xy(c, voxels).T
-        if len(x) == 0:
-            return mask
         count, regions = cv2.connectedComponents(mask, connectivity=8)
-        away = np.ones(mask.shape, np.uint8)
-        inside = (x < mask.shape[1]) & (y < mask.shape[0])
-        away[y[inside], x[inside]] = 0
-        kept = np.zeros(count, np.bool_)
-        kept[regions[y[inside], x[inside]]] = True
-        if kept[1:].all():
+        if count <= 1:
             return mask
+        kept = np.zeros(count, np.bool_)
+        kept[regions[self.near(voxels, c, mask.shape)]] = True
+        return mask if kept[1:].all() else np.where(kept[regions], mask, 0).astype(np.uint8)
+
+    def near(self, voxels: Bool, c: int, shape: tuple[int, ...]) -> Bool:
+        """Return (h, w) the pixels near voxels (N,) in a camera's image; all of them if the image shows none."""
+        x, y = self._voxels.xy(c, voxels).T
+        away = np.ones(shape, np.uint8)
+        away[y, x] = 0
+        if away.all():
+            return away > 0
         distance = cv2.distanceTransform(away, cv2.DIST_L2, 3)
-        kept[regions[distance <= _NEAR_VOXELS * self._voxels.pixels_per_voxel[c]]] = True
-        return np.where(kept[regions], mask, 0).astype(np.uint8)
+        return np.asarray(distance <= _NEAR_VOXELS * self._voxels.pixels_per_voxel[c])
 
 
 def dilated(mask: NDArray, by: int) -> Bool:

@@ -1,8 +1,7 @@
-"""Who the subject is, and where to look for him or her: the person in the working volume whom most cameras see.
+"""Sightings: people that a detector finds in single images, and where these people are in space.
 
-Sightings of people in the images, any number in each, are matched where their lines of sight meet in the volume
-(:func:`locate`); masks are matched by a coarse visual hull (:class:`tk.model.hull.coarse.CoarseHull`). A bystander in
-two images, or behind the volume, is in neither.
+Sightings of one person in several images are matched where their lines of sight meet (:func:`locate`). A
+:class:`Patch` is the square of an image in which a network looks for a person.
 """
 
 from __future__ import annotations
@@ -21,11 +20,11 @@ from tk.model.cameras.volume import Volume
 
 Float = NDArray[np.float64]
 
-# A sighting is the subject's if the point is within this share of its radius. Chosen on the development captures;
+# A sighting is a person's if the person's point is within this share of its radius. Chosen on the development captures;
 # sensitivity not measured.
 _AGREE = 0.35
-# How far outside the volume the hips may be, metres: a step.
-_MARGIN_M = 0.3
+#: how far outside the working volume people are located, metres, as :mod:`tk.model.people` looks
+BEYOND_M = 2.0
 
 # A body is seen from above or below if less than this share of it is across the line of sight.
 _FORESHORTENED = 0.3
@@ -49,6 +48,11 @@ class Sighting:
     def radius(self) -> float:
         """Radius of the circle, pixels."""
         return float(np.hypot(self.top[0] - self.center[0], self.top[1] - self.center[1]))
+
+    def patch(self, margin: float) -> Patch:
+        """Return the square about the circle, the body upright in it, larger by the factor ``margin``."""
+        angle = float(np.arctan2(self.top[0] - self.center[0], self.center[1] - self.top[1]))
+        return Patch(self.center, max(round(2 * margin * self.radius), 2), angle)
 
 
 @dataclass(frozen=True)
@@ -98,20 +102,20 @@ def _turn(angle: float) -> Float:
 
 
 @dataclass(frozen=True)
-class Subject:
-    """Where the subject is: a sphere that contains the whole body.
+class SeenPerson:
+    """Where a person is: a sphere that contains the whole body.
 
     Attributes:
         center: (3,) the mid-hip point, world frame, metres.
         top: (3,) the point of the sphere above it, along the body.
         radius_m: metres.
-        views: number of cameras with a sighting of the person.
+        cameras: indices of the cameras with a sighting of the person.
     """
 
     center: Float
     top: Float
     radius_m: float
-    views: int
+    cameras: tuple[int, ...]
 
     def patch(self, camera: Camera, margin: float) -> Patch | None:
         """Return the square about the sphere in an image, the body upright in it, larger by the factor ``margin``.
@@ -127,57 +131,67 @@ class Subject:
         return Patch((float(pixels[0, 0]), float(pixels[0, 1])), max(round(2 * margin * radius), 2), angle)
 
 
-def locate(rig: Rig, volume: Volume, sightings: Sequence[Sequence[Sighting]]) -> Subject | None:
-    """Return the person whom most cameras see at one point of the volume; None if no two do.
+def locate(
+    rig: Rig, volume: Volume, sightings: Sequence[Sequence[Sighting]]
+) -> tuple[list[SeenPerson], list[list[Sighting]]]:
+    """Return the people in the volume and around it whom two cameras or more see, and the sightings of nobody of them.
 
-    Pairs of sightings propose points; the support of a point is the truncated quadratic of MSAC (Torr and Zisserman
-    2000), so that three cameras with an exact match outweigh three with a rough one.
+    Each pair of sightings of two cameras proposes the point where their lines of sight meet. The support of a point is
+    the truncated quadratic of MSAC (Torr and Zisserman 2000), so that three cameras with an exact match outweigh three
+    with a rough one. The point with the most support is a person; the sightings that agree with it are his or hers; the
+    next person is found among the others.
 
     Args:
         rig: C cameras.
-        volume: the working volume.
+        volume: the working volume. The hips of a person are at most :data:`BEYOND_M` outside.
         sightings: C lists, in pixels of the full images.
     """
     seen = [(c, sighting) for c, each in enumerate(sightings) for sighting in each]
+    camera = np.array([c for c, _ in seen], np.int64)
     hips = [(rig[c].center, rig[c].rays([s.center])[0]) for c, s in seen]
     tops = [(rig[c].center, rig[c].rays([s.top])[0]) for c, s in seen]
-    best = 0.0
-    found: Subject | None = None
-    for a, b in combinations(range(len(seen)), 2):
-        if seen[a][0] == seen[b][0]:
-            continue
-        point = _meeting([hips[a], hips[b]])
-        if point is None or not _inside(point, volume):
-            continue
-        agreeing = _agreeing(rig, point, seen)
-        support = sum(seen[k][1].score * (1 - (distance / _AGREE) ** 2) for k, distance in agreeing.items())
-        if len(agreeing) > 1 and support > best:
-            chosen = list(agreeing)
-            center, top = (_meeting([lines[k] for k in chosen]) for lines in (hips, tops))
-            if center is not None and top is not None:
-                best = support
-                found = Subject(center, top, _radius_m(rig, center, [seen[k] for k in chosen]), len(chosen))
-    return found
+    pairs = [(a, b) for a, b in combinations(range(len(seen)), 2) if camera[a] != camera[b]]
+    met = [point for a, b in pairs if (point := _meeting([hips[a], hips[b]])) is not None and _near(point, volume)]
+    distance = _distances(rig, np.array(met).reshape(-1, 3), seen)
+    score = np.array([s.score for _, s in seen])
+    people = []
+    free = np.ones(len(seen), np.bool_)
+    while True:
+        # the nearest free sighting of each camera, if it agrees
+        open_to = np.where(free & (distance <= _AGREE), distance, np.inf)
+        chosen = np.zeros(open_to.shape, np.bool_)
+        for c in np.unique(camera):
+            own = np.flatnonzero(camera == c)
+            nearest = own[open_to[:, own].argmin(axis=1)]
+            chosen[np.arange(len(chosen)), nearest] = np.isfinite(open_to[np.arange(len(chosen)), nearest])
+        support = np.where(chosen, score * (1 - (np.where(chosen, distance, 0) / _AGREE) ** 2), 0).sum(axis=1)
+        support[chosen.sum(axis=1) < 2] = 0
+        if not support.any():
+            break
+        of_person = np.flatnonzero(chosen[support.argmax()])
+        free[of_person] = False
+        center, top = (_meeting([lines[k] for k in of_person]) for lines in (hips, tops))
+        if center is not None and top is not None:
+            radius_m = _radius_m(rig, center, [seen[k] for k in of_person])
+            people.append(SeenPerson(center, top, radius_m, tuple(camera[of_person].tolist())))
+    rest = [[s for k, (view, s) in enumerate(seen) if view == c and free[k]] for c in range(len(rig))]
+    return people, rest
+
+
+def _distances(rig: Rig, points: Float, seen: Sequence[tuple[int, Sighting]]) -> Float:
+    """Return (P, N) the distance of each point (P, 3) from each sighting in the image, in the sighting's radii."""
+    projected = [camera.project(points)[0] for camera in rig]
+    columns = [np.linalg.norm(projected[c] - np.array(s.center), axis=1) / max(s.radius, 1e-9) for c, s in seen]
+    found = np.array(columns).reshape(len(seen), len(points)).T
+    return np.where(np.isfinite(found), found, np.inf)
 
 
 def _meeting(lines: Sequence[tuple[Float, Float]]) -> Float | None:
     return closest_to_lines(np.array([origin for origin, _ in lines]), np.array([along for _, along in lines]))
 
 
-def _inside(point: Float, volume: Volume) -> bool:
-    return bool(((volume.lower - _MARGIN_M <= point) & (point <= volume.upper + _MARGIN_M)).all())
-
-
-def _agreeing(rig: Rig, point: Float, seen: Sequence[tuple[int, Sighting]]) -> dict[int, float]:
-    """Return the sightings of a person at a point, at most one a camera, with their distances in their radii."""
-    nearest: dict[int, tuple[float, int]] = {}
-    for c, camera in enumerate(rig):
-        pixels, _ = camera.project(point)
-        for k, (view, sighting) in enumerate(seen):
-            distance = float(np.linalg.norm(pixels[0] - sighting.center)) / max(sighting.radius, 1e-9)
-            if view == c and distance <= min(_AGREE, nearest.get(c, (np.inf, 0))[0]):  # false for NaN
-                nearest[c] = distance, k
-    return {k: distance for distance, k in nearest.values()}
+def _near(point: Float, volume: Volume) -> bool:
+    return bool(((volume.lower - BEYOND_M <= point) & (point <= volume.upper + BEYOND_M)).all())
 
 
 def _radius_m(rig: Rig, point: Float, seen: Sequence[tuple[int, Sighting]]) -> float:

@@ -1,16 +1,19 @@
-"""Who the subject is, from sightings and from masks; squares of pictures."""
+"""Where people are, from sightings and from masks; squares of pictures."""
 
 from __future__ import annotations
 
+from itertools import combinations
+from random import Random
+
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from tests.model.ring import ring_of_cameras
 from tk.model.cameras.volume import Volume
 from tk.model.hull.coarse import CoarseHull
-from tk.model.masks.subject import Patch, Sighting, locate, volume_patch
+from tk.model.masks.sightings import Patch, Sighting, locate, volume_patch
 
 RIG = ring_of_cameras(4, 160, 200)
 VOLUME = Volume((0.0, 0.0, 1.0), (2.4, 2.4, 2.2))
@@ -26,37 +29,49 @@ def sighted(camera, at, score=0.9, z=0.95):
 
 @settings(max_examples=40, deadline=None)
 @given(
-    at=inside,
-    others=st.lists(st.tuples(inside, st.sampled_from(range(4))), max_size=4),
+    places=st.lists(inside, max_size=3, unique_by=lambda at: (round(at[0]), round(at[1]))),
     blind=st.sampled_from([*range(4), None]),
+    order=st.randoms(use_true_random=False),
 )
-@example(at=(0.0, 0.5), others=[((0.76, 0.0), 1)], blind=1)
-def test_person_seen_by_most_cameras_is_the_subject(at, others, blind) -> None:
-    """Whoever else single cameras take for a person, and though one camera does not see the subject."""
-    sightings = [[sighted(camera, at)] if c != blind else [] for c, camera in enumerate(RIG)]
-    for c in range(4):
-        strange = [place for place, where in others if where == c][:1]  # no two of them at one place: another subject
-        sightings[c] += [sighted(RIG[c], (x + 0.01 * c, y), 0.95) for x, y in strange]
-    found = locate(RIG, VOLUME, sightings)
-    assert found is not None
-    if found.views == 4 - (blind is not None) and not others:
-        np.testing.assert_allclose(found.center, [*at, 0.95], atol=1e-6)
-        np.testing.assert_allclose(found.top, [*at, 1.85], atol=1e-6)
-        assert 0.7 < found.radius_m < 1.1
-    assert np.linalg.norm(found.center[:2] - at) < 0.5 or len(others) >= 2
+@example(places=[(0.0, 0.5), (0.76, 0.0)], blind=1, order=Random(0))
+def test_everybody_whom_several_cameras_see_is_located(places, blind, order) -> None:
+    """Although one camera sees nobody, and the sightings have no order."""
+    apart = [np.hypot(*np.subtract(a, b)) for a, b in combinations(places, 2)]
+    assume(min(apart, default=1.0) > 0.7)
+    sightings = [[sighted(camera, at) for at in places] if c != blind else [] for c, camera in enumerate(RIG)]
+    for each in sightings:
+        order.shuffle(each)
+    people, rest = locate(RIG, VOLUME, sightings)
+    assert len(people) == len(places) and not any(rest)
+    for at in places:
+        person = min(people, key=lambda p: float(np.linalg.norm(p.center[:2] - at)))
+        assert person.cameras == tuple(c for c in range(4) if c != blind)
+        np.testing.assert_allclose(person.center, [*at, 0.95], atol=1e-6)
+        np.testing.assert_allclose(person.top, [*at, 1.85], atol=1e-6)
+        assert 0.7 < person.radius_m < 1.1
 
 
-def test_no_subject_without_two_matching_sightings() -> None:
-    assert locate(RIG, VOLUME, [[], [], [], []]) is None
-    assert locate(RIG, VOLUME, [[sighted(RIG[0], (0, 0))], [], [], []]) is None
-    assert locate(RIG, VOLUME, [[sighted(c, (2.0, 0.5))] for c in RIG]) is None, "beyond the volume"
+def test_sightings_of_single_cameras_are_left_over() -> None:
+    alone = sighted(RIG[0], (0.0, 0.0))
+    assert locate(RIG, VOLUME, [[], [], [], []]) == ([], [[], [], [], []])
+    assert locate(RIG, VOLUME, [[alone], [], [], []]) == ([], [[alone], [], [], []])
+    beyond = Volume((-3.0, 0.0, 1.0), (1.0, 1.0, 2.2))
+    assert locate(RIG, beyond, [[sighted(c, (0.0, 0.5))] for c in RIG])[0] == []
     low, high = (sighted(RIG[c], (0.0, 0.0), z=z) for c, z in ((0, 0.1), (1, 1.9)))
-    assert locate(RIG, VOLUME, [[low], [high], [], []]) is None, "their lines of sight do not meet"
+    assert locate(RIG, VOLUME, [[low], [high], [], []])[0] == [], "their lines of sight do not meet"
+    (person,), rest = locate(RIG, VOLUME, [[sighted(c, (0.3, 0.2))] + [alone] * (c is RIG[0]) for c in RIG])
+    assert person.cameras == (0, 1, 2, 3) and rest == [[alone], [], [], []]
 
 
-def test_a_patch_shows_the_subject_upright() -> None:
-    found = locate(RIG, VOLUME, [[sighted(camera, (0.3, -0.2))] for camera in RIG])
-    assert found is not None
+def test_the_better_of_two_sightings_of_a_camera_is_the_person() -> None:
+    near = [sighted(RIG[0], (0.1, 0.0)), sighted(RIG[0], (0.0, 0.0)), sighted(RIG[0], (0.0, 0.1))]
+    (person,), rest = locate(RIG, VOLUME, [near, *([sighted(c, (0.0, 0.0))] for c in RIG[1:])])
+    assert rest == [[near[0], near[2]], [], [], []]
+    np.testing.assert_allclose(person.center, [0, 0, 0.95], atol=1e-6)
+
+
+def test_a_patch_shows_the_person_upright() -> None:
+    (found,), _ = locate(RIG, VOLUME, [[sighted(camera, (0.3, -0.2))] for camera in RIG])
     for camera in RIG:
         patch = found.patch(camera, 1.25)
         assert patch is not None and abs(patch.angle) < 0.1
@@ -80,6 +95,13 @@ def test_cut_and_paste_are_inverse(x: float, y: float, side: int, angle: float) 
             assert back[row, column] == pytest.approx(values[row, column], abs=0.05)
     outside = np.hypot(u - x, v - y) > side
     assert (back[outside] == 0).all()
+
+
+def test_a_patch_of_a_sighting_shows_the_body_upright() -> None:
+    patch = Sighting((50.0, 60.0), (80.0, 20.0), 0.9).patch(1.2)
+    assert patch.center == (50.0, 60.0) and patch.side == 120
+    corner = np.array([50.0, 60.0]) + 59 * np.array([[0.6, -0.8], [0.8, 0.6]])  # up, and to the right
+    assert patch.holds(corner) and not patch.holds(corner * 1.1)
 
 
 def test_a_patch_around_points() -> None:

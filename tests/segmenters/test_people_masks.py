@@ -1,0 +1,122 @@
+"""Masks of everybody: a segmenter that prefers one person, as networks do, and people who hide each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.model.ring import ring_of_cameras
+from tests.people import VOLUME, person_mask
+from tk.model.cameras.volume import Volume
+from tk.model.masks.sightings import Sighting
+from tk.segmenters.people_masks import PeopleMasks
+
+RIG = ring_of_cameras(4, 160, 200)
+HUES = ((40, 40, 200), (200, 60, 30), (30, 160, 40))  # of the people
+
+At = tuple[float, float]
+
+
+def shown(places: Sequence[At]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Return images (4, H, W, 3) of people, the nearer in front, and whom each pixel shows, from 1; 0: nobody."""
+    rng = np.random.default_rng(3)
+    images = rng.integers(90, 110, (4, 200, 160, 3)).astype(np.uint8)
+    who = np.zeros((4, 200, 160), np.int64)
+    for c, camera in enumerate(RIG):
+        for k in sorted(range(len(places)), key=lambda k: -float(camera.project([[*places[k], 1.0]])[1][0])):
+            mask = person_mask(camera, places[k]) > 0
+            images[c][mask], who[c][mask] = HUES[k], k + 1
+    return images, who
+
+
+@dataclass
+class OneOfMany:
+    """Detects one person, the largest, and segments one, the largest in the middle, as a network for single people.
+
+    ``blind``: number of the first images in which nobody is detected. ``seen``: number of people in each square.
+    """
+
+    blind: int = 0
+    seen: list[int] = field(default_factory=list)
+
+    def segment(self, picture: NDArray[np.uint8]) -> NDArray[np.float32]:
+        masks = self._masks(picture)
+        self.seen.append(len(masks))
+        side = len(picture) // 4
+        masks.sort(key=lambda mask: -np.count_nonzero(mask[side:-side, side:-side]))
+        return masks[0].astype(np.float32) * 0.9 if masks else np.zeros(picture.shape[:2], np.float32)
+
+    def find(self, picture: NDArray[np.uint8]) -> list[Sighting]:
+        self.blind -= 1
+        masks = self._masks(picture)
+        if self.blind >= 0 or not masks:
+            return []
+        x, y, width, height = cv2.boundingRect(masks[0].astype(np.uint8))
+        middle = (x + (width - 1) / 2, y + (height - 1) / 2)
+        return [Sighting(middle, (middle[0], middle[1] - 0.55 * height), 0.9)]
+
+    def _masks(self, picture: NDArray[np.uint8]) -> list[NDArray[np.bool_]]:
+        found = [(np.abs(picture.astype(int) - hue).max(axis=2) < 30) for hue in HUES]
+        return sorted((m for m in found if np.count_nonzero(m) > 60), key=lambda m: -int(np.count_nonzero(m)))
+
+
+def masks_of(segmenter: OneOfMany) -> PeopleMasks:
+    return PeopleMasks(segmenter, "one", RIG, Volume(tuple(VOLUME["center"]), tuple(VOLUME["size"])))
+
+
+@pytest.mark.parametrize(
+    "places",
+    [[(0.2, 0.1)], [(-0.6, 0.2), (0.6, -0.1)], [(0.0, 0.0), (0.5, 0.1)], [(-0.7, 0.0), (0.0, 0.6), (0.6, -0.5)]],
+    ids=["one", "two", "two who hide each other", "three"],
+)
+def test_masks_show_everybody(places: list[At]) -> None:
+    images, who = shown(places)
+    masks = masks_of(OneOfMany()).segment(images)
+    for k in range(len(places)):
+        assert (masks > 0)[who == k + 1].mean() > 0.9, k
+    assert (masks > 0)[who == 0].mean() < 0.002
+
+
+def test_person_whom_a_camera_does_not_detect_is_in_its_mask() -> None:
+    images, who = shown([(0.3, -0.2)])
+    masks = masks_of(OneOfMany(blind=1)).segment(images)
+    assert (masks[0] > 0)[who[0] == 1].mean() > 0.9
+
+
+def test_person_whom_one_camera_shows_is_in_its_mask() -> None:
+    images, who = shown([(0.3, -0.2)])
+    alone = images.copy()
+    alone[1:] = shown([])[0][1:]
+    masks = masks_of(OneOfMany()).segment(alone)
+    assert (masks[0] > 0)[who[0] == 1].mean() > 0.9 and not masks[1:].any()
+
+
+def test_nobody_is_segmented_where_nobody_is() -> None:
+    segmenter = OneOfMany()
+    masks, uncertain = masks_of(segmenter).label(shown([])[0])
+    assert not masks.any() and not uncertain.any() and not segmenter.seen
+
+
+def test_another_detection_of_the_same_person_changes_nothing() -> None:
+    """An arm that the mask misses may look like a person."""
+
+    class Twice(OneOfMany):
+        def find(self, picture: NDArray[np.uint8]) -> list[Sighting]:
+            return super().find(picture) or [Sighting((80.0, 100.0), (80.0, 30.0), 0.6)]
+
+    images, _ = shown([(0.2, 0.1)])
+    once, twice = (masks_of(segmenter).label(images) for segmenter in (OneOfMany(), Twice()))
+    for a, b in zip(once, twice, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_masks_do_not_change_the_images() -> None:
+    images, _ = shown([(-0.6, 0.2), (0.6, -0.1)])
+    before = images.copy()
+    masks_of(OneOfMany()).segment(images)
+    np.testing.assert_array_equal(images, before)

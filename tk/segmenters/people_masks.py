@@ -1,0 +1,234 @@
+"""Masks of everybody in all cameras, from a segmenter that works on single images.
+
+A network segments the person in the middle of a square. It is inaccurate for a small person in a large image, prefers
+one person if a square shows several, and misses people whom others hide. The calibrated cameras solve this:
+
+1. The segmenter detects people in every image. Detections are matched across the cameras, which gives the people in
+   space (:mod:`tk.model.masks.sightings`). In every camera, also without a detection (from above, for example), the
+   segmenter gets the square around each person.
+2. Each camera's square and mask of a person are compared with the visual hull of the person's masks in the other
+   cameras. If the square does not contain the hull or is much too large, or the mask shows somebody else, the segmenter
+   gets the square around the hull.
+3. The people who are found are painted over, and the search is repeated until nobody new is found. Detections that
+   match no other camera's are people whom one camera shows.
+4. Where somebody else stands in a person's square, the segmenter gets the square again, with everybody else painted
+   over.
+
+The mask of a camera is the union of the people's masks. A segmenter that cannot detect people gets the part of the
+image that shows the volume, and must find everybody in it.
+
+No state is kept between frames, so a resumed run sees the same masks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.model.cameras.camera import Rig
+from tk.model.cameras.volume import Volume
+from tk.model.hull.coarse import CoarseHull
+from tk.model.masks.sightings import Patch, SeenPerson, Sighting, locate, volume_patch
+from tk.segmenters import Finder, Segmenter, probabilities
+
+Images = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+
+#: side of the square, relative to the ball around the body (MediaPipe's 1.25) and to the hull (slightly more)
+_BALL_MARGIN, _HULL_MARGIN = 1.25, 1.35
+#: a mask that covers a smaller share of the others' hull shows another person. The hull is up to twice as large as the
+#: person; correct masks cover 0.4 and more (measured).
+_LEAST_SHARE = 0.3
+#: pixels with a probability from here to 0.5 are uncertain; chosen on recordings with people, sensitivity not measured
+_UNCERTAIN = 0.1
+#: a square larger than the hull's by this factor wastes the network's pixels; sensitivity not measured
+_TOO_LARGE = 1.6
+#: somebody new covers, in two cameras, this share of the square with pixels that no other mask shows. A person covers
+#: 0.1 of it, and 0.07 or more if half hidden; what the search takes for a person, an arm that a mask misses for
+#: example, less than 0.06.
+_LEAST_NEW = 0.065
+#: rounds of the search at most: three people who hide each other, and a round that finds nobody
+_ROUNDS = 4
+#: width by which a mask is enlarged before it is painted over, as a share of the square: the outline's error
+_RIM = 0.01
+
+
+@dataclass
+class _Person:
+    """A person's squares and masks.
+
+    Attributes:
+        patches: one per camera.
+        masks, uncertain: (C, H, W) uint8, 0 or 255, and bool.
+        round: round of the search in which the person was found; those of earlier ones were painted over.
+    """
+
+    patches: list[Patch]
+    masks: Images
+    uncertain: Bool
+    round: int
+
+
+class PeopleMasks:
+    """Segments the people in the images of a rig."""
+
+    def __init__(self, segmenter: Segmenter, name: str, rig: Rig, volume: Volume) -> None:
+        self._segmenter, self._name = segmenter, name
+        self._rig, self._volume = rig, volume
+        self._hull = CoarseHull(rig, volume)
+        self._whole = [volume_patch(camera, volume) for camera in rig]
+
+    def segment(self, images: Images) -> Images:
+        """Return the masks (C, H, W) uint8, 0 or 255, of images (C, H, W, 3) uint8 BGR.
+
+        Raises:
+            ConfigError: the segmenter does not return probabilities.
+        """
+        return self.label(images)[0]
+
+    def label(self, images: Images) -> tuple[Images, Bool]:
+        """Return the masks, and their uncertain pixels (C, H, W) bool, where the mask is 0."""
+        masks, uncertain = np.zeros(images.shape[:3], np.uint8), np.zeros(images.shape[:3], np.bool_)
+        for person in self._people(images):
+            masks |= person.masks
+            uncertain |= person.uncertain
+        return masks, uncertain & (masks == 0)
+
+    def _people(self, images: Images) -> list[_Person]:
+        if not isinstance(self._segmenter, Finder):
+            everybody = self._empty(self._whole)
+            for c in range(len(images)):
+                self._segment(images, c, everybody)
+            self._compare(images, everybody)
+            return [everybody]
+        left = images.copy()
+        people: list[_Person] = []
+        sightings: list[list[Sighting]] = [[] for _ in self._rig]
+        for number in range(_ROUNDS):
+            for c, each in enumerate(sightings):
+                each += self._sightings(left, c)
+            located, sightings = locate(self._rig, self._volume, sightings)
+            new = [person for seen in located if (person := self._look(left, seen, number, people))]
+            if not new:
+                break
+            people += new
+            for person in new:
+                for c in range(len(left)):
+                    self._paint(left[c], c, person.masks[c], person.patches[c])
+        self._separate(images, people)
+        return people + self._alone(images, people, sightings)
+
+    def _alone(
+        self, images: Images, people: Sequence[_Person], sightings: Sequence[Sequence[Sighting]]
+    ) -> list[_Person]:
+        """Return those whom one camera shows: at sightings that match no other camera's."""
+        alone: list[_Person] = []
+        for c, each in enumerate(sightings):
+            for sighting in each:
+                person = self._empty([sighting.patch(_BALL_MARGIN)] * len(images))
+                self._segment(images, c, person)
+                if self._new_views(person, [*people, *alone])[c]:
+                    alone.append(person)
+        return alone
+
+    def _sightings(self, images: Images, c: int) -> list[Sighting]:
+        """Return the people in the part of an image that shows the volume."""
+        assert isinstance(self._segmenter, Finder)
+        whole = self._whole[c]
+        found = self._segmenter.find(whole.cut(self._shown(images[c], c)))
+        x, y = (value - (whole.side - 1) / 2 for value in whole.center)  # whole patches are not rotated
+        moved = [Sighting((s.center[0] + x, s.center[1] + y), (s.top[0] + x, s.top[1] + y), s.score) for s in found]
+        return [s for s in moved if np.isfinite(s.radius)]
+
+    def _patches(self, person: SeenPerson) -> list[Patch]:
+        patches = [person.patch(camera, _BALL_MARGIN) for camera in self._rig]
+        return [patch or whole for patch, whole in zip(patches, self._whole, strict=True)]
+
+    def _look(self, left: Images, seen: SeenPerson, number: int, people: Sequence[_Person]) -> _Person | None:
+        """Return the masks of a person in the images that are left; None if they show nobody new."""
+        person = self._empty(self._patches(seen), number)
+        for c in seen.cameras:
+            self._segment(left, c, person)
+        if people and np.count_nonzero(self._new_views(person, people)) < 2:
+            return None
+        for c in range(len(left)):
+            if c not in seen.cameras:
+                self._segment(left, c, person)
+        self._compare(left, person)
+        hull = self._hull.subject(person.masks)
+        for c in range(len(left)):
+            person.masks[c] = self._hull.only(hull, c, person.masks[c])
+        return person
+
+    def _compare(self, images: Images, person: _Person) -> None:
+        """Compare each mask with the hull of the others; where it shows somebody else, or the square fits badly, the
+        segmenter gets the square around the hull."""
+        for c, patch in enumerate(person.patches):
+            others = self._hull.subject(person.masks, but=c)
+            expected = self._hull.points(others, c)
+            if len(expected) == 0:
+                continue
+            better = Patch.about(expected, _HULL_MARGIN, patch.angle)
+            missed = self._hull.share(others, c, person.masks[c]) < _LEAST_SHARE
+            if missed or patch.side > _TOO_LARGE * better.side or not patch.holds(expected):
+                person.patches[c] = better
+                self._segment(images, c, person)
+
+    def _new_views(self, person: _Person, people: Sequence[_Person]) -> Bool:
+        """Return (C,) whether a camera shows enough of a person that nobody else's mask shows."""
+        own = person.masks > 0
+        for other in people:
+            own &= other.masks == 0
+        area = np.count_nonzero(own, axis=(1, 2))
+        return np.asarray(area > [_LEAST_NEW * patch.side**2 for patch in person.patches])
+
+    def _separate(self, images: Images, people: Sequence[_Person]) -> None:
+        """Add what the segmenter sees of a person where others stood in the square and are now painted over."""
+        first = [person.masks.copy() for person in people]
+        for person in people:
+            for c in range(len(images)):
+                patch = person.patches[c]
+                beside = [p for p in people if p is not person and patch.holds(np.array([p.patches[c].center]))]
+                if all(other.round < person.round for other in beside):
+                    continue  # nobody is beside the person, or the others were painted over already
+                painted = images[c].copy()
+                for other, masks in zip(people, first, strict=True):
+                    if other is not person:
+                        self._paint(painted, c, masks[c], other.patches[c])
+                found = self._probability(painted, c, person.patches[c])
+                near = self._hull.near(self._hull.subject(person.masks, but=c), c, images.shape[1:3])
+                person.uncertain[c] |= (found > _UNCERTAIN) & near
+                person.masks[c][(found > 0.5) & near] = 255
+
+    def _paint(self, image: Images, c: int, mask: Images, patch: Patch) -> None:
+        """Paint a mask (H, W) over in an image (H, W, 3), with the mean colour of the other pixels."""
+        width = 2 * max(round(_RIM * patch.side), 1) + 1
+        grown = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width)))
+        picture, person = self._shown(image, c), self._shown(grown, c) > 0
+        picture[person] = cv2.mean(picture, (~person).view(np.uint8))[:3]
+
+    def _empty(self, patches: Sequence[Patch], number: int = 0) -> _Person:
+        shape = len(self._rig), *self._rig.frame_shape
+        return _Person(list(patches), np.zeros(shape, np.uint8), np.zeros(shape, np.bool_), number)
+
+    def _segment(self, images: Images, c: int, person: _Person) -> None:
+        """Give the segmenter the square of a person in an image; replace the mask."""
+        found = self._probability(images[c], c, person.patches[c])
+        person.masks[c] = np.where(found > 0.5, 255, 0)
+        person.uncertain[c] = (found > _UNCERTAIN) & (found <= 0.5)
+
+    def _probability(self, image: Images, c: int, patch: Patch) -> NDArray[np.float32]:
+        """Return the probability (H, W) of each pixel to show the person in the middle of a square; 0 outside it."""
+        whole = np.zeros(image.shape[:2], np.float32)
+        picture = self._shown(image, c)
+        found = probabilities(self._segmenter, self._name, patch.cut(picture))
+        self._shown(whole, c)[...] = patch.paste(found, picture.shape[:2])
+        return whole
+
+    def _shown(self, image: NDArray, c: int) -> NDArray:
+        """Return the part (h, w) of a padded image (H, W) that the camera shows."""
+        return image[: self._rig[c].height, : self._rig[c].width]
