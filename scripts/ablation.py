@@ -20,31 +20,25 @@ from unittest import mock
 import numpy as np
 from numpy.typing import NDArray
 
+from scripts.paper.sampling import diagonal_basis
 from tk.io.captures.capture import Capture, open_capture
 from tk.io.results.reader import read_joints
 from tk.model.cues.objective import BARRED
 from tk.run.segmentation import make_labeller
 from tk.settings import Settings
 from tk.trackers.protocol import Observation
-from tk.trackers.volumetric import SAMPLING, SCHEDULE, VolumetricTracker
+from tk.trackers.volumetric import VolumetricTracker
 
 Changes = dict[str, dict[str, Any]]
 
-VOLUMETRIC = "tk.trackers.volumetric"
+SCHEDULE = "tk.optim.schedule"
 
 # label; changes relative to the defaults: settings by their table, constants by their module
 ROWS: tuple[tuple[str, Changes], ...] = (
     ("defaults", {}),
     ("no coverage (data to model)", {"objective": {"coverage_weight": 0.0}}),
-    (
-        "σ is the limb's diameter",
-        {VOLUMETRIC: {"SAMPLING": replace(SAMPLING, sigma_m=0.0)}, "tk.model.cues.edge_term": {"SIGMA_M": 0.0}},
-    ),
-    ("SMD not whitened", {VOLUMETRIC: {"SCHEDULE": replace(SCHEDULE, whiten=False)}}),
-    (
-        "the paper's tolerance, 2° and 2 cm",
-        {VOLUMETRIC: {"SCHEDULE": replace(SCHEDULE, tolerance_deg=2.0, tolerance_m=0.02)}},
-    ),
+    ("SMD not whitened", {SCHEDULE: {"descent_basis": diagonal_basis}}),
+    ("the paper's tolerance, 2° and 2 cm", {SCHEDULE: {"TOLERANCE_DEG": 2.0, "TOLERANCE_M": 0.02}}),
     ("no prediction", {"tracking": {"prediction": 0.0}}),
     ("no waist", {"body": {"waist": False}}),
     ("no limb search", {"silhouette": {"search_every": 0}}),

@@ -60,7 +60,7 @@ from tk.model.body.skeleton import CHAINS, convert_poses
 from tk.model.body.superellipsoid_body import build_superellipsoid_body
 from tk.model.cameras.volume import VoxelGrid
 from tk.model.cues.appearance import Appearance
-from tk.model.cues.objective import BodyObjective, objective_parameters
+from tk.model.cues.objective import CHAIN_SAMPLES, COVERAGE_VOXELS, BodyObjective
 from tk.model.hull.hull import VisualHull
 from tk.run import session
 from tk.run.reporter import Silent
@@ -69,7 +69,7 @@ from tk.settings import Settings
 from tk.trackers.bodies import body_and_poses
 from tk.trackers.protocol import Estimate
 from tk.trackers.silhouette import SilhouetteTracker
-from tk.trackers.volumetric import CELL_VOXELS, SAMPLING
+from tk.trackers.volumetric import CELL_VOXELS
 
 DEMO = Path(__file__).resolve().parents[1] / "tk" / "data" / "demo"
 WINDOW = 12  # frames that the stages alone are measured on
@@ -302,7 +302,7 @@ def _search_stages(
     yield Stage("colour segmentation", median_ms(segmented), {})
 
     # the peer knows no colours, so this comparison leaves them out of ours as well
-    objective = BodyObjective(skin, objective_parameters(config.objective), SAMPLING)
+    objective = BodyObjective(skin, config.objective)
     rng = np.random.default_rng(0)
     samples = objective.draw(rng)
     points = skin.place(pose)[samples].astype(np.float32)
@@ -331,12 +331,12 @@ def _search_stages(
     index = built(segmented())
     rows = len(CHAINS)
     for name, B, M, Q in (
-        ("objective: one launch, whole body", 1, len(samples), SAMPLING.voxels),
+        ("objective: one launch, whole body", 1, len(samples), COVERAGE_VOXELS),
         (
             "objective: one launch, five chains",
             rows,
-            SAMPLING.chain,
-            SAMPLING.voxels // len(CHAINS),
+            CHAIN_SAMPLES,
+            COVERAGE_VOXELS // len(CHAINS),
         ),
     ):
         chosen = np.resize(samples, (B, M)).astype(np.int32)
@@ -349,7 +349,7 @@ def _search_stages(
             voxels,
             poses,
             np.ones_like(poses),
-            objective_parameters(config.objective),
+            objective.settings,
         )
         yield Stage(name, median_ms(call), {})
     yield from contour_stages(objective, capture, config, frame, pose, index)

@@ -18,7 +18,7 @@ from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.raycast import Cast
 from tk.model.body.limb_candidates import limbs_of
 from tk.model.cues.edge_term import ContourTerm
-from tk.model.cues.objective import BodyObjective, objective_parameters
+from tk.model.cues.objective import COVERAGE_VOXELS, BodyObjective
 from tk.model.cues.part_colors import PartColors
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Pyramid, Views
@@ -26,7 +26,6 @@ from tk.optim import gauss_newton
 from tk.settings import Settings
 from tk.trackers.bodies import body_and_poses
 from tk.trackers.contour_tracker import LINE_SEARCH, NEARBY, SCREEN_ROWS, SOLVER
-from tk.trackers.volumetric import SAMPLING
 
 Float = np.ndarray
 
@@ -83,9 +82,9 @@ def contour_stages(
     )
     entries = term.assign(images, poses, chosen)
     rng = np.random.default_rng(0)
-    samples, voxels = objective.draw(rng), rng.integers(len(index.positions), size=SAMPLING.voxels)
+    samples, voxels = objective.draw(rng), rng.integers(len(index.positions), size=COVERAGE_VOXELS)
     rows = samples[None].astype(np.int32), voxels[None].astype(np.int32)
-    settings = objective_parameters(config.objective)
+    settings = objective.settings
     for text, given in (("without entries", None), (f"and {entries.shape[1]} alignment entries", entries)):
         *_, held = objective.kernel.evaluate(index, *rows, poses, poses, settings, entries=given)
         evaluate = partial(objective.kernel.evaluate, index, *rows, poses, poses, settings, entries=given)

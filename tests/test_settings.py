@@ -15,8 +15,11 @@ from tk.errors import ConfigError
 from tk.io import settings_file
 from tk.io.settings_file import PRESETS
 from tk.model.cues.edge_term import PAIRS, VIEWS
+from tk.model.cues.objective import CHAIN_SAMPLES, TORSO_SAMPLES
+from tk.optim.schedule import REFINE
+from tk.optim.smd import MAX_ITERATIONS, MEMORY, WINDOW
 from tk.settings import Settings
-from tk.trackers.volumetric import SAMPLING, SCHEDULE, SMD, Effort
+from tk.trackers.volumetric import points_and_iterations
 
 
 def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -164,21 +167,16 @@ def test_presets_are_valid_and_unlike_the_defaults(name: str) -> None:
 
 def test_the_papers_preset_has_the_papers_numbers() -> None:
     c = settings_file.preset("kehl2006")
-    effort = Effort.of(c.effort_factor)
     assert (VIEWS, PAIRS) == (3, 5)
     assert (c.voxels, c.body.waist, c.appearance.rate) == (64, False, 0.3)
-    assert (effort.sampling.torso, effort.sampling.chain, effort.sampling.scale) == (60, 20, 1)
-    assert SCHEDULE.refine == 0.5
-    assert (effort.smd.memory, effort.smd.max_iterations, effort.smd.window) == (0.3, 40, 3)
-    assert effort.smd.shuffle
+    assert (TORSO_SAMPLES, CHAIN_SAMPLES, REFINE) == (60, 20, 0.5)
+    assert (MEMORY, MAX_ITERATIONS, WINDOW) == (0.3, 40, 3)
+    assert points_and_iterations(c.effort_factor) == (1, 40)
 
 
 def test_effort_is_iterations_below_one_and_points_above() -> None:
-    fast, normal, thorough = (Effort.of(Settings(effort=e).effort_factor) for e in ("fast", "normal", "thorough"))
-    assert (normal.sampling, normal.smd) == (SAMPLING, SMD)
-    assert fast.sampling == SAMPLING and fast.smd.max_iterations == SMD.max_iterations // 2
-    assert thorough.smd == SMD and thorough.sampling.scale == 5
-    assert Effort.of(0.05).smd.max_iterations >= 1
+    found = [points_and_iterations(Settings(effort=e).effort_factor) for e in ("fast", "normal", "thorough", 0.05)]
+    assert found == [(1, 20), (1, 40), (5, 40), (1, 2)]
 
 
 def test_there_are_at_most_35_settings() -> None:

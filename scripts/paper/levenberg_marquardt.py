@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.objective import Held
-from tk.model.cues.objective import OUTLIERS, FrameObjective, Ints
-from tk.optim.schedule import CHAIN_LEVER_M, LEVER_M, ScheduleResult
-from tk.trackers.volumetric import SCHEDULE, VolumetricTracker
+from tk.model.cues.objective import OUTLIERS, Evaluation, FrameObjective, Ints
+from tk.optim.schedule import LEVER_M, REFINE, ScheduleResult
+from tk.trackers.volumetric import VolumetricTracker
 
 Float = NDArray[np.float64]
 
@@ -168,7 +168,7 @@ class FixedProblem(Protocol):
 
 
 def optimise(
-    problem: FixedProblem, starts: Float, refine: float = SCHEDULE.refine, config: LmSettings | None = None
+    problem: FixedProblem, starts: Float, refine: float = REFINE, config: LmSettings | None = None
 ) -> ScheduleResult:
     """Optimise all degrees of freedom from the best of the starts (S, D), then each chain with the torso held.
 
@@ -181,12 +181,12 @@ def optimise(
     config = config or LmSettings()
     starts = problem.constrain(starts)
     start = starts[0] if len(starts) == 1 else min(starts, key=problem.value)
-    pose, made = _minimise_free(problem, problem.fixed(), start, np.ones(len(start), bool), LEVER_M, config)
+    pose, made = _minimise_free(problem, problem.fixed(), start, np.ones(len(start), bool), config)
     result, iterations = pose.copy(), [made]
     finer = replace(config, tolerance=refine * config.tolerance)
     for k, free in enumerate(problem.free):
         objective = problem.fixed_chain(k, pose)
-        moved, made = _minimise_free(problem, objective, pose, free, CHAIN_LEVER_M, finer)
+        moved, made = _minimise_free(problem, objective, pose, free, finer)
         result[free] = moved[free]
         iterations.append(made)
     return ScheduleResult(result, np.array(iterations, np.int32))
@@ -197,7 +197,6 @@ def _minimise_free(
     objective: FixedObjective,
     start: Float,
     free: NDArray[np.bool_],
-    lever_m: float,
     config: LmSettings,
 ) -> tuple[Float, int]:
     """Return the pose (D,) optimised in the free parameters, and the number of iterations."""
@@ -216,7 +215,7 @@ def _minimise_free(
         lambda part: objective.value(whole(part)),
         start[free],
         lambda part: problem.constrain(whole(part)[None])[0, free],
-        problem.damping(lever_m)[free],
+        problem.damping(LEVER_M)[free],
         config,
     )
     return whole(found.pose), found.iterations
@@ -239,26 +238,22 @@ class FramePoints:
 
     def value(self, pose: Float) -> float:
         """Return the objective at ``pose`` (D,)."""
-        return float(self._evaluate(pose)[0][0])
+        return float(self._evaluate(pose)[0].value[0])
 
     def model(self, pose: Float) -> Quadratic:
         """Return the quadratic model at ``pose`` (D,); outliers weigh as in the Hessian of SMD."""
-        value, gradient, held, entries = self._evaluate(pose)
+        found, held, entries = self._evaluate(pose)
         body = self._frame.objective
         linear = body.kernel.linearise(
             self._frame.index, *self._points, pose, held, body.settings, OUTLIERS, entries=entries
         )
-        return Quadratic(float(value[0]), gradient[0], linear.hessian + np.diag(body.stiffness))
+        return Quadratic(float(found.value[0]), found.gradient[0], linear.hessian + np.diag(body.stiffness))
 
-    def _evaluate(self, pose: Float) -> tuple[Float, Float, Held, NDArray[np.floating] | None]:
+    def _evaluate(self, pose: Float) -> tuple[Evaluation, Held, NDArray[np.floating] | None]:
         frame, (samples, voxels) = self._frame, self._points
-        body = frame.objective
         entries = None if self._strips is None else frame.edge_entries(pose[None], self._strips[None])
-        value, gradient, product, held = body.kernel.evaluate(
-            frame.index, samples[None], voxels[None], pose[None], None, body.settings, entries=entries
-        )
-        value, gradient, _ = body.with_stiffness(pose[None], None, value, gradient, product)
-        return value, gradient, held, entries
+        rows = samples[None], voxels[None]
+        return *frame.objective.evaluate(frame.index, *rows, pose[None], None, entries), entries
 
 
 class FrameProblem:

@@ -7,8 +7,9 @@ sides. The place to come back to is the minimum near the tracked pose of the obj
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +19,13 @@ from tk.io import settings_file
 from tk.io.captures.capture import open_capture
 from tk.kernels.nearest import SurfaceIndex
 from tk.model.cues.edge_term import ContourTerm
-from tk.model.cues.objective import CHAIN_NAMES, BodyObjective, FrameObjective, objective_parameters
+from tk.model.cues.objective import CHAIN_NAMES, BodyObjective, FrameObjective
+from tk.optim import schedule as s
 from tk.optim import smd
-from tk.optim.schedule import CHAIN_LEVER_M, descent_basis, max_step
 from tk.run.segmentation import make_segmenter
 from tk.settings import Settings
 from tk.trackers.protocol import Observation
-from tk.trackers.volumetric import CELL_VOXELS, SAMPLING, SCHEDULE, SMD, VolumetricTracker
+from tk.trackers.volumetric import CELL_VOXELS, VolumetricTracker
 
 ANGLES = ("shoulder_r_pitch", "elbow_r_flexion")
 MOVED_DEG = np.array([18.3, 5.7])
@@ -32,7 +33,8 @@ SIDES = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 BACK_DEG = 5.0
 CHAIN = CHAIN_NAMES.index("arm_r")
 AVERAGED = 40  # draws
-ARM_POINTS = 10  # on its surface; as many on each projected contour
+# Points on the arm's surface; as many on each projected contour.
+few_points = patch("tk.model.cues.objective.CHAIN_SAMPLES", 10)
 WIDTH_DEG, STEP_DEG = 36.0, 2.0
 
 
@@ -75,12 +77,14 @@ def look(options: Options, paper: Settings) -> Scene:
     every = np.full(len(surface), -1, np.int64)
     index = SurfaceIndex.build(surface.positions, every, CELL_VOXELS * tracker.hull.grid.voxel_m)
     term = ContourTerm(skin, capture.rig, paper.contours)
-    objective = BodyObjective(skin, objective_parameters(paper.objective), replace(SAMPLING, chain=ARM_POINTS), term)
+    with few_points:
+        objective = BodyObjective(skin, paper.objective, term)
     frame = FrameObjective(objective, index, np.random.default_rng(0), images=observation.images)
     two = np.array([skin.skeleton.index(name) for name in ANGLES])
     return Scene(frame, estimate.pose, two)
 
 
+@few_points
 def landscape(scene: Scene, seed: int, poses: Float, iteration: int = 0) -> Float:
     """(B,) the arm's objective at poses (B, D) on one draw."""
     owner = np.full(len(poses), CHAIN)
@@ -94,27 +98,31 @@ def moved(scene: Scene, offsets_deg: Float) -> Float:
     return scene.frame.constrain(poses)
 
 
+def diagonal_basis(hessian: Float, free: NDArray[np.bool_], damping: Float) -> tuple[Float, Float]:
+    """In the place of :func:`tk.optim.schedule.descent_basis`: unit curvature along each parameter by itself."""
+    scale = np.sqrt(np.diag(hessian) + damping)
+    return np.diag(free / scale), np.diag(free * scale)
+
+
+@few_points
 def descend(scene: Scene, start: Float, seed: int, shuffle: bool) -> tuple[Float, int]:
     """Path (I + 1, 2) of the two angles in degrees, and the iterations."""
     frame = scene.fresh(seed)
     free = np.zeros(len(start), bool)
     free[scene.two] = True
-    s = SCHEDULE
-    basis, inverse = descent_basis(frame.curvature(start), free, frame.damping(CHAIN_LEVER_M), whiten=False)
-    tolerance = s.refine * np.where(frame.angular, np.radians(s.tolerance_deg), s.tolerance_m)
+    basis, inverse = diagonal_basis(frame.curvature(start), free, frame.damping(s.LEVER_M))
+    tolerance = s.REFINE * np.where(frame.angular, np.radians(s.TOLERANCE_DEG), s.TOLERANCE_M)
+    max_step = np.where(frame.angular, np.radians(s.MAX_STEP_DEG), s.MAX_STEP_M)
+    objective = frame.chains(np.array([CHAIN]), scene.pose)
     found = smd.minimise(
-        frame.chains(np.array([CHAIN]), scene.pose),
+        lambda poses, directions, i: objective(poses, directions, i if shuffle else 0),
         start[None],
-        s.rate,
+        s.RATE,
         tolerance,
         frame.constrain,
-        basis[None],
-        replace(SMD, shuffle=shuffle),
-        keep_path=True,
-        max_step=max_step(frame.angular),
-        basis_inverse=inverse[None],
+        (basis[None], inverse[None]),
+        max_step,
     )
-    assert found.path is not None
     path = np.vstack([found.path[:, 0], found.pose])
     return np.degrees(path[:, scene.two]), int(found.iterations[0])
 

@@ -10,13 +10,13 @@ from tk.kernels import alignment as a
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective import ObjectiveParameters
 from tk.model.cues.edge_term import ContourTerm
-from tk.model.cues.objective import BodyObjective, SamplingSettings
-from tk.settings import ContourSettings
+from tk.model.cues.objective import BodyObjective
+from tk.settings import ContourSettings, ObjectiveSettings
 
 SKELETON = BODY.skeleton
 D = len(SKELETON.names)
 # nothing but the entries: one sample that finds no voxel, a constant
-SILENT = ObjectiveParameters(coverage_weight=0.0, reach_m=1e-6)
+SILENT = ObjectiveParameters(0.1, 1e-6, nu=0.35, coverage_nu=0.7, surface_weight=1.0, coverage_weight=0.0)
 INDEX = SurfaceIndex.build(np.full((1, 3), 50.0), np.full(1, -1), 0.1)
 # sums of some sixty terms near 1 in double precision
 EXACT = 1e-10
@@ -24,7 +24,7 @@ EXACT = 1e-10
 
 def kernel_of(dtype=np.float64):
     term = ContourTerm(BODY, RIG, ContourSettings(), dtype=dtype)
-    return BodyObjective(BODY, SILENT, SamplingSettings(), term, dtype).kernel
+    return BodyObjective(BODY, ObjectiveSettings(), term, dtype=dtype).kernel
 
 
 @pytest.fixture(scope="module")
@@ -195,7 +195,7 @@ def test_entries_share_tasks_with_samples_and_voxels(kernel):
     for all_at_once, pieces in zip(whole, zip(*parts, strict=True), strict=True):
         np.testing.assert_allclose(all_at_once, np.sum(pieces, axis=0), rtol=0, atol=1e-9)
     many = np.zeros((1, 117), np.int32)
-    case = replace(SILENT, coverage_weight=1.0, coverage_reach_m=1e-6)
+    case = replace(SILENT, coverage_weight=1.0)
     both = kernel.evaluate(INDEX, many, many, scene.poses, scene.direction, case, entries=scene.entries)
     np.testing.assert_allclose(both[0] - 2, whole[0], rtol=0, atol=1e-9)
     np.testing.assert_allclose(both[1], whole[1], rtol=0, atol=1e-9)

@@ -56,7 +56,7 @@ def piece_of(rng, e1, e2):
     """A piece of the body's sizes, cut somewhere."""
     radii = rng.uniform(0.03, 0.4, 3)
     lower, upper = np.sort(rng.uniform(-1, 1, 2)) * radii[2]
-    return Superellipsoid("torso", np.eye(4), tuple(radii), e1, e2, lower, upper, 0.2)
+    return Superellipsoid("torso", np.eye(4), tuple(radii), e1, e2, lower, upper)
 
 
 def margin(piece):
@@ -133,7 +133,7 @@ def test_points_of_the_surface_stay(seed, e1, e2):
 def test_one_step_comes_close_to_the_surface(e):
     """From within a quarter of the radius: the projection of a voxel near the body."""
     rng = np.random.default_rng(0)
-    piece = Superellipsoid("torso", np.eye(4), (0.1, 0.12, 0.3), e, e, -0.3, 0.3, 0.2)
+    piece = Superellipsoid("torso", np.eye(4), (0.1, 0.12, 0.3), e, e, -0.3, 0.3)
     on = piece.point(rng.uniform(-1.2, 1.2, 300), rng.uniform(-np.pi, np.pi, 300))
     q = on * rng.uniform(0.75, 1.25, (300, 1))
     _, G, projected = evaluate(q, piece)
@@ -146,7 +146,7 @@ def test_one_step_comes_close_to_the_surface(e):
 @pytest.mark.parametrize("e2", [0.1, 0.3, 1.0, 1.9])
 def test_single_precision_stays_finite(e1, e2):
     """The centre, the axes, the planes of symmetry and far outside, with exponents to the ends of their range."""
-    piece = Superellipsoid("torso", np.eye(4), (0.05, 0.1, 0.4), e1, e2, -0.1, 0.4, 0.2)
+    piece = Superellipsoid("torso", np.eye(4), (0.05, 0.1, 0.4), e1, e2, -0.1, 0.4)
     q = np.stack(np.meshgrid(*[[-0.5, -0.1, -1e-7, 0.0, 1e-3, 0.2, 0.6]] * 3), -1).reshape(-1, 3) * [0.5, 0.5, 1]
     for values in evaluate(q, piece, np.float32):
         assert np.isfinite(values).all()
@@ -159,7 +159,7 @@ def test_single_precision_stays_finite(e1, e2):
 
 def test_a_point_far_outside_does_not_count_as_on_the_surface():
     """A small piece, such as a wrist's cap, sees voxels many of its own radii away."""
-    piece = Superellipsoid("forearm_l", np.eye(4), (0.033, 0.033, 0.02), 1.0, 1.0, 0.0, 0.02, 0.066)
+    piece = Superellipsoid("forearm_l", np.eye(4), (0.033, 0.033, 0.02), 1.0, 1.0, 0.0, 0.02)
     q = np.array([[0.4, 0.0, 0.01], [0.2, -0.2, 0.3], [0.01, 0.5, -0.4]])
     _, _, projected = evaluate(q, piece)
     distance = np.linalg.norm(q - projected, axis=1)
@@ -168,7 +168,7 @@ def test_a_point_far_outside_does_not_count_as_on_the_surface():
 
 def test_single_precision_agrees_with_double():
     rng = np.random.default_rng(3)
-    piece = Superellipsoid("torso", np.eye(4), (0.1, 0.15, 0.25), 0.45, 0.8, 0.0, 0.25, 0.2)
+    piece = Superellipsoid("torso", np.eye(4), (0.1, 0.15, 0.25), 0.45, 0.8, 0.0, 0.25)
     q = points_about(rng, piece, 200)
     for single, double in zip(evaluate(q, piece, np.float32)[1:], evaluate(q, piece)[1:], strict=True):
         np.testing.assert_allclose(single, double, atol=2e-5 * np.abs(double).max())

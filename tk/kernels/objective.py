@@ -24,9 +24,9 @@ import numpy as np
 
 from tk.kernels.alignment import ENTRY_NUMBERS, add_alignment, add_curvature
 from tk.kernels.kinematics import forward_tree, load_rotation, load_translation
-from tk.kernels.linearisation import Linearisation
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective_pairs import (
+    INV_SIGMA2,
     PATCH_BITS,
     add_residual,
     assign,
@@ -60,8 +60,8 @@ def _objective_kernel(real):
     @ti.kernel
     def objective(
         tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
-        samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 7)
-        pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 25)
+        samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 6)
+        pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 24)
         cameras: ti.types.ndarray(dtype=real, ndim=2),  # (C, 22)
         voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 3)
         fits: ti.types.ndarray(dtype=ti.i64, ndim=1),  # (V,)
@@ -100,14 +100,13 @@ def _objective_kernel(real):
                         samples, pieces, voxels, fits, starts, settings, chosen, scratch, b, c, D, m, M,
                         assigned, covering,
                     )  # fmt: skip
-                v, k, x0, inv_sigma2, nu, scale = load_pair(
-                    samples, pieces, settings, chosen, assigned, covering, b, m, M
-                )
+                v, k, x0, nu, scale = load_pair(samples, pieces, settings, chosen, assigned, covering, b, m, M)
                 if v < 0:
                     sums[c, 0] = sums[c, 0] + scale
                 else:
                     x = times(load_rotation(scratch, c, k), x0) + load_translation(scratch, c, k)
-                    add_residual(scratch, sums, c, k, x, x - load_voxel(voxels, v, nu), inv_sigma2, nu, scale)
+                    r = x - load_voxel(voxels, v, nu)
+                    add_residual(scratch, sums, c, k, x, r, settings[INV_SIGMA2], nu, scale)
             collect_wrenches(tree, c, scratch, sums)
 
     return objective
@@ -123,8 +122,8 @@ def _linearise_kernel(real):
     @ti.kernel
     def linearise(
         tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
-        samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 7)
-        pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 25)
+        samples: ti.types.ndarray(dtype=real, ndim=2),  # (N, 6)
+        pieces: ti.types.ndarray(dtype=real, ndim=2),  # (P, 24)
         cameras: ti.types.ndarray(dtype=real, ndim=2),  # (C, 22)
         voxels: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (V, 3)
         settings: ti.types.ndarray(dtype=real, ndim=1),  # (13,)
@@ -154,9 +153,7 @@ def _linearise_kernel(real):
             for e in range(E * c // tasks, E * (c + 1) // tasks):
                 add_curvature(scratch, cameras, entries, c, e, floor, origin)
             for m in range((M + Q) * c // tasks, (M + Q) * (c + 1) // tasks):
-                v, k, x0, inv_sigma2, nu, scale = load_pair(
-                    samples, pieces, settings, chosen, assigned, covering, 0, m, M
-                )
+                v, k, x0, nu, scale = load_pair(samples, pieces, settings, chosen, assigned, covering, 0, m, M)
                 residual[m, 3] = v
                 for a in ti.static(range(3)):
                     residual[m, a] = 0.0
@@ -165,6 +162,7 @@ def _linearise_kernel(real):
                     r = x - load_voxel(voxels, v, nu)
                     for a in ti.static(range(3)):
                         residual[m, a] = r[a]
+                    inv_sigma2 = settings[INV_SIGMA2]
                     decay = ti.exp(-0.5 * norm_sqr(r) * inv_sigma2 / nu)
                     add_inertia(scratch, c, k, x - origin, scale * inv_sigma2 / nu * ti.max(decay, floor))
             collect_inertias(tree, c, scratch, origin, hessian)
@@ -177,20 +175,19 @@ class ObjectiveParameters:
     """Constants of the objective.
 
     Attributes:
-        nu: Leclerc's ν of the surface term, in units of ½ (d/σ)².
-        reach_m: search radius of a sample for its voxel, metres.
+        sigma_m: σ of eq. 10, metres.
+        reach_m: search radius of a sample for its voxel, and of a voxel for the body, metres.
+        nu, coverage_nu: Leclerc's ν of the surface and of the coverage term, in units of ½ (d/σ)².
+        surface_weight: w_s of eq. 8.
         coverage_weight: w_c of the coverage term; 0 removes it, as in the paper.
-        coverage_nu: ν of the coverage term.
-        coverage_reach_m: search radius of a voxel for the body, metres.
-        surface_weight: w_s of eq. 8; 0 removes the surface term.
     """
 
-    nu: float = 0.35
-    reach_m: float = 0.3
-    coverage_weight: float = 0.7
-    coverage_nu: float = 0.7
-    coverage_reach_m: float = 0.5
-    surface_weight: float = 1.0
+    sigma_m: float
+    reach_m: float
+    nu: float
+    coverage_nu: float
+    surface_weight: float
+    coverage_weight: float
 
 
 @dataclass(frozen=True)
@@ -206,6 +203,21 @@ class Held:
     covering: np.ndarray
 
 
+@dataclass(frozen=True)
+class Linearisation:
+    """K = M + Q pairs and the Gauss-Newton Hessian at one pose.
+
+    Attributes:
+        residual: (K, 3) x − x̄, metres; zero where a pair is missing.
+        hessian: (D, D) Gauss-Newton Hessian of f; outliers weigh at least the given floor.
+        partner: (K,) the voxel, -1 where missing.
+    """
+
+    residual: np.ndarray
+    hessian: np.ndarray
+    partner: np.ndarray
+
+
 class ObjectiveKernel:
     """The objective of one body. Constants and scratch are prepared once; each call takes a frame's voxels.
 
@@ -214,14 +226,11 @@ class ObjectiveKernel:
         local: (N, 3) surface samples in the zero configuration, metres.
         last_dof: (N,) last degree of freedom above each sample.
         patch: (N,) colour patch of each sample.
-        sigma: (N,) σ of eq. 10 at the samples, metres.
-        piece_sigma: (P,) σ of voxels that the piece covers, metres.
+        barred: (N,) bit masks of the parts of the body that a sample may not enter: inside it finds no voxel.
+        piece_part: (P,) the part that each piece belongs to.
         piece_patches: (P,) int64 bit masks of the colour patches on each piece: a voxel that fits none of them is not
-            covered by the piece. All patches by default.
-        barred: (N,) bit masks of the parts of the body that a sample may not enter: inside it finds no voxel. No parts
-            by default.
-        piece_part: (P,) the part, 0 to 23, that each piece belongs to.
-        cameras: (C, 22) rows of :func:`tk.kernels.projection.pack_cameras`, for the alignment term.
+            covered by the piece.
+        cameras: (C, 22) of :func:`tk.kernels.projection.pack_cameras`, for the alignment term; None without it.
         dtype: np.float32, or np.float64 for checks of derivatives.
     """
 
@@ -231,59 +240,44 @@ class ObjectiveKernel:
         *,
         local: np.ndarray,
         last_dof: np.ndarray,
-        sigma: np.ndarray,
         patch: np.ndarray,
-        piece_sigma: np.ndarray,
-        piece_patches: np.ndarray | None = None,
-        barred: np.ndarray | None = None,
-        piece_part: np.ndarray | None = None,
-        cameras: np.ndarray | None = None,
+        barred: np.ndarray,
+        piece_part: np.ndarray,
+        piece_patches: np.ndarray,
+        cameras: np.ndarray | None,
         dtype: type = np.float32,
     ) -> None:
         ensure_runtime()
         self.dtype = dtype
-        self.degrees = len(body.tree)
-        self.launches = 0
-
-        def real(array: np.ndarray) -> np.ndarray:
-            return np.ascontiguousarray(array, dtype)
-
-        tree = real(body.tree)
-        weight = 1.0 / np.asarray(sigma, np.float64) ** 2
-        piece_weight = 1.0 / np.asarray(piece_sigma, np.float64) ** 2
-        self._weights = weight, piece_weight
-        if barred is None:
-            barred = np.zeros(len(local), np.int32)
-        if piece_part is None:
-            piece_part = np.zeros(len(body.pieces), np.int32)
-        if piece_patches is None:
-            piece_patches = np.full(len(body.pieces), 2**63 - 1, np.int64)
+        self.degrees, self._rows = len(body.tree), len(body.tree) + len(body.pieces)
         patches = [piece_patches >> PATCH_BITS * part & (1 << PATCH_BITS) - 1 for part in range(3)]
-        samples = real(np.column_stack([local, last_dof, patch, weight, barred]))
-        self._pieces = real(np.column_stack([body.pieces, piece_weight, piece_part, *patches]))
-        packed_cameras = real(np.zeros((1, CAMERA_NUMBERS)) if cameras is None else cameras)
+        constants = (
+            body.tree,
+            np.column_stack([local, last_dof, patch, barred]),
+            np.column_stack([body.pieces, piece_part, *patches]),
+            np.zeros((1, CAMERA_NUMBERS)) if cameras is None else cameras,
+        )
+        real: list[np.ndarray] = [np.ascontiguousarray(array, dtype) for array in constants]
         precision = ti.f64 if dtype == np.float64 else ti.f32
-        constants = tree, samples, self._pieces, packed_cameras
-        self._kernel = Launcher(_objective_kernel(precision), *constants)
-        self._linearise = Launcher(_linearise_kernel(precision), *constants)
-        self._no_entries: np.ndarray = np.zeros((1, 1, ENTRY_NUMBERS), dtype)
+        self._kernel = Launcher(_objective_kernel(precision), *real)
+        self._linearise = Launcher(_linearise_kernel(precision), *real)
         self._scratch: dict[int, np.ndarray] = {}
 
     def _scratch_of(self, tasks: int) -> np.ndarray:
         """Return the scratch of T tasks: joints and pieces (T, D + P, 39)."""
         if tasks not in self._scratch:
-            self._scratch[tasks] = np.empty((tasks, self.degrees + len(self._pieces), SCRATCH_NUMBERS), self.dtype)
+            self._scratch[tasks] = np.empty((tasks, self._rows, SCRATCH_NUMBERS), self.dtype)
         return self._scratch[tasks]
 
     def _entries(self, entries: np.ndarray | None) -> np.ndarray:
-        return (
-            self._no_entries if entries is None or not entries.shape[1] else np.ascontiguousarray(entries, self.dtype)
-        )
+        if entries is None or not entries.shape[1]:
+            return np.zeros((1, 1, ENTRY_NUMBERS), self.dtype)
+        return np.ascontiguousarray(entries, self.dtype)
 
     def _packed(self, s: ObjectiveParameters, M: int, Q: int, index: SurfaceIndex) -> np.ndarray:
-        """Pack the settings in the kernels' order, from NU to GRID."""
-        values = [s.nu, s.reach_m, s.coverage_nu, s.coverage_reach_m]
-        shares = [s.surface_weight / max(M, 1), s.coverage_weight / max(Q, 1)]
+        """Pack the settings in the kernels' order, from INV_SIGMA2 to GRID."""
+        values = 1 / s.sigma_m**2, s.reach_m, s.nu, s.coverage_nu
+        shares = s.surface_weight / max(M, 1), s.coverage_weight / max(Q, 1)
         return np.array([*values, *shares, *index.grid.tolist()], self.dtype)
 
     def evaluate(
@@ -344,7 +338,6 @@ class ObjectiveKernel:
             found.covering,
             sums,
         )
-        self.launches += 1
         # the tasks' sums are added in a fixed order: the same input gives the same bits
         total = sums.reshape(B, tasks, -1).sum(axis=1, dtype=np.float64)
         return total[:, 0], total[:, 1 : 1 + D], total[:, 1 + D :], found
@@ -395,12 +388,8 @@ class ObjectiveKernel:
             found,
             hessian,
         )
-        self.launches += 1
-        weight, piece_weight = self._weights
-        partner = found[:, 3].astype(np.int32)
         return Linearisation(
             residual=found[:, :3].astype(np.float64),
             hessian=hessian.sum(axis=0, dtype=np.float64),
-            partner=partner,
-            inv_sigma2=np.concatenate([weight[chosen], piece_weight[held.covering[0, :Q, 0].astype(np.int64)]]),
+            partner=found[:, 3].astype(np.int32),
         )

@@ -3,8 +3,7 @@ torso held, as one batch. They see the frame's objective as a :class:`Problem`.
 
 Beyond the paper, SMD works in directions that whiten the Gauss-Newton Hessian at the start of each pass. The paper's
 step sizes (2500 for most angles, 5000 for rolls, 10000 for knees and elbows) are a diagonal estimate of the inverse
-Hessian in its own units; here it follows from the data, so that a step of 1 is a Newton step. ``whiten = False`` takes
-the diagonal only.
+Hessian in its own units; here it follows from the data, so that a step of 1 is a Newton step.
 """
 
 from __future__ import annotations
@@ -15,17 +14,23 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.errors import ConfigError
 from tk.optim import smd
 
 Float = NDArray[np.float64]
 
-# Damping of each parameter, as if all points lay this far from its axis, metres, in the first pass and for the chains:
-# without it the roll of a straight limb follows noise. Chosen on the
-# development captures; sensitivity not measured.
-LEVER_M, CHAIN_LEVER_M = 0.03, 0.06
-# Maximum change in one iteration: a draw of samples with little evidence on a parameter yields longer steps. At 15 Hz a
-# joint turns by up to 31° between frames (7.4), two steps. Chosen; sensitivity not measured.
+# ε₁ of eq. 20 for angles and for the displacement. The paper has 2° and 2 cm; at its n of 3 a joint that still turns by
+# 5° in three iterations is stopped, and a moving person is lost.
+TOLERANCE_DEG, TOLERANCE_M = 0.2, 0.002
+# ε₂ / ε₁: the paper's.
+REFINE = 0.5
+# First step size, as a share of a Newton step.
+RATE = 0.6
+# Damping of each parameter, as if all points lay this far from its axis, metres: without it the roll of a straight limb
+# follows noise. With 0.03 and 0.06 the mean errors of five captures (60 frames, three seeds) change by 0.02 cm at most.
+LEVER_M = 0.045
+# Maximum change in one iteration: a draw of samples with little evidence on a parameter yields longer steps, and
+# without a bound SMD diverges in some frame of five captures. At 15 Hz a joint turns by up to 31° between frames (7.4),
+# two steps. With half and twice the values the mean errors of walk and dance (45 frames) change by 0.01 cm at most.
 MAX_STEP_DEG, MAX_STEP_M = 20.0, 0.15
 
 
@@ -50,6 +55,10 @@ class Problem(Protocol):
         """Return the objective of all parameters."""
         ...
 
+    def chains(self, owner: NDArray[np.intp], pose: Float) -> smd.Objective:
+        """Return the objective whose row b is chain ``owner[b]``, the rest of the body at ``pose``."""
+        ...
+
     def values(self, poses: Float) -> Float:
         """Return the objective (B,) at poses (B, D) on samples that do not change from call to call."""
         ...
@@ -61,37 +70,6 @@ class Problem(Protocol):
     def damping(self, lever_m: float) -> Float:
         """Return the curvature (D,) that each parameter would have if all points lay ``lever_m`` from its axis."""
         ...
-
-    def chains(self, owner: NDArray[np.intp], pose: Float) -> smd.Objective:
-        """Return the objective whose row b is chain ``owner[b]``, the rest of the body at ``pose``."""
-        ...
-
-
-@dataclass(frozen=True)
-class ScheduleSettings:
-    """Settings of the two passes. ``smd.max_iterations`` limits the iterations of each.
-
-    Attributes:
-        tolerance_deg: ε₁ of eq. 20 for angles. The paper has 2° and 2 cm; at its n of 3 a joint that still turns by 5°
-            in three iterations is stopped, and a moving person is lost.
-        tolerance_m: ε₁ for the displacement, metres.
-        refine: ε₂ / ε₁ (paper: ½).
-        rate: first step size, as a share of a Newton step.
-        whiten: see the module's docstring.
-    """
-
-    tolerance_deg: float = 0.2
-    tolerance_m: float = 0.002
-    refine: float = 0.5
-    rate: float = 0.6
-    whiten: bool = True
-
-    def __post_init__(self) -> None:
-        for name in ("tolerance_deg", "tolerance_m", "refine"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"schedule.{name} = {getattr(self, name)} must be positive")
-        if not 0 < self.rate <= 2:
-            raise ConfigError(f"schedule.rate = {self.rate} must lie in (0, 2]")
 
 
 @dataclass(frozen=True)
@@ -107,85 +85,43 @@ class ScheduleResult:
     iterations: NDArray[np.int32]
 
 
-def optimise(problem: Problem, starts: Float, config: ScheduleSettings, smd_config: smd.SmdSettings) -> ScheduleResult:
+def optimise(problem: Problem, starts: Float, max_iterations: int = smd.MAX_ITERATIONS) -> ScheduleResult:
     """Optimise all parameters, then the chains.
 
     Args:
         problem: the frame.
         starts: (S, D) predictions; the first pass begins at the best of them.
-        config: settings of the passes.
-        smd_config: settings of SMD.
+        max_iterations: of each pass.
     """
-    tolerance = np.where(problem.angular, np.radians(config.tolerance_deg), config.tolerance_m)
+    tolerance = np.where(problem.angular, np.radians(TOLERANCE_DEG), TOLERANCE_M)
+    max_step = np.where(problem.angular, np.radians(MAX_STEP_DEG), MAX_STEP_M)
+
+    def descend(objective: smd.Objective, pose: Float, free: NDArray[np.bool_]) -> smd.SmdResult:
+        """Optimise the free parameters (B, D) from a pose (D,), row by row."""
+        hessian, damping = problem.curvature(pose), problem.damping(LEVER_M)
+        basis, inverse = map(np.stack, zip(*(descent_basis(hessian, row, damping) for row in free), strict=True))
+        start = np.repeat(pose[None], len(free), axis=0)
+        return smd.minimise(
+            objective, start, RATE, tolerance, problem.constrain, (basis, inverse), max_step, max_iterations
+        )
+
     starts = problem.constrain(starts)
     start = starts[0] if len(starts) == 1 else starts[int(np.argmin(problem.values(starts)))]
-    first = _all(problem, start, tolerance, config, smd_config)
+    first = descend(problem.full(), start, np.ones((1, len(start)), bool))
     pose = first.pose[0]
-    chains = _chains(problem, pose, tolerance * config.refine, config, smd_config)
+    tolerance = REFINE * tolerance
+    chains = descend(problem.chains(np.arange(len(problem.free)), pose), pose, problem.free)
     result = pose.copy()
     for free, found in zip(problem.free, chains.pose, strict=True):
         result[free] = found[free]
     return ScheduleResult(result, np.concatenate([first.iterations, chains.iterations]).astype(np.int32))
 
 
-def _all(
-    problem: Problem, start: Float, tolerance: Float, config: ScheduleSettings, smd_config: smd.SmdSettings
-) -> smd.SmdResult:
-    """Optimise all parameters from ``start`` (D,)."""
-    free = np.ones(len(start), bool)
-    basis, inverse = descent_basis(problem.curvature(start), free, problem.damping(LEVER_M), config.whiten)
-    return smd.minimise(
-        problem.full(),
-        start[None],
-        config.rate,
-        tolerance,
-        problem.constrain,
-        basis[None],
-        smd_config,
-        max_step=max_step(problem.angular),
-        basis_inverse=inverse[None],
-    )
-
-
-def _chains(
-    problem: Problem, pose: Float, tolerance: Float, config: ScheduleSettings, smd_config: smd.SmdSettings
-) -> smd.SmdResult:
-    """Optimise the chains, one row each, with the torso at ``pose`` (D,)."""
-    K = len(problem.free)
-    H = problem.curvature(pose)
-    damping = problem.damping(CHAIN_LEVER_M)
-    pairs = [descent_basis(H, free, damping, config.whiten) for free in problem.free]
-    return smd.minimise(
-        problem.chains(np.arange(K), pose),
-        np.repeat(pose[None], K, axis=0),
-        config.rate,
-        tolerance,
-        problem.constrain,
-        np.stack([basis for basis, _ in pairs]),
-        smd_config,
-        max_step=max_step(problem.angular),
-        basis_inverse=np.stack([inverse for _, inverse in pairs]),
-    )
-
-
-def max_step(angular: NDArray[np.bool_]) -> Float:
-    """Return the maximum change (D,) of each parameter in an iteration."""
-    return np.where(angular, np.radians(MAX_STEP_DEG), MAX_STEP_M)
-
-
-def descent_basis(hessian: Float, free: NDArray[np.bool_], damping: Float, whiten: bool) -> tuple[Float, Float]:
-    """Return directions (D, D) with unit curvature in the free parameters, zero elsewhere, and their pseudo-inverse.
-
-    Without ``whiten`` the curvature is 1 along each parameter, and the coupling of parameters remains.
-    """
+def descent_basis(hessian: Float, free: NDArray[np.bool_], damping: Float) -> tuple[Float, Float]:
+    """Return directions (D, D) with unit curvature in the free parameters, zero elsewhere, and their pseudo-inverse."""
     index = np.flatnonzero(free)
     basis, inverse = np.zeros_like(hessian), np.zeros_like(hessian)
-    H = hessian[np.ix_(index, index)] + np.diag(damping[index])
-    if whiten:
-        L = np.linalg.cholesky(H)
-        basis[np.ix_(index, index)] = np.linalg.inv(L).T
-        inverse[np.ix_(index, index)] = L.T
-    else:
-        basis[index, index] = 1 / np.sqrt(np.diag(H))
-        inverse[index, index] = np.sqrt(np.diag(H))
+    L = np.linalg.cholesky(hessian[np.ix_(index, index)] + np.diag(damping[index]))
+    basis[np.ix_(index, index)] = np.linalg.inv(L).T
+    inverse[np.ix_(index, index)] = L.T
     return basis, inverse

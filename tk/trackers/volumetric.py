@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,25 +26,18 @@ from tk.errors import CaptureError
 from tk.kernels.nearest import SurfaceIndex
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import ConeBody
-from tk.model.body.joints import WAIST
-from tk.model.body.skeleton import CHAINS, JOINTS, build_skeleton, convert_poses
+from tk.model.body.joints import CHAIN_OF_SEGMENT, CHAINS, JOINTS, WAIST
+from tk.model.body.skeleton import build_skeleton, convert_poses
 from tk.model.body.superellipsoid_body import SuperellipsoidBody, build_superellipsoid_body
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import Volume, VoxelGrid
-from tk.model.cues.appearance import LEARNING_M, Appearance
+from tk.model.cues.appearance import Appearance
 from tk.model.cues.edge_term import ContourTerm
-from tk.model.cues.objective import (
-    CHAIN_OF_SEGMENT,
-    BodyObjective,
-    Fit,
-    FrameObjective,
-    SamplingSettings,
-    objective_parameters,
-)
+from tk.model.cues.objective import NEAR_M, BodyObjective, Fit, FrameObjective
 from tk.model.hull.hull import HullSurface, VisualHull
 from tk.model.setup import InitPose, Setup
 from tk.optim import schedule
-from tk.optim.smd import SmdSettings
+from tk.optim.smd import MAX_ITERATIONS
 from tk.settings import Settings
 from tk.trackers.contour_tracker import ContourTracker, restore_body
 from tk.trackers.protocol import Estimate, Observation, Stopwatch
@@ -66,32 +59,16 @@ LOST_UNEXPLAINED = 0.25
 # follows noise, far above it stays straight.
 WAIST_COST = 0.1
 
-# The paper's schedule (6.2, 6.4), and values for the numbers that it does not print: see docs/method.md.
-SCHEDULE = schedule.ScheduleSettings()
-SAMPLING = SamplingSettings()
-SMD = SmdSettings()
 # angles of a waist or of ankles that a body does not have
 NO_ANGLES = np.zeros(0)
 
 
-@dataclass(frozen=True)
-class Effort:
-    """The paper's numbers of iterations and points, scaled by the setting ``effort``."""
+def points_and_iterations(effort: float) -> tuple[int, int]:
+    """Return the factor of the paper's numbers of points, and the iterations of a pass.
 
-    sampling: SamplingSettings
-    smd: SmdSettings
-
-    @staticmethod
-    def of(factor: float) -> Effort:
-        """Scale points from a factor of 1 upwards, iterations below, see :class:`tk.settings.Settings`."""
-
-        def share(count: int) -> int:
-            return max(round(min(factor, 1.0) * count), 1)
-
-        return Effort(
-            replace(SAMPLING, scale=max(round(factor), 1) * SAMPLING.scale),
-            replace(SMD, max_iterations=share(SMD.max_iterations)),
-        )
+    An effort above 1 multiplies the points, one below 1 the iterations, see :class:`tk.settings.Settings`.
+    """
+    return max(round(effort), 1), max(round(min(effort, 1.0) * MAX_ITERATIONS), 1)
 
 
 class VolumetricTracker:
@@ -128,7 +105,7 @@ class VolumetricTracker:
         self, rig: Rig, volume: Volume, up: str, config: Settings, cache_dir: Path | None = None, fps: float = 15.0
     ) -> None:
         self.config = config
-        self.effort = Effort.of(config.effort_factor)
+        self.scale, self.iterations = points_and_iterations(config.effort_factor)
         self.up = up
         self.rig = rig
         self.hull = VisualHull(rig, VoxelGrid.cover(volume, config.voxels), cache_dir)
@@ -183,14 +160,9 @@ class VolumetricTracker:
 
     def _build(self) -> None:
         self.skin = build_superellipsoid_body(self.body, self.up, self.config.body.waist)
-        edges, scale = self.config.contours, self.effort.sampling.scale
-        self._objective = BodyObjective(
-            self.skin,
-            objective_parameters(self.config.objective),
-            self.effort.sampling,
-            ContourTerm(self.skin, self.rig, edges, scale) if edges.edge_weight > 0 else None,
-            waist_stiffness=WAIST_COST,
-        )
+        edges, scale = self.config.contours, self.scale
+        term = ContourTerm(self.skin, self.rig, edges, scale) if edges.edge_weight > 0 else None
+        self._objective = BodyObjective(self.skin, self.config.objective, term, scale, WAIST_COST)
 
     # --- tracking (section 6.4) ---------------------------------------------------------------------------------
 
@@ -242,7 +214,7 @@ class VolumetricTracker:
 
     def optimise(self, problem: FrameObjective, starts: Float) -> schedule.ScheduleResult:
         """Minimise a frame's objective, beginning at the best of the starts (S, D)."""
-        return schedule.optimise(problem, starts, SCHEDULE, self.effort.smd)
+        return schedule.optimise(problem, starts, self.iterations)
 
     def _search_limbs(
         self, frame: Observation, problem: FrameObjective, found: schedule.ScheduleResult
@@ -336,7 +308,7 @@ class VolumetricTracker:
     ) -> tuple[NDArray[np.integer], NDArray[np.floating]]:
         """Return patches (N,) and colours (N, 3) of the samples that lie on a voxel which a camera sees."""
         M = len(fit.samples)
-        near = np.linalg.norm(fit.linear.residual[:M], axis=1) < LEARNING_M
+        near = np.linalg.norm(fit.linear.residual[:M], axis=1) < NEAR_M
         partner = index.order[fit.linear.partner[:M]]
         sure = (fit.linear.partner[:M] >= 0) & near & (surface.seen[partner] > 0)
         return self.skin.patch[fit.samples[sure]], surface.colors[partner[sure]]

@@ -20,7 +20,7 @@ many = settings(max_examples=60, deadline=None)
 def piece_of(rng, e1=1.0, e2=1.0, whole=False):
     radii = rng.uniform(0.03, 0.4, 3)
     lower, upper = (-1, 1) if whole else np.sort(rng.uniform(-1, 1, 2))
-    return Superellipsoid("torso", np.eye(4), tuple(radii), e1, e2, lower * radii[2], upper * radii[2], 0.2)
+    return Superellipsoid("torso", np.eye(4), tuple(radii), e1, e2, lower * radii[2], upper * radii[2])
 
 
 def angles_of(rng, count=40):
@@ -71,7 +71,7 @@ def test_normals_are_the_gradient_of_inside_outside(seed, e1, e2):
 
 
 def test_exponents_of_one_give_an_ellipsoid():
-    piece = Superellipsoid("head", np.eye(4), (0.1, 0.2, 0.3), 1.0, 1.0, -0.3, 0.3, 0.2)
+    piece = Superellipsoid("head", np.eye(4), (0.1, 0.2, 0.3), 1.0, 1.0, -0.3, 0.3)
     eta, omega = angles_of(np.random.default_rng(0))
     x, y, z = piece.point(eta, omega).T
     np.testing.assert_allclose((x / 0.1) ** 2 + (y / 0.2) ** 2 + (z / 0.3) ** 2, 1)
@@ -92,7 +92,7 @@ def test_contained_points_are_inside_and_between_the_planes(seed, e1, e2):
 @pytest.mark.parametrize("e2", [0.02, 0.3, 1.0, 1.7, 1.99])
 def test_degenerate_exponents_stay_finite(e1, e2):
     """From nearly a box to nearly an octahedron, the poles and the equator included; warnings are errors here."""
-    piece = Superellipsoid("torso", np.eye(4), (0.1, 0.15, 0.3), e1, e2, -0.3, 0.3, 0.2)
+    piece = Superellipsoid("torso", np.eye(4), (0.1, 0.15, 0.3), e1, e2, -0.3, 0.3)
     eta, omega = np.meshgrid(np.linspace(-np.pi / 2, np.pi / 2, 21), np.linspace(-np.pi, np.pi, 41))
     points, normals = piece.point(eta, omega), piece.normal(eta, omega)
     assert np.isfinite(points).all() and (np.abs(points) <= np.array(piece.radii) * (1 + 1e-12)).all()
@@ -127,7 +127,7 @@ def test_samples_of_the_body_are_uniform_in_area(piece):
 @pytest.mark.parametrize("e2", [0.45, 1.0, 1.9])
 def test_samples_of_other_shapes_are_uniform_in_area(e1, e2):
     """Equal steps of the angles would leave a box's faces nearly bare: their densities differ by hundreds."""
-    area = area_per_sample(Superellipsoid("torso", np.eye(4), (0.12, 0.17, 0.3), e1, e2, -0.3, 0.3, 0.2), 0.03)
+    area = area_per_sample(Superellipsoid("torso", np.eye(4), (0.12, 0.17, 0.3), e1, e2, -0.3, 0.3), 0.03)
     assert area.mean() == pytest.approx(1, abs=0.2)
     low, high = np.percentile(area, [2, 98])
     assert high / low < 3
@@ -176,6 +176,6 @@ GOOD = {"radii": (0.1, 0.1, 0.3), "e1": 1.0, "e2": 1.0, "z_lower": -0.1, "z_uppe
     ],
 )
 def test_impossible_shapes_are_refused_by_name(change, message):
-    Superellipsoid("thigh_l", np.eye(4), **GOOD, diameter_m=0.2)
+    Superellipsoid("thigh_l", np.eye(4), **GOOD)
     with pytest.raises(ConfigError, match=f"superellipsoid of thigh_l: {message}"):
-        Superellipsoid("thigh_l", np.eye(4), **(GOOD | change), diameter_m=0.2)
+        Superellipsoid("thigh_l", np.eye(4), **(GOOD | change))

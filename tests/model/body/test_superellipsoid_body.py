@@ -66,7 +66,6 @@ def test_every_part_has_a_piece_at_its_place():
 def test_samples_have_the_segment_of_their_piece():
     np.testing.assert_array_equal(PIECE_SEGMENT[BODY.piece], BODY.segment)
     assert set(BODY.segment) == set(range(len(SEGMENTS)))
-    np.testing.assert_array_equal(BODY.diameter, np.array([p.diameter_m for p in BODY.pieces])[BODY.piece])
 
 
 @given(seeds)

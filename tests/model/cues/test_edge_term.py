@@ -10,13 +10,12 @@ from tests.kernels.test_contour import BODY, RIG, some_poses
 from tests.model.figures import piece_transforms
 from tk.kernels import alignment as a
 from tk.kernels.nearest import SurfaceIndex
-from tk.kernels.objective import ObjectiveParameters
 from tk.model.body.skeleton import CHAINS, SEGMENTS
 from tk.model.body.strips import LIMBS
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cues.edge_term import VIEWS, ContourTerm
-from tk.model.cues.objective import BodyObjective, FrameObjective, SamplingSettings
-from tk.settings import ContourSettings
+from tk.model.cues.objective import BodyObjective, FrameObjective
+from tk.settings import ContourSettings, ObjectiveSettings
 
 EDGES = ContourSettings(edge_weight=1.0)
 TRUTH = some_poses(1, seed=21)[0]
@@ -128,8 +127,7 @@ def test_edge_cost_is_least_at_the_true_pose():
 def test_pictures_pull_a_displaced_body_back():
     """The value grows, and its gradient points uphill, as an arm is turned away."""
     index = SurfaceIndex.build(np.full((1, 3), 50.0), np.full(1, -1), 0.1)
-    silent = ObjectiveParameters(coverage_weight=0.0, reach_m=1e-6)
-    body = BodyObjective(BODY, silent, SamplingSettings(), term_of())
+    body = BodyObjective(BODY, ObjectiveSettings(coverage_weight=0.0), term_of())
     frame = FrameObjective(body, index, np.random.default_rng(0), images=pictures())
     for axis in (0, 2):
         for sign in (-1, 1):

@@ -26,7 +26,6 @@ class Superellipsoid:
         radii: a₁, a₂, a₃, metres.
         e1, e2: ε₁ (along the meridians) and ε₂ (along the circles of latitude), each in (0, 2).
         z_lower, z_upper: the planes between which the surface exists, metres, within ±a₃.
-        diameter_m: the limb's diameter σ of eq. 10.
     """
 
     segment: str
@@ -36,7 +35,6 @@ class Superellipsoid:
     e2: float
     z_lower: float
     z_upper: float
-    diameter_m: float
 
     def __post_init__(self) -> None:
         if min(self.radii) <= 0:

@@ -44,7 +44,6 @@ class SuperellipsoidBody:
         points: (N, 3) surface samples in the zero configuration, world frame, metres.
         segment: (N,) index of each sample's segment.
         piece: (N,) index of each sample's piece.
-        diameter: (N,) the limb diameter σ at each sample, metres (eq. 10).
         patch: (N,) index of each sample's colour patch.
         patch_names: (P,) of the colour patches.
     """
@@ -54,7 +53,6 @@ class SuperellipsoidBody:
     points: Float
     segment: NDArray[np.int32]
     piece: NDArray[np.int32]
-    diameter: Float
     patch: NDArray[np.int32]
     patch_names: tuple[str, ...]
 
@@ -110,7 +108,6 @@ def build_superellipsoid_body(
         points=(p_zero @ B.T)[keep],
         segment=segment[keep],
         piece=owner[keep],
-        diameter=np.array([p.diameter_m for p in pieces])[owner][keep],
         patch=patch_of.astype(np.int32),
         patch_names=tuple(patch_names[i] for i in used),
     )
@@ -122,20 +119,20 @@ def piece_of(part: ConePart) -> Superellipsoid:
     e1, e2 = EXPONENTS.get(group_of(part.name), (1.0, 1.0))
     a, b, h, m = part.shape
     if part.kind != CONE:
-        return Superellipsoid(part.segment, part.T_body_part, (a, b, h), e1, e2, -h, h, 2 * b)
+        return Superellipsoid(part.segment, part.T_body_part, (a, b, h), e1, e2, -h, h)
     T = part.T_body_part.copy()
     mean = 0.5 * (1 + m)
     if e1 != 1.0:
         T[:3, 3] += 0.5 * h * T[:3, 2]
         radii = (a * mean, b * mean, 0.5 * h)
-        return Superellipsoid(part.segment, T, radii, e1, e2, -0.5 * h, 0.5 * h, mean * (a + b))
+        return Superellipsoid(part.segment, T, radii, e1, e2, -0.5 * h, 0.5 * h)
     # r(z) = R √(1 − (u + w z/h)²) with r(0) = 1 and r(h) = m
     w, q = 1 / SLENDER, 1 - m**2
     u = (q - w**2) / (w + np.sqrt(w**2 + q**2 - q * w**2))
     R, begin = 1 / np.sqrt(1 - u**2), u * SLENDER * h
     T[:3, 3] -= begin * T[:3, 2]
     radii = (a * R, b * R, SLENDER * h)
-    return Superellipsoid(part.segment, T, radii, e1, e2, begin, begin + h, mean * (a + b))
+    return Superellipsoid(part.segment, T, radii, e1, e2, begin, begin + h)
 
 
 def _buried(

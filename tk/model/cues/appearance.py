@@ -35,9 +35,6 @@ _YUV_FROM_BGR = np.round([_LUMA, *_COLORS], 3)
 FLOOR_YUV = (16.0, 6.0, 6.0)
 # Maximum distance of a mean from its initial value, levels. Chosen; sensitivity not measured.
 MOST_DRIFT = 30.0
-# Maximum distance between a sample and the voxel whose colour it learns, metres: voxels lie 2 to 3 cm from the piece
-# that they belong to.
-LEARNING_M = 0.05
 # A voxel fits a patch if every channel lies within this many standard deviations of the mean. The paper does not say
 # what fits; sensitivity not measured.
 WIDTH = 2.5
