@@ -70,7 +70,7 @@ def test_the_silhouette_tracker_has_stages_of_its_own(
     (found,) = json.loads(file.read_text(encoding="utf-8"))["runs"]
     assert found["method"] == "silhouette" and found["cameras"] == 3 and found["voxels"] is found["hull_ms"] is None
     run = Run(**found["end_to_end"])
-    assert run.launches["silhouette_equations"] == 10, "three scales of three iterations and a plain step"
+    assert run.launches["silhouette_descent"] == 3, "one at each scale"
     assert {"masks_clean", "optimise", "check"} < found["stages_ms"].keys()
     alone = {stage["name"]: stage["ms"] for stage in found["alone"]}
     assert sum(name.startswith("contours, search, equations") for name in alone) == 3
