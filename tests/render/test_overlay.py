@@ -171,7 +171,7 @@ def test_joint_colour_shows_standard_deviation() -> None:
     sigma = np.full(len(JOINTS), 0.01)
     sigma[1], sigma[3] = 0.04, np.nan
     tile = np.full((40, 40, 3), 100, np.uint8)
-    draw_joints(tile, xy, dots(sigma))
+    draw_joints(tile, xy, dots(replace(figure(BODY, neutral_pose(BODY.skeleton)), sigma=sigma[None]), 0))
     certain, uncertain = sigma_colors([0.01, 0.04])
     np.testing.assert_array_equal(tile[10, 10], certain)
     np.testing.assert_array_equal(tile[10, 30], uncertain)
@@ -235,7 +235,7 @@ def test_videos_show_where_the_person_moves(result: Path) -> None:
     for camera, view, all_of_it in zip(near.rig, near._views, whole._views, strict=True):
         assert (view.width, view.height) == (all_of_it.width, all_of_it.height)
         assert view.scale >= all_of_it.scale == near.grid.scale
-        xy = view.place(camera.project(near.figures[0].joints[:2].reshape(-1, 3))[0])
+        xy = view.place(camera.project(near.people.figures[0].joints[:2].reshape(-1, 3))[0])
         assert (xy > 0).all() and (xy < (view.width, view.height)).all()
     assert max(view.scale for view in near._views) > 1.1 * near.grid.scale
 
@@ -258,7 +258,8 @@ def test_overlay_uses_cameras_and_time_offsets_of_the_run(result: Path) -> None:
         np.testing.assert_array_equal(shown[k][1], pictures[k][1])
     drawn, view = overlay.mosaic(0, shown[0]), overlay._views[0]
     old, new = (
-        np.rint(view.place(c.project(overlay.figures[0].joints[0])[0])).astype(int) for c in (capture.rig[0], turned)
+        np.rint(view.place(c.project(overlay.people.figures[0].joints[0])[0])).astype(int)
+        for c in (capture.rig[0], turned)
     )
     assert (drawn[new[:, 1], new[:, 0]] == BONE).all()
     assert (drawn[old[:, 1], old[:, 0]] == BONE).all(axis=1).mean() < 0.5

@@ -90,7 +90,7 @@ def test_3d_view_turns_and_shows_body_or_hull(tracked: Path) -> None:
 
 def test_3d_view_shows_the_nearest_solid_in_each_pixel(tracked: Path) -> None:
     scene = Scene(read_result(tracked))
-    eye, figure = scene._camera(0), scene.figures[0]
+    eye, figure = scene._camera(0), scene.people.figures[0]
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     scene._draw_bodies(image, eye, 0)
     own = [eye.to_camera(points) for points in np.split(figure.placed(0), figure.starts[1:-1])]

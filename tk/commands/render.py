@@ -47,7 +47,7 @@ def render(
         from tk.io.captures.capture import open_capture
         from tk.io.paths import check_not_input, check_output
         from tk.io.results.reader import read_result
-        from tk.render.overlay import Overlay, choose_frames, write_sheets
+        from tk.render.overlay import Overlay, write_sheets
         from tk.render.scene import Scene
         from tk.render.video import VIDEO, check_encoder, video_writer
         from tk.threads import one_thread
@@ -77,8 +77,8 @@ def render(
             else:
                 overlay, fps = Overlay(opened, loaded, full=full), opened.fps
                 if png is None:
-                    shown = choose_frames(overlay.people[0], chosen, len(overlay.row_of))
-                    images = (overlay.mosaic(frame, seen) for frame, seen in overlay.pictures(shown))
+                    shown = overlay.pictures(overlay.people.chosen(chosen))
+                    images = (overlay.mosaic(frame, seen) for frame, seen in shown)
                 else:
                     files = write_sheets(overlay, png, chosen, full=full)
             if png is None:

@@ -24,11 +24,12 @@ def view(result: Path, capture: Path | None, frame: int | None, screenshot: Path
     from tk.io.captures.capture import open_capture
     from tk.io.paths import Kind, check_output, looks_like
     from tk.io.results.reader import read_result, truth_of
+    from tk.render.people import People
     from tk.view.contents import Contents
     from tk.view.window import Window, require_display
 
-    people = read_result(result).aligned()
-    loaded = people[0]
+    people = People(read_result(result).aligned())
+    loaded = people.first
     if not len(loaded):
         raise ResultError(f"{result}: has no frames")
     known = loaded.frames.tolist()

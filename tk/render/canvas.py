@@ -16,8 +16,8 @@ from tk.model.body.joints import BONES
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Camera
 from tk.model.masks.regions import SQUARE3
-from tk.render.figure import Outline
-from tk.render.palette import BACKGROUND, BONE, INK, LOST_BODY, TEXT, Color, sigma_colors
+from tk.render.figure import Figure, Outline
+from tk.render.palette import BACKGROUND, BONE, INK, LOST, LOST_BODY, PAPER, TEXT, Color, sigma_colors
 
 Float = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -107,16 +107,24 @@ def draw_body(tile: Image, view: View, outlines: Sequence[Outline], color: Calla
     cv2.copyTo(over, contour.view(np.uint8), under)
 
 
-def dots(sigma_m: Float | None, lost: bool = False) -> Sequence[Color | None]:
-    """Return the colours of the joints by their standard deviation (15,) metres, or plain without one.
+def dots(figure: Figure, row: int) -> Sequence[Color | None]:
+    """Return the colours of the joints in a frame by their standard deviation, or plain without one.
 
     None stands for a ring: the standard deviation is unknown (NaN).
     """
-    plain = LOST_BODY if lost else BONE
-    if sigma_m is None:
-        return [plain] * len(JOINTS)
-    colors: list[Color] = [plain] * len(JOINTS) if lost else sigma_colors(np.nan_to_num(sigma_m)).tolist()
+    lost = figure.lost(row)
+    colors: list[Color] = [LOST_BODY if lost else BONE] * len(JOINTS)
+    if figure.sigma is None:
+        return colors
+    sigma_m = figure.sigma[row]
+    if not lost:
+        colors = sigma_colors(np.nan_to_num(sigma_m)).tolist()
     return [color if known else None for color, known in zip(colors, np.isfinite(sigma_m).tolist(), strict=True)]
+
+
+def draw_lost(tile: Image) -> None:
+    """Draw the border of a frame in which somebody is lost."""
+    cv2.rectangle(tile, (0, 0), (tile.shape[1] - 1, tile.shape[0] - 1), LOST, 5)
 
 
 def draw_joints(tile: Image, xy: Float, colors: Sequence[Color | None], lost: bool = False) -> None:
@@ -137,11 +145,9 @@ def draw_joints(tile: Image, xy: Float, colors: Sequence[Color | None], lost: bo
 
 def draw_truth(tile: Image, xy: Float) -> None:
     """Draw small crosses at the ground-truth joints, ``xy`` (15, 2) tile pixels."""
-    for x, y in xy[np.isfinite(xy).all(axis=1)]:
-        for color, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-            for dx, dy in ((3.5, 3.5), (3.5, -3.5)):
-                a, b = fixed(np.array([[x - dx, y - dy], [x + dx, y + dy]]))
-                cv2.line(tile, a, b, color, width, cv2.LINE_AA, SUBPIXEL_BITS)
+    for point in np.rint(xy[np.isfinite(xy).all(axis=1)]).astype(int).tolist():
+        for color, width in ((INK, 3), (PAPER, 1)):
+            cv2.drawMarker(tile, point, color, cv2.MARKER_TILTED_CROSS, 7, width, cv2.LINE_AA)
 
 
 def fixed(xy: Float) -> NDArray[np.int32]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -159,11 +158,6 @@ class Figure:
             for segment, (depths, outlines) in seen.items()
         ]
         return sorted(found, key=lambda outline: -outline.depth), joints_xy
-
-
-def lost_in(figures: Sequence[Figure], row: int) -> bool:
-    """Return whether anybody is lost in a frame."""
-    return any(figure.lost(row) and figure.there(row) for figure in figures)
 
 
 def figure_of(result: Result) -> Figure:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.results.data import Result
-from tk.io.results.status import STATUS_MEANING, Status
+from tk.io.results.status import Status
 from tk.render.canvas import Image, write
-from tk.render.figure import Figure, lost_in
 from tk.render.palette import (
     BACKGROUND,
     INK,
@@ -24,6 +20,7 @@ from tk.render.palette import (
     of_hue,
     sigma_colors,
 )
+from tk.render.people import People
 
 # Sizes in pixels: of the text's strip and of the bar below it; of the text of a frame that is lost or not; of the key.
 _STRIP, _BAR = 30, 6
@@ -41,30 +38,30 @@ _STATUS_COLORS = {
 
 
 class Legend:
-    """The legend of a result and the people in it, ``width`` pixels wide."""
+    """The legend of a result, ``width`` pixels wide."""
 
-    def __init__(self, result: Result, figures: Sequence[Figure], width: int) -> None:
-        self._result, self._figures = result, figures
-        lines = [_timeline(figure.status, width) for figure in figures]
+    def __init__(self, people: People, width: int) -> None:
+        self._people = people
+        lines = [_timeline(person.status, width) for person in people.results]
         self._timeline = np.concatenate([lines[k * len(lines) // _BAR] for k in range(_BAR)])
         self._keys: dict[bool, Image] = {}
 
     def draw(self, canvas: Image, row: int) -> None:
         """Fill ``canvas`` (LEGEND_HEIGHT, width, 3) for a row of the result."""
         strip, bar = canvas[:_STRIP], canvas[_STRIP:]
-        lost = lost_in(self._figures, row)
+        lost, result = self._people.lost(row), self._people.first
         if lost not in self._keys:
             key = self._keys[lost] = np.full_like(strip, LOST if lost else BACKGROUND)
             if strip.shape[1] > _TEXT_WIDTH[lost] + _KEY_WIDTH:
-                _draw_key(key, strip.shape[1] - _KEY_WIDTH + 20, self._figures[0].sigma is not None)
+                _draw_key(key, strip.shape[1] - _KEY_WIDTH + 20, result.sigma is not None)
         strip[...] = self._keys[lost]
-        state = ", ".join(STATUS_MEANING[figure.status[row]] for figure in self._figures)
+        state = self._people.state(row)
         if lost:
-            state = "LOST: do not use this pose" if len(self._figures) == 1 else f"LOST: {state}"
-        text = f"frame {self._result.frames[row]}   {self._result.time[row]:.2f} s   {state}"
+            state = "LOST: do not use this pose" if len(self._people) == 1 else f"LOST: {state}"
+        text = f"frame {result.frames[row]}   {result.time[row]:.2f} s   {state}"
         write(strip, text, 10, 20, TEXT, 0.5)
         bar[...] = self._timeline
-        now = round((row + 0.5) / len(self._result) * bar.shape[1])
+        now = round((row + 0.5) / len(result) * bar.shape[1])
         bar[:, max(now - 2, 0) : now + 2] = PAPER
 
 

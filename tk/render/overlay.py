@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,17 +20,27 @@ from tk.errors import ResultError
 from tk.io.captures.capture import Capture
 from tk.io.results.data import Result
 from tk.io.results.reader import truth_of
-from tk.io.results.status import STATUS_MEANING, has_pose
 from tk.model.cameras.camera import Camera, Rig
-from tk.render.canvas import Image, View, dots, draw_body, draw_joints, draw_truth, text_width, write, write_png
-from tk.render.figure import Figure, figure_of, lost_in
+from tk.render.canvas import (
+    Image,
+    View,
+    dots,
+    draw_body,
+    draw_joints,
+    draw_lost,
+    draw_truth,
+    text_width,
+    write,
+    write_png,
+)
 from tk.render.legend import LEGEND_HEIGHT, Legend
-from tk.render.palette import LOST, TEXT, Color
+from tk.render.palette import TEXT
+from tk.render.people import People
 
 Float = NDArray[np.float64]
 
 # Layout only; no measurement depends on these values.
-_GAP = 6  # pixels between the tiles of a sheet
+_GAP, _SHEET_ROWS = 6, 4  # pixels between the tiles of a sheet; frames of a sheet
 #: largest width of a video, pixels; smaller images are enlarged up to the second width
 WIDEST, _NARROWEST = 1280, 640
 _ASPECT = 9 / 16  # largest height of all tiles together, as a share of the largest width
@@ -53,9 +62,8 @@ class Overlay:
     def __init__(self, capture: Capture, result: Result, widest: int = WIDEST, full: bool = False) -> None:
         if not len(result.frames):
             raise ResultError(f"{result.path}: has no frames")
-        self.people = result.aligned()
-        self.figures = tuple(figure_of(person) for person in self.people)
-        result = self.people[0]
+        self.people = People(result.aligned())
+        result = self.people.first
         last = int(result.frames.max())
         if last >= capture.frame_count:
             raise ResultError(
@@ -65,13 +73,11 @@ class Overlay:
         tracked = as_tracked(capture, result)
         # no tile is wider than the video; a smaller image takes less time to decode and to cut
         self.capture = tracked.reduced([max(camera.width // widest, 1) for camera in tracked.rig])
-        self.result = result
         self.rig = self.capture.rig
-        self._errors = [e for person in self.people if (e := person.silhouette_error) is not None]
+        self._errors = [e for person in self.people.results if (e := person.silhouette_error) is not None]
         self.grid = Grid.of(self.rig, widest)
         self._canvas = np.full((self.grid.height + LEGEND_HEIGHT, self.grid.width, 3), 24, np.uint8)
-        self._legend = Legend(result, self.figures, self.grid.width)
-        self._colors: dict[tuple[int, int], Sequence[Color | None]] = {}
+        self._legend = Legend(self.people, self.grid.width)
         self._views = [self._steady_view(camera, full) for camera in self.rig]
         self.row_of = {int(frame): row for row, frame in enumerate(result.frames)}
         truth = truth_of(result, capture.truth_file)
@@ -102,7 +108,7 @@ class Overlay:
         for camera, image in zip(self.rig, images, strict=True):
             view = View.whole(camera, tile_height)
             if not full:
-                seen = [figure.seen(row, camera) for figure in self.figures]
+                seen = [figure.seen(row, camera) for figure in self.people.figures]
                 body = [points for outlines, _ in seen for outline in outlines for points in outline.points]
                 shown = np.concatenate([*(joints for _, joints in seen), *body, *self._true(frame, camera)])
                 view = View.around(shown, camera, round(0.75 * tile_height), tile_height)
@@ -110,37 +116,24 @@ class Overlay:
             self._draw(tile, row, camera, image, view)
             for xy in self._true(frame, camera) if truth else ():
                 draw_truth(tile, view.place(xy))
-            state = ", ".join(STATUS_MEANING[figure.status[row]] for figure in self.figures)
             tile[:20] = tile[:20] // 3
-            write(
-                tile,
-                f"{camera.name}  frame {frame}  {state}",
-                6,
-                14,
-                (120, 120, 255) if lost_in(self.figures, row) else TEXT,
-            )
+            color = (120, 120, 255) if self.people.lost(row) else TEXT
+            write(tile, f"{camera.name}  frame {frame}  {self.people.state(row)}", 6, 14, color)
             tiles.append(tile)
         return joined(tiles, axis=1)
 
     def _draw(self, tile: Image, row: int, camera: Camera, image: Image, view: View) -> None:
         """Fill a tile with a camera's image, and draw body and joints over it."""
         view.cut(image[: camera.height, : camera.width], tile)
-        there = [figure for figure in self.figures if figure.there(row)]
+        there = [figure for figure in self.people.figures if figure.there(row)]
         far = [np.nanmean(np.linalg.norm(figure.joints[row] - camera.center, axis=1)) for figure in there]
         for k in np.argsort(far)[::-1]:
             figure = there[k]
             outlines, joints = figure.seen(row, camera)
             draw_body(tile, view, outlines, partial(figure.color, row))
-            draw_joints(tile, view.place(joints), self._dots(row, figure), figure.lost(row))
-        if lost_in(self.figures, row):
-            cv2.rectangle(tile, (0, 0), (view.width - 1, view.height - 1), LOST, 5)
-
-    def _dots(self, row: int, figure: Figure) -> Sequence[Color | None]:
-        if (row, figure.person) not in self._colors:  # the same for all cameras
-            sigma = None if figure.sigma is None else figure.sigma[row]
-            self._colors = {key: colors for key, colors in self._colors.items() if key[0] == row}
-            self._colors[row, figure.person] = dots(sigma, figure.lost(row))
-        return self._colors[row, figure.person]
+            draw_joints(tile, view.place(joints), dots(figure, row), figure.lost(row))
+        if self.people.lost(row):
+            draw_lost(tile)
 
     def _true(self, frame: int, camera: Camera) -> list[Float]:
         return [camera.project(self._truth[frame])[0]] if frame in self._truth else []
@@ -164,7 +157,7 @@ class Overlay:
         """Return the view of a tile that contains the people in all frames that are not lost."""
         width, height = (max(int(size * self.grid.scale), 1) for size in (camera.width, camera.height))
         whole = View(np.zeros(2), self.grid.scale, width, height)
-        shown = np.concatenate([figure.joints[has_pose(figure.status)].reshape(-1, 3) for figure in self.figures])
+        shown = np.concatenate([person.joints[person.has_pose].reshape(-1, 3) for person in self.people.results])
         points, _ = camera.project(shown)
         if full or not camera.sees(shown).any():
             return whole
@@ -174,7 +167,7 @@ class Overlay:
     def _name(self, tile: Image, row: int, camera: Camera) -> None:
         """Write the camera's name and E_S into a corner."""
         text = camera.name
-        names = self.result.meta.residual_cameras
+        names = self.people.first.meta.residual_cameras
         errors = [e[row, names.index(camera.name)] for e in self._errors if camera.name in names]
         known = [f"{100 * error:.0f}" for error in errors if np.isfinite(error)]
         text += f"  E_S {', '.join(known)} %" if known else ""
@@ -217,20 +210,6 @@ class Grid:
         )
 
 
-def choose_frames(result: Result, frames: Sequence[int], count: int) -> list[int]:
-    """Return these frames of a result, ascending; without any, ``count`` frames spread over the result.
-
-    Raises:
-        ResultError: a frame is not in the result.
-    """
-    known = result.frames.tolist()
-    missing = sorted(set(frames) - set(known))
-    if missing:
-        raise ResultError(f"{result.path}: frame {missing[0]} is not in it; it has frames {min(known)} to {max(known)}")
-    spread = [known[i] for i in np.unique(np.linspace(0, len(known) - 1, count).astype(int))]
-    return sorted(set(frames)) or sorted(spread)
-
-
 def as_tracked(capture: Capture, result: Result) -> Capture:
     """Return the capture with the cameras and time offsets of the run, if the result has them."""
     if result.cameras is None:
@@ -259,26 +238,19 @@ def joined(tiles: Sequence[Image], axis: int) -> Image:
     return np.concatenate(parts, axis=axis)
 
 
-def write_sheets(
-    overlay: Overlay,
-    folder: Path,
-    frames: Sequence[int] = (),
-    rows: int = 4,
-    tile_height: int = 360,
-    full: bool = False,
-) -> list[Path]:
-    """Write contact sheets of ``rows`` frames each as PNG, one column per camera; eight frames by default.
+def write_sheets(overlay: Overlay, folder: Path, frames: Sequence[int] = (), full: bool = False) -> list[Path]:
+    """Write contact sheets of four frames each as PNG, one column per camera; eight frames by default.
 
     Raises:
         ResultError: a frame is not in the result.
         ExportError: a sheet cannot be written.
     """
-    chosen = choose_frames(overlay.people[0], frames, count=8)
+    chosen = overlay.people.chosen(frames, count=8)
     written: list[Path] = []
     sheet: list[tuple[int, Image]] = []
     for frame, images in overlay.pictures(chosen):
-        sheet.append((frame, overlay.sheet_row(frame, images, tile_height, full)))
-        if len(sheet) == rows or frame == chosen[-1]:
+        sheet.append((frame, overlay.sheet_row(frame, images, full=full)))
+        if len(sheet) == _SHEET_ROWS or frame == chosen[-1]:
             path = folder / f"overlay-{sheet[0][0]:06d}-{sheet[-1][0]:06d}.png"
             write_png(path, joined([image for _, image in sheet], axis=0))
             written.append(path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -12,15 +11,13 @@ from scipy.ndimage import gaussian_filter1d
 
 from tk.errors import ResultError
 from tk.io.results.data import Result
-from tk.io.results.status import has_pose
 from tk.model.body.skeleton import SEGMENTS
 from tk.model.cameras.camera import Camera, Rig
-from tk.model.cameras.up import up_vector
-from tk.render.canvas import SUBPIXEL_BITS, Image, dots, draw_joints, fixed, write
-from tk.render.figure import Figure, figure_of, lost_in
+from tk.render.canvas import SUBPIXEL_BITS, Image, dots, draw_joints, draw_lost, fixed, write
+from tk.render.figure import Figure
 from tk.render.legend import LEGEND_HEIGHT, Legend
-from tk.render.overlay import choose_frames
-from tk.render.palette import BACKGROUND, ELEVATION_DEG, FLOOR, LOST, WIRE
+from tk.render.palette import BACKGROUND, ELEVATION_DEG, FLOOR, WIRE
+from tk.render.people import People
 
 Float = NDArray[np.float64]
 
@@ -28,7 +25,6 @@ Float = NDArray[np.float64]
 WIDTH, HEIGHT = 960, 720  # pixels
 _FIELD_OF_VIEW_DEG = 38.0
 _TURN_S = 16.0  # duration of a whole turn
-_SQUARE_M, _SQUARES = 0.5, 6  # side of the floor's squares, and their number on each side of the middle
 _PYRAMID_M = 0.25  # height of a camera's pyramid
 _NEAREST_M = 0.05  # near clipping plane
 _FOLLOW_S = 0.5  # standard deviation of the smoothing of the point that the camera follows
@@ -36,67 +32,6 @@ _MARGIN_M = 0.15  # from the joints to the outline of hands, feet and head
 
 #: lines between the points of :func:`camera_pyramid`
 PYRAMID_EDGES = [edge for k in range(1, 5) for edge in ((0, k), (k, k % 4 + 1))]  # apex 0, corners 1 to 4
-
-
-@dataclass(frozen=True)
-class Stage:
-    """Where the person moves.
-
-    Attributes:
-        axes: (3, 3) two horizontal directions and up, as columns; right-handed.
-        middle: (3,) centre of the motion, metres.
-        radius: radius of a ball around ``middle`` that contains the motion, metres.
-        floor: height of the floor along up, metres.
-    """
-
-    axes: Float
-    middle: Float
-    radius: float
-    floor: float
-
-    @staticmethod
-    def of(people: Sequence[Result], figures: Sequence[Figure]) -> Stage:
-        """Return the stage of the frames that are not lost (all, if all are). The lowest feet stand on the floor."""
-        result = people[0]
-        up = up_vector(result.meta.up)
-        good = [has_pose(figure.status) for figure in figures]
-        if not any(rows.any() for rows in good):
-            good = [~rows for rows in good]
-        points = np.concatenate([f.joints[rows].reshape(-1, 3) for f, rows in zip(figures, good, strict=True)])
-        points = points[np.isfinite(points).all(axis=1)]
-        if not len(points):
-            raise ResultError(f"{result.path}: has no joints to draw")
-        side = np.eye(3)[np.argmin(np.abs(up))]
-        east = np.cross(side, up)
-        east /= np.linalg.norm(east)
-        low, high = points.min(axis=0), points.max(axis=0)
-        middle = (low + high) / 2
-        feet = [f.joints if person.feet is None else person.feet for person, f in zip(people, figures, strict=True)]
-        lowest = [(points[rows] @ up).min(axis=1) for points, rows in zip(feet, good, strict=True)]
-        heights = np.concatenate(lowest)
-        heights = heights[np.isfinite(heights)]
-        # the 10th percentile, because feet may be below the floor in single frames
-        floor = float(np.percentile(heights, 10)) if len(heights) else float((points @ up).min())
-        radius = float(np.linalg.norm(points - middle, axis=1).max()) + 0.15
-        return Stage(np.column_stack([east, np.cross(up, east), up]), middle, radius, floor)
-
-    @property
-    def origin(self) -> Float:
-        """(3,) point of the floor below or above :attr:`middle`, metres."""
-        up = self.axes[:, 2]
-        return np.asarray(self.middle + (self.floor - self.middle @ up) * up)
-
-    def floor_lines(self) -> Float:
-        """Return the ends (N, 2, 3) of the lines of the floor's squares, metres."""
-        east, north, _ = self.axes.T
-        reach = _SQUARE_M * _SQUARES
-        return np.array(
-            [
-                [self.origin + k * across - reach * along, self.origin + k * across + reach * along]
-                for k in np.linspace(-reach, reach, 2 * _SQUARES + 1)
-                for along, across in ((east, north), (north, east))
-            ]
-        )
 
 
 def camera_pyramid(camera: Camera) -> Float:
@@ -133,13 +68,10 @@ class Scene:
         if hull and result.hull is None:
             raise ResultError(f"{result.path}: holds no hull", hint="track with --method volumetric --store-hull")
         self.hull = result.hull if hull else None
-        people = (result,) if hull else result.aligned()
-        self.result = people[0]
-        self.figures = tuple(figure_of(person) for person in people)
-        self._legend = Legend(self.result, self.figures, WIDTH)
-        self.stage = Stage.of(people, self.figures)
+        self.people = People((result,) if hull else result.aligned())
+        self._legend = Legend(self.people, WIDTH)
         self.rig = rig or (result.cameras.rig if result.cameras else None)
-        self._middles, reach = _followed(self.figures, result.meta.fps)
+        self._middles, reach = _followed(self.people.figures, result.meta.fps)
         self._distance = reach / np.sin(np.radians(_FIELD_OF_VIEW_DEG / 2))
 
     def rows(self, frames: Sequence[int] = ()) -> list[int]:
@@ -148,8 +80,7 @@ class Scene:
         Raises:
             ResultError: a frame is not in the result.
         """
-        wanted = choose_frames(self.result, frames, len(self.result))
-        return np.flatnonzero(np.isin(self.result.frames, wanted)).tolist()
+        return np.flatnonzero(np.isin(self.people.first.frames, self.people.chosen(frames))).tolist()
 
     def picture(self, row: int) -> Image:
         """Return an image (HEIGHT + LEGEND_HEIGHT, WIDTH, 3).
@@ -166,27 +97,27 @@ class Scene:
             _splat(tile, eye, positions.astype(np.float64), colors[:, ::-1])
         else:
             self._draw_bodies(tile, eye, row)
-        for figure in self.figures:
-            sigma, lost = None if figure.sigma is None else figure.sigma[row], figure.lost(row)
-            draw_joints(tile, eye.project(figure.joints[row])[0], dots(sigma, lost), lost)
-        if lost_in(self.figures, row):
-            cv2.rectangle(tile, (0, 0), (WIDTH - 1, HEIGHT - 1), LOST, 5)
+        for figure in self.people.figures:
+            draw_joints(tile, eye.project(figure.joints[row])[0], dots(figure, row), figure.lost(row))
+        if self.people.lost(row):
+            draw_lost(tile)
         self._legend.draw(canvas[HEIGHT:], row)
         return canvas
 
     def _camera(self, row: int) -> Camera:
         """Return the camera, which turns about the vertical with time and looks at the middle of the people."""
-        turn = 2 * np.pi * (self.result.time[row] - self.result.time[0]) / _TURN_S
-        up = self.stage.axes[:, 2]
+        time, axes = self.people.first.time, self.people.stage.axes
+        turn = 2 * np.pi * (time[row] - time[0]) / _TURN_S
+        up = axes[:, 2]
         elevation = np.radians(ELEVATION_DEG)
-        level = self.stage.axes @ np.array([np.cos(turn), np.sin(turn), 0.0])
+        level = axes @ np.array([np.cos(turn), np.sin(turn), 0.0])
         forward = -(np.cos(elevation) * level + np.sin(elevation) * up)
         return camera_towards(
             self._middles[row] - self._distance * forward, forward, up, (WIDTH, HEIGHT), _FIELD_OF_VIEW_DEG
         )
 
     def _draw_floor(self, tile: Image, eye: Camera) -> None:
-        for a, b in self.stage.floor_lines():
+        for a, b in self.people.stage.floor_lines():
             _line(tile, eye, a, b, FLOOR)
 
     def _draw_cameras(self, tile: Image, eye: Camera) -> None:
@@ -202,7 +133,7 @@ class Scene:
 
     def _draw_bodies(self, tile: Image, eye: Camera, row: int) -> None:
         """Draw the bodies, lit from the viewer: each pixel is the mean of rays through its quarters."""
-        shown = [f for f in self.figures if f.solids and np.isfinite(f.transforms[row]).all()]
+        shown = [f for f in self.people.figures if f.solids and np.isfinite(f.transforms[row]).all()]
         if not shown:
             return
         xy, depth = eye.project(np.concatenate([figure.placed(row) for figure in shown]))

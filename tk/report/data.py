@@ -17,7 +17,7 @@ from tk.io.results.reader import read_people, truth_of
 from tk.io.results.status import STATUS_MEANING, Status
 from tk.model.body.joints import BONES, HINGES, JOINTS, LIMB_JOINTS, SEGMENTS
 from tk.model.cameras.camera import Rig
-from tk.render.figure import AROUND, Figure, figure_of
+from tk.render.figure import AROUND, Figure
 from tk.render.palette import (
     BONE,
     LOST,
@@ -28,7 +28,8 @@ from tk.render.palette import (
     person_color,
     sigma_colors,
 )
-from tk.render.scene import Stage, camera_pyramid
+from tk.render.people import People, Stage
+from tk.render.scene import camera_pyramid
 
 Float = NDArray[np.float64]
 
@@ -53,11 +54,9 @@ def describe(result: Result, rig: Rig | None = None, truth: Path | None = None) 
     meta = result.meta
     whole = result.aligned()
     step = -(-len(whole) * len(whole[0]) // _MOST_ROWS)
-    people = [person.at_rows(np.arange(0, len(person), step)) for person in whole]
-    figures = [figure_of(person) for person in people]
-    first = people[0]
-    stage = Stage.of(people, figures)
-    errors = _errors(first, people, truth)
+    people = People(tuple(person.at_rows(np.arange(0, len(person), step)) for person in whole))
+    first = people.first
+    errors = _errors(first, people.results, truth)
     return {
         "capture": meta.capture,
         "method": meta.method,
@@ -73,17 +72,17 @@ def describe(result: Result, rig: Rig | None = None, truth: Path | None = None) 
         "time": first.time.round(4).tolist(),
         "statusWords": list(STATUS_MEANING),
         "withoutPose": [int(Status.LOST), int(Status.ABSENT)],
-        "scene": _scene(stage, result.cameras.rig if result.cameras else rig),
+        "scene": _scene(people.stage, result.cameras.rig if result.cameras else rig),
         "joints": list(JOINTS),
         "cameras": list(meta.residual_cameras),
         "objectiveKind": meta.objective_kind,
         "people": [
-            _person(person, figure, stage, error) | _counts(all_rows)
-            for person, all_rows, figure, error in zip(people, whole, figures, errors, strict=True)
+            _person(person, figure, people.stage, error) | _counts(all_rows)
+            for person, all_rows, figure, error in zip(people.results, whole, people.figures, errors, strict=True)
         ],
         "colors": {
             "segments": {name: hexadecimal(color) for name, color in SEGMENT_COLORS.items()},
-            "people": [hexadecimal(person_color(person.person)) for person in people],
+            "people": [hexadecimal(person_color(person.person)) for person in people.results],
             "lost": hexadecimal(LOST),
             "lostBody": hexadecimal(LOST_BODY),
             "bone": hexadecimal(BONE),

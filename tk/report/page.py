@@ -94,7 +94,7 @@ def report(result_path: Path, capture_path: Path | None, output: Path | None, fo
     if capture_path is not None:
         overlay = Overlay(open_capture(capture_path, None, "none", result.resampled), result)
         choices, rig, truth = choose_rows(result), overlay.rig, overlay.capture.truth_file
-        frames = [int(overlay.people[0].frames[choice.row]) for choice in choices]
+        frames = [int(overlay.people.first.frames[choice.row]) for choice in choices]
         shots = {overlay.row_of[frame]: shot(overlay, frame, images) for frame, images in overlay.pictures(frames)}
         shown = embedded(choices, shots)
     write_page(target, build_page(result, shown, rig, truth))

@@ -13,7 +13,8 @@ from tk.model.body.skeleton import JOINTS, SEGMENTS
 from tk.model.cameras.camera import Rig
 from tk.render.figure import Figure
 from tk.render.palette import BONE, sigma_colors, unit_rgb
-from tk.render.scene import PYRAMID_EDGES, Stage, camera_pyramid
+from tk.render.people import Stage
+from tk.render.scene import PYRAMID_EDGES, camera_pyramid
 
 Float = NDArray[np.float64]
 

@@ -67,7 +67,7 @@ class Window:
             raise DisplayError(f"tk view: needs Open3D, which does not load: {error}; {_ALTERNATIVE}") from None
         self._contents = contents
         self._window = VisualizerWithKeyCallback()
-        if not self._window.create_window(f"{contents.result.path.name} - tk view", *SIZE):
+        if not self._window.create_window(f"{contents.people.first.path.name} - tk view", *SIZE):
             raise DisplayError(
                 f"tk view: Open3D cannot open a window: install OpenGL (Debian: libgl1-mesa-dri); {_ALTERNATIVE}"
             )
@@ -90,7 +90,7 @@ class Window:
 
     def run(self, row: int) -> None:
         """Show the window until it is closed."""
-        count = len(self._contents.result)
+        count = len(self._contents.people.first)
         steps = {_RIGHT: 1, _LEFT: -1, _PAGE_UP: -_PAGE_FRAMES, _PAGE_DOWN: _PAGE_FRAMES, _HOME: -count, _END: count}
         for key, step in steps.items():
             self._on_key(key, partial(self._step, step))
@@ -124,7 +124,7 @@ class Window:
             self._window.get_view_control().convert_from_pinhole_camera_parameters(_pinhole(self._contents), True)
 
     def _step(self, by: int) -> None:
-        self._show(int(np.clip(self._row + by, 0, len(self._contents.result) - 1)))
+        self._show(int(np.clip(self._row + by, 0, len(self._contents.people.first) - 1)))
 
     def _toggle(self, name: str) -> None:
         self._shown[name] = not self._shown[name]
@@ -135,13 +135,13 @@ class Window:
 
     def _tick(self, _: Any) -> bool:
         """Show the next frame when it is due; return whether the window has to be drawn. Open3D calls it."""
-        now, fps = time.monotonic(), self._contents.result.meta.fps
+        now, fps = time.monotonic(), self._contents.people.first.meta.fps
         if not self._playing or now < self._due:
             time.sleep(_IDLE_S)
             return False
         skipped = int((now - self._due) * fps)  # a slow machine skips frames
         self._due += (skipped + 1) / fps
-        self._show((self._row + 1 + skipped) % len(self._contents.result))
+        self._show((self._row + 1 + skipped) % len(self._contents.people.first))
         return True
 
 
@@ -149,7 +149,7 @@ def _pinhole(contents: Contents) -> Any:
     """Return Open3D's camera at :attr:`Contents.eye` that looks at the middle of the motion."""
     import open3d as o3d
 
-    stage = contents.stage
+    stage = contents.people.stage
     forward = stage.middle - contents.eye
     forward /= np.linalg.norm(forward)
     seen = camera_towards(contents.eye, forward, stage.axes[:, 2], SIZE, FIELD_OF_VIEW_DEG)
