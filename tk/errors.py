@@ -2,7 +2,8 @@
 
 Every message is one line that names the file or the option, and the remedy. The command line prints it, followed by
 the hint, and exits with the error's ``exit_code``. Any other exception is a defect of the program and keeps its
-traceback.
+traceback. Wherever files of users are read or written, one of these errors may occur; docstrings list them only where
+the interface is public or a caller handles them.
 """
 
 import errno

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 
 import pytest
 
 from tests.conftest import Tk
 from tk.commands import doctor
-from tk.commands.doctor import CHECKS, Check
+from tk.commands.doctor import CHECKS, Missing
 
 
 def test_one_line_each_on_this_machine(tk: Tk) -> None:
@@ -23,10 +24,13 @@ def test_one_line_each_on_this_machine(tk: Tk) -> None:
 
 
 def test_what_tracking_needs_decides_the_exit_code(tk: Tk, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken() -> Check:
-        raise OSError("unexpected")
+    def failing(error: Exception) -> Callable[[], str]:
+        def check() -> str:
+            raise error
 
-    checks = {"display": lambda: Check("", "no display"), "cores": lambda: Check("4"), "cache": broken}
+        return check
+
+    checks = {"display": failing(Missing("no display")), "cores": lambda: "4", "cache": failing(OSError("unexpected"))}
     monkeypatch.setattr(doctor, "CHECKS", checks)
     ran = tk("doctor")
     assert ran.code == 0 and ran.out.splitlines() == [
@@ -35,7 +39,7 @@ def test_what_tracking_needs_decides_the_exit_code(tk: Tk, monkeypatch: pytest.M
         "cache     missing: the check failed: OSError: unexpected",
         "tk track can work",
     ]
-    checks["Taichi"] = lambda: Check("1.7", "does not start", needed=True)
+    checks["Taichi"] = failing(Missing("does not start"))
     ran = tk("doctor")
     assert ran.code == 1 and ran.out.splitlines()[-1] == "tk track cannot work: Taichi"
 
@@ -43,14 +47,15 @@ def test_what_tracking_needs_decides_the_exit_code(tk: Tk, monkeypatch: pytest.M
 @pytest.mark.parametrize(
     ("code", "why"),
     [
-        ("import os; os.abort()", "the process was ended by signal 6"),
-        ("import time; time.sleep(60)", "gave no answer for 1 s"),
-        ("import no_such_package", "ModuleNotFoundError: No module named 'no_such_package'"),
+        ("import os; os.abort()", "the process was ended by signal 6; the remedy"),
+        ("import time; time.sleep(60)", "gave no answer for 1 s; the remedy"),
+        ("import no_such_package", "ModuleNotFoundError: No module named 'no_such_package'; the remedy"),
     ],
 )
 def test_crashes_and_hangs_are_reasons(code: str, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_LIMIT_S", 1.0)
-    assert doctor._try(code) == ("", why)
+    with pytest.raises(Missing, match=f"^{why}$"):
+        doctor._try(code, "; the remedy")
 
 
 def test_doctor_does_not_load_what_it_checks() -> None:

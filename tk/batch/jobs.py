@@ -45,11 +45,7 @@ class TrackOptions:
     config: Settings = field(default_factory=Settings)
 
     def to_dict(self) -> dict[str, str]:
-        """Return each option as text. They must be the same when a batch is continued.
-
-        Raises:
-            ConfigError: the file of the body cannot be read.
-        """
+        """Return each option as text. They must be the same when a batch is continued."""
         start, stop = self.frames
         return {
             "method": self.method,
@@ -146,22 +142,14 @@ class Job:
         return self.folder / RECORDS / f"{self.name}.json"
 
     def write(self, outcome: Outcome) -> None:
-        """Replace the record atomically.
-
-        Raises:
-            ResultError: it cannot be written.
-        """
+        """Replace the record atomically."""
         worker = {"host": socket.gethostname(), "pid": os.getpid()}
         record = {"capture": str(self.capture), "options": self.options.to_dict(), "by": worker, **asdict(outcome)}
         with replacing(self.record, ResultError) as part:
             part.write_text(json.dumps(record, indent=2), encoding="utf-8")
 
     def read(self) -> Outcome:
-        """Return the outcome in the record; a waiting one without a record.
-
-        Raises:
-            ResultError: the options in the record differ, or it is damaged.
-        """
+        """Return the outcome in the record; a waiting one without a record."""
         if not self.record.exists():
             return Outcome()
         record = _read_record(self.record)
@@ -185,10 +173,6 @@ def make_jobs(captures: Sequence[Path], folder: Path, options: TrackOptions, pic
 
     A capture keeps the name from an earlier run in this folder. A new one has the name of its folder; if the name is
     taken, the names of the folders above are prepended.
-
-    Raises:
-        ConfigError: a capture is given twice.
-        ResultError: the folder contains a result of another command, or a damaged record.
     """
     folder = resolved(folder)
     paths = [resolved(capture) for capture in captures]

@@ -43,11 +43,7 @@ td.bad { color: #c2571a; font-weight: 600; }
 
 
 def write_summary(folder: Path, jobs: Sequence[Job], outcomes: Mapping[str, Outcome]) -> None:
-    """Write `summary.csv` and `summary.html`, each atomically.
-
-    Raises:
-        ResultError: a file cannot be written.
-    """
+    """Write `summary.csv` and `summary.html`, each atomically."""
     rows = [_row(job, outcomes[job.name]) for job in jobs]
     table = io.StringIO()
     writer = csv.DictWriter(table, COLUMNS, lineterminator="\n")

@@ -112,9 +112,6 @@ def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[M
 
     Args:
         smoothed: use the smoothed copy; the poses are smoothed here if the result has none.
-
-    Raises:
-        ResultError: as :func:`tk.io.results.reader.read_result`, or the result has no body or no known frame.
     """
     return motion_of(read_result(path), smoothed)
 

@@ -19,12 +19,7 @@ from tk.render.palette import SEGMENT_COLORS
 
 
 def write_body_meshes(motion: Motion, folder: Path) -> None:
-    """Write one mesh per frame.
-
-    Raises:
-        ExportError: the result has no body.
-        ResultError: a file cannot be written.
-    """
+    """Write one mesh per frame."""
     figure = figure_of(motion.result)
     if not figure.solids:
         raise ExportError(f"{motion.result.path}: has no body and thus no surface; track the capture again")

@@ -41,9 +41,6 @@ def hull_mesh(occupancy: NDArray[np.bool_], grid: VoxelGrid, surface: HullPoints
         occupancy: (nx, ny, nz) bool, voxels of the hull.
         grid: their positions.
         surface: surface voxels; each vertex gets the colour of the nearest one.
-
-    Raises:
-        ResultError: Open3D cannot be loaded.
     """
     if not occupancy.any():
         return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))

@@ -38,9 +38,6 @@ def write_ply(path: Path, positions: ArrayLike, colors: NDArray[np.uint8], trian
         positions: (N, 3) metres.
         colors: (N, 3) RGB.
         triangles: (M, 3) indices of the corners; None for points without faces.
-
-    Raises:
-        ResultError: the file cannot be written.
     """
     points = np.empty(len(colors), [("xyz", "<f8", 3), ("rgb", "u1", 3)])
     points["xyz"], points["rgb"] = positions, colors
@@ -72,9 +69,6 @@ def write_hulls(path: Path, capture: Capture, grid: VoxelGrid, frames: Iterable[
 
     Returns:
         The number of frames written.
-
-    Raises:
-        ResultError: the file cannot be written, or a file of that name is not a hull file (it is not changed).
     """
     check_hull_path(path)
     count = 0
@@ -102,11 +96,7 @@ def write_hulls(path: Path, capture: Capture, grid: VoxelGrid, frames: Iterable[
 
 
 def check_hull_path(path: Path, force: bool = True, capture: Path | None = None) -> None:
-    """Check that a hull file may be written: not over other files, and over a hull file only with ``force``.
-
-    Raises:
-        TkError: with the remedy, see :func:`tk.io.paths.check_output`.
-    """
+    """Check that a hull file may be written: not over other files, and over a hull file only with ``force``."""
     check_output(path, hdf5_kind(HULL_FORMAT), force, capture=capture, error=ResultError)
 
 

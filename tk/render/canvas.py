@@ -162,11 +162,7 @@ def write(tile: Image, text: str, left: int, baseline: int, color: Color = TEXT,
 
 
 def write_png(path: Path, image: Image, kind: type[TkError] = ExportError) -> None:
-    """Write an image (h, w, 3) BGR, and the folder if there is none.
-
-    Raises:
-        TkError: ``kind``: the file cannot be written.
-    """
+    """Write an image (h, w, 3) BGR, and the folder if there is none."""
     with replacing(path, kind) as part:
         ok, coded = cv2.imencode(".png", image)
         if not ok:

@@ -161,11 +161,7 @@ class Figure:
 
 
 def figure_of(result: Result) -> Figure:
-    """Return the person of a result, joints in the order of :data:`~tk.model.body.skeleton.JOINTS`.
-
-    Raises:
-        ResultError: there are no frames, the body does not fit the poses, or a joint is missing.
-    """
+    """Return the person of a result, joints in the order of :data:`~tk.model.body.skeleton.JOINTS`."""
     if not len(result):
         raise ResultError(f"{result.path}: has no frames")
     result = result.in_joint_order()

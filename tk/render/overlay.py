@@ -54,9 +54,6 @@ class Overlay:
         result: the result. Its cameras and time offsets, if it has them, replace those of the capture.
         widest: largest width of a video, pixels.
         full: show whole images in a video, not the part in which the person moves.
-
-    Raises:
-        ResultError: the result has no frames, frames that the capture does not have, or a body that cannot be used.
     """
 
     def __init__(self, capture: Capture, result: Result, widest: int = WIDEST, full: bool = False) -> None:
@@ -239,12 +236,7 @@ def joined(tiles: Sequence[Image], axis: int) -> Image:
 
 
 def write_sheets(overlay: Overlay, folder: Path, frames: Sequence[int] = (), full: bool = False) -> list[Path]:
-    """Write contact sheets of four frames each as PNG, one column per camera; eight frames by default.
-
-    Raises:
-        ResultError: a frame is not in the result.
-        ExportError: a sheet cannot be written.
-    """
+    """Write contact sheets of four frames each as PNG, one column per camera; eight frames by default."""
     chosen = overlay.people.chosen(frames, count=8)
     written: list[Path] = []
     sheet: list[tuple[int, Image]] = []

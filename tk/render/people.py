@@ -50,11 +50,7 @@ class People:
         return ", ".join(STATUS_MEANING[person.status[row]] for person in self.results)
 
     def chosen(self, frames: Sequence[int], count: int | None = None) -> list[int]:
-        """Return these frames, ascending; without any, ``count`` frames spread over the result, all by default.
-
-        Raises:
-            ResultError: a frame is not in the result.
-        """
+        """Return these frames, ascending; without any, ``count`` frames spread over the result, all by default."""
         known = self.first.frames.tolist()
         missing = sorted(set(frames) - set(known))
         if missing:

@@ -59,9 +59,6 @@ class Scene:
         result: the result.
         rig: the cameras; those of the result by default, if it has them.
         hull: draw the stored hull instead of the body.
-
-    Raises:
-        ResultError: the result has no frames, no hull although ``hull`` is set, or a body that cannot be used.
     """
 
     def __init__(self, result: Result, rig: Rig | None = None, hull: bool = False) -> None:
@@ -75,11 +72,7 @@ class Scene:
         self._distance = reach / np.sin(np.radians(_FIELD_OF_VIEW_DEG / 2))
 
     def rows(self, frames: Sequence[int] = ()) -> list[int]:
-        """Return the rows of these frames; all rows by default.
-
-        Raises:
-            ResultError: a frame is not in the result.
-        """
+        """Return the rows of these frames; all rows by default."""
         return np.flatnonzero(np.isin(self.people.first.frames, self.people.chosen(frames))).tolist()
 
     def picture(self, row: int) -> Image:

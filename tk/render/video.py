@@ -38,9 +38,6 @@ def video_writer(path: Path, fps: float) -> Iterator[Callable[[Image], None]]:
     Args:
         path: the MP4 file. One that exists is replaced.
         fps: images per second.
-
-    Raises:
-        ExportError: it cannot be written there.
     """
     with replacing(path) as part:
         encoder = _Encoder(part, fps)

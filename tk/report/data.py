@@ -47,9 +47,6 @@ def describe(result: Result, rig: Rig | None = None, truth: Path | None = None) 
         result: the result, with at least one frame.
         rig: the cameras, if the result does not have them.
         truth: the ground truth; the file need not exist.
-
-    Raises:
-        ResultError: there are no frames or joints, or the body cannot be used.
     """
     meta = result.meta
     whole = result.aligned()

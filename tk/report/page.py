@@ -30,9 +30,6 @@ def build_page(
         pictures: images, from :func:`tk.report.pictures.embedded`.
         rig: the cameras, if the result does not have them.
         truth: the ground truth; the file need not exist.
-
-    Raises:
-        ResultError: the result cannot be drawn.
     """
     data, rows = describe(result, rig, truth), result.aligned()[0]
     shown = [
@@ -59,11 +56,7 @@ def build_page(
 
 
 def write_page(path: Path, page: str) -> None:
-    """Write the page, under a temporary name first.
-
-    Raises:
-        ExportError: the file cannot be written.
-    """
+    """Write the page, under a temporary name first."""
     with replacing(path) as part:
         part.write_text(page, encoding="utf-8", errors="replace")  # a path may be no UTF-8
 
@@ -81,11 +74,7 @@ PAGE = Kind("a report of tk", (".html", ".htm"), made_here)
 
 
 def report(result_path: Path, capture_path: Path | None, output: Path | None, force: bool = False) -> Path:
-    """Write the report of a result, and return its path.
-
-    Raises:
-        TkError: the result or the capture cannot be used, or the page cannot be written.
-    """
+    """Write the report of a result, and return its path."""
     result = read_result(result_path)
     target = output or result_path.with_suffix(".html")
     check_output(target, PAGE, force, [result_path], capture_path)

@@ -31,11 +31,7 @@ _IDLE_S = 0.01  # sleep between two events; longer ones would delay frames, shor
 
 
 def require_display() -> None:
-    """Check that there is a display: without one, Open3D never returns or ends the process.
-
-    Raises:
-        DisplayError: there is none.
-    """
+    """Check that there is a display: without one, Open3D never returns or ends the process."""
     if sys.platform != "linux":
         return
     if not os.environ.get("DISPLAY"):
@@ -54,11 +50,7 @@ def require_display() -> None:
 
 
 class Window:
-    """The window of `tk view`. It prints its keys, and a line about each frame, on stderr.
-
-    Raises:
-        DisplayError: it cannot be opened.
-    """
+    """The window of `tk view`. It prints its keys, and a line about each frame, on stderr."""
 
     def __init__(self, contents: Contents) -> None:
         try:
@@ -76,11 +68,7 @@ class Window:
         self._row, self._playing, self._due = -1, False, 0.0
 
     def save(self, row: int, target: Path) -> None:
-        """Draw a frame into an image file, and close.
-
-        Raises:
-            ExportError: the file cannot be written.
-        """
+        """Draw a frame into an image file, and close."""
         self._show(row)
         self._window.poll_events()
         self._window.capture_screen_image(target, do_render=True)

@@ -41,11 +41,7 @@ def import_project(folder: Path, output: Path, unit: str | None = None, trial: s
 
 
 def read_project(folder: Path, unit: str | None = None, trial: str | None = None) -> Project:
-    """Read the project in a folder, of any tool; arguments as for :func:`import_project`.
-
-    Raises:
-        CaptureError: no format matches, the folder is a capture already, or a file cannot be read.
-    """
+    """Read the project in a folder, of any tool; arguments as for :func:`import_project`."""
     if not folder.is_dir():
         raise CaptureError(f"{folder}: is not a folder; give the project folder of the tool that calibrated")
     if _is_capture(folder):
@@ -65,11 +61,8 @@ def read_project(folder: Path, unit: str | None = None, trial: str | None = None
 def open_recording(
     path: Path, cameras: Sequence[str] | None = None, masks: str = "auto", resample: bool = False
 ) -> Capture:
-    """Open a capture, see :func:`tk.io.captures.capture.open_capture`.
-
-    Raises:
-        CaptureError: the folder cannot be used; if it is a project of another tool, the message says how to convert it.
-    """
+    """Open a capture, see :func:`tk.io.captures.capture.open_capture`. The error about a project of another tool says
+    how to convert it."""
     try:
         return open_capture(path, cameras, masks, resample)
     except CaptureError as error:

@@ -14,11 +14,7 @@ from tk.io.toml import Table, read_text
 
 
 def read_xml(path: Path) -> Element:
-    """Return the root of an XML document. Entities are refused: they can make a small file endless.
-
-    Raises:
-        CalibrationError: it cannot be read, or is not XML.
-    """
+    """Return the root of an XML document. Entities are refused: they can make a small file endless."""
     text = read_text(path, CalibrationError)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise CalibrationError(f"{path}: declares a document type, which calibrations do not; remove the declaration")
@@ -65,11 +61,7 @@ def matching(folder: Path, *patterns: str) -> list[Path]:
 
 
 def only(files: Sequence[Path]) -> Path:
-    """Return the one file.
-
-    Raises:
-        CalibrationError: there are several.
-    """
+    """Return the one file; several are an error."""
     if len(files) > 1:
         names = ", ".join(file.name for file in files)
         raise CalibrationError(f"{files[0].parent}: holds several calibrations: {names}; keep only the right one")

@@ -130,12 +130,7 @@ class Format:
 
 
 def read_format(form: Format, files: Sequence[Path], folder: Path, unit: str | None, trial: str | None) -> Project:
-    """Read the calibration ``files``, and find a video in ``folder`` for every camera.
-
-    Raises:
-        CalibrationError: the calibration cannot be used.
-        VideoError: see :func:`tk.io.importers.videos.find_clips`.
-    """
+    """Read the calibration ``files``, and find a video in ``folder`` for every camera."""
     tables = form.read(files)
     if len(tables.cameras) < 2:
         why = "".join(f"; {note.removeprefix(f'{tables.source}: ')}" for note in tables.notes)
@@ -167,11 +162,7 @@ def read_format(form: Format, files: Sequence[Path], folder: Path, unit: str | N
 
 
 def _in_metres(rig: Rig, tables: Tables, requested: str | None, default: str) -> tuple[Rig, str]:
-    """Return the cameras with lengths in metres, and a note about the unit: requested, specified, or inferred.
-
-    Raises:
-        CalibrationError: a table top in millimetres and a room in centimetres are both possible.
-    """
+    """Return the cameras with lengths in metres, and a note about the unit: requested, specified, or inferred."""
     if requested:
         found, reason = FoundUnit(requested), "as requested"
     elif tables.unit:
@@ -192,8 +183,7 @@ def _in_metres(rig: Rig, tables: Tables, requested: str | None, default: str) ->
 def _by_person(rig: Rig, source: Path) -> FoundUnit:
     """Return millimetres if a person fits into the views then; the same numbers are a larger room in centimetres.
 
-    Raises:
-        CalibrationError: a person fits in centimetres alone, so the numbers are either those or a table top.
+    If a person fits in centimetres alone, the numbers are either those or a table top, and an error.
     """
     try:
         view = view_height(rig)

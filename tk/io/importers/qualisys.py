@@ -32,11 +32,7 @@ _DISTORTIONS = (
 
 
 def read_tables(files: Sequence[Path]) -> Tables:
-    """Read the video cameras of the one file.
-
-    Raises:
-        CalibrationError: there are several files, or the file is damaged.
-    """
+    """Read the video cameras of the one file."""
     path = only(files)
     listed = read_xml(path).findall("cameras/camera")
     if not listed:

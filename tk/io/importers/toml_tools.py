@@ -44,11 +44,7 @@ _RAW = ("videos", "raw", "raw-2d", "raw_videos", "videos_raw")
 
 
 def read_tables(files: Sequence[Path]) -> Tables:
-    """Read the cameras of the one TOML file. Tables without a camera, a pose, or with ``ignore`` are left out.
-
-    Raises:
-        CalibrationError: there are several files, or the file is damaged.
-    """
+    """Read the cameras of the one TOML file. Tables without a camera, a pose, or with ``ignore`` are left out."""
     path = only(files)
     document = load_toml(path, CalibrationError)
     found = Tables(path, given_unit(document, path))

@@ -65,9 +65,6 @@ def find_clips(
         trial: a part of the path of the videos, None to accept any.
         in_order: if names do not match, the first camera belongs to the first video, and so on.
         images: accept single images as clips.
-
-    Raises:
-        VideoError: there are no videos, several recordings, or names that cannot be matched.
     """
     folder, clips = _one_recording(root, patterns, trial, images)
     order = match_clips(cameras, list(clips), in_order)
@@ -96,9 +93,6 @@ def _clips_in(folder: Path, images: bool) -> dict[str, Path]:
     """Return the clips in a folder by name: video files; without any, folders of images or of one video each.
 
     Symbolic links are followed; pipes and devices are not clips.
-
-    Raises:
-        VideoError: two files differ in the suffix only.
     """
     files = _regular(folder)
     suffixes = VIDEO_SUFFIXES + (PICTURE_SUFFIXES if images else ())

@@ -51,9 +51,6 @@ def write_capture(project: Project, output: Path) -> Imported:
 
     Videos and images become hard links, which take no space and stay when the originals are deleted; on another file
     system they are copied.
-
-    Raises:
-        CaptureError: the output exists already or cannot be written, a video cannot be read or does not fit.
     """
     if len(project.rig) < 2:
         raise CaptureError(f"{project.source}: {len(project.rig)} camera with a video; a capture needs at least 2")
@@ -213,8 +210,7 @@ def fit_size(camera: Camera, width: int, height: int, clip: Path) -> tuple[Camer
     - One exact ratio in both directions is a scaled image: the matrix is scaled. Pixel centres are integers, so a pixel
       x maps to s (x + ½) - ½.
 
-    Raises:
-        CalibrationError: none of these rules applies.
+    Any other difference is an error.
     """
     calibrated = (camera.width, camera.height)
     if calibrated in ((width, height), (0, 0)):
