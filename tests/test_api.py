@@ -14,7 +14,7 @@ import pytest
 import tk
 from tests.conftest import QUICK
 from tests.io.conftest import picture, write_video
-from tk.errors import CaptureError, ConfigError
+from tk.errors import CaptureError, ConfigError, ResultError
 from tk.io import settings_file
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -59,9 +59,11 @@ def test_errors_name_no_options_of_the_command_line() -> None:
     assert found == []
 
 
-def test_a_path_is_tracked_and_the_result_is_described_in_three_lines(tiny, tmp_path) -> None:
+def test_a_path_is_tracked_once_and_the_result_is_described_in_three_lines(tiny, tmp_path) -> None:
     config = settings_file.from_toml(QUICK)
     result = tk.track(tiny, tmp_path / "r.h5", config=config, frames=(0, 3), causal=True)
+    with pytest.raises(ResultError, match="exists"):
+        tk.track(tiny, tmp_path / "r.h5", config=config)
     lines = repr(result).splitlines()
     assert len(lines) == 3 and all(len(line) < 120 for line in lines)
     assert "r.h5" in lines[0] and "3 frames" in lines[1]

@@ -13,12 +13,8 @@ import h5py
 import numpy as np
 import pytest
 
-import tk as package
-from tests.conftest import FRAMES, QUICK, Tk
+from tests.conftest import FRAMES, Tk
 from tk.cli import main
-from tk.errors import ConfigError, ResultError
-from tk.io import settings_file
-from tk.io.captures.capture import open_capture
 
 
 def test_result_is_replaced_only_with_force(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
@@ -55,19 +51,6 @@ def test_hull_and_point_clouds_are_replaced_only_with_force(tk: Tk, tiny: Path, 
     both = ["--ply", tmp_path / "new", "--mesh", tmp_path / "new"]
     tk(*command, "-o", tmp_path / "i.h5", *both).complaint("new", "a folder of its own")
     assert tk(*command, "-o", tmp_path / "h.h5", "--ply", tmp_path / "ply", "--force").code == 0
-
-
-def test_python_replaces_a_result_only_with_force(tiny: Path, tmp_path: Path) -> None:
-    path = tmp_path / "r.h5"
-    config = settings_file.from_toml(QUICK)
-    capture = open_capture(tiny)
-    first = package.track(capture, path, config=config, frames=(0, 1), causal=True)
-    with pytest.raises(ResultError, match="exists"):
-        package.track(capture, path, config=config)
-    with pytest.raises(ConfigError, match="one of them"):
-        package.track(capture, path, config=config, resume=True, force=True)
-    again = package.track(capture, path, config=config, frames=(0, 1), causal=True, force=True)
-    np.testing.assert_array_equal(first.pose, again.pose)
 
 
 def test_exit_code_3_if_most_frames_are_lost(tk: Tk, quick: Path, copy: Path, tmp_path: Path) -> None:

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tk.io.results.data import ResultMeta
+from tests.made_results import write_motion
 from tk.io.results.status import Status
-from tk.io.results.writer import ResultWriter
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.joints import WAIST
 from tk.model.body.skeleton import Skeleton, build_skeleton
@@ -59,32 +58,14 @@ def write(tmp_path: Path) -> Write:
         frames: np.ndarray | None = None,
         second: Collection[int] = (),  # rows in which another person makes the same movement
     ) -> Path:
-        states = status() if lost is None else lost
-        fixed = ResultMeta(
-            pose_names=skeleton.names,
-            pose_units=skeleton.units,
-            stages=("all",),
-            timing_stages=("total",),
-            fps=FPS,
-            up=up,
-            capture="walk",
-            method="volumetric",
-            seed=0,
-            config_toml="",
-            **(meta or {}),
+        states, numbers = status() if lost is None else lost, FIRST + np.arange(FRAMES) if frames is None else frames
+        model = {f"dimensions/{key}": value for key, value in asdict(BODY).items()}
+
+        def row(f: int) -> dict[str, Any]:
+            return {"frames": numbers[f], "status": states[f], **rows(f)}
+
+        return write_motion(
+            tmp_path / name, skeleton, poses(skeleton), model, row, second, fps=FPS, up=up, **(meta or {})
         )
-        path = tmp_path / name
-        people = 2 if second else 1
-        with ResultWriter.create(path, fixed, people=people) as writer:
-            for person in range(people):
-                writer.write_model({f"dimensions/{key}": value for key, value in asdict(BODY).items()}, person=person)
-            for f, pose in enumerate(poses(skeleton)):
-                index = FIRST + f if frames is None else int(frames[f])
-                row = {
-                    "frames": index, "time": index / FPS, "pose": pose, "joints/position": skeleton.joints(pose),
-                    "status": states[f], "objective": 0.0, "iterations": [0], **rows(f),
-                }  # fmt: skip
-                writer.append({person: row for person in range(people) if person == 0 or f in second})
-        return path
 
     return run

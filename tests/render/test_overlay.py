@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from tests.conftest import QUICK, Silent, Tk
+from tests.made_results import write_motion
 from tk.errors import ResultError
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
-from tk.io.results.data import ResultMeta, UsedCameras
+from tk.io.results.data import UsedCameras
 from tk.io.results.reader import read_joints, read_result
 from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
-from tk.io.results.writer import ResultWriter
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import ConeBody, build_cone_body
 from tk.model.body.gait_poses import neutral_pose
@@ -31,7 +31,6 @@ from tk.render.figure import Figure, Outline, solids_of
 from tk.render.overlay import Grid, Overlay, write_sheets
 from tk.render.palette import BONE, LOST, LOST_BODY, SEGMENT_COLORS, person_color, sigma_colors
 from tk.run.session import track
-from tk.settings import Settings
 from tk.trackers.bodies import body_and_poses
 
 DEMO = Path(__file__).resolve().parents[2] / "tk" / "data" / "demo"
@@ -55,24 +54,12 @@ def figure(body: ConeBody, pose: np.ndarray) -> Figure:
 @pytest.fixture()
 def result(tmp_path: Path) -> Path:
     """A result of three frames of the demo with the neutral pose at the true pelvis; the last frame is lost."""
-    path = tmp_path / "result.h5"
-    skeleton, truth = SKELETON, read_joints(DEMO / "truth.h5")
-    pose = neutral_pose(skeleton)
-    config = settings_file.to_toml(Settings())
-    meta = ResultMeta(
-        "demo", "made", 0, 15.0, "z", config, skeleton.names, skeleton.units, ("all",), ("total",)
-    )  # fmt: skip
-    with ResultWriter.create(path, meta) as writer:
-        writer.write_model({f"dimensions/{name}": value for name, value in asdict(BODY.dimensions).items()})
-        for frame in range(3):
-            pose[:3] = truth.positions[frame, 0]
-            status = Status.LOST if frame == 2 else Status.TRACKED
-            row = {
-                "frames": frame, "time": frame / 15, "pose": pose, "joints/position": skeleton.joints(pose),
-                "status": status, "objective": 0.1, "iterations": [1], "timing/total": 0.1,
-            }  # fmt: skip
-            writer.append({0: row})
-    return path
+    truth = read_joints(DEMO / "truth.h5").positions
+    poses = np.repeat(neutral_pose(SKELETON)[None], 3, axis=0)
+    poses[:, :3] = truth[:3, 0]
+    model = {f"dimensions/{name}": value for name, value in asdict(BODY.dimensions).items()}
+    lost = {2: {"status": Status.LOST}}
+    return write_motion(tmp_path / "result.h5", SKELETON, poses, model, lambda f: lost.get(f, {}))
 
 
 def test_bones_join_all_joints_into_one_tree() -> None:

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from tests.conftest import FRAMES
+from tests.made_results import write_motion
 from tk.io import settings_file
 from tk.io.captures.capture import open_capture
-from tk.io.results.data import JointAngles, Result, ResultMeta
+from tk.io.results.data import JointAngles, Result
 from tk.io.results.reader import read_joints
 from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
-from tk.io.results.writer import ResultWriter
 from tk.model.body.angles import ANGLES
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.cone_body import build_cone_body
@@ -36,14 +36,6 @@ def complete_result(path: Path, capture_path: Path, count: int = FRAMES) -> Path
     body = build_cone_body(BodyDimensions.from_stature(1.7), capture.up)
     skeleton = body.skeleton
     truth = read_joints(capture_path / "truth.h5").positions
-    meta = ResultMeta(
-        pose_names=skeleton.names, pose_units=skeleton.units, stages=("all",),
-        timing_stages=("decode", "optimise", "total"),
-        fps=capture.fps, up=capture.up, capture="made <up>", method="region", seed=0,
-        config_toml=settings_file.to_toml(Settings()),
-        sigma=True, residual_cameras=capture.rig.names, segment_names=SEGMENTS,
-        feet=True, angles=tuple(JointAngles(a.joint, a.names, a.convention) for a in ANGLES), objective_kind="E_S",
-    )  # fmt: skip
     rng = np.random.default_rng(1)
     poses = np.zeros((count, len(skeleton.names)))
     poses[:, :3] = truth[:count, 0]
@@ -51,21 +43,26 @@ def complete_result(path: Path, capture_path: Path, count: int = FRAMES) -> Path
         poses[:, skeleton.index(f"hip_{side}_pitch")] = -0.5 * np.clip(sign * np.sin(np.arange(count)), 0, 1)
         poses[:, skeleton.index(f"knee_{side}_flexion")] = np.clip(sign * np.sin(np.arange(count)), 0, 1)
     derived = derive(skeleton, body.dimensions, poses)
-    with ResultWriter.create(path, meta) as writer:
-        writer.write_model(ContourTracker.model(cast(Any, SimpleNamespace(body=body))))
-        for f in range(count):
-            sigma = rng.uniform(0.005, 0.03, 15)
-            sigma[8] = np.nan if f == 3 else sigma[8]
-            status = Status.LOST if f in LOST else Status.INITIALISED if f == 0 else Status.TRACKED
-            row = {
-                "frames": f, "time": f / capture.fps, "pose": poses[f], "joints/position": derived.joints[f],
-                "status": status, "objective": 0.1 + 0.01 * f, "iterations": [9], "timing/decode": 0.01,
-                "timing/optimise": 0.12, "timing/total": 0.15, "joints/sigma": sigma,
-                "residual": np.full((len(capture.rig), 2), 0.05 + (0.1 if f == 11 else 0.0005 * f)),
-                "segments/rotation": derived.rotations[f], "feet/position": derived.feet[f],
-                **{f"angles/{joint}": values[f] for joint, values in derived.angles.items()},
-            }  # fmt: skip
-            writer.append({0: row})
+    sigma = rng.uniform(0.005, 0.03, (count, 15))
+    sigma[3, 8] = np.nan
+
+    def row(f: int) -> dict[str, Any]:
+        return {
+            "joints/position": derived.joints[f], "joints/sigma": sigma[f], "objective": 0.1 + 0.01 * f,
+            "status": Status.LOST if f in LOST else Status.INITIALISED if f == 0 else Status.TRACKED,
+            "residual": np.full((len(capture.rig), 2), 0.05 + (0.1 if f == 11 else 0.0005 * f)),
+            "segments/rotation": derived.rotations[f], "feet/position": derived.feet[f],
+            **{f"angles/{joint}": values[f] for joint, values in derived.angles.items()},
+            "timing/decode": 0.01, "timing/optimise": 0.12, "timing/total": 0.15,
+        }  # fmt: skip
+
+    write_motion(
+        path, skeleton, poses, ContourTracker.model(cast(Any, SimpleNamespace(body=body))), row,
+        fps=capture.fps, up=capture.up, capture="made <up>", method="region",
+        config_toml=settings_file.to_toml(Settings()), timing_stages=("decode", "optimise", "total"), sigma=True,
+        residual_cameras=capture.rig.names, segment_names=SEGMENTS, feet=True,
+        angles=tuple(JointAngles(a.joint, a.names, a.convention) for a in ANGLES), objective_kind="E_S",
+    )  # fmt: skip
     revise_result(path, notes=["first", NOTE])
     return path
 

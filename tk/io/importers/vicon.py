@@ -95,7 +95,10 @@ def _vicon_radial(key_frame: Table) -> list[float]:
 def _opencv_radial(
     vicon: list[float], focal_px: float, reach_px: float, key_frame: Table
 ) -> tuple[NDArray[np.float64], float]:
-    """Return k1, k2, k3 (3,) of OpenCV's model, fitted within ``reach_px`` of the principal point, and the error, px."""
+    """Return k1, k2, k3 (3,) of OpenCV's model, fitted within ``reach_px`` of the principal point, and the error, px.
+
+    A model that is not monotonic within that distance is an error.
+    """
     distorted = np.linspace(0.0, reach_px, 200)[1:]
     squares = distorted**2
     ideal = distorted * (1 + vicon[0] * squares + vicon[1] * squares**2 + vicon[2] * squares**3)
