@@ -2,11 +2,12 @@
 """Render the actor by sphere tracing: images, shadow maps, compositing over the room. Taichi kernels and their hosts.
 
 Rays are traced in bundles. A tile of 16 pixels keeps the primitives that its beam of rays can meet, a block of 4 pixels
-those of the tile that its own beam can meet. The beam of a block, and then of a pixel, advances as one ray for as long
-as the body is farther away than the beam is wide; only then each ray advances alone. A beam is as wide as its rays and
-as the body's motion during the exposure.
+those of the tile that its own beam can meet. The beam of each quarter of a block advances as one ray for as long as the
+body is farther away than the beam is wide; only then each ray advances alone. A beam is as wide as its rays and as the
+body's motion during the exposure. Distances to the body are computed for four points at once: processors then work on
+four chains of operations at the same time.
 
-A pixel has a few samples. Each sample has its own place in the pixel and its own moment of the exposure: this gives
+A pixel has four samples. Each sample has its own place in the pixel and its own moment of the exposure: this gives
 antialiasing, coverage and motion blur. A pixel that the body fills is lit once, and coloured at each sample.
 """
 
@@ -39,6 +40,8 @@ PENUMBRA_PX = 2.5
 CORNERS = ((1.0, -1.0, -1.0), (-1.0, -1.0, 1.0), (-1.0, 1.0, -1.0), (1.0, 1.0, 1.0))
 
 vec3 = ti.types.vector(3, ti.f32)
+vec4, int4 = ti.types.vector(4, ti.f32), ti.types.vector(4, ti.i32)
+Points = ti.types.matrix(3, 4, ti.f32)
 Array = ti.types.ndarray
 
 
@@ -52,126 +55,150 @@ def sample_rays(camera: Camera, offsets: NDArray[np.float64]) -> NDArray[np.floa
 
 @ti.func
 def _in_bone(p, moment, i, frames: ti.template()):
-    """The point in the frame of primitive i's bone."""
-    q = vec3(0.0)
-    for r in ti.static(range(3)):
-        q[r] = frames[moment, i, 4 * r + 3]
-        for c in ti.static(range(3)):
-            q[r] += frames[moment, i, 4 * r + c] * p[c]
+    """The points in the frame of primitive i's bone, each at its own moment."""
+    q = Points(0.0)
+    for lane in ti.static(range(4)):
+        for r in ti.static(range(3)):
+            q[r, lane] = frames[moment[lane], i, 4 * r + 3]
+            for c in ti.static(range(3)):
+                q[r, lane] += frames[moment[lane], i, 4 * r + c] * p[c, lane]
     return q
 
 
 @ti.func
+def _row(p, r):
+    """Row r of (3, 4) points."""
+    return vec4(p[r, 0], p[r, 1], p[r, 2], p[r, 3])
+
+
+@ti.func
 def _primitive(p, moment, i, frames: ti.template(), shape: ti.template(), material):
-    """Signed distance to primitive i."""
+    """Signed distances of four points to primitive i."""
     q = _in_bone(p, moment, i, frames)
-    a, size = vec3(shape[i, 0], shape[i, 1], shape[i, 2]), shape[i, 3]
-    result = 0.0
+    x, y, z = _row(q, 0), _row(q, 1), _row(q, 2)
+    u, v, w = shape[i, 4] * x - shape[i, 0], shape[i, 5] * y - shape[i, 1], shape[i, 6] * z - shape[i, 2]
+    size = shape[i, 3]
+    result = vec4(0.0)
     if material % 6 == 5:  # a box with rounded edges
         edge = 0.006
-        e = ti.abs(q - a) - (size - edge)
-        result = ti.max(e, 0.0).norm() + ti.min(e.max(), 0.0) - edge
+        u, v, w = ti.abs(u) - (size - edge), ti.abs(v) - (size - edge), ti.abs(w) - (size - edge)
+        outer = ti.sqrt(ti.max(u, 0.0) ** 2 + ti.max(v, 0.0) ** 2 + ti.max(w, 0.0) ** 2)
+        result = outer + ti.min(ti.max(u, v, w), 0.0) - edge
     else:
-        inverse = vec3(shape[i, 4], shape[i, 5], shape[i, 6])
-        axis = vec3(shape[i, 7], shape[i, 8], shape[i, 9])
-        u = inverse * q - a
-        along = u.dot(axis)
-        across = ti.sqrt(ti.max(u.norm_sqr() - along * along, 0.0))
-        # the sphere of the family that is nearest to u
-        h = ti.math.clamp(along - across * shape[i, 12], 0.0, shape[i, 10])
-        spoke = u - h * axis
-        length = spoke.norm(1e-12)
+        along = shape[i, 7] * u + shape[i, 8] * v + shape[i, 9] * w
+        across = ti.sqrt(ti.max(u * u + v * v + w * w - along * along, 0.0))
+        # the sphere of the family that is nearest to the point
+        h = ti.min(ti.max(along - across * shape[i, 12], 0.0), shape[i, 10])
+        u, v, w = u - h * shape[i, 7], v - h * shape[i, 8], w - h * shape[i, 9]
+        square = u * u + v * v + w * w + 1e-12
+        u, v, w = shape[i, 4] * u, shape[i, 5] * v, shape[i, 6] * w
         # back from squeezed space: divide by the gradient there
-        result = (length - (size - shape[i, 11] * h)) * length / (inverse * spoke).norm(1e-12)
-    wrinkle = shape[i, 18]
-    if wrinkle > 0.0 and result < 0.02:
+        result = (ti.sqrt(square) - (size - shape[i, 11] * h)) * ti.sqrt(square / (u * u + v * v + w * w + 1e-12))
+    wrinkle, number = shape[i, 18], shape[i, 19]
+    if wrinkle > 0.0 and result.min() < 0.02:
         # folds: warped waves, mostly across the bone
-        w = ti.sin(23.0 * q[2] + 9.0 * q[0] + 2.5 * ti.sin(17.0 * q[1] + 11.0 * q[0] + 1.7 * shape[i, 19]))
-        w += 0.6 * ti.sin(47.0 * q[2] - 21.0 * q[1] + 2.0 * ti.sin(31.0 * q[0] + 1.3 * shape[i, 19]))
-        result -= 0.6 * wrinkle * w
-    cut = shape[i, 13] * q[0] + shape[i, 14] * q[1] + shape[i, 15] * q[2] - shape[i, 16]
+        fold = ti.sin(23.0 * z + 9.0 * x + 2.5 * ti.sin(17.0 * y + 11.0 * x + 1.7 * number))
+        fold += 0.6 * ti.sin(47.0 * z - 21.0 * y + 2.0 * ti.sin(31.0 * x + 1.3 * number))
+        result -= ti.select(result < 0.02, 0.6 * wrinkle * fold, 0.0)
+    cut = shape[i, 13] * x + shape[i, 14] * y + shape[i, 15] * z - shape[i, 16]
     return ti.max(result, -cut)
 
 
 @ti.func
 def _body(p, moment, tile, count, near: ti.template(), frames: ti.template(), shape: ti.template()):
-    """Distance to the body, and the nearest primitive's index. Materials are blended within, not between.
+    """Distances of four points to the body, each at its own moment, and the indices of the nearest primitives.
 
-    The body consists of the first ``count`` primitives of ``near[tile, 1]``.
+    The body consists of the first ``count`` primitives of ``near[tile, 1]``. Materials are blended within, not between.
     """
-    best = 1e9
-    best_i = -1
-    group = 1e9
-    group_i = -1
-    group_nearest = 1e9
+    best, group, group_nearest, outside = vec4(1e9), vec4(1e9), vec4(1e9), vec4(1e9)
+    best_i, group_i = int4(-1), int4(-1)
     current = -1
-    outside = 1e9
     for k in range(count):
         i = near[tile, 1, k]
         m = ti.cast(shape[i, 20], ti.i32)
         if m != current:
-            if group < best:
-                best, best_i = group, group_i
-            group, group_i, group_nearest, current = 1e9, -1, 1e9, m
-        c = vec3(frames[moment, i, 12], frames[moment, i, 13], frames[moment, i, 14])
-        bound = (p - c).norm() - frames[moment, i, 15]
-        if bound > CLOSE_M:  # too far to blend: its bounding sphere will do for the next step
-            outside = ti.min(outside, bound)
-        else:
-            d = _primitive(p, moment, i, frames, shape, m)
-            if d < group_nearest:
-                group_nearest, group_i = d, i
+            best_i = ti.select(group < best, group_i, best_i)
+            best = ti.min(group, best)
+            group, group_nearest, group_i, current = vec4(1e9), vec4(1e9), int4(-1), m
+        bound = vec4(0.0)
+        for lane in ti.static(range(4)):
+            a = p[0, lane] - frames[moment[lane], i, 12]
+            b = p[1, lane] - frames[moment[lane], i, 13]
+            c = p[2, lane] - frames[moment[lane], i, 14]
+            bound[lane] = a * a + b * b + c * c
+        bound = ti.sqrt(bound) - frames[0, i, 15]
+        far = bound > CLOSE_M  # too far to blend: its bounding sphere will do for the next step
+        outside = ti.select(far, ti.min(outside, bound), outside)
+        if bound.min() <= CLOSE_M:
+            d = ti.select(far, 1e9, _primitive(p, moment, i, frames, shape, m))
+            group_i = ti.select(d < group_nearest, i, group_i)
+            group_nearest = ti.min(d, group_nearest)
             blend = shape[i, 17]
             h = ti.max(blend - ti.abs(d - group), 0.0)
-            group = ti.min(d, group)
-            if blend > 0.0:
-                group -= h * h / (4.0 * blend)
-    if group < best:
-        best, best_i = group, group_i
-    return ti.min(best, outside), best_i
+            group = ti.min(d, group) - h * h / ti.max(4.0 * blend, 1e-9)
+    best_i = ti.select(group < best, group_i, best_i)
+    return ti.min(best, group, outside), best_i
 
 
 @ti.func
-def _advance(origin, axis, t, far, width, spread, tile, count, near: ti.template(), frames: ti.template(),
-             shape: ti.template()):  # fmt: skip
-    """Distance up to which a beam with the radius ``width + spread * t`` is empty; FAR_M if it is empty up to ``far``.
+def _along(origin, rays, t):
+    """The points (3, 4) at the distances t along four rays."""
+    p = Points(0.0)
+    for lane in ti.static(range(4)):
+        for r in ti.static(range(3)):
+            p[r, lane] = origin[r] + t[lane] * rays[r, lane]
+    return p
 
-    The body is the one at the first moment.
+
+@ti.func
+def _advance(origin, axes, start, far, width, spread, tile, count, near: ti.template(), frames: ti.template(),
+             shape: ti.template()):  # fmt: skip
+    """Distances up to which four beams with the radii ``width + spread * t`` are empty; FAR_M: empty up to ``far``.
+
+    The body is the one at the first moment. A beam that starts at FAR_M stays there.
     """
-    reached = FAR_M
+    t, reached = start, vec4(FAR_M)
+    active = ti.select(t < far, 1, 0)
     for _ in range(MAX_STEPS):
-        d, _i = _body(origin + t * axis, 0, tile, count, near, frames, shape)
+        if active.max() == 0:
+            break
+        d, _i = _body(_along(origin, axes, t), int4(0), tile, count, near, frames, shape)
         radius = width + spread * t
         room = STEP * d - radius
-        if room < 0.25 * radius:
-            reached = t
-            break
-        t += room
-        if t > far:
-            break
+        full = ti.select(room < 0.25 * radius, active, 0)
+        reached = ti.select(full == 1, t, reached)
+        active -= full
+        t += active * room
+        active = ti.select(t < far, active, 0)
     return reached
 
 
 @ti.func
-def _trace(origin, ray, t, far, moment, tile, count, near: ti.template(), frames: ti.template(),
+def _trace(origin, rays, start, far, moment, tile, count, near: ti.template(), frames: ti.template(),
            shape: ti.template()):  # fmt: skip
-    """Distance along a ray from ``t`` to the body (FAR_M for a miss) and the primitive that was hit."""
-    hit = FAR_M
-    hit_i = -1
-    before, step = 0.0, 0.0
+    """Distances along four rays to the body (FAR_M for a miss), and the primitives that were hit."""
+    t, hit, hit_i = start, vec4(FAR_M), int4(-1)
+    before, step = vec4(0.0), vec4(0.0)
+    active = ti.select(t < far, 1, 0)
     for k in range(MAX_STEPS):
-        d, i = _body(origin + t * ray, moment, tile, count, near, frames, shape)
-        if d < HIT_M or (k == MAX_STEPS - 1 and d < GRAZE_M):
-            hit, hit_i = t, i
-            if d < 0.0:  # between the last two points
-                hit += step * d / (before - d)
+        if active.max() == 0:
             break
+        d, i = _body(_along(origin, rays, t), moment, tile, count, near, frames, shape)
+        touch = HIT_M
+        if k == MAX_STEPS - 1:
+            touch = GRAZE_M
+        there = ti.select(d < touch, active, 0)
+        # if inside, the surface lies between the last two points
+        hit = ti.select(there == 1, t + ti.select(d < 0.0, step * d / ti.max(before - d, 1e-6), 0.0), hit)
+        hit_i = ti.select(there == 1, i, hit_i)
+        active -= there
         # near the surface the distance is nearly linear
-        step = d / ti.math.clamp((before - d) / step, 0.5, 1.0) if step > 0.0 and d < CLOSE_M else STEP * d
+        slope = ti.min(ti.max((before - d) / ti.max(step, 1e-6), 0.5), 1.0)
+        secant = ti.select(step > 0.0, ti.select(d < CLOSE_M, d / slope, STEP * d), STEP * d)
+        step = active * secant
         before = d
         t += step
-        if t > far:
-            break
+        active = ti.select(t < far, active, 0)
     return hit, hit_i
 
 
@@ -193,16 +220,17 @@ def _meets(origin, axis, spread, i, capsules: ti.template()):
 @ti.func
 def _beam(rays: ti.template(), x, y, size):
     """Axis and spread of the beam of rays through a square of pixels whose first one is (x, y)."""
+    left, top = ti.min(x, rays.shape[2] - 1), ti.min(y, rays.shape[1] - 1)
     right, low = ti.min(x + size, rays.shape[2]) - 1, ti.min(y + size, rays.shape[1]) - 1
     axis = vec3(0.0)
     for corner in ti.static(range(4)):
-        u, v = (right if corner & 1 else x), (low if corner & 2 else y)
+        u, v = (right if corner & 1 else left), (low if corner & 2 else top)
         for s in range(rays.shape[0]):
             axis += vec3(rays[s, v, u, 0], rays[s, v, u, 1], rays[s, v, u, 2])
     axis = axis.normalized()
     spread = 0.0
     for corner in ti.static(range(4)):
-        u, v = (right if corner & 1 else x), (low if corner & 2 else y)
+        u, v = (right if corner & 1 else left), (low if corner & 2 else top)
         for s in range(rays.shape[0]):
             spread = ti.max(spread, (vec3(rays[s, v, u, 0], rays[s, v, u, 1], rays[s, v, u, 2]) - axis).norm())
     return axis, spread
@@ -226,8 +254,8 @@ def _block(origin, rays: ti.template(), tile, count, x, y, capsules: ti.template
            frames: ti.template(), shape: ti.template()):  # fmt: skip
     """Fill ``near[tile, 1]`` with the primitives of the tile that a block can show.
 
-    Return their number, 0 if the block shows nothing; the distances along the rays between which the body lies; and how
-    far it moves during the exposure.
+    Return their number; the distances (4,) along the rays up to which each quarter of the block is empty, FAR_M for one
+    that shows nothing; and the distance at which the body ends.
     """
     axis, spread = _beam(rays, x, y, BLOCK)
     found = 0
@@ -239,11 +267,23 @@ def _block(origin, rays: ti.template(), tile, count, x, y, capsules: ti.template
             near[tile, 1, found] = i
             found += 1
             begin, end, moved = ti.min(begin, first), ti.max(end, last), ti.max(moved, capsules[i, 7])
+    start = vec4(FAR_M)
     if found > 0:
-        begin = _advance(origin, axis, ti.max(begin, 0.0), end, moved, spread, tile, found, near, frames, shape)
-        if begin == FAR_M:
-            found = 0
-    return found, begin, end, moved
+        axes, spreads = _beams(rays, x, y, BLOCK // 2)
+        start = _advance(origin, axes, vec4(ti.max(begin, 0.0)), end, moved, spreads, tile, found, near, frames, shape)
+    return found, start, end
+
+
+@ti.func
+def _beams(rays: ti.template(), x, y, size):
+    """Axes (3, 4) and spreads (4,) of the beams through four squares of pixels, whose first one is (x, y)."""
+    axes, spreads = Points(0.0), vec4(0.0)
+    for lane in ti.static(range(4)):
+        axis, spread = _beam(rays, x + size * (lane % 2), y + size * (lane // 2), size)
+        spreads[lane] = spread
+        for r in ti.static(range(3)):
+            axes[r, lane] = axis[r]
+    return axes, spreads
 
 
 @ti.func
@@ -335,11 +375,14 @@ def _light(p, moment, tile, count, near: ti.template(), frames: ti.template(), s
            light: ti.template(), axes: ti.template(), shadow: ti.template(),
            ambient: ti.template()):  # fmt: skip
     """Light that falls on a point of the body, RGB."""
+    corners = Points(0.0)
+    for lane in ti.static(range(4)):
+        for r in ti.static(range(3)):
+            corners[r, lane] = p[r] + 0.002 * CORNERS[lane][r]
+    d, _ = _body(corners, int4(moment), tile, count, near, frames, shape)
     normal = vec3(0.0)
-    for e in ti.static(range(4)):  # gradient from the corners of a tetrahedron
-        corner = vec3(CORNERS[e][0], CORNERS[e][1], CORNERS[e][2])
-        d, _ = _body(p + 0.002 * corner, moment, tile, count, near, frames, shape)
-        normal += corner * d
+    for lane in ti.static(range(4)):  # gradient from the corners of a tetrahedron
+        normal += d[lane] * vec3(CORNERS[lane][0], CORNERS[lane][1], CORNERS[lane][2])
     normal = normal.normalized(1e-9)
     # light bounced by the floor from below, by the room from above
     radiance = (0.72 + 0.28 * normal[2]) * vec3(ambient[0], ambient[1], ambient[2])
@@ -370,50 +413,44 @@ def _render_kernel(
 ):
     for tile in range(near.shape[0]):
         o = vec3(origin[0], origin[1], origin[2])
-        samples = rays.shape[0]
         columns = (rays.shape[2] + TILE - 1) // TILE
         left, top = tile % columns * TILE, tile // columns * TILE
         right, low = ti.min(left + TILE, rays.shape[2]), ti.min(top + TILE, rays.shape[1])
         seen = _tile(o, rays, tile, left, top, capsules, near)
         for block in range((TILE // BLOCK) ** 2 if seen > 0 else 0):
             x0, y0 = left + block % (TILE // BLOCK) * BLOCK, top + block // (TILE // BLOCK) * BLOCK
-            count, begin, end, moved = 0, FAR_M, 0.0, 0.0
+            count, begin, end = 0, vec4(FAR_M), 0.0
             if x0 < right and y0 < low:
-                count, begin, end, moved = _block(o, rays, tile, seen, x0, y0, capsules, near, frames, shape)
-            for pixel in range(BLOCK * BLOCK if count > 0 else 0):
-                x, y = x0 + pixel % BLOCK, y0 + pixel // BLOCK
-                if x >= right or y >= low:
+                count, begin, end = _block(o, rays, tile, seen, x0, y0, capsules, near, frames, shape)
+            for quarter in range(4 if count > 0 else 0):
+                x1, y1 = x0 + quarter % 2 * 2, y0 + quarter // 2 * 2
+                if begin[quarter] == FAR_M or x1 >= right or y1 >= low:
                     continue
-                axis, spread = _beam(rays, x, y, 1)
-                start = _advance(o, axis, begin, end, moved, spread, tile, count, near, frames, shape)
-                if start == FAR_M:
-                    continue
-                hits, hit = ti.Vector([0.0, 0.0, 0.0, 0.0]), ti.Vector([-1, -1, -1, -1])
-                covered = 0
-                first, last = FAR_M, 0.0
-                for s in range(samples):
-                    ray = vec3(rays[s, y, x, 0], rays[s, y, x, 1], rays[s, y, x, 2])
-                    t, i = _trace(o, ray, start, end, s, tile, count, near, frames, shape)
-                    hits[s], hit[s] = t, i
-                    if i >= 0:
-                        covered += 1
-                        first, last = ti.min(first, t), ti.max(last, t)
-                flat = covered == samples and last - first < FLAT_M
-                total, radiance = vec3(0.0), vec3(0.0)
-                for s in range(samples):
-                    if hit[s] >= 0:
-                        p = o + hits[s] * vec3(rays[s, y, x, 0], rays[s, y, x, 1], rays[s, y, x, 2])
-                        if s == 0 or not flat:
-                            radiance = _light(p, s, tile, count, near, frames, shape, light, axes, shadow,
-                                              ambient)  # fmt: skip
+                for pixel in range(4):
+                    x, y = x1 + pixel % 2, y1 + pixel // 2
+                    ray = Points(0.0)
+                    for lane in ti.static(range(4)):
+                        for r in ti.static(range(3)):
+                            ray[r, lane] = rays[lane, y, x, r]
+                    moment = int4(0, 1, 2, 3)
+                    t, hit = _trace(o, ray, vec4(begin[quarter]), end, moment, tile, count, near, frames, shape)
+                    covered = ti.select(hit >= 0, 1, 0).sum()
+                    flat = covered == 4 and t.max() - t.min() < FLAT_M
+                    points = _along(o, ray, t)
+                    total, radiance = vec3(0.0), vec3(0.0)
+                    for s in range(4):
                         i = hit[s]
-                        q = _in_bone(p, s, i, frames)
-                        number = ti.cast(shape[i, 19], ti.i32)
-                        total += _albedo(number, ti.cast(shape[i, 20], ti.i32), q, colors, stripes) * radiance
-                share = 1.0 / samples
-                for c in ti.static(range(3)):
-                    out[y, x, c] = share * total[c]
-                out[y, x, 3] = share * covered
+                        if i >= 0:
+                            if s == 0 or not flat:
+                                p = vec3(points[0, s], points[1, s], points[2, s])
+                                radiance = _light(p, s, tile, count, near, frames, shape, light, axes, shadow, ambient)
+                            q = _in_bone(points, moment, i, frames)
+                            q_s = vec3(q[0, s], q[1, s], q[2, s])
+                            number, material = ti.cast(shape[i, 19], ti.i32), ti.cast(shape[i, 20], ti.i32)
+                            total += _albedo(number, material, q_s, colors, stripes) * radiance
+                    for c in ti.static(range(3)):
+                        out[y, x, c] = 0.25 * total[c]
+                    out[y, x, 3] = 0.25 * covered
 
 
 @ti.kernel
@@ -433,12 +470,13 @@ def _depth_kernel(
         seen = _tile(o, rays, tile, left, top, capsules, near)
         for block in range((TILE // BLOCK) ** 2 if seen > 0 else 0):
             x0, y0 = left + block % (TILE // BLOCK) * BLOCK, top + block // (TILE // BLOCK) * BLOCK
-            count, begin, end, _ = _block(o, rays, tile, seen, x0, y0, capsules, near, frames, shape)
-            for pixel in range(BLOCK * BLOCK if count > 0 else 0):
-                x, y = x0 + pixel % BLOCK, y0 + pixel // BLOCK
-                ray = vec3(rays[0, y, x, 0], rays[0, y, x, 1], rays[0, y, x, 2])
-                t, _ = _trace(o, ray, begin, end, 0, tile, count, near, frames, shape)
-                out[y, x] = t
+            count, begin, end = _block(o, rays, tile, seen, x0, y0, capsules, near, frames, shape)
+            for quarter in range(4 if count > 0 else 0):
+                x, y = x0 + quarter % 2 * 2, y0 + quarter // 2 * 2
+                ray, _spreads = _beams(rays, x, y, 1)
+                t, _hit = _trace(o, ray, vec4(begin[quarter]), end, int4(0), tile, count, near, frames, shape)
+                for pixel in ti.static(range(4)):
+                    out[y + pixel // 2, x + pixel % 2] = t[pixel]
 
 
 @ti.kernel
@@ -449,10 +487,15 @@ def _distance_kernel(
     shape: Array(dtype=ti.f32, ndim=2),
     out: Array(dtype=ti.f32, ndim=1),
 ):
-    for n in range(points.shape[0]):
-        p = vec3(points[n, 0], points[n, 1], points[n, 2])
-        d, _ = _body(p, 0, 0, every.shape[2], every, frames, shape)
-        out[n] = d
+    for n in range((points.shape[0] + 3) // 4):
+        p = Points(0.0)
+        for lane in ti.static(range(4)):
+            for r in ti.static(range(3)):
+                p[r, lane] = points[ti.min(4 * n + lane, points.shape[0] - 1), r]
+        d, _ = _body(p, int4(0), 0, every.shape[2], every, frames, shape)
+        for lane in ti.static(range(4)):
+            if 4 * n + lane < points.shape[0]:
+                out[4 * n + lane] = d[lane]
 
 
 @ti.kernel
