@@ -67,6 +67,7 @@ class ColorType(click.ParamType[tuple[float, float, float]]):
     "--only", type=click.IntRange(min=0), multiple=True, help="Render only this person of a scene (repeatable)."
 )
 @click.option("--frames", type=click.IntRange(min=1), help="Number of frames [default: the motion's own length].")
+@click.option("--fps", type=click.FloatRange(5, 240), help="Frames a second [default: the motion's own].")
 @click.option("--cameras", type=click.Choice([str(n) for n in RIGS]), default="5", show_default=True)
 @click.option("--size", type=SizeType(), default="640x480", show_default=True)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of cameras and noise.")
@@ -81,6 +82,7 @@ def main(
     motion: str,
     only: tuple[int, ...],
     frames: int | None,
+    fps: float | None,
     cameras: str,
     size: tuple[int, int],
     seed: int,
@@ -97,7 +99,9 @@ def main(
         look = replace(look, shirt=shirt)
     if trousers is not None:
         look = replace(look, trousers=trousers)
-    options = Options(motion, frames, int(cameras), size, seed, height, look, crf, only or None)
+    if fps is not None and motion in SCENES:
+        raise click.UsageError("--fps: a scene of several people has its own rate")
+    options = Options(motion, frames, int(cameras), size, seed, height, look, crf, only or None, fps)
     started = time.perf_counter()
 
     def progress(done: int, total: int) -> None:

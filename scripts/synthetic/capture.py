@@ -54,6 +54,7 @@ class Options:
         stature_m, look: those of the actor; in a scene, of people without their own.
         crf: x264's constant rate factor.
         only: numbers of the people to render in a scene; everything else is as with all of them.
+        fps: frames a second; None: the motion's own. A scene keeps its own.
     """
 
     motion: str = "demo"
@@ -65,6 +66,7 @@ class Options:
     look: Look = field(default_factory=Look)
     crf: int = 20
     only: tuple[int, ...] | None = None
+    fps: float | None = None
 
 
 @dataclass(frozen=True)
@@ -185,6 +187,7 @@ def _cast(options: Options) -> list[Performer]:
     if options.motion not in SCENES:
         skeleton = make_skeleton(options.stature_m)
         motion = MOTIONS[options.motion](skeleton)
+        motion = motion if options.fps is None else motion.at_rate(options.fps)
         return [Performer.plan(motion, skeleton, options.look, options.frames or motion.frames)]
     scene, people = SCENES[options.motion], []
     for role in scene.roles:

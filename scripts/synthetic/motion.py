@@ -96,6 +96,20 @@ class Motion:
                 result[name] = result[name] + added
         return {name: np.radians(value) for name, value in result.items()}
 
+    def at_rate(self, fps: float) -> Motion:
+        """Return the same motion, in the same time, with another number of frames a second."""
+        k = fps / self.fps
+        layer, root = self.layer, self.root
+        return replace(
+            self,
+            keys=tuple((k * frame, angles) for frame, angles in self.keys),
+            frames=round(k * self.frames),
+            layer=None if layer is None else lambda frame: layer(frame / k),
+            cube=tuple((round(k * frame), side) for frame, side in self.cube),
+            root=None if root is None else lambda frame: root(frame / k),
+            fps=fps,
+        )
+
     def held_by(self, frame: int) -> str | None:
         """Side whose hand holds the cube in this frame."""
         side = None

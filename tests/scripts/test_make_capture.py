@@ -101,6 +101,19 @@ def test_feet_stand_on_the_floor_and_do_not_slide(plan: Plan) -> None:
     assert np.median(slide[planted]) < 0.01
 
 
+@pytest.mark.parametrize("name", ["demo", "object", "turn"])
+def test_another_rate_shows_the_same_motion_at_the_same_times(name: str) -> None:
+    motion = MOTIONS[name](make_skeleton(1.75))
+    faster = motion.at_rate(4 * motion.fps)
+    frames = np.arange(0.0, motion.frames, 7.0)
+    assert (faster.frames, faster.fps) == (4 * motion.frames, 4 * motion.fps)
+    for angle, values in motion.angles(frames).items():
+        np.testing.assert_allclose(faster.angles(4 * frames)[angle], values, atol=1e-9)
+    assert [faster.held_by(4 * int(f)) for f in frames] == [motion.held_by(int(f)) for f in frames]
+    if motion.root is not None and faster.root is not None:
+        np.testing.assert_allclose(faster.root(4 * frames), motion.root(frames))
+
+
 def test_hands_and_elbows_stay_out_of_the_trunk_and_the_legs(plan: Plan) -> None:
     body = next(iter(plan.subject.bodies.values()))
     actor, names = body.actor, plan.subject.skeleton.names

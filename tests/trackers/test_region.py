@@ -259,18 +259,36 @@ def test_person_is_searched_for_if_the_residual_stays_high(monkeypatch: pytest.M
     assert (tracker.state()["residual_mean"] - mean).max() < 0.2 * LEAST_SPREAD
 
 
-def test_first_scale_reaches_as_far_as_the_prediction_may_err() -> None:
+@pytest.mark.parametrize(
+    ("fps", "share", "steps", "state"),
+    [
+        (15.0, 0.9, 7, {}),
+        (15.0, 1.1, 10, {}),
+        (15.0, 0.0, 10, {"high_for": 1}),
+        (15.0, 0.0, 10, {"lost_for": 1}),
+        (60.0, 0.9, 7, {}),  # beyond the finest scale's reach
+        (30.0, 0.45, 5, {}),
+        (60.0, 0.45, 3, {}),
+        (60.0, 0.1, 2, {}),
+        (60.0, 0.0, 10, {"high_for": 1}),
+    ],
+)
+def test_scales_and_iterations_follow_from_how_far_the_prediction_may_err(
+    fps: float, share: float, steps: int, state: dict[str, int]
+) -> None:
+    """``share``: the error of the prediction, as a share of the second scale's reach."""
     tracker = tracker_at(POSES[0])
     tracker.step(observe(MASKS[0]))
-    state = dict(tracker.state())
-    still = state["poses"][:1]
-    step_px = tracker.line_search.window_px * 2 / abs(1 - tracker.contours.prediction)  # the second scale's reach
+    tracker.fps = fps
+    tracker.solver = replace(tracker.solver, tolerance=0.0)
+    before = dict(tracker.state())
+    still = before["poses"][:1]
+    step_px = tracker.line_search.window_px * 2 / abs(1 - tracker.contours.prediction)
     step_m = step_px / tracker.views.rig.pixels_per_metre(tracker.body.skeleton.joints(still)[0, 0])
-    for share, steps, more in ((0.9, 7, {}), (1.1, 10, {}), (0.0, 10, {"high_for": 1}), (0.0, 10, {"lost_for": 1})):
-        before = still.copy()
-        before[0, 0] -= share * step_m
-        tracker.rewind({**state, "poses": still, "previous": before, **more})
-        assert tracker.step(observe(MASKS[0])).iterations[0] == steps, (share, more)
+    previous = still.copy()
+    previous[0, 0] -= share * step_m
+    tracker.rewind({**before, "poses": still, "previous": previous, **state})
+    assert tracker.step(observe(MASKS[0])).iterations[0] == steps
 
 
 def test_person_is_found_without_a_given_pose() -> None:

@@ -359,6 +359,7 @@ class ContourTracker:
         images: NDArray[np.uint8] | None = None,
         prior: Prior | None = None,
         limb: Limb | None = None,
+        solver: GaussNewtonSettings | None = None,
     ) -> BatchSolution:
         """Minimise by Gauss-Newton from poses (B, D), all in one frame or each in its own.
 
@@ -369,6 +370,7 @@ class ContourTracker:
             images: with images, colour differences attract contours inside the silhouette, too.
             prior: see :class:`~tk.optim.gauss_newton.Prior`.
             limb: only this limb moves.
+            solver: iterations at each scale; None: the tracker's own.
         """
         body = self.body
         arrays, free = (limb.arrays, limb.dofs) if limb else (body.arrays, None)
@@ -381,7 +383,7 @@ class ContourTracker:
             free,
             body.skeleton.lower,
             body.skeleton.upper,
-            self.solver,
+            solver or self.solver,
             prior,
             levels,
         )
