@@ -54,8 +54,8 @@ def compare(result: Path, truth: Path) -> tuple[Errors, Errors]:
     plain, smoothed = (read_motion(result, is_smoothed)[0] for is_smoothed in (False, True))
     true = read_joints(truth)
     where = {int(frame): k for k, frame in enumerate(true.frames)}
-    rows = [f for f, frame in enumerate(plain.frames) if int(frame) in where]
-    place = true.positions[[where[int(plain.frames[f])] for f in rows]]
+    rows = [f for f, frame in enumerate(plain.result.frames) if int(frame) in where]
+    place = true.positions[[where[int(plain.result.frames[f])] for f in rows]]
     before, after = (errors(motion.points[rows][:, : len(JOINTS)], place, motion.fps) for motion in (plain, smoothed))
     return before, after
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -112,12 +113,12 @@ def test_all_formats_and_a_format_that_fails(write: Write, monkeypatch: pytest.M
     path = write()
     written = export(path, ["all"])
     names = {file.name for file in written.files}
-    assert {f"walk{ending}" for outputs in FORMATS.values() for ending, _ in outputs} == names and not written.failed
+    assert {f"walk{ending}" for form in FORMATS.values() for ending, _ in form.outputs} == names and not written.failed
 
     def fail(motion: Motion, target: Path) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setitem(FORMATS, "mot", ((".mot", fail),))
+    monkeypatch.setitem(FORMATS, "mot", replace(FORMATS["mot"], outputs=((".mot", fail),)))
     written = export(path, ["mot", "trc"], force=True)
     assert [file.name for file in written.files] == ["walk.trc"]
     assert written.failed == (f"mot: {path.with_suffix('.mot')}: cannot be written: No space left on device",)

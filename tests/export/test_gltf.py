@@ -93,7 +93,7 @@ def test_lost_frames_are_held_and_listed(write: Write) -> None:
     before = frame_transforms(file, LOST[0] - 1)
     for name, T in frame_transforms(file, LOST[1]).items():
         np.testing.assert_array_equal(T, before[name])
-    frames = read_motion(path)[0].frames
+    frames = read_motion(path)[0].result.frames
     assert file.asset.extras["lost_frames"] == [int(frames[f]) for f in LOST]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import fcntl
 import logging
 import os
 import queue
@@ -19,6 +18,8 @@ from tk.batch.jobs import DONE, FAILED, RECORDS, Job, Outcome, TrackOptions, mak
 from tk.batch.summary import write_summary
 from tk.batch.work import TOPIC, work
 from tk.errors import ConfigError, ResultError, TkError, WorkerError
+from tk.io.paths import locked
+from tk.run.worker import cores
 
 #: seconds to wait for a scheduler's answer; a remote one may be slow, an absent one never answers
 _PATIENCE_S = 8.0
@@ -130,19 +131,11 @@ def _locked(folder: Path) -> Iterator[None]:
     """Create the folder of a batch, and lock it against other batches."""
     try:
         (folder / RECORDS).mkdir(parents=True, exist_ok=True)
-        handle = os.open(folder / RECORDS, os.O_RDONLY)
     except OSError as error:
         raise ResultError(f"{folder}: cannot be created: {error.strerror or error}") from None
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ResultError(f"{folder}: another tk batch uses it; wait for its end, or choose another") from None
-        except OSError:
-            pass  # no locks on this file system
+    busy = f"{folder}: another tk batch uses it; wait for its end, or choose another"
+    with locked(folder / RECORDS, ResultError(busy)):
         yield
-    finally:
-        os.close(handle)
 
 
 async def _check_scheduler(address: str) -> None:
@@ -173,10 +166,8 @@ def _cluster(workers: int | None, scheduler: str | None, captures: int, dashboar
         with Client(scheduler, timeout=_PATIENCE_S, set_as_default=False) as client:
             yield client
         return
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    count = min(workers or max(cores // 2, 1), captures)
-    asked = os.environ.get("TK_THREADS")
-    threads = asked if asked else str(max(cores // count, 1))
+    count = min(workers or max(cores() // 2, 1), captures)
+    threads = os.environ.get("TK_THREADS") or str(max(cores() // count, 1))
     settings = {
         "distributed.scheduler.allowed-failures": _KILLED_AT_MOST,
         "distributed.scheduler.worker-saturation": 1.0,  # no captures wait in a worker that may be killed

@@ -19,6 +19,7 @@ from pathlib import Path
 import click
 
 from tk.commands import base
+from tk.run.worker import cores
 
 # Limit of a check in its own process. A first import from a slow disk and the first compilation take some 20 s.
 _LIMIT_S = 120.0
@@ -137,9 +138,8 @@ def _cache() -> str:
 
 
 def _cores() -> str:
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limit = os.environ.get("TK_THREADS")
-    return f"{count}" + (f", TK_THREADS={limit}" if limit else "")
+    return f"{cores()}" + (f", TK_THREADS={limit}" if limit else "")
 
 
 def _memory() -> str:

@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,29 +28,33 @@ __all__ = ["FORMATS", "Exported", "Motion", "export", "read_motion"]
 
 Writer = Callable[[Motion, Path], None]
 
-# For each format the files or folders to write: the suffix added to the result's name, and the function that writes it.
-FORMATS: dict[str, tuple[tuple[str, Writer], ...]] = {
-    "trc": ((".trc", write_trc),),
-    "mot": ((".mot", write_mot),),
-    "c3d": ((".c3d", write_c3d),),
-    "bvh": ((".bvh", write_bvh),),
-    "csv": ((".csv", write_points_csv), ("_angles.csv", write_angles_csv)),
-    "gltf": ((".glb", write_glb),),
-    "ply": (("_ply", write_body_meshes),),
+
+@dataclass(frozen=True)
+class Format:
+    """A format of other programs.
+
+    Attributes:
+        outputs: for each file, or folder, the suffix added to the result's name, and the function that writes it.
+        begins: regular expression for the begin of its files; None for a folder.
+        holds: True if it cannot mark a pose as unknown.
+        package: a package that it needs beyond those of tk itself.
+    """
+
+    outputs: tuple[tuple[str, Writer], ...]
+    begins: bytes | None = None
+    holds: bool = False
+    package: str = ""
+
+
+FORMATS = {
+    "trc": Format(((".trc", write_trc),), rb"PathFileType\t"),
+    "mot": Format(((".mot", write_mot),), rb"[^\n]*\nversion=1\n"),
+    "c3d": Format(((".c3d", write_c3d),), rb".P", package="ezc3d"),
+    "bvh": Format(((".bvh", write_bvh),), rb"HIERARCHY", holds=True),
+    "csv": Format(((".csv", write_points_csv), ("_angles.csv", write_angles_csv)), rb"frame,time,status,"),
+    "gltf": Format(((".glb", write_glb),), rb"glTF", holds=True),
+    "ply": Format((("_ply", write_body_meshes),), holds=True),
 }
-# Packages that a format needs beyond those of tk itself, and the command that installs it.
-_PACKAGES = {"c3d": ("ezc3d", "pip install 'tk-mocap[export]'")}
-#: how a file of each format begins
-_SIGNATURES = {
-    ".trc": looks_like(rb"PathFileType\t"),
-    ".mot": looks_like(rb"[^\n]*\nversion=1\n"),
-    ".c3d": looks_like(rb".P"),
-    ".bvh": looks_like(rb"HIERARCHY"),
-    ".csv": looks_like(rb"frame,time,status,"),
-    ".glb": looks_like(rb"glTF"),
-}
-# Formats that cannot mark a pose as unknown.
-_HOLDING = ("bvh", "gltf", "ply")
 
 
 @dataclass(frozen=True)
@@ -96,33 +100,34 @@ def export(
         raise ExportError(f"formats {', '.join(formats)}: give some of {', '.join(FORMATS)}, or all")
     if bvh_units not in BVH_UNITS:
         raise ExportError(f"BVH unit {bvh_units}: give one of {', '.join(BVH_UNITS)}")
+    chosen = {name: FORMATS[name] for name in formats}
+    if "bvh" in chosen:
+        chosen["bvh"] = replace(chosen["bvh"], outputs=((".bvh", partial(write_bvh, units=bvh_units)),))
     failed = {
-        name: f"needs the package {package}: {remedy}"
-        for name, (package, remedy) in _PACKAGES.items()
-        if name in formats and find_spec(package) is None
+        name: f"needs the package {form.package}: pip install 'tk-mocap[export]'"
+        for name, form in chosen.items()
+        if form.package and find_spec(form.package) is None
     }
     path = Path(result)
     folder = path.parent if folder is None else folder
     people = read_result(path).people
-    writers: dict[str, tuple[tuple[str, Writer], ...]] = {
-        **FORMATS,
-        "bvh": ((".bvh", partial(write_bvh, units=bvh_units)),),
-    }
     jobs = [
         (person, name, folder / f"{path.stem}{_number(person, people)}{smoothed * '_smoothed'}{ending}", write)
         for person in people
-        for name in formats
+        for name, form in chosen.items()
         if name not in failed
-        for ending, write in writers[name]
+        for ending, write in form.outputs
     ]
-    for _, _, target, _ in jobs:
-        if target.suffix in _SIGNATURES and target.parent.is_dir():
-            kind = Kind(f"a file of tk export in {target.suffix}", (target.suffix,), _SIGNATURES[target.suffix])
+    for _, name, target, _ in jobs:
+        begins = FORMATS[name].begins
+        if begins is not None and target.parent.is_dir():
+            kind = Kind(f"a file of tk export in {target.suffix}", (target.suffix,), looks_like(begins))
             check_output(target, kind, force, [path])
         elif check_not_input(target, [path]).exists() and not force:
             raise ExportError(f"{target}: exists; choose another folder", hint="or replace it with --force")
     motions: dict[int, Motion] = {}
     notes: list[str] = []
+    holding = ", ".join(name for name, form in chosen.items() if form.holds)
     for person in people:
         whose = f"person {person.person}: " if len(people) > 1 else ""
         try:
@@ -135,21 +140,20 @@ def export(
         motions[person.person] = motion
         notes += found
         lost = int((~motion.known).sum())
-        holding = [name for name in formats if name in _HOLDING]
         if lost and holding:
-            notes.append(f"{whose}{', '.join(holding)}: in {lost} lost frames the pose before is held")
+            notes.append(f"{whose}{holding}: in {lost} lost frames the pose before is held")
     written = []
     for person, name, target, write in jobs:
-        if name in failed or person.person not in motions:
-            continue
-        try:
-            _write(motions[person.person], target, write)
-            written.append(target)
-        except TkError as error:
-            failed[name] = str(error)
+        if name not in failed and person.person in motions:
+            try:
+                _write(motions[person.person], target, write)
+                written.append(target)
+            except TkError as error:
+                failed[name] = str(error)
+    reasons = tuple(f"{name}: {reason}" for name, reason in failed.items())
     if not written:
-        raise ExportError("; ".join(dict.fromkeys(f"{name}: {reason}" for name, reason in failed.items()) or notes))
-    return Exported(tuple(written), tuple(notes), tuple(f"{name}: {reason}" for name, reason in failed.items()))
+        raise ExportError("; ".join(dict.fromkeys(reasons or notes)))
+    return Exported(tuple(written), tuple(notes), reasons)
 
 
 def _number(person: Result, people: Sequence[Result]) -> str:

@@ -38,4 +38,4 @@ def write_angles_csv(motion: Motion, path: Path) -> None:
 
 
 def _start(motion: Motion, f: int) -> tuple[str, str, str]:
-    return str(motion.frames[f]), f"{motion.time[f]:.6f}", motion.status_word(f)
+    return str(motion.result.frames[f]), f"{motion.result.time[f]:.6f}", motion.status_word(f)

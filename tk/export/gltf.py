@@ -73,7 +73,7 @@ def write_glb(motion: Motion, path: Path) -> None:
         "asset": {
             "version": "2.0",
             "generator": f"tk {__version__}",
-            "extras": {"lost_frames": motion.frames[~motion.known].tolist()},
+            "extras": {"lost_frames": motion.result.frames[~motion.known].tolist()},
         },
         "scene": 0,
         "scenes": [{"nodes": [0]}],
@@ -103,7 +103,7 @@ def write_glb(motion: Motion, path: Path) -> None:
 
 def _animation(motion: Motion, tree: Tree, buffer: _Buffer) -> dict[str, Any]:
     """Return the animation: rotations of all nodes except leaves, positions of moving nodes, linear in time from 0."""
-    times = buffer.add((motion.time - motion.time[0]).astype(np.float32), bounds=True)
+    times = buffer.add((motion.result.time - motion.result.time[0]).astype(np.float32), bounds=True)
     quaternions = continuous(to_quaternions(tree.rotations))[..., [1, 2, 3, 0]].astype(np.float32)
     samplers: list[dict[str, Any]] = []
     channels: list[dict[str, Any]] = []

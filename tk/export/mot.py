@@ -46,7 +46,7 @@ def write_mot(motion: Motion, path: Path) -> None:
         "endheader",
         "\t".join(("time", *columns)),
     ]
-    values = np.column_stack([motion.time, *columns.values()])[rows]
+    values = np.column_stack([motion.result.time, *columns.values()])[rows]
     lines += ["\t".join(f"{value:.6f}" for value in row) for row in np.round(values, 6) + 0.0]  # + 0.0: no -0
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 

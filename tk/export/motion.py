@@ -12,13 +12,11 @@ from tk.errors import ConfigError, ResultError
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 from tk.io.results.status import Status
-from tk.model.body.angles import segment_rotations, standing_axes
+from tk.model.body.angles import standing_axes
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.joints import (
     FOOT_POINTS,
-    FOOT_SEGMENT,
     JOINTS,
-    LIMBS,
     REQUIRED_JOINTS,
     ROWS,
     SEGMENT_ORIGIN,
@@ -28,16 +26,15 @@ from tk.model.body.joints import (
 from tk.model.body.rotations import to_matrices
 from tk.model.body.skeleton import Skeleton, skeleton_of_names
 from tk.model.motion.derived import derive
-from tk.model.motion.segments import sole_offset
 from tk.model.motion.smoothing import smooth
 
 Float = NDArray[np.float64]
 
-STATUS_WORDS = tuple(status.name.lower() for status in Status)
-
 # Axes of glTF, used here for BVH too (left, up, forward), as rows in the body's axes (forward, left, up) in the zero
 # configuration of the skeleton; these are (x, y, z) of a world whose z axis is up.
 LEFT_UP_FORWARD = np.roll(np.eye(3), -1, axis=0)
+
+_NOTHING = "the person is lost in every frame; there is nothing to export"
 
 
 @dataclass(frozen=True)
@@ -46,11 +43,10 @@ class Motion:
 
     Attributes:
         name: of the files, without suffix: that of the result, `_0`, `_1`, … of several people, `_smoothed`.
-        fps: frames per second.
-        frames, time: (F,) source frame indices; times, s.
-        status: (F,) as in the result.
+        result: the result, or its smoothed copy if that was requested; consecutive frames.
         bridged: (F,) True where the smoothed copy fills a gap.
         known: (F,) False where the person was lost and the gap was not bridged.
+        held: (F,) row of the result that each frame shows: its own, or that of the last known frame.
         point_names: names of the P joints and points of the feet.
         points: (F, P, 3) metres, world frame.
         sigma: (F, P) m, standard deviation of each point along one axis; NaN if unknown.
@@ -58,17 +54,13 @@ class Motion:
         rotations: (F, S, 3, 3) segment to world, axes as in :mod:`tk.model.body.angles`.
         dimensions: dimensions of the fitted body.
         T_world_body: (3, 3) the world's forward, left and up axes as columns.
-        result: the result, or its smoothed copy if that was requested.
-        held: (F,) row of the result that each frame shows: its own, or that of the last known frame.
     """
 
     name: str
-    fps: float
-    frames: NDArray[np.int64]
-    time: Float
-    status: NDArray[np.uint8]
+    result: Result
     bridged: NDArray[np.bool_]
     known: NDArray[np.bool_]
+    held: NDArray[np.int64]
     point_names: tuple[str, ...]
     points: Float
     sigma: Float
@@ -76,11 +68,14 @@ class Motion:
     rotations: Float
     dimensions: BodyDimensions
     T_world_body: Float
-    result: Result
-    held: NDArray[np.int64]
 
     def __len__(self) -> int:
-        return len(self.frames)
+        return len(self.result)
+
+    @property
+    def fps(self) -> float:
+        """Return the frames per second."""
+        return self.result.meta.fps
 
     def point(self, name: str) -> Float:
         """Return the positions (F, 3) of a point, or of a joint that is not one of the points; metres, world frame."""
@@ -103,8 +98,8 @@ class Motion:
         return self.rotations[:, self.segments.index(segment)]
 
     def status_word(self, frame: int) -> str:
-        """Return one of :data:`STATUS_WORDS`, or "bridged"."""
-        return "bridged" if self.bridged[frame] else STATUS_WORDS[self.status[frame]]
+        """Return the name of a frame's status, or "bridged"."""
+        return "bridged" if self.bridged[frame] else Status(self.result.status[frame]).name.lower()
 
 
 def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[Motion, tuple[str, ...]]:
@@ -118,80 +113,67 @@ def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[M
 
 def motion_of(result: Result, smoothed: bool = False) -> tuple[Motion, tuple[str, ...]]:
     """Return the motion of one person; see :func:`read_motion`."""
-    path = result.path
+    path, notes = result.path, list[str]()
     name = path.stem
     if result.person or result.others:
         name += f"_{result.person}"
         result = _with_absent_frames(result)
     name += "_smoothed" * smoothed
     bridged = np.zeros(len(result), dtype=bool)
-    is_made_here = smoothed and result.smoothed is None
-    if smoothed and result.smoothed is not None:
+    if is_made_here := smoothed and result.smoothed is None:
+        notes.append(f"{path}: has no smoothed copy; the poses were smoothed for this export")
+    elif smoothed and result.smoothed is not None:
         bridged = np.asarray(result.smoothed["bridged"], dtype=bool)
         result = result.with_smoothed()
     joint_names = tuple(name for name in JOINTS if name in result.meta.joint_names)
     result = result.in_joint_order()
     dimensions = _dimensions(result)
-    notes: tuple[str, ...] = ()
+    try:
+        skeleton = skeleton_of_names(result.meta.pose_names, dimensions, result.meta.up)
+    except ValueError as error:
+        raise ResultError(f"{path}: /pose: {error}; track the capture again") from error
     if is_made_here:
-        result, bridged = _smooth(result, dimensions)
-        notes = (f"{path}: has no smoothed copy; the poses were smoothed for this export",)
-    segments = result.meta.segment_names if result.segments_rotation is not None else SEGMENTS
+        result, bridged = _smooth(result, skeleton)
+    if (
+        result.segments_rotation is None
+        or result.feet is None
+        or not np.isfinite(result.feet[bridged | result.has_pose]).all()
+    ):
+        result = _derived(result, skeleton, dimensions, joints=is_made_here)
+    assert result.segments_rotation is not None and result.feet is not None
+    segments = result.meta.segment_names
     missing = [ROWS[name].carrier for name in REQUIRED_JOINTS if ROWS[name].carrier not in segments]
     if missing:
         raise ResultError(f"{path}: /segments/rotation has no segment {missing[0]}; track the capture again")
-    skeleton = _skeleton(result, dimensions)
-    # (F, …) values from which the segments' rotations are computed
-    source = result.pose if result.segments_rotation is None else result.segments_rotation
-    known = bridged | result.has_pose
     joints = [JOINTS.index(name) for name in joint_names]
-    for numbers in (result.joints[:, joints], source):
-        known &= np.isfinite(numbers).reshape(len(known), -1).all(axis=1)
-    if result.segments_rotation is not None:
-        known &= (
-            np.linalg.norm(result.segments_rotation, axis=2).min(axis=1) > 0
-        )  # a quaternion of zeros is no rotation
+    known = bridged | result.has_pose
+    for values in (result.joints[:, joints], result.segments_rotation):
+        known &= np.isfinite(values).all(axis=(1, 2))
+    known &= np.linalg.norm(result.segments_rotation, axis=2).min(axis=1) > 0  # a quaternion of zeros is no rotation
     if not known.any():
-        raise ResultError(f"{path}: the person is lost in every frame; there is nothing to export")
+        raise ResultError(f"{path}: {_NOTHING}")
     if (np.diff(result.frames) != 1).any():
         raise ResultError(
             f"{path}: its frames are not consecutive, which other formats cannot represent; track all of them"
         )
     held = _held(known)
-    rotations = (
-        segment_rotations(skeleton, source[held])
-        if result.segments_rotation is None
-        else to_matrices(result.segments_rotation[held])
-    )
     sigma = np.full((len(result), len(joints) + len(FOOT_POINTS)), np.nan)
     if result.sigma is not None:
         sigma[:, : len(joints)] = result.sigma[:, joints]
-    motion = Motion(
+    return Motion(
         name=name,
-        fps=result.meta.fps,
-        frames=result.frames,
-        time=result.time,
-        status=result.status,
+        result=result,
         bridged=bridged,
         known=known,
+        held=held,
         point_names=(*joint_names, *FOOT_POINTS),
-        points=result.joints[held][:, joints],
+        points=np.concatenate([result.joints[held][:, joints], result.feet[held]], axis=1),
         sigma=sigma,
         segments=tuple(segments),
-        rotations=rotations,
+        rotations=to_matrices(result.segments_rotation[held]),
         dimensions=dimensions,
         T_world_body=skeleton.T_world_body,
-        result=result,
-        held=held,
-    )
-    if result.feet is not None and np.isfinite(result.feet[known]).all():
-        feet = result.feet[held]
-    else:
-        ankles = [ROWS[LIMBS["leg" + name[-2:]][2]].place(dimensions) for name in FOOT_POINTS]
-        soles = [ankle + sole_offset(name, dimensions) for ankle, name in zip(ankles, FOOT_POINTS, strict=True)]
-        placed = zip(FOOT_SEGMENT.values(), soles, strict=True)
-        feet = np.stack([motion.fixed_point(segment, place) for segment, place in placed], axis=1)
-    return replace(motion, points=np.concatenate([motion.points, feet], axis=1)), notes
+    ), tuple(notes)
 
 
 def _with_absent_frames(result: Result) -> Result:
@@ -228,30 +210,30 @@ def _dimensions(result: Result) -> BodyDimensions:
         raise ResultError(f"{result.path}: /model/dimensions: {error}; the file is damaged") from None
 
 
-def _skeleton(result: Result, dimensions: BodyDimensions) -> Skeleton:
-    try:
-        return skeleton_of_names(result.meta.pose_names, dimensions, result.meta.up)
-    except ValueError as error:
-        raise ResultError(f"{result.path}: /pose: {error}; track the capture again") from error
-
-
-def _smooth(result: Result, dimensions: BodyDimensions) -> tuple[Result, NDArray[np.bool_]]:
-    """Return the result with smoothed poses and derived quantities, and the bridged frames (F,)."""
-    skeleton = _skeleton(result, dimensions)
+def _smooth(result: Result, skeleton: Skeleton) -> tuple[Result, NDArray[np.bool_]]:
+    """Return the result with smoothed poses and without what others were derived from, and the bridged frames (F,)."""
     known = result.has_pose & np.isfinite(result.pose).all(axis=1)
     found = smooth(skeleton, result.pose, known, result.meta.fps)
-    changed = known | found.bridged
-    joints = result.joints.copy()
-    derived = derive(skeleton, dimensions, found.poses[changed])
-    joints[changed] = derived.joints
-    rotation = np.full((len(result), len(SEGMENTS), 4), np.nan)
-    rotation[changed] = derived.rotations
-    result = replace(
-        result,
-        meta=replace(result.meta, segment_names=SEGMENTS),
-        pose=found.poses,
-        joints=joints,
-        segments_rotation=rotation,
-        feet=None,
-    )
-    return result, found.bridged
+    pose = np.where((known | found.bridged)[:, None], found.poses, np.nan)
+    return replace(result, pose=pose, segments_rotation=None, feet=None), found.bridged
+
+
+def _derived(result: Result, skeleton: Skeleton, dimensions: BodyDimensions, joints: bool) -> Result:
+    """Return the result with rotations and feet where it has none, and with ``joints`` if requested, of its poses."""
+    rows = np.isfinite(result.pose).all(axis=1)
+    if not rows.any():
+        raise ResultError(f"{result.path}: {_NOTHING}")
+    found = derive(skeleton, dimensions, result.pose[rows])
+
+    def spread(values: Float) -> Float:
+        whole = np.full((len(result), *values.shape[1:]), np.nan)
+        whole[rows] = values
+        return whole
+
+    if result.segments_rotation is None:
+        meta = replace(result.meta, segment_names=SEGMENTS)
+        result = replace(result, meta=meta, segments_rotation=spread(found.rotations))
+    feet = spread(found.feet)
+    if result.feet is not None:
+        feet = np.where(np.isfinite(result.feet), result.feet, feet)
+    return replace(result, feet=feet, joints=spread(found.joints) if joints else result.joints)

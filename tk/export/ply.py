@@ -27,5 +27,5 @@ def write_body_meshes(motion: Motion, folder: Path) -> None:
     bgr = [SEGMENT_COLORS[SEGMENTS[solid.segment]] for solid in figure.solids]
     colors = np.repeat(np.array(bgr, np.uint8)[:, ::-1], np.diff(figure.starts), axis=0)
     triangles = np.concatenate(faces).astype(np.int32)
-    for frame, row in zip(motion.frames, motion.held, strict=True):
+    for frame, row in zip(motion.result.frames, motion.held, strict=True):
         write_ply(ply_path(folder, frame), figure.placed(int(row)), colors, triangles)

@@ -23,7 +23,7 @@ def write_trc(motion: Motion, path: Path) -> None:
     lines = [
         f"PathFileType\t4\t(X/Y/Z)\t{motion.name}.trc",
         "\t".join((*head, *original)),
-        "\t".join((rate, rate, str(count), str(len(names)), "mm", rate, str(motion.frames[0] + 1), str(count))),
+        "\t".join((rate, rate, str(count), str(len(names)), "mm", rate, str(motion.result.frames[0] + 1), str(count))),
         "Frame#\tTime\t" + "\t\t\t".join(names) + "\t\t",
         "\t\t" + "\t".join(f"{axis}{k + 1}" for k in range(len(names)) for axis in "XYZ"),
         "",
@@ -31,5 +31,5 @@ def write_trc(motion: Motion, path: Path) -> None:
     for f in range(count):
         # OpenSim ignores one tab at the end of a line: without an extra tab, the last blank would be missing
         cells = [f"{value:.4f}" for value in points[f].ravel()] if motion.known[f] else [""] * (points[f].size + 1)
-        lines.append("\t".join((str(f + 1), f"{motion.time[f]:.6f}", *cells)))
+        lines.append("\t".join((str(f + 1), f"{motion.result.time[f]:.6f}", *cells)))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -10,7 +10,6 @@ a power cut may lose an open one.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import io
 import os
 import shutil
@@ -24,6 +23,7 @@ from typing import Any
 import h5py
 
 from tk.errors import FULL, DiskFullError, ResultBusyError, ResultError
+from tk.io.paths import locked
 
 #: exceptions that h5py raises for a full disk, a removed folder or a damaged file
 _WRITE_ERRORS = (OSError, RuntimeError, KeyError, ValueError, TypeError)
@@ -51,16 +51,8 @@ class Hdf5Writer:
         self._folder = target.with_name(f".{target.name}.tmp")
         self._folder.mkdir(exist_ok=True)
         with contextlib.ExitStack() as undo:
-            lock = os.open(self._folder, os.O_RDONLY)
-            undo.callback(os.close, lock)
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise ResultBusyError(
-                    f"{target}: another run is writing this result; wait for it, or choose another name"
-                ) from None
-            except OSError:
-                pass  # this file system has no locks: a second run is not detected
+            busy = f"{target}: another run is writing this result; wait for it, or choose another name"
+            undo.enter_context(locked(self._folder, ResultBusyError(busy)))
             undo.callback(shutil.rmtree, self._folder, ignore_errors=True)
             for leftover in self._folder.iterdir():  # of a run that was killed
                 leftover.unlink()

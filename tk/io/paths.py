@@ -7,6 +7,7 @@ replaces only a file of the kind that the command writes.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import re
 import shutil
@@ -135,6 +136,22 @@ def replacing(path: Path, kind: type[TkError] = ExportError) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             shutil.rmtree(part) if part.is_dir() else part.unlink()
+
+
+@contextlib.contextmanager
+def locked(folder: Path, busy: TkError) -> Iterator[None]:
+    """Lock a folder; raise ``busy`` if another process has locked it. Some file systems have no locks."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise busy from None
+        except OSError:
+            pass
+        yield
+    finally:
+        os.close(handle)
 
 
 def resolved(path: Path, error: type[TkError] = ConfigError) -> Path:

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tk.io.importers.videos import CameraNames, match_clips, natural
+from tk.io.importers.videos import CameraNames, in_order_of_names, match_clips, natural
 
 
 def named(*names: str) -> list[CameraNames]:
@@ -28,8 +28,7 @@ def named(*names: str) -> list[CameraNames]:
     ],
 )
 def test_names_are_matched(cameras: list[str], stems: list[str]) -> None:
-    order = match_clips(named(*cameras), stems[::-1], in_order=False)
-    assert order is not None and list(order.stems) == stems
+    assert match_clips(named(*cameras), stems[::-1]) == stems
 
 
 @pytest.mark.parametrize(
@@ -44,37 +43,34 @@ def test_names_are_matched(cameras: list[str], stems: list[str]) -> None:
     ],
 )
 def test_ambiguous_names_are_not_matched(cameras: list[str], stems: list[str]) -> None:
-    assert match_clips(named(*cameras), stems, in_order=False) is None
+    assert match_clips(named(*cameras), stems) is None
 
 
 def test_missing_video_leaves_its_camera_unmatched() -> None:
-    order = match_clips(named("cam1", "cam2", "cam3", "cam4"), ["x_cam4", "x_cam2", "x_cam1"], in_order=False)
-    assert order is not None and order.stems == ("x_cam1", "x_cam2", None, "x_cam4")
+    found = match_clips(named("cam1", "cam2", "cam3", "cam4"), ["x_cam4", "x_cam2", "x_cam1"])
+    assert found == ["x_cam1", "x_cam2", None, "x_cam4"]
 
 
 def test_in_order_sorts_numbers_by_value() -> None:
-    order = match_clips(named("north", "east", "west"), ["clip 10", "clip 2", "clip 1"], in_order=True)
-    assert order is not None and order.by == "order"
-    assert order.stems == ("clip 2", "clip 1", "clip 10")  # east, north, west
-    assert match_clips(named("north", "east"), ["a", "b", "c"], in_order=True) is None
+    found = in_order_of_names(named("north", "east", "west"), ["clip 10", "clip 2", "clip 1"])
+    assert found == ["clip 2", "clip 1", "clip 10"]  # east, north, west
     assert sorted(["cam10", "cam2", "cam"], key=natural) == ["cam", "cam2", "cam10"]
 
 
 names = st.lists(st.text("abcz019_-", min_size=1, max_size=6), min_size=2, max_size=6, unique=True)
 
 
-@given(cameras=names, stems=names, in_order=st.booleans())
-def test_no_video_belongs_to_two_cameras(cameras: list[str], stems: list[str], in_order: bool) -> None:
-    order = match_clips(named(*cameras), stems, in_order)
-    if order is not None:
-        taken = [stem for stem in order.stems if stem is not None]
-        assert len(order.stems) == len(cameras) and len(taken) == len(set(taken)) >= 2
+@given(cameras=names, stems=names)
+def test_no_video_belongs_to_two_cameras(cameras: list[str], stems: list[str]) -> None:
+    found = match_clips(named(*cameras), stems)
+    if found is not None:
+        taken = [stem for stem in found if stem is not None]
+        assert len(found) == len(cameras) and len(taken) == len(set(taken)) >= 2
         assert set(taken) <= set(stems)
 
 
 @given(cameras=names)
 def test_equal_names_always_match(cameras: list[str]) -> None:
-    order = match_clips(named(*cameras), cameras[::-1], in_order=False)
     bare = {"".join(c for c in name if c.isalnum()) for name in cameras}
     if len(bare) == len(cameras):
-        assert order is not None and list(order.stems) == cameras
+        assert match_clips(named(*cameras), cameras[::-1]) == cameras

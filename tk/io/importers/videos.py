@@ -67,26 +67,22 @@ def find_clips(
         images: accept single images as clips.
     """
     folder, clips = _one_recording(root, patterns, trial, images)
-    order = match_clips(cameras, list(clips), in_order)
-    if order is None:
+    notes: list[str] = []
+    stems = match_clips(cameras, list(clips))
+    if stems is None and in_order and len(clips) == len(cameras):
+        stems = in_order_of_names(cameras, list(clips))
+        pairs = ", ".join(f"{camera.name} ↔ {clips[stem].name}" for camera, stem in zip(cameras, stems, strict=True))
+        notes.append(f"{folder}: names do not match, so cameras and videos are matched in their order: {pairs}")
+    if stems is None:
         names = ", ".join(camera.name for camera in cameras[:12]) + (", …" if len(cameras) > 12 else "")
-        hint = "rename the videos to the cameras' names"
         raise VideoError(
             f"{folder}: cannot match videos and cameras by name: the cameras are {names}, the videos "
-            f"{_some(clips)}; {hint}",
+            f"{_some(clips)}; rename the videos to the cameras' names",
             hint="" if trial else "or choose a recording with --trial NAME",
         )
-    notes = []
-    stems = [None if stem is None else clips[stem] for stem in order.stems]
-    if order.by == "order":
-        pairs = ", ".join(
-            f"{camera.name} ↔ {stem.name}" for camera, stem in zip(cameras, stems, strict=True) if stem is not None
-        )
-        notes.append(f"{folder}: names do not match, so cameras and videos are matched in their order: {pairs}")
-    left = sorted(set(clips) - {stem for stem in order.stems if stem is not None})
-    if left:
+    if left := sorted(set(clips) - set(stems)):
         notes.append(f"{folder}: no camera matches {_some(left)}")
-    return Found(folder, tuple(stems), tuple(notes))
+    return Found(folder, tuple(clips.get(stem or "") for stem in stems), tuple(notes))
 
 
 def _clips_in(folder: Path, images: bool) -> dict[str, Path]:
@@ -119,42 +115,30 @@ def _clips_in(folder: Path, images: bool) -> dict[str, Path]:
     return clips
 
 
-@dataclass(frozen=True)
-class Match:
-    """The name of each camera's clip, and ``by`` which rule they match."""
-
-    stems: tuple[str | None, ...]
-    by: str
-
-
-def match_clips(cameras: Sequence[CameraNames], stems: Sequence[str], in_order: bool) -> Match | None:
-    """Match clips with cameras by name; None if fewer than two cameras match.
+def match_clips(cameras: Sequence[CameraNames], stems: Sequence[str]) -> Sequence[str | None] | None:
+    """Return the clip's name of each camera, matched by name; None if fewer than two cameras match.
 
     The first rule that matches most cameras counts, and no rule may match two cameras with one clip: equal names; one
     name within the other ("cam01" in "int_cam01_img"); the number in which the names differ ("cam_0", "port_0"); the
-    names without their common beginning and end ("A", "trial1-camA"); and, with ``in_order``, the order of the names.
+    names without their common beginning and end ("A", "trial1-camA").
     """
-    rules: list[tuple[str, Callable[[], list[str | None]]]] = [
-        ("name", lambda: [_equal(camera, stems) for camera in cameras]),
-        ("part", lambda: [_within(camera, stems) for camera in cameras]),
-        ("number", lambda: _by_difference(cameras, stems, _distinct_numbers)),
-        ("difference", lambda: _by_difference(cameras, stems, _differences)),
-    ]
-    best: Match | None = None
-    for by, rule in rules:
-        found = rule()
+    best, most = None, 1
+    for found in (
+        [_equal(camera, stems) for camera in cameras],
+        [_within(camera, stems) for camera in cameras],
+        _by_difference(cameras, stems, _distinct_numbers),
+        _by_difference(cameras, stems, _differences),
+    ):
         taken = [stem for stem in found if stem is not None]
-        if len(taken) < 2 or len(set(taken)) < len(taken):
-            continue
-        if best is None or len(taken) > len(best.stems) - best.stems.count(None):
-            best = Match(tuple(found), by)
-    if best is None and in_order and len(stems) == len(cameras) >= 2:
-        by_name = sorted(range(len(cameras)), key=lambda index: natural(cameras[index].name))
-        ordered: list[str | None] = [None] * len(cameras)
-        for index, stem in zip(by_name, sorted(stems, key=natural), strict=True):
-            ordered[index] = stem
-        best = Match(tuple(ordered), "order")
+        if len(taken) == len(set(taken)) > most:
+            best, most = found, len(taken)
     return best
+
+
+def in_order_of_names(cameras: Sequence[CameraNames], stems: Sequence[str]) -> list[str]:
+    """Return the clip's name of each camera: the first name of a clip for the first name of a camera, and so on."""
+    order = sorted(range(len(cameras)), key=lambda index: natural(cameras[index].name))
+    return [stem for _, stem in sorted(zip(order, sorted(stems, key=natural), strict=True))]
 
 
 def natural(text: str) -> list[tuple[int, str]]:
