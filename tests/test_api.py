@@ -59,7 +59,7 @@ def test_errors_name_no_options_of_the_command_line() -> None:
     assert found == []
 
 
-def test_a_path_is_tracked_once_and_the_result_is_described_in_three_lines(tiny, tmp_path) -> None:
+def test_path_is_tracked_once_and_the_result_is_described_in_three_lines(tiny, tmp_path) -> None:
     config = settings_file.from_toml(QUICK)
     result = tk.track(tiny, tmp_path / "r.h5", config=config, frames=(0, 3), causal=True)
     with pytest.raises(ResultError, match="exists"):
@@ -69,7 +69,7 @@ def test_a_path_is_tracked_once_and_the_result_is_described_in_three_lines(tiny,
     assert "r.h5" in lines[0] and "3 frames" in lines[1]
 
 
-def test_a_missing_capture_is_reported_in_one_line(tmp_path):
+def test_missing_capture_is_reported_in_one_line(tmp_path):
     with pytest.raises(CaptureError, match="nowhere"):
         tk.open_capture(tmp_path / "nowhere")
 
@@ -78,17 +78,17 @@ def test_notes_are_logged(copy, tmp_path, caplog):
     write_video(copy / "videos" / "cam2.mp4", [picture(1, k, (160, 120)) for k in range(3)])
     config = settings_file.from_toml(QUICK)
     list(tk.track(tk.open_capture(copy), config=config))
-    (said,) = [r.getMessage() for r in caplog.records if r.name.startswith("tk") and r.levelname == "WARNING"]
-    assert "only the first 3 are used" in said
+    (warning,) = [r.getMessage() for r in caplog.records if r.name.startswith("tk") and r.levelname == "WARNING"]
+    assert "only the first 3 are used" in warning
 
 
 def test_returned_estimates_equal_those_in_the_file(tiny, tmp_path):
     """The iterator's first pass is the file's, bit for bit."""
     config = settings_file.from_toml("ahead = 0\n[silhouette]\ninit_frames = 3\n")
     opened = tk.open_capture(tiny)
-    told = list(tk.track(opened, config=config, frames=(0, 4)))
-    assert [e.frame for e in told] == [0, 1, 2, 3]
-    assert told[0].joints.shape == (15, 3) and told[0].status == "initialised"
+    estimates = list(tk.track(opened, config=config, frames=(0, 4)))
+    assert [e.frame for e in estimates] == [0, 1, 2, 3]
+    assert estimates[0].joints.shape == (15, 3) and estimates[0].status == "initialised"
     result = tk.track(opened, tmp_path / "r.h5", config=config, frames=(0, 4), causal=True)
-    np.testing.assert_array_equal(result.joints, [e.joints for e in told])
+    np.testing.assert_array_equal(result.joints, [e.joints for e in estimates])
     assert result.sigma is not None and np.isfinite(result.sigma).all()

@@ -94,8 +94,8 @@ def test_damaged_records_are_refused(tmp_path: Path, text: str) -> None:
 
 
 def test_summary_lists_all_outcomes(tmp_path: Path) -> None:
-    nasty = tmp_path / "a <b> & c"
-    captures = folders(nasty, tmp_path / "two", tmp_path / "three", tmp_path / "out" / "jobs")[:3]
+    odd = tmp_path / "a <b> & c"
+    captures = folders(odd, tmp_path / "two", tmp_path / "three", tmp_path / "out" / "jobs")[:3]
     jobs = make_jobs(captures, tmp_path / "out", TrackOptions())
     outcomes = dict(
         zip(
@@ -133,7 +133,7 @@ def test_exit_codes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (["--workers", "0"], "workers = 0"),
         (["--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], "give workers or a scheduler, not both"),
@@ -141,8 +141,8 @@ def test_exit_codes() -> None:
         (["--frames", "5"], "--frames 5"),
     ],
 )
-def test_bad_options(tk: Tk, tiny: Path, tmp_path: Path, options: list[str], said: str) -> None:
-    tk("batch", tiny, "-o", tmp_path / "out", *options).complaint(said)
+def test_bad_options(tk: Tk, tiny: Path, tmp_path: Path, options: list[str], message: str) -> None:
+    tk("batch", tiny, "-o", tmp_path / "out", *options).complaint(message)
 
 
 def test_dashboard_needs_bokeh(tk: Tk, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -190,8 +190,8 @@ class _Notes:
 def test_death_of_a_worker_is_reported(tmp_path: Path) -> None:
     """A capture that begins for the second time had another worker before."""
     (job,) = make_jobs(folders(tmp_path / "walk"), tmp_path / "out", TrackOptions())
-    said = [(0, True), (7, False), (5, True), (9, False)]
-    messages = [{"name": "walk", "done": done, "total": 9, "begins": begins} for done, begins in said]
+    progress = [(0, True), (7, False), (5, True), (9, False)]
+    messages = [{"name": "walk", "done": done, "total": 9, "begins": begins} for done, begins in progress]
     reporter = _Notes()
     assert dict(_finished(_Client(messages), [job], reporter, None)) == {"walk": Outcome(DONE)}
     assert reporter.notes == ["walk: its worker died (out of memory?); another one continues after 5 frames"]
@@ -252,9 +252,9 @@ def test_failure_of_a_capture_has_the_hint(tmp_path: Path, monkeypatch: pytest.M
 class Program:
     """Python in a separate process, and its stderr."""
 
-    def __init__(self, said: Path, *arguments: object) -> None:
-        self._said = said
-        with said.open("w") as file:
+    def __init__(self, errors: Path, *arguments: object) -> None:
+        self._errors = errors
+        with errors.open("w") as file:
             self.process = subprocess.Popen(
                 [sys.executable, *map(str, arguments)],
                 cwd=ROOT,
@@ -264,15 +264,15 @@ class Program:
             )
 
     @property
-    def said(self) -> str:
-        return self._said.read_text()
+    def errors(self) -> str:
+        return self._errors.read_text()
 
     def until(self, happened: Callable[[], bool], seconds: float = 240) -> None:
         """Wait for an event that cannot happen after this process has ended."""
         deadline = time.monotonic() + seconds
         while not happened():
-            assert self.process.poll() is None, self.said
-            assert time.monotonic() < deadline, self.said
+            assert self.process.poll() is None, self.errors
+            assert time.monotonic() < deadline, self.errors
             time.sleep(0.02)
 
 
@@ -353,8 +353,8 @@ def test_killed_worker_and_scheduler_lose_nothing_and_repeat_nothing(
     assert 2 <= done_then < frames
     first.until(lambda: len(ended()) >= 2)  # the broken one, and one of the worker that lives
     scheduler.process.kill()
-    assert first.process.wait(120) == 1, first.said
-    assert first.said.splitlines()[-1].endswith("scheduler has stopped; the same command continues the batch")
+    assert first.process.wait(120) == 1, first.errors
+    assert first.errors.splitlines()[-1].endswith("scheduler has stopped; the same command continues the batch")
     for program in workers:  # without a scheduler, the one that lives would end what it has begun
         program.process.kill()
         program.process.wait()
@@ -362,8 +362,8 @@ def test_killed_worker_and_scheduler_lose_nothing_and_repeat_nothing(
     assert before
 
     second = start(*batch, "--workers", 2)
-    assert second.process.wait(300) == 2, second.said  # for the broken one
-    assert f"note: {len(before)} of 4 captures are finished already" in second.said
+    assert second.process.wait(300) == 2, second.errors  # for the broken one
+    assert f"note: {len(before)} of 4 captures are finished already" in second.errors
     for name, (content, record) in before.items():
         assert ((out / f"{name}.h5").read_bytes(), records()[name]) == (content, record)
     assert "calibration.toml: there is no such file" in records()["broken"]["failure"]

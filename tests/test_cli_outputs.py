@@ -92,9 +92,9 @@ def test_quiet_json_prints_nothing_but_json(tk: Tk, quick: Path, tiny: Path, tmp
 def test_stages_are_printed_before_the_first_frame(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
     ran = tk("track", tiny, "-o", tmp_path / "r.h5", "--config", quick, "--frames", ":1")
     before = ran.err.partition("frame 0: ")[0]
-    said = [re.sub(r"^\[ *[\d.]+ s\] ", "", line) for line in before.splitlines()]
-    assert said[0] == "loading" and said[1] == f"opening {tiny}"
-    assert any("finding the person in frame 0" in line for line in said)
+    stages = [re.sub(r"^\[ *[\d.]+ s\] ", "", line) for line in before.splitlines()]
+    assert stages[0] == "loading" and stages[1] == f"opening {tiny}"
+    assert any("finding the person in frame 0" in line for line in stages)
 
 
 def commands() -> list[str]:
@@ -115,8 +115,8 @@ def test_help_has_an_example_that_the_command_accepts(tk: Tk, name: str) -> None
     assert ran.code == 0 and f"tk {name}" in ran.out and ran.err == ""
     assert isinstance(main, click.Group)
     command = main.commands[name]
-    told = f"{command.help}\n{command.epilog}"  # as it was written, for the help wraps its lines
-    examples = re.findall(r"(?:^|xample:|;) *tk (.+?)(?=;|$)", told, re.M)
+    text = f"{command.help}\n{command.epilog}"  # as it was written, for the help wraps its lines
+    examples = re.findall(r"(?:^|xample:|;) *tk (.+?)(?=;|$)", text, re.M)
     assert any(example.split()[0] == name for example in examples)
     for example in examples:
         first, *rest = shlex.split(example.partition(" > ")[0])

@@ -34,8 +34,8 @@ def display(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         stderr=subprocess.DEVNULL,
     )
     os.close(write)
-    with os.fdopen(read) as told:
-        number = told.readline().strip()
+    with os.fdopen(read) as pipe:
+        number = pipe.readline().strip()
     yield f":{number}"
     server.terminate()
     server.wait()
@@ -82,15 +82,15 @@ def test_missing_display_is_reported_with_the_alternative(
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (["--frame", "99"], "--frame 99: the result has frames 0 to 13"),
         (["--screenshot", "a.jpg"], "an image must end in .png"),
         (["--screenshot", "nowhere/a.png"], "the folder nowhere does not exist"),
     ],
 )
-def test_bad_options(tk: Tk, tracked: Path, options: list[str], said: str) -> None:
-    tk("view", tracked, *options).complaint(said)
+def test_bad_options(tk: Tk, tracked: Path, options: list[str], message: str) -> None:
+    tk("view", tracked, *options).complaint(message)
 
 
 def test_shapes_match_the_result(tracked: Path) -> None:

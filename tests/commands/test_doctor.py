@@ -23,7 +23,7 @@ def test_one_line_each_on_this_machine(tk: Tk) -> None:
     assert "Traceback" not in ran.out + ran.err
 
 
-def test_what_tracking_needs_decides_the_exit_code(tk: Tk, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_checks_that_tracking_needs_decide_the_exit_code(tk: Tk, monkeypatch: pytest.MonkeyPatch) -> None:
     def failing(error: Exception) -> Callable[[], str]:
         def check() -> str:
             raise error

@@ -61,7 +61,7 @@ def as_result(truth: JointTrack, **changes: Any) -> JointTrack:
     return replace(truth, **(values | changes))
 
 
-def test_the_truth_itself_is_perfect() -> None:
+def test_ground_truth_itself_has_no_error() -> None:
     truth = make_truth()
     found = evaluate(as_result(truth, seconds=np.array([1.0] + [0.05] * 19)), truth)
     for scores in (found.raw, found.corrected):
@@ -74,7 +74,7 @@ def test_the_truth_itself_is_perfect() -> None:
     assert found.median_frames_per_second == pytest.approx(20)
 
 
-def test_against_a_slow_obvious_computation() -> None:
+def test_scores_equal_a_slow_computation() -> None:
     truth = make_truth(seed=3)
     generator = np.random.default_rng(4)
     result = as_result(truth, positions=truth.positions + generator.normal(scale=0.05, size=(20, 15, 3)))
@@ -169,7 +169,7 @@ def test_result_of_nan_has_zero_pck() -> None:
     )
 
 
-def test_a_lost_frame_counts_as_miss_at_any_distance() -> None:
+def test_lost_frame_counts_as_miss_at_any_distance() -> None:
     truth = make_truth()
     status = np.zeros(20, dtype=np.uint8)
     status[[3, 9]] = Status.LOST

@@ -1,4 +1,4 @@
-"""Pixels and silhouettes by view, against numbers worked out by hand."""
+"""Pixels and silhouettes by view, compared with direct computations."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def three_views(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_every_view_is_judged_as_by_hand(tiny: Path, three_views: Path) -> None:
+def test_scores_of_all_views_equal_a_direct_computation(tiny: Path, three_views: Path) -> None:
     found = evaluate_views(three_views, tiny / "truth.h5", tiny, ("wrist_l",))
     result, truth = read_result(three_views), read_joints(tiny / "truth.h5")
     capture = open_capture(tiny)
@@ -64,7 +64,7 @@ def test_every_view_is_judged_as_by_hand(tiny: Path, three_views: Path) -> None:
     assert found.silhouette_error == pytest.approx(np.mean([view.silhouette_error for view in found.views]))
 
 
-def test_the_command_finds_the_capture_beside_the_truth(tk: Tk, tiny: Path, three_views: Path, tmp_path: Path) -> None:
+def test_command_finds_the_capture_beside_the_truth(tk: Tk, tiny: Path, three_views: Path, tmp_path: Path) -> None:
     ran = tk("evaluate", three_views, tiny / "truth.h5", "--json")
     views = json.loads(ran.out)["views"]
     assert ran.code == 0 and len(views["views"]) == 4 and views["joints"] == ["ankle_l", "ankle_r"]
@@ -83,7 +83,7 @@ def test_results_of_both_body_models_are_evaluated(tk: Tk, tiny: Path, tracked: 
     assert "E_S %" in tk("evaluate", tracked, tiny / "truth.h5").out
 
 
-def test_of_older_volumetric_results_the_dimensions_are_taken(tiny: Path, tracked: Path, tmp_path: Path) -> None:
+def test_body_of_a_result_without_parts_follows_from_its_dimensions(tiny: Path, tracked: Path, tmp_path: Path) -> None:
     older = Path(shutil.copy(tracked, tmp_path / "older.h5"))
     with h5py.File(older, "a") as file:
         del file["model/parts"]
@@ -141,7 +141,7 @@ def without_columns(path: Path, names: tuple[str, ...]) -> Path:
     return path
 
 
-def test_a_result_without_ankles_is_drawn_with_straight_ones(three_views: Path, tmp_path: Path) -> None:
+def test_result_without_ankles_is_drawn_with_straight_ones(three_views: Path, tmp_path: Path) -> None:
     ankles = tuple(name for side in "lr" for name in ROWS[f"ankle_{side}"].dof_names)
     restored = body_and_poses(read_result(without_columns(Path(shutil.copy(three_views, tmp_path / "r.h5")), ankles)))
     assert restored is not None

@@ -66,7 +66,7 @@ def test_residual_is_the_standard_deviation(write: Write) -> None:
     assert residuals[4, 0] == 127, "as much as the format holds, and not what is left over from 256"
 
 
-def test_a_missing_package_stops_its_format_only(tk: Tk, write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_package_stops_its_format_only(tk: Tk, write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write()
     monkeypatch.setitem(sys.modules, "ezc3d", None)
     with pytest.raises(ExportError, match=r"c3d: needs the package ezc3d: pip install 'tk-mocap\[export\]'"):

@@ -213,7 +213,7 @@ def test_command(tk: Tk, write: Write, tmp_path: Path) -> None:
     assert (tmp_path / "walk_smoothed.trc").exists()
 
 
-def test_a_tracked_result(tracked: Path, tmp_path: Path) -> None:
+def test_tracked_result_is_exported_in_all_formats(tracked: Path, tmp_path: Path) -> None:
     """What the tracker writes goes through every format."""
     written = export(tracked, list(FORMATS), tmp_path)
     assert all(file.stat().st_size > 1000 for file in written.files)

@@ -97,7 +97,7 @@ def test_lost_frames_are_held_and_listed(write: Write) -> None:
     assert file.asset.extras["lost_frames"] == [int(frames[f]) for f in LOST]
 
 
-def test_the_skinned_mesh_lies_on_the_body(write: Write) -> None:
+def test_skinned_mesh_lies_on_the_body(write: Write) -> None:
     """In a frame, the vertices of each segment, moved by its bone, lie where the body's surface lies."""
     path = write()
     restored = body_and_poses(read_result(path))

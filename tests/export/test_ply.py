@@ -19,7 +19,7 @@ def read(path: Path) -> open3d.geometry.TriangleMesh:
     return open3d.io.read_triangle_mesh(path)
 
 
-def test_every_frame_has_the_body_where_it_was(write: Write) -> None:
+def test_mesh_of_each_frame_lies_on_the_body(write: Write) -> None:
     path = write()
     (folder,) = export(path, ["ply"]).files
     assert folder.name == "walk_ply"
@@ -65,7 +65,7 @@ def test_smoothed_meshes_differ_and_bridge_the_gap(write: Write) -> None:
         assert 1e-6 < np.abs(a - b).max() < 0.5
 
 
-def test_a_folder_is_replaced_with_force_only(tk: Tk, write: Write) -> None:
+def test_folder_is_replaced_with_force_only(tk: Tk, write: Write) -> None:
     path = write()
     (folder,) = export(path, ["ply"]).files
     (folder / "999999.ply").write_text("old")

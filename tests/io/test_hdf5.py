@@ -1,4 +1,4 @@
-"""Files that are damaged, or made to do harm: read, or one line that names them. No traceback, no hang."""
+"""Damaged and malicious HDF5 files are read, or refused in one line that names the file; nothing hangs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ COUNT = 6
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """`result.h5` with everything that a result can have, `truth.h5` beside it."""
+    """Return a folder with `result.h5`, which has all that a result can have, and `truth.h5`."""
     folder = tmp_path_factory.mktemp("hdf5")
     with ResultWriter.create(folder / "result.h5", META) as writer:
         writer.write_model({"torso/radii_m": np.arange(4.0), "height_m": 1.78, "sex": "any", "count": 3})
@@ -40,7 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def result(folder: Path, tmp_path: Path) -> Path:
-    """A result, to be spoilt."""
+    """Return a copy of the result, to be damaged."""
     return Path(shutil.copy(folder / "result.h5", tmp_path))
 
 
@@ -50,8 +50,8 @@ def truth(folder: Path, tmp_path: Path) -> Path:
 
 
 def read_in_every_way(path: Path, folder: Path) -> list[str]:
-    """Read a file as everything that tk reads; returns the complaints, each of one line that names the file."""
-    complaints = []
+    """Read a file with all readers; return the error messages, each one line that names the file."""
+    messages = []
 
     ways: list[Callable[[], object]] = [
         lambda: read_result(path),
@@ -63,9 +63,9 @@ def read_in_every_way(path: Path, folder: Path) -> list[str]:
         try:
             way()
         except TkError as error:
-            complaints.append(str(error))
+            messages.append(str(error))
             assert path.name in str(error) and "\n" not in str(error)
-    return complaints
+    return messages
 
 
 # --- any damage -------------------------------------------------------------------------------------------------------
@@ -86,7 +86,7 @@ flips = st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 7))
 
 
 def near_structure(data: bytes, share: float) -> int:
-    """A place in the file; every second one of them where HDF5 keeps its own: what follows a signature."""
+    """Return a place in the file; every second one is near a signature of HDF5's own structures."""
     at = int(share * len(data))
     if int(share * 1e6) % 2:
         return at
@@ -104,7 +104,7 @@ def near_structure(data: bytes, share: float) -> int:
     flipped=flips,
     kept=st.one_of(st.just(1.0), st.just(1.0), st.floats(0, 1)),
 )
-def test_whatever_the_damage(
+def test_changed_and_missing_bytes_give_one_line(
     folder: Path,
     tmp_path: Path,
     name: str,
@@ -136,7 +136,7 @@ VALUES = [
 
 
 @pytest.mark.parametrize("name", DATASETS)
-def test_whatever_the_type(result: Path, folder: Path, name: str) -> None:
+def test_datasets_of_another_type_give_one_line(result: Path, folder: Path, name: str) -> None:
     good = result.read_bytes()
     for value in VALUES:
         result.write_bytes(good)
@@ -152,7 +152,7 @@ def test_whatever_the_type(result: Path, folder: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("holder", ["/", "pose", "joints/position", "timing", "angles", "cameras", "iterations"])
-def test_whatever_the_attributes(result: Path, folder: Path, holder: str) -> None:
+def test_other_attributes_give_one_line(result: Path, folder: Path, holder: str) -> None:
     good = result.read_bytes()
     with h5py.File(result) as file:
         names = list(file[holder].attrs)
@@ -171,7 +171,7 @@ def test_whatever_the_attributes(result: Path, folder: Path, holder: str) -> Non
         read_in_every_way(result, folder)
 
 
-# --- what is made to do harm ------------------------------------------------------------------------------------------
+# --- malicious files --------------------------------------------------------------------------------------------------
 
 
 def soft_link(file: h5py.File, folder: Path) -> None:
@@ -248,7 +248,7 @@ def test_links_external_data_and_oversized_data_are_refused(
             read(truth)
 
 
-def test_what_is_compressed_honestly_is_read(truth: Path) -> None:
+def test_compressed_dataset_is_read(truth: Path) -> None:
     values = np.random.default_rng(0).normal(size=(COUNT, 15, 3))
     with h5py.File(truth, "r+") as file:
         del file["joints/position"]
@@ -257,12 +257,12 @@ def test_what_is_compressed_honestly_is_read(truth: Path) -> None:
     np.testing.assert_array_equal(read_joints(truth).positions, values)
 
 
-def test_a_file_that_this_process_holds_open_is_read(truth: Path) -> None:
+def test_file_that_this_process_holds_open_is_read(truth: Path) -> None:
     with h5py.File(truth) as held:  # as in a notebook
         np.testing.assert_array_equal(read_joints(truth).positions, held["joints/position"][:])
 
 
-def test_whole_numbers_and_single_precision_will_do(truth: Path) -> None:
+def test_integers_and_single_precision_are_converted(truth: Path) -> None:
     values = np.random.default_rng(0).integers(-2, 3, (COUNT, 15, 3))
     for frames, dtype in ((np.arange(COUNT, dtype=np.float64), np.int32), (np.arange(COUNT, dtype="u1"), np.float32)):
         with h5py.File(truth, "r+") as file:
@@ -275,16 +275,16 @@ def test_whole_numbers_and_single_precision_will_do(truth: Path) -> None:
         np.testing.assert_array_equal(track.positions, values)
 
 
-def test_a_heap_of_texts_over_which_hdf5_would_hang(truth: Path) -> None:
+def test_heap_of_texts_that_would_hang_hdf5_is_refused(truth: Path) -> None:
     data = bytearray(truth.read_bytes())
     heap = data.index(b"GCOL")
-    data[heap + 16 : heap + 32] = bytes(16)  # free space of no size: HDF5 2.0.0 goes round in it for ever
+    data[heap + 16 : heap + 32] = bytes(16)  # free space of size zero: HDF5 2.0.0 loops in it forever
     truth.write_bytes(data)
     with pytest.raises(ResultError, match="heap"):
         read_joints(truth)
 
 
-def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
+def test_pipes_devices_and_dangling_links_are_refused(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe.h5"
     os.mkfifo(pipe)
     for path in (pipe, Path("/dev/zero")):

@@ -29,7 +29,7 @@ def legacy(mesh: Mesh) -> open3d.geometry.TriangleMesh:
     )
 
 
-def test_a_ball_has_its_place_volume_and_colours() -> None:
+def test_mesh_of_a_ball_has_its_place_volume_and_colours() -> None:
     x, y, z = np.meshgrid(*(np.arange(n) for n in GRID.shape), indexing="ij")
     occupancy = (x - 12) ** 2 + (y - 10) ** 2 + (z - 15) ** 2 <= 8**2
     mesh = hull_mesh(occupancy, GRID, surface_of(occupancy))

@@ -41,7 +41,7 @@ def test_open3d_reads_points_and_meshes(tmp_path: Path, count: int, faces: int, 
         np.testing.assert_allclose(np.asarray(mesh.vertex_colors) * 255, expected.colors, atol=0.51)
 
 
-def test_a_ply_that_cannot_be_written(tmp_path: Path) -> None:
+def test_unwritable_ply_is_refused(tmp_path: Path) -> None:
     cloud = points(2)
     (tmp_path / "file").write_text("mine")
     for path in (tmp_path / "file" / "a.ply", tmp_path):
@@ -85,7 +85,7 @@ def test_finished_frames_are_kept(capture: Capture, tmp_path: Path, error: BaseE
         assert len(file["frames"]) == len(file["time"]) == 2
 
 
-def test_an_older_file_stays_until_a_frame_is_finished(capture: Capture, tmp_path: Path) -> None:
+def test_older_file_stays_until_a_frame_is_finished(capture: Capture, tmp_path: Path) -> None:
     def none() -> Iterator[tuple[int, HullPoints]]:
         raise CaptureError("frame 0 is broken")
         yield
@@ -99,7 +99,7 @@ def test_an_older_file_stays_until_a_frame_is_finished(capture: Capture, tmp_pat
     assert not [file for file in tmp_path.iterdir() if file.name.endswith(".tmp")]
 
 
-def test_a_full_disk_is_one_line_and_leaves_the_older_file(
+def test_full_disk_gives_one_line_and_leaves_the_older_file(
     capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "h.h5"

@@ -181,9 +181,9 @@ def test_cameras_fill_a_grid_of_even_size() -> None:
 
 
 def test_sheets_are_written(result: Path, tmp_path: Path, tk: Tk) -> None:
-    said = tk("render", result, DEMO, "--png", tmp_path / "out", "--cameras", "cam1,cam5")
-    (sheet,) = (Path(line.removeprefix("wrote ")) for line in said.err.splitlines())
-    assert said.code == 0 and sheet.name == "overlay-000000-000002.png"
+    ran = tk("render", result, DEMO, "--png", tmp_path / "out", "--cameras", "cam1,cam5")
+    (sheet,) = (Path(line.removeprefix("wrote ")) for line in ran.err.splitlines())
+    assert ran.code == 0 and sheet.name == "overlay-000000-000002.png"
     picture = cv2.imread(str(sheet))
     assert picture.shape == (3 * 360 + 2 * 6, 2 * 270 + 6, 3)
     names = picture[2 * 366 : 2 * 366 + 20].astype(int)
@@ -253,8 +253,8 @@ def test_overlay_uses_cameras_and_time_offsets_of_the_run(result: Path) -> None:
 
 
 def test_missing_frame_is_named(result: Path, tmp_path: Path, tk: Tk) -> None:
-    said = tk("render", result, DEMO, "--png", tmp_path, "--frames", "1,7")
-    said.complaint("frame 7 is not in it; it has frames 0 to 2")
+    ran = tk("render", result, DEMO, "--png", tmp_path, "--frames", "1,7")
+    ran.complaint("frame 7 is not in it; it has frames 0 to 2")
     tk("render", tmp_path / "nothing.h5", DEMO).complaint("nothing.h5: no such file")
     tk("render", result, DEMO, "--png", tmp_path, "--frames", "one").complaint("--frames one: give A:B")
     tk("render", result, "--view", "overlay").complaint("needs the images")

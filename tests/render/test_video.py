@@ -123,8 +123,8 @@ def test_render_writes_the_requested_views_and_frames(tracked: Path, tiny: Path,
         ("3d.mp4", ["--view", "3d", "--frames", "1,3"], 2),
         ("hull.mp4", ["--view", "hull", "--frames", ":3"], 3),
     ):
-        said = tk("render", tracked, *arguments, "-o", tmp_path / name)
-        assert said.code == 0 and f"wrote {tmp_path / name}" in said.err
+        ran = tk("render", tracked, *arguments, "-o", tmp_path / name)
+        assert ran.code == 0 and f"wrote {tmp_path / name}" in ran.err
         found = decoded(tmp_path / name)
         assert len(found) == frames and found[0].std() > 10
     before = (tmp_path / "3d.mp4").read_bytes()

@@ -24,7 +24,7 @@ def test_track_writes_a_video_and_a_report(tk: Tk, tiny: Path, quick: Path, tmp_
     assert is_our_video(tmp_path / "r.mp4") and is_our_page(tmp_path / "r.html")
 
 
-def test_a_long_recording_has_a_video_of_some_images_and_of_its_duration(
+def test_video_of_a_long_recording_has_its_duration_and_some_of_its_images(
     complete: Path, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     result = tmp_path / "r.h5"

@@ -1,4 +1,4 @@
-"""Results damaged in many ways, as readers use them: a value, or one line that names the file."""
+"""Readers of damaged results return a value, or raise an error of one line that names the file."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def other_values(old: np.ndarray) -> dict[str, Any]:
 
 @settings(max_examples=30, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_whatever_the_damage_readers_give_one_line(complete: Path, tmp_path: Path, data: st.DataObject) -> None:
+def test_damaged_datasets_give_one_line(complete: Path, tmp_path: Path, data: st.DataObject) -> None:
     path = Path(shutil.copy(complete, tmp_path / "damaged.h5"))
     name = data.draw(st.sampled_from(datasets(complete)))
     with h5py.File(path, "r+") as file:

@@ -166,8 +166,8 @@ def test_images_show_lost_worst_and_typical_frames(complete: Path, tracked: Path
 
 def test_report_writes_a_page(tk: Tk, complete: Path, tiny: Path, tmp_path: Path) -> None:
     target = tmp_path / "page.html"
-    said = tk("report", complete, tiny, "-o", target)
-    assert (said.code, said.err) == (0, f"wrote {target}\n") and made_here(target)
+    ran = tk("report", complete, tiny, "-o", target)
+    assert (ran.code, ran.err) == (0, f"wrote {target}\n") and made_here(target)
     data = data_of(target.read_text(encoding="utf-8"))
     assert {picture["row"] for picture in data["pictures"]} >= {LOST[0], 11}
     assert len(data["scene"]["cameras"]) == 4

@@ -49,7 +49,7 @@ SEGMENT_COLORS = {
     for segment, color in _shades(hue_deg, CHAINS.get(limb, _TRUNK)).items()
 }
 # The other colours, by what they show. Appearance only.
-#: whatever is wrong: the border of a lost frame, a finding, a mask outside the hull
+#: errors: the border of a lost frame, a finding, a mask outside the hull
 LOST = of_hue(0.0)
 #: the body in a lost frame, and the cameras
 LOST_BODY = WIRE = grey(0.6)

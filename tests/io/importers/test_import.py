@@ -55,7 +55,7 @@ def test_unknown_project_says_what_it_holds_and_what_was_searched(folder: Path, 
 
 
 @pytest.mark.parametrize("command", [["track", "-o", "r.h5"], ["inspect"]])
-def test_a_project_of_another_tool_is_refused_with_the_command_that_imports_it(
+def test_project_of_another_tool_is_refused_with_the_command_that_imports_it(
     folder: Path, tmp_path: Path, tk: Tk, command: list[str]
 ) -> None:
     write_project(folder)

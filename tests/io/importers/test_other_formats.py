@@ -33,7 +33,7 @@ MANUAL = Path(__file__).resolve().parents[3] / "docs" / "import.md"
 
 
 def write_yml(path: Path, names: list[str], matrices: dict[str, np.ndarray], numbers: dict[str, int]) -> None:
-    """YAML as EasyMocap's writer makes it, line by line."""
+    """Write YAML as EasyMocap does."""
     lines = ["%YAML:1.0", "---", "names:", *(f'  - "{name}"' for name in names)]
     for key, values in matrices.items():
         flat = ", ".join(f"{value:.10f}" for value in values.ravel())
@@ -115,7 +115,7 @@ def test_easymocap_camera_without_a_pose(folder: Path, check: Import) -> None:
 
 
 class Trap:
-    """Unpickling it leaves a trace."""
+    """An object that makes a file when it is unpickled."""
 
     def __init__(self, trace: Path) -> None:
         self.trace = trace
@@ -228,7 +228,7 @@ def test_folder_of_texts_is_not_a_project(folder: Path, check: Import) -> None:
 
 
 def test_conversion_script_of_the_docs_works(folder: Path, check: Import, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The program that docs/import.md gives makes a project that is read; the pickles are then nobody's business."""
+    """The program in docs/import.md converts the pickles to a project that tk reads."""
     rig = renamed(make_rig(), "Cam0", "Cam1", "Cam2", "Cam3")
     for camera in rig:
         kept = {

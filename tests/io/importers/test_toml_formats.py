@@ -1,4 +1,4 @@
-"""Pose2Sim, FreeMoCap, Caliscope and Anipose: the same tables, told apart by their folders."""
+"""Pose2Sim, FreeMoCap, Caliscope and Anipose: the same tables in different folders."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CAMS = ["cam1", "cam2", "cam3", "cam4"]
 
 
 def write_pose2sim(session: Path) -> Rig:
-    """As Pose2Sim writes it: sizes as floats, four distortions, names of the intrinsic calibration's folders."""
+    """Write a session as Pose2Sim does: sizes as floats, four distortions, names of folders of the intrinsics."""
     rig = make_rig()
     named = renamed(rig, *(f"int_cam{k:02d}_img" for k in range(1, 5)))
     document = tables(named)
@@ -90,7 +90,7 @@ def test_pose2sim_with_the_file_of_qualisys(folder: Path, check: Import) -> None
 
 
 def test_freemocap_without_a_board_on_the_floor(folder: Path, check: Import) -> None:
-    """The world is camera 0's frame, lengths are millimetres, nobody says so."""
+    """The world is camera 0's frame and lengths are millimetres, which the file does not say."""
     rig = make_rig()
     first = rig[0]
     turned = [

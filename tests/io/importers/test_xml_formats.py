@@ -21,7 +21,7 @@ LEFT, TOP = 40, 24
 
 
 def write_qca(path: Path, rig: Rig, models: tuple[str, ...] = ("Miqus Video",) * 4) -> None:
-    """As QTM writes it: 64ths of a pixel of the whole sensor, millimetres, a frame with y up and z backwards."""
+    """Write a file as QTM does: 1/64 pixels of the whole sensor, millimetres, a frame with y up and z backwards."""
     cameras = []
     for camera, model in zip(rig, models, strict=True):
         R = np.diag([1.0, -1.0, -1.0]) @ camera.rotation
@@ -42,7 +42,7 @@ def write_qca(path: Path, rig: Rig, models: tuple[str, ...] = ("Miqus Video",) *
 
 
 def write_xcp(path: Path, rig: Rig, radial: tuple[float, float] = (0.0, 0.0), markers: int = 1) -> None:
-    """As Nexus writes it: millimetres, quaternions with the real part last, a distortion in pixels that undistorts."""
+    """Write a file as Nexus does: millimetres, quaternions with the real part last, an inverse distortion."""
     cameras = []
     for camera in rig:
         quaternion = " ".join(map(repr, Rotation.from_matrix(camera.rotation).as_quat().tolist()))

@@ -129,7 +129,7 @@ def test_folder_without_permission(tmp_path: Path) -> None:
         ResultWriter.create(tmp_path / "result.h5", META)
 
 
-def test_an_old_result_stays_until_the_first_new_frame(tmp_path: Path) -> None:
+def test_older_result_stays_until_the_first_new_frame(tmp_path: Path) -> None:
     path = tmp_path / "result.h5"
     write(path, 3)
     before = path.read_bytes()

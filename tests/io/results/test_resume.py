@@ -1,4 +1,4 @@
-"""Runs that are killed, and results that are taken up again."""
+"""Killed runs and resumed results."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_killed_run_keeps_every_finished_frame_and_can_be_resumed(tmp_path: Path
 
 
 @pytest.mark.slow
-def test_a_hundred_and_twenty_kills(tmp_path: Path) -> None:
+def test_120_kills_lose_no_finished_frame(tmp_path: Path) -> None:
     survive_kills(tmp_path / "result.h5", kills=120, seed=2)
 
 

@@ -100,7 +100,7 @@ def write_capture(project: Project, output: Path) -> Imported:
 
 
 def _warnings(capture: Path) -> tuple[str, ...]:
-    """Return what is to be said about a new capture; videos of different rates are no reason to refuse it."""
+    """Return the warnings about a new capture; videos of different rates are one of them, not an error."""
     try:
         return open_capture(capture).warnings
     except ClockError as error:
