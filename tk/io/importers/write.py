@@ -6,7 +6,6 @@ import json
 import os
 import re
 import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,11 +13,12 @@ from pathlib import Path
 import numpy as np
 import tomli_w
 
-from tk.errors import CalibrationError, CaptureError, ClockError, VolumeError, unwritable
+from tk.errors import CalibrationError, CaptureError, ClockError, VolumeError
 from tk.io.captures.calibration import camera_table
 from tk.io.captures.capture import open_capture
 from tk.io.captures.video import PICTURE_SUFFIXES, probe
 from tk.io.importers.project import Project
+from tk.io.paths import replacing
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import closest_to_axes, common_boxes
 from tk.model.cameras.mounting import FoundUp, infer_up
@@ -67,33 +67,20 @@ def write_capture(project: Project, output: Path) -> Imported:
         center, size = list(volume.center), list(volume.size)
         notes.append(f"[volume] center = {center}, size = {size} (metres): {where}")
 
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        draft = Path(tempfile.mkdtemp(prefix=f".{output.name}-", dir=output.parent))
-    except OSError as reason:
-        raise unwritable(output, reason, CaptureError) from None
-    try:
-        document = calibration_toml(rig, project)
-        (draft / "calibration.toml").write_text(document, encoding="utf-8")
-        (draft / "capture.toml").write_text(
-            capture_toml(output.resolve().name, project, found, volume, where), encoding="utf-8"
-        )
-        copied = _place(project.clips, rig.names, draft, "videos")
-        if project.masks:
-            copied |= _place(project.masks, rig.names, draft, "masks")
-        if project.backgrounds:
-            copied |= _place(project.backgrounds, rig.names, draft, "background")
-        warnings = _warnings(draft) if volume else ()  # without a volume it cannot be opened yet
-        draft.chmod(0o755)
-        if output.exists():
-            output.rmdir()
-        draft.rename(output)
-    except OSError as reason:
-        raise unwritable(output, reason, CaptureError) from None
-    except CaptureError as reason:  # name the output, not the draft
-        raise type(reason)(str(reason).replace(str(draft), str(output))) from None
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
+    metadata = {"units": "m", "imported_from": f"{project.tool}, {project.source.name}"}
+    tables = {camera.name: camera_table(camera) for camera in rig} | {"metadata": metadata}
+    settings = capture_toml(output.resolve().name, project, found, volume, where)
+    with replacing(output, CaptureError) as draft:
+        shutil.rmtree(draft, ignore_errors=True)  # of an import that was killed
+        draft.mkdir(parents=True)
+        (draft / "calibration.toml").write_text(tomli_w.dumps(tables), encoding="utf-8")
+        (draft / "capture.toml").write_text(settings, encoding="utf-8")
+        parts = {"videos": project.clips, "masks": project.masks, "background": project.backgrounds}
+        copied = sum(_place(clips, rig.names, draft, folder) for folder, clips in parts.items() if clips)
+        try:
+            warnings = _warnings(draft) if volume else ()  # without a volume it cannot be opened yet
+        except CaptureError as reason:  # name the output, not the draft
+            raise type(reason)(str(reason).replace(str(draft), str(output))) from None
     notes.append("the videos were copied" if copied else "the videos are hard links to the originals: no copies")
     notes += [line.replace(str(draft), str(output)) for line in warnings]
     return Imported(output, len(rig), tuple(notes))
@@ -132,12 +119,6 @@ def _rounded(volume: Volume) -> Volume:
     center = [round(x, 2) for x in volume.center]
     size = [max(round(x, 2), 0.01) for x in volume.size]
     return Volume((center[0], center[1], center[2]), (size[0], size[1], size[2]))
-
-
-def calibration_toml(rig: Rig, project: Project) -> str:
-    """Return the text of `calibration.toml`, metres."""
-    metadata = {"units": "m", "imported_from": f"{project.tool}, {project.source.name}"}
-    return tomli_w.dumps({camera.name: camera_table(camera) for camera in rig} | {"metadata": metadata})
 
 
 def capture_toml(name: str, project: Project, up: FoundUp, volume: Volume | None, where: str) -> str:
