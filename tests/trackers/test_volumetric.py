@@ -1,7 +1,5 @@
 """The volumetric tracker: what tests/test_session.py and test_region_track.py do not see from outside."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -16,13 +14,13 @@ from tk.trackers.volumetric import VolumetricTracker
 
 # level, somewhat forward; hanging, with the forearm folded up against the upper arm
 @pytest.mark.parametrize("angles", [(0.0, 1.5, 0.0, 0.0), (1.5, 0.0, 0.0, 2.3)], ids=["raised", "folded"])
-def test_limb_search_recovers_a_displaced_arm(angles: tuple[float, ...], tmp_path: Path) -> None:
+def test_limb_search_recovers_a_displaced_arm(angles: tuple[float, ...]) -> None:
     rig = ring_of_cameras(4, width=240, height=300)
     pose = walk(1)[0]
     masks = draw_silhouettes(BODY, rig, pose[None])[0]
     images = np.full((*masks.shape, 3), 90, np.uint8)
     config = Settings(voxels=48, contours=ContourSettings(edge_weight=0.0))  # one colour has no edges
-    tracker = VolumetricTracker(rig, Volume((0, 0, 1), (2, 2, 2.2)), "z", config, tmp_path)
+    tracker = VolumetricTracker(rig, Volume((0, 0, 1), (2, 2, 2.2)), "z", config)
     tracker.start([observe(masks, 0, images)], STATURE, None, BODY)
     model, state = dict(tracker.model()), dict(tracker.state())
     wrong = state["pose"].copy()

@@ -17,7 +17,6 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 from tk.errors import ConfigError
-from tk.model.hull.tables import default_cache_dir
 
 WHEEL = "mediapipe==0.10.14"
 
@@ -36,6 +35,17 @@ FILES = {
 # all wheels of this version contain the same files
 _PLATFORM = ("--platform", "manylinux2014_x86_64", "--implementation", "cp", "--python-version", "3.11")
 _TIMEOUT_S = 600  # of pip's download, 35 MB; a slower connection fails with a message
+
+
+def default_cache_dir() -> Path:
+    """Return the platform's folder for this program's cached files; it need not exist."""
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA", "")
+    elif sys.platform == "darwin":
+        base = os.path.join("~", "Library", "Caches")
+    else:
+        base = os.environ.get("XDG_CACHE_HOME", "")
+    return Path(os.path.expanduser(base or os.path.join("~", ".cache"))) / "tk"
 
 
 def weights() -> dict[str, Path]:

@@ -16,7 +16,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -79,7 +78,6 @@ class VolumetricTracker:
         volume: the working volume.
         up: the world axis that points up.
         config: all settings.
-        cache_dir: where look-up tables are kept between runs; None for the platform's cache folder.
 
     Raises:
         VolumeError: no two cameras see the volume.
@@ -101,14 +99,12 @@ class VolumetricTracker:
         """Return a new tracker with the settings of this method."""
         return cls(setup.rig, setup.volume, setup.up, settings, fps=setup.fps)
 
-    def __init__(
-        self, rig: Rig, volume: Volume, up: str, config: Settings, cache_dir: Path | None = None, fps: float = 15.0
-    ) -> None:
+    def __init__(self, rig: Rig, volume: Volume, up: str, config: Settings, fps: float = 15.0) -> None:
         self.config = config
         self.scale, self.iterations = points_and_iterations(config.effort_factor)
         self.up = up
         self.rig = rig
-        self.hull = VisualHull(rig, VoxelGrid.cover(volume, config.voxels), cache_dir)
+        self.hull = VisualHull(rig, VoxelGrid.cover(volume, config.voxels))
         self._finder = ContourTracker(rig, up, config.silhouette, fps)
         skeleton = build_skeleton(BodyDimensions.from_stature(1.7), up, (WAIST,) if config.body.waist else ())
         self.pose_names, self.pose_units = skeleton.names, skeleton.units

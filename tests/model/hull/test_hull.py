@@ -1,7 +1,5 @@
 """The visual hull of synthetic rigs and shared captures against a brute-force projection hull."""
 
-import os
-
 import cv2
 import numpy as np
 import pytest
@@ -12,7 +10,6 @@ from tests.conftest import development_capture
 from tk.errors import ConfigError, VolumeError
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.volume import Volume, VoxelGrid
-from tk.model.hull import tables as hull_tables
 from tk.model.hull.hull import VisualHull
 
 VOLUME = Volume((0.0, 0.0, 1.0), (1.0, 0.8, 1.2))
@@ -67,11 +64,6 @@ def silhouettes(rig, solid):
 def ball(center=(0.0, 0.0, 1.0), radius=0.25, count=4000, seed=0):
     directions = np.random.default_rng(seed).normal(size=(count, 3))
     return np.asarray(center) + radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
-
-
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
 @few
@@ -214,110 +206,6 @@ def test_a_volume_that_no_two_cameras_see():
     grid = VoxelGrid.cover(Volume((50.0, 50.0, 1.0), (1.0, 1.0, 1.0)), 8)
     with pytest.raises(VolumeError, match=r"capture\.toml: no two cameras see"):
         VisualHull(make_rig(3), grid)
-
-
-# --- cache ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def build_calls(monkeypatch):
-    calls = []
-    build = hull_tables._build
-    monkeypatch.setattr(hull_tables, "_build", lambda rig, grid: calls.append(1) or build(rig, grid))
-    return calls
-
-
-def same(a, b):
-    return np.array_equal(a.row_offsets, b.row_offsets) and np.array_equal(a.entries, b.entries)
-
-
-def test_tables_come_back_from_the_cache(tmp_path, build_calls):
-    rig, grid = make_rig(4), VoxelGrid.cover(VOLUME, 16)
-    first = hull_tables.load_or_build(rig, grid, tmp_path)
-    second = hull_tables.load_or_build(rig, grid, tmp_path)
-    assert len(build_calls) == 1 and same(first, second)
-    assert [p.suffix for p in tmp_path.iterdir() if p.is_file()] == [".npz"]
-
-
-def test_the_default_cache_is_the_platforms(tmp_path, build_calls):
-    VisualHull(make_rig(3), VoxelGrid.cover(VOLUME, 8))
-    assert len(list(hull_tables.default_cache_dir().glob("hull-*.npz"))) == 1
-    if os.name == "posix" and os.uname().sysname == "Linux":
-        assert hull_tables.default_cache_dir() == tmp_path / "cache" / "tk"
-
-
-def test_the_cache_key_depends_on_every_number():
-    rig, grid = make_rig(3), VoxelGrid.cover(VOLUME, 16)
-    keys = {hull_tables.table_key(rig, grid)}
-    camera = rig[1]
-    for changed in (
-        {"width": camera.width + 1},
-        {"matrix": camera.matrix + 1e-9 * np.eye(3)},
-        {"distortions": camera.distortions + 1e-9},
-        {"rotation": camera.rotation.T},
-        {"translation": camera.translation + 1e-9},
-        {"fisheye": True},
-    ):
-        other = Camera(**{**camera.__dict__, **changed})
-        keys.add(hull_tables.table_key(Rig((rig[0], other, rig[2])), grid))
-    keys.add(hull_tables.table_key(Rig((rig[1], rig[0], rig[2])), grid))
-    keys.add(hull_tables.table_key(rig, VoxelGrid.cover(VOLUME, 17)))
-    keys.add(hull_tables.table_key(rig, VoxelGrid((0.0, 0.0, 1.0), grid.voxel_m, grid.shape)))
-    assert len(keys) == 10
-
-
-def test_a_damaged_cache_is_rebuilt(tmp_path, build_calls):
-    rig, grid = make_rig(4), VoxelGrid.cover(VOLUME, 16)
-    good = hull_tables.load_or_build(rig, grid, tmp_path)
-    (path,) = tmp_path.glob("*.npz")
-    content = path.read_bytes()
-    flipped = bytearray(content)
-    flipped[len(content) // 2] ^= 0xFF
-
-    def write_npz(**arrays):
-        with path.open("wb") as stream:
-            np.savez(stream, **arrays)
-
-    beyond = good.entries.copy()
-    beyond[-1] = (32 * grid.shape[0] * grid.shape[1]) << 3
-    spoilers = [
-        lambda: path.write_bytes(b""),
-        lambda: path.write_bytes(content[: len(content) // 2]),
-        lambda: path.write_bytes(bytes(flipped)),
-        lambda: path.write_text("not an archive"),
-        lambda: write_npz(row_offsets=good.row_offsets),
-        lambda: write_npz(row_offsets=good.row_offsets[:-1], entries=good.entries),
-        lambda: write_npz(row_offsets=good.row_offsets, entries=beyond),
-        lambda: write_npz(row_offsets=good.row_offsets.astype(object), entries=good.entries),
-    ]
-    for number, spoil in enumerate(spoilers, start=2):
-        spoil()
-        assert same(hull_tables.load_or_build(rig, grid, tmp_path), good)
-        assert len(build_calls) == number
-    hull_tables.load_or_build(rig, grid, tmp_path)
-    assert len(build_calls) == len(spoilers) + 1  # the last spoilt file was mended
-
-
-def test_an_unwritable_cache_is_not_used(tmp_path, build_calls):
-    rig, grid = make_rig(3), VoxelGrid.cover(VOLUME, 8)
-    blocked = tmp_path / "a file"
-    blocked.write_text("in the way")
-    hull = VisualHull(rig, grid, blocked / "cache")
-    hull.update(silhouettes(rig, ball()))
-    assert hull.occupancy.any() and len(build_calls) == 1
-
-
-def test_the_oldest_tables_are_deleted_first(tmp_path, monkeypatch):
-    sizes = []
-    for age, voxels in enumerate((8, 9, 10)):
-        path = tmp_path / f"hull-{voxels}.npz"
-        hull_tables._save(path, hull_tables._build(make_rig(3), VoxelGrid.cover(VOLUME, voxels)))
-        os.utime(path, (1000 + age, 1000 + age))
-        sizes.append(path.stat().st_size)
-    (tmp_path / "of-somebody-else.npz").write_bytes(b"0" * 9999)
-    monkeypatch.setattr(hull_tables, "_CACHE_BYTES", sizes[1] + sizes[2])
-    hull_tables._prune(tmp_path)
-    assert sorted(p.name for p in tmp_path.glob("*.npz")) == ["hull-10.npz", "hull-9.npz", "of-somebody-else.npz"]
 
 
 # --- shared captures -----------------------------------------------------------------------------------------------

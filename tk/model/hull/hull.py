@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from tk.kernels import hull as kernels
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.volume import VoxelGrid
-from tk.model.hull.tables import HullTables, load_or_build, mask_words
+from tk.model.hull.tables import build_tables, mask_words
 
 __all__ = ["HullSurface", "VisualHull"]
 
@@ -47,18 +46,16 @@ class VisualHull:
     Args:
         rig: up to 31 cameras.
         grid: the voxels.
-        cache_dir: folder of the look-up tables between runs; by default the platform's cache folder. A cache that
-            cannot be read or written is ignored.
 
     Raises:
         VolumeError: no voxel is seen by two cameras.
         ConfigError: too many cameras or voxels for 32-bit look-up tables.
     """
 
-    def __init__(self, rig: Rig, grid: VoxelGrid, cache_dir: Path | None = None) -> None:
+    def __init__(self, rig: Rig, grid: VoxelGrid) -> None:
         self.rig = rig
         self.grid = grid
-        self._tables: HullTables = load_or_build(rig, grid, cache_dir)
+        self._tables = build_tables(rig, grid)
         self._mask_shape = (len(rig), *rig.frame_shape)
         self._pixel_count = int(np.prod(rig.frame_shape))
         self._eyes = ((rig.centers - np.asarray(grid.origin)) / grid.voxel_m).astype(np.float32)
