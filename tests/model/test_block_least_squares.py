@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tk.model.block_least_squares import Equations, Stop, gauge_projection, minimise
+from tk.model.block_least_squares import Equations, gauge_projection, minimise
 
 BLOCKS, OWN, SHARED, ROWS = 3, 4, 5, 7
 
@@ -18,12 +18,11 @@ class Linear:
         self.rows = rng.normal(size=(BLOCKS, ROWS, OWN + SHARED))
         self.target, self.weight = rng.normal(size=(BLOCKS, ROWS)), rng.uniform(0.1, 2.0, (BLOCKS, ROWS))
         self.own_precision, self.shared_precision = rng.uniform(0.5, 2.0, OWN), rng.uniform(0.5, 2.0, SHARED)
-        self.free = rng.random(OWN) < 0.7
         self.start = rng.normal(size=(BLOCKS, OWN)), rng.normal(size=SHARED)
 
     def linearise(self, state, level=0):
         p, s = state
-        equations = Equations(BLOCKS, self.free, SHARED)
+        equations = Equations(BLOCKS, OWN, SHARED)
         for b, rows in enumerate(self.rows):
             residual = self.target[b] - rows @ np.concatenate([p[b], s])
             equations.add(b, [slice(0, OWN), slice(OWN, OWN + SHARED)], rows, self.weight[b], residual)
@@ -33,9 +32,8 @@ class Linear:
         return equations
 
     def dense(self):
-        """Hessian and gradient of all free unknowns at the start: blocks first, then the shared unknowns."""
+        """Hessian and gradient of all unknowns at the start: blocks first, then the shared unknowns."""
         p, s = self.start
-
         H = np.diag(np.concatenate([np.tile(self.own_precision, BLOCKS), self.shared_precision]))
         g = -np.diag(H) * np.concatenate([p.ravel(), s])
         for b, rows in enumerate(self.rows):
@@ -43,8 +41,7 @@ class Linear:
             J[:, b * OWN : (b + 1) * OWN], J[:, BLOCKS * OWN :] = rows[:, :OWN], rows[:, OWN:]
             H += J.T @ (self.weight[b][:, None] * J)
             g += J.T @ (self.weight[b] * (self.target[b] - rows @ np.concatenate([p[b], s])))
-        kept = np.concatenate([np.tile(self.free, BLOCKS), np.ones(SHARED, bool)])
-        return H[np.ix_(kept, kept)], g[kept], kept
+        return H, g
 
 
 def move(state, own, shared):
@@ -55,10 +52,9 @@ def move(state, own, shared):
 @settings(max_examples=30, deadline=None)
 def test_step_and_covariance_equal_the_dense_solution(seed, damping):
     problem = Linear(seed)
-    H, g, kept = problem.dense()
+    H, g = problem.dense()
     H[np.diag_indices_from(H)] *= 1 + damping
-    expected = np.zeros(len(kept))
-    expected[kept] = np.linalg.solve(H, g)
+    expected = np.linalg.solve(H, g)
     reduced = problem.linearise(problem.start).reduced(damping)
     own, shared = reduced.step()
     np.testing.assert_allclose(np.concatenate([own.ravel(), shared]), expected, atol=1e-9)
@@ -70,21 +66,28 @@ def test_step_and_covariance_equal_the_dense_solution(seed, damping):
 def test_linear_problem_converges_in_two_iterations(seed):
     problem = Linear(seed)
     found = minimise(problem.start, problem.linearise, move, [0] * 5, (100.0, 100.0), tolerance=1e-8)
-    assert found.reason is Stop.CONVERGED and found.iterations == 2
-    np.testing.assert_allclose(problem.linearise(found.state).gradient[:, :OWN][:, problem.free], 0, atol=1e-8)
+    assert found.converged
+    np.testing.assert_allclose(problem.linearise(found.state).gradient[:, :OWN], 0, atol=1e-8)
 
 
 def test_steps_are_limited_and_all_iterations_are_made():
     problem = Linear(1)
     found = minimise(problem.start, problem.linearise, move, [1, 0], (0.01, 0.02), tolerance=1e-8)
-    assert found.reason is Stop.ITERATIONS and found.iterations == 2
+    assert not found.converged
     for now, before, limit in zip(found.state, problem.start, (0.02, 0.04), strict=True):
         assert np.abs(now - before).max() == pytest.approx(limit)
 
 
 def test_coarse_levels_do_not_end_the_iteration():
     problem = Linear(2)
-    assert minimise(problem.start, problem.linearise, move, [1, 1, 0], (9.0, 9.0), tolerance=np.inf).iterations == 3
+    levels = []
+
+    def linearise(state, level):
+        levels.append(level)
+        return problem.linearise(state, level)
+
+    assert minimise(problem.start, linearise, move, [1, 1, 0, 0], (9.0, 9.0), tolerance=np.inf).converged
+    assert levels == [1, 1, 0]
 
 
 def test_blocks_without_shared_unknowns_are_solved_each_on_its_own():
@@ -92,27 +95,27 @@ def test_blocks_without_shared_unknowns_are_solved_each_on_its_own():
     rows, target = rng.normal(size=(BLOCKS, ROWS, OWN)), rng.normal(size=(BLOCKS, ROWS))
 
     def linearise(p, _):
-        equations = Equations(BLOCKS, np.ones(OWN, bool), 0)
+        equations = Equations(BLOCKS, OWN, 0)
         for b in range(BLOCKS):
             equations.add(b, [slice(0, OWN)], rows[b], np.ones(ROWS), target[b] - rows[b] @ p[b])
         return equations
 
     levels = [0] * 60
     found = minimise(np.zeros((BLOCKS, OWN)), linearise, lambda p, own, _: p + own, levels, (9.0, 9.0), damping=0.2)
-    assert found.iterations == 60
+    assert not found.converged
     for b in range(BLOCKS):
         np.testing.assert_allclose(found.state[b], np.linalg.lstsq(rows[b], target[b], rcond=None)[0], atol=1e-6)
 
 
 def test_without_iterations_the_start_is_returned():
     found = minimise(3.0, lambda *_: pytest.fail("linearised"), lambda *_: 0.0, [], (1.0, 1.0))
-    assert (found.state, found.reduced, found.iterations) == (3.0, None, 0)
+    assert (found.state, found.reduced, found.converged) == (3.0, None, False)
 
 
 def test_damped_iterations_reach_the_same_minimum():
     problem = Linear(3)
     plain = minimise(problem.start, problem.linearise, move, [0], (100.0, 100.0)).state
-    damped = minimise(problem.start, problem.linearise, move, [0] * 40, (100.0, 100.0), damping=0.3).state
+    damped = minimise(problem.start, problem.linearise, move, [0] * 100, (100.0, 100.0), damping=0.3).state
     for one, other in zip(plain, damped, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-8)
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import Enum
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -23,15 +22,13 @@ class Equations:
     """Normal equations of B blocks of D unknowns each and of S shared unknowns; begin at zero.
 
     Attributes:
-        free: (D,) bool, the unknowns of a block that may change.
         hessian: (B, D + S, D + S) JᵀWJ of each block's rows; its own unknowns come first.
         gradient: (B, D + S) JᵀW times the residuals.
         prior_hessian, prior_gradient: (S, S), (S,) the same of the shared unknowns' prior.
     """
 
-    def __init__(self, blocks: int, free: NDArray[np.bool_], shared: int) -> None:
-        self.free = free
-        size = len(free) + shared
+    def __init__(self, blocks: int, own: int, shared: int) -> None:
+        size = own + shared
         self.hessian, self.gradient = np.zeros((blocks, size, size)), np.zeros((blocks, size))
         self.prior_hessian, self.prior_gradient = np.zeros((shared, shared)), np.zeros(shared)
 
@@ -57,23 +54,22 @@ class Equations:
 
     def add_block_prior(self, block: int, precision: Float, difference: Float) -> None:
         """Add a prior on a block: precision (D,) and the difference (D,) from the estimate to the prior's mean."""
-        index = np.arange(len(self.free))
+        index = np.arange(len(precision))
         self.hessian[block, index, index] += precision
         self.gradient[block, index] += precision * difference
 
     def reduced(self, damping: float = 0.0) -> Reduced:
         """Eliminate the blocks. ``damping`` is the share of each diagonal element that is added to it."""
-        D, S = len(self.free), len(self.prior_gradient)
-        free = np.flatnonzero(self.free)
+        S = len(self.prior_gradient)
+        D = self.gradient.shape[1] - S
         hessian, by_block = np.zeros((S, S)), np.zeros((len(self.hessian), S))
         plain, response = np.zeros((len(self.hessian), D)), np.zeros((len(self.hessian), D, S))
         diagonal = np.diag(self.prior_hessian).copy()
         for b, (H, g) in enumerate(zip(self.hessian, self.gradient, strict=True)):
-            across = H[free, D:]
-            own = H[np.ix_(free, free)]
+            own, across = H[:D, :D].copy(), H[:D, D:]
             own[np.diag_indices_from(own)] *= 1.0 + damping
-            solved = np.linalg.solve(own, np.column_stack([g[free], across]))
-            plain[b, free], response[b, free] = solved[:, 0], solved[:, 1:]
+            solved = np.linalg.solve(own, np.column_stack([g[:D], across]))
+            plain[b], response[b] = solved[:, 0], solved[:, 1:]
             hessian += H[D:, D:] - across.T @ solved[:, 1:]
             by_block[b] = g[D:] - across.T @ solved[:, 0]
             diagonal += np.diag(H)[D:]
@@ -104,13 +100,6 @@ class Reduced:
         return self.plain - self.response @ shared, shared
 
 
-class Stop(Enum):
-    """Why the iteration ended."""
-
-    CONVERGED = "the last step was below the tolerance"
-    ITERATIONS = "all iterations were made"
-
-
 @dataclass(frozen=True)
 class Solution(Generic[T]):
     """Result of :func:`minimise`.
@@ -118,14 +107,12 @@ class Solution(Generic[T]):
     Attributes:
         state: the estimate.
         reduced: the equations of the last step; None if no step was made.
-        iterations: number of steps.
-        reason: why the iteration ended.
+        converged: whether the last step was below the tolerance.
     """
 
     state: T
     reduced: Reduced | None
-    iterations: int
-    reason: Stop
+    converged: bool
 
 
 def minimise(
@@ -150,13 +137,13 @@ def minimise(
         damping: share of each diagonal element that is added to it.
     """
     state, reduced = start, None
-    for count, level in enumerate(levels, start=1):
+    for level in levels:
         reduced = linearise(state, level).reduced(damping)
         blocks, shared = reduced.step()
         state = move(state, np.clip(blocks, -longest[0], longest[0]), np.clip(shared, -longest[1], longest[1]))
         if tolerance is not None and level == 0 and (np.abs(shared) < tolerance).all():
-            return Solution(state, reduced, count, Stop.CONVERGED)
-    return Solution(state, reduced, len(levels), Stop.ITERATIONS)
+            return Solution(state, reduced, True)
+    return Solution(state, reduced, False)
 
 
 def gauge_projection(modes: Float, precision: Float) -> Float:

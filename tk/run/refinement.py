@@ -17,12 +17,11 @@ from tk.io.captures.mask_store import MaskStore
 from tk.io.paths import check_output
 from tk.io.results.reader import read_result
 from tk.kernels.mask_values import OTHERS
-from tk.model.block_least_squares import Stop
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.agreement import LATE_FRAMES, CameraAgreement, camera_agreement
 from tk.model.cameras.bundle import choose_frames
 from tk.model.cameras.camera import Rig
-from tk.model.cameras.refinement import Refined, RefinementSettings, refine_cameras
+from tk.model.cameras.refinement import SCALES, Refined, RefinementSettings, refine_cameras
 from tk.model.cameras.tracker_frame import TrackerFrame
 from tk.model.cues.ray_costs import Evidence, RayGrid, residual_of
 from tk.model.masks.silhouettes import Views
@@ -75,7 +74,7 @@ class Refinement:
         """Warnings about unreliable numbers, one line each."""
         r = self.refined
         lines = []
-        if r.stop is not Stop.CONVERGED:
+        if not r.converged:
             lines.append("the cameras still moved in the last round; refine again with the new calibration")
         vague = [name for name, observed in zip(self.names, r.observed, strict=True) if not observed]
         if vague:
@@ -174,7 +173,7 @@ def refine_rig(
     for _ in range(_SHIFTS):
         chosen = choose_frames(
             lambda frame, camera: masks(frame)[camera],
-            Views(rig), body.skeleton, frames, poses, usable, FRAMES, how.scales, True, late,
+            Views(rig), body.skeleton, frames, poses, usable, FRAMES, SCALES, True, late,
         )  # fmt: skip
         if len(chosen) < FEWEST:
             break

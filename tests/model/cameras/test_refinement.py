@@ -15,6 +15,7 @@ from tk.io.captures.mask_store import MaskStore
 from tk.kernels.cones import CONE
 from tk.model.body.body_parameters import BodyFamily, shapes_of
 from tk.model.body.cone_body import SHAPE_NUMBERS, group_of
+from tk.model.cameras import refinement
 from tk.model.cameras.agreement import camera_agreement
 from tk.model.cameras.bundle import camera_rows, choose_frames, farthest
 from tk.model.cameras.camera import Camera, Rig
@@ -33,7 +34,14 @@ from tk.run.refinement import refine_rig
 
 RIG = ring_of_cameras(4, width=320, height=400)
 FRAMES = 12
-QUICK = RefinementSettings(rounds=4, scales=1)
+QUICK = RefinementSettings()
+
+
+@pytest.fixture(autouse=True)
+def few_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fine scale only."""
+    monkeypatch.setattr(refinement, "COARSE_ROUNDS", 0)
+    monkeypatch.setattr(refinement, "ROUNDS", 5)
 
 
 @cache
@@ -183,7 +191,7 @@ def test_body_family_begins_at_the_body():
 
 def test_refinement_corrects_perturbed_cameras():
     # rendered contours are exact, so the prior is wide
-    how = replace(QUICK, rounds=6, trust=5.0, offsets=False)
+    how = RefinementSettings(trust=5.0, offsets=False)
     found = refine_cameras(BODY, PERTURBED, frames(in_time(), PERTURBED), how)
     (was_turned, was_moved), (turned, moved) = errors(PERTURBED), errors(found.rig)
     assert turned < 0.08 and turned < was_turned / 2.5, (was_turned, turned)
@@ -215,7 +223,7 @@ def test_focal_lengths_are_refined():
             for c in RIG
         )
     )
-    found = refine_cameras(BODY, wide, frames(in_time(), wide), replace(QUICK, focal=True))
+    found = refine_cameras(BODY, wide, frames(in_time(), wide), RefinementSettings(focal=True))
     assert found.focal[2] < 0.997 and np.abs(np.delete(found.focal, 2) - 1).max() < 0.004, found.focal
 
 

@@ -68,12 +68,11 @@ def _fitted(skeleton: Skeleton, rows: NDArray[np.int64], targets: Float) -> Floa
     start[:, skeleton.index("torso_yaw")] = np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS
     for pose in start:
         pose[:3] = targets.mean(axis=0) - skeleton.joints(rest)[rows].mean(axis=0)
-    free = np.ones(len(rest), bool)
     precision = np.where(skeleton.prismatic, 0.0, _ANGLE**-2.0)
     weight = np.full(3 * len(rows), _JOINT_M**-2.0)
 
     def linearise(poses: Float, _: int) -> Equations:
-        found = Equations(len(poses), free, 0)
+        found = Equations(len(poses), len(rest), 0)
         for b, pose in enumerate(poses):
             J = skeleton.joint_jacobian(pose)[rows].reshape(-1, len(rest))
             missing = targets - skeleton.joints(pose)[rows]

@@ -185,7 +185,7 @@ class ContourBundle:
         if self._segment_m is None:
             L = 0
         D, S = P + L, self.cameras.stop + K
-        found = Equations(len(self.frames), np.ones(D, bool), S)
+        found = Equations(len(self.frames), D, S)
         first = np.flatnonzero(np.diff([-1, *(view.frame for view in contours)])).tolist()
         for begin, end in zip(first, [*first[1:], len(contours)], strict=True):  # small arrays are faster: by frame
             views = contours[begin:end]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError
-from tk.model.block_least_squares import Stop, gauge_projection, minimise
+from tk.model.block_least_squares import gauge_projection, minimise
 from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.agreement import CAMERA_SEARCH, SCALE_DEVIATION
@@ -34,35 +34,29 @@ TURN_DEG, MOVE_M, FOCAL, OFFSET_FRAMES = 0.18, 0.007, 0.01, 2.0
 _SMALL = 0.04
 # A camera's placement counts as observed if its standard deviation is below this share of the prior one.
 _OBSERVED = 0.7
-# Iterations at each coarser scale.
-_COARSE_ROUNDS = 2
+# Scales of the edge search, and the largest number of iterations at the coarse and at the fine one. Most recordings
+# converge in fewer.
+SCALES, COARSE_ROUNDS, ROUNDS = 2, 2, 8
 
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """Settings of the camera refinement.
+    """What `tk refine` may change.
 
     Attributes:
         focal: whether focal lengths change, too.
         offsets: whether the videos' delays are estimated.
-        rounds: largest number of iterations at the finest scale.
-        scales: of the edge search; the coarsest comes first.
         trust: factor of the prior standard deviations :data:`TURN_DEG` and :data:`MOVE_M`; larger for cameras with
             larger errors.
     """
 
     focal: bool = False
     offsets: bool = True
-    rounds: int = 8
-    scales: int = 2
     trust: float = 1.0
 
     def __post_init__(self) -> None:
-        if not 1 <= self.rounds <= 100 or not 1 <= self.scales <= 5 or not 0 < self.trust <= 1000:
-            raise ConfigError(
-                f"refinement: rounds = {self.rounds} must lie in [1, 100], scales = {self.scales} in [1, 5], trust = "
-                f"{self.trust} in (0, 1000]"
-            )
+        if not 0 < self.trust <= 1000:
+            raise ConfigError(f"refinement: trust = {self.trust} must lie in (0, 1000]")
 
 
 @dataclass(frozen=True)
@@ -80,8 +74,7 @@ class Refined:
         observed: (C,) bool, whether the recording determines a camera's placement better than the prior.
         before_px, after_px: (C,) pixels of the recorded image, root mean square distance of contours from the mask's
             edges.
-        rounds: number of iterations.
-        stop: why the iteration ended.
+        converged: whether the last steps were small.
     """
 
     rig: Rig
@@ -96,8 +89,7 @@ class Refined:
     observed: NDArray[np.bool_]
     before_px: Float
     after_px: Float
-    rounds: int
-    stop: Stop
+    converged: bool
 
 
 def refine_cameras(
@@ -111,7 +103,7 @@ def refine_cameras(
     Args:
         body: the tracked body, in a world in which z is up.
         rig: the cameras as calibrated.
-        frames: with pyramids of at least ``config.scales`` scales.
+        frames: with pyramids of :data:`SCALES` scales.
         config: see :class:`RefinementSettings`.
     """
     config = config or RefinementSettings()
@@ -124,7 +116,7 @@ def refine_cameras(
         bundle.start,
         bundle.linearise,
         bundle.move,
-        [s for s in range(config.scales - 1, 0, -1) for _ in range(_COARSE_ROUNDS)] + [0] * config.rounds,
+        [1] * COARSE_ROUNDS + [0] * ROUNDS,
         (LONGEST_STEP[0], np.concatenate([np.full(len(sigma), np.inf), np.full(len(others), LONGEST_STEP[1])])),
         np.concatenate([_SMALL * sigma, others]),
     )
@@ -147,8 +139,7 @@ def refine_cameras(
         observed=(posterior["turn"] < _OBSERVED * prior["turn"]) & (posterior["move"] < _OBSERVED * prior["move"]),
         before_px=residual_px(bundle.contours(bundle.start, 0), C) * rig.reductions,
         after_px=residual_px(bundle.contours(final, 0), C) * rig.reductions,
-        rounds=solution.iterations,
-        stop=solution.reason,
+        converged=solution.converged,
     )
 
 
