@@ -6,16 +6,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.model.body.cone_body import ConeBody
-from tk.model.body.joints import HIPS, LIMBS, ROWS, SHOULDERS
+from tk.model.body.joints import HIPS, ROWS, SHOULDERS, TABLE
 from tk.model.body.skeleton import JOINTS
 from tk.model.cues.ray_costs import RayGrid
 
 Float = NDArray[np.float64]
 
 # The joints at the ends of a segment's bone; the pelvis belongs to the trunk.
-_BONES = {"torso": ("pelvis", "neck"), "head": ("neck", "head_top")}
-for _start, _middle, _end in LIMBS.values():
-    _BONES |= {ROWS[_middle].carrier: (_start, _middle), ROWS[_end].carrier: (_middle, _end)}
+_BONES = {
+    row.carrier: (row.bone_from, row.name)
+    for row in TABLE
+    if row.bone_from and (row.carrier == "torso" or ROWS[row.bone_from].chain == row.chain)
+}
 _SEGMENTS = list(_BONES)
 _ENDS = np.array([[JOINTS.index(name) for name in ends] for ends in _BONES.values()])
 # (15, S) weights of the segments that a joint belongs to: its bones, and the trunk for shoulders and hips.
