@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tk.commands.config_text import annotated_toml, meanings
@@ -46,7 +46,6 @@ def test_defaults_round_trip() -> None:
     assert settings_file.from_toml("") == Settings()
 
 
-@settings(deadline=None)
 @given(
     voxels=st.integers(8, 512),
     seed=st.integers(0, 2**62),

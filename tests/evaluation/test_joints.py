@@ -103,7 +103,7 @@ def test_limb_joints_are_the_twelve() -> None:
     assert set(JOINTS) - set(LIMB_JOINTS) == {"pelvis", "neck", "head_top"}
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 0.5))
 def test_constant_joint_offsets_are_removed_in_corrected_figures(seed: int, size: float) -> None:
     """Any constant offset of any joint in the trunk's frame, the trunk's own joints included."""
@@ -117,7 +117,7 @@ def test_constant_joint_offsets_are_removed_in_corrected_figures(seed: int, size
     assert found.raw.all.mean_cm == pytest.approx(100 * np.linalg.norm(offsets, axis=1).mean(), abs=1e-9)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1))
 def test_corrected_figures_do_not_depend_on_the_world(seed: int) -> None:
     generator = np.random.default_rng(seed)

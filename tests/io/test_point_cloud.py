@@ -24,7 +24,7 @@ def points(count: int, seed: int = 0) -> HullPoints:
     return HullPoints(rng.normal(size=(count, 3)), rng.integers(0, 256, (count, 3), dtype=np.uint8))
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=20)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=20)
 @given(count=st.integers(0, 40), faces=st.integers(0, 30), seed=st.integers(0, 1000))
 def test_open3d_reads_points_and_meshes(tmp_path: Path, count: int, faces: int, seed: int) -> None:
     expected = points(count, seed)

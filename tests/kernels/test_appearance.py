@@ -13,7 +13,7 @@ def segment_oracle(mean, bound, colors, seen):
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 63), st.integers(0, 60))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_equals_the_boxes_written_out(seed, patches, voxels):
     """Whole numbers, so that voxels lie on the walls of the boxes too."""
     rng = np.random.default_rng(seed)

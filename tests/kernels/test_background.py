@@ -104,7 +104,7 @@ def test_unconfined_statistic_is_the_smaller_eigenvalue():
         assert abs(int(collinearity[y, x]) - level_of(smaller / 27 * 0.5)) <= ONE_LEVEL
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(factor=st.floats(0.72, 0.97), seed=st.integers(0, 1000))
 def test_a_shadow_stays_collinear_and_a_highlight_does_not(factor, seed):
     plates = np.random.default_rng(seed).integers(100, 180, (1, 10, 10, 3)).astype(np.uint8)
@@ -145,7 +145,7 @@ def test_buffers_are_cleared_between_measurements():
     assert not again.labels.any() and not again.difference.any() and not again.bright.any()
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 1000), iterations=st.integers(0, 4))
 def test_relaxation_matches_the_oracle(seed, iterations):
     images, plates = scene(seed)
@@ -159,7 +159,7 @@ def test_relaxation_matches_the_oracle(seed, iterations):
     np.testing.assert_array_equal(pictures(statistic.labels, 17), labels)
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(
     seed=st.integers(0, 100),
     box=st.tuples(st.integers(0, 10), st.integers(0, 20), st.integers(1, 7), st.integers(1, 9)),

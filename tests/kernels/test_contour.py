@@ -135,7 +135,7 @@ def test_points_lie_on_the_rim_with_full_perspective(kernel):
     assert worst < INTERPOLATION_M
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     radius=st.floats(0.05, 0.3),
     distance=st.floats(1.5, 8.0),

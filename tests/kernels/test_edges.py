@@ -177,7 +177,7 @@ def test_on_demand_equals_whole_picture() -> None:
     color=st.tuples(*[st.integers(60, 250)] * 3).filter(lambda c: sum(c) > 450),
     factor=st.floats(0.75, 0.95),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_shadow_counts_little(color: tuple[int, ...], factor: float) -> None:
     """A bright colour scaled: what remains is the Euclidean share, and rounding."""
     shaded = tuple(round(factor * c) for c in color)
@@ -209,7 +209,7 @@ COLORS = st.tuples(*[st.integers(0, 255)] * 3)
 
 
 @given(left=COLORS, right=COLORS, angle=st.floats(-math.pi, math.pi), blur_px=st.sampled_from([0.4, 0.8, 2.0, 5.0]))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_direction_of_steps_and_ramps(
     left: tuple[int, ...], right: tuple[int, ...], angle: float, blur_px: float
 ) -> None:

@@ -9,7 +9,7 @@ from tk.kernels import hull as kernels
 
 shapes = st.tuples(st.integers(1, 6), st.integers(1, 6), st.integers(1, 70))
 seeds = st.integers(0, 2**32 - 1)
-few = settings(max_examples=25, deadline=None)
+few = settings(max_examples=25)
 
 
 def pack_oracle(active):

@@ -22,7 +22,7 @@ EXACT = 1e-13
 # single precision over the same chain, metres
 SINGLE = 3e-6
 seeds = st.integers(0, 2**32 - 1)
-few = settings(max_examples=25, deadline=None)
+few = settings(max_examples=25)
 
 
 def poses_of(rng, count):

@@ -49,7 +49,7 @@ def check(index, points, patch, reach):
     st.sampled_from([0.03, 0.3, 2.0]),
     st.sampled_from([0.2, 1.0, 6.0]),
 )
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 def test_equals_all_pairs(seed, count, cell_m, reach, spread):
     """Cells smaller and larger than the reach, queries inside and far outside the grid."""
     rng = np.random.default_rng(seed)
@@ -92,7 +92,7 @@ def test_reach_is_a_ball():
 
 
 @given(seeds, st.integers(1, 200), st.sampled_from([0.02, 0.1, 3.0]))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_index_holds_every_voxel_once_and_in_its_cell(seed, count, cell_m):
     rng = np.random.default_rng(seed)
     positions = rng.normal(0, 0.5, (count, 3))

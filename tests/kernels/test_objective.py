@@ -249,7 +249,7 @@ def test_nothing_within_reach_is_all_outliers(kernel):
 
 
 @given(st.integers(1, 70), st.integers(1, 40), st.integers(1, 5), st.integers(0, 2**32 - 1))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_any_number_of_points_and_poses(samples, voxels, poses, seed):
     """Tasks of 16 points: full, part-filled, and less than one."""
     scene = Scene(seed, poses, samples, voxels)

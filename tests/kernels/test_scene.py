@@ -26,7 +26,7 @@ def oracle(values, weights, tolerance, least, darkest, spread):
 
 
 @given(st.integers(0, 10**6))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_scene_equals_the_oracle(seed):
     rng = np.random.default_rng(seed)
     scene = rng.integers(40, 220, (4, 5, 3))

@@ -25,7 +25,7 @@ from tk.model.masks.silhouettes import Views, draw_silhouettes
 
 D = len(BODY.skeleton.names)
 FAMILY = BodyFamily(BODY.dimensions, 0.01)
-few = settings(max_examples=30, deadline=None)
+few = settings(max_examples=30)
 sizes = st.floats(0.03, 0.4)
 
 

@@ -14,7 +14,7 @@ from tk.model.body.superellipsoid import Superellipsoid
 EXACT = 1e-9
 seeds = st.integers(0, 2**32 - 1)
 exponents = st.floats(0.25, 1.75)
-few = settings(max_examples=30, deadline=None)
+few = settings(max_examples=30)
 
 
 def _kernel(real):

@@ -154,7 +154,7 @@ def test_kernels_of_others_keep_their_notes():
     assert "^" in str(caught.value)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(line=st.text(st.sampled_from(" \t\n\x0bab#é"), max_size=30))
 def test_lines_are_filled_as_by_textwrap(line):
     assert taichi_internals._fill(line, tabsize=4, width=9999) == textwrap.fill(line, tabsize=4, width=9999)

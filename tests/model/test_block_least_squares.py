@@ -49,7 +49,7 @@ def move(state, own, shared):
 
 
 @given(st.integers(0, 10**6), st.sampled_from([0.0, 0.3]))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_step_and_covariance_equal_the_dense_solution(seed, damping):
     problem = Linear(seed)
     H, g = problem.dense()
@@ -62,7 +62,7 @@ def test_step_and_covariance_equal_the_dense_solution(seed, damping):
 
 
 @given(st.integers(0, 10**6))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_linear_problem_converges_in_two_iterations(seed):
     problem = Linear(seed)
     found = minimise(problem.start, problem.linearise, move, [0] * 5, (100.0, 100.0), tolerance=1e-8)
@@ -121,7 +121,7 @@ def test_damped_iterations_reach_the_same_minimum():
 
 
 @given(st.integers(0, 10**6))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_gauge_projection_removes_modes_and_keeps_what_is_orthogonal(seed):
     rng = np.random.default_rng(seed)
     modes, precision, step = rng.normal(size=(8, 3)), rng.uniform(0.5, 2.0, 8), rng.normal(size=8)

@@ -87,7 +87,7 @@ def problem(seed, rows=9):
 
 
 @given(st.integers(0, 10**6))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_linear_problem_is_solved_in_one_step(seed):
     A, y, start = problem(seed)
     expected = np.linalg.lstsq(A, y, rcond=None)[0]
@@ -201,7 +201,7 @@ def test_states_of_a_batch_are_independent(tolerance):
 
 
 @given(st.integers(0, 10**6))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_scale_ends_once_no_parameter_moves_by_more_than_the_tolerance(seed):
     A, y, start = problem(seed)
     made = []
@@ -221,7 +221,7 @@ def test_scale_ends_once_no_parameter_moves_by_more_than_the_tolerance(seed):
 
 
 @given(seed=st.integers(0, 10**6), each=st.booleans())
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_prior_is_a_further_measurement(seed, each):
     """The minimum of ‖A p − y‖² + Σ w (p − m)², the mean shared or each state's own."""
     A, y, start = problem(seed)

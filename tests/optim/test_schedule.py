@@ -262,7 +262,7 @@ def test_no_iteration_moves_further_than_its_bound(monkeypatch: pytest.MonkeyPat
 
 
 @given(seed=st.integers(0, 2**32 - 1), free=st.lists(st.booleans(), min_size=6, max_size=6).filter(any))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_the_descent_basis_makes_the_curvature_of_the_free_parameters_one(seed: int, free: list[bool]) -> None:
     rng = np.random.default_rng(seed)
     J = rng.normal(size=(4, 6))  # fewer residuals than parameters: the damping makes up for what they do not see

@@ -153,7 +153,7 @@ def test_pushing_against_a_limit_leaves_the_step_size_alone() -> None:
     lower=st.floats(-2, 0),
     width=st.floats(0, 2),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_no_state_leaves_the_limits(seed: int, scale: float, lower: float, width: float) -> None:
     rng = np.random.default_rng(seed)
     gradients = scale * rng.normal(size=(12, 3, 2))
@@ -173,7 +173,7 @@ def test_no_state_leaves_the_limits(seed: int, scale: float, lower: float, width
     window=st.integers(1, 5),
     limits=st.tuples(st.integers(0, 4), st.integers(0, 4)),
 )
-@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_stops_when_the_moving_average_stands_still(
     constants, moves: list[tuple[int, ...]], window: int, limits: tuple[int, int]
 ) -> None:
@@ -387,7 +387,7 @@ def test_an_explosion_is_an_error_and_a_bound_prevents_it() -> None:
 
 
 @given(seed=st.integers(0, 2**32 - 1), scale=st.floats(1e-3, 1e6))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_the_bound_scales_an_update_as_a_whole(seed: int, scale: float) -> None:
     rng = np.random.default_rng(seed)
     gradients = scale * rng.normal(size=(1, 3, 4))

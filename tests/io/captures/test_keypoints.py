@@ -174,7 +174,7 @@ def test_people_outside_the_volume_are_refused(tmp_path: Path, capture: Capture,
         keypoint_pose(tmp_path / "pose", capture, FRAME)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damaged_files_give_one_line_or_a_pose(
     data: st.DataObject, detected: Path, capture: Capture, tmp_path: Path

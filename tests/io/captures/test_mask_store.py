@@ -15,7 +15,7 @@ from tk.kernels.mask_values import OTHERS
 
 
 @given(masks=array_shapes(min_dims=3, max_dims=3, max_side=13).flatmap(lambda s: arrays(np.uint8, s)))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_stored_masks_are_returned_as_0_255_and_other_people(masks):
     store = MaskStore()
     store.put(7, masks)
@@ -27,7 +27,7 @@ def test_stored_masks_are_returned_as_0_255_and_other_people(masks):
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_a_sequence_of_frames_has_the_requested_order(seed):
     rng = np.random.default_rng(seed)
     store, masks = MaskStore(), {}
@@ -92,7 +92,7 @@ def test_a_full_disk_is_reported_in_one_line(monkeypatch, tmp_path):
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_masks_of_a_killed_run_are_read_up_to_the_damage(seed, tmp_path_factory):
     """Whatever the damage, the masks that are read are right."""
     rng = np.random.default_rng(seed)

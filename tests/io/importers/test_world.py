@@ -36,7 +36,7 @@ def test_up_along_an_axis_is_found(name: str) -> None:
 
 
 @given(seed=seeds)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_up_of_a_rotated_world_is_found(seed: int) -> None:
     turn = Rotation.random(random_state=seed).as_matrix()
     found = infer_up(make_rig(world=turn))

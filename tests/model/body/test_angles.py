@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tk.model.body.angles import ANGLES, FORWARD_UP_RIGHT, MIRROR, joint_angles, segment_rotations, standing_axes
@@ -137,7 +137,6 @@ def test_internal_rotation_of_a_level_arm_lowers_the_hand(side: str) -> None:
     assert (np.diff(hands_in_order) < 0.02).all() and hands_in_order[0] - hands_in_order[-1] > 0.1
 
 
-@settings(deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_mirrored_poses_have_mirrored_angles(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -166,7 +165,6 @@ def test_angles_do_not_depend_on_the_axis_that_is_up(up: str) -> None:
         assert a[joint] == pytest.approx(b[joint], abs=1e-6)
 
 
-@settings(deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_angles_give_the_rotation_back(seed: int) -> None:
     rng = np.random.default_rng(seed)

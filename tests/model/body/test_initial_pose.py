@@ -17,7 +17,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 @given(seeds)
-@settings(max_examples=3, deadline=None)
+@settings(max_examples=3)
 def test_joints_of_the_rough_pose_are_near_the_written_ones(seed):
     """A body of average proportions in an everyday pose."""
     rng = np.random.default_rng(seed)

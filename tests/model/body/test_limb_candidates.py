@@ -27,7 +27,7 @@ def test_limbs_have_the_parts_and_angles_that_the_body_has():
 
 @pytest.mark.parametrize("name", LIMBS)
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_candidates_stay_within_the_limits_and_change_the_limb_only(name, seed):
     limb, rng = LIMB[name], np.random.default_rng(seed)
     pose = SKELETON.clip(rng.normal(0, 0.6, len(POSE)))
@@ -77,7 +77,7 @@ def test_leg_candidates_reach_from_behind_to_a_high_kick(name):
 
 
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 6))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_distinct_poses_differ_and_the_cheapest_is_first(seed, count):
     rng = np.random.default_rng(seed)
     limb = LIMB[list(LIMBS)[rng.integers(4)]]

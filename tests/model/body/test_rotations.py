@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -22,7 +22,6 @@ def test_composition_agrees_with_scipy(sequence: str) -> None:
 
 
 @pytest.mark.parametrize("sequence", SEQUENCES)
-@settings(deadline=None)
 @given(a=angle, b=angle, c=angle)
 def test_turns_give_the_rotation_back(sequence: str, a: float, b: float, c: float) -> None:
     R = compose(sequence, np.array([a, b, c]))
@@ -49,7 +48,6 @@ def test_unknown_sequence_is_refused() -> None:
         decompose("xyz", np.eye(3))
 
 
-@settings(deadline=None)
 @given(a=angle, b=angle, c=angle)
 def test_quaternions_give_the_matrix_back(a: float, b: float, c: float) -> None:
     R = compose("zxy", np.array([[a, b, c]]))

@@ -31,7 +31,7 @@ UPS = ("x", "y", "z", "-x", "-y", "-z")
 FORWARD, LEFT, UP = np.eye(3)
 
 seeds = st.integers(0, 2**32 - 1)
-many = settings(max_examples=60, deadline=None)
+many = settings(max_examples=60)
 
 
 def random_pose(seed):
@@ -165,7 +165,7 @@ def test_signs_of_the_ankles_are_anatomical(side):
 
 @pytest.mark.parametrize("up", ["z", "-y"])
 @given(seed=seeds)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_paper_pose_keeps_the_orientation_of_trunk_head_and_limbs(up, seed):
     skeleton = whole(up)
     poses = skeleton.clip(np.random.default_rng(seed).normal(0, 0.5, (2, 31)))
@@ -198,7 +198,7 @@ def test_skeleton_is_found_by_the_names_of_its_pose_vector():
 
 @pytest.mark.parametrize("up", ["z", "-y"])
 @given(seed=seeds)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_transforms_are_the_products_of_exponentials(up, seed):
     """T_k = T_parent(k) exp(ξ_k p_k), one after the other; a raised arm lifts its shoulder."""
     skeleton = whole(up)
@@ -443,7 +443,7 @@ def test_up_rotation_is_a_rotation_that_lifts_z(up):
 
 @pytest.mark.parametrize("up", UPS)
 @given(seed=seeds)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_another_up_gives_the_rotated_result(up, seed):
     """Angles mean the same; translations are along the world's axes."""
     skeleton, B = build_skeleton(DIMENSIONS, up), up_rotation(up)

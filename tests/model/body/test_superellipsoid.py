@@ -14,7 +14,7 @@ from tk.model.body.superellipsoid import Superellipsoid, signed_power
 PIECES = skin_of(BodyDimensions.from_stature(1.75)).pieces
 seeds = st.integers(0, 2**32 - 1)
 exponents = st.floats(0.3, 1.7)
-many = settings(max_examples=60, deadline=None)
+many = settings(max_examples=60)
 
 
 def piece_of(rng, e1=1.0, e2=1.0, whole=False):

@@ -69,7 +69,7 @@ def test_samples_have_the_segment_of_their_piece():
 
 
 @given(seeds)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_samples_lie_on_their_pieces_at_any_pose(seed):
     pose = np.random.default_rng(seed).uniform(-np.pi, np.pi, len(BODY.skeleton.names))
     points = BODY.place(pose)
@@ -124,7 +124,7 @@ def mirror_pieces():
 
 
 @given(seeds)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_mirrored_pose_gives_the_mirrored_surface(seed):
     """Every sample, reflected, lies on the partner of its piece at the reflected pose."""
     pose = np.random.default_rng(seed).uniform(-np.pi, np.pi, len(BODY.skeleton.names))

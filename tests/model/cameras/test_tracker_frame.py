@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -44,7 +44,6 @@ def bits(rig: Rig) -> list[bytes]:
 
 
 @given(seeds)
-@settings(deadline=None)
 def test_points_poses_and_cameras_survive_a_round_trip(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rig, up = random_rig(rng), random_up(rng)
@@ -61,7 +60,6 @@ def test_points_poses_and_cameras_survive_a_round_trip(seed: int) -> None:
 
 
 @given(seeds)
-@settings(deadline=None)
 def test_z_is_up_and_a_pose_places_the_same_body_in_both_worlds(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rig, up = random_rig(rng), random_up(rng)
@@ -77,7 +75,6 @@ def test_z_is_up_and_a_pose_places_the_same_body_in_both_worlds(seed: int) -> No
 
 
 @given(seeds)
-@settings(deadline=None)
 def test_cameras_are_bit_identical_in_any_world(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rig, up = random_rig(rng), random_up(rng)

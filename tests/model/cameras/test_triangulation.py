@@ -28,7 +28,7 @@ def seen(joints: np.ndarray) -> np.ndarray:
     return np.stack([np.column_stack([camera.project(joints)[0], np.full(15, 0.9)]) for camera in RIG])
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 2**16))
 def test_outliers_are_excluded(seed: int) -> None:
     """Two of five views of each joint are anywhere; the result agrees with the other three."""

@@ -88,7 +88,7 @@ def test_a_patch_that_hardly_any_voxel_fits_constrains_nothing(red, fits_all):
 
 
 @given(st.floats(0, 1), st.integers(0, 2**32 - 1))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_update_is_equation_16_within_its_bound(rate, seed):
     config = replace(CONFIG, rate=rate)
     model, _, _ = learned()

@@ -37,7 +37,7 @@ def test_every_part_has_a_group_and_either_side_the_same():
 
 
 @given(b=st.integers(0, 255), g=st.integers(0, 255), r=st.integers(0, 255))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_bins_have_sixteen_levels_of_each_channel(b, g, r):
     found = bin_of((b, g, r))
     assert found == (b // 16) * 256 + (g // 16) * 16 + r // 16

@@ -13,7 +13,7 @@ from tk.model.cameras.volume import Volume, VoxelGrid
 from tk.model.hull.hull import VisualHull
 
 VOLUME = Volume((0.0, 0.0, 1.0), (1.0, 0.8, 1.2))
-few = settings(max_examples=15, deadline=None)
+few = settings(max_examples=15)
 
 
 def look_at(name, eye, target=(0.0, 0.0, 1.0), size=(48, 40), focal=44.0, distortions=(0.05, -0.02, 0.001, -0.001)):

@@ -167,7 +167,7 @@ def test_specks_are_removed_and_small_holes_filled(learned, monkeypatch):
     assert iou(masks[0], truth[0]) > 0.93
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(seed=st.integers(0, 10_000), density=st.floats(0.2, 0.8), smooth=st.floats(0.3, 2.0))
 def test_clean_by_area_equals_a_count_of_region_pixels(seed, density, smooth):
     noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=(24, 30)), (0, 0), smooth)

@@ -79,7 +79,7 @@ def test_exact_masks_agree(masks: np.ndarray) -> None:
 @given(
     quaternion=st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1), scale=st.floats(0.01, 100)
 )
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_pairs_agree_in_every_world_and_unit(masks: np.ndarray, quaternion: tuple, scale: float) -> None:
     R = Rotation.from_quat(quaternion).as_matrix()
     rig = Rig(tuple(replace(c, rotation=c.rotation @ R.T, translation=scale * c.translation) for c in RIG))

@@ -21,7 +21,7 @@ def boxes(draw):
     return np.array(result, np.int32)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(boxes=boxes(), gap=st.integers(1, 5), factor=st.integers(1, 3))
 def test_boxes_in_a_mosaic_have_their_size_and_do_not_touch(boxes, gap, factor):
     mosaic = Mosaic.of(boxes, gap).enlarged(factor)

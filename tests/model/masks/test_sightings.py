@@ -27,7 +27,7 @@ def sighted(camera, at, score=0.9, z=0.95):
     return Sighting(tuple(pixels[0]), tuple(pixels[1]), score)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     places=st.lists(inside, max_size=3, unique_by=lambda at: (round(at[0]), round(at[1]))),
     blind=st.sampled_from([*range(4), None]),
@@ -79,7 +79,7 @@ def test_a_patch_shows_the_person_upright() -> None:
         assert patch.holds(body) and not patch.holds(body + patch.side)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.floats(20, 140), st.floats(20, 180), st.integers(20, 90), st.floats(-np.pi, np.pi))
 def test_cut_and_paste_are_inverse(x: float, y: float, side: int, angle: float) -> None:
     v, u = np.mgrid[:200, :160].astype(np.float32)
