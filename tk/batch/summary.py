@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import html
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from urllib.parse import quote
@@ -14,10 +15,39 @@ from tk.batch.jobs import BEGUN, DONE, FAILED, WAITING, Job, Outcome
 from tk.errors import ResultError
 from tk.io.paths import replacing
 
-COLUMNS = (
-    "name", "capture", "state", "frames", "lost", "lost_percent", "error_cm", "limbs_cm", "silhouette_error",
-    "sigma_median_cm", "frames_per_second", "seconds", "notes",
-)  # fmt: skip
+
+@dataclass(frozen=True)
+class Column:
+    """A column of numbers.
+
+    Attributes:
+        name: name in the CSV.
+        value: returns the number of an outcome; None if it is unknown.
+        heading, unit: text in the page; a column without a heading is in the CSV only.
+        pattern: format of the number in the page; a percentage is multiplied by 100.
+    """
+
+    name: str
+    value: Callable[[Outcome], float | None]
+    heading: str = ""
+    unit: str = ""
+    pattern: str = ".2f"
+
+
+NUMBERS = (
+    Column("frames", lambda o: o.frames or None, "frames", "", ".0f"),
+    Column("lost", lambda o: o.lost if o.frames else None),
+    Column("lost_percent", lambda o: 100 * o.lost / o.frames if o.frames else None, "lost", "%", ".1f"),
+    Column("error_cm", lambda o: o.error_cm, "error", "cm"),
+    Column("limbs_cm", lambda o: o.limbs_cm, "limbs", "cm"),
+    Column("silhouette_error", lambda o: o.silhouette_error, "E<sub>S</sub>", "%", ".2%"),
+    Column("sigma_median_cm", lambda o: o.sigma_cm, "σ", "median, cm"),
+    Column("frames_per_second", lambda o: o.frames_per_second, "speed", "frames/s", ".1f"),
+    Column("seconds", lambda o: o.seconds if o.state in (DONE, FAILED) else None),
+)
+
+#: columns of captures with ground truth
+_WITH_TRUTH = ("error_cm", "limbs_cm")
 
 # seconds between two reloads of the page while the batch runs
 _REFRESH_S = 10
@@ -44,36 +74,17 @@ td.bad { color: #c2571a; font-weight: 600; }
 
 def write_summary(folder: Path, jobs: Sequence[Job], outcomes: Mapping[str, Outcome]) -> None:
     """Write `summary.csv` and `summary.html`, each atomically."""
-    rows = [_row(job, outcomes[job.name]) for job in jobs]
     table = io.StringIO()
-    writer = csv.DictWriter(table, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(("name", "capture", "state", *(column.name for column in NUMBERS), "notes"))
+    for job in jobs:
+        outcome = outcomes[job.name]
+        values = [column.value(outcome) for column in NUMBERS]
+        numbers = [f"{v:.4g}" if isinstance(v, float) else v for v in values]
+        writer.writerow((job.name, job.capture, _state(outcome), *numbers, _notes(outcome)))
     for name, text in (("summary.csv", table.getvalue()), ("summary.html", _page(folder, jobs, outcomes))):
         with replacing(folder / name, ResultError) as part:
             part.write_text(text, encoding="utf-8")
-
-
-def _row(job: Job, outcome: Outcome) -> dict[str, object]:
-    """Return a row of the CSV, with "" for unknown values."""
-    known = outcome.frames > 0
-    values = {
-        "frames": outcome.frames if known else None,
-        "lost": outcome.lost if known else None,
-        "lost_percent": _lost_percent(outcome),
-        "error_cm": outcome.error_cm,
-        "limbs_cm": outcome.limbs_cm,
-        "silhouette_error": outcome.silhouette_error,
-        "sigma_median_cm": outcome.sigma_cm,
-        "frames_per_second": outcome.frames_per_second,
-        "seconds": outcome.seconds if outcome.state in (DONE, FAILED) else None,
-    }
-    texts = {name: f"{v:.4g}" if isinstance(v, float) else "" if v is None else v for name, v in values.items()}
-    return {"name": job.name, "capture": job.capture, "state": _state(outcome), **texts, "notes": _notes(outcome)}
-
-
-def _lost_percent(outcome: Outcome) -> float | None:
-    return 100 * outcome.lost / outcome.frames if outcome.frames else None
 
 
 def _state(outcome: Outcome) -> str:
@@ -90,8 +101,9 @@ def _page(folder: Path, jobs: Sequence[Job], outcomes: Mapping[str, Outcome]) ->
     refresh = f'<meta http-equiv="refresh" content="{_REFRESH_S}">' if running else ""
     name = html.escape(folder.resolve().name)
     has_truth = any(outcome.error_cm is not None for outcome in outcomes.values())
-    errors = "<th>error<small>cm</small></th><th>limbs<small>cm</small></th>" if has_truth else ""
-    body = "\n".join(_line(job, outcomes[job.name], has_truth) for job in jobs)
+    shown = [column for column in NUMBERS if column.heading and (has_truth or column.name not in _WITH_TRUTH)]
+    heads = "".join(f"<th>{column.heading}<small>{column.unit}</small></th>" for column in shown)
+    body = "\n".join(_line(job, outcomes[job.name], shown) for job in jobs)
     return f"""<!doctype html>
 <html lang="en">
 <head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">{refresh}
@@ -101,9 +113,7 @@ def _page(folder: Path, jobs: Sequence[Job], outcomes: Mapping[str, Outcome]) ->
 <h1>{name}</h1>
 <p class="muted">{html.escape(_counts(states, outcomes))}</p>
 <div class="scroll"><table>
-<thead><tr><th class="text">capture</th><th class="text">state</th><th>frames</th><th>lost<small>%</small></th>{errors}
-<th>E<sub>S</sub><small>%</small></th><th>σ<small>median, cm</small></th><th>speed<small>frames/s</small></th>
-<th class="text">notes</th></tr></thead>
+<thead><tr><th class="text">capture</th><th class="text">state</th>{heads}<th class="text">notes</th></tr></thead>
 <tbody>
 {body}
 </tbody></table></div>
@@ -124,26 +134,19 @@ def _counts(states: Sequence[str], outcomes: Mapping[str, Outcome]) -> str:
     return f"{len(states)} captures: {', '.join(parts)}. {frames} frames, {lost} of them lost. {when}"
 
 
-def _line(job: Job, outcome: Outcome, has_truth: bool) -> str:
-    def number(value: float | None, pattern: str, bad: bool = False) -> str:
-        return f"<td{' class=bad' if bad else ''}>{'' if value is None else format(value, pattern)}</td>"
-
+def _line(job: Job, outcome: Outcome, columns: Sequence[Column]) -> str:
     title = html.escape(job.name)
     shown = next((path for path in (job.page, job.output) if path.exists()), None)
     if shown is not None:
         title = f'<a href="{quote(shown.name)}">{title}</a>'
     look = "lost" if outcome.mostly_lost else outcome.state
-    percent = _lost_percent(outcome)
-    error = None if outcome.silhouette_error is None else 100 * outcome.silhouette_error
     cells = [
         f'<td class="text" title="{html.escape(str(job.capture))}">{title}</td>',
         f'<td class="text"><span class="state {look}">{_state(outcome)}</span></td>',
-        number(outcome.frames or None, "d"),
-        number(percent, ".1f", bad=bool(outcome.lost)),
-        *([number(outcome.error_cm, ".2f"), number(outcome.limbs_cm, ".2f")] if has_truth else []),
-        number(error, ".2f"),
-        number(outcome.sigma_cm, ".2f"),
-        number(outcome.frames_per_second, ".1f"),
-        f'<td class="text notes">{html.escape(_notes(outcome))}</td>',
     ]
+    for column in columns:
+        value = column.value(outcome)
+        text = "" if value is None else format(value, column.pattern).removesuffix("%")
+        cells.append(f"<td{' class=bad' if column.name == 'lost_percent' and value else ''}>{text}</td>")
+    cells.append(f'<td class="text notes">{html.escape(_notes(outcome))}</td>')
     return f"<tr>{''.join(cells)}</tr>"
