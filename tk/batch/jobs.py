@@ -28,17 +28,13 @@ WAITING, BEGUN, DONE, FAILED = "waiting", "begun", "done", "failed"
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """Options of `tk track` that are the same for every capture; see :func:`tk.run.session.track`.
-
-    Attributes:
-        body: a result or a TOML file with the body of the person, the same in all captures.
-    """
+    """Options of `tk track` that are the same for every capture; see :func:`tk.run.session.track`."""
 
     method: str = "region"
     frames: tuple[int, int | None] = (0, None)
     cameras: tuple[str, ...] | None = None
     masks: str = "auto"
-    body: Path | None = None
+    body: Path | None = None  # a result or a TOML file with the body of the person, the same in all captures
     causal: bool = False
     store_hull: bool = False
     people: str = "auto"
@@ -62,35 +58,24 @@ class TrackOptions:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome of a job.
+    """The outcome of a job."""
 
-    Attributes:
-        state: :data:`WAITING`, :data:`BEGUN`, :data:`DONE` or :data:`FAILED`.
-        frames, lost, suspect: number of frames, of lost and of suspect frames, in the result.
-        tracked_now: frames that the last attempt added; fewer than ``frames`` if it continued an earlier attempt.
-        seconds: duration of the last attempt.
-        error_cm, limbs_cm: mean joint distance from the ground truth, raw, and of the limbs without constant offsets;
-            None without ground truth.
-        silhouette_error: mean E_S of the frames that are not lost.
-        sigma_cm: median σ of the joints, cm.
-        notes: notes of the run.
-        failure: reason of a failure, in one line.
-        trace: traceback of a defect; empty if the input is the reason.
-    """
-
-    state: str = WAITING
+    state: str = WAITING  # `WAITING`, `BEGUN`, `DONE` or `FAILED`
+    # frames, lost, suspect: number of frames, of lost and of suspect frames, in the result
     frames: int = 0
     lost: int = 0
     suspect: int = 0
-    tracked_now: int = 0
-    seconds: float = 0.0
+    tracked_now: int = 0  # frames that the last attempt added; fewer than `frames` if it continued an earlier attempt
+    seconds: float = 0.0  # duration of the last attempt
+    # error_cm, limbs_cm: mean joint distance from the ground truth, raw, and of the limbs without constant offsets;
+    # None without ground truth
     error_cm: float | None = None
     limbs_cm: float | None = None
-    silhouette_error: float | None = None
-    sigma_cm: float | None = None
-    notes: tuple[str, ...] = ()
-    failure: str = ""
-    trace: str = ""
+    silhouette_error: float | None = None  # mean E_S of the frames that are not lost
+    sigma_cm: float | None = None  # median σ of the joints, cm
+    notes: tuple[str, ...] = ()  # notes of the run
+    failure: str = ""  # reason of a failure, in one line
+    trace: str = ""  # traceback of a defect; empty if the input is the reason
 
     @property
     def failed(self) -> bool:
@@ -110,21 +95,13 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Job:
-    """One capture of a batch.
+    """One capture of a batch."""
 
-    Attributes:
-        name: name of its result without suffix, unique in the folder.
-        capture: folder of the capture, absolute.
-        folder: folder of the batch, absolute.
-        options: options of tracking.
-        pictures: write an overlay video and a report next to the result.
-    """
-
-    name: str
-    capture: Path
-    folder: Path
-    options: TrackOptions
-    pictures: bool = False
+    name: str  # name of its result without suffix, unique in the folder
+    capture: Path  # folder of the capture, absolute
+    folder: Path  # folder of the batch, absolute
+    options: TrackOptions  # options of tracking
+    pictures: bool = False  # write an overlay video and a report next to the result
 
     @property
     def page(self) -> Path:

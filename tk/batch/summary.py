@@ -18,20 +18,14 @@ from tk.io.paths import replacing
 
 @dataclass(frozen=True)
 class Column:
-    """A column of numbers.
+    """A column of numbers."""
 
-    Attributes:
-        name: name in the CSV.
-        value: returns the number of an outcome; None if it is unknown.
-        heading, unit: text in the page; a column without a heading is in the CSV only.
-        pattern: format of the number in the page; a percentage is multiplied by 100.
-    """
-
-    name: str
-    value: Callable[[Outcome], float | None]
+    name: str  # name in the CSV
+    value: Callable[[Outcome], float | None]  # returns the number of an outcome; None if it is unknown
+    # heading, unit: text in the page; a column without a heading is in the CSV only
     heading: str = ""
     unit: str = ""
-    pattern: str = ".2f"
+    pattern: str = ".2f"  # format of the number in the page; a percentage is multiplied by 100
 
 
 NUMBERS = (

@@ -29,16 +29,12 @@ LIMB_ERROR_CM = 15.0
 
 @dataclass(frozen=True)
 class FlexionError:
-    """Error of flexion, degrees; infinite if the result has NaN joints, NaN without frames to judge.
+    """Error of flexion, degrees; infinite if the result has NaN joints, NaN without frames to judge."""
 
-    Attributes:
-        mean_deg, median_deg: mean and median of the absolute difference.
-        bias_deg: mean of result minus ground truth where both are known; positive if the result bends more.
-    """
-
+    # mean_deg, median_deg: mean and median of the absolute difference
     mean_deg: float
     median_deg: float
-    bias_deg: float
+    bias_deg: float  # mean of result minus ground truth where both are known; positive if the result bends more
 
 
 @dataclass(frozen=True)
@@ -52,23 +48,16 @@ class Run:
 
 @dataclass(frozen=True)
 class SigmaShares:
-    """Shares of the errors that are within k standard deviations.
+    """Shares of the errors that are within k standard deviations."""
 
-    Attributes:
-        raw, corrected: share by k, of the raw errors and of the errors without the joints' constant offsets; NaN
-            without positions to judge.
-        expected: share by k of normally distributed errors.
-        judged: number of joint positions with σ.
-        without: number of joint positions without σ.
-        median_cm: median of σ, cm.
-    """
-
+    # raw, corrected: share by k, of the raw errors and of the errors without the joints' constant offsets; NaN without
+    # positions to judge
     raw: Mapping[int, float]
     corrected: Mapping[int, float]
-    expected: Mapping[int, float]
-    judged: int
-    without: int
-    median_cm: float
+    expected: Mapping[int, float]  # share by k of normally distributed errors
+    judged: int  # number of joint positions with σ
+    without: int  # number of joint positions without σ
+    median_cm: float  # median of σ, cm
 
 
 def flexion_deg(p_world: Float) -> dict[str, Float]:

@@ -53,16 +53,12 @@ _LABELS = {"all": f"all {len(JOINTS)}", "limbs": f"{len(LIMB_JOINTS)} limb"}
 
 @dataclass(frozen=True)
 class Score:
-    """Errors of some joints over all judged frames.
+    """Errors of some joints over all judged frames."""
 
-    Attributes:
-        mean_cm, median_cm: mean and median distance, cm; infinite if NaN joints count, NaN without joints to judge.
-        pck: share of the joints with an error below each threshold, by threshold in cm.
-    """
-
+    # mean_cm, median_cm: mean and median distance, cm; infinite if NaN joints count, NaN without joints to judge
     mean_cm: float
     median_cm: float
-    pck: Mapping[int, float]
+    pck: Mapping[int, float]  # share of the joints with an error below each threshold, by threshold in cm
 
 
 @dataclass(frozen=True)
@@ -76,44 +72,29 @@ class Scores:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Accuracy of a result.
+    """Accuracy of a result."""
 
-    Attributes:
-        raw: raw errors.
-        corrected: errors without each joint's median offset in the trunk's frame.
-        offsets_cm: median offset of each joint: forward, left, up, cm.
-        judged: number of judged frames: frames of both files, and frames missing inside the result.
-        missing_inside: number of frames of the ground truth that are missing between the result's first and last.
-        missing_outside: number of frames of the ground truth before the result's first or after its last.
-        without_truth: number of frames of the result without ground truth.
-        lost: number of judged frames whose status is lost or absent.
-        suspect: number of judged frames whose status is suspect; they count like tracked ones.
-        nan_frames: number of judged frames with at least one NaN joint in the result, missing frames included.
-        unknown_joints: number of joint positions of judged frames that are NaN in the ground truth.
-        frames_per_second: mean rate: all frames of the result over their total wall time; None if not recorded.
-        median_frames_per_second: rate of the median frame, which excludes start-up and compilation.
-        flexion: errors of the flexion by ``knee_l`` … ``elbow_r``, and of all ``knees`` and ``elbows``.
-        longest_limb_error, longest_limb_error_raw: longest run of frames with a limb joint more than 15 cm off, without
-            the joints' offsets and raw.
-        sigma: shares of the errors within 1 and 2 σ, of ``all`` joints and of the ``limbs``; None without σ.
-    """
-
-    raw: Scores
-    corrected: Scores
-    offsets_cm: Mapping[str, tuple[float, float, float]]
-    judged: int
-    missing_inside: int
-    missing_outside: int
-    without_truth: int
-    lost: int
-    suspect: int
-    nan_frames: int
-    unknown_joints: int
+    raw: Scores  # raw errors
+    corrected: Scores  # errors without each joint's median offset in the trunk's frame
+    offsets_cm: Mapping[str, tuple[float, float, float]]  # median offset of each joint: forward, left, up, cm
+    judged: int  # number of judged frames: frames of both files, and frames missing inside the result
+    missing_inside: int  # number of frames of the ground truth that are missing between the result's first and last
+    missing_outside: int  # number of frames of the ground truth before the result's first or after its last
+    without_truth: int  # number of frames of the result without ground truth
+    lost: int  # number of judged frames whose status is lost or absent
+    suspect: int  # number of judged frames whose status is suspect; they count like tracked ones
+    nan_frames: int  # number of judged frames with at least one NaN joint in the result, missing frames included
+    unknown_joints: int  # number of joint positions of judged frames that are NaN in the ground truth
+    # mean rate: all frames of the result over their total wall time; None if not recorded
     frames_per_second: float | None
-    median_frames_per_second: float | None
+    median_frames_per_second: float | None  # rate of the median frame, which excludes start-up and compilation
+    # errors of the flexion by `knee_l` … `elbow_r`, and of all `knees` and `elbows`
     flexion: Mapping[str, FlexionError]
+    # longest_limb_error, longest_limb_error_raw: longest run of frames with a limb joint more than 15 cm off, without
+    # the joints' offsets and raw
     longest_limb_error: Run
     longest_limb_error_raw: Run
+    # shares of the errors within 1 and 2 σ, of `all` joints and of the `limbs`; None without σ
     sigma: Mapping[str, SigmaShares] | None
 
     @property

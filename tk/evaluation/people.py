@@ -42,47 +42,31 @@ MATCH_M = 0.5
 
 @dataclass(frozen=True)
 class PersonScore:
-    """How well one person of the ground truth was tracked.
+    """How well one person of the ground truth was tracked."""
 
-    Attributes:
-        person: number in the ground truth.
-        matched_with: numbers in the result, in the order of the first match.
-        frames: number of judged frames in which the person is present.
-        matches: number of these frames with a match.
-        switches: number of identity switches.
-        errors: errors in the frames with a match; None without any.
-    """
-
-    person: int
-    matched_with: tuple[int, ...]
-    frames: int
-    matches: int
-    switches: int
-    errors: Evaluation | None
+    person: int  # number in the ground truth
+    matched_with: tuple[int, ...]  # numbers in the result, in the order of the first match
+    frames: int  # number of judged frames in which the person is present
+    matches: int  # number of these frames with a match
+    switches: int  # number of identity switches
+    errors: Evaluation | None  # errors in the frames with a match; None without any
 
 
 @dataclass(frozen=True)
 class PeopleEvaluation:
-    """Accuracy of a result with several people.
+    """Accuracy of a result with several people."""
 
-    Attributes:
-        people: scores of the people of the ground truth.
-        people_in_result: number of people of the result.
-        frames: number of judged frames.
-        misses, false_positives, switches: numbers over all people.
-        mota, idf1: as defined above; NaN if the ground truth shows nobody.
-        mean_distance_cm: mean joint distance of the matches, cm; NaN without matches.
-    """
-
-    people: tuple[PersonScore, ...]
-    people_in_result: int
-    frames: int
+    people: tuple[PersonScore, ...]  # scores of the people of the ground truth
+    people_in_result: int  # number of people of the result
+    frames: int  # number of judged frames
+    # misses, false_positives, switches: numbers over all people
     misses: int
     false_positives: int
     switches: int
+    # mota, idf1: as defined above; NaN if the ground truth shows nobody
     mota: float
     idf1: float
-    mean_distance_cm: float
+    mean_distance_cm: float  # mean joint distance of the matches, cm; NaN without matches
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON; infinity and NaN become None."""

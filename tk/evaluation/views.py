@@ -34,38 +34,23 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ViewScore:
-    """Measures of one camera.
+    """Measures of one camera."""
 
-    Attributes:
-        camera: name of the camera.
-        tracked: True if the camera was used for tracking; None if unknown.
-        joint_px: mean distance of the chosen joints, pixels.
-        joint_share: joint_px as a share of the subject's height in this view.
-        silhouette_error: E_S, mean over the frames; None without masks or body.
-    """
-
-    camera: str
-    tracked: bool | None
-    joint_px: float
-    joint_share: float
-    silhouette_error: float | None
+    camera: str  # name of the camera
+    tracked: bool | None  # True if the camera was used for tracking; None if unknown
+    joint_px: float  # mean distance of the chosen joints, pixels
+    joint_share: float  # joint_px as a share of the subject's height in this view
+    silhouette_error: float | None  # E_S, mean over the frames; None without masks or body
 
 
 @dataclass(frozen=True)
 class ViewEvaluation:
-    """Measures of all views of a capture.
+    """Measures of all views of a capture."""
 
-    Attributes:
-        joints: the chosen joints.
-        frames: number of frames in both the result and the ground truth.
-        views: one score per camera.
-        note: reason for a missing E_S; empty if there is none.
-    """
-
-    joints: tuple[str, ...]
-    frames: int
-    views: tuple[ViewScore, ...]
-    note: str = ""
+    joints: tuple[str, ...]  # the chosen joints
+    frames: int  # number of frames in both the result and the ground truth
+    views: tuple[ViewScore, ...]  # one score per camera
+    note: str = ""  # reason for a missing E_S; empty if there is none
 
     @property
     def joint_px(self) -> float:

@@ -31,19 +31,13 @@ Writer = Callable[[Motion, Path], None]
 
 @dataclass(frozen=True)
 class Format:
-    """A format of other programs.
+    """A format of other programs."""
 
-    Attributes:
-        outputs: for each file, or folder, the suffix added to the result's name, and the function that writes it.
-        begins: regular expression for the begin of its files; None for a folder.
-        holds: True if it cannot mark a pose as unknown.
-        package: a package that it needs beyond those of tk itself.
-    """
-
+    # for each file, or folder, the suffix added to the result's name, and the function that writes it
     outputs: tuple[tuple[str, Writer], ...]
-    begins: bytes | None = None
-    holds: bool = False
-    package: str = ""
+    begins: bytes | None = None  # regular expression for the begin of its files; None for a folder
+    holds: bool = False  # True if it cannot mark a pose as unknown
+    package: str = ""  # a package that it needs beyond those of tk itself
 
 
 FORMATS = {
@@ -59,17 +53,11 @@ FORMATS = {
 
 @dataclass(frozen=True)
 class Exported:
-    """What :func:`export` has done.
+    """What :func:`export` has done."""
 
-    Attributes:
-        files: the files and folders that were written.
-        notes: for the user.
-        failed: for each format that could not be written, its name, the reason and the remedy.
-    """
-
-    files: tuple[Path, ...]
-    notes: tuple[str, ...]
-    failed: tuple[str, ...] = ()
+    files: tuple[Path, ...]  # the files and folders that were written
+    notes: tuple[str, ...]  # for the user
+    failed: tuple[str, ...] = ()  # for each format that could not be written, its name, the reason and the remedy
 
 
 def export(

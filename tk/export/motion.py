@@ -39,35 +39,20 @@ _NOTHING = "the person is lost in every frame; there is nothing to export"
 
 @dataclass(frozen=True)
 class Motion:
-    """A person's motion over F frames. An unknown frame has the values of the last known frame before it.
+    """A person's motion over F frames. An unknown frame has the values of the last known frame before it."""
 
-    Attributes:
-        name: of the files, without suffix: that of the result, `_0`, `_1`, … of several people, `_smoothed`.
-        result: the result, or its smoothed copy if that was requested; consecutive frames.
-        bridged: (F,) True where the smoothed copy fills a gap.
-        known: (F,) False where the person was lost and the gap was not bridged.
-        held: (F,) row of the result that each frame shows: its own, or that of the last known frame.
-        point_names: names of the P joints and points of the feet.
-        points: (F, P, 3) metres, world frame.
-        sigma: (F, P) m, standard deviation of each point along one axis; NaN if unknown.
-        segments: names of the S segments.
-        rotations: (F, S, 3, 3) segment to world, axes as in :mod:`tk.model.body.angles`.
-        dimensions: dimensions of the fitted body.
-        T_world_body: (3, 3) the world's forward, left and up axes as columns.
-    """
-
-    name: str
-    result: Result
-    bridged: NDArray[np.bool_]
-    known: NDArray[np.bool_]
-    held: NDArray[np.int64]
-    point_names: tuple[str, ...]
-    points: Float
-    sigma: Float
-    segments: tuple[str, ...]
-    rotations: Float
-    dimensions: BodyDimensions
-    T_world_body: Float
+    name: str  # of the files, without suffix: that of the result, `_0`, `_1`, … of several people, `_smoothed`
+    result: Result  # the result, or its smoothed copy if that was requested; consecutive frames
+    bridged: NDArray[np.bool_]  # (F,) True where the smoothed copy fills a gap
+    known: NDArray[np.bool_]  # (F,) False where the person was lost and the gap was not bridged
+    held: NDArray[np.int64]  # (F,) row of the result that each frame shows: its own, or that of the last known frame
+    point_names: tuple[str, ...]  # names of the P joints and points of the feet
+    points: Float  # (F, P, 3) metres, world frame
+    sigma: Float  # (F, P) m, standard deviation of each point along one axis; NaN if unknown
+    segments: tuple[str, ...]  # names of the S segments
+    rotations: Float  # (F, S, 3, 3) segment to world, axes as in `tk.model.body.angles`
+    dimensions: BodyDimensions  # dimensions of the fitted body
+    T_world_body: Float  # (3, 3) the world's forward, left and up axes as columns
 
     def __len__(self) -> int:
         return len(self.result)

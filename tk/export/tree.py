@@ -27,26 +27,17 @@ _FIXED_WITHIN = 1e-4
 
 @dataclass(frozen=True)
 class Tree:
-    """N nodes over F frames, parents first.
+    """N nodes over F frames, parents first."""
 
-    Attributes:
-        names: names of the joints, with ``lumbar`` for the waist, and of the tips of hands, toes and heels.
-        joints: the joint in whose place each node is; empty for the tips.
-        parents: (N,) index of each node's parent; -1 for the root.
-        segments: segment that each node rotates; empty for leaves.
-        offsets: (N, 3) position of each node in its parent, rest pose; zero for the root.
-        rotations: (F, N, 3, 3) rotation of each node from the rest pose, relative to its parent.
-        translations: (F, N, 3) position of each node in its parent; of the root, in the world.
-        moving: (N,) True where the position varies: the root, and the shoulders, which rise with the arms.
-    """
-
+    # names of the joints, with `lumbar` for the waist, and of the tips of hands, toes and heels
     names: tuple[str, ...]
-    joints: tuple[str, ...]
-    parents: tuple[int, ...]
-    segments: tuple[str, ...]
-    offsets: Float
-    rotations: Float
-    translations: Float
+    joints: tuple[str, ...]  # the joint in whose place each node is; empty for the tips
+    parents: tuple[int, ...]  # (N,) index of each node's parent; -1 for the root
+    segments: tuple[str, ...]  # segment that each node rotates; empty for leaves
+    offsets: Float  # (N, 3) position of each node in its parent, rest pose; zero for the root
+    rotations: Float  # (F, N, 3, 3) rotation of each node from the rest pose, relative to its parent
+    translations: Float  # (F, N, 3) position of each node in its parent; of the root, in the world
+    # (N,) True where the position varies: the root, and the shoulders, which rise with the arms
     moving: NDArray[np.bool_]
 
     def children(self, node: int) -> list[int]:

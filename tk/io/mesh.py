@@ -21,17 +21,11 @@ _SMOOTHING_ITERATIONS = 10
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh.
+    """A triangle mesh."""
 
-    Attributes:
-        vertices: (N, 3) metres, world frame.
-        triangles: (M, 3) indices of the corners, counter-clockwise seen from outside.
-        colors: (N, 3) uint8 RGB.
-    """
-
-    vertices: Float
-    triangles: NDArray[np.int32]
-    colors: NDArray[np.uint8]
+    vertices: Float  # (N, 3) metres, world frame
+    triangles: NDArray[np.int32]  # (M, 3) indices of the corners, counter-clockwise seen from outside
+    colors: NDArray[np.uint8]  # (N, 3) uint8 RGB
 
 
 def hull_mesh(occupancy: NDArray[np.bool_], grid: VoxelGrid, surface: HullPoints) -> Mesh:

@@ -30,17 +30,11 @@ _HEAD_BYTES = 4096
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of file that tk writes.
+    """A kind of file that tk writes."""
 
-    Attributes:
-        name: its name in messages, with an article.
-        suffixes: suffixes that its name may have, lower case.
-        is_one: returns whether an existing file is of this kind.
-    """
-
-    name: str
-    suffixes: tuple[str, ...]
-    is_one: Callable[[Path], bool]
+    name: str  # its name in messages, with an article
+    suffixes: tuple[str, ...]  # suffixes that its name may have, lower case
+    is_one: Callable[[Path], bool]  # returns whether an existing file is of this kind
 
 
 def looks_like(pattern: bytes) -> Callable[[Path], bool]:

@@ -32,16 +32,11 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 @dataclass(frozen=True)
 class View:
-    """The part of an image that a tile shows.
+    """The part of an image that a tile shows."""
 
-    Attributes:
-        origin: (2,) upper left corner in the image, pixels.
-        scale: tile pixels per image pixel.
-        width, height: size of the tile, pixels.
-    """
-
-    origin: Float
-    scale: float
+    origin: Float  # (2,) upper left corner in the image, pixels
+    scale: float  # tile pixels per image pixel
+    # width, height: size of the tile, pixels
     width: int
     height: int
 

@@ -27,15 +27,10 @@ _ALONG = 9
 
 @dataclass(frozen=True)
 class Solid:
-    """A convex solid that moves with a segment.
+    """A convex solid that moves with a segment."""
 
-    Attributes:
-        segment: its index in :data:`~tk.model.body.skeleton.SEGMENTS`.
-        rings: (R, AROUND, 3) circles from one end to the other in the segment's frame, zero configuration; metres.
-    """
-
-    segment: int
-    rings: Float
+    segment: int  # its index in `tk.model.body.skeleton.SEGMENTS`
+    rings: Float  # (R, AROUND, 3) circles from one end to the other in the segment's frame, zero configuration; metres
 
     @cached_property
     def divided(self) -> Solid:
@@ -63,39 +58,24 @@ class Solid:
 
 @dataclass(frozen=True)
 class Outline:
-    """A segment in the image of a camera.
+    """A segment in the image of a camera."""
 
-    Attributes:
-        segment: name of the segment; depth: metres.
-        points: (N, 2) pixels for each of its solids; their convex hull is the outline of the solid.
-    """
-
-    segment: str
-    depth: float
-    points: tuple[Float, ...]
+    segment: str  # name of the segment
+    depth: float  # metres
+    points: tuple[Float, ...]  # (N, 2) pixels for each of its solids; their convex hull is the outline of the solid
 
 
 @dataclass(frozen=True)
 class Figure:
-    """The person in F frames.
+    """The person in F frames."""
 
-    Attributes:
-        frames: (F,) source frames.
-        joints: (F, 15, 3) metres, world frame.
-        sigma: (F, 15) standard deviations of the joints, metres, or None.
-        status: (F,) as in the result.
-        solids: the body; empty if the result has no body.
-        transforms: (F, S, 4, 4) of the segments, zero configuration to world.
-        person: number in the result.
-    """
-
-    frames: NDArray[np.int64]
-    joints: Float
-    sigma: Float | None
-    status: NDArray[np.uint8]
-    solids: tuple[Solid, ...]
-    transforms: Float
-    person: int = 0
+    frames: NDArray[np.int64]  # (F,) source frames
+    joints: Float  # (F, 15, 3) metres, world frame
+    sigma: Float | None  # (F, 15) standard deviations of the joints, metres, or None
+    status: NDArray[np.uint8]  # (F,) as in the result
+    solids: tuple[Solid, ...]  # the body; empty if the result has no body
+    transforms: Float  # (F, S, 4, 4) of the segments, zero configuration to world
+    person: int = 0  # number in the result
     _placed: dict[int, Float] = field(default_factory=dict, repr=False, compare=False)
 
     def lost(self, row: int) -> bool:

@@ -63,19 +63,12 @@ class People:
 
 @dataclass(frozen=True)
 class Stage:
-    """Where people move.
+    """Where people move."""
 
-    Attributes:
-        axes: (3, 3) two horizontal directions and up, as columns; right-handed.
-        middle: (3,) centre of the motion, metres.
-        radius: radius of a ball around ``middle`` that contains the motion, metres.
-        floor: height of the floor along up, metres.
-    """
-
-    axes: Float
-    middle: Float
-    radius: float
-    floor: float
+    axes: Float  # (3, 3) two horizontal directions and up, as columns; right-handed
+    middle: Float  # (3,) centre of the motion, metres
+    radius: float  # radius of a ball around `middle` that contains the motion, metres
+    floor: float  # height of the floor along up, metres
 
     @staticmethod
     def of(people: People) -> Stage:

@@ -24,26 +24,17 @@ PERSON_VIEW_M = 1.2
 
 @dataclass(frozen=True)
 class Project:
-    """A project of another tool.
+    """A project of another tool."""
 
-    Attributes:
-        tool: name of the tool.
-        source: calibration file or folder.
-        rig: cameras with a video, metres. A width and height of 0 are unknown: the video's size is used.
-        clips: video file or folder of images of each camera.
-        masks, backgrounds: the same for masks and images of the empty scene; empty without any.
-        up: the world's up direction if the format fixes it ("-y"), else None.
-        notes: lines for the user about what was inferred or left out.
-    """
-
-    tool: str
-    source: Path
-    rig: Rig
-    clips: tuple[Path, ...]
+    tool: str  # name of the tool
+    source: Path  # calibration file or folder
+    rig: Rig  # cameras with a video, metres. A width and height of 0 are unknown: the video's size is used.
+    clips: tuple[Path, ...]  # video file or folder of images of each camera
+    # masks, backgrounds: the same for masks and images of the empty scene; empty without any
     masks: tuple[Path, ...] = ()
     backgrounds: tuple[Path, ...] = ()
-    up: str | None = None
-    notes: tuple[str, ...] = ()
+    up: str | None = None  # the world's up direction if the format fixes it ("-y"), else None
+    notes: tuple[str, ...] = ()  # lines for the user about what was inferred or left out
 
 
 class Tables:
@@ -95,30 +86,20 @@ class Tables:
 
 @dataclass(frozen=True)
 class Format:
-    """A calibration format: the constant ``FORMAT`` of a module of this package.
+    """A calibration format: the constant ``FORMAT`` of a module of this package."""
 
-    Attributes:
-        tool: name of the tool.
-        patterns: glob patterns of calibration files in a folder; the first one that matches is used.
-        read: reads the cameras from these files; raises CalibrationError.
-        videos: folders that hold videos, as patterns relative to the project; the first that matches is used.
-        unit: unit of lengths in this format, if the file does not say and the distances of the cameras allow it.
-        nests: recordings lie in folders below the calibration.
-        up: the world's up direction if the format fixes it.
-        in_order: the tool matches cameras and videos in the order of their names.
-        videos_of_all: a camera without a video is worth a note by name.
-        search: returns the calibration files in a folder, where patterns are not enough.
-    """
-
-    tool: str
-    patterns: tuple[str, ...]
-    read: Callable[[Sequence[Path]], Tables]
+    tool: str  # name of the tool
+    patterns: tuple[str, ...]  # glob patterns of calibration files in a folder; the first one that matches is used
+    read: Callable[[Sequence[Path]], Tables]  # reads the cameras from these files; raises CalibrationError
+    # folders that hold videos, as patterns relative to the project; the first that matches is used
     videos: tuple[str, ...]
+    # unit of lengths in this format, if the file does not say and the distances of the cameras allow it
     unit: str = "m"
-    nests: bool = False
-    up: str | None = None
-    in_order: bool = False
-    videos_of_all: bool = True
+    nests: bool = False  # recordings lie in folders below the calibration
+    up: str | None = None  # the world's up direction if the format fixes it
+    in_order: bool = False  # the tool matches cameras and videos in the order of their names
+    videos_of_all: bool = True  # a camera without a video is worth a note by name
+    # returns the calibration files in a folder, where patterns are not enough
     search: Callable[[Path], list[Path]] | None = None
 
     def find(self, root: Path) -> list[Path]:

@@ -35,17 +35,11 @@ class CameraNames:
 
 @dataclass(frozen=True)
 class Found:
-    """The videos of a recording.
+    """The videos of a recording."""
 
-    Attributes:
-        folder: the folder with the videos.
-        clips: video file or folder of images of each camera, None without one.
-        notes: lines about a match that is not obvious, and about videos without a camera.
-    """
-
-    folder: Path
-    clips: tuple[Path | None, ...]
-    notes: tuple[str, ...] = ()
+    folder: Path  # the folder with the videos
+    clips: tuple[Path | None, ...]  # video file or folder of images of each camera, None without one
+    notes: tuple[str, ...] = ()  # lines about a match that is not obvious, and about videos without a camera
 
 
 def find_clips(

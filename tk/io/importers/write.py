@@ -33,17 +33,11 @@ _BLOCK = 16
 
 @dataclass(frozen=True)
 class Imported:
-    """A capture that was written.
+    """A capture that was written."""
 
-    Attributes:
-        path: its folder.
-        cameras: number of cameras.
-        notes: lines for the user about what was inferred, changed or left out.
-    """
-
-    path: Path
-    cameras: int
-    notes: tuple[str, ...]
+    path: Path  # its folder
+    cameras: int  # number of cameras
+    notes: tuple[str, ...]  # lines for the user about what was inferred, changed or left out
 
 
 def write_capture(project: Project, output: Path) -> Imported:

@@ -30,17 +30,11 @@ Value = NDArray[Any] | float | int | str
 
 @dataclass(frozen=True)
 class JointAngles:
-    """The meaning of the columns of `/angles/<joint>`.
+    """The meaning of the columns of `/angles/<joint>`."""
 
-    Attributes:
-        joint: name of the dataset, such as ``knee_l``.
-        names: names of the angles, such as ``flexion``.
-        convention: zero position and positive direction, in words.
-    """
-
-    joint: str
-    names: tuple[str, ...]
-    convention: str
+    joint: str  # name of the dataset, such as `knee_l`
+    names: tuple[str, ...]  # names of the angles, such as `flexion`
+    convention: str  # zero position and positive direction, in words
 
     def __post_init__(self) -> None:
         if not self.joint or "/" in self.joint or not self.names:
@@ -55,44 +49,29 @@ class ResultMeta:
     """The values that are constant during a run. A run can be resumed only with equal values.
 
     The fields from ``sigma`` on declare the optional datasets of the file. A declared value that a frame lacks is NaN.
-
-    Attributes:
-        capture, method: name of the capture, and tracking method.
-        seed: seed of the random generator.
-        fps: frames per second of the capture.
-        up: world axis that points up.
-        config_toml: the full configuration as TOML text.
-        pose_names, pose_units: names and units of the D entries of the configuration vector.
-        stages: names of the T optimiser stages of `/iterations`.
-        timing_stages: names of the timed stages. The stage ``total``, if present, is the frame's wall time.
-        joint_names: J names in the order of `/joints/position`.
-        sigma: True if `/joints/sigma` exists.
-        residual_cameras: names of the C cameras of `/residual` and `/mask_source`.
-        mask_sources: meanings of the values of `/mask_source`; empty if no segmenter makes masks.
-        segment_names: names of the segments of `/segments/rotation`.
-        feet: True if `/feet/position` exists, the points :data:`~tk.model.body.joints.FOOT_POINTS`.
-        angles: the clinical joint angles of `/angles`.
-        objective_kind: meaning of the numbers of `/objective`; empty if unknown.
     """
 
+    # capture, method: name of the capture, and tracking method
     capture: str
     method: str
-    seed: int
-    fps: float
-    up: str
-    config_toml: str
+    seed: int  # seed of the random generator
+    fps: float  # frames per second of the capture
+    up: str  # world axis that points up
+    config_toml: str  # the full configuration as TOML text
+    # pose_names, pose_units: names and units of the D entries of the configuration vector
     pose_names: tuple[str, ...]
     pose_units: tuple[str, ...]
-    stages: tuple[str, ...]
+    stages: tuple[str, ...]  # names of the T optimiser stages of `/iterations`
+    # names of the timed stages. The stage `total`, if present, is the frame's wall time.
     timing_stages: tuple[str, ...]
-    joint_names: tuple[str, ...] = JOINTS
-    sigma: bool = False
-    residual_cameras: tuple[str, ...] = ()
-    mask_sources: tuple[str, ...] = ()
-    segment_names: tuple[str, ...] = ()
-    feet: bool = False
-    angles: tuple[JointAngles, ...] = ()
-    objective_kind: str = ""
+    joint_names: tuple[str, ...] = JOINTS  # J names in the order of `/joints/position`
+    sigma: bool = False  # True if `/joints/sigma` exists
+    residual_cameras: tuple[str, ...] = ()  # names of the C cameras of `/residual` and `/mask_source`
+    mask_sources: tuple[str, ...] = ()  # meanings of the values of `/mask_source`; empty if no segmenter makes masks
+    segment_names: tuple[str, ...] = ()  # names of the segments of `/segments/rotation`
+    feet: bool = False  # True if `/feet/position` exists, the points `tk.model.body.joints.FOOT_POINTS`
+    angles: tuple[JointAngles, ...] = ()  # the clinical joint angles of `/angles`
+    objective_kind: str = ""  # meaning of the numbers of `/objective`; empty if unknown
 
     def __post_init__(self) -> None:
         if len(self.pose_names) != len(self.pose_units):
@@ -140,15 +119,10 @@ class HullPoints:
 
 @dataclass(frozen=True)
 class UsedCameras:
-    """The calibration that a run used, refined if the run refined it.
+    """The calibration that a run used, refined if the run refined it."""
 
-    Attributes:
-        rig: the C cameras.
-        time_offset_s: (C,) s, delay of each camera: its frame k was taken at k / fps + time_offset_s.
-    """
-
-    rig: Rig
-    time_offset_s: Float
+    rig: Rig  # the C cameras
+    time_offset_s: Float  # (C,) s, delay of each camera: its frame k was taken at k / fps + time_offset_s
 
     def __post_init__(self) -> None:
         if np.shape(self.time_offset_s) != (len(self.rig),) or not np.isfinite(self.time_offset_s).all():
@@ -349,20 +323,12 @@ class Result:
 
 @dataclass(frozen=True)
 class JointTrack:
-    """Joint centres over time, from a result or from the ground truth of a capture.
+    """Joint centres over time, from a result or from the ground truth of a capture."""
 
-    Attributes:
-        path: the file.
-        frames: (F,) source frame indices without repetition.
-        positions: (F, 15, 3) metres, world frame, in the order of :data:`tk.model.body.joints.JOINTS`.
-        status: (F,) as in a result; None for ground truth.
-        seconds: (F,) wall time of each frame; None if not stored.
-        sigma: (F, 15) m, standard deviation of each position along one axis, NaN if unknown; None if not stored.
-    """
-
-    path: Path
-    frames: NDArray[np.int64]
-    positions: Float
-    status: NDArray[np.uint8] | None = None
-    seconds: Float | None = None
+    path: Path  # the file
+    frames: NDArray[np.int64]  # (F,) source frame indices without repetition
+    positions: Float  # (F, 15, 3) metres, world frame, in the order of `tk.model.body.joints.JOINTS`
+    status: NDArray[np.uint8] | None = None  # (F,) as in a result; None for ground truth
+    seconds: Float | None = None  # (F,) wall time of each frame; None if not stored
+    # (F, 15) m, standard deviation of each position along one axis, NaN if unknown; None if not stored
     sigma: Float | None = None

@@ -40,33 +40,22 @@ COUNTED = {
 
 @dataclass(frozen=True)
 class Dataset:
-    """A dataset, or a family of datasets whose path ends with a variable name.
+    """A dataset, or a family of datasets whose path ends with a variable name."""
 
-    Attributes:
-        path: path in the file, without a leading slash; ``<…>`` stands for a name.
-        shape: length of each axis: a number, or a letter of :data:`COUNTED`, ``F`` frames, ``C`` cameras, ``N`` voxels.
-        dtype: numpy type.
-        meaning: description for the docs, with unit.
-        attributes: attributes of the dataset: a field of ResultMeta, or the values themselves.
-        field: field of Result with the values; a mapping by name for a family.
-        each: field of ResultMeta that lists the names of a family.
-        optional: field of ResultMeta that is false or empty if the file has no such dataset.
-        smoothed: True if `/smoothed` may have a copy.
-        valid: range of valid numbers; infinity is read as NaN unless the range contains it.
-        finite: True if NaN and infinity are not valid.
-    """
-
-    path: str
+    path: str  # path in the file, without a leading slash; `<…>` stands for a name
+    # length of each axis: a number, or a letter of `COUNTED`, `F` frames, `C` cameras, `N` voxels
     shape: str
-    dtype: str
-    meaning: str
+    dtype: str  # numpy type
+    meaning: str  # description for the docs, with unit
+    # attributes of the dataset: a field of ResultMeta, or the values themselves
     attributes: Mapping[str, str | tuple[str, ...]] = field(default_factory=dict)
-    field: str = ""
-    each: str = ""
-    optional: str = ""
-    smoothed: bool = False
+    field: str = ""  # field of Result with the values; a mapping by name for a family
+    each: str = ""  # field of ResultMeta that lists the names of a family
+    optional: str = ""  # field of ResultMeta that is false or empty if the file has no such dataset
+    smoothed: bool = False  # True if `/smoothed` may have a copy
+    # range of valid numbers; infinity is read as NaN unless the range contains it
     valid: tuple[float, float] = (-MAX_NUMBER, MAX_NUMBER)
-    finite: bool = False
+    finite: bool = False  # True if NaN and infinity are not valid
 
     @property
     def unknown(self) -> float:
@@ -180,19 +169,12 @@ PERSON = (*dict.fromkeys(entry.path.split("/")[0] for entry in (*ROWS, BRIDGED, 
 
 @dataclass(frozen=True)
 class Column:
-    """A dataset with one row per frame in a file with certain metadata.
+    """A dataset with one row per frame in a file with certain metadata."""
 
-    Attributes:
-        entry: its entry in the table.
-        key: name within a family, such as ``knee_l``; "" otherwise.
-        shape: shape of a row.
-        attributes: values of the attributes.
-    """
-
-    entry: Dataset
-    key: str
-    shape: tuple[int, ...]
-    attributes: Mapping[str, str | tuple[str, ...]]
+    entry: Dataset  # its entry in the table
+    key: str  # name within a family, such as `knee_l`; "" otherwise
+    shape: tuple[int, ...]  # shape of a row
+    attributes: Mapping[str, str | tuple[str, ...]]  # values of the attributes
 
     def checked(self, name: str, values: Any, rows: int | None = None) -> NDArray[Any]:
         """Return a copy of one row, or of ``rows`` rows, in this column's type.
