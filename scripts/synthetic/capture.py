@@ -341,12 +341,18 @@ def _write_settings(plan: Plan, name: str, path: Path) -> None:
 
 
 def _write_truth(plan: Plan, name: str, path: Path) -> None:
-    """Write the joints. In a scene, /people/<n> holds the frames in which person n is in the volume, too."""
+    """Write the joints; in a scene those of the frames in which a person is in the volume.
+
+    Several people are in /people/0, /people/1, … in the order of their numbers, and the first one at the top level.
+    """
+    scene = plan.options.motion in SCENES
     with h5py.File(path, "w") as file:
-        _write_joints(file, plan.subject, np.arange(plan.frame_count, dtype=np.int64))
-        if plan.options.motion in SCENES:
-            for number, person in plan.people.items():
-                _write_joints(file.create_group(f"people/{number}"), person, person.within(plan.volume))
+        for k, person in enumerate(plan.people.values()):
+            frames = person.within(plan.volume) if scene else np.arange(plan.frame_count, dtype=np.int64)
+            if k == 0:
+                _write_joints(file, person, frames)
+            if len(plan.people) > 1:
+                _write_joints(file.create_group(f"people/{k}"), person, frames)
         file.attrs.update({"capture": name, "fps": plan.fps, "units": "m", "up": "z"})
 
 

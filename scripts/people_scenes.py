@@ -1,0 +1,164 @@
+"""Track scenes with several people, and each person alone, and compare the errors.
+
+    python -m scripts.people_scenes FOLDER [--work DIR] [options of tk track, e.g. --cameras cam1,cam2,cam3,cam4]
+
+Each folder in FOLDER is a scene with captures that ``scripts/make_capture.py`` renders, without masks:
+
+- ``both`` and ``alone-0``, ``alone-1``: the people together, and each alone (``--only N``);
+- or ``with`` and ``without``: a subject with a bystander, and without (``--only 0``).
+
+Scenes of the first kind are tracked with ``--people all``, the other captures with ``--people auto``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tk.evaluation.joints import Evaluation
+from tk.evaluation.people import PeopleEvaluation, evaluate_people
+from tk.io.results.data import JointTrack
+from tk.io.results.reader import read_people
+from tk.model.body.joints import JOINTS
+
+#: an embrace: pelvises nearer than this, metres
+EMBRACE_M = 0.45
+PELVIS = JOINTS.index("pelvis")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of ``tk track``.
+
+    Attributes:
+        people: what was tracked.
+        seconds: processor time of the command.
+        mib: peak memory of its largest process.
+    """
+
+    people: tuple[JointTrack, ...]
+    seconds: float
+    mib: float
+
+
+def track(capture: Path, result: Path, people: str, options: Sequence[str]) -> Run:
+    """Track a capture against its empty scene; the messages of the command are in ``result`` with suffix .log."""
+    command = ["track", capture, "-o", result, "--people", people, "--masks", "none", "--no-report", "--force"]
+    with result.with_suffix(".log").open("w") as log:
+        process = subprocess.Popen([sys.executable, "-m", "tk", *map(str, command), *options], stderr=log)
+        _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode not in (0, 3):  # 3: many frames are lost, which the table shows
+        raise RuntimeError(f"{capture}: tk track ended with {process.returncode}, see {log.name}")
+    return Run(read_people(result), usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
+
+
+def embraces(truth: Sequence[JointTrack]) -> NDArray[np.int64]:
+    """Return the frames in which two people are nearer than EMBRACE_M, by their pelvises."""
+    near = []
+    for i, a in enumerate(truth):
+        for b in truth[:i]:
+            frames, in_a, in_b = np.intersect1d(a.frames, b.frames, return_indices=True)
+            apart = np.linalg.norm(a.positions[in_a, PELVIS] - b.positions[in_b, PELVIS], axis=1)
+            near.append(frames[apart < EMBRACE_M])
+    return np.unique(np.concatenate([np.zeros(0, np.int64), *near]))
+
+
+def missed(found: PeopleEvaluation, person: int) -> int:
+    """Return the number of frames in which a person of the ground truth has no match within 50 cm."""
+    score = found.people[person]
+    return score.frames - score.matches
+
+
+def outside(truth: Sequence[JointTrack], frames: NDArray[np.int64]) -> list[JointTrack]:
+    """Return the ground truth without some frames."""
+    kept = [~np.isin(track.frames, frames) for track in truth]
+    return [
+        replace(track, frames=track.frames[k], positions=track.positions[k])
+        for track, k in zip(truth, kept, strict=True)
+    ]
+
+
+def limbs(errors: Evaluation | None) -> float:
+    """Return the mean error of the limbs without the joints' offsets, cm; infinite if the person was not found."""
+    return np.inf if errors is None else errors.corrected.limbs.mean_cm
+
+
+def raw(errors: Evaluation | None) -> float:
+    """Return the mean error of all joints, cm; infinite if the person was not found."""
+    return np.inf if errors is None else errors.raw.all.mean_cm
+
+
+def compare_together(scene: Path, work: Path, options: Sequence[str]) -> Iterator[str]:
+    """Yield a line of the first table for each person of a scene."""
+    truth = read_people(scene / "both" / "truth.h5")
+    together = track(scene / "both", work / f"{scene.name}-both.h5", "all", options)
+    found = evaluate_people(together.people, truth)
+    apart = evaluate_people(together.people, outside(truth, embraces(truth)))
+    alone = [
+        track(scene / f"alone-{k}", work / f"{scene.name}-alone-{k}.h5", "auto", options) for k in range(len(truth))
+    ]
+    seconds, mib = (np.mean([getattr(run, name) for run in alone]) for name in ("seconds", "mib"))
+    cost = f"{together.seconds / seconds:8.2f}{together.mib / mib:8.2f}"
+    for k, run in enumerate(alone):
+        single = evaluate_people(run.people, read_people(scene / f"alone-{k}" / "truth.h5"))
+        both, one = found.people[k].errors, single.people[0].errors
+        lost, embraced = missed(apart, k), missed(found, k) - missed(apart, k)
+        yield (
+            f"{scene.name:16}{k:3}{limbs(both):8.2f}{limbs(one):8.2f}{limbs(both) / limbs(one):8.2f}{raw(both):8.2f}"
+            f"{raw(one):8.2f}{lost:8}{embraced:8}{missed(single, 0):8}{found.people[k].switches:9}"
+            f"{cost if k == 0 else ''}"
+        )
+
+
+def compare_bystander(scene: Path, work: Path, options: Sequence[str]) -> str:
+    """Return the line of the second table for a scene: the subject, who is person 0, with and without the bystander."""
+    found = []
+    for name in ("with", "without"):
+        run = track(scene / name, work / f"{scene.name}-{name}.h5", "auto", options)
+        found.append(evaluate_people(run.people, read_people(scene / name / "truth.h5")[:1]))
+    a, b = (people.people[0].errors for people in found)
+    return (
+        f"{scene.name:19}{limbs(a):8.2f}{limbs(b):9.2f}{limbs(a) - limbs(b):12.2f}{raw(a):8.2f}{raw(b):9.2f}"
+        f"{missed(found[0], 0):8}{missed(found[1], 0):9}"
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Track the scenes and print the tables."""
+    parser = argparse.ArgumentParser(prog="python -m scripts.people_scenes", description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="folder of scenes")
+    parser.add_argument("--work", type=Path, help="folder for the results [default: temporary]")
+    parser.add_argument("--scenes", default="*", metavar="GLOB", help="names of the scenes [default: all]")
+    given, options = parser.parse_known_args(arguments)
+    scenes = sorted(given.folder.glob(given.scenes))
+    together = [scene for scene in scenes if (scene / "both").is_dir()]
+    bystander = [scene for scene in scenes if (scene / "without").is_dir()]
+    with tempfile.TemporaryDirectory() as scratch:
+        work = given.work or Path(scratch)
+        work.mkdir(parents=True, exist_ok=True)
+        if together:
+            print("cm: limbs without the joints' offsets, all joints raw. Frames missed outside embraces, in embraces,")
+            print("and alone. Processor time and peak memory as multiples of those for one person.")
+            print(f"{'':19}   limbs   alone   ratio     raw   alone  missed embrace   alone switches    time  memory")
+        for scene in together:
+            for line in compare_together(scene, work, options):
+                print(line, flush=True)
+        if bystander:
+            print("\nThe subject with and without a bystander, cm, and frames missed.")
+            print(f"{'':19}   limbs  without  difference     raw  without  missed  without")
+        for scene in bystander:
+            print(compare_bystander(scene, work, options), flush=True)
+
+
+if __name__ == "__main__":
+    main()
