@@ -19,17 +19,11 @@ PART_FRAME, PART_KIND, PART_DOF, PART_LIMB = 4, 16, 17, 18
 
 
 class ConeArrays(NamedTuple):
-    """A cone body as plain arrays (D degrees of freedom, P parts, Q curves), the first two of one real type.
+    """A cone body as plain arrays (D degrees of freedom, P parts, Q curves), the first two of one real type."""
 
-    Attributes:
-        tree: (D, 11) of :func:`tk.kernels.kinematics.pack_tree`.
-        parts: (P, 19) of :func:`pack_parts`.
-        curves: (Q, 2) int32 part and kind of each curve, see :mod:`tk.kernels.cones`.
-    """
-
-    tree: NDArray
-    parts: NDArray
-    curves: NDArray[np.int32]
+    tree: NDArray  # (D, 11) of `tk.kernels.kinematics.pack_tree`
+    parts: NDArray  # (P, 19) of `pack_parts`
+    curves: NDArray[np.int32]  # (Q, 2) int32 part and kind of each curve, see `tk.kernels.cones`
 
 
 def pack_parts(shape: np.ndarray, frame: np.ndarray, kind: np.ndarray, dof: np.ndarray, limb: np.ndarray) -> NDArray:

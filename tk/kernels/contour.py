@@ -200,25 +200,17 @@ def _contour_kernel(real):
 
 @dataclass(frozen=True)
 class ContourPoints:
-    """Contour points of B poses in C cameras on K strips, two slots each. Values of points not found are zero.
+    """Contour points of B poses in C cameras on K strips, two slots each. Values of points not found are zero."""
 
-    Attributes:
-        strip: (B, K) the strips.
-        points_zero: (B, C, K, 2, 3) the points in the zero configuration, metres: they move with p as material points.
-        pixels: (B, C, K, 2, 2) their projections (x, y), lens distortion included; they may lie outside the image.
-        normals: (B, C, K, 2, 2) unit normals of the contour in the image, outward.
-        scale: (B, C, K, 2) pixels per metre there.
-        found: (B, C, K, 2) uint8, 1 where the strip crosses the rim in front of the camera.
-        visible: (B, C, K, 2) uint8, 1 where found and not hidden by another piece.
-    """
-
-    strip: np.ndarray
+    strip: np.ndarray  # (B, K) the strips
+    # (B, C, K, 2, 3) the points in the zero configuration, metres: they move with p as material points
     points_zero: np.ndarray
+    # (B, C, K, 2, 2) their projections (x, y), lens distortion included; they may lie outside the image
     pixels: np.ndarray
-    normals: np.ndarray
-    scale: np.ndarray
-    found: np.ndarray
-    visible: np.ndarray
+    normals: np.ndarray  # (B, C, K, 2, 2) unit normals of the contour in the image, outward
+    scale: np.ndarray  # (B, C, K, 2) pixels per metre there
+    found: np.ndarray  # (B, C, K, 2) uint8, 1 where the strip crosses the rim in front of the camera
+    visible: np.ndarray  # (B, C, K, 2) uint8, 1 where found and not hidden by another piece
 
     @property
     def occluded(self) -> np.ndarray:

@@ -27,31 +27,28 @@ _ALIKE_PIXELS = 3.0
 class SearchSettings:
     """Settings of the search along normals.
 
-    Attributes:
-        window_px: search range along the normal, in pixels of the scale (the paper: typically 8).
-        spacing_px: distance between samples, in pixels of the scale (the paper: typically every pixel; with three,
-            joints differ by less than a millimetre, in a third of the time).
-        most_samples: maximum number of samples of a curve; longer curves have wider spacing and more weight a sample.
-        ambiguous_px: an edgel nearer than this, in pixels of the scale, to a model edge of another limb is shared with
-            it (4.4); at 0 every edgel has its full weight. The paper gives no distance; 8 is its window.
-        tangential: weight of the row along the contour (1: the paper's dx and dy; 0: the distance along the normal).
-        robust_px: distance at which the Geman-McClure weights (1 + (d/s)²)⁻² are a quarter, in pixels of the scale; 0:
-            the paper's least squares, which shadows at the feet distort. 8, the window, was chosen on the treadmill and
-            dance captures.
-        interior: whether contours in front of another part are searched, too, as in the paper. No silhouette edge is
-            expected there, and most edges found belong to other contours. Sharing ambiguous edgels (4.4) corrects this
-            in part; excluding these contours corrects more.
 
     Raises:
         ConfigError: a value is out of range.
     """
 
-    window_px: float = 8.0
+    window_px: float = 8.0  # search range along the normal, in pixels of the scale (the paper: typically 8)
+    # distance between samples, in pixels of the scale (the paper: typically every pixel; with three, joints differ by
+    # less than a millimetre, in a third of the time)
     spacing_px: float = 3.0
+    # maximum number of samples of a curve; longer curves have wider spacing and more weight a sample
     most_samples: int = 64
+    # an edgel nearer than this, in pixels of the scale, to a model edge of another limb is shared with it (4.4); at 0
+    # every edgel has its full weight. The paper gives no distance; 8 is its window.
     ambiguous_px: float = 0.0
+    # weight of the row along the contour (1: the paper's dx and dy; 0: the distance along the normal)
     tangential: float = 0.3
+    # distance at which the Geman-McClure weights (1 + (d/s)²)⁻² are a quarter, in pixels of the scale; 0: the paper's
+    # least squares, which shadows at the feet distort. 8, the window, was chosen on the treadmill and dance captures
     robust_px: float = 8.0
+    # whether contours in front of another part are searched, too, as in the paper. No silhouette edge is expected
+    # there, and most edges found belong to other contours. Sharing ambiguous edgels (4.4) corrects this in part;
+    # excluding these contours corrects more.
     interior: bool = False
 
     def __post_init__(self) -> None:
@@ -73,19 +70,12 @@ class SearchSettings:
 
 
 class Regions(NamedTuple):
-    """Colours on either side of contours in front of another part (region-based tracking, Stoiber et al. 2022, SRT3D).
+    """Colours on either side of contours in front of another part (region-based tracking; Stoiber et al. 2022)."""
 
-    Attributes:
-        image: (V, H, W, 3) uint8 BGR, the full image.
-        log_likelihood: (G, :data:`COLOR_BINS`) float32 log p(colour | group), see :func:`color_bin`.
-        group: (P,) int32 the colour group of each part.
-        weight: weight of a contour with an exact colour border, relative to a silhouette's edge.
-    """
-
-    image: NDArray[np.uint8]
-    log_likelihood: NDArray[np.float32]
-    group: NDArray[np.int32]
-    weight: float
+    image: NDArray[np.uint8]  # (V, H, W, 3) uint8 BGR, the full image
+    log_likelihood: NDArray[np.float32]  # (G, `COLOR_BINS`) float32 log p(colour | group), see `color_bin`
+    group: NDArray[np.int32]  # (P,) int32 the colour group of each part
+    weight: float  # weight of a contour with an exact colour border, relative to a silhouette's edge
 
 
 @ti.func

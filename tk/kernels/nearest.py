@@ -14,21 +14,13 @@ from tk.kernels.runtime import ensure_runtime, spread_of, ti
 
 @dataclass(frozen=True)
 class SurfaceIndex:
-    """Surface voxels in cell order. V voxels, G cells along each axis (3,).
+    """Surface voxels in cell order. V voxels, G cells along each axis (3,)."""
 
-    Attributes:
-        positions: (V, 3) float32, metres.
-        fits: (V,) int64, bit p set where the voxel's colour fits patch p.
-        starts: (G0·G1·G2 + 1,) int32, first voxel of each cell.
-        grid: (7,) float32, lower corner of cell 0 and edge of a cell (metres), cells along each axis.
-        order: (V,) the voxels' indices in the arrays given to :meth:`build`.
-    """
-
-    positions: np.ndarray
-    fits: np.ndarray
-    starts: np.ndarray
-    grid: np.ndarray
-    order: np.ndarray
+    positions: np.ndarray  # (V, 3) float32, metres
+    fits: np.ndarray  # (V,) int64, bit p set where the voxel's colour fits patch p
+    starts: np.ndarray  # (G0·G1·G2 + 1,) int32, first voxel of each cell
+    grid: np.ndarray  # (7,) float32, lower corner of cell 0 and edge of a cell (metres), cells along each axis
+    order: np.ndarray  # (V,) the voxels' indices in the arrays given to `build`
 
     @staticmethod
     def build(positions: np.ndarray, fits: np.ndarray, cell_m: float) -> "SurfaceIndex":

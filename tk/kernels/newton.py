@@ -16,19 +16,13 @@ _LEAST = 1e-9
 
 
 class NewtonSteps(NamedTuple):
-    """What determines the steps of B states with D parameters, beside the equations.
+    """What determines the steps of B states with D parameters, beside the equations."""
 
-    Attributes:
-        free: (n,) int32 the parameters that may change.
-        limits: (3, D) lower and upper limit, and precision of the prior; see :data:`LOWER`.
-        mean: (B, D) mean of the prior.
-        numbers: (5 + S,) see :data:`DAMPING`; the lengths of S steps as multiples of the equations' solution. A step of
-            length 0 evaluates the equations only.
-    """
-
-    free: NDArray[np.int32]
-    limits: NDArray[np.float64]
-    mean: NDArray[np.float64]
+    free: NDArray[np.int32]  # (n,) int32 the parameters that may change
+    limits: NDArray[np.float64]  # (3, D) lower and upper limit, and precision of the prior; see `LOWER`
+    mean: NDArray[np.float64]  # (B, D) mean of the prior
+    # (5 + S,) see `DAMPING`; the lengths of S steps as multiples of the equations' solution. A step of length 0
+    # evaluates the equations only.
     numbers: NDArray[np.float64]
 
 

@@ -172,50 +172,33 @@ def _linearise_kernel(real):
 
 @dataclass(frozen=True)
 class ObjectiveParameters:
-    """Constants of the objective.
+    """Constants of the objective."""
 
-    Attributes:
-        sigma_m: σ of eq. 10, metres.
-        reach_m: search radius of a sample for its voxel, and of a voxel for the body, metres.
-        nu, coverage_nu: Leclerc's ν of the surface and of the coverage term, in units of ½ (d/σ)².
-        surface_weight: w_s of eq. 8.
-        coverage_weight: w_c of the coverage term; 0 removes it, as in the paper.
-    """
-
-    sigma_m: float
-    reach_m: float
+    sigma_m: float  # σ of eq. 10, metres
+    reach_m: float  # search radius of a sample for its voxel, and of a voxel for the body, metres
+    # nu, coverage_nu: Leclerc's ν of the surface and of the coverage term, in units of ½ (d/σ)²
     nu: float
     coverage_nu: float
-    surface_weight: float
-    coverage_weight: float
+    surface_weight: float  # w_s of eq. 8
+    coverage_weight: float  # w_c of the coverage term; 0 removes it, as in the paper
 
 
 @dataclass(frozen=True)
 class Held:
-    """Assignments of one evaluation.
+    """Assignments of one evaluation."""
 
-    Attributes:
-        assigned: (B, M) voxel of each sample, -1 without.
-        covering: (B, Q, 4) piece of each voxel, -1 without, and the nearest point in the zero configuration, metres.
-    """
-
-    assigned: np.ndarray
+    assigned: np.ndarray  # (B, M) voxel of each sample, -1 without
+    # (B, Q, 4) piece of each voxel, -1 without, and the nearest point in the zero configuration, metres
     covering: np.ndarray
 
 
 @dataclass(frozen=True)
 class Linearisation:
-    """K = M + Q pairs and the Gauss-Newton Hessian at one pose.
+    """K = M + Q pairs and the Gauss-Newton Hessian at one pose."""
 
-    Attributes:
-        residual: (K, 3) x − x̄, metres; zero where a pair is missing.
-        hessian: (D, D) Gauss-Newton Hessian of f; outliers weigh at least the given floor.
-        partner: (K,) the voxel, -1 where missing.
-    """
-
-    residual: np.ndarray
-    hessian: np.ndarray
-    partner: np.ndarray
+    residual: np.ndarray  # (K, 3) x − x̄, metres; zero where a pair is missing
+    hessian: np.ndarray  # (D, D) Gauss-Newton Hessian of f; outliers weigh at least the given floor
+    partner: np.ndarray  # (K,) the voxel, -1 where missing
 
 
 class ObjectiveKernel:

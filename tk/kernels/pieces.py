@@ -14,15 +14,10 @@ PIECE_SHAPE, PIECE_DOF, PIECE_NUMBERS = 12, 19, 20
 
 
 class PieceArrays(NamedTuple):
-    """A superellipsoid body of D degrees of freedom and P pieces, float64.
+    """A superellipsoid body of D degrees of freedom and P pieces, float64."""
 
-    Attributes:
-        tree: (D, 11) of :func:`tk.kernels.kinematics.pack_tree`.
-        pieces: (P, 20) of :func:`pack_pieces`.
-    """
-
-    tree: NDArray[np.float64]
-    pieces: NDArray[np.float64]
+    tree: NDArray[np.float64]  # (D, 11) of `tk.kernels.kinematics.pack_tree`
+    pieces: NDArray[np.float64]  # (P, 20) of `pack_pieces`
 
 
 def pack_pieces(frame: np.ndarray, shape: np.ndarray, dof: np.ndarray) -> NDArray[np.float64]:

@@ -44,15 +44,10 @@ FAR = 1e9
 
 
 class Cast(NamedTuple):
-    """The part that each ray meets first.
+    """The part that each ray meets first."""
 
-    Attributes:
-        label: (V, H, W) uint8, 1 + the part's index; 0 where a ray meets nothing.
-        depth: (V, H, W) float32, in lengths of the ray's direction; :data:`FAR` where a ray meets nothing.
-    """
-
-    label: NDArray[np.uint8]
-    depth: NDArray[np.float32]
+    label: NDArray[np.uint8]  # (V, H, W) uint8, 1 + the part's index; 0 where a ray meets nothing
+    depth: NDArray[np.float32]  # (V, H, W) float32, in lengths of the ray's direction; `FAR` where a ray meets nothing
 
 
 @ti.func

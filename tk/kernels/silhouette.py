@@ -59,43 +59,28 @@ COST, FOUND, ALL, GRADIENT = range(4)
 
 
 class NormalEquations(NamedTuple):
-    """The normal equations of B poses, distances in pixels of the full picture.
+    """The normal equations of B poses, distances in pixels of the full picture."""
 
-    Attributes:
-        hessian: (B, D, D) JᵀWJ.
-        gradient: (B, D) JᵀWd: the step solves ``hessian @ step = gradient``.
-        cost: (B,) weighted mean square distance; a sample without an edge counts as ``lost_px``; inf without samples.
-        found: (B,) weight of the samples that found an edge, as a share of all samples.
-    """
-
-    hessian: NDArray[np.float64]
-    gradient: NDArray[np.float64]
+    hessian: NDArray[np.float64]  # (B, D, D) JᵀWJ
+    gradient: NDArray[np.float64]  # (B, D) JᵀWd: the step solves `hessian @ step = gradient`
+    # (B,) weighted mean square distance; a sample without an edge counts as `lost_px`; inf without samples
     cost: NDArray[np.float64]
-    found: NDArray[np.float64]
+    found: NDArray[np.float64]  # (B,) weight of the samples that found an edge, as a share of all samples
 
 
 class Edgels(NamedTuple):
-    """The samples of one pose that found an edge (N of them).
+    """The samples of one pose that found an edge (N of them)."""
 
-    Attributes:
-        view, part: (N,) camera and part.
-        unscaled: (N, 3) the contour point as (x / a r, y / b r, z / h) in the part's frame.
-        distance: (N,) signed distance to the edgel, pixels, positive outwards.
-        weight: (N,) weight of the edgel's row.
-        row: (N, 3) derivative of the contour's position along its normal by the point's world coordinates, pixels per
-            metre.
-        pixel: (N, 2) the sample's image.
-        normal: (N, 2) unit normal of the contour in the image, outwards.
-    """
-
+    # view, part: (N,) camera and part
     view: NDArray[np.int32]
     part: NDArray[np.int32]
-    unscaled: NDArray[np.float64]
-    distance: NDArray[np.float64]
-    weight: NDArray[np.float64]
+    unscaled: NDArray[np.float64]  # (N, 3) the contour point as (x / a r, y / b r, z / h) in the part's frame
+    distance: NDArray[np.float64]  # (N,) signed distance to the edgel, pixels, positive outwards
+    weight: NDArray[np.float64]  # (N,) weight of the edgel's row
+    # (N, 3) derivative of the contour's position along its normal by the point's world coordinates, pixels per metre
     row: NDArray[np.float64]
-    pixel: NDArray[np.float64]
-    normal: NDArray[np.float64]
+    pixel: NDArray[np.float64]  # (N, 2) the sample's image
+    normal: NDArray[np.float64]  # (N, 2) unit normal of the contour in the image, outwards
 
     def of_view(self, view: int) -> "Edgels":
         """Return the edgels of one camera; they are in the order of the cameras."""
@@ -366,17 +351,11 @@ def _descent_kernel(real):
 
 
 class Descent(NamedTuple):
-    """B poses after some steps.
+    """B poses after some steps."""
 
-    Attributes:
-        poses: (B, D).
-        hessian: (B, D, D) JᵀWJ before each pose's last step.
-        steps: (B,) number of steps made.
-    """
-
-    poses: NDArray[np.float64]
-    hessian: NDArray[np.float64]
-    steps: NDArray[np.int32]
+    poses: NDArray[np.float64]  # (B, D)
+    hessian: NDArray[np.float64]  # (B, D, D) JᵀWJ before each pose's last step
+    steps: NDArray[np.int32]  # (B,) number of steps made
 
 
 def _launch(

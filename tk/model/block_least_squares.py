@@ -79,20 +79,14 @@ class Equations:
 
 @dataclass(frozen=True)
 class Reduced:
-    """Equations of the S shared unknowns after elimination of B blocks of D unknowns.
+    """Equations of the S shared unknowns after elimination of B blocks of D unknowns."""
 
-    Attributes:
-        hessian, gradient: (S, S), (S,) of the shared unknowns, their prior included.
-        by_block: (B, S) what each block's rows add to the gradient.
-        plain: (B, D) step of the blocks if the shared unknowns stay.
-        response: (B, D, S) by which the blocks' step shrinks with a step of the shared unknowns.
-    """
-
+    # hessian, gradient: (S, S), (S,) of the shared unknowns, their prior included
     hessian: Float
     gradient: Float
-    by_block: Float
-    plain: Float
-    response: Float
+    by_block: Float  # (B, S) what each block's rows add to the gradient
+    plain: Float  # (B, D) step of the blocks if the shared unknowns stay
+    response: Float  # (B, D, S) by which the blocks' step shrinks with a step of the shared unknowns
 
     def step(self) -> tuple[Float, Float]:
         """Solve the equations: return the steps (B, D) of the blocks and (S,) of the shared unknowns."""
@@ -102,17 +96,11 @@ class Reduced:
 
 @dataclass(frozen=True)
 class Solution(Generic[T]):
-    """Result of :func:`minimise`.
+    """Result of :func:`minimise`."""
 
-    Attributes:
-        state: the estimate.
-        reduced: the equations of the last step; None if no step was made.
-        converged: whether the last step was below the tolerance.
-    """
-
-    state: T
-    reduced: Reduced | None
-    converged: bool
+    state: T  # the estimate
+    reduced: Reduced | None  # the equations of the last step; None if no step was made
+    converged: bool  # whether the last step was below the tolerance
 
 
 def minimise(

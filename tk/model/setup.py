@@ -22,19 +22,12 @@ TRANSLATIONS = ("torso_x", "torso_y", "torso_z")
 
 @dataclass(frozen=True)
 class InitPose:
-    """A rough pose given by a person, in the setup's world. Either ``joints`` or ``angles`` is empty.
+    """A rough pose given by a person, in the setup's world. Either ``joints`` or ``angles`` is empty."""
 
-    Attributes:
-        joints: name → (3,) metres.
-        angles: name → metres or radians.
-        frame: frame of the pose; None if not given.
-        height_m: height of the subject, metres; None if not given.
-    """
-
-    joints: dict[str, NDArray[np.float64]]
-    angles: dict[str, float]
-    frame: int | None = None
-    height_m: float | None = None
+    joints: dict[str, NDArray[np.float64]]  # name → (3,) metres
+    angles: dict[str, float]  # name → metres or radians
+    frame: int | None = None  # frame of the pose; None if not given
+    height_m: float | None = None  # height of the subject, metres; None if not given
 
     @property
     def center(self) -> NDArray[np.float64]:
@@ -46,43 +39,28 @@ class InitPose:
 
 @dataclass(frozen=True)
 class Subject:
-    """What is known of a person before tracking.
+    """What is known of a person before tracking."""
 
-    Attributes:
-        height_m: height without shoes, metres; None if unknown.
-        init_frame: frame of the initialisation.
-        init: rough pose in that frame; None if the tracker finds the person by itself.
-        body: the body, from an earlier recording; None if it is to be fitted.
-        in_init_pose: whether the subject stands in the initialisation pose in that frame, so that every limb is
-            visible. If not, any frame may serve, and the body is fitted again at the end.
-        position: (3,) m, rough position in that frame, to choose among several people; None if unknown.
-    """
-
-    height_m: float | None = None
-    init_frame: int = 0
-    init: InitPose | None = None
-    body: ConeBody | None = None
+    height_m: float | None = None  # height without shoes, metres; None if unknown
+    init_frame: int = 0  # frame of the initialisation
+    init: InitPose | None = None  # rough pose in that frame; None if the tracker finds the person by itself
+    body: ConeBody | None = None  # the body, from an earlier recording; None if it is to be fitted
+    # whether the subject stands in the initialisation pose in that frame, so that every limb is visible. If not, any
+    # frame may serve, and the body is fitted again at the end.
     in_init_pose: bool = True
+    # (3,) m, rough position in that frame, to choose among several people; None if unknown
     position: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
 class Setup:
-    """The scene of a run. It says nothing about where the images come from.
-
-    Attributes:
-        rig: the cameras.
-        volume: the working volume, metres.
-        up: axis that points up in the world, see :func:`tk.model.cameras.up.up_vector`.
-        fps: frame rate, 1/s.
-        subjects: the persons to be tracked, at least one.
-    """
+    """The scene of a run. It says nothing about where the images come from."""
 
     rig: Rig
-    volume: Volume
-    up: str
-    fps: float
-    subjects: tuple[Subject, ...] = (Subject(),)
+    volume: Volume  # the working volume, metres
+    up: str  # axis that points up in the world, see `tk.model.cameras.up.up_vector`
+    fps: float  # frame rate, 1/s
+    subjects: tuple[Subject, ...] = (Subject(),)  # the persons to be tracked, at least one
 
     def __post_init__(self) -> None:
         if not self.subjects:

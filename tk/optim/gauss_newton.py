@@ -31,30 +31,22 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class GaussNewtonSettings:
-    """Settings.
+    """Settings."""
 
-    Attributes:
-        scales: scales of the search, a factor of two apart; the coarsest comes first (the paper: 2).
-        iterations: at each scale (the paper: 3).
-        relaxation: length of the steps as a multiple of the equations' solution; above 1 (the paper) one plain step
-            follows at the finest scale.
-        damping: share of each diagonal element that is added to it.
-        stiffness: least number added to the diagonal, as a share of its mean over the free parameters with evidence; it
-            keeps parameters without evidence in place.
-        limit_weight: weight of the squared excess over a limit, as a share of the same mean (section 4.5, which gives
-            no number).
-        longest_step: largest change of a parameter in one iteration; steps are shortened to it as a whole.
-        tolerance: a state's iteration at a scale ends once no parameter changes by more, radians or metres; 0 (the
-            paper): all iterations are made.
-    """
-
-    scales: int = 2
-    iterations: int = 3
+    scales: int = 2  # scales of the search, a factor of two apart; the coarsest comes first (the paper: 2)
+    iterations: int = 3  # at each scale (the paper: 3)
+    # length of the steps as a multiple of the equations' solution; above 1 (the paper) one plain step follows at the
+    # finest scale
     relaxation: float = 1.0
-    damping: float = 0.02
+    damping: float = 0.02  # share of each diagonal element that is added to it
+    # least number added to the diagonal, as a share of its mean over the free parameters with evidence; it keeps
+    # parameters without evidence in place
     stiffness: float = 0.0005
+    # weight of the squared excess over a limit, as a share of the same mean (section 4.5, which gives no number)
     limit_weight: float = 1.0
-    longest_step: float = 0.5
+    longest_step: float = 0.5  # largest change of a parameter in one iteration; steps are shortened to it as a whole
+    # a state's iteration at a scale ends once no parameter changes by more, radians or metres; 0 (the paper): all
+    # iterations are made
     tolerance: float = 0.0
 
     def __post_init__(self) -> None:
@@ -80,29 +72,18 @@ class GaussNewtonSettings:
 
 @dataclass(frozen=True)
 class Prior:
-    """A normal prior on the state, in the units of the equations.
+    """A normal prior on the state, in the units of the equations."""
 
-    Attributes:
-        mean: (D,) or (B, D).
-        precision: (D,) zero without a prior.
-    """
-
-    mean: Float
-    precision: Float
+    mean: Float  # (D,) or (B, D)
+    precision: Float  # (D,) zero without a prior
 
 
 class BatchSolution(NamedTuple):
-    """Result of :func:`minimise` for B states.
+    """Result of :func:`minimise` for B states."""
 
-    Attributes:
-        states: (B, D) after the last iteration.
-        hessian: (B, D, D) JᵀWJ before the last step.
-        iterations: (L,) number at each scale, in order.
-    """
-
-    states: Float
-    hessian: Float
-    iterations: NDArray[np.int32]
+    states: Float  # (B, D) after the last iteration
+    hessian: Float  # (B, D, D) JᵀWJ before the last step
+    iterations: NDArray[np.int32]  # (L,) number at each scale, in order
 
 
 def minimise(

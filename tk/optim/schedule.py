@@ -74,15 +74,10 @@ class Problem(Protocol):
 
 @dataclass(frozen=True)
 class ScheduleResult:
-    """The result of both passes.
+    """The result of both passes."""
 
-    Attributes:
-        pose: (D,).
-        iterations: (1 + K,) of the first pass and of each chain.
-    """
-
-    pose: Float
-    iterations: NDArray[np.int32]
+    pose: Float  # (D,)
+    iterations: NDArray[np.int32]  # (1 + K,) of the first pass and of each chain
 
 
 def optimise(problem: Problem, starts: Float, max_iterations: int = smd.MAX_ITERATIONS) -> ScheduleResult:

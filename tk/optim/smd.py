@@ -46,17 +46,11 @@ Objective = Callable[[Float, Float, int], Evaluation]
 
 @dataclass(frozen=True)
 class SmdResult:
-    """The minima of B problems.
+    """The minima of B problems."""
 
-    Attributes:
-        pose: (B, D).
-        iterations: (B,) number of iterations.
-        path: (I + 1, B, D) all states; a finished row repeats its last state.
-    """
-
-    pose: Float
-    iterations: NDArray[np.int32]
-    path: Float
+    pose: Float  # (B, D)
+    iterations: NDArray[np.int32]  # (B,) number of iterations
+    path: Float  # (I + 1, B, D) all states; a finished row repeats its last state
 
 
 def minimise(

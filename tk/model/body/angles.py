@@ -39,22 +39,15 @@ _ARM_AXES = np.column_stack([CROOK, np.cross(-ARM, CROOK), -ARM])
 
 @dataclass(frozen=True)
 class AngleSet:
-    """The angles of one joint.
+    """The angles of one joint."""
 
-    Attributes:
-        joint: name of the joint and of the dataset `/angles/<joint>`.
-        parent, child: names of the segments; parent None is the world.
-        sequence: Euler sequence (moving axes) from the parent's to the child's ISB axes.
-        columns: for each angle its name, its index in the sequence, and its sign.
-        convention: zero position, signs and source, in words.
-    """
-
-    joint: str
+    joint: str  # name of the joint and of the dataset `/angles/<joint>`
+    # parent, child: names of the segments; parent None is the world
     parent: str | None
     child: str
-    sequence: str
-    columns: tuple[tuple[str, int, float], ...]
-    convention: str
+    sequence: str  # Euler sequence (moving axes) from the parent's to the child's ISB axes
+    columns: tuple[tuple[str, int, float], ...]  # for each angle its name, its index in the sequence, and its sign
+    convention: str  # zero position, signs and source, in words
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -118,21 +118,13 @@ class BodyFamily:
 
 @dataclass(frozen=True)
 class LinearisedBody:
-    """A body at M poses, with its derivatives by pose and parameters. Methods take N edgels and each one's pose (N,).
-
-    Attributes:
-        body: the body.
-        T_world_segment: (M, S, 4, 4) transforms of its segments.
-        twists: (M, 6, D) twist (ω, v) of each degree of freedom.
-        by_part: (P, 17, 24) derivatives of :func:`_part_numbers`.
-        moves: (M, S, 3, 24) derivatives of the segments' places.
-    """
+    """A body at M poses, with derivatives by pose and parameters. Methods take N edgels and each one's pose (N,)."""
 
     body: ConeBody
-    T_world_segment: Float
-    twists: Float
-    by_part: Float
-    moves: Float
+    T_world_segment: Float  # (M, S, 4, 4) transforms of its segments
+    twists: Float  # (M, 6, D) twist (ω, v) of each degree of freedom
+    by_part: Float  # (P, 17, 24) derivatives of `_part_numbers`
+    moves: Float  # (M, S, 3, 24) derivatives of the segments' places
 
     @cached_property
     def _T_world_part(self) -> Float:

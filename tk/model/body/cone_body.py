@@ -47,25 +47,18 @@ SHAPE_NUMBERS = 8
 
 @dataclass(frozen=True)
 class ConePart:
-    """A frustum of an elliptical cone, or an ellipsoid.
+    """A frustum of an elliptical cone, or an ellipsoid."""
 
-    Attributes:
-        name: of the part.
-        segment: of the skeleton, to which the part is fixed.
-        kind: :data:`~tk.kernels.cones.CONE` or :data:`~tk.kernels.cones.ELLIPSOID`.
-        shape: cone: semi-axes a, b of the section at z = 0, height h, magnification m of the section at z = h;
-            ellipsoid: semi-axes along x, y, z, and 1. Metres.
-        T_body_part: (4, 4) the part's frame in the zero configuration: a cone's axis goes from the origin along z, an
-            ellipsoid is centred on the origin.
-        ends: whether the rims at z = 0 and z = h are contours, too.
-    """
-
-    name: str
-    segment: str
-    kind: int
+    name: str  # of the part
+    segment: str  # of the skeleton, to which the part is fixed
+    kind: int  # `tk.kernels.cones.CONE` or `tk.kernels.cones.ELLIPSOID`
+    # cone: semi-axes a, b of the section at z = 0, height h, magnification m of the section at z = h; ellipsoid:
+    # semi-axes along x, y, z, and 1. Metres.
     shape: tuple[float, float, float, float]
+    # (4, 4) the part's frame in the zero configuration: a cone's axis goes from the origin along z, an ellipsoid is
+    # centred on the origin
     T_body_part: Float
-    ends: tuple[bool, bool] = (False, False)
+    ends: tuple[bool, bool] = (False, False)  # whether the rims at z = 0 and z = h are contours, too
 
     @property
     def component(self) -> str:
@@ -80,17 +73,11 @@ class ConePart:
 
 @dataclass(frozen=True)
 class ConeBody:
-    """One person's body, fixed during tracking.
+    """One person's body, fixed during tracking."""
 
-    Attributes:
-        dimensions: lengths and radii, metres.
-        skeleton: the kinematic tree.
-        parts: the cones and the ellipsoid.
-    """
-
-    dimensions: BodyDimensions
-    skeleton: Skeleton
-    parts: tuple[ConePart, ...]
+    dimensions: BodyDimensions  # lengths and radii, metres
+    skeleton: Skeleton  # the kinematic tree
+    parts: tuple[ConePart, ...]  # the cones and the ellipsoid
 
     def standing(self, up: str) -> ConeBody:
         """Return the same body in a world in which ``up`` (see :func:`tk.model.cameras.up.up_vector`) points up."""

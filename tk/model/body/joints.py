@@ -31,56 +31,37 @@ WAIST_HEIGHT = 0.25
 
 @dataclass(frozen=True)
 class Dof:
-    """A degree of freedom.
+    """A degree of freedom."""
 
-    Attributes:
-        name: what follows the joint's name, such as ``flexion``.
-        axis: (3,) unit axis in the zero configuration, body frame, left side.
-        lower, upper: limits, degrees.
-        prismatic: True for a translation.
-        straight_deg: standard deviation, degrees, of a joint that is nearly straight in most frames: its prior is about
-            zero. Infinite: the prior is about the predicted angle.
-        stiffness: of the volumetric tracker's spring to zero, as a factor of the setting.
-    """
-
-    name: str
-    axis: Float
+    name: str  # what follows the joint's name, such as `flexion`
+    axis: Float  # (3,) unit axis in the zero configuration, body frame, left side
+    # lower, upper: limits, degrees
     lower: float = -np.inf
     upper: float = np.inf
-    prismatic: bool = False
+    prismatic: bool = False  # True for a translation
+    # standard deviation, degrees, of a joint that is nearly straight in most frames: its prior is about zero. Infinite:
+    # the prior is about the predicted angle.
     straight_deg: float = np.inf
-    stiffness: float = 0.0
+    stiffness: float = 0.0  # of the volumetric tracker's spring to zero, as a factor of the setting
 
 
 @dataclass(frozen=True)
 class Joint:
-    """A row of the table.
+    """A row of the table."""
 
-    Attributes:
-        name: with the side, ``_l`` or ``_r``, for a limb's joint.
-        place: the joint centre in the zero configuration, body frame, left side, metres.
-        dofs: its degrees of freedom, in the order of the pose vector.
-        above: the joint whose last degree of freedom carries it; empty at the root.
-        turns: the segment that it moves; empty for the end of a chain.
-        chain: the chain that is optimised as one (section 6.4); empty for the trunk.
-        carrier: the segment that carries the joint centre in `/joints/position`; empty: not an output.
-        bone_from: the joint at the other end of the bone in drawings; empty at the root.
-        optional: whether a simpler body omits its degrees of freedom.
-        offset_m: constant offset of the output joint from a ground truth's, root mean square, metres.
-        added: True for an output joint beyond the 15 that every result and ground truth has; readers return NaN for a
-            file without it.
-    """
-
-    name: str
+    name: str  # with the side, `_l` or `_r`, for a limb's joint
+    # the joint centre in the zero configuration, body frame, left side, metres
     place: Callable[[BodyDimensions], Float]
-    dofs: tuple[Dof, ...] = ()
-    above: str = ""
-    turns: str = ""
-    chain: str = ""
-    carrier: str = ""
-    bone_from: str = ""
-    optional: bool = False
-    offset_m: float = np.nan
+    dofs: tuple[Dof, ...] = ()  # its degrees of freedom, in the order of the pose vector
+    above: str = ""  # the joint whose last degree of freedom carries it; empty at the root
+    turns: str = ""  # the segment that it moves; empty for the end of a chain
+    chain: str = ""  # the chain that is optimised as one (section 6.4); empty for the trunk
+    carrier: str = ""  # the segment that carries the joint centre in `/joints/position`; empty: not an output
+    bone_from: str = ""  # the joint at the other end of the bone in drawings; empty at the root
+    optional: bool = False  # whether a simpler body omits its degrees of freedom
+    offset_m: float = np.nan  # constant offset of the output joint from a ground truth's, root mean square, metres
+    # True for an output joint beyond the 15 that every result and ground truth has; readers return NaN for a file
+    # without it
     added: bool = False
 
     @property

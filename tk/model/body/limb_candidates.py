@@ -39,25 +39,15 @@ _NEAR_DEG = 25.0
 
 @dataclass(frozen=True, eq=False)
 class Limb:
-    """A limb of a body.
+    """A limb of a body."""
 
-    Attributes:
-        name: of :data:`LIMBS`.
-        skeleton: of the body.
-        dofs: (L,) its degrees of freedom.
-        parts: (K,) int32 its parts.
-        arrays: the body for the kernels, with the contours of these parts only.
-        joints: elbow and wrist, or knee and ankle, as indices into the skeleton's joints.
-        grid: (N, L) candidates.
-    """
-
-    name: str
+    name: str  # of `LIMBS`
     skeleton: Skeleton
-    dofs: NDArray[np.int64]
-    parts: NDArray[np.int32]
-    arrays: ConeArrays
-    joints: list[int]
-    grid: Float
+    dofs: NDArray[np.int64]  # (L,) its degrees of freedom
+    parts: NDArray[np.int32]  # (K,) int32 its parts
+    arrays: ConeArrays  # the body for the kernels, with the contours of these parts only
+    joints: list[int]  # elbow and wrist, or knee and ankle, as indices into the skeleton's joints
+    grid: Float  # (N, L) candidates
 
     def candidates(self, pose: Float, near: int, rng: np.random.Generator) -> Float:
         """Return (B, D) copies of a pose with the limb in all candidates of the grid, and in ``near`` random ones."""

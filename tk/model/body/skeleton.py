@@ -66,39 +66,27 @@ class Skeleton:
 
     Optional joints have more: a waist three, ankles two each; without them pelvis and feet are carried by torso and
     calves.
-
-    Attributes:
-        names: (D,) names of the degrees of freedom; translations first.
-        axis: (D, 3) unit axes in the zero configuration, world frame.
-        point: (D, 3) a point on each axis, metres; unused for translations.
-        rise: (D, 3) how far a level arm that is raised upright lifts its shoulder, metres, in the first degree of
-            freedom of each shoulder; zero elsewhere.
-        prismatic: (D,) True for translations.
-        parent: (D,) index of the degree of freedom before, -1 at the root.
-        lower, upper: (D,) limits, radians; infinite where there is none.
-        straight: (D,) radians, standard deviation about zero of a joint that is nearly straight in most frames;
-            infinite for the others.
-        stiffness: (D,) of the volumetric tracker's spring to zero, as a factor of the setting.
-        segment_dof: (S,) the last degree of freedom above each segment.
-        joint_segment: (J,) the segment that carries each joint.
-        joint_position: (J, 3) joint centres in the zero configuration, metres.
-        T_world_body: (3, 3) rotation of the body frame in the zero configuration (identity when z is up).
     """
 
-    names: tuple[str, ...]
-    axis: Float
-    point: Float
+    names: tuple[str, ...]  # (D,) names of the degrees of freedom; translations first
+    axis: Float  # (D, 3) unit axes in the zero configuration, world frame
+    point: Float  # (D, 3) a point on each axis, metres; unused for translations
+    # (D, 3) how far a level arm that is raised upright lifts its shoulder, metres, in the first degree of freedom of
+    # each shoulder; zero elsewhere
     rise: Float
-    prismatic: NDArray[np.bool_]
-    parent: NDArray[np.int32]
+    prismatic: NDArray[np.bool_]  # (D,) True for translations
+    parent: NDArray[np.int32]  # (D,) index of the degree of freedom before, -1 at the root
+    # lower, upper: (D,) limits, radians; infinite where there is none
     lower: Float
     upper: Float
+    # (D,) radians, standard deviation about zero of a joint that is nearly straight in most frames; infinite for the
+    # others
     straight: Float
-    stiffness: Float
-    segment_dof: NDArray[np.int32]
-    joint_segment: NDArray[np.int32]
-    joint_position: Float
-    T_world_body: Float
+    stiffness: Float  # (D,) of the volumetric tracker's spring to zero, as a factor of the setting
+    segment_dof: NDArray[np.int32]  # (S,) the last degree of freedom above each segment
+    joint_segment: NDArray[np.int32]  # (J,) the segment that carries each joint
+    joint_position: Float  # (J, 3) joint centres in the zero configuration, metres
+    T_world_body: Float  # (3, 3) rotation of the body frame in the zero configuration (identity when z is up)
 
     @property
     def units(self) -> tuple[str, ...]:

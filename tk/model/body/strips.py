@@ -31,17 +31,11 @@ CIRCLES, STEPS = 20, 32
 
 @dataclass(frozen=True)
 class Strips:
-    """S strips of N samples, :data:`CIRCLES` on each of some pieces.
+    """S strips of N samples, :data:`CIRCLES` on each of some pieces."""
 
-    Attributes:
-        angles: (S, N, 2) η and ω, radians. The last sample of a strip is its first.
-        normals: (S, N, 3) n_d of eq. 2 in the piece's frame, 1/m; not of unit length.
-        piece: (S,) index of each strip's piece.
-    """
-
-    angles: Float
-    normals: Float
-    piece: Ints
+    angles: Float  # (S, N, 2) η and ω, radians. The last sample of a strip is its first.
+    normals: Float  # (S, N, 3) n_d of eq. 2 in the piece's frame, 1/m; not of unit length
+    piece: Ints  # (S,) index of each strip's piece
 
 
 def limb_pieces(body: SuperellipsoidBody) -> list[int]:

@@ -18,21 +18,15 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Superellipsoid:
-    """One piece of the body's surface.
+    """One piece of the body's surface."""
 
-    Attributes:
-        segment: the body segment to which the piece is fixed.
-        T_body_piece: (4, 4) from the piece's frame to the body frame in the zero configuration.
-        radii: a₁, a₂, a₃, metres.
-        e1, e2: ε₁ (along the meridians) and ε₂ (along the circles of latitude), each in (0, 2).
-        z_lower, z_upper: the planes between which the surface exists, metres, within ±a₃.
-    """
-
-    segment: str
-    T_body_piece: Float
-    radii: tuple[float, float, float]
+    segment: str  # the body segment to which the piece is fixed
+    T_body_piece: Float  # (4, 4) from the piece's frame to the body frame in the zero configuration
+    radii: tuple[float, float, float]  # a₁, a₂, a₃, metres
+    # e1, e2: ε₁ (along the meridians) and ε₂ (along the circles of latitude), each in (0, 2)
     e1: float
     e2: float
+    # z_lower, z_upper: the planes between which the surface exists, metres, within ±a₃
     z_lower: float
     z_upper: float
 

@@ -36,25 +36,15 @@ SPACING_M = 0.03
 
 @dataclass(frozen=True)
 class SuperellipsoidBody:
-    """One person's surface: pieces and samples (N points) on a skeleton, all fixed during tracking.
+    """One person's surface: pieces and samples (N points) on a skeleton, all fixed during tracking."""
 
-    Attributes:
-        skeleton: the kinematic tree.
-        pieces: of the surface.
-        points: (N, 3) surface samples in the zero configuration, world frame, metres.
-        segment: (N,) index of each sample's segment.
-        piece: (N,) index of each sample's piece.
-        patch: (N,) index of each sample's colour patch.
-        patch_names: (P,) of the colour patches.
-    """
-
-    skeleton: Skeleton
-    pieces: tuple[Superellipsoid, ...]
-    points: Float
-    segment: NDArray[np.int32]
-    piece: NDArray[np.int32]
-    patch: NDArray[np.int32]
-    patch_names: tuple[str, ...]
+    skeleton: Skeleton  # the kinematic tree
+    pieces: tuple[Superellipsoid, ...]  # of the surface
+    points: Float  # (N, 3) surface samples in the zero configuration, world frame, metres
+    segment: NDArray[np.int32]  # (N,) index of each sample's segment
+    piece: NDArray[np.int32]  # (N,) index of each sample's piece
+    patch: NDArray[np.int32]  # (N,) index of each sample's colour patch
+    patch_names: tuple[str, ...]  # (P,) of the colour patches
 
     @cached_property
     def arrays(self) -> PieceArrays:

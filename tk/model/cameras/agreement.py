@@ -48,29 +48,20 @@ SCALE_DEVIATION = 0.03
 
 @dataclass(frozen=True)
 class CameraAgreement:
-    """How the cameras differ from each other.
+    """How the cameras differ from each other."""
 
-    Attributes:
-        names: of the C cameras.
-        shift_px: (C, 2) pixels, from the place where the other cameras expect the person to the place in this image;
-            x right and y down.
-        shift_sigma_px: (C, 2) pixels, one standard deviation.
-        offset_frames: (C,) frames by which a camera's images are taken later than the others'; NaN if nobody moves.
-        offset_sigma_frames: (C,) frames, one standard deviation.
-        size: (2,) by which share of its size each of two cameras shows the person larger than the other one expects;
-            empty unless there are two.
-        size_sigma: (2,) one standard deviation.
-        focal_px: (C,) pixels, focal lengths: they turn a shift into an angle.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the C cameras
+    # (C, 2) pixels, from the place where the other cameras expect the person to the place in this image; x right and y
+    # down
     shift_px: Float
-    shift_sigma_px: Float
-    offset_frames: Float
-    offset_sigma_frames: Float
+    shift_sigma_px: Float  # (C, 2) pixels, one standard deviation
+    offset_frames: Float  # (C,) frames by which a camera's images are taken later than the others'; NaN if nobody moves
+    offset_sigma_frames: Float  # (C,) frames, one standard deviation
+    # (2,) by which share of its size each of two cameras shows the person larger than the other one expects; empty
+    # unless there are two
     size: Float
-    size_sigma: Float
-    focal_px: Float
+    size_sigma: Float  # (2,) one standard deviation
+    focal_px: Float  # (C,) pixels, focal lengths: they turn a shift into an angle
 
     @property
     def inconsistent(self) -> NDArray[np.bool_]:

@@ -55,50 +55,32 @@ CAMERA_PARAMETERS = {"shift": 2, "turn": 3, "move": 3, "focal": 1, "offset": 1}
 
 @dataclass(frozen=True)
 class BundleFrame:
-    """One frame of a bundle.
+    """One frame of a bundle."""
 
-    Attributes:
-        pyramid: its silhouettes.
-        pose: (D,) the given pose.
-        velocity: (D,) its change from frame to frame.
-    """
-
-    pyramid: Pyramid
-    pose: Float
-    velocity: Float
+    pyramid: Pyramid  # its silhouettes
+    pose: Float  # (D,) the given pose
+    velocity: Float  # (D,) its change from frame to frame
 
 
 @dataclass(frozen=True)
 class Contours:
-    """The edgels of one frame in one camera, or in all cameras if these are known.
+    """The edgels of one frame in one camera, or in all cameras if these are known."""
 
-    Attributes:
-        frame, camera: indices; camera 0 stands for all.
-        pose: (D,) at which the body was rendered: the pose at the camera's own time.
-        edgels: of these cameras.
-    """
-
+    # frame, camera: indices; camera 0 stands for all
     frame: int
     camera: int
-    pose: Float
-    edgels: Edgels
+    pose: Float  # (D,) at which the body was rendered: the pose at the camera's own time
+    edgels: Edgels  # of these cameras
 
 
 @dataclass(frozen=True)
 class BundleState:
-    """Estimate of a bundle.
+    """Estimate of a bundle."""
 
-    Attributes:
-        rig: the C cameras.
-        change: (C, k) sum of the cameras' steps so far; the cameras' prior is about zero.
-        poses: (F, D).
-        body: (K,) parameters of the body.
-    """
-
-    rig: Rig
-    change: Float
-    poses: Float
-    body: Float
+    rig: Rig  # the C cameras
+    change: Float  # (C, k) sum of the cameras' steps so far; the cameras' prior is about zero
+    poses: Float  # (F, D)
+    body: Float  # (K,) parameters of the body
 
 
 class ContourBundle:

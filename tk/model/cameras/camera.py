@@ -31,26 +31,18 @@ class Camera:
     """A pinhole camera with lens distortion.
 
     ``p_camera = rotation @ p_world + translation`` with x right, y down, z forward.
-
-    Attributes:
-        name: the camera's name, as in `calibration.toml`.
-        width, height: image size, pixels.
-        matrix: (3, 3) intrinsic matrix, pixels.
-        distortions: (4,) or (5,) in OpenCV's order k1 k2 p1 p2 [k3]; (4,) k1…k4 when ``fisheye``.
-        rotation: (3, 3) rotation from world to camera.
-        translation: (3,) metres, of the world's origin in the camera frame.
-        fisheye: True for OpenCV's fisheye (equidistant) model.
-        recorded_size: (width, height) of the recorded image, pixels, if this image is a reduced one; else None.
     """
 
-    name: str
+    name: str  # the camera's name, as in `calibration.toml`
+    # width, height: image size, pixels
     width: int
     height: int
-    matrix: Float
-    distortions: Float
-    rotation: Float
-    translation: Float
-    fisheye: bool = False
+    matrix: Float  # (3, 3) intrinsic matrix, pixels
+    distortions: Float  # (4,) or (5,) in OpenCV's order k1 k2 p1 p2 [k3]; (4,) k1…k4 when `fisheye`
+    rotation: Float  # (3, 3) rotation from world to camera
+    translation: Float  # (3,) metres, of the world's origin in the camera frame
+    fisheye: bool = False  # True for OpenCV's fisheye (equidistant) model
+    # (width, height) of the recorded image, pixels, if this image is a reduced one; else None
     recorded_size: tuple[int, int] | None = None
 
     @property

@@ -24,17 +24,11 @@ _SPAN = 0.05
 
 @dataclass(frozen=True)
 class FoundUp:
-    """The world's up direction.
+    """The world's up direction."""
 
-    Attributes:
-        up: text as of :func:`tk.model.cameras.up.up_text`.
-        how: how it was inferred, for messages.
-        level: whether it comes from cameras that are not rolled; it is then right to about 2°.
-    """
-
-    up: str
-    how: str
-    level: bool = False
+    up: str  # text as of `tk.model.cameras.up.up_text`
+    how: str  # how it was inferred, for messages
+    level: bool = False  # whether it comes from cameras that are not rolled; it is then right to about 2°
 
 
 def infer_up(rig: Rig) -> FoundUp:

@@ -41,17 +41,11 @@ SCALES, COARSE_ROUNDS, ROUNDS = 2, 2, 8
 
 @dataclass(frozen=True)
 class RefinementSettings:
-    """What `tk refine` may change.
+    """What `tk refine` may change."""
 
-    Attributes:
-        focal: whether focal lengths change, too.
-        offsets: whether the videos' delays are estimated.
-        trust: factor of the prior standard deviations :data:`TURN_DEG` and :data:`MOVE_M`; larger for cameras with
-            larger errors.
-    """
-
-    focal: bool = False
-    offsets: bool = True
+    focal: bool = False  # whether focal lengths change, too
+    offsets: bool = True  # whether the videos' delays are estimated
+    # factor of the prior standard deviations `TURN_DEG` and `MOVE_M`; larger for cameras with larger errors
     trust: float = 1.0
 
     def __post_init__(self) -> None:
@@ -61,35 +55,29 @@ class RefinementSettings:
 
 @dataclass(frozen=True)
 class Refined:
-    """Result of :func:`refine_cameras`.
+    """Result of :func:`refine_cameras`."""
 
-    Attributes:
-        rig: the C cameras.
-        offset_frames: (C,) frames by which a camera's images are taken later than those of the reference camera, the
-            median one.
-        turn_deg, move_m, focal: (C,) degrees, metres and a factor: the change of each camera's orientation, centre and
-            focal lengths.
-        turn_sigma_deg, move_sigma_m, focal_sigma, offset_sigma_frames: (C,) one standard deviation; of turn and move
-            the vector's length.
-        observed: (C,) bool, whether the recording determines a camera's placement better than the prior.
-        before_px, after_px: (C,) pixels of the recorded image, root mean square distance of contours from the mask's
-            edges.
-        converged: whether the last steps were small.
-    """
-
-    rig: Rig
+    rig: Rig  # the C cameras
+    # (C,) frames by which a camera's images are taken later than those of the reference camera, the median one
     offset_frames: Float
+    # turn_deg, move_m, focal: (C,) degrees, metres and a factor: the change of each camera's orientation, centre and
+    # focal lengths
     turn_deg: Float
     move_m: Float
     focal: Float
+    # turn_sigma_deg, move_sigma_m, focal_sigma, offset_sigma_frames: (C,) one standard deviation; of turn and move the
+    # vector's length
     turn_sigma_deg: Float
     move_sigma_m: Float
     focal_sigma: Float
     offset_sigma_frames: Float
+    # (C,) bool, whether the recording determines a camera's placement better than the prior
     observed: NDArray[np.bool_]
+    # before_px, after_px: (C,) pixels of the recorded image, root mean square distance of contours from the mask's
+    # edges
     before_px: Float
     after_px: Float
-    converged: bool
+    converged: bool  # whether the last steps were small
 
 
 def refine_cameras(

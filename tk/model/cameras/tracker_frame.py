@@ -34,18 +34,12 @@ class TrackerFrame:
 
     Poses are those of :mod:`tk.model.body.skeleton`: only the first four entries, the pelvis's position and the trunk's
     yaw, depend on the world.
-
-    Attributes:
-        rig: the cameras in this frame.
-        rotation: (3, 3) from this frame to the capture's world.
-        origin: (3,) m, of this frame in the capture's world.
-        yaw: radians, the trunk's yaw in the capture's world minus that in this frame.
     """
 
-    rig: Rig
-    rotation: Float
-    origin: Float
-    yaw: float
+    rig: Rig  # the cameras in this frame
+    rotation: Float  # (3, 3) from this frame to the capture's world
+    origin: Float  # (3,) m, of this frame in the capture's world
+    yaw: float  # radians, the trunk's yaw in the capture's world minus that in this frame
 
     @staticmethod
     def of(rig: Rig, up: str) -> TrackerFrame:

@@ -44,19 +44,12 @@ LEAST_SHARE = 0.01
 
 @dataclass(frozen=True)
 class Appearance:
-    """Colour models of P patches, YUV levels 0…255.
+    """Colour models of P patches, YUV levels 0…255."""
 
-    Attributes:
-        mean: (P, 3).
-        initial: (P, 3) means of the initialised body.
-        deviation: (P, 3) standard deviations.
-        known: (P,) bool; False for patches without voxels at the start, which fit every voxel.
-    """
-
-    mean: Float
-    initial: Float
-    deviation: Float
-    known: NDArray[np.bool_]
+    mean: Float  # (P, 3)
+    initial: Float  # (P, 3) means of the initialised body
+    deviation: Float  # (P, 3) standard deviations
+    known: NDArray[np.bool_]  # (P,) bool; False for patches without voxels at the start, which fit every voxel
 
     @staticmethod
     def learn(patches: int, patch: NDArray[np.integer], colors_bgr: NDArray[np.floating]) -> Appearance:

@@ -184,20 +184,12 @@ def even(samples: Ints, count: int) -> Ints:
 
 @dataclass(frozen=True)
 class Fit:
-    """The pairs and the objective of a frame at one pose.
+    """The pairs and the objective of a frame at one pose."""
 
-    Attributes:
-        value: the objective over evenly spread samples and voxels.
-        linear: the linearisation at the pose (M + Q pairs).
-        samples: (M,) the samples used.
-        voxels: (Q,) the voxels used.
-        held: the assignments.
-    """
-
-    value: float
-    linear: Linearisation
-    samples: Ints
-    voxels: Ints
+    value: float  # the objective over evenly spread samples and voxels
+    linear: Linearisation  # the linearisation at the pose (M + Q pairs)
+    samples: Ints  # (M,) the samples used
+    voxels: Ints  # (Q,) the voxels used
     held: Held
 
     @property

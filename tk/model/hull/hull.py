@@ -17,20 +17,13 @@ __all__ = ["HullSurface", "VisualHull"]
 
 @dataclass(frozen=True)
 class HullSurface:
-    """The surface voxels of a hull, ascending by flat index (the same order in every run).
+    """The surface voxels of a hull, ascending by flat index (the same order in every run)."""
 
-    Attributes:
-        voxels: (N,) int32 flat indices into the grid.
-        positions: (N, 3) float32 voxel centres, world frame, metres.
-        normals: (N, 3) float32 outward unit normals; zero where undefined (symmetric neighbours).
-        colors: (N, 3) float32, 0..255 in the images' channel order (BGR); zero where ``seen`` is 0.
-        seen: (N,) int32, bit c set where camera c sees the voxel frontally and nothing of the hull hides it.
-    """
-
-    voxels: NDArray[np.int32]
-    positions: NDArray[np.float32]
-    normals: NDArray[np.float32]
-    colors: NDArray[np.float32]
+    voxels: NDArray[np.int32]  # (N,) int32 flat indices into the grid
+    positions: NDArray[np.float32]  # (N, 3) float32 voxel centres, world frame, metres
+    normals: NDArray[np.float32]  # (N, 3) float32 outward unit normals; zero where undefined (symmetric neighbours)
+    colors: NDArray[np.float32]  # (N, 3) float32, 0..255 in the images' channel order (BGR); zero where `seen` is 0
+    # (N,) int32, bit c set where camera c sees the voxel frontally and nothing of the hull hides it
     seen: NDArray[np.int32]
 
     def __len__(self) -> int:

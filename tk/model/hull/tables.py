@@ -22,23 +22,17 @@ class HullTables:
     """The paper's look-up tables (section 4.1, fig. 2) in compressed rows.
 
     For C cameras, M words of eight mask pixels an image, V voxels, W words of a packed plane (:mod:`tk.kernels.hull`):
-
-    Attributes:
-        row_offsets: (C * M + 1,) int32; word w of camera c owns
-            ``entries[row_offsets[c * M + w] : row_offsets[c * M + w + 1]]``.
-        entries: (L,) int32, the voxels whose centres project to one of the word's pixels, and which pixel it is, in
-            the layout of :func:`tk.kernels.hull.look_up_lists`.
-        pixels: (V, C) int32, each voxel's pixel in each camera, -1 outside the image.
-        empty_planes: (2C, W) uint32, the cameras' planes without foreground: voxels outside a camera's image are not
-            carved.
-        enough: (W,) uint32, the voxels in at least two images.
     """
 
+    # (C * M + 1,) int32; word w of camera c owns `entries[row_offsets[c * M + w] : row_offsets[c * M + w + 1]]`
     row_offsets: NDArray[np.int32]
+    # (L,) int32, the voxels whose centres project to one of the word's pixels, and which pixel it is, in the layout of
+    # `tk.kernels.hull.look_up_lists`
     entries: NDArray[np.int32]
-    pixels: NDArray[np.int32]
+    pixels: NDArray[np.int32]  # (V, C) int32, each voxel's pixel in each camera, -1 outside the image
+    # (2C, W) uint32, the cameras' planes without foreground: voxels outside a camera's image are not carved
     empty_planes: NDArray[np.uint32]
-    enough: NDArray[np.uint32]
+    enough: NDArray[np.uint32]  # (W,) uint32, the voxels in at least two images
 
 
 def build_tables(rig: Rig, grid: VoxelGrid) -> HullTables:

@@ -14,17 +14,11 @@ _FRAME = 2  # pixels around all boxes: the reach of a 5×5 filter, the largest t
 
 @dataclass(frozen=True)
 class Mosaic:
-    """The place of each camera's box. Zeros separate the boxes.
+    """The place of each camera's box. Zeros separate the boxes."""
 
-    Attributes:
-        boxes: (C, 4) int32, left, top, width, height in the camera's image; a box may be empty.
-        corners: (C, 2) int32, left, top in the mosaic.
-        shape: (height, width) of the mosaic.
-    """
-
-    boxes: NDArray[np.int32]
-    corners: NDArray[np.int32]
-    shape: tuple[int, int]
+    boxes: NDArray[np.int32]  # (C, 4) int32, left, top, width, height in the camera's image; a box may be empty
+    corners: NDArray[np.int32]  # (C, 2) int32, left, top in the mosaic
+    shape: tuple[int, int]  # (height, width) of the mosaic
 
     @staticmethod
     def of(boxes: NDArray[np.int32], gap: int) -> Mosaic:

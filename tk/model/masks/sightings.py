@@ -32,17 +32,12 @@ _FORESHORTENED = 0.3
 
 @dataclass(frozen=True)
 class Sighting:
-    """A person in an image.
+    """A person in an image."""
 
-    Attributes:
-        center: (x, y) of the mid-hip point, pixels.
-        top: (x, y) of the point over it, along the body, on the circle about it that holds the whole body.
-        score: confidence, 0 to 1.
-    """
-
-    center: tuple[float, float]
+    center: tuple[float, float]  # (x, y) of the mid-hip point, pixels
+    # (x, y) of the point over it, along the body, on the circle about it that holds the whole body
     top: tuple[float, float]
-    score: float
+    score: float  # confidence, 0 to 1
 
     @property
     def radius(self) -> float:
@@ -57,17 +52,11 @@ class Sighting:
 
 @dataclass(frozen=True)
 class Patch:
-    """A rotated square of an image, which may reach beyond the image.
+    """A rotated square of an image, which may reach beyond the image."""
 
-    Attributes:
-        center: (x, y) pixels.
-        side: pixels.
-        angle: radians, clockwise, from the image's upward direction to the square's.
-    """
-
-    center: tuple[float, float]
-    side: int
-    angle: float = 0.0
+    center: tuple[float, float]  # (x, y) pixels
+    side: int  # pixels
+    angle: float = 0.0  # radians, clockwise, from the image's upward direction to the square's
 
     @staticmethod
     def about(points: Float, margin: float, angle: float = 0.0) -> Patch:
@@ -103,19 +92,12 @@ def _turn(angle: float) -> Float:
 
 @dataclass(frozen=True)
 class SeenPerson:
-    """Where a person is: a sphere that contains the whole body.
+    """Where a person is: a sphere that contains the whole body."""
 
-    Attributes:
-        center: (3,) the mid-hip point, world frame, metres.
-        top: (3,) the point of the sphere above it, along the body.
-        radius_m: metres.
-        cameras: indices of the cameras with a sighting of the person.
-    """
-
-    center: Float
-    top: Float
-    radius_m: float
-    cameras: tuple[int, ...]
+    center: Float  # (3,) the mid-hip point, world frame, metres
+    top: Float  # (3,) the point of the sphere above it, along the body
+    radius_m: float  # metres
+    cameras: tuple[int, ...]  # indices of the cameras with a sighting of the person
 
     def patch(self, camera: Camera, margin: float) -> Patch | None:
         """Return the square about the sphere in an image, the body upright in it, larger by the factor ``margin``.

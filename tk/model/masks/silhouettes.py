@@ -38,16 +38,12 @@ def clean(mask: Masks) -> Masks:
 
 @dataclass(frozen=True)
 class Pyramid:
-    """Masks at several scales, a factor of two apart.
+    """Masks at several scales, a factor of two apart."""
 
-    Attributes:
-        masks: (V, H, W) uint8 for each scale, or (F V, H, W) of F frames; scale 0 is the full image. Pixels of other
-            people are :data:`~tk.kernels.mask_values.OTHERS`.
-        sizes: (V, 2) for each scale, width and height of each camera's image.
-    """
-
+    # (V, H, W) uint8 for each scale, or (F V, H, W) of F frames; scale 0 is the full image. Pixels of other people are
+    # `tk.kernels.mask_values.OTHERS`.
     masks: tuple[Masks, ...]
-    sizes: tuple[NDArray[np.int32], ...]
+    sizes: tuple[NDArray[np.int32], ...]  # (V, 2) for each scale, width and height of each camera's image
 
     @staticmethod
     def of_all(frames: Sequence[Pyramid]) -> Pyramid:

@@ -18,21 +18,14 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Derived:
-    """Quantities derived from F poses.
+    """Quantities derived from F poses."""
 
-    Attributes:
-        joints: (F, 15, 3) metres, world frame: `/joints/position`.
-        rotations: (F, S, 4) quaternions (w, x, y, z), segment to world: `/segments/rotation`, the segments being
-            :data:`tk.model.body.skeleton.SEGMENTS` with the axes of :mod:`tk.model.body.angles`.
-        feet: (F, 4, 3) metres, world frame: `/feet/position`, in the order of
-            :data:`tk.model.body.joints.FOOT_POINTS`.
-        angles: angles by joint, degrees, each (F, k): `/angles/<joint>`; names and conventions in
-            :data:`tk.model.body.angles.ANGLES`.
-    """
-
-    joints: Float
+    joints: Float  # (F, 15, 3) metres, world frame: `/joints/position`
+    # (F, S, 4) quaternions (w, x, y, z), segment to world: `/segments/rotation`, the segments being
+    # `tk.model.body.skeleton.SEGMENTS` with the axes of `tk.model.body.angles`
     rotations: Float
-    feet: Float
+    feet: Float  # (F, 4, 3) metres, world frame: `/feet/position`, in the order of `tk.model.body.joints.FOOT_POINTS`
+    # angles by joint, degrees, each (F, k): `/angles/<joint>`; names and conventions in `tk.model.body.angles.ANGLES`
     angles: dict[str, Float]
 
 

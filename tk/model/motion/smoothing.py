@@ -44,15 +44,10 @@ SHORTEST = 8
 
 @dataclass(frozen=True)
 class Smoothed:
-    """A smoothed copy of F poses.
+    """A smoothed copy of F poses."""
 
-    Attributes:
-        poses: (F, D) radians and metres; unchanged in frames that are neither known nor bridged.
-        bridged: (F,) True where the pose was unknown and has been filled in.
-    """
-
-    poses: Float
-    bridged: Bool
+    poses: Float  # (F, D) radians and metres; unchanged in frames that are neither known nor bridged
+    bridged: Bool  # (F,) True where the pose was unknown and has been filled in
 
 
 def smooth(skeleton: Skeleton, poses: Float, known: Bool, fps: float) -> Smoothed:
