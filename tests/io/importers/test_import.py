@@ -90,8 +90,9 @@ def test_pipe_as_calibration_is_refused(folder: Path, check: Import, name: str) 
     assert str(path) in str(caught.value)
 
 
-def test_pipe_as_video_is_ignored(folder: Path, check: Import) -> None:
+def test_pipe_among_the_videos_and_an_empty_output_folder_are_accepted(folder: Path, check: Import) -> None:
     write_project(folder)
+    check.output.mkdir()
     os.mkfifo(folder / "videos-raw" / "cam5.mp4")
     check(folder, make_rig())
 
@@ -174,11 +175,6 @@ def test_unwritable_output_is_refused(folder: Path, check: Import) -> None:
     (folder.parent / "file").write_text("")
     with pytest.raises(CaptureError, match="cannot be written"):
         import_project(folder, folder.parent / "file" / "capture")
-
-
-def test_empty_folder_is_accepted_as_output(folder: Path, check: Import) -> None:
-    check.output.mkdir()
-    check(write_project(folder), make_rig())
 
 
 def test_camera_without_video_is_left_out(folder: Path, check: Import) -> None:

@@ -184,16 +184,7 @@ def test_projection_matrices(folder: Path, check: Import, kind: str) -> None:
         else:
             header = "CONTOUR" if kind == "contour" else "# P of this camera"
             np.savetxt(path.with_suffix(".txt"), P, header=header, comments="")
-    (folder / "notes.txt").write_text("recorded on Monday")
-    write_clips(folder / "videos", [camera.name for camera in rig])
-    check(folder, rig)
-
-
-def test_text_without_matrix_is_noted(folder: Path, check: Import) -> None:
-    rig = make_rig(distorted=False)
-    for camera in rig:
-        np.savetxt(folder / f"{camera.name}.txt", projection_matrix(camera))
-    (folder / "notes.txt").write_text("recorded on Monday")
+    (folder / "calibration" / "notes.txt").write_text("recorded on Monday")
     write_clips(folder / "videos", [camera.name for camera in rig])
     check(folder, rig).note("notes.txt: holds no 3×4 matrix: left out")
 
