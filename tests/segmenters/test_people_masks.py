@@ -120,3 +120,12 @@ def test_masks_do_not_change_the_images() -> None:
     before = images.copy()
     masks_of(OneOfMany()).segment(images)
     np.testing.assert_array_equal(images, before)
+
+
+def test_specks_that_no_other_camera_shows_are_removed() -> None:
+    """A person whom one camera shows stays."""
+    masks = np.where(shown([(0.2, 0.1)])[1] > 0, 255, 0).astype(np.uint8)
+    masks[0, 40:160, 2:22] = 255
+    spoilt = masks.copy()
+    spoilt[0, 10:20, 140:150] = spoilt[2, 190:196, 4:20] = 255
+    np.testing.assert_array_equal(masks_of(OneOfMany()).without_specks(spoilt), masks)

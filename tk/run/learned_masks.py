@@ -128,7 +128,7 @@ class LearnedMasks:
             again = (before.masks, before.uncertain) if asked else self._people.label(frame.images)
             masks[failed], uncertain[failed] = again[0][failed], again[1][failed]
             kind[failed] = SEGMENTER
-        return masks, uncertain, kind
+        return self._people.without_specks(masks), uncertain, kind
 
     def _span_of(self, index: int) -> _Span:
         within = min(max(index, self._edges[0]), self._edges[-1] - 1)

@@ -51,6 +51,9 @@ _TOO_LARGE = 1.6
 #: 0.1 of it, and 0.07 or more if half hidden; what the search takes for a person, an arm that a mask misses for
 #: example, less than 0.06.
 _LEAST_NEW = 0.065
+#: a part of a mask that no other camera shows is a speck below this share of the largest part: somebody whom one camera
+#: shows is larger. Sensitivity not measured.
+_SPECK = 0.25
 #: rounds of the search at most: three people who hide each other, and a round that finds nobody
 _ROUNDS = 4
 #: width by which a mask is enlarged before it is painted over, as a share of the square: the outline's error
@@ -97,6 +100,13 @@ class PeopleMasks:
             masks |= person.masks
             uncertain |= person.uncertain
         return masks, uncertain & (masks == 0)
+
+    def without_specks(self, masks: Images) -> Images:
+        """Return masks (C, H, W) without small parts that no other camera shows: shadows, reflections."""
+        if all(cv2.connectedComponents(mask)[0] <= 2 for mask in masks):  # the scene and one part
+            return masks
+        hull = self._hull.everybody(masks)
+        return np.stack([self._hull.only(hull, c, mask, _SPECK) for c, mask in enumerate(masks)])
 
     def _people(self, images: Images) -> list[_Person]:
         if not isinstance(self._segmenter, Finder):

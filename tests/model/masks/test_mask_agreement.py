@@ -179,16 +179,34 @@ def test_silhouette_that_the_border_cuts_contradicts_nothing(masks: np.ndarray) 
     rig = Rig(tuple(replace(c, height=130) for c in RIG))
     found = compare(cut, rig)
     assert found.wrong == () and found.refusal == ""
-    assert np.nanmin(found.tangency.worst) < 0.02 and np.nanmax(found.tangency.worst) < 0.02
+    assert np.nanmin(found.tangency.apart) < 0.02 and np.nanmax(found.tangency.apart) < 0.02
 
 
 def test_silhouette_that_another_person_cuts_contradicts_nothing(masks: np.ndarray) -> None:
     hidden = masks.copy()
     hidden[:, 2, 150:] = np.where(masks[:, 2, 150:] > 0, OTHERS, 0)
     pairs = compare(hidden).tangency
-    assert np.nanmax(pairs.worst) < 0.02 and np.isnan(pairs.worst[2]).all()
+    assert np.nanmax(pairs.apart) < 0.02 and np.isnan(pairs.apart[2]).all()
     hidden[:, 2, 150:] = 0
-    assert np.nanmax(compare(hidden).tangency.worst) > 0.1
+    assert np.nanmax(compare(hidden).tangency.apart) > 0.1
+
+
+def test_shadow_at_the_feet_counts_half_of_a_turned_camera() -> None:
+    """A shadow moves one side of a silhouette, a turned camera moves both."""
+    error = np.full((3, 3, 2), np.nan)
+    error[0, 1], error[0, 2], error[1, 2] = (0.03, 0.0), (0.03, -0.03), (0.03, np.nan)
+    apart = Tangency(error, np.full(3, 0.01), np.zeros((3, 3))).apart
+    np.testing.assert_allclose([apart[0, 1], apart[0, 2], apart[1, 2], apart[2, 0]], [0.015, 0.03, 0.03, np.nan])
+
+
+def test_shadow_in_the_masks_of_one_camera_excludes_nobody(masks: np.ndarray) -> None:
+    shadowed = masks.copy()
+    for mask in shadowed[:, 0]:
+        y, x = np.argwhere(mask)[-1]
+        mask[y : y + 7, x - 10 : x] = 255
+    found = compare(shadowed[:, [0, 1, 3, 4]], Rig((RIG[0], RIG[1], RIG[3], RIG[4])))
+    assert np.nanmax(np.abs(found.tangency.error)) > 0.02
+    assert found.wrong == () and found.refusal == ""
 
 
 def test_set_with_an_untested_rival_blames_nobody() -> None:

@@ -158,13 +158,21 @@ class CoarseHull:
         strict, lenient = (self._agreed(masks, but, wrong) for wrong in (0, 1))
         return strict if np.count_nonzero(strict) >= _MUCH_SMALLER * np.count_nonzero(lenient) else lenient
 
-    def _agreed(self, masks: NDArray[np.uint8], but: int | None, wrong: int) -> Bool:
+    def everybody(self, masks: NDArray[np.uint8]) -> Bool:
+        """Return (N,) the voxels in all masks (C, H, W), or in all but one of four or more."""
+        return self._in_most(masks, None, 1)[0]
+
+    def _in_most(self, masks: NDArray[np.uint8], but: int | None, wrong: int) -> tuple[Bool, NDArray[np.int64]]:
+        """Return (N,) the voxels that all but ``wrong`` masks contain, and in how many masks each voxel is."""
         sees = self._voxels.sees.copy()
         if but is not None:
             sees[but] = False
         seeing = sees.sum(axis=0)
         agreeing = (self._voxels.inside(masks) & sees).sum(axis=0)
-        hull = (seeing >= 2) & (agreeing >= np.where(seeing >= _ENOUGH, seeing - wrong, seeing))
+        return (seeing >= 2) & (agreeing >= np.where(seeing >= _ENOUGH, seeing - wrong, seeing)), agreeing
+
+    def _agreed(self, masks: NDArray[np.uint8], but: int | None, wrong: int) -> Bool:
+        hull, agreeing = self._in_most(masks, but, wrong)
         objects, count = scipy.ndimage.label(hull.reshape(self._grid.shape), np.ones((3, 3, 3)))
         if count == 0:
             return hull
@@ -190,12 +198,14 @@ class CoarseHull:
         x, y = self._voxels.xy(c, voxels).T
         return float(np.mean(mask[y, x] > 0)) if len(x) else 1.0
 
-    def only(self, voxels: Bool, c: int, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the regions of a mask (h, w) that are near voxels (N,); all of it if the image shows none of them."""
-        count, regions = cv2.connectedComponents(mask, connectivity=8)
+    def only(self, voxels: Bool, c: int, mask: NDArray[np.uint8], large: float = np.inf) -> NDArray[np.uint8]:
+        """Return the regions of a mask (h, w) that are near voxels (N,) or have the share ``large`` of the largest
+        region's area; the whole mask if the image shows none of the voxels."""
+        count, regions, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
         if count <= 1:
             return mask
-        kept = np.zeros(count, np.bool_)
+        area = stats[:, cv2.CC_STAT_AREA]
+        kept = area >= large * area[1:].max()
         kept[regions[self.near(voxels, c, mask.shape)]] = True
         return mask if kept[1:].all() else np.where(kept[regions], mask, 0).astype(np.uint8)
 

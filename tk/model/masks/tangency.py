@@ -91,9 +91,13 @@ class Tangency:
     middle: Float
 
     @property
-    def worst(self) -> Float:
-        """(C, C) the larger of a pair's two errors; NaN where a pair cannot be tested."""
-        return np.asarray(np.fmax(np.abs(self.error[..., 0]), np.abs(self.error[..., 1])))
+    def apart(self) -> Float:
+        """(C, C) mean of a pair's errors on both sides, without sign; NaN where a pair cannot be tested.
+
+        A camera that is turned errs on both sides; a mask with a shadow or without a head, on one.
+        """
+        one, other = np.moveaxis(np.abs(self.error), 2, 0)
+        return np.asarray((np.where(np.isnan(one), other, one) + np.where(np.isnan(other), one, other)) / 2)
 
 
 def tangency(outlines: Sequence[Sequence[Outline | None]], centers: Float) -> Tangency:
