@@ -24,7 +24,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.evaluation.joints import Evaluation
 from tk.evaluation.people import PeopleEvaluation, evaluate_people
 from tk.io.results.data import JointTrack
 from tk.io.results.reader import read_people
@@ -40,7 +39,7 @@ class Run:
     """One run of ``tk track``.
 
     Attributes:
-        people: what was tracked.
+        people: what was tracked; nobody if the command refused the capture.
         seconds: processor time of the command.
         mib: peak memory of its largest process.
     """
@@ -53,13 +52,21 @@ class Run:
 def track(capture: Path, result: Path, people: str, options: Sequence[str]) -> Run:
     """Track a capture against its empty scene; the messages of the command are in ``result`` with suffix .log."""
     command = ["track", capture, "-o", result, "--people", people, "--masks", "none", "--no-report", "--force"]
-    with result.with_suffix(".log").open("w") as log:
-        process = subprocess.Popen([sys.executable, "-m", "tk", *map(str, command), *options], stderr=log)
+    log = result.with_suffix(".log")
+    with log.open("w") as stderr:
+        process = subprocess.Popen([sys.executable, "-m", "tk", *map(str, command), *options], stderr=stderr)
         _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode not in (0, 3):  # 3: many frames are lost, which the table shows
-        raise RuntimeError(f"{capture}: tk track ended with {process.returncode}, see {log.name}")
-    return Run(read_people(result), usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
+    cost = usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024
+    if process.returncode in (0, 3):  # 3: many frames are lost, which the table shows
+        return Run(read_people(result), *cost)
+    print(log.read_text().splitlines()[-1], file=sys.stderr)
+    return Run((), *cost)
+
+
+def compare(run: Run, truth: Sequence[JointTrack]) -> PeopleEvaluation | None:
+    """Return the errors of a run; None if the capture was refused."""
+    return evaluate_people(run.people, truth) if run.people else None
 
 
 def embraces(truth: Sequence[JointTrack]) -> NDArray[np.int64]:
@@ -73,10 +80,9 @@ def embraces(truth: Sequence[JointTrack]) -> NDArray[np.int64]:
     return np.unique(np.concatenate([np.zeros(0, np.int64), *near]))
 
 
-def missed(found: PeopleEvaluation, person: int) -> int:
+def missed(found: PeopleEvaluation | None, person: int) -> int | None:
     """Return the number of frames in which a person of the ground truth has no match within 50 cm."""
-    score = found.people[person]
-    return score.frames - score.matches
+    return None if found is None else found.people[person].frames - found.people[person].matches
 
 
 def outside(truth: Sequence[JointTrack], frames: NDArray[np.int64]) -> list[JointTrack]:
@@ -88,36 +94,39 @@ def outside(truth: Sequence[JointTrack], frames: NDArray[np.int64]) -> list[Join
     ]
 
 
-def limbs(errors: Evaluation | None) -> float:
-    """Return the mean error of the limbs without the joints' offsets, cm; infinite if the person was not found."""
-    return np.inf if errors is None else errors.corrected.limbs.mean_cm
+def cm(found: PeopleEvaluation | None, person: int) -> tuple[float | None, float | None]:
+    """Return the mean errors of the limbs without the joints' offsets and of all joints, cm; None if never found."""
+    errors = None if found is None else found.people[person].errors
+    return (None, None) if errors is None else (errors.corrected.limbs.mean_cm, errors.raw.all.mean_cm)
 
 
-def raw(errors: Evaluation | None) -> float:
-    """Return the mean error of all joints, cm; infinite if the person was not found."""
-    return np.inf if errors is None else errors.raw.all.mean_cm
+def row(name: str, cells: Sequence[float | int | str | None]) -> str:
+    """Return a line of a table; None is printed as "-"."""
+    texts = ["-" if cell is None else f"{cell:.2f}" if isinstance(cell, float) else str(cell) for cell in cells]
+    return f"{name:20}" + "".join(f"{text:>9}" for text in texts)
 
 
 def compare_together(scene: Path, work: Path, options: Sequence[str]) -> Iterator[str]:
     """Yield a line of the first table for each person of a scene."""
     truth = read_people(scene / "both" / "truth.h5")
     together = track(scene / "both", work / f"{scene.name}-both.h5", "all", options)
-    found = evaluate_people(together.people, truth)
-    apart = evaluate_people(together.people, outside(truth, embraces(truth)))
+    found, apart = compare(together, truth), compare(together, outside(truth, embraces(truth)))
     alone = [
         track(scene / f"alone-{k}", work / f"{scene.name}-alone-{k}.h5", "auto", options) for k in range(len(truth))
     ]
-    seconds, mib = (np.mean([getattr(run, name) for run in alone]) for name in ("seconds", "mib"))
-    cost = f"{together.seconds / seconds:8.2f}{together.mib / mib:8.2f}"
+    whole = [run for run in alone if run.people]
     for k, run in enumerate(alone):
-        single = evaluate_people(run.people, read_people(scene / f"alone-{k}" / "truth.h5"))
-        both, one = found.people[k].errors, single.people[0].errors
-        lost, embraced = missed(apart, k), missed(found, k) - missed(apart, k)
-        yield (
-            f"{scene.name:16}{k:3}{limbs(both):8.2f}{limbs(one):8.2f}{limbs(both) / limbs(one):8.2f}{raw(both):8.2f}"
-            f"{raw(one):8.2f}{lost:8}{embraced:8}{missed(single, 0):8}{found.people[k].switches:9}"
-            f"{cost if k == 0 else ''}"
-        )
+        single = compare(run, read_people(scene / f"alone-{k}" / "truth.h5"))
+        (limbs, raw), (limbs_alone, raw_alone) = cm(found, k), cm(single, 0)
+        ratio = limbs / limbs_alone if limbs and limbs_alone else None
+        lost, all_lost = missed(apart, k), missed(found, k)
+        embraced = None if lost is None or all_lost is None else all_lost - lost
+        cells = [limbs, limbs_alone, ratio, raw, raw_alone, lost, embraced, missed(single, 0)]
+        cells.append(None if found is None else found.people[k].switches)
+        if k == 0 and whole:
+            cells.append(together.seconds / float(np.mean([run.seconds for run in whole])))
+            cells.append(together.mib / float(np.mean([run.mib for run in whole])))
+        yield row(f"{scene.name} {k}", cells)
 
 
 def compare_bystander(scene: Path, work: Path, options: Sequence[str]) -> str:
@@ -125,12 +134,11 @@ def compare_bystander(scene: Path, work: Path, options: Sequence[str]) -> str:
     found = []
     for name in ("with", "without"):
         run = track(scene / name, work / f"{scene.name}-{name}.h5", "auto", options)
-        found.append(evaluate_people(run.people, read_people(scene / name / "truth.h5")[:1]))
-    a, b = (people.people[0].errors for people in found)
-    return (
-        f"{scene.name:19}{limbs(a):8.2f}{limbs(b):9.2f}{limbs(a) - limbs(b):12.2f}{raw(a):8.2f}{raw(b):9.2f}"
-        f"{missed(found[0], 0):8}{missed(found[1], 0):9}"
-    )
+        found.append(compare(run, read_people(scene / name / "truth.h5")[:1]))
+    (limbs, raw), (limbs_without, raw_without) = (cm(one, 0) for one in found)
+    difference = None if limbs is None or limbs_without is None else limbs - limbs_without
+    lost, lost_without = (missed(one, 0) for one in found)
+    return row(scene.name, [limbs, limbs_without, difference, raw, raw_without, lost, lost_without])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -149,13 +157,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if together:
             print("cm: limbs without the joints' offsets, all joints raw. Frames missed outside embraces, in embraces,")
             print("and alone. Processor time and peak memory as multiples of those for one person.")
-            print(f"{'':19}   limbs   alone   ratio     raw   alone  missed embrace   alone switches    time  memory")
+            names = [
+                "limbs",
+                "alone",
+                "ratio",
+                "raw",
+                "alone",
+                "missed",
+                "embrace",
+                "alone",
+                "switches",
+                "time",
+                "memory",
+            ]
+            print(row("scene, person", names))
         for scene in together:
             for line in compare_together(scene, work, options):
                 print(line, flush=True)
         if bystander:
             print("\nThe subject with and without a bystander, cm, and frames missed.")
-            print(f"{'':19}   limbs  without  difference     raw  without  missed  without")
+            print(row("scene", ["limbs", "without", "change", "raw", "without", "missed", "without"]))
         for scene in bystander:
             print(compare_bystander(scene, work, options), flush=True)
 

@@ -84,3 +84,7 @@ def test_table_has_errors_relative_to_the_person_alone(tmp_path: Path, monkeypat
     assert first[5:7] == ["2.00", "1.00"]  # raw, alone
     assert first[7:] == ["0", "0", "0", "0", "2.00", "1.50"]  # missed in three ways, switches, time, memory
     assert second[7:] == ["3", "0", "0", "0"]
+    results["alone-1"] = Run((), 4.0, 200.0)  # refused
+    first, second = (line.split() for line in compare_together(tmp_path / "scene", tmp_path, []))
+    assert first[-2:] == ["3.00", "1.50"]  # compared with the other person only
+    assert second[3:5] == ["-", "-"] and second[6] == "-"
