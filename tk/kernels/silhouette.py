@@ -49,11 +49,6 @@ _EXPORT = 13
 # Columns of the packed settings. SCALE: pixels of the full picture in one of this scale; the others: SearchSettings.
 _NUMBERS = tuple(range(11))
 SCALE, WINDOW, SPACING, AMBIGUOUS, TANGENTIAL, ROBUST, LOST, COLORS, MOST_SAMPLES, INTERIOR, EXPORT = _NUMBERS
-# First steps of a descent in which hidden samples are looked for, a third of the work; the later steps are short. With
-# one step, walk loses an arm for a frame; with all, no mean error on the development captures changes by 0.1 cm.
-_LOOKS = 2
-# Mark of a sample that is hidden or outside the image.
-_HIDDEN = -2
 # Columns of ``sums``, before the gradient: cost, weight of the samples that found an edge, weight of all.
 COST, FOUND, ALL, GRADIENT = range(4)
 
@@ -146,18 +141,14 @@ def export_sample(samples: ti.template(), c: int, i: int, x_unscaled, pixel, g, 
 @ti.func
 def prepare_pose(
     tree: ti.template(), parts: ti.template(), curves: ti.template(), cameras: ti.template(), pose: ti.template(),
-    b: int, look: bool, joints: ti.template(), placed: ti.template(), hiders: ti.template(), outlines: ti.template(),
+    b: int, joints: ti.template(), placed: ti.template(), hiders: ti.template(), outlines: ti.template(),
     sums: ti.template(),
 ):  # fmt: skip
-    """Place the body of pose b, trace its contours in every view, and set its sums to 0; arguments as in the kernel.
-
-    ``look``: find which parts may hide each other, too.
-    """
+    """Place the body of pose b, trace its contours in every view, and set its sums to 0; arguments as in the kernel."""
     V, Q = cameras.shape[0], curves.shape[0]
     forward_tree(tree, pose, b, b, joints)
     place_parts(joints, parts, b, placed)
-    if look:
-        find_hiders(placed, cameras, b, hiders)
+    find_hiders(placed, cameras, b, hiders)
     for task in range(V * Q):
         v, q = task // Q, task % Q
         trace_curve(parts, placed, cameras, b, v, curves[q, 0], curves[q, 1], b * V * Q + task, outlines)
@@ -192,13 +183,10 @@ def weigh_edgel(
 def search_contours(
     parts: ti.template(), curves: ti.template(), cameras: ti.template(), size: ti.template(), mask: ti.template(),
     frame: int, image: ti.template(), likelihood: ti.template(), group: ti.template(), numbers: ti.template(), b: int,
-    look: bool, origin, joints: ti.template(), placed: ti.template(), hiders: ti.template(), outlines: ti.template(),
-    seen: ti.template(), samples: ti.template(), sums: ti.template(),
+    origin, joints: ti.template(), placed: ti.template(), hiders: ti.template(), outlines: ti.template(),
+    samples: ti.template(), sums: ti.template(),
 ):  # fmt: skip
-    """Sum the rows of all edgels of pose b, which :func:`prepare_pose` has placed; arguments as in the kernel.
-
-    ``look``: find which samples are visible; else the samples that were visible in the last call are searched.
-    """
+    """Sum the rows of all edgels of pose b, which :func:`prepare_pose` has placed; arguments as in the kernel."""
     V, Q = cameras.shape[0], curves.shape[0]
     for task in range(V * Q):
         c, v, q = b * V * Q + task, task // Q, task % Q
@@ -210,13 +198,7 @@ def search_contours(
         if numbers[EXPORT] == 1.0:
             for i in range(most_samples):
                 samples[c, i, 0] = 0.0
-        if look:
-            seen[c, 0] = 0
-            if outlines[c, VISIBLE] > 0.0:
-                wanted = ti.cast(ti.ceil(outlines[c, LENGTH] / (numbers[SPACING] * scale)), ti.i32)
-                seen[c, 0] = ti.cast(ti.min(ti.max(wanted, 1), most_samples), ti.i16)
-        count = ti.cast(seen[c, 0], ti.i32)
-        if count > 0 and outlines[c, VISIBLE] > 0.0:
+        if outlines[c, VISIBLE] > 0.0:
             shape = shape_of(parts, p)
             R, t = load_rotation(placed, b, p), load_translation(placed, b, p)
             eye = camera_center(cameras, v)
@@ -224,22 +206,18 @@ def search_contours(
             params = ti.Vector([outlines[c, PARAMETERS], outlines[c, PARAMETERS + 1]])
             length, sign = outlines[c, LENGTH], outlines[c, SIGN]
             width, height = size[v, 0], size[v, 1]
+            wanted = ti.cast(ti.ceil(length / (numbers[SPACING] * scale)), ti.i32)
+            count = ti.min(ti.max(wanted, 1), most_samples)
             share = length / count
             for i in range(count):
-                if not look and seen[c, 1 + i] == _HIDDEN:
-                    continue
                 u = (i + 0.5 + 0.0 * scale) / count
                 x_part, x, pixel, J, n, use = sample_curve(cameras, v, kind, shape, center, params, R, t, sign, u)
                 at = (pixel + 0.5) / scale - 0.5
                 use = use and in_picture(width, height, at)
                 behind = -1
-                if not look:
-                    behind = ti.cast(seen[c, 1 + i], ti.i32)
-                else:
-                    if use:
-                        hidden, behind = find_hider(parts, placed, b, hiders[b, v, p], eye, x - eye)
-                        use = not hidden
-                    seen[c, 1 + i] = ti.cast(behind if use else _HIDDEN, ti.i16)
+                if use:
+                    hidden, behind = find_hider(parts, placed, b, hiders[b, v, p], eye, x - eye)
+                    use = not hidden
                 found, d, weight = 0, 0.0 * scale, share
                 if use and behind >= 0 and numbers[INTERIOR] == 0.0:
                     # in front of another part no edge of the silhouette is expected, but a border of colours
@@ -312,8 +290,6 @@ def _descent_kernel(real):
         placed: ti.types.ndarray(dtype=real, ndim=3),  # (B, P, 16)
         hiders: ti.types.ndarray(dtype=ti.i64, ndim=3),  # (B, V, P)
         outlines: ti.types.ndarray(dtype=real, ndim=2),  # (B V Q, 31)
-        seen: ti.types.ndarray(dtype=ti.i16, ndim=2),  # (B V Q, 1 + most_samples) number of samples of a curve,
-        # and of each sample: the part behind it, -1 for none, or _HIDDEN
         factor: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (B, n, n + 1)
         # out
         samples: ti.types.ndarray(dtype=real, ndim=3),  # (V Q, most_samples, _EXPORT), if EXPORT
@@ -328,14 +304,13 @@ def _descent_kernel(real):
             b = turn // spread
             moves, step = True, 0
             while moves:
-                look = step < _LOOKS
                 for k in range(tree.shape[0]):
                     pose[b, k] = ti.cast(state[b, k], real)
-                prepare_pose(tree, parts, curves, cameras, pose, b, look, joints, placed, hiders, outlines, sums)
+                prepare_pose(tree, parts, curves, cameras, pose, b, joints, placed, hiders, outlines, sums)
                 origin = load_translation(placed, b, 0)
                 search_contours(
-                    parts, curves, cameras, size, mask, frame[b], image, likelihood, group, numbers, b, look, origin,
-                    joints, placed, hiders, outlines, seen, samples, sums,
+                    parts, curves, cameras, size, mask, frame[b], image, likelihood, group, numbers, b, origin, joints,
+                    placed, hiders, outlines, samples, sums,
                 )  # fmt: skip
                 collect_pulls(tree, b, joints, origin, sums, GRADIENT)
                 collect_inertias(tree, b, joints, origin, hessian)
@@ -400,7 +375,7 @@ def _launch(
         steps,
         spread_of(B),
         state,
-        *_scratch(B, V, Q, D, P, settings.most_samples, dtype),
+        *_scratch(B, V, Q, D, P, dtype),
         samples,
         sums,
         hessian,
@@ -431,14 +406,13 @@ def _numbers(s: SearchSettings, scale: float, weight: float, export: bool, dtype
 
 
 @functools.lru_cache(32)
-def _scratch(B: int, V: int, Q: int, D: int, P: int, most: int, dtype: np.dtype) -> tuple[NDArray, ...]:
+def _scratch(B: int, V: int, Q: int, D: int, P: int, dtype: np.dtype) -> tuple[NDArray, ...]:
     return (
         np.empty((B, D), dtype),
         np.empty((B, D, PULL + PULL_NUMBERS), dtype),
         np.empty((B, P, PLACED_NUMBERS), dtype),
         np.empty((B, V, P), np.int64),
         np.empty((B * V * Q, OUTLINE_NUMBERS), dtype),
-        np.empty((B * V * Q, 1 + most), np.int16),
         np.empty((B, D, D + 1)),
     )
 
