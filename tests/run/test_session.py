@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import tomli_w
 
+from scripts.synthetic.capture import Options, plan_capture, write_capture
 from tests.conftest import FRAMES, QUICK, Silent, Tk
 from tests.io.conftest import write_picture
 from tk.errors import ConfigError, ResultError
@@ -200,8 +201,9 @@ def test_only_the_same_command_is_resumed(
     assert begun.read_bytes() == before
 
 
-def test_large_images_are_reduced_and_the_result_has_the_recorded_cameras(tiny: Path, tmp_path: Path) -> None:
-    capture, half = open_capture(tiny), tmp_path / "half.h5"
+def test_large_images_are_reduced_and_the_result_has_the_recorded_cameras(tmp_path: Path) -> None:
+    write_capture(plan_capture(Options(frames=2, cameras=4, size=(320, 240), seed=3)), tmp_path / "capture", masks=True)
+    capture, half = open_capture(tmp_path / "capture"), tmp_path / "half.h5"
     tall = capture.setup().person_pixels()
     config = replace(CONFIG, person_pixels=int(tall.min() / 2))
     reporter = Silent()
