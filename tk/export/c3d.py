@@ -12,7 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from tk.errors import ExportError
 from tk.export.motion import Motion
+from tk.io.paths import c_name
 from tk.model.body.joints import SEGMENT_ORIGIN
 
 # The residual is a signed byte: ezc3d would wrap 256 to 0, a point without error.
@@ -47,7 +49,7 @@ def write_c3d(motion: Motion, path: Path) -> None:
     file["data"]["rotations"] = T
     file.add_parameter("ROTATION", "LABELS", list(motion.segments))
     file.add_parameter("ROTATION", "RATE", [motion.fps])
-    file.write(str(path))
+    file.write(c_name(path, ExportError))
     _put_rotations_first(path)
 
 

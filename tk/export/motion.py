@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ConfigError, ResultError
+from tk.io.paths import text_of
 from tk.io.results.data import Result
 from tk.io.results.reader import read_result
 from tk.io.results.status import Status
@@ -99,7 +100,7 @@ def read_motion(path: str | os.PathLike[str], smoothed: bool = False) -> tuple[M
 def motion_of(result: Result, smoothed: bool = False) -> tuple[Motion, tuple[str, ...]]:
     """Return the motion of one person; see :func:`read_motion`."""
     path, notes = result.path, list[str]()
-    name = path.stem
+    name = text_of(path.stem)
     if result.person or result.others:
         name += f"_{result.person}"
         result = _with_absent_frames(result)

@@ -103,8 +103,8 @@ def check_not_input(path: Path, inputs: Iterable[Path | None] = (), capture: Pat
     for part in given:
         real = resolved(part)
         if target == real or (real in target.parents and real.is_dir()):
-            where = "is" if target == real else "lies in"
-            raise ConfigError(f"{path}: {where} an input of this command, {part}; choose another name")
+            where = "is an input of this command" if target == real else f"lies in {part}, an input of this command"
+            raise ConfigError(f"{path}: {where}; choose another name")
     if target.is_file():
         identity = _identity(target)
         for file in (file for part in given for file in _files(part)):
@@ -196,3 +196,8 @@ def c_name(path: Path, error: type[TkError]) -> str:
         return os.fsencode(path).decode("utf-8")
     except UnicodeDecodeError:
         raise error(f"{path}: its name is not UTF-8; rename the file") from None
+
+
+def text_of(name: str) -> str:
+    """Return a file's name as text that a file can hold: bytes that are not UTF-8 become a replacement character."""
+    return os.fsencode(name).decode("utf-8", "replace")

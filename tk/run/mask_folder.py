@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ConfigError, unwritable
 from tk.io.captures.capture import MASKS_RECORD, Capture
-from tk.io.paths import check_not_input, resolved
+from tk.io.paths import check_not_input, replacing, resolved
 from tk.io.toml import load_toml
 from tk.run.plan import choose_frames
 from tk.run.reporter import Reporter
@@ -28,9 +27,9 @@ class Written:
     """What :func:`write_masks` has done.
 
     Attributes:
-        frames: in the folder now, of those that were asked for.
-        now: of these, how many this run has made.
-        empty: by camera, frames of this run in which nobody was found.
+        frames: number of the requested frames that have masks in the folder.
+        now: number of frames whose masks this run has made.
+        empty: number of frames of this run in which nobody was found, by camera.
     """
 
     frames: int
@@ -48,22 +47,22 @@ def write_masks(
 ) -> Written:
     """Write ``folder/<camera>/000000.png`` …: 8 bits, 255 where the segmenter sees people, else 0.
 
-    Frames that are there already are left as they are, so the same command goes on where an earlier run stopped.
+    Existing masks do not change, so the same command continues an interrupted run.
 
     Args:
-        capture: whose pictures; masks of its own and its empty scene are not asked.
-        folder: made where it is missing.
-        reporter: who hears of the progress.
-        segmenter: its name; the first of :func:`tk.segmenters.names` if None.
-        frames: first frame and the one to stop before (None: the last).
+        capture: the recording; its own masks and its empty scene are not used.
+        folder: output folder, created if necessary.
+        reporter: receives notes and progress.
+        segmenter: name of the segmenter; None: the first of :func:`tk.segmenters.names`.
+        frames: range of frames, end exclusive (None: to the end of the recording).
 
     Raises:
-        ConfigError: no such segmenter, or the folder holds something else.
-        CaptureError: no segmenter is installed, or a frame cannot be read or written; what was finished stays.
+        ConfigError: the segmenter does not exist, or the folder holds other files.
+        CaptureError: no segmenter is installed, or a frame cannot be read or written; finished masks remain.
     """
     for warning in capture.warnings:
         reporter.note(warning)
-    capture = capture.as_recorded()  # masks are numbered as the pictures are: both shift by a time offset later
+    capture = capture.as_recorded()  # a time offset shifts masks and images alike, when they are read
     start, stop = choose_frames(capture, frames, reporter.note)
     if segmenter is None:
         installed = names()
@@ -90,7 +89,7 @@ def write_masks(
         if count:
             reporter.note(f"{folder / name}: nobody in {count} of {len(missing)} frames")
     if start > 0 and not all(_file(folder, name, 0).exists() for name in capture.rig.names):
-        reporter.note(f"{folder}: frames before {start} are missing; tk track takes a folder of masks from frame 0 on")
+        reporter.note(f"{folder}: masks of the frames before {start} are missing; tk track needs them from frame 0 on")
     return Written(stop - start, len(missing), empty)
 
 
@@ -105,7 +104,7 @@ def _file(folder: Path, camera: str, index: int) -> Path:
 
 
 def _claim(folder: Path, origin: dict[str, str | list[str]]) -> None:
-    """Note in the folder where its masks come from, so that another command does not go on with them."""
+    """Record in the folder how its masks are made; refuse a folder of masks that were made differently."""
     record = folder / MASKS_RECORD
     if record.is_file():
         found = load_toml(record, ConfigError)
@@ -120,18 +119,15 @@ def _claim(folder: Path, origin: dict[str, str | list[str]]) -> None:
         if folder.exists() and any(folder.iterdir()):
             raise ConfigError(f"{folder}: holds files that tk masks has not made; choose another folder")
         folder.mkdir(parents=True, exist_ok=True)
-        record.write_text(tomli_w.dumps(origin), encoding="utf-8")
     except OSError as error:
-        raise unwritable(folder, error, ConfigError) from None
+        raise unwritable(folder, error, CaptureError) from None
+    with replacing(record, CaptureError) as part:
+        part.write_text(tomli_w.dumps(origin), encoding="utf-8")
 
 
 def _write(path: Path, mask: NDArray[np.uint8]) -> None:
-    """All of a file or none of it."""
+    """Write a complete image file, or none."""
     _, coded = cv2.imencode(".png", mask)
-    part = path.with_name(f".{path.name}.part")
-    try:
+    with replacing(path, CaptureError) as part:
         path.parent.mkdir(exist_ok=True)
         part.write_bytes(coded.tobytes())
-        os.replace(part, path)
-    except OSError as error:
-        raise unwritable(path, error, CaptureError) from None

@@ -31,6 +31,7 @@ from tk.io.captures.video import (
     picture_number,
     probe,
 )
+from tk.io.paths import text_of
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import infer_volume, sample_box, views_of
 from tk.model.cameras.mounting import infer_up
@@ -285,7 +286,7 @@ def open_capture(
         )
     return Capture(
         path=path,
-        name=settings.name or path.resolve().name,
+        name=settings.name or text_of(path.resolve().name),
         fps=fps,
         up=_up(settings, rig, path, warnings.append),
         rig=rig,

@@ -18,7 +18,7 @@ from tk.io.captures.calibration import camera_table
 from tk.io.captures.capture import open_capture
 from tk.io.captures.video import PICTURE_SUFFIXES, probe
 from tk.io.importers.project import Project
-from tk.io.paths import replacing
+from tk.io.paths import replacing, text_of
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import closest_to_axes, common_boxes
 from tk.model.cameras.mounting import FoundUp, infer_up
@@ -61,9 +61,9 @@ def write_capture(project: Project, output: Path) -> Imported:
         center, size = list(volume.center), list(volume.size)
         notes.append(f"[volume] center = {center}, size = {size} (metres): {where}")
 
-    metadata = {"units": "m", "imported_from": f"{project.tool}, {project.source.name}"}
+    metadata = {"units": "m", "imported_from": f"{project.tool}, {text_of(project.source.name)}"}
     tables = {camera.name: camera_table(camera) for camera in rig} | {"metadata": metadata}
-    settings = capture_toml(output.resolve().name, project, found, volume, where)
+    settings = capture_toml(text_of(output.resolve().name), project, found, volume, where)
     with replacing(output, CaptureError) as draft:
         shutil.rmtree(draft, ignore_errors=True)  # of an import that was killed
         draft.mkdir(parents=True)
@@ -118,7 +118,7 @@ def _rounded(volume: Volume) -> Volume:
 def capture_toml(name: str, project: Project, up: FoundUp, volume: Volume | None, where: str) -> str:
     """Return the text of `capture.toml`: each inferred value with a comment on how it was inferred."""
     lines = [
-        f"# imported from {project.tool}, {project.source.name}",
+        f"# imported from {project.tool}, {text_of(project.source.name)}",
         tomli_w.dumps({"name": name}).strip(),
         f"# up: {up.how}",
         f"up = {_up_toml(up.up)}",
