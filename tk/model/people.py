@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import cv2
 import numpy as np
@@ -188,36 +187,37 @@ class PeopleFinder:
         chosen = [*self._on_one_floor(chosen), *self._alone(small, self._covered(chosen))]
         return tuple(sorted(chosen, key=lambda person: (not person.inside, -np.nan_to_num(person.volume_m3))))
 
-    def around(self, position: Float, masks: NDArray[np.uint8]) -> tuple[Float, Float]:
+    def around(self, position: Float, masks: NDArray[np.uint8], count: int = 0) -> tuple[Float, Float]:
         """Return the hull of one person who was at a position (3,) a frame ago, and the new position.
 
         Args:
             position: m, centre of the trunk.
             masks: (C, H, W) 128 or more where the person is, 0 where the person is not, other values where the person
                 may be hidden.
+            count: number of voxels a frame ago. If less than half of them are left, the mask fails that leaves most
+                voxels without it.
 
         Returns:
             (N, 3) m, centres of the voxels that no mask contradicts and that two masks show; and (3,) m, ``position``
             if there is no trunk near it.
         """
-        at = self._to_plan @ position
-        near = np.flatnonzero((np.abs(self._in_plan - at) <= (_HALF_M, _HALF_M, _HALF_HEIGHT_M)).all(axis=1))
+        half = np.abs(self._to_plan.T @ (_HALF_M, _HALF_M, _HALF_HEIGHT_M))
+        near = self._grid.within(position - half, position + half)
         offset = self._step // 2
         small = masks[:, offset :: self._step, offset :: self._step].reshape(len(masks), -1)
-        flat, voxels = self._table.voxels(near)
+        _, voxels = self._table.voxels(near)
         values, sees = np.take_along_axis(small, voxels.pixels, axis=1), voxels.sees
-        hull = ((values > 0) | ~sees).all(axis=0) & (((values >= 128) & sees).sum(axis=0) >= 2)
-        moved = self._in_plan[flat[hull]] - at
+        empty, shown = (values == 0) & sees, ((values >= 128) & sees).sum(axis=0) >= 2
+        contradictions = empty.sum(axis=0)
+        hull = shown & (contradictions == 0)
+        if 2 * np.count_nonzero(hull) < count:
+            hull = max((shown & (contradictions == one) for one in empty), key=np.count_nonzero)
+        moved = (voxels.centers[hull] - position) @ self._to_plan.T
         trunk = moved[np.linalg.norm(moved[:, :2], axis=1) < _STEP_M]
         if len(trunk):
             x, y = np.median(trunk[:, :2], axis=0)
             position = position + [x, y, (trunk[:, 2].min() + trunk[:, 2].max()) / 2] @ self._to_plan
         return voxels.centers[hull], np.asarray(position)
-
-    @cached_property
-    def _in_plan(self) -> NDArray[np.float32]:
-        """(N, 3) m, centres of the grid's voxels: two directions on the floor, and up."""
-        return (self._grid.centers() @ self._to_plan.T).astype(np.float32)
 
     @property
     def voxel_m(self) -> float:

@@ -1,23 +1,28 @@
 """The people of a run: who is in the scene, who is tracked, and which pixels are whose in each frame.
 
-People are found in the first frame by their visual hulls. Those who are chosen get a tracker each. The others are
-followed by their hulls, so that their pixels are no evidence for those who are tracked. A person who enters later is
-found in the pixels that nobody explains.
+People are found in the first frame by their visual hulls. Everybody in the working volume gets a tracker, also people
+who are not written, because a body separates their pixels from those of others (:mod:`tk.trackers.sharing`). Pixels
+that no body explains show somebody unknown. They are no evidence for the people who are tracked. A person who enters is
+found in them.
+
+A person who is alone in view gets the whole masks.
 """
 
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ConfigError
-from tk.kernels.raycast import FAR, Cast
 from tk.model.body.skeleton import JOINTS
+from tk.model.cues.part_colors import RenderedBody
 from tk.model.cues.ray_costs import RayGrid
 from tk.model.masks.image_health import masks_stand_still
 from tk.model.people import LocatedPerson, PeopleFinder, order_people
@@ -26,21 +31,19 @@ from tk.run.choice import Choice, chosen, matched, unknown
 from tk.run.identity import EXCHANGED, UNCLEAR, Contact, Contacts, outcome_of
 from tk.trackers.camera_monitor import CameraMonitor, opening_agreement
 from tk.trackers.protocol import Estimate, Observation, SharingTracker, Tracker, sharing
-from tk.trackers.sharing import PixelOwners, assign, cast_points
+from tk.trackers.sharing import UNKNOWN, UNKNOWN_BY_HULLS, PixelOwners, assign, cast_points
 
 _LOG = logging.getLogger(__name__)
 Float = NDArray[np.float64]
 
-# Seconds between two looks for people who enter.
+# Seconds between two searches for people who enter.
 LOOK_EVERY_S = 0.5
-# Mean surplus area of the subject's masks, as a share of the person, above which somebody else may have entered: a
-# second person adds 1 in every camera, if not hidden. No frame of the development captures has more than 0.11.
-SURPLUS = 0.25
-# Somebody who is seen so far from a person who is tracked is somebody else, metres: half a stride, and a hull's error.
-_SAME_M = 0.6
-# Voxels of somebody who is not tracked, at least: 5 litres, a head's volume.
-_LEAST_VOXELS = 25
-# Frames of somebody who enters from which the body is fitted: half a second at 15 Hz.
+# Pixels farther from the body of a person who is alone than this, metres, may show somebody else: more than half a
+# frame's motion of a fist.
+_ALONE_M = 0.25
+# Frames of the opening in which other people are searched for if the person in the first frame cannot be tracked.
+_TESTED = 4
+# Frames of somebody who enters to which the body is fitted: half a second at 15 Hz.
 _HISTORY = 8
 # Least share of the area of a person who is tracked that must be unexplained in two views before a search.
 _UNEXPLAINED = 0.25
@@ -48,51 +51,25 @@ _UNEXPLAINED = 0.25
 # colours and body: -0.1 to -0.7 for the same person, -1.6 to -3.7 for the other one.
 _SAME_COLORS = -1.1
 
-_DRAWN = "drawn"
-_WATCH, _LOST, _ABSENT, _PEOPLE, _BYSTANDERS = "watch/", "lost", "absent", "people/", "bystanders/"
+_DRAWN, _PLACE = "drawn", "place"
+_WATCH, _LOST, _ABSENT, _PEOPLE = "watch/", "lost", "absent", "people/"
 _SUBJECT, _IN_INIT_POSE = "subject", "in_init_pose"  # the number of the subject, -1: unknown
 _MODEL, _CONTACTS = "body/", "contacts/"
 
 
 @dataclass
 class Member:
-    """A person who is tracked.
+    """A person who is tracked."""
 
-    Attributes:
-        number: number in the result.
-        subject: what is known of the person.
-        written: whether the person is in the result. Others are tracked because a body explains their pixels better
-            than a hull does.
-        lost: whether the last frame is lost.
-        absent: whether nobody was seen in the last frame who could be this person.
-        drawn: (C, h, w) bool, the body in the last frame that is not lost, see :class:`~tk.trackers.protocol.Estimate`.
-    """
-
-    number: int
-    subject: Subject
+    number: int  # in the result; people who are not written have higher numbers
+    subject: Subject  # what is known of the person
     tracker: Tracker
     monitor: CameraMonitor
-    written: bool = True
-    lost: bool = False
-    absent: bool = False
-    drawn: NDArray[np.bool_] | None = None
-
-
-@dataclass(eq=False)  # a hull is an array: bystanders are compared by identity
-class Bystander:
-    """A person who is not tracked, or not yet.
-
-    Attributes:
-        position: (3,) m, centre of the trunk.
-        shape: the hull on the grid of the trackers.
-        history: the person's own observations of the last frames, if a tracker may be started.
-        refused: whether no tracker could be started.
-    """
-
-    position: Float
-    shape: Cast
-    history: list[Observation] = field(default_factory=list)
-    refused: bool = False
+    written: bool = True  # whether the person is in the result
+    lost: bool = False  # in the last frame
+    absent: bool = False  # nobody was seen in the last frame who could be this person
+    drawn: NDArray[np.bool_] | None = None  # (C, h, w) the body in the last frame that is not lost, see `Estimate`
+    place: Float | None = None  # (3,) m, mean of the joints in that frame
 
 
 @dataclass(frozen=True)
@@ -121,14 +98,16 @@ class People:
         self._setup, self._make, self._choice, self._note = setup, make, choice, note
         self._tracked = [self._member(0, setup.subjects[0], first)]
         self._contacts = Contacts()
-        self._bystanders: list[Bystander] = []
         self._every = max(1, round(LOOK_EVERY_S * setup.fps))
+        self._unknown: deque[Observation] = deque(maxlen=_HISTORY)  # people who are unknown, in the last frames
+        self._refused = 0  # consecutive people who could not be tracked
+        self._admit_from = 0  # the frame from which on another may be
         self._known_finder: PeopleFinder | None = None
         share = sharing(first)
         self._grid: RayGrid | None = None if share is None else share.choice
 
-    def _member(self, number: int, subject: Subject, tracker: Tracker) -> Member:
-        return Member(number, subject, tracker, CameraMonitor(tracker, self._setup, subject))
+    def _member(self, number: int, subject: Subject, tracker: Tracker, written: bool = True) -> Member:
+        return Member(number, subject, tracker, CameraMonitor(tracker, self._setup, subject), written)
 
     @property
     def members(self) -> list[Member]:
@@ -152,15 +131,10 @@ class People:
         present."""
         return self._choice == "all" or len(self.members) > 1
 
-    @property
-    def alone(self) -> bool:
-        """Whether nobody but one tracked person has been seen."""
-        return len(self._tracked) == 1 and not self._bystanders
-
     # --- the first frames ---------------------------------------------------------------------------------------------
 
     def start(self, opening: Sequence[Observation]) -> None:
-        """Find the people in the first frame, and start a tracker for each who is chosen.
+        """Find the people in the first frame, and start a tracker for everybody in the volume and everybody chosen.
 
         Raises:
             CaptureError: a chosen person is not there, too few cameras see the person, or the masks never change.
@@ -168,40 +142,32 @@ class People:
         if masks_stand_still([f.images for f in opening], [f.masks for f in opening]):
             raise CaptureError("the masks never change, but the images do: the masks do not show who moves")
         subjects = self._setup.subjects
-        found = self._find(opening[0].masks, opening[0].uncertain)
+        found = self._finder.find(opening[0].masks, opening[0].uncertain)
         found = order_people(found, self._setup.volume, subjects[0].height_m, subjects[0].position)
+        if self._grid is None and len(found) > 1:
+            raise ConfigError(f"the method {self._tracked[0].tracker.method} tracks one person who is alone in view")
+        numbers: tuple[int, ...] = (0,)
         if len(found) <= 1 and self._choice in ("auto", "all", (0,)):
-            self._begin(self._tracked[0], opening)
-            return
-        numbers = chosen(self._choice, found, subjects[0], self._note)
-        known = matched(
-            subjects[:1] if self._choice == "auto" else subjects, [found[n] for n in numbers], self._setup.up
-        )
-        self._tracked = [self._member(0, known[0], self._tracked[0].tracker)]
-        for k, subject in enumerate(known[1:], 1):
-            self._tracked.append(self._member(k, subject, self._make()))  # its kernels are compiled
-        if self._grid is None:
-            if len(self._tracked) > 1 or len(found) > 1:
-                raise ConfigError(
-                    f"the method {self._tracked[0].tracker.method} tracks one person who is alone in view"
-                )
-            self._begin(self._tracked[0], opening)
-            return
-        order = [*numbers, *(n for n in range(len(found)) if n not in numbers)]
-        shown = [Bystander(found[n].position, self._hull(found[n])) for n in order]
-        shares: list[list[Observation]] = [[] for _ in numbers]
-        for frame in opening:
-            owners = self._owners([b.shape for b in shown])
-            if frame is not opening[0]:
-                self._follow(shown, frame, owners)
-                owners = self._owners([b.shape for b in shown])
-            for k, own in enumerate(shares):
-                own.append(owners.share(frame, k, False))
+            try:
+                self._begin(self._tracked[0], opening)
+                return
+            except CaptureError:
+                if self._grid is None or not found or not self._several_in(opening):
+                    raise
+        else:
+            numbers = chosen(self._choice, found, subjects[0], self._note)
+        people = [found[n] for n in numbers]
+        known = matched(subjects[:1] if self._choice == "auto" else subjects, people, self._setup.up)
+        self._tracked = [self._member(0, known[0], self._tracked[0].tracker)]  # its kernels are compiled
+        self._tracked += [self._member(k, subject, self._make()) for k, subject in enumerate(known[1:], 1)]
+        rest = [person for n, person in enumerate(found) if n not in numbers and person.views.sum() >= 2]
+        shares = self._shares([*people, *rest], opening)
         refusal = opening_agreement(self._setup, opening).refusal
-        for member, frames in zip(self._tracked, shares, strict=True):
+        for member, frames in zip(self._tracked, shares, strict=False):
             self._begin(member, frames, refusal)
-        first = [Bystander(found[n].position, self._hull(found[n])) for n in order]
-        self._bystanders = first[len(numbers) :]
+        for person, frames in zip(rest, shares[len(people) :], strict=True):
+            if person.inside:
+                self._admit(frames, unknown(subjects[0]), written=False)
 
     def _begin(self, member: Member, frames: Sequence[Observation], refusal: str | None = None) -> None:
         """Start a tracker. ``refusal``: why the whole masks contradict each other, which counts if those of the person
@@ -213,54 +179,114 @@ class People:
         member.tracker.start(seen, subject.height_m, subject.init, subject.body)
         member.monitor.check_body()
 
-    def _find(self, masks: NDArray[np.uint8], uncertain: NDArray[np.bool_] | None = None) -> tuple[LocatedPerson, ...]:
-        return self._finder.find(masks, uncertain)
-
     @property
     def _finder(self) -> PeopleFinder:
         if self._known_finder is None:
             self._known_finder = PeopleFinder(self._setup.rig, self._setup.volume, self._setup.up)
         return self._known_finder
 
+    def _several_in(self, opening: Sequence[Observation]) -> bool:
+        """Return whether several people are found in some frame of the opening."""
+        chosen = np.unique(np.linspace(0, len(opening) - 1, _TESTED).round().astype(int))
+        return any(len(self._finder.find(opening[i].masks, opening[i].uncertain)) > 1 for i in chosen)
+
+    def _shares(self, people: Sequence[LocatedPerson], frames: Sequence[Observation]) -> list[list[Observation]]:
+        """Return the observations of each person in consecutive frames, by hulls that are carved again in each.
+
+        Args:
+            people: in the first frame.
+            frames: their masks may have the value :data:`~tk.kernels.mask_values.OTHERS`.
+        """
+        rig, grid, finder = self._setup.rig, self._grid, self._finder
+        assert grid is not None
+        places = [person.position for person in people]
+        counts = [len(person.points) for person in people]
+        hulls = [cast_points(rig, grid, person.points, person.voxel_m) for person in people]
+        shares: list[list[Observation]] = [[] for _ in people]
+        for frame in frames:
+            owners = assign(rig, grid, hulls, frame, UNKNOWN_BY_HULLS)
+            if frame is not frames[0]:
+                for k, place in enumerate(places):
+                    points, places[k] = finder.around(place, owners.share(frame, k).masks, counts[k])
+                    if len(points):
+                        counts[k], hulls[k] = len(points), cast_points(rig, grid, points, finder.voxel_m)
+                owners = assign(rig, grid, hulls, frame, UNKNOWN_BY_HULLS)
+            for k, own in enumerate(shares):
+                own.append(owners.share(frame, k))
+        return shares
+
     # --- one frame ----------------------------------------------------------------------------------------------------
 
     def step(self, frame: Observation) -> dict[int, Tracked]:
-        """Return the answers of the members for a frame, by number."""
-        if self.alone:
+        """Return the answers of the people in the result who are tracked, by number."""
+        owners: PixelOwners | None = None
+        if len(self._tracked) == 1 and not self._shows_others(frame):
             (member,) = self._tracked
-            tracked = self._step(member, frame)
-            answers = {member.number: tracked}
-            self._look(frame, answers)
-            return self._with_absent(answers)
-        shown = [*(self._shape(m, True) for m in self._tracked), *(b.shape for b in self._bystanders)]
-        owners = self._owners(shown)
-        if self._bystanders:
-            self._follow(self._bystanders, frame, owners, len(self._tracked))
-            owners = self._owners([*shown[: len(self._tracked)], *(b.shape for b in self._bystanders)])
-        answers = {}
-        before = [self._state_of(m) for m in self._tracked]
-        for k, member in enumerate(self._tracked):
-            answers[member.number] = self._step(member, owners.share(frame, k, member.lost and not member.absent))
-        now = self._owners([*(self._shape(m, False) for m in self._tracked), *(b.shape for b in self._bystanders)])
-        for k, member in enumerate(self._tracked):
-            if not member.lost and now.changed(owners, frame.masks, k):
-                _sharing(member).rewind(before[k])
-                self._restore(member, before[k])
-                answers[member.number] = self._step(member, now.share(frame, k, False))
-        for k, bystander in enumerate(self._bystanders, len(self._tracked)):
-            if not bystander.refused:
-                bystander.history = [*bystander.history[1 - _HISTORY :], owners.share(frame, k, False)]
-        self._judge(frame, answers)
-        self._look(frame, answers)
-        return self._with_absent(answers)
+            answers = {member.number: self._step(member, frame)}
+            self._unknown.clear()
+        else:
+            answers, owners = self._step_all(frame)
+            without = np.empty((len(frame.masks), 0, 0, 3), np.uint8)  # images are views into the ring of frames
+            self._unknown.append(replace(owners.unknown(frame), images=without))
+        self._judge(answers)
+        self._look(frame, owners)
+        for member in self._tracked:
+            if member.absent:
+                answer = answers[member.number]
+                answers[member.number] = replace(answer, estimate=replace(answer.estimate, status="absent"))
+        return {m.number: answers[m.number] for m in self.members if m.number in answers}
 
-    def _judge(self, frame: Observation, answers: Mapping[int, Tracked]) -> None:
+    def _shows_others(self, frame: Observation) -> bool:
+        """Return whether a view shows more than the only person who is tracked: pixels far from the last body."""
+        (member,) = self._tracked
+        tracker = sharing(member.tracker)
+        if tracker is None or member.lost or member.drawn is None or member.place is None:
+            return False
+        shown = tracker.screen.sample(frame.masks) >= 128
+        for camera, cells, body in zip(self._setup.rig, shown, member.drawn, strict=True):
+            area = np.count_nonzero(body)
+            if np.count_nonzero(cells) <= (1 + UNKNOWN) * area:
+                continue
+            reach = _ALONE_M * camera.pixels_per_metre(member.place) / tracker.screen.step
+            size = 2 * max(round(reach), 1) + 1
+            near = cv2.dilate(body.view(np.uint8), np.ones((size, size), np.uint8)) > 0
+            if np.count_nonzero(cells & ~near) > UNKNOWN * area:
+                return True
+        return False
+
+    def _step_all(self, frame: Observation) -> tuple[dict[int, Tracked], PixelOwners]:
+        """Return the answers of all members, and the owners of the pixels at the poses that were expected."""
+        owners = self._owners(frame, ahead=True)
+        answers = {
+            member.number: self._step(member, owners.share(frame, k, member.lost and not member.absent))
+            for k, member in enumerate(self._tracked)
+        }
+        return answers, owners
+
+    def _owners(self, frame: Observation, ahead: bool = False) -> PixelOwners:
+        """Return the owners of a frame's pixels, in the order of the members, by their bodies at the last pose, or at
+        the pose expected in the next frame if ``ahead``."""
+        assert self._grid is not None
+        bodies: list[RenderedBody | None] = [None if m.lost else _sharing(m).rendered(ahead) for m in self._tracked]
+        return assign(self._setup.rig, self._grid, bodies, frame)
+
+    def _step(self, member: Member, share: Observation) -> Tracked:
+        estimate, used = member.monitor.step(share)
+        member.lost = estimate.status == "lost"
+        if not member.lost:
+            member.drawn, member.place = estimate.drawn, estimate.joints.mean(axis=0)
+        return Tracked(estimate, share, used)
+
+    def _judge(self, answers: Mapping[int, Tracked]) -> None:
         """Compare people whose contact has ended with those before it; exchange their trackers if they were mixed
         up."""
-        here = [m for m in self._tracked if not m.lost]
-        pelvis = {m.number: answers[m.number].estimate.joints[JOINTS.index("pelvis")] for m in here}
-        for contact in self._contacts.update(frame.index, pelvis, {m.number: _sharing(m).learned() for m in here}):
-            pair = [self._tracked[number] for number in contact.people]
+        here = {m.number: m for m in self._tracked if not m.lost}
+        if len(self._tracked) == 1:
+            return
+        pelvis = {n: answers[n].estimate.joints[JOINTS.index("pelvis")] for n in here}
+        frame = next(iter(answers.values())).share.index
+        for contact in self._contacts.update(frame, pelvis, {n: _sharing(m).learned() for n, m in here.items()}):
+            pair = [here[number] for number in contact.people]
             likeness = np.zeros((2, 2))
             for i, one in enumerate(pair):
                 for j, other in enumerate(pair):
@@ -275,143 +301,69 @@ class People:
                     self._restore(member, state)
             contact.learned = ()
 
-    def _with_absent(self, answers: dict[int, Tracked]) -> dict[int, Tracked]:
-        """Return the answers of the people in the result, with the status of those who are absent."""
-        for number in (m.number for m in self._tracked if m.absent):
-            answers[number] = replace(answers[number], estimate=replace(answers[number].estimate, status="absent"))
-        return {m.number: answers[m.number] for m in self.members if m.number in answers}
-
-    def _step(self, member: Member, share: Observation) -> Tracked:
-        estimate, used = member.monitor.step(share)
-        member.lost = estimate.status == "lost"
-        if not member.lost:
-            member.drawn = estimate.drawn
-        return Tracked(estimate, share, used)
-
-    def _shape(self, member: Member, ahead: bool) -> Cast | None:
-        return None if member.lost else _sharing(member).rendered(ahead)
-
-    def _hull(self, person: LocatedPerson) -> Cast:
-        assert self._grid is not None
-        return cast_points(self._setup.rig, self._grid, person.points, person.voxel_m)
-
-    def _owners(self, shapes: Sequence[Cast | None]) -> PixelOwners:
-        assert self._grid is not None
-        return assign(self._setup.rig, self._grid, shapes)
-
-    def _follow(self, bystanders: Sequence[Bystander], frame: Observation, owners: PixelOwners, first: int = 0) -> None:
-        """Carve the hulls of people who are not tracked again; ``first``: number of the first in the owners."""
-        assert self._grid is not None
-        for k, bystander in enumerate(bystanders, first):
-            free = owners.share(frame, k, True).masks
-            points, position = self._finder.around(bystander.position, free)
-            if len(points) >= _LEAST_VOXELS:
-                bystander.position = position
-                bystander.shape = cast_points(self._setup.rig, self._grid, points, self._finder.voxel_m)
-
-    # --- what a result keeps ------------------------------------------------------------------------------------------
-
-    def report(self) -> list[str]:
-        """Return lines on excluded cameras and losses, see :meth:`CameraMonitor.report`."""
-        if len(self.members) == 1:
-            return self.members[0].monitor.report()
-        return [f"person {m.number}: {line}" for m in self.members for line in m.monitor.report()]
-
-    def state(self) -> dict[str, Any]:
-        """Return what :meth:`restore` needs beside the bodies. Person 0's entries have no prefix."""
-        state: dict[str, Any] = {}
-        for member in self._tracked:
-            prefix = f"{_PEOPLE}{member.number}/" if member.number else ""
-            state |= {prefix + name: value for name, value in self._state_of(member).items()}
-            if not member.written:
-                state |= {f"{prefix}{_MODEL}{name}": value for name, value in member.tracker.model().items()}
-        for k, b in enumerate(self._bystanders):
-            prefix = f"{_BYSTANDERS}{k}/"
-            state |= {prefix + "position": b.position, prefix + "depth": b.shape.depth}
-        return state | {_CONTACTS + name: value for name, value in self._contacts.state().items()}
-
-    def restore(self, models: Sequence[Mapping[str, Any]], state: Mapping[str, Any]) -> None:
-        """Continue a run. Frames of bystanders are not stored, so who has just entered may be tracked later.
-
-        Args:
-            models: bodies of the people who are tracked.
-            state: of :meth:`state`.
-        """
-        number = 0
-        while own := below(f"{_PEOPLE}{number}/", state) if number else state:
-            subject = int(own[_SUBJECT])
-            known = self._setup.subjects[subject] if subject >= 0 else Subject(in_init_pose=bool(own[_IN_INIT_POSE]))
-            member = self._member(number, known, self._make() if number else self._tracked[0].tracker)
-            self._tracked[number:] = [member]
-            member.written = number < len(models)
-            member.tracker.restore(models[number] if member.written else below(_MODEL, own), own)
-            self._restore(member, own)
-            number += 1
-        self._contacts.restore(below(_CONTACTS, state))
-        k = 0
-        while found := below(f"{_BYSTANDERS}{k}/", state):
-            depth = np.asarray(found["depth"], np.float32)
-            shape = Cast((depth < FAR).astype(np.uint8), depth)
-            self._bystanders.append(Bystander(np.array(found["position"]), shape))
-            k += 1
-
-    def _state_of(self, member: Member) -> dict[str, Any]:
-        watch = {_WATCH + name: value for name, value in member.monitor.state().items()}
-        drawn = {} if member.drawn is None else {_DRAWN: member.drawn}
-        number = next((k for k, known in enumerate(self._setup.subjects) if known is member.subject), -1)
-        known = {_SUBJECT: number, _IN_INIT_POSE: member.subject.in_init_pose}
-        return {**member.tracker.state(), **watch, **drawn, **known, _LOST: member.lost, _ABSENT: member.absent}
-
-    def _restore(self, member: Member, state: Mapping[str, Any]) -> None:
-        member.monitor.restore(below(_WATCH, state))
-        member.lost, member.absent = bool(state[_LOST]), bool(state[_ABSENT])
-        member.drawn = np.array(state[_DRAWN], np.bool_) if _DRAWN in state else None
-
     # --- who enters and leaves ----------------------------------------------------------------------------------------
 
-    def _look(self, frame: Observation, answers: dict[int, Tracked]) -> None:
-        """Find those who enter, and those who are absent, in the pixels that nobody explains."""
+    def _look(self, frame: Observation, owners: PixelOwners | None) -> None:
+        """Find people who enter or leave. ``owners``: of the frame's pixels; None if the only person got all."""
         lost = [m for m in self._tracked if m.lost]
         for member in self._tracked:
             member.absent &= member.lost
-        if self._grid is None:
+        if self._grid is None or not (lost or (owners is not None and frame.index % self._every == 0)):
             return
-        due = frame.index % self._every == 0 or bool(lost)
-        if self.alone:
-            residual = answers[self._tracked[0].number].estimate.residual
-            known = residual is not None and bool(np.isfinite(residual).any())
-            surplus = float(np.nanmean(residual[:, 1])) if residual is not None and known else 0.0
-            # at once: it misleads the tracker
-            due = (due and bool(lost)) or (surplus > SURPLUS and frame.index % 2 == 0)
-        self._admit()
-        if not due:
-            return
-        owners = self._owners([*(self._shape(m, False) for m in self._tracked), *(b.shape for b in self._bystanders)])
-        free = owners.unexplained(frame.masks)
-        found = [p for p in self._find(free) if p.inside] if self._much(free, owners, frame) else []
+        owners = owners or self._owners(frame)
+        found = self._newcomers(frame, owners)
         for member in lost:
             if not found and self._gone(member, frame):
                 member.absent = True
             elif found and self._choice != "all":
-                member.absent = False  # no newcomer is tracked: who appears may be this person, and the tracker looks
-        if any(not m.absent for m in lost):
-            return  # the tracker looks for the person
-        places = [b.position for b in self._bystanders]
+                member.absent = False  # no newcomer is written: who appears may be this person, and the tracker looks
+        if frame.index % self._every == 0:  # who is not written, and lost, comes back as a newcomer
+            self._tracked = [m for m in self._tracked if m.written or not m.lost]
+        if any(m.lost and not m.absent for m in self._tracked) or len(self._unknown) < _HISTORY:
+            return
+        if frame.index < self._admit_from:
+            return
         for person in found:
-            if all(np.linalg.norm(person.position - other) > _SAME_M for other in places):
-                places.append(person.position)
-                self._bystanders.append(Bystander(person.position, self._hull(person)))
+            shares = self._shares([person], list(self._unknown)[::-1])[0]
+            away = [m for m in self._tracked if m.absent]
+            alike = [_sharing(m).likeness(replace(shares[0], images=frame.images)) for m in away]
+            if alike and max(alike) > _SAME_COLORS:
+                away[int(np.argmax(alike))].absent = False  # the tracker finds this person in the unknown pixels
+                continue
+            subject = Subject(height_m=person.height_m, in_init_pose=False)
+            newcomer = self._admit(shares, subject, written=self._choice == "all")
+            if newcomer is not None and newcomer.written:
+                self._note(f"frame {frame.index}: person {newcomer.number} has entered")
+            elif newcomer is not None:
                 x, y, z = person.position
                 self._note(f"frame {frame.index}: another person is in view, at ({x:.1f}, {y:.1f}, {z:.1f}) m")
-        self._bystanders = [b for b in self._bystanders if self._seen(b, frame)]
 
-    def _much(self, free: NDArray[np.uint8], owners: PixelOwners, frame: Observation) -> bool:
-        """Return whether the pixels that nobody explains may be a person's."""
-        shown = owners.grid.sample(frame.masks) >= 128
-        areas = [np.count_nonzero(shown & (owners.owner == k), axis=(1, 2)) for k in range(len(self._tracked))]
-        person = max(float(np.median(area)) for area in areas)
-        left = np.count_nonzero(owners.grid.sample(free), axis=(1, 2))
-        return bool(np.count_nonzero(left > _UNEXPLAINED * person) >= 2)
+    def _newcomers(self, frame: Observation, owners: PixelOwners) -> list[LocatedPerson]:
+        """Return the people in the working volume whom the pixels show that no body explains."""
+        *areas, unexplained = owners.areas(frame.masks)
+        person = max((float(np.median(area)) for area in areas), default=0.0)
+        if np.count_nonzero(unexplained > _UNEXPLAINED * person) < 2:
+            return []
+        masks = owners.unknown(frame).masks
+        return [p for p in self._finder.find(masks >= 128, masks > 0) if p.inside]
+
+    def _admit(self, frames: Sequence[Observation], subject: Subject, written: bool) -> Member | None:
+        """Add a person who is tracked from the first of some frames on; None if nobody can be tracked.
+
+        After each refusal the next attempt is twice as far away: a start takes seconds.
+        """
+        number = 1 + max(m.number for m in self._tracked)
+        member = self._member(number, subject, self._make(), written)
+        try:
+            self._begin(member, frames)
+        except CaptureError as reason:
+            _LOG.info("nobody can be tracked there: %s", reason)
+            self._refused += 1
+            self._admit_from = frames[0].index + self._every * 2**self._refused
+            return None
+        self._refused = 0
+        self._tracked.append(member)
+        return member
 
     def _gone(self, member: Member, frame: Observation) -> bool:
         """Return whether a lost person has left the last place: in every view most of the body would be on background.
@@ -425,43 +377,55 @@ class People:
         covered = np.count_nonzero(body, axis=(1, 2))
         return bool((np.count_nonzero(body & (masks < 128), axis=(1, 2)) >= 0.5 * covered).all())
 
-    def _admit(self) -> None:
-        """Start trackers for people who have entered, or let the tracker of an absent person find the person again."""
-        for bystander in list(self._bystanders):
-            if len(bystander.history) < _HISTORY or not self._inside(bystander.position):
-                continue
-            self._bystanders.remove(bystander)
-            shares, bystander.history = bystander.history[::-1], []
-            away = [m for m in self._tracked if m.absent and m.written]
-            alike = [_sharing(m).likeness(shares[0]) for m in away]
-            if alike and max(alike) > _SAME_COLORS:
-                member = away[int(np.argmax(alike))]
-                member.absent = False  # lost: the pixels that nobody explains are this person's
-                continue
-            number = len(self._tracked)
-            member = self._member(number, unknown(Subject(in_init_pose=False)), self._make())
-            member.written = self._choice == "all"
-            try:
-                self._begin(member, shares)
-            except CaptureError as reason:
-                _LOG.info("nobody can be tracked there: %s", reason)
-                bystander.refused = True
-                self._bystanders.append(bystander)
-                continue
-            self._tracked.append(member)
-            if member.written:
-                self._note(f"frame {shares[0].index}: person {number} has entered")
+    # --- what a result keeps ------------------------------------------------------------------------------------------
 
-    def _inside(self, position: Float) -> bool:
-        volume = self._setup.volume
-        return bool(((volume.lower <= position) & (position <= volume.upper)).all())
+    def report(self) -> list[str]:
+        """Return lines on excluded cameras and losses, see :meth:`CameraMonitor.report`."""
+        if len(self.members) == 1:
+            return self.members[0].monitor.report()
+        return [f"person {m.number}: {line}" for m in self.members for line in m.monitor.report()]
 
-    def _seen(self, bystander: Bystander, frame: Observation) -> bool:
-        """Return whether a person who is not tracked is still in view."""
-        covered = bystander.shape.label > 0
-        assert self._grid is not None
-        shown = covered & (self._grid.sample(frame.masks) >= 128)
-        return bool(np.count_nonzero(shown) > 0.3 * np.count_nonzero(covered))
+    def state(self) -> dict[str, Any]:
+        """Return what :meth:`restore` needs beside the bodies. Person 0's entries have no prefix."""
+        state: dict[str, Any] = {}
+        for k, member in enumerate(self._tracked):
+            prefix = f"{_PEOPLE}{k}/" if k else ""
+            state |= {prefix + name: value for name, value in self._state_of(member).items()}
+            if not member.written:
+                state |= {f"{prefix}{_MODEL}{name}": value for name, value in member.tracker.model().items()}
+        return state | {_CONTACTS + name: value for name, value in self._contacts.state().items()}
+
+    def restore(self, models: Sequence[Mapping[str, Any]], state: Mapping[str, Any]) -> None:
+        """Continue a run. Earlier frames are not stored, so a person who has just entered may be tracked later.
+
+        Args:
+            models: bodies of the people in the result.
+            state: of :meth:`state`.
+        """
+        k = 0
+        while own := below(f"{_PEOPLE}{k}/", state) if k else state:
+            subject = int(own[_SUBJECT])
+            known = self._setup.subjects[subject] if subject >= 0 else Subject(in_init_pose=bool(own[_IN_INIT_POSE]))
+            tracker = self._make() if k else self._tracked[0].tracker
+            member = self._member(k, known, tracker, written=k < len(models))
+            self._tracked[k:] = [member]
+            tracker.restore(models[k] if member.written else below(_MODEL, own), own)
+            self._restore(member, own)
+            k += 1
+        self._contacts.restore(below(_CONTACTS, state))
+
+    def _state_of(self, member: Member) -> dict[str, Any]:
+        watch = {_WATCH + name: value for name, value in member.monitor.state().items()}
+        drawn = {} if member.drawn is None else {_DRAWN: member.drawn, _PLACE: member.place}
+        number = next((k for k, known in enumerate(self._setup.subjects) if known is member.subject), -1)
+        known = {_SUBJECT: number, _IN_INIT_POSE: member.subject.in_init_pose}
+        return {**member.tracker.state(), **watch, **drawn, **known, _LOST: member.lost, _ABSENT: member.absent}
+
+    def _restore(self, member: Member, state: Mapping[str, Any]) -> None:
+        member.monitor.restore(below(_WATCH, state))
+        member.lost, member.absent = bool(state[_LOST]), bool(state[_ABSENT])
+        member.drawn = np.array(state[_DRAWN], np.bool_) if _DRAWN in state else None
+        member.place = np.array(state[_PLACE], np.float64) if _PLACE in state else None
 
 
 def below(prefix: str, state: Mapping[str, Any]) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from tk.model.body.skeleton import OPTIONAL, SEGMENTS, build_skeleton, convert_p
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import spread_out
 from tk.model.cameras.tracker_frame import TrackerFrame
-from tk.model.cues.part_colors import PartColors, color_bins
+from tk.model.cues.part_colors import PartColors, RenderedBody, color_bins
 from tk.model.cues.ray_costs import Evidence, RayGrid, mean_of_views
 from tk.model.masks.silhouettes import Pyramid, Views
 from tk.model.setup import InitPose
@@ -304,13 +304,13 @@ class ContourTracker:
         """Return the poses (D,) of the last frame and of the frame before, in the tracker's frame."""
         raise NotImplementedError
 
-    def rendered(self, ahead: bool) -> Cast:
+    def rendered(self, ahead: bool) -> RenderedBody:
         """Return the body on the grid :attr:`choice`: at the last pose, or at the one expected in the next frame."""
         pose, before = self.last_poses()
         if ahead:
             pose = pose + self.contours.prediction * (pose - before)
         met = self.choice.render(self.body, pose[None])
-        return Cast(met.label[0], met.depth[0])
+        return RenderedBody(met.label[0], met.depth[0], self.colors.group, self.colors.log_likelihood)
 
     def learned(self) -> Mapping[str, Any]:
         """Return the learned colours, a part of the state."""

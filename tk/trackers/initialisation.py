@@ -60,6 +60,9 @@ AMBIGUOUS, HANDICAP, NEARLY, WORSE = 1.1, 1.1, 1.4, 1.2
 # A pose with a higher residual explains nothing: twice what an average body of the right stature leaves. Without a
 # better one in any of the frames the person is not found.
 UNEXPLAINED = 0.6
+# A view of which a mask shows less than this share of the largest one tells nothing about where the person is: others
+# hide most of the person. A view from above, or from twice as far, shows a quarter.
+WHOLE = 0.1
 # Alternatives that are followed through the opening, the likeliest of each anchor first: where nothing fits, each takes
 # seconds. Half and twice as many change no mean error of dance and cube (50 frames).
 FOLLOWED = 8
@@ -259,9 +262,10 @@ def centroid(rig: Rig, pyramid: Pyramid, index: int) -> Float:
         CaptureError: fewer than two cameras see anybody.
     """
     A, y, count = np.zeros((3, 3)), np.zeros(3), 0
-    for mask, camera in zip(pyramid.masks[0], rig, strict=True):
-        ys, xs = np.nonzero(mask >= 128)
-        if len(xs) == 0:
+    shown = [np.nonzero(mask >= 128) for mask in pyramid.masks[0]]
+    least = WHOLE * max(len(ys) for ys, _ in shown)
+    for (ys, xs), camera in zip(shown, rig, strict=True):
+        if len(ys) <= least:
             continue
         ray = camera.rays([[xs.mean(), ys.mean()]])[0]
         across = np.eye(3) - np.outer(ray, ray)

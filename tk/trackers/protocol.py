@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # the process that decodes and segments needs no parts of a tracker
-    from tk.kernels.raycast import Cast
     from tk.model.body.cone_body import ConeBody
     from tk.model.cameras.camera import Rig
     from tk.model.cameras.tracker_frame import TrackerFrame
+    from tk.model.cues.part_colors import RenderedBody
     from tk.model.cues.ray_costs import RayGrid
     from tk.model.hull.hull import HullSurface
     from tk.model.masks.silhouettes import Views
@@ -182,8 +182,8 @@ class SharingTracker(Tracker, Protocol):
     choice: RayGrid
     screen: RayGrid
 
-    def rendered(self, ahead: bool) -> Cast:
-        """Return the body on the grid: at the last pose, or at the one expected in the next frame."""
+    def rendered(self, ahead: bool) -> RenderedBody:
+        """Return the body on the grid, with its colours: at the last pose, or at the one expected in the next frame."""
         ...
 
     def last_poses(self) -> tuple[Float, Float]:

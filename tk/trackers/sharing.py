@@ -1,136 +1,291 @@
 """Joint segmentation of several people: which pixels of a frame show which person.
 
-All bodies are rendered at the poses expected in the frame, and each pixel of the mask goes to a person: by depth where
-two bodies cover it, else to the nearest body in the image. Each person is then tracked alone, with the pixels of the
-others as no evidence: there the body may be hidden, so a part costs nothing, and no contour is searched (Liu, Stoll,
-Gall, Seidel, Theobalt, *Markerless motion capture of interacting characters using multi-view image segmentation*, CVPR
-2011, and PAMI 2013, who assign the pixels by a graph cut). Pixels that could show two people are no evidence for
-either.
+All bodies are rendered at the poses expected in the frame. A pixel of the masks belongs to the person whom it most
+likely shows, by three terms: whether the person's body covers the pixel, which body is in front there, and how likely
+the pixel's colour is on the part of the body that is nearest. Liu, Stoll, Gall, Seidel and Theobalt (*Markerless motion
+capture of interacting characters using multi-view image segmentation*, CVPR 2011, and PAMI 2013) put the same terms
+into a graph cut. Each person is then tracked alone, with the pixels of the others as no evidence: there the body may be
+hidden, so a part costs nothing, and no contour is searched. Pixels that could show either of two people are no evidence
+for both. Somebody who has no body yet is unknown: pixels far from all bodies, and what has no colour of the bodies
+beside them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tk.kernels.line_search import COLOR_BINS
 from tk.kernels.mask_values import OTHERS
-from tk.kernels.raycast import FAR, Cast
+from tk.kernels.raycast import FAR
 from tk.model.cameras.camera import Rig
+from tk.model.cues.part_colors import RenderedBody, color_bins
 from tk.model.cues.ray_costs import RayGrid
 from tk.trackers.protocol import Observation
 
 Float = NDArray[np.float64]
+Single = NDArray[np.float32]
+Bool = NDArray[np.bool_]
 
+# Scale of the logistic distributions by which outline and depth of a body differ from those at the expected pose,
+# metres. NEAR_M: an outline errs by less with a probability of 0.95.
+ERROR_M = 0.04
+NEAR_M = 3 * ERROR_M
 # How far a pixel may lie from a body to be that person's, metres: a fist at 8 m/s moves so far in a frame at 15 Hz.
-# Pixels farther away are no evidence.
 REACH_M = 0.5
-# A pixel could show either of two people if their distances from it in the image, or their depths, differ by less than
-# this, metres: about the thickness of a forearm.
-MARGIN_M = 0.08
-# A person is tracked again in a frame if this share of the person's pixels has changed owner. Without this, the first
-# pass on pair is worse by 0.1 and 0.4 cm, and an arm is lost where the people pass.
-CHANGED = 0.05
+# Logarithm of the ratio by which the colours around a pixel favour a person at most.
+MOST_LOG_RATIO = 3.0
+# A pixel may show either of two people if it shows the likelier one with a lower probability.
+CLEAR = 0.85
+# Edge of the square over which the evidence of colours is averaged, pixels, and the least width of a region of unclear
+# pixels: narrower ones are the border between two people.
+_AVERAGED_PX, _BORDER_PX = 3, 5
+# A view shows somebody unknown if a connected region that is not near has this share of a person's area. A fast arm
+# that is not where it is expected has 0.05. Hulls expect nothing.
+UNKNOWN, UNKNOWN_BY_HULLS = 0.1, 0.03
+# Where somebody unknown ends is unknown, too: within this distance of the region, metres: half a trunk, and NEAR_M.
+_WIDTH_M = 0.35
 
 NOBODY, UNCLEAR = -1, -2
 
 
 @dataclass(frozen=True)
 class PixelOwners:
-    """The owner of each cell of a grid over the images.
+    """The owner of each pixel of a frame."""
 
-    Attributes:
-        grid: the cells, one ray each.
-        owner: (V, h, w) int8, the number of a person, :data:`NOBODY` if nobody is near, or :data:`UNCLEAR`.
-        beside: (V, h, w) m, distance from the nearest person, in the image.
-    """
-
-    grid: RayGrid
+    grid: RayGrid  # cells of the images, one ray each
+    # (V, H, W) the number of a person, `NOBODY` for somebody unknown, or `UNCLEAR`; without meaning outside the masks
     owner: NDArray[np.int8]
-    beside: NDArray[np.float32]
+    people: int  # number of people, also those whose body is unknown
 
-    def share(self, frame: Observation, person: int, unknown: bool) -> Observation:
+    def share(self, frame: Observation, person: int, unknown: bool = False) -> Observation:
         """Return the observation of a person, with the pixels of others as :data:`~tk.kernels.mask_values.OTHERS`.
 
-        ``unknown``: it is not known where the person is, so pixels near nobody count as the person's.
+        ``unknown``: pixels of somebody unknown may show this person.
         """
-        own = (self.owner == person) | (unknown & (self.owner == NOBODY))
-        return replace(frame, masks=self._selected(frame.masks, own))
+        masks = frame.masks.copy()
+        own = self.owner == person
+        if unknown:
+            own |= self.owner == NOBODY
+        masks[(masks >= 128) & ~own] = OTHERS
+        return replace(frame, masks=masks)
 
-    def _selected(self, masks: NDArray[np.uint8], own: NDArray[np.bool_]) -> NDArray[np.uint8]:
-        """Return the masks (V, H, W), with :data:`~tk.kernels.mask_values.OTHERS` where cells are not own."""
-        _, height, width = masks.shape
-        selected = np.empty_like(masks)
-        for v, cells in enumerate(np.where(own, np.uint8(255), np.uint8(OTHERS))):
-            size = (cells.shape[1] * self.grid.step, cells.shape[0] * self.grid.step)
-            full = cv2.resize(cells, size, interpolation=cv2.INTER_NEAREST)[:height, :width]
-            below, right = height - full.shape[0], width - full.shape[1]
-            if below or right:
-                full = cv2.copyMakeBorder(full, 0, below, 0, right, cv2.BORDER_REPLICATE)
-            _, shown = cv2.threshold(masks[v], 127, 255, cv2.THRESH_BINARY)
-            cv2.bitwise_and(shown, full, dst=selected[v])
-        return selected
+    def unknown(self, frame: Observation) -> Observation:
+        """Return the observation of people who are unknown; pixels of known people are
+        :data:`~tk.kernels.mask_values.OTHERS`."""
+        masks = frame.masks.copy()
+        masks[(masks >= 128) & (self.owner != NOBODY)] = OTHERS
+        return replace(frame, masks=masks)
 
-    def changed(self, before: PixelOwners, masks: NDArray[np.uint8], person: int) -> bool:
-        """Return whether :data:`CHANGED` of a person's pixels in the masks (V, H, W) have another owner than before."""
-        shown = self.grid.sample(masks) >= 128
-        now, then = self.owner[shown] == person, before.owner[shown] == person
-        return bool(np.count_nonzero(now != then) > CHANGED * int(np.count_nonzero(then)))
-
-    def unexplained(self, masks: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the masks (V, H, W) without pixels within twice :data:`MARGIN_M` of known people."""
-        return np.where(self._selected(masks, self.beside > 2 * MARGIN_M) == 255, np.uint8(255), np.uint8(0))
+    def areas(self, masks: NDArray[np.uint8]) -> NDArray[np.int64]:
+        """Return (K + 1, V) the number of cells of each person in masks (V, H, W), last those of unknown people."""
+        owner = np.where(self.grid.sample(masks) >= 128, self.grid.sample(self.owner), np.int8(UNCLEAR))
+        return np.array([np.count_nonzero(owner == k, axis=(1, 2)) for k in (*range(self.people), NOBODY)])
 
 
-def assign(rig: Rig, grid: RayGrid, shapes: Sequence[Cast | None]) -> PixelOwners:
-    """Return the owner of each cell.
+class _Shape(NamedTuple):
+    """A body in one view, extended to all cells (h, w) from the nearest cell that it covers."""
+
+    number: int  # the person's, or `NOBODY`
+    away: Single  # metres in the image from the body's outline, negative inside
+    label: NDArray[np.uint8]  # see `RenderedBody`
+    depth: Single  # NaN if it is unknown
+    body: RenderedBody | None  # group and colours of the parts; None if they are unknown
+
+    @staticmethod
+    def of(number: int, label: NDArray[Any], depth: Single, cell: float, body: RenderedBody | None) -> _Shape:
+        """Extend a body that covers some cells; ``cell``: metres along an edge of a cell at a depth of 1."""
+        covered = label > 0
+        flat = np.flatnonzero(covered)
+        outside, nearest = cv2.distanceTransformWithLabels(
+            (~covered).view(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        index = np.empty(len(flat) + 1, np.int64)
+        index[nearest.ravel()[flat]] = flat
+        at = index[nearest]
+        inside = cv2.distanceTransform(covered.view(np.uint8), cv2.DIST_L2, 3)
+        metres = np.float32(cell * float(np.median(depth[covered])))
+        away = np.where(covered, np.float32(0.5) - inside, outside - np.float32(0.5)) * metres
+        return _Shape(number, away, label.ravel()[at], depth.ravel()[at], body)
+
+
+def assign(
+    rig: Rig, grid: RayGrid, bodies: Sequence[RenderedBody | None], frame: Observation, unknown: float = UNKNOWN
+) -> PixelOwners:
+    """Return the owner of each pixel of the masks.
 
     Args:
         rig: the cameras.
         grid: the cells.
-        shapes: of each person the body, or the hull, on the grid; None if it is unknown where the person is.
+        bodies: of each person the body, or the hull, on the grid; None if it is unknown where the person is.
+        frame: images and masks. Pixels with values below 128 have no owner.
+        unknown: see :data:`UNKNOWN`.
     """
-    V, h, w = grid.rays.shape[:3]
-    beside = np.full((len(shapes), V, h, w), np.inf, np.float32)  # distance of a cell from a shape, metres
-    depth = np.full((len(shapes), V, h, w), np.inf, np.float32)
-    for p, shape in enumerate(shapes):
-        for v in range(V) if shape is not None else ():
-            assert shape is not None
-            covered = shape.label[v] > 0
-            if covered.any():
-                depth[p, v][covered] = shape.depth[v][covered]
-                middle = float(np.median(depth[p, v][covered]))
-                beside[p, v] = cv2.distanceTransform((~covered).view(np.uint8), cv2.DIST_L2, 3)
-                beside[p, v] *= grid.step * middle / float(rig[v].matrix[0, 0])
-    if not shapes:
-        return PixelOwners(grid, np.full((V, h, w), NOBODY, np.int8), np.full((V, h, w), np.inf, np.float32))
-    who, nearest, second = _two_least(beside)
-    owner = np.where(nearest <= REACH_M, who, np.int8(NOBODY))
-    if len(shapes) > 1:
-        who, front, behind = _two_least(depth)
-        both = np.isfinite(behind)
-        owner[both] = who[both]
-        with np.errstate(invalid="ignore"):  # inf - inf
-            owner[np.where(both, behind - front, second - nearest) < MARGIN_M] = UNCLEAR
-    return PixelOwners(grid, owner, nearest)
+    shown = grid.sample(frame.masks) >= 128
+    owner = np.full(frame.masks.shape, NOBODY, np.int8)
+    areas = [np.count_nonzero(body.label, axis=(1, 2)) for body in bodies if body is not None]
+    least = unknown * float(np.median(areas)) if areas else 0.0
+    for v, camera in enumerate(rig):
+        cells = _around(shown[v])
+        cell = grid.step / float(camera.matrix[0, 0])
+        shapes = [
+            _Shape.of(k, body.label[v][cells], body.depth[v][cells], cell, body)
+            for k, body in enumerate(bodies)
+            if body is not None and body.label[v][cells].any()
+        ]
+        if not shapes:
+            continue
+        stranger = _stranger(shown[v][cells], shapes, cell, least)
+        view = _View(grid.step, shown[v][cells], [*shapes, *stranger])
+        pixels = _pixels(cells, grid.step)
+        image = frame.images[v][pixels] if frame.images.size else None
+        owner[v][pixels] = view.owners(frame.masks[v][pixels] >= 128, image)
+    return PixelOwners(grid, owner, len(bodies))
 
 
-def _two_least(values: NDArray[np.float32]) -> tuple[NDArray[np.int8], NDArray[np.float32], NDArray[np.float32]]:
-    """Return the index of the least of values along the first axis, the least and the second."""
-    least, second = values[0].copy(), np.full(values.shape[1:], np.inf, np.float32)
-    index = np.zeros(values.shape[1:], np.int8)
-    for k, value in enumerate(values[1:], 1):
-        index[value < least] = k
-        second = np.minimum(second, np.maximum(value, least))
-        least = np.minimum(least, value)
-    return index, least, second
+def _stranger(shown: Bool, shapes: Sequence[_Shape], cell: float, least: float) -> list[_Shape]:
+    """Return somebody unknown, at an unknown depth, if at least ``least`` connected cells of a mask (h, w) are far from
+    all shapes."""
+    far = shown & (_nearest(shapes) > NEAR_M)
+    if np.count_nonzero(far) < least:
+        return []
+    _, region, stats, _ = cv2.connectedComponentsWithStats(far.view(np.uint8), connectivity=4)
+    large = stats[:, cv2.CC_STAT_AREA] >= least
+    large[0] = False
+    if not large.any():
+        return []
+    depth = np.full(shown.shape, np.median([np.median(shape.depth) for shape in shapes]), np.float32)
+    away = cv2.distanceTransform((~large[region]).view(np.uint8), cv2.DIST_L2, 3) * (cell * depth[0, 0])
+    shape = _Shape.of(NOBODY, (away <= _WIDTH_M).view(np.uint8), depth, cell, None)
+    return [shape._replace(depth=np.full_like(depth, np.nan))]
 
 
-def cast_points(rig: Rig, grid: RayGrid, points: Float, voxel_m: float) -> Cast:
-    """Return voxels with centres (N, 3) on the grid, as a :class:`~tk.kernels.raycast.Cast` of one part.
+class _View:
+    """Decides who owns the pixels of one view, or of a part of it.
+
+    Args:
+        step: pixels along an edge of a cell.
+        shown: (h, w) bool, cells of the mask.
+        shapes: the bodies.
+    """
+
+    def __init__(self, step: int, shown: Bool, shapes: Sequence[_Shape]) -> None:
+        self._step, self._shown, self._shapes = step, shown, shapes
+        self._visible = _log_visible(shapes)
+        self._first = np.argmax(self._visible, axis=0)  # the shape that a cell shows most likely
+
+    def owners(self, person: Bool, image: NDArray[np.uint8] | None) -> NDArray[np.int8]:
+        """Return (H, W) the owners of pixels, by the colours where the bodies alone do not decide.
+
+        Args:
+            person: (H, W) bool, the mask.
+            image: (H, W, 3) BGR.
+        """
+        numbers = np.array([shape.number for shape in self._shapes], np.int8)
+        near = _nearest(self._shapes) <= REACH_M
+        owner = enlarged(np.where(near, numbers[self._first], np.int8(NOBODY)), self._step, person.shape)
+        if len(numbers) == 1:
+            return owner
+        best = self._visible.max(axis=0)
+        rest = np.where(self._first == np.arange(len(numbers))[:, None, None], -np.inf, self._visible)
+        contested = self._shown & near & (best - rest.max(axis=0) < MOST_LOG_RATIO + _log_odds(CLEAR))
+        if not contested.any():
+            return owner
+        cells = _around(contested)
+        pixels = _pixels(cells, self._step)
+        shown = person[pixels]
+        score = np.stack([enlarged(one[cells], self._step, shown.shape, cv2.INTER_LINEAR) for one in self._visible])
+        if image is not None:
+            bins = color_bins(image[pixels])
+            labels = [enlarged(shape.label[cells], self._step, shown.shape) for shape in self._shapes]
+            colors = np.stack([_log_color(s, label, bins) for s, label in zip(self._shapes, labels, strict=True)])
+            colors = np.maximum(colors - colors.max(axis=0), -MOST_LOG_RATIO)
+            score += [_averaged(one, shown) for one in colors]
+        clear = np.exp(score - score.max(axis=0)).sum(axis=0) <= 1 / CLEAR
+        border = np.ones((_BORDER_PX, _BORDER_PX), np.uint8)
+        unclear = cv2.morphologyEx((shown & ~clear).view(np.uint8), cv2.MORPH_OPEN, border) > 0
+        decided = np.where(unclear, np.int8(UNCLEAR), numbers[score.argmax(axis=0)])
+        where = enlarged(contested[cells].view(np.uint8), self._step, shown.shape) > 0
+        np.copyto(owner[pixels], decided, where=where)
+        return owner
+
+
+def _around(cells: Bool) -> tuple[slice, slice]:
+    """Return the rows and the columns of the box around cells (h, w), with a cell on each side."""
+    left, top, width, height = cv2.boundingRect(cells.view(np.uint8))
+    return slice(max(top - 1, 0), top + height + 1), slice(max(left - 1, 0), left + width + 1)
+
+
+def _pixels(cells: tuple[slice, slice], step: int) -> tuple[slice, slice]:
+    """Return the rows and the columns of the pixels of cells."""
+    rows, columns = cells
+    return slice(rows.start * step, rows.stop * step), slice(columns.start * step, columns.stop * step)
+
+
+def _nearest(shapes: Sequence[_Shape]) -> Single:
+    return np.asarray(np.min([shape.away for shape in shapes], axis=0))
+
+
+def _log_odds(probability: float) -> float:
+    return float(np.log(probability / (1 - probability)))
+
+
+def _averaged(values: Single, chosen: Bool) -> Single:
+    """Return (h, w) the means of the chosen values in the square about each."""
+    square = (_AVERAGED_PX, _AVERAGED_PX)
+    share = cv2.blur(chosen.astype(np.float32), square)
+    return np.asarray(cv2.blur(np.where(chosen, values, np.float32(0)), square) / np.maximum(share, np.float32(1e-3)))
+
+
+def _log_visible(shapes: Sequence[_Shape]) -> Single:
+    """Return (K, h, w) the logarithm of the probability that a cell shows each shape: that the shape covers the cell,
+    and that no other one is in front."""
+    log_covers = [-np.logaddexp(np.float32(0), shape.away / np.float32(ERROR_M)) for shape in shapes]
+    covers = [np.exp(one) for one in log_covers]
+    total = np.array(log_covers)
+    for i, one in enumerate(shapes):
+        for j, other in enumerate(shapes[:i]):
+            # an extended depth is as uncertain as it is far extended
+            error = np.float32(ERROR_M) + np.maximum(one.away, 0) + np.maximum(other.away, 0)
+            in_front = np.nan_to_num(1 / (1 + np.exp((one.depth - other.depth) / error)), nan=0.5)
+            total[i] += np.log1p(-covers[j] * (1 - in_front))
+            total[j] += np.log1p(-covers[i] * in_front)
+    return total
+
+
+def _log_color(shape: _Shape, label: NDArray[np.uint8], bins: NDArray[np.int32]) -> Single:
+    """Return (h, w) the logarithm of the probability of colours if they show a shape: the nearest part of the body, or
+    any part.
+
+    Args:
+        shape: the shape; all colours are equally likely if its colours are unknown.
+        label: (h, w) of the nearest parts.
+        bins: (h, w) of the colours.
+    """
+    body = shape.body
+    if body is None or body.log_likelihood is None or body.group is None:
+        return np.full(bins.shape, -np.log(COLOR_BINS), np.float32)
+    log_likelihood = body.log_likelihood
+    return np.maximum(log_likelihood[body.group[label.astype(np.int64) - 1], bins], log_likelihood[-1, bins])
+
+
+def enlarged(cells: NDArray, step: int, shape: tuple[int, ...], interpolation: int = cv2.INTER_NEAREST) -> NDArray:
+    """Return a grid's cells (h, w) as an image of a shape (H, W)."""
+    height, width = shape
+    full = cv2.resize(cells, (cells.shape[1] * step, cells.shape[0] * step), interpolation=interpolation)
+    below, right = max(height - full.shape[0], 0), max(width - full.shape[1], 0)
+    if below or right:
+        full = cv2.copyMakeBorder(full, 0, below, 0, right, cv2.BORDER_REPLICATE)
+    return np.asarray(full[:height, :width])
+
+
+def cast_points(rig: Rig, grid: RayGrid, points: Float, voxel_m: float) -> RenderedBody:
+    """Return voxels with centres (N, 3) on the grid, as a body of one part whose colours are unknown.
 
     Args:
         rig: the cameras, in the world of the points.
@@ -151,4 +306,4 @@ def cast_points(rig: Rig, grid: RayGrid, points: Float, voxel_m: float) -> Cast:
         cells = voxel_m * camera.matrix[0, 0] / float(np.median(distance)) / grid.step
         width = 2 * max(int(np.ceil(cells / 2)), 1) + 1
         depth[v] = cv2.erode(depth[v], np.ones((width, width), np.uint8))
-    return Cast((depth < FAR).astype(np.uint8), depth)
+    return RenderedBody((depth < FAR).astype(np.uint8), depth)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tk.errors import VolumeError
 
@@ -63,6 +63,15 @@ class VoxelGrid:
     @property
     def count(self) -> int:
         return int(np.prod(self.shape))
+
+    def within(self, lower: ArrayLike, upper: ArrayLike) -> NDArray[np.int64]:
+        """Return the flat indices (N,) of the voxels with centres between two corners (3,), metres."""
+        first, last = ((np.asarray(corner) - self.origin) / self.voxel_m for corner in (lower, upper))
+        sides = [
+            np.arange(max(int(np.ceil(a)), 0), min(int(np.floor(b)) + 1, side))
+            for a, b, side in zip(first, last, self.shape, strict=True)
+        ]
+        return np.ravel_multi_index(np.ix_(*sides), self.shape).ravel()
 
     def centers(self, flat: NDArray[np.integer] | None = None) -> NDArray[np.float64]:
         """Return (N, 3) centres of the voxels with flat indices (all of them by default), metres."""

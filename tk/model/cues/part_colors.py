@@ -10,7 +10,7 @@ never seen on it.
 from __future__ import annotations
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -50,6 +50,16 @@ GROUPS = tuple(
 )
 
 
+class RenderedBody(NamedTuple):
+    """A body on a grid of rays, and the colours of its parts."""
+
+    label: NDArray[np.uint8]  # (V, h, w), 1 + the part that a ray meets first, 0 where it meets nothing
+    depth: NDArray[np.float32]  # (V, h, w), see `tk.kernels.raycast.Cast`
+    group: NDArray[np.int32] | None = None  # (P,) the colour group of each part; None if the colours are unknown
+    # (G + 1, COLOR_BINS) log p(colour | group), last log p(colour | person); None if the colours are unknown
+    log_likelihood: NDArray[np.float32] | None = None
+
+
 class PartColors:
     """The colour models of one person.
 
@@ -58,7 +68,8 @@ class PartColors:
 
     Attributes:
         group: (P,) the group of each part.
-        log_likelihood: (G, COLOR_BINS) log p(colour | group); None before any colours are learned.
+        log_likelihood: (G + 1, COLOR_BINS) log p(colour | group), and last log p(colour | person); None before any
+            colours are learned.
         foreign: (COLOR_BINS,) bool, colours that are not the person's.
         mismatch: (COLOR_BINS, G) in [0, 1], how much less likely a colour is in a group than in its likeliest group.
     """
@@ -88,14 +99,15 @@ class PartColors:
         self._update()
 
     def _update(self) -> None:
-        *rows, outside = _smooth(np.concatenate([self._counts, self._outside[None]]))
+        smooth = _smooth(np.concatenate([self._counts, self._outside[None]]))
+        outside, rows = smooth[-1], np.concatenate([smooth[:-1], smooth[:-1].sum(axis=0, keepdims=True)])
         total = np.sum(rows, axis=1, keepdims=True)
         share = rows / np.maximum(total, 1e-9)
         log_likelihood = np.log(((1 - _ANYTHING) * share + _ANYTHING / COLOR_BINS).astype(np.float32))
         self.log_likelihood = log_likelihood
-        deficit = (log_likelihood.max(axis=0) - log_likelihood) / _MOST_LOG_RATIO
+        deficit = (log_likelihood.max(axis=0) - log_likelihood[:-1]) / _MOST_LOG_RATIO
         self.mismatch = np.ascontiguousarray(np.minimum(deficit, 1.0).T)
-        self.foreign = outside + _ANYTHING * total.sum() / COLOR_BINS > np.sum(rows, axis=0)
+        self.foreign = outside + _ANYTHING * total[-1] / COLOR_BINS > rows[-1]
 
     def regions(self, images: NDArray[np.uint8]) -> Regions | None:
         """Return the colour cue of images (V, H, W, 3) for the contours; None before any colours are learned."""

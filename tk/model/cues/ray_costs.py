@@ -152,6 +152,12 @@ class Evidence:
         total, count = np.bincount(part, cost, len(group)), np.bincount(part, minlength=len(group))
         return total.astype(np.float64), count.astype(np.int64)
 
+    def hidden(self, label: NDArray[np.uint8]) -> float:
+        """Return the share of the rays that meet a body, labels (V, h, w), on pixels of other people."""
+        if self.others is None:
+            return 0.0
+        return float(np.count_nonzero(self.others & (label > 0))) / max(int(np.count_nonzero(label)), 1)
+
     def surplus(self, label: NDArray[np.uint8]) -> float:
         """Return the surplus area, mean over the views; labels (V, h, w)."""
         return float(mean_of_views(self.residual(label)[None, :, 1])[0])
