@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("capture", type=Path)
     parser.add_argument("--frames", type=int, help="how many from the start [default: all]")
     parser.add_argument("--seeds", type=int, help="how many [default: the experiment's own]")
-    parser.add_argument("--out", type=Path, default=Path("docs/experiments"), help="folder of the figure")
+    parser.add_argument("--out", type=Path, default=Path("out"), help="folder of the figure")
     given = parser.parse_args(arguments)
     experiment = EXPERIMENTS[given.name]
     seeds = given.seeds or experiment.seeds

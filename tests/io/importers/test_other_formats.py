@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
-import re
+import runpy
 import sys
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from tk.io.importers import import_project
 from tk.io.importers.projections import factorise
 from tk.model.cameras.camera import Rig
 
-MANUAL = Path(__file__).resolve().parents[3] / "docs" / "import.md"
+CONVERTER = Path(__file__).resolve().parents[3] / "docs" / "examples" / "convert_opencap.py"
 
 
 def write_yml(path: Path, names: list[str], matrices: dict[str, np.ndarray], numbers: dict[str, int]) -> None:
@@ -219,7 +219,7 @@ def test_folder_of_texts_is_not_a_project(folder: Path, check: Import) -> None:
 
 
 def test_conversion_script_of_the_docs_works(folder: Path, check: Import, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The program in docs/import.md converts the pickles to a project that tk reads."""
+    """The script that docs/import.md links to converts the pickles to a project that tk reads."""
     rig = renamed(make_rig(), "Cam0", "Cam1", "Cam2", "Cam3")
     for camera in rig:
         kept = {
@@ -232,8 +232,7 @@ def test_conversion_script_of_the_docs_works(folder: Path, check: Import, monkey
         path = folder / "Videos" / camera.name / "cameraIntrinsicsExtrinsics.pickle"
         path.parent.mkdir(parents=True)
         path.write_bytes(pickle.dumps(kept))
-    (program,) = re.findall(r"^```python\n(.*?)^```", MANUAL.read_text(encoding="utf-8"), re.M | re.S)
-    monkeypatch.setattr(sys, "argv", ["convert.py", str(folder)])
-    exec(compile(program, "convert.py", "exec"), {})
+    monkeypatch.setattr(sys, "argv", [CONVERTER.name, str(folder)])
+    runpy.run_path(str(CONVERTER), run_name="__main__")
     write_clips(folder / "videos-raw", [camera.name for camera in rig], suffix=".mov")
     check(folder, rig).note("lengths are in mm, as the file says")
