@@ -209,14 +209,6 @@ class Settings:
         person_pixels: least height in pixels at which a person is tracked. The images of a camera that shows the person
             at n times this height are read at 1/n of their size; 0: all at full size. Measured: at 250 to 350 pixels
             limbs are as accurate as at 620; at 205 they are 0.1 cm worse, at 150 0.2 to 0.4 cm, at 100 0.5 to 3 cm.
-        foreground: see :class:`ForegroundSettings`.
-        appearance: see :class:`AppearanceSettings`.
-        body: see :class:`BodySettings`.
-        objective: see :class:`ObjectiveSettings`.
-        contours: see :class:`ContourSettings`.
-        tracking: see :class:`TrackingSettings`.
-        silhouette: see :class:`SilhouetteSettings`.
-        region: see :class:`RegionSettings`.
     """
 
     voxels: int = 64
