@@ -36,14 +36,13 @@ SCHEDULE = "tk.optim.schedule"
 # label; changes relative to the defaults: settings by their table, constants by their module
 ROWS: tuple[tuple[str, Changes], ...] = (
     ("defaults", {}),
-    ("no coverage (data to model)", {"objective": {"coverage_weight": 0.0}}),
+    ("no coverage (data to model)", {"volumetric": {"coverage_weight": 0.0}}),
     ("SMD not whitened", {SCHEDULE: {"descent_basis": diagonal_basis}}),
     ("the paper's tolerance, 2° and 2 cm", {SCHEDULE: {"TOLERANCE_DEG": 2.0, "TOLERANCE_M": 0.02}}),
-    ("no prediction", {"tracking": {"prediction": 0.0}}),
-    ("no waist", {"body": {"waist": False}}),
+    ("no prediction", {"tk.trackers.volumetric": {"PREDICTIONS": (0.0,)}}),
     ("no limb search", {"silhouette": {"search_every": 0}}),
-    ("no colour edges", {"contours": {"edge_weight": 0.0}}),
-    ("no colours", {"appearance": {"enabled": False}}),
+    ("no colour edges", {"volumetric": {"edge_weight": 0.0}}),
+    ("no colours", {"volumetric": {"colors": False}}),
     ("shoulders do not rise with the arms", {"tk.model.body.skeleton": {"RAISED_SHOULDERS": 0.0}}),
     ("no penalty for penetration of parts", {"tk.model.cues.objective": {"BARRED": np.zeros_like(BARRED)}}),
 )

@@ -282,7 +282,7 @@ def _search_stages(
     restored = body_and_poses(result)
     if restored is None:
         raise SystemExit(f"{result.path}: has no body in /model")
-    skin = build_superellipsoid_body(restored[0], capture.up, config.body.waist)
+    skin = build_superellipsoid_body(restored[0], capture.up)
     row = np.flatnonzero(result.frames == frame.index)[0]
     pose = convert_poses(restored[1][row], restored[0].skeleton, skin.skeleton)
     hull = VisualHull(capture.rig, VoxelGrid.cover(capture.volume, config.voxels))
@@ -291,10 +291,10 @@ def _search_stages(
     mean, deviation, known = (
         np.asarray(result.model[f"patches/{name}"]) for name in ("mean_yuv", "deviation_yuv", "known")
     )
-    colours = Appearance(mean, mean, deviation, known.astype(bool))
+    colours = Appearance(mean, deviation, known.astype(bool))
 
     def segmented() -> np.ndarray:
-        return colours.segment(surface.colors, surface.seen, config.appearance)
+        return colours.segment(surface.colors, surface.seen)
 
     def built(fits: np.ndarray) -> SurfaceIndex:
         return SurfaceIndex.build(surface.positions, fits, CELL_VOXELS * hull.grid.voxel_m)
@@ -302,7 +302,7 @@ def _search_stages(
     yield Stage("colour segmentation", median_ms(segmented), {})
 
     # the peer knows no colours, so this comparison leaves them out of ours as well
-    objective = BodyObjective(skin, config.objective)
+    objective = BodyObjective(skin, config.volumetric.coverage_weight)
     rng = np.random.default_rng(0)
     samples = objective.draw(rng)
     points = skin.place(pose)[samples].astype(np.float32)

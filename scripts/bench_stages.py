@@ -17,7 +17,7 @@ from tk.kernels.edge_search import search_edges
 from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.raycast import Cast
 from tk.model.body.limb_candidates import limbs_of
-from tk.model.cues.edge_term import ContourTerm
+from tk.model.cues.edge_term import THRESHOLD, ContourTerm
 from tk.model.cues.objective import COVERAGE_VOXELS, BodyObjective
 from tk.model.cues.part_colors import PartColors
 from tk.model.cues.ray_costs import Evidence, RayGrid
@@ -66,8 +66,9 @@ def contour_stages(
     """The volumetric tracker's edge term at a pose (D,): contours, search, and what its entries cost."""
     poses = pose[None]
     images = frame.images
-    term = ContourTerm(objective.body, capture.rig, config.contours)
-    chosen = term.draw(None)[None]
+    term = ContourTerm(objective.body, capture.rig, config.volumetric.edge_weight)
+    chosen = term.draw(None)
+    chosen = chosen[chosen >= 0][None]
     views = len(capture.rig)
     yield Stage(
         f"contours: {chosen.size} strips in {views} views, one launch",
@@ -75,7 +76,7 @@ def contour_stages(
         {},
     )
     *_, lines = term.pairs(term.kernel(poses, chosen))
-    search = partial(search_edges, images, term.sizes, lines, config.contours.threshold)
+    search = partial(search_edges, images, term.sizes, lines, THRESHOLD)
     yield Stage(f"colour edges: search on demand along {len(lines)} lines", median_ms(search), {})
     yield Stage(
         "colour edges: contours, pairs, search and entries", median_ms(lambda: term.assign(images, poses, chosen)), {}

@@ -31,7 +31,7 @@ from tk.model.body.strips import Strips, build_strips, limb_pieces
 from tk.model.body.superellipsoid_body import SuperellipsoidBody, build_superellipsoid_body
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cues.edge_term import ContourTerm
-from tk.settings import ContourSettings
+from tk.settings import VolumetricSettings
 from tk.trackers.bodies import body_and_poses
 
 Float = NDArray[np.float64]
@@ -127,8 +127,9 @@ def figure(body: SuperellipsoidBody, pose: Float, rig: Rig, images: Sequence[Ima
     strips = build_strips(body, range(len(body.pieces)))
     kernel = ContourKernel(body.arrays, strips.angles, strips.normals, strips.piece, pack_cameras(rig))
     contours = kernel(pose[None], np.arange(len(strips.piece))[None])
-    term = ContourTerm(body, rig, ContourSettings())
-    pairs = term.kernel(pose[None], term.draw(None)[None])
+    term = ContourTerm(body, rig, VolumetricSettings.edge_weight)
+    drawn = term.draw(None)
+    pairs = term.kernel(pose[None], drawn[drawn >= 0][None])
     canvases = [panel(image) for image in images] + [np.full_like(panel(images[0]), BLANK)]
     for view, (camera, canvas) in enumerate(zip(rig, canvases, strict=False)):
         draw_pairs(canvas, pairs, view)

@@ -39,9 +39,6 @@ ahead = 0
 effort = 0.1
 [silhouette]
 init_frames = 2
-[silhouette.fit]
-frames = 1
-rounds = 1
 """
 POSE = "[joints]\npelvis = [0, 0, 0.9]\nneck = [0, 0, 1.4]\nhead_top = [0, 0, 1.7]\n"
 #: memory that a case may take; a larger demand fails there and not in the other processes of the machine

@@ -3,7 +3,7 @@
     python -m scripts.sensitivity NAME… --captures CAPTURE… [--factors 0.5 0.7 1.4 2] [--frames A:B] [--masks none]
                                   [--method region] [--config FILE] [--limit 0.1]
 
-NAME is a constant, ``tk.model.cameras.bundle:SEGMENT_M``, or a setting, ``silhouette.fit.rounds``. A dot after a
+NAME is a constant, ``tk.model.cameras.bundle:SEGMENT_M``, or a setting, ``silhouette.lost_error``. A dot after a
 constant's name selects a field, a key or an index: ``tk.trackers.contour_tracker:LINE_SEARCH.robust_px``. Numbers of a
 whole table are multiplied together; integers are rounded.
 

@@ -69,9 +69,6 @@ ahead = 0
 effort = 0.15
 [silhouette]
 init_frames = 3
-[silhouette.fit]
-frames = 2
-rounds = 2
 """
 
 

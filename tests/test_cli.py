@@ -89,13 +89,13 @@ def test_masks_from_a_folder_and_chosen_cameras_are_used(tk: Tk, quick: Path, co
 
 def test_options_override_the_settings_file(tk: Tk, quick: Path, tiny: Path, tmp_path: Path) -> None:
     settings = tmp_path / "settings.toml"
-    settings.write_text(f"seed = 3\n{QUICK}[tracking]\nprediction = 0\n".replace("32", "40"), encoding="utf-8")
+    settings.write_text(f"seed = 3\n{QUICK}prediction = 0\n".replace("32", "40"), encoding="utf-8")
     result = tmp_path / "r.h5"
     ran = tk("track", tiny, "-o", result, "--config", settings, "--voxels", "32", "--frames", ":1")
     assert ran.code == 0, ran.err
     with h5py.File(result, "r") as file:
         config = settings_file.from_toml(file.attrs["config"])
-    assert (config.voxels, config.seed, config.tracking.prediction) == (32, 3, 0.0)
+    assert (config.voxels, config.seed, config.silhouette.prediction) == (32, 3, 0.0)
 
 
 def test_version(tk: Tk) -> None:

@@ -14,11 +14,12 @@ from tk.commands.config_text import annotated_toml, meanings
 from tk.errors import ConfigError
 from tk.io import settings_file
 from tk.io.settings_file import PRESETS
+from tk.model.cues.appearance import RATE
 from tk.model.cues.edge_term import PAIRS, VIEWS
 from tk.model.cues.objective import CHAIN_SAMPLES, TORSO_SAMPLES
 from tk.optim.schedule import REFINE
 from tk.optim.smd import MAX_ITERATIONS, MEMORY, WINDOW
-from tk.settings import Settings
+from tk.settings import Settings, VolumetricSettings
 from tk.trackers.volumetric import points_and_iterations
 
 
@@ -49,62 +50,56 @@ def test_defaults_round_trip() -> None:
 @given(
     voxels=st.integers(8, 512),
     seed=st.integers(0, 2**62),
-    prediction=st.floats(0, 1.5, allow_subnormal=False),
+    weight=st.floats(0, 1000, allow_subnormal=False),
     effort=st.one_of(st.sampled_from(["fast", "normal", "thorough"]), st.floats(0.05, 20)),
-    enabled=st.booleans(),
+    colors=st.booleans(),
     segmentation=st.sampled_from(["collinearity", "mog2"]),
 )
 def test_values_round_trip(
-    voxels: int, seed: int, segmentation: str, prediction: float, effort: str | float, enabled: bool
+    voxels: int, seed: int, segmentation: str, weight: float, effort: str | float, colors: bool
 ) -> None:
     config = Settings(voxels=voxels, seed=seed, segmentation=segmentation, effort=effort)
-    config = dataclasses.replace(
-        config,
-        tracking=dataclasses.replace(config.tracking, prediction=prediction),
-        appearance=dataclasses.replace(config.appearance, enabled=enabled),
-    )
+    config = dataclasses.replace(config, volumetric=VolumetricSettings(colors=colors, edge_weight=weight))
     assert settings_file.from_toml(settings_file.to_toml(config)) == config
 
 
 def test_settings_missing_in_a_file_keep_their_default() -> None:
-    config = settings_file.from_toml("voxels = 128\n[tracking]\nprediction = 1\n")
-    assert config.voxels == 128 and config.tracking.prediction == 1.0
-    assert isinstance(config.tracking.prediction, float)
+    config = settings_file.from_toml("voxels = 128\n[volumetric]\nedge_weight = 1\n")
+    assert config.voxels == 128 and config.volumetric.edge_weight == 1.0
+    assert isinstance(config.volumetric.edge_weight, float)
     changed = {name for name, value in leaves(config) if value != DEFAULTS[name]}
-    assert changed == {"voxels", "tracking.prediction"}
+    assert changed == {"voxels", "volumetric.edge_weight"}
 
 
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
         ("voxel = 3", ["unknown setting voxel", "voxels"]),
-        ("[tracking]\nspeed = 3", ["unknown setting tracking.speed", "prediction"]),
+        ("[volumetric]\nspeed = 3", ["unknown setting volumetric.speed", "edge_weight"]),
         ("[traking]\n", ["unknown setting traking"]),
         ('voxels = "64"', ["voxels", "int"]),
         ("voxels = 64.0", ["voxels", "int"]),
         ("voxels = true", ["voxels", "int"]),
-        ("[tracking]\nprediction = true", ["tracking.prediction", "float"]),
-        ("[appearance]\nenabled = 1", ["appearance.enabled", "bool"]),
-        ("tracking = 3", ["tracking", "table"]),
+        ("[silhouette]\nprediction = true", ["silhouette.prediction", "float"]),
+        ("[volumetric]\ncolors = 1", ["volumetric.colors", "bool"]),
+        ("volumetric = 3", ["volumetric", "table"]),
         ("segmentation = 1", ["segmentation", "str"]),
         ('segmentation = "magic"', ["magic", "collinearity", "mog2"]),
         ("voxels = 2", ["voxels = 2", "8 to 512"]),
         ("seed = -1", ["seed = -1"]),
-        ("[tracking]\nprediction = 7.0", ["prediction = 7.0"]),
-        ("[tracking]\nprediction = 2", ["prediction = 2"]),
+        ("[silhouette]\nprediction = 7.0", ["prediction = 7.0"]),
+        ("[silhouette]\nprediction = 2", ["prediction = 2"]),
         ("[smd]\nmemory = 0.3", ["unknown setting smd"]),
         ('effort = "utmost"', ["utmost", "fast, normal, thorough"]),
         ("effort = true", ["effort", "must be of type"]),
         ("effort = 0.0", ["effort = 0", "from 0.05 to 20"]),
-        ("[appearance]\nrate = 2.0", ["rate = 2.0"]),
-        ("[tracking]\nlost_ratio = 0.5", ["lost_ratio = 0.5"]),
         ("voxels = ", ["invalid TOML"]),
-        ("tracking = " + 3000 * "[", ["invalid TOML"]),
+        ("region = " + 3000 * "[", ["invalid TOML"]),
         ("[silhouette]\ninit_frames = 1000000000\n", ["silhouette.init_frames = 1000000000 is too large"]),
         ("[foreground]\nshadow_min = 1.5", ["foreground.shadow_min = 1.5"]),
-        ("[objective]\nsurface_weight = -1.0\n", ["objective.surface_weight = -1"]),
-        ("[contours]\nthreshold = 1e300\n", ["contours.threshold = 1e+300 is too large"]),
-        (f"[contours]\nthreshold = 1{400 * '0'}\n", ["contours.threshold = 1000", "is too large"]),
+        ("[volumetric]\nedge_weight = -1.0\n", ["volumetric.edge_weight = -1"]),
+        ("[volumetric]\nedge_weight = 1e300\n", ["volumetric.edge_weight = 1e+300 is too large"]),
+        (f"[volumetric]\nedge_weight = 1{400 * '0'}\n", ["volumetric.edge_weight = 1000", "is too large"]),
         ("[region]\nhypotheses = 0\n", ["region.hypotheses = 0"]),
         (f"voxels = 1{5000 * '0'}\n", ["invalid TOML"]),
         ("seed = 99999999999999999999", ["seed"]),
@@ -153,7 +148,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
 
 
 def test_every_default_is_finite() -> None:
-    assert len(NUMBERS) > 10
+    assert len(NUMBERS) > 5
     assert all(math.isfinite(DEFAULTS[name]) for name in NUMBERS)
 
 
@@ -167,7 +162,7 @@ def test_presets_are_valid_and_unlike_the_defaults(name: str) -> None:
 def test_the_papers_preset_has_the_papers_numbers() -> None:
     c = settings_file.preset("kehl2006")
     assert (VIEWS, PAIRS) == (3, 5)
-    assert (c.voxels, c.body.waist, c.appearance.rate) == (64, False, 0.3)
+    assert (c.voxels, RATE) == (64, 0.3)
     assert (TORSO_SAMPLES, CHAIN_SAMPLES, REFINE) == (60, 20, 0.5)
     assert (MEMORY, MAX_ITERATIONS, WINDOW) == (0.3, 40, 3)
     assert points_and_iterations(c.effort_factor) == (1, 40)
@@ -209,18 +204,18 @@ def test_each_setting_is_explained() -> None:
     check(Settings())
 
 
-def test_the_papers_preset_is_the_default_but_for_the_waist_and_the_search() -> None:
+def test_the_papers_preset_is_the_default_but_for_the_search() -> None:
     c = settings_file.preset("kehl2006")
-    assert not c.body.waist and c.silhouette.search_every == 0
+    assert c.silhouette.search_every == 0
     silhouette = dataclasses.replace(c.silhouette, search_every=Settings().silhouette.search_every)
-    assert dataclasses.replace(c, body=Settings().body, silhouette=silhouette) == Settings()
+    assert dataclasses.replace(c, silhouette=silhouette) == Settings()
 
 
 def test_a_file_wins_over_a_preset(tmp_path: Path) -> None:
     file = tmp_path / "own.toml"
-    file.write_text("voxels = 128\n[contours]\nthreshold = 0.2\n")
+    file.write_text("voxels = 128\n[volumetric]\nedge_weight = 0.2\n")
     config = settings_file.read(file, settings_file.preset("kehl2006"))
-    assert (config.voxels, config.contours.threshold, config.body.waist) == (128, 0.2, False)
+    assert (config.voxels, config.volumetric.edge_weight, config.silhouette.search_every) == (128, 0.2, 0)
 
 
 def test_an_unknown_preset_is_named() -> None:

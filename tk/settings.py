@@ -52,96 +52,22 @@ class ForegroundSettings:
 
 
 @dataclass(frozen=True)
-class AppearanceSettings:
-    """Colour models, of --method volumetric, as [body], [objective], [contours] and [tracking].
+class VolumetricSettings:
+    """The terms of the objective of --method volumetric; the weight of its surface term is 1.
 
     Attributes:
-        enabled: whether colour confines the nearest-neighbour search.
-        rate: α of eq. 16 (paper: 0.3).
+        colors: whether a point of the body looks only among voxels of its colour (section 6.1.3 of the paper).
+        coverage_weight: weight of the distances from the visual hull to the body; 0 leaves them out, as the paper does.
+        edge_weight: weight of the distances from the body's contours to edges in the images (6.1.2); 0 leaves them out.
+            The paper prints no weights.
     """
 
-    enabled: bool = True
-    rate: float = 0.3
-
-    def __post_init__(self) -> None:
-        _check("appearance", self, rate=(0, 1))
-
-
-@dataclass(frozen=True)
-class BodySettings:
-    """The body of the volumetric tracker.
-
-    Attributes:
-        waist: whether the pelvis turns against the trunk, by three angles beyond the paper's 24 degrees of freedom. A
-            dancer's hips stay level while the trunk leans; a rigid trunk would tilt them.
-    """
-
-    waist: bool = True
-
-
-@dataclass(frozen=True)
-class ObjectiveSettings:
-    """The objective of --method volumetric (Kehl, section 6.1).
-
-    Attributes:
-        coverage_weight: w_c of the coverage term, from data to model; 0 leaves it out, as the paper does.
-        surface_weight: w_s of eq. 8; 0 leaves the surface term out.
-    """
-
+    colors: bool = True
     coverage_weight: float = 0.7
-    surface_weight: float = 1.0
-
-    def __post_init__(self) -> None:
-        _check("objective", self, coverage_weight=(0, MOST_WEIGHT), surface_weight=(0, MOST_WEIGHT))
-
-
-@dataclass(frozen=True)
-class ContourSettings:
-    """The edge term of --method volumetric (Kehl, section 6.1.2).
-
-    Attributes:
-        edge_weight: w_e (eq. 8) beside the surface term's w_s; 0 leaves the term out. The paper prints neither.
-        threshold: least colour gradient of an edge, 0…1; the paper tuned its own by hand for each camera.
-    """
-
     edge_weight: float = 0.1
-    threshold: float = 0.12
 
     def __post_init__(self) -> None:
-        _check("contours", self, edge_weight=(0, MOST_WEIGHT), threshold=(0, 1))
-
-
-@dataclass(frozen=True)
-class TrackingSettings:
-    """Prediction and loss, of --method volumetric.
-
-    Attributes:
-        prediction: share of the last frame's motion that is predicted for the next one. The paper does not say how it
-            predicts; at 15 Hz an arm turns by up to 31° between frames (its section 7.4).
-        lost_ratio: a frame is lost if its objective exceeds the running mean by this factor.
-    """
-
-    prediction: float = 0.9
-    lost_ratio: float = 3.0
-
-    def __post_init__(self) -> None:
-        _check("tracking", self, prediction=(0, 1.5), lost_ratio=(1, MOST_WEIGHT))
-
-
-@dataclass(frozen=True)
-class BodyFitSettings:
-    """The fit of the body to the silhouettes.
-
-    Attributes:
-        frames: most frames that are used, evenly spaced.
-        rounds: Gauss-Newton iterations.
-    """
-
-    frames: int = 8
-    rounds: int = 6
-
-    def __post_init__(self) -> None:
-        _check("silhouette.fit", self, frames=(1, 200), rounds=(0, 50))
+        _check("volumetric", self, coverage_weight=(0, MOST_WEIGHT), edge_weight=(0, MOST_WEIGHT))
 
 
 @dataclass(frozen=True)
@@ -163,7 +89,6 @@ class SilhouetteSettings:
     init_frames: int = 24
     search_every: float = 0.7
     lost_error: float = 0.6
-    fit: BodyFitSettings = field(default_factory=BodyFitSettings)
 
     def __post_init__(self) -> None:
         _check("silhouette", self, init_frames=(1, 1000), search_every=(0, 5), prediction=(0, 1.5))
@@ -220,11 +145,7 @@ class Settings:
     resample: bool = False
     person_pixels: int = 240
     foreground: ForegroundSettings = field(default_factory=ForegroundSettings)
-    appearance: AppearanceSettings = field(default_factory=AppearanceSettings)
-    body: BodySettings = field(default_factory=BodySettings)
-    objective: ObjectiveSettings = field(default_factory=ObjectiveSettings)
-    contours: ContourSettings = field(default_factory=ContourSettings)
-    tracking: TrackingSettings = field(default_factory=TrackingSettings)
+    volumetric: VolumetricSettings = field(default_factory=VolumetricSettings)
     silhouette: SilhouetteSettings = field(default_factory=SilhouetteSettings)
     region: RegionSettings = field(default_factory=RegionSettings)
 

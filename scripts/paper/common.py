@@ -113,9 +113,9 @@ def track(
     return Track(error, pose, units, iterations, optimise, lost)
 
 
-def contours(config: Settings, **values: Any) -> Settings:
-    """The configuration with other settings of the contour cues."""
-    return replace(config, contours=replace(config.contours, **values))
+def terms(config: Settings, **values: Any) -> Settings:
+    """The settings with other weights of the objective's terms."""
+    return replace(config, volumetric=replace(config.volumetric, **values))
 
 
 def over_seeds(

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-from scripts.paper.common import Options, contours, over_seeds, plt, save, spread, table
+from scripts.paper.common import Options, over_seeds, plt, save, spread, table, terms
 from tk.settings import Settings
 
 
 def variants() -> dict[str, Settings]:
     """The cues by name."""
     default = Settings()
-    without = replace(default, objective=replace(default.objective, coverage_weight=0.0))
+    without = terms(default, coverage_weight=0.0)
     return {
-        "surface": contours(without, edge_weight=0.0),
+        "surface": terms(without, edge_weight=0.0),
         "surface, colour edges": without,
-        "surface, coverage": contours(default, edge_weight=0.0),
+        "surface, coverage": terms(default, edge_weight=0.0),
         "surface, coverage, colour edges": default,
     }
 

@@ -16,8 +16,8 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.objective import Held
-from tk.model.cues.objective import OUTLIERS, Evaluation, FrameObjective, Ints
+from tk.kernels.objective import Evaluation
+from tk.model.cues.objective import OUTLIERS, FrameObjective, Ints
 from tk.optim.schedule import LEVER_M, REFINE, ScheduleResult
 from tk.trackers.volumetric import VolumetricTracker
 
@@ -228,10 +228,10 @@ class FramePoints:
         frame: the frame.
         samples: (M,).
         voxels: (Q,).
-        strips: (K,) strips of the edge term; None without it.
+        strips: (K,) strips of the edge term.
     """
 
-    def __init__(self, frame: FrameObjective, samples: Ints, voxels: Ints, strips: Ints | None) -> None:
+    def __init__(self, frame: FrameObjective, samples: Ints, voxels: Ints, strips: Ints) -> None:
         self._frame = frame
         self._points = samples, voxels
         self._strips = strips
@@ -242,18 +242,18 @@ class FramePoints:
 
     def model(self, pose: Float) -> Quadratic:
         """Return the quadratic model at ``pose`` (D,); outliers weigh as in the Hessian of SMD."""
-        found, held, entries = self._evaluate(pose)
+        found, entries = self._evaluate(pose)
         body = self._frame.objective
         linear = body.kernel.linearise(
-            self._frame.index, *self._points, pose, held, body.settings, OUTLIERS, entries=entries
+            self._frame.index, *self._points, pose, found.held, body.settings, OUTLIERS, entries=entries
         )
-        return Quadratic(float(found.value[0]), found.gradient[0], linear.hessian + np.diag(body.stiffness))
+        return Quadratic(float(found.value[0]), found.gradient[0], linear.hessian)
 
-    def _evaluate(self, pose: Float) -> tuple[Evaluation, Held, NDArray[np.floating] | None]:
-        frame, (samples, voxels) = self._frame, self._points
-        entries = None if self._strips is None else frame.edge_entries(pose[None], self._strips[None])
+    def _evaluate(self, pose: Float) -> tuple[Evaluation, NDArray[np.floating] | None]:
+        frame, (samples, voxels), body = self._frame, self._points, self._frame.objective
+        entries = frame.edge_entries(pose[None], self._strips[None])
         rows = samples[None], voxels[None]
-        return *frame.objective.evaluate(frame.index, *rows, pose[None], None, entries), entries
+        return body.kernel.evaluate(frame.index, *rows, pose[None], None, body.settings, entries=entries), entries
 
 
 class FrameProblem:
@@ -266,16 +266,12 @@ class FrameProblem:
 
     def fixed(self) -> FramePoints:
         """Return the objective of all parameters on one draw of points."""
-        frame = self._frame
-        strips = None if frame.contours is None else frame.contours.draw(frame.rng)
-        return FramePoints(frame, *frame.draw_all(), strips)
+        return FramePoints(self._frame, *self._frame.draw_all())
 
     def fixed_chain(self, chain: int, pose: Float) -> FramePoints:
         """Return the objective of one chain on one draw of points, the rest of the body at ``pose``."""
         frame = self._frame
-        frame.assign_voxels(pose)
-        strips = None if frame.contours is None else frame.contours.draw_chains(frame.rng)[chain]
-        return FramePoints(frame, *frame.draw_chain(chain), strips)
+        return FramePoints(frame, *(rows[chain] for rows in frame.draw_chains(frame.chain_voxels(pose))))
 
 
 @contextmanager

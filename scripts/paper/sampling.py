@@ -76,9 +76,9 @@ def look(options: Options, paper: Settings) -> Scene:
     # colours do not confine the neighbours here: the arm's own are what it could not mistake
     every = np.full(len(surface), -1, np.int64)
     index = SurfaceIndex.build(surface.positions, every, CELL_VOXELS * tracker.hull.grid.voxel_m)
-    term = ContourTerm(skin, capture.rig, paper.contours)
+    term = ContourTerm(skin, capture.rig, paper.volumetric.edge_weight)
     with few_points:
-        objective = BodyObjective(skin, paper.objective, term)
+        objective = BodyObjective(skin, paper.volumetric.coverage_weight, term)
     frame = FrameObjective(objective, index, np.random.default_rng(0), images=observation.images)
     two = np.array([skin.skeleton.index(name) for name in ANGLES])
     return Scene(frame, estimate.pose, two)

@@ -13,11 +13,10 @@ import pytest
 from tests.made_results import write_motion
 from tk.io.results.status import Status
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.joints import WAIST
 from tk.model.body.skeleton import Skeleton, build_skeleton
 
 BODY = BodyDimensions.from_stature(1.75)
-SKELETON = build_skeleton(BODY, optional=(WAIST,))
+SKELETON = build_skeleton(BODY)
 FRAMES, FPS, FIRST = 24, 12.5, 5
 LOST = (10, 11)
 

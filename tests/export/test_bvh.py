@@ -9,7 +9,6 @@ from bvh import Bvh
 
 from tests.export.conftest import FPS, FRAMES, LOST, SKELETON, Write
 from tk.export import export, read_motion
-from tk.model.body.joints import WAIST
 from tk.model.body.rotations import turn
 from tk.model.body.skeleton import JOINTS, build_skeleton
 
@@ -92,7 +91,7 @@ def test_only_moving_nodes_have_position_channels(write: Write) -> None:
 
 
 def test_another_axis_up(write: Write) -> None:
-    skeleton = build_skeleton(read_motion(write())[0].dimensions, "-y", optional=(WAIST,))
+    skeleton = build_skeleton(read_motion(write())[0].dimensions, "-y")
     (target,) = export(write("y.h5", skeleton, up="-y"), ["bvh"]).files
     (other,) = export(write("z.h5", SKELETON), ["bvh"]).files
     a, b = places(target, 3), places(other, 3)

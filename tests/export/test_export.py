@@ -59,7 +59,7 @@ def test_csv_of_angles(write: Write) -> None:
 
 
 def test_without_a_waist(write: Write) -> None:
-    skeleton = build_skeleton(BodyDimensions.from_stature(1.75))
+    skeleton = build_skeleton(BodyDimensions.from_stature(1.75), paper=True)
     motion, _ = read_motion(write(skeleton=skeleton))
     np.testing.assert_allclose(motion.rotation("pelvis"), motion.rotation("torso"), atol=1e-12)
 

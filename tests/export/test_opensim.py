@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from tests.export.conftest import BODY, FIRST, FPS, FRAMES, LOST, SKELETON, Write, poses
 from tk.export import export, read_motion
 from tk.export.mot import coordinates
-from tk.model.body.joints import WAIST
 from tk.model.body.rotations import compose, follow_rotations, turn
 from tk.model.body.skeleton import JOINTS, build_skeleton
 
@@ -78,7 +77,7 @@ def test_trc_holds_the_joints(write: Write) -> None:
 
 
 def test_trc_is_upright_whatever_the_world(write: Write) -> None:
-    skeleton = build_skeleton(read_motion(write())[0].dimensions, "-y", optional=(WAIST,))
+    skeleton = build_skeleton(read_motion(write())[0].dimensions, "-y")
     a = read_trc(export(write("a.h5"), ["trc"]).files[0]).points
     b = read_trc(export(write("b.h5", skeleton, up="-y"), ["trc"]).files[0]).points
     # the same pose: about the pelvis the same points; the root's coordinates are along the world's axes in both

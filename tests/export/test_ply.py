@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import open3d
 import pytest
 
 from tests.conftest import Tk
-from tests.export.conftest import BODY, FIRST, FRAMES, LOST, Write, poses
+from tests.export.conftest import BODY, FIRST, FRAMES, LOST, SKELETON, Write, poses
 from tests.model.figures import skin_of
 from tk.errors import ExportError
 from tk.export import export
@@ -25,7 +26,7 @@ def test_mesh_of_each_frame_lies_on_the_body(write: Write) -> None:
     assert folder.name == "walk_ply"
     files = sorted(folder.iterdir())
     assert [file.name for file in files] == [f"{FIRST + f:06d}.ply" for f in range(FRAMES)]
-    body = skin_of(BODY, waist=True)
+    body = replace(skin_of(BODY), skeleton=SKELETON)
     for f in (0, 7, FRAMES - 1):
         mesh = read(files[f])
         scene = open3d.t.geometry.RaycastingScene()

@@ -11,20 +11,19 @@ from tk.kernels.nearest import SurfaceIndex
 from tk.kernels.objective import ObjectiveParameters
 from tk.model.cues.edge_term import ContourTerm
 from tk.model.cues.objective import BodyObjective
-from tk.settings import ContourSettings, ObjectiveSettings
 
 SKELETON = BODY.skeleton
 D = len(SKELETON.names)
 # nothing but the entries: one sample that finds no voxel, a constant
-SILENT = ObjectiveParameters(0.1, 1e-6, nu=0.35, coverage_nu=0.7, surface_weight=1.0, coverage_weight=0.0)
+SILENT = ObjectiveParameters(0.1, 1e-6, nu=0.35, coverage_nu=0.7, coverage_weight=0.0)
 INDEX = SurfaceIndex.build(np.full((1, 3), 50.0), np.full(1, -1), 0.1)
 # sums of some sixty terms near 1 in double precision
 EXACT = 1e-10
 
 
 def kernel_of(dtype=np.float64):
-    term = ContourTerm(BODY, RIG, ContourSettings(), dtype=dtype)
-    return BodyObjective(BODY, ObjectiveSettings(), term, dtype=dtype).kernel
+    term = ContourTerm(BODY, RIG, 0.1, dtype=dtype)
+    return BodyObjective(BODY, 0.7, term, dtype=dtype).kernel
 
 
 @pytest.fixture(scope="module")

@@ -21,9 +21,8 @@ D = len(SKELETON.names)
 SAMPLE_DOF = SKELETON.segment_dof[BODY.segment]
 PIECE_DOF = SKELETON.segment_dof[[SEGMENTS.index(p.segment) for p in BODY.pieces]]
 
-BOTH = ObjectiveParameters(0.1, 0.3, nu=0.35, coverage_nu=0.7, surface_weight=1.0, coverage_weight=0.7)
+BOTH = ObjectiveParameters(0.1, 0.3, nu=0.35, coverage_nu=0.7, coverage_weight=0.7)
 SURFACE = replace(BOTH, coverage_weight=0.0)
-COVERAGE = replace(BOTH, surface_weight=0.0)
 # sums of some hundred terms near 1 / 100 in double precision
 EXACT = 1e-11
 # derivatives by central differences of 1e-6
@@ -81,7 +80,7 @@ def pairs_oracle(scene, b, held, settings):
     """The pairs of pose b, samples before voxels: x (NaN if none), x̄, ∂x/∂p (K, 3, D), ν, share."""
     n, v = scene.chosen[b], held.assigned[b]
     local, dof, y = BODY.points[n], SAMPLE_DOF[n], scene.index.positions[v]
-    nu, scale = np.full(len(n), settings.nu), np.full(len(n), settings.surface_weight / len(n))
+    nu, scale = np.full(len(n), settings.nu), np.full(len(n), 1 / len(n))
     missing = v < 0
     if settings.coverage_weight > 0:
         q, i = scene.voxels[b], held.covering[b, :, 0].astype(int)
@@ -119,10 +118,9 @@ cases = pytest.mark.parametrize(
     [
         BOTH,
         SURFACE,
-        COVERAGE,
-        ObjectiveParameters(0.2, 0.2, nu=2.0, coverage_nu=0.3, surface_weight=0.6, coverage_weight=2.5),
+        ObjectiveParameters(0.2, 0.2, nu=2.0, coverage_nu=0.3, coverage_weight=2.5),
     ],
-    ids=["both", "surface", "coverage", "others"],
+    ids=["both", "surface", "others"],
 )
 
 
@@ -179,7 +177,7 @@ def test_value(kernel, case):
     value, _, _, held = scene.evaluate(kernel, case)
     expected = [value_oracle(scene, b, held, case) for b in range(3)]
     np.testing.assert_allclose(value, expected, rtol=0, atol=EXACT)
-    assert (value > 0).all() and (value < case.surface_weight + case.coverage_weight).all()
+    assert (value > 0).all() and (value < 1 + case.coverage_weight).all()
 
 
 @cases

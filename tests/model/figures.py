@@ -27,11 +27,9 @@ def surface_points(body: ConeBody, pose: np.ndarray, part: np.ndarray, unscaled:
     return (T[:, :3, :3] @ body.local(part, unscaled)[:, :, None])[:, :, 0] + T[:, :3, 3]
 
 
-def skin_of(
-    dimensions: BodyDimensions, up: str = "z", waist: bool = False, spacing_m: float = SPACING_M
-) -> SuperellipsoidBody:
+def skin_of(dimensions: BodyDimensions, up: str = "z", spacing_m: float = SPACING_M) -> SuperellipsoidBody:
     """The skin of a body with these dimensions whose parts are as they are on an average."""
-    return build_superellipsoid_body(build_cone_body(dimensions, up), up, waist, spacing_m)
+    return build_superellipsoid_body(build_cone_body(dimensions, up), up, spacing_m)
 
 
 def piece_transforms(body: SuperellipsoidBody, pose: np.ndarray) -> np.ndarray:

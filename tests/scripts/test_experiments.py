@@ -79,8 +79,8 @@ def test_optimisers_differ_only_in_the_optimiser_and_the_number_of_points(
 def test_cues_are_what_their_names_say() -> None:
     found = cues.variants()
     for name, config in found.items():
-        assert (config.contours.edge_weight > 0) == ("edges" in name)
-        assert (config.objective.coverage_weight > 0) == ("coverage" in name)
+        assert (config.volumetric.edge_weight > 0) == ("edges" in name)
+        assert (config.volumetric.coverage_weight > 0) == ("coverage" in name)
     assert len(set(found.values())) == len(found)
 
 

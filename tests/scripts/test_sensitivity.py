@@ -57,11 +57,11 @@ def test_table_names_values_errors_and_range() -> None:
     def errors(run: Run) -> np.ndarray:
         return np.array([[1.0, 2.0], [1.5, 2.5]]) + 0.09 * abs(run.factor - 1)
 
-    lines = list(measure("silhouette.fit.rounds", [0.5, 0.95, 2.0, 3.0], errors, 0.1))
-    rounds = value_of("silhouette.fit.rounds")
-    assert lines[0] == f"silhouette.fit.rounds = {rounds}" and len(lines) == 6  # 0.95 rounds to the same
+    lines = list(measure("silhouette.init_frames", [0.5, 0.99, 2.0, 3.0], errors, 0.1))
+    frames = value_of("silhouette.init_frames")
+    assert lines[0] == f"silhouette.init_frames = {frames}" and len(lines) == 6  # 0.99 rounds to the same
     assert "1.09  2.09" in lines[3] and "mean  1.34  2.34" in lines[3]
-    assert lines[-1] == f"changes by less than 0.1 cm: {round(rounds / 2)} to {2 * rounds}"
+    assert lines[-1] == f"changes by less than 0.1 cm: {round(frames / 2)} to {2 * frames}"
 
 
 def test_constant_and_numbers_derived_from_it_change_in_a_process_of_its_own() -> None:
@@ -97,8 +97,8 @@ def test_tiny_capture_is_tracked_with_each_value(
     config = tmp_path / "quick.toml"
     config.write_text(QUICK, encoding="utf-8")
     options = ["--factors", "0.5", "--frames", "0:3", "--masks", "auto", "--config", str(config), "--limit", "100"]
-    main(["silhouette.fit.rounds", "--captures", str(tiny), *options])
+    main(["silhouette.init_frames", "--captures", str(tiny), *options])
     lines = capsys.readouterr().out.splitlines()
     plain, changed = (line.split("mean")[1] for line in lines[2:4])
     assert plain.split()[:2] != changed.split()[:2] and "nan" not in changed
-    assert lines[-1] == "changes by less than 100 cm: 1 to 2"
+    assert lines[-1] == "changes by less than 100 cm: 2 to 3"

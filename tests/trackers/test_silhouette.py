@@ -11,7 +11,7 @@ from tk.model.body.cone_body import build_cone_body
 from tk.model.body.skeleton import JOINTS
 from tk.model.masks.silhouettes import draw_silhouettes
 from tk.model.setup import InitPose
-from tk.settings import BodyFitSettings, SilhouetteSettings
+from tk.settings import SilhouetteSettings
 from tk.trackers.silhouette import SilhouetteTracker
 
 RIG = ring_of_cameras(3, width=240, height=300)
@@ -85,12 +85,11 @@ def test_stature_is_estimated_from_the_silhouettes():
 def test_start_adapts_the_body_dimensions():
     thick = scaled(BODY.dimensions, thigh_radius=1.25, head_radius=1.15)
     masks = draw_silhouettes(build_cone_body(thick), RIG, POSES[:3])
-    config = SilhouetteSettings(fit=BodyFitSettings(frames=2, rounds=5))
-    tracker = SilhouetteTracker(RIG, "z", config)
+    tracker = SilhouetteTracker(RIG, "z", SilhouetteSettings())
     init = init_of(POSES[0])
     tracker.start([observe(m, i) for i, m in enumerate(masks)], None, init)
     found = tracker.body.dimensions
-    # what is known of bodies holds radii back a little: two frames, edgels that are taken to err by 3 px
+    # what is known of bodies holds radii back a little: three frames, edgels that are taken to err by 3 px
     for name in ("thigh_radius", "head_radius"):
         true, average = getattr(thick, name), getattr(BODY.dimensions, name)
         assert 0.5 < (getattr(found, name) - average) / (true - average) < 1.2, name

@@ -24,9 +24,6 @@ QUICK = """
 ahead = 0
 [silhouette]
 init_frames = 3
-[silhouette.fit]
-frames = 2
-rounds = 3
 """
 
 

@@ -8,7 +8,7 @@ from tests.trackers.walker import BODY, STATURE, errors, observe, walk
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.volume import Volume
 from tk.model.masks.silhouettes import draw_silhouettes
-from tk.settings import ContourSettings, Settings
+from tk.settings import Settings, VolumetricSettings
 from tk.trackers.volumetric import VolumetricTracker
 
 
@@ -19,7 +19,7 @@ def test_limb_search_recovers_a_displaced_arm(angles: tuple[float, ...]) -> None
     pose = walk(1)[0]
     masks = draw_silhouettes(BODY, rig, pose[None])[0]
     images = np.full((*masks.shape, 3), 90, np.uint8)
-    config = Settings(voxels=48, contours=ContourSettings(edge_weight=0.0))  # one colour has no edges
+    config = Settings(voxels=48, volumetric=VolumetricSettings(edge_weight=0.0))  # one colour has no edges
     tracker = VolumetricTracker(rig, Volume((0, 0, 1), (2, 2, 2.2)), "z", config)
     tracker.start([observe(masks, 0, images)], STATURE, None, BODY)
     model, state = dict(tracker.model()), dict(tracker.state())

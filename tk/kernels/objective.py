@@ -19,6 +19,7 @@ the Hessian of eq. 19 is approximated, as Schraudolph does, by the positive semi
 
 import functools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -179,7 +180,6 @@ class ObjectiveParameters:
     # nu, coverage_nu: Leclerc's ν of the surface and of the coverage term, in units of ½ (d/σ)²
     nu: float
     coverage_nu: float
-    surface_weight: float  # w_s of eq. 8
     coverage_weight: float  # w_c of the coverage term; 0 removes it, as in the paper
 
 
@@ -190,6 +190,15 @@ class Held:
     assigned: np.ndarray  # (B, M) voxel of each sample, -1 without
     # (B, Q, 4) piece of each voxel, -1 without, and the nearest point in the zero configuration, metres
     covering: np.ndarray
+
+
+class Evaluation(NamedTuple):
+    """The objective at B poses."""
+
+    value: np.ndarray  # (B,) mean ρ of the samples, plus the weighted mean ρ of the voxels, plus the entries' shares
+    gradient: np.ndarray  # (B, D)
+    hessian_vector: np.ndarray  # (B, D)
+    held: Held  # the assignments made
 
 
 @dataclass(frozen=True)
@@ -260,7 +269,7 @@ class ObjectiveKernel:
     def _packed(self, s: ObjectiveParameters, M: int, Q: int, index: SurfaceIndex) -> np.ndarray:
         """Pack the settings in the kernels' order, from INV_SIGMA2 to GRID."""
         values = 1 / s.sigma_m**2, s.reach_m, s.nu, s.coverage_nu
-        shares = s.surface_weight / max(M, 1), s.coverage_weight / max(Q, 1)
+        shares = 1 / max(M, 1), s.coverage_weight / max(Q, 1)
         return np.array([*values, *shares, *index.grid.tolist()], self.dtype)
 
     def evaluate(
@@ -273,7 +282,7 @@ class ObjectiveKernel:
         settings: ObjectiveParameters,
         held: Held | None = None,
         entries: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Held]:
+    ) -> Evaluation:
         """Return value, gradient and Hessian-vector product at B poses.
 
         Args:
@@ -285,10 +294,6 @@ class ObjectiveKernel:
             settings: constants.
             held: assignments to use instead of a new search.
             entries: (B, E, 16) of the alignment term (:mod:`tk.kernels.alignment`), if it counts.
-
-        Returns:
-            f (B,): ``surface_weight`` times mean ρ over the samples plus ``coverage_weight`` times mean ρ over the
-            voxels, plus the entries' shares; its gradient (B, D); H·v (B, D); the assignments made.
         """
         E = 0 if entries is None else entries.shape[1]
         B, D = pose.shape
@@ -323,7 +328,7 @@ class ObjectiveKernel:
         )
         # the tasks' sums are added in a fixed order: the same input gives the same bits
         total = sums.reshape(B, tasks, -1).sum(axis=1, dtype=np.float64)
-        return total[:, 0], total[:, 1 : 1 + D], total[:, 1 + D :], found
+        return Evaluation(total[:, 0], total[:, 1 : 1 + D], total[:, 1 + D :], found)
 
     def linearise(
         self,

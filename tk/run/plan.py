@@ -19,7 +19,7 @@ from tk.io.results.data import JointAngles, ResultMeta
 from tk.io.settings_file import to_toml
 from tk.model.body.angles import ANGLES
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.skeleton import OPTIONAL, SEGMENTS, build_skeleton
+from tk.model.body.skeleton import SEGMENTS, build_skeleton
 from tk.model.setup import Setup, Subject
 from tk.run.prefetch import TIMING_STAGES, Observations, open_observations
 from tk.run.segmentation import mask_source, sources_of_masks
@@ -46,7 +46,7 @@ def recording_setup(capture: Capture, init_pose: Path | None, body: Path | None,
     """
     setup = capture.setup()
     subjects: list[Subject] = []
-    names = build_skeleton(BodyDimensions.from_stature(1.7), optional=OPTIONAL).names
+    names = build_skeleton(BodyDimensions.from_stature(1.7)).names
     for subject, given in zip(setup.subjects, capture.subjects, strict=True):
         first = not subjects
         pose_file = init_pose if first and init_pose else capture.path / given.init if given.init else None

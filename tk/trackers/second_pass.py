@@ -25,7 +25,6 @@ from tk.model.body.joint_sigma import directions, posture_variance
 from tk.model.body.skeleton import JOINTS, Skeleton
 from tk.model.cues.ray_costs import Evidence, mean_of_views, residual_of
 from tk.model.masks.silhouettes import Pyramid
-from tk.settings import BodyFitSettings
 from tk.trackers.contour_tracker import GAIN, SAME_POSE_M
 from tk.trackers.hypotheses import MARGIN, RENEWAL, Hypothesis, disagreement
 
@@ -34,8 +33,8 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-# Settings of the body fit, and how far a frame may move from its pose in the first pass.
-FIT = BodyFitSettings(frames=24, rounds=4)
+# Frames of the body fit, and how far a frame may move from its pose in the first pass.
+FIT_FRAMES = 24
 ANGLE_DEG = 15.0
 # Standard deviation of the logarithm of the stature about that of the first fit, where no height was given.
 STATURE = 0.03
@@ -88,11 +87,11 @@ class SecondPass:
         tracker, tracked = self.tracker, self.tracked
         opening = tracked[: tracker.contours.init_frames : 3]
         error = np.nanmean(self.residual[tracked].sum(axis=2), axis=1)
-        chosen = np.union1d(opening, _lowest(tracked, error, FIT.frames - len(opening)))
+        chosen = np.union1d(opening, _lowest(tracked, error, FIT_FRAMES - len(opening)))
         stature = height_m or tracker.body.dimensions.stature
         deviation = STATURE_DEVIATION if height_m else STATURE
         seen = [self._pyramid(i) for i in chosen]
-        body, _ = tracker.fit(seen, self.poses[chosen], np.arange(len(chosen)), stature, FIT, deviation)
+        body, _ = tracker.fit(seen, self.poses[chosen], np.arange(len(chosen)), stature, deviation)
         tracker.take_body(body)
 
     def optimise(self) -> None:

@@ -28,7 +28,6 @@ from tk.io.results.revision import revise_result
 from tk.io.results.status import Status
 from tk.io.results.writer import ResultWriter
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.joints import OPTIONAL
 from tk.model.body.skeleton import JOINTS, build_skeleton, paper_poses
 
 
@@ -220,7 +219,7 @@ def test_suspect_frames_have_a_pose_and_absent_frames_have_none(tmp_path: Path) 
 
 
 def test_paper_pose_is_derived_from_the_names_of_the_pose(tmp_path: Path) -> None:
-    skeleton = build_skeleton(BodyDimensions.from_stature(1.7), optional=OPTIONAL)
+    skeleton = build_skeleton(BodyDimensions.from_stature(1.7))
     path = tmp_path / "result.h5"
     pose = skeleton.clip(np.linspace(-0.3, 0.3, 31))
     with ResultWriter.create(path, replace(META, pose_names=skeleton.names, pose_units=skeleton.units)) as writer:

@@ -10,12 +10,11 @@ from hypothesis import strategies as st
 from tk.model.body.angles import ANGLES, FORWARD_UP_RIGHT, MIRROR, joint_angles, segment_rotations, standing_axes
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.gait_poses import neutral_pose
-from tk.model.body.joints import WAIST
 from tk.model.body.rotations import compose
 from tk.model.body.skeleton import JOINTS, SEGMENTS, Skeleton, build_skeleton, shoulder_angles
 
 BODY = BodyDimensions.from_stature(1.75)
-SKELETON = build_skeleton(BODY, optional=(WAIST,))
+SKELETON = build_skeleton(BODY)
 BY_JOINT = {angles.joint: angles for angles in ANGLES}
 
 
@@ -159,7 +158,7 @@ def test_mirrored_poses_have_mirrored_angles(seed: int) -> None:
 @pytest.mark.parametrize("up", ["z", "-y", "x"])
 def test_angles_do_not_depend_on_the_axis_that_is_up(up: str) -> None:
     pose = np.random.default_rng(3).uniform(-0.5, 0.5, len(SKELETON.names))
-    skeleton = build_skeleton(BODY, up, optional=(WAIST,))
+    skeleton = build_skeleton(BODY, up)
     a, b = angles_of(pose), angles_of(pose, skeleton)
     for joint in BY_JOINT:
         assert a[joint] == pytest.approx(b[joint], abs=1e-6)

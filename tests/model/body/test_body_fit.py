@@ -21,7 +21,6 @@ from tk.model.body.skeleton import SEGMENTS
 from tk.model.cues.part_colors import PartColors
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Views, draw_silhouettes
-from tk.settings import BodyFitSettings
 
 STATURE = 1.75
 VIEWS = Views(ring_of_cameras(3, width=240, height=300))
@@ -147,7 +146,7 @@ def test_lengths_of_a_known_body_are_recovered(monkeypatch):
     body = build_cone_body(true)
     poses = walk(body, 4)
     start = poses + np.random.default_rng(0).normal(0, 0.01, poses.shape)
-    found, fitted = fit_body(VIEWS, pyramids_of(body, poses), start, SEARCH, true.stature, BodyFitSettings(16, 4))
+    found, fitted = fit_body(VIEWS, pyramids_of(body, poses), start, SEARCH, true.stature)
     for name in ("thigh", "calf", "upper_arm", "forearm"):
         assert getattr(found.dimensions, name) == pytest.approx(getattr(true, name), rel=0.02), name
     off = [
@@ -167,7 +166,7 @@ def test_shapes_are_recovered_as_mirror_images():
     true = AVERAGE.reshaped(change)
     poses = walk(true, 3)
     seen = pyramids_of(true, poses)
-    found, fitted = fit_body(VIEWS, seen, poses, SEARCH, STATURE, BodyFitSettings(16, 4))
+    found, fitted = fit_body(VIEWS, seen, poses, SEARCH, STATURE)
     grid, group = RayGrid(VIEWS.rig, 150), PartColors(AVERAGE).group
 
     def error(body, poses):
@@ -182,15 +181,6 @@ def test_shapes_are_recovered_as_mirror_images():
             assert parts[part.name[:-2] + "_r"].shape == pytest.approx(part.shape)
     start = {part.name: part for part in AVERAGE.parts}
     assert parts["thigh_l"].shape[0] > 1.08 * start["thigh_l"].shape[0]
-
-
-def test_without_rounds_the_average_body_is_returned():
-    poses = walk(AVERAGE, 1)
-    seen = pyramids_of(AVERAGE, poses)
-    found, fitted = fit_body(VIEWS, seen, poses, SEARCH, STATURE, BodyFitSettings(rounds=0))
-    np.testing.assert_array_equal(fitted, poses)
-    for name in DIMENSIONS:
-        assert getattr(found.dimensions, name) == pytest.approx(getattr(AVERAGE.dimensions, name), rel=1e-12)
 
 
 def test_ends_of_a_part_move_separately_and_mirrored():

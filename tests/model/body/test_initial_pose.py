@@ -21,7 +21,7 @@ seeds = st.integers(0, 2**32 - 1)
 def test_joints_of_the_rough_pose_are_near_the_written_ones(seed):
     """A body of average proportions in an everyday pose."""
     rng = np.random.default_rng(seed)
-    skeleton = build_skeleton(BodyDimensions.from_stature(1.8))
+    skeleton = build_skeleton(BodyDimensions.from_stature(1.8), paper=True)
     rest = neutral_pose(skeleton)
     for side in ("l", "r"):
         hanging = shoulder_angles(np.array([0.1, 0.3, -0.95]))
@@ -32,7 +32,9 @@ def test_joints_of_the_rough_pose_are_near_the_written_ones(seed):
     pose[:4] = [*rng.uniform(-1, 1, 3), rng.uniform(-np.pi, np.pi)]
     joints = dict(zip(JOINTS, skeleton.joints(pose), strict=True))
     dimensions, _, found = rough_pose(joints, {}, 1.8, WORLD)
-    error = np.linalg.norm(build_skeleton(dimensions).joints(WORLD.poses_out(found)) - skeleton.joints(pose), axis=1)
+    error = np.linalg.norm(
+        build_skeleton(dimensions, paper=True).joints(WORLD.poses_out(found)) - skeleton.joints(pose), axis=1
+    )
     assert error.max() < 0.04 and error.mean() < 0.02
 
 

@@ -16,10 +16,9 @@ from tk.model.body.joint_sigma import (
     posture_variance,
     view_variance,
 )  # fmt: skip
-from tk.model.body.joints import OPTIONAL
 from tk.model.body.skeleton import JOINTS, build_skeleton
 
-SKELETON = build_skeleton(BodyDimensions.from_stature(1.75), optional=OPTIONAL)
+SKELETON = build_skeleton(BodyDimensions.from_stature(1.75))
 NAMES = SKELETON.names
 
 

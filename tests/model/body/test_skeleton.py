@@ -9,7 +9,7 @@ from scipy.linalg import expm
 from tk.errors import ConfigError
 from tk.model.body.anthropometry import FRACTIONS, RAISED_SHOULDERS, BodyDimensions
 from tk.model.body.gait_poses import neutral_pose
-from tk.model.body.joints import OPTIONAL, ROWS, WAIST
+from tk.model.body.joints import ROWS, WAIST
 from tk.model.body.skeleton import (
     CHAINS,
     JOINTS,
@@ -24,7 +24,7 @@ from tk.model.body.skeleton import (
 )
 
 DIMENSIONS = BodyDimensions.from_stature(1.75)
-SKELETON = build_skeleton(DIMENSIONS)
+SKELETON, PAPER = build_skeleton(DIMENSIONS), build_skeleton(DIMENSIONS, paper=True)
 D = len(SKELETON.names)
 EXACT = 1e-12
 UPS = ("x", "y", "z", "-x", "-y", "-z")
@@ -50,25 +50,25 @@ def joints(pose, skeleton=SKELETON):
     return dict(zip(JOINTS, skeleton.joints(pose), strict=True))
 
 
-def mirrored(pose):
+def mirrored(pose, skeleton=SKELETON):
     """The pose of the body reflected in the plane y = 0 of the zero configuration."""
-    result = np.empty(D)
-    for k, name in enumerate(SKELETON.names):
+    result = np.empty(len(pose))
+    for k, name in enumerate(skeleton.names):
         partner = name.replace("_l_", "_#_").replace("_r_", "_l_").replace("_#_", "_r_")
         # what moves along y, or turns about an axis in the plane of symmetry, changes its sign
-        sign = -1 if name in ("torso_y", "torso_yaw", "torso_roll", "neck_yaw") else 1
-        result[SKELETON.index(partner)] = sign * pose[k]
+        sign = -1 if name in ("torso_y", "torso_yaw", "torso_roll", "neck_yaw", "waist_roll", "waist_yaw") else 1
+        result[skeleton.index(partner)] = sign * pose[k]
     return result
 
 
 # The tree
 
 
-def test_joints_parents_and_degrees_of_freedom_of_the_skeleton():
-    s = SKELETON
-    assert len(s.names) == len(set(s.names)) == D == 24
+def test_joints_parents_and_degrees_of_freedom_of_the_papers_skeleton():
+    s = PAPER
+    assert len(s.names) == len(set(s.names)) == 24
     assert s.units == ("m",) * 3 + ("rad",) * 21
-    assert (s.parent < np.arange(D)).all() and s.parent[0] == -1
+    assert (s.parent < np.arange(24)).all() and s.parent[0] == -1
     np.testing.assert_allclose(np.linalg.norm(s.axis, axis=1), 1)
     assert [s.names[k] for k in s.segment_dof] == [
         "torso_pitch",
@@ -87,70 +87,36 @@ def test_joints_parents_and_degrees_of_freedom_of_the_skeleton():
     ]
 
 
-# The waist
+def test_waist_and_ankles_are_seven_more_degrees_of_freedom():
+    s = SKELETON
+    assert tuple(np.array(s.names)[~s.is_straight]) == PAPER.names
+    assert (s.parent < np.arange(D)).all() and D == 31
+    assert tuple(np.array(s.names)[s.is_waist]) == ROWS[WAIST].dof_names
+    legs = {"pelvis"} | {f"{segment}_{side}" for segment in ("thigh", "calf", "foot") for side in "lr"}
+    moving = {WAIST: legs, "ankle_l": {"foot_l"}, "ankle_r": {"foot_r"}}
+    for joint, segments in moving.items():
+        moved = s.ancestors[:, np.isin(s.names, ROWS[joint].dof_names)]
+        assert {SEGMENTS[k] for k in np.flatnonzero(moved.all(axis=1))} == segments
+        assert (moved.any(axis=1) == moved.all(axis=1)).all()
 
-WAISTED = build_skeleton(DIMENSIONS, optional=(WAIST,))
 
-
-def waisted_poses(count=20, up="z"):
-    skeleton = build_skeleton(DIMENSIONS, up, optional=(WAIST,))
-    poses = np.random.default_rng(3).normal(0, 0.4, (count, len(skeleton.names)))
-    return skeleton, skeleton.clip(poses)
-
-
-def test_a_waist_is_three_more_degrees_of_freedom_between_trunk_and_pelvis():
-    assert tuple(np.array(WAISTED.names)[~WAISTED.is_waist]) == SKELETON.names
-    assert tuple(np.array(WAISTED.names)[WAISTED.is_waist]) == ROWS[WAIST].dof_names
-    assert (WAISTED.parent < np.arange(27)).all()
-    moved = WAISTED.ancestors[:, WAISTED.is_waist]
-    below = {SEGMENTS[s] for s in np.flatnonzero(moved.all(axis=1))}
-    assert (
-        below == {"pelvis", "thigh_l", "calf_l", "foot_l", "thigh_r", "calf_r", "foot_r"}
-        and (moved.any(axis=1) == moved.all(axis=1)).all()
+def test_straight_waist_and_ankles_change_nothing():
+    poses = SKELETON.clip(np.random.default_rng(3).normal(0, 0.4, (20, D)))
+    poses[:, SKELETON.is_straight] = 0
+    found, expected = (
+        s.segment_transforms(p) for s, p in ((SKELETON, poses), (PAPER, poses[:, ~SKELETON.is_straight]))
     )
-    assert not np.array([WAISTED.chain_dofs(c) for c in CHAINS])[:, WAISTED.is_waist].any()
-
-
-def test_a_straight_waist_changes_nothing():
-    _, poses = waisted_poses()
-    poses[:, WAISTED.is_waist] = 0
-    for pose in poses:
-        np.testing.assert_allclose(WAISTED.joints(pose), SKELETON.joints(pose[~WAISTED.is_waist]), atol=EXACT)
-
-
-# The whole skeleton, with waist and ankles
-
-
-def whole(up="z"):
-    return build_skeleton(DIMENSIONS, up, optional=OPTIONAL)
-
-
-def is_ankle(skeleton):
-    return skeleton.is_straight & ~skeleton.is_waist
-
-
-def test_ankles_are_two_more_degrees_of_freedom_a_side_that_move_the_foot_only():
-    skeleton = whole()
-    assert len(skeleton.names) == 31 and OPTIONAL == (WAIST, "ankle")
-    assert tuple(np.array(skeleton.names)[~skeleton.is_straight]) == SKELETON.names
-    for side in "lr":
-        moved = skeleton.ancestors[:, [skeleton.index(f"ankle_{side}_{n}") for n in ("flexion", "inversion")]]
-        assert [s for s, m in zip(SEGMENTS, moved.any(axis=1), strict=True) if m] == [f"foot_{side}"]
-        assert moved[SEGMENTS.index(f"foot_{side}")].all()
-    pose = np.random.default_rng(0).uniform(-0.5, 0.5, 31)
-    bent = pose.copy()
-    bent[is_ankle(skeleton)] = 0.3
-    np.testing.assert_array_equal(skeleton.joints(bent), skeleton.joints(pose), err_msg="no joint is below an ankle")
+    np.testing.assert_allclose(found, expected, atol=EXACT)
 
 
 @pytest.mark.parametrize("side", ["l", "r"])
 def test_signs_of_the_ankles_are_anatomical(side):
     """Flexion lifts the toes, inversion turns the sole inwards; the limits are those of a foot."""
-    skeleton = whole()
+    skeleton = SKELETON
     foot = SEGMENTS.index(f"foot_{side}")
 
     def turned(name):
-        pose = np.zeros(31)
+        pose = np.zeros(D)
         pose[skeleton.index(f"ankle_{side}_{name}")] = 0.2
         return skeleton.segment_transforms(pose)[foot][:3, :3]
 
@@ -160,16 +126,14 @@ def test_signs_of_the_ankles_are_anatomical(side):
     for name, low, high in (("flexion", -60, 40), ("inversion", -30, 40)):
         k = skeleton.index(f"ankle_{side}_{name}")
         np.testing.assert_allclose(np.degrees([skeleton.lower[k], skeleton.upper[k]]), [low, high])
-    assert (skeleton.clip(np.full(31, -9.0))[is_ankle(skeleton)] < 0).all()
 
 
 @pytest.mark.parametrize("up", ["z", "-y"])
 @given(seed=seeds)
 @settings(max_examples=20)
 def test_paper_pose_keeps_the_orientation_of_trunk_head_and_limbs(up, seed):
-    skeleton = whole(up)
-    poses = skeleton.clip(np.random.default_rng(seed).normal(0, 0.5, (2, 31)))
-    plain = build_skeleton(DIMENSIONS, up)
+    skeleton, plain = (build_skeleton(DIMENSIONS, up, paper) for paper in (False, True))
+    poses = skeleton.clip(np.random.default_rng(seed).normal(0, 0.5, (2, D)))
     paper = paper_poses(skeleton, poses)
     assert paper.shape == (2, 24)
     np.testing.assert_array_equal(paper[1], paper_poses(skeleton, poses[1]))
@@ -182,18 +146,18 @@ def test_paper_pose_keeps_the_orientation_of_trunk_head_and_limbs(up, seed):
 
 
 def test_poses_of_another_skeleton_are_taken_by_name():
-    pose = SKELETON.clip(random_pose(3))
-    full = convert_poses(pose, SKELETON, whole())
-    assert not full[whole().is_straight].any()
-    np.testing.assert_array_equal(full[np.isin(whole().names, SKELETON.names)], pose)
-    np.testing.assert_allclose(convert_poses(full, whole(), SKELETON), pose, atol=1e-12)
+    pose = PAPER.clip(random_pose(3)[:24])
+    full = convert_poses(pose, PAPER, SKELETON)
+    assert not full[SKELETON.is_straight].any()
+    np.testing.assert_array_equal(full[np.isin(SKELETON.names, PAPER.names)], pose)
+    np.testing.assert_allclose(convert_poses(full, SKELETON, PAPER), pose, atol=1e-12)
 
 
 def test_skeleton_is_found_by_the_names_of_its_pose_vector():
-    for skeleton in (SKELETON, WAISTED, whole()):
+    for skeleton in (SKELETON, PAPER):
         assert skeleton_of_names(skeleton.names, DIMENSIONS, "z").names == skeleton.names
     with pytest.raises(ValueError, match="waist_pitch"):
-        skeleton_of_names([name for name in whole().names if name != "waist_pitch"], DIMENSIONS, "z")
+        skeleton_of_names([name for name in SKELETON.names if name != "waist_pitch"], DIMENSIONS, "z")
 
 
 @pytest.mark.parametrize("up", ["z", "-y"])
@@ -201,8 +165,8 @@ def test_skeleton_is_found_by_the_names_of_its_pose_vector():
 @settings(max_examples=20)
 def test_transforms_are_the_products_of_exponentials(up, seed):
     """T_k = T_parent(k) exp(ξ_k p_k), one after the other; a raised arm lifts its shoulder."""
-    skeleton = whole(up)
-    pose = np.random.default_rng(seed).uniform(-np.pi, np.pi, 31)
+    skeleton = build_skeleton(DIMENSIONS, up)
+    pose = random_pose(seed)
     expected = []
     for k, parent in enumerate(skeleton.parent):
         step = np.eye(4)
@@ -222,7 +186,7 @@ def test_transforms_are_the_products_of_exponentials(up, seed):
 def test_chains_and_torso_share_out_the_degrees_of_freedom():
     free = np.array([SKELETON.chain_dofs(c) for c in CHAINS])
     assert free.sum(axis=0).max() == 1
-    assert free.sum(axis=1).tolist() == [2, 4, 4, 4, 4]
+    assert free.sum(axis=1).tolist() == [2, 4, 4, 6, 6]
     assert [SKELETON.names[k] for k in np.flatnonzero(~free.any(axis=0))] == [
         "torso_x",
         "torso_y",
@@ -230,6 +194,9 @@ def test_chains_and_torso_share_out_the_degrees_of_freedom():
         "torso_yaw",
         "torso_roll",
         "torso_pitch",
+        "waist_roll",
+        "waist_pitch",
+        "waist_yaw",
     ]
     for chain, moved in zip(CHAINS, free, strict=True):
         # a chain's degrees of freedom move its own segments and no others
@@ -248,7 +215,7 @@ def test_ancestors_are_what_moves_a_segment():
 @given(seeds)
 @many
 def test_lengths_do_not_depend_on_the_pose(seed):
-    d, j = DIMENSIONS, joints(random_pose(seed))
+    d, j = DIMENSIONS, joints(random_pose(seed)[:24], PAPER)
     pelvis = (j["hip_l"] + j["hip_r"]) / 2
     np.testing.assert_allclose(j["pelvis"], pelvis, atol=EXACT)
     lengths = {("pelvis", "neck"): d.trunk, ("neck", "head_top"): d.head, ("hip_l", "hip_r"): 2 * d.hip_half_width}

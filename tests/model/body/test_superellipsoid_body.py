@@ -128,7 +128,7 @@ def mirror_pieces():
 def test_mirrored_pose_gives_the_mirrored_surface(seed):
     """Every sample, reflected, lies on the partner of its piece at the reflected pose."""
     pose = np.random.default_rng(seed).uniform(-np.pi, np.pi, len(BODY.skeleton.names))
-    there = mirrored(pose)
+    there = mirrored(pose, BODY.skeleton)
     points = BODY.place(pose)
     partners = mirror_pieces()
     for i in range(len(BODY.pieces)):

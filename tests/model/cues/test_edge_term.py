@@ -1,7 +1,6 @@
 """The contour cues of a body: which points, views and weights; and that the truth explains its own pictures."""
 
 import functools
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -15,16 +14,20 @@ from tk.model.body.strips import LIMBS
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cues.edge_term import VIEWS, ContourTerm
 from tk.model.cues.objective import BodyObjective, FrameObjective
-from tk.settings import ContourSettings, ObjectiveSettings
 
-EDGES = ContourSettings(edge_weight=1.0)
 TRUTH = some_poses(1, seed=21)[0]
 # rendered from 3 × 10⁴ triangles a piece, sampled at whole pixels, searched at half pixels
 NEAR_PX = 1.5
 
 
-def term_of(config=EDGES, rig=RIG):
-    return ContourTerm(BODY, rig, config)
+def term_of(weight=1.0, rig=RIG):
+    return ContourTerm(BODY, rig, weight)
+
+
+def strips_of(term, rng=None):
+    """Strips (K,) of all limbs."""
+    drawn = term.draw(rng)
+    return drawn[drawn >= 0]
 
 
 @functools.cache
@@ -62,13 +65,13 @@ def residual_px(entries, pose, b=0):
 
 def assigned(term, poses, chosen=None):
     poses = np.atleast_2d(poses)
-    chosen = np.repeat(term.draw(None)[None], len(poses), 0) if chosen is None else chosen
+    chosen = np.repeat(strips_of(term)[None], len(poses), 0) if chosen is None else chosen
     return term.assign(pictures(), poses, chosen), term.kernel(poses, chosen)
 
 
 def test_colour_edges_are_searched_in_the_views_with_the_fewest_hidden_points():
     poses = some_poses(6, seed=22)
-    term = term_of(EDGES)
+    term = term_of()
     entries, points = assigned(term, poses)
     hidden = np.sum(points.found != points.visible, axis=(2, 3))
     fewer = False
@@ -85,7 +88,7 @@ def test_limbs_only_have_edges():
     limbs = {int(BODY.skeleton.segment_dof[SEGMENTS.index(s)]) for s in LIMBS}
     term = term_of()
     head = list(CHAINS).index("head")
-    for chosen in (term.draw(None)[None], term.draw_chains(None)[[head]]):
+    for chosen in (strips_of(term)[None], term.draw(None)[[head]]):
         entries = term.assign(pictures(), TRUTH[None], chosen)[0]
         found = {int(k) for k in entries[entries[:, a.STATE] != a.ABSENT, a.LAST_DOF]}
         assert found == (limbs if len(chosen[0]) > 20 else set())
@@ -108,8 +111,7 @@ def test_hidden_points_cost_and_pull_nowhere():
 
 
 def test_weights_sum_to_the_terms_weight():
-    config = replace(EDGES, edge_weight=0.7)
-    entries, _ = assigned(term_of(config), some_poses(3, seed=24))
+    entries, _ = assigned(term_of(0.7), some_poses(3, seed=24))
     scale = np.where(entries[..., a.STATE] == a.ABSENT, 0, entries[..., a.SCALE])
     np.testing.assert_allclose(scale.sum(axis=1), 0.7, rtol=1e-5)
     assert (scale >= 0).all()
@@ -127,7 +129,7 @@ def test_edge_cost_is_least_at_the_true_pose():
 def test_pictures_pull_a_displaced_body_back():
     """The value grows, and its gradient points uphill, as an arm is turned away."""
     index = SurfaceIndex.build(np.full((1, 3), 50.0), np.full(1, -1), 0.1)
-    body = BodyObjective(BODY, ObjectiveSettings(coverage_weight=0.0), term_of())
+    body = BodyObjective(BODY, 0.0, term_of())
     frame = FrameObjective(body, index, np.random.default_rng(0), images=pictures())
     for axis in (0, 2):
         for sign in (-1, 1):
@@ -141,7 +143,7 @@ def test_pictures_pull_a_displaced_body_back():
 def test_a_batch_equals_its_poses_one_by_one():
     term = term_of()
     poses = some_poses(3, seed=25)
-    chosen = np.stack([term.draw(np.random.default_rng(i)) for i in range(3)])
+    chosen = np.stack([strips_of(term, np.random.default_rng(i)) for i in range(3)])
     together = term.assign(pictures(), poses, chosen)
     for b in range(3):
         alone = term.assign(pictures(), poses[b : b + 1], chosen[b : b + 1])[0]
@@ -152,7 +154,7 @@ def test_a_batch_equals_its_poses_one_by_one():
 def test_strips_of_the_chains_are_their_own():
     term = term_of()
     for generator in (None, np.random.default_rng(0)):
-        drawn = term.draw_chains(generator)
+        drawn = term.draw(generator)
         for row, chain in zip(drawn, CHAINS.values(), strict=True):
             if set(chain) & {*LIMBS}:
                 assert {BODY.pieces[i].segment for i in term.strips.piece[row]} == set(chain) & {*LIMBS}
@@ -176,6 +178,6 @@ def test_a_body_that_nobody_sees_has_no_entries():
         np.diag([-1.0, 1, -1]) @ looks_away.rotation,
         np.diag([-1.0, 1, -1]) @ looks_away.translation,
     )
-    term = term_of(EDGES, Rig((turned,)))
-    entries = term.assign(pictures()[:1], TRUTH[None], term.draw(None)[None])
+    term = term_of(rig=Rig((turned,)))
+    entries = term.assign(pictures()[:1], TRUTH[None], strips_of(term)[None])
     assert not (entries[..., a.STATE] != a.ABSENT).any()

@@ -7,16 +7,16 @@ import pytest
 
 from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.joints import FOOT_POINTS
-from tk.model.body.skeleton import JOINTS, OPTIONAL, build_skeleton
+from tk.model.body.skeleton import JOINTS, build_skeleton
 from tk.model.motion.segments import foot_points, joint_positions
 
 BODY = BodyDimensions.from_stature(1.75)
 
 
 @pytest.mark.parametrize("up", ["z", "-y"])
-@pytest.mark.parametrize("optional", [(), OPTIONAL])
-def test_agrees_with_the_skeleton(up: str, optional: tuple[str, ...]) -> None:
-    skeleton = build_skeleton(BODY, up, optional)
+@pytest.mark.parametrize("paper", [False, True])
+def test_agrees_with_the_skeleton(up: str, paper: bool) -> None:
+    skeleton = build_skeleton(BODY, up, paper)
     poses = np.random.default_rng(1).uniform(-1, 1, (7, len(skeleton.names)))
     T = skeleton.segment_transforms(poses)
     joints = joint_positions(skeleton, T)
@@ -27,7 +27,7 @@ def test_agrees_with_the_skeleton(up: str, optional: tuple[str, ...]) -> None:
 
 def test_feet_stand_on_the_floor() -> None:
     skeleton = build_skeleton(BODY)
-    T = skeleton.segment_transforms(np.zeros((1, 24)))
+    T = skeleton.segment_transforms(np.zeros((1, 31)))
     feet = foot_points(skeleton, BODY, T)[0]
     ankle = joint_positions(skeleton, T)[0, JOINTS.index("ankle_l")]
     np.testing.assert_allclose(feet[:, 2], ankle[2] - BODY.ankle_height)

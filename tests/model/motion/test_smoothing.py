@@ -7,12 +7,11 @@ import pytest
 from scipy.interpolate import make_smoothing_spline
 
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.joints import WAIST
 from tk.model.body.skeleton import build_skeleton
 from tk.model.motion import smoothing
 from tk.model.motion.smoothing import SHORTEST, smooth
 
-SKELETON = build_skeleton(BodyDimensions.from_stature(1.75), optional=(WAIST,))
+SKELETON = build_skeleton(BodyDimensions.from_stature(1.75), paper=True)
 D = len(SKELETON.names)
 FPS = 60.0
 NOISE = 0.03

@@ -20,17 +20,16 @@ from tk.model.body.body_parameters import BodyFamily
 from tk.model.body.cone_body import ConeBody
 from tk.model.cameras.bundle import INFORMATION, LONGEST_STEP, SPACING_PX, BundleFrame, ContourBundle
 from tk.model.masks.silhouettes import Pyramid, Views
-from tk.settings import BodyFitSettings
 
 Float = NDArray[np.float64]
 
 # More frames than this do not make the body more certain: shapes that no cone has err alike in all frames. With 4 to 16
 # the mean errors of walk and dance (60 frames) change by less than 0.1 cm.
 _INFORMATIVE_FRAMES = 8
-
-
 # Prior standard deviation of the logarithm of the stature about a given height: 1 %, of shoes, posture and measurement.
 STATURE_DEVIATION = 0.01
+# Gauss-Newton iterations.
+ROUNDS = 6
 
 
 def fit_body(
@@ -39,7 +38,6 @@ def fit_body(
     poses: Float,
     settings: SearchSettings,
     stature_m: float,
-    config: BodyFitSettings,
     stature_deviation: float = STATURE_DEVIATION,
 ) -> tuple[ConeBody, Float]:
     """Fit a body and poses to several frames.
@@ -50,7 +48,6 @@ def fit_body(
         poses: (F, D) initial poses, close enough for the edge search to find the right edges.
         settings: of the edge search.
         stature_m: the subject's height without shoes, given or estimated, metres.
-        config: see :class:`BodyFitSettings`.
         stature_deviation: prior standard deviation of the logarithm of the stature about ``stature_m``.
 
     Returns:
@@ -65,5 +62,5 @@ def fit_body(
         INFORMATION / max(len(poses) / _INFORMATIVE_FRAMES, 1.0),
         segment_m=None,
     )
-    state = minimise(bundle.start, bundle.linearise, bundle.move, [0] * config.rounds, LONGEST_STEP).state
+    state = minimise(bundle.start, bundle.linearise, bundle.move, [0] * ROUNDS, LONGEST_STEP).state
     return bundle.family.build(state.body), state.poses

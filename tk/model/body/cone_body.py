@@ -26,7 +26,7 @@ from tk.model.body.anthropometry import (
     PELVIS_FORWARD,
     BodyDimensions,
 )
-from tk.model.body.joints import ARM, CHAIN_OF_SEGMENT, CROOK, ELBOW_AXIS, LIMBS, OPTIONAL, ROWS, SEGMENTS
+from tk.model.body.joints import ARM, CHAIN_OF_SEGMENT, CROOK, ELBOW_AXIS, LIMBS, ROWS, SEGMENTS
 from tk.model.body.skeleton import Skeleton, build_skeleton, up_rotation
 
 Float = NDArray[np.float64]
@@ -83,7 +83,7 @@ class ConeBody:
         """Return the same body in a world in which ``up`` (see :func:`tk.model.cameras.up.up_vector`) points up."""
         if np.array_equal(self.skeleton.T_world_body, up_rotation(up)):
             return self
-        return replace(self, skeleton=build_skeleton(self.dimensions, up, OPTIONAL))
+        return replace(self, skeleton=build_skeleton(self.dimensions, up))
 
     @cached_property
     def arrays(self) -> ConeArrays:
@@ -232,7 +232,7 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z") -> ConeBody:
         low = ankle + ANKLE_OUTWARD * d.stature * (M @ y)
         parts.append(_between(f"thigh_{side}", f"thigh_{side}", top, hollow, d.thigh_radius, d.knee_radius))
         parts += _calf(side, hollow, low, d) + _foot(side, ankle, d)
-    return ConeBody(d, build_skeleton(d, up, OPTIONAL), tuple(parts))
+    return ConeBody(d, build_skeleton(d, up), tuple(parts))
 
 
 def _calf(side: str, knee: Float, ankle: Float, d: BodyDimensions) -> list[ConePart]:

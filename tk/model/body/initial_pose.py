@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tk.model.block_least_squares import Equations, minimise
 from tk.model.body.anthropometry import FRACTIONS, BodyDimensions
 from tk.model.body.gait_poses import neutral_pose
-from tk.model.body.joints import HIPS, LIMBS, OPTIONAL, SHOULDERS
+from tk.model.body.joints import HIPS, LIMBS, SHOULDERS
 from tk.model.body.skeleton import JOINTS, Skeleton, build_skeleton, shoulder_angles
 from tk.model.cameras.tracker_frame import TrackerFrame
 from tk.model.setup import AVERAGE_STATURE_M
@@ -46,12 +46,12 @@ def rough_pose(
     """
     dimensions = BodyDimensions.from_stature(height_m or _stature_of(joints) or AVERAGE_STATURE_M)
     if angles:
-        skeleton = build_skeleton(dimensions, optional=OPTIONAL)
+        skeleton = build_skeleton(dimensions)
         pose = neutral_pose(skeleton)
         for name, value in angles.items():
             pose[skeleton.index(name)] = value
         return dimensions, skeleton, world.poses_in(skeleton.clip(pose))
-    skeleton = build_skeleton(dimensions)
+    skeleton = build_skeleton(dimensions, paper=True)
     rows = np.array([JOINTS.index(name) for name in joints])
     return dimensions, skeleton, _fitted(skeleton, rows, world.points_in(list(joints.values())))
 

@@ -42,7 +42,6 @@ class Dof:
     # standard deviation, degrees, of a joint that is nearly straight in most frames: its prior is about zero. Infinite:
     # the prior is about the predicted angle.
     straight_deg: float = np.inf
-    stiffness: float = 0.0  # of the volumetric tracker's spring to zero, as a factor of the setting
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ class Joint:
     chain: str = ""  # the chain that is optimised as one (section 6.4); empty for the trunk
     carrier: str = ""  # the segment that carries the joint centre in `/joints/position`; empty: not an output
     bone_from: str = ""  # the joint at the other end of the bone in drawings; empty at the root
-    optional: bool = False  # whether a simpler body omits its degrees of freedom
+    added_dofs: bool = False  # whether its degrees of freedom are beyond the paper's 24
     offset_m: float = np.nan  # constant offset of the output joint from a ground truth's, root mean square, metres
     # True for an output joint beyond the 15 that every result and ground truth has; readers return NaN for a file
     # without it
@@ -116,8 +115,7 @@ def _neck(d: BodyDimensions) -> Float:
 # eversion 21±5.
 #
 # Standard deviations of waist and ankles about zero, degrees. Chosen on the development captures; half and twice the
-# value change the mean errors of walk (32 frames) by 0.01 cm. Stiffness of the waist: nothing outlines
-# the pelvis from the front, and a hip can turn as well as it.
+# value change the mean errors of walk (32 frames) by 0.01 cm.
 _WAIST_DEG, _ANKLE_DEG = 12.0, 20.0
 # `offset_m`: the median offset in the trunk's frame, which `tk evaluate` removes, root mean square over walk, dance,
 # fold, cube, treadmill-slow, rig9 and sixteen, both sides.
@@ -127,10 +125,10 @@ _MIDDLE = (
         Dof("yaw", _Z), Dof("roll", _X, -80.0, 80.0), Dof("pitch", _Y),
     )),
     Joint("waist", lambda d: np.array([0.0, 0.0, WAIST_HEIGHT * d.trunk]), above="torso", turns="pelvis", dofs=(
-        Dof("roll", _X, -30.0, 30.0, straight_deg=_WAIST_DEG, stiffness=1.0),
-        Dof("pitch", -_Y, -25.0, 50.0, straight_deg=_WAIST_DEG, stiffness=3.0),
-        Dof("yaw", _Z, -35.0, 35.0, straight_deg=_WAIST_DEG, stiffness=5.0),
-    ), optional=True),
+        Dof("roll", _X, -30.0, 30.0, straight_deg=_WAIST_DEG),
+        Dof("pitch", -_Y, -25.0, 50.0, straight_deg=_WAIST_DEG),
+        Dof("yaw", _Z, -35.0, 35.0, straight_deg=_WAIST_DEG),
+    ), added_dofs=True),
     Joint("pelvis", lambda d: np.zeros(3), above="waist", carrier="pelvis", offset_m=0.017),
     Joint("neck", _neck, above="torso", turns="head", chain="head", carrier="torso", bone_from="pelvis", dofs=(
         Dof("pitch", _Y, -70.0, 65.0), Dof("yaw", _X, -50.0, 50.0),
@@ -155,7 +153,7 @@ _LEG_ROWS = (
           dofs=(Dof("flexion", _Y, -10.0, 160.0),), offset_m=0.023),
     Joint("ankle", _ankle, above="knee", turns="foot", chain="leg", carrier="calf", bone_from="knee",
           dofs=(Dof("flexion", -_Y, -60.0, 40.0, straight_deg=_ANKLE_DEG),
-                Dof("inversion", -_X, -30.0, 40.0, straight_deg=_ANKLE_DEG)), optional=True, offset_m=0.011),
+                Dof("inversion", -_X, -30.0, 40.0, straight_deg=_ANKLE_DEG)), added_dofs=True, offset_m=0.011),
 )  # fmt: skip
 
 
@@ -191,10 +189,8 @@ ROWS = {row.name: row for row in TABLE}
 JOINTS = tuple(row.name for added in (False, True) for row in TABLE if row.carrier and row.added == added)
 #: those that every result and ground truth has
 REQUIRED_JOINTS = tuple(name for name in JOINTS if not ROWS[name].added)
-#: segments of `/segments/rotation`: what the paper's joints turn, then what optional joints turn
-SEGMENTS = tuple(row.turns for optional in (False, True) for row in TABLE if row.turns and row.optional == optional)
-#: kinds of joints whose degrees of freedom a simpler body omits
-OPTIONAL = tuple(dict.fromkeys(row.kind for row in TABLE if row.optional))
+#: segments of `/segments/rotation`: what the paper's joints turn, then what the others turn
+SEGMENTS = tuple(row.turns for added in (False, True) for row in TABLE if row.turns and row.added_dofs == added)
 #: bones of drawings, as pairs of joints
 BONES = tuple((row.bone_from, row.name) for row in TABLE if row.bone_from)
 #: the segments of the chains that are optimised one by one with the torso held (section 6.4)

@@ -21,7 +21,7 @@ while the trunk leans; the paper's torso takes them along.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -36,7 +36,6 @@ from tk.model.body.joints import (
     CHAINS,
     HIPS,
     JOINTS,
-    OPTIONAL,
     ROWS,
     SEGMENTS,
     SHOULDERS,
@@ -47,7 +46,7 @@ from tk.model.body.joints import (
 )
 from tk.model.cameras.up import up_vector
 
-__all__ = ["CHAINS", "JOINTS", "OPTIONAL", "SEGMENTS"]
+__all__ = ["CHAINS", "JOINTS", "SEGMENTS"]
 
 Float = NDArray[np.float64]
 
@@ -82,7 +81,6 @@ class Skeleton:
     # (D,) radians, standard deviation about zero of a joint that is nearly straight in most frames; infinite for the
     # others
     straight: Float
-    stiffness: Float  # (D,) of the volumetric tracker's spring to zero, as a factor of the setting
     segment_dof: NDArray[np.int32]  # (S,) the last degree of freedom above each segment
     joint_segment: NDArray[np.int32]  # (J,) the segment that carries each joint
     joint_position: Float  # (J, 3) joint centres in the zero configuration, metres
@@ -304,7 +302,7 @@ def convert_poses(poses: Float, source: Skeleton, target: Skeleton) -> Float:
 
 def paper_poses(skeleton: Skeleton, poses: Float) -> Float:
     """(..., 24) poses (..., D) in the degrees of freedom of the paper's body; the hips are angles against the trunk."""
-    return convert_poses(poses, skeleton, build_skeleton(BodyDimensions.from_stature(1.75)))
+    return convert_poses(poses, skeleton, build_skeleton(BodyDimensions.from_stature(1.75), paper=True))
 
 
 def _with_waist_in_hips(skeleton: Skeleton, poses: Float) -> Float:
@@ -336,9 +334,14 @@ def up_rotation(up: str) -> Float:
     return np.column_stack([x, np.cross(z, x), z])
 
 
-def build_skeleton(dimensions: BodyDimensions, up: str = "z", optional: Collection[str] = ()) -> Skeleton:
-    """The skeleton with these dimensions, standing upright along ``up``: the paper's 24 degrees of freedom, and those
-    of the ``optional`` joints, some of :data:`OPTIONAL`."""
+def build_skeleton(dimensions: BodyDimensions, up: str = "z", paper: bool = False) -> Skeleton:
+    """Return the skeleton with these dimensions, standing upright along ``up``.
+
+    Args:
+        dimensions: lengths, metres.
+        up: see :func:`up_rotation`.
+        paper: whether it has the paper's 24 degrees of freedom only: no waist, no ankles.
+    """
     B = up_rotation(up) if up != "z" else np.eye(3)
     dofs: list[tuple[Joint, Dof, str]] = []
     parents: list[int] = []
@@ -346,7 +349,7 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z", optional: Collecti
     segment_dof: dict[str, int] = {}
     for row in TABLE:
         last[row.name] = last[row.above]
-        for dof, name in zip(row.dofs, row.dof_names, strict=True) if not row.optional or row.kind in optional else ():
+        for dof, name in zip(row.dofs, row.dof_names, strict=True) if not (paper and row.added_dofs) else ():
             parents.append(last[row.name])
             dofs.append((row, dof, name))
             last[row.name] = len(dofs) - 1
@@ -368,7 +371,6 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z", optional: Collecti
         lower=np.radians([dof.lower for _, dof, _ in dofs]),
         upper=np.radians([dof.upper for _, dof, _ in dofs]),
         straight=np.radians([dof.straight_deg for _, dof, _ in dofs]),
-        stiffness=np.array([dof.stiffness for _, dof, _ in dofs]),
         segment_dof=np.array([segment_dof[s] for s in SEGMENTS], dtype=np.int32),
         joint_segment=np.array([SEGMENTS.index(row.carrier) for row in joints], dtype=np.int32),
         joint_position=np.array([row.place(dimensions) for row in joints]) @ B.T,
@@ -377,14 +379,14 @@ def build_skeleton(dimensions: BodyDimensions, up: str = "z", optional: Collecti
 
 
 def skeleton_of_names(names: Sequence[str], dimensions: BodyDimensions, up: str) -> Skeleton:
-    """The skeleton whose pose vector has entries of these names, in this order.
+    """Return the skeleton whose pose vector has entries of these names, in this order.
 
     Raises:
         ValueError: no skeleton has them.
     """
-    has = {row.kind for row in TABLE if not {*row.dof_names}.isdisjoint(names)}
-    skeleton = build_skeleton(dimensions, up, has)
-    if skeleton.names != tuple(names):
-        different = sorted({*skeleton.names} ^ {*names}) or ["other order"]
-        raise ValueError(f"the pose vector is not one of this body ({different[0]})")
-    return skeleton
+    found = [build_skeleton(dimensions, up, paper) for paper in (False, True)]
+    for skeleton in found:
+        if skeleton.names == tuple(names):
+            return skeleton
+    different = sorted({*found[0].names} ^ {*names}) or ["other order"]
+    raise ValueError(f"the pose vector is not one of this body ({different[0]})")

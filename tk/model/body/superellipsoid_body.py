@@ -17,7 +17,6 @@ from tk.kernels.cones import CONE
 from tk.kernels.pieces import PieceArrays, pack_pieces
 from tk.model.body.cone_body import ConeBody, ConePart, group_of
 from tk.model.body.gait_poses import neutral_pose
-from tk.model.body.joints import WAIST
 from tk.model.body.skeleton import SEGMENTS, Skeleton, build_skeleton
 from tk.model.body.superellipsoid import Superellipsoid
 
@@ -63,19 +62,15 @@ class SuperellipsoidBody:
         return np.asarray(np.einsum("nab,nb->na", T[:, :3, :3], self.points) + T[:, :3, 3])
 
 
-def build_superellipsoid_body(
-    body: ConeBody, up: str = "z", waist: bool = False, spacing_m: float = SPACING_M
-) -> SuperellipsoidBody:
-    """Build the superellipsoid body of a cone body.
+def build_superellipsoid_body(body: ConeBody, up: str = "z", spacing_m: float = SPACING_M) -> SuperellipsoidBody:
+    """Build the superellipsoid body of a cone body, with the paper's 24 degrees of freedom: no waist, no ankles.
 
     Args:
         body: its dimensions and parts.
         up: the world axis that points up.
-        waist: whether the pelvis turns against the trunk, by three degrees of freedom beyond the paper's 24. There are
-            no ankles, as in the paper: a foot moves with its calf.
         spacing_m: distance between neighbouring surface samples.
     """
-    skeleton = build_skeleton(body.dimensions, up, (WAIST,) if waist else ())
+    skeleton = build_skeleton(body.dimensions, up, paper=True)
     pieces = tuple(piece_of(part) for part in body.parts)
     points, normals = [], []
     for piece in pieces:
