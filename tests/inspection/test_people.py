@@ -72,6 +72,20 @@ def test_people_who_cross_keep_their_numbers(tk: Tk, crossing: Path, tmp_path: P
     assert min(plan.shape[:2]) > 500
 
 
+def test_people_outside_the_volume_make_no_camera_inconsistent(tk: Tk, tmp_path: Path) -> None:
+    write_walkers(tmp_path, [[(-0.3, -0.5), (0.3, -0.5)], [(2.2, 0.9), (0.9, 0.9)]])
+    ran = tk("inspect", tmp_path, "--json")
+    assert ran.code == 0, ran.err
+    found = json.loads(ran.out)
+    first, second = found["people"]
+    assert first["enters"] == 0 and 0 < second["enters"] < FRAMES and 0 < second["inside"] < 1
+    assert found["extent_m"] == pytest.approx(1.75, abs=0.1)
+    assert max(camera["outside"] for camera in found["cameras"]) < 0.05
+    findings = "\n".join(found["findings"])
+    assert "do not belong together" not in findings and "something else" not in findings
+    assert f"person 1 enters the volume at about frame {second['enters']}" in findings
+
+
 def test_one_person_is_listed_without_a_finding(tk: Tk, tmp_path: Path) -> None:
     write_walkers(tmp_path, [[(-0.3, 0.0), (0.3, 0.0)]])
     ran = tk("inspect", tmp_path)

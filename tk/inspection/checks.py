@@ -3,7 +3,8 @@
 The masks of ten frames are compared through the calibration (:mod:`tk.model.masks.mask_agreement`, the test that
 `tk track` makes at its start): do they have a visual hull in common, which camera is inconsistent, by how many pixels,
 and would its video be consistent some frames earlier or later? Further checks: each camera's masks, the working volume,
-the floor, and the up direction.
+the floor, and the up direction. If there are several people and the pixels of person 0 are consistent, the checks are
+of these pixels.
 """
 
 from __future__ import annotations
@@ -200,10 +201,17 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
             if frame.index in kept:
                 images[frame.index] = frame.images.copy()
     compare = MaskAgreement(capture.rig, capture.volume)
+    people = watch.people()
+    agreement = compare.compare([masks[int(i)] for i in frames])
+    if len(people) > 1:
+        own = {index: watch.of_first(index, m) for index, m in masks.items()}
+        alone = compare.compare([own[int(i)] for i in frames])
+        if not (alone.refusal or alone.wrong or alone.disagreement > INCONSISTENT):
+            # the others are people, not what a turned camera shows of one person
+            masks, agreement = own, alone
     chosen = [masks[int(i)] for i in frames]
-    agreement = compare.compare(chosen)
     late = _delays(compare, masks, centers, agreement)
-    hulls = compare.hulls([compare.small(m) for m in chosen])
+    hulls = compare.hulls([compare.possible(m) for m in chosen])
     good = agreement.right
     points = [hull.points(good) for hull in hulls if hull is not None]
     leveling = find_up(capture.rig, capture.up, points)
@@ -222,7 +230,7 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
         seen_by_two=float((views >= 2).mean()),
         at_border=float(at_border.mean()) if len(p) else float("nan"),
         leveling=leveling,
-        people=watch.people(),
+        people=people,
         findings=(),
         notes=tuple(notes),
     )
@@ -241,7 +249,7 @@ def _delays(
     """Return the delay of each camera (C,) frames: the shift with which its masks lie in the hull of the others."""
     C = len(compare.rig)
     small = {index: compare.small(m) for index, m in masks.items()}
-    hulls = compare.hulls([small[i] for i in centers])
+    hulls = compare.hulls([compare.possible(masks[i]) for i in centers])
     shifts = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 1)
     late = np.zeros(C, np.int64)
     out = np.zeros((C, len(shifts)))

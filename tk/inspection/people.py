@@ -10,7 +10,11 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from tk.io.captures.capture import Capture
+from tk.model.cues.ray_costs import RayGrid
 from tk.model.people import LocatedPerson, PeopleFinder, order_people
+from tk.trackers.contour_tracker import CHOICE_ROWS
+from tk.trackers.protocol import Observation
+from tk.trackers.sharing import UNKNOWN_BY_HULLS, assign, cast_points
 
 Float = NDArray[np.float64]
 
@@ -36,6 +40,7 @@ class PersonReport:
         path: (K, 3) m, world, positions in these frames.
         height_m: median extent along up.
         inside: share of these frames in which the person is in the working volume.
+        enters: first of these frames in which the person is in the working volume, or None.
         views: (K,) number of cameras that show the person.
         cameras: names of the cameras that show the person in most of these frames.
     """
@@ -45,6 +50,7 @@ class PersonReport:
     path: tuple[tuple[float, float, float], ...]
     height_m: float
     inside: float
+    enters: int | None
     views: tuple[int, ...]
     cameras: tuple[str, ...]
 
@@ -121,6 +127,18 @@ class PeopleWatch:
                 self._open.append(taken[k])
             taken[k].found.append((index, person))
 
+    def of_first(self, index: int, masks: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the masks (C, H, W) of a frame with the pixels of everybody but person 0 as those of others."""
+        rig, path = self._capture.rig, self._paths[0].found
+        last = min(path, key=lambda look: abs(look[0] - index))[1]
+        found = self._finder.find(masks)
+        by_distance = sorted(found, key=lambda person: float(np.linalg.norm(person.position - last.position)))
+        grid = RayGrid(rig, CHOICE_ROWS)
+        hulls = [cast_points(rig, grid, person.points, person.voxel_m) for person in by_distance]
+        whole = Observation(index, np.empty((len(rig), 0, 0, 3), np.uint8), masks)
+        owners = assign(rig, grid, hulls, whole, UNKNOWN_BY_HULLS)
+        return owners.share(whole, 0, False).masks
+
     def people(self) -> tuple[PersonReport, ...]:
         """Return the people: those of the first look in the order of :func:`order_people`, then as they came.
 
@@ -139,6 +157,7 @@ class PeopleWatch:
             path=tuple((float(x), float(y), float(z)) for x, y, z in (person.position for person in people)),
             height_m=float(np.median([person.height_m for person in people])),
             inside=float(np.mean([person.inside for person in people])),
+            enters=next((index for index, person in found if person.inside), None),
             views=tuple(int(person.views.sum()) for person in people),
             cameras=tuple(name for name, share in zip(self._capture.rig.names, shown, strict=True) if share > 0.5),
         )
@@ -148,15 +167,20 @@ def many_people(people: Sequence[PersonReport]) -> list[str]:
     """Return what several people mean for tracking, one line each."""
     if len(people) < 2:
         return []
-    inside = [person for person in people if person.inside > 0]
+    inside = [person for person in people if person.enters is not None]
     lines = [
         f"{len(people)} people are in view, {len(inside)} of them in the volume: tk track takes person 0, "
         "--people 1 takes person 1, --people all takes everybody in the volume"
     ]
     for person in people:
-        if person.inside == 0:
+        if person.enters is None:
             lines.append(
                 f"person {person.number} stays outside the volume, in {', '.join(person.cameras)}: tk track does not "
                 "take these pixels for the subject's"
+            )
+        elif person.enters > person.frames[0]:
+            lines.append(
+                f"person {person.number} enters the volume at about frame {person.enters}: --people all takes this "
+                "person from then on"
             )
     return lines

@@ -51,6 +51,9 @@ UNKNOWN, UNKNOWN_BY_HULLS = 0.1, 0.03
 # Where somebody unknown ends is unknown, too: within this distance of the region, metres: half a trunk, and NEAR_M.
 _WIDTH_M = 0.35
 
+# e to this power is a number in float32; its inverse is zero beside 1.
+_SURELY = np.float32(80)
+
 NOBODY, UNCLEAR = -1, -2
 
 
@@ -252,7 +255,8 @@ def _log_visible(shapes: Sequence[_Shape]) -> Single:
         for j, other in enumerate(shapes[:i]):
             # an extended depth is as uncertain as it is far extended
             error = np.float32(ERROR_M) + np.maximum(one.away, 0) + np.maximum(other.away, 0)
-            in_front = np.nan_to_num(1 / (1 + np.exp((one.depth - other.depth) / error)), nan=0.5)
+            behind = np.minimum((one.depth - other.depth) / error, _SURELY)
+            in_front = np.nan_to_num(1 / (1 + np.exp(behind)), nan=0.5)
             total[i] += np.log1p(-covers[j] * (1 - in_front))
             total[j] += np.log1p(-covers[i] * in_front)
     return total

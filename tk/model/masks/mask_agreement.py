@@ -145,6 +145,10 @@ class MaskAgreement:
         offset = self.step // 2
         return np.asarray(masks[:, offset :: self.step, offset :: self.step] >= 128)
 
+    def possible(self, masks: Masks) -> Bool:
+        """Return (C, h, w) the same, with the pixels where others may hide the person."""
+        return self.small(masks) | self.small(np.uint8(255) * (masks == OTHERS))
+
     def compare(self, frames: Sequence[Masks]) -> Agreement:
         """Return the agreement over frames of masks (C, H, W)."""
         C = len(self.rig)
@@ -156,8 +160,7 @@ class MaskAgreement:
         # a silhouette that extends beyond no other is no contradiction: the mask misses a part, or others have a shadow
         wrong = [c for c in tested if c not in kept and extends(pairs, c)] if kept else []
         seen = [self.small(masks) for masks in frames]
-        # the person may stand behind others
-        hulls = self.hulls([m | self.small(np.uint8(255) * (f == OTHERS)) for m, f in zip(seen, frames, strict=True)])
+        hulls = self.hulls([self.possible(masks) for masks in frames])
         views = [(masks, hull) for masks, hull in zip(seen, hulls, strict=True) if hull is not None]
         right = [c for c in range(C) if c not in wrong]
         refused = not kept and bool(tested)
