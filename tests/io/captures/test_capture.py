@@ -361,7 +361,7 @@ def test_a_volume_that_cannot_be_inferred_is_reported(make_capture: MakeCapture)
         ("dance", 5, 120, True, 25),
         ("punch", 5, 150, False, 25),
         ("treadmill-slow", 6, 340, True, None),
-        ("rig9", 9, 40, True, 25),
+        ("rig9", 9, 40, True, 18),
         ("balance", 4, 100, False, 1),
     ],
 )

@@ -51,11 +51,12 @@ MASKS_RECORD = "masks.toml"
 #: frame rate, 1/s, if neither `capture.toml` nor the videos give one; a note says so
 DEFAULT_FPS = 30.0
 
-#: most images of the empty scene for each camera, the first of a clip, and most bytes of all of them. Decoding more
-#: delays the first pose. With 16 or 25 the errors on walk, dance, fold, cube, treadmill-slow, hd and rig9 differ by at
-#: most 0.04 cm, but with 16 the masks of three cameras of 160x120 contradict each other.
-_BACKGROUND_FRAMES = 32
-_BACKGROUND_BYTES = 400_000_000
+# Most images of the empty scene for each camera, the first of a clip; most recorded pixels and most bytes of all of
+# them, but at least so many images. Decoding more delays the first pose. With 16 or 25 the errors on walk, dance, fold,
+# cube, treadmill-slow, hd and rig9 differ by at most 0.04 cm, on hd and sixteen with 8 or 25 by at most 0.02 cm, but
+# with 16 the masks of three cameras of 160x120 contradict each other.
+_BACKGROUND_FRAMES, _LEAST_BACKGROUND = 32, 8
+_BACKGROUND_PIXELS, _BACKGROUND_BYTES = 50_000_000, 400_000_000
 
 #: most images of a video that are checked for damage after a camera has disagreed: about a millisecond each
 _CHECKED_IMAGES = 3000
@@ -216,8 +217,8 @@ class Capture:
     def background(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return the empty scene: an array (T, h, w, 3) uint8 BGR for each camera; None without a `background/` folder.
 
-        T is 1 for an image. Of a clip the first 32 frames are used, and fewer of large images (384 MiB over all
-        cameras).
+        T is 1 for an image. Of a clip the first 32 frames are used; fewer, but at least 8, of many or large images,
+        and fewer still if they would exceed 400 MB.
 
         Raises:
             VideoError: a camera has no background, or it cannot be read, or has another size.
@@ -227,7 +228,9 @@ class Capture:
             return None
         clips = _clips_of(self.calibration, folder, "background", "png", pictures=True)
         pixels = sum(camera.width * camera.height for camera in self.rig)
-        most = min(_BACKGROUND_FRAMES, max(2, _BACKGROUND_BYTES // (3 * pixels)))
+        recorded = sum(camera.width * camera.height * camera.reduction**2 for camera in self.rig)
+        most = min(_BACKGROUND_FRAMES, max(_LEAST_BACKGROUND, _BACKGROUND_PIXELS // recorded))
+        most = min(most, max(2, _BACKGROUND_BYTES // (3 * pixels)))
         small = [clip.reduced(camera.reduction) for clip, camera in zip(clips, self.rig, strict=True)]
         with ThreadPoolExecutor(os.cpu_count()) as threads:
             return tuple(threads.map(lambda clip: _read_some(clip, most), small))
