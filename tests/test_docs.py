@@ -175,6 +175,15 @@ def test_every_page_is_in_the_index_and_in_the_readme() -> None:
     assert all(f"(docs/{page}.md)" in readme for page in pages)
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_tables_begin_with_their_heading(page: Path) -> None:
+    """An empty line inside a table splits it, and the rest is shown as text."""
+    lines = ["", *page.read_text(encoding="utf-8").splitlines(), ""]
+    for before, line, after in zip(lines, lines[1:], lines[2:], strict=False):
+        if line.startswith("|") and not before.startswith("|"):
+            assert re.fullmatch(r"\|[-:| ]+\|", after), line
+
+
 def test_lines_of_documentation_are_short() -> None:
     for page in PAGES:
         if page.name == "CHANGELOG.md":
