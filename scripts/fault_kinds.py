@@ -491,10 +491,11 @@ def volume_beside(faulty: Faulty, sides: float) -> None:
 
 def give_background(faulty: Faulty, image: Callable[[int], Image]) -> None:
     """Replace the clips of the empty scene by still images, given a camera's index."""
+    images = [image(c) for c in faulty.all]  # some are made from the clips
     shutil.rmtree(faulty.folder / "background", ignore_errors=True)
     (faulty.folder / "background").mkdir()
-    for c, camera in enumerate(faulty.original.rig):
-        cv2.imwrite(str(faulty.folder / "background" / f"{camera.name}.png"), image(c))
+    for camera, own in zip(faulty.original.rig, images, strict=True):
+        cv2.imwrite(str(faulty.folder / "background" / f"{camera.name}.png"), own)
 
 
 def shifted(masks: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -49,6 +49,7 @@ def test_leaves_the_callers_runtime_alone():
         program = ti.lang.impl.get_runtime().prog
         ensure_runtime()
         print(ti.lang.impl.get_runtime().prog is program, ti.lang.impl.current_cfg().random_seed)
+        ti.reset()  # the caller's part: Taichi may crash if its threads end after the interpreter
         """,
         TK_THREADS="2",
     )

@@ -156,6 +156,12 @@ def test_cameras_of_another_recording_are_refused(masks: np.ndarray) -> None:
     assert "calibration.toml is of another recording" in found.refusal
 
 
+def test_volume_beside_the_person_is_named(masks: np.ndarray) -> None:
+    beside = Volume((0.0, -1.3, 1.0), (2.4, 2.4, 2.2))
+    found = MaskAgreement(RIG, beside).compare(list(masks))
+    assert "does not hold the person" in found.refusal and "[volume]" in found.refusal
+
+
 def test_masks_of_a_thing_that_never_moves_are_refused(masks: np.ndarray) -> None:
     box = np.zeros_like(masks)
     box[:, :, 60:200, 20:90] = 255

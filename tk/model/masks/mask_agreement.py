@@ -232,7 +232,13 @@ class MaskAgreement:
         if len(frames) > 1 and all(np.array_equal(masks, frames[0]) for masks in frames[1:]):
             return f"the masks of {listed} contradict each other, and they never change: do they show the person?"
         error = pairs.apart[np.ix_(cameras, cameras)]
-        apart = f" by up to {np.nanmax(error):.0%} of the person's size" if np.isfinite(error).any() else ""
+        most = float(np.nanmax(error)) if np.isfinite(error).any() else np.nan
+        if most <= TOLERANCE:
+            return (
+                f"the outlines in {listed} agree, but the working volume does not hold the person whom they show: "
+                "correct [volume] in capture.toml"
+            )
+        apart = f" by up to {most:.0%} of the person's size" if np.isfinite(most) else ""
         if len(names) == 2:
             return f"{listed} contradict each other{apart}, and two cameras do not show which one is wrong: {_CAUSES}"
         return f"the cameras {listed} do not belong together: they contradict each other{apart}: {_CAUSES}"
