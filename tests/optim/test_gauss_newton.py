@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tk.errors import ConfigError
-from tk.kernels.newton import LENGTHS, TOLERANCE, newton_step
+from tk.kernels.newton import LENGTHS, MEAN, TOLERANCE, newton_step
 from tk.kernels.runtime import ensure_runtime, ti
 from tk.kernels.silhouette import Descent
 from tk.optim import gauss_newton
@@ -24,8 +24,7 @@ ALL = None
 @ti.kernel
 def _step_kernel(
     free: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    limits: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    mean: ti.types.ndarray(dtype=ti.f64, ndim=2),
+    priors: ti.types.ndarray(dtype=ti.f64, ndim=2),
     numbers: ti.types.ndarray(dtype=ti.f64, ndim=1),
     length: ti.f64,
     hessian: ti.types.ndarray(dtype=ti.f64, ndim=3),
@@ -35,7 +34,7 @@ def _step_kernel(
     change: ti.types.ndarray(dtype=ti.f64, ndim=1),
 ):
     for b in range(state.shape[0]):
-        change[b] = newton_step(free, limits, mean, numbers, b, length, hessian, gradient, ti.static(0), factor, state)
+        change[b] = newton_step(free, priors, numbers, b, length, hessian, gradient, ti.static(0), factor, state)
 
 
 def solve(equations, start, free=ALL, lower=NONE[0], upper=NONE[1], config=None, prior=None, levels=None):
@@ -48,7 +47,8 @@ def solve(equations, start, free=ALL, lower=NONE[0], upper=NONE[1], config=None,
         for length in steps.numbers[LENGTHS:]:
             moved, change, scratch = states[rows], np.zeros(len(rows)), np.zeros((len(rows), 4, 5))
             here = equations(moved.copy(), scale, rows)
-            numbers = steps.free, steps.limits, steps.mean[rows], steps.numbers, length
+            priors = np.vstack([steps.priors[:MEAN], steps.priors[MEAN + rows]])
+            numbers = steps.free, priors, steps.numbers, length
             _step_kernel(*numbers, here.hessian, here.gradient, scratch, moved, change)
             states[rows], hessian[rows] = moved, here.hessian
             made[rows] += 1

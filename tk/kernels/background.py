@@ -34,7 +34,7 @@ _EXPONENT_BIAS = (127 << 3) - _LEVEL_ONE
 
 
 def level_of(value: float) -> int:
-    """The level of a positive value: about ``128 + 8 log2(value)``, piecewise linear, clipped to 0…255."""
+    """Return the level of a positive value: about ``128 + 8 log2(value)``, piecewise linear, clipped to 0…255."""
     bits = int(np.float32(value).view(np.int32)) >> _MANTISSA_SHIFT
     return min(max(bits - _EXPONENT_BIAS, 0), 255)
 
@@ -47,7 +47,7 @@ def _level(value: ti.f32) -> ti.u8:
 
 @ti.func
 def _square(images: ti.template(), plates: ti.template(), i: ti.i32) -> ti.i32:
-    """|a - b|² of one pixel; ``i`` is the index of its first channel."""
+    """Return |a - b|² of one pixel; ``i`` is the index of its first channel."""
     d0 = ti.cast(images[i], ti.i32) - ti.cast(plates[i], ti.i32)
     d1 = ti.cast(images[i + 1], ti.i32) - ti.cast(plates[i + 1], ti.i32)
     d2 = ti.cast(images[i + 2], ti.i32) - ti.cast(plates[i + 2], ti.i32)
@@ -56,7 +56,7 @@ def _square(images: ti.template(), plates: ti.template(), i: ti.i32) -> ti.i32:
 
 @ti.func
 def _column(images: ti.template(), plates: ti.template(), pixel: ti.i32, width: ti.i32, up: ti.i32, down: ti.i32):
-    """(d·b, b·b, brightness of d) over a column of the window: rows ``up`` (-1 or 0) to ``down`` (0 or 1) around it."""
+    """Return (d·b, b·b, brightness of d) over a column of the window, rows ``up`` (-1 or 0) to ``down`` (0 or 1)."""
     db = 0
     bb = 0
     brighter = 0
@@ -73,7 +73,7 @@ def _column(images: ti.template(), plates: ti.template(), pixel: ti.i32, width: 
 
 @ti.func
 def _relaxed(planes: ti.template(), i: ti.i32, stride: ti.i32, level: ti.i32, per_neighbour: ti.i32, threshold: ti.i32):
-    """The label of a pixel given the labels of its eight neighbours around place ``i``, 0 or 1."""
+    """Return the label of the pixel at place ``i``, 0 or 1, given the labels of its eight neighbours."""
     above = planes[i - stride - 1] + planes[i - stride] + planes[i - stride + 1]
     below = planes[i + stride - 1] + planes[i + stride] + planes[i + stride + 1]
     count = ti.cast(above + below + planes[i - 1] + planes[i + 1], ti.i32)
@@ -82,7 +82,7 @@ def _relaxed(planes: ti.template(), i: ti.i32, stride: ti.i32, level: ti.i32, pe
 
 @ti.func
 def _clamped(dd: ti.f32, db: ti.f32, bb: ti.f32, shadow_min: ti.f32, light_max: ti.f32) -> ti.f32:
-    """The least ``|a - s b|² / (1 + s²)`` for s in [shadow_min, light_max], from d·d, d·b and b·b with d = a - b."""
+    """Return the least ``|a - s b|² / (1 + s²)``, s in [shadow_min, light_max], from d·d, d·b, b·b with d = a - b."""
     # every product follows from these without cancellation
     excess = dd + 2.0 * db  # a·a - b·b
     cross = bb + db  # a·b, positive thanks to the offset

@@ -41,7 +41,7 @@ FOUND, VISIBLE = 1, 2  # bits of a point's flags
 
 @ti.func
 def signed_power(base, exponent):
-    """sign(b)·|b|^e."""
+    """Return sign(b)·|b|^e."""
     result = base
     if exponent != 1.0:
         result = power(base, exponent)
@@ -52,7 +52,7 @@ def signed_power(base, exponent):
 
 @ti.func
 def surface_point(turns, radii, e1, e2):
-    """r(η, ω) (eq. 1); ``turns`` are cos η, sin η, cos ω, sin ω."""
+    """Return r(η, ω) (eq. 1); ``turns`` are cos η, sin η, cos ω, sin ω."""
     ring = signed_power(turns[0], e1)
     return ti.Vector(
         [
@@ -65,7 +65,7 @@ def surface_point(turns, radii, e1, e2):
 
 @ti.func
 def surface_normal(turns, radii, e1, e2):
-    """n_d(η, ω), outward, not of unit length (eq. 2)."""
+    """Return n_d(η, ω), outward, not of unit length (eq. 2)."""
     ring = signed_power(turns[0], 2.0 - e1)
     return ti.Vector(
         [

@@ -65,19 +65,19 @@ def store_frame(frames: ti.template(), c: int, k: int, R, t):
 
 @ti.func
 def rotation_of(array: ti.template(), i: int, first: ti.template()):
-    """Rotation (3, 3) of the 3×4 transform in row i, from column ``first`` on."""
+    """Return the rotation (3, 3) of the 3×4 transform in row i, from column ``first`` on."""
     return ti.Matrix([[array[i, first + 4 * a + b] for b in ti.static(range(3))] for a in ti.static(range(3))])
 
 
 @ti.func
 def translation_of(array: ti.template(), i: int, first: ti.template()):
-    """Translation (3,) of the same."""
+    """Return the translation (3,) of the same."""
     return ti.Vector([array[i, first + 4 * a + 3] for a in ti.static(range(3))])
 
 
 @ti.func
 def carried(joints: ti.template(), c: int, k: int, array: ti.template(), i: int, first: ti.template()):
-    """Rotation and translation to the world of what degree of freedom k carries; its transform to the zero
+    """Return rotation and translation to the world of what degree of freedom k carries; its transform to the zero
     configuration is that of :func:`rotation_of`."""
     R = load_rotation(joints, c, k)
     t = times(R, translation_of(array, i, first)) + load_translation(joints, c, k)
@@ -86,13 +86,13 @@ def carried(joints: ti.template(), c: int, k: int, array: ti.template(), i: int,
 
 @ti.func
 def parent_of(tree: ti.template(), k: int):
-    """The degree of freedom above k, or -1."""
+    """Return the degree of freedom above k, or -1."""
     return ti.cast(tree[k, TREE_PARENT], ti.i32)
 
 
 @ti.func
 def rodrigues(w, angle):
-    """exp of the skew matrix of ``angle·w``, with w a unit axis."""
+    """Return the exponential of the skew matrix of ``angle·w``, with w a unit axis."""
     s, c = ti.sin(angle), ti.cos(angle)
     K = ti.Matrix([[0.0 * s, -w[2], w[1]], [w[2], 0.0 * s, -w[0]], [-w[1], w[0], 0.0 * s]])
     eye = ti.Matrix(

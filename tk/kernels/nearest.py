@@ -127,7 +127,7 @@ def nearest(
     patch: np.ndarray,
     reach_m: float = 1.0,
 ) -> np.ndarray:
-    """The nearest voxel of each query that fits its patch.
+    """Return the nearest voxel of each query that fits its patch.
 
     Args:
         index: the frame's surface voxels.

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from tk.kernels.runtime import ti
 
-# Rows of ``limits``.
-LOWER, UPPER, PRECISION = range(3)
+# Rows of ``priors``.
+LOWER, UPPER, PRECISION, MEAN = range(4)
 # Columns of ``numbers``: settings of :class:`tk.optim.gauss_newton.GaussNewtonSettings`, then the steps' lengths.
 DAMPING, STIFFNESS, LIMIT_WEIGHT, LONGEST_STEP, TOLERANCE, LENGTHS = range(6)
 # Keeps the factorisation defined without damping and stiffness, share of the mean diagonal element.
@@ -19,8 +19,8 @@ class NewtonSteps(NamedTuple):
     """What determines the steps of B states with D parameters, beside the equations."""
 
     free: NDArray[np.int32]  # (n,) int32 the parameters that may change
-    limits: NDArray[np.float64]  # (3, D) lower and upper limit, and precision of the prior; see `LOWER`
-    mean: NDArray[np.float64]  # (B, D) mean of the prior
+    # (3 + B, D) limits and precision of the prior, see `LOWER`; from row `MEAN` on the mean of each state's prior
+    priors: NDArray[np.float64]
     # (5 + S,) see `DAMPING`; the lengths of S steps as multiples of the equations' solution. A step of length 0
     # evaluates the equations only.
     numbers: NDArray[np.float64]
@@ -29,8 +29,7 @@ class NewtonSteps(NamedTuple):
 @ti.func
 def newton_step(
     free: ti.template(),  # (n,)
-    limits: ti.template(),  # (3, D)
-    mean: ti.template(),  # (B, D)
+    priors: ti.template(),  # (3 + B, D)
     numbers: ti.template(),  # (5 + S,)
     b: int,
     length,
@@ -55,14 +54,14 @@ def newton_step(
     for i in range(n):
         k = free[i]
         p, element = state[b, k], hessian[b, k, k]
-        excess = ti.min(ti.max(p, limits[LOWER, k]), limits[UPPER, k]) - p
-        element += numbers[DAMPING] * element + (numbers[STIFFNESS] + _LEAST) * unit + limits[PRECISION, k]
+        excess = ti.min(ti.max(p, priors[LOWER, k]), priors[UPPER, k]) - p
+        element += numbers[DAMPING] * element + (numbers[STIFFNESS] + _LEAST) * unit + priors[PRECISION, k]
         if excess != 0.0:
             element += pull
         for j in range(i):
             factor[b, i, j] = hessian[b, k, free[j]]
         factor[b, i, i] = element
-        factor[b, i, n] = gradient[b, first + k] + pull * excess + limits[PRECISION, k] * (mean[b, k] - p)
+        factor[b, i, n] = gradient[b, first + k] + pull * excess + priors[PRECISION, k] * (priors[MEAN + b, k] - p)
     for i in range(n):
         for j in range(i + 1):
             rest = factor[b, i, j]

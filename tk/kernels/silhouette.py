@@ -30,7 +30,7 @@ from tk.kernels.cone_contours import (
 from tk.kernels.cones import point_on, unscaled
 from tk.kernels.kinematics import forward_tree, load_rotation, load_translation
 from tk.kernels.line_search import COLOR_BINS, Regions, SearchSettings, in_picture, search_colors, search_mask
-from tk.kernels.newton import LENGTHS, TOLERANCE, NewtonSteps, newton_step
+from tk.kernels.newton import LENGTHS, MEAN, TOLERANCE, NewtonSteps, newton_step
 from tk.kernels.projection import camera_center, project
 from tk.kernels.runtime import ensure_runtime, spread_of, ti
 from tk.kernels.taichi_internals import Launcher
@@ -49,8 +49,8 @@ _EXPORT = 13
 # Columns of the packed settings. SCALE: pixels of the full picture in one of this scale; the others: SearchSettings.
 _NUMBERS = tuple(range(11))
 SCALE, WINDOW, SPACING, AMBIGUOUS, TANGENTIAL, ROBUST, LOST, COLORS, MOST_SAMPLES, INTERIOR, EXPORT = _NUMBERS
-# Columns of ``sums``, before the gradient: cost, weight of the samples that found an edge, weight of all.
-COST, FOUND, ALL, GRADIENT = range(4)
+# Columns of ``sums``: cost, weight of the samples that found an edge, weight of all, steps made; then the gradient.
+COST, FOUND, ALL, STEPS, GRADIENT = range(5)
 
 
 class NormalEquations(NamedTuple):
@@ -270,16 +270,14 @@ def _descent_kernel(real):
         # the frame
         cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
         size: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (V, 2) width, height at this scale
-        mask: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (F V, H, W) at this scale, of F frames
-        frame: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (B,) each pose's frame
+        mask: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (F V, H, W) at this scale, of F = 1 or B frames
         image: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (V, H, W, 3) of the full picture
         likelihood: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (G, COLOR_BINS)
         group: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,) colour group of each part
         # settings
         numbers: ti.types.ndarray(dtype=real, ndim=1),  # (11,) from SCALE to EXPORT
-        free: ti.types.ndarray(dtype=ti.i32, ndim=1),  # this and the next three: :class:`NewtonSteps`
-        limits: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (3, D)
-        mean: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (B, D)
+        free: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (n,) this and the next two: :class:`NewtonSteps`
+        priors: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (3 + B, D)
         steps: ti.types.ndarray(dtype=ti.f64, ndim=1),  # (5 + S,)
         spread: ti.i32,
         # the poses
@@ -293,15 +291,15 @@ def _descent_kernel(real):
         factor: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (B, n, n + 1)
         # out
         samples: ti.types.ndarray(dtype=real, ndim=3),  # (V Q, most_samples, _EXPORT), if EXPORT
-        sums: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (B, 3 + D) from COST to GRADIENT, before the last step
+        sums: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (B, 4 + D) see COST, before the last step
         hessian: ti.types.ndarray(dtype=ti.f64, ndim=3),  # (B, D, D) likewise; zeroed by the caller
-        made: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (B,) evaluations of the equations
     ):
         # one thread handles a pose from end to end; a variant without threads costs 0.4 s to compile and saves nothing
         for turn in range(spread * state.shape[0]):
             if turn % spread != 0:
                 continue
             b = turn // spread
+            frame = b % (mask.shape[0] // cameras.shape[0])
             moves, step = True, 0
             while moves:
                 for k in range(tree.shape[0]):
@@ -309,7 +307,7 @@ def _descent_kernel(real):
                 prepare_pose(tree, parts, curves, cameras, pose, b, joints, placed, hiders, outlines, sums)
                 origin = load_translation(placed, b, 0)
                 search_contours(
-                    parts, curves, cameras, size, mask, frame[b], image, likelihood, group, numbers, b, origin, joints,
+                    parts, curves, cameras, size, mask, frame, image, likelihood, group, numbers, b, origin, joints,
                     placed, hiders, outlines, samples, sums,
                 )  # fmt: skip
                 collect_pulls(tree, b, joints, origin, sums, GRADIENT)
@@ -318,9 +316,9 @@ def _descent_kernel(real):
                 step += 1
                 moves = step < steps.shape[0] - LENGTHS
                 if length > 0.0:
-                    change = newton_step(free, limits, mean, steps, b, length, hessian, sums, GRADIENT, factor, state)
+                    change = newton_step(free, priors, steps, b, length, hessian, sums, GRADIENT, factor, state)
                     moves = moves and change > steps[TOLERANCE]
-            made[b] = step
+            sums[b, STEPS] = step
 
     return Launcher(silhouette_descent)
 
@@ -345,7 +343,7 @@ def _launch(
     newton: NewtonSteps | None = None,
     export: bool = False,
 ) -> tuple[Descent, NDArray[np.float64], NDArray[np.floating]]:
-    """Return the poses after the steps; sums (B, 3 + D) and samples before the last step, see the kernel. Without
+    """Return the poses after the steps; sums (B, 4 + D) and samples before the last step, see the kernel. Without
     ``newton`` the poses stay as they are."""
     ensure_runtime()
     dtype = body.tree.dtype
@@ -353,49 +351,34 @@ def _launch(
     B, D = state.shape
     V, Q, P = len(cameras), len(body.curves), len(body.parts)
     regions = regions or _no_regions(P)
-    frames = len(masks) // V
-    if frames not in (1, B):
+    if len(masks) not in (V, B * V):
         raise ValueError(f"{len(masks)} masks of {V} views: one set, or one for each frame of the {B} poses")
-    free, limits, mean, steps = newton or _no_steps(D)
-    sums, hessian, made = np.empty((B, GRADIENT + D)), np.zeros((B, D, D)), np.empty(B, np.int32)
+    sums, hessian = np.empty((B, GRADIENT + D)), np.zeros((B, D, D))
     samples = np.zeros((B * V * Q, settings.most_samples, _EXPORT) if export else (1, 1, _EXPORT), dtype)
     _descent_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
         *body,
         np.ascontiguousarray(cameras, dtype),
         np.ascontiguousarray(sizes, np.int32),
         np.ascontiguousarray(masks),
-        _frames(B, frames),
         regions.image,
         regions.log_likelihood,
         regions.group,
         _numbers(settings, scale, regions.weight, export, dtype),
-        free,
-        limits,
-        mean,
-        steps,
+        *(newton or _no_steps(D)),
         spread_of(B),
         state,
         *_scratch(B, V, Q, D, P, dtype),
         samples,
         sums,
         hessian,
-        made,
     )
-    return Descent(state, hessian, made), sums, samples
-
-
-@functools.lru_cache(32)
-def _frames(poses: int, frames: int) -> NDArray[np.int32]:
-    """Return (B,) the frame of each pose: pose b is in frame b, or all are in the same."""
-    return np.arange(poses, dtype=np.int32) % frames
+    return Descent(state, hessian, sums[:, STEPS].astype(np.int32)), sums, samples
 
 
 @functools.cache
 def _no_steps(parameters: int) -> NewtonSteps:
     """Return the arguments of a launch that evaluates the equations only."""
-    return NewtonSteps(
-        np.zeros(1, np.int32), np.zeros((3, parameters)), np.zeros((1, parameters)), np.zeros(LENGTHS + 1)
-    )
+    return NewtonSteps(np.zeros(1, np.int32), np.zeros((MEAN + 1, parameters)), np.zeros(LENGTHS + 1))
 
 
 @functools.lru_cache(64)

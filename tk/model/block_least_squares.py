@@ -135,7 +135,7 @@ def minimise(
 
 
 def gauge_projection(modes: Float, precision: Float) -> Float:
-    """(S, S) the projection that removes a gauge's modes from a step.
+    """Return the projection (S, S) that removes a gauge's modes from a step.
 
     Args:
         modes: (S, M) changes of the unknowns that change no residual, such as a motion of the whole world.

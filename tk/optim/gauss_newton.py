@@ -111,13 +111,13 @@ def minimise(
     states = np.array(start, np.float64)
     hessian = np.zeros((*states.shape, states.shape[1]))
     mean, precision = (0.0, 0.0) if prior is None else (prior.mean, prior.precision)
-    limits = np.stack([lower, upper, np.broadcast_to(precision, len(lower))]).astype(np.float64)
-    mean = np.ascontiguousarray(np.broadcast_to(mean, states.shape), np.float64)
+    rows = lower, upper, np.broadcast_to(precision, len(lower)), np.broadcast_to(mean, states.shape)
+    priors = np.vstack(rows).astype(np.float64)
     index = np.arange(len(lower), dtype=np.int32) if free is None else free.astype(np.int32)
     scales = range(config.scales - 1, -1, -1) if levels is None else levels
     iterations = np.zeros(len(scales), np.int32)
     for i, scale in enumerate(scales):
-        states, hessian, made = descend(states, scale, NewtonSteps(index, limits, mean, _numbers(config, scale == 0)))
+        states, hessian, made = descend(states, scale, NewtonSteps(index, priors, _numbers(config, scale == 0)))
         iterations[i] = made.max(initial=0)
     return BatchSolution(states, hessian, iterations)
 

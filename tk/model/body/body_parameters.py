@@ -74,20 +74,20 @@ class BodyFamily:
 
     @staticmethod
     def around(body: ConeBody, stature_deviation: float) -> BodyFamily:
-        """The family whose prior is about a body's dimensions and which begins at the body."""
+        """Return the family whose prior is about a body's dimensions and which begins at the body."""
         family = BodyFamily(body.dimensions, stature_deviation)
         family.start[len(_DIMENSIONS) :] = shapes_of(body).ravel()
         return family
 
     def build(self, shared: Float) -> ConeBody:
-        """The body with parameters (K,)."""
+        """Return the body with parameters (K,)."""
         values = np.exp(shared[: len(_DIMENSIONS)])
         dimensions = BodyDimensions(**dict(zip(_DIMENSIONS, values.tolist(), strict=True)))
         change = shared[len(_DIMENSIONS) :].reshape(len(self.groups), SHAPE_NUMBERS)
         return build_cone_body(dimensions).reshaped(change)
 
     def linearised(self, shared: Float, poses: Float) -> LinearisedBody:
-        """The body with parameters (K,) at poses (M, D), and its derivatives by the dimensions: differences of bodies.
+        """Return the body with parameters (K,) at poses (M, D), and its derivatives by the dimensions.
 
         A dimension moves a point in its segment's frame, alike at all poses, and it moves the segment.
         """
@@ -131,13 +131,13 @@ class LinearisedBody:
         return self.body.part_transforms(self.T_world_segment)
 
     def points(self, pose: NDArray[np.integer], edgels: Edgels) -> Float:
-        """(N, 3) the edgels' points on the surface, world."""
+        """Return the edgels' points (N, 3) on the surface, world frame, metres."""
         T = self._T_world_part[pose, edgels.part]
         local = self.body.local(edgels.part, edgels.unscaled)
         return np.asarray((T[:, :3, :3] @ local[:, :, None])[:, :, 0] + T[:, :3, 3])
 
     def pose_rows(self, pose: NDArray[np.integer], edgels: Edgels, x_world: Float) -> Float:
-        """(N, D) derivatives of the contour's position along its normal by the pose, pixels, at points (N, 3)."""
+        """Return the derivatives (N, D) of the contour's position along its normal by the pose, pixels, at N points."""
         # n · (ω × x + v) = ω · (x × n) + v · n
         wrench = np.hstack([np.cross(x_world, edgels.row), edgels.row])
         rows = np.empty((len(pose), self.twists.shape[-1]))
@@ -147,12 +147,12 @@ class LinearisedBody:
         return rows
 
     def rows(self, pose: NDArray[np.integer], edgels: Edgels) -> Float:
-        """(N, K) derivatives by all parameters of the body."""
+        """Return the derivatives (N, K) by all parameters of the body."""
         shape = shape_rows(self.body, self._T_world_part[pose, edgels.part], edgels)
         return np.hstack([self.dimension_rows(pose, edgels), shape])
 
     def dimension_rows(self, pose: NDArray[np.integer], edgels: Edgels) -> Float:
-        """(N, 24) derivatives by the dimensions."""
+        """Return the derivatives (N, 24) by the dimensions."""
         part, u = edgels.part, edgels.unscaled
         segments, inside = self.body.frames
         segment = segments[part]

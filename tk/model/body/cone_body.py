@@ -236,7 +236,7 @@ def build_cone_body(dimensions: BodyDimensions, up: str = "z") -> ConeBody:
 
 
 def _calf(side: str, knee: Float, ankle: Float, d: BodyDimensions) -> list[ConePart]:
-    """Two frusta that meet where the muscle is thickest."""
+    """Return two frusta that meet where the muscle is thickest."""
     share = 0.35
     belly = knee + share * (ankle - knee)
     radius = CALF_BELLY * (d.knee_radius + share * (d.ankle_radius - d.knee_radius))
@@ -250,7 +250,7 @@ def _calf(side: str, knee: Float, ankle: Float, d: BodyDimensions) -> list[ConeP
 def _between(
     name: str, segment: str, begin: Float, end: Float, r0: float, r1: float, toward: Float = _FORWARD
 ) -> ConePart:
-    """A frustum whose x axis is as close as possible to the direction ``toward``."""
+    """Return a frustum whose x axis is as close as possible to the direction ``toward``."""
     length = float(np.linalg.norm(end - begin))
     axis = (end - begin) / length
     front = toward - (toward @ axis) * axis
@@ -258,7 +258,7 @@ def _between(
 
 
 def _foot(side: str, ankle: Float, d: BodyDimensions) -> list[ConePart]:
-    """A flat sole from heel to toes and the instep from the ankle down to the ball."""
+    """Return a flat sole from heel to toes, and the instep from the ankle down to the ball."""
     x, y, z = np.eye(3)
     ground = ankle - d.ankle_height * z
     thick, thin = 0.45 * d.ankle_height, 0.3 * d.ankle_height
@@ -278,7 +278,7 @@ def _foot(side: str, ankle: Float, d: BodyDimensions) -> list[ConePart]:
 
 
 def _trunk_and_head(d: BodyDimensions) -> list[ConePart]:
-    """Torso and head in more detail: abdomen, belly, chest, shoulders; skull, neck.
+    """Return the parts of torso and head: abdomen, belly, chest, shoulders; skull, neck.
 
     At the hips the trunk lies in front of the line of the joints, at the shoulders on it; hair stands on the crown.
     """
@@ -333,7 +333,7 @@ def group_of(name: str) -> str:
 
 
 def _frame(origin: Float, axis: Float, front: Float) -> Float:
-    """(4, 4) frame at ``origin`` with z along ``axis`` and x along ``front`` (perpendicular to it)."""
+    """Return the frame (4, 4) at ``origin`` with z along ``axis`` and x along ``front`` (perpendicular to it)."""
     (a, b, c), (x, y, z) = axis, front
     T = np.eye(4)
     T[:3, 0], T[:3, 2], T[:3, 3] = front, axis, origin

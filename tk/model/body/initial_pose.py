@@ -57,8 +57,10 @@ def rough_pose(
 
 
 def _fitted(skeleton: Skeleton, rows: NDArray[np.int64], targets: Float) -> Float:
-    """(D,) pose within the limits whose joints ``rows`` (N,) are closest to targets (N, 3); the best of several
-    headings."""
+    """Return the pose (D,) within the limits whose joints ``rows`` (N,) are closest to targets (N, 3), metres.
+
+    The best of several headings is returned.
+    """
     rest = neutral_pose(skeleton)
     hanging = shoulder_angles(np.array([0.0, 0.2, -0.98]))
     for shoulder, hip in zip(SHOULDERS, HIPS, strict=True):  # arms down, legs together
@@ -91,7 +93,7 @@ def _fitted(skeleton: Skeleton, rows: NDArray[np.int64], targets: Float) -> Floa
 
 
 def _stature_of(joints: dict[str, Float]) -> float | None:
-    """Median stature by the distances of neighbouring joints; None if there are fewer than three."""
+    """Return the median stature by the distances of neighbouring joints; None if there are fewer than three."""
     table = {
         ("pelvis", "neck"): FRACTIONS["trunk"],
         ("neck", "head_top"): FRACTIONS["head"],

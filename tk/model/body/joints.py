@@ -75,7 +75,7 @@ class Joint:
 
 
 def side_of(name: str) -> str:
-    """The side with which a name ends, ``_l`` or ``_r``; empty in the middle."""
+    """Return the side with which a name ends, ``_l`` or ``_r``; empty in the middle."""
     return name[-2:] if name.endswith(("_l", "_r")) else ""
 
 

@@ -19,7 +19,7 @@ _DAMPED_STEPS = 20
 
 
 def to_quaternions(R: Float) -> Float:
-    """(..., 4) unit quaternions (w, x, y, z) of rotations (..., 3, 3); w is not negative."""
+    """Return unit quaternions (..., 4), w, x, y, z, of rotations (..., 3, 3); w is not negative."""
     R = np.asarray(R)
     diagonal = np.diagonal(R, axis1=-2, axis2=-1)
     # 4 q qᵀ: each row is a multiple of the quaternion, that with the largest diagonal entry is the most exact
@@ -37,7 +37,7 @@ def to_quaternions(R: Float) -> Float:
 
 
 def to_matrices(quaternions: Float) -> Float:
-    """(..., 3, 3) rotations of quaternions (..., 4), w first; they need not have length 1, but must not be zero."""
+    """Return rotations (..., 3, 3) of quaternions (..., 4), w first, of any length but 0."""
     q = np.asarray(quaternions)
     w, v = q[..., 0, None, None], q[..., 1:]
     squares = q[..., None, :] @ q[..., None]
@@ -47,14 +47,14 @@ def to_matrices(quaternions: Float) -> Float:
 
 
 def continuous(quaternions: Float) -> Float:
-    """Quaternions (F, ..., 4) over time with the signs such that each is near to the one before."""
+    """Return quaternions (F, ..., 4) over time, each with the sign that brings it nearer to the one before."""
     turns_back = (quaternions[1:] * quaternions[:-1]).sum(axis=-1) < 0
     signs = np.cumprod(np.where(turns_back, -1.0, 1.0), axis=0)
     return np.concatenate([quaternions[:1], quaternions[1:] * signs[..., None]])
 
 
 def turn(axis: str, angle: Float) -> Float:
-    """(..., 3, 3) the rotation by ``angle`` (...), radians, about the axis "x", "y" or "z"."""
+    """Return the rotation (..., 3, 3) by ``angle`` (...), radians, about the axis "x", "y" or "z"."""
     k = "xyz".index(axis)
     i, j = (k + 1) % 3, (k + 2) % 3
     R = np.zeros((*np.shape(angle), 3, 3))
@@ -66,13 +66,13 @@ def turn(axis: str, angle: Float) -> Float:
 
 
 def compose(sequence: str, angles: Float) -> Float:
-    """(..., 3, 3) turns about moving axes, the first first: "zxy" is Rz(angles[..., 0]) Rx(angles[..., 1]) Ry(...)."""
+    """Return rotations (..., 3, 3) of angles (..., 3), radians, about moving axes: "zxy" is Rz Rx Ry."""
     first, second, third = (turn(axis, angles[..., k]) for k, axis in enumerate(sequence))
     return first @ second @ third
 
 
 def decompose(sequence: str, R: Float) -> Float:
-    """(..., 3) radians, the inverse of :func:`compose` for the sequences "zxy", "yxz" and "yxy".
+    """Return angles (..., 3), radians, the inverse of :func:`compose` for the sequences "zxy", "yxz" and "yxy".
 
     The middle angle lies within ±90°, or for "yxy" within -180° and 0. Where it is at an end of that range only the sum
     or difference of the others is determined; the first is then 0.
@@ -97,7 +97,7 @@ def decompose(sequence: str, R: Float) -> Float:
 
 
 def follow(angles: Float) -> Float:
-    """Angles (F, 3), radians, of turns about three different axes, rewritten such that each frame is near to the last.
+    """Return angles (F, 3), radians, about three different axes, rewritten so that each frame is near to the last.
 
     (a, b, c) is the same rotation as (a + π, π - b, c + π), and each angle may have whole turns added. Euler angles
     that are to be looked at, or interpolated, must not jump between these.
@@ -109,7 +109,7 @@ def follow(angles: Float) -> Float:
 
 
 def _nearest(angles: Float, near: Float) -> Float:
-    """The same rotation by the angles (3,) that are nearest to others (3,)."""
+    """Return the angles (3,) of the same rotation that are nearest to others (3,)."""
     a, b, c = angles
     found = np.array([[a, b, c], [a + np.pi, np.pi - b, c + np.pi]])
     found -= 2 * np.pi * np.round((found - near) / (2 * np.pi))
@@ -117,8 +117,7 @@ def _nearest(angles: Float, near: Float) -> Float:
 
 
 def follow_rotations(sequence: str, R: Float) -> Float:
-    """Angles (F, 3), radians, about three different axes, that change little from frame to frame, of rotations (F, 3,
-    3).
+    """Return angles (F, 3) of rotations (F, 3, 3), radians, about three different axes, that change little by frame.
 
     They follow as in :func:`follow`; of the equivalent sequences, that with medians near zero is returned. Near the
     singular middle angle of ±90° only the sum or difference of the first and the last is determined well, and noise

@@ -102,11 +102,11 @@ class Skeleton:
         return np.isfinite(self.straight)
 
     def index(self, name: str) -> int:
-        """The position of a degree of freedom in p."""
+        """Return the position of a degree of freedom in the pose vector."""
         return self.names.index(name)
 
     def clip(self, poses: Float) -> Float:
-        """Poses (..., D) mapped into the limits (eq. 22)."""
+        """Map poses (..., D) into the limits (eq. 22)."""
         return np.clip(poses, self.lower, self.upper)
 
     @cached_property
@@ -132,8 +132,7 @@ class Skeleton:
         return np.flatnonzero(self.rise.any(axis=1))
 
     def transforms(self, pose: Float) -> Float:
-        """(..., D, 4, 4) transforms T_k after each degree of freedom of poses (..., D), float64. Kernels have their
-        own."""
+        """Return the transforms T_k (..., D, 4, 4) after each degree of freedom of poses (..., D), float64."""
         pose = np.asarray(pose, dtype=np.float64)
         if pose.ndim > 1:
             return self._transforms(pose)
@@ -188,13 +187,13 @@ class Skeleton:
         return pack_tree(self.axis, self.point, self.rise, self.prismatic, self.parent)
 
     def in_world(self, T_body: Float) -> Float:
-        """Transforms (..., 4, 4) or (..., 3, 4) to the body frame as transforms to the world, zero configuration."""
+        """Return transforms (..., 4, 4) or (..., 3, 4) to the body frame as transforms to the world, at zero angles."""
         B = np.eye(4)
         B[:3, :3] = self.T_world_body
         return B[: np.shape(T_body)[-2], : np.shape(T_body)[-2]] @ T_body
 
     def twists(self, pose: Float) -> tuple[Float, Float]:
-        """World twists (ω, v), each (..., D, 3), at poses (..., D): a point x below degree of freedom k moves at
+        """Return world twists (ω, v), each (..., D, 3), at poses (..., D): a point x below degree of freedom k moves at
         ω_k × x + v_k (eqs. 6-8)."""
         T = self.transforms(pose)
         above = np.where((self.parent >= 0)[:, None, None], T[..., self.parent, :, :], np.eye(4))
@@ -209,7 +208,7 @@ class Skeleton:
         return np.where(self.prismatic[:, None], 0.0, axis), v
 
     def rotation(self, dofs: Iterable[int], poses: Float) -> Float:
-        """(..., 3, 3) the product of successive rotations about these axes of the zero configuration."""
+        """Return the product (..., 3, 3) of successive rotations about these axes of the zero configuration."""
         K, squares = self._generators
         R = np.eye(3)
         for k in dofs:
@@ -218,24 +217,24 @@ class Skeleton:
         return R
 
     def segment_transforms(self, pose: Float) -> Float:
-        """(..., S, 4, 4) transforms of the segments."""
+        """Return the transforms (..., S, 4, 4) of the segments."""
         if np.ndim(pose) == 2 and len(pose) > _BLOCK:
             return np.concatenate([self.segment_transforms(block) for block in blocks(pose)])
         return self.transforms(pose)[..., self.segment_dof, :, :]
 
     def joints(self, pose: Float) -> Float:
-        """(..., J, 3) joint centres in the world frame at poses (..., D), metres, in the order of :data:`JOINTS`."""
+        """Return joint centres (..., J, 3), metres, world frame, at poses (..., D), in the order of :data:`JOINTS`."""
         if np.ndim(pose) == 2 and len(pose) > _BLOCK:
             return np.concatenate([self.joints(block) for block in blocks(pose)])
         T = self.segment_transforms(pose)[..., self.joint_segment, :, :]
         return np.asarray((T[..., :3, :3] @ self.joint_position[:, :, None])[..., 0] + T[..., :3, 3])
 
     def apart(self, poses: Float, joints: Float) -> Float:
-        """(...) how far the joints of poses (..., D) lie at most from others (J, 3), metres."""
+        """Return the largest distance (...) of the joints of poses (..., D) from others (J, 3), metres."""
         return np.asarray(np.linalg.norm(self.joints(poses) - joints, axis=-1).max(axis=-1))
 
     def joint_jacobian(self, poses: Float) -> Float:
-        """(..., J, 3, D) derivatives of :meth:`joints` at poses (..., D)."""
+        """Return the derivatives (..., J, 3, D) of :meth:`joints` at poses (..., D)."""
         w, v = self.twists(poses)
         moved = cross(w[..., None, :, :], self.joints(poses)[..., None, :]) + v[..., None, :, :]
         return np.swapaxes(moved * self.ancestors[self.joint_segment][:, :, None], -1, -2)
@@ -251,7 +250,7 @@ class Skeleton:
         return result
 
     def chain_dofs(self, chain: str) -> NDArray[np.bool_]:
-        """(D,) True for the degrees of freedom of one of :data:`CHAINS`; the torso's are in none of them."""
+        """Return (D,) True for the degrees of freedom of one of :data:`CHAINS`; the torso's are in none of them."""
         return np.isin(self.names, [name for row in TABLE if row.chain == chain for name in row.dof_names])
 
 
@@ -266,13 +265,13 @@ def blocks(poses: Float) -> list[Float]:
 
 
 def shoulder_angles(direction: Float) -> tuple[float, float]:
-    """Yaw and pitch of the shoulder that point the arm along ``direction`` (3,): forward, outward, up."""
+    """Return yaw and pitch of the shoulder that point the arm along ``direction`` (3,): forward, outward, up."""
     pitch = float(np.arcsin(np.clip(direction @ ARM_POLE, -1, 1)))
     return float(np.arctan2(direction @ np.cross(ARM_POLE, ARM), direction @ ARM)), pitch
 
 
 def arm_elevation(first: ArrayLike, second: ArrayLike, by: int | None = None) -> Float:
-    """Sine of the arm's elevation over the horizontal in the trunk's frame, from a shoulder's first two angles.
+    """Return the sine of the arm's elevation in the trunk's frame, from a shoulder's first two angles.
 
     Args:
         by: 0 or 1 for the derivative by the first or the second angle.
@@ -286,7 +285,7 @@ def arm_elevation(first: ArrayLike, second: ArrayLike, by: int | None = None) ->
 
 
 def convert_poses(poses: Float, source: Skeleton, target: Skeleton) -> Float:
-    """(..., D') poses (..., D) of one skeleton as poses of another: angles by name, 0 where the source has none.
+    """Return poses (..., D) of one skeleton as poses (..., D') of another: angles by name, 0 where the source has none.
 
     If only the source has a waist, the hips take over its rotation: trunk, head and all limbs keep their orientation,
     and the legs move with their sockets.
@@ -301,12 +300,12 @@ def convert_poses(poses: Float, source: Skeleton, target: Skeleton) -> Float:
 
 
 def paper_poses(skeleton: Skeleton, poses: Float) -> Float:
-    """(..., 24) poses (..., D) in the degrees of freedom of the paper's body; the hips are angles against the trunk."""
+    """Return poses (..., D) in the paper's degrees of freedom (..., 24); the hips are angles against the trunk."""
     return convert_poses(poses, skeleton, build_skeleton(BodyDimensions.from_stature(1.75), paper=True))
 
 
 def _with_waist_in_hips(skeleton: Skeleton, poses: Float) -> Float:
-    """The poses (..., D) with hip angles against the trunk instead of the pelvis."""
+    """Return the poses (..., D) with hip angles against the trunk instead of the pelvis."""
     result = np.array(poses, dtype=np.float64)
     B = skeleton.T_world_body
     waist = skeleton.rotation(np.flatnonzero(skeleton.is_waist), result)
@@ -320,7 +319,7 @@ def _with_waist_in_hips(skeleton: Skeleton, poses: Float) -> Float:
 
 
 def up_rotation(up: str) -> Float:
-    """(3, 3) rotation of the body frame such that its z axis points along ``up`` (see
+    """Return the rotation (3, 3) of the body frame such that its z axis points along ``up`` (see
     :func:`tk.model.cameras.up.up_vector`).
 
     The body's x axis is the world axis that follows the one nearest to ``up``, made horizontal: y for x, z for y, x for

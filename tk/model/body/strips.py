@@ -57,7 +57,7 @@ def build_strips(body: SuperellipsoidBody, pieces: Sequence[int]) -> Strips:
 
 
 def _circle_heights(piece: Superellipsoid) -> Float:
-    """(CIRCLES,) η in the middle of equal lengths of the wider meridian."""
+    """Return η (CIRCLES,) in the middle of equal lengths of the wider meridian."""
     eta = np.linspace(*piece.eta_range, 513)
     a1, a2, _ = piece.radii
     meridian = piece.point(eta, np.full_like(eta, 0.0 if a1 >= a2 else np.pi / 2))

@@ -127,7 +127,7 @@ def _buried(
     segment: NDArray[np.int32],
     piece: NDArray[np.int32],
 ) -> NDArray[np.bool_]:
-    """(N,) bool, samples inside another piece in the Da Vinci pose: armpits, the crotch, the inside of joints."""
+    """Return (N,) True for samples inside another piece in the Da Vinci pose: armpits, crotch, inside of joints."""
     T = skeleton.segment_transforms(neutral_pose(skeleton))
     p_world = np.einsum("nab,nb->na", T[segment][:, :3, :3], points) + T[segment][:, :3, 3]
     buried = np.zeros(len(points), dtype=bool)
@@ -139,7 +139,10 @@ def _buried(
 
 
 def _patches(points: Float, normals: Float, segment: NDArray[np.int32]) -> tuple[NDArray[np.int32], list[str]]:
-    """Colour patches: each segment cut along its length, the trunk and head also into front and back."""
+    """Return each sample's colour patch (N,) and the patches' names.
+
+    A segment is cut along its length, the trunk and the head also into front and back.
+    """
     names: list[str] = []
     patch = np.zeros(len(points), dtype=np.int32)
     for s, name in enumerate(SEGMENTS):

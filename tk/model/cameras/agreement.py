@@ -129,8 +129,11 @@ def camera_agreement(body: ConeBody, rig: Rig, frames: Sequence[BundleFrame]) ->
 
 
 def _gauge_modes(rig: Rig, p_world: Float, parameters: int) -> Float:
-    """(k C, m) changes of the k parameters of C cameras by motions of the world near a point along x, y, z, by a common
-    delay and, of two cameras, by another size of the person."""
+    """Return the changes (k C, m) of the k parameters of C cameras by each of m motions that no image shows.
+
+    They are motions of the world near a point along x, y, z, a common delay and, of two cameras, another size of the
+    person.
+    """
     C, more = len(rig), parameters - 3
     modes = np.zeros((C, parameters, 4 + more))
     steps = np.concatenate([_STEP_M * np.eye(3), -_STEP_M * np.eye(3)])

@@ -129,7 +129,7 @@ class ContourBundle:
         return BundleState(self.rig, np.zeros((len(self.rig), len(self.sigma))), poses, self.family.start)
 
     def offsets(self, state: BundleState) -> Float:
-        """(C,) time offset of each camera, frames."""
+        """Return the time offset (C,) of each camera, frames."""
         return state.change[:, -1] if "offset" in self.parameters else np.zeros(len(self.rig))
 
     def contours(self, state: BundleState, scale: int) -> list[Contours]:
@@ -153,11 +153,11 @@ class ContourBundle:
         return found
 
     def linearise(self, state: BundleState, scale: int) -> Equations:
-        """The equations at an estimate and a scale's index, priors included."""
+        """Return the equations at an estimate and a scale's index, priors included."""
         return self.equations(state, self.contours(state, scale))
 
     def equations(self, state: BundleState, contours: Sequence[Contours]) -> Equations:
-        """The equations of contours at an estimate, priors included.
+        """Return the equations of contours at an estimate, priors included.
 
         A block holds a frame's pose and, unless segments are fixed, the displacement (3,) of every segment.
         """
@@ -207,7 +207,7 @@ class ContourBundle:
         return found
 
     def move(self, state: BundleState, poses: Float, shared: Float) -> BundleState:
-        """The estimate after steps of the blocks (F, D, of which the poses come first) and of the shared unknowns."""
+        """Return the estimate after steps of the blocks (F, D or more; poses come first) and of the shared unknowns."""
         step = shared[self.cameras].reshape(state.change.shape)
         moved = (_moved(camera, self.parameters, row) for camera, row in zip(state.rig, step, strict=True))
         return BundleState(
@@ -239,7 +239,7 @@ def camera_rows(camera: Camera, x_world: Float, edgels: Edgels, name: str) -> Fl
 
 
 def _moved(camera: Camera, parameters: Sequence[str], row: Float) -> Camera:
-    """The camera after a step (k,) of "turn", "move" and, if it is a parameter, "focal"."""
+    """Return the camera after a step (k,) of "turn", "move" and, if it is a parameter, "focal"."""
     turn = np.asarray(cv2.Rodrigues(row[:3])[0])
     moved = replace(camera, rotation=turn @ camera.rotation, translation=turn @ camera.translation + row[3:6])
     if "focal" in parameters:

@@ -18,7 +18,7 @@ _CONVERGED = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 
 def _undistort(points: Float, matrix: Float, distortions: Float, criteria: tuple[int, int, float]) -> Float:
-    """Normalised coordinates (N, 1, 2) of pixels (N, 1, 2), iterated until ``criteria`` hold."""
+    """Return normalised coordinates (N, 1, 2) of pixels (N, 1, 2), iterated until ``criteria`` hold."""
     if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4 has a separate function
         result = cv2.undistortPointsIter(points, matrix, distortions, None, None, criteria)
     else:
@@ -101,7 +101,7 @@ class Camera:
         return pixels, depth
 
     def _pixels(self, p_camera: Float) -> Float:
-        """(N, 2) pixels of points (N, 3) in front of the camera, NaN beyond the fold of the distortion."""
+        """Return pixels (N, 2) of points (N, 3) in front of the camera, NaN beyond the fold of the distortion."""
         xy = p_camera[:, :2] / p_camera[:, 2:]
         squared = np.einsum("na,na->n", xy, xy)
         if self.fisheye:

@@ -73,5 +73,5 @@ def infer_up(rig: Rig) -> FoundUp:
 
 
 def _is_world(camera: Camera) -> bool:
-    """Whether the world is this camera's own frame."""
+    """Return whether the world is this camera's own frame."""
     return bool(np.allclose(camera.rotation, np.eye(3), atol=1e-6) and np.allclose(camera.translation, 0.0, atol=1e-6))

@@ -163,7 +163,7 @@ def aligned(rig: Rig, target: Rig, turn: float, move: float, scaling: bool = Tru
 
 
 def _twist(camera: Camera, other: Camera) -> Float:
-    """(6,) turn, radians, and move of the centre, metres, from another camera to this one, in the camera frame."""
+    """Return (6,) turn, radians, and move of the centre, metres, from another camera to this one, camera frame."""
     turn = np.asarray(cv2.Rodrigues(camera.rotation @ other.rotation.T)[0]).ravel()
     return np.concatenate([turn, -camera.rotation @ (camera.center - other.center)])
 
@@ -189,7 +189,7 @@ def _cross(a: Float) -> Float:
 
 
 def _deviations(covariance: Float, bundle: ContourBundle) -> dict[str, Float]:
-    """(C,) standard deviations of each camera parameter, after the gauges are projected out."""
+    """Return (C,) standard deviations of each camera parameter, after the gauges are projected out."""
     C, k, timed = len(bundle.rig), len(bundle.sigma), "offset" in bundle.parameters
     modes = np.zeros((C, k, 7 + timed))
     modes[:, :6, :7] = world_motions(bundle.rig).reshape(C, 6, 7)

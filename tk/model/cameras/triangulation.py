@@ -154,19 +154,21 @@ def same_person(rig: Rig, people: Sequence[Float], inside: tuple[Float, Float]) 
 
 
 def _support(errors: Float, gate: Float, weight: Float) -> Float:
-    """Support of observations for points by their reprojection errors (MSAC: Torr & Zisserman, CVIU 2000): the weight
-    at an error of 0, falling with the error's square to 0 at the gate."""
+    """Return the support of observations for points by their reprojection errors (MSAC: Torr & Zisserman, CVIU 2000).
+
+    It is the weight at an error of 0 and falls with the error's square to 0 at the gate.
+    """
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(errors < gate, weight * (1.0 - (errors / gate) ** 2), 0.0)
 
 
 def _weights(joints: Float) -> Float:
-    """(..., J) confidences of at least :data:`LEAST_CONFIDENCE`, 0 elsewhere."""
+    """Return (..., J) confidences of at least :data:`LEAST_CONFIDENCE`, 0 elsewhere."""
     confidence = np.where(np.isfinite(joints).all(axis=-1), joints[..., 2], 0.0)
     return np.where(confidence >= LEAST_CONFIDENCE, np.minimum(confidence, 1.0), 0.0)
 
 
 def _gate_px(person: Float) -> float:
-    """Largest reprojection error of an inlier of a person (J, 3), pixels."""
+    """Return the largest reprojection error of an inlier of a person (J, 3), pixels."""
     confident = person[_weights(person) > 0, :2]
     return GATE * float(np.ptp(confident, axis=0).max()) if len(confident) else 0.0

@@ -69,7 +69,7 @@ class Views:
         self.sizes = np.array([(c.width, c.height) for c in rig], np.int32)
 
     def pyramid(self, masks: Masks, scales: int, cleaning: bool) -> Pyramid:
-        """The scales of masks (V, H, W), cleaned if ``cleaning``."""
+        """Return the scales of masks (V, H, W), cleaned if ``cleaning``."""
         # everything happens inside boxes around the people
         crops = [(slice(y, y + h), slice(x, x + w)) for x, y, w, h in map(cv2.boundingRect, masks)]
         shared = any((mask[crop] == OTHERS).any() for mask, crop in zip(masks, crops, strict=True))

@@ -16,7 +16,7 @@ _HEEL, _TOE = -0.2, 0.8
 
 
 def joint_positions(skeleton: Skeleton, transforms: Float) -> Float:
-    """Return joint centres (F, 15, 3), metres, world frame, from :meth:`Skeleton.segment_transforms`."""
+    """Return joint centres (F, J, 3), metres, world frame, from :meth:`Skeleton.segment_transforms`."""
     T = transforms[:, skeleton.joint_segment]
     return np.einsum("fjab,jb->fja", T[..., :3, :3], skeleton.joint_position) + T[..., :3, 3]
 
