@@ -258,7 +258,7 @@ def test_single_precision_finds_the_same_points(kernel):
     assert (single.visible != double.visible).mean() < 5e-3
 
 
-def test_nothing_is_found_behind_a_camera_and_no_stale_numbers_are_left():
+def test_points_behind_a_camera_are_zero():
     turned = RIG[0]
     away = Camera(
         "away",

@@ -475,7 +475,7 @@ def test_along_rows_and_columns_the_border_is_found_to_half_a_pixel(normal, offs
     assert abs(found - (offset + 0.5)) < 0.25 and certainty > 0.8
 
 
-def test_equal_colors_tell_nothing():
+def test_equal_colors_give_no_border():
     x = np.mgrid[:60, :60][1]
     split = np.where((x < 30)[..., None], RED, BLUE).astype(np.uint8)
     plain = np.full((60, 60, 3), RED, np.uint8)
@@ -488,6 +488,6 @@ def test_equal_colors_tell_nothing():
     assert border(np.full((60, 60, 3), BLUE, np.uint8), two_colors(), (30, 30), (1.0, 0.0))[1] < -6
 
 
-def test_settings_out_of_range_are_told():
+def test_settings_out_of_range_are_refused():
     with pytest.raises(ConfigError, match="window_px = 0"):
         SearchSettings(window_px=0)

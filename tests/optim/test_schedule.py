@@ -152,7 +152,7 @@ def test_finds_the_target(coupling: float) -> None:
     assert result.iterations.shape == (3,) and result.iterations.dtype == np.int32
 
 
-def test_the_second_pass_holds_the_torso_and_the_other_chains() -> None:
+def test_second_pass_of_a_chain_keeps_torso_and_other_chains() -> None:
     toy = Toy(coupling=0.3)
     # so short a first pass leaves the torso where the chains would like to pull it
     result = solve(toy, TARGET + 0.6, iterations=4)
@@ -175,7 +175,7 @@ def test_the_second_pass_begins_where_the_first_ended() -> None:
     assert 0 < np.abs(pose - toy.asked_full[-1][0]).max() < np.radians(2)
 
 
-def test_refines_to_a_part_of_the_first_tolerance(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_second_pass_has_a_smaller_tolerance(monkeypatch: pytest.MonkeyPatch) -> None:
     """The chains alone: the coarser ε₁ leaves an error that ε₂ does not."""
 
     def refined(share: float) -> ScheduleResult:
@@ -206,7 +206,7 @@ def test_begins_at_the_best_of_the_predictions() -> None:
     np.testing.assert_array_equal(toy.asked_full[0], starts[[1]])
 
 
-def test_a_prediction_outside_the_limits_is_judged_inside() -> None:
+def test_prediction_outside_the_limits_is_clipped_before_it_is_evaluated() -> None:
     """Far outside, the first would be the worst of the two."""
     toy = Toy(target=np.where(np.arange(D) == 0, LIMIT, TARGET))
     beyond, near = toy.target.copy(), toy.target + 0.1

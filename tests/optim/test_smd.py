@@ -84,7 +84,7 @@ def slow_smd(
 
 @pytest.mark.parametrize("limits", [(-np.inf, np.inf), (-0.5, 0.8)])
 @pytest.mark.parametrize("memory", [0.0, 0.3, 0.9])
-def test_every_state_is_that_of_the_equations(constants, memory: float, limits: tuple[float, float]) -> None:
+def test_states_follow_the_equations(constants, memory: float, limits: tuple[float, float]) -> None:
     constants(META_STEP=0.7, MEMORY=memory)
     rng = np.random.default_rng(3)
     B, D, count = 4, 3, 25
@@ -106,7 +106,7 @@ def test_every_state_is_that_of_the_equations(constants, memory: float, limits: 
         np.testing.assert_allclose(result.path[:, b], path, atol=ROUNDING)
 
 
-def test_descent_in_a_basis_is_descent_on_the_problem_seen_through_it() -> None:
+def test_descent_in_a_basis_equals_descent_on_the_transformed_problem() -> None:
     rng = np.random.default_rng(4)
     hessian = np.diag([1.0, 3.0, 0.2])
     centre = np.array([1.0, -2.0, 0.5])
@@ -131,7 +131,7 @@ def test_a_step_size_is_at_most_halved(constants) -> None:
     np.testing.assert_array_equal(np.diff(path[:, 0, 0]), [-50.0, 25.0])
 
 
-def test_pushing_against_a_limit_leaves_the_step_size_alone() -> None:
+def test_step_size_does_not_change_at_a_limit() -> None:
     """Eq. 23: at a limit p does not move, so there is no effect of the step size to learn from. With the plain gradient
     in eq. 19 ten iterations against the limit make the step size explode."""
     pull = [1.0] * 10 + [-1.0]
@@ -174,7 +174,7 @@ def test_no_state_leaves_the_limits(seed: int, scale: float, lower: float, width
     limits=st.tuples(st.integers(0, 4), st.integers(0, 4)),
 )
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_stops_when_the_moving_average_stands_still(
+def test_stops_when_the_moving_average_changes_by_less_than_the_tolerance(
     constants, moves: list[tuple[int, ...]], window: int, limits: tuple[int, int]
 ) -> None:
     """Eq. 20 in its long form, with the means, for two rows of two parameters."""
@@ -194,7 +194,7 @@ def test_stops_when_the_moving_average_stands_still(
         np.testing.assert_array_equal(result.path[-1, b], states[stop])
 
 
-def test_a_change_of_the_tolerance_itself_is_small_enough(constants) -> None:
+def test_change_equal_to_the_tolerance_stops(constants) -> None:
     constants(META_STEP=0, MEMORY=0, WINDOW=1)
     gradients = np.full((10, 1, 1), 0.25)
     exact = minimise(scripted(gradients), [[0.0]], 1.0, np.array([0.25]), iterations=10)
@@ -231,7 +231,7 @@ def test_a_row_does_not_depend_on_other_rows() -> None:
         np.testing.assert_allclose(alone.pose[0], company.pose[b], rtol=1e-12)
 
 
-def test_a_finished_row_is_not_asked_for_more(constants) -> None:
+def test_finished_row_is_not_evaluated_again(constants) -> None:
     """Row 0 is done after the first window; what its gradient is from then on must not matter, not even NaN."""
     gradients = np.ones((20, 2, 1))
     gradients[:, 0] = 0
@@ -242,7 +242,7 @@ def test_a_finished_row_is_not_asked_for_more(constants) -> None:
     assert result.pose[0, 0] == 7.0
 
 
-def test_a_finished_rows_direction_does_not_run_away(constants) -> None:
+def test_direction_of_a_finished_row_stays_bounded(constants) -> None:
     """Eq. 19 alone would go on: with λ|1 − aH| above 1, v grows without bound where p stands still."""
     directions: list[float] = []
 
@@ -258,7 +258,7 @@ def test_a_finished_rows_direction_does_not_run_away(constants) -> None:
     np.testing.assert_array_equal(directions[3:], directions[3])
 
 
-def test_columns_of_zeros_hold_parameters_still() -> None:
+def test_parameters_outside_the_basis_do_not_change() -> None:
     rng = np.random.default_rng(8)
     factor = rng.normal(size=(4, 4))
     hessian = factor @ factor.T + np.eye(4)
@@ -281,7 +281,7 @@ def test_columns_of_zeros_hold_parameters_still() -> None:
 # --- known answers ----------------------------------------------------------------------------------------------------
 
 
-def test_a_round_bowl() -> None:
+def test_isotropic_quadratic_is_minimised() -> None:
     hessian = np.diag([1.0, 0.7, 1.4])
     centre = np.array([3.0, -2.0, 0.1])
     result = minimise(bowl(hessian, centre), np.zeros((1, 3)), 0.5, np.full(3, 1e-9), iterations=100)
@@ -289,7 +289,7 @@ def test_a_round_bowl() -> None:
     np.testing.assert_allclose(result.pose[0], centre, atol=1e-6)
 
 
-def test_a_whitening_basis_makes_any_bowl_round() -> None:
+def test_whitening_basis_makes_any_quadratic_isotropic() -> None:
     """A bowl of condition 10⁵, askew: along its valley the unit vectors' step sizes get nowhere."""
     rng = np.random.default_rng(5)
     axes = rotation(rng, 4)
@@ -305,7 +305,7 @@ def test_a_whitening_basis_makes_any_bowl_round() -> None:
     assert np.linalg.norm(plain.pose[0] - centre) > 0.1
 
 
-def test_the_step_sizes_find_their_way_through_a_curved_valley(constants) -> None:
+def test_step_sizes_adapt_in_a_curved_valley(constants) -> None:
     """Rosenbrock's valley from the usual start: SMD against gradient descent (μ = 0) with the same first step."""
 
     def found(mu: float) -> tuple[Float, float]:
@@ -374,7 +374,7 @@ def test_leclerc_regression_ignores_outliers() -> None:
 # --- divergence -------------------------------------------------------------------------------------------------------
 
 
-def test_an_explosion_is_an_error_and_a_bound_prevents_it() -> None:
+def test_divergence_is_an_error_and_a_bound_prevents_it() -> None:
     start = [[30.0, -20.0]]
     with (
         pytest.raises(FloatingPointError, match=r"not finite at iteration \d+, row 0"),

@@ -61,7 +61,7 @@ class SigmaShares:
 
 
 def flexion_deg(p_world: Float) -> dict[str, Float]:
-    """Return the flexion (F,) of each hinge, degrees, from joints (F, 15, 3); NaN if a bone is unknown or zero."""
+    """Return the flexion (F,) of each hinge, degrees, from joints (F, J, 3); NaN if a bone is unknown or zero."""
     at = {name: p_world[:, index] for index, name in enumerate(JOINTS)}
     found = {}
     for name, (before, after) in HINGES.items():
@@ -75,7 +75,7 @@ def flexion_deg(p_world: Float) -> dict[str, Float]:
 
 
 def flexion_errors(p_result: Float, p_truth: Float) -> dict[str, FlexionError]:
-    """Return the errors by hinge, and of all ``knees`` and ``elbows``, from joints (F, 15, 3) of the same frames."""
+    """Return the errors by hinge, and of all ``knees`` and ``elbows``, from joints (F, J, 3) of the same frames."""
     found, true = flexion_deg(p_result), flexion_deg(p_truth)
     groups = {name: (name,) for name in HINGES} | {f"{kind}s": sides for kind, sides in HINGE_KINDS.items()}
     return {

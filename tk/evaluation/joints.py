@@ -233,7 +233,7 @@ def evaluate(result: JointTrack, truth: JointTrack) -> Evaluation:
 
 
 def trunk_axes(p_world: Float) -> Float:
-    """Return the trunk axes (F, 3, 3) of joints (F, 15, 3): the columns point forward, left and up.
+    """Return the trunk axes (F, 3, 3) of joints (F, J, 3): the columns point forward, left and up.
 
     Up points from the pelvis to the neck. Left is the sum of the vectors from right to left hip and shoulder, made
     perpendicular to up; forward completes a right-handed frame. NaN if the trunk is unknown or degenerate.

@@ -16,7 +16,7 @@ _LEAST = 1e-9
 
 
 class NewtonSteps(NamedTuple):
-    """What determines the steps of B states with D parameters, beside the equations."""
+    """What determines the steps of B states with D parameters, besides the equations."""
 
     free: NDArray[np.int32]  # (n,) int32 the parameters that may change
     # (3 + B, D) limits and precision of the prior, see `LOWER`; from row `MEAN` on the mean of each state's prior

@@ -123,7 +123,7 @@ def draw_lost(tile: Image) -> None:
 
 
 def draw_joints(tile: Image, xy: Float, colors: Sequence[Color | None], lost: bool = False) -> None:
-    """Draw bones as lines and joints in the colours of :func:`dots`; ``xy`` (15, 2) tile pixels."""
+    """Draw bones as lines and joints in the colours of :func:`dots`; ``xy`` (J, 2) tile pixels."""
     points = fixed(np.nan_to_num(xy))
     seen = np.asarray(np.isfinite(xy).all(axis=1))
     plain = LOST_BODY if lost else BONE
@@ -139,7 +139,7 @@ def draw_joints(tile: Image, xy: Float, colors: Sequence[Color | None], lost: bo
 
 
 def draw_truth(tile: Image, xy: Float) -> None:
-    """Draw small crosses at the ground-truth joints, ``xy`` (15, 2) tile pixels."""
+    """Draw small crosses at the ground-truth joints, ``xy`` (J, 2) tile pixels."""
     for point in np.rint(xy[np.isfinite(xy).all(axis=1)]).astype(int).tolist():
         for color, width in ((INK, 3), (PAPER, 1)):
             cv2.drawMarker(tile, point, color, cv2.MARKER_TILTED_CROSS, 7, width, cv2.LINE_AA)

@@ -70,8 +70,8 @@ class Figure:
     """The person in F frames."""
 
     frames: NDArray[np.int64]  # (F,) source frames
-    joints: Float  # (F, 15, 3) metres, world frame
-    sigma: Float | None  # (F, 15) standard deviations of the joints, metres, or None
+    joints: Float  # (F, J, 3) metres, world frame
+    sigma: Float | None  # (F, J) standard deviations of the joints, metres, or None
     status: NDArray[np.uint8]  # (F,) as in the result
     solids: tuple[Solid, ...]  # the body; empty if the result has no body
     transforms: Float  # (F, S, 4, 4) of the segments, zero configuration to world
@@ -112,7 +112,7 @@ class Figure:
         return np.cumsum([0, *(solid.rings.size // 3 for solid in self.solids)])
 
     def seen(self, row: int, camera: Camera) -> tuple[list[Outline], Float]:
-        """Return the segments in the image of a camera, farthest first, and the joints (15, 2) pixels.
+        """Return the segments in the image of a camera, farthest first, and the joints (J, 2) pixels.
 
         Solids are convex, so each outline is the convex hull of the projected circles (lens distortion bends it by
         less than a pixel over a limb). Solids that are partly behind the camera are left out; such joints are NaN.

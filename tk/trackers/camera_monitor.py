@@ -216,7 +216,7 @@ class CameraMonitor:
         return estimate, used, np.where(kept, offset, np.nan)
 
     def _is_wrong(self, camera: int, residual: Float, before: Float, others: NDArray[np.bool_], joints: Float) -> bool:
-        """Return whether a camera is wrong, by the joints (15, 3) and the residual (C, 2) of the pose without it.
+        """Return whether a camera is wrong, by the joints (J, 3) and the residual (C, 2) of the pose without it.
 
         Cameras that see the person from the same or from opposite sides contradict no other camera, because they do not
         determine a pose.

@@ -53,14 +53,14 @@ class Estimate:
 
     Attributes:
         pose: (D,) pose vector, radians and metres, in the order of the tracker's ``pose_names``.
-        joints: (15, 3) joint centres, metres.
+        joints: (J, 3) joint centres, metres.
         status: "tracked", "initialised", "recovered", "lost", "suspect" (by the camera monitor), or "absent" (by the
             run: nobody is there).
         objective: the objective's final value; the region tracker gives the running mean of its cost.
         iterations: (S,) optimiser iterations by stage; for ``search`` 1 if limbs were searched, else 0.
         timing: seconds by stage.
         surface: the hull's surface, if the tracker made one.
-        sigma: (15,) m, standard deviation of each joint position along one axis; NaN if unknown, None if the tracker
+        sigma: (J,) m, standard deviation of each joint position along one axis; NaN if unknown, None if the tracker
             does not report it.
         residual: (C, 2) missing area (body outside the mask) and surplus area (mask outside the body) by camera, shares
             of the person's pixels, NaN for a camera that was not used; their sum is E_S. None if not measured.

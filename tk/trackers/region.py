@@ -385,7 +385,7 @@ class RegionTracker(ContourTracker):
         return met.label[0], here.hessian[0], evidence.residual(met.label[0])
 
     def _sigma(self, pose: Float, curvature: Float, label: NDArray[np.uint8], residual: Float) -> Float:
-        """Return (15,) one standard deviation of each joint's position along an axis, metres: from the evidence of this
+        """Return (J,) one standard deviation of each joint's position along an axis, metres: from the evidence of this
         frame, the difference to the mean posture until now, and the spread of the hypotheses."""
         skeleton = self.body.skeleton
         variance = self.variance(pose, curvature, self.prior(pose), label, residual)
@@ -398,7 +398,7 @@ class RegionTracker(ContourTracker):
         return np.asarray(np.sqrt(variance))
 
     def variance(self, pose: Float, curvature: Float, prior: Prior, label: NDArray[np.uint8], residual: Float) -> Float:
-        """Return (..., 15) variance of the joints' positions along an axis, metres², from the contours' noise and the
+        """Return (..., J) variance of the joints' positions along an axis, metres², from the contours' noise and the
         directions of the views, scaled by the residual.
 
         Args:

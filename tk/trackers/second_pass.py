@@ -56,7 +56,7 @@ class SecondPass:
         report: receives the share of the work that is done.
 
     Attributes:
-        poses, residual, variance: (F, D), (F, C, 2), (F, 15) the result; the variance without that of the posture.
+        poses, residual, variance: (F, D), (F, C, 2), (F, J) the result; the variance without that of the posture.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class SecondPass:
 
     @property
     def sigma(self) -> Float:
-        """(F, 15) metres, one standard deviation of the joints' positions along an axis; 0 in lost frames."""
+        """(F, J) metres, one standard deviation of the joints' positions along an axis; 0 in lost frames."""
         skeleton, tracked = self.tracker.body.skeleton, self.tracked
         variance = self.variance.copy()
         posture = np.median(directions(skeleton, self.poses[tracked]), axis=0)

@@ -183,7 +183,7 @@ def test_transforms_are_the_products_of_exponentials(up, seed):
     np.testing.assert_allclose(skeleton.transforms(pose), expected, atol=1e-12)
 
 
-def test_chains_and_torso_share_out_the_degrees_of_freedom():
+def test_each_degree_of_freedom_belongs_to_torso_waist_or_one_chain():
     free = np.array([SKELETON.chain_dofs(c) for c in CHAINS])
     assert free.sum(axis=0).max() == 1
     assert free.sum(axis=1).tolist() == [2, 4, 4, 6, 6]
@@ -204,7 +204,7 @@ def test_chains_and_torso_share_out_the_degrees_of_freedom():
         assert {s for s, a in zip(SEGMENTS, affected, strict=True) if a} == set(CHAINS[chain])
 
 
-def test_ancestors_are_what_moves_a_segment():
+def test_ancestors_are_the_degrees_of_freedom_that_move_a_segment():
     pose = random_pose(0)
     before = SKELETON.segment_transforms(pose)
     for k in range(D):
@@ -421,7 +421,7 @@ def test_another_up_gives_the_rotated_result(up, seed):
     np.testing.assert_array_equal(skeleton.lower, SKELETON.lower)
 
 
-def test_z_is_the_default_and_leaves_the_body_frame():
+def test_default_up_is_z_and_keeps_the_body_frame():
     np.testing.assert_array_equal(up_rotation("z"), np.eye(3))
     np.testing.assert_array_equal(build_skeleton(DIMENSIONS).T_world_body, np.eye(3))
 

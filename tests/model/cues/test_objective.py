@@ -58,7 +58,7 @@ def test_draw_follows_the_generator(objective):
     assert not np.array_equal(a, b)
 
 
-def test_every_sample_is_drawn_sooner_or_later(objective):
+def test_all_samples_are_drawn_in_many_iterations(objective):
     rng = np.random.default_rng(0)
     seen = set()
     for _ in range(400):
@@ -113,7 +113,7 @@ def test_same_seed_same_bits(objective, index, truth):
             np.testing.assert_array_equal(x, y)
 
 
-def test_gradient_leads_back_to_the_truth(frame, truth):
+def test_gradient_descends_towards_the_true_pose(frame, truth):
     """On average over draws, −∇f of a displaced body points towards its place, along each axis."""
     evaluate = frame.full()
     for axis in range(3):
@@ -193,7 +193,7 @@ def test_damping_is_what_inliers_would_give(frame, truth):
 # Chains
 
 
-def test_a_chains_samples_pull_at_it_and_the_torso_only(index, truth):
+def test_samples_of_a_chain_have_gradients_for_it_and_the_torso_only(index, truth):
     frame = FrameObjective(BodyObjective(BODY, SURFACE), index, np.random.default_rng(0))
     result = frame.chains(ALL_CHAINS, truth)(np.repeat(truth[None], 5, 0) + 0.03, np.zeros((5, D)), 0)
     torso = ~frame.free.any(axis=0)

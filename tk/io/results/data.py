@@ -327,8 +327,8 @@ class JointTrack:
 
     path: Path  # the file
     frames: NDArray[np.int64]  # (F,) source frame indices without repetition
-    positions: Float  # (F, 15, 3) metres, world frame, in the order of `tk.model.body.joints.JOINTS`
+    positions: Float  # (F, J, 3) metres, world frame, in the order of `tk.model.body.joints.JOINTS`
     status: NDArray[np.uint8] | None = None  # (F,) as in a result; None for ground truth
     seconds: Float | None = None  # (F,) wall time of each frame; None if not stored
-    # (F, 15) m, standard deviation of each position along one axis, NaN if unknown; None if not stored
+    # (F, J) m, standard deviation of each position along one axis, NaN if unknown; None if not stored
     sigma: Float | None = None

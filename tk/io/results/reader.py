@@ -82,7 +82,7 @@ def read_joints(path: str | os.PathLike[str]) -> JointTrack:
 
 
 def truth_of(result: Result, path: Path) -> Float | None:
-    """Return the ground-truth joints (P, F, 15, 3) of each person in the result's frames, NaN if missing; None without
+    """Return the ground-truth joints (P, F, J, 3) of each person in the result's frames, NaN if missing; None without
     the file."""
     if not path.exists():
         return None

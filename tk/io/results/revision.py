@@ -37,7 +37,7 @@ def revise_result(
     Args:
         path: the result; no run may be writing it.
         columns: new values of datasets with one row per frame, by dataset name, for all F frames:
-            ``{"pose": (F, D), "joints/position": (F, 15, 3)}``. The result must have these datasets: a tracker that
+            ``{"pose": (F, D), "joints/position": (F, J, 3)}``. The result must have these datasets: a tracker that
             fills them in a second pass declares them in its :class:`ResultMeta`, and the first pass writes NaN.
             New columns delete `/smoothed`, unless ``smoothed`` is given.
         smoothed: all of `/smoothed`, by the names of the unsmoothed datasets; ``bridged`` (F,) bool is required.

@@ -140,7 +140,7 @@ class ConeBody:
         return np.array([groups.index(group_of(part.name)) for part in self.parts])
 
     def reshaped(self, change: Float) -> ConeBody:
-        """Return a body whose parts have other sizes and lie elsewhere about their bones; the skeleton stays.
+        """Return a body whose parts have other sizes and positions about their bones; the skeleton stays.
 
         Args:
             change: (G, 8) for each of :attr:`shape_groups` the growth of the logarithms of a, b, m and h (of an

@@ -41,21 +41,21 @@ _TRUNK = SEGMENTS.index("torso")
 
 
 def contour_variance(skeleton: Skeleton, pose: Float, precision: Float) -> Float:
-    """Return (..., 15) variance of the joints' positions along an axis, metres², from the contours' noise.
+    """Return (..., J) variance of the joints' positions along an axis, metres², from the contours' noise.
 
     Args:
         skeleton: of D degrees of freedom.
         pose: (..., D).
         precision: (..., D, D) information of contours and priors about the pose.
     """
-    J = skeleton.joint_jacobian(pose)  # (..., 15, 3, D)
+    J = skeleton.joint_jacobian(pose)  # (..., J, 3, D)
     J = J.reshape(*J.shape[:-3], -1, J.shape[-1])
     covariance = np.linalg.inv(precision)
     return np.asarray(((J @ covariance) * J).reshape(*J.shape[:-2], len(JOINTS), -1).sum(axis=-1) / 3)
 
 
 def view_variance(rays: Float, shares: Float, view_m: float = VIEW_M) -> Float:
-    """Return (..., 15) variance of the joints' positions along the direction that the views determine least, metres²;
+    """Return (..., J) variance of the joints' positions along the direction that the views determine least, metres²;
     NaN for a joint whose rays are not finite.
 
     A view measures a joint's position across its ray only, and only as far as it shows the joint's bones. Priors and
@@ -64,8 +64,8 @@ def view_variance(rays: Float, shares: Float, view_m: float = VIEW_M) -> Float:
     direction: so much three cameras around the person give, and the contours' noise covers it.
 
     Args:
-        rays: (..., V, 15, 3) unit vectors between the cameras and the joints.
-        shares: (..., V, 15) how much of the joint's bones a view shows, 0 to 1; 0 for a view that was not used.
+        rays: (..., V, J, 3) unit vectors between the cameras and the joints.
+        shares: (..., V, J) how much of the joint's bones a view shows, 0 to 1; 0 for a view that was not used.
         view_m: displacement of a bone's contours in one view, metres, :data:`VIEW_M` if the cameras are correct.
     """
     across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
@@ -77,7 +77,7 @@ def view_variance(rays: Float, shares: Float, view_m: float = VIEW_M) -> Float:
 
 
 def directions(skeleton: Skeleton, poses: Float) -> Float:
-    """Return (..., 15, 3) the direction, relative to the trunk, of the bone that each joint turns with, at poses
+    """Return (..., J, 3) the direction, relative to the trunk, of the bone that each joint turns with, at poses
     (..., D); zero for the trunk's own joints."""
     x = skeleton.joints(poses)
     bones = (x[..., _TO, :] - x[..., _FROM, :]) @ skeleton.segment_transforms(poses)[..., _TRUNK, :3, :3]
@@ -87,10 +87,10 @@ def directions(skeleton: Skeleton, poses: Float) -> Float:
 
 
 def posture_variance(skeleton: Skeleton, poses: Float, mean: Float) -> Float:
-    """Return (..., 15) variance of the joints' offsets along an axis, metres², at poses (..., D).
+    """Return (..., J) variance of the joints' offsets along an axis, metres², at poses (..., D).
 
     Args:
-        mean: (15, 3) mean or median of :func:`directions` over the recording.
+        mean: (J, 3) mean or median of :func:`directions` over the recording.
     """
     length = np.linalg.norm(mean, axis=-1, keepdims=True)
     turned = directions(skeleton, poses) - mean / np.where(length > 0, length, 1.0)

@@ -96,7 +96,7 @@ class Plausibility:
 
         Args:
             index: frame index.
-            joints: (15, 3) metres.
+            joints: (J, 3) metres.
             offset: (C,) the smaller of missing and surplus area of each used camera, as a share of the person; NaN for
                 other cameras. None if not measured.
         """

@@ -1,7 +1,7 @@
 """Whether the cameras agree about the person: the residuals that remain when the poses have explained what they can.
 
-A camera that is turned, moved or late shows the body's contours beside those of the other cameras, in every frame
-alike. Each camera gets an unknown shift of its image and an unknown delay; one Gauss-Newton step over all frames
+A camera that is turned, moved or late shows the body's contours next to where the other cameras expect them, in every
+frame alike. Each camera gets an unknown shift of its image and an unknown delay. One Gauss-Newton step over all frames
 estimates them with their standard deviations. A motion of the whole world shifts all images and cannot be observed, so
 it is projected out of the step.
 """
@@ -24,8 +24,8 @@ from tk.model.cameras.camera import Rig
 Float = NDArray[np.float64]
 
 # Prior standard deviations of a camera's shift, pixels, and delay, frames: wide, so that 20 frames outweigh them.
-# If one of two cameras is turned sideways, the person seems to be elsewhere, and only the person's size contradicts
-# that. So two cameras have an unknown focal length, too (its logarithm).
+# With two cameras, a sideways turn of one looks like another position of the person, and only the person's size
+# contradicts it. So each of two cameras also has an unknown focal length (its logarithm).
 _SIGMA = {"shift": 5.0, "offset": 2.0}
 _SIGMA_OF_TWO = {"shift": 5.0, "focal": 0.05, "offset": 2.0}
 # Half the difference of points for a derivative, metres.

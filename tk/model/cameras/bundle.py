@@ -271,7 +271,7 @@ def choose_frames(
     cleaning: bool,
     late: NDArray[np.int64] | None = None,
 ) -> list[BundleFrame]:
-    """Choose frames whose joints lie as far apart as possible and whose neighbours are usable, too: velocities need
+    """Choose frames whose joints lie as far apart as possible and whose neighbours are also usable: velocities need
     them.
 
     Args:

@@ -20,7 +20,7 @@ _BONES = {
 }
 _SEGMENTS = list(_BONES)
 _ENDS = np.array([[JOINTS.index(name) for name in ends] for ends in _BONES.values()])
-# (15, S) weights of the segments that a joint belongs to: its bones, and the trunk for shoulders and hips.
+# (J, S) weights of the segments that a joint belongs to: its bones, and the trunk for shoulders and hips.
 _OF_JOINT = np.zeros((len(JOINTS), len(_BONES)))
 for _s, _ends in enumerate(_BONES.values()):
     _OF_JOINT[[JOINTS.index(name) for name in _ends], _s] = 1.0
@@ -29,14 +29,14 @@ _OF_JOINT /= _OF_JOINT.sum(axis=1, keepdims=True)
 
 
 def contour_shares(body: ConeBody, grid: RayGrid, label: NDArray[np.uint8], joints: Float) -> Float:
-    """Return (..., V, 15) how much of the outline of each joint's bones a view shows against the background, 0 to 1: 1
+    """Return (..., V, J) how much of the outline of each joint's bones a view shows against the background, 0 to 1: 1
     if one side is visible over the bone's whole length, 0 if the bones lie before or behind other parts of the body.
 
     Args:
         body: the body.
         grid: rays of the V views.
         label: (..., V, h, w) 1 + the part that a ray meets, 0 where it meets nothing.
-        joints: (..., 15, 3) m, in the world of the grid's cameras.
+        joints: (..., J, 3) m, in the world of the grid's cameras.
     """
     h, w = label.shape[-2:]
     images = label.reshape(-1, h, w)

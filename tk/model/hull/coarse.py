@@ -117,7 +117,7 @@ class Hull:
         return np.asarray(self.inside[chosen].all(axis=0) & self.voxels.sees[chosen].any(axis=0))
 
     def common(self, cameras: Sequence[int]) -> Bool:
-        """Return (N,) the part of these cameras' hull that most cameras see: elsewhere little is carved away."""
+        """Return (N,) True for voxels of these cameras' hull that most cameras see: where few see, little is carved."""
         carved = self.carve(cameras)
         views = self.voxels.sees.sum(axis=0)
         return carved & (views >= np.percentile(views[carved], 95)) if carved.any() else carved
@@ -142,7 +142,7 @@ class Hull:
 
 
 class CoarseHull:
-    """The person's hull in large voxels, from masks of which one may be wrong."""
+    """The person's hull in large voxels, from masks; one of the masks may be wrong."""
 
     def __init__(self, rig: Rig, volume: Volume) -> None:
         self._grid = VoxelGrid.cover(volume, _VOXELS)

@@ -28,7 +28,7 @@ Float = NDArray[np.float64]
 Masks = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 
-# Error of a pair that correct cameras may have, as a share of the person's size, beside one pixel of either mask.
+# Error of a pair that correct cameras may have, as a share of the person's size, plus one pixel of either mask.
 # The worst pair of correct cameras has 0.2 tolerances on the opening of walk, dance, fold, cube and pair; against a
 # learned scene, in which shadows remain at the feet, 0.2 to 0.8. Of cameras turned by 2° and by 3°, 60 and 70 % are
 # found, all of them rightly; the others turn about the person. Another recording's calibration has 7 to 23. Below 0.01,

@@ -116,7 +116,7 @@ class SeenPerson:
 def locate(
     rig: Rig, volume: Volume, sightings: Sequence[Sequence[Sighting]]
 ) -> tuple[list[SeenPerson], list[list[Sighting]]]:
-    """Return the people in the volume and around it whom two cameras or more see, and the sightings of nobody of them.
+    """Return the people in and around the volume that two or more cameras see, and the sightings of none of them.
 
     Each pair of sightings of two cameras proposes the point where their lines of sight meet. The support of a point is
     the truncated quadratic of MSAC (Torr and Zisserman 2000), so that three cameras with an exact match outweigh three

@@ -20,7 +20,7 @@ Float = NDArray[np.float64]
 class Derived:
     """Quantities derived from F poses."""
 
-    joints: Float  # (F, 15, 3) metres, world frame: `/joints/position`
+    joints: Float  # (F, J, 3) metres, world frame: `/joints/position`
     # (F, S, 4) quaternions (w, x, y, z), segment to world: `/segments/rotation`, the segments being
     # `tk.model.body.skeleton.SEGMENTS` with the axes of `tk.model.body.angles`
     rotations: Float
