@@ -20,7 +20,7 @@ from tk.kernels.line_search import SearchSettings
 from tk.kernels.raycast import Cast
 from tk.model.body import gait_poses as gait
 from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.body_fit import STATURE_DEVIATION, fit_body
+from tk.model.body.body_fit import INFORMATIVE_FRAMES, STATURE_DEVIATION, fit_body
 from tk.model.body.cone_body import ConeBody, ConePart, build_cone_body
 from tk.model.body.initial_pose import rough_pose
 from tk.model.body.limb_candidates import Limb, distinct, limbs_of, pairs
@@ -42,9 +42,6 @@ Float = NDArray[np.float64]
 
 # Standard deviation of the logarithm of a stature that was estimated from the silhouettes: their areas err by 6 %.
 ESTIMATED_STATURE_DEVIATION = 0.05
-# Frames of the opening that the body is fitted to, evenly spaced, at most. With 4 to 16 the mean errors of walk and
-# dance (60 frames) change by less than 0.1 cm.
-FIT_FRAMES = 8
 # A person who is lost in consecutive frames is searched for, from the centroid of the silhouettes, in every so many.
 RECOVER_EVERY = 3
 # Of the poses from which a lost person is searched for at the coarsest scale, one in RECOVERY_KEPT goes on to the finer
@@ -240,7 +237,7 @@ class ContourTracker:
             hypotheses: trajectories over these frames.
             stature, known: stature, metres, and whether it was given rather than estimated.
         """
-        count = min(FIT_FRAMES, len(pyramids))
+        count = min(INFORMATIVE_FRAMES, len(pyramids))
         chosen = np.unique(np.linspace(0, len(pyramids) - 1, count).round().astype(int))
         deviation = STATURE_DEVIATION if known else ESTIMATED_STATURE_DEVIATION
         found: list[tuple[float, ConeBody, Float]] = []

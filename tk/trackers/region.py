@@ -28,6 +28,7 @@ from tk.model.body.cone_body import ConeBody
 from tk.model.body.joint_sigma import VIEW_M, contour_variance, directions, posture_variance, view_variance
 from tk.model.body.limb_candidates import Limb
 from tk.model.body.skeleton import JOINTS
+from tk.model.cameras.bundle import CORRELATION_PX
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import color_bins
 from tk.model.cues.ray_costs import Evidence, mean_of_views
@@ -49,8 +50,8 @@ Float = NDArray[np.float64]
 # Frames over which the mean posture is a plain mean; then the oldest are forgotten.
 _POSTURE_FRAMES = 200
 
-# Information of one pixel of contour, 1/px²: edgels err by 2 px, and together along 10 px.
-INFORMATION = 1.0 / (2.0**2 * 10.0)
+# Information of one pixel of contour, 1/px²: edgels err by 2 px.
+INFORMATION = 1.0 / (2.0**2 * CORRELATION_PX)
 # Scales of a frame, at least: from the finest alone Gauss-Newton does not converge.
 FEWEST = 2
 # Rate up to which a frame has all iterations, Hz. With one over-relaxed iteration a scale at 15 Hz, no mean error of
@@ -60,8 +61,8 @@ FULL_HZ = 15.0
 # limbs of fold and cube, with a single iteration at 15 Hz, are 0.08 cm worse.
 PLAIN = 0.25
 # Standard deviations of the priors about the predicted pose (tk.model.body.joints has those about zero). Chosen on the
-# development captures; half and twice the angle change the mean errors of dance and cube (50 frames) by 0.04 cm at
-# most, the translation's sensitivity is not measured.
+# development captures; half and twice the value change the mean errors of dance and cube (50 frames) by 0.04 cm at
+# most (angle) and 0.01 cm (translation).
 ANGLE_DEG, TRANSLATION_M = 40.0, 0.3
 # After this many consecutive frames with a high residual, and two failed searches for the person, sigma is set to NaN.
 UNKNOWN_AFTER = 2 * RECOVER_EVERY

@@ -25,7 +25,7 @@ Float = NDArray[np.float64]
 
 # More frames than this do not make the body more certain: shapes that no cone has err alike in all frames. With 4 to 16
 # the mean errors of walk and dance (60 frames) change by less than 0.1 cm.
-_INFORMATIVE_FRAMES = 8
+INFORMATIVE_FRAMES = 8
 # Prior standard deviation of the logarithm of the stature about a given height: 1 %, of shoes, posture and measurement.
 STATURE_DEVIATION = 0.01
 # Gauss-Newton iterations.
@@ -59,7 +59,7 @@ def fit_body(
         [BundleFrame(pyramid, pose, np.zeros_like(pose)) for pyramid, pose in zip(pyramids, poses, strict=True)],
         replace(settings, spacing_px=SPACING_PX),
         {},
-        INFORMATION / max(len(poses) / _INFORMATIVE_FRAMES, 1.0),
+        INFORMATION / max(len(poses) / INFORMATIVE_FRAMES, 1.0),
         segment_m=None,
     )
     state = minimise(bundle.start, bundle.linearise, bundle.move, [0] * ROUNDS, LONGEST_STEP).state

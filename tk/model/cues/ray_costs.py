@@ -30,8 +30,8 @@ COLOR_COST = 0.4
 # values are equally likely.
 UNCERTAIN_COST = 0.5
 # Beside pixels of other people, a view of whose pixels few show the person counts as if it showed this share of those
-# in the view that shows most, so that a hand beside somebody's back does not count as much as a whole person. Chosen on
-# pair; sensitivity not measured.
+# in the view that shows most, so that a hand beside another person's back does not count as much as a whole person.
+# Chosen on pair. With one person (dance and cube, 50 frames) half and twice the value change no mean error.
 LEAST_SEEN = 0.25
 
 

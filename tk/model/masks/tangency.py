@@ -24,7 +24,8 @@ from tk.model.cameras.camera import Camera
 Float = NDArray[np.float64]
 Masks = NDArray[np.uint8]
 
-# Parts of a mask smaller than this share of the largest one are not the person. Sensitivity not measured.
+# Parts of a mask smaller than this share of the largest one are not the person. Half and twice the
+# value change no mean error of dance and cube (50 frames).
 _SPECK_SHARE = 0.1
 # Pixels of a mask's largest part, at least: a smaller one has no shape.
 _LEAST_PIXELS = 20
