@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import sys
+from pathlib import Path
 
 import ezc3d
 import numpy as np
@@ -13,6 +14,7 @@ from tests.conftest import Tk
 from tests.export.conftest import FPS, FRAMES, LOST, Write
 from tk.errors import ExportError, ResultError
 from tk.export import export, read_motion
+from tk.export.c3d import write_c3d
 from tk.model.body.skeleton import JOINTS, SEGMENTS
 
 
@@ -37,6 +39,13 @@ def test_points_and_segments(write: Write) -> None:
     knee = motion.points[motion.known, JOINTS.index("knee_r")]
     np.testing.assert_allclose(T[:3, 3, SEGMENTS.index("calf_r")].T[motion.known] / 1000, knee, atol=1e-6)
     assert np.isnan(T[:3, :3, :, list(LOST)]).all()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full, where every write fails")
+def test_full_disk_is_reported(write: Write) -> None:
+    motion, _ = read_motion(write())
+    with pytest.raises(OSError, match="No space left"):
+        write_c3d(motion, Path("/dev/full"))
 
 
 def test_missing_points_have_residual_minus_one(write: Write) -> None:

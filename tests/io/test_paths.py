@@ -10,7 +10,7 @@ import pytest
 
 from tests.conftest import refused
 from tk.errors import ConfigError, ExportError, VideoError
-from tk.io.paths import Kind, c_name, check_not_input, check_output, looks_like, resolved
+from tk.io.paths import Kind, c_name, check_not_input, check_output, looks_like, resolved, text_of
 
 TEXT = Kind("a text of mine", (".txt", ".text"), looks_like(rb"mine"))
 
@@ -93,3 +93,9 @@ def test_names_that_are_not_utf8_are_refused_for_c_libraries() -> None:
     assert c_name(Path("größe.mp4"), VideoError) == "größe.mp4"
     with refused(VideoError, "is not UTF-8; rename the file"):
         c_name(Path(os.fsdecode(b"gr\xf6\xdfe.mp4")), VideoError)
+
+
+def test_text_of_a_name_can_always_be_written() -> None:
+    assert text_of("größe") == "größe"
+    assert text_of("größe".encode()) == "größe"
+    assert text_of(b"gr\xf6\xdfe".decode("utf-8", "surrogateescape")) == "gr\ufffd\ufffde"

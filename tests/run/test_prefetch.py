@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import os
 import signal
@@ -63,6 +64,19 @@ def test_prefetched_frames_equal_direct_ones(tiny: Path, masks: str, keep_images
         if a[3] is not None and b[3] is not None:
             assert a[3].any()
             np.testing.assert_array_equal(a[3], b[3], strict=True)
+
+
+def test_frames_are_made_here_if_no_memory_can_be_shared(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+
+    capture, notes = open_capture(tiny), list[str]()
+    monkeypatch.setattr(prefetch.os, "ftruncate", refuse)
+    with open_observations(capture.setup(), capture, AHEAD, notes.append) as observations:
+        assert isinstance(observations, Serial)
+    assert notes == [
+        "no memory can be shared with another process (File too large): frames are made one after the other"
+    ]
 
 
 @pytest.mark.parametrize("spare", [2, 40])

@@ -130,7 +130,7 @@ def export(
         lost = int((~motion.known).sum())
         if lost and holding:
             notes.append(f"{whose}{holding}: in {lost} lost frames the pose before is held")
-    written = []
+    written, refused = list[Path](), list[TkError]()
     for person, name, target, write in jobs:
         if name not in failed and person.person in motions:
             try:
@@ -138,9 +138,10 @@ def export(
                 written.append(target)
             except TkError as error:
                 failed[name] = str(error)
+                refused.append(error)
     reasons = tuple(f"{name}: {reason}" for name, reason in failed.items())
     if not written:
-        raise ExportError("; ".join(dict.fromkeys(reasons or notes)))
+        raise (type(refused[0]) if refused else ExportError)("; ".join(dict.fromkeys(reasons or notes)))
     return Exported(tuple(written), tuple(notes), reasons)
 
 

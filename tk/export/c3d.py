@@ -7,14 +7,15 @@ point. ROTATION is each segment's 4×4 transform to the world; in unknown frames
 
 from __future__ import annotations
 
+import os
 import struct
+import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from tk.errors import ExportError
 from tk.export.motion import Motion
-from tk.io.paths import c_name
 from tk.model.body.joints import SEGMENT_ORIGIN
 
 # The residual is a signed byte: ezc3d would wrap 256 to 0, a point without error.
@@ -49,16 +50,24 @@ def write_c3d(motion: Motion, path: Path) -> None:
     file["data"]["rotations"] = T
     file.add_parameter("ROTATION", "LABELS", list(motion.segments))
     file.add_parameter("ROTATION", "RATE", [motion.fps])
-    file.write(c_name(path, ExportError))
-    _put_rotations_first(path)
+    path.write_bytes(_rotations_first(_bytes_of(file)))
 
 
-def _put_rotations_first(path: Path) -> None:
-    """Exchange the data sections of points and rotations in a file of ezc3d.
+def _bytes_of(file: Any) -> bytearray:
+    """Return the bytes that ezc3d writes. It does not report a full disk, so it writes to memory."""
+    handle = os.memfd_create("c3d")
+    with os.fdopen(handle, "rb") as memory, tempfile.TemporaryDirectory() as folder:
+        link = Path(folder, "memory.c3d")  # ezc3d adds the suffix where it is missing
+        link.symlink_to(f"/proc/self/fd/{handle}")
+        file.write(str(link))
+        return bytearray(memory.read())
+
+
+def _rotations_first(data: bytearray) -> bytes:
+    """Return a file of ezc3d with the data sections of points and rotations exchanged.
 
     Readers that do not know rotations expect nothing after the points, and warn of bytes that are left over.
     """
-    data = bytearray(path.read_bytes())
     places = _parameters(data)
     begins = [places[group, "DATA_START"] for group in ("POINT", "ROTATION")]
     first, second = (struct.unpack_from("<H", data, begin)[0] for begin in begins)
@@ -66,10 +75,10 @@ def _put_rotations_first(path: Path) -> None:
     rotations += bytes(-len(rotations) % _BLOCK)
     start = first + len(rotations) // _BLOCK
     if start > _LAST_BLOCK:
-        return
+        return bytes(data)
     for place, block in ((begins[0], start), (begins[1], first), (_HEADER_DATA_START, start)):
         struct.pack_into("<H", data, place, block)
-    path.write_bytes(data[: _BLOCK * (first - 1)] + rotations + points)
+    return bytes(data[: _BLOCK * (first - 1)] + rotations + points)
 
 
 def _parameters(data: bytearray) -> dict[tuple[str, str], int]:

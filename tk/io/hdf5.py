@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.errors import ResultError, TkError
+from tk.io.paths import text_of
 
 #: limits of groups and datasets in a file, nested groups, bytes of an attribute: far more than a result has
 MAX_OBJECTS, MAX_DEPTH, MAX_ATTRIBUTE_BYTES = 10_000, 12, 1_000_000
@@ -150,7 +151,7 @@ class Hdf5Reader:
             if found.get_type().get_class() not in (*_NUMBERS, h5py.h5t.STRING) or size > MAX_ATTRIBUTE_BYTES:
                 self.fail(f"the attribute {name} of /{holder} is neither text nor numbers; the file is damaged")
             value = held.attrs[name]
-            return _readable(value) if isinstance(value, (bytes, str)) else value
+            return text_of(value) if isinstance(value, (bytes, str)) else value
 
     def is_format(self, name: str) -> bool:
         """Return True if the attribute `format` of the file has this value."""
@@ -176,7 +177,7 @@ class Hdf5Reader:
     def names(self, holder: str, name: str) -> tuple[str, ...]:
         """Return an attribute that is a list of texts."""
         value = self.attribute(holder, name)
-        listed = [_readable(item) if isinstance(item, (bytes, str)) else item for item in np.atleast_1d(value)]
+        listed = [text_of(item) if isinstance(item, (bytes, str)) else item for item in np.atleast_1d(value)]
         if value is None or np.ndim(value) > 1 or not all(isinstance(item, str) for item in listed):
             self._no_attribute(holder, name, "a list of texts")
         return tuple(str(item) for item in listed)
@@ -259,11 +260,6 @@ class Hdf5Reader:
         if stored > self._bytes or declared > limit:
             self.fail(f"/{name} declares {declared} bytes, and {stored} are stored; the file is damaged")
         return shape
-
-
-def _readable(text: bytes | str) -> str:
-    """Return a text with bytes that are not UTF-8 replaced; h5py returns them in a form that cannot be written."""
-    return (text if isinstance(text, bytes) else text.encode("utf-8", "surrogateescape")).decode("utf-8", "replace")
 
 
 def _check_text_heaps(path: Path, file: h5py.File) -> None:

@@ -198,6 +198,9 @@ def c_name(path: Path, error: type[TkError]) -> str:
         raise error(f"{path}: its name is not UTF-8; rename the file") from None
 
 
-def text_of(name: str) -> str:
-    """Return a file's name as text that a file can hold: bytes that are not UTF-8 become a replacement character."""
-    return os.fsencode(name).decode("utf-8", "replace")
+def text_of(name: str | bytes) -> str:
+    """Return text that a file can hold: bytes that are not UTF-8 become a replacement character.
+
+    Python, and h5py, read such bytes as surrogates, which cannot be written.
+    """
+    return (name if isinstance(name, bytes) else name.encode("utf-8", "surrogateescape")).decode("utf-8", "replace")

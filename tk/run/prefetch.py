@@ -100,10 +100,15 @@ def open_observations(
         CaptureError: there is nothing to make masks from.
     """
     mask_source(source)  # before a process is started
-    if settings.ahead == 0 or worker.cores() < 2 or not sys.executable or not _can_be_sent(source.segmenter):
-        worker.dismiss()
-        return Serial(setup, source, settings, note, keep_images)
-    return Ahead(setup, source, settings, note, keep_images)
+    if settings.ahead and worker.cores() > 1 and sys.executable and _can_be_sent(source.segmenter):
+        try:
+            return Ahead(setup, source, settings, note, keep_images)
+        except OSError as error:  # ulimit -f, -n or -v
+            note(
+                f"no memory can be shared with another process ({error.strerror}): frames are made one after the other"
+            )
+    worker.dismiss()
+    return Serial(setup, source, settings, note, keep_images)
 
 
 def _can_be_sent(segmenter: Segmenter | None) -> bool:
