@@ -59,9 +59,9 @@ def test_project_of_another_tool_is_refused_with_the_command_that_imports_it(
     folder: Path, tmp_path: Path, tk: Tk, command: list[str]
 ) -> None:
     write_project(folder)
-    tk(command[0], folder, *command[1:]).complaint("a calibration of Anipose", f"tk import {folder} -o CAPTURE")
+    tk(command[0], folder, *command[1:]).complaint("is a project of Anipose", f"tk import {folder} -o CAPTURE")
     (folder / "calibration.toml").rename(folder / "my_camera_calibration.toml")
-    tk(command[0], folder, *command[1:]).complaint("a calibration of FreeMoCap", f"tk import {folder} -o CAPTURE")
+    tk(command[0], folder, *command[1:]).complaint("is a project of FreeMoCap", f"tk import {folder} -o CAPTURE")
     (folder / "my_camera_calibration.toml").unlink()
     tk(command[0], folder, *command[1:]).complaint(str(folder / "calibration.toml"))
 

@@ -76,8 +76,8 @@ def open_recording(
                 or any(list(path.glob(pattern)) for pattern in found[0].videos if pattern not in own)
             ):
                 raise CaptureError(
-                    f"{path}: is no capture, but has a calibration of {found[0].tool}, {found[1][0].name}; import it",
-                    hint=f"tk import {path} -o CAPTURE",
+                    f"{path}: is a project of {found[0].tool} with {found[1][0].name}, not a capture; import it first",
+                    hint=f"type tk import {path} -o CAPTURE",
                 ) from None
         raise error
 
