@@ -35,6 +35,11 @@ def drawn(places: list[tuple[float, float]], statures: list[float] | None = None
     return np.array(alone)
 
 
+def test_masks_that_are_full_everywhere_have_few_candidates() -> None:
+    """Every cell of their floor plan is a maximum; comparing all of them takes minutes."""
+    assert len(FINDER._maxima(np.full((90, 90), 2.0), 1.0)) <= 12
+
+
 def nearest(found: tuple[LocatedPerson, ...], places: list[tuple[float, float]]) -> list[float]:
     """Return the distance on the floor from each place to the nearest person, metres."""
     return [min(float(np.linalg.norm(person.position[:2] - place)) for person in found) for place in places]

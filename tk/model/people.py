@@ -369,7 +369,7 @@ class PeopleFinder:
         if len(part) * self._litres <= _LITRES[1]:
             return [part]
         plan, cell, _ = self._plan(part)
-        seeds = self._maxima(plan, 1.0, self._grid.voxel_m)[:_MOST]
+        seeds = self._maxima(plan, 1.0, self._grid.voxel_m)
         away = np.linalg.norm(cell[:, None] - seeds[None], axis=2) * self._grid.voxel_m
         return [part[near] for near in (away < _BODY_M).T]
 
@@ -382,7 +382,7 @@ class PeopleFinder:
     def _maxima(self, plan: Float, saddle: float = _SADDLE, sigma_m: float = _SMOOTH_M) -> NDArray[np.int64]:
         """Return the cells (K, 2) of the people's trunks in a floor plan smoothed by ``sigma_m``, the tallest first.
 
-        Between two of them the plan falls to the share ``saddle`` of the lower one.
+        At most :data:`_MOST`. Between two of them the plan falls to the share ``saddle`` of the lower one.
         """
         edge = self._grid.voxel_m
         smooth = _blurred(plan, sigma_m / edge)
@@ -398,6 +398,8 @@ class PeopleFinder:
             ]
             if all(lowest <= saddle * height for lowest in between):
                 kept.append(peak)
+            if len(kept) == _MOST:  # masks that are full everywhere have a maximum in every cell
+                break
         return np.array(kept).reshape(-1, 2)
 
     def _person(self, part: NDArray[np.int64], inside: Bool, allowed: Bool) -> LocatedPerson:
