@@ -18,16 +18,17 @@ from tests.trackers.walker import BODY, STATURE, walk
 from tk.errors import CaptureError
 from tk.io import settings_file
 from tk.io.captures.frames import FrameSet
-from tk.io.results.data import UsedCameras
+from tk.io.results.data import Result, UsedCameras
 from tk.io.results.reader import read_result
 from tk.io.results.status import Status
 from tk.model.cameras.volume import Volume
 from tk.model.masks.silhouettes import draw_silhouettes
 from tk.model.setup import Setup, Subject
 from tk.run import offline
-from tk.run.people import Member
+from tk.run.people import Member, People
 from tk.run.plan import Plan
 from tk.run.session import estimates, track_source
+from tk.trackers.protocol import Observation
 
 SETTINGS = settings_file.from_toml(QUICK)
 RIG = ring_of_cameras(3, width=160, height=200)
@@ -190,18 +191,20 @@ def test_a_number_that_nobody_has_is_refused() -> None:
         list(estimates(PAIR, Rendered(MASKS.max(axis=0)), SETTINGS, people=(2,)))
 
 
-def test_somebody_who_enters_gets_a_number_and_who_leaves_is_absent(tmp_path: Path) -> None:
-    """Person 1 is there in frames 3 to 16 of 22."""
-    count, shown = 22, slice(3, 17)
+def track_entering(path: Path, count: int) -> tuple[np.ndarray, tuple[Result, ...]]:
+    """Return the poses and the results of two people; person 1 is there in frames 3 to 16."""
     poses = np.array([walk(count), walk(count, first=0.4)])
     poses[:, :, :2] += [[[0.35, -0.05]], [[-0.35, 0.05]]]
     masks = np.array([draw_silhouettes(BODY, FOUR, own) for own in poses])
-    hidden = np.ones(count, bool)
-    hidden[shown] = False
-    masks[1, hidden] = 0
+    masks[1, :3] = masks[1, 17:] = 0
     setup = replace(PAIR, fps=4.0, subjects=PAIR.subjects[:1])
-    track_source(setup, Rendered(masks.max(axis=0)), tmp_path / "r.h5", SETTINGS, Silent(), people="all", causal=True)
-    first, second = read_result(tmp_path / "r.h5").people
+    track_source(setup, Rendered(masks.max(axis=0)), path, SETTINGS, Silent(), people="all", causal=True)
+    return poses, read_result(path).people
+
+
+def test_somebody_who_enters_gets_a_number_and_who_leaves_is_absent(tmp_path: Path) -> None:
+    count = 22
+    poses, (first, second) = track_entering(tmp_path / "r.h5", count)
     np.testing.assert_array_equal(first.frames, np.arange(count))
     assert not (first.status == Status.LOST).any()
     np.testing.assert_array_equal(second.frames, np.arange(second.frames[0], 17))
@@ -209,3 +212,19 @@ def test_somebody_who_enters_gets_a_number_and_who_leaves_is_absent(tmp_path: Pa
     for own, result in zip(poses, (first, second), strict=True):
         joints = np.array([BODY.skeleton.joints(pose) for pose in own[result.frames]])
         assert np.median(np.linalg.norm(result.joints - joints, axis=2)) < 0.1  # coarse settings
+
+
+def test_attempts_to_track_somebody_who_is_refused_are_twice_as_far_apart_each_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin, attempts = People._begin, []
+
+    def refuse_others(people: People, member: Member, frames: Sequence[Observation], *rest: Any) -> None:
+        attempts.append(frames[0].index)
+        if member.number > 0:
+            raise CaptureError("half a person")
+        begin(people, member, frames, *rest)
+
+    monkeypatch.setattr(People, "_begin", refuse_others)
+    _, found = track_entering(tmp_path / "r.h5", 17)
+    assert len(found) == 1 and attempts == [0, 10, 12, 16]  # at 4 Hz, from the eighth frame on

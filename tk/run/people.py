@@ -45,6 +45,9 @@ _ALONE_M = 0.25
 _TESTED = 4
 # Frames of somebody who enters to which the body is fitted: half a second at 15 Hz.
 _HISTORY = 8
+# After each refusal of somebody who enters the next attempt is twice as far away, up to this multiple of LOOK_EVERY_S:
+# a start takes seconds. The first attempt often fails, because the person is still partly out of view.
+_LONGEST_PAUSE = 8
 # Least share of the area of a person who is tracked that must be unexplained in two views before a search.
 _UNEXPLAINED = 0.25
 # Likeness by the colours above which somebody who enters is a person who has left. On pair and a rendered crossing, by
@@ -348,10 +351,7 @@ class People:
         return [p for p in self._finder.find(masks >= 128, masks > 0) if p.inside]
 
     def _admit(self, frames: Sequence[Observation], subject: Subject, written: bool) -> Member | None:
-        """Add a person who is tracked from the first of some frames on; None if nobody can be tracked.
-
-        After each refusal the next attempt is twice as far away: a start takes seconds.
-        """
+        """Add a person who is tracked from the first of some frames on; None if nobody can be tracked."""
         number = 1 + max(m.number for m in self._tracked)
         member = self._member(number, subject, self._make(), written)
         try:
@@ -359,7 +359,8 @@ class People:
         except CaptureError as reason:
             _LOG.info("nobody can be tracked there: %s", reason)
             self._refused += 1
-            self._admit_from = frames[0].index + self._every * 2**self._refused
+            pause = min(2 ** (self._refused - 1), _LONGEST_PAUSE)
+            self._admit_from = frames[0].index + self._every * pause
             return None
         self._refused = 0
         self._tracked.append(member)
