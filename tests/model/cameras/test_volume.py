@@ -55,3 +55,12 @@ def test_flat_indices_run_with_z_fastest(shape, origin, voxel_m):
     np.testing.assert_allclose(grid.centers(), expected, rtol=0, atol=1e-12)
     some = np.arange(grid.count)[::-2]
     np.testing.assert_array_equal(grid.centers(some), grid.centers()[some])
+
+
+@given(points, points)
+def test_voxels_within_a_box_are_those_with_centres_in_it(a, b):
+    grid = VoxelGrid.cover(Volume((0.3, -0.2, 1.0), (2.0, 1.5, 2.2)), 9)
+    lower, upper = np.minimum(a, b), np.maximum(a, b)
+    centers = grid.centers()
+    expected = np.flatnonzero(((lower <= centers) & (centers <= upper)).all(axis=1))
+    np.testing.assert_array_equal(grid.within(lower, upper), expected)
