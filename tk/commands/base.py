@@ -82,7 +82,7 @@ class Commands(click.Group):
 
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
         for stream in (sys.stdout, sys.stderr):
-            if isinstance(stream, io.TextIOWrapper):  # characters that its encoding lacks, as in a path, are escaped
+            if isinstance(stream, io.TextIOWrapper):  # characters outside its encoding, as in a path, are escaped
                 stream.reconfigure(errors="backslashreplace")
         with errors_in_one_line():
             return super().make_context(*args, **kwargs)

@@ -120,7 +120,7 @@ class _Twins:
             shutil.copyfile(source, self.path)
         self._file: _File = io.FileIO(self.path, "r+" if source else "w+")
         self._other: _File | None = None
-        self._changes: list[Callable[[_File], object]] = []  # what the other twin lacks
+        self._changes: list[Callable[[_File], object]] = []  # changes that the other twin still misses
         self._kept = False
         self._error: OSError | None = None
 

@@ -60,8 +60,8 @@ AMBIGUOUS, HANDICAP, NEARLY, WORSE = 1.1, 1.1, 1.4, 1.2
 # A pose with a higher residual explains nothing: twice what an average body of the right stature leaves. Without a
 # better one in any of the frames the person is not found.
 UNEXPLAINED = 0.6
-# A view of which a mask shows less than this share of the largest one tells nothing about where the person is: others
-# hide most of the person. A view from above, or from twice as far, shows a quarter.
+# A mask smaller than this share of the largest one does not show where the person is, because others hide most of the
+# person. A view from above, or from twice as far, shows a quarter.
 WHOLE = 0.1
 # Alternatives that are followed through the opening, the likeliest of each anchor first: where nothing fits, each takes
 # seconds. Half and twice as many change no mean error of dance and cube (50 frames).

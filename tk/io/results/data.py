@@ -48,7 +48,7 @@ class JointAngles:
 class ResultMeta:
     """The values that are constant during a run. A run can be resumed only with equal values.
 
-    The fields from ``sigma`` on declare the optional datasets of the file. A declared value that a frame lacks is NaN.
+    The fields from ``sigma`` on declare the optional datasets of the file. A value that a frame does not have is NaN.
     """
 
     # capture, method: name of the capture, and tracking method

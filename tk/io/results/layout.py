@@ -68,8 +68,8 @@ class Layout:
             put_attributes(dataset, column.attributes)
 
     def append(self, person: int, rows: Sequence[Values]) -> None:
-        """Append a person's frames, of :func:`~tk.io.results.schema.checked_row`, and remove `/smoothed`, which lacks
-        them."""
+        """Append a person's frames, of :func:`~tk.io.results.schema.checked_row`, and remove `/smoothed`, which does
+        not have them."""
         prefix = prefix_of(person)
         self._remove(f"{prefix}smoothed")
         if f"{prefix}hull" in self.file or any("hull/positions" in row for row in rows):
