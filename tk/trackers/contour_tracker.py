@@ -23,7 +23,7 @@ from tk.model.body.anthropometry import BodyDimensions
 from tk.model.body.body_fit import INFORMATIVE_FRAMES, STATURE_DEVIATION, fit_body
 from tk.model.body.cone_body import ConeBody, ConePart, build_cone_body
 from tk.model.body.initial_pose import rough_pose
-from tk.model.body.limb_candidates import Limb, distinct, limbs_of, pairs
+from tk.model.body.limb_candidates import Limb, exchanged, limbs_of, pairs
 from tk.model.body.skeleton import SEGMENTS, build_skeleton, convert_poses
 from tk.model.cameras.camera import Rig
 from tk.model.cameras.common_view import spread_out
@@ -61,8 +61,8 @@ OUTSIDE = 0.4
 # converged, it is dropped if it costs this share of the person's pixels more. Mean errors of dance and cube (60
 # frames): 0.15 cm more with a factor of 0.75, unchanged with 3; unchanged with half and twice the share.
 PROPOSED, PROMISING = 1.5, 0.01
-# Poses that a search refines with all limbs, beside the current one; and for each pair of limbs.
-FINISHED, FINISHED_PAIRS = 2, 4
+# Poses that a search refines with all limbs, beside the current one.
+FINISHED = 2
 # Poses that differ by more than this, mean over the joints, metres, are different.
 SAME_POSE_M = 0.05
 # A recovered person who faces the other way than before must have a residual (E_S) lower by this at a half turn.
@@ -405,18 +405,16 @@ class ContourTracker:
         pose: Float,
         images: NDArray[np.uint8] | None = None,
         misplaced: Sequence[Limb] = (),
-        in_pairs: bool = False,
     ) -> tuple[Float, Float]:
         """Search for better poses of the limbs: screen all candidates of a limb in one launch, refine the best ones by
-        the limb alone, then the most promising by the whole body.
+        the limb alone, then the most promising by the whole body. Exchanged arms and legs are candidates, too: where
+        each has taken the other's place, neither finds its own as long as the other stays.
 
         Args:
             frame, pyramid, evidence: the frame, its silhouettes, its costs on the grid :attr:`screen`.
             pose: (D,) current pose.
             images: as in :meth:`settle`.
             misplaced: limbs that are known to be misplaced.
-            in_pairs: move both arms, or both legs, at once. Where one of a pair has taken the other's place, neither is
-                found as long as the other stays.
 
         Returns:
             Poses (B, D), the current one first, and their costs (B,).
@@ -429,50 +427,41 @@ class ContourTracker:
         joints = skeleton.joints(pose)
         level = (min(1, self.solver.scales - 1),)
         found: list[tuple[NDArray[np.int64], Float]] = []
-        part_cost, rays = evidence.cost_of_parts(group, met.label[0])
-        for limbs in pairs(self.limbs) if in_pairs else [(limb,) for limb in self.limbs]:
-            moved = np.concatenate([limb.parts for limb in limbs])
-            if in_pairs and part_cost[moved].sum() * rays.sum() <= part_cost.sum() * rays[moved].sum():
-                continue  # their rays cost less than those of the rest of the body
-            others = np.setdiff1d(np.arange(len(group), dtype=np.int32), moved)
+        for limb in self.limbs:
+            others = np.setdiff1d(np.arange(len(group), dtype=np.int32), limb.parts)
             without, rest = evidence.cast(self.body, group, pose[None], others, export=True)
             assert rest is not None
-            if not in_pairs and limbs[0] not in misplaced and mean_of_views(without)[0] - own > surplus:
+            if limb not in misplaced and mean_of_views(without)[0] - own > surplus:
                 continue  # the limb covers more than the surplus area that it could cover elsewhere
             before = Cast(rest.label[0].copy(), rest.depth[0].copy())
-            settled = pose[None]
-            for limb in limbs:
-                tried = limb.candidates(pose, NEARBY, rng)
-                by_view, _ = evidence.cast(self.body, group, tried, limb.parts, before, most_outside=OUTSIDE)
-                cost = mean_of_views(by_view)
-                if not in_pairs:
-                    cost[cost > PROPOSED * own] = np.inf
-                count = MORE_CANDIDATES if in_pairs or limb in misplaced else CANDIDATES
-                chosen = limb.distinct(tried, cost, count)
-                if len(chosen):
-                    chosen = self.settle(pyramid, chosen, level, images, limb=limb).states
-                settled = limb.combined(settled, np.concatenate([pose[None], chosen])[:, limb.dofs])
-            cost = mean_of_views(evidence.cast(self.body, group, settled, moved, before)[0])
+            tried = limb.candidates(pose, NEARBY, rng)
+            by_view, _ = evidence.cast(self.body, group, tried, limb.parts, before, most_outside=OUTSIDE)
+            cost = mean_of_views(by_view)
+            cost[cost > PROPOSED * own] = np.inf
+            chosen = limb.distinct(tried, cost, MORE_CANDIDATES if limb in misplaced else CANDIDATES)
+            if not len(chosen):
+                continue
+            settled = self.settle(pyramid, chosen, level, images, limb=limb).states
+            cost = mean_of_views(evidence.cast(self.body, group, settled, limb.parts, before)[0])
             order = np.argsort(cost, kind="stable")
             settled, cost = settled[order], cost[order]
-            if in_pairs:  # the trunk has followed the limbs as they are: only the whole body's cost can rank a pair
-                better = settled[distinct(skeleton.joints(settled), FINISHED_PAIRS, joints)]
-            else:
-                better = settled[(cost < own + PROMISING) & (skeleton.apart(settled, joints) > SAME_POSE_M)][:2]
+            better = settled[(cost < own + PROMISING) & (skeleton.apart(settled, joints) > SAME_POSE_M)][:2]
             if len(better):
-                found.append((np.concatenate([limb.dofs for limb in limbs]), better))
-        if not found:
+                found.append((limb.dofs, better))
+        swaps = np.array([exchanged(pose, *pair) for pair in pairs(self.limbs)])
+        swaps = self.settle(pyramid, swaps, (*level, 0), images).states
+        swaps = swaps[mean_of_views(evidence.cast(self.body, group, swaps)[0]) < own + PROMISING]
+        if not (len(swaps) or found):
             return pose[None], np.array([own])
-        # the best poses of each group, and combinations of two groups
-        poses = [one for _, better in found for one in better]
+        # exchanged arms and legs, the best poses of each limb, and combinations of two limbs
+        poses = [*swaps, *(one for _, better in found for one in better)]
         for i, (_, better) in enumerate(found):
             for dofs, others in found[i + 1 :]:
                 both = better[0].copy()
                 both[dofs] = others[0][dofs]
                 poses.append(both)
         cost = mean_of_views(evidence.cast(self.body, group, np.array(poses))[0])
-        best = np.argsort(cost, kind="stable")[: None if in_pairs else FINISHED]
-        chosen = np.array(poses)[best]
+        chosen = np.array(poses)[np.argsort(cost, kind="stable")[:FINISHED]]
         settled = np.concatenate([pose[None], self.settle(pyramid, chosen, (0,), images).states])
         fine = self.evidence(self.choice, frame, pyramid)
         return settled, mean_of_views(fine.cast(self.body, group, settled)[0])

@@ -118,7 +118,6 @@ class RegionTracker(ContourTracker):
         """Forget the residuals and everything that was decided from them."""
         self.residuals = ResidualBaseline(len(self.rig), self.config.false_alarm)
         self._lost_for = self._high_for = 0
-        self._search_failed = False
 
     def start(
         self,
@@ -177,16 +176,12 @@ class RegionTracker(ContourTracker):
         misplaced = self.misplaced(evidence, label)
         searched = self._needs_search(frame, self.residuals.high(error), misplaced, evidence.hidden(label))
         if searched:
-            # after a search for single limbs that failed, one of a pair may have taken the other's place
-            in_pairs, settled = self._search_failed, self._best.pose
-            self._propose(frame, pyramid, evidence, images, misplaced, in_pairs)
+            settled = self._best.pose
+            self._propose(frame, pyramid, evidence, images, misplaced)
             if self._best.pose is not settled:
                 label, curvature, residual = self._look(evidence, pyramid, images)
                 error = residual.sum(axis=1)
                 misplaced = self.misplaced(evidence, label)
-            self._search_failed = not in_pairs and self.residuals.high(error)
-        else:
-            self._search_failed = False
         watch.lap("search")
         followed = self._best.pose
         lost = self._recover(pyramid, error)
@@ -328,11 +323,10 @@ class RegionTracker(ContourTracker):
         evidence: Evidence,
         images: NDArray[np.uint8] | None,
         misplaced: Sequence[Limb],
-        in_pairs: bool,
     ) -> None:
         """Add the poses of a limb search to the hypotheses, with their cost relative to the best one's running mean."""
         best = self._best
-        poses, cost = self.search(frame, pyramid, evidence, best.pose, images, misplaced, in_pairs)
+        poses, cost = self.search(frame, pyramid, evidence, best.pose, images, misplaced)
         gain = cost[0] - cost
         # a gain within the noise of two casts counts only if it lasts over the next frames
         self._alive += [
@@ -471,7 +465,6 @@ class RegionTracker(ContourTracker):
             "postures": self._postures,
             "lost_for": self._lost_for,
             "high_for": self._high_for,
-            "search_failed": self._search_failed,
             "view_m": self.view_m,
             **self.colors.state(),
         }
@@ -485,7 +478,6 @@ class RegionTracker(ContourTracker):
         self._postures = int(state["postures"])
         self._lost_for = int(state["lost_for"])
         self._high_for = int(state["high_for"])
-        self._search_failed = bool(state["search_failed"])
         self.view_m = float(state["view_m"])
         self.colors.restore(state)
         self._fresh = False

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.model.figures import BODY
-from tk.model.body.gait_poses import standing_pose
-from tk.model.body.limb_candidates import DISTINCT_M, LIMBS, limbs_of, pairs
+from tk.model.body.gait_poses import standing_pose, walking_pose
+from tk.model.body.limb_candidates import DISTINCT_M, LIMBS, exchanged, limbs_of, pairs
 from tk.model.body.skeleton import JOINTS
 
 SKELETON = BODY.skeleton
@@ -99,10 +99,15 @@ def test_equal_poses_count_once():
     assert len(limb.distinct(np.repeat(POSE[None], 5, axis=0), np.arange(5.0), 3)) == 1
 
 
-def test_combined_has_all_pairs_of_two_limbs_poses():
-    rng = np.random.default_rng(0)
-    left, right = (LIMB[name].candidates(POSE, 0, rng)[:n] for name, n in (("leg_l", 3), ("leg_r", 4)))
-    found = LIMB["leg_r"].combined(left, right[:, LIMB["leg_r"].dofs])
-    assert found.shape == (12, len(POSE)) and len(np.unique(found, axis=0)) == 12
-    wanted = {(*a[LIMB["leg_l"].dofs], *b[LIMB["leg_r"].dofs]) for a in left for b in right}
-    assert {(*p[LIMB["leg_l"].dofs], *p[LIMB["leg_r"].dofs]) for p in found} == wanted
+@pytest.mark.parametrize("phase", [0.1, 0.35, 0.6])
+def test_exchanged_legs_are_at_each_other_s_places_within_the_limits(phase):
+    skeleton = BODY.skeleton
+    _, (left, right) = pairs(limbs_of(BODY))
+    pose = walking_pose(skeleton, phase)
+    result = exchanged(pose, left, right)
+    before, after = skeleton.joints(pose), skeleton.joints(result)
+    moved = left.joints + right.joints
+    assert np.linalg.norm(after[moved] - before[right.joints + left.joints], axis=1).max() < 0.06
+    others = np.setdiff1d(np.arange(len(JOINTS)), moved)
+    np.testing.assert_allclose(after[others], before[others], atol=1e-12)
+    assert (result >= np.minimum(pose, skeleton.lower)).all() and (result <= np.maximum(pose, skeleton.upper)).all()

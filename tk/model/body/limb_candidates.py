@@ -33,6 +33,8 @@ _HIPS_DEG = (-20.0, 10.0, 40.0, 70.0, 100.0)
 _SPREADS_DEG = (-10.0, 10.0, 35.0)
 _LEG_ROLLS_DEG = (-25.0, 25.0)
 _KNEES_DEG = (5.0, 45.0, 85.0, 130.0)
+# Gauss-Newton steps of exchanged limbs, and their damping, m²: angles that move joints by less than 3 cm a radian stay.
+_EXCHANGE_STEPS, _EXCHANGE_DAMPING = 6, 0.03**2
 # Standard deviation of the angles of candidates near the current pose.
 _NEAR_DEG = 25.0
 
@@ -53,12 +55,9 @@ class Limb:
         """Return (B, D) copies of a pose with the limb in all candidates of the grid, and in ``near`` random ones."""
         turned = pose[self.dofs] + rng.normal(scale=np.radians(_NEAR_DEG), size=(near, len(self.dofs)))
         near_angles = np.clip(turned, self.skeleton.lower[self.dofs], self.skeleton.upper[self.dofs])
-        return self.combined(pose[None], np.concatenate([self.grid, near_angles]))
-
-    def combined(self, poses: Float, angles: Float) -> Float:
-        """Return (B·N, D) each of the poses (B, D) with each of the limb's angles (N, L)."""
-        result = np.repeat(poses, len(angles), axis=0)
-        result[:, self.dofs] = np.tile(angles, (len(poses), 1))
+        angles = np.concatenate([self.grid, near_angles])
+        result = np.repeat(pose[None], len(angles), axis=0)
+        result[:, self.dofs] = angles
         return result
 
     def distinct(self, poses: Float, cost: Float, count: int) -> Float:
@@ -72,17 +71,13 @@ class Limb:
         return np.asarray(poses[best[chosen]])
 
 
-def distinct(joints: Float, count: int, current: Float | None = None) -> list[int]:
-    """Return the indices of the first positions (N, J, 3) that differ from each other and the current one (J, 3)."""
-
-    def differs(other: Float) -> NDArray[np.bool_]:
-        return np.asarray(np.linalg.norm(joints - other, axis=-1).max(axis=-1) > DISTINCT_M)
-
-    free = np.ones(len(joints), np.bool_) if current is None else differs(current)
+def distinct(joints: Float, count: int) -> list[int]:
+    """Return the indices of the first positions (N, J, 3) that differ from each other by :data:`DISTINCT_M`."""
+    free = np.ones(len(joints), np.bool_)
     chosen: list[int] = []
     while len(chosen) < count and free.any():
         chosen.append(int(np.argmax(free)))
-        free &= differs(joints[chosen[-1]])
+        free &= np.linalg.norm(joints - joints[chosen[-1]], axis=-1).max(axis=-1) > DISTINCT_M
     return chosen
 
 
@@ -112,6 +107,23 @@ def pairs(limbs: Sequence[Limb]) -> list[tuple[Limb, ...]]:
     """Return the pairs of arms and of legs."""
     kinds = [[limb for limb in limbs if limb.name.startswith(kind)] for kind in ("arm", "leg")]
     return [tuple(pair) for pair in kinds if len(pair) == 2]
+
+
+def exchanged(pose: Float, one: Limb, other: Limb) -> Float:
+    """Return a pose (D,) with the joints of two legs, or arms, at each other's places as nearly as the limits allow.
+
+    Their angles are exchanged, then corrected by damped Gauss-Newton steps, since the limbs begin at different joints.
+    """
+    skeleton, dofs = one.skeleton, np.concatenate([one.dofs, other.dofs])
+    moved, joints = one.joints + other.joints, other.joints + one.joints
+    target, result = skeleton.joints(pose)[joints], pose.copy()
+    result[dofs] = pose[np.concatenate([other.dofs, one.dofs])]
+    for _ in range(_EXCHANGE_STEPS):
+        J = skeleton.joint_jacobian(result)[moved][..., dofs].reshape(-1, len(dofs))
+        missing = (target - skeleton.joints(result)[moved]).ravel()
+        step = np.linalg.solve(J.T @ J + _EXCHANGE_DAMPING * np.eye(len(dofs)), J.T @ missing)
+        result[dofs] = np.clip(result[dofs] + step, skeleton.lower[dofs], skeleton.upper[dofs])
+    return result
 
 
 def _arm_grid() -> Float:
