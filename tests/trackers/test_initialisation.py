@@ -153,6 +153,14 @@ def test_estimated_stature_hardly_depends_on_the_pose(stature: float) -> None:
     np.testing.assert_allclose(statures, stature, rtol=0.09)
 
 
+@pytest.mark.parametrize("height", [1.25, 2.4])
+def test_height_that_contradicts_the_silhouettes_is_refused(height: float) -> None:
+    tracker = tracker_of()
+    masks = draw_silhouettes(tracker.body, RIG, placed(standing_pose(SKELETON), 0.4)[None])[0]
+    with pytest.raises(CaptureError, match=f"height of {height:.2f} m contradicts the silhouettes.*about 1.7"):
+        tracker.find([Observation(0, np.zeros(0, np.uint8), masks)], height, None)
+
+
 def test_empty_first_frame_is_refused() -> None:
     tracker = tracker_of()
     empty = Observation(7, np.zeros(0, np.uint8), np.zeros((3, 250, 200), np.uint8))

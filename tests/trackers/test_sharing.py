@@ -102,6 +102,13 @@ def test_the_nearer_of_two_bodies_owns_pixels_that_both_cover(first: float) -> N
     assert (owner[:, 20, 17:21] == (0 if first < 2.5 else 1)).all()
 
 
+def test_a_wide_body_far_in_front_of_another_owns_what_both_cover() -> None:
+    """No float32 overflow or logarithm of zero: warnings are errors."""
+    bodies = [block(0, 40, 4.0), block(0, 40, 40.0)]
+    owner = GRID.sample(assign(RIG, GRID, bodies, masks_of(*bodies)).owner)
+    assert (owner[:, 20, 2:38] == 0).all()
+
+
 def test_pixels_are_unclear_where_two_bodies_are_equally_near_and_colors_are_unknown() -> None:
     bodies = [block(5, 20, 3.0), block(15, 30, 3.01)]
     found, frame = assign(RIG, GRID, bodies, masks_of(*bodies)), masks_of(*bodies)

@@ -47,6 +47,9 @@ RECOVER_EVERY = 3
 # Of the poses from which a lost person is searched for at the coarsest scale, one in RECOVERY_KEPT goes on to the finer
 # ones, if its residual is below HALVED times the current one: no finer scale halves a residual.
 RECOVERY_KEPT, HALVED = 4, 2.0
+# A given height is refused if the one that the silhouettes' area suggests differs by more than this factor. With true
+# heights the factor is 0.955 to 1.077 on nine recordings; children's proportions and wide clothes need more.
+MOST_STATURE_RATIO = 1.35
 # Decrease of the cost, as a share of the person's pixels, at which another pose of a limb replaces the current one.
 # Between half and twice the value, the mean errors of dance and cube (60 frames) change by 0.01 cm at most.
 GAIN = 0.004
@@ -176,14 +179,22 @@ class ContourTracker:
             body: the body, if known; it is not fitted then.
 
         Raises:
-            CaptureError: fewer than two cameras see anybody in the first frame.
+            CaptureError: fewer than two cameras see anybody in the first frame, or the silhouettes contradict the
+                height.
         """
         pyramids = [self.pyramid(frame) for frame in frames]
         rough: Float | None = None
         stature = (init and init.height_m) or height_m
         if init is None:
             centroid(self.views.rig, pyramids[0], frames[0].index)  # raises if nobody is there, before a body is taken
-            average = BodyDimensions.from_stature(stature or stature_of(self, pyramids))
+            apparent = stature_of(self, pyramids[:: 6 if stature else 1])  # a check needs fewer frames
+            if stature and not 1 / MOST_STATURE_RATIO < apparent / stature < MOST_STATURE_RATIO:
+                raise CaptureError(
+                    f"the height of {stature:.2f} m contradicts the silhouettes, which show a person of about "
+                    f"{apparent:.2f} m: correct the height in capture.toml, or omit it; if it is right, "
+                    "calibration.toml has another unit or scale"
+                )
+            average = BodyDimensions.from_stature(stature or apparent)
         else:
             average, given, angles = rough_pose(init.joints, init.angles, stature, self.world)
         self.take_body(body or build_cone_body(average))
@@ -456,13 +467,13 @@ class ContourTracker:
         # exchanged arms and legs, the best poses of each limb, and combinations of two limbs
         poses = [*swaps, *(one for _, better in found for one in better)]
         for i, (_, better) in enumerate(found):
-            for dofs, others in found[i + 1 :]:
+            for dofs, second in found[i + 1 :]:
                 both = better[0].copy()
-                both[dofs] = others[0][dofs]
+                both[dofs] = second[0][dofs]
                 poses.append(both)
         cost = mean_of_views(evidence.cast(self.body, group, np.array(poses))[0])
-        chosen = np.array(poses)[np.argsort(cost, kind="stable")[:FINISHED]]
-        settled = np.concatenate([pose[None], self.settle(pyramid, chosen, (0,), images).states])
+        best = np.array(poses)[np.argsort(cost, kind="stable")[:FINISHED]]
+        settled = np.concatenate([pose[None], self.settle(pyramid, best, (0,), images).states])
         fine = self.evidence(self.choice, frame, pyramid)
         return settled, mean_of_views(fine.cast(self.body, group, settled)[0])
 

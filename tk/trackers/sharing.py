@@ -51,8 +51,8 @@ UNKNOWN, UNKNOWN_BY_HULLS = 0.1, 0.03
 # Where somebody unknown ends is unknown, too: within this distance of the region, metres: half a trunk, and NEAR_M.
 _WIDTH_M = 0.35
 
-# e to this power is a number in float32; its inverse is zero beside 1.
-_SURELY = np.float32(80)
+# e to this power is a number in float32; its inverse is zero beside 1. The largest probability below 1.
+_SURELY, _ALMOST_ONE = np.float32(80), np.nextafter(np.float32(1), np.float32(0))
 
 NOBODY, UNCLEAR = -1, -2
 
@@ -249,7 +249,7 @@ def _log_visible(shapes: Sequence[_Shape]) -> Single:
     """Return (K, h, w) the logarithm of the probability that a cell shows each shape: that the shape covers the cell,
     and that no other one is in front."""
     log_covers = [-np.logaddexp(np.float32(0), shape.away / np.float32(ERROR_M)) for shape in shapes]
-    covers = [np.exp(one) for one in log_covers]
+    covers = [np.minimum(np.exp(one), _ALMOST_ONE) for one in log_covers]
     total = np.array(log_covers)
     for i, one in enumerate(shapes):
         for j, other in enumerate(shapes[:i]):
