@@ -237,7 +237,7 @@ class MaskAgreement:
         if most <= TOLERANCE:
             return (
                 f"the outlines in {listed} agree, but the working volume does not hold the person whom they show: "
-                "correct [volume] in capture.toml"
+                "correct [volume] in capture.toml, or choose a first frame with the person inside (--frames N:)"
             )
         apart = f" by up to {most:.0%} of the person's size" if np.isfinite(most) else ""
         if len(names) == 2:
