@@ -32,18 +32,22 @@ Float = NDArray[np.float64]
 Single = NDArray[np.float32]
 Bool = NDArray[np.bool_]
 
+# The numbers of the segmentation. In a rendered handshake, of the pixels of two people 0.24 %
+# are given to the wrong person, and 2.2 % are unclear. Behind each number: these shares with other values.
 # Scale of the logistic distributions by which outline and depth of a body differ from those at the expected pose,
-# metres. NEAR_M: an outline errs by less with a probability of 0.95.
+# metres (0.02: 0.35, 1.4 %; 0.06: 0.21, 2.9 %). NEAR_M: an outline errs by less with a probability of 0.95.
 ERROR_M = 0.04
 NEAR_M = 3 * ERROR_M
 # How far a pixel may lie from a body to be that person's, metres: a fist at 8 m/s moves so far in a frame at 15 Hz.
 REACH_M = 0.5
-# Logarithm of the ratio by which the colours around a pixel favour a person at most.
+# Logarithm of the ratio by which the colours around a pixel favour a person at most (2: 0.20, 2.6 %; 6: 0.24, 2.1 %).
 MOST_LOG_RATIO = 3.0
-# A pixel may show either of two people if it shows the likelier one with a lower probability.
+# A pixel may show either of two people if it shows the likelier one with a lower probability (0.7: 0.50, 0.6 %; 0.95:
+# 0.08, 5.2 %).
 CLEAR = 0.85
-# Edge of the square over which the evidence of colours is averaged, pixels, and the least width of a region of unclear
-# pixels: narrower ones are the border between two people.
+# Edge of the square over which the evidence of colours is averaged, pixels (1: 0.37, 1.8 %; 9: 0.15, 2.6 %), and the
+# least width of a region of unclear pixels (3: 0.17, 2.6 %; 9: 0.38, 1.5 %): narrower ones are the border between two
+# people.
 _AVERAGED_PX, _BORDER_PX = 3, 5
 # A view shows somebody unknown if a connected region that is not near has this share of a person's area. A fast arm
 # that is not where it is expected has 0.05. Hulls expect nothing.

@@ -34,6 +34,7 @@ _SPREADS_DEG = (-10.0, 10.0, 35.0)
 _LEG_ROLLS_DEG = (-25.0, 25.0)
 _KNEES_DEG = (5.0, 45.0, 85.0, 130.0)
 # Gauss-Newton steps of exchanged limbs, and their damping, m²: angles that move joints by less than 3 cm a radian stay.
+# In a walk, half and four times the steps, and half and twice the 3 cm, move exchanged joints by less than 0.1 cm.
 _EXCHANGE_STEPS, _EXCHANGE_DAMPING = 6, 0.03**2
 # Standard deviation of the angles of candidates near the current pose.
 _NEAR_DEG = 25.0
