@@ -35,8 +35,9 @@ from tk.threads import one_thread
 
 Masks = NDArray[np.uint8]
 
-# Chosen on the development captures; sensitivity not measured. These values decide which findings are printed, and no
-# tracking result depends on them.
+# These values decide which findings are printed, and no tracking result depends on them. With half and twice each value
+# the findings on walk, fold, rig9, pair and treadmill-slow are the same, except for specks in the ragged masks of
+# treadmill-slow: half the value names two cameras more, twice the value one fewer.
 #: frames that are compared; frames whose neighbours are also compared, and number of neighbours before and after: the
 #: largest delay that is found
 _FRAMES, _DELAY_FRAMES, _LARGEST_DELAY = 10, 5, 5

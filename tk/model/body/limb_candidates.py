@@ -24,8 +24,8 @@ Float = NDArray[np.float64]
 DISTINCT_M = 0.12
 
 # Grids of angles. The upper arm has directions on the sphere about 20° apart, without those through the back or far
-# across. Half and twice as many change the mean errors of dance and cube (50 frames) by 0.02 cm at most. The other
-# angles: chosen on the development captures; sensitivity not measured.
+# across. Half and twice as many, and half and twice the other angles, change the mean errors of dance and cube
+# (50 frames) by 0.02 cm at most.
 _DIRECTIONS = 84
 _ELBOWS_DEG = (60.0, 115.0)
 _ARM_ROLLS_DEG = (-80.0, -30.0, 20.0, 70.0)
