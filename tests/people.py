@@ -36,27 +36,27 @@ from tk.model.masks.sightings import Sighting
 class Red:
     """Segments all people."""
 
-    def segment(self, picture):
-        return np.where(red(picture) > 0, 0.9, 0.1).astype(np.float32)
+    def segment(self, image):
+        return np.where(red(image) > 0, 0.9, 0.1).astype(np.float32)
 
 
 class Finding:
     """Finds all people and segments the one in the middle."""
 
-    def segment(self, picture):
-        _, parts = cv2.connectedComponents(red(picture))
+    def segment(self, image):
+        _, parts = cv2.connectedComponents(red(image))
         middle = parts[parts.shape[0] // 2, parts.shape[1] // 2]
         return np.where((parts == middle) & (parts > 0), 0.9, 0.1).astype(np.float32)
 
-    def find(self, picture):
-        _, _, stats, middles = cv2.connectedComponentsWithStats(red(picture))
+    def find(self, image):
+        _, _, stats, middles = cv2.connectedComponentsWithStats(red(image))
         people = [(x, y, height) for (x, y), (_, _, _, height, area) in zip(middles[1:], stats[1:]) if area > 20]
         return [Sighting((x, y), (x, y - 0.6 * height), 0.9) for x, y, height in people]
 
 
 class Wrong:
-    def segment(self, picture):
-        return np.full(picture.shape[:2], 3.0, np.float32)
+    def segment(self, image):
+        return np.full(image.shape[:2], 3.0, np.float32)
 
 
 def red(picture):

@@ -78,6 +78,18 @@ def test_inspect_and_track_name_swapped_videos(tk: Tk, copy: Path, tmp_path: Pat
     tk("track", copy, "-o", tmp_path / "r.h5").complaint("the videos of cam1 and cam2 look swapped")
 
 
+def test_inspect_and_track_refuse_masks_of_other_frames(tk: Tk, copy: Path, tmp_path: Path) -> None:
+    for folder in (copy / "masks").iterdir():
+        paths = sorted(folder.iterdir())
+        images = [path.read_bytes() for path in paths]
+        for i, path in enumerate(paths):
+            path.write_bytes(images[i - len(paths) // 2])
+    expected = "the masks belong to other frames"
+    ran = tk("inspect", copy, "--json")
+    assert expected in json.loads(ran.out)["findings"][0]
+    tk("track", copy, "-o", tmp_path / "r.h5").complaint(str(copy), expected)
+
+
 def test_delay_of_a_video_is_found_in_frames(tk: Tk, tmp_path: Path) -> None:
     """The masks are rendered; those of one camera are three frames ahead."""
     rig, count, late = ring_of_cameras(4, 160, 120), 24, 3

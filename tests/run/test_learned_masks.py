@@ -33,9 +33,9 @@ class Counting:
 
     asked: list[int] = field(default_factory=lambda: [0])
 
-    def segment(self, picture: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def segment(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         self.asked[0] += 1
-        blue, green, red = np.moveaxis(picture.astype(int), 2, 0)
+        blue, green, red = np.moveaxis(image.astype(int), 2, 0)
         return np.where((red > 150) & (green < 90) & (blue < 90), 0.9, 0.05).astype(np.float32)
 
 

@@ -205,8 +205,8 @@ def test_masks_of_the_masks_command_are_used(
 class Scarlet:
     """A segmenter of a script: what is red is the person."""
 
-    def segment(self, picture: NDArray[np.uint8]) -> NDArray[np.float32]:
-        blue, green, red = np.moveaxis(picture.astype(np.float32), 2, 0)
+    def segment(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        blue, green, red = np.moveaxis(image.astype(np.float32), 2, 0)
         return (red > 1.5 * np.maximum(blue, green) + 20).astype(np.float32)
 
 

@@ -44,16 +44,16 @@ class OneOfMany:
     blind: int = 0
     seen: list[int] = field(default_factory=list)
 
-    def segment(self, picture: NDArray[np.uint8]) -> NDArray[np.float32]:
-        masks = self._masks(picture)
+    def segment(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        masks = self._masks(image)
         self.seen.append(len(masks))
-        side = len(picture) // 4
+        side = len(image) // 4
         masks.sort(key=lambda mask: -np.count_nonzero(mask[side:-side, side:-side]))
-        return masks[0].astype(np.float32) * 0.9 if masks else np.zeros(picture.shape[:2], np.float32)
+        return masks[0].astype(np.float32) * 0.9 if masks else np.zeros(image.shape[:2], np.float32)
 
-    def find(self, picture: NDArray[np.uint8]) -> list[Sighting]:
+    def find(self, image: NDArray[np.uint8]) -> list[Sighting]:
         self.blind -= 1
-        masks = self._masks(picture)
+        masks = self._masks(image)
         if self.blind >= 0 or not masks:
             return []
         x, y, width, height = cv2.boundingRect(masks[0].astype(np.uint8))
@@ -106,8 +106,8 @@ def test_another_detection_of_the_same_person_changes_nothing() -> None:
     """An arm that the mask misses may look like a person."""
 
     class Twice(OneOfMany):
-        def find(self, picture: NDArray[np.uint8]) -> list[Sighting]:
-            return super().find(picture) or [Sighting((80.0, 100.0), (80.0, 30.0), 0.6)]
+        def find(self, image: NDArray[np.uint8]) -> list[Sighting]:
+            return super().find(image) or [Sighting((80.0, 100.0), (80.0, 30.0), 0.6)]
 
     images, _ = shown([(0.2, 0.1)])
     once, twice = (masks_of(segmenter).label(images) for segmenter in (OneOfMany(), Twice()))

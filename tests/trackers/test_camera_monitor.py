@@ -220,7 +220,7 @@ def test_sigma_counts_what_the_test_of_the_opening_tolerates(scene: Scene, monke
 
 def test_person_whose_size_contradicts_the_given_height_is_refused(scene: Scene) -> None:
     monitor = CameraMonitor(scene.monitor().tracker, scene.setup, Subject(height_m=0.95))
-    with pytest.raises(CaptureError, match=r"measures 1\.\d+ m in the pictures, but .* says 0.95 m"):
+    with pytest.raises(CaptureError, match=r"measures 1\.\d+ m in the images, but .* says 0.95 m"):
         monitor.start(scene.frames[:3])
 
 

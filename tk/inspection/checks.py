@@ -25,7 +25,7 @@ from tk.model.body.plausibility import fits_height
 from tk.model.cameras.common_view import sample_box, views_of
 from tk.model.cameras.up import up_vector
 from tk.model.hull.coarse import Hull
-from tk.model.masks.image_health import ImageHealth
+from tk.model.masks.image_health import ImageHealth, Sampled, contradiction, sampled
 from tk.model.masks.mask_agreement import INCONSISTENT, Agreement, MaskAgreement
 from tk.model.masks.regions import clean_by_area
 from tk.model.masks.silhouettes import HOLE_SHARE
@@ -187,6 +187,7 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
     health, sick = ImageHealth(), np.zeros(len(capture.rig), int)
     masks: dict[int, Masks] = {}
     images: dict[int, NDArray[np.uint8]] = {}
+    small: dict[int, Sampled] = {}
     with capture.frames(0, span) as reader:
         for frame in reader:
             compared = frame.index in near or frame.index in frames
@@ -198,9 +199,12 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
             if not compared:
                 continue
             masks[frame.index] = labels.copy()
+            small[frame.index] = sampled(frame.images, labels)
             sick += [reason is not None for reason in health.look(frame.images, masks[frame.index])]
             if frame.index in kept:
                 images[frame.index] = frame.images.copy()
+    pairs = [(i + s, i + s + _LARGEST_DELAY) for i in centers for s in (-_LARGEST_DELAY, 0)]
+    unrelated = contradiction((small[i], small[k]) for i, k in pairs if i in small and k in small)
     compare = MaskAgreement(capture.rig, capture.volume)
     people = watch.people()
     agreement = compare.compare([masks[int(i)] for i in frames])
@@ -239,9 +243,8 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
         Sample(int(i), images[int(i)], masks[int(i)], _silhouettes(hulls[list(frames).index(i)], good), compare.step)
         for i in kept
     ]
-    return replace(
-        inspection, findings=(*_findings(inspection, capture, agreement), *many_people(inspection.people))
-    ), seen
+    findings = [*_findings(inspection, capture, agreement), *many_people(inspection.people)]
+    return replace(inspection, findings=tuple([unrelated, *findings] if unrelated else findings)), seen
 
 
 def _delays(
@@ -319,8 +322,8 @@ def _camera(
         verdict = "its image is blank, or frozen while the others move"
     elif late:
         verdict = (
-            f"its video seems to start {abs(late)} frame(s) {'late' if late > 0 else 'early'}: its frame k shows what "
-            f"frame k {late:+d} of the others shows"
+            f"its video seems to start {abs(late)} frame(s) {'late' if late > 0 else 'early'}: its frame "
+            f"{max(-late, 0)} shows what frame {max(late, 0)} of the others shows"
         )
     elif c in agreement.wrong:
         verdict = agreement.reason(c)

@@ -14,6 +14,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -24,12 +25,12 @@ from tk.errors import CaptureError, ConfigError
 from tk.model.body.skeleton import JOINTS
 from tk.model.cues.part_colors import RenderedBody
 from tk.model.cues.ray_costs import RayGrid
-from tk.model.masks.image_health import masks_stand_still
+from tk.model.masks.image_health import contradiction, sampled
 from tk.model.people import LocatedPerson, PeopleFinder, order_people
 from tk.model.setup import Setup, Subject
 from tk.run.choice import Choice, chosen, matched, unknown
 from tk.run.identity import EXCHANGED, UNCLEAR, Contact, Contacts, outcome_of
-from tk.trackers.camera_monitor import CameraMonitor, opening_agreement
+from tk.trackers.camera_monitor import CameraMonitor, opening_agreement, spread_over
 from tk.trackers.protocol import Estimate, Observation, SharingTracker, Tracker, sharing
 from tk.trackers.sharing import UNKNOWN, UNKNOWN_BY_HULLS, PixelOwners, assign, cast_points
 
@@ -140,10 +141,11 @@ class People:
         """Find the people in the first frame, and start a tracker for everybody in the volume and everybody chosen.
 
         Raises:
-            CaptureError: a chosen person is not there, too few cameras see the person, or the masks never change.
+            CaptureError: a chosen person is not there, too few cameras see the person, or the masks do not
+                belong to the images.
         """
-        if masks_stand_still([f.images for f in opening], [f.masks for f in opening]):
-            raise CaptureError("the masks never change, but the images do: the masks do not show who moves")
+        if reason := contradiction(pairwise(sampled(f.images, f.masks) for f in spread_over(opening))):
+            raise CaptureError(reason)
         subjects = self._setup.subjects
         found = self._finder.find(opening[0].masks, opening[0].uncertain)
         found = order_people(found, self._setup.volume, subjects[0].height_m, subjects[0].position)
@@ -190,8 +192,7 @@ class People:
 
     def _several_in(self, opening: Sequence[Observation]) -> bool:
         """Return whether several people are found in some frame of the opening."""
-        chosen = np.unique(np.linspace(0, len(opening) - 1, _TESTED).round().astype(int))
-        return any(len(self._finder.find(opening[i].masks, opening[i].uncertain)) > 1 for i in chosen)
+        return any(len(self._finder.find(f.masks, f.uncertain)) > 1 for f in spread_over(opening, _TESTED))
 
     def _shares(self, people: Sequence[LocatedPerson], frames: Sequence[Observation]) -> list[list[Observation]]:
         """Return the observations of each person in consecutive frames, by hulls that are carved again in each.

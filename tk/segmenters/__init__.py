@@ -28,7 +28,7 @@ INSTALL = "pip install tk-mocap[segmenter]"
 class Segmenter(Protocol):
     """Estimates which pixels show a person."""
 
-    def segment(self, picture: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def segment(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the probability (h, w) that each pixel of an image (h, w, 3) BGR shows a person.
 
         A :class:`Finder` may segment the person in the middle only.
@@ -41,7 +41,7 @@ class Segmenter(Protocol):
 class Finder(Protocol):
     """A segmenter that can also detect people."""
 
-    def find(self, picture: NDArray[np.uint8]) -> list[Sighting]:
+    def find(self, image: NDArray[np.uint8]) -> list[Sighting]:
         """Return the people in an image (h, w, 3) BGR, in any order."""
         ...
 
@@ -74,16 +74,16 @@ def load(name: str) -> Segmenter:
     return BlazePose()
 
 
-def probabilities(segmenter: Segmenter, name: str, picture: NDArray[np.uint8]) -> NDArray[np.float32]:
+def probabilities(segmenter: Segmenter, name: str, image: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return the checked result of a segmenter for an image.
 
     Raises:
         ConfigError: the result is not a probability for each pixel.
     """
-    found = np.asarray(segmenter.segment(picture))
-    if found.shape != picture.shape[:2] or found.dtype.kind != "f":
+    found = np.asarray(segmenter.segment(image))
+    if found.shape != image.shape[:2] or found.dtype.kind != "f":
         raise ConfigError(
-            f"segmenter {name}: returned an array {found.shape} of {found.dtype} for an image {picture.shape[:2]}; "
+            f"segmenter {name}: returned an array {found.shape} of {found.dtype} for an image {image.shape[:2]}; "
             "it must return a probability for each pixel"
         )
     if not (found.min() >= 0 and found.max() <= 1):  # also fails for NaN

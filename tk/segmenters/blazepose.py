@@ -46,9 +46,9 @@ class BlazePose:
         self._pose = _Network(files["pose_landmark_full.tflite"])
         self._anchors = np.concatenate([_grid(cells, count) for cells, count in _GRIDS])
 
-    def find(self, picture: NDArray[np.uint8]) -> list[Sighting]:
+    def find(self, image: NDArray[np.uint8]) -> list[Sighting]:
         """Return the people in an image (h, w, 3) BGR, the most certain first."""
-        square, scale = _in_square(picture, _DETECTOR_SIDE)
+        square, scale = _in_square(image, _DETECTOR_SIDE)
         found = self._detector(square / np.float32(127.5) - 1)
         rows, logits = (found[i][0] for i in np.argsort([-array.shape[-1] for array in found]))
         scores = 1 / (1 + np.exp(-np.clip(logits[:, 0].astype(np.float64), -100, 100)))
@@ -69,10 +69,10 @@ class BlazePose:
             hips, circle, weight = hips[~same], circle[~same], weight[~same]
         return people
 
-    def segment(self, picture: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def segment(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the probability (h, w) that each pixel shows the person in the middle of the image (h, w, 3)."""
-        height, width = picture.shape[:2]
-        square, _ = _in_square(picture, _POSE_SIDE)
+        height, width = image.shape[:2]
+        square, _ = _in_square(image, _POSE_SIDE)
         (logits,) = (a for a in self._pose(square / np.float32(255)) if a.shape[1:3] == (_POSE_SIDE,) * 2)
         side = max(height, width)
         # enlarged before thresholding, so that the outline is finer than the network's pixels
@@ -92,9 +92,9 @@ class _Network:
         self._input = self._interpreter.get_input_details()[0]["index"]
         self._outputs = [detail["index"] for detail in self._interpreter.get_output_details()]
 
-    def __call__(self, picture: NDArray[np.floating]) -> list[NDArray[Any]]:
+    def __call__(self, image: NDArray[np.floating]) -> list[NDArray[Any]]:
         """Return the outputs (1, …) for an image (n, n, 3)."""
-        self._interpreter.set_tensor(self._input, picture[None].astype(np.float32))
+        self._interpreter.set_tensor(self._input, image[None].astype(np.float32))
         self._interpreter.invoke()
         return [self._interpreter.get_tensor(index) for index in self._outputs]
 
@@ -118,11 +118,11 @@ def _grid(cells: int, count: int) -> NDArray[np.float64]:
     return np.repeat(np.stack([x.ravel(), y.ravel()], axis=1) / cells, count, axis=0)
 
 
-def _in_square(picture: NDArray[np.uint8], side: int) -> tuple[NDArray[np.uint8], float]:
+def _in_square(image: NDArray[np.uint8], side: int) -> tuple[NDArray[np.uint8], float]:
     """Return the image in RGB, scaled into the upper left of a black square (side, side, 3), and the scale."""
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     largest = max(height, width)
-    padded = cv2.copyMakeBorder(picture, 0, largest - height, 0, largest - width, cv2.BORDER_CONSTANT)
+    padded = cv2.copyMakeBorder(image, 0, largest - height, 0, largest - width, cv2.BORDER_CONSTANT)
     shrunk = cv2.INTER_AREA if largest > side else cv2.INTER_LINEAR
     small = cv2.resize(padded, (side, side), interpolation=shrunk)
     return np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2RGB), np.uint8), side / largest

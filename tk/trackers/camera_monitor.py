@@ -43,7 +43,7 @@ from tk.trackers.residual import OUTLIER, RATE, RECENT, contradicted
 
 Float = NDArray[np.float64]
 
-# Frames of the opening whose masks are compared.
+# Frames of the opening that are compared.
 _OPENING = 5
 # A camera with a residual (E_S) above this is excluded whatever its baseline: its mask is unrelated to the body.
 _UNRELATED = 0.75
@@ -65,10 +65,14 @@ Span = tuple[int, int, int]
 """Frames: the first, the last, and their number."""
 
 
+def spread_over(frames: Sequence[Observation], count: int = _OPENING) -> list[Observation]:
+    """Return this many of the opening's frames, spread over it."""
+    return [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]
+
+
 def opening_agreement(setup: Setup, frames: Sequence[Observation]) -> Agreement:
-    """Return whether the silhouettes of the opening frames agree; a few frames, spread over them, are compared."""
-    chosen = np.unique(np.linspace(0, len(frames) - 1, _OPENING).round().astype(int))
-    return MaskAgreement(setup.rig, setup.volume).compare([frames[i].masks for i in chosen])
+    """Return whether the silhouettes of the opening frames agree."""
+    return MaskAgreement(setup.rig, setup.volume).compare([frame.masks for frame in spread_over(frames)])
 
 
 class CameraMonitor:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
-from tk.model.masks.image_health import BLANK, FROZEN, ImageHealth, described, masks_stand_still
+from tk.model.masks.image_health import BLANK, FROZEN, ImageHealth, contradiction, described, sampled
 
 C, H, W = 4, 96, 128
 
@@ -24,15 +27,30 @@ def test_healthy_images_have_no_reason() -> None:
     assert all(health.look(*frame(t, rng)) == [None] * C for t in range(12))
 
 
-def test_masks_that_never_change_stand_still_only_if_somebody_moves() -> None:
+def complaint(images: Sequence[np.ndarray], masks: Sequence[np.ndarray]) -> str:
+    return contradiction(pairwise(map(sampled, images, masks))) or ""
+
+
+def test_masks_that_never_change_are_contradicted_only_if_somebody_moves() -> None:
     rng = np.random.default_rng(0)
     images, masks = zip(*(frame(t, rng) for t in range(6)), strict=True)
     still = [frame(0, rng)[0] for _ in range(6)]
     same = [masks[0]] * 6
-    assert masks_stand_still(images, same)
-    assert not masks_stand_still(images, masks)  # the person moves
-    assert not masks_stand_still(still, same)  # nobody does
-    assert not masks_stand_still([np.zeros((C, 0, 0, 3), np.uint8)] * 6, same)
+    assert "never change" in complaint(images, same)
+    assert not complaint(images, masks)  # the person moves
+    assert not complaint(still, same)  # nobody does
+    assert not complaint([np.zeros((C, 0, 0, 3), np.uint8)] * 6, same)
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.8])
+def test_images_change_where_masks_of_the_same_time_change(gain: float) -> None:
+    rng = np.random.default_rng(0)
+    images, masks = zip(*(frame(2 * t, rng) for t in range(10)), strict=True)
+    images = tuple((p * gain ** (t % 2)).astype(np.uint8) for t, p in enumerate(images))  # the exposure changes
+    assert not complaint(images, masks)
+    assert not complaint(images, [np.roll(m, 1, axis=2) for m in masks])  # a mask one pixel off
+    for late in (-5, 5):
+        assert "other frames" in complaint(images, np.roll(masks, late, axis=0))
 
 
 def test_frozen_camera_is_found_once_the_others_have_moved_until_it_moves_again() -> None:

@@ -58,7 +58,7 @@ def check_extent(extent_m: float, height_m: float) -> None:
     """
     if not fits_height(extent_m, height_m):
         raise CaptureError(
-            f"the person measures {extent_m:.2f} m in the pictures, but [subject] height in capture.toml says "
+            f"the person measures {extent_m:.2f} m in the images, but [subject] height in capture.toml says "
             f"{height_m:.2f} m: {_CAUSES}"
         )
 
@@ -71,7 +71,7 @@ def check_stature(stature_m: float) -> None:
     """
     if not STATURE_M[0] <= stature_m <= STATURE_M[1]:
         raise CaptureError(
-            f"the person measures {stature_m:.2f} m in the pictures: {_CAUSES}; if the size is right, or the person "
+            f"the person measures {stature_m:.2f} m in the images: {_CAUSES}; if the size is right, or the person "
             "does not stand at the beginning, give [subject] height in capture.toml"
         )
 
