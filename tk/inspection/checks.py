@@ -204,7 +204,8 @@ def inspect(capture: Capture, config: Settings, pictures: int = 3) -> tuple[Insp
             if frame.index in kept:
                 images[frame.index] = frame.images.copy()
     pairs = [(i + s, i + s + _LARGEST_DELAY) for i in centers for s in (-_LARGEST_DELAY, 0)]
-    unrelated = contradiction((small[i], small[k]) for i, k in pairs if i in small and k in small)
+    given = [(small[i], small[k]) for i, k in pairs if capture.has_masks and i in small and k in small]
+    unrelated = contradiction(given)
     compare = MaskAgreement(capture.rig, capture.volume)
     people = watch.people()
     agreement = compare.compare([masks[int(i)] for i in frames])

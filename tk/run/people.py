@@ -137,14 +137,17 @@ class People:
 
     # --- the first frames ---------------------------------------------------------------------------------------------
 
-    def start(self, opening: Sequence[Observation]) -> None:
+    def start(self, opening: Sequence[Observation], given_masks: bool = False) -> None:
         """Find the people in the first frame, and start a tracker for everybody in the volume and everybody chosen.
+
+        Masks that were made from the images belong to them; ``given_masks`` are compared with them.
 
         Raises:
             CaptureError: a chosen person is not there, too few cameras see the person, or the masks do not
                 belong to the images.
         """
-        if reason := contradiction(pairwise(sampled(f.images, f.masks) for f in spread_over(opening))):
+        compared = spread_over(opening) if given_masks else ()
+        if reason := contradiction(pairwise(sampled(f.images, f.masks) for f in compared)):
             raise CaptureError(reason)
         subjects = self._setup.subjects
         found = self._finder.find(opening[0].masks, opening[0].uncertain)

@@ -37,7 +37,8 @@ Float = NDArray[np.float64]
 Note = Callable[[str], None]
 
 # Frames of a refinement, at most and at least, and of a check of the cameras' agreement. On dance with turned cameras
-# 16, 24 and 40 frames give the same joints within 0.02 cm. Fewer than eight show too little motion (not measured).
+# 16, 24 and 40 frames give the same joints within 0.02 cm. Fewer than eight show little motion; these
+# recordings are longer, so the least number changes nothing on them.
 FRAMES, FEWEST = 20, 8
 AGREEMENT_FRAMES = 20
 # Refined cameras are used if they reduce the contours' distance to less than this share. One of five cameras turned by

@@ -41,8 +41,9 @@ Labeller = Callable[[FrameSet], Labels]
 # what :func:`mask_source` returns; "none": no masks are given, they are made from the empty scene
 _GIVEN, _SCENE, _MEDIAN, _SEGMENTER = "given", "none", "median", "segmenter "
 
-# frames of the median background. More take longer to decode; sensitivity not measured.
-PLATE_FRAMES = 25
+# Frames of the median background. With 12, 25, 50 and 100, limbs of walk have errors of 0.8, 0.9, 0.7 and 0.7 cm. With
+# 25 no note says that the median shows parts of the dancer (limbs 5.1 cm), with 50 and 100 one does (2.4 and 1.9 cm).
+PLATE_FRAMES = 50
 
 # The median is the empty scene where the person covers a pixel in less than half of the frames. A pixel that is covered
 # in more than _LONG of the frames is in danger; a note says so if these pixels exceed _MANY of the person's area

@@ -314,7 +314,7 @@ class _Run:
         _LOG.info("finding the person in frame %d and fitting the body to %d frames", plan.first, len(opening))
         try:
             with one_thread():
-                self.people.start([o for o, _ in opening])
+                self.people.start([o for o, _ in opening], plan.source.has_masks)
         except CaptureError as error:
             reasons = "; ".join([str(error), *plan.source.damaged(plan.first + len(opening))])
             raise CaptureError(f"{plan.source.where}: {reasons}", error.hint) from None

@@ -29,7 +29,8 @@ _GRIDS = ((28, 2), (14, 2), (7, 6))
 _HIPS, _CIRCLE = slice(4, 6), slice(6, 8)  # columns: mid-hip point, point on the circle around the body
 _LEAST_SCORE = 0.5  # MediaPipe's value
 # Detections whose mid-hip points differ by less than this share of the radius are one person. Detections of one person
-# differ by far less, different people by more; sensitivity not measured.
+# differ by far less, different people by more. Half and twice the value change the mean errors of walk and pair without
+# an empty scene (55 frames) by 0.01 cm.
 _SAME = 0.5
 
 

@@ -80,7 +80,8 @@ _BRIGHT_STEP = 16  # rows and columns from one such mean to the next, where its 
 # errors are correlated within a window. At 0.3 and 1.4 masks change by 1 to 4 %; more leaves holes in grey clothes.
 _NOISE_FLOOR = 0.7
 # The same with a single image of the empty scene, whose own coding errors and later changes of the light are not
-# averaged out. Chosen on one real capture; sensitivity not measured.
+# averaged out. Chosen on one real capture. Half and twice the value change the mean errors of walk and dance with one
+# image of the empty scene (60 frames) by 0.06 and 0.03 cm.
 _STILL_NOISE = 15.0
 
 # A label is the edge of a shadow if the statistic is below this share of the plain difference nearby. The statistic

@@ -17,7 +17,7 @@ _DEVIATIONS = 3.0  # a coarse pixel differs from the scene by this many standard
 _WHOLE = 128  # fixed-point value of the share 1 of the scene's light, so that twice the light fits into a byte
 _CROWD = 4  # of nine neighbouring coarse pixels, the number that must differ; without it boxes are larger, masks equal
 # Side of a cell in coarse pixels. Regions in cells that touch, or are one cell apart, are one region. It sets how far a
-# hand may be from the body; sensitivity not measured.
+# hand may be from the body. Half and twice the value change nothing on dance and cube (50 frames).
 _CELL = 4
 # Regions with a smaller share of the largest region's pixels are ignored. From 0 to 0.1 the masks of seven captures are
 # equal; with 0 the boxes are larger and segmentation slower.
