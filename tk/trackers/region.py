@@ -181,7 +181,6 @@ class RegionTracker(ContourTracker):
             if self._best.pose is not settled:
                 label, curvature, residual = self._look(evidence, pyramid, images)
                 error = residual.sum(axis=1)
-                misplaced = self.misplaced(evidence, label)
         watch.lap("search")
         followed = self._best.pose
         lost = self._recover(pyramid, error)
@@ -196,8 +195,6 @@ class RegionTracker(ContourTracker):
         self._fresh = False
         pose = self._best.pose
         sigma = self._sigma(pose, curvature, label, residual)
-        for limb in self.misplaced(evidence, label):
-            sigma[list(limb.joints)] = np.nan
         if self._high_for >= UNKNOWN_AFTER and self.residuals.high(error):
             sigma[:] = np.nan
         watch.lap("check")
