@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -151,6 +152,22 @@ def test_estimated_stature_hardly_depends_on_the_pose(stature: float) -> None:
         statures.append(stature_of(tracker, [tracker.pyramid(Observation(0, np.zeros(0, np.uint8), m))
                                              for m in draw_silhouettes(body, RIG, pose[None])]))  # fmt: skip
     np.testing.assert_allclose(statures, stature, rtol=0.09)
+
+
+@pytest.mark.parametrize(("hull_m", "expected"), [(STATURE, STATURE), (2.3, None), (1.2, None)])
+def test_lower_hull_corrects_the_stature_of_wide_clothes(monkeypatch, hull_m: float, expected: float | None) -> None:
+    """Raised arms, or a bent body, leave the estimate from the silhouettes' area."""
+    tracker = SilhouetteTracker(RIG, "z", SilhouetteSettings(adapt=False))
+    bare = draw_silhouettes(BODY, RIG, placed(standing_pose(SKELETON), 0.5)[None])[0]
+    masks = np.array([cv2.dilate(mask, np.ones((5, 5), np.uint8)) for mask in bare])
+    frame = Observation(0, np.zeros(0, np.uint8), masks)
+    apparent = stature_of(tracker, [tracker.pyramid(frame)])
+    monkeypatch.setattr(
+        "tk.trackers.contour_tracker.find_person", lambda *_: [TrajectoryHypothesis(np.zeros((1, 1)), 0.1)]
+    )
+    tracker.find([frame], None, None, hull_m=hull_m)
+    assert apparent > 1.1 * STATURE
+    assert tracker.body.dimensions == BodyDimensions.from_stature(expected or apparent)
 
 
 @pytest.mark.parametrize("height", [1.25, 2.4])

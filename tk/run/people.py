@@ -157,7 +157,7 @@ class People:
         numbers: tuple[int, ...] = (0,)
         if len(found) <= 1 and self._choice in ("auto", "all", (0,)):
             try:
-                self._begin(self._tracked[0], opening)
+                self._begin(self._tracked[0], opening, found[0].height_m if found else None)
                 return
             except CaptureError:
                 if self._grid is None or not found or not self._several_in(opening):
@@ -171,20 +171,23 @@ class People:
         rest = [person for n, person in enumerate(found) if n not in numbers and person.views.sum() >= 2]
         shares = self._shares([*people, *rest], opening)
         refusal = opening_agreement(self._setup, opening).refusal
-        for member, frames in zip(self._tracked, shares, strict=False):
-            self._begin(member, frames, refusal)
+        for member, frames, person in zip(self._tracked, shares, people, strict=False):
+            self._begin(member, frames, person.height_m, refusal)
         for person, frames in zip(rest, shares[len(people) :], strict=True):
             if person.inside:
-                self._admit(frames, unknown(subjects[0]), written=False)
+                self._admit(frames, person, unknown(subjects[0]), written=False)
 
-    def _begin(self, member: Member, frames: Sequence[Observation], refusal: str | None = None) -> None:
-        """Start a tracker. ``refusal``: why the whole masks contradict each other, which counts if those of the person
-        alone cannot be compared: cameras that do not belong together show several people where one is."""
+    def _begin(
+        self, member: Member, frames: Sequence[Observation], hull_m: float | None, refusal: str | None = None
+    ) -> None:
+        """Start a tracker. ``hull_m``: height of the visual hull in the first frame. ``refusal``: why the whole masks
+        contradict each other, which counts if those of the person alone cannot be compared: cameras that do not belong
+        together show several people where one is."""
         subject = member.subject
         seen = member.monitor.start(frames)
         if refusal and not member.monitor.tested:
             raise CaptureError(refusal)
-        member.tracker.start(seen, subject.height_m, subject.init, subject.body)
+        member.tracker.start(seen, subject.height_m, subject.init, subject.body, hull_m)
         member.monitor.check_body()
 
     @property
@@ -337,8 +340,7 @@ class People:
             if alike and max(alike) > _SAME_COLORS:
                 away[int(np.argmax(alike))].absent = False  # the tracker finds this person in the unknown pixels
                 continue
-            subject = Subject(height_m=person.height_m, in_init_pose=False)
-            newcomer = self._admit(shares, subject, written=self._choice == "all")
+            newcomer = self._admit(shares, person, Subject(in_init_pose=False), written=self._choice == "all")
             if newcomer is not None and newcomer.written:
                 self._note(f"frame {frame.index}: person {newcomer.number} has entered")
             elif newcomer is not None:
@@ -354,12 +356,14 @@ class People:
         masks = owners.unknown(frame).masks
         return [p for p in self._finder.find(masks >= 128, masks > 0) if p.inside]
 
-    def _admit(self, frames: Sequence[Observation], subject: Subject, written: bool) -> Member | None:
+    def _admit(
+        self, frames: Sequence[Observation], person: LocatedPerson, subject: Subject, written: bool
+    ) -> Member | None:
         """Add a person who is tracked from the first of some frames on; None if nobody can be tracked."""
         number = 1 + max(m.number for m in self._tracked)
         member = self._member(number, subject, self._make(), written)
         try:
-            self._begin(member, frames)
+            self._begin(member, frames, person.height_m)
         except CaptureError as reason:
             _LOG.info("nobody can be tracked there: %s", reason)
             self._refused += 1

@@ -167,7 +167,12 @@ class ContourTracker:
     # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
 
     def find(
-        self, frames: Sequence[Observation], height_m: float | None, init: InitPose | None, body: ConeBody | None = None
+        self,
+        frames: Sequence[Observation],
+        height_m: float | None,
+        init: InitPose | None,
+        body: ConeBody | None = None,
+        hull_m: float | None = None,
     ) -> Float:
         """Return the pose (D,) in the first of the frames; the body is fitted to all of them.
 
@@ -177,6 +182,7 @@ class ContourTracker:
             init: a rough pose given by the user, in the capture's world; None tries walking phases, standing and the Da
                 Vinci pose.
             body: the body, if known; it is not fitted then.
+            hull_m: the height of the visual hull, if known, an estimate of the stature.
 
         Raises:
             CaptureError: fewer than two cameras see anybody in the first frame, or the silhouettes contradict the
@@ -194,6 +200,9 @@ class ContourTracker:
                     f"{apparent:.2f} m: correct the height in capture.toml, or omit it; if it is right, "
                     "calibration.toml has another unit or scale"
                 )
+            # clothes enlarge the silhouettes, raised arms the hull; who bends has a low hull
+            if hull_m and apparent / hull_m < MOST_STATURE_RATIO:
+                apparent = min(apparent, hull_m)
             average = BodyDimensions.from_stature(stature or apparent)
         else:
             average, given, angles = rough_pose(init.joints, init.angles, stature, self.world)
@@ -286,9 +295,10 @@ class ContourTracker:
         height_m: float | None,
         init: InitPose | None,
         body: ConeBody | None = None,
+        hull_m: float | None = None,
     ) -> None:
         """Find the subject in the first frame, see :meth:`find`."""
-        self.find(frames, height_m, init, body)
+        self.find(frames, height_m, init, body, hull_m)
 
     def state(self) -> Mapping[str, Any]:
         """Return what :meth:`restore` needs, beside the model, to continue after the last frame.

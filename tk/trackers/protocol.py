@@ -143,6 +143,7 @@ class Tracker(Protocol):
         height_m: float | None,
         init: InitPose | None,
         body: ConeBody | None = None,
+        hull_m: float | None = None,
     ) -> None:
         """Find the subject in the first of ``frames`` and fit the body. The first :meth:`step` is for that frame, too.
 
@@ -151,6 +152,7 @@ class Tracker(Protocol):
             height_m: the subject's height, if known.
             init: a rough pose given by a person.
             body: the body, if known; it is not fitted then.
+            hull_m: the height of the visual hull, if known, an estimate of the stature.
         """
         ...
 

@@ -125,9 +125,10 @@ class RegionTracker(ContourTracker):
         height_m: float | None,
         init: InitPose | None,
         body: ConeBody | None = None,
+        hull_m: float | None = None,
     ) -> None:
         """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourTracker.find`."""
-        pose = self.find(frames, height_m, init, body)
+        pose = self.find(frames, height_m, init, body, hull_m)
         self._alive = [Hypothesis(pose, pose, 0.0)]
         self._mean_posture, self._postures = np.zeros((len(JOINTS), 3)), 0
         self._fresh = True

@@ -61,9 +61,10 @@ class SilhouetteTracker(ContourTracker):
         height_m: float | None,
         init: InitPose | None,
         body: ConeBody | None = None,
+        hull_m: float | None = None,
     ) -> None:
         """Find the subject in the first frame and fit the body to all of them, see :meth:`ContourTracker.find`."""
-        self._pose = self._previous = self.find([_blind(f) for f in frames], height_m, init, body)
+        self._pose = self._previous = self.find([_blind(f) for f in frames], height_m, init, body, hull_m)
         self._lost_for = 0
         self._fresh = True
 

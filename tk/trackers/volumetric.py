@@ -120,6 +120,7 @@ class VolumetricTracker:
         height_m: float | None,
         init: InitPose | None,
         body: ConeBody | None = None,
+        hull_m: float | None = None,
     ) -> None:
         """Find the subject in the first frame and fit the body to all frames, see :meth:`ContourTracker.find`.
 
@@ -128,7 +129,7 @@ class VolumetricTracker:
         """
         # without images: colours inside the silhouettes are a cue of the region tracker only
         blind = [Observation(f.index, f.images[:0], f.masks) for f in frames]
-        pose = self._finder.find(blind, height_m, init, body)
+        pose = self._finder.find(blind, height_m, init, body, hull_m)
         first = frames[0]
         self.hull.update(first.masks)
         surface = self.hull.surface(first.images)
