@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,13 +127,14 @@ class Figure:
         middle = np.add.reduceat(depth, starts) / np.diff(self.starts)
         whole = np.isfinite(np.add.reduceat(xy[:, 0], starts))
         seen: dict[int, tuple[list[float], list[Float]]] = {}
-        for solid, points, distance, is_whole in zip(
-            self.solids, np.split(xy, starts[1:]), middle.tolist(), whole.tolist(), strict=True
+        ends = pairwise(self.starts.tolist())
+        for solid, (begin, end), distance, is_whole in zip(
+            self.solids, ends, middle.tolist(), whole.tolist(), strict=True
         ):
             if is_whole:
                 depths, outlines = seen.setdefault(solid.segment, ([], []))
                 depths.append(distance)
-                outlines.append(points)
+                outlines.append(xy[begin:end])
         found = [
             Outline(SEGMENTS[segment], sum(depths) / len(depths), tuple(outlines))
             for segment, (depths, outlines) in seen.items()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from colorsys import hls_to_rgb
+from functools import cache
 
 import cv2
 import numpy as np
@@ -73,9 +74,13 @@ _DARKEST = 60
 
 def sigma_colors(sigma_m: ArrayLike) -> NDArray[np.uint8]:
     """Return the colours (N, 3) of N standard deviations along one axis, metres, none of them NaN."""
-    table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[::-1, None], cv2.COLORMAP_INFERNO)[:, 0]
     share = np.clip(np.asarray(sigma_m, float) / SIGMA_MOST_M, 0, 1)
-    return np.asarray(table[(share * (255 - _DARKEST)).round().astype(int)], np.uint8)
+    return np.asarray(_inferno()[(share * (255 - _DARKEST)).round().astype(int)], np.uint8)
+
+
+@cache
+def _inferno() -> NDArray[np.uint8]:
+    return np.asarray(cv2.applyColorMap(np.arange(256, dtype=np.uint8)[::-1, None], cv2.COLORMAP_INFERNO)[:, 0])
 
 
 def unit_rgb(color: Color) -> list[float]:
