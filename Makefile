@@ -1,8 +1,8 @@
 # `make demo` and `make test` are enough by themselves: they set up what is missing first.
 VENV ?= .venv
 RUN = "$(VENV)/bin/python" -m
-# a file's tests stay together, for they share what they have tracked; a process that has crashed is not started again,
-# for the new one would repeat the test that crashed it
+# a file's tests stay together, because they share what they have tracked; a process that has crashed is not started
+# again, because the new one would repeat the test that crashed it
 EACH_CORE = -n auto --dist loadfile --max-worker-restart 0
 
 .PHONY: help install demo test test-slow test-random lint format docs bench clean

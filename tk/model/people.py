@@ -50,7 +50,7 @@ _SMOOTH_M = 0.1
 # Radius of a person's column in a block, metres: half the breadth of the shoulders, and a step.
 _BODY_M = 0.35
 # Two columns are two people if the floor plan between them falls to this share of the lower one. Half and twice the
-# value, and those of the prices of candidates below, change the number of people in 2 of 40 frames of pair and of a
+# value, and those of the prices of candidates below, change the number of people in one of 40 frames of pair and of a
 # rendered embrace at most.
 _SADDLE = 0.7
 # A person costs as much as this area of unexplained pixels, sum over the views, m²: half the silhouette of an adult in

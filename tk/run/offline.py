@@ -39,8 +39,9 @@ REFINED = "refined"
 # Differences of cameras that a result file rounds, in the units of a calibration; a refinement changes more.
 _ROUNDED = 1e-7
 # A joint keeps its sigma of the first pass where that exceeds the sigma of the second pass by this factor. With 1, 5 %
-# more of walk's joints are within one sigma, where 12 % too many are; 4 changes nothing. Without the rule, joints more
-# than 15 cm off with a sigma below 5 cm rise from 0 to 0.1 % (dance, three cameras; walk, two: 1.0 to 1.1 %).
+# more of walk's joints are within one sigma, where 12 % too many are; 4 changes such shares by less than 1 %. Without
+# the rule, joints more than 15 cm off with a sigma below 5 cm rise from 0 to 0.1 % (dance, three cameras) and from 1.0
+# to 1.1 % (walk, two).
 _LESS_SURE = 2.0
 
 

@@ -48,7 +48,8 @@ RECOVER_EVERY = 3
 # ones, if its residual is below HALVED times the current one: no finer scale halves a residual.
 RECOVERY_KEPT, HALVED = 4, 2.0
 # A given height is refused if the one that the silhouettes' area suggests differs by more than this factor. With true
-# heights the factor is 0.955 to 1.077 on nine recordings; children's proportions and wide clothes need more.
+# heights the factor is 0.955 to 1.077 on nine recordings; children's proportions and wide clothes need more. A visual
+# hull that is lower by more than this shows a person who bends, so its height is no estimate of the stature.
 MOST_STATURE_RATIO = 1.35
 # Decrease of the cost, as a share of the person's pixels, at which another pose of a limb replaces the current one.
 # Between half and twice the value, the mean errors of dance and cube (60 frames) change by 0.01 cm at most.
