@@ -37,8 +37,8 @@ Masks = NDArray[np.uint8]
 
 # These values decide which findings are printed, and no tracking result depends on them. With half and twice each value
 # the findings on walk, fold, rig9, pair and treadmill-slow are the same, except for specks in the ragged masks of
-# treadmill-slow (half the value names two cameras more, twice the value one fewer), and for its delay of one frame,
-# which is two with half as many compared frames.
+# treadmill-slow (half the value names two cameras more, twice the value one fewer), and for the delay of its cam1,
+# which cuts the person off in 80 % of the frames: 0 to 2 frames, now 1.
 #: frames that are compared; frames whose neighbours are also compared, and number of neighbours before and after: the
 #: largest delay that is found
 _FRAMES, _DELAY_FRAMES, _LARGEST_DELAY = 10, 5, 5
