@@ -27,7 +27,7 @@ from tk.model.body.skeleton import JOINTS, build_skeleton
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.masks.silhouettes import draw_silhouettes
 from tk.render.canvas import View, dots, draw_body, draw_joints
-from tk.render.figure import Figure, Outline, solids_of
+from tk.render.figure import Figure, Seen, solids_of
 from tk.render.overlay import Grid, Overlay, write_sheets
 from tk.render.palette import BONE, LOST, LOST_BODY, SEGMENT_COLORS, person_color, sigma_colors
 from tk.run.session import track
@@ -67,6 +67,11 @@ def test_bones_join_all_joints_into_one_tree() -> None:
     assert {name for bone in BONES for name in bone} == set(JOINTS)
 
 
+def solids(points: np.ndarray, *parts: tuple[str, int, int]) -> Seen:
+    """Solids in an image without joints."""
+    return Seen(np.zeros((0, 2)), points, parts)
+
+
 def test_body_is_restored_from_the_model(result: Path) -> None:
     restored = body_and_poses(read_result(result))
     assert restored is not None
@@ -82,9 +87,10 @@ def test_outlines_of_cones_are_their_silhouette() -> None:
     pose[:3] = 0.0
     cam = camera()
     mask = np.zeros((240, 320), np.uint8)
-    for outline in figure(body, pose).seen(0, cam)[0]:
-        for points in outline.points:
-            cv2.fillConvexPoly(mask, cv2.convexHull(np.rint(points * 16).astype(np.int32)), 255, cv2.LINE_8, 4)
+    seen = figure(body, pose).seen(0, cam)
+    for _, begin, end in seen.solids:
+        outline = cv2.convexHull(np.rint(seen.points[begin:end] * 16).astype(np.int32))
+        cv2.fillConvexPoly(mask, outline, 255, cv2.LINE_8, 4)
     drawn = draw_silhouettes(body, Rig((cam,)), pose[None])[0, 0]
     assert ((drawn > 0) & (mask == 0)).sum() < 0.01 * (drawn > 0).sum()
     outside = (cv2.erode(mask, np.ones((3, 3), np.uint8)) > 0) & (drawn == 0)  # in a narrow gap between two solids
@@ -106,7 +112,7 @@ def test_results_of_the_region_tracker_are_drawn(tiny: Path, tmp_path: Path) -> 
 
 
 def test_body_behind_the_camera_is_not_drawn() -> None:
-    assert figure(BODY, neutral_pose(BODY.skeleton)).seen(0, camera(-5.0))[0] == []
+    assert figure(BODY, neutral_pose(BODY.skeleton)).seen(0, camera(-5.0)).solids == ()
 
 
 def test_tile_contains_its_points() -> None:
@@ -127,28 +133,28 @@ def test_tile_contains_its_points() -> None:
 
 def test_near_segment_hides_far_segment() -> None:
     tile = np.full((40, 40, 3), 200, np.uint8)
-    square = (np.array([[5.0, 5.0], [35.0, 5.0], [35.0, 35.0], [5.0, 35.0]]),)
+    square = np.array([[5.0, 5.0], [35.0, 5.0], [35.0, 35.0], [5.0, 35.0]])
+    both = np.concatenate([square, square])
     view = View(np.zeros(2), 1.0, 40, 40)
     near = np.array(SEGMENT_COLORS["calf_l"])
-    draw_body(tile, view, [Outline("thigh_r", 5.0, square), Outline("calf_l", 2.0, square)], SEGMENT_COLORS.__getitem__)
+    draw_body(tile, view, solids(both, ("thigh_r", 0, 4), ("calf_l", 4, 8)), SEGMENT_COLORS.__getitem__)
     assert (tile[0, 0] == 200).all()
     share = (tile[20, 20].astype(float) - 200) / (near - 200.0)
     assert share.min() > 0.2 and share.max() < 0.6, "the near one's colour, and the picture shines through"
     np.testing.assert_allclose(share, share.mean(), atol=0.02)
     np.testing.assert_array_equal(tile[4, 20], near, err_msg="the contour is opaque")
     grey = np.full((40, 40, 3), 200, np.uint8)
-    draw_body(grey, view, [Outline("calf_l", 2.0, square)], lambda _: LOST_BODY)
+    draw_body(grey, view, solids(square, ("calf_l", 0, 4)), lambda _: LOST_BODY)
     assert len(set(grey[20, 20].tolist())) == 1, "a lost body has no colour"
 
 
 def test_body_is_clipped_at_the_tile() -> None:
     whole, part = (np.full((60, 60, 3), 90, np.uint8) for _ in range(2))
     polygon = np.array([[-20.0, 10.0], [80.0, 10.0], [80.0, 200.0], [-20.0, 200.0]])
-    draw_body(whole, View(np.zeros(2), 1.0, 60, 60), [Outline("torso", 1.0, (polygon,))], SEGMENT_COLORS.__getitem__)
+    view, trunk = View(np.zeros(2), 1.0, 60, 60), ("torso", 0, 4)
+    draw_body(whole, view, solids(polygon, trunk), SEGMENT_COLORS.__getitem__)
     assert (whole[5] == 90).all() and (whole[15:, 1:-1] != 90).any(axis=2).all()
-    draw_body(
-        part, View(np.zeros(2), 1.0, 60, 60), [Outline("torso", 1.0, (polygon + 500,))], SEGMENT_COLORS.__getitem__
-    )
+    draw_body(part, view, solids(polygon + 500, trunk), SEGMENT_COLORS.__getitem__)
     assert (part == 90).all()
 
 

@@ -24,8 +24,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy  # its packages are imported when they are first used
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from tk.errors import ResultError
 from tk.evaluation.joints import Evaluation, evaluate, plain_values
@@ -124,7 +124,7 @@ def evaluate_people(result: Sequence[JointTrack], truth: Sequence[JointTrack]) -
         near = distance <= MATCH_M
         within[np.ix_(true, here)] += near
         # a pair too far apart costs more than all matches together, so the number of matches is the largest possible
-        for i, j in zip(*linear_sum_assignment(np.where(near, distance, 1e6)), strict=True):
+        for i, j in zip(*scipy.optimize.linear_sum_assignment(np.where(near, distance, 1e6)), strict=True):
             if near[i, j]:
                 matched[true[i]][frame] = here[j]
                 distances_m.append(float(distance[i, j]))
@@ -141,7 +141,7 @@ def evaluate_people(result: Sequence[JointTrack], truth: Sequence[JointTrack]) -
     )
     present, switches = sum(score.frames for score in people), sum(score.switches for score in people)
     misses, false_positives = present - len(distances_m), found - len(distances_m)
-    kept = int(within[linear_sum_assignment(within, maximize=True)].sum())
+    kept = int(within[scipy.optimize.linear_sum_assignment(within, maximize=True)].sum())
     return PeopleEvaluation(
         people=people,
         people_in_result=len(result),

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy  # its packages are imported when they are first used
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from tk.io.captures.capture import Capture
 from tk.model.cues.ray_costs import RayGrid
@@ -118,7 +118,7 @@ class PeopleWatch:
         seconds = np.array([index - path.last[0] for path in self._open]) / self._capture.fps
         reach = np.minimum(_FASTEST_M_S * seconds, _FASTEST_M_S) + _ERROR_M
         fits = distance <= reach[:, None]
-        rows, columns = linear_sum_assignment(np.where(fits, distance, 1e3))
+        rows, columns = scipy.optimize.linear_sum_assignment(np.where(fits, distance, 1e3))
         taken = {int(k): self._open[i] for i, k in zip(rows, columns, strict=True) if fits[i, k]}
         for k, person in enumerate(found):
             if k not in taken:

@@ -16,7 +16,7 @@ from tk.model.body.joints import BONES
 from tk.model.body.skeleton import JOINTS
 from tk.model.cameras.camera import Camera
 from tk.model.masks.regions import SQUARE3
-from tk.render.figure import Figure, Outline
+from tk.render.figure import Figure, Seen
 from tk.render.palette import BACKGROUND, BONE, INK, LOST, LOST_BODY, PAPER, TEXT, Color, sigma_colors
 
 Float = NDArray[np.float64]
@@ -77,24 +77,24 @@ class View:
         return np.asarray((xy + 0.5 - self.origin) * self.scale - 0.5)
 
 
-def draw_body(tile: Image, view: View, outlines: Sequence[Outline], color: Callable[[str], Color]) -> None:
+def draw_body(tile: Image, view: View, seen: Seen, color: Callable[[str], Color]) -> None:
     """Draw the segments, translucent, with their contours, near ones over far ones; ``color`` is that of a segment."""
-    solids = [points for outline in outlines for points in outline.points]
-    if not solids:
+    if not seen.solids:
         return
-    placed = fixed(view.place(np.concatenate(solids)))
+    placed = fixed(view.place(seen.points))
     x, y, width, height = _box(placed, tile)
     if width <= 0 or height <= 0:
         return
     placed -= np.array([x, y], np.int32) << SUBPIXEL_BITS
     # rank of the visible segment in each pixel; near segments have higher ranks
-    layer, end = np.zeros((height, width), np.uint8), 0
+    layer = np.zeros((height, width), np.uint8)
     colors = np.zeros((256, 1, 3), np.uint8)
-    for rank, outline in enumerate(outlines, 1):
-        colors[rank] = color(outline.segment)
-        for points in outline.points:
-            begin, end = end, end + len(points)
-            cv2.fillConvexPoly(layer, cv2.convexHull(placed[begin:end]), (rank,), cv2.LINE_8, SUBPIXEL_BITS)
+    rank, drawn = 0, ""
+    for segment, begin, end in seen.solids:
+        if segment != drawn:
+            rank, drawn = rank + 1, segment
+            colors[rank] = color(segment)
+        cv2.fillConvexPoly(layer, cv2.convexHull(placed[begin:end]), (rank,), cv2.LINE_8, SUBPIXEL_BITS)
     near = cv2.dilate(layer, SQUARE3)
     contour = near != cv2.erode(layer, SQUARE3)
     over, under = cv2.applyColorMap(near, colors), tile[y : y + height, x : x + width]

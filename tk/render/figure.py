@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,12 +57,16 @@ class Solid:
 
 
 @dataclass(frozen=True)
-class Outline:
-    """A segment in the image of a camera."""
+class Seen:
+    """A person in the image of a camera.
 
-    segment: str  # name of the segment
-    depth: float  # metres
-    points: tuple[Float, ...]  # (N, 2) pixels for each of its solids; their convex hull is the outline of the solid
+    Solids are convex, so the outline of each is the convex hull of its projected circles (lens distortion bends it by
+    less than a pixel over a limb). Solids that are partly behind the camera are left out; such joints are NaN.
+    """
+
+    joints: Float  # (J, 2) pixels
+    points: Float  # (N, 2) pixels, the circles of all solids
+    solids: tuple[tuple[str, int, int], ...]  # segment, first point and end of each solid; the farthest segment first
 
 
 @dataclass(frozen=True)
@@ -112,34 +115,27 @@ class Figure:
         """(S + 1,) index of the first point of each solid in :meth:`placed`, and the number of points."""
         return np.cumsum([0, *(solid.rings.size // 3 for solid in self.solids)])
 
-    def seen(self, row: int, camera: Camera) -> tuple[list[Outline], Float]:
-        """Return the segments in the image of a camera, farthest first, and the joints (J, 2) pixels.
-
-        Solids are convex, so each outline is the convex hull of the projected circles (lens distortion bends it by
-        less than a pixel over a limb). Solids that are partly behind the camera are left out; such joints are NaN.
-        """
+    def seen(self, row: int, camera: Camera) -> Seen:
+        """Return the person in the image of a camera."""
         joints = self.joints[row]
         if not self.solids or not self.there(row):
-            return [], camera.project(joints)[0]
+            return Seen(camera.project(joints)[0], np.zeros((0, 2)), ())
         xy, depth = camera.project(np.concatenate([self.placed(row), joints]))
-        xy, depth, joints_xy = xy[: -len(joints)], depth[: -len(joints)], xy[-len(joints) :]
-        starts = self.starts[:-1]
-        middle = np.add.reduceat(depth, starts) / np.diff(self.starts)
-        whole = np.isfinite(np.add.reduceat(xy[:, 0], starts))
-        seen: dict[int, tuple[list[float], list[Float]]] = {}
-        ends = pairwise(self.starts.tolist())
-        for solid, (begin, end), distance, is_whole in zip(
-            self.solids, ends, middle.tolist(), whole.tolist(), strict=True
-        ):
-            if is_whole:
-                depths, outlines = seen.setdefault(solid.segment, ([], []))
-                depths.append(distance)
-                outlines.append(xy[begin:end])
-        found = [
-            Outline(SEGMENTS[segment], sum(depths) / len(depths), tuple(outlines))
-            for segment, (depths, outlines) in seen.items()
-        ]
-        return sorted(found, key=lambda outline: -outline.depth), joints_xy
+        starts, segment = self.starts, self._segment
+        xy_joints, xy = xy[starts[-1] :], xy[: starts[-1]]
+        middle = np.add.reduceat(depth[: starts[-1]], starts[:-1]) / np.diff(starts)
+        whole = np.isfinite(np.add.reduceat(xy[:, 0], starts[:-1]))
+        total = np.bincount(segment, np.where(whole, middle, 0), len(SEGMENTS))
+        far = total / np.maximum(np.bincount(segment, whole, len(SEGMENTS)), 1)
+        order = np.argsort(-far[segment], kind="stable").tolist()  # the solids of a segment stay together
+        ends = starts.tolist()
+        solids = tuple((SEGMENTS[self.solids[k].segment], ends[k], ends[k + 1]) for k in order if whole[k])
+        return Seen(xy_joints, xy, solids)
+
+    @cached_property
+    def _segment(self) -> NDArray[np.int64]:
+        """(S,) segment of each solid."""
+        return np.array([solid.segment for solid in self.solids])
 
 
 def figure_of(result: Result) -> Figure:

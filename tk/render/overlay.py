@@ -33,8 +33,9 @@ from tk.render.canvas import (
     write,
     write_png,
 )
+from tk.render.figure import Figure
 from tk.render.legend import LEGEND_HEIGHT, Legend
-from tk.render.palette import TEXT
+from tk.render.palette import TEXT, Color
 from tk.render.people import People
 
 Float = NDArray[np.float64]
@@ -102,15 +103,16 @@ class Overlay:
     ) -> Image:
         """Return a row of tiles of a frame, one per camera: the part with the person, or the ``full`` images."""
         row, tiles = self.row_of[frame], []
+        people = self._there(row)
         for camera, image in zip(self.rig, images, strict=True):
             view = View.whole(camera, tile_height)
             if not full:
                 seen = [figure.seen(row, camera) for figure in self.people.figures]
-                body = [points for outlines, _ in seen for outline in outlines for points in outline.points]
-                shown = np.concatenate([*(joints for _, joints in seen), *body, *self._true(frame, camera)])
+                body = [person.points[begin:end] for person in seen for _, begin, end in person.solids]
+                shown = np.concatenate([*(person.joints for person in seen), *body, *self._true(frame, camera)])
                 view = View.around(shown, camera, round(0.75 * tile_height), tile_height)
             tile = np.empty((view.height, view.width, 3), np.uint8)
-            self._draw(tile, row, camera, image, view)
+            self._draw(tile, row, people, camera, image, view)
             for xy in self._true(frame, camera) if truth else ():
                 draw_truth(tile, view.place(xy))
             tile[:20] = tile[:20] // 3
@@ -119,16 +121,27 @@ class Overlay:
             tiles.append(tile)
         return joined(tiles, axis=1)
 
-    def _draw(self, tile: Image, row: int, camera: Camera, image: Image, view: View) -> None:
-        """Fill a tile with a camera's image, and draw body and joints over it."""
+    def _there(self, row: int) -> list[tuple[Figure, Sequence[Color | None]]]:
+        """Return the people of whom a joint is known in a frame, and the colours of their joints."""
+        return [(figure, dots(figure, row)) for figure in self.people.figures if figure.there(row)]
+
+    def _draw(
+        self,
+        tile: Image,
+        row: int,
+        people: Sequence[tuple[Figure, Sequence[Color | None]]],
+        camera: Camera,
+        image: Image,
+        view: View,
+    ) -> None:
+        """Fill a tile with a camera's image, and draw bodies and joints over it."""
         view.cut(image[: camera.height, : camera.width], tile)
-        there = [figure for figure in self.people.figures if figure.there(row)]
-        far = [np.nanmean(np.linalg.norm(figure.joints[row] - camera.center, axis=1)) for figure in there]
+        far = [np.nanmean(np.linalg.norm(figure.joints[row] - camera.center, axis=1)) for figure, _ in people]
         for k in np.argsort(far)[::-1]:
-            figure = there[k]
-            outlines, joints = figure.seen(row, camera)
-            draw_body(tile, view, outlines, partial(figure.color, row))
-            draw_joints(tile, view.place(joints), dots(figure, row), figure.lost(row))
+            figure, colors = people[k]
+            seen = figure.seen(row, camera)
+            draw_body(tile, view, seen, partial(figure.color, row))
+            draw_joints(tile, view.place(seen.joints), colors, figure.lost(row))
         if self.people.lost(row):
             draw_lost(tile)
 
@@ -141,11 +154,12 @@ class Overlay:
         The next call overwrites the image.
         """
         grid, row, canvas = self.grid, self.row_of[frame], self._canvas
+        people = self._there(row)
         for c, (camera, image) in enumerate(zip(self.rig, images, strict=True)):
             view = self._views[c]
             y, x = grid.corner(c, (view.height, view.width))
             tile = canvas[y : y + view.height, x : x + view.width]
-            self._draw(tile, row, camera, image, view)
+            self._draw(tile, row, people, camera, image, view)
             self._name(tile, row, camera)
         self._legend.draw(canvas[grid.height :], row)
         return canvas

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+import scipy  # its packages are imported when they are first used
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from tk.errors import ResultError
 from tk.io.results.data import Result
@@ -171,7 +171,7 @@ def _followed(figures: Sequence[Figure], fps: float) -> tuple[Float, float]:
     frames = np.arange(len(joints))
     middles = (np.nanmin(joints[known], axis=1) + np.nanmax(joints[known], axis=1)) / 2
     filled = np.stack([np.interp(frames, frames[known], axis) for axis in middles.T], axis=1)
-    smooth = gaussian_filter1d(filled, _FOLLOW_S * fps, axis=0, mode="nearest")
+    smooth = scipy.ndimage.gaussian_filter1d(filled, _FOLLOW_S * fps, axis=0, mode="nearest")
     reach = np.nanmax(np.linalg.norm(joints[known] - smooth[known, None], axis=-1))
     return smooth, float(reach) + _MARGIN_M
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tk.evaluation.joints import Evaluation, evaluate_files, plain_values
+from tk.evaluation.joints import Evaluation, evaluate, plain_values
 from tk.evaluation.people import evaluate_people
 from tk.io.results.data import Result
-from tk.io.results.reader import read_people, truth_of
+from tk.io.results.reader import joint_tracks, positions_at, read_people
 from tk.io.results.status import STATUS_MEANING, Status
 from tk.model.body.joints import BONES, HINGES, JOINTS, LIMB_JOINTS, SEGMENTS
 from tk.model.cameras.camera import Rig
@@ -53,7 +53,7 @@ def describe(result: Result, rig: Rig | None = None, truth: Path | None = None) 
     step = -(-len(whole) * len(whole[0]) // _MOST_ROWS)
     people = People(tuple(person.at_rows(np.arange(0, len(person), step)) for person in whole))
     first = people.first
-    errors = _errors(first, people.results, truth)
+    errors = _errors(result, people.results, truth)
     return {
         "capture": meta.capture,
         "method": meta.method,
@@ -192,15 +192,18 @@ def hinge_sigma_deg(figure: Figure, joints: Sequence[str]) -> Float:
 
 
 def _errors(result: Result, people: Sequence[Result], truth: Path | None) -> list[dict[str, Any] | None]:
-    """Return the errors of each person against the ground truth, cm: by joint, and the mean of each frame; None
-    without a truth."""
-    positions = None if truth is None else truth_of(result, truth)
-    if truth is None or positions is None or not np.isfinite(positions).any():
-        return [None] * len(people)
-    if len(people) == len(positions) == 1:
-        return [_error_data(evaluate_files(result.path, truth), people[0], positions[0])]
+    """Return the errors of each person against the ground truth, cm: by joint over all frames of the result, and the
+    mean of each frame of ``people``; None without a truth."""
     errors: list[dict[str, Any] | None] = [None] * len(people)
-    for score in evaluate_people(read_people(result.path), read_people(truth)).people:
+    if truth is None or not truth.exists():
+        return errors
+    found, true = joint_tracks(result), read_people(truth)
+    positions = positions_at(people[0].frames, true)
+    if not np.isfinite(positions).any():
+        return errors
+    if len(people) == len(true) == 1:
+        return [_error_data(evaluate(found[0], true[0]), people[0], positions[0])]
+    for score in evaluate_people(found, true).people:
         for k, person in enumerate(people):
             if score.errors is not None and score.matched_with[0] == person.person:
                 errors[k] = _error_data(score.errors, person, positions[score.person])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -73,7 +73,7 @@ def read_people(path: str | os.PathLike[str]) -> tuple[JointTrack, ...]:
                 file.fail(f"units = {units}; joint positions must be in metres (m)")
             prefixes = [f"people/{person}/" for person in range(_count_people(file))] if "people" in file else [""]
             return tuple(_read_truth(file, prefix) for prefix in prefixes)
-    return tuple(_track_of(person) for person in read_result(path).people)
+    return joint_tracks(read_result(path))
 
 
 def read_joints(path: str | os.PathLike[str]) -> JointTrack:
@@ -81,15 +81,22 @@ def read_joints(path: str | os.PathLike[str]) -> JointTrack:
     return read_people(path)[0]
 
 
+def joint_tracks(result: Result) -> tuple[JointTrack, ...]:
+    """Return the joints of each person of a result."""
+    return tuple(_track_of(person) for person in result.people)
+
+
 def truth_of(result: Result, path: Path) -> Float | None:
     """Return the ground-truth joints (P, F, J, 3) of each person in the result's frames, NaN if missing; None without
     the file."""
-    if not path.exists():
-        return None
-    people = read_people(path)
-    places = np.full((len(people), len(result), *people[0].positions.shape[1:]), np.nan)
+    return positions_at(result.frames, read_people(path)) if path.exists() else None
+
+
+def positions_at(frames: NDArray[np.int64], people: Sequence[JointTrack]) -> Float:
+    """Return the joints (P, F, J, 3) of each person in these frames, NaN if missing."""
+    places = np.full((len(people), len(frames), *people[0].positions.shape[1:]), np.nan)
     for person, track in zip(places, people, strict=True):
-        _, mine, theirs = np.intersect1d(result.frames, track.frames, return_indices=True)
+        _, mine, theirs = np.intersect1d(frames, track.frames, return_indices=True)
         person[mine] = track.positions[theirs]
     return places
 
