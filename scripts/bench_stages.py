@@ -19,7 +19,6 @@ from tk.kernels.raycast import Cast
 from tk.model.body.limb_candidates import limbs_of
 from tk.model.cues.edge_term import THRESHOLD, ContourTerm
 from tk.model.cues.objective import COVERAGE_VOXELS, BodyObjective
-from tk.model.cues.part_colors import PartColors
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Pyramid, Views
 from tk.optim import gauss_newton
@@ -115,11 +114,9 @@ def silhouette_stages(
     last, pose = pyramids[-1], poses[-1][None]
     limb = limbs_of(body)[0]
     variants = limb.candidates(pose[0], NEARBY, np.random.default_rng(0))
-    group = PartColors(body).group
     evidence = Evidence.of(RayGrid(capture.rig, SCREEN_ROWS), last.masks[0])
-    _, rest = evidence.cast(
-        body, group, pose, np.setdiff1d(np.arange(len(group), dtype=np.int32), limb.parts), export=True
-    )
+    drawn = np.setdiff1d(np.arange(len(body.parts), dtype=np.int32), limb.parts)
+    _, rest = evidence.cast(body, pose, drawn, export=True)
     assert rest is not None
     others = Cast(rest.label[0], rest.depth[0])
     limits = None, body.skeleton.lower, body.skeleton.upper
@@ -147,10 +144,10 @@ def silhouette_stages(
             statistics.median(median_ms(partial(fit, *frame), 3) for frame in zip(poses, pyramids, strict=True)),
             {},
         ),
-        Stage("E_S of a pose", median_ms(lambda: evidence.cast(body, group, pose)), {}),
+        Stage("E_S of a pose", median_ms(lambda: evidence.cast(body, pose)), {}),
         Stage(
             f"E_S of {len(variants)} places of an arm",
-            median_ms(lambda: evidence.cast(body, group, variants, limb.parts, others)),
+            median_ms(lambda: evidence.cast(body, variants, limb.parts, others)),
             {},
         ),
     ]

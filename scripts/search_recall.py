@@ -58,16 +58,16 @@ class Trials(RegionTracker):
         frame = self.without_foreign(frame)
         pyramid = self.pyramid(frame)
         evidence = self.evidence(self.screen, frame, pyramid)
-        pose, group = self._best.pose, self.colors.group
+        pose = self._best.pose
         rng = np.random.default_rng(frame.index)
-        own = float(mean_of_views(evidence.cast(self.body, group, pose[None])[0])[0])
+        own = float(mean_of_views(evidence.cast(self.body, pose[None])[0])[0])
         for limb in self.limbs:
             places = limb.candidates(pose, 0, rng)
-            cost = mean_of_views(evidence.cast(self.body, group, places)[0])
+            cost = mean_of_views(evidence.cast(self.body, places)[0])
             allowed = np.flatnonzero((self._off(limb, places, pose) > DISPLACED_M) & (cost < own + ALLOWED))
             for k in rng.choice(allowed, min(TRIES, len(allowed)), replace=False):
                 wrong = self.settle(pyramid, places[k][None], (1, 0), frame.images).states
-                by_view, met = evidence.cast(self.body, group, wrong, export=True)
+                by_view, met = evidence.cast(self.body, wrong, export=True)
                 assert met is not None
                 if self._off(limb, wrong, pose)[0] < OFF_M or mean_of_views(by_view)[0] < own + WORSE:
                     continue

@@ -132,7 +132,7 @@ def track(data: Sequence3D, name: str, views: int, config: Variant) -> tuple[Row
     error = []
     for i in range(0, len(frames), every):
         pose = estimates[i].pose
-        shares, _ = Evidence.of(grid, data.masks[i]).cast(body, tracker.colors.group, pose[None])
+        shares, _ = Evidence.of(grid, data.masks[i]).cast(body, pose[None])
         error.append(np.nanmean(shares))
     found, true = joints[:, ANKLES], data.truth[:, ANKLES]
     off, height = [], []

@@ -11,13 +11,11 @@ from tk.kernels.cones import CONE
 from tk.kernels.projection import pack_cameras
 from tk.kernels.raycast import FAR, Cast, cast, nothing
 from tk.model.body import gait_poses as gait
-from tk.model.body.cone_body import ConeBody
+from tk.model.body.cone_body import COLOR_GROUPS, ConeBody
 from tk.model.body.skeleton import CHAINS, SEGMENTS
 from tk.model.cameras.camera import Rig
-from tk.model.cues.part_colors import GROUPS, PartColors
 from tk.model.masks.silhouettes import pixel_rays
 
-GROUP = PartColors(BODY).group
 RIG = ring_of_cameras(3, width=160, height=200)
 STEP = 4
 RAYS = pixel_rays(RIG, STEP)
@@ -34,7 +32,7 @@ def poses_of(count: int) -> np.ndarray:
 
 
 POSES = poses_of(3)
-COST = np.random.default_rng(5).uniform(0, 1, (V, H, W, len(GROUPS) + 1)).astype(np.float32)
+COST = np.random.default_rng(5).uniform(0, 1, (V, H, W, len(COLOR_GROUPS) + 1)).astype(np.float32)
 
 
 def entered(shape, kind, eye, rays):
@@ -87,12 +85,12 @@ def brute_force(
 
 
 def cast_all(body: ConeBody, poses: np.ndarray, dtype: type = np.float64, **options):
-    return cast(body.pack(dtype), GROUP, pack_cameras(RIG), STEP, RAYS, COST, poses, **options)
+    return cast(body.pack(dtype), pack_cameras(RIG), STEP, RAYS, COST, poses, **options)
 
 
 def cost_of(label: np.ndarray) -> float:
     """The sum of what the labels (V, H, W) cost."""
-    column = np.concatenate([[0], GROUP + 1])[label]
+    column = np.concatenate([[0], BODY.color_group + 1])[label]
     return float(np.take_along_axis(COST.astype(np.float64), column[..., None], axis=-1).sum())
 
 
@@ -123,7 +121,7 @@ def test_lenses_that_bend_lines_hide_no_part(fisheye: bool) -> None:
     center = np.array([[0, 0, c] for c in (319.5, 399.5)] + [[0, 0, 0]]) * (1 - focal[0, 0])
     rig = Rig(tuple(replace(c, matrix=focal @ c.matrix + center, distortions=bent, fisheye=fisheye) for c in near))
     rays = pixel_rays(rig, 4 * STEP)
-    _, met = cast(BODY.pack(np.float64), GROUP, pack_cameras(rig), 4 * STEP, rays, COST, POSES, export=True)
+    _, met = cast(BODY.pack(np.float64), pack_cameras(rig), 4 * STEP, rays, COST, POSES, export=True)
     assert met is not None
     for b, pose in enumerate(POSES):
         label = brute_force(BODY, pose, 1.0, rig, rays)[0]
@@ -161,6 +159,17 @@ def test_without_export_the_costs_are_the_same_and_in_any_batch():
     np.testing.assert_array_equal(cast_all(BODY, POSES[1:2], np.float32)[0][0], without[1])
 
 
+def test_two_columns_of_costs_suffice_without_colors():
+    few = np.ascontiguousarray(COST[..., :2])
+    total, met = cast(BODY.arrays, pack_cameras(RIG), STEP, RAYS, few, POSES, export=True)
+    many = np.repeat(few, [1, len(COLOR_GROUPS)], axis=-1)
+    expected, _ = cast(BODY.arrays, pack_cameras(RIG), STEP, RAYS, many, POSES)
+    np.testing.assert_array_equal(total, expected)
+    before = Cast(met.label[0].copy(), met.depth[0].copy())
+    again, _ = cast(BODY.arrays, pack_cameras(RIG), STEP, RAYS, few, POSES[:1], before=before)
+    np.testing.assert_allclose(again[0], total[0], rtol=1e-6)
+
+
 def test_a_body_out_of_sight_costs_what_nothing_costs():
     away = POSES[:1].copy()
     away[:, 2] += 50.0
@@ -177,5 +186,5 @@ def test_a_smaller_picture_has_no_rays_outside():
     rays = pixel_rays(narrow, STEP)
     outside = ~rays.any(axis=-1)
     assert outside[1].any() and not outside[[0, 2]].any()
-    _, met = cast(BODY.arrays, GROUP, pack_cameras(narrow), STEP, rays, COST, POSES[:1], export=True)
+    _, met = cast(BODY.arrays, pack_cameras(narrow), STEP, rays, COST, POSES[:1], export=True)
     assert not met.label[0][outside].any() and met.label[0][1].any()

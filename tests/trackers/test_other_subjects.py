@@ -23,11 +23,11 @@ MARKED, CUT = (np.where(IN_FRONT, np.uint8(value), MASKS) for value in (OTHERS, 
 
 
 def test_body_part_on_another_person_costs_nothing() -> None:
-    grid, group = RayGrid(RIG, 50), np.zeros(len(BODY.parts), np.int32)
+    grid = RayGrid(RIG, 50)
     found = []
     for masks in (MARKED, CUT):
         evidence = Evidence.of(grid, masks[0])
-        cost, met = evidence.cast(BODY, group, POSES[:1], export=True)
+        cost, met = evidence.cast(BODY, POSES[:1], export=True)
         assert met is not None
         np.testing.assert_allclose(evidence.residual(met.label[0]).sum(axis=1), cost[0], atol=1e-6)
         found.append(cost[0])

@@ -12,12 +12,11 @@ from tests.model.figures import scaled
 from tests.model.ring import ring_of_cameras
 from tests.trackers.walker import BODY, EMPTY, NAMES, STATURE, errors, find_again_elsewhere, observe, walk
 from tk.errors import CaptureError
-from tk.model.body.cone_body import ConeBody, build_cone_body
+from tk.model.body.cone_body import COLOR_GROUPS, ConeBody, build_cone_body
 from tk.model.body.gait_poses import standing_pose, walking_pose
 from tk.model.body.limb_candidates import exchanged, pairs
 from tk.model.body.skeleton import JOINTS, shoulder_angles
 from tk.model.cameras.camera import Rig
-from tk.model.cues.part_colors import GROUPS, PartColors
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import draw_silhouettes
 from tk.model.setup import InitPose
@@ -304,11 +303,10 @@ FRONT = Rig(ring_of_cameras(24, width=160, height=200).cameras[:2])
 
 def clothed(poses: np.ndarray) -> np.ndarray:
     """(F, V, H, W, 3) the body in clothes before grey: a blue shirt, bare forearms, dark trousers."""
-    colors = PartColors(BODY)
-    worn = np.array([(90, 90, 90), *(SHADES.get(GROUPS[g], (45, 60, 40)) for g in colors.group)], np.uint8)
+    worn = np.array([(90, 90, 90), *(SHADES.get(COLOR_GROUPS[g], (45, 60, 40)) for g in BODY.color_group)], np.uint8)
     grid = RayGrid(FRONT, FRONT.frame_shape[0])
     nobody = np.zeros(grid.rays.shape[:3], np.uint8)
-    _, met = Evidence.of(grid, nobody).cast(BODY, colors.group, poses, export=True)
+    _, met = Evidence.of(grid, nobody).cast(BODY, poses, export=True)
     assert met is not None
     return worn[met.label]
 

@@ -74,7 +74,6 @@ class Regions(NamedTuple):
 
     image: NDArray[np.uint8]  # (V, H, W, 3) uint8 BGR, the full image
     log_likelihood: NDArray[np.float32]  # (G, `COLOR_BINS`) float32 log p(colour | group), see `color_bin`
-    group: NDArray[np.int32]  # (P,) int32 the colour group of each part
     weight: float  # weight of a contour with an exact colour border, relative to a silhouette's edge
 
 

@@ -1,8 +1,9 @@
 """Cast a grid of rays at a cone body: the part that each ray meets first and its cost (silhouette paper, eq. 12).
 
-A ray costs column 0 of ``cost`` where it meets nothing, column g + 1 where it meets a part of colour group g. With
-costs of 0 and 1 taken from the masks, the sum is the number of wrong pixels, E_S's numerator; costs from colours
-distinguish a forearm in front of the trunk from one behind it.
+A ray costs column 0 of ``cost`` where it meets nothing, column g + 1 where it meets a part of colour group g (the last
+column if there are fewer: two columns suffice without colours). With costs of 0 and 1 taken from the masks, the sum is
+the number of wrong pixels, E_S's numerator; costs from colours distinguish a forearm in front of the trunk from one
+behind it.
 
 To compare many poses that differ in one limb, the rest is cast once: a launch may start from the labels and depths of
 an earlier one, and draw some parts only.
@@ -14,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.cone_arrays import NEAREST_M, PART_DOF, ConeArrays, kind_of, place_part, shape_of
+from tk.kernels.cone_arrays import NEAREST_M, PART_DOF, PART_GROUP, ConeArrays, group_of, kind_of, place_part, shape_of
 from tk.kernels.cones import capsule, enter_unit, extent, interior_point
 from tk.kernels.kinematics import (
     JOINT_NUMBERS,
@@ -51,6 +52,12 @@ class Cast(NamedTuple):
 
 
 @ti.func
+def column_of(parts: ti.template(), cost: ti.template(), p: int):
+    """Return the column of ``cost`` of a ray that meets part p."""
+    return ti.min(group_of(parts, p) + 1, cost.shape[3] - 1)
+
+
+@ti.func
 def _in_row(outline: ti.template(), b: int, v: int, p: int, y: int):
     """Return where a row of an image enters and leaves the capsule that encloses a part; left > right if it misses."""
     radius = outline[b, v, p, _RADIUS]
@@ -81,10 +88,10 @@ def middle_cost(
     b: int,
     v: int,
     p: int,
-    g: int,
+    column: int,
     step: int,
 ):
-    """Return the cost of the ray nearest to a part's middle, group g instead of nothing, and 1; zeros without a ray.
+    """Return the cost of the ray nearest to a part's middle, ``column`` instead of nothing, and 1; zeros without a ray.
 
     Stores the middle's pixel in the outline.
     """
@@ -94,14 +101,14 @@ def middle_cost(
     j = ti.cast(ti.round((pixel[1] - step // 2) / step), ti.i32)
     more, seen = ti.cast(0.0, ti.f32), 0
     if depth_m > NEAREST_M and i >= 0 and j >= 0 and i < cost.shape[2] and j < cost.shape[1]:
-        more = ti.max(cost[v, j, i, g + 1] - cost[v, j, i, 0], 0.0)
+        more = ti.max(cost[v, j, i, column] - cost[v, j, i, 0], 0.0)
         seen = 1
     return more, seen
 
 
 @ti.func
 def enclose_part(
-    parts: ti.template(),  # (P, 19)
+    parts: ti.template(),  # (P, 20)
     placed: ti.template(),  # (B, P, 12)
     cameras: ti.template(),  # (V, 22)
     b: int,
@@ -178,7 +185,7 @@ def covered_columns(
 
 @ti.func
 def first_part(
-    parts: ti.template(),  # (P, 19)
+    parts: ti.template(),  # (P, 20)
     placed: ti.template(),  # (B, P, 12)
     outline: ti.template(),  # (B, V, P, _COLUMNS)
     stretch: ti.template(),  # (B, K, 2)
@@ -208,8 +215,7 @@ def _cast_kernel(real):
     def cast_rows(
         # the body
         tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
-        parts: ti.types.ndarray(dtype=real, ndim=2),  # (P, 19)
-        group: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,) colour group of each part
+        parts: ti.types.ndarray(dtype=real, ndim=2),  # (P, 20)
         drawn: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (K,) the parts to draw
         chain: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (N,) the degrees of freedom that move them
         # the frame
@@ -249,9 +255,9 @@ def _cast_kernel(real):
                 size = extent(kind, shape, 1.0)
                 M = ti.Matrix([[R[j, i] / size[i] for j in ti.static(range(3))] for i in ti.static(range(3))])
                 store_frame(placed, b, p, M, t)
-                middle = times(R, interior_point(kind, shape)) + t
+                middle, column = times(R, interior_point(kind, shape)) + t, column_of(parts, cost, p)
                 for v in range(V):
-                    more, one = middle_cost(middle, cameras, cost, outline, b, v, p, group[p], step)
+                    more, one = middle_cost(middle, cameras, cost, outline, b, v, p, column, step)
                     out += ti.cast(more, real)
                     seen += one
             if out / seen > numbers[_MOST_OUTSIDE]:
@@ -273,11 +279,11 @@ def _cast_kernel(real):
                         if norm_sqr(ray) > 0.0:
                             met, nearest = first_part(parts, placed, outline, stretch, drawn, b, v, i, ray, nearest)
                         if met >= 0:
-                            before = ti.cast(before_label[v, j, i], ti.i32)
-                            column = 0
-                            if before > 0:
-                                column = group[before - 1] + 1
-                            in_row += cost[v, j, i, group[met] + 1] - cost[v, j, i, column]
+                            hidden = ti.cast(before_label[v, j, i], ti.i32) - 1
+                            before = 0
+                            if hidden >= 0:
+                                before = column_of(parts, cost, hidden)
+                            in_row += cost[v, j, i, column_of(parts, cost, met)] - cost[v, j, i, before]
                             if numbers[_EXPORT] == 1.0:
                                 label[b, v, j, i] = ti.cast(met + 1, ti.u8)
                                 depth[b, v, j, i] = ti.cast(nearest, ti.f32)
@@ -294,7 +300,6 @@ def nothing(shape: tuple[int, int, int]) -> Cast:
 
 def cast(
     body: ConeArrays,
-    group: NDArray[np.int32],
     cameras: NDArray[np.floating],
     step: int,
     rays: NDArray[np.float32],
@@ -309,7 +314,6 @@ def cast(
 
     Args:
         body: the cone body.
-        group: (P,) colour group of each part.
         cameras: (V, 22) rows of :func:`tk.kernels.projection.pack_cameras`.
         step: pixels between rays; the first goes through pixel ``step // 2``.
         rays: (V, H, W, 3) float32 viewing directions, world frame; zero where a camera has no pixel.
@@ -342,7 +346,6 @@ def cast(
     _cast_kernel(ti.f64 if dtype == np.float64 else ti.f32)(
         body.tree,
         body.parts,
-        group,
         drawn,
         _above(body, drawn),
         np.ascontiguousarray(cameras, dtype),
@@ -362,7 +365,8 @@ def cast(
         depth,
     )
     if before.label.any():
-        columns = np.concatenate([[0], group + 1])[before.label]
+        column = np.minimum(body.parts[:, PART_GROUP].astype(np.int32) + 1, cost.shape[3] - 1)
+        columns = np.concatenate([[0], column])[before.label]
         base = np.take_along_axis(cost, columns[..., None], axis=-1)[..., 0].sum(axis=(1, 2), dtype=np.float64)
     else:
         base = cost[..., 0].sum(axis=(1, 2), dtype=np.float64)

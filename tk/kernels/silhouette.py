@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.kernels.cone_arrays import PART_DOF, PART_LIMB, ConeArrays, shape_of
+from tk.kernels.cone_arrays import PART_DOF, PART_LIMB, ConeArrays, group_of, shape_of
 from tk.kernels.cone_contours import (
     LENGTH,
     OUTLINE_NUMBERS,
@@ -51,6 +51,7 @@ _NUMBERS = tuple(range(11))
 SCALE, WINDOW, SPACING, AMBIGUOUS, TANGENTIAL, ROBUST, LOST, COLORS, MOST_SAMPLES, INTERIOR, EXPORT = _NUMBERS
 # Columns of ``sums``: cost, weight of the samples that found an edge, weight of all, steps made; then the gradient.
 COST, FOUND, ALL, STEPS, GRADIENT = range(5)
+_NO_REGIONS = Regions(np.zeros((1, 1, 1, 3), np.uint8), np.zeros((1, COLOR_BINS), np.float32), 0.0)
 
 
 class NormalEquations(NamedTuple):
@@ -182,8 +183,8 @@ def weigh_edgel(
 @ti.func
 def search_contours(
     parts: ti.template(), curves: ti.template(), cameras: ti.template(), size: ti.template(), mask: ti.template(),
-    frame: int, image: ti.template(), likelihood: ti.template(), group: ti.template(), numbers: ti.template(), b: int,
-    origin, joints: ti.template(), placed: ti.template(), hiders: ti.template(), outlines: ti.template(),
+    frame: int, image: ti.template(), likelihood: ti.template(), numbers: ti.template(), b: int, origin,
+    joints: ti.template(), placed: ti.template(), hiders: ti.template(), outlines: ti.template(),
     samples: ti.template(), sums: ti.template(),
 ):  # fmt: skip
     """Sum the rows of all edgels of pose b, which :func:`prepare_pose` has placed; arguments as in the kernel."""
@@ -221,14 +222,12 @@ def search_contours(
                 found, d, weight = 0, 0.0 * scale, share
                 if use and behind >= 0 and numbers[INTERIOR] == 0.0:
                     # in front of another part no edge of the silhouette is expected, but a border of colours
-                    if (
-                        numbers[COLORS] > 0.0
-                        and parts[behind, PART_LIMB] != parts[p, PART_LIMB]
-                        and group[behind] != group[p]
-                    ):
+                    front, back = group_of(parts, p), group_of(parts, behind)
+                    other_limb = parts[behind, PART_LIMB] != parts[p, PART_LIMB]
+                    if numbers[COLORS] > 0.0 and other_limb and front != back:
                         certainty, place = search_colors(
-                            image, likelihood, v, image.shape[2], image.shape[1], pixel, n, window, scale, group[p],
-                            group[behind],
+                            image, likelihood, v, image.shape[2], image.shape[1], pixel, n, window, scale, front,
+                            back,
                         )  # fmt: skip
                         found, d, weight = 2, place * scale, share * numbers[COLORS] * certainty
                 elif use:
@@ -265,7 +264,7 @@ def _descent_kernel(real):
     def silhouette_descent(
         # the body
         tree: ti.types.ndarray(dtype=real, ndim=2),  # (D, 11)
-        parts: ti.types.ndarray(dtype=real, ndim=2),  # (P, 19)
+        parts: ti.types.ndarray(dtype=real, ndim=2),  # (P, 20)
         curves: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (Q, 2)
         # the frame
         cameras: ti.types.ndarray(dtype=real, ndim=2),  # (V, 22)
@@ -273,7 +272,6 @@ def _descent_kernel(real):
         mask: ti.types.ndarray(dtype=ti.u8, ndim=3),  # (F V, H, W) at this scale, of F = 1 or B frames
         image: ti.types.ndarray(dtype=ti.u8, ndim=4),  # (V, H, W, 3) of the full picture
         likelihood: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (G, COLOR_BINS)
-        group: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (P,) colour group of each part
         # settings
         numbers: ti.types.ndarray(dtype=real, ndim=1),  # (11,) from SCALE to EXPORT
         free: ti.types.ndarray(dtype=ti.i32, ndim=1),  # (n,) this and the next two: :class:`NewtonSteps`
@@ -307,8 +305,8 @@ def _descent_kernel(real):
                 prepare_pose(tree, parts, curves, cameras, pose, b, joints, placed, hiders, outlines, sums)
                 origin = load_translation(placed, b, 0)
                 search_contours(
-                    parts, curves, cameras, size, mask, frame, image, likelihood, group, numbers, b, origin, joints,
-                    placed, hiders, outlines, samples, sums,
+                    parts, curves, cameras, size, mask, frame, image, likelihood, numbers, b, origin, joints, placed,
+                    hiders, outlines, samples, sums,
                 )  # fmt: skip
                 collect_pulls(tree, b, joints, origin, sums, GRADIENT)
                 collect_inertias(tree, b, joints, origin, hessian)
@@ -350,7 +348,7 @@ def _launch(
     state = np.array(poses, np.float64)
     B, D = state.shape
     V, Q, P = len(cameras), len(body.curves), len(body.parts)
-    regions = regions or _no_regions(P)
+    regions = regions or _NO_REGIONS
     if len(masks) not in (V, B * V):
         raise ValueError(f"{len(masks)} masks of {V} views: one set, or one for each frame of the {B} poses")
     sums, hessian = np.empty((B, GRADIENT + D)), np.zeros((B, D, D))
@@ -362,7 +360,6 @@ def _launch(
         np.ascontiguousarray(masks),
         regions.image,
         regions.log_likelihood,
-        regions.group,
         _numbers(settings, scale, regions.weight, export, dtype),
         *(newton or _no_steps(D)),
         spread_of(B),
@@ -397,13 +394,6 @@ def _scratch(B: int, V: int, Q: int, D: int, P: int, dtype: np.dtype) -> tuple[N
         np.empty((B, V, P), np.int64),
         np.empty((B * V * Q, OUTLINE_NUMBERS), dtype),
         np.empty((B, D, D + 1)),
-    )
-
-
-@functools.cache
-def _no_regions(parts: int) -> Regions:
-    return Regions(
-        np.zeros((1, 1, 1, 3), np.uint8), np.zeros((1, COLOR_BINS), np.float32), np.zeros(parts, np.int32), 0.0
     )
 
 

@@ -280,11 +280,11 @@ def whole_delays(
     if not len(rows):
         return late
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, DELAY_FRAMES).round().astype(int))]
-    grid, group = RayGrid(rig, SCREEN_ROWS), np.zeros(len(body.parts), np.int32)
+    grid = RayGrid(rig, SCREEN_ROWS)
     sampled = cache(lambda frame: grid.sample(masks(frame)).copy())
     bodies = []
     for i in rows:
-        _, met = Evidence.of(grid, masks(int(frames[i]))).cast(body, group, poses[i][None], export=True)
+        _, met = Evidence.of(grid, masks(int(frames[i]))).cast(body, poses[i][None], export=True)
         assert met is not None
         bodies.append(met.label[0] > 0)
 

@@ -163,7 +163,7 @@ class ContourTracker:
         seen = self.views.pyramid(empty, 1, False)
         pose = np.zeros((1, len(body.skeleton.names)))
         self.views.equations(body.arrays, seen, pose, 0, self.line_search)
-        Evidence.of(self.screen, empty).cast(body, np.zeros(len(body.parts), np.int32), pose)
+        Evidence.of(self.screen, empty).cast(body, pose)
 
     # --- initialisation (silhouette paper, section 4.6) ---------------------------------------------------------
 
@@ -331,7 +331,7 @@ class ContourTracker:
         if ahead:
             pose = pose + self.contours.prediction * (pose - before)
         met = self.choice.render(self.body, pose[None])
-        return RenderedBody(met.label[0], met.depth[0], self.colors.group, self.colors.log_likelihood)
+        return RenderedBody(met.label[0], met.depth[0], self.body.color_group, self.colors.log_likelihood)
 
     def learned(self) -> Mapping[str, Any]:
         """Return the learned colours, a part of the state."""
@@ -417,7 +417,7 @@ class ContourTracker:
         """Return (B,) E_S, mean over the views that see anybody, inf if none does. A body on ``uncertain`` pixels
         counts half."""
         evidence = Evidence.of(self.screen, pyramid.masks[0], uncertain)
-        return mean_of_views(evidence.cast(self.body, self.colors.group, poses)[0])
+        return mean_of_views(evidence.cast(self.body, poses)[0])
 
     def search(
         self,
@@ -441,30 +441,30 @@ class ContourTracker:
         Returns:
             Poses (B, D), the current one first, and their costs (B,).
         """
-        skeleton, group = self.body.skeleton, self.colors.group
+        body, skeleton = self.body, self.body.skeleton
         rng = np.random.default_rng([7, frame.index])
-        by_view, met = evidence.cast(self.body, group, pose[None], export=True)
+        by_view, met = evidence.cast(body, pose[None], export=True)
         assert met is not None
         own, surplus = mean_of_views(by_view)[0], evidence.surplus(met.label[0])
         joints = skeleton.joints(pose)
         level = (min(1, self.solver.scales - 1),)
         found: list[tuple[NDArray[np.int64], Float]] = []
         for limb in self.limbs:
-            others = np.setdiff1d(np.arange(len(group), dtype=np.int32), limb.parts)
-            without, rest = evidence.cast(self.body, group, pose[None], others, export=True)
+            others = np.setdiff1d(np.arange(len(body.parts), dtype=np.int32), limb.parts)
+            without, rest = evidence.cast(body, pose[None], others, export=True)
             assert rest is not None
             if limb not in misplaced and mean_of_views(without)[0] - own > surplus:
                 continue  # the limb covers more than the surplus area that it could cover elsewhere
             before = Cast(rest.label[0].copy(), rest.depth[0].copy())
             tried = limb.candidates(pose, NEARBY, rng)
-            by_view, _ = evidence.cast(self.body, group, tried, limb.parts, before, most_outside=OUTSIDE)
+            by_view, _ = evidence.cast(body, tried, limb.parts, before, most_outside=OUTSIDE)
             cost = mean_of_views(by_view)
             cost[cost > PROPOSED * own] = np.inf
             chosen = limb.distinct(tried, cost, MORE_CANDIDATES if limb in misplaced else CANDIDATES)
             if not len(chosen):
                 continue
             settled = self.settle(pyramid, chosen, level, images, limb=limb).states
-            cost = mean_of_views(evidence.cast(self.body, group, settled, limb.parts, before)[0])
+            cost = mean_of_views(evidence.cast(body, settled, limb.parts, before)[0])
             order = np.argsort(cost, kind="stable")
             settled, cost = settled[order], cost[order]
             better = settled[(cost < own + PROMISING) & (skeleton.apart(settled, joints) > SAME_POSE_M)][:2]
@@ -472,7 +472,7 @@ class ContourTracker:
                 found.append((limb.dofs, better))
         swaps = np.array([exchanged(pose, *pair) for pair in pairs(self.limbs)])
         swaps = self.settle(pyramid, swaps, (*level, 0), images).states
-        swaps = swaps[mean_of_views(evidence.cast(self.body, group, swaps)[0]) < own + PROMISING]
+        swaps = swaps[mean_of_views(evidence.cast(body, swaps)[0]) < own + PROMISING]
         if not (len(swaps) or found):
             return pose[None], np.array([own])
         # exchanged arms and legs, the best poses of each limb, and combinations of two limbs
@@ -482,11 +482,11 @@ class ContourTracker:
                 both = better[0].copy()
                 both[dofs] = second[0][dofs]
                 poses.append(both)
-        cost = mean_of_views(evidence.cast(self.body, group, np.array(poses))[0])
+        cost = mean_of_views(evidence.cast(body, np.array(poses))[0])
         best = np.array(poses)[np.argsort(cost, kind="stable")[:FINISHED]]
         settled = np.concatenate([pose[None], self.settle(pyramid, best, (0,), images).states])
         fine = self.evidence(self.choice, frame, pyramid)
-        return settled, mean_of_views(fine.cast(self.body, group, settled)[0])
+        return settled, mean_of_views(fine.cast(body, settled)[0])
 
     def improved(self, frame: Observation, pyramid: Pyramid, pose: Float) -> Float:
         """Return the pose (D,), or the best one of a limb search if that costs :data:`GAIN` less."""

@@ -287,7 +287,6 @@ def stature_of(tracker: ContourTracker, pyramids: Sequence[Pyramid]) -> float:
     cause an error of about 6 %. Median over the views of all frames, against the mean area of hanging and spread arms.
     """
     body: ConeBody = build_cone_body(BodyDimensions.from_stature(AVERAGE_STATURE_M))
-    group = np.zeros(len(body.parts), np.int32)
     ratios: list[Float] = []
     for pyramid in pyramids:
         try:
@@ -296,7 +295,7 @@ def stature_of(tracker: ContourTracker, pyramids: Sequence[Pyramid]) -> float:
             continue
         poses = gait.hypotheses(body.skeleton, 4, 0, p_centroid)  # standing, and the Da Vinci pose
         evidence = Evidence.of(tracker.screen, pyramid.masks[0])
-        met = evidence.cast(body, group, poses, export=True)[1]
+        met = evidence.cast(body, poses, export=True)[1]
         assert met is not None
         drawn = met.label > 0 if evidence.others is None else (met.label > 0) & ~evidence.others
         covered = np.count_nonzero(drawn, axis=(2, 3)).mean(axis=0)

@@ -155,7 +155,7 @@ class RegionTracker(ContourTracker):
         poses, hessian, iterations = self.settle(pyramid, starts, levels, images, self.prior(starts), solver=solver)
         watch.lap("optimise")
         evidence = self.evidence(self.screen, frame, pyramid)
-        by_view, met = evidence.cast(self.body, self.colors.group, poses, export=True)
+        by_view, met = evidence.cast(self.body, poses, export=True)
         assert met is not None
         cost = mean_of_views(by_view)
         if not np.isfinite(cost).all():
@@ -302,7 +302,7 @@ class RegionTracker(ContourTracker):
 
     def misplaced(self, evidence: Evidence, label: NDArray[np.uint8]) -> tuple[Limb, ...]:
         """Return the limbs of which a large part lies outside the mask, or on colours that are not theirs."""
-        cost, count = evidence.cost_of_parts(self.colors.group, label)
+        cost, count = evidence.cost_of_parts(self.body, label)
         return tuple(
             limb for limb in self.limbs if cost[limb.parts].sum() > MISPLACED * max(count[limb.parts].sum(), 1)
         )
@@ -371,7 +371,7 @@ class RegionTracker(ContourTracker):
     ) -> tuple[NDArray[np.uint8], Float, Float]:
         """Return the best pose's labels on the grid (V, h, w), JᵀWJ (D, D), and residual (V, 2)."""
         best = self._best.pose[None]
-        _, met = evidence.cast(self.body, self.colors.group, best, export=True)
+        _, met = evidence.cast(self.body, best, export=True)
         assert met is not None
         regions = None if images is None else self.colors.regions(images)
         here = self.views.equations(self.body.arrays, pyramid, best, 0, self.line_search, regions)

@@ -148,7 +148,7 @@ class SecondPass:
         parts that the grid's rays meet (B, V, h, w)."""
         tracker = self.tracker
         evidence = Evidence.of(tracker.screen, pyramid.masks[0])
-        by_view, met = evidence.cast(tracker.body, tracker.colors.group, poses, export=True)
+        by_view, met = evidence.cast(tracker.body, poses, export=True)
         assert met is not None
         return mean_of_views(by_view), np.array([evidence.residual(label) for label in met.label]), met.label
 

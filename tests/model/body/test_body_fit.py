@@ -18,7 +18,6 @@ from tk.model.body.body_parameters import BodyFamily, shape_rows
 from tk.model.body.cone_body import SHAPE_NUMBERS, build_cone_body
 from tk.model.body.gait_poses import walking_pose
 from tk.model.body.skeleton import SEGMENTS
-from tk.model.cues.part_colors import PartColors
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.masks.silhouettes import Views, draw_silhouettes
 
@@ -167,12 +166,10 @@ def test_shapes_are_recovered_as_mirror_images():
     poses = walk(true, 3)
     seen = pyramids_of(true, poses)
     found, fitted = fit_body(VIEWS, seen, poses, SEARCH, STATURE)
-    grid, group = RayGrid(VIEWS.rig, 150), PartColors(AVERAGE).group
+    grid = RayGrid(VIEWS.rig, 150)
 
     def error(body, poses):
-        return np.mean(
-            [Evidence.of(grid, p.masks[0]).cast(body, group, q[None])[0] for p, q in zip(seen, poses, strict=True)]
-        )
+        return np.mean([Evidence.of(grid, p.masks[0]).cast(body, q[None])[0] for p, q in zip(seen, poses, strict=True)])
 
     assert error(found, fitted) < 0.6 * error(AVERAGE, poses)
     parts = {part.name: part for part in found.parts}

@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 
 from tests.model.figures import BODY
 from tk.kernels.line_search import COLOR_BINS
-from tk.model.cues.part_colors import GROUPS, PartColors, color_bins
+from tk.model.body.cone_body import COLOR_GROUPS
+from tk.model.cues.part_colors import PartColors, color_bins
 
 NAMES = [part.name for part in BODY.parts]
 SHIRT, SKIN, TROUSERS = (200, 40, 30), (120, 150, 220), (30, 30, 35)
@@ -28,9 +29,8 @@ def clothed(colors, pixels=400, seed=0):
 
 
 def test_every_part_has_a_group_and_either_side_the_same():
-    group = PartColors(BODY).group
-    assert group.dtype == np.int32 and len(group) == len(BODY.parts) and group.max() < len(GROUPS)
-    of = dict(zip(NAMES, group, strict=True))
+    assert set(BODY.color_group) == set(range(len(COLOR_GROUPS)))
+    of = dict(zip(NAMES, BODY.color_group, strict=True))
     for name, value in of.items():
         if name.endswith("_l"):
             assert of[name[:-2] + "_r"] == value
@@ -48,7 +48,7 @@ def test_likelihoods_are_uniform_before_learning():
     colors = PartColors(BODY)
     assert not colors.known and colors.state() == {}
     assert colors.regions(np.zeros((2, 4, 4, 3), np.uint8)) is None
-    assert colors.mismatch.shape == (COLOR_BINS, len(GROUPS)) and not colors.mismatch.any()
+    assert colors.mismatch.shape == (COLOR_BINS, len(COLOR_GROUPS)) and not colors.mismatch.any()
 
 
 def test_colors_distinguish_parts():
@@ -56,7 +56,7 @@ def test_colors_distinguish_parts():
     clothed(colors)
     mismatch = colors.mismatch
     assert colors.known and mismatch.dtype == np.float32 and mismatch.min() >= 0 and mismatch.max() <= 1
-    torso, forearm, thigh = (GROUPS.index(name) for name in ("torso", "forearm", "thigh"))
+    torso, forearm, thigh = (COLOR_GROUPS.index(name) for name in ("torso", "forearm", "thigh"))
     for color, suits in ((SHIRT, torso), (SKIN, forearm), (TROUSERS, thigh)):
         row = mismatch[bin_of(color)]
         assert row[suits] < 0.15
@@ -69,20 +69,19 @@ def test_likelihoods_are_shares_and_nothing_is_impossible():
     colors = PartColors(BODY)
     clothed(colors)
     share = np.exp(colors.log_likelihood)
-    learned = [GROUPS.index(name) for name in ("torso", "forearm", "thigh", "head", "calf")]
+    learned = [COLOR_GROUPS.index(name) for name in ("torso", "forearm", "thigh", "head", "calf")]
     np.testing.assert_allclose(share[learned].sum(axis=1), 1, rtol=1e-3)
     assert (share > 0).all()
     regions = colors.regions(np.zeros((2, 4, 4, 3), np.uint8))
     assert regions is not None and 0 < regions.weight <= 1
     np.testing.assert_array_equal(regions.log_likelihood, colors.log_likelihood)
-    np.testing.assert_array_equal(regions.group, colors.group)
 
 
 def test_new_colors_are_learned_slowly():
     colors = PartColors(BODY)
     torso = NAMES.index("chest") + 1
     red, green = bin_of((0, 0, 250)), bin_of((0, 250, 0))
-    group = GROUPS.index("torso")
+    group = COLOR_GROUPS.index("torso")
     colors.learn(np.full(500, red), np.full(500, torso, np.uint8))
     suits = [colors.mismatch[green, group]]
     for _ in range(60):

@@ -7,6 +7,7 @@ import pytest
 
 from tests.model.figures import BODY
 from tests.model.ring import ring_of_cameras
+from tk.model.body.cone_body import COLOR_GROUPS
 from tk.model.body.gait_poses import walking_pose
 from tk.model.cameras.camera import Rig
 from tk.model.cues.part_colors import PartColors
@@ -14,7 +15,6 @@ from tk.model.cues.ray_costs import COLOR_COST, UNCERTAIN_COST, Evidence, RayGri
 from tk.model.masks.silhouettes import draw_silhouettes, share_wrong
 
 RIG = ring_of_cameras(3, width=120, height=160)
-COLORS = PartColors(BODY)
 FINE = RayGrid(RIG, 160)
 POSE = walking_pose(BODY.skeleton, 0.2)
 POSE[2] = 0.92
@@ -26,7 +26,7 @@ MASKS = DRAWN[0]
 
 
 def cast(evidence, poses=POSES, **options):
-    return evidence.cast(BODY, COLORS.group, poses, **options)
+    return evidence.cast(BODY, poses, **options)
 
 
 def test_grids_sample_the_middle_of_their_squares():
@@ -83,11 +83,10 @@ def test_color_of_another_part_costs():
     _, met = cast(Evidence.of(FINE, MASKS), POSES[:1], export=True)
     assert met is not None
     label = met.label[0]
-    palette = np.random.default_rng(3).permutation(15)[: len(set(COLORS.group.tolist()))] * 17
+    palette = np.random.default_rng(3).permutation(15)[: len(COLOR_GROUPS)] * 17
     lookup = np.zeros((len(BODY.parts) + 1, 3), np.uint8)
-    groups = sorted(set(COLORS.group.tolist()))
-    for p, g in enumerate(COLORS.group, 1):
-        level = palette[groups.index(g)]
+    for p, g in enumerate(BODY.color_group, 1):
+        level = palette[g]
         lookup[p] = (level, 255 - level, (7 * level) % 255)
     images = lookup[label]
     colors = PartColors(BODY)
@@ -98,7 +97,7 @@ def test_color_of_another_part_costs():
     assert right.max() < 0.02
     arm, trunk = (GROUP_OF[name] for name in ("forearm_l", "chest"))
     swapped = label.copy()
-    is_arm, is_trunk = (np.isin(label, np.flatnonzero(COLORS.group == g) + 1) for g in (arm, trunk))
+    is_arm, is_trunk = (np.isin(label, np.flatnonzero(BODY.color_group == g) + 1) for g in (arm, trunk))
     swapped[is_arm], swapped[is_trunk] = NAMES.index("chest") + 1, NAMES.index("forearm_l") + 1
     wrong, _ = cast(Evidence.of(FINE, MASKS, None, lookup[swapped], colors), POSES[:1])
     share = (is_arm | is_trunk).sum(axis=(1, 2)) / (MASKS > 0).sum(axis=(1, 2))
@@ -108,7 +107,7 @@ def test_color_of_another_part_costs():
 
 
 NAMES = [part.name for part in BODY.parts]
-GROUP_OF = dict(zip(NAMES, COLORS.group.tolist(), strict=True))
+GROUP_OF = dict(zip(NAMES, BODY.color_group.tolist(), strict=True))
 
 
 def test_images_of_different_sizes_are_handled():

@@ -6,7 +6,6 @@ from tests.model.figures import BODY
 from tests.model.ring import ring_of_cameras
 from tk.model.body.gait_poses import neutral_pose
 from tk.model.body.skeleton import JOINTS, shoulder_angles
-from tk.model.cues.part_colors import PartColors
 from tk.model.cues.ray_costs import Evidence, RayGrid
 from tk.model.cues.visible_contours import contour_shares
 
@@ -23,7 +22,7 @@ def shares(left_arm: tuple[float, float, float]) -> np.ndarray:
         angles = shoulder_angles(np.array(direction) / np.linalg.norm(direction))
         pose[[skeleton.index(f"shoulder_{side}_{name}") for name in ("yaw", "pitch")]] = angles
     evidence = Evidence.of(GRID, np.full((4, *RIG.frame_shape), 255, np.uint8))
-    _, met = evidence.cast(BODY, PartColors(BODY).group, pose[None], export=True)
+    _, met = evidence.cast(BODY, pose[None], export=True)
     assert met is not None
     return contour_shares(BODY, GRID, met.label[0], skeleton.joints(pose))
 

@@ -26,7 +26,7 @@ from tk.model.body.anthropometry import (
     PELVIS_FORWARD,
     BodyDimensions,
 )
-from tk.model.body.joints import ARM, CHAIN_OF_SEGMENT, CROOK, ELBOW_AXIS, LIMBS, ROWS, SEGMENTS
+from tk.model.body.joints import ARM, CHAIN_OF_SEGMENT, CROOK, ELBOW_AXIS, LIMBS, ROWS, SEGMENTS, side_of
 from tk.model.body.skeleton import Skeleton, build_skeleton, up_rotation
 
 Float = NDArray[np.float64]
@@ -41,6 +41,8 @@ SKULL_TILT_DEG = 15.0
 
 _FORWARD = np.eye(3)[0]
 
+# Groups of parts with one colour model each: the rigid components without their sides, because clothes are symmetric.
+COLOR_GROUPS = ("pelvis", "torso", "head", "upper_arm", "forearm", "hand", "thigh", "calf", "foot")
 # Numbers of a part that :meth:`ConeBody.reshaped` changes: logarithms of a, b, m and h; x and y of either end.
 SHAPE_NUMBERS = 8
 
@@ -65,6 +67,11 @@ class ConePart:
         """Rigid component of the part: its segment, or its own name if it is a hand or a foot."""
         name = self.name.replace("instep_", "foot_")
         return name if name.startswith(("hand_", "foot_")) else self.segment
+
+    @property
+    def color_group(self) -> int:
+        """Index of the part's group in :data:`COLOR_GROUPS`."""
+        return COLOR_GROUPS.index(self.component.removesuffix(side_of(self.component)))
 
     def __post_init__(self) -> None:
         if not all(0 < value < 3 for value in self.shape):
@@ -110,8 +117,14 @@ class ConeBody:
             kind=np.array([part.kind for part in self.parts]),
             dof=self.skeleton.segment_dof[segments],
             limb=CHAIN_OF_SEGMENT[segments],
+            group=self.color_group,
         )
         return ConeArrays(self.skeleton.tree.astype(dtype), parts.astype(dtype), np.array(curves, np.int32))
+
+    @cached_property
+    def color_group(self) -> NDArray[np.int32]:
+        """(P,) index of each part's group in :data:`COLOR_GROUPS`."""
+        return np.array([part.color_group for part in self.parts], np.int32)
 
     @cached_property
     def shape(self) -> Float:

@@ -1,7 +1,7 @@
 """Colours of a body's parts, learned while the person moves: how likely is a pixel's colour on each part?
 
-Left and right parts share a model, because clothes are symmetric. A model is a histogram over 16 levels of blue, green
-and red: unlike a single Gaussian it represents a shirt with stripes, or an arm half in a sleeve.
+Parts of one group (:data:`~tk.model.body.cone_body.COLOR_GROUPS`) share a model: a histogram over 16 levels of blue,
+green and red. Unlike a single Gaussian it represents a shirt with stripes, or an arm half in a sleeve.
 
 Carried objects are in the mask, too. A colour is foreign if it is seen outside the body more often than on it, or was
 never seen on it.
@@ -17,10 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tk.kernels.line_search import COLOR_BINS, Regions
-from tk.model.body.anthropometry import BodyDimensions
-from tk.model.body.cone_body import ConeBody, build_cone_body
-from tk.model.body.joints import side_of
-from tk.model.setup import AVERAGE_STATURE_M
+from tk.model.body.cone_body import COLOR_GROUPS, ConeBody
 
 Float = NDArray[np.float64]
 
@@ -36,18 +33,6 @@ _RATE = 0.05
 _MOST_LOG_RATIO = 5.0
 # Weight of a contour between two parts of different colours, relative to a silhouette's edge. 0.35: 0.05 cm worse.
 _CONTOUR_WEIGHT = 0.5
-
-
-def _group(component: str) -> str:
-    return component.removesuffix(side_of(component))
-
-
-# rigid components of the full body without their sides, one colour model each
-GROUPS = tuple(
-    dict.fromkeys(
-        _group(part.component) for part in build_cone_body(BodyDimensions.from_stature(AVERAGE_STATURE_M)).parts
-    )
-)
 
 
 class RenderedBody(NamedTuple):
@@ -67,7 +52,6 @@ class PartColors:
         body: the body with the parts.
 
     Attributes:
-        group: (P,) the group of each part.
         log_likelihood: (G + 1, COLOR_BINS) log p(colour | group), and last log p(colour | person); None before any
             colours are learned.
         foreign: (COLOR_BINS,) bool, colours that are not the person's.
@@ -75,12 +59,12 @@ class PartColors:
     """
 
     def __init__(self, body: ConeBody) -> None:
-        self.group = np.array([GROUPS.index(_group(part.component)) for part in body.parts], np.int32)
-        self._counts: Float = np.zeros((len(GROUPS), COLOR_BINS))
+        self._group = body.color_group
+        self._counts: Float = np.zeros((len(COLOR_GROUPS), COLOR_BINS))
         self._outside: Float = np.zeros(COLOR_BINS)
         self.foreign = np.zeros(COLOR_BINS, np.bool_)
         self.log_likelihood: NDArray[np.float32] | None = None
-        self.mismatch = np.zeros((COLOR_BINS, len(GROUPS)), np.float32)
+        self.mismatch = np.zeros((COLOR_BINS, len(COLOR_GROUPS)), np.float32)
 
     @property
     def known(self) -> bool:
@@ -90,7 +74,7 @@ class PartColors:
     def learn(self, bins: NDArray[np.int32], label: NDArray[np.uint8]) -> None:
         """Learn the colours (N,) of the mask's pixels; they show the parts ``label - 1`` (N,), or none: 0."""
         shown = label > 0
-        flat = self.group[label[shown].astype(np.int64) - 1] * COLOR_BINS + bins[shown]
+        flat = self._group[label[shown].astype(np.int64) - 1] * COLOR_BINS + bins[shown]
         seen = np.bincount(flat, minlength=self._counts.size).reshape(self._counts.shape)
         outside = np.bincount(bins[~shown], minlength=COLOR_BINS)
         rate = _RATE if self.known else 1.0
@@ -113,7 +97,7 @@ class PartColors:
         """Return the colour cue of images (V, H, W, 3) for the contours; None before any colours are learned."""
         if self.log_likelihood is None:
             return None
-        return Regions(np.ascontiguousarray(images), self.log_likelihood, self.group, _CONTOUR_WEIGHT)
+        return Regions(np.ascontiguousarray(images), self.log_likelihood, _CONTOUR_WEIGHT)
 
     def likeness(self, bins: NDArray[np.int32]) -> float:
         """Return the mean log-likelihood of colours (N,), relative to that of the learned colours: about 0 if they are

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from tk.kernels.mask_values import OTHERS
 from tk.kernels.projection import pack_cameras
 from tk.kernels.raycast import Cast, cast
-from tk.model.body.cone_body import ConeBody
+from tk.model.body.cone_body import COLOR_GROUPS, ConeBody
 from tk.model.cameras.camera import Rig
-from tk.model.cues.part_colors import GROUPS, PartColors, color_bins
+from tk.model.cues.part_colors import PartColors, color_bins
 from tk.model.masks.silhouettes import pixel_rays
 
 Float = NDArray[np.float64]
@@ -56,8 +56,8 @@ class RayGrid:
 
     def render(self, body: ConeBody, poses: Float) -> Cast:
         """Return the parts of the body that the rays meet at poses (B, D): labels and depths (B, V, h, w)."""
-        group, free = np.zeros(len(body.parts), np.int32), np.zeros((*self.rays.shape[:3], 2), np.float32)
-        _, met = cast(body.arrays, group, self.cameras, self.step, self.rays, free, poses, export=True)
+        free = np.zeros((*self.rays.shape[:3], 2), np.float32)
+        _, met = cast(body.arrays, self.cameras, self.step, self.rays, free, poses, export=True)
         assert met is not None
         return met
 
@@ -97,7 +97,7 @@ class Evidence:
         shared = bool(others.any())
         if shared:
             outside[others] = 0.0
-        cost = np.empty((*person.shape, len(GROUPS) + 1), np.float32)
+        cost = np.empty((*person.shape, len(COLOR_GROUPS) + 1), np.float32)
         cost[..., 0] = person
         cost[..., 1:] = np.where(person, 0.0, outside)[..., None]
         bins = None if images is None or images.size == 0 else color_bins(grid.sample(images))
@@ -108,7 +108,6 @@ class Evidence:
     def cast(
         self,
         body: ConeBody,
-        group: NDArray[np.int32],
         poses: Float,
         drawn: NDArray[np.int32] | None = None,
         before: Cast | None = None,
@@ -123,7 +122,6 @@ class Evidence:
         grid = self.grid
         total, met = cast(
             body.arrays,
-            group,
             grid.cameras,
             grid.step,
             grid.rays,
@@ -141,15 +139,16 @@ class Evidence:
         """Return (V, 2) missing and surplus area of a rendered body, labels (V, h, w), see :func:`residual_of`."""
         return residual_of(label > 0, self.person, self.others)
 
-    def cost_of_parts(self, group: NDArray[np.int32], label: NDArray[np.uint8]) -> tuple[Float, NDArray[np.int64]]:
+    def cost_of_parts(self, body: ConeBody, label: NDArray[np.uint8]) -> tuple[Float, NDArray[np.int64]]:
         """Return the summed cost (P,) and the number (P,) of the rays that hit each part, labels (V, h, w).
 
         Views that see nobody do not count.
         """
         met = (label > 0) & np.asarray(self.person.any(axis=(1, 2)))[:, None, None]
         part = label[met].astype(np.int64) - 1
-        cost = self.cost[met, group[part] + 1]
-        total, count = np.bincount(part, cost, len(group)), np.bincount(part, minlength=len(group))
+        cost = self.cost[met, body.color_group[part] + 1]
+        parts = len(body.parts)
+        total, count = np.bincount(part, cost, parts), np.bincount(part, minlength=parts)
         return total.astype(np.float64), count.astype(np.int64)
 
     def hidden(self, label: NDArray[np.uint8]) -> float:

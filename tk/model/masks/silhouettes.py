@@ -186,12 +186,11 @@ class SilhouetteRenderer:
     def __init__(self, body: ConeBody, rig: Rig) -> None:
         self._arrays = body.arrays
         self._rays, self._cameras = pixel_rays(rig), pack_cameras(rig).astype(np.float32)
-        self._group = np.zeros(len(body.parts), np.int32)
         self._cost = np.zeros((*self._rays.shape[:3], 2), np.float32)
 
     def draw(self, pose: Float) -> NDArray[np.uint8]:
         """Return the silhouettes (V, H, W) at a pose (D,), 0 or 255."""
-        _, met = cast(self._arrays, self._group, self._cameras, 1, self._rays, self._cost, pose[None], export=True)
+        _, met = cast(self._arrays, self._cameras, 1, self._rays, self._cost, pose[None], export=True)
         assert met is not None
         return np.where(met.label[0] > 0, np.uint8(255), np.uint8(0))
 
