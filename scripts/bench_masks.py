@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from tk.io.captures.capture import Capture, open_capture
-from tk.io.captures.video import MASK_THRESHOLD
+from tk.io.captures.clip import MASK_THRESHOLD
 from tk.run.segmentation import make_labeller
 from tk.settings import Settings
 

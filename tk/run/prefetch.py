@@ -2,11 +2,13 @@
 
 A thread would not do: Taichi's launches hold the interpreter, so the tracker would wait while a thread segments. The
 process is a fresh interpreter (a fork would hang in Taichi, and multiprocessing's spawn imports the user's script
-again). It receives its task through a socket and passes frames in a ring of memory that both processes map. That memory
-has no name, and the system frees it when both processes have ended, however they end. When the tracker ends, the socket
-closes, and the process ends, too.
+again). Messages pass through a socket, frames through memory that both processes map, divided into slots of one frame:
 
-The frames are the same, bit for bit, as those that :func:`observe` makes in the tracker's own process.
+    tracker ── task, span of frames, numbers of free slots ──► process
+            ◄── _Ready: number of a slot with a frame, notes, _Failed, None after the last frame ──
+
+The memory has no name, so the system frees it when both processes have ended, however they end. When the tracker ends,
+the socket closes, and the process ends, too. The frames equal those of :class:`Serial` bit for bit.
 """
 
 from __future__ import annotations
@@ -55,12 +57,11 @@ TIMING_STAGES = ("decode", "masks", "wait")
 
 #: frames that the tracker usually holds: the current one, and the one before while it asks for the next
 _HELD = 2
-#: further frames that the tracker may hold without a copy, more than an opening has. Their memory is given back to the
-#: system when they are dropped.
-_SPARE = 40
-#: most bytes of the frames made ahead, beside the held ones: a few of eight full-HD cameras. Fewer would make the
-#: process wait.
-_RING_BYTES = 400_000_000
+#: slots of frames that the tracker holds, more than an opening has; further frames are copied. The memory of all but
+#: :data:`_HELD` free ones is given back to the system.
+_SPARE = 42
+#: most bytes of the frames made ahead: a few of eight full-HD cameras. Fewer would make the process wait.
+_AHEAD_BYTES = 400_000_000
 _HANDLE = b"memory"  # goes with the descriptor of the memory that both processes share
 #: seconds in which the process may end by itself. A shorter time would lose kernels that it has compiled.
 _PATIENCE_S = 5.0
@@ -197,7 +198,7 @@ class _Failed:
 
 
 class _Layout:
-    """Position of a slot's layers: images, masks, uncertain."""
+    """Size of a slot, and the position of its layers: images, masks, uncertain pixels."""
 
     def __init__(self, rig: Rig, keep_images: bool) -> None:
         self.masks = (len(rig), *rig.frame_shape)
@@ -230,19 +231,19 @@ def _nameless_file(size: int) -> int:
 class Ahead:
     """Observations that a separate process makes. It starts at once and learns the background.
 
-    The arrays of a frame stay as they are while they are referenced; then their place in the ring is used again.
+    The arrays of a frame stay as they are while they are referenced; then their slot is used again. For each frame that
+    it receives, the tracker gives the process a free slot, so the process always has ``settings.ahead`` of them.
     """
 
     def __init__(self, setup: Setup, source: Source, settings: Settings, note: Note, keep_images: bool = True) -> None:
         self._where, self._note = source.where, note
         self._layout = _Layout(setup.rig, keep_images)
-        slots = max(min(settings.ahead, _RING_BYTES // self._layout.bytes), 1) + _HELD
+        slots = max(min(settings.ahead, _AHEAD_BYTES // self._layout.bytes), 1)
         size = (slots + _SPARE) * self._layout.bytes  # the system provides memory where it is written
         handle = _nameless_file(size)
         self._memory = mmap.mmap(handle, size)
-        self._held = 0
-        self._spare = list(range(slots, slots + _SPARE))
-        self._returned: deque[int] = deque()
+        self._free = list(range(slots, slots + _SPARE))
+        self._dropped: deque[int] = deque()  # slots of frames that are no longer referenced
         self._begun = False
         try:
             started = worker.take()
@@ -262,7 +263,7 @@ class Ahead:
     def _arriving(self) -> Iterator[Observed]:
         while True:
             asked = time.perf_counter()
-            self._give_back()
+            self._collect()
             message = self._receive()
             if message is None:
                 return
@@ -273,30 +274,25 @@ class Ahead:
     def _take(self, ready: _Ready) -> Observation:
         size = self._layout.bytes
         slot = np.frombuffer(self._memory, np.uint8, size, ready.slot * size)
-        if self._held < _HELD or self._spare:
+        if self._free:
             # every view has this array for its base, so it goes with the last of them
-            weakref.finalize(slot, self._returned.append, ready.slot).atexit = False
-            if self._held >= _HELD:
-                self._send([self._spare.pop()])
-            self._held += 1
+            weakref.finalize(slot, self._dropped.append, ready.slot).atexit = False
+            self._send(self._free.pop())
         else:
             slot = slot.copy()
-            self._send([ready.slot])
+            self._send(ready.slot)
         images, masks, uncertain = self._layout.layers(slot)
         return Observation(
             ready.index, images, masks, uncertain if ready.uncertain else None, ready.time, ready.sources
         )
 
-    def _give_back(self) -> None:
-        slots = [self._returned.popleft() for _ in range(len(self._returned))]
-        more = max(min(self._held - _HELD, len(slots)), 0)  # as many as the process was given in their place
-        self._held -= len(slots)
-        for slot in slots[:more]:
-            if hasattr(mmap, "MADV_REMOVE"):  # Linux
+    def _collect(self) -> None:
+        """Make the dropped frames' slots free."""
+        while self._dropped:
+            slot = self._dropped.popleft()
+            if len(self._free) < _SPARE - _HELD and hasattr(mmap, "MADV_REMOVE"):  # Linux
                 self._memory.madvise(mmap.MADV_REMOVE, slot * self._layout.bytes, self._layout.bytes)
-        self._spare += slots[:more]
-        if slots[more:]:
-            self._send(slots[more:])
+            self._free.append(slot)
 
     def _send(self, message: object) -> None:
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # its last messages are still to be read
@@ -349,8 +345,8 @@ class Ahead:
 # --- the process's side -----------------------------------------------------------------------------------------------
 
 
-class _Ring:
-    """The process's end of it."""
+class _Slots:
+    """The process's end of the shared memory."""
 
     def __init__(self, tracker: Connection, memory: mmap.mmap, task: _Task) -> None:
         self._tracker = tracker
@@ -361,7 +357,7 @@ class _Ring:
     def put(self, observation: Observation, watch: Stopwatch) -> None:
         """Hand a frame over; waits for a free slot."""
         while not self._free:
-            self._free += self._tracker.recv()
+            self._free.append(self._tracker.recv())
         number, size = self._free.pop(), self._layout.bytes
         images, masks, uncertain = self._layout.layers(np.frombuffer(self._memory, np.uint8, size, number * size))
         images[...] = observation.images
@@ -419,8 +415,8 @@ def _warm_up(end: socket.socket) -> None:
 def _serve(tracker: Connection, memory: mmap.mmap) -> None:
     task: _Task = tracker.recv()
     label = make_labeller(task.setup, task.source, task.settings, tracker.send)
-    ring = _Ring(tracker, memory, task)
+    slots = _Slots(tracker, memory, task)
     span: tuple[int, int | None] = tracker.recv()
     for observation, watch in observe(task.source, label, span, task.keep_images):
-        ring.put(observation, watch)
+        slots.put(observation, watch)
     tracker.send(None)

@@ -18,8 +18,10 @@ import pytest
 
 from tests.io.conftest import HEIGHT, WIDTH, picture, read_tag, write_picture, write_video
 from tk.errors import VideoError
+from tk.io.captures.clip import Clip, Image
+from tk.io.captures.clip_folder import list_clips, probe
 from tk.io.captures.frames import FrameReader
-from tk.io.captures.video import Clip, Image, list_clips, probe, probe_video
+from tk.io.captures.video import probe_video
 
 
 @pytest.fixture(autouse=True)
@@ -310,7 +312,7 @@ def test_opencv_and_ffmpeg_print_nothing(tmp_path: Path) -> None:
     (tmp_path / "empty.png").touch()
     program = (
         "import cv2, sys, pathlib\n"  # OpenCV is imported first, as in a user's script
-        "from tk.io.captures.video import probe\n"
+        "from tk.io.captures.clip_folder import probe\n"
         "from tk.errors import VideoError\n"
         "for name in ('cut.mp4', 'text.mp4', 'cut.png', 'cut.jpg', 'none.mp4', 'empty.png'):\n"
         "    try: probe(pathlib.Path(sys.argv[1]) / name)\n"
@@ -468,7 +470,7 @@ def test_an_open_reader_does_not_block_the_exit(tmp_path: Path) -> None:
     write_video(tmp_path / "a.mp4", [picture(0, k) for k in range(30)])
     program = (
         "import sys, pathlib\n"
-        "from tk.io.captures.video import probe\n"
+        "from tk.io.captures.clip_folder import probe\n"
         "from tk.io.captures.frames import FrameReader\n"
         "clip = probe(pathlib.Path(sys.argv[1]))\n"
         "reader = FrameReader([clip, clip], None, (clip.height, clip.width), range(30))\n"

@@ -16,21 +16,15 @@ from numpy.typing import NDArray
 from tk.errors import CaptureError, VideoError, VolumeError
 from tk.io.captures.calibration import Calibration, match_camera, read_calibration
 from tk.io.captures.capture_toml import CaptureSettings, GivenSubject, read_settings
+from tk.io.captures.clip import Clip, Image
+from tk.io.captures.clip_folder import list_clips, probe
 from tk.io.captures.frames import FrameReader, FrameSet
 from tk.io.captures.mobo import SETTINGS as MOBO_SETTINGS
 from tk.io.captures.mobo import find_walk, read_cameras
+from tk.io.captures.pictures import PictureClip, picture_number
 from tk.io.captures.timing import check_clock, read_stamps
 from tk.io.captures.timing import resample as resampled
-from tk.io.captures.video import (
-    Clip,
-    Image,
-    PictureClip,
-    VideoClip,
-    damaged_images,
-    list_clips,
-    picture_number,
-    probe,
-)
+from tk.io.captures.video import VideoClip, damaged_images
 from tk.io.paths import text_of
 from tk.model.cameras.camera import Camera, Rig
 from tk.model.cameras.common_view import infer_volume, sample_box, views_of

@@ -14,7 +14,7 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-from tk.io.captures.video import Clip, Image, Reader
+from tk.io.captures.clip import Clip, Image, Reader
 
 #: most frames decoded ahead, and most bytes of them. Fewer make the consumer wait for a slow image.
 _AHEAD = 8

@@ -7,7 +7,7 @@ same moment as frame k of the others, so different rates are an error, unless th
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tk.errors import CaptureError, ClockError
 from tk.io.captures.calibration import Calibration, match_camera
-from tk.io.captures.video import Clip, Reader
+from tk.io.captures.clip import Clip, Reader
 from tk.io.toml import read_text, shown
 
 Float = NDArray[np.float64]
@@ -196,14 +196,10 @@ def resample(
             f"resampled to {fps:.5g} frames/s by the time stamps"
             + (f"; frames without an image: {', '.join(missing)}" if missing else "")
         )
-    new = tuple(Resampled(clip, numbers, fps) for clip, numbers in zip(clips, pictures, strict=True))
-    if masks is None:
-        return new, None, fps
-    return (
-        new,
-        tuple(Resampled(mask, n[n < mask.frame_count], fps) for mask, n in zip(masks, pictures, strict=True)),
-        fps,
-    )
+    new = tuple(map(Resampled.of, clips, pictures))
+    if masks is not None:
+        masks = tuple(Resampled.of(mask, n[n < mask.frame_count]) for mask, n in zip(masks, pictures, strict=True))
+    return new, masks, fps
 
 
 def _nearest(stamps: Stamps, begin: float, fps: float) -> NDArray[np.int64]:
@@ -218,45 +214,23 @@ def _nearest(stamps: Stamps, begin: float, fps: float) -> NDArray[np.int64]:
     return np.where(far, -1, nearest)
 
 
-@dataclass(frozen=True)
-class Resampled:
-    """Images of a clip in another order of time. See :class:`tk.io.captures.video.Clip`.
+@dataclass(frozen=True, kw_only=True)
+class Resampled(Clip):
+    """Images of a clip in another order of time."""
 
-    Attributes:
-        clip: the images.
-        pictures: (F,) number of each frame's image, never decreasing; -1: the frame is blank.
-        fps: frame rate, 1/s.
-    """
+    clip: Clip  # the images
+    pictures: NDArray[np.int64] = field(compare=False)  # (F,) see :meth:`shown`, never decreasing
 
-    clip: Clip
-    pictures: NDArray[np.int64] = field(compare=False)
-    fps: float | None
-
-    @property
-    def path(self) -> Path:
-        return self.clip.path
-
-    @property
-    def width(self) -> int:
-        return self.clip.width
-
-    @property
-    def height(self) -> int:
-        return self.clip.height
-
-    @property
-    def frame_count(self) -> int:
-        return len(self.pictures)
-
-    @property
-    def times_s(self) -> None:
-        return None
+    @staticmethod
+    def of(clip: Clip, pictures: NDArray[np.int64]) -> Resampled:
+        """Return a clip whose frame k shows image ``pictures[k]``; -1: it is blank."""
+        return Resampled(clip.path, clip.width, clip.height, len(pictures), clip=clip, pictures=pictures)
 
     def open(self) -> Reader:
         return self.clip.open()
 
     def shown(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
-        return self.pictures[np.clip(frames, 0, self.frame_count - 1)]
+        return self.pictures[super().shown(frames)]
 
     def reduced(self, factor: int) -> Resampled:
-        return replace(self, clip=self.clip.reduced(factor))
+        return Resampled.of(self.clip.reduced(factor), self.pictures)

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from tk.errors import CaptureError, VideoError
 from tk.io.captures.calibration import match_camera
-from tk.io.captures.video import PICTURE_SUFFIXES, VIDEO_SUFFIXES
+from tk.io.captures.pictures import PICTURE_SUFFIXES
+from tk.io.captures.video import VIDEO_SUFFIXES
 
 #: suffixes of videos that tk does not read; a message names such files if there are no others
 _OTHER_VIDEOS = (".m4v", ".mts", ".m2ts", ".webm", ".wmv", ".mpg", ".mpeg", ".flv", ".3gp", ".ts")

@@ -16,7 +16,8 @@ import tomli_w
 from tk.errors import CalibrationError, CaptureError, ClockError, VolumeError
 from tk.io.captures.calibration import camera_table
 from tk.io.captures.capture import open_capture
-from tk.io.captures.video import PICTURE_SUFFIXES, probe
+from tk.io.captures.clip_folder import probe
+from tk.io.captures.pictures import PICTURE_SUFFIXES
 from tk.io.importers.project import Project
 from tk.io.paths import replacing, text_of
 from tk.model.cameras.camera import Camera, Rig
