@@ -35,7 +35,8 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from scripts.fault_kinds import FAULTS, Faulty
+from scripts.fault_kinds import FAULTS
+from scripts.faulty import Faulty
 from tk.io.captures.calibration import read_calibration
 from tk.io.captures.capture import open_capture
 from tk.io.results.reader import read_joints

@@ -17,9 +17,10 @@ from scripts.make_capture import main
 from scripts.synthetic.actor import Look, make_actor
 from scripts.synthetic.capture import BACKGROUND_FRAMES, OFFSETS, CameraRenderer, Options, Plan, plan_capture
 from scripts.synthetic.motion import HOLD, KNEE_RADIUS, MOTIONS
-from scripts.synthetic.render import CLOSE_M, Body, distances, render_actor, sample_rays
+from scripts.synthetic.render import Body, distances, render_actor, sample_rays
 from scripts.synthetic.rig import RIGS
 from scripts.synthetic.skeleton import JOINTS, LIMITS_DEG, Pose, forward, make_skeleton, sole_points
+from scripts.synthetic.tracing import CLOSE_M
 from tk.io.toml import load_toml
 from tk.model.cameras.camera import Camera
 
