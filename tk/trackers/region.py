@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -76,6 +76,19 @@ MISPLACED = 0.25
 # limb has no contour to follow, and appears elsewhere. With 0.1 and 0.2 the limbs of seven people in four rendered
 # scenes are on average 0.3 and 0.4 cm worse; a search in every frame changes the mean of 13 people by 0.1 cm.
 HIDDEN, SEARCH_HIDDEN = 0.02, 2
+
+
+class _Look(NamedTuple):
+    """How the best pose explains a frame."""
+
+    label: NDArray[np.uint8]  # (V, h, w) the parts that the grid's rays meet
+    curvature: Float  # (D, D) JᵀWJ
+    residual: Float  # (V, 2) missing and surplus area
+
+    @property
+    def error(self) -> Float:
+        """(V,) E_S."""
+        return np.asarray(self.residual.sum(axis=1))
 
 
 class RegionTracker(ContourTracker):
@@ -166,37 +179,32 @@ class RegionTracker(ContourTracker):
         ]
         self._rank()
         i = int(np.argmin([np.abs(pose - self._best.pose).max() for pose in poses]))
-        label, curvature = met.label[i], hessian[i]
-        residual = evidence.residual(label)
-        error = residual.sum(axis=1)
+        look = _Look(met.label[i], hessian[i], evidence.residual(met.label[i]))
         watch.lap("check")
-        cut = not self._lost_for and self.residuals.jumped(residual)
-        if cut and self._find_again(pyramid, error):
-            label, curvature, residual = self._look(evidence, pyramid, images)
-            error = residual.sum(axis=1)
-        misplaced = self.misplaced(evidence, label)
-        searched = self._needs_search(frame, self.residuals.high(error), misplaced, evidence.hidden(label))
+        cut = not self._lost_for and self.residuals.jumped(look.residual)
+        if cut and self._find_again(pyramid, look.error):
+            look = self._look(evidence, pyramid, images)
+        misplaced = self.misplaced(evidence, look.label)
+        searched = self._needs_search(frame, self.residuals.high(look.error), misplaced, evidence.hidden(look.label))
         if searched:
             settled = self._best.pose
             self._propose(frame, pyramid, evidence, images, misplaced)
             if self._best.pose is not settled:
-                label, curvature, residual = self._look(evidence, pyramid, images)
-                error = residual.sum(axis=1)
+                look = self._look(evidence, pyramid, images)
         watch.lap("search")
         followed = self._best.pose
-        lost = self._recover(pyramid, error)
+        lost = self._recover(pyramid, look.error)
         if self._best.pose is not followed:
-            label, curvature, residual = self._look(evidence, pyramid, images)
-            error = residual.sum(axis=1)
-        lost |= self._lost_for < UNKNOWN_AFTER and self.residuals.jumped(residual)
-        self._learn(evidence, label, error, lost)
+            look = self._look(evidence, pyramid, images)
+        lost |= self._lost_for < UNKNOWN_AFTER and self.residuals.jumped(look.residual)
+        self._learn(evidence, look, lost)
         again = cut or self._lost_for > 0
         status = "lost" if lost else "initialised" if self._fresh else "recovered" if again else "tracked"
         self._lost_for = self._lost_for + 1 if lost else 0
         self._fresh = False
         pose = self._best.pose
-        sigma = self._sigma(pose, curvature, label, residual)
-        if self._high_for >= UNKNOWN_AFTER and self.residuals.high(error):
+        sigma = self._sigma(pose, look)
+        if self._high_for >= UNKNOWN_AFTER and self.residuals.high(look.error):
             sigma[:] = np.nan
         watch.lap("check")
         return Estimate(
@@ -206,9 +214,9 @@ class RegionTracker(ContourTracker):
             iterations=np.array([iterations.sum(), int(searched)], np.int32),
             timing=watch.laps,
             sigma=sigma,
-            residual=residual,
+            residual=look.residual,
             masks=pyramid.masks[0],
-            drawn=label > 0,
+            drawn=look.label > 0,
         )
 
     def without_foreign(self, frame: Observation) -> Observation:
@@ -358,30 +366,28 @@ class RegionTracker(ContourTracker):
         self._alive = [Hypothesis(pose, pose, self._best.cost)]
         return True
 
-    def _learn(self, evidence: Evidence, label: NDArray[np.uint8], by_view: Float, lost: bool) -> None:
-        """Update the baseline of the residual; the colours, too, if E_S (V,) is not above the baseline."""
+    def _learn(self, evidence: Evidence, look: _Look, lost: bool) -> None:
+        """Update the baseline of the residual; the colours, too, if E_S is not above the baseline."""
         if lost:
             return
-        if self.config.colors and evidence.bins is not None and self.residuals.mean_excess(by_view) <= 0:
-            self.colors.learn(evidence.bins[evidence.person], label[evidence.person])
-        self.residuals.learn(by_view)
+        if self.config.colors and evidence.bins is not None and self.residuals.mean_excess(look.error) <= 0:
+            self.colors.learn(evidence.bins[evidence.person], look.label[evidence.person])
+        self.residuals.learn(look.error)
 
-    def _look(
-        self, evidence: Evidence, pyramid: Pyramid, images: NDArray[np.uint8] | None
-    ) -> tuple[NDArray[np.uint8], Float, Float]:
-        """Return the best pose's labels on the grid (V, h, w), JᵀWJ (D, D), and residual (V, 2)."""
+    def _look(self, evidence: Evidence, pyramid: Pyramid, images: NDArray[np.uint8] | None) -> _Look:
+        """Return how the best pose explains the frame."""
         best = self._best.pose[None]
         _, met = evidence.cast(self.body, best, export=True)
         assert met is not None
         regions = None if images is None else self.colors.regions(images)
         here = self.views.equations(self.body.arrays, pyramid, best, 0, self.line_search, regions)
-        return met.label[0], here.hessian[0], evidence.residual(met.label[0])
+        return _Look(met.label[0], here.hessian[0], evidence.residual(met.label[0]))
 
-    def _sigma(self, pose: Float, curvature: Float, label: NDArray[np.uint8], residual: Float) -> Float:
+    def _sigma(self, pose: Float, look: _Look) -> Float:
         """Return (J,) one standard deviation of each joint's position along an axis, metres: from the evidence of this
         frame, the difference to the mean posture until now, and the spread of the hypotheses."""
         skeleton = self.body.skeleton
-        variance = self.variance(pose, curvature, self.prior(pose), label, residual)
+        variance = self.variance(pose, look.curvature, self.prior(pose), look.label, look.residual)
         self._postures = min(self._postures + 1, _POSTURE_FRAMES)
         self._mean_posture += (directions(skeleton, pose) - self._mean_posture) / self._postures
         variance += posture_variance(skeleton, pose, self._mean_posture)
